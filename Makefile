@@ -1,0 +1,37 @@
+# Everything runs in .venv, made here from nothing but Python with venv.
+
+PYTHON ?= python3
+BIN := .venv/bin
+PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile
+
+.DEFAULT_GOAL := help
+.PHONY: help study test test-long check clean
+
+help:  ## this list
+	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 16
+
+study: .venv/installed  ## run the study of the paper into results/paper
+	$(BIN)/studies paper --out results/paper
+
+test: .venv/installed  ## run the tests
+	$(PYTEST)
+
+test-long: .venv/installed  ## run the long campaigns
+	$(PYTEST) -m long
+
+check: .venv/installed  ## lint, check types, run the tests
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(PYTEST)
+
+clean:  ## remove the environment, caches and build products; results stay
+	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+.venv/installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys, ensurepip, venv; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null \
+	  || { echo "$(PYTHON) is $$($(PYTHON) --version 2>&1): Python 3.11 to 3.13 with venv is needed" \
+	       "(Debian: package python3-venv); name another with: make PYTHON=python3.12" >&2; exit 1; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,dev]'
+	@touch $@

@@ -1,0 +1,126 @@
+"""One case of a study: `Case` holds every traced number, `Structure` what fixes the compiled program.
+
+Cases of equal structure stack into one batch and share one compilation.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from jaxmodel.motion import Path
+from jaxmodel.parameters import Array, Machine
+
+
+class Structure(NamedTuple):
+    """Static and hashable: array sizes and the few choices that change the program."""
+
+    n_modes: int = 8  # R, plant modes per link (upper bound; `Case.n_modes` may be fewer)
+    n_controlled: int = 3  # C, controlled modes per link (upper bound; `Control.n_active`)
+    n_patches: int = 3  # K, patch pairs per link
+    n_steps: int = 8000  # samples in the run
+    substeps: int = 1  # plant steps per sample
+    n_frequencies: int = 9  # points of the power spectral density per controlled mode
+    basis: str = "pinned_pinned"  # of the plant
+    controller_basis: str = "pinned_pinned"
+    feedback: str = "sampled"  # "sampled", "ideal" or "none"
+    law: str = "imsc"  # "imsc" or "srf"
+    has_feedforward: bool = False  # computed torque on top of PD
+    has_noise: bool = False  # seeded ADC noise and force ripple
+    is_smooth: bool = False  # rounding replaced by equal noise, limits by tanh: for gradients
+
+    @property
+    def n_channels(self) -> int:
+        """Signals the estimator works on, per link."""
+        return self.n_patches if self.law == "srf" else self.n_controlled
+
+
+class Control(NamedTuple):
+    """Controller settings; masks are 1 or 0."""
+
+    n_active: Array  # number of controlled modes, ()
+    link_mask: Array  # controlled links, (3,)
+    mode_mask: Array  # controlled modes of each link, (3, C)
+    velocity_gain: Array  # k_d of mode 1 [N s/m] or [1/s], (3,); SRF: [s]
+    position_gain: Array  # k_p of mode 1 [N/m] or [1/s2], (3,); SRF: [1]
+    ratio: Array  # EMC ratios (24) [1], (3, C)
+    gain_factor: Array  # common factor on all gains [1], ()
+    is_per_mass: Array  # 1: gains in 1/s and 1/s2, 0: in N s/m and N/m, ()
+    feedthrough_factor: Array  # share of the residual modes' feed-through compensated [1], ()
+
+
+class Electronics(NamedTuple):
+    """Sampling, converters and the velocity estimate."""
+
+    period: Array  # T [s], ()
+    antialias: Array  # corner of the Butterworth filter [rad/s], ()
+    conditioner_gain: Array  # ADC volt per sensor volt [1], ()
+    conditioner_bias: Array  # [V], ()
+    adc_range: Array  # full scale, from 0 [V], ()
+    adc_levels: Array  # 2^bits [1], ()
+    adc_noise: Array  # rms, at the ADC input [V], ()
+    voltage_limit: Array  # actuator limit [V], ()
+    estimator: Array  # index in `estimator.KINDS`, ()
+    highpass: Array  # [rad/s], ()
+    lowpass_ratio: Array  # kappa [1], (C,)
+    lowpass_zeta: Array  # [1], (C,)
+    difference_cutoff: Array  # [rad/s], ()
+
+
+class Shaping(NamedTuple):
+    """Input shaper of the reference, one entry per shaped frequency."""
+
+    kind: Array  # index in `shaper.KINDS`, ()
+    omega: Array  # [rad/s], (n,)
+    zeta: Array  # [1], (n,)
+    tolerance: Array  # V of the EI family [1], ()
+    is_exact: Array  # 1: impulses split exactly for the first frequency, 0: linearly, ()
+
+
+class Drive(NamedTuple):
+    """Slider servo and what disturbs it; (3,) or ()."""
+
+    kp: Array  # [N/m]
+    kd: Array  # [N s/m]
+    force_limit: Array  # [N]
+    coulomb_friction: Array  # [N]
+    friction_speed: Array  # speed of the tanh [m/s]
+    viscous_friction: Array  # [N s/m]
+    ripple: Array  # seeded force ripple, rms [N]
+    pulse_force: Array  # disturbance [N], (3,)
+    pulse_start: Array  # [s], ()
+    pulse_length: Array  # [s], ()
+    is_locked: Array  # 1: sliders held (bases with Y(L) = 0), ()
+
+
+class Initial(NamedTuple):
+    """State at t = 0 beyond rest at the first way-point."""
+
+    modal: Array  # q [m], (3, R)
+    load_station: Array  # where a static transverse load bends the links [m], ()
+    load_deflection: Array  # chord deflection there [m], (3,)
+
+
+class Windows(NamedTuple):
+    """How metrics look at the run."""
+
+    residual_delay: Array  # from the end of the shaped command [s], ()
+    residual_length: Array  # [s], ()
+    settling_band: Array  # chord deflection [m], ()
+    saturation_limit: Array  # tolerated fraction of saturated samples [1], ()
+    condition_limit: Array  # tolerated condition number [1], ()
+    stations: Array  # where chord deflection is taken [m], (S,)
+
+
+class Case(NamedTuple):
+    """Every number of one closed-loop run."""
+
+    machine: Machine
+    n_modes: Array  # plant modes per link in use, ()
+    path: Path
+    shaping: Shaping
+    control: Control
+    electronics: Electronics
+    drive: Drive
+    initial: Initial
+    windows: Windows
+    seed: Array  # of ADC noise and ripple, ()

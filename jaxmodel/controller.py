@@ -1,0 +1,123 @@
+"""The sampled controller: ADC, modal filter, estimator, gains, synthesizer, saturation, delay.
+
+`controller_step` is what a DSP does once per sample. Shapes: links first, then patches (K) or
+channels (C), then lanes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from jaxmodel.estimator import Estimator
+from jaxmodel.parameters import Array
+
+
+class Controller(NamedTuple):
+    """Coefficients, worked out once per case."""
+
+    filter: Array  # channels from sensor voltages [m/V] (SRF: identity), (3, C, K)
+    estimator: Estimator  # (3, C) each
+    velocity_gain: Array  # [N s/m] (SRF: [s]), (3, C)
+    position_gain: Array  # [N/m] (SRF: [1]), (3, C)
+    synthesizer: Array  # voltages from channel forces [V/N] (SRF: identity), (3, K, C)
+    feedthrough: Array  # sensor volts per actuator volt to subtract [1], (3, K, K)
+    voltage_limit: Array  # [V], ()
+    adc_gain: Array  # conditioner gain [1], ()
+    adc_bias: Array  # [V], ()
+    adc_step: Array  # one code [V], ()
+    adc_top: Array  # highest code [1], ()
+    adc_noise: Array  # rms at the ADC input [V], ()
+
+
+class ControllerState(NamedTuple):
+    """What the controller remembers from sample to sample."""
+
+    first: Array  # state of the first-order section, (3, C)
+    second: tuple[Array, Array]  # delay line of the second-order section, (3, C) each
+    voltage: Array  # command applied during this sample, computed in the last one [V], (3, K)
+
+
+class ControllerInfo(NamedTuple):
+    """Diagnostics of one sample."""
+
+    measured: Array  # sensor voltage as the controller sees it [V], (3, K)
+    command: Array  # new command, applied from the next sample on [V], (3, K)
+    is_clipped: Array  # ADC at its end, 0 or 1 per channel, (3, K)
+
+
+def rest_controller(n_channels: int, n_patches: int, dtype) -> ControllerState:
+    """All zeros."""
+    zero = jnp.zeros((3, n_channels), dtype)
+    return ControllerState(zero, (zero, zero), jnp.zeros((3, n_patches), dtype))
+
+
+def soft_limit(x: Array, bound: Array, is_smooth: bool) -> Array:
+    """x limited to +-bound: clipped, or bound tanh(x/bound) where a gradient is wanted."""
+    return bound * jnp.tanh(x / bound) if is_smooth else jnp.clip(x, -bound, bound)
+
+
+def convert(controller: Controller, voltage: Array, noise: Array | None, is_smooth: bool):
+    """Conditioner and ADC: sensor voltage [V] as read back from the code, and where it clips.
+
+    Args:
+        controller: coefficients.
+        voltage: filtered sensor voltage [V], (3, K).
+        noise: standard normal numbers, (3, K), or None.
+        is_smooth: leave out rounding and clipping, add noise of equal variance instead.
+
+    Returns:
+        (measured [V], is_clipped), (3, K) each.
+    """
+    level = controller.adc_gain * voltage + controller.adc_bias
+    step, sigma = controller.adc_step, controller.adc_noise
+    if is_smooth:  # uniform rounding error has variance step^2/12
+        sigma = jnp.sqrt(sigma * sigma + step * step / 12)
+    if noise is not None:
+        level = level + sigma * noise
+    if is_smooth:
+        return (level - controller.adc_bias) / controller.adc_gain, jnp.zeros_like(level)
+    code = jnp.round(level / step)
+    clipped = jnp.clip(code, 0.0, controller.adc_top)
+    is_clipped = jnp.where(code == clipped, jnp.zeros_like(code), jnp.ones_like(code))
+    return (clipped * step - controller.adc_bias) / controller.adc_gain, is_clipped
+
+
+def controller_step(
+    controller: Controller,
+    state: ControllerState,
+    voltage: Array,
+    noise: Array | None = None,
+    is_smooth: bool = False,
+) -> tuple[ControllerState, ControllerInfo]:
+    """One sample of the controller.
+
+    Args:
+        controller: coefficients.
+        state: from the last sample; `state.voltage` is on the actuators now.
+        voltage: sensor voltages behind the anti-alias filter at the sampling instant [V], (3, K).
+        noise: standard normal numbers for the ADC, (3, K), or None.
+        is_smooth: see `Structure`.
+
+    Returns:
+        (next state, ControllerInfo).
+    """
+    measured, is_clipped = convert(controller, voltage, noise, is_smooth)
+    own = jnp.sum(controller.feedthrough * state.voltage[:, None], axis=2)
+    channel = jnp.sum(controller.filter * (measured - own)[:, None], axis=2)
+
+    estimator = controller.estimator
+    b0, b1, a1 = estimator.first
+    high = b0 * channel + state.first
+    newest = high - estimator.denominator[0] * state.second[0]
+    newest = newest - estimator.denominator[1] * state.second[1]
+    line = (newest, state.second[0], state.second[1])
+    rate = sum(n * x for n, x in zip(estimator.velocity, line))
+    value = sum(n * x for n, x in zip(estimator.position, line)) + estimator.direct * channel
+
+    force = -controller.velocity_gain * rate - controller.position_gain * value
+    wanted = jnp.sum(controller.synthesizer * force[:, None], axis=2)
+    command = soft_limit(wanted, controller.voltage_limit, is_smooth)
+    after = ControllerState(b1 * channel - a1 * high, (newest, state.second[0]), command)
+    return after, ControllerInfo(measured, command, is_clipped)

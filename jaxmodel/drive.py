@@ -1,0 +1,43 @@
+"""Slider drive: PD on rho, optional computed torque, force limit, smooth friction, disturbances."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from jaxmodel.case import Drive
+from jaxmodel.controller import soft_limit
+from jaxmodel.parameters import Array
+
+
+class Reference(NamedTuple):
+    """Wanted motion of the sliders at one instant, (3,) each."""
+
+    rho: Array  # [m]
+    rho_rate: Array  # [m/s]
+    feedforward: Array | None  # computed-torque force [N]
+    disturbance: Array  # force from outside, held over the sample [N]
+
+
+def motor_force(drive: Drive, reference: Reference, rho: Array, rho_rate: Array, is_smooth: bool):
+    """Force of the motors F = Kp (rho_d - rho) + Kd (rho_d' - rho') (+ feed-forward) [N], (3,).
+
+    Args:
+        drive: gains and limit, fields (3,) or ().
+        reference: wanted motion.
+        rho: slider positions [m], (3,).
+        rho_rate: [m/s], (3,).
+        is_smooth: limit by tanh instead of clipping.
+    """
+    force = drive.kp * (reference.rho - rho) + drive.kd * (reference.rho_rate - rho_rate)
+    if reference.feedforward is not None:
+        force = force + reference.feedforward
+    return soft_limit(force, drive.force_limit, is_smooth)
+
+
+def slider_force(drive: Drive, reference: Reference, rho: Array, rho_rate: Array, is_smooth: bool):
+    """Total force on the sliders [N], (3,): motors, friction F_c tanh(rho'/v) + c rho', disturbance."""
+    friction = drive.coulomb_friction * jnp.tanh(rho_rate / drive.friction_speed)
+    motors = motor_force(drive, reference, rho, rho_rate, is_smooth)
+    return motors - friction - drive.viscous_friction * rho_rate + reference.disturbance

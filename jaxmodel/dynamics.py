@@ -1,0 +1,293 @@
+"""Equations of motion (1)-(9), reduced to pose and modes by Kane's method, O(R) per link.
+
+The mass matrix is a block arrow: links couple only through the three pose accelerations. Per link
+the modal accelerations are eliminated through a few sums, then one symmetric 3x3 system gives the
+pose and back-substitution the rest. docs/theory.md derives each line. Elementwise arithmetic only.
+Shapes as in `jaxmodel.plant`: structure first, lanes last.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from jaxmodel.kinematics import Chain, close_chain
+from jaxmodel.parameters import Array
+from jaxmodel.plant import Plant
+
+
+class Accelerations(NamedTuple):
+    """Result of one evaluation of the dynamics."""
+
+    pose: Array  # X'' [m/s2, m/s2, rad/s2], (3,)
+    modal: Array  # q'' [m/s2], (3, R)
+    coupling: Array  # q'' + (k q + d q')/m: all but the oscillator itself [m/s2], (3, R)
+    rho: Array  # rho'' [m/s2], (3,)
+    gamma: Array  # gamma'' [rad/s2], (3,)
+
+
+def modal_chain(
+    plant: Plant, pose: Array, pose_rate: Array, q: Array, q_rate: Array
+) -> Chain:
+    """`close_chain` of the bent machine: w = sum_j Y_j(L) q_j (4), (6).
+
+    Args:
+        plant: the machine.
+        pose: (3,) [m, m, rad].
+        pose_rate: (3,).
+        q: modal coordinates [m], (3, R).
+        q_rate: [m/s], (3, R).
+    """
+    if plant.tip is None:
+        return close_chain(plant, pose, pose_rate)
+    tip, tip_rate = jnp.sum(plant.tip * q, axis=1), jnp.sum(plant.tip * q_rate, axis=1)
+    return close_chain(plant, pose, pose_rate, tip, tip_rate)
+
+
+class _Link(NamedTuple):
+    """Reduced 2x2 system of a link in (rho, gamma): K (rho0'', gamma0'') + load."""
+
+    k_rr: Array
+    k_rg: Array
+    k_gg: Array
+    load_r: Array
+    load_g: Array
+
+
+def accelerations(
+    plant: Plant,
+    chain: Chain,
+    pose_rate: Array,
+    q: Array,
+    q_rate: Array,
+    slider_force: Array,
+    modal_force: Array,
+) -> Accelerations:
+    """Accelerations of pose and modes, (7) solved.
+
+    Args:
+        plant: the machine.
+        chain: closure at this state, from `modal_chain`.
+        pose_rate: (3,).
+        q: modal coordinates [m], (3, R).
+        q_rate: [m/s], (3, R).
+        slider_force: along the guides [N], (3,).
+        modal_force: generalised piezo forces Q_j (14) [N], (3, R).
+
+    Returns:
+        Accelerations.
+    """
+    sine, cosine, root, rate = chain.sine, chain.cosine, chain.root, chain.gamma_rate
+    phi2 = pose_rate[2] * pose_rate[2]
+    lever = chain.h / root
+    # velocity terms of gamma'' and rho'' at X'' = 0, w'' = 0
+    root_rate = (chain.tip * chain.tip_rate - chain.h * chain.h_rate) / root
+    gamma_0 = (sine * rate * chain.tip_rate - rate * root_rate - chain.cn * phi2) / root
+    rho_0 = (
+        chain.h_rate * rate + cosine * rate * chain.tip_rate - chain.cu * phi2 + chain.h * gamma_0
+    )
+    # modal force balance without inertia: f = k q + d q' - Q - m q gamma'^2
+    centrifugal = plant.mass * q * (rate * rate)[:, None]
+    force = plant.stiffness * q + plant.damping * q_rate - modal_force - centrifugal
+
+    b_m, c_m = plant.b / plant.mass, plant.c / plant.mass
+    bq, bq_rate = jnp.sum(plant.b * q, axis=1), jnp.sum(plant.b * q_rate, axis=1)
+    bf, cf = jnp.sum(b_m * force, axis=1), jnp.sum(c_m * force, axis=1)
+    swing = plant.first_moment * sine + cosine * bq
+    link = _Link(
+        k_rr=plant.slider_link_mass - sine * sine * jnp.sum(b_m * plant.b, axis=1),
+        k_rg=sine * jnp.sum(b_m * plant.c, axis=1) - swing,
+        k_gg=plant.inertia
+        + jnp.sum(plant.mass * q * q, axis=1)
+        - jnp.sum(c_m * plant.c, axis=1),
+        load_r=sine * bf
+        - (plant.first_moment * cosine - sine * bq) * rate * rate
+        - 2 * cosine * rate * bq_rate
+        - slider_force,
+        load_g=2 * rate * jnp.sum(plant.mass * q * q_rate, axis=1) - cf,
+    )
+    if plant.tip is None:
+        tip_system, reduced = None, link
+    else:
+        tip_system, reduced = _eliminate_tip(plant, chain, link, force)
+    pose_acc = plant.free * _pose_acceleration(plant, chain, reduced, rho_0, gamma_0, lever)
+
+    along = plant.ux * pose_acc[0] + plant.uy * pose_acc[1] - chain.cn * pose_acc[2]
+    across = plant.ux * pose_acc[1] - plant.uy * pose_acc[0] + chain.cu * pose_acc[2]
+    gamma_acc = across / root + gamma_0
+    rho_acc = along + lever * across + rho_0
+    if tip_system is not None:
+        tip_acc, multiplier = tip_system(rho_acc, gamma_acc)
+        rho_acc = rho_acc - chain.tip / root * tip_acc
+        gamma_acc = gamma_acc - cosine / root * tip_acc
+    inertial = b_m * (sine * rho_acc)[:, None] - c_m * gamma_acc[:, None]
+    if tip_system is not None:
+        inertial = inertial + plant.tip / plant.mass * multiplier[:, None]
+    coupling = inertial + (modal_force + centrifugal) / plant.mass
+    modal_acc = inertial - force / plant.mass
+    return Accelerations(pose_acc, modal_acc, coupling, rho_acc, gamma_acc)
+
+
+def _eliminate_tip(plant: Plant, chain: Chain, link: _Link, force: Array):
+    """Take the link's tip acceleration w'' and its reaction out of the 2x2 system.
+
+    The tip moves with rho'' = rho0'' - alpha w'', gamma'' = gamma0'' - kappa w'' (alpha = w/P,
+    kappa = cos gamma/P), which gives two linear equations in w'' and the reaction Lambda:
+    D w'' = y.x0 - f_y + Y_y Lambda, D Lambda = beta.(M x0 + load) - (beta.M beta) w''.
+    """
+    tip_m = plant.tip / plant.mass
+    alpha, kappa = chain.tip / chain.root, chain.cosine / chain.root
+    y_r = chain.sine * jnp.sum(tip_m * plant.b, axis=1)
+    y_g = -jnp.sum(tip_m * plant.c, axis=1)
+    tip_force = jnp.sum(tip_m * force, axis=1)
+    compliance = jnp.sum(tip_m * plant.tip, axis=1)
+    m_r = alpha * link.k_rr + kappa * link.k_rg
+    m_g = alpha * link.k_rg + kappa * link.k_gg
+    beta_m_beta = alpha * m_r + kappa * m_g
+    beta_load = alpha * link.load_r + kappa * link.load_g
+    lead = 1 + y_r * alpha + y_g * kappa
+    determinant = lead * lead + compliance * beta_m_beta
+
+    def tip_system(rho_0: Array, gamma_0: Array) -> tuple[Array, Array]:
+        push = y_r * rho_0 + y_g * gamma_0 - tip_force
+        pull = m_r * rho_0 + m_g * gamma_0 + beta_load
+        return (
+            (lead * push + compliance * pull) / determinant,
+            (lead * pull - beta_m_beta * push) / determinant,
+        )
+
+    tip_0 = (compliance * beta_load - lead * tip_force) / determinant
+    multiplier_0 = (lead * beta_load + beta_m_beta * tip_force) / determinant
+
+    def reduced_term(m_a: Array, y_a: Array, m_b: Array, y_b: Array) -> Array:
+        mixed = lead * (m_a * y_b + y_a * m_b)
+        return (mixed + compliance * m_a * m_b - beta_m_beta * y_a * y_b) / determinant
+
+    return tip_system, _Link(
+        k_rr=link.k_rr - reduced_term(m_r, y_r, m_r, y_r),
+        k_rg=link.k_rg - reduced_term(m_r, y_r, m_g, y_g),
+        k_gg=link.k_gg - reduced_term(m_g, y_g, m_g, y_g),
+        load_r=link.load_r - m_r * tip_0 - y_r * multiplier_0,
+        load_g=link.load_g - m_g * tip_0 - y_g * multiplier_0,
+    )
+
+
+def _pose_acceleration(
+    plant: Plant, chain: Chain, link: _Link, rho_0: Array, gamma_0: Array, lever: Array
+) -> Array:
+    """Assemble sum_i T_i^t K_i T_i and solve it; T = rows (a + (h/P) d), d/P, a and d as below."""
+    ux, uy = plant.ux, plant.uy
+    v = link.k_rr * lever + link.k_rg / chain.root
+    z = lever * (v + link.k_rg / chain.root) + link.k_gg / (chain.root * chain.root)
+    force_r = link.k_rr * rho_0 + link.k_rg * gamma_0 + link.load_r
+    force_g = link.k_rg * rho_0 + link.k_gg * gamma_0 + link.load_g
+    force_d = lever * force_r + force_g / chain.root
+    a = (ux, uy, -chain.cn)  # s'' = a.X'' - cu phi'^2
+    d = (-uy, ux, chain.cu)  # h'' = d.X'' - cn phi'^2
+
+    def entry(i: int, j: int) -> Array:
+        term = link.k_rr * a[i] * a[j] + v * (a[i] * d[j] + d[i] * a[j]) + z * d[i] * d[j]
+        return jnp.sum(term, axis=0)
+
+    def load(i: int) -> Array:
+        return -jnp.sum(a[i] * force_r + d[i] * force_d, axis=0)
+
+    matrix = (
+        entry(0, 0) + plant.platform_mass, entry(0, 1), entry(0, 2),
+        entry(1, 1) + plant.platform_mass, entry(1, 2),
+        entry(2, 2) + plant.platform_inertia,
+    )  # fmt: skip
+    return solve_symmetric_3(matrix, (load(0), load(1), load(2)))
+
+
+def solve_symmetric_3(matrix: tuple[Array, ...], right: tuple[Array, ...]) -> Array:
+    """Solve a symmetric positive definite 3x3 system by L D L^t, elementwise.
+
+    Args:
+        matrix: (m00, m01, m02, m11, m12, m22).
+        right: three right-hand sides.
+
+    Returns:
+        (3,) stacked on a new first axis.
+    """
+    m00, m01, m02, m11, m12, m22 = matrix
+    l10, l20 = m01 / m00, m02 / m00
+    d1 = m11 - l10 * m01
+    e12 = m12 - l20 * m01
+    l21 = e12 / d1
+    d2 = m22 - l20 * m02 - l21 * e12
+    y1 = right[1] - l10 * right[0]
+    y2 = right[2] - l20 * right[0] - l21 * y1
+    x2 = y2 / d2
+    x1 = y1 / d1 - l21 * x2
+    return jnp.stack([right[0] / m00 - l10 * x1 - l20 * x2, x1, x2])
+
+
+def inverse_dynamics(plant: Plant, pose: Array, pose_rate: Array, pose_acc: Array) -> Array:
+    """Slider forces [N] that give the unbent machine a wanted pose acceleration (computed torque).
+
+    sum_i T_i^t (K_i x_i'' + load_i) + M_p X'' = J^t F with J rows a + (h/P) d.
+
+    Args:
+        plant: the machine.
+        pose: (3,) [m, m, rad].
+        pose_rate: (3,).
+        pose_acc: (3,).
+
+    Returns:
+        (3,).
+    """
+    chain = close_chain(plant, pose, pose_rate)
+    rate, lever = chain.gamma_rate, chain.h / chain.root
+    phi2 = pose_rate[2] * pose_rate[2]
+    a = jnp.stack([plant.ux, plant.uy, -chain.cn])
+    d = jnp.stack([-plant.uy, plant.ux, chain.cu])
+    along = jnp.sum(a * pose_acc[:, None], axis=0) - chain.cu * phi2
+    across = jnp.sum(d * pose_acc[:, None], axis=0) - chain.cn * phi2
+    gamma_acc = (across + rate * rate * chain.h) / chain.root
+    rho_acc = along + chain.h_rate * rate + chain.h * gamma_acc
+    swing = plant.first_moment * chain.sine
+    force_r = (
+        plant.slider_link_mass * rho_acc
+        - swing * gamma_acc
+        - plant.first_moment * chain.cosine * rate * rate
+    )
+    force_g = plant.inertia * gamma_acc - swing * rho_acc
+    jacobian = a + lever * d
+    platform = jnp.stack([plant.platform_mass, plant.platform_mass, plant.platform_inertia])
+    load = platform * pose_acc + jnp.sum(jacobian * force_r + d * force_g / chain.root, axis=1)
+    return jnp.linalg.solve(jacobian, load)
+
+
+def kinetic_energy(plant: Plant, chain: Chain, pose_rate: Array, q: Array, q_rate: Array) -> Array:
+    """Kinetic energy (1) [J] in closed form, docs/theory.md.
+
+    Args:
+        plant: the machine.
+        chain: closure at this state.
+        pose_rate: (3,).
+        q: [m], (3, R).
+        q_rate: [m/s], (3, R).
+    """
+    bq, bq_rate = jnp.sum(plant.b * q, axis=1), jnp.sum(plant.b * q_rate, axis=1)
+    swing = plant.first_moment * chain.sine + chain.cosine * bq
+    rotary = plant.inertia + jnp.sum(plant.mass * q * q, axis=1)
+    links = (
+        plant.slider_link_mass * chain.rho_rate**2 / 2
+        + rotary * chain.gamma_rate**2 / 2
+        + jnp.sum(plant.mass * q_rate**2, axis=1) / 2
+        + chain.gamma_rate * jnp.sum(plant.c * q_rate, axis=1)
+        - chain.rho_rate * chain.gamma_rate * swing
+        - chain.rho_rate * chain.sine * bq_rate
+    )
+    platform = (
+        plant.platform_mass * (pose_rate[0] ** 2 + pose_rate[1] ** 2)
+        + plant.platform_inertia * pose_rate[2] ** 2
+    ) / 2
+    return jnp.sum(links, axis=0) + platform
+
+
+def potential_energy(plant: Plant, q: Array) -> Array:
+    """Bending energy (2) [J]: sum k_j q_j^2/2."""
+    return jnp.sum(plant.stiffness * q * q) / 2

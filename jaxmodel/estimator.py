@@ -1,0 +1,125 @@
+"""Velocity (and position) estimates of the sampled controller, one filter chain per channel.
+
+Every estimator is a first-order section followed by a second-order one, so that they differ in
+numbers only. The second section keeps its state before the numerators and so serves two outputs.
+
+- `modal_phase`: high-pass (Tustin) times low-pass (Tustin, prewarped) whose output a q + b q' is
+  chosen so that anti-alias filter, delay, hold and filter together are exactly j omega at the
+  assembled frequency omega of the mode: right amplitude and phase where the vibration is.
+- `difference`: backward difference behind a first-order low-pass. A warning, not a proposal: it
+  destabilises the paper's gains on a plant with seven modes or more.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from jaxmodel.parameters import Array
+
+KINDS = ("modal_phase", "difference")
+
+
+class Estimator(NamedTuple):
+    """Coefficients per channel, (3, C) each; z^-1 polynomials, leading denominator term 1."""
+
+    first: tuple[Array, Array, Array]  # numerator b0, b1 and denominator a1
+    denominator: tuple[Array, Array]  # a1, a2 of the second section
+    velocity: tuple[Array, Array, Array]  # its numerator for the velocity
+    position: tuple[Array, Array, Array]  # and for the position
+    direct: Array  # share of the raw channel signal in the position
+
+
+def design_estimator(
+    kind: Array,
+    omega: Array,
+    period: Array,
+    antialias: Array,
+    highpass: Array,
+    lowpass_ratio: Array,
+    lowpass_zeta: Array,
+    difference_cutoff: Array,
+) -> Estimator:
+    """Estimator of either kind, selected by a traced index.
+
+    Args:
+        kind: index in `KINDS`, ().
+        omega: assembled frequency the chain is exact at [rad/s], (3, C).
+        period: sample time T [s], ().
+        antialias: corner of the analogue Butterworth filter [rad/s], ().
+        highpass: corner of the high-pass [rad/s], ().
+        lowpass_ratio: kappa, low-pass corner over omega [1], (C,).
+        lowpass_zeta: damping of the low-pass [1], (C,).
+        difference_cutoff: low-pass corner of the `difference` kind [rad/s], ().
+
+    Returns:
+        Estimator.
+    """
+    phase = _modal_phase(omega, period, antialias, highpass, lowpass_ratio, lowpass_zeta)
+    plain = _difference(omega, period, difference_cutoff)
+    is_phase = jnp.asarray(kind) == 0
+
+    def choose(a, b):
+        return jnp.where(is_phase, a, b)
+
+    return Estimator(
+        tuple(map(choose, phase.first, plain.first)),
+        tuple(map(choose, phase.denominator, plain.denominator)),
+        tuple(map(choose, phase.velocity, plain.velocity)),
+        tuple(map(choose, phase.position, plain.position)),
+        choose(phase.direct, plain.direct),
+    )
+
+
+def measurement_chain(omega: Array, period: Array, antialias: Array) -> Array:
+    """Response of anti-alias filter, one-sample delay and hold at omega [rad/s].
+
+    R = AA(j omega) exp(-j omega T (1/2 + 1)) sinc(omega T/2).
+    """
+    s = 1j * omega / antialias
+    hold = jnp.sin(omega * period / 2) / (omega * period / 2)
+    return hold * jnp.exp(-1.5j * omega * period) / (s * s + jnp.sqrt(2.0) * s + 1)
+
+
+def _modal_phase(
+    omega: Array, period: Array, antialias: Array, highpass: Array, kappa: Array, zeta: Array
+) -> Estimator:
+    zeta = jnp.broadcast_to(zeta, omega.shape)
+    # high-pass s/(s + w) by Tustin
+    half = highpass * period / 2
+    gain, pole = 1 / (1 + half), (half - 1) / (1 + half)
+    first = (gain * jnp.ones_like(omega), -gain * jnp.ones_like(omega), pole * jnp.ones_like(omega))
+    # low-pass w^2/(s^2 + 2 zeta w s + w^2) by Tustin, prewarped at w = kappa omega; s = c (z-1)/(z+1)
+    warp = jnp.tan(kappa * omega * period / 2)  # w/c
+    lead = 1 + 2 * zeta * warp + warp * warp
+    a1, a2 = 2 * (warp * warp - 1) / lead, (1 - 2 * zeta * warp + warp * warp) / lead
+    low = warp * warp / lead  # numerator low (1 + z^-1)^2; that of s LP is c low (1 - z^-2)
+
+    z = jnp.exp(-1j * omega * period)  # z^-1 on the unit circle
+    high_response = first[0] * (1 - z) / (1 + first[2] * z)
+    low_response = low * (1 + z) ** 2 / (1 + a1 * z + a2 * z * z)
+    chain = measurement_chain(omega, period, antialias) * high_response * low_response
+    rate = jnp.tan(omega * period / 2)  # (z-1)/(z+1) = j tan(omega T/2)
+
+    def numerator(target: Array) -> tuple[Array, Array, Array]:
+        wanted = target / chain
+        value, slope = jnp.real(wanted), jnp.imag(wanted) / rate
+        return low * (value + slope), low * 2 * value, low * (value - slope)
+
+    return Estimator(
+        first, (a1, a2), numerator(1j * omega), numerator(1.0 + 0j * omega), jnp.zeros_like(omega)
+    )
+
+
+def _difference(omega: Array, period: Array, cutoff: Array) -> Estimator:
+    one, zero = jnp.ones_like(omega), jnp.zeros_like(omega)
+    pole = jnp.exp(-cutoff * period)
+    gain = (1 - pole) / period
+    return Estimator(
+        (gain * one, -gain * one, -pole * one),
+        (zero, zero),
+        (one, zero, zero),
+        (zero, zero, zero),
+        one,
+    )

@@ -1,0 +1,173 @@
+"""Linearisation at a pose: frequencies, damping, mode shapes, frequency response.
+
+The state is x = (X, X', q, q', z, z'), flattened, about the resting machine at that pose with the
+drive holding it there. Matrices come from forward-mode differentiation of the loop's own plant.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.case import Structure
+from jaxmodel.drive import Reference
+from jaxmodel.kinematics import close_chain
+from jaxmodel.loop import Loop, PlantState, plant_rates
+from jaxmodel.parameters import Array
+
+
+class LinearPlant(NamedTuple):
+    """x' = A x + B_voltage V_a + B_force F; outputs are rows to multiply with x."""
+
+    state: Array  # A [1/s and mixed], (n, n), n = 6 + 12 R
+    voltage: Array  # B_voltage, (n, 3 K)
+    force: Array  # B_force, disturbance on the sliders, (n, 3)
+    deflection: Array  # chord deflection at the stations [m], (3 S, n)
+    sensor: Array  # anti-alias filtered sensor voltages [V], (3 K, n)
+
+
+def flatten(state: PlantState) -> Array:
+    """x = (X, X', q, q', z, z') as a vector, (6 + 12 R,)."""
+    return jnp.concatenate([jnp.ravel(part) for part in state])
+
+
+def unflatten(x: Array, n_modes: int) -> PlantState:
+    """Inverse of `flatten`."""
+    modes = jnp.reshape(x[6:], (4, 3, n_modes))
+    return PlantState(x[:3], x[3:6], *modes)
+
+
+def linearise(structure: Structure, loop: Loop, pose: Array, antialias: Array) -> LinearPlant:
+    """Linear plant at a resting pose; with ideal feedback in `structure` its loop is closed in A.
+
+    Args:
+        structure: static choices.
+        loop: constants of the case.
+        pose: (x, y, phi) [m, m, rad], (3,).
+        antialias: corner of the anti-alias filter [rad/s], ().
+
+    Returns:
+        LinearPlant.
+    """
+    pose = jnp.asarray(pose, loop.omega.dtype)
+    still = jnp.zeros_like(pose)
+    rho = close_chain(loop.plant, pose, still).rho
+    zero = jnp.zeros_like(loop.omega)
+    rest = flatten(PlantState(pose, still, zero, zero, zero, zero))
+
+    def derivative(x: Array, voltage: Array, force: Array) -> Array:
+        at = unflatten(x, structure.n_modes)
+        forward = jnp.zeros_like(rho) if structure.has_feedforward else None
+        reference = Reference(rho, jnp.zeros_like(rho), forward, force)
+        rates = plant_rates(structure, loop, at, reference, jnp.reshape(voltage, (3, -1)))
+        z_acc = antialias**2 * (at.q - at.z) - jnp.sqrt(2.0) * antialias * at.z_rate
+        return flatten(
+            PlantState(
+                at.pose_rate, rates.acceleration.pose, at.q_rate, rates.acceleration.modal,
+                at.z_rate, z_acc,
+            )
+        )  # fmt: skip
+
+    n_voltages = 3 * structure.n_patches
+    a, b_voltage, b_force = jax.jacfwd(derivative, (0, 1, 2))(
+        rest, jnp.zeros((n_voltages,), rest.dtype), still
+    )
+    return LinearPlant(
+        a,
+        b_voltage,
+        b_force,
+        _rows(loop.deflection_at, 0, structure.n_modes),
+        _rows(loop.sensor, 2, structure.n_modes),
+    )
+
+
+def _rows(matrix: Array, block: int, n_modes: int) -> Array:
+    """Per-link output matrix (3, m, R) of modal block 0..3 (q, q', z, z') as rows over x."""
+    m = matrix.shape[1]
+    wide = jnp.einsum("imr,il->imlr", matrix, jnp.eye(3)).reshape(3 * m, 3 * n_modes)
+    before = 6 + 3 * n_modes * block
+    after = 3 * n_modes * (3 - block)
+    return jnp.pad(wide, ((0, 0), (before, after)))
+
+
+def mechanical(plant: LinearPlant) -> Array:
+    """The rows and columns of A that belong to (X, q, X', q'), without the filters, (2 m, 2 m)."""
+    n = plant.state.shape[0]
+    r3 = (n - 6) // 4
+    position = np.r_[0:3, 6 : 6 + r3]
+    velocity = np.r_[3:6, 6 + r3 : 6 + 2 * r3]
+    index = np.r_[position, velocity]
+    return plant.state[np.ix_(index, index)]
+
+
+class NaturalModes(NamedTuple):
+    """Natural modes, ascending in frequency."""
+
+    frequency: np.ndarray  # |lambda|/2 pi [Hz], (m,)
+    damping_ratio: np.ndarray  # [1], (m,)
+    shape: np.ndarray  # (X, q) part of the eigenvectors, largest entry 1, (m, m), one per column
+
+
+def natural_modes(plant: LinearPlant) -> NaturalModes:
+    """Frequencies, damping ratios and shapes of the assembled machine (on the host).
+
+    An undamped machine is solved as lambda^2 of the position block, which keeps rigid modes at
+    zero. Otherwise the 2 m poles are paired: conjugates, and real ones two by two in ascending
+    order, for which frequency means sqrt(lambda_1 lambda_2) and the damping ratio is 1 or more.
+    """
+    a = np.asarray(mechanical(plant))
+    m = a.shape[0] // 2
+    if not np.any(a[m:, m:]):
+        value, vector = np.linalg.eig(a[m:, :m])
+        # motion of the pose without any spring is a zero eigenvalue with rounding on top
+        omega = np.sqrt(np.maximum(-value.real, 0.0))
+        order = np.argsort(omega)
+        return NaturalModes(
+            omega[order] / (2 * np.pi), np.zeros(m), _scaled(vector.real[:, order])
+        )
+    value, vector = np.linalg.eig(a)
+    # a pair that rounding has split off the real axis by less than this is real
+    is_real = np.abs(value.imag) <= 1e-9 * np.abs(value).max()
+    upper = np.flatnonzero(~is_real & (value.imag > 0))
+    real = np.flatnonzero(is_real)
+    real = real[np.argsort(np.abs(value[real]))]
+    omega = list(np.abs(value[upper]))
+    zeta = list(-value[upper].real / np.abs(value[upper]))
+    column = list(upper)
+    for one, two in zip(real[0::2], real[1::2]):
+        product = max(abs(value[one].real * value[two].real), 0.0)
+        root = np.sqrt(product)
+        omega.append(root)
+        zeta.append(-(value[one].real + value[two].real) / (2 * root) if root > 0 else 0.0)
+        column.append(two)
+    order = np.argsort(omega)
+    shape = _scaled(vector[:m, np.array(column)[order]])
+    return NaturalModes(np.array(omega)[order] / (2 * np.pi), np.array(zeta)[order], shape)
+
+
+def _scaled(shape: np.ndarray) -> np.ndarray:
+    peak = shape[np.argmax(np.abs(shape), axis=0), np.arange(shape.shape[1])]
+    return shape / np.where(peak == 0, 1.0, peak)
+
+
+def frequency_response(plant: LinearPlant, output: Array, source: Array, frequency: Array) -> Array:
+    """Response output (j omega - A)^-1 source.
+
+    Args:
+        plant: linear plant.
+        output: rows over x, (p, n), such as `plant.deflection`.
+        source: columns, (n, m), such as `plant.force`.
+        frequency: [Hz], (f,).
+
+    Returns:
+        complex, (f, p, m).
+    """
+    eye = jnp.eye(plant.state.shape[0])
+
+    def at(f: Array) -> Array:
+        return output @ jnp.linalg.solve(2j * jnp.pi * f * eye - plant.state, source + 0j)
+
+    return jax.vmap(at)(jnp.asarray(frequency))

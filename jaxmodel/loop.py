@@ -1,0 +1,372 @@
+"""One sample of the closed loop: the function every executor compiles.
+
+`step(structure, loop, state, inputs) -> (state, record)`: controller, plant (ETDRK4), metrics and
+status, elementwise arithmetic on short arrays only. A case that goes bad keeps its last good state
+and its first status code. Shapes: structure first, lanes last (see `jaxmodel.plant`).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxmodel import metrics, status
+from jaxmodel.case import Drive, Structure
+from jaxmodel.controller import (
+    Controller,
+    ControllerState,
+    controller_step,
+    rest_controller,
+    soft_limit,
+)
+from jaxmodel.drive import Reference, motor_force, slider_force
+from jaxmodel.dynamics import Accelerations, accelerations, modal_chain
+from jaxmodel.integrator import Exponential
+from jaxmodel.kinematics import Chain, chain_status
+from jaxmodel.parameters import Array
+from jaxmodel.plant import Plant
+
+#: Chord deflection beyond this fraction of the link counts as diverged [1].
+DIVERGED_DEFLECTION = 0.1
+#: So does a pose error beyond this [m or rad].
+DIVERGED_POSE = 0.5
+
+
+class Loop(NamedTuple):
+    """Everything `step` reads that stays constant over a run."""
+
+    plant: Plant
+    omega: Array  # plant modes [rad/s], (3, R)
+    exponential: Exponential
+    plant_step: Array  # length of one plant step [s], ()
+    sensor: Array  # V_s of a modal coordinate, lambda_s Phi_s^t [V/m], (3, K, R)
+    actuator: Array  # modal force of a voltage, lambda_a Phi_a [N/V], (3, R, K)
+    deflection_at: Array  # chord deflection at the stations [1], (3, S, R)
+    controller: Controller
+    observer: Array  # controlled modes of the true deflection, modal filter x sensor [1], (3, C, R)
+    modal_omega: Array  # frequencies of the controller's modes [rad/s], (3, C)
+    rotation: tuple[Array, Array]  # of the spectra's phasors per sample, (C, n_frequencies)
+    drive: Drive
+    settling_band: Array  # [m], ()
+
+
+class PlantState(NamedTuple):
+    """Mechanism and modes; z is the anti-alias filtered modal coordinate."""
+
+    pose: Array  # [m, m, rad], (3,)
+    pose_rate: Array  # (3,)
+    q: Array  # [m], (3, R)
+    q_rate: Array  # [m/s], (3, R)
+    z: Array  # [m], (3, R)
+    z_rate: Array  # [m/s], (3, R)
+
+
+class State(NamedTuple):
+    """What must carry from sample to sample."""
+
+    plant: PlantState
+    controller: ControllerState
+    totals: metrics.Totals
+    status: Array  # code of `jaxmodel.status`, as a float, ()
+    bad_time: Array  # when the status appeared [s], 0 while fine, ()
+
+
+class Inputs(NamedTuple):
+    """What comes from outside at one sample; P = 2 substeps + 1 points from its start to its end."""
+
+    rho: Array  # wanted slider position [m], (P, 3)
+    rho_rate: Array  # [m/s], (P, 3)
+    feedforward: Array | None  # [N], (P, 3)
+    pose: Array  # wanted pose at the start [m, m, rad], (3,)
+    disturbance: Array  # slider force held over the sample [N], (3,)
+    adc_noise: Array | None  # standard normal, (3, K)
+    window: metrics.Window
+
+
+class Record(NamedTuple):
+    """Signals at the sampling instant, for trajectories."""
+
+    time: Array  # [s], ()
+    pose: Array  # (3,)
+    pose_error: Array  # against the shaped command, (3,)
+    slider: Array  # rho [m], (3,)
+    modal_coordinate: Array  # plant q [m], (3, R)
+    controlled_coordinate: Array  # controller's modes, noise-free [m], (3, C)
+    chord_deflection_stations: Array  # [m], (3, S)
+    sensor_voltage: Array  # raw V_s [V], (3, K)
+    actuator_voltage: Array  # on the actuators [V], (3, K)
+    slider_force: Array  # of the motors [N], (3,)
+
+
+class Rates(NamedTuple):
+    """One evaluation of the continuous plant."""
+
+    chain: Chain
+    acceleration: Accelerations
+
+
+def plant_rates(
+    structure: Structure, loop: Loop, state: PlantState, reference: Reference, voltage: Array
+) -> Rates:
+    """Evaluate the continuous plant with drive (and ideal feedback) at one instant.
+
+    Args:
+        structure: static choices.
+        loop: constants.
+        state: pose and modes.
+        reference: for the drive.
+        voltage: on the actuators [V], (3, K); ignored with ideal feedback.
+
+    Returns:
+        Rates.
+    """
+    chain = modal_chain(loop.plant, state.pose, state.pose_rate, state.q, state.q_rate)
+    force = slider_force(loop.drive, reference, chain.rho, chain.rho_rate, structure.is_smooth)
+    if structure.feedback == "ideal":
+        voltage = ideal_voltage(structure, loop, state.q, state.q_rate)
+    modal_force = jnp.sum(loop.actuator * voltage[:, None], axis=2)
+    rates = accelerations(
+        loop.plant, chain, state.pose_rate, state.q, state.q_rate, force, modal_force
+    )
+    return Rates(chain, rates)
+
+
+def ideal_voltage(structure: Structure, loop: Loop, q: Array, q_rate: Array) -> Array:
+    """Actuator voltages [V] of continuous feedback (20) from noise-free sensors, (3, K)."""
+    controller = loop.controller
+    channel = _sensed(loop, q, controller.filter)
+    channel_rate = _sensed(loop, q_rate, controller.filter)
+    force = -controller.velocity_gain * channel_rate - controller.position_gain * channel
+    voltage = jnp.sum(controller.synthesizer * force[:, None], axis=2)
+    return soft_limit(voltage, controller.voltage_limit, structure.is_smooth)
+
+
+def _sensed(loop: Loop, q: Array, channel_filter: Array) -> Array:
+    voltage = jnp.sum(loop.sensor * q[:, None], axis=2)
+    return jnp.sum(channel_filter * voltage[:, None], axis=2)
+
+
+def plant_step(
+    structure: Structure,
+    loop: Loop,
+    state: PlantState,
+    references: tuple[Reference, Reference, Reference],
+    voltage: Array,
+) -> tuple[PlantState, Rates]:
+    """One ETDRK4 step of the plant (RK4 for the pose, whose linear part is zero).
+
+    Args:
+        structure: static choices.
+        loop: constants.
+        state: at the start.
+        references: at start, middle and end of the step.
+        voltage: held over the step [V], (3, K).
+
+    Returns:
+        (state at the end, rates at the start).
+    """
+    h, coefficients = loop.plant_step, loop.exponential
+    e, f = coefficients.half, coefficients.half_force
+    start, middle, end = references
+
+    def rates(at: PlantState, reference: Reference) -> Rates:
+        return plant_rates(structure, loop, at, reference, voltage)
+
+    def stage(origin: PlantState, x: tuple, slope: tuple, length: Array, push: Array) -> PlantState:
+        """exp(A h/2) on the modes of `origin`, Euler from x along `slope` for the pose."""
+        pose, pose_rate = x
+        return state._replace(
+            pose=pose + length * slope[0],
+            pose_rate=pose_rate + length * slope[1],
+            q=e[0, 0] * origin.q + e[0, 1] * origin.q_rate + f[0] * push,
+            q_rate=e[1, 0] * origin.q + e[1, 1] * origin.q_rate + f[1] * push,
+        )
+
+    x = (state.pose, state.pose_rate)
+    first = rates(state, start)
+    n1, slope1 = first.acceleration.coupling, (state.pose_rate, first.acceleration.pose)
+    a = stage(state, x, slope1, h / 2, n1)
+    second = rates(a, middle).acceleration
+    n2, slope2 = second.coupling, (a.pose_rate, second.pose)
+    b = stage(state, x, slope2, h / 2, n2)
+    third = rates(b, middle).acceleration
+    n3, slope3 = third.coupling, (b.pose_rate, third.pose)
+    c = stage(a, x, slope3, h, 2 * n3 - n1)
+    fourth = rates(c, end).acceleration
+    n4, slope4 = fourth.coupling, (c.pose_rate, fourth.pose)
+
+    def combine(k: int) -> Array:
+        return slope1[k] + 2 * (slope2[k] + slope3[k]) + slope4[k]
+
+    full, weight = coefficients.full, coefficients.full_force
+    old = (state.q, state.q_rate, state.z, state.z_rate)
+
+    def mode(row: int) -> Array:
+        forced = weight[0, row] * n1 + weight[1, row] * (n2 + n3) + weight[2, row] * n4
+        width = 2 if row < 2 else 4  # the filter does not act back on the mode
+        return forced + sum(full[row, k] * old[k] for k in range(width))
+
+    after = PlantState(
+        state.pose + h / 6 * combine(0), state.pose_rate + h / 6 * combine(1),
+        mode(0), mode(1), mode(2), mode(3),
+    )  # fmt: skip
+    return after, first
+
+
+def step(
+    structure: Structure, loop: Loop, state: State, inputs: Inputs
+) -> tuple[State, Record]:
+    """One sample of the closed loop.
+
+    The controller samples first; its command reaches the actuators one sample later.
+
+    Args:
+        structure: static choices.
+        loop: constants of the case.
+        state: at the sampling instant.
+        inputs: of this sample.
+
+    Returns:
+        (state at the next instant, Record of this one).
+    """
+    plant, controller = state.plant, loop.controller
+    voltage, clipped = state.controller.voltage, 0.0
+    next_controller = state.controller
+    if structure.feedback == "sampled":
+        filtered = jnp.sum(loop.sensor * plant.z[:, None], axis=2)
+        next_controller, info = controller_step(
+            controller, state.controller, filtered, inputs.adc_noise, structure.is_smooth
+        )
+        clipped = jnp.max(jnp.max(info.is_clipped, axis=1), axis=0)
+    elif structure.feedback == "ideal":
+        voltage = ideal_voltage(structure, loop, plant.q, plant.q_rate)
+
+    next_plant, rates = _advance(structure, loop, plant, inputs, voltage)
+    reference = _reference(inputs, 0)
+    motors = motor_force(
+        loop.drive, reference, rates.chain.rho, rates.chain.rho_rate, structure.is_smooth
+    )
+    sample = _sample(loop, plant, inputs, voltage, clipped, motors)
+    totals = metrics.accumulate(
+        state.totals, sample, inputs.window, loop.omega, loop.modal_omega, loop.rotation,
+        loop.settling_band,
+    )  # fmt: skip
+    record = Record(
+        time=inputs.window.time,
+        pose=plant.pose,
+        pose_error=sample.pose_error,
+        slider=rates.chain.rho,
+        modal_coordinate=plant.q,
+        controlled_coordinate=sample.modal,
+        chord_deflection_stations=sample.deflection,
+        sensor_voltage=jnp.sum(loop.sensor * plant.q[:, None], axis=2),
+        actuator_voltage=voltage,
+        slider_force=motors,
+    )
+    proposed = State(next_plant, next_controller, totals, state.status, state.bad_time)
+    return _freeze_if_bad(structure, loop, state, proposed, rates.chain, inputs), record
+
+
+def _reference(inputs: Inputs, point: int) -> Reference:
+    forward = None if inputs.feedforward is None else inputs.feedforward[point]
+    return Reference(inputs.rho[point], inputs.rho_rate[point], forward, inputs.disturbance)
+
+
+def _advance(
+    structure: Structure, loop: Loop, plant: PlantState, inputs: Inputs, voltage: Array
+) -> tuple[PlantState, Rates]:
+    """All plant steps of one sample; held inputs stay constant. Returns the rates at its start."""
+    if structure.substeps == 1:
+        points = tuple(_reference(inputs, k) for k in range(3))
+        return plant_step(structure, loop, plant, points, voltage)
+
+    def part(x: Array | None) -> Array | None:
+        if x is None:
+            return None
+        return jnp.stack([x[0:-2:2], x[1::2], x[2::2]], axis=1)
+
+    def body(at: PlantState, points: tuple) -> tuple[PlantState, Rates]:
+        rho, rho_rate, forward = points
+        references = tuple(
+            Reference(
+                rho[k], rho_rate[k], None if forward is None else forward[k], inputs.disturbance
+            )
+            for k in range(3)
+        )
+        return plant_step(structure, loop, at, references, voltage)
+
+    points = (part(inputs.rho), part(inputs.rho_rate), part(inputs.feedforward))
+    last, rates = jax.lax.scan(body, plant, points)
+    return last, jax.tree.map(lambda x: x[0], rates)
+
+
+def _sample(
+    loop: Loop, plant: PlantState, inputs: Inputs, voltage: Array, clipped: Array, motors: Array
+) -> metrics.Sample:
+    limit = loop.controller.voltage_limit * (1 - 1e-9)
+    highest = jnp.max(jnp.max(jnp.abs(voltage), axis=1), axis=0)
+    return metrics.Sample(
+        deflection=jnp.sum(loop.deflection_at * plant.q[:, None], axis=2),
+        q=plant.q,
+        q_rate=plant.q_rate,
+        modal=jnp.sum(loop.observer * plant.q[:, None], axis=2),
+        modal_rate=jnp.sum(loop.observer * plant.q_rate[:, None], axis=2),
+        pose_error=plant.pose - inputs.pose,
+        voltage=voltage,
+        is_saturated=jnp.where(highest >= limit, 1.0, 0.0).astype(voltage.dtype),
+        is_clipped=clipped,
+        motor_force=motors,
+    )
+
+
+def _freeze_if_bad(
+    structure: Structure, loop: Loop, old: State, new: State, chain: Chain, inputs: Inputs
+) -> State:
+    """Keep `old` from the first bad sample on."""
+    plant = new.plant
+    deflection = jnp.max(jnp.abs(jnp.sum(loop.deflection_at * plant.q[:, None], axis=2)), axis=1)
+    is_wild = jnp.any(deflection > DIVERGED_DEFLECTION * loop.plant.length, axis=0)
+    is_wild = is_wild | jnp.any(jnp.abs(plant.pose - inputs.pose) > DIVERGED_POSE, axis=0)
+    total = jnp.sum(plant.pose + plant.pose_rate, axis=0)
+    total = total + jnp.sum(jnp.sum(plant.q + plant.q_rate + plant.z_rate, axis=1), axis=0)
+    total = total + jnp.sum(jnp.sum(new.controller.voltage, axis=1), axis=0)
+    is_finite = jnp.abs(total) < jnp.inf  # false for NaN too
+    code = chain_status(loop.plant, chain)
+    code = jnp.where((code == status.OK) & is_wild, float(status.DIVERGED), code)
+    code = jnp.where(is_finite, code, float(status.NON_FINITE)).astype(old.status.dtype)
+    is_first = (old.status == status.OK) & (code != status.OK)
+    kept = jnp.where(old.status == status.OK, code, old.status)
+    is_good = kept == status.OK
+    chosen = jax.tree.map(lambda a, b: jnp.where(is_good, a, b), new, old)
+    return chosen._replace(
+        status=kept, bad_time=jnp.where(is_first, inputs.window.time, old.bad_time)
+    )
+
+
+def initial_state(structure: Structure, loop: Loop, pose: Array, q: Array, code: Array) -> State:
+    """State at rest at a pose with given modal coordinates.
+
+    Args:
+        structure: static choices.
+        loop: constants, only for sizes.
+        pose: (3,).
+        q: [m], (3, R); the anti-alias filter starts settled on it.
+        code: status known before the run, as a float, ().
+
+    Returns:
+        State.
+    """
+    zero, still = jnp.zeros_like(q), jnp.zeros_like(pose)
+    n_stations = loop.deflection_at.shape[1]
+    totals = metrics.zero_totals(
+        n_stations, structure.n_modes, structure.n_controlled, structure.n_frequencies, q.dtype
+    )
+    return State(
+        PlantState(pose, still, q, zero, q, zero),
+        rest_controller(structure.n_channels, structure.n_patches, q.dtype),
+        totals,
+        code,
+        jnp.zeros_like(code),
+    )

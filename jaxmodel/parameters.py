@@ -1,0 +1,115 @@
+"""The physical description of one machine: nested NamedTuples of numbers, all of them traced.
+
+Nothing here is derived and nothing is static, so `jax.vmap`, `jax.grad` and `jax.jit` run over any
+field. Per-link quantities have shape (3,); a scalar stands for three equal links. `paper_machine()`
+is the machine of the paper.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Array = Any  # a JAX or NumPy array, or a Python number
+
+#: Body angles psi [rad] of the platform joints for the two assemblies that fit the paper's text.
+ASSEMBLIES = {
+    "inward": (np.pi / 2, 7 * np.pi / 6, 11 * np.pi / 6),
+    "outward": (3 * np.pi / 2, np.pi / 6, 5 * np.pi / 6),
+}
+#: Home pose (x [m], y [m], phi [rad]) of the paper.
+HOME = (0.0, 0.0, np.pi / 6)
+
+
+class Geometry(NamedTuple):
+    """Guides and platform joints. The guides are the sides of an equilateral triangle round O."""
+
+    guide_side: Array  # a [m], ()
+    guide_angle: Array  # alpha [rad], (3,)
+    joint_radius: Array  # distance platform centre - C_i [m], () or (3,)
+    joint_angle: Array  # psi, body angle of C_i [rad], (3,)
+
+
+class Masses(NamedTuple):
+    """Rigid bodies."""
+
+    platform_mass: Array  # m_p [kg], ()
+    platform_inertia: Array  # I_p [kg m2], ()
+    slider_mass: Array  # m_s [kg], () or (3,)
+
+
+class Beam(NamedTuple):
+    """Flexible links of rectangular section, () or (3,) each."""
+
+    length: Array  # L [m]
+    thickness: Array  # t_b [m]
+    width: Array  # [m]
+    density: Array  # [kg/m3]
+    youngs_modulus: Array  # E [Pa]
+    stiffness_factor: Array  # true bending stiffness over the one controller and shaper believe [1]
+    damping_ratio: Array  # zeta of every link mode [1]
+    joint_inertia_b: Array  # rotary inertia J_B at the slider joint [kg m2]
+    joint_inertia_c: Array  # rotary inertia J_C at the platform joint [kg m2]
+
+
+class Patches(NamedTuple):
+    """Piezo pairs: sensor and actuator of pair k share a centre, on opposite faces of the link."""
+
+    center: Array  # [m], (3, n_patches)
+    sensor_length: Array  # [m], ()
+    actuator_length: Array  # [m], ()
+    width: Array  # [m], ()
+    thickness: Array  # t_p [m], ()
+    youngs_modulus: Array  # E_p [Pa], ()
+    d31: Array  # [C/N], ()
+    relative_permittivity: Array  # eps33T/eps0 [1], ()
+    density: Array  # [kg/m3], ()
+
+
+class Machine(NamedTuple):
+    """Everything physical about the mechanism with its patches."""
+
+    geometry: Geometry
+    masses: Masses
+    beam: Beam
+    patches: Patches
+
+
+def paper_machine() -> Machine:
+    """The paper's 3-PRR manipulator.
+
+    Values that the paper does not print (E, density, width, I_p, damping, PZT permittivity and
+    density) are the estimates listed in docs/theory.md.
+    """
+    return Machine(
+        geometry=Geometry(
+            guide_side=0.6,
+            guide_angle=np.array([2 * np.pi / 3, 4 * np.pi / 3, 0.0]),
+            joint_radius=0.12 / np.sqrt(3.0),
+            joint_angle=np.array(ASSEMBLIES["inward"]),
+        ),
+        masses=Masses(platform_mass=0.25, platform_inertia=3.0e-4, slider_mass=0.15),
+        beam=Beam(
+            length=0.2,
+            thickness=2e-3,
+            width=10e-3,
+            density=2750.0,
+            youngs_modulus=70e9,
+            stiffness_factor=1.0,
+            damping_ratio=0.01,
+            joint_inertia_b=0.0,
+            joint_inertia_c=0.0,
+        ),
+        patches=Patches(
+            center=np.tile([0.05, 0.10, 0.15], (3, 1)),
+            sensor_length=0.010,
+            actuator_length=0.030,
+            width=0.010,
+            thickness=0.2e-3,
+            youngs_modulus=66e9,
+            d31=-180e-12,
+            relative_permittivity=1750.0,
+            density=7800.0,
+        ),
+    )

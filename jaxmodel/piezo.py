@@ -1,0 +1,100 @@
+"""Piezo patches by laminate theory: sections, actuator and sensor constants, slope differences."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from jaxmodel.parameters import Array, Beam, Patches
+
+VACUUM_PERMITTIVITY = 8.8541878128e-12  # [F/m]
+
+
+class Section(NamedTuple):
+    """A laminated cross-section, added to the bare link's."""
+
+    stiffness: Array  # bending stiffness beyond the bare link's [N m2]
+    neutral_axis: Array  # shift z_n of the neutral axis from the link's mid-plane [m]
+
+
+def bare_stiffness(beam: Beam) -> Array:
+    """Bending stiffness E I = E b t^3/12 [N m2] of the link without patches."""
+    return beam.youngs_modulus * beam.width * beam.thickness**3 / 12
+
+
+def one_sided_section(beam: Beam, patches: Patches) -> Section:
+    """Link with one patch on one face; the neutral axis moves towards the patch.
+
+    z_n = E_p A_p z_p/(E A + E_p A_p) with z_p = (t_b + t_p)/2; parallel-axis theorem for the rest.
+
+    Args:
+        beam: link section data, () or (3,) fields.
+        patches: patch data.
+
+    Returns:
+        Section with fields shaped like the beam's.
+    """
+    offset = (beam.thickness + patches.thickness) / 2
+    axial_beam = beam.youngs_modulus * beam.width * beam.thickness
+    axial_patch = patches.youngs_modulus * patches.width * patches.thickness
+    shift = axial_patch * offset / (axial_beam + axial_patch)
+    own = axial_patch * patches.thickness**2 / 12
+    stiffness = axial_beam * shift**2 + axial_patch * (offset - shift) ** 2 + own
+    return Section(stiffness, shift)
+
+
+def two_sided_section(beam: Beam, patches: Patches) -> Section:
+    """Link with a patch on both faces; symmetric, so the neutral axis stays in the middle."""
+    offset = (beam.thickness + patches.thickness) / 2
+    axial_patch = patches.youngs_modulus * patches.width * patches.thickness
+    stiffness = 2 * axial_patch * (offset**2 + patches.thickness**2 / 12)
+    return Section(stiffness, jnp.zeros_like(stiffness))
+
+
+def actuator_constant(beam: Beam, patches: Patches) -> Array:
+    """lambda_a [N m/V] of (14): bending moment per volt of an actuator alone on its face.
+
+    lambda_a = b_p E_p |d31| ((t_b + t_p)/2 - z_n); polarity chosen so that it is positive.
+    """
+    arm = (beam.thickness + patches.thickness) / 2 - one_sided_section(beam, patches).neutral_axis
+    return patches.width * patches.youngs_modulus * jnp.abs(patches.d31) * arm
+
+
+def sensor_constant(beam: Beam, patches: Patches) -> Array:
+    """lambda_s [V/rad] of (15): open-circuit voltage per slope difference over the sensor.
+
+    lambda_s = b_p E_p |d31| z_s/C with z_s = (t_b + t_p)/2, since the actuator covers the other
+    face, and the clamped capacitance C = eps33T (1 - k31^2) b_p l_s/t_p, k31^2 = d31^2 E_p/eps33T.
+    """
+    permittivity = patches.relative_permittivity * VACUUM_PERMITTIVITY
+    coupling = patches.d31**2 * patches.youngs_modulus / permittivity
+    area = patches.width * patches.sensor_length
+    capacitance = permittivity * (1 - coupling) * area / patches.thickness
+    arm = (beam.thickness + patches.thickness) / 2
+    charge = patches.width * patches.youngs_modulus * jnp.abs(patches.d31) * arm
+    return charge / capacitance
+
+
+def patch_ends(center: Array, length: Array) -> tuple[Array, Array]:
+    """Left and right end [m] of patches of a given length [m] at `center` [m]."""
+    return center - length / 2, center + length / 2
+
+
+def placement_faults(patches: Patches, length: Array) -> tuple[Array, Array]:
+    """Whether any patch leaves its link, and whether any two pairs of a link overlap.
+
+    Args:
+        patches: patch data; the longer of sensor and actuator decides.
+        length: link length [m], () or (3,).
+
+    Returns:
+        (is_off_link, is_overlapping), boolean scalars.
+    """
+    half = jnp.maximum(patches.sensor_length, patches.actuator_length) / 2
+    center = jnp.sort(jnp.asarray(patches.center), axis=-1)
+    tolerance = 1e-12  # [m], so that patches that just touch are allowed in spite of rounding
+    end = jnp.broadcast_to(jnp.asarray(length), (3,))[:, None]
+    is_off = jnp.any(center - half < -tolerance) | jnp.any(center + half > end + tolerance)
+    is_overlapping = jnp.any(jnp.diff(center, axis=-1) < 2 * half - tolerance)
+    return is_off, is_overlapping

@@ -1,0 +1,90 @@
+"""The numbers one evaluation of the dynamics reads, worked out once per case.
+
+Layout used by every per-step function: structure first, lanes last. Pose arrays have shape (3,),
+link arrays (3,), mode arrays (3, R); any further trailing axes are lanes of a batch. Link arrays
+meet mode arrays as `x[:, None]`, sums run over axis 1 (modes) and axis 0 (links), so the same code
+runs on one case, under `vmap`, and on lanes in the last axis.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from jaxmodel.beam import ModalBasis
+from jaxmodel.parameters import Array, Machine
+
+
+class Plant(NamedTuple):
+    """Machine and modal basis in the form the equations of motion use (shapes as above)."""
+
+    # guides in the frame (u, n): s = u.X + cu + s0, h = n.X + cn + h0
+    ux: Array  # direction of guide i [1], (3,)
+    uy: Array
+    joint_cos: Array  # |PC| cos(psi - alpha) [m], (3,)
+    joint_sin: Array  # |PC| sin(psi - alpha) [m], (3,)
+    s0: Array  # -u.A [m], (3,)
+    h0: Array  # -n.A [m], (3,)
+    length: Array  # L [m], (3,)
+    # rigid inertia
+    slider_link_mass: Array  # m_b + m_s [kg], (3,)
+    first_moment: Array  # e [kg m], (3,)
+    inertia: Array  # J0 [kg m2], (3,)
+    platform_mass: Array  # [kg], ()
+    platform_inertia: Array  # [kg m2], ()
+    # modes
+    mass: Array  # m_j [kg], (3, R)
+    stiffness: Array  # k_j [N/m], (3, R)
+    damping: Array  # d_j = 2 zeta sqrt(k m) [N s/m], (3, R)
+    tip: Array | None  # Y_j(L) [1], (3, R), None where zero
+    b: Array  # [kg], (3, R)
+    c: Array  # [kg m], (3, R)
+    # 1 where the machine may move, 0 where the sliders are locked (bases with Y(L) = 0 only)
+    free: Array  # [1], ()
+
+
+def build_plant(machine: Machine, basis: ModalBasis, is_locked: Array = False) -> Plant:
+    """Collect machine and basis into a `Plant`.
+
+    Guide i starts at A_i = -r_in n_i - (a/2) u_i, r_in = a/(2 sqrt 3), with u_i = (cos, sin) alpha_i
+    and the inward normal n_i = u_i turned by +90 deg.
+
+    Args:
+        machine: physical description.
+        basis: modal basis of the links.
+        is_locked: hold all sliders. With Y_j(L) = 0 the pose is then held too; the caller refuses
+            bases with Y_j(L) != 0.
+
+    Returns:
+        Plant.
+    """
+    geometry, masses, beam = machine.geometry, machine.masses, machine.beam
+    angle = jnp.asarray(geometry.guide_angle)
+    psi = jnp.asarray(geometry.joint_angle)
+    damping_ratio = jnp.broadcast_to(jnp.asarray(beam.damping_ratio), (3,))
+
+    def link(x: Array) -> Array:
+        return jnp.broadcast_to(jnp.asarray(x), (3,))
+
+    return Plant(
+        ux=jnp.cos(angle),
+        uy=jnp.sin(angle),
+        joint_cos=link(geometry.joint_radius) * jnp.cos(psi - angle),
+        joint_sin=link(geometry.joint_radius) * jnp.sin(psi - angle),
+        s0=link(geometry.guide_side / 2),
+        h0=link(geometry.guide_side / jnp.sqrt(12.0)),
+        length=link(beam.length),
+        slider_link_mass=link(masses.slider_mass) + basis.link_mass,
+        first_moment=basis.first_moment,
+        inertia=basis.inertia,
+        platform_mass=jnp.asarray(masses.platform_mass),
+        platform_inertia=jnp.asarray(masses.platform_inertia),
+        mass=basis.mass,
+        stiffness=basis.stiffness,
+        damping=2 * damping_ratio[:, None] * jnp.sqrt(basis.stiffness * basis.mass),
+        tip=basis.tip,
+        b=basis.b,
+        c=basis.c,
+        free=1.0 - jnp.asarray(is_locked, basis.mass.dtype),
+    )

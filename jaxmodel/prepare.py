@@ -1,0 +1,242 @@
+"""From a `Case` to what the loop reads: matrices and coefficients, worked out once per case."""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxmodel import shaper, status
+from jaxmodel.beam import ModalBasis, assembled_frequency, build_basis
+from jaxmodel.case import Case, Structure
+from jaxmodel.control import active_modes, condition_number, force_gains, left_inverse
+from jaxmodel.controller import Controller
+from jaxmodel.estimator import design_estimator
+from jaxmodel.integrator import exponential_step
+from jaxmodel.loop import Loop
+from jaxmodel.parameters import Array
+from jaxmodel.piezo import actuator_constant, placement_faults, sensor_constant
+from jaxmodel.plant import build_plant
+
+#: Frequencies of the spectra lie within this fraction of the modal frequency [1].
+SPECTRUM_SPAN = 0.1
+
+
+class Prepared(NamedTuple):
+    """A case ready to run."""
+
+    loop: Loop
+    taps: shaper.Taps  # shaper on the sample grid
+    initial_q: Array  # [m], (3, R)
+    sensor_condition: Array  # condition number of the modal filter per link [1], (3,)
+    actuator_condition: Array  # of the synthesizer [1], (3,)
+    status: Array  # what is wrong before the run, as a float, ()
+
+
+class ControllerDesign(NamedTuple):
+    """Controller and what its design knows, before gains are chosen or judged."""
+
+    controller: Controller
+    observer: Array  # (3, C, K): modal filter of the controlled modes [m/V]
+    modal_omega: Array  # frequencies of the controller's own modes [rad/s], (3, C)
+    assembled_omega: Array  # frequencies the estimator is exact at [rad/s], (3, C)
+    sensor_condition: Array  # (3,)
+    actuator_condition: Array  # (3,)
+
+
+def prepare(structure: Structure, case: Case) -> Prepared:
+    """Work out everything the loop needs.
+
+    Args:
+        structure: static choices.
+        case: the numbers.
+
+    Returns:
+        Prepared; `status` says what makes the case unfit, the numbers stay finite all the same.
+    """
+    machine, electronics = case.machine, case.electronics
+    mask = (jnp.arange(structure.n_modes) < case.n_modes).astype(jnp.result_type(float))
+    basis = build_basis(
+        structure.basis, machine.beam, machine.patches, structure.n_modes,
+        case.windows.stations, mask,
+    )  # fmt: skip
+    plant = build_plant(machine, basis, case.drive.is_locked)
+    design = design_controller(structure, case)
+    omega = jnp.sqrt(basis.stiffness / basis.mass)
+    zeta = plant.damping / (2 * basis.mass * omega)
+    step = electronics.period / structure.substeps
+    lambda_s, lambda_a = _constants(case)
+    sensor = lambda_s[:, None, None] * jnp.swapaxes(basis.sensor_slope, 1, 2)
+    span = jnp.linspace(1 - SPECTRUM_SPAN, 1 + SPECTRUM_SPAN, structure.n_frequencies)
+    angle = jnp.mean(design.assembled_omega, axis=0)[:, None] * span * electronics.period
+    loop = Loop(
+        plant=plant,
+        omega=omega,
+        exponential=exponential_step(omega, zeta, step, electronics.antialias),
+        plant_step=step,
+        sensor=sensor,
+        actuator=lambda_a[:, None, None] * basis.actuator_slope,
+        deflection_at=basis.deflection_at,
+        controller=design.controller,
+        observer=jnp.einsum("ick,ikr->icr", design.observer, sensor),
+        modal_omega=design.modal_omega,
+        rotation=(jnp.cos(angle), jnp.sin(angle)),
+        drive=case.drive._replace(
+            **{
+                name: jnp.broadcast_to(jnp.asarray(getattr(case.drive, name)), (3,))
+                for name in _PER_LINK_DRIVE
+            }
+        ),
+        settling_band=jnp.asarray(case.windows.settling_band),
+    )
+    return Prepared(
+        loop,
+        design_taps(case),
+        mask * _initial_modes(structure, case, basis),
+        design.sensor_condition,
+        design.actuator_condition,
+        _static_status(structure, case, design),
+    )
+
+
+_PER_LINK_DRIVE = (
+    "kp", "kd", "force_limit", "coulomb_friction", "friction_speed", "viscous_friction", "ripple",
+)  # fmt: skip
+
+
+def spectrum_frequencies(structure: Structure, case: Case) -> Array:
+    """Frequencies [Hz] at which `Metrics.spectral_density` is taken, (C, n_frequencies)."""
+    omega = assembled_frequency(case.machine.beam, structure.n_controlled)
+    span = jnp.linspace(1 - SPECTRUM_SPAN, 1 + SPECTRUM_SPAN, structure.n_frequencies)
+    return jnp.mean(omega, axis=0)[:, None] * span / (2 * jnp.pi)
+
+
+def _constants(case: Case) -> tuple[Array, Array]:
+    beam, patches = case.machine.beam, case.machine.patches
+    lambda_s = jnp.broadcast_to(sensor_constant(beam, patches), (3,))
+    return lambda_s, jnp.broadcast_to(actuator_constant(beam, patches), (3,))
+
+
+def design_controller(structure: Structure, case: Case) -> ControllerDesign:
+    """Controller of a case, from its belief of the links: the controller basis at nominal stiffness.
+
+    IMSC: modal filter pinv(lambda_s Phi_s^t), synthesizer pinv(lambda_a Phi_a), gains (20) with
+    ratios (24). SRF (16): every patch feeds back the rate of its own voltage.
+
+    Args:
+        structure: static choices; `law`, `controller_basis` and sizes are read.
+        case: the numbers.
+
+    Returns:
+        ControllerDesign.
+    """
+    control, patches, electronics = case.control, case.machine.patches, case.electronics
+    belief = case.machine.beam._replace(stiffness_factor=1.0)
+    n = structure.n_controlled
+    known = max(structure.n_modes, n)
+    model = build_basis(structure.controller_basis, belief, patches, known, case.windows.stations)
+    lambda_s, lambda_a = _constants(case)
+    sensor = lambda_s[:, None, None] * jnp.swapaxes(model.sensor_slope, 1, 2)  # (3, K, known)
+    actuator = lambda_a[:, None, None] * model.actuator_slope  # (3, known, K)
+    mask = active_modes(control.n_active, n, structure.n_patches)
+    seen, driven = sensor[:, :, :n], jnp.swapaxes(actuator[:, :n], 1, 2)
+    observer = jax.vmap(left_inverse, (0, None))(seen, mask)
+    synthesizer = jnp.swapaxes(jax.vmap(left_inverse, (0, None))(driven, mask), 1, 2)
+
+    assembled = assembled_frequency(belief, n)
+    on = jnp.asarray(control.link_mask)[:, None] * control.gain_factor
+    if structure.law == "srf":
+        eye = jnp.broadcast_to(jnp.eye(structure.n_patches), (3,) + (structure.n_patches,) * 2)
+        channel_filter, synthesizer = eye, eye
+        velocity = on * jnp.broadcast_to(control.velocity_gain[:, None], (3, structure.n_patches))
+        position = on * jnp.broadcast_to(control.position_gain[:, None], (3, structure.n_patches))
+        channel_omega = jnp.broadcast_to(assembled[:, :1], (3, structure.n_patches))
+        ratio, zeta = electronics.lowpass_ratio[0], electronics.lowpass_zeta[0]
+    else:
+        channel_filter = observer
+        on = on * jnp.asarray(control.mode_mask) * mask
+        modal_mass = model.mass[:, :n]
+        velocity = on * force_gains(
+            control.velocity_gain, control.ratio, modal_mass, control.is_per_mass
+        )
+        position = on * force_gains(
+            control.position_gain, control.ratio, modal_mass, control.is_per_mass
+        )
+        channel_omega = assembled
+        ratio, zeta = electronics.lowpass_ratio, electronics.lowpass_zeta
+    residual = (1.0 - jnp.pad(mask, (0, known - n))) / model.stiffness
+    feedthrough = jnp.einsum("ikr,ir,irl->ikl", sensor, residual, actuator)
+    controller = Controller(
+        filter=channel_filter,
+        estimator=design_estimator(
+            electronics.estimator, channel_omega, electronics.period, electronics.antialias,
+            electronics.highpass, ratio, zeta, electronics.difference_cutoff,
+        ),
+        velocity_gain=velocity,
+        position_gain=position,
+        synthesizer=synthesizer,
+        feedthrough=control.feedthrough_factor * feedthrough,
+        voltage_limit=jnp.asarray(electronics.voltage_limit),
+        adc_gain=jnp.asarray(electronics.conditioner_gain),
+        adc_bias=jnp.asarray(electronics.conditioner_bias),
+        adc_step=jnp.asarray(electronics.adc_range / electronics.adc_levels),
+        adc_top=jnp.asarray(electronics.adc_levels - 1.0),
+        adc_noise=jnp.asarray(electronics.adc_noise),
+    )  # fmt: skip
+    return ControllerDesign(
+        controller,
+        observer,
+        jnp.sqrt(model.stiffness / model.mass)[:, :n],
+        assembled,
+        condition_number(seen, mask),
+        condition_number(driven, mask),
+    )
+
+
+def design_taps(case: Case) -> shaper.Taps:
+    """Shaper of the case on its sample grid; several frequencies in series."""
+    shaping, period = case.shaping, case.electronics.period
+    omega, zeta = jnp.asarray(shaping.omega), jnp.asarray(shaping.zeta)
+    each = [
+        shaper.design_shaper(shaping.kind, omega[k], zeta[k], shaping.tolerance)
+        for k in range(omega.shape[0])
+    ]
+    impulses = reduce(shaper.convolve, each)
+    linear = shaper.split_linear(impulses, period)
+    exact = shaper.split_exact(impulses, period, omega[0], zeta[0])
+    return linear._replace(weight=jnp.where(shaping.is_exact > 0, exact.weight, linear.weight))
+
+
+def _initial_modes(structure: Structure, case: Case, basis: ModalBasis) -> Array:
+    """Modal coordinates at t = 0: given ones plus a static load at a station, q_j = Y_j(x) F/k_j."""
+    initial = case.initial
+    station = jnp.asarray(initial.load_station)[None]
+    at = build_basis(
+        structure.basis, case.machine.beam, case.machine.patches, structure.n_modes, station
+    ).deflection_at[:, 0]
+    mask = (jnp.arange(structure.n_modes) < case.n_modes).astype(at.dtype)
+    at = at * mask
+    compliance = jnp.sum(at * at / basis.stiffness, axis=1)
+    load = jnp.asarray(initial.load_deflection) / jnp.where(compliance > 0, compliance, 1.0)
+    return jnp.asarray(initial.modal) + at / basis.stiffness * load[:, None]
+
+
+def _static_status(structure: Structure, case: Case, design: ControllerDesign) -> Array:
+    patches, limit = case.machine.patches, case.windows.condition_limit
+    is_off, is_overlapping = placement_faults(patches, case.machine.beam.length)
+    worst = jnp.maximum(jnp.max(design.sensor_condition), jnp.max(design.actuator_condition))
+    uses_filter = structure.law == "imsc" and structure.feedback != "none"
+    checks = (
+        ((worst > limit) & uses_filter, status.ILL_CONDITIONED),
+        (case.control.n_active > structure.n_patches, status.TOO_MANY_MODES),
+        (is_overlapping, status.PATCHES_OVERLAP),
+        (is_off, status.PATCH_OFF_LINK),
+    )
+    code = jnp.zeros(())
+    for is_wrong, value in checks:
+        code = jnp.where(is_wrong, float(value), code)
+    return code
+
+

@@ -1,0 +1,152 @@
+"""One closed-loop run: reference, scan over samples, metrics, status. Pure; batch it with `vmap`."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel import metrics, status
+from jaxmodel.case import Case, Structure
+from jaxmodel.dynamics import inverse_dynamics
+from jaxmodel.kinematics import inverse_kinematics, path_status
+from jaxmodel.loop import Inputs, Record, initial_state, step
+from jaxmodel.motion import end_of_path, shape_path
+from jaxmodel.parameters import Array
+from jaxmodel.prepare import Prepared, prepare
+
+
+class Result(NamedTuple):
+    """Outcome of a run."""
+
+    metrics: metrics.Metrics
+    status: Array  # code of `jaxmodel.status`, integer, ()
+    bad_time: Array  # when it appeared [s], 0 where fine or wrong from the start, ()
+    command_end: Array  # end of the shaped command [s], ()
+    sensor_condition: Array  # condition number of the modal filter per link [1], (3,)
+    actuator_condition: Array  # of the synthesizer [1], (3,)
+    record: Record | None  # trajectories, leading axis (n_steps,), if asked for
+
+
+class Command(NamedTuple):
+    """Everything that enters the loop from outside, for all samples."""
+
+    inputs: Inputs  # leading axis (n_steps,)
+    start_pose: Array  # (3,)
+    end: Array  # end of the shaped command [s], ()
+    status: Array  # reach, singularity or length fault of the command, as a float, ()
+    bad_time: Array  # when it appears [s], ()
+
+
+def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
+    """Shaped reference, disturbances, noise and metric windows of a case.
+
+    Args:
+        structure: static choices.
+        case: the numbers.
+        prepared: from `prepare`.
+
+    Returns:
+        Command.
+    """
+    n, per_sample = structure.n_steps, 2 * structure.substeps
+    period, plant = case.electronics.period, prepared.loop.plant
+    grid = n * per_sample + 1
+    wanted = shape_path(case.path, prepared.taps, grid, per_sample, period / per_sample)
+    rho, rho_rate = inverse_kinematics(plant, wanted.position, wanted.velocity)
+    forward = None
+    if structure.has_feedforward:
+        forward = _points(jax.vmap(inverse_dynamics, (None, 0, 0, 0))(plant, *wanted), n)
+
+    time = period * jnp.arange(n)
+    last_tap = jnp.max(jnp.where(prepared.taps.weight != 0, prepared.taps.sample, 0))
+    end = end_of_path(case.path) + last_tap * period
+    code, index = path_status(plant, wanted.position)
+    bad_time = index * period / per_sample
+    is_long = end > n * period
+    code = jnp.where((code == status.OK) & is_long, float(status.SHAPER_TOO_LONG), code)
+    adc_noise, disturbance = _disturbance(structure, case, prepared, time)
+    inputs = Inputs(
+        rho=_points(rho, n),
+        rho_rate=_points(rho_rate, n),
+        feedforward=forward,
+        pose=wanted.position[:-1:per_sample],
+        disturbance=disturbance,
+        adc_noise=adc_noise,
+        window=_windows(structure, case, time, end),
+    )
+    return Command(inputs, wanted.position[0], end, code, bad_time)
+
+
+def _points(x: Array, n: int) -> Array:
+    """Group a fine grid (n p + 1, ...) into the p + 1 points of each sample, (n, p + 1, ...)."""
+    p = (x.shape[0] - 1) // n
+    body = jnp.reshape(x[:-1], (n, p) + x.shape[1:])
+    return jnp.concatenate([body, x[p::p][:, None]], axis=1)
+
+
+def _windows(structure: Structure, case: Case, time: Array, end: Array) -> metrics.Window:
+    windows, tick = case.windows, case.electronics.period / 2  # half a sample against rounding
+    begin = end + windows.residual_delay
+    is_residual = (time > begin - tick) & (time < begin + windows.residual_length - tick)
+    taper = np.sin(np.pi * np.arange(structure.n_steps) / structure.n_steps) ** 2
+    return metrics.Window(
+        time=time,
+        is_moving=(time < end - tick).astype(time.dtype),
+        is_residual=is_residual.astype(time.dtype),
+        after_command=jnp.maximum(time - end, 0.0),
+        taper=jnp.asarray(taper, time.dtype),
+    )
+
+
+def _disturbance(structure: Structure, case: Case, prepared: Prepared, time: Array):
+    """(standard normal ADC noise or None, slider disturbance [N])."""
+    drive, n = prepared.loop.drive, structure.n_steps
+    since = time - drive.pulse_start
+    is_on = (since >= -1e-12) & (since < drive.pulse_length - 1e-12)
+    force = jnp.where(is_on[:, None], jnp.broadcast_to(drive.pulse_force, (n, 3)), 0.0)
+    if not structure.has_noise:
+        return None, force
+    adc_key, ripple_key = jax.random.split(jax.random.key(case.seed))
+    noise = jax.random.normal(adc_key, (n, 3, structure.n_patches), time.dtype)
+    ripple = jax.random.normal(ripple_key, (n, 3), time.dtype)
+    return noise, force + drive.ripple * ripple
+
+
+def simulate(structure: Structure, case: Case, has_record: bool = False) -> Result:
+    """Run one case.
+
+    Args:
+        structure: static choices.
+        case: the numbers; `jax.vmap` over any of them.
+        has_record: return trajectories too (static).
+
+    Returns:
+        Result. Nothing is raised inside: `status` says what went wrong.
+    """
+    prepared = prepare(structure, case)
+    outside = command(structure, case, prepared)
+    loop = prepared.loop
+    code = jnp.where(prepared.status == status.OK, outside.status, prepared.status)
+    start = initial_state(structure, loop, outside.start_pose, prepared.initial_q, code)
+
+    def body(state, inputs):
+        after, record = step(structure, loop, state, inputs)
+        return after, record if has_record else None
+
+    last, record = jax.lax.scan(body, start, outside.inputs)
+    result = metrics.finish(last.totals, case.electronics.period)
+    is_saturated = result.saturated_fraction > case.windows.saturation_limit
+    final = jnp.where((last.status == status.OK) & is_saturated, status.SATURATED, last.status)
+    early = jnp.where(prepared.status == status.OK, outside.bad_time, 0.0)
+    return Result(
+        metrics=result,
+        status=final.astype(jnp.int32),
+        bad_time=jnp.where(code == status.OK, last.bad_time, early),
+        command_end=outside.end,
+        sensor_condition=prepared.sensor_condition,
+        actuator_condition=prepared.actuator_condition,
+        record=record,
+    )

@@ -1,0 +1,33 @@
+"""Status of a case: why it stopped, as a number that travels through a compiled batch.
+
+Inside the loop a status is a floating-point scalar (0 = fine) so that one arithmetic runs on every
+executor; the first code that appears stays, and the state is frozen from there.
+"""
+
+OK = 0
+OUT_OF_REACH = 1
+SINGULAR = 2
+DIVERGED = 3
+NON_FINITE = 4
+SATURATED = 5
+ILL_CONDITIONED = 6
+TOO_MANY_MODES = 7
+PATCHES_OVERLAP = 8
+PATCH_OFF_LINK = 9
+UNSTABLE = 10
+SHAPER_TOO_LONG = 11
+
+REASONS = {
+    OK: "ok",
+    OUT_OF_REACH: "pose out of reach",
+    SINGULAR: "singular pose: a link parallel or perpendicular to its guide",
+    DIVERGED: "diverged: bending beyond a tenth of the link",
+    NON_FINITE: "non-finite number",
+    SATURATED: "actuators saturated too often",
+    ILL_CONDITIONED: "modal filter or synthesizer ill-conditioned",
+    TOO_MANY_MODES: "more controlled modes than patches",
+    PATCHES_OVERLAP: "patches overlap",
+    PATCH_OFF_LINK: "patch off the link",
+    UNSTABLE: "linearised sampled loop unstable",
+    SHAPER_TOO_LONG: "shaped motion longer than the run",
+}

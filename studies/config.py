@@ -1,0 +1,172 @@
+"""Settings of JAX that must be made before it starts: precision, compiler flags, devices, cache.
+
+Importing this module changes nothing; `configure` does, and `info` says what is in force.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import re
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from studies.errors import StudyError, field_error, nearest
+
+PACKAGE = "flexlink-studies"
+PRECISIONS = ("float64", "float32")
+
+# Flags of XLA's CPU compiler for a scan over time steps that are vectorised over cases.
+# An unknown flag of XLA ends the process, so each of them is checked on every supported JAX.
+COMPILER_FLAGS = {
+    # XLA stops at 256 bits by itself; twice the cases per instruction where the CPU has 512.
+    "--xla_cpu_prefer_vector_width": "512",
+    "--xla_backend_extra_options": ",".join(
+        (
+            # Without it each state output recomputes the expressions that it shares with the rest.
+            "xla_cpu_use_multi_output_fusion",
+            # Loops up to this many bytes run as one compiled function instead of one task per
+            # operation. Less leaves out the batched time loop. Reverse mode through a long scan
+            # then has to checkpoint blocks of steps: a scan that stores every step copies the
+            # whole store at each of them (measured: 30 to 100 times slower over 2000 steps).
+            "xla_cpu_small_while_loop_byte_threshold=2000000",
+        )
+    ),
+}
+# XLA runs a program on one core of a device, so a device per core is how a batch uses them all.
+DEVICE_FLAG = "--xla_force_host_platform_device_count"
+
+
+def configure(
+    precision: str = "float64",
+    devices: int | None = None,
+    flags: bool = True,
+    cache: bool = True,
+) -> None:
+    """Prepare JAX for studies; call it before the first JAX operation.
+
+    precision: "float64" or "float32", the default floating type.
+    devices: number of CPU devices; None takes what XLA_FLAGS says, else one per usable core.
+    flags: add COMPILER_FLAGS to XLA_FLAGS, each only where the environment does not set it already.
+    cache: keep compiled programs in JAX_COMPILATION_CACHE_DIR, else in the user's cache folder.
+
+    Raises StudyError for a value outside its range, and where JAX has already started without the
+    flags or devices asked for. Calls with equal settings may be repeated at any time.
+    """
+    if precision not in PRECISIONS:
+        raise field_error(
+            "precision", precision, " or ".join(PRECISIONS), hint=nearest(str(precision), PRECISIONS)
+        )
+    if devices is not None and (not isinstance(devices, int) or devices < 1):
+        raise field_error("devices", devices, "a whole number from 1")
+
+    old_flags = os.environ.get("XLA_FLAGS", "")
+    new_flags = _extended(old_flags, devices, flags)
+    if not is_backend_started():
+        os.environ["XLA_FLAGS"] = new_flags
+    else:
+        _require_in_force(old_flags, devices, flags)
+    jax.config.update("jax_enable_x64", precision == "float64")
+    _set_cache(cache)
+
+
+def info() -> dict[str, Any]:
+    """Versions and settings in force, as plain values for `studies info`; starts JAX."""
+    kinds = [device.device_kind for device in jax.devices()]
+    folder = jax.config.jax_compilation_cache_dir if jax.config.jax_enable_compilation_cache else ""
+    return {
+        PACKAGE: _version(PACKAGE),
+        "python": platform.python_version(),
+        **{name: _version(name) for name in ("jax", "jaxlib", "numpy", "h5py")},
+        "devices": ", ".join(f"{kinds.count(kind)} x {kind}" for kind in sorted(set(kinds))),
+        "precision": "float64" if jax.config.jax_enable_x64 else "float32",
+        "cache": folder or "none",
+        "cache_mib": round(_folder_bytes(folder) / 2**20, 1) if folder else 0.0,
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
+    }
+
+
+def is_backend_started() -> bool:
+    """Whether JAX has started its devices, after which compiler flags are no longer read."""
+    count = jax.config.jax_num_cpu_devices
+    try:
+        # The public sign of it: JAX refuses to change this setting once it has started.
+        jax.config.update("jax_num_cpu_devices", count + 1)
+    except RuntimeError:
+        return True
+    jax.config.update("jax_num_cpu_devices", count)
+    return False
+
+
+def _extended(present: str, devices: int | None, flags: bool) -> str:
+    """XLA_FLAGS with what is missing from it; an explicit number of devices replaces its own."""
+    wanted = dict(COMPILER_FLAGS) if flags else {}
+    if devices is not None:
+        present = re.sub(rf"{DEVICE_FLAG}=\S*", "", present)
+    wanted[DEVICE_FLAG] = str(devices or _usable_cores())
+    missing = [f"{name}={value}" for name, value in wanted.items() if name not in present]
+    return " ".join(present.split() + missing)
+
+
+def _require_in_force(present: str, devices: int | None, flags: bool) -> None:
+    """Raise StudyError where a JAX that has already started lacks what is asked for."""
+    lacking = [name for name in COMPILER_FLAGS if flags and name not in present]
+    count = len(jax.local_devices(backend="cpu"))
+    if devices not in (None, count):
+        lacking.append(f"{devices} CPU devices (it has {count})")
+    if lacking:
+        raise StudyError(
+            f"configure() came too late: JAX has already started without {', '.join(lacking)}; "
+            "call it before the first JAX operation (in a notebook: restart the kernel), "
+            "or accept JAX as it is, several times slower, with configure(flags=False)"
+        )
+
+
+def _set_cache(cache: bool) -> None:
+    """Turn the persistent cache of compiled programs on or off."""
+    jax.config.update("jax_enable_compilation_cache", cache)
+    if not cache:
+        return
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(_default_cache_folder())
+    if not _is_usable_folder(folder):
+        # The cache saves time only: a home that cannot be written to must not stop a study.
+        jax.config.update("jax_enable_compilation_cache", False)
+        return
+    jax.config.update("jax_compilation_cache_dir", folder)
+    # Reading an entry costs tens of milliseconds: not worth it for quick compilations.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def _is_usable_folder(folder: str) -> bool:
+    """Whether `folder` is there, made where it was missing, and can be written to."""
+    try:
+        # For this user alone: whoever can write to the cache can run code through it.
+        Path(folder).mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK | os.X_OK)
+
+
+def _default_cache_folder() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME")
+    return Path(base) / PACKAGE if base else Path.home() / ".cache" / PACKAGE
+
+
+def _usable_cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _folder_bytes(folder: str) -> int:
+    return sum(entry.stat().st_size for entry in os.scandir(folder) if entry.is_file())

@@ -1,0 +1,34 @@
+"""The one exception that a user is meant to read, and how its message is built."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class StudyError(Exception):
+    """A mistake in what was asked for; its text is one complete message for the user."""
+
+
+def field_error(
+    field: str, value: object, allowed: str, unit: str = "", hint: str = ""
+) -> StudyError:
+    """Build the error `field = value: allowed ... [unit]; did you mean ...?`, to be raised.
+
+    field: the name as the user wrote it. value: what was given. allowed: the range or the names.
+    unit: unit of the range, "" for none. hint: the nearest valid name, "" for none (see `nearest`).
+    """
+    shown = repr(value) if isinstance(value, str) else str(value)
+    message = f"{field} = {shown}: allowed {allowed}"
+    if unit:
+        message += f" [{unit}]"
+    if hint:
+        message += f"; did you mean {hint!r}?"
+    return StudyError(message)
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """The entry of `names` most like `name` regardless of case, or "" where none is close."""
+    by_lower = {candidate.lower(): candidate for candidate in names}
+    close = get_close_matches(name.lower(), by_lower, n=1)
+    return by_lower[close[0]] if close else ""

@@ -1,0 +1,205 @@
+"""Labelled results in one file: netCDF-4 written as plain HDF5, which xarray opens by name.
+
+Every axis has a dimension scale, every variable its units and its long name, and the file appears
+whole or not at all.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+
+from studies.errors import StudyError, field_error
+
+# What netCDF, HDF5 and xarray's attribute access all take as a name.
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_TEXT = h5py.string_dtype("utf-8")
+
+
+class Variable(NamedTuple):
+    """One labelled array.
+
+    data: numbers, booleans or text, one axis per name in dims.
+    dims: name of each axis; a one-dimensional variable named like its axis is its coordinate.
+    units: SI symbol such as "m" or "Hz", "1" for none. Not "seconds": xarray makes dates of that.
+    long_name: what it is, in words.
+    """
+
+    data: np.ndarray
+    dims: tuple[str, ...]
+    units: str
+    long_name: str
+
+
+def write_store(
+    path: str | Path, variables: Mapping[str, Variable], attributes: Mapping[str, Any]
+) -> None:
+    """Write variables and global attributes to a netCDF-4 file, replacing the one that is there.
+
+    path: the file; its folder must exist. attributes: text, numbers or lists of one of them.
+    An axis without a coordinate gets its index. Booleans become int8.
+
+    Raises StudyError for a target that cannot be written, and for data that netCDF cannot label or
+    hold; whatever was at `path` is then still there.
+    """
+    check_target(path)
+    arrays = {name: _stored(name, variable) for name, variable in variables.items()}
+    sizes = _axis_sizes(variables, arrays)
+    labels = {name: _attribute(name, value) for name, value in attributes.items()}
+    coordinates = {
+        axis: Variable(np.arange(size), (axis,), "1", f"index of {axis}")
+        for axis, size in sizes.items()
+        if axis not in variables
+    }
+    arrays |= {axis: coordinate.data for axis, coordinate in coordinates.items()}
+    with replacing(path) as temporary, h5py.File(temporary, "w", track_order=True) as file:
+        file.attrs.update(labels)
+        for name, variable in (coordinates | dict(variables)).items():
+            dataset = file.create_dataset(name, data=arrays[name], track_order=True)
+            dataset.attrs["units"] = variable.units
+            dataset.attrs["long_name"] = variable.long_name
+        for axis in sizes:
+            file[axis].make_scale(axis)
+        for name, variable in variables.items():
+            if name not in sizes:
+                for position, axis in enumerate(variable.dims):
+                    file[name].dims[position].attach_scale(file[axis])
+
+
+def read_store(path: str | Path) -> tuple[dict[str, Variable], dict[str, Any]]:
+    """Read what `write_store` wrote: the variables, index coordinates with them, and attributes.
+
+    Raises StudyError where there is no such file or it is not a store.
+    """
+    if not Path(path).is_file():
+        raise StudyError(f"{path}: no such file")
+    try:
+        with h5py.File(path, "r") as file:
+            variables = {name: _read_variable(dataset) for name, dataset in file.items()}
+            attributes = {name: _plain(value) for name, value in file.attrs.items()}
+    except (OSError, RuntimeError, KeyError, AttributeError) as error:
+        raise StudyError(f"{path}: not a store of results ({error})") from error
+    return variables, attributes
+
+
+def check_target(path: str | Path) -> None:
+    """Raise StudyError unless a file can be written at `path`; call it before long work."""
+    target = Path(os.path.realpath(path))
+    folder = target.parent
+    if not folder.is_dir():
+        raise StudyError(f"{path}: cannot write there, {folder} is not a folder; create it first")
+    if target.exists() and not target.is_file():
+        raise StudyError(f"{path}: cannot write there, it is a folder or a device; name a file")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise StudyError(f"{path}: cannot write there, no permission for the folder {folder}")
+    if target.exists() and not os.access(target, os.W_OK):
+        raise StudyError(f"{path}: cannot write there, the file is write-protected")
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path that becomes `path` on success, and is removed on any failure.
+
+    Errors of writing are raised as StudyError.
+    """
+    check_target(path)
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        yield temporary
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, target)
+    except (OSError, RuntimeError) as error:  # h5py raises either when a disk is full
+        raise StudyError(f"{path}: cannot write it ({error})") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _stored(name: str, variable: Variable) -> np.ndarray:
+    """The array as the file holds it, or StudyError for what netCDF cannot label or hold."""
+    _check_name("variable", name)
+    for label in ("units", "long_name"):
+        if not getattr(variable, label):
+            raise field_error(f"{name}.{label}", getattr(variable, label), "a text that is not empty")
+    data = np.asarray(variable.data)
+    dims = variable.dims
+    for axis in dims:
+        _check_name(f"dimension of {name}", axis)
+    if len(dims) != data.ndim or len(set(dims)) != len(dims):
+        raise field_error(f"{name}.dims", dims, f"one distinct name for each of {data.ndim} axes")
+    if name in dims and len(dims) > 1:
+        raise field_error(f"{name}.dims", dims, f"only ({name!r},) for the coordinate of {name}")
+    return _storable(name, data)
+
+
+def _storable(field: str, data: np.ndarray) -> np.ndarray:
+    """Text as UTF-8 strings, booleans as int8, numbers as they are; StudyError for the rest."""
+    if data.dtype.kind == "U" or (
+        data.dtype.kind == "O" and all(isinstance(value, str) for value in data.flat)
+    ):
+        if any("\0" in text for text in data.flat):
+            raise field_error(field, "text with a NUL character", "text without NUL characters")
+        return data.astype(_TEXT)
+    if data.dtype.kind == "b":
+        return data.astype(np.int8)
+    if data.dtype.kind in "iu" or data.dtype in (np.float32, np.float64):
+        return data
+    raise field_error(f"type of {field}", data.dtype, "integers, float32, float64, bool or text")
+
+
+def _axis_sizes(
+    variables: Mapping[str, Variable], arrays: Mapping[str, np.ndarray]
+) -> dict[str, int]:
+    """Length of each axis, which must be the same in all variables."""
+    sizes: dict[str, int] = {}
+    for name, variable in variables.items():
+        for axis, size in zip(variable.dims, arrays[name].shape, strict=True):
+            if sizes.setdefault(axis, size) != size:
+                raise field_error(
+                    f"length of {name} along {axis}", size, f"{sizes[axis]} as in other variables"
+                )
+    for axis in sizes:
+        if axis in variables and variables[axis].dims != (axis,):
+            raise field_error(f"{axis}.dims", variables[axis].dims, f"({axis!r},), it is an axis")
+    return sizes
+
+
+def _attribute(name: str, value: Any) -> Any:
+    """A global attribute as the file holds it."""
+    _check_name("attribute", name)
+    data = np.asarray(value)
+    if data.ndim > 1:
+        raise field_error(f"shape of attribute {name}", data.shape, "one value or a list")
+    return _storable(f"attribute {name}", data)
+
+
+def _check_name(kind: str, name: str) -> None:
+    if not _NAME.fullmatch(name):
+        raise field_error(kind, name, "letters, digits and _, not beginning with a digit")
+
+
+def _read_variable(dataset: h5py.Dataset) -> Variable:
+    is_text = h5py.check_string_dtype(dataset.dtype) is not None
+    data = dataset.asstr()[()] if is_text else dataset[()]
+    if dataset.is_scale:
+        dims: tuple[str, ...] = (dataset.name.lstrip("/"),)
+    else:
+        dims = tuple(axis[0].name.lstrip("/") for axis in dataset.dims)
+    array = np.asarray(data, dtype=str if is_text else None)
+    return Variable(array, dims, dataset.attrs["units"], dataset.attrs["long_name"])
+
+
+def _plain(value: Any) -> Any:
+    """An attribute as Python text or number where it is one value, else as an array."""
+    if isinstance(value, np.ndarray) and value.dtype.kind == "O":
+        return value.astype(str)
+    return value.item() if isinstance(value, np.generic) else value

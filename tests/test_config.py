@@ -1,0 +1,115 @@
+"""Settings of JAX: in force under the tests, refused when wrong or late, none at import."""
+
+import json
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from studies.config import COMPILER_FLAGS, DEVICE_FLAG, configure, info, is_backend_started
+from studies.errors import StudyError
+
+
+def run(code, **environment):
+    """Standard output, read as JSON, of `code` in a Python with no settings of ours."""
+    clean = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=clean | environment, capture_output=True, text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_float64_and_flags_are_in_force():
+    assert jnp.zeros(1).dtype == jnp.float64
+    assert all(name in os.environ["XLA_FLAGS"] for name in (*COMPILER_FLAGS, DEVICE_FLAG))
+
+
+def test_equal_settings_may_be_repeated_after_the_start():
+    jax.block_until_ready(jnp.ones(2) + 1)
+    assert is_backend_started()
+    before = os.environ["XLA_FLAGS"]
+    configure()
+    configure(devices=jax.local_device_count("cpu"))
+    assert os.environ["XLA_FLAGS"] == before
+
+
+def test_late_devices_are_refused_with_the_cure():
+    count = len(jax.local_devices(backend="cpu"))
+    with pytest.raises(StudyError, match=rf"too late.*\(it has {count}\).*restart the kernel"):
+        configure(devices=count + 1)
+
+
+def test_late_flags_are_refused_with_the_cure(monkeypatch):
+    jax.devices()
+    monkeypatch.setenv("XLA_FLAGS", "")
+    with pytest.raises(StudyError, match=r"too late.*xla_cpu.*configure\(flags=False\)"):
+        configure()
+    configure(flags=False)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"precision": "float46"}, "precision = 'float46': allowed float64 or float32; "
+                                   "did you mean 'float64'?"),
+        ({"devices": 0}, "devices = 0: allowed a whole number from 1"),
+        ({"devices": 1.5}, "devices = 1.5: allowed a whole number from 1"),
+    ],
+)
+def test_wrong_values_are_named(settings, words):
+    with pytest.raises(StudyError) as caught:
+        configure(**settings)
+    assert str(caught.value) == words
+
+
+def test_import_sets_nothing_and_configure_does(tmp_path):
+    """Also: settings made after `import jax` count, and other flags of the user are kept."""
+    seen = run(
+        "import json, os, jax\n"
+        "import jax.numpy as jnp\n"
+        "import studies.config as config\n"
+        "untouched = [os.environ['XLA_FLAGS'], jax.config.jax_enable_x64,\n"
+        "             jax.config.jax_compilation_cache_dir, config.is_backend_started()]\n"
+        "config.configure('float32', devices=3)\n"
+        "config.configure('float32', devices=3)\n"
+        "started = config.is_backend_started()\n"
+        "f = jax.jit(jax.grad(lambda x: jnp.sin(jax.scipy.linalg.expm(x)).sum()))\n"
+        "f(jnp.eye(4)).block_until_ready()\n"
+        "print(json.dumps([untouched, started, os.environ['XLA_FLAGS'], config.info()]))\n",
+        XLA_FLAGS=f"--xla_cpu_prefer_vector_width=256 {DEVICE_FLAG}=2",
+        XDG_CACHE_HOME=str(tmp_path),
+        JAX_COMPILATION_CACHE_DIR="",
+    )
+    untouched, started, flags, facts = seen
+    assert untouched == [f"--xla_cpu_prefer_vector_width=256 {DEVICE_FLAG}=2", False, "", False]
+    assert started is False
+    extra = f"--xla_backend_extra_options={COMPILER_FLAGS['--xla_backend_extra_options']}"
+    assert flags.split() == ["--xla_cpu_prefer_vector_width=256", extra, f"{DEVICE_FLAG}=3"]
+    assert facts["devices"].startswith("3 x ")
+    assert facts["precision"] == "float32"
+    assert facts["cache"] == str(tmp_path / "flexlink-studies")
+    assert any((tmp_path / "flexlink-studies").iterdir())
+
+
+def test_unusable_cache_folder_does_not_stop_a_study(tmp_path):
+    (tmp_path / "file").write_text("")
+    facts = run(
+        "import json, studies.config as config\n"
+        "config.configure(devices=1)\n"
+        "print(json.dumps(config.info()))\n",
+        JAX_COMPILATION_CACHE_DIR=str(tmp_path / "file" / "cache"),
+    )
+    assert facts["cache"] == "none" and facts["cache_mib"] == 0.0
+
+
+def test_info_is_plain_and_complete():
+    facts = info()
+    assert facts["jax"] == jax.__version__ and facts["precision"] == "float64"
+    assert {"flexlink-studies", "python", "jaxlib", "numpy", "h5py", "devices", "cache",
+            "cache_mib", "xla_flags"} <= facts.keys()
+    json.dumps(facts)

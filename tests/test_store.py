@@ -1,0 +1,212 @@
+"""The store: round trip, what xarray sees, what is refused, and that nothing half-written stays."""
+
+import importlib.util
+import subprocess
+import sys
+import warnings
+
+import h5py
+import numpy as np
+import pytest
+import xarray
+
+from studies import store
+from studies.errors import StudyError, field_error, nearest
+from studies.store import Variable, check_target, read_store, write_store
+
+ENGINES = [
+    name
+    for name, package in (("h5netcdf", "h5netcdf"), ("netcdf4", "netCDF4"))
+    if importlib.util.find_spec(package)
+]
+
+VARIABLES = {
+    "case": Variable(np.array([10, 20, 30]), ("case",), "1", "number of the case"),
+    "link": Variable(np.array(["first", "zweites é"]), ("link",), "1", "name of the link"),
+    "peak": Variable(np.array([[1.0, np.nan], [2.0, -0.0], [np.inf, 3e-310]]), ("case", "link"),
+                     "m", "largest tip deflection"),
+    "history": Variable(np.linspace(0, 1, 24).reshape(3, 2, 4), ("case", "link", "sample"),
+                        "m", "tip deflection"),
+    "narrow": Variable(np.float32([0.1, 0.2, 0.3]), ("case",), "Hz", "single precision"),
+    "is_stable": Variable(np.array([True, False, True]), ("case",), "1", "whether it settled"),
+    "message": Variable(np.array(["", "x\ny", "ü"], dtype=object), ("case",), "1", "what failed"),
+    "span": Variable(np.float64(0.8), (), "s", "simulated time"),
+}
+ATTRIBUTES = {"title": "Größen", "note": "", "seed": 7, "gain": 0.1, "spec": "x" * 100_000,
+              "gains": [1.5, 2.5], "names": ["a", "bb"]} | {f"more_{i}": i for i in range(10)}
+
+
+@pytest.fixture
+def path(tmp_path):
+    file = tmp_path / "results.nc"
+    write_store(file, VARIABLES, ATTRIBUTES)
+    return file
+
+
+def leftovers(folder):
+    return [entry.name for entry in folder.iterdir() if entry.name.endswith(".tmp")]
+
+
+def test_read_store_returns_what_was_written(path):
+    variables, attributes = read_store(path)
+    for name, written in VARIABLES.items():
+        assert variables[name][1:] == written[1:]
+        np.testing.assert_array_equal(variables[name].data, written.data)
+    assert variables["narrow"].data.dtype == np.float32
+    assert variables["is_stable"].data.dtype == np.int8
+    assert attributes.keys() == ATTRIBUTES.keys()
+    for name, written in ATTRIBUTES.items():
+        np.testing.assert_array_equal(attributes[name], written)
+
+
+def test_axis_without_coordinate_gets_its_index(path):
+    index = read_store(path)[0]["sample"]
+    assert index.dims == ("sample",) and index.units == "1"
+    np.testing.assert_array_equal(index.data, np.arange(4))
+
+
+def test_a_store_can_be_written_again_from_what_was_read(path, tmp_path):
+    again = tmp_path / "again.nc"
+    write_store(again, *read_store(path))
+    first, second = read_store(path)[0], read_store(again)[0]
+    assert first.keys() == second.keys()
+    for name in first:
+        np.testing.assert_array_equal(first[name].data, second[name].data)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_xarray_opens_it_without_warnings(path, engine):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with xarray.open_dataset(path, engine=engine) as dataset:
+            dataset.load()
+    assert set(dataset.coords) == {"case", "link", "sample"}
+    assert dict(dataset.sizes) == {"case": 3, "link": 2, "sample": 4}
+    for name, written in VARIABLES.items():
+        assert dataset[name].dims == written.dims
+        assert dataset[name].attrs == {"units": written.units, "long_name": written.long_name}
+        np.testing.assert_array_equal(dataset[name].values, written.data)
+    assert dataset.attrs["title"] == ATTRIBUTES["title"]
+    assert float(dataset["peak"].sel(case=20, link="first")) == 2.0
+
+
+def test_every_axis_of_every_dataset_has_a_scale_and_labels(path):
+    with h5py.File(path) as file:
+        for dataset in file.values():
+            assert dataset.attrs["units"] and dataset.attrs["long_name"]
+            assert dataset.is_scale or all(len(axis) == 1 for axis in dataset.dims)
+
+
+def changed(**fields):
+    return {"peak": VARIABLES["peak"]._replace(**fields)}
+
+
+@pytest.mark.parametrize(
+    ("variables", "attributes", "words"),
+    [
+        (changed(units=""), {}, "peak.units = ''"),
+        (changed(long_name=""), {}, "peak.long_name = ''"),
+        (changed(dims=("case",)), {}, "peak.dims"),
+        (changed(dims=("case", "case")), {}, "peak.dims"),
+        (changed(dims=("case", "peak")), {}, "peak.dims"),
+        (changed(data=np.ones((3, 2), complex)), {}, "complex128"),
+        (changed(data=np.ones((3, 2), np.float16)), {}, "float16"),
+        (changed(data=np.full((3, 2), None)), {}, "object"),
+        (changed(data=np.full((3, 2), "a\0b")), {}, "NUL"),
+        (changed() | {"a/b": VARIABLES["span"]}, {}, "variable = 'a/b'"),
+        (changed() | {"case": Variable(np.arange(4), ("case",), "1", "case")}, {},
+         "length of case along case = 4: allowed 3"),
+        (changed() | {"link": VARIABLES["span"]}, {}, "link.dims = ()"),
+        ({}, {"spec": None}, "attribute spec"),
+        ({}, {"grid": [[1, 2]]}, "attribute grid"),
+        ({}, {"a b": 1}, "attribute = 'a b'"),
+    ],
+)
+def test_what_netcdf_cannot_hold_is_refused_before_the_file_is_touched(
+    path, variables, attributes, words
+):
+    before = path.read_bytes()
+    with pytest.raises(StudyError) as caught:
+        write_store(path, variables, attributes)
+    assert words in str(caught.value)
+    assert path.read_bytes() == before and leftovers(path.parent) == []
+
+
+def test_failed_rename_keeps_the_old_file_and_no_temporary(path, monkeypatch):
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(store.os, "replace", fail)
+    with pytest.raises(StudyError, match="no space left"):
+        write_store(path, VARIABLES, {})
+    assert path.read_bytes() == before and leftovers(path.parent) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="file size limits are POSIX")
+def test_full_disk_is_one_message_and_leaves_nothing(tmp_path):
+    code = (
+        "import resource, sys, numpy as np\n"
+        "from studies.store import StudyError, Variable, write_store\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\n"
+        "try: write_store(sys.argv[1], {'x': Variable(np.ones(100_000), ('n',), 'm', 'x')}, {})\n"
+        "except StudyError as error: print('refused', error)\n"
+    )
+    target = tmp_path / "big.nc"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(target)], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"refused {target}: cannot write it")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_interrupt_leaves_no_temporary(tmp_path):
+    with pytest.raises(KeyboardInterrupt), store.replacing(tmp_path / "table.csv") as temporary:
+        temporary.write_text("half")
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unwritable_targets_are_refused(tmp_path):
+    file = tmp_path / "file"
+    file.write_text("")
+    for target, words in (
+        (tmp_path / "absent" / "a.nc", "create it first"),
+        (file / "a.nc", "is not a folder"),
+        (tmp_path, "name a file"),
+        ("/dev/null", "name a file"),
+    ):
+        with pytest.raises(StudyError, match=words):
+            check_target(target)
+    check_target(file)
+
+
+def test_a_link_is_written_through(tmp_path):
+    (tmp_path / "real.nc").write_text("")
+    (tmp_path / "link.nc").symlink_to(tmp_path / "real.nc")
+    write_store(tmp_path / "link.nc", VARIABLES, {})
+    assert (tmp_path / "link.nc").is_symlink()
+    assert read_store(tmp_path / "real.nc")[0].keys() >= VARIABLES.keys()
+
+
+def test_files_that_are_no_store_are_named(tmp_path):
+    (tmp_path / "text.nc").write_text("no HDF5")
+    with h5py.File(tmp_path / "plain.h5", "w") as file:
+        file["x"] = np.arange(3)
+    for name, words in (("none.nc", "no such file"), ("text.nc", "not a store"),
+                        ("plain.h5", "not a store")):
+        with pytest.raises(StudyError, match=f"{name}: {words}"):
+            read_store(tmp_path / name)
+
+
+def test_field_error_names_value_range_unit_and_nearest():
+    hint = nearest("Modal_fitler", ["modal_filter", "shaper"])
+    error = field_error("plant.length", 0.5, "0.1 to 0.3", "m", hint)
+    assert isinstance(error, StudyError)
+    assert str(error) == (
+        "plant.length = 0.5: allowed 0.1 to 0.3 [m]; did you mean 'modal_filter'?"
+    )
+    assert str(field_error("method", "", "rk4")) == "method = '': allowed rk4"
+    assert nearest("zzz", ["modal_filter"]) == ""
