@@ -115,6 +115,25 @@ def _disturbance(structure: Structure, case: Case, prepared: Prepared, time: Arr
     return noise, force + drive.ripple * ripple
 
 
+def _scan_in_blocks(body, start, inputs: Inputs):
+    """Scan for reverse mode: sqrt(n) blocks, each computed again on the way back.
+
+    Keeping every step instead costs n states of memory, and XLA copies the whole store at each step.
+    """
+    n = inputs.rho.shape[0]
+    size = max(int(np.sqrt(n)), 1)
+    count = n // size
+
+    @jax.checkpoint
+    def block(state, part):
+        return jax.lax.scan(lambda s, x: (body(s, x)[0], None), state, part)
+
+    main = jax.tree.map(lambda x: x[: count * size].reshape((count, size) + x.shape[1:]), inputs)
+    rest = jax.tree.map(lambda x: x[count * size :], inputs)
+    state, _ = jax.lax.scan(block, start, main)
+    return block(state, rest)[0]
+
+
 def simulate(structure: Structure, case: Case, has_record: bool = False) -> Result:
     """Run one case.
 
@@ -136,7 +155,10 @@ def simulate(structure: Structure, case: Case, has_record: bool = False) -> Resu
         after, record = step(structure, loop, state, inputs)
         return after, record if has_record else None
 
-    last, record = jax.lax.scan(body, start, outside.inputs)
+    if structure.is_smooth and not has_record:
+        last, record = _scan_in_blocks(body, start, outside.inputs), None
+    else:
+        last, record = jax.lax.scan(body, start, outside.inputs)
     result = metrics.finish(last.totals, case.electronics.period)
     is_saturated = result.saturated_fraction > case.windows.saturation_limit
     final = jnp.where((last.status == status.OK) & is_saturated, status.SATURATED, last.status)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel import estimator, motion, shaper
@@ -68,11 +69,11 @@ def build_case(study: Study) -> Case:
 
 def as_arrays(case: Case) -> Case:
     """Every leaf as an array of the working precision (integers stay integers)."""
-    real = np.dtype(jax.numpy.result_type(float))
+    real = jnp.result_type(float)
 
     def leaf(x):
         x = np.asarray(x)
-        return x if np.issubdtype(x.dtype, np.integer) else x.astype(real)
+        return jnp.asarray(x, None if np.issubdtype(x.dtype, np.integer) else real)
 
     return jax.tree.map(leaf, case)
 

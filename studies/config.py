@@ -16,6 +16,9 @@ import jax
 
 from studies.errors import StudyError, field_error, nearest
 
+# Its attributes are made at run time, where type checkers do not see them.
+settings: Any = jax.config
+
 PACKAGE = "flexlink-studies"
 PRECISIONS = ("float64", "float32")
 
@@ -57,9 +60,8 @@ def configure(
     flags or devices asked for. Calls with equal settings may be repeated at any time.
     """
     if precision not in PRECISIONS:
-        raise field_error(
-            "precision", precision, " or ".join(PRECISIONS), hint=nearest(str(precision), PRECISIONS)
-        )
+        hint = nearest(str(precision), PRECISIONS)
+        raise field_error("precision", precision, " or ".join(PRECISIONS), hint=hint)
     if devices is not None and (not isinstance(devices, int) or devices < 1):
         raise field_error("devices", devices, "a whole number from 1")
 
@@ -69,20 +71,20 @@ def configure(
         os.environ["XLA_FLAGS"] = new_flags
     else:
         _require_in_force(old_flags, devices, flags)
-    jax.config.update("jax_enable_x64", precision == "float64")
+    settings.update("jax_enable_x64", precision == "float64")
     _set_cache(cache)
 
 
 def info() -> dict[str, Any]:
     """Versions and settings in force, as plain values for `studies info`; starts JAX."""
     kinds = [device.device_kind for device in jax.devices()]
-    folder = jax.config.jax_compilation_cache_dir if jax.config.jax_enable_compilation_cache else ""
+    folder = settings.jax_compilation_cache_dir if settings.jax_enable_compilation_cache else ""
     return {
         PACKAGE: _version(PACKAGE),
         "python": platform.python_version(),
         **{name: _version(name) for name in ("jax", "jaxlib", "numpy", "h5py")},
         "devices": ", ".join(f"{kinds.count(kind)} x {kind}" for kind in sorted(set(kinds))),
-        "precision": "float64" if jax.config.jax_enable_x64 else "float32",
+        "precision": "float64" if settings.jax_enable_x64 else "float32",
         "cache": folder or "none",
         "cache_mib": round(_folder_bytes(folder) / 2**20, 1) if folder else 0.0,
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
@@ -91,13 +93,13 @@ def info() -> dict[str, Any]:
 
 def is_backend_started() -> bool:
     """Whether JAX has started its devices, after which compiler flags are no longer read."""
-    count = jax.config.jax_num_cpu_devices
+    count = settings.jax_num_cpu_devices
     try:
         # The public sign of it: JAX refuses to change this setting once it has started.
-        jax.config.update("jax_num_cpu_devices", count + 1)
+        settings.update("jax_num_cpu_devices", count + 1)
     except RuntimeError:
         return True
-    jax.config.update("jax_num_cpu_devices", count)
+    settings.update("jax_num_cpu_devices", count)
     return False
 
 
@@ -127,17 +129,17 @@ def _require_in_force(present: str, devices: int | None, flags: bool) -> None:
 
 def _set_cache(cache: bool) -> None:
     """Turn the persistent cache of compiled programs on or off."""
-    jax.config.update("jax_enable_compilation_cache", cache)
+    settings.update("jax_enable_compilation_cache", cache)
     if not cache:
         return
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(_default_cache_folder())
     if not _is_usable_folder(folder):
         # The cache saves time only: a home that cannot be written to must not stop a study.
-        jax.config.update("jax_enable_compilation_cache", False)
+        settings.update("jax_enable_compilation_cache", False)
         return
-    jax.config.update("jax_compilation_cache_dir", folder)
+    settings.update("jax_compilation_cache_dir", folder)
     # Reading an entry costs tens of milliseconds: not worth it for quick compilations.
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    settings.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def _is_usable_folder(folder: str) -> bool:

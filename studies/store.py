@@ -128,8 +128,9 @@ def _stored(name: str, variable: Variable) -> np.ndarray:
     """The array as the file holds it, or StudyError for what netCDF cannot label or hold."""
     _check_name("variable", name)
     for label in ("units", "long_name"):
-        if not getattr(variable, label):
-            raise field_error(f"{name}.{label}", getattr(variable, label), "a text that is not empty")
+        text = getattr(variable, label)
+        if not text:
+            raise field_error(f"{name}.{label}", text, "a text that is not empty")
     data = np.asarray(variable.data)
     dims = variable.dims
     for axis in dims:

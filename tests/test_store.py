@@ -144,7 +144,6 @@ def test_failed_rename_keeps_the_old_file_and_no_temporary(path, monkeypatch):
     assert path.read_bytes() == before and leftovers(path.parent) == []
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="file size limits are POSIX")
 def test_full_disk_is_one_message_and_leaves_nothing(tmp_path):
     code = (
         "import resource, sys, numpy as np\n"

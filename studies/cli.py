@@ -1,0 +1,142 @@
+"""The command line. Every command ends with exit code 0, or 2 and one message; never a traceback."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from typer.exceptions import Abort, TyperException
+
+from studies.config import configure
+from studies.errors import StudyError
+
+app = typer.Typer(
+    help="Parameter studies of a planar 3-PRR manipulator with flexible links.",
+    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+)  # fmt: skip
+console = Console(highlight=False)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of the `studies` command."""
+    try:
+        app(args=arguments, standalone_mode=False)
+    except (StudyError, TyperException) as error:
+        text = error.format_message() if isinstance(error, TyperException) else str(error)
+        print(f"studies: {text}", file=sys.stderr)
+        sys.exit(2)
+    except (KeyboardInterrupt, Abort):
+        print("studies: interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+@app.command()
+def paper(
+    out: Annotated[Path, typer.Option(help="folder for data, figures and report")],
+    precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
+) -> None:
+    """Run the paper's study: data, counterparts of its figures, report with both sets of numbers."""
+    configure(precision)
+    from studies.paper import run_paper
+
+    run_paper(out, console)
+
+
+@app.command()
+def simulate(
+    study: Annotated[Path, typer.Argument(help="study file (TOML)")],
+    out: Annotated[Path, typer.Option(help="HDF5 file to write")],
+    precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
+) -> None:
+    """Run one study with full trajectories."""
+    configure(precision)
+    from studies.runs import describe, run_attributes, run_study, run_variables
+    from studies.spec import load_study
+    from studies.store import check_target, write_store
+
+    spec = load_study(study)
+    check_target(out)
+    run = run_study(spec)
+    write_store(out, run_variables(run), run_attributes(spec))
+    metrics = run.result.metrics
+    console.print(f"status: {describe(run.status)}")
+    table = Table("link", "residual rms [um]", "settling [ms]", "peak voltage [V]")
+    for i in range(3):
+        table.add_row(
+            str(i + 1), f"{1e6 * metrics.residual_rms[i].max():.4g}",
+            f"{1e3 * metrics.settling_time[i]:.4g}", f"{metrics.voltage_peak[i]:.4g}",
+        )  # fmt: skip
+    console.print(table)
+    if run.loop is not None:
+        console.print(f"gain margin of the linearised sampled loop: {run.loop.gain_margin:.4g}")
+    console.print(f"written: {out}")
+
+
+@app.command()
+def modes(
+    pose: Annotated[
+        Optional[tuple[float, float, float]], typer.Option(help="x [m] y [m] phi [rad]; default home")
+    ] = None,
+    kp: Annotated[float, typer.Option(help="drive stiffness [N/m], 0 = free sliders")] = 2e4,
+    kd: Annotated[float, typer.Option(help="drive damping [N s/m]")] = 0.0,
+    damping: Annotated[float, typer.Option(help="structural damping ratio [1]")] = 0.0,
+    locked: Annotated[bool, typer.Option("--locked", help="hold the sliders")] = False,
+    basis: Annotated[str, typer.Option(help="modal basis of the links")] = "pinned_pinned",
+    n_modes: Annotated[int, typer.Option("--modes", help="modes per link")] = 3,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+) -> None:
+    """Natural frequencies and damping ratios of the assembled machine."""
+    configure()
+    from studies.modes import machine_modes
+
+    found = machine_modes(pose, kp, kd, damping, locked, basis, n_modes)
+    if as_json:
+        text = {
+            "frequencies_hz": found.frequency.tolist(),
+            "damping_ratios": found.damping_ratio.tolist(),
+        }
+        print(json.dumps(text))
+        return
+    table = Table("mode", "frequency [Hz]", "damping ratio [1]")
+    for k, (f, z) in enumerate(zip(found.frequency, found.damping_ratio)):
+        table.add_row(str(k + 1), f"{f:.4f}", f"{z:.5f}")
+    console.print(table)
+
+
+@app.command()
+def init(
+    out: Annotated[Optional[Path], typer.Argument(help="file to write; default: print it")] = None,
+) -> None:
+    """Write a commented study file with every field and its default."""
+    from studies.store import check_target
+    from studies.template import study_template
+
+    if out is None:
+        print(study_template(), end="")
+        return
+    if out.exists():
+        raise StudyError(f"{out}: exists already; name a new file")
+    check_target(out)
+    out.write_text(study_template(), encoding="utf-8")
+    console.print(f"written: {out}")
+
+
+@app.command()
+def info() -> None:
+    """Versions, devices, precision, compilation cache."""
+    configure()
+    from studies.config import info as facts
+
+    table = Table(show_header=False)
+    for name, value in facts().items():
+        table.add_row(name, str(value))
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()

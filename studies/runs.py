@@ -1,0 +1,319 @@
+"""One study, one run: checks before it, the run, and its labelled results.
+
+`run_study` is what `studies simulate` and `studies paper` call.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel import status
+from jaxmodel.beam import build_basis
+from jaxmodel.case import Case, Structure
+from jaxmodel.kinematics import path_status
+from jaxmodel.linear import linearise, mechanical
+from jaxmodel.motion import end_of_path, sample_path
+from jaxmodel.prepare import prepare, spectrum_frequencies
+from jaxmodel.sampled_loop import LoopReport, loop_report
+from jaxmodel.simulate import Result, simulate
+from studies import config
+from studies.cases import as_arrays, build_case, build_structure
+from studies.errors import field_error
+from studies.spec import Study
+from studies.store import Variable
+
+#: |Re lambda| h that one explicit step of the ideal feedback may have; ETDRK4 loses stability near 2.8.
+STIFFNESS_LIMIT = 2.5
+#: More plant steps per sample than this are refused.
+SUBSTEP_LIMIT = 200
+
+_simulate = jax.jit(simulate, static_argnums=(0, 2))
+
+
+class Run(NamedTuple):
+    """A finished run."""
+
+    study: Study
+    structure: Structure
+    case: Case
+    result: Result  # NumPy arrays
+    loop: LoopReport | None  # linearised sampled loop, where there is one
+    status: int  # code of `jaxmodel.status`; UNSTABLE comes from the linearised loop
+
+
+def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> Run:
+    """Run one study after checking what can be known before.
+
+    Args:
+        study: what to run.
+        has_record: keep trajectories.
+        has_loop: judge the linearised sampled loop too (seconds).
+
+    Raises:
+        StudyError: pose out of reach, singular path, motion longer than the run, too stiff feedback.
+    """
+    structure, case = check_run(study)
+    result = jax.tree.map(np.asarray, _simulate(structure, case, has_record))
+    loop, code = None, int(result.status)
+    if has_loop and structure.feedback == "sampled":
+        loop = loop_report(structure, case, _home(study))
+        if code in (status.OK, status.SATURATED) and not loop.is_stable:
+            code = status.UNSTABLE
+    return Run(study, structure, case, result, loop, code)
+
+
+def _home(study: Study) -> np.ndarray:
+    return np.array(study.motion.waypoints[0], float)
+
+
+class Preflight(NamedTuple):
+    """What is known of a case before it runs."""
+
+    pose_status: Any  # of every way-point, (n,)
+    path_status: Any  # first fault along the unshaped path, ()
+    path_time: Any  # when [s], ()
+    path_pose: Any  # where, (3,)
+    motion_end: Any  # of the unshaped motion [s], ()
+    shaper_length: Any  # [s], ()
+    condition: Any  # worst condition number of filter and synthesizer [1], ()
+
+
+@partial(jax.jit, static_argnums=0)
+def _preflight(structure: Structure, case: Case) -> Preflight:
+    prepared = prepare(structure, case)
+    plant, taps = prepared.loop.plant, prepared.taps
+    each = jax.vmap(lambda pose: path_status(plant, pose[None])[0])(case.path.waypoints)
+    end = end_of_path(case.path)
+    time = jnp.linspace(0.0, 1.0, 2001) * end
+    poses = sample_path(case.path, time).position
+    code, index = path_status(plant, poses)
+    last = jnp.max(jnp.where(taps.weight != 0, taps.sample, 0))
+    worst = jnp.maximum(prepared.sensor_condition.max(), prepared.actuator_condition.max())
+    return Preflight(
+        each, code, time[index], poses[index], end, last * case.electronics.period, worst
+    )
+
+
+def check_run(study: Study) -> tuple[Structure, Case]:
+    """Structure and case of a study, checked against its geometry and step size.
+
+    Raises:
+        StudyError: see `run_study`.
+    """
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    known = jax.tree.map(np.asarray, _preflight(structure, case))
+    for k, pose in enumerate(study.motion.waypoints):
+        check_pose(f"motion.waypoints.{k}", pose, int(known.pose_status[k]))
+    if int(known.path_status) != status.OK:
+        x, y, phi = known.path_pose
+        raise field_error(
+            "motion.waypoints",
+            f"path at t = {known.path_time:.4g} s, pose ({x:.4g}, {y:.4g}, {phi:.4g})",
+            "a path on which every link angle gamma stays inside (0, 90) deg "
+            f"(here: {status.REASONS[int(known.path_status)]})", "m, m, rad",
+        )  # fmt: skip
+    _check_duration(study, structure, known)
+    is_modal = structure.law == "imsc" and structure.feedback != "none"
+    if is_modal and known.condition > study.metrics.condition_limit:
+        raise field_error(
+            "patches.centers", study.patches.centers,
+            f"a placement whose modal filter for control.modes = {study.control.modes} has a "
+            f"condition number up to metrics.condition_limit = {study.metrics.condition_limit:g}; "
+            f"it is {known.condition:.3g}", "m",
+        )  # fmt: skip
+    if structure.feedback == "ideal" and not study.run.substeps:
+        structure = structure._replace(substeps=_ideal_substeps(study, structure, case))
+    return structure, case
+
+
+def check_pose(field: str, pose: tuple[float, float, float], code: int) -> None:
+    """Refuse a pose that no link can reach, or where a link is parallel or square to its guide.
+
+    Args:
+        field: name for the message.
+        pose: (x, y, phi) [m, m, rad].
+        code: its status.
+
+    Raises:
+        StudyError: out of reach or singular.
+    """
+    if code != status.OK:
+        raise field_error(
+            field, pose,
+            "a pose where every link angle gamma is inside (0, 90) deg "
+            f"(here: {status.REASONS[code]})", "m, m, rad",
+        )  # fmt: skip
+
+
+def _check_duration(study: Study, structure: Structure, known: Preflight) -> None:
+    duration = structure.n_steps / study.electronics.sample_rate_hz
+    end = float(known.motion_end + known.shaper_length)
+    if end > duration * (1 + 1e-12):
+        raise field_error(
+            "run.duration", study.run.duration,
+            f"at least {end:.6g}, the end of the motion with its shaper of "
+            f"{known.shaper_length:.4g} s", "s",
+        )  # fmt: skip
+    left = duration - end - study.metrics.residual_delay
+    is_moving = len(study.motion.waypoints) > 1
+    if is_moving and study.metrics.residual_length > left + 1e-9:
+        raise field_error(
+            "metrics.residual_length", study.metrics.residual_length,
+            f"up to {max(left, 0):.6g}, what run.duration = {duration:g} leaves after the shaped "
+            "motion and metrics.residual_delay", "s",
+        )  # fmt: skip
+
+
+def pole_decay(structure: Structure, case: Case, pose: Any) -> float:
+    """Fastest decay |Re lambda| [1/s] of the plant with ideal feedback at a pose."""
+    poles = np.linalg.eigvals(np.asarray(_mechanical(structure, case, pose)))
+    return float(np.abs(poles.real).max())
+
+
+@partial(jax.jit, static_argnums=0)
+def _mechanical(structure: Structure, case: Case, pose: Any) -> Any:
+    loop = prepare(structure, case).loop
+    return mechanical(linearise(structure, loop, pose, case.electronics.antialias))
+
+
+def _ideal_substeps(study: Study, structure: Structure, case: Case) -> int:
+    """Plant steps per sample that ideal feedback needs: the worst way-point decides."""
+    poses = {np.array(pose, float).tobytes(): np.array(pose) for pose in study.motion.waypoints}
+    fastest = max(pole_decay(structure, case, pose) for pose in poses.values())
+    needed = int(np.ceil(fastest / study.electronics.sample_rate_hz / STIFFNESS_LIMIT))
+    if needed > SUBSTEP_LIMIT:
+        raise field_error(
+            "control.gain_factor", study.control.gain_factor,
+            f"gains low enough for {SUBSTEP_LIMIT} plant steps per sample; ideal feedback has a pole "
+            f"at {fastest:.3g} 1/s, which needs {needed}", "1",
+        )  # fmt: skip
+    return max(needed, 1)
+
+
+_METRIC_LABELS = {
+    "residual_rms": (("link", "station"), "m", "rms chord deflection in the residual window"),
+    "residual_peak": (("link", "station"), "m", "peak chord deflection in the residual window"),
+    "structural_rms": (("link", "station"), "m", "rms chord deflection while moving"),
+    "structural_peak": (("link", "station"), "m", "peak chord deflection while moving"),
+    "residual_modal_rms": (("link", "mode"), "m", "rms of plant modes in the residual window"),
+    "residual_modal_peak": (("link", "mode"), "m", "peak of plant modes in the residual window"),
+    "structural_modal_rms": (("link", "mode"), "m", "rms of plant modes while moving"),
+    "settling_time": (("link",), "s", "from the command's end until the deflection stays in the band"),
+    "pose_error_peak": (("pose_axis",), "m; m; rad", "peak error against the shaped command while moving"),
+    "pose_error_rms": (("pose_axis",), "m; m; rad", "rms error in the residual window"),
+    "voltage_peak": (("link",), "V", "peak actuator voltage"),
+    "saturated_fraction": ((), "1", "samples with an actuator at its limit"),
+    "clipped_fraction": ((), "1", "samples with an ADC channel at its end"),
+    "control_energy": ((), "V2 s", "integral of the summed squared actuator voltages"),
+    "force_peak": (("slider_axis",), "N", "peak motor force"),
+    "plant_energy": (("link", "mode"), "m2/s2", "mean omega^2 q^2 + q'^2 while moving, plant modes"),
+    "modal_energy": (("link", "controlled_mode"), "m2/s2", "the same in the controller's modes"),
+    "spectral_density": (
+        ("link", "controlled_mode", "spectrum_point"), "m2/Hz",
+        "one-sided power spectral density of the controller's modes, Hann periodogram of the run",
+    ),
+}  # fmt: skip
+
+
+def metric_variables(result: Result) -> dict[str, Variable]:
+    """Labelled metrics of a run."""
+    return {
+        name: Variable(np.asarray(getattr(result.metrics, name)), dims, unit, text)
+        for name, (dims, unit, text) in _METRIC_LABELS.items()
+    }
+
+
+_RECORD_LABELS = {
+    "pose": (("time", "pose_axis"), "m; m; rad", "platform pose (x, y, phi)"),
+    "pose_error": (("time", "pose_axis"), "m; m; rad", "pose minus shaped command"),
+    "slider": (("time", "slider_axis"), "m", "slider position rho"),
+    "modal_coordinate": (("time", "link", "mode"), "m", "modal coordinates q of the plant"),
+    "controlled_coordinate": (
+        ("time", "link", "controlled_mode"), "m", "controller's modes seen by an ideal modal filter"
+    ),
+    "chord_deflection_stations": (
+        ("time", "link", "station"), "m", "deflection relative to the chord B-C at the stations"
+    ),
+    "sensor_voltage": (("time", "link", "patch"), "V", "raw sensor voltage"),
+    "actuator_voltage": (("time", "link", "patch"), "V", "actuator voltage"),
+    "slider_force": (("time", "slider_axis"), "N", "motor force"),
+}  # fmt: skip
+
+
+def run_variables(run: Run) -> dict[str, Variable]:
+    """Everything a run's file holds: axes, trajectories (where kept), metrics, judgement."""
+    stations = np.array(run.study.metrics.stations)
+    frequency = np.asarray(spectrum_frequencies(run.structure, run.case))
+    variables = {
+        "station": Variable(stations, ("station",), "m", "position along the link"),
+        "link": Variable(np.arange(1, 4), ("link",), "1", "link number"),
+        "pose_axis": Variable(np.array(["x", "y", "phi"]), ("pose_axis",), "1", "pose component"),
+        "spectrum_frequency": Variable(
+            frequency, ("controlled_mode", "spectrum_point"), "Hz", "frequency of spectral_density"
+        ),
+        "status": Variable(np.array(run.status), (), "1", status_text()),
+        "bad_time": Variable(run.result.bad_time, (), "s", "when the status appeared, 0 if ok"),
+        "command_end": Variable(run.result.command_end, (), "s", "end of the shaped command"),
+        "sensor_condition": Variable(
+            run.result.sensor_condition, ("link",), "1", "condition number of the modal filter"
+        ),
+        "actuator_condition": Variable(
+            run.result.actuator_condition, ("link",), "1", "condition number of the synthesizer"
+        ),
+        **metric_variables(run.result),
+    }
+    if run.loop is not None:
+        variables |= {
+            "loop_spectral_radius": Variable(
+                np.array(run.loop.spectral_radius), (), "1", "of the linearised sampled loop"
+            ),
+            "gain_margin": Variable(
+                np.array(run.loop.gain_margin), (), "1", "common gain factor before instability"
+            ),
+        }
+    if run.result.record is not None:
+        record = run.result.record
+        variables["time"] = Variable(record.time, ("time",), "s", "time")
+        for name, (dims, unit, text) in _RECORD_LABELS.items():
+            variables[name] = Variable(getattr(record, name), dims, unit, text)
+        variables["chord_deflection"] = Variable(
+            chord_deflection(run), ("time", "link"), "m", "deflection of mid-span from the chord B-C"
+        )
+    return variables
+
+
+def chord_deflection(run: Run) -> np.ndarray:
+    """Mid-span deflection relative to the chord B-C [m], (n_steps, 3), from the plant's modes."""
+    machine, structure = run.case.machine, run.structure
+    middle = jnp.asarray([run.study.link.length / 2])
+    shape = build_basis(structure.basis, machine.beam, machine.patches, structure.n_modes, middle)
+    at = np.asarray(shape.deflection_at)[:, 0]
+    return np.einsum("tir,ir->ti", run.result.record.modal_coordinate, at)  # type: ignore[union-attr]
+
+
+def status_text() -> str:
+    """All status codes in words."""
+    return "; ".join(f"{code} {reason}" for code, reason in status.REASONS.items())
+
+
+def run_attributes(study: Study) -> dict[str, Any]:
+    """What a file must say about its origin: the study, versions, device, precision."""
+    facts = config.info()
+    keep = (config.PACKAGE, "python", "jax", "jaxlib", "numpy", "h5py", "devices", "precision")
+    return {
+        "title": study.title,
+        "study": json.dumps(study.model_dump(mode="json")),
+        **{name.replace("-", "_"): str(facts[name]) for name in keep},
+    }
+
+
+def describe(code: int) -> str:
+    """A status code in words."""
+    return status.REASONS.get(code, f"status {code}")
+
