@@ -19,7 +19,7 @@ class Path(NamedTuple):
     waypoints: poses (x, y, phi) [m, m, rad], shape (n + 1, 3).
     move_time: duration of each move, positive [s], shape (n,).
     dwell: pause after each move, the last one included [s], shape (n,).
-    profile: index of the time law in `PROFILES` [-], shape ().
+    profile: index of the time law in `PROFILES` [1], shape ().
     """
 
     waypoints: Array
@@ -74,7 +74,7 @@ def end_of_path(path: Path) -> Array:
 
 
 def cycloid(u: Array) -> tuple[Array, Array, Array]:
-    """Return (25), s = u - sin(2 pi u)/(2 pi), with s' and s'' for u in [0, 1] [-]."""
+    """Return (25), s = u - sin(2 pi u)/(2 pi), with s' and s'' for u in [0, 1] [1]."""
     # The whole turn taken off makes the end exact: no acceleration is left at u = 1.
     angle = 2 * np.pi * (u - jnp.round(u))
     sine = jnp.sin(angle)
@@ -82,7 +82,7 @@ def cycloid(u: Array) -> tuple[Array, Array, Array]:
 
 
 def quintic(u: Array) -> tuple[Array, Array, Array]:
-    """Return s = 10 u^3 - 15 u^4 + 6 u^5 with s' and s'' for u in [0, 1] [-]."""
+    """Return s = 10 u^3 - 15 u^4 + 6 u^5 with s' and s'' for u in [0, 1] [1]."""
     rest = 1 - u
     return (
         u**3 * (10 - 15 * u + 6 * u**2),
@@ -104,6 +104,7 @@ def sample_path(path: Path, time: ArrayLike) -> PathSample:
     Returns:
         PathSample with arrays of shape (..., 3).
     """
+    path = jax.tree.map(jnp.asarray, path)
     starts = move_starts(path)
     steps = jnp.diff(path.waypoints, axis=0)
     last = len(path.move_time) - 1
@@ -136,9 +137,9 @@ def shape_path(
 
     Args:
         path: the moves.
-        taps: weights W_i [-] and delays n_i [samples], not negative, shape (m,).
-        n_times: number of grid points, positive, static [-].
-        per_sample: grid steps in one sample period, static [-].
+        taps: weights W_i [1] and delays n_i [samples], not negative, shape (m,).
+        n_times: number of grid points, positive, static [1].
+        per_sample: grid steps in one sample period, static [1].
         step: h, grid step [s], shape ().
 
     Returns:

@@ -18,7 +18,7 @@ MAX_IMPULSES = 5
 
 
 class Impulses(NamedTuple):
-    """A shaper: amplitude [-] and time [s] of each impulse, both of shape (n,).
+    """A shaper: amplitude [1] and time [s] of each impulse, both of shape (n,).
 
     An impulse of zero amplitude is padding and has no effect anywhere.
     """
@@ -28,7 +28,7 @@ class Impulses(NamedTuple):
 
 
 class Taps(NamedTuple):
-    """A shaper on the sample grid: weight [-] and delay `sample` [samples], both of shape (m,)."""
+    """A shaper on the sample grid: weight [1] and delay `sample` [samples], both of shape (m,)."""
 
     weight: Array
     sample: Array
@@ -41,7 +41,7 @@ def _root(x: ArrayLike) -> Array:
 
 
 def damped_frequency(omega: ArrayLike, zeta: ArrayLike) -> Array:
-    """Return w_d = w sqrt(1 - z^2) [rad/s] of a mode omega [rad/s], zeta in [0, 1) [-]."""
+    """Return w_d = w sqrt(1 - z^2) [rad/s] of a mode omega [rad/s], zeta in [0, 1) [1]."""
     return jnp.sqrt(1 - jnp.square(zeta)) * omega
 
 
@@ -70,7 +70,7 @@ def zv(omega: ArrayLike, zeta: ArrayLike) -> Impulses:
 
     Args:
         omega: natural frequency of the mode [rad/s], shape ().
-        zeta: its damping ratio, in [0, 1) [-], shape ().
+        zeta: its damping ratio, in [0, 1) [1], shape ().
     """
     return _zero_vibration(1, omega, zeta)
 
@@ -99,8 +99,8 @@ def ei(omega: ArrayLike, zeta: ArrayLike, tolerance: ArrayLike) -> Impulses:
 
     Args:
         omega: natural frequency of the mode [rad/s], shape ().
-        zeta: its damping ratio, in [0, 1) [-], shape ().
-        tolerance: V, residual vibration accepted at omega, in [0, 1) [-], shape ().
+        zeta: its damping ratio, in [0, 1) [1], shape ().
+        tolerance: V, residual vibration accepted at omega, in [0, 1) [1], shape ().
     """
     tolerance = jnp.asarray(tolerance)
     outer = (1 + tolerance) / 4
@@ -111,7 +111,8 @@ def ei_damped(omega: ArrayLike, zeta: ArrayLike, tolerance: ArrayLike) -> Impuls
     """Return the extra-insensitive shaper of a damped mode, shape (3,).
 
     A_1, A_3 and t_2/T_d are polynomials in V and z that Singhose fitted to the exact solution,
-    A_2 = 1 - A_1 - A_3, t_3 = T_d. Arguments as in `ei`.
+    A_2 = 1 - A_1 - A_3, t_3 = T_d. The residual vibration at omega is V within 6 % of it for z up
+    to 0.3 and V from 0.05 to 0.15. Arguments as in `ei`.
     """
     v, z = jnp.asarray(tolerance), jnp.asarray(zeta)
     first = (
@@ -168,10 +169,10 @@ def design_shaper(
     """Return the shaper of the given kind, padded with zero amplitudes to shape (5,).
 
     Args:
-        kind: index in `KINDS`, may be traced [-], shape ().
+        kind: index in `KINDS`, may be traced [1], shape ().
         omega: natural frequency of the mode [rad/s], shape ().
-        zeta: its damping ratio, in [0, 1) [-], shape ().
-        tolerance: V of the extra-insensitive kinds, in [0, 1) [-], shape ().
+        zeta: its damping ratio, in [0, 1) [1], shape ().
+        tolerance: V of the extra-insensitive kinds, in [0, 1) [1], shape ().
     """
     shapers = (
         none(),
@@ -247,7 +248,7 @@ def split_exact(impulses: Impulses, period: ArrayLike, omega: ArrayLike, zeta: A
         impulses: shaper, shape (n,).
         period: T, sample period [s], shape ().
         omega: natural frequency of the mode [rad/s], shape ().
-        zeta: its damping ratio, in [0, 1) [-], shape ().
+        zeta: its damping ratio, in [0, 1) [1], shape ().
 
     Returns:
         Taps of shape (2n,).
@@ -265,7 +266,7 @@ def split_exact(impulses: Impulses, period: ArrayLike, omega: ArrayLike, zeta: A
 
 
 def residual_vibration(impulses: Impulses, omega: ArrayLike, zeta: ArrayLike) -> Array:
-    """Return the vibration left by the shaper, relative to that of a unit impulse [-].
+    """Return the vibration left by the shaper, relative to that of a unit impulse [1].
 
     V = e^{-z w t_n} sqrt(C^2 + S^2), C = sum A_i e^{z w t_i} cos(w_d t_i), S the same with sin:
     (10) with the squares outside the sums and the decay counted once. Gradient zero where V = 0.
@@ -273,7 +274,7 @@ def residual_vibration(impulses: Impulses, omega: ArrayLike, zeta: ArrayLike) ->
     Args:
         impulses: shaper, shape (n,).
         omega: natural frequency [rad/s], shape (...,).
-        zeta: damping ratio, in [0, 1) [-], a shape that broadcasts with omega.
+        zeta: damping ratio, in [0, 1) [1], a shape that broadcasts with omega.
 
     Returns:
         V, in the broadcast shape.
@@ -291,13 +292,13 @@ def residual_vibration(impulses: Impulses, omega: ArrayLike, zeta: ArrayLike) ->
 def sensitivity_curve(
     impulses: Impulses, ratio: ArrayLike, omega: ArrayLike, zeta: ArrayLike
 ) -> Array:
-    """Return (10) at the frequencies ratio * omega [-], in the shape of ratio.
+    """Return (10) at the frequencies ratio * omega [1], in the shape of ratio.
 
     Args:
         impulses: shaper designed for omega, shape (n,).
-        ratio: actual over assumed frequency [-], shape (...,).
+        ratio: actual over assumed frequency [1], shape (...,).
         omega: assumed natural frequency [rad/s], shape ().
-        zeta: damping ratio, in [0, 1) [-], shape ().
+        zeta: damping ratio, in [0, 1) [1], shape ().
     """
     return residual_vibration(impulses, omega * jnp.asarray(ratio), zeta)
 
@@ -305,7 +306,7 @@ def sensitivity_curve(
 def insensitivity(
     impulses: Impulses, omega: ArrayLike, zeta: ArrayLike, level: ArrayLike = 0.05
 ) -> Array:
-    """Return the width of the band of frequencies with V below a level, in units of omega [-].
+    """Return the width of the band of frequencies with V below a level, in units of omega [1].
 
     Summed over the ratios from 0 to 2, so that a hump a little above the level, as (13) has on a
     damped mode, costs its own width only.
@@ -313,8 +314,8 @@ def insensitivity(
     Args:
         impulses: shaper designed for omega, shape (n,).
         omega: assumed natural frequency [rad/s], shape ().
-        zeta: damping ratio, in [0, 1) [-], shape ().
-        level: accepted residual vibration [-], shape ().
+        zeta: damping ratio, in [0, 1) [1], shape ().
+        level: accepted residual vibration [1], shape ().
     """
     ratio = jnp.linspace(0, 2, 2001)
     excess = sensitivity_curve(impulses, ratio, omega, zeta) - level

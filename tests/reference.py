@@ -1,0 +1,175 @@
+"""Slow, plain forms of the model, written apart from `jaxmodel`, to test it against.
+
+Geometry in the plane's own coordinates, kinetic energy from the velocity field of a link,
+accelerations from the Lagrangian by automatic differentiation and from the index-3 equations (5)
+with multipliers, and the classical Runge-Kutta step. Everything dense, nothing eliminated.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+class Motion(NamedTuple):
+    """State of the reduced machine: what is free after the closure (6)."""
+
+    pose: jax.Array  # (3,)
+    pose_rate: jax.Array  # (3,)
+    q: jax.Array  # (3, R)
+    q_rate: jax.Array  # (3, R)
+
+
+class Loads(NamedTuple):
+    """Forces from outside."""
+
+    slider: jax.Array  # along the guides [N], (3,)
+    modal: jax.Array  # on the modal coordinates [N], (3, R)
+
+
+def guides(geometry):
+    """Starting corners A_i [m], directions u_i and inward normals n_i, (3, 2) each."""
+    angle = geometry.guide_angle
+    u = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+    n = jnp.stack([-jnp.sin(angle), jnp.cos(angle)], axis=1)
+    inradius = geometry.guide_side / (2 * np.sqrt(3.0))
+    return -inradius * n - geometry.guide_side / 2 * u, u, n
+
+
+def platform_joints(geometry, pose):
+    """Joints C_i [m] of the platform, (3, 2)."""
+    angle = geometry.joint_angle + pose[2]
+    return pose[:2] + geometry.joint_radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+
+
+def tip_deflection(basis, q):
+    """w = sum Y_j(L) q_j [m], (3,)."""
+    return jnp.zeros(3) if basis.tip is None else jnp.sum(basis.tip * q, axis=1)
+
+
+def link_tips(machine, basis, rho, gamma, q):
+    """Joints C_i [m] from the side of slider and bent link, (3, 2)."""
+    corner, u, _ = guides(machine.geometry)
+    beta = gamma + machine.geometry.guide_angle
+    along = jnp.stack([jnp.cos(beta), jnp.sin(beta)], axis=1)
+    across = jnp.stack([-jnp.sin(beta), jnp.cos(beta)], axis=1)
+    tip = tip_deflection(basis, q)
+    return corner + rho[:, None] * u + machine.beam.length * along + tip[:, None] * across
+
+
+def close(machine, basis, pose, q):
+    """(rho [m], gamma [rad]), (3,) each, from the triangle of slider, joint and guide."""
+    corner, u, n = guides(machine.geometry)
+    to_joint = platform_joints(machine.geometry, pose) - corner
+    tip, length = tip_deflection(basis, q), machine.beam.length
+    distance = jnp.sqrt(length**2 + tip**2)
+    slant = jnp.arcsin(jnp.sum(to_joint * n, axis=1) / distance)
+    rho = jnp.sum(to_joint * u, axis=1) - distance * jnp.cos(slant)
+    return rho, slant - jnp.arctan2(tip, length)
+
+
+def kinetic_energy(machine, basis, gamma, q, rho_rate, gamma_rate, pose_rate, q_rate):
+    """T [J] from the velocity a + x b + sum_j Y_j(x) c_j of the points of a link."""
+    along = jnp.stack([jnp.cos(gamma), jnp.sin(gamma)], axis=1)  # in the guide's frame
+    across = jnp.stack([-jnp.sin(gamma), jnp.cos(gamma)], axis=1)
+    a = rho_rate[:, None] * jnp.array([1.0, 0.0])
+    b = gamma_rate[:, None] * across
+    turning = gamma_rate[:, None] * q
+    c = q_rate[:, :, None] * across[:, None] - turning[:, :, None] * along[:, None]
+    a_dot_c = jnp.einsum("id,ijd->ij", a, c)
+    b_dot_c = jnp.einsum("id,ijd->ij", b, c)
+    links = (
+        (basis.link_mass + machine.masses.slider_mass) * jnp.sum(a * a, axis=1)
+        + basis.inertia * jnp.sum(b * b, axis=1)
+        + 2 * basis.first_moment * jnp.sum(a * b, axis=1)
+        + jnp.sum(basis.mass * jnp.sum(c * c, axis=2), axis=1)
+        + 2 * jnp.sum(basis.b * a_dot_c + basis.c * b_dot_c, axis=1)
+    )
+    masses = machine.masses
+    platform = masses.platform_mass * jnp.sum(pose_rate[:2] ** 2)
+    return (jnp.sum(links) + platform + masses.platform_inertia * pose_rate[2] ** 2) / 2
+
+
+def modal_load(machine, basis, q, q_rate, force):
+    """Generalised forces of the modes: actuators, structural damping and stiffness, (3, R)."""
+    damping = 2 * machine.beam.damping_ratio * jnp.sqrt(basis.stiffness * basis.mass)
+    return force - damping * q_rate - basis.stiffness * q
+
+
+def by_lagrangian(machine, basis, motion: Motion, loads: Loads):
+    """Accelerations (X'' (3,), q'' (3, R)) from the Lagrangian in (X, q)."""
+    shape = motion.q.shape
+
+    def split(z):
+        return z[:3], z[3:].reshape(shape)
+
+    def joint_coordinates(z):
+        return close(machine, basis, *split(z))
+
+    def energy(z, z_rate):
+        (_, gamma), (rho_rate, gamma_rate) = jax.jvp(joint_coordinates, (z,), (z_rate,))
+        rates = (rho_rate, gamma_rate, *split(z_rate))
+        return kinetic_energy(machine, basis, gamma, split(z)[1], *rates)
+
+    z = jnp.concatenate([motion.pose, motion.q.ravel()])
+    z_rate = jnp.concatenate([motion.pose_rate, motion.q_rate.ravel()])
+    mass = jax.hessian(energy, 1)(z, z_rate)
+    inertial = jax.jacfwd(jax.grad(energy, 1), 0)(z, z_rate) @ z_rate - jax.grad(energy)(z, z_rate)
+    on_modes = modal_load(machine, basis, motion.q, motion.q_rate, loads.modal)
+    load = jnp.concatenate([jnp.zeros(3), on_modes.ravel()])
+    load = load + jax.jacfwd(lambda z: joint_coordinates(z)[0])(z).T @ loads.slider
+    return split(jnp.linalg.solve(mass, load - inertial))
+
+
+def by_multipliers(machine, basis, motion: Motion, loads: Loads):
+    """(X'', q'', rho'', gamma'') from (5): coordinates (rho, gamma, X, q), constraints (6)."""
+    shape = motion.q.shape
+
+    def split(y):
+        return y[:3], y[3:6], y[6:9], y[9:].reshape(shape)
+
+    def constraints(y):
+        rho, gamma, pose, q = split(y)
+        tips = link_tips(machine, basis, rho, gamma, q)
+        return (tips - platform_joints(machine.geometry, pose)).ravel()
+
+    def energy(y, y_rate):
+        _, gamma, _, q = split(y)
+        return kinetic_energy(machine, basis, gamma, q, *split(y_rate))
+
+    def all_coordinates(z):
+        pose, q = z
+        return jnp.concatenate([*close(machine, basis, pose, q), pose, q.ravel()])
+
+    y, y_rate = jax.jvp(
+        all_coordinates, ((motion.pose, motion.q),), ((motion.pose_rate, motion.q_rate),)
+    )
+    mass = jax.hessian(energy, 1)(y, y_rate)
+    inertial = jax.jacfwd(jax.grad(energy, 1), 0)(y, y_rate) @ y_rate - jax.grad(energy)(y, y_rate)
+    on_modes = modal_load(machine, basis, motion.q, motion.q_rate, loads.modal)
+    load = jnp.concatenate([loads.slider, jnp.zeros(6), on_modes.ravel()])
+    jacobian = jax.jacfwd(constraints)(y)
+    curvature = jax.jvp(lambda y: jax.jvp(constraints, (y,), (y_rate,))[1], (y,), (y_rate,))[1]
+    system = jnp.block([[mass, jacobian.T], [jacobian, jnp.zeros((6, 6))]])
+    solution = jnp.linalg.solve(system, jnp.concatenate([load - inertial, -curvature]))
+    rho_acc, gamma_acc, pose_acc, q_acc = split(solution[: y.size])
+    return pose_acc, q_acc, rho_acc, gamma_acc
+
+
+def rk4_step(derivative, state, step, inputs):
+    """One classical Runge-Kutta step; `inputs` at start, middle and end."""
+
+    def along(slope, length):
+        return jax.tree.map(lambda x, dx: x + length * dx, state, slope)
+
+    start, middle, end = inputs
+    k1 = derivative(state, start)
+    k2 = derivative(along(k1, step / 2), middle)
+    k3 = derivative(along(k2, step / 2), middle)
+    k4 = derivative(along(k3, step), end)
+    return jax.tree.map(
+        lambda x, a, b, c, d: x + step / 6 * (a + 2 * b + 2 * c + d), state, k1, k2, k3, k4
+    )

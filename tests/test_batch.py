@@ -1,0 +1,154 @@
+"""A batch is its members: vmap equals single runs, members do not touch each other, one compilation."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxmodel import status
+from jaxmodel.simulate import simulate
+from studies.cases import as_arrays, build_case, build_structure
+from studies.spec import paper_study
+
+N_CASES = 64
+
+
+def short_study(**changes):
+    """One 5 mm move in 25 ms, then 10 ms of residual vibration."""
+    short = {
+        "run__duration": 0.045,
+        "motion__waypoints": ((0.0, 0.0, np.pi / 6), (0.0, 0.005, np.pi / 6)),
+        "motion__move_time": 0.025,
+        "metrics__residual_length": 0.01,
+    }
+    return paper_study().change(**(short | changes))
+
+
+def mixed_case(rng):
+    """Placement, mode counts, links, gains, shaper and geometry drawn at random."""
+    first = rng.uniform(0.02, 0.05)
+    centers = first + np.cumsum(np.r_[0, rng.uniform(0.035, 0.06, 2)])
+    ratios = tuple((1.0, *rng.uniform(0, 0.3, 2)) for _ in range(3))
+    study = short_study(
+        patches__centers=tuple(centers),
+        control__links=tuple(bool(b) for b in rng.integers(0, 2, 3)),
+        control__velocity_gain=tuple(rng.uniform(0.1, 0.6, 3)),
+        control__ratios=ratios,
+        shaper__kind=str(rng.choice(["none", "zv", "ei"])),
+        link__youngs_modulus=rng.uniform(60e9, 80e9),
+        machine__guide_side=rng.uniform(0.59, 0.61),
+        machine__platform_mass=rng.uniform(0.2, 0.3),
+        drive__kp=rng.uniform(1e4, 4e4),
+    )
+    case = build_case(study)
+    return as_arrays(
+        case._replace(
+            n_modes=rng.integers(3, 9),
+            control=case.control._replace(n_active=float(rng.integers(1, 4))),
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def structure():
+    return build_structure(short_study())
+
+
+@pytest.fixture(scope="module")
+def cases():
+    rng = np.random.default_rng(7)
+    return [mixed_case(rng) for _ in range(N_CASES)]
+
+
+@pytest.fixture(scope="module")
+def batch(structure):
+    """Compiled batch run that counts its own traces."""
+    traces = []
+
+    @jax.jit
+    def run(stacked):
+        traces.append(1)
+        return jax.vmap(lambda case: simulate(structure, case))(stacked)
+
+    run.traces = traces
+    return run
+
+
+def stack(cases):
+    return jax.tree.map(lambda *x: np.stack(x), *cases)
+
+
+def compare(batched, index, single):
+    for name, x, y in zip(single._fields, batched, single):
+        if name == "record":
+            continue
+        for a, b in zip(jax.tree.leaves(x), jax.tree.leaves(y)):
+            a, b = np.asarray(a)[index], np.asarray(b)
+            assert np.max(np.abs(a - b)) <= 1e-9 * max(np.max(np.abs(b)), 1e-300), name
+
+
+def test_mixed_batch_equals_single_runs(structure, cases, batch):
+    result = batch(stack(cases))
+    assert np.all(np.asarray(result.status) == status.OK)
+    traces = []
+
+    @jax.jit
+    def one(case):
+        traces.append(1)
+        return simulate(structure, case)
+
+    for index, case in enumerate(cases):
+        compare(result, index, one(case))
+    assert len(traces) == 1
+    assert len(batch.traces) == 1
+    rms = np.asarray(result.metrics.residual_rms)
+    assert np.unique(np.round(rms[:, 0, 1], 12)).size == N_CASES  # the cases do differ
+
+
+def test_order_and_neighbours_do_not_matter(cases, batch):
+    whole = batch(stack(cases))
+    order = np.random.default_rng(3).permutation(N_CASES)
+    moved = batch(stack([cases[k] for k in order]))
+    other = batch(stack([*cases[:8], *([cases[40]] * (N_CASES - 8))]))
+    for name in ("residual_rms", "voltage_peak", "spectral_density"):
+        x = np.asarray(getattr(whole.metrics, name))
+        close = 1e-12 * np.abs(x).max()
+        assert np.abs(np.asarray(getattr(moved.metrics, name)) - x[order]).max() <= close
+        assert np.abs(np.asarray(getattr(other.metrics, name))[:8] - x[:8]).max() <= close
+
+
+def test_bad_members_are_frozen_and_alone(cases, batch):
+    whole = batch(stack(cases))
+    bad = list(cases)
+    centers = np.asarray(bad[1].machine.patches.center)
+    patches = bad[1].machine.patches._replace(center=centers * 0 + np.array([0.05, 0.06, 0.15]))
+    bad[1] = bad[1]._replace(machine=bad[1].machine._replace(patches=patches))
+    points = np.array(bad[2].path.waypoints)
+    points[1, 1] = 0.5
+    bad[2] = bad[2]._replace(path=bad[2].path._replace(waypoints=points))
+    bad[3] = bad[3]._replace(control=bad[3].control._replace(gain_factor=np.array(np.nan)))
+    drive = bad[4].drive._replace(kd=np.array(-2e3))
+    bad[4] = bad[4]._replace(drive=drive)
+    result = batch(stack(bad))
+    codes = np.asarray(result.status)
+    assert codes[1] == status.PATCHES_OVERLAP
+    assert codes[2] == status.OUT_OF_REACH
+    assert codes[3] == status.NON_FINITE
+    assert codes[4] in (status.DIVERGED, status.OUT_OF_REACH, status.SINGULAR)
+    assert 0 < np.asarray(result.bad_time)[4] < 0.045
+    good = np.r_[0, 5:N_CASES]
+    assert np.all(codes[good] == status.OK)
+    for a, b in zip(jax.tree.leaves(result.metrics), jax.tree.leaves(whole.metrics)):
+        a, b = np.asarray(a)[good], np.asarray(b)[good]
+        assert np.abs(a - b).max() <= 1e-12 * np.abs(b).max()
+    finite = np.r_[0:3, 4:N_CASES]
+    assert all(np.all(np.isfinite(np.asarray(a)[finite])) for a in jax.tree.leaves(result.metrics))
+
+
+def test_comparator_can_fail(structure, cases, batch):
+    """A difference of 1e-8 in one number is noticed."""
+    result = batch(stack(cases))
+    single = jax.tree.map(lambda x: np.asarray(x)[0], result)
+    metrics = single.metrics
+    off = metrics._replace(residual_rms=metrics.residual_rms * (1 + 1e-8))
+    with pytest.raises(AssertionError):
+        compare(result, 0, single._replace(metrics=off))

@@ -1,0 +1,256 @@
+"""Dynamics against the Lagrangian, the multiplier form and the paper's geometry."""
+
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmodel import dynamics, kinematics, status
+from jaxmodel.beam import BASES, build_basis
+from jaxmodel.parameters import ASSEMBLIES, HOME, paper_machine
+from jaxmodel.plant import build_plant
+from tests import reference
+
+MACHINE = paper_machine()
+R = 3
+HOME_POSE = np.array(HOME)
+N_STATES = 8
+
+
+def make(kind, machine=MACHINE, mask=1.0, stations=(0.1,)):
+    basis = build_basis(kind, machine.beam, machine.patches, R, np.array(stations), mask)
+    return basis, build_plant(machine, basis)
+
+
+@pytest.fixture(scope="module")
+def states():
+    """Random states far from rest: bending of millimetres, speeds of the fast moves."""
+    rng = np.random.default_rng(7)
+    scale = np.array([0.01, 0.01, 0.05])
+    motion = reference.Motion(
+        pose=HOME_POSE + scale * rng.normal(size=(N_STATES, 3)),
+        pose_rate=rng.normal(size=(N_STATES, 3)) * [0.3, 0.3, 1.0],
+        q=1e-3 * rng.normal(size=(N_STATES, 3, R)),
+        q_rate=0.5 * rng.normal(size=(N_STATES, 3, R)),
+    )
+    shape = (N_STATES, 3)
+    loads = reference.Loads(10 * rng.normal(size=shape), 3 * rng.normal(size=(*shape, R)))
+    return motion, loads
+
+
+def closed_form(plant, motion, loads):
+    chain = dynamics.modal_chain(plant, motion.pose, motion.pose_rate, motion.q, motion.q_rate)
+    return dynamics.accelerations(
+        plant, chain, motion.pose_rate, motion.q, motion.q_rate, loads.slider, loads.modal
+    )
+
+
+@pytest.mark.parametrize("kind", BASES)
+def test_accelerations_equal_lagrangian_and_multiplier_form(kind, states):
+    basis, plant = make(kind)
+
+    @jax.jit
+    @jax.vmap
+    def all_forms(motion, loads):
+        return (
+            closed_form(plant, motion, loads),
+            reference.by_lagrangian(MACHINE, basis, motion, loads),
+            reference.by_multipliers(MACHINE, basis, motion, loads),
+        )
+
+    found, (pose_l, q_l), (pose_m, q_m, rho_m, gamma_m) = all_forms(*states)
+    pairs = (
+        (found.pose, pose_l), (found.modal, q_l), (found.pose, pose_m), (found.modal, q_m),
+        (found.rho, rho_m), (found.gamma, gamma_m),
+    )  # fmt: skip
+    for mine, wanted in pairs:
+        axes = tuple(range(1, wanted.ndim))
+        error = np.abs(mine - wanted).max(axis=axes) / np.abs(wanted).max(axis=axes)
+        assert error.max() < 1e-10
+    oscillator = (plant.stiffness * states[0].q + plant.damping * states[0].q_rate) / plant.mass
+    np.testing.assert_allclose(
+        found.coupling, found.modal + oscillator, atol=1e-12 * np.abs(oscillator).max()
+    )
+    if basis.tip is not None:  # the states do bend the chord away from the tangent
+        assert np.abs(np.sum(basis.tip * states[0].q, axis=2)).min() > 1e-5
+
+
+@pytest.mark.parametrize("kind", ["pinned_pinned", "pinned_free"])
+def test_kinetic_energy_equals_quadrature_over_the_link(kind, states):
+    node, weight = np.polynomial.legendre.leggauss(24)
+    length = MACHINE.beam.length
+    x, share = length * (node + 1) / 2, weight / 2
+    basis, plant = make(kind, stations=x)
+    tip = 0.0 if basis.tip is None else basis.tip[0]
+    shape = basis.deflection_at[0] + (x / length)[:, None] * tip
+    motion, _ = states
+
+    def points(pose, q):
+        """Points of the links in the plane, their sliders, (3, points, 2) and (3, 2)."""
+        rho, gamma = reference.close(MACHINE, basis, pose, q)
+        corner, u, _ = reference.guides(MACHINE.geometry)
+        beta = gamma + MACHINE.geometry.guide_angle
+        along = jnp.stack([jnp.cos(beta), jnp.sin(beta)], axis=1)[:, None]
+        across = jnp.stack([-jnp.sin(beta), jnp.cos(beta)], axis=1)[:, None]
+        slider = corner + rho[:, None] * u
+        return slider[:, None] + x[:, None] * along + (q @ shape.T)[:, :, None] * across, slider
+
+    @jax.jit
+    @jax.vmap
+    def energies(m):
+        velocity, slider = jax.jvp(points, (m.pose, m.q), (m.pose_rate, m.q_rate))[1]
+        links = 0.011 * jnp.sum(share * jnp.sum(velocity**2, axis=2))
+        rigid = 0.15 * jnp.sum(slider**2) + 0.25 * jnp.sum(m.pose_rate[:2] ** 2)
+        chain = dynamics.modal_chain(plant, m.pose, m.pose_rate, m.q, m.q_rate)
+        mine = dynamics.kinetic_energy(plant, chain, m.pose_rate, m.q, m.q_rate)
+        return mine, (links + rigid + 3e-4 * m.pose_rate[2] ** 2) / 2
+
+    mine, wanted = energies(motion)
+    np.testing.assert_allclose(mine, wanted, rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["pinned_pinned", "pinned_free"])
+def test_closure_holds_to_rounding_along_a_random_motion(kind):
+    basis, plant = make(kind)
+    rng = np.random.default_rng(3)
+    frequency, phase = rng.uniform(5, 200, 12), rng.uniform(0, 2 * np.pi, 12)
+    amplitude = np.r_[0.012, 0.012, 0.06, np.full(9, 1e-3)]
+
+    def path(t):
+        z = jnp.concatenate([HOME_POSE, jnp.zeros(9)]) + amplitude * jnp.sin(frequency * t + phase)
+        return z[:3], z[3:].reshape(3, R)
+
+    @jax.jit
+    @jax.vmap
+    def along(t):
+        (pose, q), (pose_rate, q_rate) = jax.jvp(path, (t,), (1.0,))
+        chain = dynamics.modal_chain(plant, pose, pose_rate, q, q_rate)
+        gamma = kinematics.link_angle(chain)
+        tips = reference.link_tips(MACHINE, basis, chain.rho, gamma, q)
+        rates = jax.jvp(
+            lambda t: reference.close(MACHINE, basis, *path(t)), (t,), (1.0,)
+        )[1]
+        return (
+            tips - reference.platform_joints(MACHINE.geometry, pose),
+            kinematics.closure_residual(plant, pose, chain, gamma),
+            (chain.rho_rate - rates[0], chain.gamma_rate - rates[1]),
+        )
+
+    outside, own, rate_errors = along(np.linspace(0, 1, 500))
+    assert np.abs(outside).max() < 5e-16  # [m]: a few roundings of 0.3 m
+    assert np.abs(own).max() < 5e-16
+    assert np.abs(rate_errors[0]).max() < 1e-13 and np.abs(rate_errors[1]).max() < 1e-12
+
+
+@pytest.mark.parametrize(("assembly", "rho_home_mm"), [("inward", 269.28), ("outward", 130.72)])
+def test_both_assemblies_start_where_the_paper_says(assembly, rho_home_mm):
+    machine = MACHINE._replace(
+        geometry=MACHINE.geometry._replace(joint_angle=np.array(ASSEMBLIES[assembly]))
+    )
+    _, plant = make("pinned_pinned", machine)
+    chain = kinematics.close_chain(plant, HOME_POSE, np.zeros(3))
+    np.testing.assert_allclose(chain.rho * 1e3, rho_home_mm, atol=5e-3)
+    np.testing.assert_allclose(np.degrees(kinematics.link_angle(chain)), 60, atol=1e-9)
+    assert kinematics.chain_status(plant, chain) == status.OK
+
+
+def test_link_angles_on_the_square():
+    _, plant = make("pinned_pinned")
+    corners = 0.01 * np.array([[0, 0], [0, 1], [1, 1], [1, 0], [0, 0]])
+    part = np.linspace(0, 1, 101)[:, None]
+    xy = np.concatenate([a + part * (b - a) for a, b in pairwise(corners)])
+    poses = np.column_stack([xy, np.full(len(xy), HOME[2])])
+
+    def beta(pose):
+        chain = kinematics.close_chain(plant, pose, jnp.zeros(3))
+        return kinematics.link_angle(chain) + MACHINE.geometry.guide_angle
+
+    angle = np.asarray(jax.jit(jax.vmap(beta))(poses)) / np.pi
+    np.testing.assert_allclose(angle.min(axis=0), [0.961, 1.651, 1 / 3], atol=5e-4)
+    np.testing.assert_allclose(angle.max(axis=0), [1.0, 1.697, 0.3686], atol=5e-4)
+    assert kinematics.path_status(plant, poses)[0] == status.OK
+
+
+SHIFTED = {  # y of the platform: guide 3 lies along x, so it alone decides h_3 = 0.1732 m + y
+    "home": (0.0, status.OK),
+    "out of reach": (0.04, status.OUT_OF_REACH),
+    "perpendicular": (0.2 - 0.2 * np.sin(np.pi / 3) - 1e-9, status.SINGULAR),
+    "parallel": (-0.2 * np.sin(np.pi / 3), status.SINGULAR),
+}
+
+
+@pytest.mark.parametrize("kind", ["pinned_pinned", "pinned_free"])
+def test_singular_poses_are_reported_and_keep_gradients_finite(kind):
+    _, plant = make(kind)
+    poses = HOME_POSE + np.array([[0, y, 0] for y, _ in SHIFTED.values()])
+    rate, q = np.array([0.1, -0.2, 0.3]), np.full((3, R), 1e-5)
+    loads = reference.Loads(np.ones(3), np.ones((3, R)))
+
+    def total(pose):
+        motion = reference.Motion(pose, rate, q, 10 * q)
+        found = closed_form(plant, motion, loads)
+        return sum(jnp.sum(part) for part in found)
+
+    @jax.jit
+    @jax.vmap
+    def judge(pose):
+        chain = dynamics.modal_chain(plant, pose, rate, 0 * q, q)
+        return kinematics.chain_status(plant, chain), *jax.value_and_grad(total)(pose)
+
+    codes, value, gradient = judge(poses)
+    np.testing.assert_array_equal(codes, [code for _, code in SHIFTED.values()])
+    assert np.isfinite(value).all() and np.isfinite(gradient).all()
+
+
+def test_path_status_names_the_first_bad_pose():
+    _, plant = make("pinned_pinned")
+    poses = HOME_POSE + np.linspace(0, 0.04, 41)[:, None] * np.array([0, 1, 0])
+    code, index = kinematics.path_status(plant, poses)
+    # h_3 = 0.1732 m + y reaches sin(gamma) L with cos(gamma) = 0.001 just before 0.2 m
+    assert (code, index) == (status.OUT_OF_REACH, 27)
+    sound = kinematics.path_status(plant, poses[:20])
+    assert (sound[0], sound[1]) == (status.OK, 0)
+
+
+def test_inverse_kinematics_on_a_time_axis_equals_single_poses():
+    _, plant = make("pinned_pinned")
+    rng = np.random.default_rng(0)
+    pose, rate = HOME_POSE + 0.01 * rng.normal(size=(5, 2, 3)), rng.normal(size=(5, 2, 3))
+    rho, rho_rate = kinematics.inverse_kinematics(plant, pose, rate)
+    for k in np.ndindex(5, 2):
+        chain = kinematics.close_chain(plant, pose[k], rate[k])
+        np.testing.assert_allclose(rho[k], chain.rho, rtol=1e-14)
+        np.testing.assert_allclose(rho_rate[k], chain.rho_rate, rtol=1e-12)
+
+
+def test_modal_mass_matrix_of_pinned_free_links_at_rest():
+    basis, plant = make("pinned_free")
+    zero, still = jnp.zeros((3, R)), jnp.zeros(3)
+
+    def energy(q_rate):
+        q_rate = q_rate.reshape(3, R)
+        chain = dynamics.modal_chain(plant, HOME_POSE, still, zero, q_rate)
+        return dynamics.kinetic_energy(plant, chain, still, zero, q_rate)
+
+    block = 0.011 * (np.eye(R) / 4 + np.ones((R, R)) / 3)
+    mass = jax.jit(jax.hessian(energy))(jnp.zeros(3 * R))
+    np.testing.assert_allclose(mass, np.kron(np.eye(3), block), atol=1e-16)
+
+
+def test_inverse_dynamics_is_the_inverse_of_accelerations_for_rigid_links(states):
+    # modes that couple to nothing leave the rigid machine
+    _, plant = make("pinned_pinned", mask=0.0)
+    motion, _ = states
+    wanted = np.random.default_rng(5).normal(size=(N_STATES, 3)) * [5, 5, 30]
+
+    @jax.jit
+    @jax.vmap
+    def round_trip(pose, rate, acceleration):
+        force = dynamics.inverse_dynamics(plant, pose, rate, acceleration)
+        still = reference.Motion(pose, rate, jnp.zeros((3, R)), jnp.zeros((3, R)))
+        return closed_form(plant, still, reference.Loads(force, jnp.zeros((3, R)))).pose
+
+    found = round_trip(motion.pose, motion.pose_rate, wanted)
+    np.testing.assert_allclose(found, wanted, atol=1e-11 * np.abs(wanted).max())
