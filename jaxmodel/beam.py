@@ -216,9 +216,15 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
     xi = jnp.concatenate([whole_x, (left[:, None] + span * patch_x).ravel()])
     weight = length * jnp.concatenate([whole_w, (span * patch_w).ravel()])
     n_points = patch_x.size
-    mass_w = weight * jnp.concatenate([line_mass * jnp.ones_like(whole_x), jnp.repeat(extra_mass, n_points)])
+    mass_w = weight * jnp.concatenate(
+        [line_mass * jnp.ones_like(whole_x), jnp.repeat(extra_mass, n_points)]
+    )
     bending = bare_stiffness(beam) * jnp.ones_like(whole_x)
-    bending_w = weight * beam.stiffness_factor * jnp.concatenate([bending, jnp.repeat(extra_stiffness, n_points)])
+    bending_w = (
+        weight
+        * beam.stiffness_factor
+        * jnp.concatenate([bending, jnp.repeat(extra_stiffness, n_points)])
+    )
 
     value, _, curvature = _ritz(xi, n_sines)
     ends = _ritz(jnp.array([0.0, 1.0]), n_sines)[1] / length

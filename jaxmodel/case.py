@@ -1,4 +1,4 @@
-"""One case of a study: `Case` holds every traced number, `Structure` what fixes the compiled program.
+"""One case of a study: `Case` holds the traced numbers, `Structure` what fixes the program.
 
 Cases of equal structure stack into one batch and share one compilation.
 """

@@ -87,9 +87,7 @@ def condition_number(matrix: Array, mask: Array) -> Array:
     return jnp.sqrt(value[..., -1] / jnp.maximum(value[..., 0], floor))
 
 
-def force_gains(
-    first_gain: Array, ratio: Array, modal_mass: Array, is_per_mass: Array
-) -> Array:
+def force_gains(first_gain: Array, ratio: Array, modal_mass: Array, is_per_mass: Array) -> Array:
     """Modal force gains [N s/m] (or [N/m]) from the first mode's gain and the ratios (24).
 
     Args:

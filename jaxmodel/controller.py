@@ -113,8 +113,9 @@ def controller_step(
     newest = high - estimator.denominator[0] * state.second[0]
     newest = newest - estimator.denominator[1] * state.second[1]
     line = (newest, state.second[0], state.second[1])
-    rate = sum(n * x for n, x in zip(estimator.velocity, line))
-    value = sum(n * x for n, x in zip(estimator.position, line)) + estimator.direct * channel
+    rate = sum(n * x for n, x in zip(estimator.velocity, line, strict=True))
+    value = sum(n * x for n, x in zip(estimator.position, line, strict=True))
+    value = value + estimator.direct * channel
 
     force = -controller.velocity_gain * rate - controller.position_gain * value
     wanted = jnp.sum(controller.synthesizer * force[:, None], axis=2)

@@ -37,7 +37,7 @@ def motor_force(drive: Drive, reference: Reference, rho: Array, rho_rate: Array,
 
 
 def slider_force(drive: Drive, reference: Reference, rho: Array, rho_rate: Array, is_smooth: bool):
-    """Total force on the sliders [N], (3,): motors, friction F_c tanh(rho'/v) + c rho', disturbance."""
+    """Force on the sliders [N], (3,): motors, friction F_c tanh(rho'/v) + c rho', disturbance."""
     friction = drive.coulomb_friction * jnp.tanh(rho_rate / drive.friction_speed)
     motors = motor_force(drive, reference, rho, rho_rate, is_smooth)
     return motors - friction - drive.viscous_friction * rho_rate + reference.disturbance

@@ -27,9 +27,7 @@ class Accelerations(NamedTuple):
     gamma: Array  # gamma'' [rad/s2], (3,)
 
 
-def modal_chain(
-    plant: Plant, pose: Array, pose_rate: Array, q: Array, q_rate: Array
-) -> Chain:
+def modal_chain(plant: Plant, pose: Array, pose_rate: Array, q: Array, q_rate: Array) -> Chain:
     """`close_chain` of the bent machine: w = sum_j Y_j(L) q_j (4), (6).
 
     Args:
@@ -98,9 +96,7 @@ def accelerations(
     link = _Link(
         k_rr=plant.slider_link_mass - sine * sine * jnp.sum(b_m * plant.b, axis=1),
         k_rg=sine * jnp.sum(b_m * plant.c, axis=1) - swing,
-        k_gg=plant.inertia
-        + jnp.sum(plant.mass * q * q, axis=1)
-        - jnp.sum(c_m * plant.c, axis=1),
+        k_gg=plant.inertia + jnp.sum(plant.mass * q * q, axis=1) - jnp.sum(c_m * plant.c, axis=1),
         load_r=sine * bf
         - (plant.first_moment * cosine - sine * bq) * rate * rate
         - 2 * cosine * rate * bq_rate

@@ -90,7 +90,7 @@ def _modal_phase(
     half = highpass * period / 2
     gain, pole = 1 / (1 + half), (half - 1) / (1 + half)
     first = (gain * jnp.ones_like(omega), -gain * jnp.ones_like(omega), pole * jnp.ones_like(omega))
-    # low-pass w^2/(s^2 + 2 zeta w s + w^2) by Tustin, prewarped at w = kappa omega; s = c (z-1)/(z+1)
+    # low-pass w^2/(s^2 + 2 zeta w s + w^2), s = c (z-1)/(z+1), prewarped at w = kappa omega
     warp = jnp.tan(kappa * omega * period / 2)  # w/c
     lead = 1 + 2 * zeta * warp + warp * warp
     a1, a2 = 2 * (warp * warp - 1) / lead, (1 - 2 * zeta * warp + warp * warp) / lead

@@ -108,9 +108,12 @@ def inverse_kinematics(plant: Plant, pose: Array, pose_rate: Array) -> tuple[Arr
         (rho, rho_rate), (..., 3) each.
     """
     lead = pose.shape[:-1]
-    lanes = plant._replace(**{
-        name: jnp.reshape(getattr(plant, name), (3,) + (1,) * len(lead)) for name in _LINK_FIELDS
-    })
+    lanes = plant._replace(
+        **{
+            name: jnp.reshape(getattr(plant, name), (3,) + (1,) * len(lead))
+            for name in _LINK_FIELDS
+        }
+    )
     chain = close_chain(lanes, jnp.moveaxis(pose, -1, 0), jnp.moveaxis(pose_rate, -1, 0))
     return jnp.moveaxis(chain.rho, 0, -1), jnp.moveaxis(chain.rho_rate, 0, -1)
 

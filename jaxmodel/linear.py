@@ -125,9 +125,7 @@ def natural_modes(plant: LinearPlant) -> NaturalModes:
         # motion of the pose without any spring is a zero eigenvalue with rounding on top
         omega = np.sqrt(np.maximum(-value.real, 0.0))
         order = np.argsort(omega)
-        return NaturalModes(
-            omega[order] / (2 * np.pi), np.zeros(m), _scaled(vector.real[:, order])
-        )
+        return NaturalModes(omega[order] / (2 * np.pi), np.zeros(m), _scaled(vector.real[:, order]))
     value, vector = np.linalg.eig(a)
     # a pair that rounding has split off the real axis by less than this is real
     is_real = np.abs(value.imag) <= 1e-9 * np.abs(value).max()
@@ -137,7 +135,7 @@ def natural_modes(plant: LinearPlant) -> NaturalModes:
     omega = list(np.abs(value[upper]))
     zeta = list(-value[upper].real / np.abs(value[upper]))
     column = list(upper)
-    for one, two in zip(real[0::2], real[1::2]):
+    for one, two in zip(real[0::2], real[1::2], strict=True):
         product = max(abs(value[one].real * value[two].real), 0.0)
         root = np.sqrt(product)
         omega.append(root)

@@ -74,7 +74,7 @@ class State(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What comes from outside at one sample; P = 2 substeps + 1 points from its start to its end."""
+    """What comes from outside at one sample, at P = 2 substeps + 1 points from start to end."""
 
     rho: Array  # wanted slider position [m], (P, 3)
     rho_rate: Array  # [m/s], (P, 3)
@@ -215,9 +215,7 @@ def plant_step(
     return after, first
 
 
-def step(
-    structure: Structure, loop: Loop, state: State, inputs: Inputs
-) -> tuple[State, Record]:
+def step(structure: Structure, loop: Loop, state: State, inputs: Inputs) -> tuple[State, Record]:
     """One sample of the closed loop.
 
     The controller samples first; its command reaches the actuators one sample later.
@@ -232,7 +230,7 @@ def step(
         (state at the next instant, Record of this one).
     """
     plant, controller = state.plant, loop.controller
-    voltage, clipped = state.controller.voltage, 0.0
+    voltage, clipped = state.controller.voltage, jnp.zeros_like(state.status)
     next_controller = state.controller
     if structure.feedback == "sampled":
         filtered = jnp.sum(loop.sensor * plant.z[:, None], axis=2)
@@ -279,8 +277,8 @@ def _advance(
 ) -> tuple[PlantState, Rates]:
     """All plant steps of one sample; held inputs stay constant. Returns the rates at its start."""
     if structure.substeps == 1:
-        points = tuple(_reference(inputs, k) for k in range(3))
-        return plant_step(structure, loop, plant, points, voltage)
+        start, middle, end = (_reference(inputs, k) for k in range(3))
+        return plant_step(structure, loop, plant, (start, middle, end), voltage)
 
     def part(x: Array | None) -> Array | None:
         if x is None:
@@ -289,13 +287,13 @@ def _advance(
 
     def body(at: PlantState, points: tuple) -> tuple[PlantState, Rates]:
         rho, rho_rate, forward = points
-        references = tuple(
+        start, middle, end = (
             Reference(
                 rho[k], rho_rate[k], None if forward is None else forward[k], inputs.disturbance
             )
             for k in range(3)
         )
-        return plant_step(structure, loop, at, references, voltage)
+        return plant_step(structure, loop, at, (start, middle, end), voltage)
 
     points = (part(inputs.rho), part(inputs.rho_rate), part(inputs.feedforward))
     last, rates = jax.lax.scan(body, plant, points)

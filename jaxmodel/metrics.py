@@ -147,9 +147,7 @@ def accumulate(
         residual_peak=jnp.maximum(totals.residual_peak, residual * size),
         moving_modal_square=totals.moving_modal_square + moving * modal_square,
         residual_modal_square=totals.residual_modal_square + residual * modal_square,
-        residual_modal_peak=jnp.maximum(
-            totals.residual_modal_peak, residual * jnp.abs(sample.q)
-        ),
+        residual_modal_peak=jnp.maximum(totals.residual_modal_peak, residual * jnp.abs(sample.q)),
         settled_at=jnp.where(is_outside, window.after_command, totals.settled_at),
         moving_error_peak=jnp.maximum(
             totals.moving_error_peak, moving * jnp.abs(sample.pose_error)

@@ -5,9 +5,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import lax
 from jax.typing import ArrayLike
 
+from jaxmodel.parameters import Array
 from jaxmodel.shaper import Taps
 
 PROFILES = ("cycloid", "quintic")

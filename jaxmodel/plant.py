@@ -47,8 +47,8 @@ class Plant(NamedTuple):
 def build_plant(machine: Machine, basis: ModalBasis, is_locked: Array = False) -> Plant:
     """Collect machine and basis into a `Plant`.
 
-    Guide i starts at A_i = -r_in n_i - (a/2) u_i, r_in = a/(2 sqrt 3), with u_i = (cos, sin) alpha_i
-    and the inward normal n_i = u_i turned by +90 deg.
+    Guide i starts at A_i = -r_in n_i - (a/2) u_i, r_in = a/(2 sqrt 3), u_i = (cos, sin) alpha_i,
+    and n_i, the inward normal, is u_i turned by +90 deg.
 
     Args:
         machine: physical description.

@@ -120,7 +120,7 @@ def _constants(case: Case) -> tuple[Array, Array]:
 
 
 def design_controller(structure: Structure, case: Case) -> ControllerDesign:
-    """Controller of a case, from its belief of the links: the controller basis at nominal stiffness.
+    """Controller of a case from what it believes: the controller basis at nominal stiffness.
 
     IMSC: modal filter pinv(lambda_s Phi_s^t), synthesizer pinv(lambda_a Phi_a), gains (20) with
     ratios (24). SRF (16): every patch feeds back the rate of its own voltage.
@@ -210,7 +210,7 @@ def design_taps(case: Case) -> shaper.Taps:
 
 
 def _initial_modes(structure: Structure, case: Case, basis: ModalBasis) -> Array:
-    """Modal coordinates at t = 0: given ones plus a static load at a station, q_j = Y_j(x) F/k_j."""
+    """Modal coordinates at t = 0: given ones plus a static load F at x, q_j = Y_j(x) F/k_j."""
     initial = case.initial
     station = jnp.asarray(initial.load_station)[None]
     at = build_basis(
@@ -238,5 +238,3 @@ def _static_status(structure: Structure, case: Case, design: ControllerDesign) -
     for is_wrong, value in checks:
         code = jnp.where(is_wrong, float(value), code)
     return code
-
-

@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jax.typing import ArrayLike
+
+from jaxmodel.parameters import Array
 
 KINDS = ("none", "zv", "zvd", "zvdd", "ei", "ei_damped", "ei2", "ei3")
 MAX_IMPULSES = 5

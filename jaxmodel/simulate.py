@@ -1,4 +1,4 @@
-"""One closed-loop run: reference, scan over samples, metrics, status. Pure; batch it with `vmap`."""
+"""One closed-loop run: reference, scan over samples, metrics, status. Batch it with `vmap`."""
 
 from __future__ import annotations
 
@@ -118,10 +118,13 @@ def _disturbance(structure: Structure, case: Case, prepared: Prepared, time: Arr
 def _scan_in_blocks(body, start, inputs: Inputs):
     """Scan for reverse mode: sqrt(n) blocks, each computed again on the way back.
 
-    Keeping every step instead costs n states of memory, and XLA copies the whole store at each step.
+    Keeping every step costs n states of memory, and XLA copies the whole store at each step.
     """
     n = inputs.rho.shape[0]
-    size = max(int(np.sqrt(n)), 1)
+    root = int(np.sqrt(n))
+    divisor = max(k for k in range(1, root + 1) if n % k == 0)
+    # a remainder compiles the step a second time, so an even division is preferred
+    size = divisor if divisor > root // 4 else root
     count = n // size
 
     @jax.checkpoint
@@ -129,9 +132,10 @@ def _scan_in_blocks(body, start, inputs: Inputs):
         return jax.lax.scan(lambda s, x: (body(s, x)[0], None), state, part)
 
     main = jax.tree.map(lambda x: x[: count * size].reshape((count, size) + x.shape[1:]), inputs)
-    rest = jax.tree.map(lambda x: x[count * size :], inputs)
     state, _ = jax.lax.scan(block, start, main)
-    return block(state, rest)[0]
+    if count * size < n:
+        state, _ = block(state, jax.tree.map(lambda x: x[count * size :], inputs))
+    return state
 
 
 def simulate(structure: Structure, case: Case, has_record: bool = False) -> Result:

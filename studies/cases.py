@@ -9,7 +9,14 @@ import numpy as np
 from jaxmodel import estimator, motion, shaper
 from jaxmodel.beam import assembled_frequency
 from jaxmodel.case import (
-    Case, Control, Drive, Electronics, Initial, Shaping, Structure, Windows,
+    Case,
+    Control,
+    Drive,
+    Electronics,
+    Initial,
+    Shaping,
+    Structure,
+    Windows,
 )  # fmt: skip
 from jaxmodel.parameters import ASSEMBLIES, Beam, Geometry, Machine, Masses, Patches
 from studies.spec import Study, patch_centers
@@ -105,7 +112,9 @@ def _path(study: Study) -> motion.Path:
     is_still = len(study.motion.waypoints) == 1
     return motion.Path(
         points,
-        np.full(moves, 1e-9) if is_still else np.broadcast_to(study.motion.move_time, (moves,)) + 0.0,
+        np.full(moves, 1e-9)
+        if is_still
+        else np.broadcast_to(study.motion.move_time, (moves,)) + 0.0,
         np.zeros(moves) if is_still else np.broadcast_to(study.motion.dwell, (moves,)) + 0.0,
         motion.PROFILES.index(study.motion.profile),
     )

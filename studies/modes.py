@@ -7,7 +7,7 @@ from functools import partial
 import jax
 import numpy as np
 
-from jaxmodel.case import Structure
+from jaxmodel.case import Case, Structure
 from jaxmodel.kinematics import path_status
 from jaxmodel.linear import NaturalModes, linearise, natural_modes
 from jaxmodel.prepare import prepare

@@ -1,4 +1,4 @@
-"""A batch is its members: vmap equals single runs, members do not touch each other, one compilation."""
+"""A batch is its members: vmap equals single runs, no member touches another, one compilation."""
 
 import jax
 import numpy as np
@@ -78,10 +78,10 @@ def stack(cases):
 
 
 def compare(batched, index, single):
-    for name, x, y in zip(single._fields, batched, single):
+    for name, x, y in zip(single._fields, batched, single, strict=True):
         if name == "record":
             continue
-        for a, b in zip(jax.tree.leaves(x), jax.tree.leaves(y)):
+        for a, b in zip(jax.tree.leaves(x), jax.tree.leaves(y), strict=True):
             a, b = np.asarray(a)[index], np.asarray(b)
             assert np.max(np.abs(a - b)) <= 1e-9 * max(np.max(np.abs(b)), 1e-300), name
 
@@ -137,7 +137,7 @@ def test_bad_members_are_frozen_and_alone(cases, batch):
     assert 0 < np.asarray(result.bad_time)[4] < 0.045
     good = np.r_[0, 5:N_CASES]
     assert np.all(codes[good] == status.OK)
-    for a, b in zip(jax.tree.leaves(result.metrics), jax.tree.leaves(whole.metrics)):
+    for a, b in zip(jax.tree.leaves(result.metrics), jax.tree.leaves(whole.metrics), strict=True):
         a, b = np.asarray(a)[good], np.asarray(b)[good]
         assert np.abs(a - b).max() <= 1e-12 * np.abs(b).max()
     finite = np.r_[0:3, 4:N_CASES]
