@@ -73,7 +73,7 @@ class Shaping(NamedTuple):
     omega: Array  # [rad/s], (n,)
     zeta: Array  # [1], (n,)
     tolerance: Array  # V of the EI family [1], ()
-    is_exact: Array  # 1: impulses split exactly for the first frequency, 0: linearly, ()
+    is_exact: Array  # 1: impulses split exactly for their mode, 0: linearly, ()
 
 
 class Drive(NamedTuple):

@@ -196,17 +196,16 @@ def design_controller(structure: Structure, case: Case) -> ControllerDesign:
 
 
 def design_taps(case: Case) -> shaper.Taps:
-    """Shaper of the case on its sample grid; several frequencies in series."""
+    """Shaper of the case on its sample grid; each frequency split for its own mode, in series."""
     shaping, period = case.shaping, case.electronics.period
-    omega, zeta = jnp.asarray(shaping.omega), jnp.asarray(shaping.zeta)
-    each = [
-        shaper.design_shaper(shaping.kind, omega[k], zeta[k], shaping.tolerance)
-        for k in range(omega.shape[0])
-    ]
-    impulses = reduce(shaper.convolve, each)
-    linear = shaper.split_linear(impulses, period)
-    exact = shaper.split_exact(impulses, period, omega[0], zeta[0])
-    return linear._replace(weight=jnp.where(shaping.is_exact > 0, exact.weight, linear.weight))
+
+    def one(omega: Array, zeta: Array) -> shaper.Taps:
+        impulses = shaper.design_shaper(shaping.kind, omega, zeta, shaping.tolerance)
+        linear = shaper.split_linear(impulses, period)
+        exact = shaper.split_exact(impulses, period, omega, zeta)
+        return linear._replace(weight=jnp.where(shaping.is_exact > 0, exact.weight, linear.weight))
+
+    return reduce(shaper.in_series, map(one, jnp.asarray(shaping.omega), jnp.asarray(shaping.zeta)))
 
 
 def _initial_modes(structure: Structure, case: Case, basis: ModalBasis) -> Array:

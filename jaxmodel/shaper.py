@@ -266,6 +266,14 @@ def split_exact(impulses: Impulses, period: ArrayLike, omega: ArrayLike, zeta: A
     return Taps(weight / jnp.sum(weight), samples)
 
 
+def in_series(first: Taps, second: Taps) -> Taps:
+    """Return both sampled shapers in series, W_i V_j at n_i + m_j samples, shape (n m,)."""
+    return Taps(
+        jnp.outer(first.weight, second.weight).ravel(),
+        jnp.add.outer(first.sample, second.sample).ravel(),
+    )
+
+
 def residual_vibration(impulses: Impulses, omega: ArrayLike, zeta: ArrayLike) -> Array:
     """Return the vibration left by the shaper, relative to that of a unit impulse [1].
 

@@ -19,6 +19,7 @@ from jaxmodel.shaper import (
     ei2,
     ei3,
     ei_damped,
+    in_series,
     insensitivity,
     none,
     residual_vibration,
@@ -148,6 +149,30 @@ def test_ei_of_the_paper_fails_on_a_well_damped_mode():
     assert float(jnp.max(damped)) < 0.0505
     light = curve(design(index("ei"), OMEGA, 0.05, 0.05), ratio, OMEGA, 0.05)
     assert float(jnp.max(light)) < 0.05
+
+
+@pytest.mark.parametrize(
+    "v, zeta, first, third, middle",
+    [
+        (0.1, 0.3, 0.62486627, 0.09821858, 0.575785737),
+        (0.05, 0.1, 0.3548861, 0.19211919, 0.50469656),
+    ],
+)
+def test_damped_ei_is_its_polynomial(v, zeta, first, third, middle):
+    """Values worked out apart from the code, from the published coefficients."""
+    amplitude, time = ei_damped(OMEGA, zeta, v)
+    np.testing.assert_allclose(amplitude, [first, 1 - first - third, third], rtol=1e-7)
+    period = 2 * np.pi / damped_frequency(OMEGA, zeta)
+    np.testing.assert_allclose(time / period, [0, middle, 1], rtol=1e-7)
+
+
+def test_damped_ei_is_near_the_exact_solution():
+    """Zeros on both sides (11), V and slope zero at omega (12): solved numerically, V = 5 %."""
+    exact = {0.05: (0.3068, 0.2256, 0.5011), 0.1: (0.3547, 0.1919, 0.5026)}
+    for zeta, (first, third, middle) in exact.items():
+        amplitude, time = ei_damped(OMEGA, zeta, 0.05)
+        np.testing.assert_allclose(amplitude[::2], [first, third], rtol=0, atol=4e-4)
+        np.testing.assert_allclose(time[1] / time[2], middle, rtol=0, atol=4e-3)
 
 
 @settings(max_examples=50, deadline=None)
@@ -316,3 +341,15 @@ def test_gradients_are_finite_at_the_limits(kind):
 def test_gradient_of_no_vibration_is_zero():
     silent = Impulses(jnp.zeros(2), jnp.array([0.0, 0.01]))
     assert jax.grad(residual_vibration, 1)(silent, OMEGA, 0.1) == 0
+
+
+def test_exact_splits_in_series_cancel_both_modes():
+    """Split for its own mode and only then put in series, each ZV still cancels its mode."""
+    period, modes = 1e-4, ((2 * np.pi * 114.39, 0.01), (2 * np.pi * 457.55, 0.02))
+    first, second = (split_exact(zv(*mode), period, *mode) for mode in modes)
+    taps = in_series(first, second)
+    on_grid = Impulses(taps.weight, taps.sample * period)
+    for omega, zeta in modes:
+        assert residual_vibration(on_grid, omega, zeta) < 1e-12
+    linear = in_series(*(split_linear(zv(*mode), period) for mode in modes))
+    assert residual_vibration(Impulses(linear.weight, linear.sample * period), *modes[1]) > 1e-4
