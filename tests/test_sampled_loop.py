@@ -1,4 +1,4 @@
-"""Damping, margins and leakage of the closed loop: the published design table, and the run itself."""
+"""Damping, margins and leakage of the closed loop: the table of designs, and the run itself."""
 
 import jax
 import numpy as np
@@ -60,7 +60,7 @@ def test_difference_is_unstable_with_eight_modes_and_not_with_six():
 
 
 def test_margin_stops_at_the_first_instability():
-    """A loop that is unstable in a band of factors and stable again beyond has the band's margin."""
+    """Unstable in a band of factors and stable again beyond: the band decides."""
 
     def poles(factor):
         return np.array([1.5 if 2.0 < factor < 3.0 else 0.5])
