@@ -115,10 +115,11 @@ def _disturbance(structure: Structure, case: Case, prepared: Prepared, time: Arr
     return noise, force + drive.ripple * ripple
 
 
-def _scan_in_blocks(body, start, inputs: Inputs):
-    """Scan for reverse mode: sqrt(n) blocks, each computed again on the way back.
+def _scan_in_blocks(body, start, inputs: Inputs, is_checkpointed: bool):
+    """`lax.scan` in about sqrt(n) blocks, for runs that keep something of every step.
 
-    Keeping every step costs n states of memory, and XLA copies the whole store at each step.
+    XLA copies the store of a scan at each step; so it copies a block's store, not the run's. With
+    checkpoints reverse mode keeps the state of every block and computes the rest again.
     """
     n = inputs.rho.shape[0]
     root = int(np.sqrt(n))
@@ -127,15 +128,17 @@ def _scan_in_blocks(body, start, inputs: Inputs):
     size = divisor if divisor > root // 4 else root
     count = n // size
 
-    @jax.checkpoint
     def block(state, part):
-        return jax.lax.scan(lambda s, x: (body(s, x)[0], None), state, part)
+        return jax.lax.scan(body, state, part)
 
+    block = jax.checkpoint(block) if is_checkpointed else block
     main = jax.tree.map(lambda x: x[: count * size].reshape((count, size) + x.shape[1:]), inputs)
-    state, _ = jax.lax.scan(block, start, main)
+    state, kept = jax.lax.scan(block, start, main)
+    kept = jax.tree.map(lambda x: x.reshape((count * size,) + x.shape[2:]), kept)
     if count * size < n:
-        state, _ = block(state, jax.tree.map(lambda x: x[count * size :], inputs))
-    return state
+        state, rest = block(state, jax.tree.map(lambda x: x[count * size :], inputs))
+        kept = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), kept, rest)
+    return state, kept
 
 
 def simulate(structure: Structure, case: Case, has_record: bool = False) -> Result:
@@ -159,8 +162,8 @@ def simulate(structure: Structure, case: Case, has_record: bool = False) -> Resu
         after, record = step(structure, loop, state, inputs)
         return after, record if has_record else None
 
-    if structure.is_smooth and not has_record:
-        last, record = _scan_in_blocks(body, start, outside.inputs), None
+    if structure.is_smooth or has_record:
+        last, record = _scan_in_blocks(body, start, outside.inputs, structure.is_smooth)
     else:
         last, record = jax.lax.scan(body, start, outside.inputs)
     result = metrics.finish(last.totals, case.electronics.period)
