@@ -85,9 +85,9 @@ def _series(x: Array) -> list[Array]:
     identity = jnp.eye(4, dtype=x.dtype) + 0 * x
     result = []
     for k in range(4):
-        total = identity / factorial(_TERMS + k)
+        total = identity / float(factorial(_TERMS + k))
         for n in reversed(range(_TERMS)):
-            total = x @ total + identity / factorial(n + k)
+            total = x @ total + identity / float(factorial(n + k))
         result.append(total)
     return result
 

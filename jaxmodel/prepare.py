@@ -142,8 +142,9 @@ def design_controller(structure: Structure, case: Case) -> ControllerDesign:
     actuator = lambda_a[:, None, None] * model.actuator_slope  # (3, known, K)
     mask = active_modes(control.n_active, n, structure.n_patches)
     seen, driven = sensor[:, :, :n], jnp.swapaxes(actuator[:, :n], 1, 2)
-    observer = jax.vmap(left_inverse, (0, None))(seen, mask)
-    synthesizer = jnp.swapaxes(jax.vmap(left_inverse, (0, None))(driven, mask), 1, 2)
+    # in one call: XLA's CPU compiler aborts on two of them side by side where C = 1 (jax 0.10)
+    inverse = jax.vmap(left_inverse, (0, None))(jnp.concatenate([seen, driven]), mask)
+    observer, synthesizer = inverse[:3], jnp.swapaxes(inverse[3:], 1, 2)
 
     assembled = assembled_frequency(belief, n)
     on = jnp.asarray(control.link_mask)[:, None] * control.gain_factor

@@ -19,7 +19,8 @@ from jaxmodel.case import (
     Windows,
 )  # fmt: skip
 from jaxmodel.parameters import ASSEMBLIES, Beam, Geometry, Machine, Masses, Patches
-from studies.spec import Study, patch_centers
+from studies.consistency import patch_centers
+from studies.spec import Study
 
 TWO_PI = 2 * np.pi
 

@@ -1,11 +1,11 @@
-"""The command line. Every command ends with exit code 0, or 2 and one message; never a traceback."""
+"""The command line. A command ends with exit code 0, or with 2 and one message; no traceback."""
 
 from __future__ import annotations
 
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -19,7 +19,7 @@ app = typer.Typer(
     help="Parameter studies of a planar 3-PRR manipulator with flexible links.",
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
 )  # fmt: skip
-console = Console(highlight=False)
+console = Console(highlight=False, markup=False)  # a unit in brackets is no markup
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -28,7 +28,8 @@ def main(arguments: list[str] | None = None) -> None:
         app(args=arguments, standalone_mode=False)
     except (StudyError, TyperException) as error:
         text = error.format_message() if isinstance(error, TyperException) else str(error)
-        print(f"studies: {text}", file=sys.stderr)
+        if text:  # none where help has been printed for want of a command
+            print(f"studies: {text}", file=sys.stderr)
         sys.exit(2)
     except (KeyboardInterrupt, Abort):
         print("studies: interrupted", file=sys.stderr)
@@ -40,7 +41,7 @@ def paper(
     out: Annotated[Path, typer.Option(help="folder for data, figures and report")],
     precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
 ) -> None:
-    """Run the paper's study: data, counterparts of its figures, report with both sets of numbers."""
+    """Run the paper's study: data, counterparts of its figures, report beside its numbers."""
     configure(precision)
     from studies.paper import run_paper
 
@@ -74,13 +75,13 @@ def simulate(
     console.print(table)
     if run.loop is not None:
         console.print(f"gain margin of the linearised sampled loop: {run.loop.gain_margin:.4g}")
-    console.print(f"written: {out}")
+    console.print(f"written: {out}", soft_wrap=True)
 
 
 @app.command()
 def modes(
     pose: Annotated[
-        Optional[tuple[float, float, float]], typer.Option(help="x [m] y [m] phi [rad]; default home")
+        tuple[float, float, float] | None, typer.Option(help="x [m] y [m] phi [rad]; default home")
     ] = None,
     kp: Annotated[float, typer.Option(help="drive stiffness [N/m], 0 = free sliders")] = 2e4,
     kd: Annotated[float, typer.Option(help="drive damping [N s/m]")] = 0.0,
@@ -103,17 +104,17 @@ def modes(
         print(json.dumps(text))
         return
     table = Table("mode", "frequency [Hz]", "damping ratio [1]")
-    for k, (f, z) in enumerate(zip(found.frequency, found.damping_ratio)):
+    for k, (f, z) in enumerate(zip(found.frequency, found.damping_ratio, strict=True)):
         table.add_row(str(k + 1), f"{f:.4f}", f"{z:.5f}")
     console.print(table)
 
 
 @app.command()
 def init(
-    out: Annotated[Optional[Path], typer.Argument(help="file to write; default: print it")] = None,
+    out: Annotated[Path | None, typer.Argument(help="file to write; default: print it")] = None,
 ) -> None:
     """Write a commented study file with every field and its default."""
-    from studies.store import check_target
+    from studies.store import replacing
     from studies.template import study_template
 
     if out is None:
@@ -121,9 +122,9 @@ def init(
         return
     if out.exists():
         raise StudyError(f"{out}: exists already; name a new file")
-    check_target(out)
-    out.write_text(study_template(), encoding="utf-8")
-    console.print(f"written: {out}")
+    with replacing(out) as temporary:
+        temporary.write_text(study_template(), encoding="utf-8")
+    console.print(f"written: {out}", soft_wrap=True)
 
 
 @app.command()

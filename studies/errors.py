@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+#: More of a value than this is not shown [characters].
+LONGEST = 120
+
 
 class StudyError(Exception):
     """A mistake in what was asked for; its text is one complete message for the user."""
@@ -18,13 +21,26 @@ def field_error(
     field: the name as the user wrote it. value: what was given. allowed: the range or the names.
     unit: unit of the range, "" for none. hint: the nearest valid name, "" for none (see `nearest`).
     """
-    shown = repr(value) if isinstance(value, str) else str(value)
-    message = f"{field} = {shown}: allowed {allowed}"
+    message = f"{field} = {shown(value)}: allowed {allowed}"
     if unit:
         message += f" [{unit}]"
     if hint:
         message += f"; did you mean {hint!r}?"
     return StudyError(message)
+
+
+def shown(value: object) -> str:
+    """A value as a study file writes it, on one line and shortened to `LONGEST` characters."""
+    text = _text(value)
+    return text if len(text) <= LONGEST else text[: LONGEST - 4] + " ..."
+
+
+def _text(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (tuple, list)):
+        return "[" + ", ".join(_text(entry) for entry in value) + "]"
+    return repr(value) if isinstance(value, str) else str(value)
 
 
 def nearest(name: str, names: Iterable[str]) -> str:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel import status
-from jaxmodel.beam import build_basis
+from jaxmodel.beam import assembled_frequency, build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.kinematics import path_status
 from jaxmodel.linear import linearise, mechanical
@@ -28,10 +28,12 @@ from studies.errors import field_error
 from studies.spec import Study
 from studies.store import Variable
 
-#: |Re lambda| h that one explicit step of the ideal feedback may have; ETDRK4 loses stability near 2.8.
+#: |Re lambda| h that one step may have with ideal feedback; ETDRK4 is unstable from about 2.8.
 STIFFNESS_LIMIT = 2.5
 #: More plant steps per sample than this are refused.
 SUBSTEP_LIMIT = 200
+#: omega h of the highest plant mode beyond which the coefficients of ETDRK4 lose digits.
+MODE_STEP_LIMIT = 100
 
 _simulate = jax.jit(simulate, static_argnums=(0, 2))
 
@@ -56,13 +58,16 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
         has_loop: judge the linearised sampled loop too (seconds).
 
     Raises:
-        StudyError: pose out of reach, singular path, motion longer than the run, too stiff feedback.
+        StudyError: pose out of reach, singular path, motion longer than the run, stiff feedback.
     """
     structure, case = check_run(study)
     result = jax.tree.map(np.asarray, _simulate(structure, case, has_record))
     loop, code = None, int(result.status)
     if has_loop and structure.feedback == "sampled":
-        loop = loop_report(structure, case, _home(study))
+        try:
+            loop = loop_report(structure, case, _home(study), min(3, structure.n_modes))
+        except np.linalg.LinAlgError:  # an entry that is not finite
+            return Run(study, structure, case, result, None, code or status.NON_FINITE)
         if code in (status.OK, status.SATURATED) and not loop.is_stable:
             code = status.UNSTABLE
     return Run(study, structure, case, result, loop, code)
@@ -82,6 +87,8 @@ class Preflight(NamedTuple):
     motion_end: Any  # of the unshaped motion [s], ()
     shaper_length: Any  # [s], ()
     condition: Any  # worst condition number of filter and synthesizer [1], ()
+    highest: Any  # frequency of the highest plant mode [rad/s], ()
+    corner: Any  # highest low-pass corner of the velocity estimate [rad/s], ()
 
 
 @partial(jax.jit, static_argnums=0)
@@ -95,9 +102,19 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
     code, index = path_status(plant, poses)
     last = jnp.max(jnp.where(taps.weight != 0, taps.sample, 0))
     worst = jnp.maximum(prepared.sensor_condition.max(), prepared.actuator_condition.max())
+    ratio = case.electronics.lowpass_ratio
+    corner = jnp.max(ratio * assembled_frequency(case.machine.beam, ratio.size))
     return Preflight(
-        each, code, time[index], poses[index], end, last * case.electronics.period, worst
-    )
+        each, code, time[index], poses[index], end, last * case.electronics.period, worst,
+        jnp.max(prepared.loop.omega), corner,
+    )  # fmt: skip
+
+
+def _without_run(structure: Structure) -> Structure:
+    """Only what describes machine and controller, so that runs of any kind share a compilation."""
+    kept = ("n_modes", "n_controlled", "n_patches", "basis", "controller_basis", "law")
+    fields = {name: getattr(structure, name) for name in kept}
+    return Structure(n_steps=1, feedback="none", **fields)
 
 
 def check_run(study: Study) -> tuple[Structure, Case]:
@@ -107,7 +124,7 @@ def check_run(study: Study) -> tuple[Structure, Case]:
         StudyError: see `run_study`.
     """
     structure, case = build_structure(study), as_arrays(build_case(study))
-    known = jax.tree.map(np.asarray, _preflight(structure, case))
+    known = jax.tree.map(np.asarray, _preflight(_without_run(structure), case))
     for k, pose in enumerate(study.motion.waypoints):
         check_pose(f"motion.waypoints.{k}", pose, int(known.pose_status[k]))
     if int(known.path_status) != status.OK:
@@ -127,7 +144,8 @@ def check_run(study: Study) -> tuple[Structure, Case]:
             f"condition number up to metrics.condition_limit = {study.metrics.condition_limit:g}; "
             f"it is {known.condition:.3g}", "m",
         )  # fmt: skip
-    if structure.feedback == "ideal" and not study.run.substeps:
+    _check_rates(study, structure, known)
+    if structure.feedback == "ideal":
         structure = structure._replace(substeps=_ideal_substeps(study, structure, case))
     return structure, case
 
@@ -170,8 +188,31 @@ def _check_duration(study: Study, structure: Structure, known: Preflight) -> Non
         )  # fmt: skip
 
 
+def _check_rates(study: Study, structure: Structure, known: Preflight) -> None:
+    """Plant modes that the step can carry, and low-passes that the sample rate can carry."""
+    rate = study.electronics.sample_rate_hz
+    needed = known.highest / MODE_STEP_LIMIT
+    if needed > rate * structure.substeps:
+        raise field_error(
+            "link.modes", study.link.modes,
+            f"modes up to {MODE_STEP_LIMIT * rate * structure.substeps / (2 * np.pi):.4g} Hz at "
+            f"electronics.sample_rate_hz = {rate:g} and run.substeps = {structure.substeps}; the "
+            f"highest one has {known.highest / (2 * np.pi):.4g} Hz", "1",
+        )  # fmt: skip
+    is_modal_phase = study.electronics.estimator == "modal_phase"
+    corner = known.corner / (2 * np.pi)
+    if structure.feedback == "sampled" and is_modal_phase and corner >= rate / 2:
+        raise field_error(
+            "electronics.lowpass_ratio", study.electronics.lowpass_ratio,
+            f"low-pass corners below half the sample rate, {rate / 2:g} Hz; the highest of the "
+            f"{structure.n_channels} is at {corner:.5g} Hz (lower it, control.modes or raise "
+            "electronics.sample_rate_hz)", "1",
+        )  # fmt: skip
+
+
 def pole_decay(structure: Structure, case: Case, pose: Any) -> float:
     """Fastest decay |Re lambda| [1/s] of the plant with ideal feedback at a pose."""
+    structure = _without_run(structure)._replace(feedback="ideal")
     poles = np.linalg.eigvals(np.asarray(_mechanical(structure, case, pose)))
     return float(np.abs(poles.real).max())
 
@@ -183,17 +224,24 @@ def _mechanical(structure: Structure, case: Case, pose: Any) -> Any:
 
 
 def _ideal_substeps(study: Study, structure: Structure, case: Case) -> int:
-    """Plant steps per sample that ideal feedback needs: the worst way-point decides."""
-    poses = {np.array(pose, float).tobytes(): np.array(pose) for pose in study.motion.waypoints}
-    fastest = max(pole_decay(structure, case, pose) for pose in poses.values())
+    """Plant steps per sample for ideal feedback: what the worst way-point needs, or given."""
+    poses = set(study.motion.waypoints)
+    fastest = max(pole_decay(structure, case, np.array(pose)) for pose in poses)
     needed = int(np.ceil(fastest / study.electronics.sample_rate_hz / STIFFNESS_LIMIT))
+    given = study.run.substeps
+    if given and given < needed <= SUBSTEP_LIMIT:
+        raise field_error(
+            "run.substeps", given,
+            f"{needed} to {SUBSTEP_LIMIT}, or 0 for as many as needed; ideal feedback has a pole "
+            f"at {fastest:.3g} 1/s", "1",
+        )  # fmt: skip
     if needed > SUBSTEP_LIMIT:
         raise field_error(
             "control.gain_factor", study.control.gain_factor,
-            f"gains low enough for {SUBSTEP_LIMIT} plant steps per sample; ideal feedback has a pole "
-            f"at {fastest:.3g} 1/s, which needs {needed}", "1",
+            f"gains low enough for {SUBSTEP_LIMIT} plant steps per sample; ideal feedback has a "
+            f"pole at {fastest:.3g} 1/s, which needs {needed}", "1",
         )  # fmt: skip
-    return max(needed, 1)
+    return given or max(needed, 1)
 
 
 _METRIC_LABELS = {
@@ -204,15 +252,17 @@ _METRIC_LABELS = {
     "residual_modal_rms": (("link", "mode"), "m", "rms of plant modes in the residual window"),
     "residual_modal_peak": (("link", "mode"), "m", "peak of plant modes in the residual window"),
     "structural_modal_rms": (("link", "mode"), "m", "rms of plant modes while moving"),
-    "settling_time": (("link",), "s", "from the command's end until the deflection stays in the band"),
-    "pose_error_peak": (("pose_axis",), "m; m; rad", "peak error against the shaped command while moving"),
+    "settling_time": (("link",), "s", "from the command's end until all stations stay in the band"),
+    "pose_error_peak": (
+        ("pose_axis",), "m; m; rad", "peak error from the shaped command while moving"
+    ),
     "pose_error_rms": (("pose_axis",), "m; m; rad", "rms error in the residual window"),
     "voltage_peak": (("link",), "V", "peak actuator voltage"),
     "saturated_fraction": ((), "1", "samples with an actuator at its limit"),
     "clipped_fraction": ((), "1", "samples with an ADC channel at its end"),
     "control_energy": ((), "V2 s", "integral of the summed squared actuator voltages"),
     "force_peak": (("slider_axis",), "N", "peak motor force"),
-    "plant_energy": (("link", "mode"), "m2/s2", "mean omega^2 q^2 + q'^2 while moving, plant modes"),
+    "plant_energy": (("link", "mode"), "m2/s2", "mean of omega^2 q^2 + q'^2 while moving"),
     "modal_energy": (("link", "controlled_mode"), "m2/s2", "the same in the controller's modes"),
     "spectral_density": (
         ("link", "controlled_mode", "spectrum_point"), "m2/Hz",
@@ -283,7 +333,7 @@ def run_variables(run: Run) -> dict[str, Variable]:
         for name, (dims, unit, text) in _RECORD_LABELS.items():
             variables[name] = Variable(getattr(record, name), dims, unit, text)
         variables["chord_deflection"] = Variable(
-            chord_deflection(run), ("time", "link"), "m", "deflection of mid-span from the chord B-C"
+            chord_deflection(run), ("time", "link"), "m", "mid-span relative to the chord B-C"
         )
     return variables
 

@@ -1,4 +1,4 @@
-"""The study file: every field with unit, default and allowed range. This is the only place of defaults.
+"""The study file: every field with unit, default and allowed range; the only place of defaults.
 
 `load_study(path)` reads TOML into a frozen `Study`, or raises `StudyError` naming field, value,
 allowed range, unit and the nearest valid name. `studies.cases` turns a `Study` into arrays.
@@ -14,10 +14,20 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jaxmodel.parameters import HOME
-from studies.errors import StudyError, field_error, nearest
+from studies.consistency import check_consistency
+from studies.errors import StudyError
+from studies.explain import explain
 
 Basis = Literal["pinned_pinned", "pinned_free", "loaded"]
-Triple = tuple[float, float, float]
+
+
+# numbers within bounds, as entries of a list
+Coordinate = Annotated[float, Field(ge=-10, le=10)]
+Deflection = Annotated[float, Field(ge=-0.1, le=0.1)]
+Force = Annotated[float, Field(ge=-1e4, le=1e4)]
+Gain = Annotated[float, Field(ge=-1e9, le=1e9)]
+Time = Annotated[float, Field(ge=1e-4, le=100)]
+Pause = Annotated[float, Field(ge=0, le=100)]
 Flags = tuple[bool, bool, bool]
 
 
@@ -27,7 +37,7 @@ def _f(default: Any, unit: str, text: str, **bounds: Any) -> Any:
 
 class Section(BaseModel):
     model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=False, allow_inf_nan=False, validate_default=True
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, validate_default=True
     )
 
 
@@ -35,20 +45,22 @@ class Run(Section):
     """How long and how finely."""
 
     duration: float = _f(0.8, "s", "length of the run", gt=0, le=100)
-    seed: int = _f(0, "1", "of ADC noise and force ripple", ge=0, lt=2**31)
-    substeps: int = _f(0, "1", "plant steps per sample; 0: 1, or what ideal feedback needs", ge=0, le=200)
-    smooth: bool = _f(False, "1", "smooth limits, noise instead of rounding (for gradients)")
+    seed: int = _f(0, "1", "of ADC noise and force ripple", ge=0, le=10**9)
+    substeps: int = _f(0, "1", "plant steps per sample; 0: as many as needed", ge=0, le=200)
+    smooth: bool = _f(False, "-", "smooth limits, noise instead of rounding (for gradients)")
 
 
 class Machine(Section):
     """Guides, platform, sliders."""
 
     assembly: Literal["inward", "outward"] = _f("inward", "-", "which of the two assemblies")
-    guide_side: float = _f(0.6, "m", "side of the guide triangle", gt=0, le=10)
-    joint_radius: float = _f(round(0.12 / 3**0.5, 12), "m", "platform centre to joint", gt=0, le=5)
-    platform_mass: float = _f(0.25, "kg", "m_p", gt=0, le=1e3)
-    platform_inertia: float = _f(3.0e-4, "kg m2", "I_p", gt=0, le=1e2)
-    slider_mass: float = _f(0.15, "kg", "m_s of each slider", gt=0, le=1e3)
+    guide_side: float = _f(0.6, "m", "side of the guide triangle", ge=0.01, le=10)
+    joint_radius: float = _f(
+        round(0.12 / 3**0.5, 12), "m", "platform centre to joint", ge=1e-4, le=5
+    )
+    platform_mass: float = _f(0.25, "kg", "m_p", ge=1e-3, le=1e3)
+    platform_inertia: float = _f(3.0e-4, "kg m2", "I_p", ge=1e-7, le=1e2)
+    slider_mass: float = _f(0.15, "kg", "m_s of each slider", ge=1e-3, le=1e3)
 
 
 class Link(Section):
@@ -56,13 +68,17 @@ class Link(Section):
 
     basis: Basis = _f("pinned_pinned", "-", "modal basis of the plant")
     modes: int = _f(8, "1", "plant modes per link", ge=1, le=16)
-    length: float = _f(0.2, "m", "L", gt=0, le=10)
-    thickness: float = _f(2e-3, "m", "t_b", gt=0, le=0.1)
-    width: float = _f(10e-3, "m", "width", gt=0, le=1)
-    density: float = _f(2750.0, "kg/m3", "density", gt=0, le=3e4)
-    youngs_modulus: float = _f(70e9, "Pa", "E", gt=0, le=2e12)
+    length: float = _f(0.2, "m", "L", ge=1e-3, le=10)
+    thickness: float = _f(2e-3, "m", "t_b", ge=1e-5, le=0.1)
+    width: float = _f(10e-3, "m", "width", ge=1e-4, le=1)
+    density: float = _f(2750.0, "kg/m3", "density", ge=1, le=3e4)
+    youngs_modulus: float = _f(70e9, "Pa", "E", ge=1e3, le=2e12)
     stiffness_factor: float = _f(
-        1.0, "1", "true bending stiffness over the one controller and shaper believe", gt=0, le=10
+        1.0,
+        "1",
+        "true bending stiffness over the one controller and shaper believe",
+        ge=1e-3,
+        le=10,
     )
     damping_ratio: float = _f(0.01, "1", "of every link mode", ge=0, lt=1)
     joint_inertia_b: float = _f(0.0, "kg m2", "at the slider joint (basis loaded)", ge=0, le=1)
@@ -75,28 +91,30 @@ class Patches(Section):
     centers: tuple[float, ...] | tuple[tuple[float, ...], ...] = _f(
         (0.05, 0.10, 0.15), "m", "centres along the link; one list for all links, or three lists"
     )
-    sensor_length: float = _f(0.010, "m", "sensor length", gt=0, le=1)
-    actuator_length: float = _f(0.030, "m", "actuator length", gt=0, le=1)
-    width: float = _f(0.010, "m", "patch width", gt=0, le=1)
-    thickness: float = _f(0.2e-3, "m", "t_p", gt=0, le=0.01)
-    youngs_modulus: float = _f(66e9, "Pa", "E_p", gt=0, le=2e12)
-    d31: float = _f(-180e-12, "C/N", "piezoelectric constant (its sign does not matter)", ge=-1e-9, le=1e-9)
-    relative_permittivity: float = _f(1750.0, "1", "eps33T/eps0", gt=0, le=1e5)
+    sensor_length: float = _f(0.010, "m", "sensor length", ge=1e-5, le=1)
+    actuator_length: float = _f(0.030, "m", "actuator length", ge=1e-5, le=1)
+    width: float = _f(0.010, "m", "patch width", ge=1e-5, le=1)
+    thickness: float = _f(0.2e-3, "m", "t_p", ge=1e-6, le=0.01)
+    youngs_modulus: float = _f(66e9, "Pa", "E_p", ge=1e3, le=2e12)
+    d31: float = _f(
+        -180e-12, "C/N", "piezoelectric constant (its sign has no effect)", ge=-1e-9, le=1e-9
+    )
+    relative_permittivity: float = _f(1750.0, "1", "eps33T/eps0", ge=1, le=1e5)
     density: float = _f(7800.0, "kg/m3", "density of the ceramic", ge=0, le=3e4)
 
 
 class Motion(Section):
     """The platform's path: point-to-point moves."""
 
-    waypoints: tuple[Triple, ...] = _f(
+    waypoints: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = _f(
         (
             (0.0, 0.0, HOME[2]), (0.0, 0.01, HOME[2]), (0.01, 0.01, HOME[2]),
             (0.01, 0.0, HOME[2]), (0.0, 0.0, HOME[2]),
         ),
         "m, m, rad", "poses (x, y, phi) to visit", min_length=1, max_length=100,
     )  # fmt: skip
-    move_time: float | tuple[float, ...] = _f(0.1, "s", "t_f of each move, or one per move")
-    dwell: float | tuple[float, ...] = _f(0.0, "s", "rest after each move, or one per move")
+    move_time: Time | tuple[Time, ...] = _f(0.1, "s", "t_f of each move, or one per move")
+    dwell: Pause | tuple[Pause, ...] = _f(0.0, "s", "rest after each move, or one per move")
     profile: Literal["cycloid", "quintic"] = _f("cycloid", "-", "cycloid is (25)")
 
 
@@ -106,8 +124,11 @@ class Shaper(Section):
     kind: Literal["none", "zv", "zvd", "zvdd", "ei", "ei_damped", "ei2", "ei3"] = _f(
         "ei", "-", "ei is the paper's (13)"
     )
-    frequencies_hz: tuple[Annotated[float, Field(gt=0, le=1e5)], ...] = _f(
-        (), "Hz", "modes to shape for, in series; empty: mode 1 of the assembled links", max_length=3
+    frequencies_hz: tuple[Annotated[float, Field(ge=0.1, le=1e5)], ...] = _f(
+        (),
+        "Hz",
+        "modes to shape for, in series; empty: mode 1 of the assembled links",
+        max_length=3,
     )
     damping_ratio: float = _f(0.01, "1", "zeta the shaper assumes", ge=0, lt=0.9)
     tolerance: float = _f(0.05, "1", "V of the EI family", ge=0, lt=1)
@@ -123,14 +144,18 @@ class Control(Section):
     law: Literal["imsc", "srf"] = _f("imsc", "-", "modal control, or strain rate feedback (16)")
     basis: Basis = _f("pinned_pinned", "-", "modal basis the controller believes in")
     modes: int = _f(3, "1", "controlled modes per link", ge=1, le=12)
-    links: Flags = _f((True, True, True), "1", "controlled links")
+    links: Flags = _f((True, True, True), "-", "controlled links")
     mode_mask: tuple[tuple[bool, ...], ...] = _f(
-        (), "1", "on/off per link and controlled mode; empty: all on"
+        (), "-", "on/off per link and controlled mode; empty: all on"
     )
-    velocity_gain: Triple = _f((3.1, 3.5, 3.4), "N s/m or 1/s", "k_d of mode 1 per link (SRF: s)")
-    position_gain: Triple = _f((0.0, 0.0, 0.0), "N/m or 1/s2", "k_p of mode 1 per link (SRF: 1)")
+    velocity_gain: tuple[Gain, Gain, Gain] = _f(
+        (3.1, 3.5, 3.4), "N s/m or 1/s", "k_d of mode 1 per link (SRF: s)"
+    )
+    position_gain: tuple[Gain, Gain, Gain] = _f(
+        (0.0, 0.0, 0.0), "N/m or 1/s2", "k_p of mode 1 per link (SRF: 1)"
+    )
     gain_unit: Literal["N s/m", "1/s"] = _f("N s/m", "-", "modal force or modal acceleration")
-    ratios: tuple[tuple[float, ...], ...] = _f(
+    ratios: tuple[tuple[Gain, ...], ...] = _f(
         ((1.0, 0.345, 0.045), (1.0, 0.304, 0.041), (1.0, 0.321, 0.038)),
         "1", "EMC ratios k_dj : k_d1 per link (24); missing ones are 0",
     )  # fmt: skip
@@ -148,7 +173,10 @@ class Electronics(Section):
     estimator: Literal["modal_phase", "difference"] = _f("modal_phase", "-", "velocity estimate")
     highpass_hz: float = _f(60.0, "Hz", "high-pass of modal_phase", gt=0, le=1e5)
     lowpass_ratio: tuple[Annotated[float, Field(gt=0.1, le=100)], ...] = _f(
-        (3.0, 2.0, 2.0), "1", "kappa_j, low-pass corner over omega_j; the last one goes on", min_length=1
+        (3.0, 2.0, 2.0),
+        "1",
+        "kappa_j, low-pass corner over omega_j; the last one goes on",
+        min_length=1,
     )
     lowpass_zeta: tuple[Annotated[float, Field(gt=0, le=5)], ...] = _f(
         (0.7, 0.7, 0.7), "1", "damping of the low-pass; the last one goes on", min_length=1
@@ -173,28 +201,36 @@ class Drive(Section):
     friction_speed: float = _f(1e-3, "m/s", "v_0", gt=0, le=1)
     viscous_friction: float = _f(0.0, "N s/m", "viscous friction", ge=0, le=1e4)
     ripple: float = _f(0.0, "N", "seeded force ripple, rms, new at every sample", ge=0, le=1e3)
-    pulse_force: Triple = _f((0.0, 0.0, 0.0), "N", "disturbance on the sliders")
-    pulse_start: float = _f(0.0, "s", "its start", ge=0)
-    pulse_length: float = _f(0.001, "s", "its length", ge=0)
-    locked: bool = _f(False, "1", "hold the sliders (bases with Y(L) = 0)")
+    pulse_force: tuple[Force, Force, Force] = _f((0.0, 0.0, 0.0), "N", "disturbance on the sliders")
+    pulse_start: float = _f(0.0, "s", "its start", ge=0, le=100)
+    pulse_length: float = _f(0.001, "s", "its length", ge=0, le=100)
+    locked: bool = _f(False, "-", "hold the sliders (bases with Y(L) = 0)")
 
 
 class Initial(Section):
     """State at t = 0."""
 
-    modal: tuple[tuple[float, ...], ...] = _f((), "m", "modal coordinates per link; missing ones 0")
-    load_station: float = _f(0.1, "m", "where a static transverse load acts", gt=0)
-    load_deflection: Triple = _f((0.0, 0.0, 0.0), "m", "chord deflection there, per link")
+    modal: tuple[tuple[Deflection, ...], ...] = _f(
+        (), "m", "modal coordinates per link; missing ones 0"
+    )
+    load_station: float = _f(0.1, "m", "where a static transverse load acts", gt=0, le=10)
+    load_deflection: tuple[Deflection, Deflection, Deflection] = _f(
+        (0.0, 0.0, 0.0), "m", "chord deflection there, per link"
+    )
 
 
 class Metrics(Section):
     """How a run is judged."""
 
-    residual_delay: float = _f(0.0, "s", "residual window starts this long after the command", ge=0)
-    residual_length: float = _f(0.3, "s", "length of the residual window", gt=0)
+    residual_delay: float = _f(
+        0.0, "s", "residual window starts this long after the command", ge=0, le=100
+    )
+    residual_length: float = _f(0.3, "s", "length of the residual window", gt=0, le=100)
     settling_band: float = _f(1e-6, "m", "chord deflection that counts as settled", gt=0, le=0.1)
     saturation_limit: float = _f(0.05, "1", "tolerated share of saturated samples", ge=0, le=1)
-    condition_limit: float = _f(1e3, "1", "tolerated condition number of filter and synthesizer", ge=1, le=1e6)
+    condition_limit: float = _f(
+        1e3, "1", "tolerated condition number of filter and synthesizer", ge=1, le=1e6
+    )
     stations: tuple[float, ...] = _f(
         (0.05, 0.10, 0.15), "m", "where chord deflection is taken", min_length=1, max_length=20
     )
@@ -227,7 +263,10 @@ class Study(Section):
             *sections, leaf = name.split("__")
             target = data
             for section in sections:
-                target = target[section]
+                target = target.setdefault(section, {})
+                if not isinstance(target, dict):
+                    field = name.replace("__", ".")
+                    raise StudyError(f"{field}: {section} is no section of a study")
             target[leaf] = value
         return parse_study(data)
 
@@ -238,12 +277,22 @@ def parse_study(data: dict[str, Any]) -> Study:
     Raises:
         StudyError: first fault found, with field, value, allowed range and unit.
     """
+    data = {name: _plain(value) for name, value in data.items()}
     try:
         study = Study.model_validate(data)
     except ValidationError as error:
-        raise _explain(error) from None
+        raise explain(error, Study, data) from None
     check_consistency(study)
     return study
+
+
+def _plain(value: Any) -> Any:
+    """Lists as tuples and NumPy's numbers as Python's, all the way down."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {name: _plain(entry) for name, entry in value.items()}
+    return tuple(map(_plain, value)) if isinstance(value, (list, tuple)) else value
 
 
 def load_study(path: str | Path) -> Study:
@@ -261,162 +310,12 @@ def load_study(path: str | Path) -> Study:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise StudyError(f"study file {path}: cannot be read ({reason})") from None
     try:
-        return parse_study(tomllib.loads(text))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        data = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # ValueError: also a number of 5000 digits
         raise StudyError(f"study file {path}: not valid TOML ({error})") from None
+    return parse_study(data)
 
 
 def paper_study() -> Study:
     """The paper's case, `studies/specs/paper.toml`."""
     return load_study(Path(__file__).parent / "specs" / "paper.toml")
-
-
-def _explain(error: ValidationError) -> StudyError:
-    fault = error.errors(include_url=False)[0]
-    location = [part for part in fault["loc"] if not _is_union_tag(part)]
-    field = ".".join(str(part) for part in location)
-    if fault["type"] == "extra_forbidden":
-        model, names = Study, list(Study.model_fields)
-        for part in location[:-1]:
-            inner = model.model_fields[str(part)].annotation
-            if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
-                break
-            model, names = inner, list(inner.model_fields)  # type: ignore[assignment]
-        close = nearest(str(location[-1]), names)
-        hint = f"did you mean {close}?" if close else f"known here: {', '.join(names)}"
-        return StudyError(f"{field} = {fault['input']!r}: unknown field; {hint}")
-    return field_error(field, fault["input"], _allowed(fault, location), _unit(location))
-
-
-def _is_union_tag(part: Any) -> bool:
-    text = str(part)
-    return text in ("float", "int", "str") or "[" in text or text.startswith("tuple")
-
-
-def _allowed(fault: Any, location: list) -> str:
-    context = fault.get("ctx", {})
-    model: Any = Study
-    for part in location:
-        if not (isinstance(model, type) and issubclass(model, BaseModel)):
-            break
-        info = model.model_fields.get(str(part))
-        if info is None:
-            break
-        model = info.annotation
-        limits = []
-        for item in info.metadata:
-            for name, sign in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<=")):
-                if getattr(item, name, None) is not None:
-                    limits.append(f"{sign} {getattr(item, name):g}")
-        if limits and fault["type"] in (
-            "greater_than", "greater_than_equal", "less_than", "less_than_equal"
-        ):  # fmt: skip
-            return " and ".join(limits)
-    if "expected" in context:
-        return str(context["expected"])
-    return str(fault["msg"]).removeprefix("Input should be ").removeprefix("Value error, ")
-
-
-def _unit(location: list) -> str:
-    model: Any = Study
-    unit = ""
-    for part in location:
-        if not (isinstance(model, type) and issubclass(model, BaseModel)):
-            break
-        info = model.model_fields.get(str(part))
-        if info is None:
-            break
-        extra = info.json_schema_extra
-        unit = str(extra.get("unit", "")) if isinstance(extra, dict) else ""
-        model = info.annotation
-    return unit
-
-
-def patch_centers(study: Study) -> np.ndarray:
-    """Patch centres of every link [m], (3, K)."""
-    centers = study.patches.centers
-    is_nested = len(centers) > 0 and isinstance(centers[0], tuple)
-    rows = centers if is_nested else (centers,) * 3
-    if len(rows) != 3 or len({len(row) for row in rows}) != 1 or not rows[0]:  # type: ignore[arg-type]
-        raise field_error(
-            "patches.centers", centers, "one list of centres, or three lists of equal length", "m"
-        )
-    return np.array(rows, float)
-
-
-def check_consistency(study: Study) -> None:
-    """Faults that involve more than one field. Physical ones of a pose are found in `studies.cases`.
-
-    Raises:
-        StudyError: the first fault.
-    """
-    link, patches, control = study.link, study.patches, study.control
-    centers = patch_centers(study)
-    half = max(patches.sensor_length, patches.actuator_length) / 2
-    for row in centers:
-        ordered = np.sort(row)
-        if ordered[0] < half - 1e-12 or ordered[-1] > link.length - half + 1e-12:
-            raise field_error(
-                "patches.centers", _plain(row),
-                f"{half:g} to {link.length - half:g}, so that no patch leaves the link", "m",
-            )
-        if np.any(np.diff(ordered) < 2 * half - 1e-12):
-            raise field_error(
-                "patches.centers", _plain(row),
-                f"centres at least {2 * half:g} apart, so that no patches overlap", "m",
-            )
-    n_patches = centers.shape[1]
-    if control.law == "imsc" and control.modes > n_patches:
-        raise field_error(
-            "control.modes", control.modes,
-            f"1 to {n_patches}, the number of patch pairs of a link", "1",
-        )
-    _check_lists(study)
-    if link.basis != "loaded" and (link.joint_inertia_b or link.joint_inertia_c):
-        raise field_error(
-            "link.basis", link.basis, "loaded, where a joint has rotary inertia", "-"
-        )
-    if study.drive.locked and link.basis == "pinned_free":
-        raise field_error(
-            "link.basis", link.basis, "pinned_pinned or loaded, where drive.locked is true", "-"
-        )
-    if study.electronics.antialias_hz >= study.electronics.sample_rate_hz / 2:
-        raise field_error(
-            "electronics.antialias_hz", study.electronics.antialias_hz,
-            f"below half the sample rate, {study.electronics.sample_rate_hz / 2:g}", "Hz",
-        )
-    for station in (*study.metrics.stations, study.initial.load_station):
-        if not 0 < station < link.length:
-            raise field_error(
-                "metrics.stations / initial.load_station", station,
-                f"between 0 and link.length = {link.length:g}", "m",
-            )
-
-
-def _check_lists(study: Study) -> None:
-    moves = len(study.motion.waypoints) - 1
-    for name, low in (("move_time", "above 0"), ("dwell", "0 or more")):
-        value = getattr(study.motion, name)
-        values = value if isinstance(value, tuple) else (value,) * moves
-        if isinstance(value, tuple) and len(value) != moves:
-            raise field_error(
-                f"motion.{name}", value, f"one number, or {moves} of them (one per move)", "s"
-            )
-        if any(v < 0 or (v == 0 and name == "move_time") for v in (values or (value,))):
-            raise field_error(f"motion.{name}", value, low, "s")
-    control = study.control
-    tables = (
-        ("control.ratios", control.ratios, control.modes, "1"),
-        ("control.mode_mask", control.mode_mask, control.modes, "1"),
-        ("initial.modal", study.initial.modal, study.link.modes, "m"),
-    )
-    for name, table, _width, unit in tables:
-        if table and len(table) != 3:
-            raise field_error(name, table, "three lists, one per link", unit)
-    for name, table, width, unit in tables[1:]:
-        if any(len(row) > width for row in table):
-            raise field_error(name, table, f"at most {width} entries per link", unit)
-
-
-def _plain(row: np.ndarray) -> list[float]:
-    return [float(f"{x:.9g}") for x in row]

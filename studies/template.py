@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 from pydantic import BaseModel
 
+from studies.explain import allowed_values, unit_of
 from studies.spec import Study
 
 
-def study_template() -> str:
-    """A complete commented study file that reads back as the default study."""
-    lines = ["# Study file: every field with its default. SI units unless the name says otherwise.", ""]
-    study = Study()
+def study_template(study: Study | None = None) -> str:
+    """A complete commented study file that reads back as `study`, default: all defaults."""
+    study = study or Study()
+    lines = ["# Study file: every field, in SI units unless its name says otherwise.", ""]
     lines += _field(study, "title")
     for name in Study.model_fields:
         section = getattr(study, name)
@@ -25,17 +27,9 @@ def study_template() -> str:
 
 def _field(section: BaseModel, name: str) -> list[str]:
     info = type(section).model_fields[name]
-    extra = info.json_schema_extra
-    unit = extra.get("unit", "") if isinstance(extra, dict) else ""
-    limits = [
-        f"{sign} {getattr(item, key):g}"
-        for item in info.metadata
-        for key, sign in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
-        if getattr(item, key, None) is not None
-    ]
-    choices = [repr(v) for v in getattr(info.annotation, "__args__", ()) if isinstance(v, str)]
-    allowed = ", ".join(limits) or " | ".join(choices)
-    note = f"{info.description} [{unit}]" + (f"; {allowed}" if allowed else "")
+    unit = unit_of(info)
+    allowed = allowed_values(info.annotation, info.metadata)
+    note = f"{info.description}{f' [{unit}]' if unit else ''}; {allowed}"
     return [f"# {note}", f"{name} = {toml_value(getattr(section, name))}"]
 
 
@@ -43,8 +37,8 @@ def toml_value(value: Any) -> str:
     """A Python value as TOML."""
     if isinstance(value, bool):
         return "true" if value else "false"
-    if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, str):  # JSON escapes all that TOML wants escaped but one
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, (tuple, list)):
-        return "[" + ", ".join(toml_value(v) for v in value) + "]"
+        return "[" + ", ".join(toml_value(entry) for entry in value) + "]"
     return repr(value)

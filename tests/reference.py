@@ -99,6 +99,13 @@ def modal_load(machine, basis, q, q_rate, force):
     return force - damping * q_rate - basis.stiffness * q
 
 
+def inertia(energy, z, z_rate):
+    """Mass matrix and velocity terms of d/dt dT/dz' - dT/dz."""
+    mass = jax.hessian(energy, 1)(z, z_rate)
+    change = jax.jvp(lambda at: jax.grad(energy, 1)(at, z_rate), (z,), (z_rate,))[1]
+    return mass, change - jax.grad(energy)(z, z_rate)
+
+
 def by_lagrangian(machine, basis, motion: Motion, loads: Loads):
     """Accelerations (X'' (3,), q'' (3, R)) from the Lagrangian in (X, q)."""
     shape = motion.q.shape
@@ -116,8 +123,7 @@ def by_lagrangian(machine, basis, motion: Motion, loads: Loads):
 
     z = jnp.concatenate([motion.pose, motion.q.ravel()])
     z_rate = jnp.concatenate([motion.pose_rate, motion.q_rate.ravel()])
-    mass = jax.hessian(energy, 1)(z, z_rate)
-    inertial = jax.jacfwd(jax.grad(energy, 1), 0)(z, z_rate) @ z_rate - jax.grad(energy)(z, z_rate)
+    mass, inertial = inertia(energy, z, z_rate)
     on_modes = modal_load(machine, basis, motion.q, motion.q_rate, loads.modal)
     load = jnp.concatenate([jnp.zeros(3), on_modes.ravel()])
     load = load + jax.jacfwd(lambda z: joint_coordinates(z)[0])(z).T @ loads.slider
@@ -147,8 +153,7 @@ def by_multipliers(machine, basis, motion: Motion, loads: Loads):
     y, y_rate = jax.jvp(
         all_coordinates, ((motion.pose, motion.q),), ((motion.pose_rate, motion.q_rate),)
     )
-    mass = jax.hessian(energy, 1)(y, y_rate)
-    inertial = jax.jacfwd(jax.grad(energy, 1), 0)(y, y_rate) @ y_rate - jax.grad(energy)(y, y_rate)
+    mass, inertial = inertia(energy, y, y_rate)
     on_modes = modal_load(machine, basis, motion.q, motion.q_rate, loads.modal)
     load = jnp.concatenate([loads.slider, jnp.zeros(6), on_modes.ravel()])
     jacobian = jax.jacfwd(constraints)(y)

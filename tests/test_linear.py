@@ -1,112 +1,127 @@
-"""The assembled machine against an independent finite-element multibody code."""
+"""Linearisation and free motion against an independent finite-element multibody code."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from jaxmodel.linear import frequency_response, linearise
+from jaxmodel.linear import flatten, frequency_response, linearise, natural_modes, unflatten
+from jaxmodel.loop import PlantState
 from jaxmodel.parameters import HOME
 from jaxmodel.prepare import prepare
+from jaxmodel.simulate import simulate
 from studies.cases import as_arrays, build_case, build_structure
-from studies.errors import StudyError
-from studies.modes import machine_modes
-from studies.runs import chord_deflection, run_study
 from studies.spec import paper_study
 
 DATA = Path(__file__).parent / "data"
-CASES = {
-    "sliders_locked": {"locked": True},
-    "sliders_free": {"kp": 0.0},
-    "sliders_on_springs_2e4_N_per_m": {"kp": 2e4},
+UNDAMPED = paper_study().change(
+    link__modes=3, link__damping_ratio=0.0, control__feedback="none", drive__kd=0.0
+)
+ORACLE = {  # case of the finite-element code: fields that make it
+    "sliders_locked": {"drive__locked": True},
+    "sliders_free": {"drive__kp": 0.0},
+    "sliders_on_springs_2e4_N_per_m": {},
 }
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_frequencies_of_the_assembled_machine(name):
-    wanted = np.array(json.loads((DATA / "frequencies.json").read_text())["cases"][name])
-    found = machine_modes(**CASES[name]).frequency
-    assert np.all(np.diff(found) >= 0)
-    wanted = wanted[(wanted > 1) & (wanted < 1100)]
-    elastic = found[(found > 1) & (found < 1100)]
-    np.testing.assert_allclose(elastic, wanted, rtol=5e-4)
-    if name == "sliders_free":
-        assert found.size == 12 and np.all(found[:3] < 0.1)
+@partial(jax.jit, static_argnums=0)
+def linear_plant(structure, case):
+    loop = prepare(structure, case).loop
+    return linearise(structure, loop, np.array(HOME), case.electronics.antialias)
 
 
-def test_one_mode_is_enough():
-    """The chord frame converges at once: one mode per link gives 114.65 and 115.04 Hz."""
-    found = machine_modes(kp=0.0, n_modes=1).frequency
-    np.testing.assert_allclose(found[3:], (114.6518, 115.0373, 115.0373), rtol=1e-5)
+def linear(study):
+    plant = linear_plant(build_structure(study), as_arrays(build_case(study)))
+    return jax.tree.map(np.asarray, plant)
 
 
-def test_paper_basis_converges_slowly():
-    """Three pinned-free modes per link: 114.9 and 462.8 Hz."""
-    found = machine_modes(kp=0.0, basis="pinned_free").frequency
-    assert found[3] == pytest.approx(114.9, abs=0.06)
-    assert found[6] == pytest.approx(462.8, abs=0.06)
+def oracle_frequencies(name):
+    given = np.array(json.loads((DATA / "frequencies.json").read_text())["cases"][name])
+    return given[given > 1]  # its free rigid motions sit between 0 and 0.05 Hz
 
 
-def test_both_assemblies_have_the_same_frequencies():
-    def at_home(assembly):
-        study = paper_study().change(
-            machine__assembly=assembly, link__modes=3, link__damping_ratio=0.0, drive__kd=0.0
-        )
-        structure, case = build_structure(study), as_arrays(build_case(study))
-        loop = jax.jit(prepare, static_argnums=0)(structure, case).loop
-        plant = linearise(structure, loop, np.array(HOME), case.electronics.antialias)
-        return np.sort(np.abs(np.linalg.eigvals(np.asarray(plant.state))))
-
-    np.testing.assert_allclose(at_home("inward"), at_home("outward"), rtol=1e-6)
+@pytest.mark.parametrize("name", ORACLE)
+def test_frequencies_equal_finite_elements(name):
+    modes = natural_modes(linear(UNDAMPED.change(**ORACLE[name])))
+    rigid = modes.frequency[modes.frequency < 1]
+    found = modes.frequency[modes.frequency > 1]
+    assert rigid.size == (0 if "springs" in name else 3)
+    np.testing.assert_allclose(found, oracle_frequencies(name), rtol=2e-4)
+    assert not modes.damping_ratio.any()
 
 
-def test_drive_damping_and_structural_damping_show():
-    quiet, driven = machine_modes(), machine_modes(kd=60.0)
-    assert np.all(quiet.damping_ratio == 0)
-    assert driven.frequency.size == quiet.frequency.size
-    assert np.all(driven.damping_ratio[:3] > 0.1)
-    structural = machine_modes(damping=0.01, locked=True)
-    np.testing.assert_allclose(structural.damping_ratio[3:], 0.01, rtol=1e-6)
+def test_one_mode_is_enough_for_the_first_frequency():
+    modes = natural_modes(linear(UNDAMPED.change(link__modes=1, drive__kp=0.0)))
+    wanted = oracle_frequencies("sliders_free")[:3]
+    np.testing.assert_allclose(modes.frequency[3:], wanted, rtol=3e-6)
 
 
-def test_locked_needs_a_basis_that_is_still_at_the_tip():
-    with pytest.raises(StudyError, match="pinned_free"):
-        machine_modes(locked=True, basis="pinned_free")
+def test_pinned_free_modes_converge_slowly_to_the_same_frequencies():
+    modes = natural_modes(linear(UNDAMPED.change(link__basis="pinned_free", drive__kp=0.0)))
+    np.testing.assert_allclose(modes.frequency[[3, 6]], [114.9, 462.8], atol=0.05)
 
 
-def test_frequency_response_has_its_static_value_and_its_resonance():
-    study = paper_study().change(link__modes=3)
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    loop = jax.jit(prepare, static_argnums=0)(structure, case).loop
-    plant = linearise(structure, loop, np.array(HOME), case.electronics.antialias)
-    frequency = np.array([0.0, 20.0, 114.7, 200.0])
-    response = np.abs(frequency_response(plant, plant.deflection, plant.voltage, frequency))
-    # a static voltage bends its own link by Y_j lambda_a Phi_a/k_j
-    static = np.einsum(
-        "sr,rk->sk",
-        np.asarray(loop.deflection_at[0]),
-        np.asarray(loop.actuator[0]) / np.asarray(loop.plant.stiffness[0])[:, None],
+def test_first_frequencies_are_the_same_for_the_other_assembly():
+    changes = {"machine__assembly": "outward", "drive__kp": 0.0}
+    modes = natural_modes(linear(UNDAMPED.change(**changes)))
+    np.testing.assert_allclose(modes.frequency[3:], oracle_frequencies("sliders_free"), rtol=2e-4)
+
+
+def test_damping_ratio_of_the_links_alone():
+    modes = natural_modes(linear(UNDAMPED.change(link__damping_ratio=0.013, drive__locked=True)))
+    np.testing.assert_allclose(modes.damping_ratio[3:], 0.013, rtol=1e-9)
+
+
+def test_overdamped_pairs_keep_their_frequency_and_damping():
+    plant = linear(UNDAMPED.change(drive__kd=600.0, link__damping_ratio=0.01))
+    modes = natural_modes(plant)
+    assert modes.frequency.size == 3 + 9 and np.all(np.diff(modes.frequency) >= 0)
+    # the product of all poles is det A, so frequencies multiply to its root
+    mechanical = np.prod(np.linalg.eigvals(plant.state[:24, :24]))
+    log_product = 2 * np.sum(np.log(2 * np.pi * modes.frequency))
+    np.testing.assert_allclose(log_product, np.log(mechanical.real), rtol=1e-9)
+    assert np.sum(modes.damping_ratio >= 1) >= 3
+
+
+def test_response_of_a_locked_link_to_its_actuators_is_the_modal_sum():
+    study = UNDAMPED.change(link__damping_ratio=0.01, drive__locked=True)
+    plant = linear(study)
+    frequency = np.array([1.0, 60.0, 114.39, 300.0, 457.5])
+    found = np.asarray(frequency_response(plant, plant.deflection, plant.voltage, frequency))
+    loop = jax.jit(prepare, static_argnums=0)(
+        build_structure(study), as_arrays(build_case(study))
+    ).loop
+    omega, s = np.asarray(loop.omega[0]), 2j * np.pi * frequency[:, None]
+    receptance = 1 / (loop.plant.mass[0] * (s**2 + 0.02 * omega * s + omega**2))
+    modal_sum = np.einsum(
+        "sr,fr,rk->fsk", loop.deflection_at[0], np.asarray(receptance), loop.actuator[0]
     )
-    np.testing.assert_allclose(response[0, :3, :3], np.abs(static), rtol=1e-8)
-    assert response[2, 1, 1] > 20 * response[0, 1, 1]
+    scale = np.abs(modal_sum).max()
+    np.testing.assert_allclose(found[:, :3, :3], modal_sum, atol=1e-10 * scale)
+    np.testing.assert_allclose(found[:, 3:, :3], 0, atol=1e-10 * scale)  # no way to other links
 
 
-def test_released_beam_moves_as_in_the_finite_element_code():
-    """Link 1 bent by a load at mid-span, sliders locked, no damping: first 0.05 s within 1 %."""
-    table = np.loadtxt(DATA / "free_response.csv", delimiter=",")
-    study = paper_study().change(
-        run__duration=0.0601, link__modes=3, link__damping_ratio=0.0, drive__locked=True,
-        control__feedback="none", shaper__kind="none", motion__waypoints=(HOME,),
-        metrics__residual_length=0.01, electronics__sample_rate_hz=10e3,
+def test_flatten_and_unflatten_are_inverse():
+    rng = np.random.default_rng(0)
+    state = PlantState(*rng.normal(size=(2, 3)), *rng.normal(size=(4, 3, 5)))
+    for before, after in zip(state, unflatten(flatten(state), 5), strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_released_link_moves_like_the_finite_element_link():
+    given = np.loadtxt(DATA / "free_response.csv", delimiter=",")
+    study = UNDAMPED.change(
+        link__modes=8, drive__locked=True, run__duration=0.0501,
+        motion__waypoints=((0.0, 0.0, HOME[2]),), shaper__kind="none",
         initial__load_station=0.1, initial__load_deflection=(5e-5, 0.0, 0.0),
+        metrics__stations=(0.1,),
     )  # fmt: skip
-    run = run_study(study)
-    time = np.asarray(run.result.record.time)
-    table = table[table[:, 0] <= 0.05 + 1e-9]
-    index = np.round(table[:, 0] * 10e3).astype(int)
-    np.testing.assert_allclose(time[index], table[:, 0], atol=1e-9)
-    found = chord_deflection(run)[index, 0]
-    assert np.abs(found - table[:, 1]).max() < 0.01 * 5e-5
-    assert np.abs(chord_deflection(run)[:, 1:]).max() < 1e-9
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    record = jax.jit(simulate, static_argnums=(0, 2))(structure, case, True).record
+    deflection = np.asarray(record.chord_deflection_stations)[:, :, 0]
+    np.testing.assert_allclose(record.time[::2], given[:, 0], atol=1e-12)
+    np.testing.assert_allclose(deflection[::2, 0], given[:, 1], atol=0.01 * 5e-5)
+    assert not deflection[:, 1:].any()

@@ -116,7 +116,7 @@ def changed(**fields):
         (changed() | {"a/b": VARIABLES["span"]}, {}, "variable = 'a/b'"),
         (changed() | {"case": Variable(np.arange(4), ("case",), "1", "case")}, {},
          "length of case along case = 4: allowed 3"),
-        (changed() | {"link": VARIABLES["span"]}, {}, "link.dims = ()"),
+        (changed() | {"link": VARIABLES["span"]}, {}, "link.dims = []"),
         ({}, {"spec": None}, "attribute spec"),
         ({}, {"grid": [[1, 2]]}, "attribute grid"),
         ({}, {"a b": 1}, "attribute = 'a b'"),

@@ -1,0 +1,38 @@
+"""Draw docs/first_picture.png: what is left of a fast square with and without control."""
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+import studies
+
+
+def main() -> None:
+    """Run the paper's square at 0.03 s a move without shaper, twice, and plot the bending."""
+    studies.configure()
+    fast = studies.paper_study().change(
+        motion__move_time=0.03, shaper__kind="none", run__duration=0.5
+    )
+    runs = {
+        "without control": studies.run_study(fast.change(control__gain_factor=0.0)),
+        "with control": studies.run_study(fast),
+    }
+    figure, axes = plt.subplots(3, 1, sharex=True, figsize=(7, 5), layout="constrained")
+    for (label, run), color in zip(runs.items(), ("0.6", "C0"), strict=True):
+        time = 1e3 * (run.result.record.time - run.result.command_end)
+        for axis, deflection in zip(axes, 1e6 * studies.chord_deflection(run).T, strict=True):
+            axis.plot(time, deflection, color=color, lw=1.2, label=label)
+    for i, axis in enumerate(axes):
+        axis.axvline(0, color="0.3", ls="--", lw=1)
+        axis.set(ylabel=f"link {i + 1} [µm]", xlim=(-20, 200), ylim=(-60, 60))
+    axes[0].legend(loc="upper right")
+    axes[0].set_title("Bending at mid-span; the command ends at 0 (four moves of 10 mm in 30 ms)")
+    axes[-1].set_xlabel("time [ms]")
+    figure.savefig(Path(__file__).with_name("first_picture.png"), dpi=110)
+
+
+if __name__ == "__main__":
+    main()

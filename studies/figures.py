@@ -1,0 +1,168 @@
+"""Plots of the studies, in one style. Each takes data in SI units and an optional axes.
+
+They compute nothing but units. Colours are those of Okabe and Ito, which colour-blind readers tell
+apart; in grey print the two curves of a comparison differ in lightness and width.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+WITHOUT: dict[str, Any] = {"color": "#E69F00", "linewidth": 1.6, "label": "without control"}
+CONTROLLED: dict[str, Any] = {"color": "#0B3C6F", "linewidth": 0.8, "label": "with control"}
+SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000")
+DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)))
+
+STYLE: dict[str, Any] = {
+    "font.size": 8.5,
+    "axes.titlesize": 9,
+    "axes.labelsize": 8.5,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.color": "#DDDDDD",
+    "grid.linewidth": 0.5,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "lines.solid_joinstyle": "round",
+    "figure.dpi": 100,
+    "savefig.dpi": 150,
+    "path.simplify_threshold": 0.5,
+}
+
+
+def styled() -> Any:
+    """Context in which figures of this project are made and saved."""
+    return matplotlib.rc_context(STYLE)  # type: ignore[arg-type]
+
+
+def new_figure(
+    rows: int, columns: int, row_height: float = 1.9, has_shared_abscissa: bool = True
+) -> tuple[Figure, np.ndarray]:
+    """Figure of the printed page's width with its axes, (rows, columns); row_height in inches."""
+    figure = Figure(figsize=(7.4, 0.75 + row_height * rows), layout="constrained")
+    axes = figure.subplots(
+        rows, columns, squeeze=False, sharex="col" if has_shared_abscissa else "none"
+    )
+    return figure, axes
+
+
+def legend_above(figure: Figure, ax: Axes) -> None:
+    """One legend for the whole figure, with the entries of `ax`."""
+    handles, labels = ax.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+
+
+def save(figure: Figure, folder: Path, name: str) -> None:
+    """Write the figure as PNG and PDF."""
+    figure.savefig(folder / f"{name}.png")
+    figure.savefig(folder / f"{name}.pdf")
+
+
+def _axes(ax: Axes | None) -> Axes:
+    return plt.subplots(layout="constrained")[1] if ax is None else ax
+
+
+def comparison(
+    time: np.ndarray,
+    without: np.ndarray,
+    controlled: np.ndarray,
+    label: str,
+    ax: Axes | None = None,
+) -> Axes:
+    """Two responses over time.
+
+    Args:
+        time: [s], (T,).
+        without: response without control, in the unit of the label, (T,).
+        controlled: the same with control, (T,).
+        label: quantity and unit of the ordinate.
+        ax: where to draw; a new figure where left out.
+    """
+    ax = _axes(ax)
+    ax.plot(time, without, **WITHOUT)
+    ax.plot(time, controlled, **CONTROLLED)
+    ax.set_ylabel(label)
+    ax.margins(x=0.01)
+    return ax
+
+
+def magnified(
+    time: np.ndarray,
+    without: np.ndarray,
+    controlled: np.ndarray,
+    span: tuple[float, float],
+    limit: float,
+    ax: Axes,
+) -> Axes:
+    """Inset in the upper right of a `comparison`: the responses in `span` [s] and +- `limit`."""
+    low, high = ax.get_ylim()
+    ax.set_yticks([tick for tick in ax.get_yticks() if low <= tick <= high])
+    ax.set_ylim(low, high + 1.1 * (high - low))  # room above the curves
+    inset = ax.inset_axes((0.56, 0.58, 0.42, 0.4))
+    part = (time >= span[0]) & (time <= span[1])
+    inset.plot(time[part], without[part], **WITHOUT | {"linewidth": 1.0})
+    inset.plot(time[part], controlled[part], **CONTROLLED | {"linewidth": 0.6})
+    inset.set_xlim(span)
+    inset.set_ylim(-limit, limit)
+    inset.tick_params(labelsize=6.5, length=2, pad=1.5)
+    inset.locator_params(nbins=3, axis="y")
+    inset.locator_params(nbins=4, axis="x")
+    return inset
+
+
+def spectrum(
+    frequency: np.ndarray,
+    without: np.ndarray,
+    controlled: np.ndarray | None,
+    mode_hz: float,
+    label: str,
+    ax: Axes | None = None,
+) -> Axes:
+    """Power spectral density of a mode.
+
+    Args:
+        frequency: [Hz], (F,).
+        without: without control [m2/Hz], (F,).
+        controlled: with control [m2/Hz], (F,); None to leave it out.
+        mode_hz: frequency to mark [Hz].
+        label: quantity and unit of the ordinate.
+        ax: where to draw; a new figure where left out.
+    """
+    ax = _axes(ax)
+    ax.axvline(mode_hz, color="#888888", linewidth=0.8, linestyle=":")
+    ax.semilogy(frequency[1:], without[1:], **WITHOUT)
+    if controlled is not None:
+        ax.semilogy(frequency[1:], controlled[1:], **CONTROLLED | {"linewidth": 1.0})
+    ax.set_ylabel(label)
+    ax.margins(x=0.01)
+    return ax
+
+
+def sensitivity(
+    ratio: np.ndarray, curves: dict[str, np.ndarray], level: float, ax: Axes | None = None
+) -> Axes:
+    """Residual vibration of input shapers over the error of the frequency they assume.
+
+    Args:
+        ratio: actual over assumed frequency [1], (n,).
+        curves: residual vibration relative to the unshaped one [1], (n,), by shaper.
+        level: tolerated residual vibration, marked [1].
+        ax: where to draw; a new figure where left out.
+    """
+    ax = _axes(ax)
+    ax.axhline(100 * level, color="#888888", linewidth=0.8, linestyle=":")
+    for k, (name, curve) in enumerate(curves.items()):
+        ax.plot(ratio, 100 * curve, color=SERIES[k], linestyle=DASHES[k], linewidth=1.3, label=name)
+    ax.set_xlabel("actual over assumed frequency [1]")
+    ax.set_ylabel("residual vibration [%]")
+    ax.legend()
+    return ax

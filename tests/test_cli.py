@@ -1,0 +1,269 @@
+"""The command line: what it writes, and that bad input ends in one message and exit code 2.
+
+All short runs share one machine of two modes, so that it is compiled once.
+"""
+
+import contextlib
+import io
+import json
+import math
+
+import numpy as np
+import pytest
+import xarray
+
+from studies.cli import main
+
+HOME_PHI = math.pi / 6
+SHORT = f"""
+[run]
+duration = 0.05
+[link]
+modes = 2
+[control]
+modes = 2
+[motion]
+waypoints = [[0, 0, {HOME_PHI}], [0, 0.002, {HOME_PHI}]]
+move_time = 0.02
+[metrics]
+residual_length = 0.02
+"""
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout and stderr of a command."""
+    code = 0
+    try:
+        main([str(argument) for argument in arguments])
+    except SystemExit as end:
+        code = end.code
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def refused(capsys, *arguments):
+    """Its only line on stderr, of a command that must fail."""
+    code, _, err = run(capsys, *arguments)
+    assert code == 2
+    assert err.startswith("studies: ") and err.count("\n") == 1, err
+    return err
+
+
+def refused_study(capsys, folder, text):
+    """The message of `studies simulate` on a bad study, which must leave no file."""
+    (folder / "bad.toml").write_text(text)
+    message = refused(capsys, "simulate", folder / "bad.toml", "--out", folder / "run.h5")
+    assert [entry.name for entry in folder.iterdir()] == ["bad.toml"]
+    return message
+
+
+@pytest.fixture(scope="module")
+def short_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    (folder / "short.toml").write_text('title = "short"\n' + SHORT)
+    shown = io.StringIO()
+    with contextlib.redirect_stdout(shown):
+        main(["simulate", str(folder / "short.toml"), "--out", str(folder / "run.h5")])
+    assert "status: ok" in shown.getvalue() and "[um]" in shown.getvalue()
+    assert f"written: {folder / 'run.h5'}\n" in shown.getvalue()
+    with xarray.open_dataset(folder / "run.h5", engine="h5netcdf") as data:
+        return data.load()
+
+
+TRAJECTORIES = {
+    "time": (("time",), "s"),
+    "pose": (("time", "pose_axis"), "m; m; rad"),
+    "pose_error": (("time", "pose_axis"), "m; m; rad"),
+    "slider": (("time", "slider_axis"), "m"),
+    "modal_coordinate": (("time", "link", "mode"), "m"),
+    "chord_deflection": (("time", "link"), "m"),
+    "chord_deflection_stations": (("time", "link", "station"), "m"),
+    "sensor_voltage": (("time", "link", "patch"), "V"),
+    "actuator_voltage": (("time", "link", "patch"), "V"),
+    "slider_force": (("time", "slider_axis"), "N"),
+}
+
+
+@pytest.mark.parametrize("name", TRAJECTORIES)
+def test_simulate_writes_labelled_trajectories(short_run, name):
+    dims, units = TRAJECTORIES[name]
+    assert short_run[name].dims == dims
+    assert short_run[name].attrs["units"] == units
+    assert short_run[name].attrs["long_name"]
+    assert short_run[name].dtype == np.float64
+    assert np.all(np.isfinite(short_run[name]))
+
+
+def test_simulate_writes_a_consistent_run(short_run):
+    axes = {"time": 500, "link": 3, "station": 3, "mode": 2, "patch": 3, "pose_axis": 3}
+    assert {name: short_run.sizes[name] for name in axes} == axes
+    np.testing.assert_allclose(short_run.time, np.arange(500) * 1e-4, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(short_run.station, [0.05, 0.10, 0.15])
+    assert list(short_run.pose_axis.values) == ["x", "y", "phi"]
+    assert int(short_run.status) == 0 and float(short_run.gain_margin) > 1
+    assert json.loads(short_run.attrs["study"])["title"] == "short"
+    # the platform arrives (2 mm within 50 um), and middle and mid-span station are one place
+    np.testing.assert_allclose(short_run.pose[-1], [0, 0.002, HOME_PHI], rtol=0, atol=5e-5)
+    middle = short_run.chord_deflection_stations.sel(station=0.10)
+    np.testing.assert_allclose(short_run.chord_deflection, middle, rtol=1e-12, atol=1e-18)
+    assert float(abs(short_run.actuator_voltage).max()) > 0.1
+
+
+def test_the_metrics_agree_with_the_trajectories(short_run):
+    after = short_run.time > float(short_run.command_end) - 0.5e-4
+    within = short_run.time < float(short_run.command_end) + 0.02 - 0.5e-4
+    window = short_run.chord_deflection_stations[(after & within).values]
+    rms = np.sqrt((window**2).mean("time"))
+    np.testing.assert_allclose(short_run.residual_rms, rms, rtol=1e-9)
+    peak = abs(short_run.actuator_voltage).max(("time", "patch"))
+    np.testing.assert_allclose(short_run.voltage_peak, peak, rtol=1e-12)
+
+
+def test_modes_as_json_and_as_table(capsys):
+    code, out, err = run(capsys, "modes", "--modes", 2, "--json")
+    found = json.loads(out)
+    assert (code, err) == (0, "")
+    assert list(found) == ["frequencies_hz", "damping_ratios"]
+    frequency = np.array(found["frequencies_hz"])
+    assert len(frequency) == len(found["damping_ratios"]) == 3 + 3 * 2
+    assert np.all(np.diff(frequency) >= 0)
+    assert found["damping_ratios"] == [0.0] * 9
+    # the links vibrate near their pinned-pinned frequencies
+    assert np.all(np.abs(frequency[3:6] / 114.39 - 1) < 0.01)
+    code, out, _ = run(capsys, "modes", "--modes", 2, "--kd", 60, "--damping", 0.01, "--locked")
+    assert code == 0 and "damping ratio" in out and "114.388" in out and "0.01000" in out
+
+
+def test_modes_at_another_pose_differ(capsys):
+    moved = run(capsys, "modes", "--modes", 2, "--pose", 0.01, 0.005, 0.6, "--json")
+    home = run(capsys, "modes", "--modes", 2, "--json")
+    moved, home = (np.array(json.loads(out)["frequencies_hz"]) for _, out, _ in (moved, home))
+    assert 1e-4 < np.max(np.abs(moved / home - 1)) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--kp", -1), "drive.kp = -1.0: allowed a finite number >= 0 and <= 1e+08 [N/m]"),
+        (("--kp", "stiff"), "Invalid value for '--kp'"),
+        (("--kd", "inf"), "drive.kd = inf: allowed a finite number"),
+        (("--damping", 1.5), "link.damping_ratio = 1.5: allowed a finite number >= 0 and < 1 [1]"),
+        (("--modes", 0), "link.modes = 0: allowed a whole number >= 1 and <= 16 [1]"),
+        (("--modes", 17), "link.modes = 17: allowed a whole number >= 1 and <= 16 [1]"),
+        (("--basis", "pinned_pined"), "did you mean 'pinned_pinned'?"),
+        (("--locked", "--basis", "pinned_free"), "allowed pinned_pinned or loaded, where"),
+        (("--pose", 1, 2), "Option '--pose' requires 3 arguments"),
+        (("--pose", "nan", 0, 0.5), "= nan: allowed a finite number"),
+        (("--modes", 2, "--pose", 0.5, 0, 0.5), "inside (0, 90) deg (here: pose out of reach)"),
+        (("--modes", 2, "--pose", 0.09526, 0.055, -1.047), "(here: singular pose: a link parallel"),
+        (("--poze", 1, 2, 3), "No such option: --poze (Possible options:"),
+    ],
+)
+def test_modes_refuses(capsys, arguments, words):
+    assert words in refused(capsys, "modes", *arguments)
+
+
+def change(old, new):
+    assert old in SHORT
+    return SHORT.replace(old, new)
+
+
+WAYPOINTS = f"[[0, 0, {HOME_PHI}], [0, 0.002, {HOME_PHI}]]"
+IDEAL = '[control]\nfeedback = "ideal"\nvelocity_gain = '
+# 110 mm against the normal of guide 1 every link stands well at phi = 0 and at -120 deg; turning
+# from one to the other takes h of link 1 from 29 mm through 0 (parallel to the guide) to -6 mm.
+X, Y = 0.0952627944, 0.055
+TURN = f"[[{X}, {Y}, 0], [{X}, {Y}, {-2 * math.pi / 3}]]"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            change(WAYPOINTS, f"[[0, 0, {HOME_PHI}], [0.3, 0, {HOME_PHI}]]"),
+            "motion.waypoints.1 = [0.3, 0.0, 0.523598775598",
+        ),
+        (change(WAYPOINTS, TURN), "(here: singular pose: a link parallel or perpendicular to its"),
+        (
+            change("duration = 0.05", "duration = 0.025"),
+            "run.duration = 0.025: allowed at least 0.0288, the end of the motion with its shaper",
+        ),
+        (
+            change("residual_length = 0.02", "residual_length = 0.04"),
+            "metrics.residual_length = 0.04: allowed up to 0.0212, what run.duration = 0.05 leaves",
+        ),
+        (
+            change("[control]", IDEAL + "[1e6, 1, 1]"),
+            "control.gain_factor = 0.5: allowed gains low enough for 200 plant steps per sample",
+        ),
+        (
+            change("[control]", IDEAL + "[1e3, 1, 1]").replace("[run]", "[run]\nsubsteps = 1"),
+            "run.substeps = 1: allowed ",
+        ),
+        (
+            SHORT + "[electronics]\nlowpass_ratio = [3.0, 11.0]",
+            "low-pass corners below half the sample rate, 5000 Hz; the highest of the 2 is at 5033",
+        ),
+        (change("[link]", "[link]\nlength = 0.01"), "patches.actuator_length = 0.03: allowed at"),
+        (
+            change("[link]", "[link]\nthickness = 0.1\nyoungs_modulus = 2e12\ndensity = 1"),
+            "link.modes = 2: allowed modes up to 1.592e+05 Hz at electronics.sample_rate_hz",
+        ),
+        ("[patches]\ncenters = [0.05, 0.06, 0.15]", "so that no patches overlap [m]"),
+        ("[control]\nmodes = 4", "control.modes = 4: allowed 1 to 3, the number of patch pairs"),
+        ("[run]\nduration = ", "not valid TOML"),
+    ],
+)
+def test_simulate_refuses(capsys, tmp_path, text, words):
+    assert words in refused_study(capsys, tmp_path, text)
+
+
+def test_a_binary_file_is_refused(capsys, tmp_path):
+    (tmp_path / "bad.toml").write_bytes(b"\x89HDF\r\n\x1a\n\xff")
+    message = refused(capsys, "simulate", tmp_path / "bad.toml", "--out", tmp_path / "run.h5")
+    assert "not UTF-8 text" in message
+    message = refused(capsys, "simulate", tmp_path / "none.toml", "--out", tmp_path / "run.h5")
+    assert "No such file" in message
+    assert [entry.name for entry in tmp_path.iterdir()] == ["bad.toml"]
+
+
+def test_a_target_that_cannot_be_written_is_refused_before_the_run(capsys, tmp_path):
+    (tmp_path / "short.toml").write_text(SHORT)
+    inside = tmp_path / "missing" / "run.h5"
+    message = refused(capsys, "simulate", tmp_path / "short.toml", "--out", inside)
+    assert "missing is not a folder; create it first" in message
+    message = refused(capsys, "simulate", tmp_path / "short.toml", "--out", tmp_path)
+    assert "it is a folder or a device; name a file" in message
+    below = tmp_path / "short.toml" / "run.h5"
+    assert "is not a folder" in refused(capsys, "simulate", tmp_path / "short.toml", "--out", below)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["short.toml"]
+
+
+def test_a_bad_precision_or_command_is_refused(capsys, tmp_path):
+    (tmp_path / "short.toml").write_text(SHORT)
+    arguments = ("simulate", tmp_path / "short.toml", "--out", tmp_path / "run.h5")
+    message = refused(capsys, *arguments, "--precision", "float16")
+    assert "precision = 'float16': allowed float64 or float32; did you mean 'float64'?" in message
+    assert "Missing option '--out'" in refused(capsys, *arguments[:2])
+    assert "No such command 'simulat'" in refused(capsys, "simulat")
+    code, out, _ = run(capsys)
+    assert code == 2 and "simulate" in out
+
+
+def test_init_writes_a_study_once(capsys, tmp_path):
+    target = tmp_path / "my.toml"
+    code, out, _ = run(capsys, "init", target)
+    assert code == 0 and "written" in out
+    text = target.read_text()
+    assert run(capsys, "init")[1] == text
+    assert "exists already; name a new file" in refused(capsys, "init", target)
+    assert target.read_text() == text
+    assert "is not a folder" in refused(capsys, "init", tmp_path / "missing" / "my.toml")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["my.toml"]
+
+
+def test_info_names_versions_devices_and_precision(capsys):
+    code, out, _ = run(capsys, "info")
+    assert code == 0
+    for word in ("flexlink-studies", "jax", "devices", "float64", "cache"):
+        assert word in out

@@ -1,0 +1,242 @@
+"""The paper's study end to end on a short run, and the tables and numbers it reports."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import xarray
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from studies import paper, paper_cases, paper_figures, report, report_context
+from studies.cli import main
+from studies.errors import StudyError
+from studies.figures import comparison
+from studies.paper_cases import ALL, OFF, run_cases
+from studies.paper_measures import measure
+from studies.runs import run_study
+from studies.spec import paper_study
+from studies.store import read_store
+
+#: Cases left out of the short run: more compilations, or seconds of eigenvalues each.
+LONG = ("ideal", "paper-gains-own-ratios", "paper-ratios", "paper-preset", "difference")
+
+
+def short_study():
+    """One move, few modes, 0.4 s."""
+    home = paper_study().motion.waypoints[0]
+    return paper_study().change(
+        run__duration=0.4,
+        metrics__residual_length=0.2,
+        link__modes=3,
+        motion__waypoints=(home, (home[0], 0.01, home[2])),
+    )
+
+
+class Short(NamedTuple):
+    folder: object
+    runs: paper_cases.PaperRuns
+    measures: object
+    printed: str
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("paper")
+    cases = [case for case in paper_cases.paper_cases(0.5) if case.name not in LONG]
+    kept = {}
+
+    def run(*arguments):
+        kept["runs"] = run_cases(*arguments)
+        return kept["runs"]
+
+    console = Console(record=True, width=120, quiet=False, file=open("/dev/null", "w"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper_cases, "JUDGED", ())
+        patch.setattr(paper, "run_cases", run)
+        few = {name: paper_figures.PAPER_FIGURES[name] for name in ("fig03", "fig14", "shapers")}
+        patch.setattr(paper, "PAPER_FIGURES", few)
+        paper.write_paper(folder, console, short_study(), cases)
+    return Short(folder, kept["runs"], measure(kept["runs"]), console.export_text())
+
+
+def test_folder_holds_whole_files_and_nothing_else(short):
+    names = sorted(file.name for file in short.folder.iterdir())
+    figures = [f"{name}.{kind}" for name in ("fig03", "fig14", "shapers") for kind in ("pdf", "png")]
+    assert names == sorted([*figures, "paper.h5", "report.md"])
+    assert (short.folder / "fig03.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert (short.folder / "fig03.pdf").read_bytes()[:5] == b"%PDF-"
+
+
+def test_status_of_every_case_is_printed(short):
+    for case in short.runs.cases:
+        assert case.name in short.printed
+    assert "report.md" in short.printed and "paper.h5" in short.printed
+
+
+@pytest.mark.filterwarnings("error")
+def test_data_open_in_xarray_and_agree_with_the_runs(short):
+    with xarray.open_dataset(short.folder / "paper.h5", engine="h5netcdf") as data:
+        assert list(data["case"].values) == [case.name for case in short.runs.cases]
+        for name in data.variables:
+            assert data[name].attrs["long_name"] and data[name].attrs["units"]
+        one = data.sel(case="fast-none-2modes-links12")
+        assert one["controlled_links"] == "1+2" and one["status_text"] == "ok"
+        # a case that separates two modes has no third one
+        third = one["controlled_coordinate"].sel(controlled_mode=3)
+        assert np.isnan(third).all() and not np.isnan(one["chord_deflection"]).any()
+        middle = one["chord_deflection_stations"].sel(station=0.1, method="nearest")
+        np.testing.assert_array_equal(one["chord_deflection"], middle)
+
+
+def test_batched_case_equals_its_own_run(short):
+    """Vmap, masks and padding change nothing: a three-link case run alone."""
+    k = short.runs.where(move="fast", shaper="ei", modes=3, links=ALL)
+    case = short.runs.cases[k]
+    study = paper_cases.case_study(short.runs.study, case, short.runs.ratio[k])
+    alone = run_study(study, has_record=False, has_loop=False).result.metrics
+    for name in ("residual_rms", "voltage_peak", "pose_error_rms"):
+        batched = getattr(short.runs.result.metrics, name)[k]
+        np.testing.assert_allclose(batched, getattr(alone, name), rtol=1e-6)
+
+
+def test_controlled_cases_take_ratios_of_their_uncontrolled_counterpart(short):
+    """(24) by hand for three modes; the comparison cases of section 5 control mode 1 only."""
+    runs = short.runs
+    off = runs.where(move="paper", shaper="none", modes=3, links=OFF)
+    on = runs.where(move="paper", shaper="none", modes=3, links=ALL)
+    energy = runs.result.metrics.modal_energy[off]
+    omega = runs.frame.modal_omega
+    by_hand = energy / energy[:, :1] * omega[:, :1] / omega
+    np.testing.assert_allclose(runs.ratio[on], by_hand, rtol=1e-12)
+    first = runs.where(modes=2, links=paper_cases.ONE)
+    np.testing.assert_array_equal(runs.ratio[first], [[1, 0, 0]] * 3)
+    assert not runs.ratio[off].any()
+    two = runs.where(modes=2, links=ALL)
+    assert (runs.ratio[two, :, 1] > 0).all() and not runs.ratio[two, :, 2].any()
+
+
+def test_control_acts_where_it_is_and_off_means_off(short):
+    metrics = short.runs.result.metrics
+    for k, case in enumerate(short.runs.cases):
+        np.testing.assert_array_equal(metrics.voltage_peak[k] > 0, case.links)
+    off = short.runs.where(move="fast", shaper="none", modes=3, links=OFF)
+    on = short.runs.where(move="fast", shaper="none", modes=3, links=ALL)
+    assert (short.measures.late_deflection[on] < 0.1 * short.measures.late_deflection[off]).all()
+
+
+def test_spectrum_of_a_known_oscillation(short):
+    """A sine of amplitude a: PSD at its frequency is a^2/2 over the Hann window's 1.5/T."""
+    runs = short.runs
+    record = runs.result.record
+    time, amplitude = record.time[0], 2e-6
+    frequency = 50 / (time.size * (time[1] - time[0]))  # on the grid, 125 Hz, near mode 1
+    wave = np.broadcast_to(
+        amplitude * np.sin(2 * np.pi * frequency * time)[:, None, None], (time.size, 3, 3)
+    )
+    coordinate = np.broadcast_to(wave, record.controlled_coordinate.shape)
+    changed = record._replace(controlled_coordinate=coordinate)
+    found = measure(runs._replace(result=runs.result._replace(record=changed)))
+    expected = amplitude**2 / 2 * 0.4 / 1.5
+    np.testing.assert_allclose(found.spectral_peak[:, :, 0], expected, rtol=1e-6)
+
+
+def test_late_window_and_settling_of_a_known_decay(short):
+    """x = exp(-t'/tau) after the command: rms in closed form, below 5 % after tau ln 20."""
+    runs = short.runs
+    record, end = runs.result.record, np.asarray(runs.result.command_end)
+    after = np.maximum(record.time - end[:, None], 0.0)
+    tau, peak = 0.03, 1e-6
+    shape = record.chord_deflection_stations.shape
+    decay = np.broadcast_to((peak * np.exp(-after / tau))[..., None, None], shape)
+    metrics = runs.result.metrics._replace(residual_peak=np.full(shape[:1] + shape[2:], peak))
+    changed = runs.result._replace(
+        record=record._replace(chord_deflection_stations=decay), metrics=metrics
+    )
+    found = measure(runs._replace(result=changed))
+    np.testing.assert_allclose(found.settling, tau * np.log(20), atol=1.1e-4)
+    length = runs.study.metrics.residual_length
+    low, high = length / 3, length
+    mean = tau / 2 * (np.exp(-2 * low / tau) - np.exp(-2 * high / tau)) / (high - low)
+    np.testing.assert_allclose(found.late_deflection, peak * np.sqrt(mean), rtol=5e-3)
+
+
+def test_report_holds_the_papers_numbers_and_those_of_the_run(short):
+    text = (short.folder / "report.md").read_text(encoding="utf-8")
+    for value in ("0.345", "0.412", "36.51 (-44.97 %)", "34.92 (-43.23 %)", "-52.21 %", "0.07 s"):
+        assert value in text
+    k = short.runs.where(move="fast", shaper="none", modes=2, links=OFF)
+    assert f"| ours, fast move (0.05 s), no shaper: link 1 | {short.measures.spectral_peak[k, 0, 0]:.3g} |" in text
+    for name in paper_figures.PAPER_FIGURES:
+        assert f"({name}.png)" in text
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    assert len(rows) > 60
+
+
+def test_table_1_percentages_are_the_papers():
+    """The constants against the percentages printed in the paper's table."""
+    percent = [[100 * (v / row[0] - 1) for v in row[1:]] for row in report.TABLE_1]
+    printed = [[-44.97, -43.62, -42.30], [-42.92, -43.23, -1.50], [-42.32, -1.84, 0.92]]
+    np.testing.assert_allclose(percent, printed, atol=0.006)
+
+
+def test_formatting():
+    assert report_context.change(0.5, 2.0) == "-75.0 %"
+    assert report_context.change(1.0, 0.0) == "-"
+    assert report_context.span([0.1, 0.1]) == "0.1"
+    assert report_context.table(["a", "b"], [["1", "2"]]) == ["| a | b |", "| --- | --- |", "| 1 | 2 |"]
+
+
+def test_every_figure_has_units_on_its_axes(short):
+    for figure in paper_figures.PAPER_FIGURES.values():
+        drawn = figure.draw(short.runs, short.measures)
+        axes = np.array(drawn.axes).reshape(len(drawn.axes) // 2, 2) if len(drawn.axes) == 6 else None
+        labels = [ax.get_xlabel() for ax in drawn.axes if ax.get_xlabel()]
+        labels += [ax.get_ylabel() for ax in drawn.axes if ax.get_ylabel()]
+        assert len(labels) >= 4 and all("[" in label and "]" in label for label in labels)
+        if axes is not None:
+            assert all(ax.get_ylabel() for ax in axes[:, 0])
+
+
+def test_plot_functions_take_an_axes_or_make_one():
+    time = np.linspace(0, 1, 5)
+    ax = Figure().subplots()
+    assert comparison(time, time, 2 * time, "x [m]", ax) is ax
+    own = comparison(time, time, 2 * time, "x [m]")
+    np.testing.assert_array_equal(own.lines[1].get_ydata(), 2 * time)
+
+
+@pytest.mark.parametrize("place", ["file", "below a file"])
+def test_refuses_a_bad_folder_before_any_work(tmp_path, capsys, place):
+    file = tmp_path / "taken"
+    file.write_text("mine")
+    target = file if place == "file" else file / "below"
+    with pytest.raises(SystemExit) as stop:
+        main(["paper", "--out", str(target)])
+    assert stop.value.code == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1 and "--out" in message and "folder" in message
+    assert file.read_text() == "mine"
+
+
+def test_failure_while_writing_leaves_old_files_whole(short, tmp_path, monkeypatch):
+    """A figure that cannot be written: the earlier report stays, nothing half-written appears."""
+    (tmp_path / "report.md").write_text("old")
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(paper, "run_cases", lambda *_: short.runs)
+    monkeypatch.setattr(paper, "draw_figure", fail)
+    with pytest.raises(StudyError, match="disk full"):
+        paper.write_paper(tmp_path, Console(quiet=True), short.runs.study, short.runs.cases)
+    assert [file.name for file in tmp_path.iterdir()] == ["report.md"]
+    assert (tmp_path / "report.md").read_text() == "old"
+
+
+def test_stored_metrics_are_the_runs(short):
+    stored, attributes = read_store(short.folder / "paper.h5")
+    metrics = short.runs.result.metrics
+    np.testing.assert_array_equal(stored["residual_rms"].data, metrics.residual_rms)
+    assert stored["residual_rms"].dims == ("case", "link", "station")
+    assert "waypoints" in attributes["study"]
