@@ -88,7 +88,8 @@ def variants(context: Context) -> list[str]:
             zeta = ", ".join(f"{z:.3f}" for z in loop.damping_ratio.min(axis=1))
         rows.append([
             f"`{case.name}`", case.feedback, case.estimator, f"{case.gain_factor:g}",
-            case.ratio_from, describe(int(runs.status[k])), margin, zeta, ", ".join(context.drop(k, mode=1)),
+            case.ratio_from, describe(int(runs.status[k])), margin, zeta,
+            ", ".join(context.drop(k, mode=1)),
             f"{1e6 * measures.late_deflection[k].max():.3g}",
             f"{runs.result.metrics.voltage_peak[k].max():.3g}",
         ])  # fmt: skip

@@ -104,6 +104,30 @@ def test_response_of_a_locked_link_to_its_actuators_is_the_modal_sum():
     np.testing.assert_allclose(found[:, 3:, :3], 0, atol=1e-10 * scale)  # no way to other links
 
 
+def test_static_response_of_the_free_machine_is_that_of_its_springs():
+    """At rest on the drive a voltage bends its own link by sum Y_j Q_j/k_j and moves nothing."""
+    study = UNDAMPED.change(link__damping_ratio=0.01, drive__kd=60.0)
+    plant = linear(study)
+    found = np.array(frequency_response(plant, plant.deflection, plant.voltage, np.zeros(1)))[0]
+    loop = jax.jit(prepare, static_argnums=0)(
+        build_structure(study), as_arrays(build_case(study))
+    ).loop
+    bending = np.asarray(loop.actuator / loop.plant.stiffness[:, :, None])
+    static = np.einsum("isr,irk->isk", np.asarray(loop.deflection_at), bending)
+    scale = np.abs(static).max()
+    for i in range(3):
+        own = slice(3 * i, 3 * i + 3)
+        np.testing.assert_allclose(found[own, own], static[i], atol=1e-9 * scale)
+        found[own, own] = 0
+    np.testing.assert_allclose(found, 0, atol=1e-9 * scale)
+
+
+def test_drive_damps_the_pose_modes():
+    modes = natural_modes(linear(UNDAMPED.change(drive__kd=60.0)))
+    assert np.all(modes.damping_ratio[:3] > 0.1)
+    assert np.all(modes.damping_ratio[3:] < 0.01)
+
+
 def test_flatten_and_unflatten_are_inverse():
     rng = np.random.default_rng(0)
     state = PlantState(*rng.normal(size=(2, 3)), *rng.normal(size=(4, 3, 5)))
