@@ -1,6 +1,8 @@
 # Everything runs in .venv, made here from nothing but Python with venv.
 
 PYTHON ?= python3
+# Small eigenvalue problems are slower on several BLAS threads, much slower beside other processes.
+export OPENBLAS_NUM_THREADS ?= 1
 BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile
 

@@ -64,6 +64,7 @@ def legend_above(figure: Figure, ax: Axes) -> None:
 def save(figure: Figure, folder: Path, name: str) -> None:
     """Write the figure as PNG and PDF."""
     figure.savefig(folder / f"{name}.png")
+    figure.set_layout_engine("none")  # keeps what has been laid out, which takes half a second
     figure.savefig(folder / f"{name}.pdf")
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from studies.errors import StudyError
 from studies.paper_cases import (
@@ -109,7 +109,7 @@ def _open_folder(out: Path) -> None:
 
 
 def _print_outcome(out: Path, console: Console, runs: PaperRuns) -> None:
-    table = Table("case", "controlled links", "modes", "status")
+    table = Table(Column("case", no_wrap=True), "links", "modes", "status")
     for case, code in zip(runs.cases, runs.status, strict=True):
         table.add_row(case.name, case.links_text, str(case.modes), describe(int(code)))
     console.print(table)

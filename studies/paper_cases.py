@@ -8,6 +8,7 @@ only, so one program, compiled once for a fixed number of cases, runs them all.
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -208,40 +209,53 @@ def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:
     off = [case for case in cases if not case.is_controlled]
     on = [case for case in cases if case.is_controlled and case.feedback == "sampled"]
     ideal = [case for case in cases if case.feedback == "ideal"]
-    built = [build_paper_case(base, case) for case in off]
-    structure = built[0][0]
-    frame = _frame(structure, built[0][1])
-    first = run_batches(structure, [arrays for _, arrays in built], tell)
-    energy = np.asarray(efficient_modal_control(first.metrics.modal_energy, frame.modal_omega))
-    by_counterpart = {case.counterpart: energy[k] for k, case in enumerate(off)}
-
-    ratios = [_ratio(case, by_counterpart) for case in on]
-    arrays = [build_paper_case(base, case, r)[1] for case, r in zip(on, ratios, strict=True)]
-    results = [first]
-    if arrays:
-        results.append(run_batches(structure, arrays, tell))
-    for case in ideal:
-        tell("simulating ideal feedback", 0.0)
-        one = run_study(case_study(base, case), has_loop=False).result
-        results.append(jax.tree.map(lambda x: np.asarray(x)[None], one))
-        ratios.append(np.array(PAPER_RATIOS))
-        tell("simulated ideal feedback", 1.0)
+    # programs of their own, compiled on the second core while the first one runs the batches
+    with ThreadPoolExecutor(1) as side:
+        free = side.submit(_pinned_free_ratios, base, off, tell)
+        ideal_runs = [side.submit(_run_ideal, base, case, tell) for case in ideal]
+        built = [build_paper_case(base, case) for case in off]
+        structure = built[0][0]
+        frame = _frame(structure, built[0][1])
+        results = [run_batches(structure, [arrays for _, arrays in built], tell)]
+        energy = results[0].metrics.modal_energy
+        energy_ratio = np.asarray(efficient_modal_control(energy, frame.modal_omega))
+        by_counterpart = {case.counterpart: energy_ratio[k] for k, case in enumerate(off)}
+        ratios = [_ratio(case, by_counterpart) for case in on]
+        arrays = [build_paper_case(base, case, r)[1] for case, r in zip(on, ratios, strict=True)]
+        results += [run_batches(structure, arrays, tell)] if arrays else []
+        loops = _judge(structure, {c.name: a for c, a in zip(on, arrays, strict=True)}, base, tell)
+        results += [run.result() for run in ideal_runs]
+        rows = [
+            EnergyRatio(case.move, case.shaper, structure.controller_basis, energy_ratio[k])
+            for k, case in enumerate(off)
+            if case.modes == 3 and not case.is_extra
+        ] + free.result()
     result = jax.tree.map(lambda *x: np.concatenate(x), *results)
     ordered = off + on + ideal
-    loops = _judge(structure, {c.name: a for c, a in zip(on, arrays, strict=True)}, base, tell)
-    codes = np.array(result.status)
-    for k, case in enumerate(ordered):
-        report = loops.get(case.name)
-        if report and not report.is_stable and codes[k] in (status.OK, status.SATURATED):
-            codes[k] = status.UNSTABLE
-    rows = [
-        EnergyRatio(case.move, case.shaper, structure.controller_basis, energy[k])
-        for k, case in enumerate(off)
-        if case.modes == 3 and not case.is_extra
+    gains = np.array([*(0 * energy_ratio), *ratios, *(np.array(PAPER_RATIOS) for _ in ideal)])
+    codes = _judged_status(ordered, np.array(result.status), loops)
+    return PaperRuns(base, frame, ordered, result, codes, gains, loops, rows)
+
+
+def _judged_status(
+    cases: list[PaperCase], codes: np.ndarray, loops: dict[str, LoopReport]
+) -> np.ndarray:
+    """Codes, UNSTABLE where the linearised loop is and the run did not stop for another reason."""
+    unstable = [
+        case.name in loops
+        and not loops[case.name].is_stable
+        and code in (status.OK, status.SATURATED)
+        for case, code in zip(cases, codes, strict=True)
     ]
-    rows += _pinned_free_ratios(base, off, tell)
-    ratio = np.concatenate([np.zeros_like(energy), np.array(ratios)]) if ratios else 0 * energy
-    return PaperRuns(base, frame, ordered, result, codes, ratio, loops, rows)
+    return np.where(unstable, status.UNSTABLE, codes)
+
+
+def _run_ideal(base: Study, case: PaperCase, tell: Tell) -> Result:
+    """A case with ideal feedback, as a batch of one."""
+    tell("simulating ideal feedback", 0.0)
+    result = run_study(case_study(base, case), has_loop=False).result
+    tell("simulated ideal feedback", 1.0)
+    return jax.tree.map(lambda x: np.asarray(x)[None], result)
 
 
 def _ratio(case: PaperCase, by_counterpart: dict[tuple, np.ndarray]) -> np.ndarray:

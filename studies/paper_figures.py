@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -173,6 +174,17 @@ def _limit_decades(ax: Axes, density: np.ndarray) -> None:
     ax.set_ylim(max(density.min() / 3, 1e-12 * top), 5 * top)
 
 
+@jax.jit
+def _sensitivity(kinds: Any, ratio: Any, omega: Any, zeta: Any, level: Any) -> Any:
+    """Sensitivity curves of several kinds of shapers, (kinds, ratio)."""
+
+    def of(kind: Any) -> Any:
+        impulses = shaper.design_shaper(kind, omega, zeta, level)
+        return shaper.sensitivity_curve(impulses, ratio, omega, zeta)
+
+    return jax.vmap(of)(kinds)
+
+
 def _shapers(runs: PaperRuns, measures: Measures) -> Figure:
     """Sensitivity curves, and the deflection of link 1 after the faster move."""
     figure, axes = figures.new_figure(2, 1, 2.6, has_shared_abscissa=False)
@@ -180,11 +192,9 @@ def _shapers(runs: PaperRuns, measures: Measures) -> Figure:
     level = runs.study.shaper.tolerance
     ratio = np.linspace(0.5, 1.5, 401)
     kinds = {"ZV": "zv", "ZVD": "zvd", "EI (the paper's)": "ei", "two-hump EI": "ei2"}
-    curves = {}
-    for label, kind in kinds.items():
-        impulses = shaper.design_shaper(shaper.KINDS.index(kind), omega, zeta, level)
-        curves[label] = np.asarray(shaper.sensitivity_curve(impulses, ratio, omega, zeta))
-    figures.sensitivity(ratio, curves, level, axes[0, 0])
+    indices = np.array([shaper.KINDS.index(kind) for kind in kinds.values()])
+    curves = np.asarray(_sensitivity(indices, ratio, omega, zeta, level))
+    figures.sensitivity(ratio, dict(zip(kinds, curves, strict=True)), level, axes[0, 0])
     axes[0, 0].set_ylim(0, 40)
     time = runs.result.record.time[0]  # type: ignore[union-attr]
     station = _station(runs)
