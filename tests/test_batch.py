@@ -86,22 +86,39 @@ def compare(batched, index, single):
             assert np.max(np.abs(a - b)) <= 1e-9 * max(np.max(np.abs(b)), 1e-300), name
 
 
-def test_mixed_batch_equals_single_runs(structure, cases, batch):
-    result = batch(stack(cases))
-    assert np.all(np.asarray(result.status) == status.OK)
+@pytest.fixture(scope="module")
+def one(structure):
+    """Compiled single run that counts its own traces."""
     traces = []
 
     @jax.jit
-    def one(case):
+    def run(case):
         traces.append(1)
         return simulate(structure, case)
 
+    run.traces = traces
+    return run
+
+
+def check_batch(cases, batch, one):
+    result = batch(stack(cases))
+    assert np.all(np.asarray(result.status) == status.OK)
     for index, case in enumerate(cases):
         compare(result, index, one(case))
-    assert len(traces) == 1
-    assert len(batch.traces) == 1
+    assert len(one.traces) == len(batch.traces) == 1
     rms = np.asarray(result.metrics.residual_rms)
     assert np.unique(np.round(rms[:, 0, 1], 12)).size == N_CASES  # the cases do differ
+
+
+def test_mixed_batch_equals_single_runs(cases, batch, one):
+    check_batch(cases, batch, one)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(8, 20))
+def test_many_mixed_batches_equal_single_runs(batch, one, seed):
+    rng = np.random.default_rng(seed)
+    check_batch([mixed_case(rng) for _ in range(N_CASES)], batch, one)
 
 
 def test_order_and_neighbours_do_not_matter(cases, batch):
