@@ -114,7 +114,7 @@ def _print_outcome(out: Path, console: Console, runs: PaperRuns) -> None:
         table.add_row(case.name, case.links_text, str(case.modes), describe(int(code)))
     console.print(table)
     console.print(f"report:  {out / REPORT}")
-    console.print(f"figures: {out}{os.sep}fig*.png and fig*.pdf")
+    console.print(f"figures: {out}{os.sep}*.png and *.pdf")
     console.print(f"data:    {out / DATA}")
 
 
