@@ -69,8 +69,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     step = electronics.period / structure.substeps
     lambda_s, lambda_a = _constants(case)
     sensor = lambda_s[:, None, None] * jnp.swapaxes(basis.sensor_slope, 1, 2)
-    span = jnp.linspace(1 - SPECTRUM_SPAN, 1 + SPECTRUM_SPAN, structure.n_frequencies)
-    angle = jnp.mean(design.assembled_omega, axis=0)[:, None] * span * electronics.period
+    angle = 2 * jnp.pi * electronics.period * spectrum_frequencies(structure, case)
     loop = Loop(
         plant=plant,
         omega=omega,
@@ -94,7 +93,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     return Prepared(
         loop,
         design_taps(case),
-        mask * _initial_modes(structure, case, basis),
+        _initial_modes(structure, case, basis, mask),
         design.sensor_condition,
         design.actuator_condition,
         _static_status(structure, case, design),
@@ -209,18 +208,17 @@ def design_taps(case: Case) -> shaper.Taps:
     return reduce(shaper.in_series, map(one, jnp.asarray(shaping.omega), jnp.asarray(shaping.zeta)))
 
 
-def _initial_modes(structure: Structure, case: Case, basis: ModalBasis) -> Array:
+def _initial_modes(structure: Structure, case: Case, basis: ModalBasis, mask: Array) -> Array:
     """Modal coordinates at t = 0: given ones plus a static load F at x, q_j = Y_j(x) F/k_j."""
     initial = case.initial
     station = jnp.asarray(initial.load_station)[None]
+    machine = case.machine
     at = build_basis(
-        structure.basis, case.machine.beam, case.machine.patches, structure.n_modes, station
+        structure.basis, machine.beam, machine.patches, structure.n_modes, station, mask
     ).deflection_at[:, 0]
-    mask = (jnp.arange(structure.n_modes) < case.n_modes).astype(at.dtype)
-    at = at * mask
     compliance = jnp.sum(at * at / basis.stiffness, axis=1)
     load = jnp.asarray(initial.load_deflection) / jnp.where(compliance > 0, compliance, 1.0)
-    return jnp.asarray(initial.modal) + at / basis.stiffness * load[:, None]
+    return mask * jnp.asarray(initial.modal) + at / basis.stiffness * load[:, None]
 
 
 def _static_status(structure: Structure, case: Case, design: ControllerDesign) -> Array:

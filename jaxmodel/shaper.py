@@ -266,6 +266,11 @@ def split_exact(impulses: Impulses, period: ArrayLike, omega: ArrayLike, zeta: A
     return Taps(weight / jnp.sum(weight), samples)
 
 
+def last_sample(taps: Taps) -> Array:
+    """Return the delay of the last tap with non-zero weight [samples], shape ()."""
+    return jnp.max(jnp.where(taps.weight != 0, taps.sample, 0))
+
+
 def in_series(first: Taps, second: Taps) -> Taps:
     """Return both sampled shapers in series, W_i V_j at n_i + m_j samples, shape (n m,)."""
     return Taps(

@@ -16,6 +16,7 @@ from jaxmodel.loop import Inputs, Record, initial_state, step
 from jaxmodel.motion import end_of_path, shape_path
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import Prepared, prepare
+from jaxmodel.shaper import last_sample
 
 
 class Result(NamedTuple):
@@ -61,8 +62,7 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
         forward = _points(jax.vmap(inverse_dynamics, (None, 0, 0, 0))(plant, *wanted), n)
 
     time = period * jnp.arange(n)
-    last_tap = jnp.max(jnp.where(prepared.taps.weight != 0, prepared.taps.sample, 0))
-    end = end_of_path(case.path) + last_tap * period
+    end = end_of_path(case.path) + last_sample(prepared.taps) * period
     code, index = path_status(plant, wanted.position)
     bad_time = index * period / per_sample
     is_long = end > n * period

@@ -155,7 +155,7 @@ def _axes(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
     names = np.array([case.name for case in runs.cases])
     return {
         "case": Variable(names, ("case",), "1", "name of the case"),
-        "time": Variable(runs.result.record.time[0], ("time",), "s", "time"),  # type: ignore[union-attr]
+        "time": Variable(runs.record.time[0], ("time",), "s", "time"),
         "link": Variable(np.arange(1, 4), ("link",), "1", "link number"),
         "station": Variable(
             np.array(runs.study.metrics.stations), ("station",), "m", "position along the link"
@@ -235,8 +235,7 @@ def _separated(runs: PaperRuns, values: np.ndarray) -> np.ndarray:
 
 
 def _trajectories(runs: PaperRuns) -> dict[str, Variable]:
-    record = runs.result.record
-    assert record is not None
+    record = runs.record
     deflection = record.chord_deflection_stations
     series = ("case", "time")
     modal = np.moveaxis(_separated(runs, np.moveaxis(record.controlled_coordinate, 1, -1)), -1, 1)

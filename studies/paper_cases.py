@@ -16,14 +16,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel import status
 from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.control import efficient_modal_control
+from jaxmodel.loop import Record
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopReport, loop_report
 from jaxmodel.simulate import Result, simulate
-from studies.runs import check_run, run_study
+from studies.runs import check_run, judged_status, run_study
 from studies.spec import Flags, Study
 
 #: Cases per call of the compiled program; the last batch is filled up with copies.
@@ -105,6 +105,12 @@ class PaperRuns(NamedTuple):
     ratio: np.ndarray  # gains of the modes over that of mode 1 [1], (n, 3, C)
     loops: dict[str, LoopReport]  # by case name, where the loop was linearised
     energy_ratio: list[EnergyRatio]
+
+    @property
+    def record(self) -> Record:
+        """Trajectories, which every run here keeps."""
+        assert self.result.record is not None
+        return self.result.record
 
     def where(self, **wanted: Any) -> int:
         """Position of the first case with these values."""
@@ -233,21 +239,11 @@ def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:
     result = jax.tree.map(lambda *x: np.concatenate(x), *results)
     ordered = off + on + ideal
     gains = np.array([*(0 * energy_ratio), *ratios, *(np.array(PAPER_RATIOS) for _ in ideal)])
-    codes = _judged_status(ordered, np.array(result.status), loops)
+    codes = np.array(result.status)
+    for k, case in enumerate(ordered):
+        if case.name in loops:
+            codes[k] = judged_status(int(codes[k]), loops[case.name])
     return PaperRuns(base, frame, ordered, result, codes, gains, loops, rows)
-
-
-def _judged_status(
-    cases: list[PaperCase], codes: np.ndarray, loops: dict[str, LoopReport]
-) -> np.ndarray:
-    """Codes, UNSTABLE where the linearised loop is and the run did not stop for another reason."""
-    unstable = [
-        case.name in loops
-        and not loops[case.name].is_stable
-        and code in (status.OK, status.SATURATED)
-        for case, code in zip(cases, codes, strict=True)
-    ]
-    return np.where(unstable, status.UNSTABLE, codes)
 
 
 def _run_ideal(base: Study, case: PaperCase, tell: Tell) -> Result:

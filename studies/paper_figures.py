@@ -60,7 +60,7 @@ def _responses(
 ) -> tuple[Figure, np.ndarray]:
     """Rows of comparisons of signal (n, T, rows), in a unit of so many SI units."""
     figure, axes = figures.new_figure(len(labels), 2)
-    time = runs.result.record.time[0]  # type: ignore[union-attr]
+    time = runs.record.time[0]
     for column, (off, on) in enumerate(pairs):
         axes[0, column].set_title(TITLES[column])
         axes[-1, column].set_xlabel("time [s]")
@@ -78,7 +78,7 @@ def _with_views(
 ) -> Figure:
     """`_responses` with a magnified view of the time after the command in each axes."""
     figure, axes = _responses(runs, pairs, signal, labels, unit)
-    time = runs.result.record.time[0]  # type: ignore[union-attr]
+    time = runs.record.time[0]
     for column, (off, on) in enumerate(pairs):
         begin = float(runs.result.command_end[off])
         for row in range(len(labels)):
@@ -92,13 +92,13 @@ def _with_views(
 
 def _left_over(runs: PaperRuns, pair: tuple[int, int], signal: np.ndarray) -> float:
     """Peak of a signal (n, T) of two cases from SCALE_DELAY after the command on."""
-    time = runs.result.record.time[0]  # type: ignore[union-attr]
+    time = runs.record.time[0]
     begin = float(runs.result.command_end[pair[0]]) + SCALE_DELAY
     return max(float(np.abs(signal[case, time >= begin]).max()) for case in pair)
 
 
 def _deflection(runs: PaperRuns, measures: Measures, links: tuple[bool, ...]) -> Figure:
-    signal = runs.result.record.chord_deflection_stations[..., _station(runs)]  # type: ignore[union-attr]
+    signal = runs.record.chord_deflection_stations[..., _station(runs)]
     labels = [f"link {i}: deflection\nat 150 mm [µm]" for i in (1, 2, 3)]
     return _with_views(runs, _pairs(runs, links, 3), signal, labels, 1e-6)
 
@@ -110,7 +110,7 @@ def _station(runs: PaperRuns) -> int:
 
 
 def _modes(runs: PaperRuns, measures: Measures) -> Figure:
-    q = runs.result.record.controlled_coordinate[:, :, 0]  # type: ignore[union-attr]
+    q = runs.record.controlled_coordinate[:, :, 0]
     signal = q * runs.frame.mode_shape[0, _station(runs)]
     labels = [f"mode {j} of link 1\nat 150 mm [µm]" for j in (1, 2, 3)]
     return _with_views(runs, _pairs(runs, ALL, 3), signal, labels, 1e-6)
@@ -120,13 +120,13 @@ _POSE_LABELS = ["x error [µm]", "y error [µm]", "φ error [µrad]"]
 
 
 def _pose(runs: PaperRuns, measures: Measures) -> Figure:
-    signal = runs.result.record.pose_error  # type: ignore[union-attr]
+    signal = runs.record.pose_error
     return _responses(runs, _pairs(runs, ALL, 3), signal, _POSE_LABELS, 1e-6)[0]
 
 
 def _pose_after(runs: PaperRuns, measures: Measures, links: tuple[bool, ...]) -> Figure:
     """After the command, scaled to the vibration that is left once the drive has settled."""
-    signal = runs.result.record.pose_error  # type: ignore[union-attr]
+    signal = runs.record.pose_error
     pairs = _pairs(runs, links, 3)
     labels = [label.replace("[µ", "[n") for label in _POSE_LABELS]
     figure, axes = _responses(runs, pairs, signal, labels, 1e-9)
@@ -140,7 +140,7 @@ def _pose_after(runs: PaperRuns, measures: Measures, links: tuple[bool, ...]) ->
 
 
 def _sensor(runs: PaperRuns, measures: Measures) -> Figure:
-    signal = runs.result.record.sensor_voltage[..., -1]  # type: ignore[union-attr]
+    signal = runs.record.sensor_voltage[..., -1]
     labels = [f"link {i}: sensor at\n150 mm [V]" for i in (1, 2, 3)]
     return _with_views(runs, _pairs(runs, ALL, 2), signal, labels, 1.0)
 
@@ -196,13 +196,13 @@ def _shapers(runs: PaperRuns, measures: Measures) -> Figure:
     curves = np.asarray(_sensitivity(indices, ratio, omega, zeta, level))
     figures.sensitivity(ratio, dict(zip(kinds, curves, strict=True)), level, axes[0, 0])
     axes[0, 0].set_ylim(0, 40)
-    time = runs.result.record.time[0]  # type: ignore[union-attr]
+    time = runs.record.time[0]
     station = _station(runs)
     for k, kind in enumerate(("none", "ei")):
         case = runs.where(move="fast", shaper=kind, modes=3, links=OFF)
         begin = float(runs.result.command_end[case])
         part = (time >= begin) & (time <= begin + VIEW_LENGTH)
-        deflection = runs.result.record.chord_deflection_stations[case, part, 0, station]  # type: ignore[union-attr]
+        deflection = runs.record.chord_deflection_stations[case, part, 0, station]
         axes[1, 0].plot(
             time[part] - begin, deflection / 1e-6, color=figures.SERIES[1 - k],
             linewidth=1.5 - 0.5 * k, label={"none": "no shaper", "ei": "EI shaper"}[kind],

@@ -81,9 +81,7 @@ def _rms(signal: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return np.sqrt(total / np.maximum(mask.sum(axis=1), 1)[:, None])
 
 
-def _settling(
-    time: np.ndarray, end: np.ndarray, size: np.ndarray, limit: np.ndarray
-) -> np.ndarray:
+def _settling(time: np.ndarray, end: np.ndarray, size: np.ndarray, limit: np.ndarray) -> np.ndarray:
     """Last time after `end` at which size (n, T, 3) exceeds limit (n, 3), from `end` on."""
     is_outside = (size > limit[:, None]) & (time >= end[:, None])[..., None]
     last = np.max(np.where(is_outside, time[:, None], 0.0), axis=1)

@@ -21,6 +21,7 @@ from jaxmodel.linear import linearise, mechanical
 from jaxmodel.motion import end_of_path, sample_path
 from jaxmodel.prepare import prepare, spectrum_frequencies
 from jaxmodel.sampled_loop import LoopReport, loop_report
+from jaxmodel.shaper import last_sample
 from jaxmodel.simulate import Result, simulate
 from studies import config
 from studies.cases import as_arrays, build_case, build_structure
@@ -68,9 +69,14 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
             loop = loop_report(structure, case, _home(study), min(3, structure.n_modes))
         except np.linalg.LinAlgError:  # an entry that is not finite
             return Run(study, structure, case, result, None, code or status.NON_FINITE)
-        if code in (status.OK, status.SATURATED) and not loop.is_stable:
-            code = status.UNSTABLE
+        code = judged_status(code, loop)
     return Run(study, structure, case, result, loop, code)
+
+
+def judged_status(code: int, loop: LoopReport) -> int:
+    """Status of a run, UNSTABLE where its loop is and it did not stop for another reason."""
+    is_bounded = code in (status.OK, status.SATURATED)
+    return status.UNSTABLE if is_bounded and not loop.is_stable else code
 
 
 def _home(study: Study) -> np.ndarray:
@@ -94,18 +100,18 @@ class Preflight(NamedTuple):
 @partial(jax.jit, static_argnums=0)
 def _preflight(structure: Structure, case: Case) -> Preflight:
     prepared = prepare(structure, case)
-    plant, taps = prepared.loop.plant, prepared.taps
+    plant = prepared.loop.plant
+    shaper_length = last_sample(prepared.taps) * case.electronics.period
     each = jax.vmap(lambda pose: path_status(plant, pose[None])[0])(case.path.waypoints)
     end = end_of_path(case.path)
     time = jnp.linspace(0.0, 1.0, 2001) * end
     poses = sample_path(case.path, time).position
     code, index = path_status(plant, poses)
-    last = jnp.max(jnp.where(taps.weight != 0, taps.sample, 0))
     worst = jnp.maximum(prepared.sensor_condition.max(), prepared.actuator_condition.max())
     ratio = case.electronics.lowpass_ratio
     corner = jnp.max(ratio * assembled_frequency(case.machine.beam, ratio.size))
     return Preflight(
-        each, code, time[index], poses[index], end, last * case.electronics.period, worst,
+        each, code, time[index], poses[index], end, shaper_length, worst,
         jnp.max(prepared.loop.omega), corner,
     )  # fmt: skip
 
@@ -366,4 +372,3 @@ def run_attributes(study: Study) -> dict[str, Any]:
 def describe(code: int) -> str:
     """A status code in words."""
     return status.REASONS.get(code, f"status {code}")
-

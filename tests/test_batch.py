@@ -59,18 +59,27 @@ def cases():
     return [mixed_case(rng) for _ in range(N_CASES)]
 
 
-@pytest.fixture(scope="module")
-def batch(structure):
-    """Compiled batch run that counts its own traces."""
+def counted(function):
+    """Compiled function that counts its own traces."""
     traces = []
 
     @jax.jit
-    def run(stacked):
+    def run(case):
         traces.append(1)
-        return jax.vmap(lambda case: simulate(structure, case))(stacked)
+        return function(case)
 
     run.traces = traces
     return run
+
+
+@pytest.fixture(scope="module")
+def batch(structure):
+    return counted(jax.vmap(lambda case: simulate(structure, case)))
+
+
+@pytest.fixture(scope="module")
+def one(structure):
+    return counted(lambda case: simulate(structure, case))
 
 
 def stack(cases):
@@ -84,20 +93,6 @@ def compare(batched, index, single):
         for a, b in zip(jax.tree.leaves(x), jax.tree.leaves(y), strict=True):
             a, b = np.asarray(a)[index], np.asarray(b)
             assert np.max(np.abs(a - b)) <= 1e-9 * max(np.max(np.abs(b)), 1e-300), name
-
-
-@pytest.fixture(scope="module")
-def one(structure):
-    """Compiled single run that counts its own traces."""
-    traces = []
-
-    @jax.jit
-    def run(case):
-        traces.append(1)
-        return simulate(structure, case)
-
-    run.traces = traces
-    return run
 
 
 def check_batch(cases, batch, one):
