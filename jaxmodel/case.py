@@ -70,7 +70,7 @@ class Shaping(NamedTuple):
     """Input shaper of the reference, one entry per shaped frequency."""
 
     kind: Array  # index in `shaper.KINDS`, ()
-    omega: Array  # [rad/s], (n,)
+    omega: Array  # [rad/s], 0: mode 1 of the assembled links, (n,)
     zeta: Array  # [1], (n,)
     tolerance: Array  # V of the EI family [1], ()
     is_exact: Array  # 1: impulses split exactly for their mode, 0: linearly, ()

@@ -56,11 +56,11 @@ class Totals(NamedTuple):
     settled_at: Array  # last time outside the band after the command [s], (3,)
     moving_error_peak: Array  # pose, (3,)
     residual_error_square: Array
-    voltage_peak: Array  # (3,)
+    peak_voltage: Array  # (3,)
     voltage_square: Array  # ()
     saturated: Array  # ()
     clipped: Array  # ()
-    force_peak: Array  # (3,)
+    peak_force: Array  # (3,)
     plant_energy: Array  # sum while moving, (3, R)
     modal_energy: Array  # the same in the controller's modes, (3, C)
     taper_square: Array  # ()
@@ -81,11 +81,11 @@ class Metrics(NamedTuple):
     settling_time: Array  # from the command's end until it stays in the band [s], (3,)
     pose_error_peak: Array  # while moving [m, m, rad], (3,)
     pose_error_rms: Array  # in the residual window [m, m, rad], (3,)
-    voltage_peak: Array  # [V], (3,)
+    peak_voltage: Array  # [V], (3,)
     saturated_fraction: Array  # samples with any actuator at its limit [1], ()
     clipped_fraction: Array  # samples with any ADC channel at its end [1], ()
     control_energy: Array  # integral of sum V_a^2 over the run [V2 s], ()
-    force_peak: Array  # of the motors [N], (3,)
+    peak_force: Array  # of the motors [N], (3,)
     plant_energy: Array  # mean of omega^2 q^2 + q'^2 while moving, plant modes [m2/s2], (3, R)
     modal_energy: Array  # the same, controller's modes, for EMC (24) [m2/s2], (3, C)
     spectral_density: Array  # one-sided PSD of the controller's modes [m2/Hz], (3, C, n)
@@ -154,12 +154,12 @@ def accumulate(
         ),
         residual_error_square=totals.residual_error_square
         + residual * sample.pose_error * sample.pose_error,
-        voltage_peak=jnp.maximum(totals.voltage_peak, jnp.max(jnp.abs(sample.voltage), axis=1)),
+        peak_voltage=jnp.maximum(totals.peak_voltage, jnp.max(jnp.abs(sample.voltage), axis=1)),
         voltage_square=totals.voltage_square
         + jnp.sum(jnp.sum(sample.voltage * sample.voltage, axis=1), axis=0),
         saturated=totals.saturated + sample.is_saturated,
         clipped=totals.clipped + sample.is_clipped,
-        force_peak=jnp.maximum(totals.force_peak, jnp.abs(sample.motor_force)),
+        peak_force=jnp.maximum(totals.peak_force, jnp.abs(sample.motor_force)),
         plant_energy=totals.plant_energy + moving * plant_energy,
         modal_energy=totals.modal_energy + moving * modal_energy,
         taper_square=totals.taper_square + window.taper * window.taper,
@@ -198,11 +198,11 @@ def finish(totals: Totals, period: Array) -> Metrics:
         settling_time=totals.settled_at,
         pose_error_peak=totals.moving_error_peak,
         pose_error_rms=_root(totals.residual_error_square / residual),
-        voltage_peak=totals.voltage_peak,
+        peak_voltage=totals.peak_voltage,
         saturated_fraction=totals.saturated / count,
         clipped_fraction=totals.clipped / count,
         control_energy=totals.voltage_square * period,
-        force_peak=totals.force_peak,
+        peak_force=totals.peak_force,
         plant_energy=totals.plant_energy / moving,
         modal_energy=totals.modal_energy / moving,
         spectral_density=2 * period * power / taper,

@@ -13,7 +13,7 @@ from jaxmodel.beam import ModalBasis, assembled_frequency, build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.control import active_modes, condition_number, force_gains, left_inverse
 from jaxmodel.controller import Controller
-from jaxmodel.estimator import design_estimator
+from jaxmodel.estimator import KINDS, design_estimator
 from jaxmodel.integrator import exponential_step
 from jaxmodel.loop import Loop
 from jaxmodel.parameters import Array
@@ -22,6 +22,8 @@ from jaxmodel.plant import build_plant
 
 #: Frequencies of the spectra lie within this fraction of the modal frequency [1].
 SPECTRUM_SPAN = 0.1
+#: omega h of the highest plant mode beyond which the coefficients of ETDRK4 lose digits [1].
+MODE_STEP_LIMIT = 100
 
 
 class Prepared(NamedTuple):
@@ -96,7 +98,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         _initial_modes(structure, case, basis, mask),
         design.sensor_condition,
         design.actuator_condition,
-        _static_status(structure, case, design),
+        _static_status(structure, case, design, omega * mask * step),
     )
 
 
@@ -196,10 +198,15 @@ def design_controller(structure: Structure, case: Case) -> ControllerDesign:
 
 
 def design_taps(case: Case) -> shaper.Taps:
-    """Shaper of the case on its sample grid; each frequency split for its own mode, in series."""
+    """Shaper of the case on its sample grid; each frequency split for its own mode, in series.
+
+    A frequency of zero stands for mode 1 of the assembled links.
+    """
     shaping, period = case.shaping, case.electronics.period
+    known = assembled_frequency(case.machine.beam, 1)[0, 0]
 
     def one(omega: Array, zeta: Array) -> shaper.Taps:
+        omega = jnp.where(omega > 0, omega, known)
         impulses = shaper.design_shaper(shaping.kind, omega, zeta, shaping.tolerance)
         linear = shaper.split_linear(impulses, period)
         exact = shaper.split_exact(impulses, period, omega, zeta)
@@ -221,18 +228,48 @@ def _initial_modes(structure: Structure, case: Case, basis: ModalBasis, mask: Ar
     return mask * jnp.asarray(initial.modal) + at / basis.stiffness * load[:, None]
 
 
-def _static_status(structure: Structure, case: Case, design: ControllerDesign) -> Array:
-    patches, limit = case.machine.patches, case.windows.condition_limit
-    is_off, is_overlapping = placement_faults(patches, case.machine.beam.length)
-    worst = jnp.maximum(jnp.max(design.sensor_condition), jnp.max(design.actuator_condition))
-    uses_filter = structure.law == "imsc" and structure.feedback != "none"
+def lowpass_corner(structure: Structure, case: Case) -> Array:
+    """Highest low-pass corner of the velocity estimate among the controlled modes [rad/s], ()."""
+    ratio = case.electronics.lowpass_ratio
+    is_used = jnp.arange(structure.n_controlled) < case.control.n_active
+    return jnp.max(jnp.where(is_used, ratio * assembled_frequency(case.machine.beam, ratio.size), 0))
+
+
+def _static_status(
+    structure: Structure, case: Case, design: ControllerDesign, mode_step: Array
+) -> Array:
+    """Status before the run; mode_step is omega h of the plant modes in use [1], (3, R)."""
+    patches, windows, control = case.machine.patches, case.windows, case.control
+    length = case.machine.beam.length
+    is_off, is_overlapping = placement_faults(patches, length)
+    is_modal = structure.law == "imsc"
     checks = (
-        ((worst > limit) & uses_filter, status.ILL_CONDITIONED),
-        (case.control.n_active > structure.n_patches, status.TOO_MANY_MODES),
+        (_is_ill_conditioned(structure, case, design), status.ILL_CONDITIONED),
+        ((control.n_active > structure.n_patches) & is_modal, status.TOO_MANY_MODES),
         (is_overlapping, status.PATCHES_OVERLAP),
         (is_off, status.PATCH_OFF_LINK),
+        (_is_too_fast(structure, case) | jnp.any(mode_step > MODE_STEP_LIMIT), status.TOO_FAST),
+        (~jnp.all((windows.stations > 0) & (windows.stations < length)), status.STATION_OFF_LINK),
     )
     code = jnp.zeros(())
     for is_wrong, value in checks:
         code = jnp.where(is_wrong, float(value), code)
     return code
+
+
+def _is_ill_conditioned(structure: Structure, case: Case, design: ControllerDesign) -> Array:
+    uses_filter = structure.law == "imsc" and structure.feedback != "none"
+    worst = jnp.maximum(jnp.max(design.sensor_condition), jnp.max(design.actuator_condition))
+    return (worst > case.windows.condition_limit) & uses_filter
+
+
+def _is_too_fast(structure: Structure, case: Case) -> Array:
+    """Whether a filter or the shaper is beyond half the sample rate."""
+    half = jnp.pi / case.electronics.period
+    is_shaped = case.shaping.kind != shaper.KINDS.index("none")
+    is_fast = jnp.any(case.shaping.omega >= half) & is_shaped
+    if structure.feedback != "sampled":
+        return is_fast
+    has_lowpass = case.electronics.estimator == KINDS.index("modal_phase")
+    is_fast |= (lowpass_corner(structure, case) >= half) & has_lowpass
+    return is_fast | (case.electronics.antialias >= half)

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxmodel import metrics, status
 from jaxmodel.case import Case, Structure
+from jaxmodel.control import efficient_modal_control
 from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.kinematics import inverse_kinematics, path_status
 from jaxmodel.loop import Inputs, Record, initial_state, step
@@ -28,6 +29,7 @@ class Result(NamedTuple):
     command_end: Array  # end of the shaped command [s], ()
     sensor_condition: Array  # condition number of the modal filter per link [1], (3,)
     actuator_condition: Array  # of the synthesizer [1], (3,)
+    energy_ratio: Array  # EMC ratios (24) that this run's modal energies give [1], (3, C)
     record: Record | None  # trajectories, leading axis (n_steps,), if asked for
 
 
@@ -67,6 +69,10 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
     bad_time = index * period / per_sample
     is_long = end > n * period
     code = jnp.where((code == status.OK) & is_long, float(status.SHAPER_TOO_LONG), code)
+    left = n * period - end - case.windows.residual_delay
+    is_moving = jnp.any(jnp.diff(case.path.waypoints, axis=0) != 0)
+    is_cut = is_moving & (case.windows.residual_length > left + period / 2)
+    code = jnp.where((code == status.OK) & is_cut, float(status.WINDOW_TOO_LONG), code)
     adc_noise, disturbance = _disturbance(structure, case, prepared, time)
     inputs = Inputs(
         rho=_points(rho, n),
@@ -177,5 +183,6 @@ def simulate(structure: Structure, case: Case, has_record: bool = False) -> Resu
         command_end=outside.end,
         sensor_condition=prepared.sensor_condition,
         actuator_condition=prepared.actuator_condition,
+        energy_ratio=efficient_modal_control(result.modal_energy, loop.modal_omega),
         record=record,
     )

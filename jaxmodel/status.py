@@ -16,6 +16,10 @@ PATCHES_OVERLAP = 8
 PATCH_OFF_LINK = 9
 UNSTABLE = 10
 SHAPER_TOO_LONG = 11
+WINDOW_TOO_LONG = 12
+TOO_FAST = 13
+STATION_OFF_LINK = 14
+TOO_STIFF = 15
 
 REASONS = {
     OK: "ok",
@@ -30,4 +34,8 @@ REASONS = {
     PATCH_OFF_LINK: "patch off the link",
     UNSTABLE: "linearised sampled loop unstable",
     SHAPER_TOO_LONG: "shaped motion longer than the run",
+    WINDOW_TOO_LONG: "residual window longer than the run",
+    TOO_FAST: "a filter, shaper or plant mode too fast for the step",
+    STATION_OFF_LINK: "station off the link",
+    TOO_STIFF: "ideal feedback too stiff for the step",
 }

@@ -1,13 +1,18 @@
-"""From a validated `Study` to the arrays of the model: `Structure` (static) and `Case` (traced)."""
+"""From studies to the arrays of the model: `Structure` (static) and `Case` (traced).
+
+One way for one study and for many: every leaf is built with a leading case axis, of length 1 where
+no column makes it vary, so that a batch computes only once what its cases share.
+"""
 
 from __future__ import annotations
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel import estimator, motion, shaper
-from jaxmodel.beam import assembled_frequency
 from jaxmodel.case import (
     Case,
     Control,
@@ -20,9 +25,12 @@ from jaxmodel.case import (
 )  # fmt: skip
 from jaxmodel.parameters import ASSEMBLIES, Beam, Geometry, Machine, Masses, Patches
 from studies.consistency import patch_centers
+from studies.fields import Columns, Fields
 from studies.spec import Study
 
 TWO_PI = 2 * np.pi
+#: Duration of a move that only fills up a path of fewer moves [s].
+NO_TIME = 1e-9
 
 
 def build_structure(study: Study, substeps: int | None = None) -> Structure:
@@ -53,25 +61,44 @@ def build_structure(study: Study, substeps: int | None = None) -> Structure:
 
 def build_case(study: Study) -> Case:
     """Traced part of a study, as NumPy numbers and arrays in SI units."""
-    structure = build_structure(study)
+    return jax.tree.map(lambda x: x[0], build_cases(study, {}, build_structure(study)))
+
+
+def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
+    """Traced part of many studies that differ in some fields.
+
+    Args:
+        study: values of all fields that no column names.
+        columns: values of the others, one per case (see `studies.fields`).
+        structure: sizes; those of the largest case.
+
+    Returns:
+        Case whose leaves have a leading axis: the cases, or of length 1 where they do not differ.
+    """
+    fields = Fields(study, columns)
+    number = fields.numbers
     return Case(
-        machine=build_machine(study),
-        n_modes=study.link.modes,
-        path=_path(study),
-        shaping=_shaping(study),
-        control=_control(study, structure),
-        electronics=_electronics(study, structure),
-        drive=_drive(study),
-        initial=_initial(study, structure),
-        windows=Windows(
-            study.metrics.residual_delay,
-            study.metrics.residual_length,
-            study.metrics.settling_band,
-            study.metrics.saturation_limit,
-            study.metrics.condition_limit,
-            np.array(study.metrics.stations),
+        machine=_machine(fields),
+        n_modes=number("link.modes").astype(int),
+        path=_path(fields),
+        shaping=_shaping(fields),
+        control=_control(fields, structure),
+        electronics=_electronics(fields, structure),
+        drive=_drive(fields),
+        initial=Initial(
+            _filled(number("initial.modal"), (3, structure.n_modes), 0.0),
+            number("initial.load_station"),
+            number("initial.load_deflection"),
         ),
-        seed=study.run.seed,
+        windows=Windows(
+            number("metrics.residual_delay"),
+            number("metrics.residual_length"),
+            number("metrics.settling_band"),
+            number("metrics.saturation_limit"),
+            number("metrics.condition_limit"),
+            number("metrics.stations"),
+        ),
+        seed=fields.raw("run.seed").astype(int),
     )
 
 
@@ -86,112 +113,133 @@ def as_arrays(case: Case) -> Case:
     return jax.tree.map(leaf, case)
 
 
-def build_machine(study: Study) -> Machine:
-    """Physical description of a study."""
-    machine, link, patches = study.machine, study.link, study.patches
+def _machine(fields: Fields) -> Machine:
+    def number(section: str, name: str) -> np.ndarray:
+        return fields.numbers(f"{section}.{name}")
+
+    outward = fields.choices("machine.assembly", tuple(ASSEMBLIES))
     return Machine(
         Geometry(
-            machine.guide_side,
-            np.array([2 * np.pi / 3, 4 * np.pi / 3, 0.0]),
-            machine.joint_radius,
-            np.array(ASSEMBLIES[machine.assembly]),
+            number("machine", "guide_side"),
+            np.array([[2 * np.pi / 3, 4 * np.pi / 3, 0.0]]),
+            number("machine", "joint_radius"),
+            np.array(list(ASSEMBLIES.values()))[outward],
         ),
-        Masses(machine.platform_mass, machine.platform_inertia, machine.slider_mass),
-        Beam(*(getattr(link, name) for name in Beam._fields)),
+        Masses(*(number("machine", f) for f in ("platform_mass", "platform_inertia", "slider_mass"))),
+        Beam(*(number("link", name) for name in Beam._fields)),
         Patches(
-            center=patch_centers(study),
-            **{name: getattr(patches, name) for name in Patches._fields if name != "center"},
+            center=_centers(number("patches", "centers")),
+            **{name: number("patches", name) for name in Patches._fields if name != "center"},
         ),
     )
 
 
-def _path(study: Study) -> motion.Path:
-    points = np.array(study.motion.waypoints, float)
-    if len(points) == 1:  # stand still: one move to the same place
-        points = np.repeat(points, 2, axis=0)
-    moves = len(points) - 1
-    is_still = len(study.motion.waypoints) == 1
+def _centers(centers: np.ndarray) -> np.ndarray:
+    """One list for all links, or three, as (m, 3, K)."""
+    if centers.ndim == 2:
+        centers = np.repeat(centers[:, None], 3, axis=1)
+    return centers
+
+
+def _path(fields: Fields) -> motion.Path:
+    points = fields.numbers("motion.waypoints")  # (m, M, 3), NaN beyond the last one
+    count = np.sum(~np.isnan(points[..., 0]), axis=1)
+    moves = max(points.shape[1] - 1, 1)  # a platform that stands still moves to where it is
+    reached = np.minimum(np.arange(moves + 1), count[:, None] - 1)
+    points = np.take_along_axis(points, reached[..., None], axis=1)
+    is_move = np.arange(moves) < count[:, None] - 1
+
+    def times(field: str, rest: float) -> np.ndarray:
+        given = fields.numbers(field)
+        given = given[:, None] if given.ndim == 1 else given[:, :moves]
+        return np.where(is_move, np.broadcast_arrays(given, is_move)[0], rest)
+
     return motion.Path(
         points,
-        np.full(moves, 1e-9)
-        if is_still
-        else np.broadcast_to(study.motion.move_time, (moves,)) + 0.0,
-        np.zeros(moves) if is_still else np.broadcast_to(study.motion.dwell, (moves,)) + 0.0,
-        motion.PROFILES.index(study.motion.profile),
+        times("motion.move_time", NO_TIME),
+        times("motion.dwell", 0.0),
+        fields.choices("motion.profile", motion.PROFILES),
     )
 
 
-def _shaping(study: Study) -> Shaping:
-    given = TWO_PI * np.array(study.shaper.frequencies_hz, float)
-    if given.size == 0:
-        given = np.asarray(assembled_frequency(build_machine(study).beam, 1))[:1, 0]
+def _shaping(fields: Fields) -> Shaping:
+    given = TWO_PI * fields.numbers("shaper.frequencies_hz")
+    if given.shape[1] == 0:
+        given = np.zeros((len(given), 1))  # that of the assembled links, see `design_taps`
+    zeta = fields.numbers("shaper.damping_ratio")
     return Shaping(
-        shaper.KINDS.index(study.shaper.kind),
+        fields.choices("shaper.kind", shaper.KINDS),
         given,
-        np.full(given.shape, study.shaper.damping_ratio),
-        study.shaper.tolerance,
-        float(study.shaper.split == "exact"),
+        np.repeat(zeta[:, None], given.shape[1], axis=1),
+        fields.numbers("shaper.tolerance"),
+        fields.choices("shaper.split", ("linear", "exact")).astype(float),
     )
 
 
-def _control(study: Study, structure: Structure) -> Control:
-    control, n = study.control, structure.n_controlled
+def _control(fields: Fields, structure: Structure) -> Control:
+    shape = (3, structure.n_controlled)
+    number = fields.numbers
+    ratio = _filled(number("control.ratios"), shape, 0.0)
+    exponent = number("control.ratio_exponent")[:, None, None]
     return Control(
-        n_active=float(n),
-        link_mask=np.array(control.links, float),
-        mode_mask=_table(control.mode_mask, n, 1.0) if control.mode_mask else np.ones((3, n)),
-        velocity_gain=np.array(control.velocity_gain),
-        position_gain=np.array(control.position_gain),
-        ratio=_table(control.ratios, n, 0.0),
-        gain_factor=control.gain_factor,
-        is_per_mass=float(control.gain_unit == "1/s"),
-        feedthrough_factor=control.feedthrough_factor,
+        n_active=number("control.modes"),
+        link_mask=number("control.links"),
+        mode_mask=_filled(number("control.mode_mask"), shape, 1.0),
+        velocity_gain=number("control.velocity_gain"),
+        position_gain=number("control.position_gain"),
+        ratio=powered(ratio, exponent),
+        gain_factor=number("control.gain_factor"),
+        is_per_mass=fields.choices("control.gain_unit", ("N s/m", "1/s")).astype(float),
+        feedthrough_factor=number("control.feedthrough_factor"),
     )
 
 
-def _table(rows, n: int, fill: float) -> np.ndarray:
-    """Three rows cut or filled to n entries."""
-    table = np.full((3, n), fill)
-    for i, row in enumerate(rows):
-        table[i, : min(n, len(row))] = row[:n]
-    return table
+def powered(ratio: Any, exponent: Any) -> np.ndarray:
+    """|ratio|^exponent with the ratio's sign; a mode that is off (ratio 0) stays off."""
+    size = np.abs(ratio)
+    power = np.where(size > 0, np.where(size > 0, size, 1.0) ** exponent, 0.0)
+    return np.where(np.asarray(ratio) < 0, -power, power)
 
 
-def _electronics(study: Study, structure: Structure) -> Electronics:
-    e, n = study.electronics, structure.n_controlled
+def _filled(table: np.ndarray, shape: tuple[int, ...], fill: float) -> np.ndarray:
+    """(m, ...) cut or filled to (m, *shape); NaN is what a list lacks."""
+    whole = np.full((len(table), *shape), np.nan)
+    if table.size:
+        kept = tuple(slice(0, min(a, b)) for a, b in zip(table.shape[1:], shape, strict=True))
+        whole[(slice(None), *kept)] = table[(slice(None), *kept)]
+    return np.where(np.isnan(whole), fill, whole)
 
-    def extend(values) -> np.ndarray:
-        return np.array((list(values) + [values[-1]] * n)[:n], float)
+
+def _electronics(fields: Fields, structure: Structure) -> Electronics:
+    number = fields.numbers
+
+    def extend(field: str) -> np.ndarray:
+        """The last entry goes on."""
+        values = number(field)
+        last = np.maximum(np.sum(~np.isnan(values), axis=1) - 1, 0)
+        index = np.minimum(np.arange(structure.n_controlled), last[:, None])
+        return np.take_along_axis(values, index, axis=1)
 
     return Electronics(
-        period=1 / e.sample_rate_hz,
-        antialias=TWO_PI * e.antialias_hz,
-        conditioner_gain=e.conditioner_gain,
-        conditioner_bias=e.conditioner_bias,
-        adc_range=e.adc_range,
-        adc_levels=float(2**e.adc_bits),
-        adc_noise=e.adc_noise,
-        voltage_limit=e.voltage_limit,
-        estimator=estimator.KINDS.index(e.estimator),
-        highpass=TWO_PI * e.highpass_hz,
-        lowpass_ratio=extend(e.lowpass_ratio),
-        lowpass_zeta=extend(e.lowpass_zeta),
-        difference_cutoff=TWO_PI * e.difference_cutoff_hz,
+        period=1 / number("electronics.sample_rate_hz"),
+        antialias=TWO_PI * number("electronics.antialias_hz"),
+        conditioner_gain=number("electronics.conditioner_gain"),
+        conditioner_bias=number("electronics.conditioner_bias"),
+        adc_range=number("electronics.adc_range"),
+        adc_levels=2.0 ** number("electronics.adc_bits"),
+        adc_noise=number("electronics.adc_noise"),
+        voltage_limit=number("electronics.voltage_limit"),
+        estimator=fields.choices("electronics.estimator", estimator.KINDS),
+        highpass=TWO_PI * number("electronics.highpass_hz"),
+        lowpass_ratio=extend("electronics.lowpass_ratio"),
+        lowpass_zeta=extend("electronics.lowpass_zeta"),
+        difference_cutoff=TWO_PI * number("electronics.difference_cutoff_hz"),
     )
 
 
-def _drive(study: Study) -> Drive:
-    d = study.drive
-    return Drive(
-        d.kp, d.kd, d.force_limit, d.coulomb_friction, d.friction_speed, d.viscous_friction,
-        d.ripple, np.array(d.pulse_force), d.pulse_start, d.pulse_length, float(d.locked),
+def _drive(fields: Fields) -> Drive:
+    same = (
+        "kp", "kd", "force_limit", "coulomb_friction", "friction_speed", "viscous_friction",
+        "ripple", "pulse_force", "pulse_start", "pulse_length",
     )  # fmt: skip
-
-
-def _initial(study: Study, structure: Structure) -> Initial:
-    initial = study.initial
-    return Initial(
-        _table(initial.modal, structure.n_modes, 0.0),
-        initial.load_station,
-        np.array(initial.load_deflection),
-    )
+    return Drive(*(fields.numbers(f"drive.{name}") for name in (*same, "locked")))

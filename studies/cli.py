@@ -70,7 +70,7 @@ def simulate(
     for i in range(3):
         table.add_row(
             str(i + 1), f"{1e6 * metrics.residual_rms[i].max():.4g}",
-            f"{1e3 * metrics.settling_time[i]:.4g}", f"{metrics.voltage_peak[i]:.4g}",
+            f"{1e3 * metrics.settling_time[i]:.4g}", f"{metrics.peak_voltage[i]:.4g}",
         )  # fmt: skip
     console.print(table)
     if run.loop is not None:

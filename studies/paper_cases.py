@@ -18,7 +18,6 @@ import numpy as np
 
 from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
-from jaxmodel.control import efficient_modal_control
 from jaxmodel.loop import Record
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopReport, loop_report
@@ -223,8 +222,7 @@ def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:
         structure = built[0][0]
         frame = _frame(structure, built[0][1])
         results = [run_batches(structure, [arrays for _, arrays in built], tell)]
-        energy = results[0].metrics.modal_energy
-        energy_ratio = np.asarray(efficient_modal_control(energy, frame.modal_omega))
+        energy_ratio = results[0].energy_ratio
         by_counterpart = {case.counterpart: energy_ratio[k] for k, case in enumerate(off)}
         ratios = [_ratio(case, by_counterpart) for case in on]
         arrays = [build_paper_case(base, case, r)[1] for case, r in zip(on, ratios, strict=True)]
@@ -279,9 +277,7 @@ def _pinned_free_ratios(base: Study, off: list[PaperCase], tell: Tell) -> list[E
     for case in _unshaped(off):
         tell("modal energies in pinned-free coordinates", 0.0)
         run = run_study(case_study(study, case), has_record=False, has_loop=False)
-        omega = _frame(run.structure, run.case).modal_omega
-        ratio = efficient_modal_control(run.result.metrics.modal_energy, omega)
-        rows.append(EnergyRatio(case.move, case.shaper, "pinned_free", np.asarray(ratio)))
+        rows.append(EnergyRatio(case.move, case.shaper, "pinned_free", run.result.energy_ratio))
         tell("modal energies in pinned-free coordinates", 1.0)
     return rows
 

@@ -91,7 +91,7 @@ def variants(context: Context) -> list[str]:
             case.ratio_from, describe(int(runs.status[k])), margin, zeta,
             ", ".join(context.drop(k, mode=1)),
             f"{1e6 * measures.late_deflection[k].max():.3g}",
-            f"{runs.result.metrics.voltage_peak[k].max():.3g}",
+            f"{runs.result.metrics.peak_voltage[k].max():.3g}",
         ])  # fmt: skip
     return [
         "## Other designs: three links, three modes, fast move without shaper",
@@ -168,7 +168,7 @@ def _loop_words(context: Context) -> list[str]:
             "- **Velocity estimate.** The same gains with a filtered difference instead of the "
             f"modal phase filter: {describe(int(runs.status[k]))}, gain margin "
             f"{runs.loops['difference'].gain_margin:.3g}, "
-            f"{runs.result.metrics.voltage_peak[k].max():.3g} V at the actuators: modes beyond the "
+            f"{runs.result.metrics.peak_voltage[k].max():.3g} V at the actuators: modes beyond the "
             "controlled ones decide, and a model with few modes does not show them."
         )
     k = context.named("ideal")

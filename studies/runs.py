@@ -14,17 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel import status
-from jaxmodel.beam import assembled_frequency, build_basis
+from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.kinematics import path_status
 from jaxmodel.linear import linearise, mechanical
 from jaxmodel.motion import end_of_path, sample_path
-from jaxmodel.prepare import prepare, spectrum_frequencies
+from jaxmodel.prepare import MODE_STEP_LIMIT, lowpass_corner, prepare, spectrum_frequencies
 from jaxmodel.sampled_loop import LoopReport, loop_report
 from jaxmodel.shaper import last_sample
 from jaxmodel.simulate import Result, simulate
 from studies import config
-from studies.cases import as_arrays, build_case, build_structure
+from studies.cases import as_arrays, build_case, build_structure, powered
 from studies.errors import field_error
 from studies.spec import Study
 from studies.store import Variable
@@ -33,8 +33,6 @@ from studies.store import Variable
 STIFFNESS_LIMIT = 2.5
 #: More plant steps per sample than this are refused.
 SUBSTEP_LIMIT = 200
-#: omega h of the highest plant mode beyond which the coefficients of ETDRK4 lose digits.
-MODE_STEP_LIMIT = 100
 
 _simulate = jax.jit(simulate, static_argnums=(0, 2))
 
@@ -62,6 +60,9 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
         StudyError: pose out of reach, singular path, motion longer than the run, stiff feedback.
     """
     structure, case = check_run(study)
+    if study.control.ratio_source == "own_run":
+        ratio = _simulate(structure, uncontrolled(case), has_record).energy_ratio
+        case = with_ratio(case, powered(ratio, study.control.ratio_exponent))
     result = jax.tree.map(np.asarray, _simulate(structure, case, has_record))
     loop, code = None, int(result.status)
     if has_loop and structure.feedback == "sampled":
@@ -71,6 +72,18 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
             return Run(study, structure, case, result, None, code or status.NON_FINITE)
         code = judged_status(code, loop)
     return Run(study, structure, case, result, loop, code)
+
+
+def uncontrolled(case: Case) -> Case:
+    """The same case, or cases, with no link controlled."""
+    off = jnp.zeros_like(case.control.link_mask)
+    return case._replace(control=case.control._replace(link_mask=off))
+
+
+def with_ratio(case: Case, ratio: Any) -> Case:
+    """The same case, or cases, with other EMC ratios, (..., 3, C)."""
+    ratio = jnp.asarray(ratio, jnp.result_type(float))
+    return case._replace(control=case.control._replace(ratio=ratio))
 
 
 def judged_status(code: int, loop: LoopReport) -> int:
@@ -108,8 +121,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
     poses = sample_path(case.path, time).position
     code, index = path_status(plant, poses)
     worst = jnp.maximum(prepared.sensor_condition.max(), prepared.actuator_condition.max())
-    ratio = case.electronics.lowpass_ratio
-    corner = jnp.max(ratio * assembled_frequency(case.machine.beam, ratio.size))
+    corner = lowpass_corner(structure, case)
     return Preflight(
         each, code, time[index], poses[index], end, shaper_length, worst,
         jnp.max(prepared.loop.omega), corner,
@@ -263,11 +275,11 @@ _METRIC_LABELS = {
         ("pose_axis",), "m; m; rad", "peak error from the shaped command while moving"
     ),
     "pose_error_rms": (("pose_axis",), "m; m; rad", "rms error in the residual window"),
-    "voltage_peak": (("link",), "V", "peak actuator voltage"),
+    "peak_voltage": (("link",), "V", "peak actuator voltage"),
     "saturated_fraction": ((), "1", "samples with an actuator at its limit"),
     "clipped_fraction": ((), "1", "samples with an ADC channel at its end"),
     "control_energy": ((), "V2 s", "integral of the summed squared actuator voltages"),
-    "force_peak": (("slider_axis",), "N", "peak motor force"),
+    "peak_force": (("slider_axis",), "N", "peak motor force"),
     "plant_energy": (("link", "mode"), "m2/s2", "mean of omega^2 q^2 + q'^2 while moving"),
     "modal_energy": (("link", "controlled_mode"), "m2/s2", "the same in the controller's modes"),
     "spectral_density": (
@@ -321,6 +333,10 @@ def run_variables(run: Run) -> dict[str, Variable]:
         ),
         "actuator_condition": Variable(
             run.result.actuator_condition, ("link",), "1", "condition number of the synthesizer"
+        ),
+        "energy_ratio": Variable(
+            run.result.energy_ratio, ("link", "controlled_mode"), "1",
+            "EMC ratios (24) that this run's modal energies give",
         ),
         **metric_variables(run.result),
     }

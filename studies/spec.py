@@ -159,6 +159,12 @@ class Control(Section):
         ((1.0, 0.345, 0.045), (1.0, 0.304, 0.041), (1.0, 0.321, 0.038)),
         "1", "EMC ratios k_dj : k_d1 per link (24); missing ones are 0",
     )  # fmt: skip
+    ratio_source: Literal["given", "own_run"] = _f(
+        "given", "-", "ratios as given, or by (24) from the same case's uncontrolled run"
+    )
+    ratio_exponent: float = _f(
+        1.0, "1", "exponent on the ratios: 0 makes all gains equal", ge=0, le=10
+    )
     gain_factor: float = _f(0.5, "1", "f, common factor on all gains", ge=0, le=1e3)
     feedthrough_factor: float = _f(
         0.0, "1", "share of the residual modes' feed-through that is subtracted", ge=0, le=1

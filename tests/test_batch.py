@@ -121,7 +121,7 @@ def test_order_and_neighbours_do_not_matter(cases, batch):
     order = np.random.default_rng(3).permutation(N_CASES)
     moved = batch(stack([cases[k] for k in order]))
     other = batch(stack([*cases[:8], *([cases[40]] * (N_CASES - 8))]))
-    for name in ("residual_rms", "voltage_peak", "spectral_density"):
+    for name in ("residual_rms", "peak_voltage", "spectral_density"):
         x = np.asarray(getattr(whole.metrics, name))
         close = 1e-12 * np.abs(x).max()
         assert np.abs(np.asarray(getattr(moved.metrics, name)) - x[order]).max() <= close

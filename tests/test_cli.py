@@ -116,7 +116,7 @@ def test_the_metrics_agree_with_the_trajectories(short_run):
     rms = np.sqrt((window**2).mean("time"))
     np.testing.assert_allclose(short_run.residual_rms, rms, rtol=1e-9)
     peak = abs(short_run.actuator_voltage).max(("time", "patch"))
-    np.testing.assert_allclose(short_run.voltage_peak, peak, rtol=1e-12)
+    np.testing.assert_allclose(short_run.peak_voltage, peak, rtol=1e-12)
 
 
 def test_modes_as_json_and_as_table(capsys):

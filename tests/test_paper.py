@@ -99,7 +99,7 @@ def test_batched_case_equals_its_own_run(short):
     study = paper_cases.case_study(short.runs.study, case, short.runs.ratio[k])
     study = study.change(control__modes=2)
     alone = run_study(study, has_record=False, has_loop=False).result.metrics
-    for name in ("residual_rms", "voltage_peak", "pose_error_rms"):
+    for name in ("residual_rms", "peak_voltage", "pose_error_rms"):
         batched = getattr(short.runs.result.metrics, name)[k]
         np.testing.assert_allclose(batched, getattr(alone, name), rtol=1e-6)
 
@@ -123,7 +123,7 @@ def test_controlled_cases_take_ratios_of_their_uncontrolled_counterpart(short):
 def test_control_acts_where_it_is_and_off_means_off(short):
     metrics = short.runs.result.metrics
     for k, case in enumerate(short.runs.cases):
-        np.testing.assert_array_equal(metrics.voltage_peak[k] > 0, case.links)
+        np.testing.assert_array_equal(metrics.peak_voltage[k] > 0, case.links)
     off = short.runs.where(move="fast", shaper="none", modes=3, links=OFF)
     on = short.runs.where(move="fast", shaper="none", modes=3, links=ALL)
     assert (short.measures.late_deflection[on] < 0.1 * short.measures.late_deflection[off]).all()
