@@ -115,8 +115,9 @@ def natural_modes(plant: LinearPlant) -> NaturalModes:
     """Frequencies, damping ratios and shapes of the assembled machine (on the host).
 
     An undamped machine is solved as lambda^2 of the position block, which keeps rigid modes at
-    zero. Otherwise the 2 m poles are paired: conjugates, and real ones two by two in ascending
-    order, for which frequency means sqrt(lambda_1 lambda_2) and the damping ratio is 1 or more.
+    zero. Otherwise the 2 m poles are paired: conjugates, and real ones a slow with
+    a fast one of like shape, for which frequency means sqrt(lambda_1 lambda_2) and the damping
+    ratio is 1 or more (1 where the slow one is zero: held by nothing but damping).
     """
     a = np.asarray(mechanical(plant))
     m = a.shape[0] // 2
@@ -131,7 +132,7 @@ def natural_modes(plant: LinearPlant) -> NaturalModes:
     is_real = np.abs(value.imag) <= 1e-9 * np.abs(value).max()
     upper = np.flatnonzero(~is_real & (value.imag > 0))
     real = np.flatnonzero(is_real)
-    real = real[np.argsort(np.abs(value[real]))]
+    real = _paired(real[np.argsort(np.abs(value[real]))], value, vector[:m])
     omega = list(np.abs(value[upper]))
     zeta = list(-value[upper].real / np.abs(value[upper]))
     column = list(upper)
@@ -139,11 +140,25 @@ def natural_modes(plant: LinearPlant) -> NaturalModes:
         product = max(abs(value[one].real * value[two].real), 0.0)
         root = np.sqrt(product)
         omega.append(root)
-        zeta.append(-(value[one].real + value[two].real) / (2 * root) if root > 0 else 0.0)
+        zeta.append(-(value[one].real + value[two].real) / (2 * root) if root > 0 else 1.0)
         column.append(two)
     order = np.argsort(omega)
     shape = _scaled(vector[:m, np.array(column)[order]])
     return NaturalModes(np.array(omega)[order] / (2 * np.pi), np.array(zeta)[order], shape)
+
+
+def _paired(real: np.ndarray, value: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Real poles in ascending size, reordered so that two that follow belong to one oscillator.
+
+    Both poles of an overdamped oscillator move the machine in nearly the same shape.
+    """
+    slow, fast = real[: len(real) // 2], list(real[len(real) // 2 :])
+    unit = shape / np.linalg.norm(shape, axis=0)
+    order = []
+    for one in slow:
+        likeness = [abs(np.vdot(unit[:, one], unit[:, two])) for two in fast]
+        order += [one, fast.pop(int(np.argmax(likeness)))]
+    return np.array(order, int)
 
 
 def _scaled(shape: np.ndarray) -> np.ndarray:

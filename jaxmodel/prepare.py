@@ -24,6 +24,8 @@ from jaxmodel.plant import build_plant
 SPECTRUM_SPAN = 0.1
 #: omega h of the highest plant mode beyond which the coefficients of ETDRK4 lose digits [1].
 MODE_STEP_LIMIT = 100
+#: |Re lambda| h that one plant step may have outside the links; ETDRK4 is unstable from about 2.8.
+STIFFNESS_LIMIT = 2.5
 
 
 class Prepared(NamedTuple):
@@ -232,7 +234,9 @@ def lowpass_corner(structure: Structure, case: Case) -> Array:
     """Highest low-pass corner of the velocity estimate among the controlled modes [rad/s], ()."""
     ratio = case.electronics.lowpass_ratio
     is_used = jnp.arange(structure.n_controlled) < case.control.n_active
-    return jnp.max(jnp.where(is_used, ratio * assembled_frequency(case.machine.beam, ratio.size), 0))
+    return jnp.max(
+        jnp.where(is_used, ratio * assembled_frequency(case.machine.beam, ratio.size), 0)
+    )
 
 
 def _static_status(
@@ -249,12 +253,35 @@ def _static_status(
         (is_overlapping, status.PATCHES_OVERLAP),
         (is_off, status.PATCH_OFF_LINK),
         (_is_too_fast(structure, case) | jnp.any(mode_step > MODE_STEP_LIMIT), status.TOO_FAST),
+        (
+            drive_rate(case) * case.electronics.period / structure.substeps > STIFFNESS_LIMIT,
+            status.TOO_STIFF,
+        ),
         (~jnp.all((windows.stations > 0) & (windows.stations < length)), status.STATION_OFF_LINK),
+        (~_is_finite(case), status.NON_FINITE),
     )
     code = jnp.zeros(())
     for is_wrong, value in checks:
         code = jnp.where(is_wrong, float(value), code)
     return code
+
+
+def _is_finite(case: Case) -> Array:
+    """Whether no number of the case is NaN or infinite."""
+    numbers = (jnp.asarray(leaf) for leaf in jax.tree.leaves(case))
+    return reduce(jnp.logical_and, (jnp.all(jnp.isfinite(leaf)) for leaf in numbers))
+
+
+def drive_rate(case: Case) -> Array:
+    """Bound on the rate of the sliders' drive, d/m_s + sqrt(Kp/m_s) [1/s], ().
+
+    d adds Kd, viscous friction and the steepest slope of the friction law; the mass that a slider
+    feels is at least its own. Sliders that are locked have none.
+    """
+    drive, mass = case.drive, case.machine.masses.slider_mass
+    damping = drive.kd + drive.viscous_friction + drive.coulomb_friction / drive.friction_speed
+    rate = jnp.max(damping / mass + jnp.sqrt(drive.kp / mass))
+    return jnp.where(case.drive.is_locked > 0, 0.0, rate)
 
 
 def _is_ill_conditioned(structure: Structure, case: Case, design: ControllerDesign) -> Array:

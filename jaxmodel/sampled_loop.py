@@ -172,7 +172,9 @@ def _follow(matrices: LoopMatrices, poles, period: float, n_tracked: int) -> np.
             nearest = int(np.argmin(np.abs(np.array(candidates) - wanted)))
             found.append(candidates.pop(nearest))
         velocity, tracked = np.array(found) - tracked, np.array(found)
-    return tracked.reshape(n_tracked, 3)
+    return np.pad(
+        tracked.reshape(-1, 3), ((0, n_tracked - tracked.size // 3), (0, 0)), constant_values=np.nan
+    )
 
 
 def _link_poles(state: np.ndarray, n_tracked: int) -> np.ndarray:
@@ -190,4 +192,5 @@ def _link_poles(state: np.ndarray, n_tracked: int) -> np.ndarray:
     n_rigid = value.size - modes
     flexible = np.sort_complex(1j * value[np.argsort(weight)[: value.size - max(n_rigid, 0)]])
     flexible = flexible[np.argsort(np.abs(flexible))] / 1j
-    return flexible[: 3 * n_tracked].reshape(n_tracked, 3)
+    kept = min(flexible.size // 3, n_tracked)  # overdamped modes have no such pole
+    return flexible[: 3 * kept].reshape(kept, 3)

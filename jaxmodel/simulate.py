@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import jax
@@ -23,7 +24,7 @@ from jaxmodel.shaper import last_sample
 class Result(NamedTuple):
     """Outcome of a run."""
 
-    metrics: metrics.Metrics
+    metrics: metrics.Metrics  # NaN where the run did not finish
     status: Array  # code of `jaxmodel.status`, integer, ()
     bad_time: Array  # when it appeared [s], 0 where fine or wrong from the start, ()
     command_end: Array  # end of the shaped command [s], ()
@@ -70,8 +71,10 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
     is_long = end > n * period
     code = jnp.where((code == status.OK) & is_long, float(status.SHAPER_TOO_LONG), code)
     left = n * period - end - case.windows.residual_delay
+    # free vibration of a platform at rest: the window may end with the run
     is_moving = jnp.any(jnp.diff(case.path.waypoints, axis=0) != 0)
     is_cut = is_moving & (case.windows.residual_length > left + period / 2)
+    is_cut |= case.windows.residual_length < period
     code = jnp.where((code == status.OK) & is_cut, float(status.WINDOW_TOO_LONG), code)
     adc_noise, disturbance = _disturbance(structure, case, prepared, time)
     inputs = Inputs(
@@ -173,8 +176,15 @@ def simulate(structure: Structure, case: Case, has_record: bool = False) -> Resu
     else:
         last, record = jax.lax.scan(body, start, outside.inputs)
     result = metrics.finish(last.totals, case.electronics.period)
-    is_saturated = result.saturated_fraction > case.windows.saturation_limit
-    final = jnp.where((last.status == status.OK) & is_saturated, status.SATURATED, last.status)
+    final = last.status
+    for share, bad in (
+        (result.saturated_fraction, status.SATURATED), (result.clipped_fraction, status.CLIPPED)
+    ):  # fmt: skip
+        is_often = (final == status.OK) & (share > case.windows.saturation_limit)
+        final = jnp.where(is_often, float(bad), final)
+    # zeros of a run that stopped would look like a perfect one
+    is_finished = reduce(jnp.logical_or, (final == code for code in status.FINISHED))
+    result = jax.tree.map(lambda x: jnp.where(is_finished, x, jnp.nan), result)
     early = jnp.where(prepared.status == status.OK, outside.bad_time, 0.0)
     return Result(
         metrics=result,

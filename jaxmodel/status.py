@@ -20,6 +20,10 @@ WINDOW_TOO_LONG = 12
 TOO_FAST = 13
 STATION_OFF_LINK = 14
 TOO_STIFF = 15
+CLIPPED = 16
+
+#: A case with one of these ran to its end, and its metrics hold.
+FINISHED = (OK, SATURATED, UNSTABLE, CLIPPED)
 
 REASONS = {
     OK: "ok",
@@ -34,8 +38,9 @@ REASONS = {
     PATCH_OFF_LINK: "patch off the link",
     UNSTABLE: "linearised sampled loop unstable",
     SHAPER_TOO_LONG: "shaped motion longer than the run",
-    WINDOW_TOO_LONG: "residual window longer than the run",
+    WINDOW_TOO_LONG: "residual window longer than the run or shorter than a sample",
     TOO_FAST: "a filter, shaper or plant mode too fast for the step",
     STATION_OFF_LINK: "station off the link",
-    TOO_STIFF: "ideal feedback too stiff for the step",
+    TOO_STIFF: "drive or ideal feedback too stiff for the step",
+    CLIPPED: "ADC clipped too often",
 }

@@ -125,7 +125,9 @@ def _machine(fields: Fields) -> Machine:
             number("machine", "joint_radius"),
             np.array(list(ASSEMBLIES.values()))[outward],
         ),
-        Masses(*(number("machine", f) for f in ("platform_mass", "platform_inertia", "slider_mass"))),
+        Masses(
+            *(number("machine", f) for f in ("platform_mass", "platform_inertia", "slider_mass"))
+        ),
         Beam(*(number("link", name) for name in Beam._fields)),
         Patches(
             center=_centers(number("patches", "centers")),

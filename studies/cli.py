@@ -66,7 +66,7 @@ def simulate(
     write_store(out, run_variables(run), run_attributes(spec))
     metrics = run.result.metrics
     console.print(f"status: {describe(run.status)}")
-    table = Table("link", "residual rms [um]", "settling [ms]", "peak voltage [V]")
+    table = Table("link", "residual rms, worst station [um]", "settling [ms]", "peak voltage [V]")
     for i in range(3):
         table.add_row(
             str(i + 1), f"{1e6 * metrics.residual_rms[i].max():.4g}",

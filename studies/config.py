@@ -72,6 +72,8 @@ def configure(
     else:
         _require_in_force(old_flags, devices, flags)
     settings.update("jax_enable_x64", precision == "float64")
+    global _is_configured
+    _is_configured = True
     _set_cache(cache)
 
 
@@ -89,6 +91,18 @@ def info() -> dict[str, Any]:
         "cache_mib": round(_folder_bytes(folder) / 2**20, 1) if folder else 0.0,
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }
+
+
+_is_configured = False
+
+
+def require_configured() -> None:
+    """Raise StudyError unless `configure` has been called: JAX's default is single precision."""
+    if not _is_configured:
+        raise StudyError(
+            "studies.configure() must be called first, before any JAX operation: it sets double "
+            "precision, compiler flags, devices and the compilation cache"
+        )
 
 
 def is_backend_started() -> bool:

@@ -58,6 +58,10 @@ def check_consistency(study: Study) -> None:
                 f"centres at least {2 * half:g} apart, so that no patches overlap",
                 "m",
             )
+    if patches.width > link.width * (1 + 1e-9):
+        raise field_error(
+            "patches.width", patches.width, f"at most link.width = {link.width:g}", "m"
+        )
     n_patches = centers.shape[1]
     if control.law == "imsc" and control.modes > n_patches:
         raise field_error(
@@ -82,6 +86,19 @@ def check_consistency(study: Study) -> None:
                 )
     _check_sampling(study)
     _check_coupling(study)
+
+
+def check_locked(study: Study) -> None:
+    """Locked sliders follow no path; a linearisation does not mind, a run does.
+
+    Raises:
+        StudyError: more than one way-point.
+    """
+    if study.drive.locked and len(study.motion.waypoints) > 1:
+        raise field_error(
+            "motion.waypoints", study.motion.waypoints,
+            "one pose where drive.locked is true: locked sliders follow no path", "m, m, rad",
+        )  # fmt: skip
 
 
 def _check_coupling(study: Study) -> None:

@@ -35,6 +35,12 @@ def shown(value: object) -> str:
     return text if len(text) <= LONGEST else text[: LONGEST - 4] + " ..."
 
 
+def shown_name(name: str) -> str:
+    """A name as it is where it is one, else quoted; shortened to `LONGEST` characters."""
+    text = name if name.replace(".", "").replace("_", "").isalnum() else repr(name)
+    return text if len(text) <= LONGEST else text[: LONGEST - 4] + " ..."
+
+
 def _text(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()

@@ -9,11 +9,11 @@ from typing import Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from studies.errors import StudyError, field_error, nearest, shown
+from studies.errors import StudyError, field_error, nearest, shown, shown_name
 
 _SIGNS = (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
 _WORDS = {bool: "true or false", str: "text", float: "a finite number", int: "a whole number"}
-_PLURALS = {bool: "values true or false", float: "finite numbers"}
+_PLURALS = {bool: "values true or false", float: "finite numbers", str: "texts", dict: "tables"}
 
 
 def unit_of(info: FieldInfo) -> str:
@@ -36,6 +36,8 @@ def allowed_values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
     if origin is Literal:
         names = [repr(name) for name in arguments]
         return " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+    if origin is dict:
+        return "a table"
     if origin is tuple:
         return _entries(arguments, metadata)
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
@@ -47,6 +49,7 @@ def _entries(arguments: tuple[Any, ...], metadata: Iterable[Any]) -> str:
     """A list: how many entries, and of what."""
     entry = arguments[0]
     inner = get_args(entry)[0] if hasattr(entry, "__metadata__") else entry
+    inner = dict if get_origin(inner) is dict else inner
     least, most = _bound(metadata, "min_length"), _bound(metadata, "max_length")
     if arguments[-1] is not Ellipsis:
         count = f"{len(arguments)} "
@@ -85,10 +88,13 @@ def _range(metadata: Iterable[Any]) -> str:
     return " and ".join(limits)
 
 
-def explain(error: ValidationError, study: type[BaseModel], data: dict[str, Any]) -> StudyError:
+def explain(
+    error: ValidationError, study: type[BaseModel], data: dict[str, Any], inside: str = ""
+) -> StudyError:
     """The first fault that pydantic found, in the words of the study file.
 
     error: what validation raised. study: the outermost model. data: what was validated.
+    inside: name of the section that the model describes, "" for a whole study.
     """
     fault = error.errors(include_url=False)[0]
     location = list(fault["loc"])
@@ -96,21 +102,23 @@ def explain(error: ValidationError, study: type[BaseModel], data: dict[str, Any]
     for used, part in enumerate(location, 1):
         info = model.model_fields.get(str(part))
         if info is None:
-            return _unknown(study, model, location[:used], fault["input"])
+            return _unknown(study, model, location[:used], fault["input"], inside)
         inner = info.annotation
         if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
             break
         model = inner
     if info is None:
-        return field_error("study", fault["input"], allowed_values(study))
-    return _bad_value(info, location[:used], location[used:], fault["type"] == "missing", data)
+        return field_error(inside or "study", fault["input"], allowed_values(study))
+    is_missing = fault["type"] == "missing"
+    return _bad_value(info, location[:used], location[used:], is_missing, data, inside)
 
 
 def _unknown(
-    study: type[BaseModel], model: type[BaseModel], location: list[Any], value: Any
+    study: type[BaseModel], model: type[BaseModel], location: list[Any], value: Any, inside: str
 ) -> StudyError:
-    field, name = ".".join(str(part) for part in location), str(location[-1])
-    prefix = "".join(f"{part}." for part in location[:-1])
+    name = str(location[-1])
+    prefix = "".join(f"{part}." for part in [inside, *location[:-1]] if part != "")
+    field = prefix + name
     close = nearest(name, model.model_fields)
     hint = f"did you mean {prefix + close!r}?" if close else ""
     for section, info in study.model_fields.items() if not close else ():
@@ -118,18 +126,23 @@ def _unknown(
             hint = f"did you mean {f'{section}.{name}'!r}?"
     where = f"in [{prefix.rstrip('.')}]" if prefix else "at the top"
     hint = hint or f"allowed {where}: {', '.join(model.model_fields)}"
-    return StudyError(f"{field} = {shown(value)}: unknown field; {hint}")
+    return StudyError(f"{shown_name(field)} = {shown(value)}: unknown field; {hint}")
 
 
 def _bad_value(
-    info: FieldInfo, name: list[Any], inside: list[Any], is_missing: bool, data: dict[str, Any]
+    info: FieldInfo,
+    name: list[Any],
+    entries: list[Any],
+    is_missing: bool,
+    data: dict[str, Any],
+    inside: str,
 ) -> StudyError:
     annotation, metadata = info.annotation, list(info.metadata)
     value: Any = data
     for part in name:
         value = value[part]
     # an entry of a list is named by its index, as far as its type is clear
-    for part in inside[:-1] if is_missing else inside:
+    for part in entries[:-1] if is_missing else entries:
         if get_origin(annotation) is not tuple or not isinstance(part, int):
             break
         arguments = get_args(annotation)
@@ -138,5 +151,5 @@ def _bad_value(
         name = [*name, part]
     choices = get_args(annotation) if get_origin(annotation) is Literal else ()
     hint = nearest(value, choices) if isinstance(value, str) else ""
-    field = ".".join(str(part) for part in name)
+    field = ".".join(str(part) for part in [inside, *name] if part != "")
     return field_error(field, value, allowed_values(annotation, metadata), unit_of(info), hint)

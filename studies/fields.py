@@ -1,8 +1,8 @@
 """Fields of a study as arrays with a leading case axis, of length 1 where nothing varies.
 
-A *column* holds the values of one field for many cases: numbers, or lists of equal shape, as a NumPy
-array with the cases first; lists of unequal shape as an object array of tuples. A column may also
-be named after an entry of a list, `control.velocity_gain[0]`.
+A *column* holds the values of one field for many cases: numbers, or lists of equal shape, as a
+NumPy array with the cases first; lists of unequal shape as an object array of tuples. A column may
+also be named after an entry of a list, `control.velocity_gain[0]`.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class Fields:
             if entry is not None and entry.field == field and entry.indices:
                 if len(array) != len(column):
                     array = np.repeat(array, len(column), axis=0)
-                array[(slice(None), *entry.indices)] = column
+                np.moveaxis(array, 0, -1)[entry.indices] = column
         return array
 
     def choices(self, field: str, names: tuple[str, ...]) -> np.ndarray:

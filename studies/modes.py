@@ -65,7 +65,10 @@ def machine_modes(
     where = study.motion.waypoints[0]
     code, plant = _at_pose(structure, case, np.array(where))
     check_pose("pose", where, int(code))
-    return natural_modes(plant)
+    found = natural_modes(plant)
+    if locked:  # the three coordinates that the sliders hold are no modes
+        found = NaturalModes(found.frequency[3:], found.damping_ratio[3:], found.shape[:, 3:])
+    return found
 
 
 @partial(jax.jit, static_argnums=0)

@@ -62,7 +62,8 @@ def _responses(
     figure, axes = figures.new_figure(len(labels), 2)
     time = runs.record.time[0]
     for column, (off, on) in enumerate(pairs):
-        axes[0, column].set_title(TITLES[column])
+        title = TITLES[column] + f"\ncontrolled: links {runs.cases[on].links_text}"
+        axes[0, column].set_title(title)
         axes[-1, column].set_xlabel("time [s]")
         for row, label in enumerate(labels):
             figures.comparison(

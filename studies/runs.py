@@ -19,18 +19,24 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.kinematics import path_status
 from jaxmodel.linear import linearise, mechanical
 from jaxmodel.motion import end_of_path, sample_path
-from jaxmodel.prepare import MODE_STEP_LIMIT, lowpass_corner, prepare, spectrum_frequencies
+from jaxmodel.prepare import (
+    MODE_STEP_LIMIT,
+    STIFFNESS_LIMIT,
+    drive_rate,
+    lowpass_corner,
+    prepare,
+    spectrum_frequencies,
+)  # fmt: skip
 from jaxmodel.sampled_loop import LoopReport, loop_report
 from jaxmodel.shaper import last_sample
 from jaxmodel.simulate import Result, simulate
 from studies import config
 from studies.cases import as_arrays, build_case, build_structure, powered
+from studies.consistency import check_locked
 from studies.errors import field_error
 from studies.spec import Study
 from studies.store import Variable
 
-#: |Re lambda| h that one step may have with ideal feedback; ETDRK4 is unstable from about 2.8.
-STIFFNESS_LIMIT = 2.5
 #: More plant steps per sample than this are refused.
 SUBSTEP_LIMIT = 200
 
@@ -76,7 +82,7 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
 
 def uncontrolled(case: Case) -> Case:
     """The same case, or cases, with no link controlled."""
-    off = jnp.zeros_like(case.control.link_mask)
+    off = 0 * case.control.link_mask
     return case._replace(control=case.control._replace(link_mask=off))
 
 
@@ -141,7 +147,10 @@ def check_run(study: Study) -> tuple[Structure, Case]:
     Raises:
         StudyError: see `run_study`.
     """
+    config.require_configured()
+    check_locked(study)
     structure, case = build_structure(study), as_arrays(build_case(study))
+    structure = structure._replace(substeps=_drive_substeps(study, structure, case))
     known = jax.tree.map(np.asarray, _preflight(_without_run(structure), case))
     for k, pose in enumerate(study.motion.waypoints):
         check_pose(f"motion.waypoints.{k}", pose, int(known.pose_status[k]))
@@ -189,6 +198,10 @@ def check_pose(field: str, pose: tuple[float, float, float], code: int) -> None:
 
 def _check_duration(study: Study, structure: Structure, known: Preflight) -> None:
     duration = structure.n_steps / study.electronics.sample_rate_hz
+    if duration > 1.5 * study.run.duration:
+        raise field_error(
+            "run.duration", study.run.duration, f"at least {duration:g}, one sample", "s"
+        )
     end = float(known.motion_end + known.shaper_length)
     if end > duration * (1 + 1e-12):
         raise field_error(
@@ -197,12 +210,14 @@ def _check_duration(study: Study, structure: Structure, known: Preflight) -> Non
             f"{known.shaper_length:.4g} s", "s",
         )  # fmt: skip
     left = duration - end - study.metrics.residual_delay
-    is_moving = len(study.motion.waypoints) > 1
-    if is_moving and study.metrics.residual_length > left + 1e-9:
+    # free vibration of a platform at rest: the window may end with the run
+    longest = left if len(study.motion.waypoints) > 1 else np.inf
+    period = 1 / study.electronics.sample_rate_hz
+    if not period * (1 - 1e-9) <= study.metrics.residual_length <= longest + 1e-9:
         raise field_error(
             "metrics.residual_length", study.metrics.residual_length,
-            f"up to {max(left, 0):.6g}, what run.duration = {duration:g} leaves after the shaped "
-            "motion and metrics.residual_delay", "s",
+            f"{period:g} to {max(left, 0):.6g}, from one sample to what run.duration = "
+            f"{duration:g} leaves after the shaped motion and metrics.residual_delay", "s",
         )  # fmt: skip
 
 
@@ -241,11 +256,41 @@ def _mechanical(structure: Structure, case: Case, pose: Any) -> Any:
     return mechanical(linearise(structure, loop, pose, case.electronics.antialias))
 
 
+def _drive_substeps(study: Study, structure: Structure, case: Case) -> int:
+    """Plant steps per sample that the sliders' drive and friction need, or given."""
+    rate = float(drive_rate(case))
+    needed = max(int(np.ceil(rate / study.electronics.sample_rate_hz / STIFFNESS_LIMIT)), 1)
+    given, drive = study.run.substeps, study.drive
+    if needed <= (given or SUBSTEP_LIMIT):
+        return given or needed
+    if needed <= SUBSTEP_LIMIT:
+        raise field_error(
+            "run.substeps", given,
+            f"{needed} to {SUBSTEP_LIMIT}, or 0 for as many as needed; drive and friction have a "
+            f"rate of {rate:.3g} 1/s", "1",
+        )  # fmt: skip
+    slope = drive.coulomb_friction / drive.friction_speed
+    parts = {
+        "drive.kd": drive.kd, "drive.viscous_friction": drive.viscous_friction,
+        "drive.coulomb_friction": slope,
+    }  # fmt: skip
+    name = max(parts, key=parts.__getitem__)
+    value = drive.coulomb_friction if name == "drive.coulomb_friction" else parts[name]
+    raise field_error(
+        name, value,
+        f"so much that {SUBSTEP_LIMIT} plant steps per sample carry drive.kd, "
+        f"drive.viscous_friction and drive.coulomb_friction/drive.friction_speed = {slope:g} N s/m "
+        f"on machine.slider_mass; {needed} would be needed",
+        "N" if name == "drive.coulomb_friction" else "N s/m",
+    )  # fmt: skip
+
+
 def _ideal_substeps(study: Study, structure: Structure, case: Case) -> int:
     """Plant steps per sample for ideal feedback: what the worst way-point needs, or given."""
     poses = set(study.motion.waypoints)
     fastest = max(pole_decay(structure, case, np.array(pose)) for pose in poses)
     needed = int(np.ceil(fastest / study.electronics.sample_rate_hz / STIFFNESS_LIMIT))
+    needed = max(needed, structure.substeps)  # what the drive wants
     given = study.run.substeps
     if given and given < needed <= SUBSTEP_LIMIT:
         raise field_error(
@@ -335,7 +380,9 @@ def run_variables(run: Run) -> dict[str, Variable]:
             run.result.actuator_condition, ("link",), "1", "condition number of the synthesizer"
         ),
         "energy_ratio": Variable(
-            run.result.energy_ratio, ("link", "controlled_mode"), "1",
+            run.result.energy_ratio,
+            ("link", "controlled_mode"),
+            "1",
             "EMC ratios (24) that this run's modal energies give",
         ),
         **metric_variables(run.result),
@@ -347,6 +394,18 @@ def run_variables(run: Run) -> dict[str, Variable]:
             ),
             "gain_margin": Variable(
                 np.array(run.loop.gain_margin), (), "1", "common gain factor before instability"
+            ),
+            "loop_frequency": Variable(
+                run.loop.frequency_hz,
+                ("tracked_mode", "tracked_pole"),
+                "Hz",
+                "frequencies of the lowest link modes under control, three of each order",
+            ),
+            "loop_damping_ratio": Variable(
+                run.loop.damping_ratio,
+                ("tracked_mode", "tracked_pole"),
+                "1",
+                "their damping ratios",
             ),
         }
     if run.result.record is not None:

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jaxmodel.parameters import HOME
 from studies.consistency import check_consistency
-from studies.errors import StudyError
+from studies.errors import StudyError, field_error
 from studies.explain import explain
 
 Basis = Literal["pinned_pinned", "pinned_free", "loaded"]
@@ -31,7 +31,7 @@ Pause = Annotated[float, Field(ge=0, le=100)]
 Flags = tuple[bool, bool, bool]
 
 
-def _f(default: Any, unit: str, text: str, **bounds: Any) -> Any:
+def described(default: Any, unit: str, text: str, **bounds: Any) -> Any:
     return Field(default, description=text, json_schema_extra={"unit": unit}, **bounds)
 
 
@@ -44,129 +44,137 @@ class Section(BaseModel):
 class Run(Section):
     """How long and how finely."""
 
-    duration: float = _f(0.8, "s", "length of the run", gt=0, le=100)
-    seed: int = _f(0, "1", "of ADC noise and force ripple", ge=0, le=10**9)
-    substeps: int = _f(0, "1", "plant steps per sample; 0: as many as needed", ge=0, le=200)
-    smooth: bool = _f(False, "-", "smooth limits, noise instead of rounding (for gradients)")
+    duration: float = described(0.8, "s", "length of the run", gt=0, le=100)
+    seed: int = described(0, "1", "of ADC noise and force ripple", ge=0, le=10**9)
+    substeps: int = described(0, "1", "plant steps per sample; 0: as many as needed", ge=0, le=200)
+    smooth: bool = described(False, "-", "smooth limits, noise instead of rounding (for gradients)")
 
 
 class Machine(Section):
     """Guides, platform, sliders."""
 
-    assembly: Literal["inward", "outward"] = _f("inward", "-", "which of the two assemblies")
-    guide_side: float = _f(0.6, "m", "side of the guide triangle", ge=0.01, le=10)
-    joint_radius: float = _f(
+    assembly: Literal["inward", "outward"] = described("inward", "-", "which of the two assemblies")
+    guide_side: float = described(0.6, "m", "side of the guide triangle", ge=0.01, le=10)
+    joint_radius: float = described(
         round(0.12 / 3**0.5, 12), "m", "platform centre to joint", ge=1e-4, le=5
     )
-    platform_mass: float = _f(0.25, "kg", "m_p", ge=1e-3, le=1e3)
-    platform_inertia: float = _f(3.0e-4, "kg m2", "I_p", ge=1e-7, le=1e2)
-    slider_mass: float = _f(0.15, "kg", "m_s of each slider", ge=1e-3, le=1e3)
+    platform_mass: float = described(0.25, "kg", "m_p", ge=1e-3, le=1e3)
+    platform_inertia: float = described(3.0e-4, "kg m2", "I_p", ge=1e-7, le=1e2)
+    slider_mass: float = described(0.15, "kg", "m_s of each slider", ge=1e-3, le=1e3)
 
 
 class Link(Section):
     """The three flexible links."""
 
-    basis: Basis = _f("pinned_pinned", "-", "modal basis of the plant")
-    modes: int = _f(8, "1", "plant modes per link", ge=1, le=16)
-    length: float = _f(0.2, "m", "L", ge=1e-3, le=10)
-    thickness: float = _f(2e-3, "m", "t_b", ge=1e-5, le=0.1)
-    width: float = _f(10e-3, "m", "width", ge=1e-4, le=1)
-    density: float = _f(2750.0, "kg/m3", "density", ge=1, le=3e4)
-    youngs_modulus: float = _f(70e9, "Pa", "E", ge=1e3, le=2e12)
-    stiffness_factor: float = _f(
+    basis: Basis = described("pinned_pinned", "-", "modal basis of the plant")
+    modes: int = described(8, "1", "plant modes per link", ge=1, le=16)
+    length: float = described(0.2, "m", "L", ge=1e-3, le=10)
+    thickness: float = described(2e-3, "m", "t_b", ge=1e-5, le=0.1)
+    width: float = described(10e-3, "m", "width", ge=1e-4, le=1)
+    density: float = described(2750.0, "kg/m3", "density", ge=1, le=3e4)
+    youngs_modulus: float = described(70e9, "Pa", "E", ge=1e3, le=2e12)
+    stiffness_factor: float = described(
         1.0,
         "1",
         "true bending stiffness over the one controller and shaper believe",
         ge=1e-3,
         le=10,
     )
-    damping_ratio: float = _f(0.01, "1", "of every link mode", ge=0, lt=1)
-    joint_inertia_b: float = _f(0.0, "kg m2", "at the slider joint (basis loaded)", ge=0, le=1)
-    joint_inertia_c: float = _f(0.0, "kg m2", "at the platform joint (basis loaded)", ge=0, le=1)
+    damping_ratio: float = described(0.01, "1", "of every link mode", ge=0, lt=1)
+    joint_inertia_b: float = described(
+        0.0, "kg m2", "at the slider joint (basis loaded)", ge=0, le=1
+    )
+    joint_inertia_c: float = described(
+        0.0, "kg m2", "at the platform joint (basis loaded)", ge=0, le=1
+    )
 
 
 class Patches(Section):
     """Piezo pairs: a sensor and an actuator on opposite faces share a centre."""
 
-    centers: tuple[float, ...] | tuple[tuple[float, ...], ...] = _f(
+    centers: tuple[float, ...] | tuple[tuple[float, ...], ...] = described(
         (0.05, 0.10, 0.15), "m", "centres along the link; one list for all links, or three lists"
     )
-    sensor_length: float = _f(0.010, "m", "sensor length", ge=1e-5, le=1)
-    actuator_length: float = _f(0.030, "m", "actuator length", ge=1e-5, le=1)
-    width: float = _f(0.010, "m", "patch width", ge=1e-5, le=1)
-    thickness: float = _f(0.2e-3, "m", "t_p", ge=1e-6, le=0.01)
-    youngs_modulus: float = _f(66e9, "Pa", "E_p", ge=1e3, le=2e12)
-    d31: float = _f(
+    sensor_length: float = described(0.010, "m", "sensor length", ge=1e-5, le=1)
+    actuator_length: float = described(0.030, "m", "actuator length", ge=1e-5, le=1)
+    width: float = described(0.010, "m", "patch width", ge=1e-5, le=1)
+    thickness: float = described(0.2e-3, "m", "t_p", ge=1e-6, le=0.01)
+    youngs_modulus: float = described(66e9, "Pa", "E_p", ge=1e3, le=2e12)
+    d31: float = described(
         -180e-12, "C/N", "piezoelectric constant (its sign has no effect)", ge=-1e-9, le=1e-9
     )
-    relative_permittivity: float = _f(1750.0, "1", "eps33T/eps0", ge=1, le=1e5)
-    density: float = _f(7800.0, "kg/m3", "density of the ceramic", ge=0, le=3e4)
+    relative_permittivity: float = described(1750.0, "1", "eps33T/eps0", ge=1, le=1e5)
+    density: float = described(7800.0, "kg/m3", "density of the ceramic", ge=0, le=3e4)
 
 
 class Motion(Section):
     """The platform's path: point-to-point moves."""
 
-    waypoints: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = _f(
+    waypoints: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = described(
         (
             (0.0, 0.0, HOME[2]), (0.0, 0.01, HOME[2]), (0.01, 0.01, HOME[2]),
             (0.01, 0.0, HOME[2]), (0.0, 0.0, HOME[2]),
         ),
         "m, m, rad", "poses (x, y, phi) to visit", min_length=1, max_length=100,
     )  # fmt: skip
-    move_time: Time | tuple[Time, ...] = _f(0.1, "s", "t_f of each move, or one per move")
-    dwell: Pause | tuple[Pause, ...] = _f(0.0, "s", "rest after each move, or one per move")
-    profile: Literal["cycloid", "quintic"] = _f("cycloid", "-", "cycloid is (25)")
+    move_time: Time | tuple[Time, ...] = described(0.1, "s", "t_f of each move, or one per move")
+    dwell: Pause | tuple[Pause, ...] = described(0.0, "s", "rest after each move, or one per move")
+    profile: Literal["cycloid", "quintic"] = described("cycloid", "-", "cycloid is (25)")
 
 
 class Shaper(Section):
     """Input shaper on the motion."""
 
-    kind: Literal["none", "zv", "zvd", "zvdd", "ei", "ei_damped", "ei2", "ei3"] = _f(
+    kind: Literal["none", "zv", "zvd", "zvdd", "ei", "ei_damped", "ei2", "ei3"] = described(
         "ei", "-", "ei is the paper's (13)"
     )
-    frequencies_hz: tuple[Annotated[float, Field(ge=0.1, le=1e5)], ...] = _f(
+    frequencies_hz: tuple[Annotated[float, Field(ge=0.1, le=1e5)], ...] = described(
         (),
         "Hz",
         "modes to shape for, in series; empty: mode 1 of the assembled links",
         max_length=3,
     )
-    damping_ratio: float = _f(0.01, "1", "zeta the shaper assumes", ge=0, lt=0.9)
-    tolerance: float = _f(0.05, "1", "V of the EI family", ge=0, lt=1)
-    split: Literal["linear", "exact"] = _f("linear", "-", "impulses onto the sample grid")
+    damping_ratio: float = described(0.01, "1", "zeta the shaper assumes", ge=0, lt=0.9)
+    tolerance: float = described(0.05, "1", "V of the EI family", ge=0, lt=1)
+    split: Literal["linear", "exact"] = described("linear", "-", "impulses onto the sample grid")
 
 
 class Control(Section):
     """Active vibration control of the links."""
 
-    feedback: Literal["sampled", "ideal", "none"] = _f(
+    feedback: Literal["sampled", "ideal", "none"] = described(
         "sampled", "-", "digital loop, the paper's continuous state feedback, or none"
     )
-    law: Literal["imsc", "srf"] = _f("imsc", "-", "modal control, or strain rate feedback (16)")
-    basis: Basis = _f("pinned_pinned", "-", "modal basis the controller believes in")
-    modes: int = _f(3, "1", "controlled modes per link", ge=1, le=12)
-    links: Flags = _f((True, True, True), "-", "controlled links")
-    mode_mask: tuple[tuple[bool, ...], ...] = _f(
+    law: Literal["imsc", "srf"] = described(
+        "imsc", "-", "modal control, or strain rate feedback (16)"
+    )
+    basis: Basis = described("pinned_pinned", "-", "modal basis the controller believes in")
+    modes: int = described(3, "1", "controlled modes per link", ge=1, le=12)
+    links: Flags = described((True, True, True), "-", "controlled links")
+    mode_mask: tuple[tuple[bool, ...], ...] = described(
         (), "-", "on/off per link and controlled mode; empty: all on"
     )
-    velocity_gain: tuple[Gain, Gain, Gain] = _f(
+    velocity_gain: tuple[Gain, Gain, Gain] = described(
         (3.1, 3.5, 3.4), "N s/m or 1/s", "k_d of mode 1 per link (SRF: s)"
     )
-    position_gain: tuple[Gain, Gain, Gain] = _f(
+    position_gain: tuple[Gain, Gain, Gain] = described(
         (0.0, 0.0, 0.0), "N/m or 1/s2", "k_p of mode 1 per link (SRF: 1)"
     )
-    gain_unit: Literal["N s/m", "1/s"] = _f("N s/m", "-", "modal force or modal acceleration")
-    ratios: tuple[tuple[Gain, ...], ...] = _f(
+    gain_unit: Literal["N s/m", "1/s"] = described(
+        "N s/m", "-", "modal force or modal acceleration"
+    )
+    ratios: tuple[tuple[Gain, ...], ...] = described(
         ((1.0, 0.345, 0.045), (1.0, 0.304, 0.041), (1.0, 0.321, 0.038)),
         "1", "EMC ratios k_dj : k_d1 per link (24); missing ones are 0",
     )  # fmt: skip
-    ratio_source: Literal["given", "own_run"] = _f(
+    ratio_source: Literal["given", "own_run"] = described(
         "given", "-", "ratios as given, or by (24) from the same case's uncontrolled run"
     )
-    ratio_exponent: float = _f(
+    ratio_exponent: float = described(
         1.0, "1", "exponent on the ratios: 0 makes all gains equal", ge=0, le=10
     )
-    gain_factor: float = _f(0.5, "1", "f, common factor on all gains", ge=0, le=1e3)
-    feedthrough_factor: float = _f(
+    gain_factor: float = described(0.5, "1", "f, common factor on all gains", ge=0, le=1e3)
+    feedthrough_factor: float = described(
         0.0, "1", "share of the residual modes' feed-through that is subtracted", ge=0, le=1
     )
 
@@ -174,53 +182,61 @@ class Control(Section):
 class Electronics(Section):
     """Sampling, converters, velocity estimate."""
 
-    sample_rate_hz: float = _f(10_000.0, "Hz", "f_s", gt=100, le=1e6)
-    antialias_hz: float = _f(2_000.0, "Hz", "2nd-order Butterworth corner", gt=10, le=1e6)
-    estimator: Literal["modal_phase", "difference"] = _f("modal_phase", "-", "velocity estimate")
-    highpass_hz: float = _f(60.0, "Hz", "high-pass of modal_phase", gt=0, le=1e5)
-    lowpass_ratio: tuple[Annotated[float, Field(gt=0.1, le=100)], ...] = _f(
+    sample_rate_hz: float = described(10_000.0, "Hz", "f_s", gt=100, le=1e6)
+    antialias_hz: float = described(2_000.0, "Hz", "2nd-order Butterworth corner", gt=10, le=1e6)
+    estimator: Literal["modal_phase", "difference"] = described(
+        "modal_phase", "-", "velocity estimate"
+    )
+    highpass_hz: float = described(60.0, "Hz", "high-pass of modal_phase", gt=0, le=1e5)
+    lowpass_ratio: tuple[Annotated[float, Field(gt=0.1, le=100)], ...] = described(
         (3.0, 2.0, 2.0),
         "1",
         "kappa_j, low-pass corner over omega_j; the last one goes on",
         min_length=1,
     )
-    lowpass_zeta: tuple[Annotated[float, Field(gt=0, le=5)], ...] = _f(
+    lowpass_zeta: tuple[Annotated[float, Field(gt=0, le=5)], ...] = described(
         (0.7, 0.7, 0.7), "1", "damping of the low-pass; the last one goes on", min_length=1
     )
-    difference_cutoff_hz: float = _f(2_000.0, "Hz", "low-pass of the difference", gt=0, le=1e6)
-    conditioner_gain: float = _f(0.1, "1", "ADC volt per sensor volt", gt=0, le=1e3)
-    conditioner_bias: float = _f(1.5, "V", "bias at the ADC", ge=0, le=100)
-    adc_range: float = _f(3.0, "V", "full scale, from 0", gt=0, le=100)
-    adc_bits: int = _f(12, "1", "resolution", ge=4, le=32)
-    adc_noise: float = _f(0.0, "V", "rms at the ADC input", ge=0, le=10)
-    voltage_limit: float = _f(100.0, "V", "actuators, +-", gt=0, le=1e4)
+    difference_cutoff_hz: float = described(
+        2_000.0, "Hz", "low-pass of the difference", gt=0, le=1e6
+    )
+    conditioner_gain: float = described(0.1, "1", "ADC volt per sensor volt", gt=0, le=1e3)
+    conditioner_bias: float = described(1.5, "V", "bias at the ADC", ge=0, le=100)
+    adc_range: float = described(3.0, "V", "full scale, from 0", gt=0, le=100)
+    adc_bits: int = described(12, "1", "resolution", ge=4, le=32)
+    adc_noise: float = described(0.0, "V", "rms at the ADC input", ge=0, le=10)
+    voltage_limit: float = described(100.0, "V", "actuators, +-", gt=0, le=1e4)
 
 
 class Drive(Section):
     """Slider servo and disturbances."""
 
-    kind: Literal["pd", "computed_torque"] = _f("pd", "-", "PD, or PD with computed torque")
-    kp: float = _f(2e4, "N/m", "Kp", ge=0, le=1e8)
-    kd: float = _f(60.0, "N s/m", "Kd", ge=0, le=1e5)
-    force_limit: float = _f(1e3, "N", "motors, +-", gt=0, le=1e6)
-    coulomb_friction: float = _f(0.0, "N", "F_c of F_c tanh(v/v_0)", ge=0, le=1e3)
-    friction_speed: float = _f(1e-3, "m/s", "v_0", gt=0, le=1)
-    viscous_friction: float = _f(0.0, "N s/m", "viscous friction", ge=0, le=1e4)
-    ripple: float = _f(0.0, "N", "seeded force ripple, rms, new at every sample", ge=0, le=1e3)
-    pulse_force: tuple[Force, Force, Force] = _f((0.0, 0.0, 0.0), "N", "disturbance on the sliders")
-    pulse_start: float = _f(0.0, "s", "its start", ge=0, le=100)
-    pulse_length: float = _f(0.001, "s", "its length", ge=0, le=100)
-    locked: bool = _f(False, "-", "hold the sliders (bases with Y(L) = 0)")
+    kind: Literal["pd", "computed_torque"] = described("pd", "-", "PD, or PD with computed torque")
+    kp: float = described(2e4, "N/m", "Kp", ge=0, le=1e8)
+    kd: float = described(60.0, "N s/m", "Kd", ge=0, le=1e5)
+    force_limit: float = described(1e3, "N", "motors, +-", gt=0, le=1e6)
+    coulomb_friction: float = described(0.0, "N", "F_c of F_c tanh(v/v_0)", ge=0, le=1e3)
+    friction_speed: float = described(1e-3, "m/s", "v_0", gt=0, le=1)
+    viscous_friction: float = described(0.0, "N s/m", "viscous friction", ge=0, le=1e4)
+    ripple: float = described(
+        0.0, "N", "seeded force ripple, rms, new at every sample", ge=0, le=1e3
+    )
+    pulse_force: tuple[Force, Force, Force] = described(
+        (0.0, 0.0, 0.0), "N", "disturbance on the sliders"
+    )
+    pulse_start: float = described(0.0, "s", "its start", ge=0, le=100)
+    pulse_length: float = described(0.001, "s", "its length", ge=0, le=100)
+    locked: bool = described(False, "-", "hold the sliders (bases with Y(L) = 0)")
 
 
 class Initial(Section):
     """State at t = 0."""
 
-    modal: tuple[tuple[Deflection, ...], ...] = _f(
+    modal: tuple[tuple[Deflection, ...], ...] = described(
         (), "m", "modal coordinates per link; missing ones 0"
     )
-    load_station: float = _f(0.1, "m", "where a static transverse load acts", gt=0, le=10)
-    load_deflection: tuple[Deflection, Deflection, Deflection] = _f(
+    load_station: float = described(0.1, "m", "where a static transverse load acts", gt=0, le=10)
+    load_deflection: tuple[Deflection, Deflection, Deflection] = described(
         (0.0, 0.0, 0.0), "m", "chord deflection there, per link"
     )
 
@@ -228,16 +244,20 @@ class Initial(Section):
 class Metrics(Section):
     """How a run is judged."""
 
-    residual_delay: float = _f(
+    residual_delay: float = described(
         0.0, "s", "residual window starts this long after the command", ge=0, le=100
     )
-    residual_length: float = _f(0.3, "s", "length of the residual window", gt=0, le=100)
-    settling_band: float = _f(1e-6, "m", "chord deflection that counts as settled", gt=0, le=0.1)
-    saturation_limit: float = _f(0.05, "1", "tolerated share of saturated samples", ge=0, le=1)
-    condition_limit: float = _f(
+    residual_length: float = described(0.3, "s", "length of the residual window", gt=0, le=100)
+    settling_band: float = described(
+        1e-6, "m", "chord deflection that counts as settled", gt=0, le=0.1
+    )
+    saturation_limit: float = described(
+        0.05, "1", "tolerated share of saturated samples", ge=0, le=1
+    )
+    condition_limit: float = described(
         1e3, "1", "tolerated condition number of filter and synthesizer", ge=1, le=1e6
     )
-    stations: tuple[float, ...] = _f(
+    stations: tuple[float, ...] = described(
         (0.05, 0.10, 0.15), "m", "where chord deflection is taken", min_length=1, max_length=20
     )
 
@@ -245,7 +265,7 @@ class Metrics(Section):
 class Study(Section):
     """One study file."""
 
-    title: str = _f("study", "-", "what this is", max_length=200)
+    title: str = described("study", "-", "what this is", max_length=200)
     run: Run = Run()
     machine: Machine = Machine()
     link: Link = Link()
@@ -283,6 +303,8 @@ def parse_study(data: dict[str, Any]) -> Study:
     Raises:
         StudyError: first fault found, with field, value, allowed range and unit.
     """
+    if not isinstance(data, dict):
+        raise field_error("study", data, "a table of sections")
     data = {name: _plain(value) for name, value in data.items()}
     try:
         study = Study.model_validate(data)
@@ -310,16 +332,27 @@ def load_study(path: str | Path) -> Study:
     Raises:
         StudyError: unreadable, not TOML, or not a valid study.
     """
+    data = read_toml(path)
+    if "sweep" in data:
+        raise StudyError(f"{path}: has a section [sweep]; run it with studies sweep")
+    return parse_study(data)
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Read a TOML file as a dictionary.
+
+    Raises:
+        StudyError: unreadable or not TOML.
+    """
     try:
         text = Path(path).read_bytes().decode("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise StudyError(f"study file {path}: cannot be read ({reason})") from None
     try:
-        data = tomllib.loads(text)
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # ValueError: also a number of 5000 digits
         raise StudyError(f"study file {path}: not valid TOML ({error})") from None
-    return parse_study(data)
 
 
 def paper_study() -> Study:

@@ -11,6 +11,7 @@ import re
 import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,7 +46,7 @@ def write_store(
     """Write variables and global attributes to a netCDF-4 file, replacing the one that is there.
 
     path: the file; its folder must exist. attributes: text, numbers or lists of one of them.
-    An axis without a coordinate gets its index. Booleans become int8.
+    An axis without a coordinate gets its numbers, from 1. Booleans become int8.
 
     Raises StudyError for a target that cannot be written, and for data that netCDF cannot label or
     hold; whatever was at `path` is then still there.
@@ -55,12 +56,14 @@ def write_store(
     sizes = _axis_sizes(variables, arrays)
     labels = {name: _attribute(name, value) for name, value in attributes.items()}
     coordinates = {
-        axis: Variable(np.arange(size), (axis,), "1", f"index of {axis}")
+        axis: Variable(np.arange(1, size + 1), (axis,), "1", f"number of {axis}")
         for axis, size in sizes.items()
         if axis not in variables
     }
     arrays |= {axis: coordinate.data for axis, coordinate in coordinates.items()}
-    with replacing(path) as temporary, h5py.File(temporary, "w", track_order=True) as file:
+    # made in memory: HDF5 itself may crash on a full disk
+    image = BytesIO()
+    with h5py.File(image, "w", track_order=True) as file:
         file.attrs.update(labels)
         for name, variable in (coordinates | dict(variables)).items():
             dataset = file.create_dataset(name, data=arrays[name], track_order=True)
@@ -72,6 +75,8 @@ def write_store(
             if name not in sizes:
                 for position, axis in enumerate(variable.dims):
                     file[name].dims[position].attach_scale(file[axis])
+    with replacing(path) as temporary:
+        temporary.write_bytes(image.getbuffer())
 
 
 def read_store(path: str | Path) -> tuple[dict[str, Variable], dict[str, Any]]:
@@ -118,8 +123,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
         os.replace(temporary, target)
-    except (OSError, RuntimeError) as error:  # h5py raises either when a disk is full
-        raise StudyError(f"{path}: cannot write it ({error})") from error
+    except OSError as error:
+        raise StudyError(f"{path}: cannot write it ({error.strerror or error})") from error
     finally:
         temporary.unlink(missing_ok=True)
 

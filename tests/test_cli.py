@@ -190,7 +190,8 @@ TURN = f"[[{X}, {Y}, 0], [{X}, {Y}, {-2 * math.pi / 3}]]"
         ),
         (
             change("residual_length = 0.02", "residual_length = 0.04"),
-            "metrics.residual_length = 0.04: allowed up to 0.0212, what run.duration = 0.05 leaves",
+            "metrics.residual_length = 0.04: allowed 0.0001 to 0.0212, from one sample to what "
+            "run.duration = 0.05 leaves",
         ),
         (
             change("[control]", IDEAL + "[1e6, 1, 1]"),

@@ -17,7 +17,10 @@ def run(code, **environment):
     """Standard output, read as JSON, of `code` in a Python with no settings of ours."""
     clean = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     done = subprocess.run(
-        [sys.executable, "-c", code], env=clean | environment, capture_output=True, text=True,
+        [sys.executable, "-c", code],
+        env=clean | environment,
+        capture_output=True,
+        text=True,
         timeout=120,
     )
     assert done.returncode == 0, done.stderr
@@ -55,8 +58,10 @@ def test_late_flags_are_refused_with_the_cure(monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"precision": "float46"}, "precision = 'float46': allowed float64 or float32; "
-                                   "did you mean 'float64'?"),
+        (
+            {"precision": "float46"},
+            "precision = 'float46': allowed float64 or float32; did you mean 'float64'?",
+        ),
         ({"devices": 0}, "devices = 0: allowed a whole number from 1"),
         ({"devices": 1.5}, "devices = 1.5: allowed a whole number from 1"),
     ],
@@ -110,6 +115,15 @@ def test_unusable_cache_folder_does_not_stop_a_study(tmp_path):
 def test_info_is_plain_and_complete():
     facts = info()
     assert facts["jax"] == jax.__version__ and facts["precision"] == "float64"
-    assert {"flexlink-studies", "python", "jaxlib", "numpy", "h5py", "devices", "cache",
-            "cache_mib", "xla_flags"} <= facts.keys()
+    assert {
+        "flexlink-studies",
+        "python",
+        "jaxlib",
+        "numpy",
+        "h5py",
+        "devices",
+        "cache",
+        "cache_mib",
+        "xla_flags",
+    } <= facts.keys()
     json.dumps(facts)

@@ -137,9 +137,7 @@ def test_closure_holds_to_rounding_along_a_random_motion(kind):
         chain = dynamics.modal_chain(plant, pose, pose_rate, q, q_rate)
         gamma = kinematics.link_angle(chain)
         tips = reference.link_tips(MACHINE, basis, chain.rho, gamma, q)
-        rates = jax.jvp(
-            lambda t: reference.close(MACHINE, basis, *path(t)), (t,), (1.0,)
-        )[1]
+        rates = jax.jvp(lambda t: reference.close(MACHINE, basis, *path(t)), (t,), (1.0,))[1]
         return (
             tips - reference.platform_joints(MACHINE.geometry, pose),
             kinematics.closure_residual(plant, pose, chain, gamma),

@@ -107,9 +107,7 @@ def derivative(structure, loop, voltage, state, wanted):
     """Time derivative of the plant with its filter, for classical Runge-Kutta."""
     rates = plant_rates(structure, loop, state, wanted, voltage).acceleration
     z_acc = CORNER**2 * (state.q - state.z) - np.sqrt(2) * CORNER * state.z_rate
-    return PlantState(
-        state.pose_rate, rates.pose, state.q_rate, rates.modal, state.z_rate, z_acc
-    )
+    return PlantState(state.pose_rate, rates.pose, state.q_rate, rates.modal, state.z_rate, z_acc)
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -86,6 +86,15 @@ def test_overdamped_pairs_keep_their_frequency_and_damping():
     assert np.sum(modes.damping_ratio >= 1) >= 3
 
 
+def test_real_poles_are_paired_with_their_own():
+    """Sliders braked hard: all three drive modes are alike, slow and fast poles of one each."""
+    modes = natural_modes(linear(UNDAMPED.change(drive__kd=1000.0)))
+    drive = modes.damping_ratio > 1
+    assert drive.sum() == 3
+    np.testing.assert_allclose(modes.frequency[drive], [50.9, 50.9, 56.2], atol=0.1)
+    np.testing.assert_allclose(modes.damping_ratio[drive], [8.0, 8.0, 8.83], atol=0.01)
+
+
 def test_response_of_a_locked_link_to_its_actuators_is_the_modal_sum():
     study = UNDAMPED.change(link__damping_ratio=0.01, drive__locked=True)
     plant = linear(study)

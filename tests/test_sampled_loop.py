@@ -60,8 +60,7 @@ loop_matrices = jax.jit(closed_loop, static_argnums=0)
 def reports():
     """Loop reports of the table at eight plant modes."""
     return {
-        name: loop_report(*arrays(**changes), HOME_POSE)
-        for name, (changes, _, _) in TABLE.items()
+        name: loop_report(*arrays(**changes), HOME_POSE) for name, (changes, _, _) in TABLE.items()
     }
 
 
@@ -223,6 +222,13 @@ def test_nonlinear_run_follows_the_loop_matrix():
     for k, seen in enumerate(q):
         np.testing.assert_allclose(seen.ravel(), state[6 : 6 + modes], atol=1e-3 * SMALL, err_msg=k)
         state = transition @ state
+
+
+def test_overdamped_link_modes_are_not_followed():
+    structure, case = arrays(link__modes=3, link__damping_ratio=0.9999999999999999)
+    report = loop_report(structure, case, HOME_POSE)
+    assert report.damping_ratio.shape == (3, 3)
+    assert 0 < report.spectral_radius < 1 and report.gain_margin > 1
 
 
 def test_decay_of_the_nonlinear_run_is_the_predicted_damping():

@@ -84,6 +84,9 @@ REFUSED = [
     ("[initial]\nload_station = 0.5", "initial.load_station = 0.5: allowed between 0 and link.len"),
     ("[electronics]\nantialias_hz = 5e3", "antialias_hz = 5000.0: allowed below half the sample r"),
     ("[shaper]\nfrequencies_hz = [6e3]", "allowed below half the sample rate, 5000 [Hz]"),
+    ("[patches]\nwidth = 0.5", "patches.width = 0.5: allowed at most link.width = 0.01 [m]"),
+    ('[run]\n"du\\nration" = 1', "'run.du\\nration' = 1: unknown field"),
+    (f"{'x' * 9999} = 1", "x ... = 1: unknown field"),
     ("[run]\nduration = 100\nsubsteps = 50", "run.duration = 100.0: allowed up to 4 at"),
 ]
 
@@ -158,8 +161,9 @@ def test_the_paper_study_is_the_paper_square():
     study = paper_study()
     assert study.link.modes == 8 and study.control.modes == 3
     assert study.control.velocity_gain == (3.1, 3.5, 3.4)
-    np.testing.assert_allclose(np.array(study.motion.waypoints)[:, :2] * 1e3,
-                               [[0, 0], [0, 10], [10, 10], [10, 0], [0, 0]])
+    np.testing.assert_allclose(
+        np.array(study.motion.waypoints)[:, :2] * 1e3, [[0, 0], [0, 10], [10, 10], [10, 0], [0, 0]]
+    )
 
 
 def test_allowed_values_in_words():
@@ -201,9 +205,7 @@ STUDIES = st.fixed_dictionaries(
         "motion__move_time": _numbers(0.001, 10),
         "control__links": st.tuples(st.booleans(), st.booleans(), st.booleans()),
         "control__velocity_gain": st.tuples(*[_numbers(-1e9, 1e9)] * 3),
-        "control__ratios": st.lists(
-            st.lists(_numbers(-1, 1), max_size=4), min_size=3, max_size=3
-        ),
+        "control__ratios": st.lists(st.lists(_numbers(-1, 1), max_size=4), min_size=3, max_size=3),
         "shaper__frequencies_hz": st.lists(_numbers(0.1, 4999), max_size=3),
         "metrics__stations": st.lists(_numbers(0.001, 0.199), min_size=1, max_size=4),
         "run__seed": st.integers(0, 10**9),
@@ -216,3 +218,9 @@ STUDIES = st.fixed_dictionaries(
 def test_a_study_survives_being_written(fields):
     study = Study().change(**fields)
     assert parse_study(tomllib.loads(study_template(study))) == study
+
+
+@pytest.mark.parametrize("data", [None, [], 1, "x", {"sweep": {}}])
+def test_what_is_no_study_is_refused(data):
+    with pytest.raises(StudyError):
+        parse_study(data)

@@ -1,6 +1,7 @@
 """The store: round trip, what xarray sees, what is refused, and that nothing half-written stays."""
 
 import importlib.util
+import resource
 import subprocess
 import sys
 import warnings
@@ -23,17 +24,29 @@ ENGINES = [
 VARIABLES = {
     "case": Variable(np.array([10, 20, 30]), ("case",), "1", "number of the case"),
     "link": Variable(np.array(["first", "zweites é"]), ("link",), "1", "name of the link"),
-    "peak": Variable(np.array([[1.0, np.nan], [2.0, -0.0], [np.inf, 3e-310]]), ("case", "link"),
-                     "m", "largest tip deflection"),
-    "history": Variable(np.linspace(0, 1, 24).reshape(3, 2, 4), ("case", "link", "sample"),
-                        "m", "tip deflection"),
+    "peak": Variable(
+        np.array([[1.0, np.nan], [2.0, -0.0], [np.inf, 3e-310]]),
+        ("case", "link"),
+        "m",
+        "largest tip deflection",
+    ),
+    "history": Variable(
+        np.linspace(0, 1, 24).reshape(3, 2, 4), ("case", "link", "sample"), "m", "tip deflection"
+    ),
     "narrow": Variable(np.float32([0.1, 0.2, 0.3]), ("case",), "Hz", "single precision"),
     "is_stable": Variable(np.array([True, False, True]), ("case",), "1", "whether it settled"),
     "message": Variable(np.array(["", "x\ny", "ü"], dtype=object), ("case",), "1", "what failed"),
     "span": Variable(np.float64(0.8), (), "s", "simulated time"),
 }
-ATTRIBUTES = {"title": "Größen", "note": "", "seed": 7, "gain": 0.1, "spec": "x" * 100_000,
-              "gains": [1.5, 2.5], "names": ["a", "bb"]} | {f"more_{i}": i for i in range(10)}
+ATTRIBUTES = {
+    "title": "Größen",
+    "note": "",
+    "seed": 7,
+    "gain": 0.1,
+    "spec": "x" * 100_000,
+    "gains": [1.5, 2.5],
+    "names": ["a", "bb"],
+} | {f"more_{i}": i for i in range(10)}
 
 
 @pytest.fixture
@@ -59,10 +72,24 @@ def test_read_store_returns_what_was_written(path):
         np.testing.assert_array_equal(attributes[name], written)
 
 
-def test_axis_without_coordinate_gets_its_index(path):
+def test_axis_without_coordinate_gets_numbers_from_one(path):
     index = read_store(path)[0]["sample"]
     assert index.dims == ("sample",) and index.units == "1"
-    np.testing.assert_array_equal(index.data, np.arange(4))
+    np.testing.assert_array_equal(index.data, np.arange(1, 5))
+
+
+def test_full_disk_leaves_the_old_file_and_no_crash(path, tmp_path):
+    """A limit on the size of files stands in for a full disk; HDF5 itself would crash on it."""
+    before = path.read_bytes()
+    wide = {"x": Variable(np.zeros(10**6), ("sample",), "m", "too much")}
+    old = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, old[1]))
+    try:
+        with pytest.raises(StudyError, match="cannot write it"):
+            write_store(path, wide, {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
+    assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
 def test_a_store_can_be_written_again_from_what_was_read(path, tmp_path):
@@ -114,8 +141,11 @@ def changed(**fields):
         (changed(data=np.full((3, 2), None)), {}, "object"),
         (changed(data=np.full((3, 2), "a\0b")), {}, "NUL"),
         (changed() | {"a/b": VARIABLES["span"]}, {}, "variable = 'a/b'"),
-        (changed() | {"case": Variable(np.arange(4), ("case",), "1", "case")}, {},
-         "length of case along case = 4: allowed 3"),
+        (
+            changed() | {"case": Variable(np.arange(4), ("case",), "1", "case")},
+            {},
+            "length of case along case = 4: allowed 3",
+        ),
         (changed() | {"link": VARIABLES["span"]}, {}, "link.dims = []"),
         ({}, {"spec": None}, "attribute spec"),
         ({}, {"grid": [[1, 2]]}, "attribute grid"),
@@ -194,8 +224,11 @@ def test_files_that_are_no_store_are_named(tmp_path):
     (tmp_path / "text.nc").write_text("no HDF5")
     with h5py.File(tmp_path / "plain.h5", "w") as file:
         file["x"] = np.arange(3)
-    for name, words in (("none.nc", "no such file"), ("text.nc", "not a store"),
-                        ("plain.h5", "not a store")):
+    for name, words in (
+        ("none.nc", "no such file"),
+        ("text.nc", "not a store"),
+        ("plain.h5", "not a store"),
+    ):
         with pytest.raises(StudyError, match=f"{name}: {words}"):
             read_store(tmp_path / name)
 
