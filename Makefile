@@ -12,8 +12,12 @@ PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 16
 
-study: .venv/installed  ## run the study of the paper into results/paper
+study: .venv/installed  ## run the study of the paper and a sweep of patch placements
 	$(BIN)/studies paper --out results/paper
+	rm -rf results/placement
+	$(BIN)/studies sweep placement --out results/placement
+	$(BIN)/studies best results/placement --by residual_rms --count 5
+	$(BIN)/studies plot results/placement --out results/placement/best.png
 
 test: .venv/installed  ## run the tests
 	$(PYTEST)

@@ -4,6 +4,9 @@ from studies.config import configure, info
 from studies.errors import StudyError
 from studies.runs import Run, chord_deflection, run_study
 from studies.spec import Study, load_study, paper_study, parse_study
+from studies.sweeps.results import load
+from studies.sweeps.run import run_sweep
+from studies.sweeps.spec import load_sweep, parse_sweep
 
 __all__ = [
     "Run",
@@ -12,8 +15,12 @@ __all__ = [
     "chord_deflection",
     "configure",
     "info",
+    "load",
     "load_study",
+    "load_sweep",
     "paper_study",
     "parse_study",
+    "parse_sweep",
     "run_study",
+    "run_sweep",
 ]

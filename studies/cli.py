@@ -14,6 +14,7 @@ from typer.exceptions import Abort, TyperException
 
 from studies.config import configure
 from studies.errors import StudyError
+from studies.sweeps.commands import add_commands
 
 app = typer.Typer(
     help="Parameter studies of a planar 3-PRR manipulator with flexible links.",
@@ -79,6 +80,34 @@ def simulate(
 
 
 @app.command()
+def replay(
+    design: Annotated[Path, typer.Argument(help="study file, or folder of a sweep")],
+    case: Annotated[int | None, typer.Option(help="number of the case, for a sweep")] = None,
+    out: Annotated[Path | None, typer.Option(help="HDF5 file for the trajectories")] = None,
+) -> None:
+    """Run one case of a sweep again with full trajectories, and compare with what it found."""
+    configure()
+    from studies.design import deviation, load_design
+    from studies.runs import describe, run_attributes, run_study, run_variables
+    from studies.store import check_target, write_store
+
+    found = load_design(design, case)
+    if out is not None:
+        check_target(out)
+    run = run_study(found.study)
+    console.print(f"{found.study.title}: {describe(run.status)}")
+    if found.stored:
+        difference, name = deviation(run, found.stored)
+        console.print(
+            f"sweep: {describe(int(found.stored['status']))}; largest difference of a metric "
+            f"{difference:.1e} of its size{f' ({name})' if name else ''}"
+        )
+    if out is not None:
+        write_store(out, run_variables(run), run_attributes(found.study))
+        console.print(f"written: {out}", soft_wrap=True)
+
+
+@app.command()
 def modes(
     pose: Annotated[
         tuple[float, float, float] | None, typer.Option(help="x [m] y [m] phi [rad]; default home")
@@ -137,6 +166,9 @@ def info() -> None:
     for name, value in facts().items():
         table.add_row(name, str(value))
     console.print(table)
+
+
+add_commands(app, console)
 
 
 if __name__ == "__main__":

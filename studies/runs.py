@@ -307,7 +307,7 @@ def _ideal_substeps(study: Study, structure: Structure, case: Case) -> int:
     return given or max(needed, 1)
 
 
-_METRIC_LABELS = {
+METRIC_LABELS = {
     "residual_rms": (("link", "station"), "m", "rms chord deflection in the residual window"),
     "residual_peak": (("link", "station"), "m", "peak chord deflection in the residual window"),
     "structural_rms": (("link", "station"), "m", "rms chord deflection while moving"),
@@ -338,7 +338,7 @@ def metric_variables(result: Result) -> dict[str, Variable]:
     """Labelled metrics of a run."""
     return {
         name: Variable(np.asarray(getattr(result.metrics, name)), dims, unit, text)
-        for name, (dims, unit, text) in _METRIC_LABELS.items()
+        for name, (dims, unit, text) in METRIC_LABELS.items()
     }
 
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 import os
 import re
 import secrets
-from collections.abc import Iterator, Mapping
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -25,16 +26,31 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _TEXT = h5py.string_dtype("utf-8")
 
 
+class Streamed(NamedTuple):
+    """Numbers too many for memory, written part by part along the first axis.
+
+    parts: called once, gives (first row, rows); what no part covers is NaN or -1.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    parts: Callable[[], Iterable[tuple[int, np.ndarray]]]
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+
 class Variable(NamedTuple):
     """One labelled array.
 
-    data: numbers, booleans or text, one axis per name in dims.
+    data: numbers, booleans or text, one axis per name in dims; `Streamed` only to be written.
     dims: name of each axis; a one-dimensional variable named like its axis is its coordinate.
     units: SI symbol such as "m" or "Hz", "1" for none. Not "seconds": xarray makes dates of that.
     long_name: what it is, in words.
     """
 
-    data: np.ndarray
+    data: Any
     dims: tuple[str, ...]
     units: str
     long_name: str
@@ -61,12 +77,12 @@ def write_store(
         if axis not in variables
     }
     arrays |= {axis: coordinate.data for axis, coordinate in coordinates.items()}
-    # made in memory: HDF5 itself may crash on a full disk
-    image = BytesIO()
-    with h5py.File(image, "w", track_order=True) as file:
+    everything = coordinates | dict(variables)
+
+    def fill(file: h5py.File) -> None:
         file.attrs.update(labels)
-        for name, variable in (coordinates | dict(variables)).items():
-            dataset = file.create_dataset(name, data=arrays[name], track_order=True)
+        for name, variable in everything.items():
+            dataset = _dataset(file, name, arrays[name])
             dataset.attrs["units"] = variable.units
             dataset.attrs["long_name"] = variable.long_name
         for axis in sizes:
@@ -75,8 +91,46 @@ def write_store(
             if name not in sizes:
                 for position, axis in enumerate(variable.dims):
                     file[name].dims[position].attach_scale(file[axis])
+
     with replacing(path) as temporary:
-        temporary.write_bytes(image.getbuffer())
+        # HDF5 itself may crash on a full disk: what fits is made in memory, the rest has room
+        if any(isinstance(array, Streamed) for array in arrays.values()):
+            _check_room(path, arrays)
+            with h5py.File(temporary, "w", track_order=True) as file:
+                fill(file)
+        else:
+            image = BytesIO()
+            with h5py.File(image, "w", track_order=True) as file:
+                fill(file)
+            temporary.write_bytes(image.getbuffer())
+
+
+def _dataset(file: h5py.File, name: str, array: np.ndarray | Streamed) -> h5py.Dataset:
+    if not isinstance(array, Streamed):
+        return file.create_dataset(name, data=array, track_order=True)
+    empty = np.nan if array.dtype.kind == "f" else -1
+    dataset = file.create_dataset(
+        name, array.shape, array.dtype, fillvalue=empty, fletcher32=True, track_order=True
+    )
+    for start, rows in array.parts():
+        dataset[start : start + len(rows)] = rows
+    return dataset
+
+
+def _check_room(path: str | Path, arrays: Mapping[str, np.ndarray | Streamed]) -> None:
+    """Raise StudyError where the disk has no room for the arrays."""
+    text = 32  # bytes that a short text takes, as a guess
+    needed = sum(
+        float(np.prod(np.array(array.shape, float)))
+        * (text if array.dtype.kind == "O" else array.dtype.itemsize)
+        for array in arrays.values()
+    )
+    free = shutil.disk_usage(Path(os.path.realpath(path)).parent).free
+    if free < 1.1 * needed:
+        raise StudyError(
+            f"{path}: cannot write it, {needed / 2**20:.0f} MiB are needed and "
+            f"{free / 2**20:.0f} MiB are free"
+        )
 
 
 def read_store(path: str | Path) -> tuple[dict[str, Variable], dict[str, Any]]:
@@ -129,14 +183,16 @@ def replacing(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def _stored(name: str, variable: Variable) -> np.ndarray:
+def _stored(name: str, variable: Variable) -> np.ndarray | Streamed:
     """The array as the file holds it, or StudyError for what netCDF cannot label or hold."""
     _check_name("variable", name)
     for label in ("units", "long_name"):
         text = getattr(variable, label)
         if not text:
             raise field_error(f"{name}.{label}", text, "a text that is not empty")
-    data = np.asarray(variable.data)
+    data = variable.data
+    if not isinstance(data, Streamed):
+        data = np.asarray(data)
     dims = variable.dims
     for axis in dims:
         _check_name(f"dimension of {name}", axis)
@@ -144,7 +200,7 @@ def _stored(name: str, variable: Variable) -> np.ndarray:
         raise field_error(f"{name}.dims", dims, f"one distinct name for each of {data.ndim} axes")
     if name in dims and len(dims) > 1:
         raise field_error(f"{name}.dims", dims, f"only ({name!r},) for the coordinate of {name}")
-    return _storable(name, data)
+    return data if isinstance(data, Streamed) else _storable(name, data)
 
 
 def _storable(field: str, data: np.ndarray) -> np.ndarray:
@@ -163,7 +219,7 @@ def _storable(field: str, data: np.ndarray) -> np.ndarray:
 
 
 def _axis_sizes(
-    variables: Mapping[str, Variable], arrays: Mapping[str, np.ndarray]
+    variables: Mapping[str, Variable], arrays: Mapping[str, np.ndarray | Streamed]
 ) -> dict[str, int]:
     """Length of each axis, which must be the same in all variables."""
     sizes: dict[str, int] = {}

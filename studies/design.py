@@ -1,0 +1,75 @@
+"""A DESIGN: a study file, or a case of a sweep's folder; both end in one checked study."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from studies.errors import StudyError
+from studies.runs import Run, metric_variables
+from studies.spec import Study, load_study
+from studies.sweeps.folder import read_manifest
+from studies.sweeps.results import NOT_RUN, load, metric_names
+from studies.sweeps.spec import parse_sweep
+from studies.sweeps.table import build_table, case_study
+
+
+class Design(NamedTuple):
+    """One study and, for a case of a sweep, what the sweep found."""
+
+    study: Study
+    stored: dict[str, np.ndarray]  # metrics and status of the sweep; {} for a study file
+
+
+def load_design(path: Path, case: int | None = None) -> Design:
+    """Read a DESIGN.
+
+    Args:
+        path: study file, or folder of a sweep.
+        case: number of the case, with a sweep's folder only.
+
+    Raises:
+        StudyError: not found, case missing or not allowed, or a case that does not stand alone.
+    """
+    if not path.is_dir():
+        if case is not None:
+            raise StudyError(f"--case {case}: {path} is no folder of a sweep; leave --case out")
+        return Design(load_study(path), {})
+    data = load(path)
+    if case is None or not 0 <= case < data.n_cases:
+        raise StudyError(f"--case {case}: allowed 0 to {data.n_cases - 1}, the cases of {path}")
+    table = build_table(parse_sweep(read_manifest(path)["spec"]))
+    study = case_study(table, case)
+    steps = int(data["substeps"][case]) if "substeps" in data.variables else -1
+    if steps > 0:
+        study = study.change(run__substeps=steps)
+    if data["status"][case] == NOT_RUN:
+        return Design(study, {})
+    names = ["status", *(name for name in metric_names() if name in data.variables)]
+    return Design(study, {name: data[name][case] for name in names})
+
+
+def deviation(run: Run, stored: dict[str, np.ndarray]) -> tuple[float, str]:
+    """Largest difference between a run's metrics and stored ones, relative to each metric's size.
+
+    Args:
+        run: the run.
+        stored: metrics of the same case; NaN where a mode does not exist.
+
+    Returns:
+        (difference [1], name of the metric); (0, "") where there is nothing to compare.
+    """
+    found = {name: variable.data for name, variable in metric_variables(run.result).items()}
+    found["energy_ratio"] = run.result.energy_ratio
+    worst = (0.0, "")
+    for name, wanted in stored.items():
+        if name == "status":
+            continue
+        own = np.asarray(found[name])
+        part = np.asarray(wanted)[tuple(slice(0, n) for n in own.shape)]
+        size = np.nanmax(np.abs(part), initial=0.0)
+        difference = np.nanmax(np.abs(own - part), initial=0.0) / size if size > 0 else 0.0
+        worst = max(worst, (float(difference), name))
+    return worst

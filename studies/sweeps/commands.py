@@ -1,0 +1,156 @@
+"""The commands of sweeps: sweep, show, plot, best, sensitivity."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from studies.config import configure
+from studies.errors import StudyError
+
+Folder = Annotated[Path, typer.Argument(help="folder of a sweep")]
+
+
+def add_commands(app: typer.Typer, console: Console) -> None:
+    """Add the commands of sweeps to the command line."""
+
+    @app.command()
+    def sweep(
+        spec: Annotated[Path, typer.Argument(help="sweep file (TOML), or the name of a ready one")],
+        out: Annotated[Path | None, typer.Option(help="folder for the results")] = None,
+        resume: Annotated[
+            bool, typer.Option("--resume", help="go on with the sweep that is there, or extend it")
+        ] = False,
+        dry_run: Annotated[
+            bool, typer.Option("--dry-run", help="say what would be run, and how long it takes")
+        ] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", help="no progress")] = False,
+        precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
+    ) -> None:
+        """Run thousands of cases from one file; finished ones survive whatever happens."""
+        configure(precision)
+        from studies.sweeps.run import make_plan, run_sweep
+        from studies.sweeps.show import print_plan
+        from studies.sweeps.spec import load_sweep, ready_spec
+
+        asked = load_sweep(ready_spec(spec))
+        if dry_run:
+            print_plan(make_plan(asked), console)
+            return
+        if out is None:
+            raise StudyError("--out: name a folder for the results")
+        done = run_sweep(asked, out, resume, console, quiet)
+        if done.is_interrupted:
+            print(
+                f"studies: interrupted; {done.n_done} of {len(done.table)} cases are safe; go on "
+                f"with: studies sweep {spec} --out {out} --resume",
+                file=sys.stderr,
+            )
+            sys.exit(130)
+        if not quiet:
+            console.print(
+                f"{done.n_run} cases in {done.run_time:.1f} s and {done.compile_time:.1f} s of "
+                f"compiling; results: {out / 'results.h5'}",
+                soft_wrap=True,
+            )
+
+    @app.command()
+    def show(
+        folder: Folder,
+        failed: Annotated[bool, typer.Option("--failed", help="list failed cases")] = False,
+    ) -> None:
+        """Overview of a sweep: statuses, best cases; or its failed cases."""
+        configure()
+        from studies.sweeps.results import load
+        from studies.sweeps.show import print_causes
+        from studies.sweeps.show import show as show_sweep
+
+        data = load(folder)
+        show_sweep(data, console, failed)
+        print_causes(data, console)
+
+    @app.command()
+    def best(
+        folder: Folder,
+        by: Annotated[str, typer.Option(help="metric to make small; -metric: to make large")],
+        subject_to: Annotated[str, typer.Option(help="condition on metrics and axes")] = "",
+        count: Annotated[int, typer.Option(min=1, help="how many")] = 10,
+    ) -> None:
+        """Best cases of a sweep by a metric."""
+        configure()
+        from studies.sweeps.results import load
+        from studies.sweeps.show import best_cases, print_cases
+
+        data = load(folder)
+        print_cases(data, best_cases(data, by, subject_to, count), [by.lstrip("-")], console)
+
+    @app.command()
+    def plot(
+        folder: Folder,
+        y: Annotated[str, typer.Option(help="metric or axis")] = "residual_rms",
+        x: Annotated[str | None, typer.Option(help="axis or metric; none: all axes")] = None,
+        hue: Annotated[str | None, typer.Option(help="axis or metric for the colour")] = None,
+        out: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG; default: folder")] = None,
+    ) -> None:
+        """One figure of a sweep; its kind follows from the axes."""
+        configure()
+        from studies.sweeps.plots import plot as draw
+        from studies.sweeps.plots import save_plot
+        from studies.sweeps.results import load, variable_name
+
+        names = [variable_name(name) for name in (y, x, hue) if name]
+        path = out or folder / f"{'-over-'.join(names[:2])}{'-by-' + names[2] if hue else ''}.png"
+        save_plot(draw(load(folder), x, y, hue), path)
+        console.print(f"written: {path}", soft_wrap=True)
+
+    @app.command()
+    def sensitivity(
+        folder: Folder,
+        by: Annotated[str, typer.Option(help="metric")] = "residual_rms",
+    ) -> None:
+        """Which parameters matter: from a sweep with method morris or saltelli."""
+        configure()
+        from studies.sweeps.designs import unit_points
+        from studies.sweeps.results import load
+        from studies.sweeps.sensitivity import (
+            design_values,
+            elementary_effects,
+            factor_names,
+            sobol_indices,
+        )
+        from studies.sweeps.show import label
+
+        data = load(folder)
+        names = factor_names(data)
+        value = design_values(data, by)
+        console.print(f"{label(data, by)}, {len(value)} rows of a {data.spec.sweep.method} design")
+        if data.spec.sweep.method == "morris":
+            points = unit_points(data.spec.root, len(names), data.spec.sweep.seed)
+            effects = elementary_effects(points, value)
+            table = Table("factor", "mean |effect|", "mean effect", "deviation", "effects used")
+            columns = zip(
+                names, effects.mean_size, effects.mean, effects.deviation, effects.n_used,
+                strict=True,
+            )  # fmt: skip
+            for name, *numbers, used in sorted(columns, key=lambda row: -row[1]):
+                table.add_row(name, *(f"{x:.4g}" for x in numbers), str(used))
+            left_out, what = effects.n_left_out, "effects"
+        else:
+            found = sobol_indices(value, len(names))
+            table = Table("factor", "first", "95 %", "total", "95 %")
+            for k in np.argsort(-found.total):
+                a, b = found.first_interval[k], found.total_interval[k]
+                table.add_row(
+                    names[k], f"{found.first[k]:.3f}", f"{a[0]:.3f} to {a[1]:.3f}",
+                    f"{found.total[k]:.3f}", f"{b[0]:.3f} to {b[1]:.3f}",
+                )  # fmt: skip
+            left_out, what = found.n_left_out, "base points"
+        console.print(table)
+        if left_out:
+            console.print(f"left out because of failed cases: {left_out} {what}")

@@ -1,0 +1,207 @@
+"""How axes combine: from the tree of blocks to columns of values, one row per case."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from studies.errors import StudyError, field_error
+from studies.fields import Columns
+from studies.spec import Study
+from studies.sweeps.axes import (
+    LIMIT,
+    READY_MADE,
+    Axis,
+    build_axis,
+    checked_value,
+    column_of,
+    known_field,
+)
+from studies.sweeps.spec import SAMPLED, Node
+
+
+def spread(node: Node, study: Study, seed: int) -> Columns:
+    """Columns of a block: what varies, one row per case; {} for a block without axes.
+
+    Args:
+        node: the block.
+        study: values of everything else.
+        seed: of the sampling methods.
+
+    Raises:
+        StudyError: a bad axis, a name used twice, too many cases.
+    """
+    block = node.block
+    if block.method == "list":
+        own = _listed(node, study)
+    elif block.method in SAMPLED:
+        own = _sampled(node, study, seed)
+    else:
+        own = None
+    parts = [own] if own is not None else [_grid_of(a, n) for n, a in _axes(node, study).items()]
+    parts += [spread(child, study, seed + 1000 * (k + 1)) for k, child in enumerate(node.children)]
+    _check_names(parts, node.path)
+    if block.method == "zip":
+        return _paired(parts, node.path)
+    return _product(parts, node.path)
+
+
+def _axes(node: Node, study: Study) -> dict[str, Axis]:
+    path = f"{node.path}.axes"
+    return {
+        f"{path}.{name}": build_axis(name, written, study, path)
+        for name, written in node.block.axes.items()
+    }
+
+
+def _grid_of(axis: Axis, path: str) -> Columns:
+    if axis.grid is None:
+        raise StudyError(
+            f"{path}: a range needs count (placement: candidates) for methods grid and zip"
+        )
+    return axis.grid
+
+
+def length(columns: Columns) -> int:
+    """Number of rows."""
+    return len(next(iter(columns.values()))) if columns else 1
+
+
+def _check_names(parts: list[Columns], path: str) -> None:
+    seen: set[str] = set()
+    for columns in parts:
+        for name in columns:
+            if name in seen:
+                raise StudyError(f"{path}: {name} varies twice; let one axis or block vary it")
+            seen.add(name)
+    for name in seen:
+        whole = name.split("[")[0]
+        if whole != name and whole in seen:
+            raise StudyError(f"{path}: {whole} varies as a whole and by its entry {name}")
+
+
+def _paired(parts: list[Columns], path: str) -> Columns:
+    sizes = [length(columns) for columns in parts]
+    if len(set(sizes)) > 1:
+        named = ", ".join(
+            f"{'/'.join(columns)}: {size}" for columns, size in zip(parts, sizes, strict=True)
+        )
+        raise StudyError(f"{path}.method = 'zip': axes of one length; here {named}")
+    return {name: column for columns in parts for name, column in columns.items()}
+
+
+def _product(parts: list[Columns], path: str) -> Columns:
+    sizes = [length(columns) for columns in parts]
+    total = int(np.prod([float(size) for size in sizes]))
+    if total > LIMIT:
+        raise StudyError(f"{path}: {total:.3g} cases; allowed up to {LIMIT}")
+    result: dict[str, np.ndarray] = {}
+    inner, outer = total, 1
+    for columns, size in zip(parts, sizes, strict=True):
+        inner //= size
+        index = np.tile(np.repeat(np.arange(size), inner), outer)
+        outer *= size
+        result |= {name: column[index] for name, column in columns.items()}
+    return result
+
+
+def _listed(node: Node, study: Study) -> Columns:
+    """Spelt-out cases; what a case does not name has the base study's value."""
+    path = f"{node.path}.cases"
+    for k, case in enumerate(node.block.cases):
+        for name in case:
+            if name in READY_MADE:
+                raise StudyError(f"{path}.{k}: {name} is no field; write the field it stands for")
+            known_field(name, study, f"{path}.{k}")
+    names = list(dict.fromkeys(name for case in node.block.cases for name in case))
+    columns: dict[str, np.ndarray] = {}
+    for name in names:
+        base = known_field(name, study)
+        values: list[Any] = [
+            checked_value(study, name, case[name], f"{path}.{k}") if name in case else base
+            for k, case in enumerate(node.block.cases)
+        ]
+        columns[name] = column_of(values)
+    return columns
+
+
+def _sampled(node: Node, study: Study, seed: int) -> Columns:
+    axes = _axes(node, study)
+    dimensions = sum(axis.dimensions for axis in axes.values())
+    points = unit_points(node, dimensions, seed)
+    columns: dict[str, np.ndarray] = {}
+    at = 0
+    for path, axis in axes.items():
+        part = axis.sample(points[:, at : at + axis.dimensions])
+        for name in part:
+            if name in columns:
+                raise StudyError(f"{path}: {name} varies twice; let one axis vary it")
+        columns |= part
+        at += axis.dimensions
+    return columns
+
+
+def unit_points(node: Node, dimensions: int, seed: int) -> np.ndarray:
+    """Points of the unit cube for a sampling method, (n, dimensions).
+
+    The first rows stay the same when more are asked for, so that a study can grow.
+    """
+    block = node.block
+    if block.method == "random":
+        return np.random.default_rng(seed).random((block.count, dimensions))
+    if block.method == "latin_hypercube":
+        size = block.size or block.count
+        parts = [
+            qmc.LatinHypercube(dimensions, rng=np.random.default_rng([seed, k])).random(size)
+            for k in range(block.count // size)
+        ]
+        return np.concatenate(parts)
+    if block.method == "sobol":
+        return _sobol(block.count, dimensions, seed, node.path)
+    if block.method == "saltelli":
+        return saltelli_points(_sobol(block.count, 2 * dimensions, seed, node.path))
+    return morris_points(block.count, dimensions, block.levels, seed)
+
+
+def _sobol(count: int, dimensions: int, seed: int, path: str) -> np.ndarray:
+    if dimensions > 21201:
+        raise field_error(f"{path}.axes", dimensions, "up to 21201 dimensions for Sobol points")
+    # the next power of two, cut: a balanced sequence, and no warning about its length
+    exponent = int(np.ceil(np.log2(max(count, 1))))
+    engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
+    return engine.random_base2(exponent)[:count]
+
+
+def saltelli_points(points: np.ndarray) -> np.ndarray:
+    """Design for Sobol indices from (n, 2 d) points: rows A, B, A with column i of B; (n (d+2), d).
+
+    The d + 2 rows of each base point follow one another. Saltelli et al. 2010.
+    """
+    n, d = len(points), points.shape[1] // 2
+    a, b = points[:, :d], points[:, d:]
+    mixed = np.repeat(a[:, None], d, axis=1)
+    mixed[:, np.arange(d), np.arange(d)] = b
+    return np.concatenate([a[:, None], b[:, None], mixed], axis=1).reshape(n * (d + 2), d)
+
+
+def morris_points(count: int, dimensions: int, levels: int, seed: int) -> np.ndarray:
+    """Trajectories for elementary effects, (count (d + 1), d); Morris 1991.
+
+    Each starts on a random point of the grid and changes one coordinate after the other, in random
+    order, by +-levels/(2 (levels - 1)). The ends of the cube are part of the grid.
+    """
+    step = (levels // 2) / (levels - 1)
+    rows = []
+    for k in range(count):
+        rng = np.random.default_rng([seed, k])
+        start = rng.integers(0, levels, dimensions) / (levels - 1)
+        sign = np.where(start + step > 1 + 1e-12, -1.0, 1.0)
+        is_free = (start + step <= 1 + 1e-12) & (start - step >= -1e-12)
+        sign = np.where(is_free & (rng.random(dimensions) < 0.5), -1.0, sign)
+        moved = np.zeros((dimensions + 1, dimensions))
+        for position, axis in enumerate(rng.permutation(dimensions)):
+            moved[position + 1 :, axis] = sign[axis] * step
+        rows.append(start + moved)
+    return np.concatenate(rows).clip(0.0, 1.0)

@@ -1,0 +1,250 @@
+"""The folder of a sweep: every finished chunk survives whatever ends the run.
+
+`sweep.json` says what is being run and by which code; each chunk is one file in `chunks/`, whose
+name holds the hash of its bytes, so that a half-written or damaged one is recognised; at the end
+`results.h5` joins them and they go. A lock keeps a second process out.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+import subprocess
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from hashlib import file_digest, sha256
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+
+from studies import config
+from studies.errors import StudyError
+from studies.store import Variable, replacing, write_store
+
+RESULTS, MANIFEST, CHUNKS, LOCK = "results.h5", "sweep.json", "chunks", ".lock"
+_CHUNK = re.compile(r"(\d{6,})-([0-9a-f]{16})\.h5")
+_SOURCES = Path(__file__).parents[2]
+
+
+class Finished(NamedTuple):
+    """Where finished cases are."""
+
+    case_id: np.ndarray  # (n,)
+    file: np.ndarray  # position in `files`, (n,)
+    row: np.ndarray  # in that file, (n,)
+    files: list[Path]
+
+
+class SweepFolder:
+    """One folder, open for writing by this process alone. Make it with `open_folder`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @property
+    def results(self) -> Path:
+        return self.path / RESULTS
+
+    @property
+    def chunks(self) -> Path:
+        return self.path / CHUNKS
+
+    def write_chunk(self, variables: Mapping[str, Variable]) -> None:
+        """Keep a finished chunk: write beside, flush, rename.
+
+        Raises:
+            StudyError: the disk is full or cannot be written to; nothing half-written stays.
+        """
+        self.chunks.mkdir(exist_ok=True)
+        temporary = self.chunks / "unfinished.tmp"
+        try:
+            write_store(temporary, variables, {})
+            number = 1 + max((n for n, _ in _chunk_files(self.chunks)), default=-1)
+            os.replace(temporary, self.chunks / f"{number:06d}-{file_hash(temporary)}.h5")
+            _sync(self.chunks)
+        except OSError as error:
+            raise StudyError(f"{self.chunks}: cannot write a chunk ({error})") from error
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    def remove_chunks(self) -> None:
+        """Remove the chunks that `results.h5` holds now."""
+        for _, path in _chunk_files(self.chunks):
+            path.unlink()
+        if self.chunks.is_dir() and not any(self.chunks.iterdir()):
+            self.chunks.rmdir()
+
+
+@contextmanager
+def open_folder(path: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterator[SweepFolder]:
+    """Open a sweep's folder, made where it is missing, and lock it.
+
+    Args:
+        path: the folder.
+        manifest: from `make_manifest`.
+        is_resumed: go on with what is there.
+
+    Raises:
+        StudyError: not writable, in use, holds something else, or a sweep that does not fit.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        lock = open(path / LOCK, "a")
+    except FileExistsError:
+        raise StudyError(f"--out {path}: this is a file; name a folder") from None
+    except OSError as error:
+        raise StudyError(f"--out {path}: cannot write there ({error.strerror})") from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise StudyError(f"--out {path}: another process is running a sweep there") from None
+        folder = SweepFolder(path)
+        _check_content(folder, manifest, is_resumed)
+        for left in (*path.glob("*.tmp"), *path.glob(".*.tmp"), *path.glob(f"{CHUNKS}/*.tmp")):
+            left.unlink()
+        text = json.dumps(manifest, indent=1)
+        if not (path / MANIFEST).is_file() or (path / MANIFEST).read_text() != text:
+            with replacing(path / MANIFEST) as temporary:
+                temporary.write_text(text)
+        yield folder
+
+
+def make_manifest(data: dict[str, Any]) -> dict[str, Any]:
+    """What decides a sweep's numbers, and what ran it.
+
+    Args:
+        data: the sweep file as read.
+    """
+    facts = config.info()
+    keep = (config.PACKAGE, "python", "jax", "jaxlib", "numpy", "h5py", "devices", "precision")
+    return {"spec": data, "code": code_digest(), "git": git_state(), **{k: facts[k] for k in keep}}
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """The manifest of a sweep's folder.
+
+    Raises:
+        StudyError: no sweep there.
+    """
+    try:
+        manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+        if not isinstance(manifest, dict) or "spec" not in manifest:
+            raise ValueError("no spec in it")
+    except OSError:
+        raise StudyError(f"{path}: no folder of a sweep ({MANIFEST} is missing)") from None
+    except ValueError as error:
+        raise StudyError(f"{path / MANIFEST}: damaged ({error})") from None
+    return manifest
+
+
+def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bool) -> None:
+    """Refuse a folder of something else, a sweep already there, other code, other precision."""
+    if not (folder.path / MANIFEST).exists():
+        if is_resumed:
+            raise StudyError(f"--resume: {folder.path} holds no sweep; leave --resume out")
+        others = [p.name for p in folder.path.iterdir() if p.name != LOCK and p.suffix != ".tmp"]
+        if others:
+            raise StudyError(
+                f"--out {folder.path}: holds other files ({', '.join(sorted(others)[:3])}); "
+                "name a new or empty folder"
+            )
+        return
+    if not is_resumed:
+        raise StudyError(
+            f"--out {folder.path}: holds a sweep already; add --resume to go on with it or to "
+            "extend it, or name a new folder"
+        )
+    old = read_manifest(folder.path)
+    for key, what in (
+        ("code", "code"),
+        ("precision", "precision"),
+        ("jaxlib", "version of jaxlib"),
+    ):
+        if old.get(key) != manifest[key]:
+            raise StudyError(
+                f"--resume: {folder.path} was begun with another {what} ({old.get(key)}, now "
+                f"{manifest[key]}), so its cases would not fit new ones; name a new folder"
+            )
+
+
+def finished_cases(path: Path, tell: Any = None) -> Finished:
+    """Cases that are done, each once; damaged chunks are set aside and told about.
+
+    Args:
+        path: the sweep's folder.
+        tell: called with a text for every damaged file; None: leave it where it is.
+    """
+    files = [path / RESULTS] if (path / RESULTS).is_file() else []
+    for _, chunk in _chunk_files(path / CHUNKS):
+        if file_hash(chunk) == _CHUNK.fullmatch(chunk.name)[2]:  # type: ignore[index]
+            files.append(chunk)
+        elif tell is not None:
+            tell(f"{chunk.name} is damaged; its cases run again")
+            chunk.rename(chunk.with_suffix(".damaged"))
+    ids, sources, rows = [], [], []
+    kept: list[Path] = []
+    for file in files:
+        try:
+            with h5py.File(file, "r") as store:
+                status, names = store["status"][()], store["case_id"][()]
+        except (OSError, RuntimeError, KeyError) as error:
+            if file.name == RESULTS:
+                raise StudyError(
+                    f"{file}: damaged ({error}); remove it to run its cases again"
+                ) from None
+            continue
+        is_run = status >= 0
+        ids.append(np.array(names, "S16")[is_run])
+        rows.append(np.flatnonzero(is_run))
+        sources.append(np.full(is_run.sum(), len(kept)))
+        kept.append(file)
+    if not ids:
+        return Finished(np.empty(0, "S16"), np.empty(0, int), np.empty(0, int), [])
+    case_id, first = np.unique(np.concatenate(ids), return_index=True)
+    return Finished(case_id, np.concatenate(sources)[first], np.concatenate(rows)[first], kept)
+
+
+def file_hash(path: Path) -> str:
+    """First 16 digits of a file's SHA-256."""
+    with open(path, "rb") as file:
+        return file_digest(file, "sha256").hexdigest()[:16]
+
+
+def _chunk_files(folder: Path) -> list[tuple[int, Path]]:
+    if not folder.is_dir():
+        return []
+    found = ((_CHUNK.fullmatch(path.name), path) for path in folder.iterdir())
+    return sorted((int(match[1]), path) for match, path in found if match)
+
+
+def _sync(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def code_digest() -> str:
+    """Hash of the sources that decide a case's numbers."""
+    digest = sha256()
+    names = ("cases.py", "fields.py", "spec.py", "sweeps/executor.py", "sweeps/table.py")
+    sources = sorted((_SOURCES / "jaxmodel").glob("*.py"))
+    for path in (*sources, *(_SOURCES / "studies" / name for name in names)):
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def git_state() -> str:
+    """Commit of the sources, "unknown" outside a repository."""
+    command = ["git", "-C", str(_SOURCES), "describe", "--always", "--dirty"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return done.stdout.strip()

@@ -1,0 +1,222 @@
+"""How a table of cases is run: grouped by program, cut into chunks of one size."""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.linear import linearise, mechanical
+from jaxmodel.prepare import STIFFNESS_LIMIT, drive_rate, prepare
+from studies.cases import build_cases, build_structure
+from studies.errors import StudyError
+from studies.runs import SUBSTEP_LIMIT
+from studies.sweeps.table import Table, loose_study, values
+
+#: Fields that change the program; each combination of their values is compiled by itself.
+STATIC = (
+    "link.basis", "control.basis", "control.feedback", "control.law", "drive.kind",
+    "run.substeps", "run.smooth", "run.duration", "electronics.sample_rate_hz",
+)  # fmt: skip
+#: More programs than this are refused.
+PROGRAM_LIMIT = 32
+#: Cases side by side on one device: enough to fill vectors, few enough to stay in its cache.
+LANES = 64
+#: Samples times cases in a chunk: a few seconds of work on two cores.
+CHUNK_WORK = 2**22
+#: Most cases in a chunk.
+LARGEST_CHUNK = 8192
+#: Cases whose poles are looked at together.
+POLE_BATCH = 256
+
+
+class Layout(NamedTuple):
+    """Shape of a chunk: devices x blocks x lanes."""
+
+    devices: int
+    blocks: int  # run one after the other on a device
+    lanes: int  # run side by side
+
+    @property
+    def size(self) -> int:
+        """Cases in a chunk."""
+        return self.devices * self.blocks * self.lanes
+
+
+class Group(NamedTuple):
+    """Cases that share a program."""
+
+    structure: Structure
+    rows: np.ndarray  # of the table, (m,)
+    is_too_stiff: np.ndarray  # drive or ideal feedback that no allowed step carries, (m,)
+    layout: Layout
+
+    def chunks(self) -> list[np.ndarray]:
+        """Rows of the table, chunk by chunk."""
+        return [
+            self.rows[k : k + self.layout.size] for k in range(0, len(self.rows), self.layout.size)
+        ]
+
+
+def plan_groups(table: Table, rows: np.ndarray, devices: int) -> list[Group]:
+    """Group cases by program and lay out their chunks.
+
+    Args:
+        table: all cases.
+        rows: those to run.
+        devices: how many devices share a chunk.
+
+    Raises:
+        StudyError: too many programs.
+    """
+    keys = np.zeros(len(table), int)
+    for name in STATIC:
+        if name in table.columns:
+            _, position = np.unique(table.columns[name], return_inverse=True)
+            keys = keys * (position.max() + 1) + position
+    # sizes come from the whole table: an extended or resumed sweep then runs the same program
+    distinct = np.unique(keys)
+    if len(distinct) > PROGRAM_LIMIT:
+        swept = ", ".join(name for name in STATIC if name in table.columns)
+        raise StudyError(
+            f"sweep: {len(distinct)} combinations of {swept}, each of which needs a compilation; "
+            f"allowed up to {PROGRAM_LIMIT}"
+        )
+    groups = []
+    for key in distinct:
+        members = np.flatnonzero(keys == key)
+        structure = _structure(table, members)
+        wanted = rows[np.isin(rows, members)]
+        if len(wanted) == 0:
+            continue
+        structure, stiff = _with_substeps(table, structure, members)
+        is_too_stiff = stiff[np.searchsorted(members, wanted)]
+        layout = _layout(len(wanted), structure, devices)
+        groups.append(Group(structure, wanted, is_too_stiff, layout))
+    return groups
+
+
+def _structure(table: Table, members: np.ndarray) -> Structure:
+    """Sizes of the largest case, choices of all of them."""
+
+    def column(name: str) -> np.ndarray:
+        found = values(table.study, table.columns, name)
+        return found[members] if len(found) > 1 else found
+
+    one = build_structure(loose_study(table, int(members[0])))
+    noisy = (column("electronics.adc_noise") > 0).any() | (column("drive.ripple") > 0).any()
+    return one._replace(
+        n_modes=int(column("link.modes").max()),
+        n_controlled=min(int(column("control.modes").max()), one.n_patches),
+        has_noise=bool(noisy) or one.is_smooth,
+    )
+
+
+def chunk_cases(table: Table, rows: np.ndarray, structure: Structure, size: int) -> Case:
+    """Arrays of a chunk, filled up to `size` with its last case; leading axis `size` or 1.
+
+    Args:
+        table: all cases.
+        rows: cases of the chunk, at most `size`.
+        structure: of their group.
+        size: cases the program takes.
+
+    Returns:
+        Case of NumPy arrays in the working precision.
+    """
+    filled = np.concatenate([rows, np.full(size - len(rows), rows[-1])])
+    columns = {name: column[filled] for name, column in table.fields.items()}
+    columns["run.seed"] = table.seed[filled]
+    real = np.dtype(jnp.result_type(float))
+
+    def cast(x: np.ndarray) -> np.ndarray:
+        return x if np.issubdtype(x.dtype, np.integer) else x.astype(real)
+
+    return jax.tree.map(cast, build_cases(table.study, columns, structure))
+
+
+@partial(jax.jit, static_argnums=0)
+def _mechanics(structure: Structure, cases: Case) -> Any:
+    """State matrices at every way-point of every case, (n, poses, s, s)."""
+
+    def at(case: Case, pose: Any) -> Any:
+        loop = prepare(structure, case).loop
+        return mechanical(linearise(structure, loop, pose, case.electronics.antialias))
+
+    def one(case: Case) -> Any:
+        return jax.vmap(lambda pose: at(case, pose))(case.path.waypoints)
+
+    return jax.vmap(one)(cases)
+
+
+def _with_substeps(
+    table: Table, structure: Structure, members: np.ndarray
+) -> tuple[Structure, np.ndarray]:
+    """One number of plant steps per sample for all cases that can be run, and which cannot."""
+    rate = _drive_rates(table, structure, members)
+    if structure.feedback == "ideal":
+        rate = np.maximum(rate, _pole_decay(table, structure, members))
+    period = 1 / values(table.study, table.columns, "electronics.sample_rate_hz")
+    period = period[members] if len(period) > 1 else period
+    needed = np.maximum(np.ceil(rate * period / STIFFNESS_LIMIT), 1)
+    steps = values(table.study, table.columns, "run.substeps")
+    given = int(steps[members[0]] if len(steps) > 1 else steps[0])
+    is_too_stiff = needed > (given or SUBSTEP_LIMIT)
+    fitting = needed[~is_too_stiff]
+    most = int(fitting.max()) if len(fitting) else 1
+    return structure._replace(substeps=given or most), is_too_stiff
+
+
+#: Columns that `drive_rate` depends on.
+_DRIVE = ("drive.", "machine.slider_mass")
+
+
+def _drive_rates(table: Table, structure: Structure, members: np.ndarray) -> np.ndarray:
+    columns = {n: c[members] for n, c in table.fields.items() if n.startswith(_DRIVE)}
+    case = build_cases(table.study, columns, structure)
+    is_many = [len(leaf) > 1 for leaf in jax.tree.leaves(case)]
+    if not any(is_many):
+        one = float(drive_rate(jax.tree.map(lambda x: x[0], case)))
+        return np.full(len(members), one)
+    axes = jax.tree.map(lambda x: 0 if len(x) > 1 else None, case)
+    shared = jax.tree.map(lambda x: x if len(x) > 1 else x[0], case)
+    return np.asarray(jax.vmap(drive_rate, (axes,))(shared))
+
+
+def _pole_decay(table: Table, structure: Structure, members: np.ndarray) -> np.ndarray:
+    """Fastest decay |Re lambda| of each case at its way-points [1/s], (m,)."""
+    fastest = np.zeros(len(members))
+    for start in range(0, len(members), POLE_BATCH):
+        rows = members[start : start + POLE_BATCH]
+        cases = chunk_cases(table, rows, structure, POLE_BATCH)
+        whole = jax.tree.map(lambda x: np.repeat(x, POLE_BATCH // len(x), axis=0), cases)
+        small = structure._replace(n_steps=1, substeps=1)
+        matrices = np.asarray(_mechanics(small, whole))[: len(rows)]
+        is_finite = np.isfinite(matrices).all(axis=(1, 2, 3))
+        safe = np.where(is_finite[:, None, None, None], matrices, 0.0)
+        fastest[start : start + len(rows)] = np.abs(np.linalg.eigvals(safe).real).max(axis=(1, 2))
+    return fastest
+
+
+def _layout(n: int, structure: Structure, devices: int) -> Layout:
+    # a case's command takes most of the memory: references at every point of every step
+    points = structure.n_steps * (2 * structure.substeps + 1)
+    lane_bytes = points * 3 * 8 * 8 + 2**16
+    lanes = LANES
+    while lanes > 8 and devices * lanes * lane_bytes > memory_budget():
+        lanes //= 2
+    per_device = -(-n // devices)
+    lanes = min(lanes, -(-per_device // 8) * 8)
+    wanted = min(max(CHUNK_WORK // (structure.n_steps * structure.substeps), 1), LARGEST_CHUNK)
+    blocks = max(min(wanted, n) // (devices * lanes), 1)
+    return Layout(devices, blocks, lanes)
+
+
+def memory_budget() -> int:
+    """Memory that the arrays of a chunk may take: a quarter of what the machine has [bytes]."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4

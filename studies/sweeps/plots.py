@@ -1,0 +1,253 @@
+"""`studies plot`: one figure of a sweep, whose kind follows from its axes.
+
+No x: parallel coordinates of all axes, or the best placements where patches move. x and hue on a
+numeric grid: heat map. x of few values: lines, one per hue. Else points, coloured by hue.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from studies import figures
+from studies.errors import StudyError
+from studies.store import replacing
+from studies.sweeps.results import SweepData, metric_values, swept_names
+from studies.sweeps.show import best_cases, label
+
+#: More distinct values than this are no grid.
+FEW = 60
+#: Placements drawn one below the other.
+N_PLACEMENTS = 15
+MAP = "viridis"
+
+
+def plot(data: SweepData, x: str | None, y: str, hue: str | None) -> Figure:
+    """The figure of a sweep.
+
+    Args:
+        data: the sweep.
+        x: axis or metric along the abscissa; None: all axes at once.
+        y: metric or axis.
+        hue: axis or metric that sets the colour.
+
+    Raises:
+        StudyError: unknown name, or no finished case.
+    """
+    value = metric_values(data, y)
+    if value.dtype.kind not in "fiub":
+        raise StudyError(f"--y {y}: a text, not a number")
+    chosen = data.is_finished & np.isfinite(value)
+    if not chosen.any():
+        raise StudyError(f"--y {y}: no finished case has it")
+    if x is None:
+        if hue is not None:
+            raise StudyError("--hue: needs --x")
+        if "patches_centers" in data.variables and data["patches_centers"].ndim == 2:
+            return _placements(data, y)
+        return _parallel(data, y, chosen)
+    across = metric_values(data, x)[chosen]
+    group = None if hue is None else metric_values(data, hue)[chosen]
+    with figures.styled():
+        figure = Figure(figsize=(5.2, 3.6), layout="constrained")
+        ax = figure.subplots()
+        ax.set_xlabel(label(data, x))
+        if group is not None and _is_grid(across, group):
+            _heat_map(figure, ax, across, group, value[chosen], label(data, y))
+            ax.set_ylabel(label(data, str(hue)))
+            return figure
+        ax.set_ylabel(label(data, y))
+        if len(np.unique(across)) <= min(FEW, max(len(across) // 2, 12)):
+            _lines(ax, across, value[chosen], group, hue)
+        else:
+            _points(figure, ax, across, value[chosen], group, "" if hue is None else hue)
+    return figure
+
+
+def save_plot(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, PDF or SVG, by the ending of its name.
+
+    Raises:
+        StudyError: another ending, or it cannot be written there.
+    """
+    if path.suffix not in (".png", ".pdf", ".svg"):
+        raise StudyError(f"--out {path}: allowed endings .png, .pdf, .svg")
+    with replacing(path) as temporary, figures.styled():
+        figure.savefig(temporary, format=path.suffix[1:])
+
+
+def _is_grid(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two numeric columns take few values each, in nearly all combinations."""
+    if a.dtype.kind not in "fi" or b.dtype.kind not in "fi":
+        return False
+    na, nb = len(np.unique(a)), len(np.unique(b))
+    pairs = len(np.unique(np.stack([a, b]).astype(float), axis=1).T)
+    return min(na, nb) >= 4 and max(na, nb) <= FEW and pairs > 0.5 * na * nb
+
+
+def _heat_map(
+    figure: Figure, ax: Axes, a: np.ndarray, b: np.ndarray, value: np.ndarray, text: str
+) -> None:
+    columns, i = np.unique(a, return_inverse=True)
+    rows, j = np.unique(b, return_inverse=True)
+    total, count = np.zeros((2, len(rows), len(columns)))
+    np.add.at(total, (j, i), value)
+    np.add.at(count, (j, i), 1)
+    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    scale = "log" if _is_wide(value) else "linear"
+    mesh = ax.pcolormesh(
+        columns, rows, mean, cmap=MAP, norm=scale, shading="nearest", rasterized=True
+    )
+    figure.colorbar(mesh, ax=ax, label=text)
+    ax.set_xscale("log" if _is_geometric(columns) else "linear")
+    ax.set_yscale("log" if _is_geometric(rows) else "linear")
+    ax.grid(False)
+
+
+def _is_wide(value: np.ndarray) -> bool:
+    """Whether numbers call for a logarithmic scale."""
+    return bool(np.all(value > 0) and value.max() > 30 * value.min())
+
+
+def _is_geometric(values: np.ndarray) -> bool:
+    """Whether sorted numbers follow one another by a factor, over more than a decade."""
+    if values.dtype.kind != "f" or len(values) < 4 or values[0] <= 0:
+        return False
+    ratios = values[1:] / values[:-1]
+    return bool(values[-1] > 10 * values[0] and np.ptp(ratios) < 0.1 * ratios.mean())
+
+
+def _lines(
+    ax: Axes, across: np.ndarray, value: np.ndarray, group: np.ndarray | None, hue: str | None
+) -> None:
+    groups = [None] if group is None else list(np.unique(group))
+    if len(groups) > 12:
+        groups = [groups[k] for k in np.linspace(0, len(groups) - 1, 12).astype(int)]
+    for k, name in enumerate(groups):
+        part = np.ones(len(across), bool) if group is None else group == name
+        at, index = np.unique(across[part], return_inverse=True)
+        inside = [value[part][index == m] for m in range(len(at))]
+        middle = [np.median(v) for v in inside]
+        position = np.arange(len(at)) if at.dtype.kind in "UOb" else at
+        style: dict[str, Any] = {
+            "color": figures.SERIES[k % len(figures.SERIES)],
+            "linestyle": figures.DASHES[(k // len(figures.SERIES)) % len(figures.DASHES)],
+        }
+        text = None if name is None else f"{hue} = {_short(name)}"
+        ax.plot(position, middle, marker="o", markersize=3, label=text, **style)
+        if any(len(v) > 1 for v in inside) and len(groups) == 1:
+            low, high = [np.min(v) for v in inside], [np.max(v) for v in inside]
+            ax.fill_between(position, low, high, color=style["color"], alpha=0.15, linewidth=0)
+            ax.set_title("median; shaded: smallest to largest", fontsize=7.5, loc="right")
+        if at.dtype.kind in "UOb":
+            ax.set_xticks(position, [str(v) for v in at], rotation=30, ha="right")
+    if group is not None:
+        ax.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    ax.set_yscale("log" if _is_wide(value) else "linear")
+    if _is_geometric(np.unique(across)):
+        ax.set_xscale("log")
+
+
+def _short(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, (float, np.floating)) else str(value)
+
+
+def _points(
+    figure: Figure, ax: Axes, across: np.ndarray, value: np.ndarray, group: np.ndarray | None,
+    hue: str,
+) -> None:  # fmt: skip
+    size = 9 if len(value) < 2000 else 4
+    if group is None:
+        ax.scatter(across, value, s=size, color=figures.SERIES[0], linewidths=0)
+    elif group.dtype.kind in "fi":
+        dots = ax.scatter(across, value, s=size, c=group, cmap=MAP, linewidths=0)
+        figure.colorbar(dots, ax=ax, label=hue)
+    else:
+        for k, name in enumerate(np.unique(group)):
+            part = group == name
+            color = figures.SERIES[k % len(figures.SERIES)]
+            ax.scatter(
+                across[part], value[part], s=size, color=color, linewidths=0, label=str(name)
+            )
+        ax.legend(fontsize=7, title=hue)
+    ax.set_yscale("log" if _is_wide(value) else "linear")
+
+
+def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
+    """Every axis a vertical line, every case a polyline, coloured by rank; best ones on top."""
+    names = [name for name in swept_names(data) if data[name].ndim == 1]
+    if not names:
+        raise StudyError("--x: needed here, no axis of this sweep is a single number or text")
+    value = metric_values(data, y)[chosen]
+    order = np.argsort(-value)
+    rank = np.argsort(np.argsort(value)) / max(len(value) - 1, 1)
+    lines = []
+    with figures.styled():
+        figure = Figure(figsize=(max(5.0, 1.5 * (len(names) + 1)), 3.6), layout="constrained")
+        ax = figure.subplots()
+        for k, name in enumerate([*names, y]):
+            column = value if k == len(names) else data[name][chosen]
+            if column.dtype.kind in "UO":
+                ticks, column = np.unique(column.astype(str), return_inverse=True)
+                texts = list(ticks)
+                low, high = 0.0, float(max(len(ticks) - 1, 1))
+            else:
+                column = column.astype(float)
+                low, high = float(column.min()), float(column.max())
+                texts = [f"{v:.3g}" for v in (low, high)]
+            lines.append((column - low) / max(high - low, 1e-300))
+            places = np.linspace(0, 1, len(texts)) if len(texts) > 1 else [0.0]
+            for place, text in zip(places, texts, strict=True):
+                ax.annotate(text, (k, place), xytext=(3, 0), textcoords="offset points", fontsize=7)
+        matrix = np.array(lines)
+        for case in order[-3000:]:
+            color = figures.matplotlib.colormaps[MAP](rank[case])
+            ax.plot(matrix[:, case], color=color, linewidth=0.5, alpha=0.6)
+        ax.set_xticks(range(len(names) + 1), [*names, label(data, y)], rotation=15, ha="right")
+        ax.set_yticks([])
+        ax.set_title("dark: smallest", fontsize=7.5, loc="right")
+    return figure
+
+
+def _placements(data: SweepData, y: str) -> Figure:
+    """The best placements on the link, one below the other, over all cases by each patch."""
+    centers, value = data["patches_centers"], metric_values(data, y)
+    patches, link = data.spec.study.patches, data.spec.study.link
+    chosen = best_cases(data, y, count=N_PLACEMENTS)
+    is_ok = data.is_finished & np.isfinite(value)
+    unit = 1e3
+    with figures.styled():
+        figure = Figure(figsize=(7.4, 5.6), layout="constrained")
+        top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.2, 1))
+        for row, case in enumerate(chosen):
+            top.plot([0, link.length * unit], [row, row], color="#AAAAAA", linewidth=1)
+            for center in centers[case]:
+                for length, color, height in (
+                    (patches.actuator_length, figures.SERIES[0], 0.6),
+                    (patches.sensor_length, figures.SERIES[1], 0.3),
+                ):
+                    left = (center - length / 2) * unit
+                    top.barh(row, length * unit, height, left, color=color, linewidth=0)
+            text = f"case {case}: {value[case]:.3g}"
+            top.annotate(text, (link.length * unit * 1.02, row), fontsize=7, va="center")
+        top.set_ylim(len(chosen) - 0.4, -0.6)
+        top.set_xlim(0, link.length * unit * 1.25)
+        top.set_ylabel("best placements")
+        top.set_yticks([])
+        top.grid(False)
+        top.set_title(f"smallest {label(data, y)}; blue: actuator, orange: sensor", fontsize=8.5)
+        for k in range(centers.shape[1]):
+            color = figures.SERIES[k % len(figures.SERIES)]
+            bottom.scatter(
+                centers[is_ok, k] * unit, value[is_ok], s=3, color=color, linewidths=0,
+                label=f"pair {k + 1}", alpha=0.5, rasterized=True,
+            )  # fmt: skip
+        bottom.set_yscale("log" if _is_wide(value[is_ok]) else "linear")
+        bottom.set_xlabel("centre of the patch pair along the link [mm]")
+        bottom.set_ylabel(label(data, y))
+        bottom.legend(fontsize=7, markerscale=3)
+    return figure

@@ -1,0 +1,412 @@
+"""Results of a sweep: as they are stored, and as they are read again."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from jaxmodel import status
+from jaxmodel.prepare import SPECTRUM_SPAN
+from jaxmodel.simulate import Result
+from studies.errors import StudyError, field_error, nearest
+from studies.explain import unit_of
+from studies.fields import field_value, parse_entry
+from studies.runs import METRIC_LABELS, status_text
+from studies.spec import Study
+from studies.store import Streamed, Variable, read_store, write_store
+from studies.sweeps.axes import ALIASES, LABELS, known_field
+from studies.sweeps.folder import CHUNKS, RESULTS, Finished, finished_cases, read_manifest
+from studies.sweeps.spec import SweepSpec, parse_sweep
+from studies.sweeps.table import Table, as_numbers, build_table, values
+
+#: Status of a case that has not been run.
+NOT_RUN = -1
+#: Names of the axes of fields that are lists, outermost first.
+_LIST_AXES = {
+    "patches.centers": ("link", "patch"),
+    "control.links": ("link",),
+    "control.mode_mask": ("link", "controlled_mode"),
+    "control.ratios": ("link", "controlled_mode"),
+    "control.velocity_gain": ("link",),
+    "control.position_gain": ("link",),
+    "drive.pulse_force": ("slider_axis",),
+    "metrics.stations": ("station",),
+}
+_PER_CASE = {
+    "status": ("1", f"{NOT_RUN} not run; {status_text()}"),
+    "bad_time": ("s", "when the status appeared, 0 if ok"),
+    "command_end": ("s", "end of the shaped command"),
+    "substeps": ("1", "plant steps per sample"),
+}
+
+
+def metric_names() -> list[str]:
+    """Metrics that a sweep can keep."""
+    return [*METRIC_LABELS, "energy_ratio"]
+
+
+def kept_metrics(spec: SweepSpec) -> list[str]:
+    """Metrics that a sweep keeps.
+
+    Raises:
+        StudyError: unknown metric.
+    """
+    names = metric_names()
+    for name in spec.sweep.metrics:
+        if name not in names:
+            hint = nearest(name, names)
+            raise field_error("sweep.metrics", name, ", ".join(names), hint=hint)
+    return list(spec.sweep.metrics) or names
+
+
+def chunk_variables(
+    table: Table,
+    rows: np.ndarray,
+    result: Result,
+    is_too_stiff: np.ndarray,
+    substeps: int,
+    kept: list[str],
+) -> dict[str, Variable]:
+    """What a chunk's file holds: ids, status, metrics of its cases, without padding.
+
+    Args:
+        table: all cases.
+        rows: those of the chunk.
+        result: of the chunk, padded.
+        is_too_stiff: per case of the chunk.
+        substeps: plant steps per sample of its program.
+        kept: metrics to keep.
+
+    Returns:
+        Variables; metrics of a case that did not finish, and of modes that it does not have, NaN.
+    """
+    count = len(rows)
+    code = np.asarray(result.status)[:count].copy()
+    code[is_too_stiff] = status.TOO_STIFF
+    is_finished = np.isin(code, status.FINISHED)
+    modes, controlled = (
+        np.broadcast_to(values(table.study, table.columns, name), (len(table),))[rows]
+        for name in ("link.modes", "control.modes")
+    )
+    variables = {
+        "case_id": Variable(table.case_id[rows].astype(str), ("case",), "1", "hash of the case"),
+        "status": Variable(code, ("case",), *_PER_CASE["status"]),
+        "substeps": Variable(np.full(count, substeps), ("case",), *_PER_CASE["substeps"]),
+    }
+    for name in ("bad_time", "command_end"):
+        data = np.asarray(getattr(result, name))[:count]
+        variables[name] = Variable(data, ("case",), *_PER_CASE[name])
+    for name in kept:
+        source = result if name == "energy_ratio" else result.metrics
+        data = np.array(getattr(source, name), copy=True)[:count]
+        dims, unit, text = metric_label(name)
+        if "mode" in dims:
+            _forget(data, dims.index("mode"), modes)
+        if "controlled_mode" in dims:
+            _forget(data, dims.index("controlled_mode"), controlled)
+        data[~is_finished] = np.nan
+        variables[name] = Variable(data, ("case", *dims), unit, text)
+    return variables
+
+
+def metric_label(name: str) -> tuple[tuple[str, ...], str, str]:
+    """Axes after `case`, unit and long name of a metric."""
+    if name == "energy_ratio":
+        text = "EMC ratios (24) that the run's modal energies give"
+        return ("link", "controlled_mode"), "1", text
+    return METRIC_LABELS[name]
+
+
+def _forget(data: np.ndarray, axis: int, count: np.ndarray) -> None:
+    """NaN beyond the first `count` entries of an axis (after the one of cases)."""
+    shape = [1] * data.ndim
+    shape[axis + 1] = -1
+    order = np.arange(data.shape[axis + 1]).reshape(shape)
+    limit = count.reshape((-1,) + (1,) * (data.ndim - 1))
+    data[np.broadcast_to(order >= limit, data.shape)] = np.nan
+
+
+def variable_name(field: str) -> str:
+    """Name in a file: `control.velocity_gain[0]` is `control_velocity_gain_0`."""
+    return re.sub(r"\W+", "_", field).strip("_")
+
+
+def case_variables(table: Table) -> dict[str, Variable]:
+    """What tells the cases apart: number, id, seed, repeat and every column."""
+    axis = ("case",)
+    variables = {
+        "case": Variable(np.arange(len(table)), axis, "1", "number of the case"),
+        "case_id": Variable(table.case_id.astype(str), axis, "1", "hash of the case's parameters"),
+        "seed": Variable(table.seed, axis, "1", "seed of noise and ripple"),
+        "repeat": Variable(table.repeat, axis, "1", "number of the repeat"),
+    }
+    for name, column in table.columns.items():
+        array = as_numbers(column)
+        entry = parse_entry(name)
+        field = entry.field if entry else name
+        dims = _LIST_AXES.get(field, ())[-(array.ndim - 1) :] if array.ndim > 1 else ()
+        if len(dims) != array.ndim - 1:
+            dims = tuple(f"{variable_name(name)}_{k}" for k in range(1, array.ndim))
+        variables[variable_name(name)] = Variable(array, (*axis, *dims), _unit(field), name)
+    return variables
+
+
+def _unit(field: str) -> str:
+    section, _, leaf = field.partition(".")
+    if not leaf:
+        return "1"
+    model: Any = Study.model_fields[section].annotation
+    return unit_of(model.model_fields[leaf]) or "1"
+
+
+def axis_variables(table: Table, sizes: Mapping[str, int]) -> dict[str, Variable]:
+    """Coordinates of the metrics' axes."""
+    found = {"link": Variable(np.arange(1, 4), ("link",), "1", "link number")}
+    if "pose_axis" in sizes:
+        names = np.array(["x", "y", "phi"])
+        found["pose_axis"] = Variable(names, ("pose_axis",), "1", "pose component")
+    if "station" in sizes and "metrics.stations" not in table.columns:
+        stations = np.array(field_value(table.study, "metrics.stations"))
+        found["station"] = Variable(stations, ("station",), "m", "position along the link")
+    if "spectrum_point" in sizes:
+        ratio = np.linspace(1 - SPECTRUM_SPAN, 1 + SPECTRUM_SPAN, sizes["spectrum_point"])
+        found["spectrum_point"] = Variable(
+            ratio, ("spectrum_point",), "1", "frequency over the modal frequency"
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class SweepData:
+    """A sweep as read: named arrays, and what belongs to them."""
+
+    variables: dict[str, Variable]
+    attributes: dict[str, Any]
+    spec: SweepSpec
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.variables[name].data
+
+    @property
+    def n_cases(self) -> int:
+        return len(self.variables["case"].data)
+
+    @property
+    def is_finished(self) -> np.ndarray:
+        """Cases whose metrics hold, (n,)."""
+        return np.isin(self["status"], status.FINISHED)
+
+    def to_xarray(self) -> Any:
+        """The same as an xarray dataset.
+
+        Raises:
+            StudyError: xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError:
+            raise StudyError("xarray is missing: install flexlink-studies[xarray]") from None
+        return xarray.Dataset(
+            {
+                name: (v.dims, v.data, {"units": v.units, "long_name": v.long_name})
+                for name, v in self.variables.items()
+            },
+            attrs=self.attributes,
+        )
+
+
+def swept_names(data: SweepData) -> list[str]:
+    """What varies, as variables of the file, in the order of the sweep; labels stand for fields."""
+    columns = build_table(data.spec).columns
+    labelled = {LABELS[name] for name in columns if name in LABELS}
+    return [variable_name(name) for name in columns if name not in labelled]
+
+
+def load(path: str | Path) -> SweepData:
+    """Read a sweep, finished or not; cases that have not been run have status -1 and NaN.
+
+    Args:
+        path: the sweep's folder.
+
+    Raises:
+        StudyError: no sweep there, or a damaged file.
+    """
+    folder = Path(path)
+    spec = parse_sweep(read_manifest(folder)["spec"])
+    if (folder / RESULTS).is_file() and not any((folder / CHUNKS).glob("*.h5")):
+        variables, attributes = read_store(folder / RESULTS)
+        return SweepData(variables, attributes, spec)
+    table = build_table(spec)
+    gathered = gather(table, finished_cases(folder))
+    sizes = _sizes(gathered)
+    variables = case_variables(table) | gathered | axis_variables(table, sizes)
+    for axis, size in (_sizes(variables)).items():
+        if axis not in variables:
+            variables[axis] = Variable(np.arange(1, size + 1), (axis,), "1", f"number of {axis}")
+    return SweepData(variables, {"title": spec.study.title}, spec)
+
+
+def _sizes(variables: Mapping[str, Variable]) -> dict[str, int]:
+    return {
+        axis: size
+        for v in variables.values()
+        for axis, size in zip(v.dims, v.data.shape, strict=True)
+    }
+
+
+def gather(table: Table, finished: Finished) -> dict[str, Variable]:
+    """Status and metrics of all cases of a table, from the files that hold them.
+
+    Args:
+        table: all cases.
+        finished: from `finished_cases`.
+
+    Returns:
+        Variables with the axis `case`; NaN and status -1 for what is not there.
+    """
+    order = np.argsort(table.case_id)
+    at = np.searchsorted(table.case_id[order], finished.case_id)
+    at = np.minimum(at, len(table) - 1)
+    is_known = table.case_id[order][at] == finished.case_id
+    target = order[at]
+    variables: dict[str, Variable] = {}
+    n = len(table)
+    for number, file in enumerate(finished.files):
+        chosen = is_known & (finished.file == number)
+        if not chosen.any():
+            continue
+        with h5py.File(file, "r") as store:
+            for name, dataset in store.items():
+                if name not in _PER_CASE and name not in metric_names():
+                    continue
+                data = dataset[()]
+                if name not in variables:
+                    empty = np.full((n, *data.shape[1:]), -1 if data.dtype.kind == "i" else np.nan)
+                    dims, unit, text = _label(name)
+                    data_there = empty.astype(data.dtype)
+                    variables[name] = Variable(data_there, ("case", *dims), unit, text)
+                variables[name].data[target[chosen]] = data[finished.row[chosen]]
+    if "status" not in variables:
+        empty = np.full(n, NOT_RUN)
+        variables["status"] = Variable(empty, ("case",), *_PER_CASE["status"])
+    return variables
+
+
+def metric_values(data: SweepData, name: str) -> np.ndarray:
+    """One number per case: a metric, an entry of it, or a field, (n,).
+
+    A metric with more axes counts with its largest value: `residual_rms` is that of the worst link
+    and station, `residual_rms[0]` that of the worst station of link 1. A field that does not vary
+    has its value in every case.
+
+    Raises:
+        StudyError: unknown name or entry.
+    """
+    name = ALIASES.get(name, name)
+    entry = parse_entry(name)
+    key = entry.field if entry else name
+    variables = data.variables
+    for candidate in (variable_name(name), variable_name(key)):
+        if candidate in variables and variables[candidate].dims[:1] == ("case",):
+            return _entry(variables[candidate], name, entry.indices if entry else (), candidate)
+    if "." in key:
+        value = known_field(name, data.spec.study)
+        if isinstance(value, tuple):
+            raise StudyError(f"{name}: a list; name one entry of it, such as {name}[0]")
+        return np.full(data.n_cases, value)
+    known = [n for n, v in variables.items() if v.dims[:1] == ("case",)]
+    close = nearest(key, known) or _turned(key, known)
+    hint = f"did you mean {close!r}?" if close else f"known: {', '.join(known)}"
+    raise StudyError(f"{name!r}: unknown metric or axis; {hint}")
+
+
+def _turned(name: str, known: list[str]) -> str:
+    """A name of the same words in another order."""
+    words = sorted(name.split("_"))
+    return next((other for other in known if sorted(other.split("_")) == words), "")
+
+
+def _entry(variable: Variable, name: str, indices: tuple[int, ...], candidate: str) -> np.ndarray:
+    array = variable.data
+    if variable_name(name) != candidate or "[" not in name:
+        used = indices
+    else:
+        used = ()  # the entry is a variable of its own
+    for index in used:
+        if array.ndim < 2 or index >= array.shape[1]:
+            sizes = ", ".join(
+                f"{axis}: 0 to {size - 1}"
+                for axis, size in zip(variable.dims[1:], variable.data.shape[1:], strict=True)
+            )
+            raise StudyError(f"{name!r}: no such entry; indices allowed: {sizes or 'none'}")
+        array = array[:, index]
+    if array.ndim == 1:
+        return array
+    flat = array.reshape(len(array), -1)
+    if flat.dtype.kind != "f":
+        return flat.max(axis=1)
+    is_empty = np.all(np.isnan(flat), axis=1)
+    return np.where(is_empty, np.nan, np.nanmax(np.where(np.isnan(flat), -np.inf, flat), axis=1))
+
+
+def manifest_attributes(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """Global attributes of `results.h5`."""
+    return {
+        name.replace("-", "_"): json.dumps(value) if isinstance(value, dict) else str(value)
+        for name, value in manifest.items()
+    }
+
+
+def merge(folder: Path, table: Table, finished: Finished, attributes: dict[str, Any]) -> None:
+    """Join all finished cases in `results.h5`, file by file, so that memory stays small.
+
+    Args:
+        folder: the sweep's folder.
+        table: all cases, in the order of the file.
+        finished: from `finished_cases`.
+        attributes: global ones.
+
+    Raises:
+        StudyError: no room on the disk, or it cannot be written to.
+    """
+    order = np.argsort(table.case_id)
+    places = []
+    for number, path in enumerate(finished.files):
+        chosen = np.flatnonzero(finished.file == number)
+        at = np.searchsorted(table.case_id[order], finished.case_id[chosen])
+        target = order[np.minimum(at, len(table) - 1)]
+        is_known = table.case_id[target] == finished.case_id[chosen]
+        target, row = target[is_known], finished.row[chosen][is_known]
+        ascending = np.argsort(target)
+        places.append((path, target[ascending], row[ascending]))
+
+    def parts(name: str) -> Iterator[tuple[int, np.ndarray]]:
+        for path, target, row in places:
+            with h5py.File(path, "r") as store:
+                data = store[name][()]
+            breaks = np.flatnonzero(np.diff(target) != 1) + 1
+            runs = zip(np.split(target, breaks), np.split(row, breaks), strict=True)
+            yield from ((int(at[0]), data[rows]) for at, rows in runs if len(at))
+
+    variables = case_variables(table)
+    with h5py.File(finished.files[-1], "r") as store:
+        for name in [n for n in store if n in _PER_CASE or n in metric_names()]:
+            dims, unit, text = _label(name)
+            shape = (len(table), *store[name].shape[1:])
+            streamed = Streamed(shape, store[name].dtype, partial(parts, name))
+            variables[name] = Variable(streamed, ("case", *dims), unit, text)
+    variables |= axis_variables(table, _sizes(variables))
+    write_store(folder / RESULTS, variables, attributes)
+
+
+def _label(name: str) -> tuple[tuple[str, ...], str, str]:
+    """Axes after `case`, unit and long name of what a chunk holds."""
+    return ((), *_PER_CASE[name]) if name in _PER_CASE else metric_label(name)

@@ -1,0 +1,267 @@
+"""`studies sweep`: runs what is not done yet, chunk by chunk, and joins the results."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from jaxmodel.case import Case
+from jaxmodel.simulate import Result
+from studies import config
+from studies.cases import powered
+from studies.errors import StudyError
+from studies.runs import with_ratio
+from studies.sweeps.executor import Executor
+from studies.sweeps.folder import (
+    RESULTS,
+    SweepFolder,
+    finished_cases,
+    make_manifest,
+    open_folder,
+)  # fmt: skip
+from studies.sweeps.plan import Group, chunk_cases, plan_groups
+from studies.sweeps.progress import Reporter
+from studies.sweeps.results import chunk_variables, kept_metrics, manifest_attributes, merge
+from studies.sweeps.spec import SweepSpec
+from studies.sweeps.table import Table, build_table, values
+
+
+class Outcome(NamedTuple):
+    """How a sweep ended."""
+
+    table: Table
+    n_done: int  # cases with results, those of earlier runs included
+    n_run: int  # in this run
+    compile_time: float  # [s]
+    run_time: float  # [s]
+    is_interrupted: bool  # by Ctrl-C
+
+
+class Plan(NamedTuple):
+    """What a sweep would do."""
+
+    table: Table
+    groups: list[Group]
+    kept: list[str]
+
+
+def make_plan(spec: SweepSpec, rows: np.ndarray | None = None) -> Plan:
+    """Cases of a sweep, grouped by program.
+
+    Args:
+        spec: the sweep.
+        rows: cases to run; default: all.
+
+    Raises:
+        StudyError: a fault of the sweep.
+    """
+    config.require_configured()
+    kept = kept_metrics(spec)
+    table = build_table(spec)
+    every = np.arange(len(table)) if rows is None else rows
+    return Plan(table, plan_groups(table, every, len(jax.local_devices())), kept)
+
+
+def run_sweep(
+    spec: SweepSpec,
+    out: Path,
+    is_resumed: bool = False,
+    console: Console | None = None,
+    is_quiet: bool = False,
+) -> Outcome:
+    """Run a sweep into a folder.
+
+    Args:
+        spec: the sweep.
+        out: its folder.
+        is_resumed: go on with, or extend, the sweep that is there.
+        console: where progress goes; default: standard output.
+        is_quiet: no progress.
+
+    Returns:
+        Outcome; `results.h5` is there unless the run was interrupted.
+
+    Raises:
+        StudyError: a fault of the sweep, the folder or the disk. Finished chunks stay.
+    """
+    config.require_configured()
+    kept = kept_metrics(spec)
+    table = build_table(spec)
+    console = console or Console(highlight=False, markup=False)
+    manifest = make_manifest(spec.data)
+    with open_folder(out, manifest, is_resumed) as folder:
+        finished = finished_cases(out, lambda text: console.print(text, soft_wrap=True))
+        _check_fit(table, finished.case_id, out)
+        rows = np.flatnonzero(~np.isin(table.case_id, finished.case_id))
+        groups = plan_groups(table, rows, len(jax.local_devices()))
+        n_before = len(table) - len(rows)
+        with Reporter(console, len(table), n_before, is_quiet) as reporter, _interrupts() as stop:
+            reporter.say(_headline(table, groups, n_before))
+            is_interrupted = _run_groups(table, groups, kept, folder, reporter, stop)
+            if not is_interrupted:
+                finished = finished_cases(out)
+                attributes = {"title": spec.study.title, **manifest_attributes(manifest)}
+                timings = {"compile_time": reporter.compile_time, "run_time": reporter.run_time}
+                merge(out, table, finished, attributes | timings)
+                folder.remove_chunks()
+        return Outcome(
+            table, reporter.done, reporter.n_run, reporter.compile_time, reporter.run_time,
+            is_interrupted,
+        )  # fmt: skip
+
+
+def _headline(table: Table, groups: list[Group], n_before: int) -> str:
+    text = f"{len(table)} cases"
+    if table.n_dropped:
+        text += f" ({table.n_dropped} left out by where)"
+    if table.n_double:
+        text += f" ({table.n_double} doubles left out)"
+    if n_before:
+        text += f", {n_before} of them done before"
+    chunks = sum(len(group.chunks()) for group in groups)
+    return f"{text}; {chunks} chunks, {len(groups)} programs to compile, executor: XLA scan"
+
+
+def _check_fit(table: Table, done: np.ndarray, out: Path) -> None:
+    """A resumed sweep may have more cases than the one that is there, but none less."""
+    strange = int(np.sum(~np.isin(done, table.case_id)))
+    if strange:
+        raise StudyError(
+            f"--resume: {strange} of {len(done)} finished cases in {out} are not part of this "
+            "sweep; an extended sweep keeps all cases of the old one (same study, seed and axes; "
+            "more values or points; for a Latin hypercube the same size). Name a new folder for "
+            "another sweep"
+        )
+
+
+def _run_groups(
+    table: Table,
+    groups: list[Group],
+    kept: list[str],
+    folder: SweepFolder,
+    reporter: Reporter,
+    stop: threading.Event,
+) -> bool:
+    """Run all chunks; whether Ctrl-C ended it."""
+    source = values_of(table, "control.ratio_source")
+    for group in groups:
+        is_own = source[group.rows] == "own_run"
+        executor = Executor(group.structure, group.layout, bool(is_own.any()))
+        substeps = group.structure.substeps
+        pending: tuple[np.ndarray, np.ndarray, Result] | None = None
+        position = 0
+        for rows in group.chunks():
+            if stop.is_set():
+                break
+            cases = chunk_cases(table, rows, group.structure, group.layout.size)
+            is_first = executor.compile_time == 0
+            started = start_chunk(executor, table, rows, cases)
+            if is_first:
+                reporter.compiled(executor.compile_time)
+            stiff = group.is_too_stiff[position : position + len(rows)]
+            position += len(rows)
+            # the device computes this chunk while the one before is written
+            if pending is not None:
+                _finish(table, pending, substeps, kept, folder, reporter)
+            pending = (rows, stiff, started)
+        if pending is not None:
+            _finish(table, pending, substeps, kept, folder, reporter)
+        if stop.is_set():
+            return reporter.done < reporter.total
+    return False
+
+
+def values_of(table: Table, name: str) -> np.ndarray:
+    """Values of a field for every case, (n,)."""
+    return np.broadcast_to(values(table.study, table.columns, name), (len(table),))
+
+
+def start_chunk(executor: Executor, table: Table, rows: np.ndarray, cases: Case) -> Result:
+    """Start a chunk, after its uncontrolled pass where gain ratios come from that.
+
+    Args:
+        executor: of the group.
+        table: all cases.
+        rows: those of the chunk.
+        cases: from `chunk_cases`.
+    """
+    if executor.has_own_ratio:
+        filled = np.concatenate([rows, np.full(executor.layout.size - len(rows), rows[-1])])
+        is_own = values_of(table, "control.ratio_source")[filled] == "own_run"
+        exponent = values_of(table, "control.ratio_exponent")[filled][:, None, None]
+        own = powered(executor.energy_ratio(cases), exponent)
+        cases = with_ratio(cases, np.where(is_own[:, None, None], own, cases.control.ratio))
+    return executor(cases)
+
+
+def _finish(
+    table: Table, pending: tuple[Any, Any, Result], substeps: int, kept: list[str],
+    folder: SweepFolder, reporter: Reporter,
+) -> None:  # fmt: skip
+    rows, stiff, result = pending
+    arrays = jax.tree.map(np.asarray, result)
+    variables = chunk_variables(table, rows, arrays, stiff, substeps, kept)
+    folder.write_chunk(variables)
+    reporter.chunk(variables["status"].data)
+
+
+@contextmanager
+def _interrupts() -> Iterator[threading.Event]:
+    """An event that Ctrl-C sets; a second Ctrl-C ends the process at once."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+
+    def ask(*_: object) -> None:
+        stop.set()
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+class Estimate(NamedTuple):
+    """What a sweep would take."""
+
+    compile_time: float  # of the first program [s]
+    chunk_time: float  # of one of its chunks [s]
+    memory: int  # temporaries of the program [bytes]
+    total: float  # compiling and running everything [s]
+
+
+def calibrate(plan: Plan) -> Estimate:
+    """Compile the first program and time one chunk of it."""
+    group = plan.groups[0]
+    has_own = bool((values_of(plan.table, "control.ratio_source")[group.rows] == "own_run").any())
+    executor = Executor(group.structure, group.layout, has_own)
+    rows = group.chunks()[0]
+    cases = chunk_cases(plan.table, rows, group.structure, group.layout.size)
+    jax.block_until_ready(start_chunk(executor, plan.table, rows, cases))
+    began = time.perf_counter()
+    jax.block_until_ready(start_chunk(executor, plan.table, rows, cases))
+    chunk_time = time.perf_counter() - began
+    per_step = chunk_time / (group.layout.size * group.structure.n_steps * group.structure.substeps)
+    running = sum(
+        len(g.chunks()) * g.layout.size * g.structure.n_steps * g.structure.substeps * per_step
+        for g in plan.groups
+    )
+    total = running + len(plan.groups) * executor.compile_time
+    return Estimate(executor.compile_time, chunk_time, executor.temporary_bytes, total)
+
+
+def results_path(out: Path) -> Path:
+    """The file that a finished sweep leaves."""
+    return out / RESULTS

@@ -1,0 +1,178 @@
+"""What `studies show`, `studies best` and `studies sweep --dry-run` print."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table as RichTable
+
+from jaxmodel import status
+from studies.errors import StudyError
+from studies.sweeps.condition import evaluate
+from studies.sweeps.results import NOT_RUN, SweepData, metric_values, swept_names, variable_name
+from studies.sweeps.run import Plan, calibrate
+from studies.sweeps.sensitivity import failure_causes
+
+#: What `show` ranks cases by unless told otherwise.
+DEFAULT_METRIC = "residual_rms"
+
+
+def reason(code: int) -> str:
+    """A status in words."""
+    return "not run yet" if code == NOT_RUN else status.REASONS.get(code, f"status {code}")
+
+
+def select(data: SweepData, subject_to: str) -> np.ndarray:
+    """Cases of status ok for which a condition holds, (n,).
+
+    Raises:
+        StudyError: not a condition, or unknown names in it.
+    """
+    chosen = data["status"] == status.OK
+    if subject_to:
+        truth = evaluate(subject_to, lambda name: metric_values(data, name), "--subject-to")
+        chosen = chosen & np.broadcast_to(truth, chosen.shape)
+    return chosen
+
+
+def best_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) -> np.ndarray:
+    """Numbers of the cases with the smallest metric, best first.
+
+    Args:
+        data: the sweep.
+        by: metric or entry of one; "-" before it: largest first.
+        subject_to: condition on metrics and axes.
+        count: how many.
+
+    Raises:
+        StudyError: unknown metric, or no case left.
+    """
+    sign, name = (-1, by[1:]) if by.startswith("-") else (1, by)
+    value = metric_values(data, name)
+    if value.dtype.kind not in "fiub":
+        raise StudyError(f"--by {by}: a text, not a number")
+    chosen = np.flatnonzero(select(data, subject_to) & np.isfinite(value))
+    if len(chosen) == 0:
+        raise StudyError(f"--subject-to {subject_to!r}: true for no case of status ok")
+    return chosen[np.argsort(sign * value[chosen], kind="stable")][:count]
+
+
+def show(data: SweepData, console: Console, is_failed: bool) -> None:
+    """Print an overview, or the failed cases one by one."""
+    codes = data["status"]
+    if is_failed:
+        _print_failed(data, codes, console)
+        return
+    counts = Counter(codes.tolist())
+    n = data.n_cases
+    console.print(f"{data.spec.study.title}: {n} cases, {', '.join(swept_names(data))}")
+    table = RichTable("status", "cases", "share [%]")
+    for code, count in sorted(counts.items(), key=lambda item: -item[1]):
+        table.add_row(reason(code), str(count), f"{100 * count / n:.1f}")
+    console.print(table)
+    if DEFAULT_METRIC in data.variables and data.is_finished.any():
+        console.print(f"best cases by {DEFAULT_METRIC}, worst link and station:")
+        print_cases(data, best_cases(data, DEFAULT_METRIC), [DEFAULT_METRIC], console)
+
+
+def _print_failed(data: SweepData, codes: np.ndarray, console: Console) -> None:
+    failed = np.flatnonzero((codes != status.OK) & (codes != NOT_RUN))
+    if len(failed) == 0:
+        console.print("no failed case")
+        return
+    names = swept_names(data)
+    table = RichTable("case", "status", "from [s]", *names)
+    for k in failed:
+        cells = [shown_value(data, name, int(k)) for name in names]
+        table.add_row(str(k), reason(int(codes[k])), f"{data['bad_time'][k]:.4g}", *cells)
+    console.print(table)
+
+
+def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console: Console) -> None:
+    """A table of cases with what varies and some metrics."""
+    names = swept_names(data)
+    heads = [label(data, name) for name in metrics]
+    table = RichTable("case", *names, *heads)
+    columns = [metric_values(data, name) for name in metrics]
+    for k in cases:
+        cells = [shown_value(data, name, k) for name in names]
+        table.add_row(str(k), *cells, *(f"{column[k]:.4g}" for column in columns))
+    console.print(table)
+
+
+def label(data: SweepData, name: str) -> str:
+    """A name with its unit; a metric of several links or stations counts with its largest."""
+    unit = unit_of_metric(data, name)
+    return f"{name} [{unit}]" if unit else name
+
+
+def shown_value(data: SweepData, name: str, case: int) -> str:
+    """A value of one case, short."""
+    return _short(data[name][case])
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return "[" + ", ".join(_short(entry) for entry in value) + "]"
+    if isinstance(value, (float, np.floating)):
+        return f"{value:.4g}"
+    return str(value)
+
+
+def unit_of_metric(data: SweepData, name: str) -> str:
+    """Unit of a metric or axis, "" where it has none."""
+    key = variable_name(name)
+    variable = data.variables.get(key) or data.variables.get(variable_name(name.split("[")[0]))
+    return "" if variable is None or variable.units == "1" else variable.units
+
+
+def print_plan(plan: Plan, console: Console) -> None:
+    """What a sweep would run, a sample case, and the time it takes, after a short calibration."""
+    table = plan.table
+    console.print(
+        f"{len(table)} cases ({table.n_dropped} left out by where, {table.n_double} doubles)"
+    )
+    axes = RichTable("axis", "values", "from", "to")
+    for name, column in table.columns.items():
+        if column.ndim == 1 and column.dtype.kind in "fi":
+            span = [f"{column.min():.4g}", f"{column.max():.4g}"]
+        else:
+            span = [_short(column[0]), _short(column[-1])]
+        axes.add_row(name, str(len(np.unique(column.astype(str), axis=0))), *span)
+    console.print(axes)
+    for group in plan.groups:
+        layout, structure = group.layout, group.structure
+        console.print(
+            f"program: {structure.basis}, {structure.n_modes} modes, {structure.feedback} "
+            f"feedback, {structure.n_steps} samples of {structure.substeps} plant steps: "
+            f"{len(group.rows)} "
+            f"cases in {len(group.chunks())} chunks of {layout.devices} devices x {layout.blocks} "
+            f"blocks x {layout.lanes} lanes"
+        )
+    middle = len(table) // 2
+    values = ", ".join(f"{name} = {_short(c[middle])}" for name, c in table.columns.items())
+    console.print(f"sample: case {middle}, id {table.case_id[middle].decode()}: {values}")
+    found = calibrate(plan)
+    console.print(
+        f"estimate: {found.total:.0f} s, of which {found.compile_time * len(plan.groups):.0f} s "
+        f"compiling; {found.chunk_time:.2g} s a chunk; memory of the program "
+        f"{found.memory / 2**20:.0f} MiB"
+    )
+
+
+def print_causes(data: SweepData, console: Console) -> None:
+    """Which parameters go with the failures, if any do."""
+    causes = failure_causes(data)
+    if not causes:
+        return
+    console.print("what the failures depend on (share of failures where it is low and high):")
+    table = RichTable("parameter", "distance", "p", "lowest quarter", "highest quarter")
+    for cause in causes[:8]:
+        table.add_row(
+            cause.name, f"{cause.distance:.2f}", f"{cause.p_value:.1g}",
+            f"{100 * cause.low_rate:.0f} %", f"{100 * cause.high_rate:.0f} %",
+        )  # fmt: skip
+    console.print(table)

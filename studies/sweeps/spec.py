@@ -1,0 +1,150 @@
+"""The file of a sweep: a study plus `[sweep]`, which says what varies and how.
+
+`[sweep]` is a block; a block holds axes and further blocks, and its method combines them:
+
+- `grid`: every combination; `zip`: all side by side, of equal length; `list`: `cases`, spelt out;
+- `random`, `latin_hypercube`, `sobol`: `count` points of its axes, combined with every further
+  block; a Latin hypercube of `size` points follows the next, so that more can be asked for later;
+- `morris`: `count` trajectories on a grid of `levels`; `saltelli`: `count` base points: the designs
+  that `studies sensitivity` reads.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from pydantic import ValidationError
+
+from studies.errors import StudyError, field_error
+from studies.explain import explain
+from studies.spec import Section, Study, described, parse_study, read_toml
+
+Method = Literal[
+    "grid", "zip", "list", "random", "latin_hypercube", "sobol", "morris", "saltelli"
+]  # fmt: skip
+SAMPLED = ("random", "latin_hypercube", "sobol", "morris", "saltelli")
+
+
+class Block(Section):
+    """Axes and how they combine."""
+
+    method: Method = described("grid", "-", "how axes and blocks combine")
+    axes: dict[str, Any] = described({}, "-", "field or ready-made axis = values")
+    blocks: tuple[dict[str, Any], ...] = described((), "-", "further blocks")
+    cases: tuple[dict[str, Any], ...] = described(
+        (), "-", "for method list: field = value, per case"
+    )
+    count: int = described(0, "1", "points of a sampling method", ge=0, le=10**7)
+    size: int = described(0, "1", "points of one Latin hypercube; 0: count", ge=0, le=10**7)
+    levels: int = described(4, "1", "levels of a Morris grid", ge=2, le=100)
+
+
+class Sweep(Block):
+    """What varies, and what is kept."""
+
+    where: str = described("", "-", "condition on the fields; other cases are left out")
+    repeats: int = described(1, "1", "runs of each case, with seeds of their own", ge=1, le=10**6)
+    seed: int = described(0, "1", "of the sampling methods", ge=0, le=10**9)
+    metrics: tuple[str, ...] = described((), "-", "metrics to keep; empty: all")
+
+
+class Node(NamedTuple):
+    """A validated block with its validated blocks; `path` names it in messages."""
+
+    block: Block
+    children: tuple[Node, ...]
+    path: str
+
+
+class SweepSpec(NamedTuple):
+    """A sweep as asked for."""
+
+    study: Study  # values of all fields that do not vary
+    sweep: Sweep
+    root: Node  # the tree of blocks; its block is `sweep`
+    data: dict[str, Any]  # as read, for the record
+
+
+def ready_spec(name: Path) -> Path:
+    """A file, or the ready-made sweep of that name where there is no such file."""
+    ready = Path(__file__).parents[1] / "specs" / f"{name.stem}.toml"
+    is_name = not name.exists() and len(name.parts) == 1 and name.suffix in ("", ".toml")
+    return ready if is_name and ready.is_file() else name
+
+
+def load_sweep(path: str | Path) -> SweepSpec:
+    """Read a sweep file.
+
+    Raises:
+        StudyError: unreadable, not TOML, or not a valid sweep.
+    """
+    return parse_sweep(read_toml(path))
+
+
+def parse_sweep(data: dict[str, Any]) -> SweepSpec:
+    """Validate a dictionary as a sweep.
+
+    Raises:
+        StudyError: first fault found, with field, value, allowed range and unit.
+    """
+    if "sweep" not in data:
+        raise StudyError("sweep: missing; a sweep is a study file with a section [sweep]")
+    study = parse_study({name: value for name, value in data.items() if name != "sweep"})
+    sweep = _parse_block(Sweep, data["sweep"], "sweep")
+    assert isinstance(sweep, Sweep)
+    return SweepSpec(study, sweep, _node(sweep, "sweep"), data)
+
+
+def _parse_block(model: type[Block], data: Any, path: str) -> Block:
+    try:
+        block = model.model_validate(_tuples(data))
+    except ValidationError as error:
+        raise explain(error, model, data, inside=path) from None
+    _check_block(block, path)
+    return block
+
+
+def _tuples(data: Any) -> Any:
+    """Lists of blocks and cases as tuples; what is inside them is checked where it is used."""
+    if not isinstance(data, dict):
+        return data
+    listed = ("blocks", "cases", "metrics")
+    return {k: tuple(v) if k in listed and isinstance(v, list) else v for k, v in data.items()}
+
+
+def _node(block: Block, path: str) -> Node:
+    children = []
+    for k, data in enumerate(block.blocks):
+        inner = f"{path}.blocks.{k}"
+        children.append(_node(_parse_block(Block, data, inner), inner))
+    return Node(block, tuple(children), path)
+
+
+def _check_block(block: Block, path: str) -> None:
+    """What a method needs, and nothing that it would ignore."""
+    is_sampled = block.method in SAMPLED
+    if is_sampled and block.count < 1:
+        raise field_error(f"{path}.count", block.count, f"1 or more, for method {block.method}")
+    if not is_sampled and block.count:
+        raise field_error(f"{path}.count", block.count, f"0, method {block.method} has no count")
+    if block.size and block.method != "latin_hypercube":
+        raise field_error(f"{path}.size", block.size, "0, but for method latin_hypercube")
+    if block.size and block.count % block.size:
+        raise field_error(
+            f"{path}.count", block.count, f"a multiple of {path}.size = {block.size}", "1"
+        )
+    if (block.method == "list") != bool(block.cases):
+        raise field_error(f"{path}.cases", block.cases, "one or more, with method list only")
+    if block.method == "list" and block.axes:
+        raise field_error(f"{path}.axes", list(block.axes), "none with method list")
+    if is_sampled and not block.axes:
+        raise field_error(f"{path}.axes", {}, "one axis or more")
+    if not (block.axes or block.blocks or block.cases) and path != "sweep":
+        raise field_error(path, {}, "a block with axes, blocks or cases")
+    if path != "sweep" and block.method in ("morris", "saltelli"):
+        raise field_error(
+            f"{path}.method", block.method, "any other inside a block; these stand alone in [sweep]"
+        )
+    if block.method in ("morris", "saltelli") and block.blocks:
+        raise field_error(f"{path}.blocks", len(block.blocks), "none with method " + block.method)

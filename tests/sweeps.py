@@ -1,0 +1,37 @@
+"""A small sweep that all tests of the batch engine share, so that it is compiled once."""
+
+import copy
+
+import numpy as np
+
+from studies.sweeps.spec import parse_sweep
+
+HOME_PHI = float(np.pi / 6)
+#: 2 mm in 15 ms, then 10 ms; two modes.
+BASE = {
+    "title": "small",
+    "run": {"duration": 0.025},
+    "link": {"modes": 3},
+    "motion": {"waypoints": [[0, 0, HOME_PHI], [0, 0.002, HOME_PHI]], "move_time": 0.01},
+    "shaper": {"kind": "zv"},
+    "metrics": {"residual_length": 0.01},
+}
+MIXED = {
+    "method": "grid",
+    "axes": {
+        "controlled_modes": [1, 2, 3],
+        "plant_modes": [2, 3],
+        "link_subsets": ["none", "1", "1+2+3"],
+    },
+    "blocks": [{"method": "sobol", "count": 4, "axes": {"placement": {"kind": "same"}}}],
+}
+
+
+def small(sweep=MIXED, **sections):
+    """Dictionary of a sweep on the small machine."""
+    data = copy.deepcopy(BASE) | copy.deepcopy(sections)
+    return data | {"sweep": copy.deepcopy(sweep)}
+
+
+def small_spec(sweep=MIXED, **sections):
+    return parse_sweep(small(sweep, **sections))

@@ -1,0 +1,418 @@
+"""Running sweeps: one compilation, nothing lost, nothing run twice, failures kept apart."""
+
+import contextlib
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import xarray
+from rich.console import Console
+
+import studies
+from jaxmodel import status
+from studies.design import deviation, load_design
+from studies.errors import StudyError
+from studies.runs import run_study
+from studies.sweeps import plan
+from studies.sweeps.executor import TRACES
+from studies.sweeps.folder import CHUNKS, finished_cases
+from studies.sweeps.results import load
+from studies.sweeps.run import make_plan, run_sweep
+from studies.sweeps.show import best_cases
+from tests.sweeps import MIXED, small, small_spec
+
+SILENT = Console(file=open(os.devnull, "w"))  # noqa: SIM115
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    """Chunks of 16 cases, so that a small sweep has several."""
+    monkeypatch.setattr(plan, "LANES", 8)
+    monkeypatch.setattr(plan, "LARGEST_CHUNK", 16)
+
+
+def run(spec, out, **options):
+    return run_sweep(spec, Path(out), console=SILENT, **options)
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory):
+    """Folder of a finished sweep of 72 cases, and how often its program was traced."""
+    out = tmp_path_factory.mktemp("mixed") / "sweep"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "LANES", 8)
+        patch.setattr(plan, "LARGEST_CHUNK", 16)
+        before = len(TRACES)
+        outcome = run(small_spec(), out)
+    assert outcome.n_done == outcome.n_run == 72
+    return out, len(TRACES) - before
+
+
+def arrays(folder):
+    return {name: v.data for name, v in load(folder).variables.items()}
+
+
+def assert_same(a, b, tolerance=1e-12):
+    assert a.keys() == b.keys()
+    for name, x in a.items():
+        y = b[name]
+        if x.dtype.kind == "f":
+            size = max(np.nanmax(np.abs(x), initial=0.0), 1e-300)
+            assert np.array_equal(np.isnan(x), np.isnan(y)), name
+            assert np.nanmax(np.abs(x - y), initial=0.0) <= tolerance * size, name
+        else:
+            np.testing.assert_array_equal(x, y, err_msg=name)
+
+
+def test_mode_counts_subsets_and_placements_share_one_compilation(mixed):
+    folder, traces = mixed
+    assert traces == 1
+    data = load(folder)
+    assert data.n_cases == 72 and not (folder / CHUNKS).exists()
+    assert set(np.unique(data["status"])) <= {status.OK, status.SATURATED}
+    rms = data["residual_modal_rms"]
+    assert np.isnan(rms[data["link_modes"] == 2][:, :, 2]).all()  # a mode that does not exist
+    assert np.isfinite(rms[data["link_modes"] == 3]).all()
+    assert len(np.unique(data["residual_rms"][:, 0, 0])) > 40
+
+
+def test_every_case_equals_its_replay(mixed):
+    folder, _ = mixed
+    for case in (0, 7, 35, 71):
+        design = load_design(folder, case)
+        found = run_study(design.study, has_record=False, has_loop=False)
+        assert found.status == design.stored["status"]
+        difference, name = deviation(found, design.stored)
+        assert 0 < difference < 1e-9, name
+
+
+def test_results_open_in_xarray_and_in_plain_hdf5(mixed):
+    folder, _ = mixed
+    with xarray.open_dataset(folder / "results.h5") as data:
+        assert data.residual_rms.dims == ("case", "link", "station")
+        assert data.residual_rms.attrs["units"] == "m"
+        assert data.control_modes.dims == ("case",)
+        assert set(data.link_subset.values) == {"none", "1", "1+2+3"}
+        assert "git" in data.attrs and float(data.attrs["run_time"]) > 0
+        assert load(folder).to_xarray().residual_rms.equals(data.residual_rms)
+    with h5py.File(folder / "results.h5") as file:
+        for name, dataset in file.items():
+            assert dataset.is_scale or all(len(axis) == 1 for axis in dataset.dims), name
+
+
+def test_equal_sweeps_have_equal_datasets(mixed, tmp_path):
+    folder, _ = mixed
+    run(small_spec(), tmp_path / "again")
+    assert_same(arrays(folder), arrays(tmp_path / "again"), 0.0)
+
+
+def test_impossible_cases_do_not_touch_the_others(tmp_path):
+    good = [{"control.gain_factor": 0.1 * k} for k in range(1, 10)]
+    bad = [
+        {"patches.centers": [0.05, 0.06, 0.15]},
+        {"motion.waypoints": [[0, 0, 0.5], [0, 0.5, 0.5]]},
+        {"patches.centers": [0.001, 0.06, 0.15]},
+        {"metrics.residual_length": 1.0},
+        {"control.modes": 4},
+        {"drive.kd": 9e4, "run.substeps": 1},
+        {"electronics.antialias_hz": 6e3},
+    ]
+    mixed_list = [*good[:4], *bad, *good[4:]]
+    # the axes of the listed cases must exist in both, so that programs and columns are the same
+    run(small_spec({"method": "list", "cases": good + [good[0] | b for b in bad[:0]]}), tmp_path / "a")
+    run(small_spec({"method": "list", "cases": mixed_list}), tmp_path / "b")
+    clean, dirty = load(tmp_path / "a"), load(tmp_path / "b")
+    codes = dirty["status"]
+    is_bad = np.isin(np.arange(len(codes)), range(4, 11))
+    wanted = [
+        status.PATCHES_OVERLAP, status.OUT_OF_REACH, status.PATCH_OFF_LINK, status.WINDOW_TOO_LONG,
+        status.TOO_MANY_MODES, status.TOO_STIFF, status.TOO_FAST,
+    ]  # fmt: skip
+    np.testing.assert_array_equal(codes[is_bad], wanted)
+    np.testing.assert_array_equal(codes[~is_bad], clean["status"])
+    assert np.isnan(dirty["residual_rms"][is_bad]).all()
+    for name in ("residual_rms", "peak_voltage", "pose_error_rms", "control_energy"):
+        a, b = clean[name], dirty[name][~is_bad]
+        assert np.abs(a - b).max() <= 1e-9 * np.abs(a).max(), name
+
+
+def test_gains_from_each_cases_own_uncontrolled_run(tmp_path):
+    axes = {"control.ratio_source": "all", "emc_exponent": [0.5, 1.0], "move_time": [0.008, 0.01]}
+    run(small_spec({"axes": axes}), tmp_path / "s")
+    data = load(tmp_path / "s")
+    is_own = data["control_ratio_source"] == "own_run"
+    assert is_own.sum() == 4
+    for case in np.flatnonzero(is_own):
+        design = load_design(tmp_path / "s", int(case))
+        found = run_study(design.study, has_record=False, has_loop=False)
+        assert deviation(found, design.stored)[0] < 1e-9
+    assert np.abs(data["control_energy"][is_own] / data["control_energy"][~is_own] - 1).min() > 1e-6
+
+
+def test_noise_differs_between_repeats_and_is_the_same_again(tmp_path):
+    electronics = {"adc_noise": 0.01}
+    sweep = {"axes": {"gain": [0.5]}, "repeats": 4}
+    run(small_spec(sweep, electronics=electronics), tmp_path / "a")
+    run(small_spec(sweep, electronics=electronics), tmp_path / "b")
+    energy = load(tmp_path / "a")["control_energy"]
+    assert len(np.unique(energy)) == 4
+    np.testing.assert_array_equal(energy, load(tmp_path / "b")["control_energy"])
+
+
+def test_static_choices_make_groups_and_ideal_feedback_gets_its_steps(tmp_path):
+    axes = {"control.feedback": ["none", "ideal"], "gain": [0.1, 1.0]}
+    run(small_spec({"axes": axes}, link={"modes": 2}, control={"modes": 2}), tmp_path / "s")
+    data = load(tmp_path / "s")
+    assert np.all(data["status"] == status.OK)
+    is_ideal = data["control_feedback"] == "ideal"
+    assert len(set(data["substeps"][is_ideal].tolist())) == 1
+    for case in np.flatnonzero(is_ideal):
+        design = load_design(tmp_path / "s", int(case))
+        found = run_study(design.study, has_record=False, has_loop=False)
+        assert found.structure.substeps == data["substeps"][case]
+        assert deviation(found, design.stored)[0] < 1e-9
+    with pytest.raises(StudyError, match="needs a compilation; allowed up to 32"):
+        many = {"run.duration": {"from": 0.021, "to": 0.025, "count": 40}}
+        make_plan(small_spec({"axes": many}))
+
+
+# --- what must survive ----------------------------------------------------------------------------
+
+SCRIPT = """
+import json, os, sys
+sys.path.insert(0, sys.argv[3])
+import studies
+studies.configure()
+from pathlib import Path
+from studies.sweeps import plan
+from studies.sweeps.run import run_sweep
+from studies.sweeps.spec import parse_sweep
+plan.LANES, plan.LARGEST_CHUNK = 8, 16
+run_sweep(parse_sweep(json.loads(sys.argv[1])), Path(sys.argv[2]), "--resume" in sys.argv)
+"""
+
+
+def started(data, out, *options):
+    """A sweep in a process of its own."""
+    import json
+
+    root = str(Path(__file__).parents[1])
+    command = [sys.executable, "-c", SCRIPT, json.dumps(data), str(out), root, *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def killed_until_done(data, out, n_kills, seed):
+    """Kill a sweep at random moments, resume, and so on; ids finished at each kill."""
+    rng = random.Random(seed)
+    seen = []
+    for kill in range(n_kills):
+        process = started(data, out, *(["--resume"] if (out / "sweep.json").exists() else []))
+        before = len(list((out / CHUNKS).glob("*.h5"))) if (out / CHUNKS).exists() else 0
+        deadline = time.monotonic() + 120
+        wanted = before + rng.randint(0, 2)
+        while process.poll() is None and time.monotonic() < deadline:
+            folder = out / CHUNKS
+            done = len(list(folder.glob("*.h5"))) if folder.exists() else 0
+            if done > wanted or (out / "results.h5").exists():
+                break
+            time.sleep(0.002)
+        time.sleep(rng.random() * 0.05)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        seen.append(set(finished_cases(out).case_id.tolist()))
+        assert kill == 0 or seen[-1] >= seen[-2]
+    return seen
+
+
+def check_kills(tmp_path, n_kills, seed):
+    sweep = MIXED | {"blocks": [MIXED["blocks"][0] | {"count": 8}]}
+    data = small(sweep)
+    out = tmp_path / f"killed{seed}"
+    seen = killed_until_done(data, out, n_kills, seed)
+    assert any(0 < len(ids) < 144 for ids in seen)
+    outcome = run(small_spec(sweep), out, is_resumed=True)
+    assert outcome.n_done == 144
+    assert outcome.n_run == 144 - len(seen[-1])  # what was finished is not run again
+    whole = tmp_path / "whole"
+    if not whole.exists():
+        run(small_spec(sweep), whole)
+    assert_same(arrays(whole), arrays(out))
+
+
+def test_killed_at_random_moments(tmp_path):
+    check_kills(tmp_path, 3, 0)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(1, 8))
+def test_killed_at_many_random_moments(tmp_path, seed):
+    check_kills(tmp_path, 3, seed)
+
+
+def partly_done(out, spec=None):
+    """A sweep that stopped after two chunks, as Ctrl-C leaves it."""
+    spec = spec or small_spec()
+    from studies.sweeps import run as module
+
+    original, count = module.SweepFolder.write_chunk, [0]
+
+    def write(self, variables):
+        original(self, variables)
+        count[0] += 1
+        if count[0] == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.01)
+
+    module.SweepFolder.write_chunk = write
+    try:
+        return run(spec, out)
+    finally:
+        module.SweepFolder.write_chunk = original
+
+
+def test_ctrl_c_finishes_the_chunk_and_says_so(tmp_path, mixed):
+    out = tmp_path / "s"
+    outcome = partly_done(out)
+    assert outcome.is_interrupted and 32 <= outcome.n_done < 72
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    data = load(out)
+    assert np.sum(data["status"] >= 0) == outcome.n_done
+    assert np.isnan(data["residual_rms"][data["status"] < 0]).all()
+    resumed = run(small_spec(), out, is_resumed=True)
+    assert resumed.n_run == 72 - outcome.n_done
+    assert_same(arrays(mixed[0]), arrays(out))
+
+
+def test_damaged_chunks_run_again(tmp_path, mixed):
+    out = tmp_path / "s"
+    partly_done(out)
+    chunks = sorted((out / CHUNKS).glob("*.h5"))
+    content = bytearray(chunks[0].read_bytes())
+    content[len(content) // 2] ^= 1
+    chunks[0].write_bytes(content)
+    chunks[1].write_bytes(chunks[1].read_bytes()[:1000])
+    (out / CHUNKS / "unfinished.tmp").write_bytes(b"half")
+    before = len(finished_cases(out).case_id)
+    resumed = run(small_spec(), out, is_resumed=True)
+    assert resumed.n_run == 72 - before >= 32
+    assert_same(arrays(mixed[0]), arrays(out))
+    assert len(list((out / CHUNKS).glob("*.damaged"))) == 2
+
+
+def test_extended_sweep_runs_only_new_cases(tmp_path):
+    def spec(count, modes):
+        inner = {"method": "sobol", "count": count, "axes": {"placement": {"kind": "same"}}}
+        return small_spec({"axes": {"controlled_modes": modes}, "blocks": [inner]})
+
+    out = tmp_path / "s"
+    run(spec(8, [2, 3]), out)
+    longer = run(spec(16, [1, 2, 3]), out, is_resumed=True)
+    assert longer.n_run == 48 - 16 and longer.n_done == 48
+    run(spec(16, [1, 2, 3]), tmp_path / "whole")
+    assert_same(arrays(tmp_path / "whole"), arrays(out), 1e-9)
+    with pytest.raises(StudyError, match="finished cases in .* are not part of this sweep"):
+        run(spec(8, [2, 3]), out, is_resumed=True)
+
+
+def test_what_does_not_fit_is_refused(tmp_path, mixed):
+    folder, _ = mixed
+    with pytest.raises(StudyError, match="holds a sweep already; add --resume"):
+        run(small_spec(), folder)
+    with pytest.raises(StudyError, match="holds no sweep; leave --resume out"):
+        run(small_spec(), tmp_path / "new", is_resumed=True)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").write_text("x")
+    with pytest.raises(StudyError, match="holds other files .thesis.tex."):
+        run(small_spec(), tmp_path / "other")
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(StudyError, match="this is a file; name a folder"):
+        run(small_spec(), tmp_path / "file")
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    text = (copy / "sweep.json").read_text()
+    digest = text.split('"code": "')[1][:16]
+    (copy / "sweep.json").write_text(text.replace(digest, "0" * 16))
+    with pytest.raises(StudyError, match="begun with another code"):
+        run(small_spec(), copy, is_resumed=True)
+    (copy / "sweep.json").write_text("{")
+    with pytest.raises(StudyError, match="damaged"):
+        load(copy)
+
+
+def test_two_processes_cannot_share_a_folder(tmp_path):
+    from studies.sweeps.folder import make_manifest, open_folder
+
+    out = tmp_path / "s"
+    with open_folder(out, make_manifest(small()), False):
+        other = started(small(), out)
+        _, message = other.communicate(timeout=120)
+    assert other.returncode != 0 and "another process is running a sweep there" in message
+    assert run(small_spec(), out, is_resumed=True).n_done == 72
+
+
+def test_full_disk_keeps_what_is_finished(tmp_path, mixed):
+    """A small file system where the test may mount one, else a limit on the size of files."""
+    out = tmp_path / "disk"
+    out.mkdir()
+    is_mounted = _mount(out, "size=240k")
+    old = resource.getrlimit(resource.RLIMIT_FSIZE)
+    if not is_mounted:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, old[1]))
+    try:
+        with pytest.raises(StudyError, match="cannot write"):
+            run(small_spec(), out / "s")
+        kept = len(finished_cases(out / "s").case_id)
+        assert not list((out / "s" / CHUNKS).glob("*.tmp"))
+        if is_mounted:
+            assert 0 < kept < 72
+            subprocess.run(["mount", "-o", "remount,size=8m", str(out)], check=True)
+        else:
+            resource.setrlimit(resource.RLIMIT_FSIZE, old)
+        assert run(small_spec(), out / "s", is_resumed=True).n_run == 72 - kept
+        assert_same(arrays(mixed[0]), arrays(out / "s"))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
+        if is_mounted:
+            subprocess.run(["umount", "-l", str(out)], check=False)
+
+
+def _mount(folder, options):
+    with contextlib.suppress(OSError):
+        command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
+        return subprocess.run(command, capture_output=True).returncode == 0
+    return False
+
+
+def test_best_cases_obey_conditions(mixed):
+    data = studies.load(mixed[0])
+    first = best_cases(data, "residual_rms", count=5)
+    value = data["residual_rms"].reshape(72, -1).max(axis=1)
+    is_ok = data["status"] == status.OK
+    assert value[first[0]] == value[is_ok].min() and np.all(np.diff(value[first]) >= 0)
+    limited = best_cases(data, "residual_rms[1]", "peak_voltage < 1 and control.modes == 2", 99)
+    assert len(limited) and np.all(data["peak_voltage"][limited].max(axis=1) < 1)
+    assert np.all(data["control_modes"][limited] == 2)
+    with pytest.raises(StudyError, match="did you mean 'peak_voltage'"):
+        best_cases(data, "voltage_peak")
+    with pytest.raises(StudyError, match="true for no case"):
+        best_cases(data, "residual_rms", "peak_voltage < 0")
+
+
+def test_background_threads_may_run_sweeps(tmp_path):
+    """Signals can be caught in the main thread only; elsewhere a sweep runs without."""
+    found = []
+    spec = small_spec({"axes": {"gain": [0.5]}})
+    thread = threading.Thread(target=lambda: found.append(run(spec, tmp_path / "s")))
+    thread.start()
+    thread.join()
+    assert found[0].n_done == 1
