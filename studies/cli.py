@@ -13,7 +13,7 @@ from rich.table import Table
 from typer.exceptions import Abort, TyperException
 
 from studies.config import configure
-from studies.errors import StudyError
+from studies.errors import StudyError, field_error
 from studies.sweeps.commands import add_commands
 
 app = typer.Typer(
@@ -135,6 +135,28 @@ def modes(
     table = Table("mode", "frequency [Hz]", "damping ratio [1]")
     for k, (f, z) in enumerate(zip(found.frequency, found.damping_ratio, strict=True)):
         table.add_row(str(k + 1), f"{f:.4f}", f"{z:.5f}")
+    console.print(table)
+
+
+@app.command()
+def bench(
+    work: Annotated[str, typer.Option(help="sweep")] = "sweep",
+    cases: Annotated[int, typer.Option(min=1, help="cases of the sweep")] = 100_000,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+) -> None:
+    """Measure speed and memory on this machine."""
+    configure()
+    from studies.bench import bench_sweep
+
+    if work != "sweep":
+        raise field_error("--work", work, "'sweep'")
+    found = bench_sweep(cases, Console(file=sys.stderr, highlight=False, markup=False))
+    if as_json:
+        print(json.dumps(found))
+        return
+    table = Table(show_header=False)
+    for name, value in found.items():
+        table.add_row(name, str(value))
     console.print(table)
 
 

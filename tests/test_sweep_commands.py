@@ -1,0 +1,95 @@
+"""The commands of sweeps, in one process: sweep, dry run, show, best, plot, sensitivity, replay."""
+
+import pytest
+from PIL import Image
+
+from studies.sweeps import plan
+from studies.template import toml_value
+from tests.sweeps import BASE
+from tests.test_cli import refused, run
+
+SWEEP = """
+[sweep]
+method = "{method}"
+count = {count}
+metrics = ["residual_rms", "peak_voltage", "control_energy"]
+[sweep.axes]
+gain = {{ from = 0.05, to = 1.0, scale = "log" }}
+"drive.kp" = {{ from = 1e4, to = 4e4 }}
+placement = {{ kind = "mirrored" }}
+"""
+
+
+def text_of(sweep):
+    lines = [f'title = "{BASE["title"]}"']
+    for name, section in BASE.items():
+        if isinstance(section, dict):
+            lines += [f"[{name}]", *(f"{k} = {toml_value(v)}" for k, v in section.items())]
+    return "\n".join(lines) + sweep
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    monkeypatch.setattr(plan, "LANES", 8)
+    monkeypatch.setattr(plan, "LARGEST_CHUNK", 16)
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory):
+    path = tmp_path_factory.mktemp("spec") / "small.toml"
+    path.write_text(text_of(SWEEP.format(method="saltelli", count=8)))
+    return path
+
+
+def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
+    out = tmp_path / "s"
+    code, text, _ = run(capsys, "sweep", spec, "--dry-run")
+    assert code == 0 and "40 cases" in text and "estimate:" in text and "sample: case 20" in text
+    assert not out.exists()
+    code, text, _ = run(capsys, "sweep", spec, "--out", out)
+    assert code == 0 and "40/40 cases" in text and "compiled in" in text and "results.h5" in text
+    code, text, _ = run(capsys, "show", out)
+    assert code == 0 and "ok" in text and "best cases by residual_rms" in text
+    assert "residual_rms [m]" in text
+    assert run(capsys, "show", out, "--failed")[0] == 0
+    code, text, _ = run(
+        capsys, "best", out, "--by", "control_energy", "--subject-to",
+        "peak_voltage<100 and gain > 0.1", "--count", "3",
+    )  # fmt: skip
+    assert code == 0 and "V2 s" in text
+    code, text, _ = run(capsys, "sensitivity", out, "--by", "control_energy")
+    assert code == 0 and "placement" in text and "first" in text
+    code, text, _ = run(capsys, "replay", out, "--case", "3", "--out", tmp_path / "run.h5")
+    assert code == 0 and "largest difference of a metric" in text
+    assert (tmp_path / "run.h5").stat().st_size > 10_000
+    for options, name in (
+        ((), "placement.png"),
+        (("--x", "gain", "--hue", "drive.kp"), "points.pdf"),
+        (("--x", "patches.centers[0]", "--y", "control_energy"), "energy.svg"),
+    ):
+        assert run(capsys, "plot", out, *options, "--out", tmp_path / name)[0] == 0
+        assert (tmp_path / name).stat().st_size > 5_000
+    assert Image.open(tmp_path / "placement.png").size[0] > 600
+
+
+def test_quiet_says_nothing(capsys, spec, tmp_path):
+    code, text, err = run(capsys, "sweep", spec, "--out", tmp_path / "s", "--quiet")
+    assert (code, text, err) == (0, "", "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("show", "nowhere"), "no folder of a sweep"),
+        (("best", "nowhere", "--by", "x"), "no folder of a sweep"),
+        (("plot", "nowhere"), "no folder of a sweep"),
+        (("replay", "nowhere.toml"), "cannot be read"),
+        (("replay", "nowhere.toml", "--case", "1"), "leave --case out"),
+        (("sweep", "nowhere.toml", "--out", "x"), "cannot be read"),
+        (("sweep", "gains"), "--out: name a folder"),
+    ],
+)
+def test_commands_refuse(capsys, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    assert words in refused(capsys, *arguments)
+    assert list(tmp_path.iterdir()) == []
