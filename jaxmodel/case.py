@@ -26,6 +26,7 @@ class Structure(NamedTuple):
     law: str = "imsc"  # "imsc" or "srf"
     has_feedforward: bool = False  # computed torque on top of PD
     has_noise: bool = False  # seeded ADC noise and force ripple
+    has_friction: bool = False  # Coulomb friction on the sliders
     is_smooth: bool = False  # rounding replaced by equal noise, limits by tanh: for gradients
 
     @property

@@ -36,8 +36,22 @@ def motor_force(drive: Drive, reference: Reference, rho: Array, rho_rate: Array,
     return soft_limit(force, drive.force_limit, is_smooth)
 
 
-def slider_force(drive: Drive, reference: Reference, rho: Array, rho_rate: Array, is_smooth: bool):
-    """Force on the sliders [N], (3,): motors, friction F_c tanh(rho'/v) + c rho', disturbance."""
-    friction = drive.coulomb_friction * jnp.tanh(rho_rate / drive.friction_speed)
-    motors = motor_force(drive, reference, rho, rho_rate, is_smooth)
-    return motors - friction - drive.viscous_friction * rho_rate + reference.disturbance
+def slider_force(
+    drive: Drive,
+    reference: Reference,
+    rho: Array,
+    rho_rate: Array,
+    has_friction: bool,
+    is_smooth: bool,
+):
+    """Force on the sliders [N], (3,): motors, friction F_c tanh(rho'/v) + c rho', disturbance.
+
+    Args:
+        drive, reference, rho, rho_rate, is_smooth: as in `motor_force`.
+        has_friction: whether there is Coulomb friction at all (tanh is costly).
+    """
+    force = motor_force(drive, reference, rho, rho_rate, is_smooth) + reference.disturbance
+    force = force - drive.viscous_friction * rho_rate
+    if has_friction:
+        force = force - drive.coulomb_friction * jnp.tanh(rho_rate / drive.friction_speed)
+    return force

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxmodel import status
 from jaxmodel.parameters import Array
 from jaxmodel.plant import Plant
+from jaxmodel.trigonometry import sine_cosine
 
 #: sin and cos of gamma must exceed this: parallel or perpendicular to the guide is singular [1].
 SINGULAR_MARGIN = 1e-3
@@ -55,7 +56,7 @@ def close_chain(
         Chain. Out of reach or at a singular pose P is replaced by a safe value, so the numbers are
         finite there but meaningless: `chain_status` tells.
     """
-    cosine, sine = jnp.cos(pose[2]), jnp.sin(pose[2])
+    sine, cosine = sine_cosine(pose[2])
     cu = plant.joint_cos * cosine - plant.joint_sin * sine
     cn = plant.joint_sin * cosine + plant.joint_cos * sine
     ux, uy, length = plant.ux, plant.uy, plant.length

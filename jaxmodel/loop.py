@@ -123,7 +123,10 @@ def plant_rates(
         Rates.
     """
     chain = modal_chain(loop.plant, state.pose, state.pose_rate, state.q, state.q_rate)
-    force = slider_force(loop.drive, reference, chain.rho, chain.rho_rate, structure.is_smooth)
+    force = slider_force(
+        loop.drive, reference, chain.rho, chain.rho_rate, structure.has_friction,
+        structure.is_smooth,
+    )  # fmt: skip
     if structure.feedback == "ideal":
         voltage = ideal_voltage(structure, loop, state.q, state.q_rate)
     modal_force = jnp.sum(loop.actuator * voltage[:, None], axis=2)

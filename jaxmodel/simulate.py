@@ -14,7 +14,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.control import efficient_modal_control
 from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.kinematics import inverse_kinematics, path_status
-from jaxmodel.loop import Inputs, Record, initial_state, step
+from jaxmodel.loop import Inputs, Loop, Record, State, initial_state, step
 from jaxmodel.motion import end_of_path, shape_path
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import Prepared, prepare
@@ -150,8 +150,93 @@ def _scan_in_blocks(body, start, inputs: Inputs, is_checkpointed: bool):
     return state, kept
 
 
+class Outline(NamedTuple):
+    """What is known of a case before its first step."""
+
+    early_time: Array  # when a fault of the command appears [s], ()
+    command_end: Array  # [s], ()
+    sensor_condition: Array  # (3,)
+    actuator_condition: Array  # (3,)
+    modal_omega: Array  # of the controller's modes [rad/s], (3, C)
+    period: Array  # [s], ()
+    saturation_limit: Array  # [1], ()
+
+
+class Start(NamedTuple):
+    """A case ready to be stepped: what an executor reads, and what the end of the run needs."""
+
+    loop: Loop
+    inputs: Inputs  # leading axis (n_steps,)
+    state: State
+    outline: Outline
+
+
+def begin(structure: Structure, case: Case) -> Start:
+    """Everything before the first step.
+
+    Args:
+        structure: static choices.
+        case: the numbers.
+
+    Returns:
+        Start.
+    """
+    prepared = prepare(structure, case)
+    outside = command(structure, case, prepared)
+    code = jnp.where(prepared.status == status.OK, outside.status, prepared.status)
+    loop = prepared.loop
+    return Start(
+        loop,
+        outside.inputs,
+        initial_state(structure, loop, outside.start_pose, prepared.initial_q, code),
+        Outline(
+            jnp.where(prepared.status == status.OK, outside.bad_time, 0.0),
+            outside.end,
+            prepared.sensor_condition,
+            prepared.actuator_condition,
+            loop.modal_omega,
+            jnp.asarray(case.electronics.period),
+            jnp.asarray(case.windows.saturation_limit),
+        ),
+    )
+
+
+def conclude(outline: Outline, code: Array, last: State, record: Record | None = None) -> Result:
+    """Judge a run.
+
+    Args:
+        outline: of the case.
+        code: status it began with, as a float, ().
+        last: state after the last step.
+        record: trajectories, to be passed on.
+
+    Returns:
+        Result.
+    """
+    result = metrics.finish(last.totals, outline.period)
+    final = last.status
+    for share, bad in (
+        (result.saturated_fraction, status.SATURATED), (result.clipped_fraction, status.CLIPPED)
+    ):  # fmt: skip
+        is_often = (final == status.OK) & (share > outline.saturation_limit)
+        final = jnp.where(is_often, float(bad), final)
+    # zeros of a run that stopped would look like a perfect one
+    is_finished = reduce(jnp.logical_or, (final == code for code in status.FINISHED))
+    result = jax.tree.map(lambda x: jnp.where(is_finished, x, jnp.nan), result)
+    return Result(
+        metrics=result,
+        status=final.astype(jnp.int32),
+        bad_time=jnp.where(code == status.OK, last.bad_time, outline.early_time),
+        command_end=outline.command_end,
+        sensor_condition=outline.sensor_condition,
+        actuator_condition=outline.actuator_condition,
+        energy_ratio=efficient_modal_control(result.modal_energy, outline.modal_omega),
+        record=record,
+    )
+
+
 def simulate(structure: Structure, case: Case, has_record: bool = False) -> Result:
-    """Run one case.
+    """Run one case: the reference executor, a scan; other executors share all but that.
 
     Args:
         structure: static choices.
@@ -161,38 +246,14 @@ def simulate(structure: Structure, case: Case, has_record: bool = False) -> Resu
     Returns:
         Result. Nothing is raised inside: `status` says what went wrong.
     """
-    prepared = prepare(structure, case)
-    outside = command(structure, case, prepared)
-    loop = prepared.loop
-    code = jnp.where(prepared.status == status.OK, outside.status, prepared.status)
-    start = initial_state(structure, loop, outside.start_pose, prepared.initial_q, code)
+    start = begin(structure, case)
 
     def body(state, inputs):
-        after, record = step(structure, loop, state, inputs)
+        after, record = step(structure, start.loop, state, inputs)
         return after, record if has_record else None
 
     if structure.is_smooth or has_record:
-        last, record = _scan_in_blocks(body, start, outside.inputs, structure.is_smooth)
+        last, record = _scan_in_blocks(body, start.state, start.inputs, structure.is_smooth)
     else:
-        last, record = jax.lax.scan(body, start, outside.inputs)
-    result = metrics.finish(last.totals, case.electronics.period)
-    final = last.status
-    for share, bad in (
-        (result.saturated_fraction, status.SATURATED), (result.clipped_fraction, status.CLIPPED)
-    ):  # fmt: skip
-        is_often = (final == status.OK) & (share > case.windows.saturation_limit)
-        final = jnp.where(is_often, float(bad), final)
-    # zeros of a run that stopped would look like a perfect one
-    is_finished = reduce(jnp.logical_or, (final == code for code in status.FINISHED))
-    result = jax.tree.map(lambda x: jnp.where(is_finished, x, jnp.nan), result)
-    early = jnp.where(prepared.status == status.OK, outside.bad_time, 0.0)
-    return Result(
-        metrics=result,
-        status=final.astype(jnp.int32),
-        bad_time=jnp.where(code == status.OK, last.bad_time, early),
-        command_end=outside.end,
-        sensor_condition=prepared.sensor_condition,
-        actuator_condition=prepared.actuator_condition,
-        energy_ratio=efficient_modal_control(result.modal_energy, loop.modal_omega),
-        record=record,
-    )
+        last, record = jax.lax.scan(body, start.state, start.inputs)
+    return conclude(start.outline, start.state.status, last, record)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
+from studies.sweeps.plan import peak_memory
 from studies.sweeps.results import load
 from studies.sweeps.run import run_sweep
 from studies.sweeps.spec import parse_sweep
@@ -64,8 +64,3 @@ def bench_sweep(cases: int, console: Console) -> dict[str, Any]:
         "steps": 10,
         "fingerprint": float(np.mean(rms)),
     }
-
-
-def peak_memory() -> int:
-    """Most memory that this process has held [bytes]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

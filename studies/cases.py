@@ -30,7 +30,7 @@ from studies.spec import Study
 
 TWO_PI = 2 * np.pi
 #: Duration of a move that only fills up a path of fewer moves [s].
-NO_TIME = 1e-9
+NO_TIME = 1e-12
 
 
 def build_structure(study: Study, substeps: int | None = None) -> Structure:
@@ -55,6 +55,7 @@ def build_structure(study: Study, substeps: int | None = None) -> Structure:
         law=study.control.law,
         has_feedforward=study.drive.kind == "computed_torque",
         has_noise=noisy,
+        has_friction=study.drive.coulomb_friction > 0,
         is_smooth=study.run.smooth,
     )
 

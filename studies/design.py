@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxmodel import status
 from studies.errors import StudyError
 from studies.runs import Run, metric_variables
 from studies.spec import Study, load_study
@@ -41,7 +42,13 @@ def load_design(path: Path, case: int | None = None) -> Design:
     if case is None or not 0 <= case < data.n_cases:
         raise StudyError(f"--case {case}: allowed 0 to {data.n_cases - 1}, the cases of {path}")
     table = build_table(parse_sweep(read_manifest(path)["spec"]))
-    study = case_study(table, case)
+    code = int(data["status"][case])
+    try:
+        study = case_study(table, case)
+    except StudyError as error:
+        raise StudyError(
+            f"--case {case}: {status.REASONS.get(code, 'not run')}; it cannot run alone ({error})"
+        ) from None
     steps = int(data["substeps"][case]) if "substeps" in data.variables else -1
     if steps > 0:
         study = study.change(run__substeps=steps)

@@ -275,6 +275,12 @@ REFUSED = [
     ({"metrics": ["residual"], "axes": {"gain": [1.0]}}, "sweep.metrics = 'residual'"),
     ({"repeats": 0, "axes": {"gain": [1.0]}}, "sweep.repeats = 0: allowed a whole number >= 1"),
     ({"axes": {"patches.centers": [[0.05], [0.05, 0.1]]}}, "lists of different shape"),
+    ({"axes": {"placement": {"candidates": 2}}}, "so many that 3 patches fit on them apart"),
+    (range_of(to=10**400), "allowed a finite number"),
+    ({"axes": {"frequency_error": [10**400]}}, "allowed a list of finite numbers"),
+    ({"axes": {"patches.centers[0]": {"from": -1e308, "to": 1e308, "count": 3}}}, "up to 1e150"),
+    ({"axes": {"x" * 9999: [1]}}, "unknown field"),
+    ({"axes": {"a\nb": [1]}}, "unknown field"),
     ({"axes": {"link.joint_inertia_b": [0.0, 1e-5]}}, "link.basis = 'pinned_pinned': allowed"),
 ]  # fmt: skip
 
@@ -290,6 +296,16 @@ def test_a_bad_sweep_is_refused_in_one_clear_line(sweep, words):
     message = str(caught.value)
     assert words in message, message
     assert "\n" not in message and len(message) < 1200
+
+
+@pytest.mark.parametrize("depth", [30, 300, 3000])
+def test_deep_nesting_is_refused(depth):
+    blocks, values = {"axes": {"gain": [1.0]}}, [1.0]
+    for _ in range(depth):
+        blocks, values = {"blocks": [blocks]}, [values]
+    for sweep in (blocks, {"axes": {"gain": values}}):
+        with pytest.raises(StudyError):
+            build_table(parse_sweep(BASE | {"sweep": sweep}))
 
 
 def test_a_study_is_no_sweep_and_a_sweep_no_study(tmp_path):

@@ -166,6 +166,18 @@ def test_gains_from_each_cases_own_uncontrolled_run(tmp_path):
     assert np.abs(data["control_energy"][is_own] / data["control_energy"][~is_own] - 1).min() > 1e-6
 
 
+def test_programs_of_different_mode_counts_join(tmp_path):
+    cases = [
+        {"link.modes": 3, "control.modes": 2, "run.duration": 0.025},
+        {"link.modes": 2, "control.modes": 1, "run.duration": 0.026},
+    ]
+    run(small_spec({"method": "list", "cases": cases}), tmp_path / "s")
+    data = load(tmp_path / "s")
+    assert np.all(data["status"] == status.OK) and data["residual_modal_rms"].shape == (2, 3, 3)
+    assert np.isnan(data["residual_modal_rms"][1, :, 2]).all()
+    assert np.isfinite(data["residual_modal_rms"][0]).all()
+
+
 def test_noise_differs_between_repeats_and_is_the_same_again(tmp_path):
     electronics = {"adc_noise": 0.01}
     sweep = {"axes": {"gain": [0.5]}, "repeats": 4}
@@ -336,6 +348,10 @@ def test_extended_sweep_runs_only_new_cases(tmp_path):
     assert longer.n_run == 48 - 16 and longer.n_done == 48
     run(spec(16, [1, 2, 3]), tmp_path / "whole")
     assert_same(arrays(tmp_path / "whole"), arrays(out), 1e-9)
+    other = spec(16, [1, 2, 3])
+    other.data["sweep"]["metrics"] = ["residual_rms"]
+    with pytest.raises(StudyError, match="keeps sweep.metrics"):
+        run(other, out, is_resumed=True)
     with pytest.raises(StudyError, match="finished cases in .* are not part of this sweep"):
         run(spec(8, [2, 3]), out, is_resumed=True)
 

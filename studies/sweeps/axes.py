@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from studies.consistency import check_consistency
-from studies.errors import StudyError, field_error, nearest
+from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.explain import explain
 from studies.fields import Columns, field_value, parse_entry
 from studies.spec import Study
@@ -50,12 +50,21 @@ LABELS = {
     "link_subset": "control.links",
     "link_mode_mask": "control.mode_mask",
 }
+#: Columns that ready-made axes are found under in results.
+SHOWN_AS = ALIASES | {
+    "placement": "patches.centers",
+    "link_subsets": "link_subset",
+    "link_mode_masks": "link_mode_mask",
+    "shaper_frequency": "shaper.frequencies_hz",
+}
 PLACEMENTS = ("same", "mirrored", "per_link")
 #: Faults in these fields are a status of the case, so that a sweep may run into them.
 JUDGED_BY_STATUS = (
     "patches.", "motion.", "machine.", "link.length", "link.modes", "control.modes",
     "electronics.", "shaper.frequencies_hz", "run.duration", "metrics.",
 )  # fmt: skip
+#: Numbers beyond this are refused.
+LARGEST = 1e150
 #: More values than this from one axis or block are refused.
 LIMIT = 10**7
 
@@ -101,8 +110,9 @@ def build_axis(name: str, written: Any, study: Study, path: str) -> Axis:
     Raises:
         StudyError: unknown name, bad value, bad range.
     """
+    full = f"{path}.{shown_name(name)}"
     if name in ALIASES:
-        return _field_axis(ALIASES[name], written, study, f"{path}.{name}")
+        return _field_axis(ALIASES[name], written, study, full)
     special = {
         "placement": _placement,
         "link_subsets": _link_subsets,
@@ -111,8 +121,8 @@ def build_axis(name: str, written: Any, study: Study, path: str) -> Axis:
         "frequency_error": _frequency_error,
     }
     if name in special:
-        return special[name](written, study, f"{path}.{name}")
-    return _field_axis(name, written, study, f"{path}.{name}")
+        return special[name](written, study, full)
+    return _field_axis(name, written, study, full)
 
 
 def known_field(name: str, study: Study, path: str = "") -> Any:
@@ -128,7 +138,7 @@ def known_field(name: str, study: Study, path: str = "") -> Any:
         wanted = entry.field if entry else name
         close = nearest(wanted, [*names, *READY_MADE]) or _by_leaf(wanted, names)
         hint = f"did you mean {close!r}?" if close else "see studies init for all fields"
-        raise StudyError(f"{where}{name!r}: unknown field; {hint}")
+        raise StudyError(f"{where}{shown(name)}: unknown field; {hint}")
     value = field_value(study, entry.field)
     for index in entry.indices:
         if not isinstance(value, tuple) or index >= len(value):
@@ -250,6 +260,12 @@ def choice_axis(columns: Columns) -> Axis:
     return Axis(1, sample, columns)
 
 
+def _is_number(value: Any) -> bool:
+    """Whether it is a number whose differences and squares are numbers too."""
+    is_numeric = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return is_numeric and abs(value) <= LARGEST
+
+
 def _parse_range(written: dict[str, Any], path: str) -> Range:
     allowed = ("from", "to", "count", "scale")
     for key in written:
@@ -258,8 +274,8 @@ def _parse_range(written: dict[str, Any], path: str) -> Range:
             raise field_error(f"{path}.{key}", written[key], ", ".join(allowed), hint=hint)
     for key in ("from", "to"):
         value = written.get(key)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-            raise field_error(f"{path}.{key}", value, "a finite number")
+        if not _is_number(value):
+            raise field_error(f"{path}.{key}", value, "a finite number up to 1e150 in size")
     count, scale = written.get("count", 0), written.get("scale", "linear")
     if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= LIMIT:
         raise field_error(f"{path}.count", count, f"a whole number from 1 to {LIMIT}")
@@ -317,7 +333,7 @@ def _numbers_axis(written: Any, path: str) -> Axis:
         span = _parse_range(written, path)
         return _numeric_axis("value", span, span.at)
     is_list = isinstance(written, list) and len(written) > 0
-    if not is_list or any(type(v) not in (int, float) or not np.isfinite(v) for v in written):
+    if not is_list or not all(map(_is_number, written)):
         raise field_error(path, written, "a list of finite numbers, or a range {from, to, ...}")
     return choice_axis({"value": np.array(written, float)})
 
@@ -397,6 +413,10 @@ def _placement(written: Any, study: Study, path: str) -> Axis:
 
         return Axis(3 * count, sample, None)
     grid = {"patches.centers": room.grid(candidates)} if candidates else None
+    if grid is not None and len(grid["patches.centers"]) == 0:
+        raise field_error(
+            f"{path}.candidates", candidates, f"so many that {count} patches fit on them apart", "1"
+        )
     return Axis(room.free, lambda u: {"patches.centers": room.place(u)}, grid)
 
 

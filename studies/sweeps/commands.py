@@ -85,10 +85,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         """Best cases of a sweep by a metric."""
         configure()
         from studies.sweeps.results import load
-        from studies.sweeps.show import best_cases, print_cases
+        from studies.sweeps.show import best_cases, print_cases, tell_left_out
 
         data = load(folder)
         print_cases(data, best_cases(data, by, subject_to, count), [by.lstrip("-")], console)
+        tell_left_out(data, console)
 
     @app.command()
     def plot(
@@ -103,10 +104,13 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.sweeps.plots import plot as draw
         from studies.sweeps.plots import save_plot
         from studies.sweeps.results import load, variable_name
+        from studies.sweeps.show import tell_left_out
 
         names = [variable_name(name) for name in (y, x, hue) if name]
         path = out or folder / f"{'-over-'.join(names[:2])}{'-by-' + names[2] if hue else ''}.png"
-        save_plot(draw(load(folder), x, y, hue), path)
+        data = load(folder)
+        save_plot(draw(data, x, y, hue), path)
+        tell_left_out(data, console)
         console.print(f"written: {path}", soft_wrap=True)
 
     @app.command()

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from studies.errors import StudyError
+from studies.errors import StudyError, shown
 
 #: A longer condition is refused [characters].
 LONGEST = 1000
@@ -64,21 +64,20 @@ def evaluate(text: str, lookup: Lookup, field: str) -> np.ndarray:
     """
     if len(text) > LONGEST:
         raise StudyError(f"{field}: {len(text)} characters; allowed up to {LONGEST}")
+    said = shown(text)
     try:
         tree = ast.parse(text.strip(), mode="eval").body
         with np.errstate(all="ignore"):
             value = np.asarray(_value(tree, lookup))
     except StudyError as error:
-        raise StudyError(f"{field} = {text!r}: {error}") from None
+        raise StudyError(f"{field} = {said}: {error}") from None
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         reason = error.msg if isinstance(error, SyntaxError) else str(error)
-        raise StudyError(
-            f"{field} = {text!r}: no condition ({reason}); allowed {_ALLOWED}"
-        ) from None
+        raise StudyError(f"{field} = {said}: no condition ({reason}); allowed {_ALLOWED}") from None
     except (TypeError, OverflowError):
-        raise StudyError(f"{field} = {text!r}: mixes text and numbers") from None
+        raise StudyError(f"{field} = {said}: mixes text and numbers") from None
     if value.dtype != bool:
-        raise StudyError(f"{field} = {text!r}: gives no true or false; compare it with something")
+        raise StudyError(f"{field} = {said}: gives no true or false; compare it with something")
     return value
 
 

@@ -160,6 +160,12 @@ def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bo
             "extend it, or name a new folder"
         )
     old = read_manifest(folder.path)
+    kept, wanted = (m["spec"]["sweep"].get("metrics", []) for m in (old, manifest))
+    if kept != wanted:
+        raise StudyError(
+            f"--resume: {folder.path} keeps sweep.metrics = {kept}, now {wanted}; a resumed sweep "
+            "keeps the same"
+        )
     for key, what in (
         ("code", "code"),
         ("precision", "precision"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -114,6 +115,7 @@ def _structure(table: Table, members: np.ndarray) -> Structure:
         n_modes=int(column("link.modes").max()),
         n_controlled=min(int(column("control.modes").max()), one.n_patches),
         has_noise=bool(noisy) or one.is_smooth,
+        has_friction=bool((column("drive.coulomb_friction") > 0).any()),
     )
 
 
@@ -220,3 +222,8 @@ def _layout(n: int, structure: Structure, devices: int) -> Layout:
 def memory_budget() -> int:
     """Memory that the arrays of a chunk may take: a quarter of what the machine has [bytes]."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4
+
+
+def peak_memory() -> int:
+    """Most memory that this process has held [bytes]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

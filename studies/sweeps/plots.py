@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jaxmodel import status
 from studies import figures
 from studies.errors import StudyError
 from studies.store import replacing
@@ -41,9 +42,9 @@ def plot(data: SweepData, x: str | None, y: str, hue: str | None) -> Figure:
     value = metric_values(data, y)
     if value.dtype.kind not in "fiub":
         raise StudyError(f"--y {y}: a text, not a number")
-    chosen = data.is_finished & np.isfinite(value)
+    chosen = (data["status"] == status.OK) & np.isfinite(value)
     if not chosen.any():
-        raise StudyError(f"--y {y}: no finished case has it")
+        raise StudyError(f"--y {y}: no case of status ok has it")
     if x is None:
         if hue is not None:
             raise StudyError("--hue: needs --x")
@@ -139,9 +140,9 @@ def _lines(
         }
         text = None if name is None else f"{hue} = {_short(name)}"
         ax.plot(position, middle, marker="o", markersize=3, label=text, **style)
-        if any(len(v) > 1 for v in inside) and len(groups) == 1:
+        if any(len(v) > 1 for v in inside):
             low, high = [np.min(v) for v in inside], [np.max(v) for v in inside]
-            ax.fill_between(position, low, high, color=style["color"], alpha=0.15, linewidth=0)
+            ax.fill_between(position, low, high, color=style["color"], alpha=0.1, linewidth=0)
             ax.set_title("median; shaded: smallest to largest", fontsize=7.5, loc="right")
         if at.dtype.kind in "UOb":
             ax.set_xticks(position, [str(v) for v in at], rotation=30, ha="right")
@@ -199,6 +200,8 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
                 column = column.astype(float)
                 low, high = float(column.min()), float(column.max())
                 texts = [f"{v:.3g}" for v in (low, high)]
+                if low > 0 and high > 30 * low:
+                    column, low, high = np.log(column), np.log(low), np.log(high)
             lines.append((column - low) / max(high - low, 1e-300))
             places = np.linspace(0, 1, len(texts)) if len(texts) > 1 else [0.0]
             for place, text in zip(places, texts, strict=True):
@@ -218,7 +221,7 @@ def _placements(data: SweepData, y: str) -> Figure:
     centers, value = data["patches_centers"], metric_values(data, y)
     patches, link = data.spec.study.patches, data.spec.study.link
     chosen = best_cases(data, y, count=N_PLACEMENTS)
-    is_ok = data.is_finished & np.isfinite(value)
+    is_ok = (data["status"] == status.OK) & np.isfinite(value)
     unit = 1e3
     with figures.styled():
         figure = Figure(figsize=(7.4, 5.6), layout="constrained")
@@ -233,7 +236,7 @@ def _placements(data: SweepData, y: str) -> Figure:
                     left = (center - length / 2) * unit
                     top.barh(row, length * unit, height, left, color=color, linewidth=0)
             text = f"case {case}: {value[case]:.3g}"
-            top.annotate(text, (link.length * unit * 1.02, row), fontsize=7, va="center")
+            top.annotate(text, (link.length * unit * 1.01, row), fontsize=7, va="center")
         top.set_ylim(len(chosen) - 0.4, -0.6)
         top.set_xlim(0, link.length * unit * 1.25)
         top.set_ylabel("best placements")

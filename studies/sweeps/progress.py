@@ -52,10 +52,10 @@ class Reporter:
         if not self.is_quiet:
             self.console.print(text, soft_wrap=True)
 
-    def compiled(self, seconds: float) -> None:
+    def compiled(self, executor: str, seconds: float) -> None:
         """A program is ready."""
         self.compile_time += seconds
-        self.say(f"compiled in {seconds:.1f} s")
+        self.say(f"executor: {executor}, compiled in {seconds:.1f} s")
 
     def chunk(self, codes: np.ndarray) -> None:
         """A chunk is safe on the disk; codes are its statuses."""

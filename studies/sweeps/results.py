@@ -22,7 +22,7 @@ from studies.fields import field_value, parse_entry
 from studies.runs import METRIC_LABELS, status_text
 from studies.spec import Study
 from studies.store import Streamed, Variable, read_store, write_store
-from studies.sweeps.axes import ALIASES, LABELS, known_field
+from studies.sweeps.axes import LABELS, SHOWN_AS, known_field
 from studies.sweeps.folder import CHUNKS, RESULTS, Finished, finished_cases, read_manifest
 from studies.sweeps.spec import SweepSpec, parse_sweep
 from studies.sweeps.table import Table, as_numbers, build_table, values
@@ -204,6 +204,13 @@ class SweepData:
         """Cases whose metrics hold, (n,)."""
         return np.isin(self["status"], status.FINISHED)
 
+    def __repr__(self) -> str:
+        done = int(np.sum(self["status"] != NOT_RUN))
+        return (
+            f"<sweep {self.spec.study.title!r}: {done} of {self.n_cases} cases, axes "
+            f"{', '.join(swept_names(self))}; {len(self.variables)} variables>"
+        )
+
     def to_xarray(self) -> Any:
         """The same as an xarray dataset.
 
@@ -279,6 +286,7 @@ def gather(table: Table, finished: Finished) -> dict[str, Variable]:
     target = order[at]
     variables: dict[str, Variable] = {}
     n = len(table)
+    largest = _largest(finished.files)
     for number, file in enumerate(finished.files):
         chosen = is_known & (finished.file == number)
         if not chosen.any():
@@ -289,11 +297,13 @@ def gather(table: Table, finished: Finished) -> dict[str, Variable]:
                     continue
                 data = dataset[()]
                 if name not in variables:
-                    empty = np.full((n, *data.shape[1:]), -1 if data.dtype.kind == "i" else np.nan)
+                    shape = (n, *largest[name][1:])
+                    empty = np.full(shape, -1 if data.dtype.kind == "i" else np.nan)
                     dims, unit, text = _label(name)
-                    data_there = empty.astype(data.dtype)
-                    variables[name] = Variable(data_there, ("case", *dims), unit, text)
-                variables[name].data[target[chosen]] = data[finished.row[chosen]]
+                    filled = empty.astype(data.dtype)
+                    variables[name] = Variable(filled, ("case", *dims), unit, text)
+                inside = (target[chosen], *map(slice, data.shape[1:]))
+                variables[name].data[inside] = data[finished.row[chosen]]
     if "status" not in variables:
         empty = np.full(n, NOT_RUN)
         variables["status"] = Variable(empty, ("case",), *_PER_CASE["status"])
@@ -310,8 +320,10 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
     Raises:
         StudyError: unknown name or entry.
     """
-    name = ALIASES.get(name, name)
     entry = parse_entry(name)
+    if entry is not None and entry.field in SHOWN_AS:
+        name = SHOWN_AS[entry.field] + name[len(entry.field) :]
+        entry = parse_entry(name)
     key = entry.field if entry else name
     variables = data.variables
     for candidate in (variable_name(name), variable_name(key)):
@@ -391,20 +403,43 @@ def merge(folder: Path, table: Table, finished: Finished, attributes: dict[str, 
     def parts(name: str) -> Iterator[tuple[int, np.ndarray]]:
         for path, target, row in places:
             with h5py.File(path, "r") as store:
-                data = store[name][()]
+                data = _fitted(store[name][()], largest[name][1:])
             breaks = np.flatnonzero(np.diff(target) != 1) + 1
             runs = zip(np.split(target, breaks), np.split(row, breaks), strict=True)
             yield from ((int(at[0]), data[rows]) for at, rows in runs if len(at))
 
+    largest = _largest(finished.files)
     variables = case_variables(table)
     with h5py.File(finished.files[-1], "r") as store:
-        for name in [n for n in store if n in _PER_CASE or n in metric_names()]:
+        for name, shape in largest.items():
             dims, unit, text = _label(name)
-            shape = (len(table), *store[name].shape[1:])
-            streamed = Streamed(shape, store[name].dtype, partial(parts, name))
+            streamed = Streamed(
+                (len(table), *shape[1:]), store[name].dtype, partial(parts, name)
+            )  # fmt: skip
             variables[name] = Variable(streamed, ("case", *dims), unit, text)
     variables |= axis_variables(table, _sizes(variables))
     write_store(folder / RESULTS, variables, attributes)
+
+
+def _largest(files: list[Path]) -> dict[str, tuple[int, ...]]:
+    """Largest shape of each variable: programs of one sweep may have different mode counts."""
+    largest: dict[str, tuple[int, ...]] = {}
+    for file in files:
+        with h5py.File(file, "r") as store:
+            for name, dataset in store.items():
+                if name in _PER_CASE or name in metric_names():
+                    old = largest.get(name, dataset.shape)
+                    largest[name] = tuple(map(max, old, dataset.shape))
+    return largest
+
+
+def _fitted(data: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Rows of a larger shape, NaN where they have nothing."""
+    if data.shape[1:] == shape:
+        return data
+    whole = np.full((len(data), *shape), np.nan, data.dtype)
+    whole[(slice(None), *map(slice, data.shape[1:]))] = data
+    return whole
 
 
 def _label(name: str) -> tuple[tuple[str, ...], str, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from studies import config
 from studies.cases import powered
 from studies.errors import StudyError
 from studies.runs import with_ratio
-from studies.sweeps.executor import Executor
+from studies.sweeps.executor import Executor, make_executor, own_ratios
 from studies.sweeps.folder import (
     RESULTS,
     SweepFolder,
@@ -128,7 +128,7 @@ def _headline(table: Table, groups: list[Group], n_before: int) -> str:
     if n_before:
         text += f", {n_before} of them done before"
     chunks = sum(len(group.chunks()) for group in groups)
-    return f"{text}; {chunks} chunks, {len(groups)} programs to compile, executor: XLA scan"
+    return f"{text}; chunks: {chunks}, programs to compile: {len(groups)}"
 
 
 def _check_fit(table: Table, done: np.ndarray, out: Path) -> None:
@@ -155,18 +155,18 @@ def _run_groups(
     source = values_of(table, "control.ratio_source")
     for group in groups:
         is_own = source[group.rows] == "own_run"
-        executor = Executor(group.structure, group.layout, bool(is_own.any()))
+        executor = make_executor(group.structure, group.layout, bool(is_own.any()))
         substeps = group.structure.substeps
-        pending: tuple[np.ndarray, np.ndarray, Result] | None = None
+        pending: tuple[np.ndarray, np.ndarray, Callable[[], Result]] | None = None
         position = 0
         for rows in group.chunks():
             if stop.is_set():
                 break
             cases = chunk_cases(table, rows, group.structure, group.layout.size)
             is_first = executor.compile_time == 0
-            started = start_chunk(executor, table, rows, cases)
+            started = start_chunk(executor, table, rows, cases, bool(is_own.any()))
             if is_first:
-                reporter.compiled(executor.compile_time)
+                reporter.compiled(executor.name, executor.compile_time)
             stiff = group.is_too_stiff[position : position + len(rows)]
             position += len(rows)
             # the device computes this chunk while the one before is written
@@ -185,7 +185,9 @@ def values_of(table: Table, name: str) -> np.ndarray:
     return np.broadcast_to(values(table.study, table.columns, name), (len(table),))
 
 
-def start_chunk(executor: Executor, table: Table, rows: np.ndarray, cases: Case) -> Result:
+def start_chunk(
+    executor: Executor, table: Table, rows: np.ndarray, cases: Case, has_own_ratio: bool
+) -> Callable[[], Result]:
     """Start a chunk, after its uncontrolled pass where gain ratios come from that.
 
     Args:
@@ -193,23 +195,27 @@ def start_chunk(executor: Executor, table: Table, rows: np.ndarray, cases: Case)
         table: all cases.
         rows: those of the chunk.
         cases: from `chunk_cases`.
+        has_own_ratio: whether such a pass is needed.
+
+    Returns:
+        Function that waits for the result.
     """
-    if executor.has_own_ratio:
-        filled = np.concatenate([rows, np.full(executor.layout.size - len(rows), rows[-1])])
+    if has_own_ratio:
+        size = max(map(len, jax.tree.leaves(cases)))
+        filled = np.concatenate([rows, np.full(size - len(rows), rows[-1])])
         is_own = values_of(table, "control.ratio_source")[filled] == "own_run"
         exponent = values_of(table, "control.ratio_exponent")[filled][:, None, None]
-        own = powered(executor.energy_ratio(cases), exponent)
+        own = powered(own_ratios(executor, cases), exponent)
         cases = with_ratio(cases, np.where(is_own[:, None, None], own, cases.control.ratio))
-    return executor(cases)
+    return executor.start(cases)
 
 
 def _finish(
-    table: Table, pending: tuple[Any, Any, Result], substeps: int, kept: list[str],
+    table: Table, pending: tuple[Any, Any, Callable[[], Result]], substeps: int, kept: list[str],
     folder: SweepFolder, reporter: Reporter,
 ) -> None:  # fmt: skip
-    rows, stiff, result = pending
-    arrays = jax.tree.map(np.asarray, result)
-    variables = chunk_variables(table, rows, arrays, stiff, substeps, kept)
+    rows, stiff, wait = pending
+    variables = chunk_variables(table, rows, wait(), stiff, substeps, kept)
     folder.write_chunk(variables)
     reporter.chunk(variables["status"].data)
 
@@ -238,7 +244,6 @@ class Estimate(NamedTuple):
 
     compile_time: float  # of the first program [s]
     chunk_time: float  # of one of its chunks [s]
-    memory: int  # temporaries of the program [bytes]
     total: float  # compiling and running everything [s]
 
 
@@ -246,12 +251,12 @@ def calibrate(plan: Plan) -> Estimate:
     """Compile the first program and time one chunk of it."""
     group = plan.groups[0]
     has_own = bool((values_of(plan.table, "control.ratio_source")[group.rows] == "own_run").any())
-    executor = Executor(group.structure, group.layout, has_own)
+    executor = make_executor(group.structure, group.layout, has_own)
     rows = group.chunks()[0]
     cases = chunk_cases(plan.table, rows, group.structure, group.layout.size)
-    jax.block_until_ready(start_chunk(executor, plan.table, rows, cases))
+    start_chunk(executor, plan.table, rows, cases, has_own)()
     began = time.perf_counter()
-    jax.block_until_ready(start_chunk(executor, plan.table, rows, cases))
+    start_chunk(executor, plan.table, rows, cases, has_own)()
     chunk_time = time.perf_counter() - began
     per_step = chunk_time / (group.layout.size * group.structure.n_steps * group.structure.substeps)
     running = sum(
@@ -259,7 +264,7 @@ def calibrate(plan: Plan) -> Estimate:
         for g in plan.groups
     )
     total = running + len(plan.groups) * executor.compile_time
-    return Estimate(executor.compile_time, chunk_time, executor.temporary_bytes, total)
+    return Estimate(executor.compile_time, chunk_time, total)
 
 
 def results_path(out: Path) -> Path:

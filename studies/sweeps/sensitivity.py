@@ -213,5 +213,6 @@ def design_values(data: SweepData, metric: str) -> np.ndarray:
     Raises:
         StudyError: unknown metric.
     """
-    value = np.where(data.is_finished, metric_values(data, metric).astype(float), np.nan)
+    is_ok = data["status"] == status.OK
+    value = np.where(is_ok, metric_values(data, metric).astype(float), np.nan)
     return value[build_table(data.spec).origin]

@@ -12,6 +12,7 @@ from rich.table import Table as RichTable
 from jaxmodel import status
 from studies.errors import StudyError
 from studies.sweeps.condition import evaluate
+from studies.sweeps.plan import peak_memory
 from studies.sweeps.results import NOT_RUN, SweepData, metric_values, swept_names, variable_name
 from studies.sweeps.run import Plan, calibrate
 from studies.sweeps.sensitivity import failure_causes
@@ -103,6 +104,15 @@ def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console:
     console.print(table)
 
 
+def tell_left_out(data: SweepData, console: Console) -> None:
+    """Say how many cases are not ok, and so take no part."""
+    codes = data["status"]
+    counts = Counter(codes[codes != status.OK].tolist())
+    if counts:
+        reasons = "; ".join(f"{n} {reason(code)}" for code, n in counts.most_common())
+        console.print(f"left out: {reasons}")
+
+
 def label(data: SweepData, name: str) -> str:
     """A name with its unit; a metric of several links or stations counts with its largest."""
     unit = unit_of_metric(data, name)
@@ -158,8 +168,8 @@ def print_plan(plan: Plan, console: Console) -> None:
     found = calibrate(plan)
     console.print(
         f"estimate: {found.total:.0f} s, of which {found.compile_time * len(plan.groups):.0f} s "
-        f"compiling; {found.chunk_time:.2g} s a chunk; memory of the program "
-        f"{found.memory / 2**20:.0f} MiB"
+        f"compiling; {found.chunk_time:.2g} s a chunk; memory so far "
+        f"{peak_memory() / 2**20:.0f} MiB"
     )
 
 

@@ -90,10 +90,21 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
     """
     if "sweep" not in data:
         raise StudyError("sweep: missing; a sweep is a study file with a section [sweep]")
+    if isinstance(data["sweep"], (dict, list)):
+        _check_depth(data["sweep"])
     study = parse_study({name: value for name, value in data.items() if name != "sweep"})
     sweep = _parse_block(Sweep, data["sweep"], "sweep")
     assert isinstance(sweep, Sweep)
     return SweepSpec(study, sweep, _node(sweep, "sweep"), data)
+
+
+def _check_depth(data: Any, depth: int = 0) -> None:
+    """Lists and tables inside one another, as far as any sweep needs them."""
+    if depth > 10 * DEEPEST:
+        raise StudyError("sweep: lists or tables nested too deep")
+    for entry in data.values() if isinstance(data, dict) else data:
+        if isinstance(entry, (dict, list, tuple)):
+            _check_depth(entry, depth + 1)
 
 
 def _parse_block(model: type[Block], data: Any, path: str) -> Block:
@@ -113,11 +124,17 @@ def _tuples(data: Any) -> Any:
     return {k: tuple(v) if k in listed and isinstance(v, list) else v for k, v in data.items()}
 
 
-def _node(block: Block, path: str) -> Node:
+#: Blocks may lie this deep in one another.
+DEEPEST = 20
+
+
+def _node(block: Block, path: str, depth: int = 0) -> Node:
     children = []
+    if depth > DEEPEST:
+        raise StudyError(f"sweep.blocks: nested {depth} deep; allowed up to {DEEPEST}")
     for k, data in enumerate(block.blocks):
         inner = f"{path}.blocks.{k}"
-        children.append(_node(_parse_block(Block, data, inner), inner))
+        children.append(_node(_parse_block(Block, data, inner), inner, depth + 1))
     return Node(block, tuple(children), path)
 
 

@@ -1,0 +1,140 @@
+"""The traced kernel against the scan: the same step, the same results."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmodel import status
+from jaxmodel.trigonometry import sine_cosine
+from studies import kernel
+from studies.sweeps.executor import KernelExecutor, ScanExecutor, make_executor
+from studies.sweeps.plan import Layout, chunk_cases, plan_groups
+from studies.sweeps.table import build_table
+from tests.sweeps import MIXED, small_spec
+
+LAYOUT = Layout(devices=2, blocks=1, lanes=16)
+ALL_SORTS = {
+    "method": "random",
+    "count": 32,
+    "axes": {
+        "placement": {"kind": "per_link"},
+        "plant_modes": [2, 3],
+        "controlled_modes": [1, 2, 3],
+        "link_subsets": "all",
+        "gain": {"from": 0.01, "to": 0.1},
+        "shaper": ["none", "zv"],
+        "initial.load_deflection[0]": [0.0, 0.0, 0.0, 0.019, 0.1],
+        "drive.kp": {"from": 1e4, "to": 3e4},
+        "machine.platform_mass": {"from": 0.2, "to": 0.3},
+    },
+}
+
+
+def both(spec):
+    """Results of the same cases by kernel and by scan."""
+    table = build_table(spec)
+    group = plan_groups(table, np.arange(len(table)), 2)[0]
+    cases = chunk_cases(table, np.arange(len(table)), group.structure, LAYOUT.size)
+    return [
+        executor(group.structure, LAYOUT, False).start(cases)()
+        for executor in (KernelExecutor, ScanExecutor)
+    ]
+
+
+def check_equal(fast, reference):
+    np.testing.assert_array_equal(fast.status, reference.status)
+    for a, b in zip(jax.tree.leaves(fast), jax.tree.leaves(reference), strict=True):
+        assert np.array_equal(np.isnan(a), np.isnan(b))
+        size = np.nanmax(np.abs(b), initial=1e-300)
+        assert np.nanmax(np.abs(a - b), initial=0.0) <= 1e-9 * size
+
+
+#: Everything that the first one leaves out: another law, noise, friction, several steps a sample.
+OTHER_SORTS = {
+    "link": {"modes": 2, "basis": "pinned_free"},
+    "control": {"law": "srf", "velocity_gain": [1e-6, 2e-6, 1e-6]},
+    "electronics": {"adc_noise": 0.01},
+    "drive": {
+        "coulomb_friction": 0.5, "friction_speed": 0.05, "kind": "computed_torque", "kd": 6e3
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("sweep", "sections"),
+    [
+        (ALL_SORTS, {"metrics": {"residual_length": 0.004}}),
+        ({"method": "random", "count": 32, "axes": {"drive.kp": {"from": 1e4, "to": 2e4}}},
+         OTHER_SORTS),
+    ],
+    ids=["mixed sampled cases", "strain rate, noise, friction, steps"],
+)  # fmt: skip
+def test_kernel_equals_scan(sweep, sections):
+    fast, reference = both(small_spec(sweep, **sections))
+    assert np.sum(reference.status == status.OK) >= 12
+    if sweep is ALL_SORTS:  # cases that stop, at once or on the way, are frozen alike
+        assert status.DIVERGED in reference.status
+        assert np.any(reference.bad_time[reference.status == status.DIVERGED] > 0)
+    check_equal(fast, reference)
+
+
+def test_without_llvmlite_the_scan_runs(monkeypatch):
+    table = build_table(small_spec(MIXED))
+    group = plan_groups(table, np.arange(8), 2)[0]
+    assert isinstance(make_executor(group.structure, LAYOUT, False), KernelExecutor)
+    monkeypatch.setattr(kernel, "binding", None)
+    assert isinstance(make_executor(group.structure, LAYOUT, False), ScanExecutor)
+
+
+# --- the translation itself -----------------------------------------------------------------------
+
+
+def translated(function, shape, dtype=np.float64, lanes=16):
+    """Result of one application of `x -> function(x, c)` by kernel and by JAX, lanes last."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(*shape, lanes)).astype(dtype) * 2
+    c = rng.normal(size=shape).astype(dtype)
+    built = kernel.build_kernel(
+        lambda constants, row, state: [function(state[0], constants[0]) + 0 * row[0][0]],
+        [kernel.Leaf(shape, False)], [kernel.Leaf((1,), False)], [kernel.Leaf(shape, True)], dtype,
+    )  # fmt: skip
+    out = x.copy()
+    built.run([c, np.zeros((1, 1), dtype), out], 1, lanes)
+    wanted = np.asarray(jax.vmap(function, (-1, None), -1)(x, c))
+    return out, wanted
+
+
+def every_operation(x, c):
+    """All kinds of operations that a step may use."""
+    a = jnp.where(x > c, jnp.sqrt(jnp.abs(x)), jnp.minimum(x, c) / (2 + c * c))
+    a = a + jnp.clip(x, -0.5, 0.5) * jnp.round(x) - jnp.maximum(x, 0.25) ** 3 + jnp.tanh(x)
+    sine, cosine = sine_cosine(x)
+    mixed = jnp.concatenate([a[1:], a[:1]]) + jnp.sum(x, axis=0) * jnp.max(x * c)
+    flag = (x < 0) & (c > 0) | ~(x <= 1)
+    odd = jnp.where(flag, jnp.sign(x), 0.0) + jnp.any(flag, axis=0)
+    return mixed + sine * cosine + odd + x[:, :1] * c[None, 0] * jnp.isfinite(x)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_every_operation_is_translated(dtype):
+    with jax.enable_x64(dtype == np.float64):
+        out, wanted = translated(every_operation, (3, 4), dtype)
+    scale = np.abs(wanted).max()
+    assert np.abs(out - wanted).max() < 50 * np.finfo(dtype).eps * scale
+    assert scale > 1
+
+
+def test_not_a_number_goes_through_limits():
+    """A limit must not hide a number that is none, or a case that went bad would look fine."""
+
+    def limited(x, c):
+        return jnp.clip(jnp.maximum(x * jnp.nan, c), -1.0, 1.0)
+
+    out, wanted = translated(limited, (2,))
+    assert np.isnan(wanted).all() and np.isnan(out).all()
+
+
+def test_unknown_operation_is_named():
+    with pytest.raises(NotImplementedError, match="'cumsum'"):
+        translated(lambda x, c: jnp.cumsum(x), (3,))
