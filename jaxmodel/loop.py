@@ -45,6 +45,7 @@ class Loop(NamedTuple):
     actuator: Array  # modal force of a voltage, lambda_a Phi_a [N/V], (3, R, K)
     deflection_at: Array  # chord deflection at the stations [1], (3, S, R)
     controller: Controller
+    channel: Array  # what the estimator works on, noise-free: filter x sensor, (3, channels, R)
     observer: Array  # controlled modes of the true deflection, modal filter x sensor [1], (3, C, R)
     modal_omega: Array  # frequencies of the controller's modes [rad/s], (3, C)
     rotation: tuple[Array, Array]  # of the spectra's phasors per sample, (C, n_frequencies)
@@ -139,16 +140,11 @@ def plant_rates(
 def ideal_voltage(structure: Structure, loop: Loop, q: Array, q_rate: Array) -> Array:
     """Actuator voltages [V] of continuous feedback (20) from noise-free sensors, (3, K)."""
     controller = loop.controller
-    channel = _sensed(loop, q, controller.filter)
-    channel_rate = _sensed(loop, q_rate, controller.filter)
+    channel = jnp.sum(loop.channel * q[:, None], axis=2)
+    channel_rate = jnp.sum(loop.channel * q_rate[:, None], axis=2)
     force = -controller.velocity_gain * channel_rate - controller.position_gain * channel
     voltage = jnp.sum(controller.synthesizer * force[:, None], axis=2)
     return soft_limit(voltage, controller.voltage_limit, structure.is_smooth)
-
-
-def _sensed(loop: Loop, q: Array, channel_filter: Array) -> Array:
-    voltage = jnp.sum(loop.sensor * q[:, None], axis=2)
-    return jnp.sum(channel_filter * voltage[:, None], axis=2)
 
 
 def plant_step(
@@ -362,8 +358,9 @@ def initial_state(structure: Structure, loop: Loop, pose: Array, q: Array, code:
     zero, still = jnp.zeros_like(q), jnp.zeros_like(pose)
     n_stations = loop.deflection_at.shape[1]
     totals = metrics.zero_totals(
-        n_stations, structure.n_modes, structure.n_controlled, structure.n_frequencies, q.dtype
-    )
+        n_stations, structure.n_modes, structure.n_controlled, structure.n_frequencies, q.dtype,
+        structure.metrics,
+    )  # fmt: skip
     return State(
         PlantState(pose, still, q, zero, q, zero),
         rest_controller(structure.n_channels, structure.n_patches, q.dtype),

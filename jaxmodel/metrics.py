@@ -91,17 +91,64 @@ class Metrics(NamedTuple):
     spectral_density: Array  # one-sided PSD of the controller's modes [m2/Hz], (3, C, n)
 
 
-def zero_totals(n_stations: int, n_modes: int, n_controlled: int, n_frequencies: int, dtype):
-    """Totals before the first sample."""
+#: Totals that each metric needs.
+NEEDS = {
+    "residual_rms": ("residual_count", "residual_square"),
+    "residual_peak": ("residual_peak",),
+    "structural_rms": ("moving_count", "moving_square"),
+    "structural_peak": ("moving_peak",),
+    "residual_modal_rms": ("residual_count", "residual_modal_square"),
+    "residual_modal_peak": ("residual_modal_peak",),
+    "structural_modal_rms": ("moving_count", "moving_modal_square"),
+    "settling_time": ("settled_at",),
+    "pose_error_peak": ("moving_error_peak",),
+    "pose_error_rms": ("residual_count", "residual_error_square"),
+    "peak_voltage": ("peak_voltage",),
+    "saturated_fraction": ("count", "saturated"),
+    "clipped_fraction": ("count", "clipped"),
+    "control_energy": ("voltage_square",),
+    "peak_force": ("peak_force",),
+    "plant_energy": ("moving_count", "plant_energy"),
+    "modal_energy": ("moving_count", "modal_energy"),
+    "spectral_density": ("taper_square", "phasor", "spectrum"),
+}
+#: Metrics that the status of a run depends on.
+ALWAYS = ("saturated_fraction", "clipped_fraction")
+
+
+def zero_totals(
+    n_stations: int, n_modes: int, n_controlled: int, n_frequencies: int, dtype,
+    wanted: tuple[str, ...] = (),
+) -> Totals:  # fmt: skip
+    """Totals before the first sample.
+
+    Args:
+        n_stations, n_modes, n_controlled, n_frequencies: sizes.
+        dtype: of all of them.
+        wanted: metrics to accumulate, () for all; what only others need is None.
+    """
     zero, link = jnp.zeros((), dtype), jnp.zeros((3,), dtype)
     stations, modes = jnp.zeros((3, n_stations), dtype), jnp.zeros((3, n_modes), dtype)
     controlled = jnp.zeros((3, n_controlled), dtype)
     one = jnp.ones((n_controlled, n_frequencies), dtype)
     lines = jnp.zeros((3, n_controlled, n_frequencies), dtype)
-    return Totals(
+    whole = Totals(
         zero, zero, zero, stations, stations, stations, stations, modes, modes, modes, link, link,
         link, link, zero, zero, zero, link, modes, controlled, zero, (one, 0 * one), (lines, lines),
     )  # fmt: skip
+    names = {*wanted, *ALWAYS} if wanted else NEEDS
+    needed = {total for name in names for total in NEEDS[name]}
+    kept = (x if f in needed else None for f, x in zip(Totals._fields, whole, strict=True))
+    return Totals._make(kept)
+
+
+def _filled(totals: Totals) -> Totals:
+    """Zeros for what is not accumulated, so that one arithmetic serves all choices."""
+    pairs = ("phasor", "spectrum")
+    return Totals._make(
+        x if x is not None else (0.0, 0.0) if f in pairs else 0.0
+        for f, x in zip(Totals._fields, totals, strict=True)
+    )
 
 
 def accumulate(
@@ -127,17 +174,18 @@ def accumulate(
     Returns:
         Totals.
     """
+    given, totals = totals, _filled(totals)
     moving, residual = window.is_moving, window.is_residual
     size = jnp.abs(sample.deflection)
     square = sample.deflection * sample.deflection
     modal_square = sample.q * sample.q
     is_outside = jnp.max(size, axis=1) > band
-    cosine, sine = totals.phasor
+    cosine, sine = (jnp.asarray(x) for x in totals.phasor)
     turn_c, turn_s = rotation
     weighted = (window.taper * sample.modal)[:, :, None]
     plant_energy = omega * omega * modal_square + sample.q_rate * sample.q_rate
     modal_energy = (modal_omega * sample.modal) ** 2 + sample.modal_rate * sample.modal_rate
-    return Totals(
+    new = Totals(
         count=totals.count + 1,
         moving_count=totals.moving_count + moving,
         residual_count=totals.residual_count + residual,
@@ -169,6 +217,7 @@ def accumulate(
             totals.spectrum[1] + weighted * sine[None],
         ),
     )
+    return Totals._make(None if a is None else b for a, b in zip(given, new, strict=True))
 
 
 def _root(x: Array) -> Array:
@@ -180,14 +229,16 @@ def finish(totals: Totals, period: Array) -> Metrics:
     """Metrics from the totals of a run sampled every `period` [s].
 
     The spectral density is the Hann-windowed periodogram 2 T |sum w x e^(-j omega t)|^2/sum w^2 at
-    given frequencies, one-sided.
+    given frequencies, one-sided. Metrics that have not been accumulated are None.
     """
+    is_there = {f: x is not None for f, x in zip(Totals._fields, totals, strict=True)}
+    totals = _filled(totals)
     moving = jnp.maximum(totals.moving_count, 1)
     residual = jnp.maximum(totals.residual_count, 1)
     count = jnp.maximum(totals.count, 1)
     power = totals.spectrum[0] ** 2 + totals.spectrum[1] ** 2
     taper = jnp.where(totals.taper_square > 0, totals.taper_square, 1.0)
-    return Metrics(
+    whole = Metrics(
         residual_rms=_root(totals.residual_square / residual),
         residual_peak=totals.residual_peak,
         structural_rms=_root(totals.moving_square / moving),
@@ -206,4 +257,10 @@ def finish(totals: Totals, period: Array) -> Metrics:
         plant_energy=totals.plant_energy / moving,
         modal_energy=totals.modal_energy / moving,
         spectral_density=2 * period * power / taper,
+    )
+    return Metrics(
+        *(
+            x if all(is_there[total] for total in NEEDS[name]) else None
+            for name, x in zip(Metrics._fields, whole, strict=True)
+        )
     )

@@ -83,6 +83,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         actuator=lambda_a[:, None, None] * basis.actuator_slope,
         deflection_at=basis.deflection_at,
         controller=design.controller,
+        channel=jnp.einsum("ick,ikr->icr", design.controller.filter, sensor),
         observer=jnp.einsum("ick,ikr->icr", design.observer, sensor),
         modal_omega=design.modal_omega,
         rotation=(jnp.cos(angle), jnp.sin(angle)),

@@ -230,7 +230,9 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
         command_end=outline.command_end,
         sensor_condition=outline.sensor_condition,
         actuator_condition=outline.actuator_condition,
-        energy_ratio=efficient_modal_control(result.modal_energy, outline.modal_omega),
+        energy_ratio=None
+        if result.modal_energy is None
+        else efficient_modal_control(result.modal_energy, outline.modal_omega),
         record=record,
     )
 

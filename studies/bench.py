@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import statistics
 import tempfile
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +13,12 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from studies.sweeps.plan import peak_memory
+from studies import config, kernel
+from studies.cases import build_cases, build_structure
+from studies.errors import StudyError, field_error
+from studies.spec import paper_study
+from studies.sweeps.executor import Executor, KernelExecutor, ScanExecutor, make_executor
+from studies.sweeps.plan import LANES, Layout, peak_memory
 from studies.sweeps.results import load
 from studies.sweeps.run import run_sweep
 from studies.sweeps.spec import parse_sweep
@@ -37,6 +45,75 @@ SHORT_RUNS: dict[str, Any] = {
 }
 
 
+#: Workloads of closed-loop runs, 0.8 s at 10 kHz, by what differs from the paper's study.
+WORKS: dict[str, dict[str, Any]] = {
+    # PD drive, ideal modal velocity feedback, unshaped square, residual rms only
+    "W0": {"link__modes": 3, "control__feedback": "ideal", "shaper__kind": "none"},
+    # the default sampled design with all metrics, 3 and 8 modes a link
+    "W1": {"link__modes": 3},
+    "W8": {"link__modes": 8},
+}
+EXECUTORS: dict[str, Callable[..., Executor]] = {"kernel": KernelExecutor, "scan": ScanExecutor}
+#: Runs of which the median counts.
+REPEATS = 5
+
+
+def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
+    """Speed of a batch of closed-loop runs that differ in their gains.
+
+    Args:
+        work: key of WORKS.
+        executor: key of EXECUTORS; "" for the fastest one at hand.
+        batch: cases in a chunk; 0: two blocks of lanes on every device.
+
+    Returns:
+        Figures by name; configurations a second are those of the median run, compiling apart.
+
+    Raises:
+        StudyError: unknown work or executor, or one that is not installed.
+    """
+    if work not in WORKS:
+        raise field_error("--work", work, ", ".join(map(repr, (*WORKS, "sweep"))))
+    if executor and executor not in EXECUTORS:
+        raise field_error("--executor", executor, ", ".join(map(repr, EXECUTORS)))
+    if executor == "kernel" and not kernel.is_available():
+        raise StudyError("--executor kernel: needs llvmlite: install flexlink-studies[fast]")
+    config.require_configured()
+    devices = len(jax.local_devices())
+    lanes = LANES if not batch else max(8, min(LANES, -(-batch // (8 * devices)) * 8))
+    blocks = max(batch // (devices * lanes), 1) if batch else 2
+    layout = Layout(devices, blocks, lanes)
+    study = paper_study().change(**WORKS[work])
+    metrics = ("residual_rms",) if work == "W0" else ()
+    structure = build_structure(study)._replace(metrics=metrics)
+    gains = np.random.default_rng(0).uniform(0.01, 0.5, layout.size)
+    cases = build_cases(study, {"control.gain_factor": gains}, structure)
+    real = jax.dtypes.canonicalize_dtype(np.float64)
+    cases = jax.tree.map(lambda x: x if x.dtype.kind == "i" else x.astype(real), cases)
+    chosen = EXECUTORS[executor] if executor else None
+    made = chosen(structure, layout, False) if chosen else make_executor(structure, layout, False)
+    result = made.start(cases)()
+    times = []
+    for _ in range(REPEATS):
+        began = time.perf_counter()
+        result = made.start(cases)()
+        times.append(time.perf_counter() - began)
+    seconds = statistics.median(times)
+    return {
+        "work": work,
+        "executor": made.name,
+        "configs_per_s": round(layout.size / seconds, 1),
+        "ns_per_step": round(1e9 * seconds / layout.size / structure.n_steps, 1),
+        "compile_s": round(made.compile_time, 2),
+        "peak_mib": round(peak_memory() / 2**20, 1),
+        "device": f"{devices} x {jax.local_devices()[0].device_kind}",
+        "dtype": str(result.metrics.residual_rms.dtype),
+        "batch": layout.size,
+        "steps": structure.n_steps,
+        "fingerprint": float(np.mean(result.metrics.residual_rms)),
+    }
+
+
 def bench_sweep(cases: int, console: Console) -> dict[str, Any]:
     """Time and peak memory of a sweep of very short runs, chunk files and joining included.
 
@@ -52,7 +129,6 @@ def bench_sweep(cases: int, console: Console) -> dict[str, Any]:
         rms = load(out)["residual_rms"]
     return {
         "work": "sweep",
-        "executor": "XLA scan",
         "cases": done.n_run,
         "configs_per_s": round(done.n_run / done.run_time, 1),
         "run_s": round(done.run_time, 2),

@@ -13,7 +13,7 @@ from rich.table import Table
 from typer.exceptions import Abort, TyperException
 
 from studies.config import configure
-from studies.errors import StudyError, field_error
+from studies.errors import StudyError
 from studies.sweeps.commands import add_commands
 
 app = typer.Typer(
@@ -140,17 +140,21 @@ def modes(
 
 @app.command()
 def bench(
-    work: Annotated[str, typer.Option(help="sweep")] = "sweep",
+    work: Annotated[str, typer.Option(help="W0, W1, W8 or sweep")] = "W1",
+    executor: Annotated[str, typer.Option(help="kernel or scan; default: the faster one")] = "",
+    batch: Annotated[int, typer.Option(min=0, help="cases of a chunk; 0: a good number")] = 0,
     cases: Annotated[int, typer.Option(min=1, help="cases of the sweep")] = 100_000,
+    precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Measure speed and memory on this machine."""
-    configure()
-    from studies.bench import bench_sweep
+    configure(precision)
+    from studies.bench import bench_runs, bench_sweep
 
-    if work != "sweep":
-        raise field_error("--work", work, "'sweep'")
-    found = bench_sweep(cases, Console(file=sys.stderr, highlight=False, markup=False))
+    if work == "sweep":
+        found = bench_sweep(cases, Console(file=sys.stderr, highlight=False, markup=False))
+    else:
+        found = bench_runs(work, executor, batch)
     if as_json:
         print(json.dumps(found))
         return

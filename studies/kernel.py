@@ -13,6 +13,7 @@ it stays scalar) or *varying* (lanes last in memory: loaded as a vector).
 from __future__ import annotations
 
 import ctypes
+import os
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, NamedTuple
@@ -109,9 +110,9 @@ def _compile(text: str) -> Any:
     module = binding.parse_assembly(text)
     target = binding.Target.from_default_triple().create_target_machine(
         cpu=binding.get_host_cpu_name(), features=binding.get_host_cpu_features().flatten(),
-        opt=3, jit=True,
+        opt=int(os.environ.get("KOPT","3")), jit=True,
     )  # fmt: skip
-    options = binding.create_pipeline_tuning_options(speed_level=2)
+    options = binding.create_pipeline_tuning_options(speed_level=int(os.environ.get("KSP", "2")))
     options.slp_vectorization = False
     passes = binding.create_pass_builder(target, options)
     passes.getModulePassManager().run(module, passes)
@@ -160,15 +161,17 @@ class _Writer:
         places = self._places(state, bases[at:], lanes, first, None)
         for slot, place in zip(slots, places, strict=True):
             self.builder.store(self._load(place, True), slot, align=VECTOR_BYTES)
-        fixed = [
-            self._array(leaf, base, lanes, first, None)
-            for leaf, base in zip(constants, bases, strict=False)
-        ]
         self.builder.branch(loop)
 
         self.builder.position_at_end(loop)
         sample = self.builder.phi(self.index)
         sample.add_incoming(ir.Constant(self.index, 0), entry)
+        if os.environ.get("KBAR", "1") == "1":
+            self.builder.asm(ir.FunctionType(ir.VoidType(), []), "", "~{memory}", [], True)
+        fixed = [
+            self._array(leaf, base, lanes, first, None)
+            for leaf, base in zip(constants, bases, strict=False)
+        ]
         rows = [
             self._array(leaf, base, lanes, first, sample)
             for leaf, base in zip(inputs, bases[len(constants) : at], strict=True)

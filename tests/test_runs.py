@@ -19,6 +19,12 @@ def judged(**changes):
 
 
 def test_stiff_drive_gets_the_steps_it_needs():
+    assert check_run(short_study(**SMALL, drive__kd=5000.0))[0].substeps == 2
+    assert check_run(short_study(**SMALL))[0].substeps == 1
+
+
+@pytest.mark.long
+def test_stiff_drive_runs_as_with_many_steps():
     """A brake of 5000 N s/m is unstable at one step per sample; many more steps are the truth."""
     automatic = judged(drive__kd=5000.0)
     assert automatic.structure.substeps == 2

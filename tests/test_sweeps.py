@@ -166,6 +166,7 @@ def test_gains_from_each_cases_own_uncontrolled_run(tmp_path):
     assert np.abs(data["control_energy"][is_own] / data["control_energy"][~is_own] - 1).min() > 1e-6
 
 
+@pytest.mark.long
 def test_programs_of_different_mode_counts_join(tmp_path):
     cases = [
         {"link.modes": 3, "control.modes": 2, "run.duration": 0.025},
@@ -178,6 +179,7 @@ def test_programs_of_different_mode_counts_join(tmp_path):
     assert np.isfinite(data["residual_modal_rms"][0]).all()
 
 
+@pytest.mark.long
 def test_noise_differs_between_repeats_and_is_the_same_again(tmp_path):
     electronics = {"adc_noise": 0.01}
     sweep = {"axes": {"gain": [0.5]}, "repeats": 4}
@@ -188,10 +190,12 @@ def test_noise_differs_between_repeats_and_is_the_same_again(tmp_path):
     np.testing.assert_array_equal(energy, load(tmp_path / "b")["control_energy"])
 
 
+@pytest.mark.long
 def test_ideal_feedback_gets_one_number_of_steps_from_its_worst_case(tmp_path):
     spec = small_spec(
         {"axes": {"control.velocity_gain[0]": [0.06, 0.1, 1e6]}},
-        link={"modes": 1}, control={"modes": 1, "feedback": "ideal", "velocity_gain": [0.1] * 3}, shaper={"kind": "none"},
+        link={"modes": 1}, shaper={"kind": "none"},
+        control={"modes": 1, "feedback": "ideal", "velocity_gain": [0.1] * 3},
     )  # fmt: skip
     run(spec, tmp_path / "s")
     data = load(tmp_path / "s")

@@ -64,13 +64,16 @@ class Group(NamedTuple):
         ]
 
 
-def plan_groups(table: Table, rows: np.ndarray, devices: int) -> list[Group]:
+def plan_groups(
+    table: Table, rows: np.ndarray, devices: int, metrics: tuple[str, ...] = ()
+) -> list[Group]:
     """Group cases by program and lay out their chunks.
 
     Args:
         table: all cases.
         rows: those to run.
         devices: how many devices share a chunk.
+        metrics: those that are kept; () for all.
 
     Raises:
         StudyError: too many programs.
@@ -91,7 +94,7 @@ def plan_groups(table: Table, rows: np.ndarray, devices: int) -> list[Group]:
     groups = []
     for key in distinct:
         members = np.flatnonzero(keys == key)
-        structure = _structure(table, members)
+        structure = _structure(table, members)._replace(metrics=_accumulated(table, metrics))
         wanted = rows[np.isin(rows, members)]
         if len(wanted) == 0:
             continue
@@ -100,6 +103,15 @@ def plan_groups(table: Table, rows: np.ndarray, devices: int) -> list[Group]:
         layout = _layout(len(wanted), structure, devices)
         groups.append(Group(structure, wanted, is_too_stiff, layout))
     return groups
+
+
+def _accumulated(table: Table, kept: tuple[str, ...]) -> tuple[str, ...]:
+    """Metrics that the runs must accumulate for those that are kept; () for all."""
+    if not kept:
+        return ()
+    has_own = (values(table.study, table.columns, "control.ratio_source") == "own_run").any()
+    names = {"modal_energy" if name == "energy_ratio" else name for name in kept}
+    return tuple(sorted(names | ({"modal_energy"} if has_own else set())))
 
 
 def _structure(table: Table, members: np.ndarray) -> Structure:

@@ -68,7 +68,9 @@ def make_plan(spec: SweepSpec, rows: np.ndarray | None = None) -> Plan:
     kept = kept_metrics(spec)
     table = build_table(spec)
     every = np.arange(len(table)) if rows is None else rows
-    return Plan(table, plan_groups(table, every, len(jax.local_devices())), kept)
+    return Plan(
+        table, plan_groups(table, every, len(jax.local_devices()), spec.sweep.metrics), kept
+    )
 
 
 def run_sweep(
@@ -102,7 +104,7 @@ def run_sweep(
         finished = finished_cases(out, lambda text: console.print(text, soft_wrap=True))
         _check_fit(table, finished.case_id, out)
         rows = np.flatnonzero(~np.isin(table.case_id, finished.case_id))
-        groups = plan_groups(table, rows, len(jax.local_devices()))
+        groups = plan_groups(table, rows, len(jax.local_devices()), spec.sweep.metrics)
         n_before = len(table) - len(rows)
         with Reporter(console, len(table), n_before, is_quiet) as reporter, _interrupts() as stop:
             reporter.say(_headline(table, groups, n_before))
