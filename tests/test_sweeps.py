@@ -153,6 +153,7 @@ def test_impossible_cases_do_not_touch_the_others(tmp_path):
         assert np.abs(a - b).max() <= 1e-9 * np.abs(a).max(), name
 
 
+@pytest.mark.long
 def test_gains_from_each_cases_own_uncontrolled_run(tmp_path):
     axes = {"control.ratio_source": "all", "emc_exponent": [0.5, 1.0], "move_time": [0.008, 0.01]}
     run(small_spec({"axes": axes}), tmp_path / "s")
