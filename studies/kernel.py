@@ -13,9 +13,8 @@ it stays scalar) or *varying* (lanes last in memory: loaded as a vector).
 from __future__ import annotations
 
 import ctypes
-import os
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -110,9 +109,9 @@ def _compile(text: str) -> Any:
     module = binding.parse_assembly(text)
     target = binding.Target.from_default_triple().create_target_machine(
         cpu=binding.get_host_cpu_name(), features=binding.get_host_cpu_features().flatten(),
-        opt=int(os.environ.get("KOPT","3")), jit=True,
+        opt=3, jit=True,
     )  # fmt: skip
-    options = binding.create_pipeline_tuning_options(speed_level=int(os.environ.get("KSP", "2")))
+    options = binding.create_pipeline_tuning_options(speed_level=2)
     options.slp_vectorization = False
     passes = binding.create_pass_builder(target, options)
     passes.getModulePassManager().run(module, passes)
@@ -161,17 +160,15 @@ class _Writer:
         places = self._places(state, bases[at:], lanes, first, None)
         for slot, place in zip(slots, places, strict=True):
             self.builder.store(self._load(place, True), slot, align=VECTOR_BYTES)
+        fixed = [
+            self._array(leaf, base, lanes, first, None)
+            for leaf, base in zip(constants, bases, strict=False)
+        ]
         self.builder.branch(loop)
 
         self.builder.position_at_end(loop)
         sample = self.builder.phi(self.index)
         sample.add_incoming(ir.Constant(self.index, 0), entry)
-        if os.environ.get("KBAR", "1") == "1":
-            self.builder.asm(ir.FunctionType(ir.VoidType(), []), "", "~{memory}", [], True)
-        fixed = [
-            self._array(leaf, base, lanes, first, None)
-            for leaf, base in zip(constants, bases, strict=False)
-        ]
         rows = [
             self._array(leaf, base, lanes, first, sample)
             for leaf, base in zip(inputs, bases[len(constants) : at], strict=True)
@@ -291,6 +288,8 @@ class _Writer:
             return self._each(lambda x: self._power(x, params["y"]), given, shape)
         if name == "convert_element_type":
             return self._each(lambda x: self._converted(x, params["new_dtype"]), given, shape)
+        if name in _SIGNS:
+            return self._each(partial(self._compared, _SIGNS[name]), given, shape)
         operation = getattr(self, f"_op_{name}", None)
         if operation is None:
             raise NotImplementedError(f"operation {name!r} of the step")
@@ -395,24 +394,6 @@ class _Writer:
         compare = self.builder.fcmp_unordered if sign == "!=" else self.builder.fcmp_ordered
         return compare(sign, *self._pair(a, b))
 
-    def _op_lt(self, a: Any, b: Any) -> Any:
-        return self._compared("<", a, b)
-
-    def _op_le(self, a: Any, b: Any) -> Any:
-        return self._compared("<=", a, b)
-
-    def _op_gt(self, a: Any, b: Any) -> Any:
-        return self._compared(">", a, b)
-
-    def _op_ge(self, a: Any, b: Any) -> Any:
-        return self._compared(">=", a, b)
-
-    def _op_eq(self, a: Any, b: Any) -> Any:
-        return self._compared("==", a, b)
-
-    def _op_ne(self, a: Any, b: Any) -> Any:
-        return self._compared("!=", a, b)
-
     def _op_and(self, a: Any, b: Any) -> Any:
         if _is_known(a) or _is_known(b):
             known, other = (a, b) if _is_known(a) else (b, a)
@@ -456,11 +437,11 @@ class _Writer:
         return self._op_min(self._op_max(x, low), high)
 
     def _op_sign(self, a: Any) -> Any:
-        up = self._op_select_n(self._op_gt(a, 0.0), 0.0, 1.0)
-        return self._op_select_n(self._op_lt(a, 0.0), up, -1.0)
+        up = self._op_select_n(self._compared(">", a, 0.0), 0.0, 1.0)
+        return self._op_select_n(self._compared("<", a, 0.0), up, -1.0)
 
     def _op_is_finite(self, a: Any) -> Any:
-        return self._op_lt(self._op_abs(a), np.inf)
+        return self._compared("<", self._op_abs(a), np.inf)
 
     def _op_abs(self, a: Any) -> Any:
         return abs(a) if _is_known(a) else self._intrinsic("fabs", a)
@@ -497,6 +478,8 @@ class _Writer:
         return self.builder.call(function, [a])
 
 
+#: Names of comparisons among JAX's operations.
+_SIGNS = {"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "==", "ne": "!="}
 _COMPARE: dict[str, Callable[[Any, Any], Any]] = {
     "<": lambda a, b: a < b,
     "<=": lambda a, b: a <= b,

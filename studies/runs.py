@@ -246,14 +246,17 @@ def _check_rates(study: Study, structure: Structure, known: Preflight) -> None:
 def pole_decay(structure: Structure, case: Case, pose: Any) -> float:
     """Fastest decay |Re lambda| [1/s] of the plant with ideal feedback at a pose."""
     structure = _without_run(structure)._replace(feedback="ideal")
-    poles = np.linalg.eigvals(np.asarray(_mechanical(structure, case, pose)))
+    poles = np.linalg.eigvals(np.asarray(_mechanics_at(structure, case, pose)))
     return float(np.abs(poles.real).max())
 
 
-@partial(jax.jit, static_argnums=0)
-def _mechanical(structure: Structure, case: Case, pose: Any) -> Any:
+def mechanics_at(structure: Structure, case: Case, pose: Any) -> Any:
+    """State matrix of the plant (with ideal feedback, where the structure has it) at a pose."""
     loop = prepare(structure, case).loop
     return mechanical(linearise(structure, loop, pose, case.electronics.antialias))
+
+
+_mechanics_at = jax.jit(mechanics_at, static_argnums=0)
 
 
 def _drive_substeps(study: Study, structure: Structure, case: Case) -> int:

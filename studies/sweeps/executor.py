@@ -235,28 +235,20 @@ def _stages(structure: Structure, lanes: int, split: _Split, block: list[np.ndar
 
 
 def _compile_stages(structure: Structure, split: _Split) -> _Stages:
-    def whole(own: list, common: list) -> list:
-        case = _joined(split.tree, split.is_varying, own, common)
-        return jax.tree.leaves(begin(structure, case))
+    def whole(own: list, common: list) -> Start:
+        return begin(structure, _joined(split.tree, split.is_varying, own, common))
 
     one = [leaf[0] for leaf in split.varying]
-    traced = jax.make_jaxpr(whole)(one, split.shared)
+    traced, shapes = jax.make_jaxpr(whole, return_shape=True)(one, split.shared)
     is_varying = _dependence(traced.jaxpr, len(one))
-    tree = jax.tree.structure(
-        jax.eval_shape(
-            lambda own, common: begin(
-                structure, _joined(split.tree, split.is_varying, own, common)
-            ),
-            one,
-            split.shared,
-        )  # fmt: skip
-    )
+    tree = jax.tree.structure(shapes)
 
-    def chosen(leaves: list, wanted: bool) -> list:
+    def chosen(own: list, common: list, wanted: bool) -> list:
+        leaves = jax.tree.leaves(whole(own, common))
         return [x for x, varies in zip(leaves, is_varying, strict=True) if varies == wanted]
 
-    shared = jax.jit(lambda own, common: chosen(whole(own, common), False))
-    varying = jax.jit(jax.vmap(lambda own, common: chosen(whole(own, common), True), (0, None), -1))
+    shared = jax.jit(partial(chosen, wanted=False))
+    varying = jax.jit(jax.vmap(partial(chosen, wanted=True), (0, None), -1))
     parts: Start = jax.tree.unflatten(
         tree,
         [

@@ -239,7 +239,10 @@ def _sync(folder: Path) -> None:
 def code_digest() -> str:
     """Hash of the sources that decide a case's numbers."""
     digest = sha256()
-    names = ("cases.py", "fields.py", "spec.py", "sweeps/executor.py", "sweeps/table.py")
+    names = (
+        "cases.py", "fields.py", "kernel.py", "spec.py", "sweeps/executor.py", "sweeps/plan.py",
+        "sweeps/table.py",
+    )  # fmt: skip
     sources = sorted((_SOURCES / "jaxmodel").glob("*.py"))
     for path in (*sources, *(_SOURCES / "studies" / name for name in names)):
         digest.update(path.name.encode() + path.read_bytes())

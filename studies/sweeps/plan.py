@@ -12,12 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.linear import linearise, mechanical
-from jaxmodel.prepare import STIFFNESS_LIMIT, drive_rate, prepare
+from jaxmodel.prepare import STIFFNESS_LIMIT, drive_rate
 from studies.cases import build_cases, build_structure
 from studies.errors import StudyError
-from studies.runs import SUBSTEP_LIMIT
-from studies.sweeps.table import Table, loose_study, values
+from studies.runs import SUBSTEP_LIMIT, mechanics_at
+from studies.sweeps.table import Table, loose_study
 
 #: Fields that change the program; each combination of their values is compiled by itself.
 STATIC = (
@@ -109,7 +108,7 @@ def _accumulated(table: Table, kept: tuple[str, ...]) -> tuple[str, ...]:
     """Metrics that the runs must accumulate for those that are kept; () for all."""
     if not kept:
         return ()
-    has_own = (values(table.study, table.columns, "control.ratio_source") == "own_run").any()
+    has_own = (table.values("control.ratio_source") == "own_run").any()
     names = {"modal_energy" if name == "energy_ratio" else name for name in kept}
     return tuple(sorted(names | ({"modal_energy"} if has_own else set())))
 
@@ -118,8 +117,7 @@ def _structure(table: Table, members: np.ndarray) -> Structure:
     """Sizes of the largest case, choices of all of them."""
 
     def column(name: str) -> np.ndarray:
-        found = values(table.study, table.columns, name)
-        return found[members] if len(found) > 1 else found
+        return table.values(name)[members]
 
     one = build_structure(loose_study(table, int(members[0])))
     noisy = (column("electronics.adc_noise") > 0).any() | (column("drive.ripple") > 0).any()
@@ -158,12 +156,8 @@ def chunk_cases(table: Table, rows: np.ndarray, structure: Structure, size: int)
 def _mechanics(structure: Structure, cases: Case) -> Any:
     """State matrices at every way-point of every case, (n, poses, s, s)."""
 
-    def at(case: Case, pose: Any) -> Any:
-        loop = prepare(structure, case).loop
-        return mechanical(linearise(structure, loop, pose, case.electronics.antialias))
-
     def one(case: Case) -> Any:
-        return jax.vmap(lambda pose: at(case, pose))(case.path.waypoints)
+        return jax.vmap(lambda pose: mechanics_at(structure, case, pose))(case.path.waypoints)
 
     return jax.vmap(one)(cases)
 
@@ -175,11 +169,9 @@ def _with_substeps(
     rate = _drive_rates(table, structure, members)
     if structure.feedback == "ideal":
         rate = np.maximum(rate, _pole_decay(table, structure, members))
-    period = 1 / values(table.study, table.columns, "electronics.sample_rate_hz")
-    period = period[members] if len(period) > 1 else period
+    period = 1 / table.values("electronics.sample_rate_hz")[members]
     needed = np.maximum(np.ceil(rate * period / STIFFNESS_LIMIT), 1)
-    steps = values(table.study, table.columns, "run.substeps")
-    given = int(steps[members[0]] if len(steps) > 1 else steps[0])
+    given = int(table.values("run.substeps")[members[0]])
     is_too_stiff = needed > (given or SUBSTEP_LIMIT)
     fitting = needed[~is_too_stiff]
     most = int(fitting.max()) if len(fitting) else 1

@@ -25,7 +25,7 @@ from studies.store import Streamed, Variable, read_store, write_store
 from studies.sweeps.axes import LABELS, SHOWN_AS, known_field
 from studies.sweeps.folder import CHUNKS, RESULTS, Finished, finished_cases, read_manifest
 from studies.sweeps.spec import SweepSpec, parse_sweep
-from studies.sweeps.table import Table, as_numbers, build_table, values
+from studies.sweeps.table import Table, as_numbers, build_table
 
 #: Status of a case that has not been run.
 NOT_RUN = -1
@@ -92,10 +92,7 @@ def chunk_variables(
     code = np.asarray(result.status)[:count].copy()
     code[is_too_stiff] = status.TOO_STIFF
     is_finished = np.isin(code, status.FINISHED)
-    modes, controlled = (
-        np.broadcast_to(values(table.study, table.columns, name), (len(table),))[rows]
-        for name in ("link.modes", "control.modes")
-    )
+    modes, controlled = (table.values(name)[rows] for name in ("link.modes", "control.modes"))
     variables = {
         "case_id": Variable(table.case_id[rows].astype(str), ("case",), "1", "hash of the case"),
         "status": Variable(code, ("case",), *_PER_CASE["status"]),
@@ -279,11 +276,7 @@ def gather(table: Table, finished: Finished) -> dict[str, Variable]:
     Returns:
         Variables with the axis `case`; NaN and status -1 for what is not there.
     """
-    order = np.argsort(table.case_id)
-    at = np.searchsorted(table.case_id[order], finished.case_id)
-    at = np.minimum(at, len(table) - 1)
-    is_known = table.case_id[order][at] == finished.case_id
-    target = order[at]
+    target, is_known = _positions(table, finished)
     variables: dict[str, Variable] = {}
     n = len(table)
     largest = _largest(finished.files)
@@ -389,16 +382,12 @@ def merge(folder: Path, table: Table, finished: Finished, attributes: dict[str, 
     Raises:
         StudyError: no room on the disk, or it cannot be written to.
     """
-    order = np.argsort(table.case_id)
+    target, is_known = _positions(table, finished)
     places = []
     for number, path in enumerate(finished.files):
-        chosen = np.flatnonzero(finished.file == number)
-        at = np.searchsorted(table.case_id[order], finished.case_id[chosen])
-        target = order[np.minimum(at, len(table) - 1)]
-        is_known = table.case_id[target] == finished.case_id[chosen]
-        target, row = target[is_known], finished.row[chosen][is_known]
-        ascending = np.argsort(target)
-        places.append((path, target[ascending], row[ascending]))
+        chosen = np.flatnonzero(is_known & (finished.file == number))
+        chosen = chosen[np.argsort(target[chosen])]
+        places.append((path, target[chosen], finished.row[chosen]))
 
     def parts(name: str) -> Iterator[tuple[int, np.ndarray]]:
         for path, target, row in places:
@@ -419,6 +408,14 @@ def merge(folder: Path, table: Table, finished: Finished, attributes: dict[str, 
             variables[name] = Variable(streamed, ("case", *dims), unit, text)
     variables |= axis_variables(table, _sizes(variables))
     write_store(folder / RESULTS, variables, attributes)
+
+
+def _positions(table: Table, finished: Finished) -> tuple[np.ndarray, np.ndarray]:
+    """Number of each finished case in the table, and whether it is one of its cases."""
+    order = np.argsort(table.case_id)
+    at = np.searchsorted(table.case_id[order], finished.case_id)
+    target = order[np.minimum(at, len(table) - 1)]
+    return target, table.case_id[target] == finished.case_id
 
 
 def _largest(files: list[Path]) -> dict[str, tuple[int, ...]]:

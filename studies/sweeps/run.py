@@ -22,7 +22,6 @@ from studies.errors import StudyError
 from studies.runs import with_ratio
 from studies.sweeps.executor import Executor, make_executor, own_ratios
 from studies.sweeps.folder import (
-    RESULTS,
     SweepFolder,
     finished_cases,
     make_manifest,
@@ -32,7 +31,7 @@ from studies.sweeps.plan import Group, chunk_cases, plan_groups
 from studies.sweeps.progress import Reporter
 from studies.sweeps.results import chunk_variables, kept_metrics, manifest_attributes, merge
 from studies.sweeps.spec import SweepSpec
-from studies.sweeps.table import Table, build_table, values
+from studies.sweeps.table import Table, build_table
 
 
 class Outcome(NamedTuple):
@@ -51,26 +50,22 @@ class Plan(NamedTuple):
 
     table: Table
     groups: list[Group]
-    kept: list[str]
 
 
-def make_plan(spec: SweepSpec, rows: np.ndarray | None = None) -> Plan:
+def make_plan(spec: SweepSpec) -> Plan:
     """Cases of a sweep, grouped by program.
 
     Args:
         spec: the sweep.
-        rows: cases to run; default: all.
 
     Raises:
         StudyError: a fault of the sweep.
     """
     config.require_configured()
-    kept = kept_metrics(spec)
+    kept_metrics(spec)
     table = build_table(spec)
-    every = np.arange(len(table)) if rows is None else rows
-    return Plan(
-        table, plan_groups(table, every, len(jax.local_devices()), spec.sweep.metrics), kept
-    )
+    every = np.arange(len(table))
+    return Plan(table, plan_groups(table, every, len(jax.local_devices()), spec.sweep.metrics))
 
 
 def run_sweep(
@@ -154,7 +149,7 @@ def _run_groups(
     stop: threading.Event,
 ) -> bool:
     """Run all chunks; whether Ctrl-C ended it."""
-    source = values_of(table, "control.ratio_source")
+    source = table.values("control.ratio_source")
     for group in groups:
         is_own = source[group.rows] == "own_run"
         executor = make_executor(group.structure, group.layout, bool(is_own.any()))
@@ -182,11 +177,6 @@ def _run_groups(
     return False
 
 
-def values_of(table: Table, name: str) -> np.ndarray:
-    """Values of a field for every case, (n,)."""
-    return np.broadcast_to(values(table.study, table.columns, name), (len(table),))
-
-
 def start_chunk(
     executor: Executor, table: Table, rows: np.ndarray, cases: Case, has_own_ratio: bool
 ) -> Callable[[], Result]:
@@ -205,8 +195,8 @@ def start_chunk(
     if has_own_ratio:
         size = max(map(len, jax.tree.leaves(cases)))
         filled = np.concatenate([rows, np.full(size - len(rows), rows[-1])])
-        is_own = values_of(table, "control.ratio_source")[filled] == "own_run"
-        exponent = values_of(table, "control.ratio_exponent")[filled][:, None, None]
+        is_own = table.values("control.ratio_source")[filled] == "own_run"
+        exponent = table.values("control.ratio_exponent")[filled][:, None, None]
         own = powered(own_ratios(executor, cases), exponent)
         cases = with_ratio(cases, np.where(is_own[:, None, None], own, cases.control.ratio))
     return executor.start(cases)
@@ -252,7 +242,7 @@ class Estimate(NamedTuple):
 def calibrate(plan: Plan) -> Estimate:
     """Compile the first program and time one chunk of it."""
     group = plan.groups[0]
-    has_own = bool((values_of(plan.table, "control.ratio_source")[group.rows] == "own_run").any())
+    has_own = bool((plan.table.values("control.ratio_source")[group.rows] == "own_run").any())
     executor = make_executor(group.structure, group.layout, has_own)
     rows = group.chunks()[0]
     cases = chunk_cases(plan.table, rows, group.structure, group.layout.size)
@@ -267,8 +257,3 @@ def calibrate(plan: Plan) -> Estimate:
     )
     total = running + len(plan.groups) * executor.compile_time
     return Estimate(executor.compile_time, chunk_time, total)
-
-
-def results_path(out: Path) -> Path:
-    """The file that a finished sweep leaves."""
-    return out / RESULTS

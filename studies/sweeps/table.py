@@ -47,6 +47,10 @@ class Table:
         """Columns of fields, without labels."""
         return {name: column for name, column in self.columns.items() if "." in name}
 
+    def values(self, name: str) -> np.ndarray:
+        """Values of a field, an entry or a label for every case, (n,); errors as `values`."""
+        return np.broadcast_to(values(self.study, self.columns, name), (len(self),))
+
     def rows(self, chosen: np.ndarray) -> Table:
         """Some of the cases."""
         return replace(
