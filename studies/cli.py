@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -20,7 +21,14 @@ app = typer.Typer(
     help="Parameter studies of a planar 3-PRR manipulator with flexible links.",
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
 )  # fmt: skip
-console = Console(highlight=False, markup=False)  # a unit in brackets is no markup
+#: Columns of tables where nobody watches; a terminal's own width otherwise.
+FILE_WIDTH = 240
+is_watched = sys.stdout.isatty() or "COLUMNS" in os.environ
+console = Console(
+    highlight=False,
+    markup=False,  # a unit in brackets is no markup
+    width=None if is_watched else FILE_WIDTH,
+)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -82,7 +90,7 @@ def simulate(
 @app.command()
 def replay(
     design: Annotated[Path, typer.Argument(help="study file, or folder of a sweep")],
-    case: Annotated[int | None, typer.Option(help="number of the case, for a sweep")] = None,
+    case: Annotated[str | None, typer.Option(help="number, or id: and digits of its id")] = None,
     out: Annotated[Path | None, typer.Option(help="HDF5 file for the trajectories")] = None,
 ) -> None:
     """Run one case of a sweep again with full trajectories, and compare with what it found."""

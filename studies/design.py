@@ -12,7 +12,7 @@ from studies.errors import StudyError
 from studies.runs import Run, metric_variables
 from studies.spec import Study, load_study
 from studies.sweeps.folder import read_manifest
-from studies.sweeps.results import NOT_RUN, load, metric_names
+from studies.sweeps.results import NOT_RUN, SweepData, load, metric_names
 from studies.sweeps.spec import parse_sweep
 from studies.sweeps.table import build_table, case_study
 
@@ -24,12 +24,13 @@ class Design(NamedTuple):
     stored: dict[str, np.ndarray]  # metrics and status of the sweep; {} for a study file
 
 
-def load_design(path: Path, case: int | None = None) -> Design:
+def load_design(path: Path, case: int | str | None = None) -> Design:
     """Read a DESIGN.
 
     Args:
         path: study file, or folder of a sweep.
-        case: number of the case, with a sweep's folder only.
+        case: number of the case, or "id:" and the first digits of its id; with a sweep's folder
+            only.
 
     Raises:
         StudyError: not found, case missing or not allowed, or a case that does not stand alone.
@@ -39,23 +40,38 @@ def load_design(path: Path, case: int | None = None) -> Design:
             raise StudyError(f"--case {case}: {path} is no folder of a sweep; leave --case out")
         return Design(load_study(path), {})
     data = load(path)
-    if case is None or not 0 <= case < data.n_cases:
-        raise StudyError(f"--case {case}: allowed 0 to {data.n_cases - 1}, the cases of {path}")
+    number = _number(data, str(case), path)
     table = build_table(parse_sweep(read_manifest(path)["spec"]))
-    code = int(data["status"][case])
+    code = int(data["status"][number])
     try:
-        study = case_study(table, case)
+        study = case_study(table, number)
     except StudyError as error:
         raise StudyError(
             f"--case {case}: {status.REASONS.get(code, 'not run')}; it cannot run alone ({error})"
         ) from None
-    steps = int(data["substeps"][case]) if "substeps" in data.variables else -1
+    steps = int(data["substeps"][number]) if "substeps" in data.variables else -1
     if steps > 0:
         study = study.change(run__substeps=steps)
-    if data["status"][case] == NOT_RUN:
+    if code == NOT_RUN:
         return Design(study, {})
     names = ["status", *(name for name in metric_names() if name in data.variables)]
-    return Design(study, {name: data[name][case] for name in names})
+    return Design(study, {name: data[name][number] for name in names})
+
+
+def _number(data: SweepData, case: str, path: Path) -> int:
+    """Number of the case that is meant."""
+    if case.startswith("id:"):
+        ids = data["case_id"].astype(str)
+        found = np.flatnonzero(np.char.startswith(ids, case.removeprefix("id:").lower()))
+        if len(found) != 1:
+            raise StudyError(f"--case {case}: fits {len(found)} cases of {path}; allowed: one")
+        return int(found[0])
+    if not (case.isascii() and case.isdigit()) or int(case) >= data.n_cases:
+        raise StudyError(
+            f"--case {case}: allowed 0 to {data.n_cases - 1}, the cases of {path}, or id: and the "
+            "first digits of a case's id"
+        )
+    return int(case)
 
 
 def deviation(run: Run, stored: dict[str, np.ndarray]) -> tuple[float, str]:

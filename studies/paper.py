@@ -27,7 +27,7 @@ from studies.paper_cases import (
 from studies.paper_figures import PAPER_FIGURES, draw_figure
 from studies.paper_measures import Measures, measure, middle_station
 from studies.report import write_report
-from studies.runs import describe, metric_variables, run_attributes, status_text
+from studies.runs import STATUS_LABEL, describe, metric_variables, run_attributes
 from studies.spec import Study, paper_study
 from studies.store import Variable, check_target, write_store
 
@@ -137,7 +137,7 @@ def paper_variables(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
     return {
         **_axes(runs, measures),
         **_case_labels(runs.cases),
-        "status": Variable(runs.status, per_case, "1", status_text()),
+        "status": Variable(runs.status, per_case, *STATUS_LABEL),
         "status_text": Variable(
             np.array([describe(int(k)) for k in runs.status]), per_case, "1", "status in words"
         ),

@@ -310,6 +310,9 @@ def _ideal_substeps(study: Study, structure: Structure, case: Case) -> int:
     return given or max(needed, 1)
 
 
+#: Unit, long name and flags of a status in a file.
+STATUS_LABEL = ("1", "how the run ended", status.REASONS)
+
 METRIC_LABELS = {
     "residual_rms": (("link", "station"), "m", "rms chord deflection in the residual window"),
     "residual_peak": (("link", "station"), "m", "peak chord deflection in the residual window"),
@@ -373,7 +376,7 @@ def run_variables(run: Run) -> dict[str, Variable]:
         "spectrum_frequency": Variable(
             frequency, ("controlled_mode", "spectrum_point"), "Hz", "frequency of spectral_density"
         ),
-        "status": Variable(np.array(run.status), (), "1", status_text()),
+        "status": Variable(np.array(run.status), (), *STATUS_LABEL),
         "bad_time": Variable(run.result.bad_time, (), "s", "when the status appeared, 0 if ok"),
         "command_end": Variable(run.result.command_end, (), "s", "end of the shaped command"),
         "sensor_condition": Variable(
@@ -429,11 +432,6 @@ def chord_deflection(run: Run) -> np.ndarray:
     shape = build_basis(structure.basis, machine.beam, machine.patches, structure.n_modes, middle)
     at = np.asarray(shape.deflection_at)[:, 0]
     return np.einsum("tir,ir->ti", run.result.record.modal_coordinate, at)  # type: ignore[union-attr]
-
-
-def status_text() -> str:
-    """All status codes in words."""
-    return "; ".join(f"{code} {reason}" for code, reason in status.REASONS.items())
 
 
 def run_attributes(study: Study) -> dict[str, Any]:

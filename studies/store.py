@@ -23,6 +23,8 @@ from studies.errors import StudyError, field_error
 
 # What netCDF, HDF5 and xarray's attribute access all take as a name.
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+# What the words of flag_meanings may not contain.
+_NO_FLAG = re.compile(r"[^A-Za-z0-9_.+@-]+")
 _TEXT = h5py.string_dtype("utf-8")
 
 
@@ -48,12 +50,14 @@ class Variable(NamedTuple):
     dims: name of each axis; a one-dimensional variable named like its axis is its coordinate.
     units: SI symbol such as "m" or "Hz", "1" for none. Not "seconds": xarray makes dates of that.
     long_name: what it is, in words.
+    flags: meaning of each number, for codes; flag_values and flag_meanings in the file, _ for " ".
     """
 
     data: Any
     dims: tuple[str, ...]
     units: str
     long_name: str
+    flags: Mapping[int, str] | None = None
 
 
 def write_store(
@@ -85,6 +89,10 @@ def write_store(
             dataset = _dataset(file, name, arrays[name])
             dataset.attrs["units"] = variable.units
             dataset.attrs["long_name"] = variable.long_name
+            if variable.flags:
+                words = (_NO_FLAG.sub("_", text) for text in variable.flags.values())
+                dataset.attrs["flag_values"] = np.array(list(variable.flags), arrays[name].dtype)
+                dataset.attrs["flag_meanings"] = " ".join(words)
         for axis in sizes:
             file[axis].make_scale(axis)
         for name, variable in variables.items():
@@ -257,7 +265,12 @@ def _read_variable(dataset: h5py.Dataset) -> Variable:
     else:
         dims = tuple(axis[0].name.lstrip("/") for axis in dataset.dims)
     array = np.asarray(data, dtype=str if is_text else None)
-    return Variable(array, dims, dataset.attrs["units"], dataset.attrs["long_name"])
+    labels = dataset.attrs
+    flags = None
+    if "flag_values" in labels:
+        words = labels["flag_meanings"].split()
+        flags = dict(zip(labels["flag_values"].tolist(), words, strict=True))
+    return Variable(array, dims, labels["units"], labels["long_name"], flags)
 
 
 def _plain(value: Any) -> Any:

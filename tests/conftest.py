@@ -10,3 +10,5 @@ from studies.config import configure
 
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
 configure()
+# tables as wide as they need to be, wherever the tests run
+os.environ["COLUMNS"] = "240"

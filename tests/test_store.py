@@ -36,6 +36,7 @@ VARIABLES = {
     "narrow": Variable(np.float32([0.1, 0.2, 0.3]), ("case",), "Hz", "single precision"),
     "is_stable": Variable(np.array([True, False, True]), ("case",), "1", "whether it settled"),
     "message": Variable(np.array(["", "x\ny", "ü"], dtype=object), ("case",), "1", "what failed"),
+    "code": Variable(np.array([0, -1, 0]), ("case",), "1", "how it ended", {0: "ok", -1: "no_run"}),
     "span": Variable(np.float64(0.8), (), "s", "simulated time"),
 }
 ATTRIBUTES = {
@@ -78,6 +79,13 @@ def test_axis_without_coordinate_gets_numbers_from_one(path):
     np.testing.assert_array_equal(index.data, np.arange(1, 5))
 
 
+def test_codes_carry_their_meanings(path):
+    with h5py.File(path) as file:
+        labels = dict(file["code"].attrs)
+    assert labels["flag_values"].tolist() == [0, -1] and labels["flag_meanings"] == "ok no_run"
+    assert read_store(path)[0]["code"].flags == {0: "ok", -1: "no_run"}
+
+
 def test_full_disk_leaves_the_old_file_and_no_crash(path, tmp_path):
     """A limit on the size of files stands in for a full disk; HDF5 itself would crash on it."""
     before = path.read_bytes()
@@ -111,7 +119,8 @@ def test_xarray_opens_it_without_warnings(path, engine):
     assert dict(dataset.sizes) == {"case": 3, "link": 2, "sample": 4}
     for name, written in VARIABLES.items():
         assert dataset[name].dims == written.dims
-        assert dataset[name].attrs == {"units": written.units, "long_name": written.long_name}
+        labels = {k: v for k, v in dataset[name].attrs.items() if not k.startswith("flag_")}
+        assert labels == {"units": written.units, "long_name": written.long_name}
         np.testing.assert_array_equal(dataset[name].values, written.data)
     assert dataset.attrs["title"] == ATTRIBUTES["title"]
     assert float(dataset["peak"].sel(case=20, link="first")) == 2.0

@@ -1,8 +1,11 @@
 """The commands of sweeps, in one process: sweep, dry run, show, best, plot, sensitivity, replay."""
 
+import re
+
 import pytest
 from PIL import Image
 
+from studies.design import load_design
 from studies.sweeps import plan
 from studies.template import toml_value
 from tests.sweeps import BASE
@@ -62,6 +65,11 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     code, text, _ = run(capsys, "replay", out, "--case", "3", "--out", tmp_path / "run.h5")
     assert code == 0 and "largest difference of a metric" in text
     assert (tmp_path / "run.h5").stat().st_size > 10_000
+    _, text, _ = run(capsys, "best", out, "--by", "residual_rms", "--count", "1")
+    number, name = re.search(r"(\d+) +│ ([0-9a-f]{8}) ", text).groups()
+    assert load_design(out, f"id:{name}").study == load_design(out, int(number)).study
+    assert "fits 40 cases" in refused(capsys, "replay", out, "--case", "id:")
+    assert "allowed 0 to 39" in refused(capsys, "replay", out, "--case", "40")
     for options, name in (
         ((), "placement.png"),
         (("--x", "gain", "--hue", "drive.kp"), "points.pdf"),

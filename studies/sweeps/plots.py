@@ -18,7 +18,7 @@ from studies import figures
 from studies.errors import StudyError
 from studies.store import replacing
 from studies.sweeps.results import SweepData, metric_values, swept_names
-from studies.sweeps.show import best_cases, label
+from studies.sweeps.show import best_cases, label, shown_value
 
 #: More distinct values than this are no grid.
 FEW = 60
@@ -222,6 +222,7 @@ def _placements(data: SweepData, y: str) -> Figure:
     patches, link = data.spec.study.patches, data.spec.study.link
     chosen = best_cases(data, y, count=N_PLACEMENTS)
     is_ok = (data["status"] == status.OK) & np.isfinite(value)
+    others = [name for name in swept_names(data) if name != "patches_centers"]
     unit = 1e3
     with figures.styled():
         figure = Figure(figsize=(7.4, 5.6), layout="constrained")
@@ -235,7 +236,8 @@ def _placements(data: SweepData, y: str) -> Figure:
                 ):
                     left = (center - length / 2) * unit
                     top.barh(row, length * unit, height, left, color=color, linewidth=0)
-            text = f"case {case}: {value[case]:.3g}"
+            also = "".join(f", {name} = {shown_value(data, name, case)}" for name in others)
+            text = f"case {case}: {value[case]:.3g}{also}"
             top.annotate(text, (link.length * unit * 1.01, row), fontsize=7, va="center")
         top.set_ylim(len(chosen) - 0.4, -0.6)
         top.set_xlim(0, link.length * unit * 1.25)

@@ -19,7 +19,7 @@ from jaxmodel.simulate import Result
 from studies.errors import StudyError, field_error, nearest
 from studies.explain import unit_of
 from studies.fields import field_value, parse_entry
-from studies.runs import METRIC_LABELS, status_text
+from studies.runs import METRIC_LABELS, STATUS_LABEL
 from studies.spec import Study
 from studies.store import Streamed, Variable, read_store, write_store
 from studies.sweeps.axes import LABELS, SHOWN_AS, known_field
@@ -40,8 +40,8 @@ _LIST_AXES = {
     "drive.pulse_force": ("slider_axis",),
     "metrics.stations": ("station",),
 }
-_PER_CASE = {
-    "status": ("1", f"{NOT_RUN} not run; {status_text()}"),
+_PER_CASE: dict[str, tuple] = {
+    "status": (*STATUS_LABEL[:2], {NOT_RUN: "not run", **STATUS_LABEL[2]}),
     "bad_time": ("s", "when the status appeared, 0 if ok"),
     "command_end": ("s", "end of the shaped command"),
     "substeps": ("1", "plant steps per sample"),
@@ -292,9 +292,9 @@ def gather(table: Table, finished: Finished) -> dict[str, Variable]:
                 if name not in variables:
                     shape = (n, *largest[name][1:])
                     empty = np.full(shape, -1 if data.dtype.kind == "i" else np.nan)
-                    dims, unit, text = _label(name)
+                    dims, *label = _label(name)
                     filled = empty.astype(data.dtype)
-                    variables[name] = Variable(filled, ("case", *dims), unit, text)
+                    variables[name] = Variable(filled, ("case", *dims), *label)
                 inside = (target[chosen], *map(slice, data.shape[1:]))
                 variables[name].data[inside] = data[finished.row[chosen]]
     if "status" not in variables:
@@ -401,11 +401,11 @@ def merge(folder: Path, table: Table, finished: Finished, attributes: dict[str, 
     variables = case_variables(table)
     with h5py.File(finished.files[-1], "r") as store:
         for name, shape in largest.items():
-            dims, unit, text = _label(name)
+            dims, *label = _label(name)
             streamed = Streamed(
                 (len(table), *shape[1:]), store[name].dtype, partial(parts, name)
             )  # fmt: skip
-            variables[name] = Variable(streamed, ("case", *dims), unit, text)
+            variables[name] = Variable(streamed, ("case", *dims), *label)
     variables |= axis_variables(table, _sizes(variables))
     write_store(folder / RESULTS, variables, attributes)
 
@@ -439,6 +439,6 @@ def _fitted(data: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return whole
 
 
-def _label(name: str) -> tuple[tuple[str, ...], str, str]:
-    """Axes after `case`, unit and long name of what a chunk holds."""
+def _label(name: str) -> tuple:
+    """Axes after `case`, unit, long name and any flags of what a chunk holds."""
     return ((), *_PER_CASE[name]) if name in _PER_CASE else metric_label(name)

@@ -19,6 +19,8 @@ from studies.sweeps.sensitivity import failure_causes
 
 #: What `show` ranks cases by unless told otherwise.
 DEFAULT_METRIC = "residual_rms"
+#: Digits of a case's id that tables show.
+ID_DIGITS = 8
 
 
 def reason(code: int) -> str:
@@ -85,10 +87,11 @@ def _print_failed(data: SweepData, codes: np.ndarray, console: Console) -> None:
         console.print("no failed case")
         return
     names = swept_names(data)
-    table = RichTable("case", "status", "from [s]", *names)
+    table = RichTable("case", "id", "status", "from [s]", *names)
     for k in failed:
         cells = [shown_value(data, name, int(k)) for name in names]
-        table.add_row(str(k), reason(int(codes[k])), f"{data['bad_time'][k]:.4g}", *cells)
+        time = f"{data['bad_time'][k]:.4g}"
+        table.add_row(str(k), short_id(data, int(k)), reason(int(codes[k])), time, *cells)
     console.print(table)
 
 
@@ -96,12 +99,18 @@ def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console:
     """A table of cases with what varies and some metrics."""
     names = swept_names(data)
     heads = [label(data, name) for name in metrics]
-    table = RichTable("case", *names, *heads)
+    table = RichTable("case", "id", *names, *heads)
     columns = [metric_values(data, name) for name in metrics]
     for k in cases:
         cells = [shown_value(data, name, k) for name in names]
-        table.add_row(str(k), *cells, *(f"{column[k]:.4g}" for column in columns))
+        numbers = (f"{column[k]:.4g}" for column in columns)
+        table.add_row(str(k), short_id(data, k), *cells, *numbers)
     console.print(table)
+
+
+def short_id(data: SweepData, case: int) -> str:
+    """Enough of a case's id to name it by; unlike its number it is the same in any sweep."""
+    return str(data["case_id"][case])[:ID_DIGITS]
 
 
 def tell_left_out(data: SweepData, console: Console) -> None:
