@@ -76,56 +76,58 @@ def accelerations(
     Returns:
         Accelerations.
     """
-    sine, cosine, root, rate = chain.sine, chain.cosine, chain.root, chain.gamma_rate
-    phi2 = pose_rate[2] * pose_rate[2]
-    lever = chain.h / root
+    sine, cosine, rate, inverse = chain.sine, chain.cosine, chain.gamma_rate, 1 / chain.root
+    phi2, rate2 = pose_rate[2] * pose_rate[2], rate * rate
+    lever = chain.h * inverse
     # velocity terms of gamma'' and rho'' at X'' = 0, w'' = 0
-    root_rate = (chain.tip * chain.tip_rate - chain.h * chain.h_rate) / root
-    gamma_0 = (sine * rate * chain.tip_rate - rate * root_rate - chain.cn * phi2) / root
-    rho_0 = (
-        chain.h_rate * rate + cosine * rate * chain.tip_rate - chain.cu * phi2 + chain.h * gamma_0
-    )
-    # modal force balance without inertia: f = k q + d q' - Q - m q gamma'^2
-    centrifugal = plant.mass * q * (rate * rate)[:, None]
-    force = plant.stiffness * q + plant.damping * q_rate - modal_force - centrifugal
+    gamma_0 = lever * rate2 - inverse * (chain.cn * phi2)
+    rho_0 = chain.h_rate * rate - chain.cu * phi2
+    if plant.tip is not None:
+        slip = chain.tip_rate * inverse
+        gamma_0 = gamma_0 + slip * (sine * rate + rate * (lever * cosine - chain.tip * inverse))
+        rho_0 = rho_0 + cosine * rate * chain.tip_rate
+    rho_0 = rho_0 + chain.h * gamma_0
+    # modal accelerations without inertia: of piezos and rotation, and of the oscillator itself
+    push = modal_force / plant.mass + q * rate2[:, None]
+    own = (plant.stiffness / plant.mass) * q + (plant.damping / plant.mass) * q_rate
+    pull = own - push
 
-    b_m, c_m = plant.b / plant.mass, plant.c / plant.mass
+    b_m, c_m, mq = plant.b / plant.mass, plant.c / plant.mass, plant.mass * q
     bq, bq_rate = jnp.sum(plant.b * q, axis=1), jnp.sum(plant.b * q_rate, axis=1)
-    bf, cf = jnp.sum(b_m * force, axis=1), jnp.sum(c_m * force, axis=1)
-    swing = plant.first_moment * sine + cosine * bq
+    moment = plant.first_moment
     link = _Link(
         k_rr=plant.slider_link_mass - sine * sine * jnp.sum(b_m * plant.b, axis=1),
-        k_rg=sine * jnp.sum(b_m * plant.c, axis=1) - swing,
-        k_gg=plant.inertia + jnp.sum(plant.mass * q * q, axis=1) - jnp.sum(c_m * plant.c, axis=1),
-        load_r=sine * bf
-        - (plant.first_moment * cosine - sine * bq) * rate * rate
-        - 2 * cosine * rate * bq_rate
+        k_rg=sine * (jnp.sum(b_m * plant.c, axis=1) - moment) - cosine * bq,
+        k_gg=plant.inertia - jnp.sum(c_m * plant.c, axis=1) + jnp.sum(mq * q, axis=1),
+        load_r=sine * (jnp.sum(plant.b * pull, axis=1) + bq * rate2)
+        - cosine * (moment * rate2 + 2 * rate * bq_rate)
         - slider_force,
-        load_g=2 * rate * jnp.sum(plant.mass * q * q_rate, axis=1) - cf,
+        load_g=2 * rate * jnp.sum(mq * q_rate, axis=1) - jnp.sum(plant.c * pull, axis=1),
     )
     if plant.tip is None:
         tip_system, reduced = None, link
     else:
-        tip_system, reduced = _eliminate_tip(plant, chain, link, force)
-    pose_acc = plant.free * _pose_acceleration(plant, chain, reduced, rho_0, gamma_0, lever)
+        tip_system, reduced = _eliminate_tip(plant, chain, link, pull)
+    force_r = reduced.k_rr * rho_0 + reduced.k_rg * gamma_0 + reduced.load_r
+    force_g = reduced.k_rg * rho_0 + reduced.k_gg * gamma_0 + reduced.load_g
+    pose_acc = _pose_acceleration(plant, chain, reduced, force_r, force_g, lever, inverse)
+    pose_acc = plant.free * pose_acc
 
     along = plant.ux * pose_acc[0] + plant.uy * pose_acc[1] - chain.cn * pose_acc[2]
     across = plant.ux * pose_acc[1] - plant.uy * pose_acc[0] + chain.cu * pose_acc[2]
-    gamma_acc = across / root + gamma_0
+    gamma_acc = across * inverse + gamma_0
     rho_acc = along + lever * across + rho_0
     if tip_system is not None:
         tip_acc, multiplier = tip_system(rho_acc, gamma_acc)
-        rho_acc = rho_acc - chain.tip / root * tip_acc
-        gamma_acc = gamma_acc - cosine / root * tip_acc
-    inertial = b_m * (sine * rho_acc)[:, None] - c_m * gamma_acc[:, None]
+        rho_acc = rho_acc - chain.tip * inverse * tip_acc
+        gamma_acc = gamma_acc - cosine * inverse * tip_acc
+    coupling = b_m * (sine * rho_acc)[:, None] - c_m * gamma_acc[:, None] + push
     if tip_system is not None:
-        inertial = inertial + plant.tip / plant.mass * multiplier[:, None]
-    coupling = inertial + (modal_force + centrifugal) / plant.mass
-    modal_acc = inertial - force / plant.mass
-    return Accelerations(pose_acc, modal_acc, coupling, rho_acc, gamma_acc)
+        coupling = coupling + plant.tip / plant.mass * multiplier[:, None]
+    return Accelerations(pose_acc, coupling - own, coupling, rho_acc, gamma_acc)
 
 
-def _eliminate_tip(plant: Plant, chain: Chain, link: _Link, force: Array):
+def _eliminate_tip(plant: Plant, chain: Chain, link: _Link, pull: Array):
     """Take the link's tip acceleration w'' and its reaction out of the 2x2 system.
 
     The tip moves with rho'' = rho0'' - alpha w'', gamma'' = gamma0'' - kappa w'' (alpha = w/P,
@@ -136,7 +138,7 @@ def _eliminate_tip(plant: Plant, chain: Chain, link: _Link, force: Array):
     alpha, kappa = chain.tip / chain.root, chain.cosine / chain.root
     y_r = chain.sine * jnp.sum(tip_m * plant.b, axis=1)
     y_g = -jnp.sum(tip_m * plant.c, axis=1)
-    tip_force = jnp.sum(tip_m * force, axis=1)
+    tip_force = jnp.sum(plant.tip * pull, axis=1)
     compliance = jnp.sum(tip_m * plant.tip, axis=1)
     m_r = alpha * link.k_rr + kappa * link.k_rg
     m_g = alpha * link.k_rg + kappa * link.k_gg
@@ -170,31 +172,40 @@ def _eliminate_tip(plant: Plant, chain: Chain, link: _Link, force: Array):
 
 
 def _pose_acceleration(
-    plant: Plant, chain: Chain, link: _Link, rho_0: Array, gamma_0: Array, lever: Array
+    plant: Plant,
+    chain: Chain,
+    link: _Link,
+    force_r: Array,
+    force_g: Array,
+    lever: Array,
+    inverse: Array,
 ) -> Array:
-    """Assemble sum_i T_i^t K_i T_i and solve it; T = rows (a + (h/P) d), d/P, a and d as below."""
-    ux, uy = plant.ux, plant.uy
-    v = link.k_rr * lever + link.k_rg / chain.root
-    z = lever * (v + link.k_rg / chain.root) + link.k_gg / (chain.root * chain.root)
-    force_r = link.k_rr * rho_0 + link.k_rg * gamma_0 + link.load_r
-    force_g = link.k_rg * rho_0 + link.k_gg * gamma_0 + link.load_g
-    force_d = lever * force_r + force_g / chain.root
-    a = (ux, uy, -chain.cn)  # s'' = a.X'' - cu phi'^2
-    d = (-uy, ux, chain.cu)  # h'' = d.X'' - cn phi'^2
+    """Assemble sum_i T_i^t K_i T_i X'' = -sum_i T_i^t (force_r, force_g) and solve it.
 
-    def entry(i: int, j: int) -> Array:
-        term = link.k_rr * a[i] * a[j] + v * (a[i] * d[j] + d[i] * a[j]) + z * d[i] * d[j]
-        return jnp.sum(term, axis=0)
-
-    def load(i: int) -> Array:
-        return -jnp.sum(a[i] * force_r + d[i] * force_d, axis=0)
-
+    T = rows (a + (h/P) d, d/P); s'' = a.X'' and h'' = d.X'' at rest, a = (ux, uy, -cn) and
+    d = (-uy, ux, cu). Per link the sum is k a a^t + v (a d^t + d a^t) + z d d^t.
+    """
+    ux, uy, cn, cu = plant.ux, plant.uy, chain.cn, chain.cu
+    xx, xy, yy = ux * ux, ux * uy, uy * uy
+    k, w = link.k_rr, link.k_rg * inverse
+    v = k * lever + w
+    z = lever * (v + w) + link.k_gg * (inverse * inverse)
+    a_phi, d_phi = v * cu - k * cn, z * cu - v * cn  # how X'' along a and d meets phi''
     matrix = (
-        entry(0, 0) + plant.platform_mass, entry(0, 1), entry(0, 2),
-        entry(1, 1) + plant.platform_mass, entry(1, 2),
-        entry(2, 2) + plant.platform_inertia,
-    )  # fmt: skip
-    return solve_symmetric_3(matrix, (load(0), load(1), load(2)))
+        plant.platform_mass + jnp.sum(xx * k + yy * z - (2 * xy) * v, axis=0),
+        jnp.sum(xy * (k - z) + (xx - yy) * v, axis=0),
+        jnp.sum(ux * a_phi - uy * d_phi, axis=0),
+        plant.platform_mass + jnp.sum(yy * k + xx * z + (2 * xy) * v, axis=0),
+        jnp.sum(uy * a_phi + ux * d_phi, axis=0),
+        plant.platform_inertia + jnp.sum(cu * d_phi - cn * a_phi, axis=0),
+    )
+    force_d = lever * force_r + inverse * force_g
+    load = (
+        jnp.sum(uy * force_d - ux * force_r, axis=0),
+        jnp.sum(-uy * force_r - ux * force_d, axis=0),
+        jnp.sum(cn * force_r - cu * force_d, axis=0),
+    )
+    return solve_symmetric_3(matrix, load)
 
 
 def solve_symmetric_3(matrix: tuple[Array, ...], right: tuple[Array, ...]) -> Array:

@@ -98,10 +98,10 @@ def translated(function, shape, dtype=np.float64, lanes=16):
     c = rng.normal(size=shape).astype(dtype)
     built = kernel.build_kernel(
         lambda constants, row, state: [function(state[0], constants[0]) + 0 * row[0][0]],
-        [kernel.Leaf(shape, False)], [kernel.Leaf((1,), False)], [kernel.Leaf(shape, True)], dtype,
+        [c], [kernel.Leaf((1,), False)], [kernel.Leaf(shape, True)], dtype,
     )  # fmt: skip
     out = x.copy()
-    built.run([c, np.zeros((1, 1), dtype), out], 1, lanes)
+    built.run([np.zeros((1, 1), dtype), out], 1, lanes)
     wanted = np.asarray(jax.vmap(function, (-1, None), -1)(x, c))
     return out, wanted
 

@@ -75,9 +75,11 @@ class _Split(NamedTuple):
 
 
 def _split(cases: Case, layout: Layout, structure: Structure, has_own_ratio: bool) -> _Split:
-    if has_own_ratio:  # the same program for both passes
+    if has_own_ratio:  # the same program for both passes, which differ in ratios and links
         shape = (layout.size, 3, structure.n_controlled)
         cases = with_ratio(cases, np.broadcast_to(cases.control.ratio, shape))
+        links = np.broadcast_to(cases.control.link_mask, shape[:2])
+        cases = cases._replace(control=cases.control._replace(link_mask=links))
     leaves, tree = jax.tree.flatten(cases)
     leaves = [np.asarray(leaf) for leaf in leaves]
     is_varying = tuple(len(leaf) == layout.size for leaf in leaves)
@@ -152,18 +154,25 @@ class ScanExecutor:
 # --- the traced kernel ----------------------------------------------------------------------------
 
 
-class _Stages(NamedTuple):
-    """Compiled parts of a run: what comes before the steps, the steps, what comes after."""
+class _Parts(NamedTuple):
+    """A Start leaf by leaf: which leaves vary from case to case, and their shapes."""
 
-    tree: Any  # of a Start
-    is_varying: tuple[bool, ...]  # per leaf of a Start
-    shared: Callable[[list, list], list]  # leaves of a Start that all cases share
-    varying: Callable[[list, list], list]  # the others, lanes last
-    steps: kernel.Kernel
-    conclude: Callable[..., Result]
+    tree: Any
+    is_varying: tuple[bool, ...]
+    shapes: tuple[tuple[int, ...], ...]  # of one case
 
 
-_STAGES: dict[tuple, _Stages] = {}
+class _Steps(NamedTuple):
+    """Compiled for the numbers that all cases of a group share."""
+
+    parts: _Parts
+    shared: list[np.ndarray]  # leaves of a Start that do not vary
+    run: kernel.Kernel
+
+
+_STEPS: dict[tuple, _Steps] = {}
+#: Kernels kept in memory.
+KEPT_KERNELS = 8
 
 
 class KernelExecutor:
@@ -174,48 +183,55 @@ class KernelExecutor:
     def __init__(self, structure: Structure, layout: Layout, has_own_ratio: bool) -> None:
         self.structure, self.layout, self.has_own_ratio = structure, layout, has_own_ratio
         self.compile_time = 0.0
-        self._stages: _Stages | None = None
-        self._shared: list[np.ndarray] | None = None
+        self._steps: _Steps | None = None
         self._pool = ThreadPoolExecutor(layout.devices)
 
     def start(self, cases: Case) -> Callable[[], Result]:
         split = _split(cases, self.layout, self.structure, self.has_own_ratio)
+        program = _Program(self.structure, self.layout, split.tree, split.is_varying)
         lanes = self.layout.lanes
         blocks = [
             [leaf[k : k + lanes] for leaf in split.varying]
             for k in range(0, self.layout.size, lanes)
         ]
-        if self._stages is None:
+        if self._steps is None:
             started = time.perf_counter()
-            self._stages = _stages(self.structure, lanes, split, blocks[0])
-            one = [leaf[0] for leaf in blocks[0]]
-            found = self._stages.shared(one, split.shared)
-            self._shared = [np.asarray(leaf, order="C") for leaf in found]
+            self._steps = _steps(program, split)
+            _prepare(program, self._steps.parts, blocks[0], split.shared)
             self.compile_time = time.perf_counter() - started
-        running = [self._pool.submit(self._block, block, split.shared) for block in blocks]
-        return lambda: self._result(running)
+        steps = self._steps
+        running = [self._pool.submit(_step_block, program, steps, b, split.shared) for b in blocks]
+        return lambda: _concluded(running)
 
-    def _block(self, varying: list[np.ndarray], shared: list[np.ndarray]) -> Start:
-        """A Start whose state is that after the last step; every leaf of the state lanes last."""
-        stages, lanes = self._stages, self.layout.lanes
-        assert stages is not None and self._shared is not None
-        own = [np.asarray(leaf, order="C") for leaf in stages.varying(varying, shared)]
-        start: Start = _joined(stages.tree, stages.is_varying, own, self._shared)  # type: ignore
-        varies: Start = jax.tree.unflatten(stages.tree, stages.is_varying)
-        state = jax.tree.map(lambda x, v: _wide(x, v, lanes), start.state, varies.state)
-        outline = jax.tree.map(lambda x, v: _wide(x, v, lanes), start.outline, varies.outline)
-        code = state.status.copy()
-        leaves = jax.tree.leaves((start.loop, start.inputs, state))
-        stages.steps.run(leaves, self.structure.n_steps, lanes)
-        return Start((), code, state, outline)  # type: ignore[arg-type]
 
-    def _result(self, running: list[Future]) -> Result:
-        done = [future.result() for future in running]
-        whole = jax.tree.map(lambda *x: np.concatenate(x, axis=-1), *done)
-        assert self._stages is not None
-        return jax.tree.map(
-            np.asarray, self._stages.conclude(whole.outline, whole.inputs, whole.state)
-        )
+def _step_block(
+    program: _Program, steps: _Steps, varying: list[np.ndarray], shared: list[np.ndarray]
+) -> Start:
+    """A Start whose state is that after the last step; state and outline lanes last."""
+    lanes, parts = program.layout.lanes, steps.parts
+    own = [np.asarray(x, order="C") for x in _prepare(program, parts, varying, shared)]
+    start: Start = _joined(parts.tree, parts.is_varying, own, steps.shared)  # type: ignore
+    varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
+    state = jax.tree.map(lambda x, v: _wide(x, v, lanes), start.state, varies.state)
+    outline = jax.tree.map(lambda x, v: _wide(x, v, lanes), start.outline, varies.outline)
+    code = state.status.copy()
+    loop = zip(jax.tree.leaves(start.loop), jax.tree.leaves(varies.loop), strict=True)
+    read = [leaf for leaf, is_read in loop if is_read]
+    leaves = [*read, *jax.tree.leaves((start.inputs, state))]
+    steps.run.run(leaves, program.structure.n_steps, lanes)
+    return Start((), code, state, outline)  # type: ignore[arg-type]
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(-1, -1, -1))
+def _conclude(outline: Any, code: Any, state: Any) -> Result:
+    return conclude(outline, code, state)
+
+
+def _concluded(running: list[Future]) -> Result:
+    done = [future.result() for future in running]
+    whole = jax.tree.map(lambda *x: np.concatenate(x, axis=-1), *done)
+    return jax.tree.map(np.asarray, _conclude(whole.outline, whole.inputs, whole.state))
 
 
 def _wide(x: np.ndarray, is_varying: bool, lanes: int) -> np.ndarray:
@@ -224,63 +240,36 @@ def _wide(x: np.ndarray, is_varying: bool, lanes: int) -> np.ndarray:
     return np.array(wide, order="C", copy=True)
 
 
-def _stages(structure: Structure, lanes: int, split: _Split, block: list[np.ndarray]) -> _Stages:
-    """Compile everything for a structure, once per process."""
-    shapes = tuple(np.shape(leaf) for leaf in (*block, *split.shared))
-    key = (structure, lanes, split.tree, split.is_varying, shapes, jax.config.jax_enable_x64)  # type: ignore[attr-defined]
-    if key not in _STAGES:
-        TRACES.append(structure)
-        _STAGES[key] = _compile_stages(structure, split)
-    return _STAGES[key]
+# --- what comes before the steps
 
 
-def _compile_stages(structure: Structure, split: _Split) -> _Stages:
-    def whole(own: list, common: list) -> Start:
-        return begin(structure, _joined(split.tree, split.is_varying, own, common))
-
-    one = [leaf[0] for leaf in split.varying]
-    traced, shapes = jax.make_jaxpr(whole, return_shape=True)(one, split.shared)
-    is_varying = _dependence(traced.jaxpr, len(one))
-    tree = jax.tree.structure(shapes)
-
-    def chosen(own: list, common: list, wanted: bool) -> list:
-        leaves = jax.tree.leaves(whole(own, common))
-        return [x for x, varies in zip(leaves, is_varying, strict=True) if varies == wanted]
-
-    shared = jax.jit(partial(chosen, wanted=False))
-    varying = jax.jit(jax.vmap(partial(chosen, wanted=True), (0, None), -1))
-    parts: Start = jax.tree.unflatten(
-        tree,
-        [
-            kernel.Leaf(out.aval.shape, varies)
-            for out, varies in zip(traced.jaxpr.outvars, is_varying, strict=True)
-        ],
-    )
-    is_leaf = partial(_is_instance, kernel.Leaf)
-    trees = [jax.tree.structure(part, is_leaf=is_leaf) for part in parts[:3]]
-    loop, inputs, state = (jax.tree.leaves(part, is_leaf=is_leaf) for part in parts[:3])
-
-    def sample(constants: list, row: list, carried: list) -> list:
-        args = (
-            jax.tree.unflatten(t, x) for t, x in zip(trees, (constants, row, carried), strict=True)
-        )
-        at_loop, at_inputs, at_state = args
-        return jax.tree.leaves(step(structure, at_loop, at_state, at_inputs)[0])
-
-    steps = kernel.build_kernel(
-        sample,
-        loop,
-        [kernel.Leaf(leaf.shape[1:], leaf.is_varying) for leaf in inputs],
-        [kernel.Leaf(leaf.shape, True) for leaf in state],
-        jax.dtypes.canonicalize_dtype(np.float64),
-    )
-    return _Stages(
-        tree, is_varying, shared, varying, steps, jax.jit(jax.vmap(conclude, (-1, -1, -1)))
-    )
+def _begin(program: _Program, own: list, common: list) -> Start:
+    return begin(program.structure, _joined(program.tree, program.is_varying, own, common))
 
 
-def _is_instance(kind: type, x: object) -> bool:
-    return isinstance(x, kind)
+def _chosen(program: _Program, parts: _Parts, wanted: bool, own: list, common: list) -> list:
+    leaves = jax.tree.leaves(_begin(program, own, common))
+    return [x for x, varies in zip(leaves, parts.is_varying, strict=True) if varies == wanted]
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _prepare(program: _Program, parts: _Parts, own: list, common: list) -> list:
+    """The leaves that vary, lanes last."""
+    chosen = partial(_chosen, program, parts, True)
+    return jax.vmap(chosen, (0, None), -1)(own, common)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _prepare_shared(program: _Program, parts: _Parts, own: list, common: list) -> list:
+    """The others, of any one case."""
+    return _chosen(program, parts, False, own, common)
+
+
+def _find_parts(program: _Program, own: list, common: list) -> _Parts:
+    traced, shapes = jax.make_jaxpr(partial(_begin, program), return_shape=True)(own, common)
+    is_varying = _dependence(traced.jaxpr, len(own))
+    sizes = tuple(out.aval.shape for out in traced.jaxpr.outvars)
+    return _Parts(jax.tree.structure(shapes), is_varying, sizes)
 
 
 def _dependence(jaxpr: Any, n_varying: int) -> tuple[bool, ...]:
@@ -290,3 +279,50 @@ def _dependence(jaxpr: Any, n_varying: int) -> tuple[bool, ...]:
         if any(not hasattr(atom, "val") and atom in depends for atom in equation.invars):
             depends.update(equation.outvars)
     return tuple(not hasattr(out, "val") and out in depends for out in jaxpr.outvars)
+
+
+# --- the steps
+
+
+def _steps(program: _Program, split: _Split) -> _Steps:
+    """Compile the steps, once per process for the same program and shared numbers."""
+    real = jax.dtypes.canonicalize_dtype(np.float64)
+    numbers = tuple((leaf.shape, leaf.tobytes()) for leaf in split.shared)
+    shapes = tuple(leaf.shape for leaf in split.varying)
+    key = (program, shapes, numbers, real)
+    if key not in _STEPS:
+        while len(_STEPS) >= KEPT_KERNELS:
+            del _STEPS[next(iter(_STEPS))]
+        one = [leaf[0] for leaf in split.varying]
+        parts = _find_parts(program, one, split.shared)
+        found = _prepare_shared(program, parts, one, split.shared)
+        shared = [np.asarray(leaf, order="C") for leaf in found]
+        TRACES.append(program.structure)
+        _STEPS[key] = _Steps(parts, shared, _build(program.structure, parts, shared, real))
+    return _STEPS[key]
+
+
+def _build(structure: Structure, parts: _Parts, shared: list[np.ndarray], real: Any) -> Any:
+    """The kernel of a structure, with what is shared written into it."""
+    leaves = [kernel.Leaf(*x) for x in zip(parts.shapes, parts.is_varying, strict=True)]
+    start: Start = jax.tree.unflatten(parts.tree, range(len(leaves)))
+    trees = [jax.tree.structure(part) for part in start[:3]]
+    known = iter(shared)
+    values = [leaf if leaf.is_varying else next(known) for leaf in leaves]
+    loop = [values[k] for k in jax.tree.leaves(start.loop)]
+    inputs = [leaves[k] for k in jax.tree.leaves(start.inputs)]
+    state = [leaves[k] for k in jax.tree.leaves(start.state)]
+
+    def sample(constants: list, row: list, carried: list) -> list:
+        at_loop, at_inputs, at_state = (
+            jax.tree.unflatten(t, x) for t, x in zip(trees, (constants, row, carried), strict=True)
+        )
+        return jax.tree.leaves(step(structure, at_loop, at_state, at_inputs)[0])
+
+    return kernel.build_kernel(
+        sample,
+        loop,
+        [kernel.Leaf(leaf.shape[1:], leaf.is_varying) for leaf in inputs],
+        [kernel.Leaf(leaf.shape, True) for leaf in state],
+        real,
+    )

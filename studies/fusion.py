@@ -1,0 +1,117 @@
+"""The last look at a graph before it becomes code: fewer operations, in an order that suits.
+
+A processor multiplies and adds in one instruction (`fma`) and holds 32 vectors at hand; whatever
+else is in flight goes to memory and back.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from studies.graph import Node, is_known
+
+_SUMS = ("add", "sub", "neg")
+
+
+def fused(results: Sequence[Any]) -> list[Any]:
+    """The same results with every sum as one chain of `fma`, rounded once a link.
+
+    Sums within a sum that nothing else wants become terms of it; products that nothing else wants
+    are added as they are multiplied: `fma` is a b + c, `fnma` is c - a b.
+    """
+    order = in_order(results)
+    reader: dict[int, Node | None] = {}  # the only node that reads a number; None: several
+    for node in order:
+        for x in node.args:
+            reader[id(x)] = None if id(x) in reader else node
+    for x in results:
+        reader[id(x)] = None
+
+    def is_inner(x: Any) -> bool:
+        """Whether only a sum reads it."""
+        only = None if is_known(x) else reader[id(x)]
+        return only is not None and only.operation in _SUMS
+
+    made: dict[int, Any] = {}
+
+    def terms(x: Any, sign: int, is_root: bool) -> list[tuple[int, Any]]:
+        if is_known(x) or x.operation not in _SUMS or not (is_root or is_inner(x)):
+            return [(sign, x)]
+        signs: tuple[int, ...] = (sign, -sign) if x.operation == "sub" else (sign, sign)
+        if x.operation == "neg":
+            signs = (-sign,)
+        return [t for s, a in zip(signs, x.args, strict=True) for t in terms(a, s, False)]
+
+    def new(x: Any) -> Any:
+        return x if is_known(x) else made[id(x)]
+
+    for node in order:
+        if node.operation == "read":
+            made[id(node)] = node
+        elif node.operation in _SUMS:
+            if is_inner(node):
+                continue
+            products, plain = [], []
+            for sign, x in terms(node, 1, True):
+                if not is_known(x) and x.operation == "mul" and is_inner(x):
+                    products.append((sign, new(x.args[0]), new(x.args[1])))
+                else:
+                    plain.append((sign, new(x)))
+            made[id(node)] = _chain(products, plain)
+        elif not (node.operation == "mul" and is_inner(node)):
+            made[id(node)] = _like(node.operation, *map(new, node.args), is_truth=node.is_truth)
+    return [new(x) for x in results]
+
+
+def _like(operation: str, *args: Any, is_truth: bool = False) -> Node:
+    is_varying = any(not is_known(x) and x.is_varying for x in args)
+    return Node(operation, args, is_varying, is_truth)
+
+
+def _chain(products: list[tuple[int, Any, Any]], plain: list[tuple[int, Any]]) -> Node:
+    """Sum of signed products and signed numbers."""
+    if all(sign < 0 for sign, *_ in (*products, *plain)):
+        turned = [(1, a, b) for _, a, b in products], [(1, x) for _, x in plain]
+        return _like("neg", _chain(*turned))
+    plain.sort(key=lambda term: -term[0])
+    products.sort(key=lambda term: -term[0])
+    if plain and plain[0][0] > 0:
+        total = plain.pop(0)[1]
+    else:
+        _, a, b = products.pop(0)
+        total = _like("mul", a, b)
+    for sign, x in plain:
+        total = _like("add" if sign > 0 else "sub", total, x)
+    for sign, a, b in products:
+        total = _like("fma" if sign > 0 else "fnma", a, b, total)
+    return total
+
+
+def in_order(wanted: Iterable[Any]) -> list[Node]:
+    """Nodes that some results need, each after its arguments and as late as possible.
+
+    Depth first keeps few numbers in flight: each is worked out just before its first use.
+
+    Args:
+        wanted: nodes; numbers are passed over.
+    """
+    order: list[Node] = []
+    seen: set[int] = set()
+    for result in wanted:
+        stack = [(result, False)]
+        while stack:
+            node, is_ready = stack.pop()
+            if is_ready:
+                order.append(node)
+            elif not is_known(node) and id(node) not in seen:
+                seen.add(id(node))
+                stack.append((node, True))
+                stack.extend((x, False) for x in reversed(node.args))
+    return order
+
+
+def count_operations(wanted: Iterable[Any]) -> Counter[str]:
+    """How many operations of each kind some results need."""
+    return Counter(node.operation for node in in_order(wanted))

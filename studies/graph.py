@@ -1,0 +1,324 @@
+"""A traced function as a graph of operations on single numbers, simplified while it is built.
+
+`trace` carries out the equations of a jaxpr on arrays of nodes. A node is a number of one case:
+*known* (a Python number, arithmetic on it is done at once), *shared* (the same for all cases) or
+*varying*. Equal operations on equal nodes are one node, and what nobody reads is never visited, so
+the graph holds the arithmetic that has to be done and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+
+class Node:
+    """One operation, or one number that is read from memory (`read`)."""
+
+    __slots__ = ("args", "is_truth", "is_varying", "operation", "place")
+
+    def __init__(
+        self, operation: str, args: tuple, is_varying: bool, is_truth: bool, place: Any = None
+    ) -> None:
+        self.operation, self.args = operation, args
+        self.is_varying, self.is_truth = is_varying, is_truth
+        self.place = place  # of a `read`: whatever its reader knows it by
+
+
+class Graph:
+    """Makes nodes; one instance for one traced function."""
+
+    def __init__(self) -> None:
+        self._made: dict[tuple, Node] = {}
+
+    def read(self, place: Any, is_varying: bool) -> Node:
+        """A number from memory."""
+        return Node("read", (), is_varying, False, place)
+
+    def trace(
+        self, function: Callable[..., Any], arguments: Sequence[Any], dtype: Any
+    ) -> list[np.ndarray]:
+        """Results of a function of lists of arrays.
+
+        Args:
+            function: elementwise JAX function, `function(*arguments)`.
+            arguments: lists of arrays of nodes and numbers.
+            dtype: of all of them.
+
+        Returns:
+            Arrays of nodes and numbers, flat in the order of the function's result.
+
+        Raises:
+            NotImplementedError: an operation that a graph does not know.
+        """
+        shapes = [[jax.ShapeDtypeStruct(x.shape, dtype) for x in part] for part in arguments]
+        closed = jax.make_jaxpr(function)(*shapes)
+        return self._evaluate(closed.jaxpr, closed.consts, [x for part in arguments for x in part])
+
+    # --- equations --------------------------------------------------------------------------------
+
+    def _evaluate(self, jaxpr: Any, consts: Sequence[Any], given: list[np.ndarray]) -> list:
+        known: dict[Any, np.ndarray] = {}
+
+        def value(atom: Any) -> np.ndarray:
+            if hasattr(atom, "val"):
+                return objects(np.asarray(atom.val).ravel().tolist(), np.shape(atom.val))
+            return known[atom]
+
+        for variable, constant in zip(jaxpr.constvars, consts, strict=True):
+            known[variable] = objects(np.asarray(constant).ravel().tolist(), np.shape(constant))
+        known |= dict(zip(jaxpr.invars, given, strict=True))
+        for equation in jaxpr.eqns:
+            arguments = [value(atom) for atom in equation.invars]
+            inner = equation.params.get("jaxpr") or equation.params.get("call_jaxpr")
+            if equation.primitive.name == "scan":
+                results = self._unrolled(equation.params, arguments)
+            elif inner is not None:
+                body, own = (inner.jaxpr, inner.consts) if hasattr(inner, "consts") else (inner, ())
+                results = self._evaluate(body, own, arguments)
+            else:
+                results = [self._apply(equation, arguments)]
+            known |= dict(zip(equation.outvars, results, strict=True))
+        return [value(atom) for atom in jaxpr.outvars]
+
+    def _unrolled(self, params: Any, given: list[np.ndarray]) -> list[np.ndarray]:
+        """A scan, one turn after the other."""
+        body, n_consts, n_carry = params["jaxpr"], params["num_consts"], params["num_carry"]
+        constants, carry = given[:n_consts], given[n_consts : n_consts + n_carry]
+        stacked = given[n_consts + n_carry :]
+        kept = []
+        for k in range(params["length"]):
+            rows = [x[k : k + 1].reshape(x.shape[1:]) for x in stacked]
+            results = self._evaluate(body.jaxpr, body.consts, [*constants, *carry, *rows])
+            carry = results[:n_carry]
+            kept.append(results[n_carry:])
+        return [*carry, *(np.stack(parts) for parts in zip(*kept, strict=True))]
+
+    def _apply(self, equation: Any, given: list[np.ndarray]) -> np.ndarray:
+        name, params = equation.primitive.name, equation.params
+        shape = equation.outvars[0].aval.shape
+        if name in _STRUCTURAL:
+            return _STRUCTURAL[name](params, shape, *given)
+        if name.startswith("reduce_"):
+            return self._reduce(name.removeprefix("reduce_"), given[0], params["axes"], shape)
+        if name == "integer_pow":
+            return self._each(lambda x: self._power(x, params["y"]), given, shape)
+        if name == "convert_element_type":
+            is_truth = np.dtype(params["new_dtype"]) == bool
+            return self._each(lambda x: self._converted(x, is_truth), given, shape)
+        if name in _COMPARE:
+            return self._each(partial(self._compared, name), given, shape)
+        operation = getattr(self, f"_op_{name}", None)
+        if operation is None:
+            raise NotImplementedError(f"operation {name!r} of the step")
+        return self._each(operation, given, shape)
+
+    def _each(
+        self, operation: Callable[..., Any], given: list[np.ndarray], shape: tuple[int, ...]
+    ) -> np.ndarray:
+        wide = [np.broadcast_to(array, shape) for array in given]
+        values = [operation(*row) for row in zip(*(array.flat for array in wide), strict=True)]
+        return objects(values, shape)
+
+    def _reduce(
+        self, name: str, array: np.ndarray, axes: tuple[int, ...], shape: tuple[int, ...]
+    ) -> np.ndarray:
+        join = getattr(self, "_op_" + {"sum": "add"}.get(name, name))
+        kept = [k for k in range(array.ndim) if k not in axes]
+        rows = np.transpose(array, [*kept, *axes]).reshape(int(np.prod(shape)), -1)
+        return objects([_tree(join, list(row)) for row in rows], shape)
+
+    # --- operations on single numbers -------------------------------------------------------------
+
+    def _node(self, operation: str, *args: Any, is_truth: bool = False) -> Node:
+        names = [(type(x), x) if is_known(x) else id(x) for x in args]
+        key = (operation, *(sorted(names, key=str) if operation in _SYMMETRIC else names))
+        if key not in self._made:
+            is_varying = any(isinstance(x, Node) and x.is_varying for x in args)
+            self._made[key] = Node(operation, args, is_varying, is_truth)
+        return self._made[key]
+
+    def _op_add(self, a: Any, b: Any) -> Any:
+        if is_known(a) and is_known(b):
+            return a + b
+        if _is(a, 0) or _is(b, 0):
+            return b if _is(a, 0) else a
+        return self._node("add", a, b)
+
+    def _op_sub(self, a: Any, b: Any) -> Any:
+        if is_known(a) and is_known(b):
+            return a - b
+        if _is(b, 0):
+            return a
+        return self._op_neg(b) if _is(a, 0) else self._node("sub", a, b)
+
+    def _op_mul(self, a: Any, b: Any) -> Any:
+        if is_known(a) and is_known(b):
+            return a * b
+        for one, other in ((a, b), (b, a)):
+            if _is(one, 1):
+                return other
+            if _is(one, -1):
+                return self._op_neg(other)
+            if _is(one, 0):
+                return 0.0  # a number that is not finite shows in the state itself
+        return self._node("mul", a, b)
+
+    def _op_div(self, a: Any, b: Any) -> Any:
+        # several divisions by one number share its reciprocal: a division costs 16 cycles
+        if is_known(b):
+            return self._op_mul(a, float(np.divide(1.0, b)))
+        return self._op_mul(a, self._node("reciprocal", b))
+
+    def _op_neg(self, a: Any) -> Any:
+        return -a if is_known(a) else self._node("neg", a)
+
+    def _op_square(self, a: Any) -> Any:
+        return self._op_mul(a, a)
+
+    def _power(self, a: Any, y: int) -> Any:
+        if y < 0:
+            return self._op_div(1.0, self._power(a, -y))
+        return _tree(self._op_mul, [a] * y) if y else 1.0
+
+    def _converted(self, a: Any, is_truth: bool) -> Any:
+        if is_truth:
+            return self._compared("ne", a, 0.0)
+        if is_known(a):
+            return float(a)
+        return self._op_select_n(a, 0.0, 1.0) if a.is_truth else a
+
+    def _compared(self, sign: str, a: Any, b: Any) -> Any:
+        if is_known(a) and is_known(b):
+            return bool(_COMPARE[sign](a, b))
+        return self._node(sign, a, b, is_truth=True)
+
+    def _op_and(self, a: Any, b: Any) -> Any:
+        if is_known(a) or is_known(b):
+            known, other = (a, b) if is_known(a) else (b, a)
+            return other if known else False
+        return self._node("and", a, b, is_truth=True)
+
+    def _op_or(self, a: Any, b: Any) -> Any:
+        if is_known(a) or is_known(b):
+            known, other = (a, b) if is_known(a) else (b, a)
+            return True if known else other
+        return self._node("or", a, b, is_truth=True)
+
+    def _op_not(self, a: Any) -> Any:
+        return not a if is_known(a) else self._node("not", a, is_truth=True)
+
+    def _op_select_n(self, which: Any, no: Any, yes: Any) -> Any:
+        if is_known(which):
+            return yes if which else no
+        if no is yes or (is_known(no) and is_known(yes) and no == yes):
+            return no
+        is_truth = any(isinstance(x, bool) or getattr(x, "is_truth", False) for x in (no, yes))
+        return self._node("select", which, no, yes, is_truth=is_truth)
+
+    def _op_max(self, a: Any, b: Any) -> Any:
+        return self._extreme("max", a, b, np.maximum, -np.inf)
+
+    def _op_min(self, a: Any, b: Any) -> Any:
+        return self._extreme("min", a, b, np.minimum, np.inf)
+
+    def _extreme(
+        self, name: str, a: Any, b: Any, extreme: Callable[..., Any], no_limit: float
+    ) -> Any:
+        """The larger or smaller one; not a number if either is none."""
+        if is_known(b):
+            a, b = b, a
+        if is_known(b):
+            return float(extreme(a, b))
+        return b if _is(a, no_limit) else self._node(name, a, b)
+
+    def _op_clamp(self, low: Any, x: Any, high: Any) -> Any:
+        return self._op_min(self._op_max(x, low), high)
+
+    def _op_sign(self, a: Any) -> Any:
+        up = self._op_select_n(self._compared("gt", a, 0.0), 0.0, 1.0)
+        return self._op_select_n(self._compared("lt", a, 0.0), up, -1.0)
+
+    def _op_is_finite(self, a: Any) -> Any:
+        return self._compared("lt", self._op_abs(a), np.inf)
+
+    def _op_abs(self, a: Any) -> Any:
+        return abs(a) if is_known(a) else self._node("abs", a)
+
+    def _op_sqrt(self, a: Any) -> Any:
+        return float(np.sqrt(a)) if is_known(a) else self._node("sqrt", a)
+
+    def _op_round(self, a: Any) -> Any:
+        return float(np.round(a)) if is_known(a) else self._node("round", a)
+
+    def _op_tanh(self, a: Any) -> Any:
+        return float(np.tanh(a)) if is_known(a) else self._node("tanh", a)
+
+
+def objects(values: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
+    """An array of nodes and numbers."""
+    array = np.empty(len(values), object)
+    array[:] = values
+    return array.reshape(shape)
+
+
+def is_known(value: Any) -> bool:
+    """Whether it is a number, not a node."""
+    return not isinstance(value, Node)
+
+
+def _is(value: Any, number: float) -> bool:
+    return is_known(value) and not isinstance(value, bool) and value == number
+
+
+def _tree(join: Callable[..., Any], values: list[Any]) -> Any:
+    while len(values) > 1:
+        pairs = [join(a, b) for a, b in zip(values[::2], values[1::2], strict=False)]
+        values = pairs + values[len(values) - len(values) % 2 :]
+    return values[0]
+
+
+#: Operations whose arguments may change places.
+_SYMMETRIC = ("add", "mul")
+#: Comparisons by their names among JAX's operations.
+_COMPARE: dict[str, Callable[[Any, Any], Any]] = {
+    "lt": lambda a, b: a < b,
+    "le": lambda a, b: a <= b,
+    "gt": lambda a, b: a > b,
+    "ge": lambda a, b: a >= b,
+    "eq": lambda a, b: a == b,
+    "ne": lambda a, b: a != b,
+}
+
+
+def _broadcast(params: Any, shape: tuple[int, ...], array: np.ndarray, *_: Any) -> np.ndarray:
+    places = params["broadcast_dimensions"]
+    lined = [1] * len(shape)
+    for place, size in zip(places, array.shape, strict=True):
+        lined[place] = size
+    return np.broadcast_to(array.reshape(lined), shape)
+
+
+def _slice(params: Any, shape: tuple[int, ...], array: np.ndarray) -> np.ndarray:
+    starts, limits = params["start_indices"], params["limit_indices"]
+    strides = params["strides"] or (1,) * len(starts)
+    return array[tuple(map(slice, starts, limits, strides))]
+
+
+#: Operations that only move elements.
+_STRUCTURAL: dict[str, Callable[..., np.ndarray]] = {
+    "broadcast_in_dim": _broadcast,
+    "reshape": lambda p, shape, a: a.reshape(shape),
+    "squeeze": lambda p, shape, a: a.reshape(shape),
+    "expand_dims": lambda p, shape, a: a.reshape(shape),
+    "transpose": lambda p, shape, a: np.transpose(a, p["permutation"]),
+    "slice": _slice,
+    "concatenate": lambda p, shape, *a: np.concatenate(a, axis=p["dimension"]),
+    "stack": lambda p, shape, *a: np.stack(a, axis=p.get("axis", p.get("dimension", 0))),
+    "copy": lambda p, shape, a: a,
+    "stop_gradient": lambda p, shape, a: a,
+}
