@@ -27,6 +27,7 @@ class Structure(NamedTuple):
     has_feedforward: bool = False  # computed torque on top of PD
     has_noise: bool = False  # seeded ADC noise and force ripple
     has_friction: bool = False  # Coulomb friction on the sliders
+    has_position_gain: bool = True  # feedback of modal positions, not of velocities alone
     metrics: tuple[str, ...] = ()  # to accumulate; (): all of them
     is_smooth: bool = False  # rounding replaced by equal noise, limits by tanh: for gradients
 

@@ -20,7 +20,7 @@ class Controller(NamedTuple):
     filter: Array  # channels from sensor voltages [m/V] (SRF: identity), (3, C, K)
     estimator: Estimator  # (3, C) each
     velocity_gain: Array  # [N s/m] (SRF: [s]), (3, C)
-    position_gain: Array  # [N/m] (SRF: [1]), (3, C)
+    position_gain: Array | None  # [N/m] (SRF: [1]), (3, C), None where there is none
     synthesizer: Array  # voltages from channel forces [V/N] (SRF: identity), (3, K, C)
     feedthrough: Array  # sensor volts per actuator volt to subtract [1], (3, K, K)
     voltage_limit: Array  # [V], ()
@@ -114,10 +114,10 @@ def controller_step(
     newest = newest - estimator.denominator[1] * state.second[1]
     line = (newest, state.second[0], state.second[1])
     rate = sum(n * x for n, x in zip(estimator.velocity, line, strict=True))
-    value = sum(n * x for n, x in zip(estimator.position, line, strict=True))
-    value = value + estimator.direct * channel
-
-    force = -controller.velocity_gain * rate - controller.position_gain * value
+    force = -controller.velocity_gain * rate
+    if controller.position_gain is not None:
+        value = sum(n * x for n, x in zip(estimator.position, line, strict=True))
+        force = force - controller.position_gain * (value + estimator.direct * channel)
     wanted = jnp.sum(controller.synthesizer * force[:, None], axis=2)
     command = soft_limit(wanted, controller.voltage_limit, is_smooth)
     after = ControllerState(b1 * channel - a1 * high, (newest, state.second[0]), command)

@@ -60,7 +60,7 @@ def accelerations(
     q: Array,
     q_rate: Array,
     slider_force: Array,
-    modal_force: Array,
+    piezo: Array,
 ) -> Accelerations:
     """Accelerations of pose and modes, (7) solved.
 
@@ -71,7 +71,7 @@ def accelerations(
         q: modal coordinates [m], (3, R).
         q_rate: [m/s], (3, R).
         slider_force: along the guides [N], (3,).
-        modal_force: generalised piezo forces Q_j (14) [N], (3, R).
+        piezo: generalised piezo forces (14) over the modal masses, Q_j/m_j [m/s2], (3, R).
 
     Returns:
         Accelerations.
@@ -88,7 +88,7 @@ def accelerations(
         rho_0 = rho_0 + cosine * rate * chain.tip_rate
     rho_0 = rho_0 + chain.h * gamma_0
     # modal accelerations without inertia: of piezos and rotation, and of the oscillator itself
-    push = modal_force / plant.mass + q * rate2[:, None]
+    push = piezo + q * rate2[:, None]
     own = (plant.stiffness / plant.mass) * q + (plant.damping / plant.mass) * q_rate
     pull = own - push
 

@@ -31,7 +31,7 @@ class LinearPlant(NamedTuple):
 
 def flatten(state: PlantState) -> Array:
     """x = (X, X', q, q', z, z') as a vector, (6 + 12 R,)."""
-    return jnp.concatenate([jnp.ravel(part) for part in state])
+    return jnp.concatenate([jnp.ravel(jnp.asarray(part)) for part in state])
 
 
 def unflatten(x: Array, n_modes: int) -> PlantState:

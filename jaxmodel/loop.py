@@ -42,10 +42,10 @@ class Loop(NamedTuple):
     exponential: Exponential
     plant_step: Array  # length of one plant step [s], ()
     sensor: Array  # V_s of a modal coordinate, lambda_s Phi_s^t [V/m], (3, K, R)
-    actuator: Array  # modal force of a voltage, lambda_a Phi_a [N/V], (3, R, K)
+    actuator: Array  # modal acceleration of a voltage, lambda_a Phi_a/m [m/s2/V], (3, R, K)
     deflection_at: Array  # chord deflection at the stations [1], (3, S, R)
     controller: Controller
-    channel: Array  # what the estimator works on, noise-free: filter x sensor, (3, channels, R)
+    ideal: tuple[Array, Array | None] | None  # voltage of q' [V s/m] and q [V/m], (3, K, R) each
     observer: Array  # controlled modes of the true deflection, modal filter x sensor [1], (3, C, R)
     modal_omega: Array  # frequencies of the controller's modes [rad/s], (3, C)
     rotation: tuple[Array, Array]  # of the spectra's phasors per sample, (C, n_frequencies)
@@ -54,14 +54,14 @@ class Loop(NamedTuple):
 
 
 class PlantState(NamedTuple):
-    """Mechanism and modes; z is the anti-alias filtered modal coordinate."""
+    """Mechanism and modes; z is the anti-alias filtered modal coordinate, None if not sampled."""
 
     pose: Array  # [m, m, rad], (3,)
     pose_rate: Array  # (3,)
     q: Array  # [m], (3, R)
     q_rate: Array  # [m/s], (3, R)
-    z: Array  # [m], (3, R)
-    z_rate: Array  # [m/s], (3, R)
+    z: Array | None  # [m], (3, R)
+    z_rate: Array | None  # [m/s], (3, R)
 
 
 class State(NamedTuple):
@@ -130,21 +130,19 @@ def plant_rates(
     )  # fmt: skip
     if structure.feedback == "ideal":
         voltage = ideal_voltage(structure, loop, state.q, state.q_rate)
-    modal_force = jnp.sum(loop.actuator * voltage[:, None], axis=2)
-    rates = accelerations(
-        loop.plant, chain, state.pose_rate, state.q, state.q_rate, force, modal_force
-    )
+    piezo = jnp.sum(loop.actuator * voltage[:, None], axis=2)
+    rates = accelerations(loop.plant, chain, state.pose_rate, state.q, state.q_rate, force, piezo)
     return Rates(chain, rates)
 
 
 def ideal_voltage(structure: Structure, loop: Loop, q: Array, q_rate: Array) -> Array:
     """Actuator voltages [V] of continuous feedback (20) from noise-free sensors, (3, K)."""
-    controller = loop.controller
-    channel = jnp.sum(loop.channel * q[:, None], axis=2)
-    channel_rate = jnp.sum(loop.channel * q_rate[:, None], axis=2)
-    force = -controller.velocity_gain * channel_rate - controller.position_gain * channel
-    voltage = jnp.sum(controller.synthesizer * force[:, None], axis=2)
-    return soft_limit(voltage, controller.voltage_limit, structure.is_smooth)
+    assert loop.ideal is not None
+    on_rate, on_position = loop.ideal
+    voltage = jnp.sum(on_rate * q_rate[:, None], axis=2)
+    if on_position is not None:
+        voltage = voltage + jnp.sum(on_position * q[:, None], axis=2)
+    return soft_limit(voltage, loop.controller.voltage_limit, structure.is_smooth)
 
 
 def plant_step(
@@ -207,10 +205,12 @@ def plant_step(
         width = 2 if row < 2 else 4  # the filter does not act back on the mode
         return forced + sum(full[row, k] * old[k] for k in range(width))
 
+    is_filtered = state.z is not None
     after = PlantState(
-        state.pose + h / 6 * combine(0), state.pose_rate + h / 6 * combine(1),
-        mode(0), mode(1), mode(2), mode(3),
-    )  # fmt: skip
+        state.pose + h / 6 * combine(0),
+        state.pose_rate + h / 6 * combine(1),
+        *(mode(row) if row < 2 or is_filtered else None for row in range(4)),
+    )
     return after, first
 
 
@@ -231,7 +231,7 @@ def step(structure: Structure, loop: Loop, state: State, inputs: Inputs) -> tupl
     plant, controller = state.plant, loop.controller
     voltage, clipped = state.controller.voltage, jnp.zeros_like(state.status)
     next_controller = state.controller
-    if structure.feedback == "sampled":
+    if plant.z is not None:
         filtered = jnp.sum(loop.sensor * plant.z[:, None], axis=2)
         next_controller, info = controller_step(
             controller, state.controller, filtered, inputs.adc_noise, structure.is_smooth
@@ -327,7 +327,7 @@ def _freeze_if_bad(
     is_wild = jnp.any(deflection > DIVERGED_DEFLECTION * loop.plant.length, axis=0)
     is_wild = is_wild | jnp.any(jnp.abs(plant.pose - inputs.pose) > DIVERGED_POSE, axis=0)
     total = jnp.sum(plant.pose + plant.pose_rate, axis=0)
-    total = total + jnp.sum(jnp.sum(plant.q + plant.q_rate + plant.z_rate, axis=1), axis=0)
+    total = total + jnp.sum(jnp.sum(plant.q + plant.q_rate, axis=1), axis=0)
     total = total + jnp.sum(jnp.sum(new.controller.voltage, axis=1), axis=0)
     is_finite = jnp.abs(total) < jnp.inf  # false for NaN too
     code = chain_status(loop.plant, chain)
@@ -356,13 +356,14 @@ def initial_state(structure: Structure, loop: Loop, pose: Array, q: Array, code:
         State.
     """
     zero, still = jnp.zeros_like(q), jnp.zeros_like(pose)
+    is_sampled = structure.feedback == "sampled"
     n_stations = loop.deflection_at.shape[1]
     totals = metrics.zero_totals(
         n_stations, structure.n_modes, structure.n_controlled, structure.n_frequencies, q.dtype,
         structure.metrics,
     )  # fmt: skip
     return State(
-        PlantState(pose, still, q, zero, q, zero),
+        PlantState(pose, still, q, zero, *((q, zero) if is_sampled else (None, None))),
         rest_controller(structure.n_channels, structure.n_patches, q.dtype),
         totals,
         code,

@@ -80,10 +80,10 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         exponential=exponential_step(omega, zeta, step, electronics.antialias),
         plant_step=step,
         sensor=sensor,
-        actuator=lambda_a[:, None, None] * basis.actuator_slope,
+        actuator=lambda_a[:, None, None] * basis.actuator_slope / basis.mass[:, :, None],
         deflection_at=basis.deflection_at,
         controller=design.controller,
-        channel=jnp.einsum("ick,ikr->icr", design.controller.filter, sensor),
+        ideal=_ideal(design.controller, sensor) if structure.feedback == "ideal" else None,
         observer=jnp.einsum("ick,ikr->icr", design.observer, sensor),
         modal_omega=design.modal_omega,
         rotation=(jnp.cos(angle), jnp.sin(angle)),
@@ -103,6 +103,18 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         design.actuator_condition,
         _static_status(structure, case, design, omega * mask * step),
     )
+
+
+def _ideal(controller: Controller, sensor: Array) -> tuple[Array, Array | None]:
+    """Voltages of continuous feedback per modal velocity and position, (3, K, R) each."""
+    channel = jnp.einsum("ick,ikr->icr", controller.filter, sensor)
+
+    def matrix(gain: Array | None) -> Array | None:
+        if gain is None:
+            return None
+        return -jnp.einsum("ikc,icr->ikr", controller.synthesizer, gain[:, :, None] * channel)
+
+    return matrix(controller.velocity_gain), matrix(controller.position_gain)
 
 
 _PER_LINK_DRIVE = (
@@ -180,7 +192,7 @@ def design_controller(structure: Structure, case: Case) -> ControllerDesign:
             electronics.highpass, ratio, zeta, electronics.difference_cutoff,
         ),
         velocity_gain=velocity,
-        position_gain=position,
+        position_gain=position if structure.has_position_gain else None,
         synthesizer=synthesizer,
         feedthrough=control.feedthrough_factor * feedthrough,
         voltage_limit=jnp.asarray(electronics.voltage_limit),

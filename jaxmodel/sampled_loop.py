@@ -57,10 +57,9 @@ def closed_loop(structure: Structure, case: Case, pose: Array) -> LoopMatrices:
     def advance(x: Array, factor: Array) -> Array:
         state, line = x[:n], jnp.reshape(x[n : n + 9 * channels], (3, 3, channels))
         voltage = jnp.reshape(x[n + 9 * channels :], (3, patches))
-        controller = loop.controller._replace(
-            velocity_gain=factor * loop.controller.velocity_gain,
-            position_gain=factor * loop.controller.position_gain,
-        )
+        controller = loop.controller._replace(velocity_gain=factor * loop.controller.velocity_gain)
+        if controller.position_gain is not None:
+            controller = controller._replace(position_gain=factor * controller.position_gain)
         before = ControllerState(line[0], (line[1], line[2]), voltage)
         filtered = jnp.reshape(plant.sensor @ state, (3, patches))
         after, _ = controller_step(controller, before, filtered, None, True)

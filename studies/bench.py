@@ -92,11 +92,11 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
     cases = jax.tree.map(lambda x: x if x.dtype.kind == "i" else x.astype(real), cases)
     chosen = EXECUTORS[executor] if executor else None
     made = chosen(structure, layout, False) if chosen else make_executor(structure, layout, False)
-    result = made.start(cases)()
+    result = made.start(cases).wait()
     times = []
     for _ in range(REPEATS):
         began = time.perf_counter()
-        result = made.start(cases)()
+        result = made.start(cases).wait()
         times.append(time.perf_counter() - began)
     seconds = statistics.median(times)
     return {

@@ -56,6 +56,7 @@ def build_structure(study: Study, substeps: int | None = None) -> Structure:
         has_feedforward=study.drive.kind == "computed_torque",
         has_noise=noisy,
         has_friction=study.drive.coulomb_friction > 0,
+        has_position_gain=any(gain != 0 for gain in study.control.position_gain),
         is_smooth=study.run.smooth,
     )
 

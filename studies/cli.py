@@ -31,10 +31,15 @@ console = Console(
 )
 
 
+#: Exit code after Ctrl-C.
+INTERRUPTED = 130
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `studies` command."""
     try:
-        app(args=arguments, standalone_mode=False)
+        if app(args=arguments, standalone_mode=False) == INTERRUPTED:
+            raise KeyboardInterrupt
     except (StudyError, TyperException) as error:
         text = error.format_message() if isinstance(error, TyperException) else str(error)
         if text:  # none where help has been printed for want of a command
@@ -42,7 +47,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(2)
     except (KeyboardInterrupt, Abort):
         print("studies: interrupted", file=sys.stderr)
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
 
 
 @app.command()

@@ -66,7 +66,8 @@ def _number(data: SweepData, case: str, path: Path) -> int:
         if len(found) != 1:
             raise StudyError(f"--case {case}: fits {len(found)} cases of {path}; allowed: one")
         return int(found[0])
-    if not (case.isascii() and case.isdigit()) or int(case) >= data.n_cases:
+    is_number = case.isascii() and case.isdigit() and len(case) < 20
+    if not is_number or int(case) >= data.n_cases:
         raise StudyError(
             f"--case {case}: allowed 0 to {data.n_cases - 1}, the cases of {path}, or id: and the "
             "first digits of a case's id"

@@ -85,6 +85,8 @@ def _range(metadata: Iterable[Any]) -> str:
     longest = _bound(metadata, "max_length")
     if longest is not None:
         limits.append(f"of at most {longest} characters")
+    if _bound(metadata, "pattern") is not None:  # the only one there is
+        limits.append("without NUL characters")
     return " and ".join(limits)
 
 

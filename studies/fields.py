@@ -17,7 +17,7 @@ from studies.spec import Study
 
 Columns = Mapping[str, np.ndarray]
 
-_ENTRY = re.compile(r"(?P<field>[^\[\]]+)(?P<indices>(\[\d+\])*)")
+_ENTRY = re.compile(r"(?P<field>[^\s\[\]]+)(?P<indices>(\[\d{1,6}\])*)")
 
 
 class Entry(NamedTuple):
@@ -29,7 +29,7 @@ class Entry(NamedTuple):
 
 def parse_entry(name: str) -> Entry | None:
     """Split a name into field and indices; None where it is no such name."""
-    match = _ENTRY.fullmatch(name.strip())
+    match = _ENTRY.fullmatch(name)
     if match is None:
         return None
     return Entry(match["field"], tuple(map(int, re.findall(r"\d+", match["indices"]))))
@@ -46,7 +46,7 @@ def padded(values: list[Any]) -> np.ndarray:
     """Numbers, or lists of them of any lengths, as one float array, missing entries NaN."""
     if not isinstance(values[0], (tuple, list, np.ndarray)):
         return np.array(values, float)
-    if all(len(value) == 0 for value in values):
+    if all(np.size(np.array(value, object)) == 0 for value in values):
         return np.zeros((len(values), 0))
     depth = _depth(values)
     shape = [len(values)] + [0] * depth
@@ -107,7 +107,7 @@ class Fields:
             if entry is not None and entry.field == field and entry.indices:
                 if len(array) != len(column):
                     array = np.repeat(array, len(column), axis=0)
-                np.moveaxis(array, 0, -1)[entry.indices] = column
+                np.moveaxis(array, 0, -1)[entry.indices] = np.moveaxis(column, 0, -1)
         return array
 
     def choices(self, field: str, names: tuple[str, ...]) -> np.ndarray:

@@ -7,7 +7,7 @@ else is in flight goes to memory and back.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from studies.graph import Node, is_known
@@ -92,11 +92,19 @@ def _chain(products: list[tuple[int, Any, Any]], plain: list[tuple[int, Any]]) -
 def in_order(wanted: Iterable[Any]) -> list[Node]:
     """Nodes that some results need, each after its arguments and as late as possible.
 
-    Depth first keeps few numbers in flight: each is worked out just before its first use.
+    Depth first, the argument with the longest history first, keeps few numbers in flight.
 
     Args:
         wanted: nodes; numbers are passed over.
     """
+    wanted = list(wanted)
+    height: dict[int, int] = {}
+    for node in _depth_first(wanted, lambda x: 0):
+        height[id(node)] = 1 + max((height.get(id(x), 0) for x in node.args), default=0)
+    return _depth_first(wanted, lambda x: height.get(id(x), 0))
+
+
+def _depth_first(wanted: list[Any], priority: Callable[[Any], int]) -> list[Node]:
     order: list[Node] = []
     seen: set[int] = set()
     for result in wanted:
@@ -108,7 +116,7 @@ def in_order(wanted: Iterable[Any]) -> list[Node]:
             elif not is_known(node) and id(node) not in seen:
                 seen.add(id(node))
                 stack.append((node, True))
-                stack.extend((x, False) for x in reversed(node.args))
+                stack.extend((x, False) for x in sorted(node.args, key=priority))
     return order
 
 

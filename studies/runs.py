@@ -259,13 +259,21 @@ def mechanics_at(structure: Structure, case: Case, pose: Any) -> Any:
 _mechanics_at = jax.jit(mechanics_at, static_argnums=0)
 
 
+def step_counts(needed: Any) -> np.ndarray:
+    """Plant steps per sample to take where `needed` would do: the next power of two.
+
+    So the cases of a sweep need few programs, and each takes the steps it takes anywhere.
+    """
+    return 2 ** np.ceil(np.log2(np.maximum(needed, 1))).astype(int)
+
+
 def _drive_substeps(study: Study, structure: Structure, case: Case) -> int:
     """Plant steps per sample that the sliders' drive and friction need, or given."""
     rate = float(drive_rate(case))
     needed = max(int(np.ceil(rate / study.electronics.sample_rate_hz / STIFFNESS_LIMIT)), 1)
     given, drive = study.run.substeps, study.drive
     if needed <= (given or SUBSTEP_LIMIT):
-        return given or needed
+        return given or int(step_counts(needed))
     if needed <= SUBSTEP_LIMIT:
         raise field_error(
             "run.substeps", given,
@@ -307,7 +315,7 @@ def _ideal_substeps(study: Study, structure: Structure, case: Case) -> int:
             f"gains low enough for {SUBSTEP_LIMIT} plant steps per sample; ideal feedback has a "
             f"pole at {fastest:.3g} 1/s, which needs {needed}", "1",
         )  # fmt: skip
-    return given or max(needed, 1)
+    return given or int(step_counts(needed))
 
 
 #: Unit, long name and flags of a status in a file.

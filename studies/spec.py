@@ -265,7 +265,7 @@ class Metrics(Section):
 class Study(Section):
     """One study file."""
 
-    title: str = described("study", "-", "what this is", max_length=200)
+    title: str = described("study", "-", "what this is", max_length=200, pattern="^[^\0]*$")
     run: Run = Run()
     machine: Machine = Machine()
     link: Link = Link()

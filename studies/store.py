@@ -87,12 +87,7 @@ def write_store(
         file.attrs.update(labels)
         for name, variable in everything.items():
             dataset = _dataset(file, name, arrays[name])
-            dataset.attrs["units"] = variable.units
-            dataset.attrs["long_name"] = variable.long_name
-            if variable.flags:
-                words = (_NO_FLAG.sub("_", text) for text in variable.flags.values())
-                dataset.attrs["flag_values"] = np.array(list(variable.flags), arrays[name].dtype)
-                dataset.attrs["flag_meanings"] = " ".join(words)
+            dataset.attrs.update(variable_labels(variable))
         for axis in sizes:
             file[axis].make_scale(axis)
         for name, variable in variables.items():
@@ -139,6 +134,16 @@ def _check_room(path: str | Path, arrays: Mapping[str, np.ndarray | Streamed]) -
             f"{path}: cannot write it, {needed / 2**20:.0f} MiB are needed and "
             f"{free / 2**20:.0f} MiB are free"
         )
+
+
+def variable_labels(variable: Variable) -> dict[str, Any]:
+    """Attributes of a variable, named as the CF conventions do."""
+    labels: dict[str, Any] = {"units": variable.units, "long_name": variable.long_name}
+    if variable.flags:
+        words = (_NO_FLAG.sub("_", text) for text in variable.flags.values())
+        labels["flag_values"] = np.array(list(variable.flags), variable.data.dtype)
+        labels["flag_meanings"] = " ".join(words)
+    return labels
 
 
 def read_store(path: str | Path) -> tuple[dict[str, Variable], dict[str, Any]]:

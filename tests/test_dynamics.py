@@ -50,7 +50,13 @@ def states():
 def closed_form(plant, motion, loads):
     chain = dynamics.modal_chain(plant, motion.pose, motion.pose_rate, motion.q, motion.q_rate)
     return dynamics.accelerations(
-        plant, chain, motion.pose_rate, motion.q, motion.q_rate, loads.slider, loads.modal
+        plant,
+        chain,
+        motion.pose_rate,
+        motion.q,
+        motion.q_rate,
+        loads.slider,
+        loads.modal / plant.mass,
     )
 
 

@@ -37,7 +37,7 @@ def both(spec):
     group = plan_groups(table, np.arange(len(table)), 2)[0]
     cases = chunk_cases(table, np.arange(len(table)), group.structure, LAYOUT.size)
     return [
-        executor(group.structure, LAYOUT, False).start(cases)()
+        executor(group.structure, LAYOUT, False).start(cases).wait()
         for executor in (KernelExecutor, ScanExecutor)
     ]
 

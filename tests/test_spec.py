@@ -193,7 +193,7 @@ def _numbers(low, high):
 
 STUDIES = st.fixed_dictionaries(
     {
-        "title": st.text(st.characters(codec="utf-8"), max_size=20),
+        "title": st.text(st.characters(codec="utf-8", min_codepoint=1), max_size=20),
         "run__duration": _numbers(0.1, 100),
         "run__smooth": st.booleans(),
         "link__basis": st.sampled_from(["pinned_pinned", "pinned_free", "loaded"]),

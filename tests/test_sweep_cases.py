@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from studies.cases import as_arrays, build_case, build_cases, build_structure
 from studies.errors import StudyError
-from studies.fields import padded
+from studies.fields import Fields, padded
 from studies.sweeps.designs import morris_points, saltelli_points
 from studies.sweeps.spec import load_sweep, parse_sweep, ready_spec
 from studies.sweeps.table import build_table, case_study
@@ -184,6 +184,13 @@ def leaves(tree):
     return jax.tree.leaves(tree)
 
 
+def test_an_entry_that_is_a_list_can_vary():
+    table = table_of({"axes": {"motion.waypoints[1]": [[0.0, 0.003, 0.5], [0.0, 0.001, 0.5]]}})
+    found = Fields(table.study, table.fields).numbers("motion.waypoints")
+    np.testing.assert_array_equal(found[:, 1], [[0.0, 0.003, 0.5], [0.0, 0.001, 0.5]])
+    np.testing.assert_array_equal(found[:, 0], [table.study.motion.waypoints[0]] * 2)
+
+
 def test_ragged_lists_are_padded():
     array = padded([((1.0,), (2.0, 3.0)), ((4.0, 5.0, 6.0), ())])
     assert array.shape == (2, 2, 3)
@@ -282,6 +289,19 @@ REFUSED = [
     ({"axes": {"x" * 9999: [1]}}, "unknown field"),
     ({"axes": {"a\nb": [1]}}, "unknown field"),
     ({"axes": {"link.joint_inertia_b": [0.0, 1e-5]}}, "link.basis = 'pinned_pinned': allowed"),
+    ({"axes": {" control.gain_factor": [0.1, 0.2]}}, "did you mean 'control.gain_factor'?"),
+    ({"method": "list", "cases": [{"control.gain_factor ": 0.2}]}, "unknown field; did you mean"),
+    ({"axes": {"motion.move_time": [[]]}}, "as many as there are moves"),
+    ({"axes": {"motion.dwell": [[0.01, 0.02]]}}, "as many as there are moves"),
+    ({"axes": {"drive.locked": "all"}}, "locked sliders follow no path"),
+    ({"axes": {"control.velocity_gain": [[1.0, 1.0, 1.0]], "motion.waypoints[1]": [[0.0]]}},
+     "motion.waypoints"),
+    ({"axes": {"control.velocity_gain[" + "1" * 5000 + "]": [1.0]}}, "unknown field"),
+    ({"axes": {"gain": {"from": 1, "to": 2, "count": 20}}, "repeats": 10**6},
+     "sweep.repeats = 1000000: allowed at most 500000 with 20 cases"),
+    ({"axes": {"run.duration": [100.0], "electronics.sample_rate_hz": [1e6]}}, "1e+08 samples"),
+    ({"method": "sobol", "count": 4, "axes": {"placement": {"kind": "per_link"}},
+      "where": "patches.centers[0] > 0.01"}, "name one entry of it, such as patches.centers[0][0]"),
 ]  # fmt: skip
 
 

@@ -229,6 +229,8 @@ def _field_axis(name: str, written: Any, study: Study, path: str) -> Axis:
     if not isinstance(written, list) or not written:
         raise field_error(path, written, _WRITTEN)
     values = column_of([checked_value(study, name, value, path) for value in written])
+    if isinstance(base, tuple) and "[" in name and values.shape[1:] != np.shape(base):
+        raise field_error(path, written, f"lists of the shape of the one there, {list(base)}")
     return choice_axis({name: values})
 
 

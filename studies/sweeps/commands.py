@@ -41,7 +41,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         asked = load_sweep(ready_spec(spec))
         if dry_run:
-            print_plan(make_plan(asked), console)
+            print_plan(make_plan(asked, out if resume else None), console)
             return
         if out is None:
             raise StudyError("--out: name a folder for the results")
@@ -155,6 +155,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
                     f"{found.total[k]:.3f}", f"{b[0]:.3f} to {b[1]:.3f}",
                 )  # fmt: skip
             left_out, what = found.n_left_out, "base points"
+            if np.any(found.first > found.total_interval[:, 1]):
+                console.print(
+                    "a first index beyond the total one: not settled yet, take more base points"
+                )
         console.print(table)
         if left_out:
             console.print(f"left out because of failed cases: {left_out} {what}")

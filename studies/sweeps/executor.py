@@ -31,14 +31,21 @@ TRACES: list[Structure] = []
 KERNEL_SUBSTEPS = 4
 
 
+class Running(NamedTuple):
+    """A chunk on its way."""
+
+    wait: Callable[[], Result]  # until it is done; NumPy arrays
+    cancel: Callable[[], None]  # give it up, as far as it has not begun
+
+
 class Executor(Protocol):
     """Runs chunks of one group."""
 
     name: str
     compile_time: float  # [s], 0 before the first chunk
 
-    def start(self, cases: Case) -> Callable[[], Result]:
-        """Start a chunk; calling what is returned waits for its result (NumPy arrays).
+    def start(self, cases: Case) -> Running:
+        """Start a chunk.
 
         Args:
             cases: from `chunk_cases`, `layout.size` of them.
@@ -62,7 +69,7 @@ def make_executor(structure: Structure, layout: Layout, has_own_ratio: bool) -> 
 
 def own_ratios(executor: Executor, cases: Case) -> np.ndarray:
     """EMC ratios of the cases' own uncontrolled runs, (size, 3, C)."""
-    return np.asarray(executor.start(uncontrolled(cases))().energy_ratio)
+    return np.asarray(executor.start(uncontrolled(cases)).wait().energy_ratio)
 
 
 class _Split(NamedTuple):
@@ -140,7 +147,7 @@ class ScanExecutor:
         self.compile_time = 0.0
         self._compiled: Any = None
 
-    def start(self, cases: Case) -> Callable[[], Result]:
+    def start(self, cases: Case) -> Running:
         split = _split(cases, self.layout, self.structure, self.has_own_ratio)
         if self._compiled is None:
             program = _Program(self.structure, self.layout, split.tree, split.is_varying)
@@ -148,7 +155,7 @@ class ScanExecutor:
             self._compiled = _run.lower(program, split.varying, split.shared).compile()
             self.compile_time = time.perf_counter() - started
         running = self._compiled(split.varying, split.shared)
-        return lambda: jax.tree.map(np.asarray, running)
+        return Running(lambda: jax.tree.map(np.asarray, running), lambda: None)
 
 
 # --- the traced kernel ----------------------------------------------------------------------------
@@ -186,7 +193,7 @@ class KernelExecutor:
         self._steps: _Steps | None = None
         self._pool = ThreadPoolExecutor(layout.devices)
 
-    def start(self, cases: Case) -> Callable[[], Result]:
+    def start(self, cases: Case) -> Running:
         split = _split(cases, self.layout, self.structure, self.has_own_ratio)
         program = _Program(self.structure, self.layout, split.tree, split.is_varying)
         lanes = self.layout.lanes
@@ -201,7 +208,7 @@ class KernelExecutor:
             self.compile_time = time.perf_counter() - started
         steps = self._steps
         running = [self._pool.submit(_step_block, program, steps, b, split.shared) for b in blocks]
-        return lambda: _concluded(running)
+        return Running(lambda: _concluded(running), lambda: _cancel(running))
 
 
 def _step_block(
@@ -226,6 +233,11 @@ def _step_block(
 @partial(jax.vmap, in_axes=(-1, -1, -1))
 def _conclude(outline: Any, code: Any, state: Any) -> Result:
     return conclude(outline, code, state)
+
+
+def _cancel(running: list[Future]) -> None:
+    for future in running:
+        future.cancel()
 
 
 def _concluded(running: list[Future]) -> Result:

@@ -2,7 +2,8 @@
 
 `sweep.json` says what is being run and by which code; each chunk is one file in `chunks/`, whose
 name holds the hash of its bytes, so that a half-written or damaged one is recognised; at the end
-`results.h5` joins them and they go. A lock keeps a second process out.
+`results.h5`, whose hash is in `sweep.json`, joins them and they go. A lock keeps a second process
+out.
 """
 
 from __future__ import annotations
@@ -26,6 +27,10 @@ from studies.errors import StudyError
 from studies.store import Variable, replacing, write_store
 
 RESULTS, MANIFEST, CHUNKS, LOCK = "results.h5", "sweep.json", "chunks", ".lock"
+#: The results before they get their name.
+JOINED = ".joined.h5"
+#: What an end at a bad moment may leave behind.
+_LEFTOVER = re.compile(r"\.joined\.h5|\.(joined\.h5|sweep\.json)\.[0-9a-f]{8}\.tmp")
 _CHUNK = re.compile(r"(\d{6,})-([0-9a-f]{16})\.h5")
 _SOURCES = Path(__file__).parents[2]
 
@@ -59,9 +64,9 @@ class SweepFolder:
         Raises:
             StudyError: the disk is full or cannot be written to; nothing half-written stays.
         """
-        self.chunks.mkdir(exist_ok=True)
         temporary = self.chunks / "unfinished.tmp"
         try:
+            self.chunks.mkdir(exist_ok=True)
             write_store(temporary, variables, {})
             number = 1 + max((n for n, _ in _chunk_files(self.chunks)), default=-1)
             os.replace(temporary, self.chunks / f"{number:06d}-{file_hash(temporary)}.h5")
@@ -71,8 +76,32 @@ class SweepFolder:
         finally:
             temporary.unlink(missing_ok=True)
 
-    def remove_chunks(self) -> None:
-        """Remove the chunks that `results.h5` holds now."""
+    def begin(self, manifest: dict[str, Any]) -> None:
+        """From here on the folder holds this sweep, or the one that was there extended to it."""
+        old = read_manifest(self.path) if (self.path / MANIFEST).is_file() else {}
+        self._write_manifest({**manifest, "results": old.get("results", [])})
+
+    def publish(self) -> None:
+        """Give the joined file its name; chunks that it holds go."""
+        joined = self.path / JOINED
+        manifest = read_manifest(self.path)
+        try:
+            # both hashes are good until the new file is in place
+            manifest["results"] = [*manifest.get("results", [])[-1:], file_hash(joined)]
+            self._write_manifest(manifest)
+            os.replace(joined, self.results)
+            _sync(self.path)
+            self._remove_chunks()
+        except OSError as error:
+            raise StudyError(f"{self.results}: cannot write it ({error})") from error
+
+    def _write_manifest(self, manifest: dict[str, Any]) -> None:
+        text, path = json.dumps(manifest, indent=1), self.path / MANIFEST
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            with replacing(path) as temporary:
+                temporary.write_text(text, encoding="utf-8")
+
+    def _remove_chunks(self) -> None:
         for _, path in _chunk_files(self.chunks):
             path.unlink()
         if self.chunks.is_dir() and not any(self.chunks.iterdir()):
@@ -105,12 +134,9 @@ def open_folder(path: Path, manifest: dict[str, Any], is_resumed: bool) -> Itera
             raise StudyError(f"--out {path}: another process is running a sweep there") from None
         folder = SweepFolder(path)
         _check_content(folder, manifest, is_resumed)
-        for left in (*path.glob("*.tmp"), *path.glob(".*.tmp"), *path.glob(f"{CHUNKS}/*.tmp")):
-            left.unlink()
-        text = json.dumps(manifest, indent=1)
-        if not (path / MANIFEST).is_file() or (path / MANIFEST).read_text() != text:
-            with replacing(path / MANIFEST) as temporary:
-                temporary.write_text(text)
+        for left in (*path.iterdir(), *path.glob(f"{CHUNKS}/*.tmp")):
+            if left.is_file() and (left.parent != path or _LEFTOVER.fullmatch(left.name)):
+                left.unlink()
         yield folder
 
 
@@ -133,8 +159,11 @@ def read_manifest(path: Path) -> dict[str, Any]:
     """
     try:
         manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
-        if not isinstance(manifest, dict) or "spec" not in manifest:
-            raise ValueError("no spec in it")
+        spec = manifest.get("spec") if isinstance(manifest, dict) else None
+        if not isinstance(spec, dict) or not isinstance(spec.get("sweep"), dict):
+            raise ValueError("no sweep in it")
+    except RecursionError:
+        raise StudyError(f"{path / MANIFEST}: damaged (nested too deeply)") from None
     except OSError:
         raise StudyError(f"{path}: no folder of a sweep ({MANIFEST} is missing)") from None
     except ValueError as error:
@@ -147,7 +176,8 @@ def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bo
     if not (folder.path / MANIFEST).exists():
         if is_resumed:
             raise StudyError(f"--resume: {folder.path} holds no sweep; leave --resume out")
-        others = [p.name for p in folder.path.iterdir() if p.name != LOCK and p.suffix != ".tmp"]
+        names = [p.name for p in folder.path.iterdir() if p.name != LOCK]
+        others = [name for name in names if not _LEFTOVER.fullmatch(name)]
         if others:
             raise StudyError(
                 f"--out {folder.path}: holds other files ({', '.join(sorted(others)[:3])}); "
@@ -185,6 +215,7 @@ def finished_cases(path: Path, tell: Any = None) -> Finished:
         path: the sweep's folder.
         tell: called with a text for every damaged file; None: leave it where it is.
     """
+    check_results(path)
     files = [path / RESULTS] if (path / RESULTS).is_file() else []
     for _, chunk in _chunk_files(path / CHUNKS):
         if file_hash(chunk) == _CHUNK.fullmatch(chunk.name)[2]:  # type: ignore[index]
@@ -215,6 +246,16 @@ def finished_cases(path: Path, tell: Any = None) -> Finished:
     return Finished(case_id, np.concatenate(sources)[first], np.concatenate(rows)[first], kept)
 
 
+def check_results(path: Path) -> None:
+    """Raise StudyError where `results.h5` is not what this sweep wrote."""
+    results = path / RESULTS
+    if results.is_file() and file_hash(results) not in read_manifest(path).get("results", []):
+        raise StudyError(
+            f"{results}: damaged, or not of this sweep; put the right one back, or remove it "
+            "and run its cases again with --resume"
+        )
+
+
 def file_hash(path: Path) -> str:
     """First 16 digits of a file's SHA-256."""
     with open(path, "rb") as file:
@@ -240,8 +281,8 @@ def code_digest() -> str:
     """Hash of the sources that decide a case's numbers."""
     digest = sha256()
     names = (
-        "cases.py", "fields.py", "kernel.py", "spec.py", "sweeps/executor.py", "sweeps/plan.py",
-        "sweeps/table.py",
+        "cases.py", "fields.py", "fusion.py", "graph.py", "kernel.py", "spec.py",
+        "sweeps/executor.py", "sweeps/plan.py", "sweeps/table.py",
     )  # fmt: skip
     sources = sorted((_SOURCES / "jaxmodel").glob("*.py"))
     for path in (*sources, *(_SOURCES / "studies" / name for name in names)):

@@ -15,7 +15,8 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.prepare import STIFFNESS_LIMIT, drive_rate
 from studies.cases import build_cases, build_structure
 from studies.errors import StudyError
-from studies.runs import SUBSTEP_LIMIT, mechanics_at
+from studies.fields import Fields
+from studies.runs import SUBSTEP_LIMIT, mechanics_at, step_counts
 from studies.sweeps.table import Table, loose_study
 
 #: Fields that change the program; each combination of their values is compiled by itself.
@@ -23,6 +24,7 @@ STATIC = (
     "link.basis", "control.basis", "control.feedback", "control.law", "drive.kind",
     "run.substeps", "run.smooth", "run.duration", "electronics.sample_rate_hz",
 )  # fmt: skip
+_POSITION = "control.position_gain"
 #: More programs than this are refused.
 PROGRAM_LIMIT = 32
 #: Cases side by side on one device: enough to fill vectors, few enough to stay in its cache.
@@ -97,10 +99,13 @@ def plan_groups(
         wanted = rows[np.isin(rows, members)]
         if len(wanted) == 0:
             continue
-        structure, stiff = _with_substeps(table, structure, members)
-        is_too_stiff = stiff[np.searchsorted(members, wanted)]
-        layout = _layout(len(wanted), structure, devices)
-        groups.append(Group(structure, wanted, is_too_stiff, layout))
+        counts, is_too_stiff = _plant_steps(table, structure, members)
+        place = np.searchsorted(members, wanted)
+        for count in np.unique(counts[place]):
+            chosen = counts[place] == count
+            stepped = structure._replace(substeps=int(count))
+            layout = _layout(int(chosen.sum()), stepped, devices)
+            groups.append(Group(stepped, wanted[chosen], is_too_stiff[place][chosen], layout))
     return groups
 
 
@@ -126,6 +131,7 @@ def _structure(table: Table, members: np.ndarray) -> Structure:
         n_controlled=min(int(column("control.modes").max()), one.n_patches),
         has_noise=bool(noisy) or one.is_smooth,
         has_friction=bool((column("drive.coulomb_friction") > 0).any()),
+        has_position_gain=bool(np.any(Fields(table.study, table.fields).numbers(_POSITION) != 0)),
     )
 
 
@@ -162,10 +168,10 @@ def _mechanics(structure: Structure, cases: Case) -> Any:
     return jax.vmap(one)(cases)
 
 
-def _with_substeps(
+def _plant_steps(
     table: Table, structure: Structure, members: np.ndarray
-) -> tuple[Structure, np.ndarray]:
-    """One number of plant steps per sample for all cases that can be run, and which cannot."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Plant steps per sample of each case, and which cases no allowed number carries."""
     rate = _drive_rates(table, structure, members)
     if structure.feedback == "ideal":
         rate = np.maximum(rate, _pole_decay(table, structure, members))
@@ -173,9 +179,8 @@ def _with_substeps(
     needed = np.maximum(np.ceil(rate * period / STIFFNESS_LIMIT), 1)
     given = int(table.values("run.substeps")[members[0]])
     is_too_stiff = needed > (given or SUBSTEP_LIMIT)
-    fitting = needed[~is_too_stiff]
-    most = int(fitting.max()) if len(fitting) else 1
-    return structure._replace(substeps=given or most), is_too_stiff
+    counts = np.full(len(members), given) if given else step_counts(needed)
+    return np.where(is_too_stiff, given or 1, counts), is_too_stiff
 
 
 #: Columns that `drive_rate` depends on.

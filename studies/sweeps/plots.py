@@ -56,6 +56,11 @@ def plot(data: SweepData, x: str | None, y: str, hue: str | None) -> Figure:
     with figures.styled():
         figure = Figure(figsize=(5.2, 3.6), layout="constrained")
         ax = figure.subplots()
+        n_left = int(np.sum(~chosen))
+        if n_left:
+            ax.set_title(
+                f"{n_left} of {len(chosen)} cases not ok, left out", fontsize=7.5, loc="left"
+            )
         ax.set_xlabel(label(data, x))
         if group is not None and _is_grid(across, group):
             _heat_map(figure, ax, across, group, value[chosen], label(data, y))
@@ -95,18 +100,30 @@ def _heat_map(
 ) -> None:
     columns, i = np.unique(a, return_inverse=True)
     rows, j = np.unique(b, return_inverse=True)
-    total, count = np.zeros((2, len(rows), len(columns)))
-    np.add.at(total, (j, i), value)
-    np.add.at(count, (j, i), 1)
-    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    middle = np.full((len(rows), len(columns)), np.nan)
+    cell = j * len(columns) + i
+    order = np.argsort(cell, kind="stable")
+    numbers, start = np.unique(cell[order], return_index=True)
+    for number, values in zip(numbers, np.split(value[order], start[1:]), strict=True):
+        middle.flat[number] = np.median(values)
     scale = "log" if _is_wide(value) else "linear"
     mesh = ax.pcolormesh(
-        columns, rows, mean, cmap=MAP, norm=scale, shading="nearest", rasterized=True
+        _edges(columns), _edges(rows), middle, cmap=MAP, norm=scale, rasterized=True
     )
-    figure.colorbar(mesh, ax=ax, label=text)
+    several = "median of " if len(value) > len(numbers) else ""
+    figure.colorbar(mesh, ax=ax, label=several + text)
     ax.set_xscale("log" if _is_geometric(columns) else "linear")
     ax.set_yscale("log" if _is_geometric(rows) else "linear")
     ax.grid(False)
+
+
+def _edges(middles: np.ndarray) -> np.ndarray:
+    """Borders of cells around sorted numbers, on the scale they are drawn on."""
+    if _is_geometric(middles):
+        return np.exp(_edges(np.log(middles)))
+    inner = (middles[1:] + middles[:-1]) / 2
+    ends = 2 * middles[0] - inner[0], 2 * middles[-1] - inner[-1]
+    return np.concatenate([ends[:1], inner, ends[1:]])
 
 
 def _is_wide(value: np.ndarray) -> bool:
@@ -125,32 +142,45 @@ def _is_geometric(values: np.ndarray) -> bool:
 def _lines(
     ax: Axes, across: np.ndarray, value: np.ndarray, group: np.ndarray | None, hue: str | None
 ) -> None:
-    groups = [None] if group is None else list(np.unique(group))
+    groups = [None] if group is None else _distinct(group)
     if len(groups) > 12:
         groups = [groups[k] for k in np.linspace(0, len(groups) - 1, 12).astype(int)]
     for k, name in enumerate(groups):
         part = np.ones(len(across), bool) if group is None else group == name
-        at, index = np.unique(across[part], return_inverse=True)
-        inside = [value[part][index == m] for m in range(len(at))]
+        is_text = across.dtype.kind in "UOb"
+        wanted = np.array(_distinct(across))  # texts in the order of the file, on one axis
+        at = np.array([x for x in wanted if np.any(across[part] == x)])
+        inside = [value[part][across[part] == x] for x in at]
         middle = [np.median(v) for v in inside]
-        position = np.arange(len(at)) if at.dtype.kind in "UOb" else at
+        position = np.flatnonzero(np.isin(wanted, at)) if is_text else at
         style: dict[str, Any] = {
             "color": figures.SERIES[k % len(figures.SERIES)],
             "linestyle": figures.DASHES[(k // len(figures.SERIES)) % len(figures.DASHES)],
         }
+        if is_text:
+            style["linestyle"] = "none"
         text = None if name is None else f"{hue} = {_short(name)}"
         ax.plot(position, middle, marker="o", markersize=3, label=text, **style)
         if any(len(v) > 1 for v in inside):
             low, high = [np.min(v) for v in inside], [np.max(v) for v in inside]
-            ax.fill_between(position, low, high, color=style["color"], alpha=0.1, linewidth=0)
-            ax.set_title("median; shaded: smallest to largest", fontsize=7.5, loc="right")
-        if at.dtype.kind in "UOb":
-            ax.set_xticks(position, [str(v) for v in at], rotation=30, ha="right")
+            if is_text:
+                ax.vlines(position, low, high, color=style["color"], alpha=0.3)
+            else:
+                ax.fill_between(position, low, high, color=style["color"], alpha=0.1, linewidth=0)
+            ax.set_title("median, smallest to largest", fontsize=7.5, loc="right")
+        if is_text:
+            ax.set_xticks(range(len(wanted)), [str(v) for v in wanted], rotation=30, ha="right")
     if group is not None:
         ax.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     ax.set_yscale("log" if _is_wide(value) else "linear")
     if _is_geometric(np.unique(across)):
         ax.set_xscale("log")
+
+
+def _distinct(values: np.ndarray) -> list[Any]:
+    """Different values: numbers sorted, texts in the order of their first appearance."""
+    found, first = np.unique(values, return_index=True)
+    return list(found if values.dtype.kind in "fi" else values[np.sort(first)])
 
 
 def _short(value: object) -> str:
@@ -225,8 +255,9 @@ def _placements(data: SweepData, y: str) -> Figure:
     others = [name for name in swept_names(data) if name != "patches_centers"]
     unit = 1e3
     with figures.styled():
-        figure = Figure(figsize=(7.4, 5.6), layout="constrained")
+        figure = Figure(figsize=(11.0 if others else 7.4, 5.6), layout="constrained")
         top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.2, 1))
+        texts = []
         for row, case in enumerate(chosen):
             top.plot([0, link.length * unit], [row, row], color="#AAAAAA", linewidth=1)
             for center in centers[case]:
@@ -237,14 +268,17 @@ def _placements(data: SweepData, y: str) -> Figure:
                     left = (center - length / 2) * unit
                     top.barh(row, length * unit, height, left, color=color, linewidth=0)
             also = "".join(f", {name} = {shown_value(data, name, case)}" for name in others)
-            text = f"case {case}: {value[case]:.3g}{also}"
-            top.annotate(text, (link.length * unit * 1.01, row), fontsize=7, va="center")
+            texts.append(f"case {case}: {value[case]:.3g}{also}")
         top.set_ylim(len(chosen) - 0.4, -0.6)
-        top.set_xlim(0, link.length * unit * 1.25)
+        top.set_xlim(0, link.length * unit)
         top.set_ylabel("best placements")
-        top.set_yticks([])
+        top.yaxis.tick_right()
+        top.set_yticks(range(len(chosen)), texts, fontsize=7)
+        top.tick_params(axis="y", length=0)
         top.grid(False)
-        top.set_title(f"smallest {label(data, y)}; blue: actuator, orange: sensor", fontsize=8.5)
+        top.set_title(
+            f"smallest {label(data, y)}; blue: actuator, orange: sensor", fontsize=8.5, loc="left"
+        )
         for k in range(centers.shape[1]):
             color = figures.SERIES[k % len(figures.SERIES)]
             bottom.scatter(

@@ -21,9 +21,17 @@ from studies.explain import unit_of
 from studies.fields import field_value, parse_entry
 from studies.runs import METRIC_LABELS, STATUS_LABEL
 from studies.spec import Study
-from studies.store import Streamed, Variable, read_store, write_store
+from studies.store import Streamed, Variable, read_store, variable_labels, write_store
 from studies.sweeps.axes import LABELS, SHOWN_AS, known_field
-from studies.sweeps.folder import CHUNKS, RESULTS, Finished, finished_cases, read_manifest
+from studies.sweeps.folder import (
+    CHUNKS,
+    JOINED,
+    RESULTS,
+    Finished,
+    check_results,
+    finished_cases,
+    read_manifest,
+)
 from studies.sweeps.spec import SweepSpec, parse_sweep
 from studies.sweeps.table import Table, as_numbers, build_table
 
@@ -33,8 +41,9 @@ NOT_RUN = -1
 _LIST_AXES = {
     "patches.centers": ("link", "patch"),
     "control.links": ("link",),
-    "control.mode_mask": ("link", "controlled_mode"),
-    "control.ratios": ("link", "controlled_mode"),
+    # lists of their own lengths
+    "control.mode_mask": ("link", "mode_mask_entry"),
+    "control.ratios": ("link", "ratios_entry"),
     "control.velocity_gain": ("link",),
     "control.position_gain": ("link",),
     "drive.pulse_force": ("slider_axis",),
@@ -219,10 +228,7 @@ class SweepData:
         except ImportError:
             raise StudyError("xarray is missing: install flexlink-studies[xarray]") from None
         return xarray.Dataset(
-            {
-                name: (v.dims, v.data, {"units": v.units, "long_name": v.long_name})
-                for name, v in self.variables.items()
-            },
+            {name: (v.dims, v.data, variable_labels(v)) for name, v in self.variables.items()},
             attrs=self.attributes,
         )
 
@@ -244,10 +250,13 @@ def load(path: str | Path) -> SweepData:
         StudyError: no sweep there, or a damaged file.
     """
     folder = Path(path)
-    spec = parse_sweep(read_manifest(folder)["spec"])
+    written = read_manifest(folder)["spec"]
+    spec = parse_sweep(written)
     if (folder / RESULTS).is_file() and not any((folder / CHUNKS).glob("*.h5")):
+        check_results(folder)
         variables, attributes = read_store(folder / RESULTS)
-        return SweepData(variables, attributes, spec)
+        if json.loads(attributes["spec"]) == written:  # else an extension has begun
+            return SweepData(variables, attributes, spec)
     table = build_table(spec)
     gathered = gather(table, finished_cases(folder))
     sizes = _sizes(gathered)
@@ -355,6 +364,8 @@ def _entry(variable: Variable, name: str, indices: tuple[int, ...], candidate: s
         array = array[:, index]
     if array.ndim == 1:
         return array
+    if candidate not in metric_names():
+        raise StudyError(f"{name!r}: a list; name one entry of it, such as {name}[0]")
     flat = array.reshape(len(array), -1)
     if flat.dtype.kind != "f":
         return flat.max(axis=1)
@@ -371,7 +382,7 @@ def manifest_attributes(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def merge(folder: Path, table: Table, finished: Finished, attributes: dict[str, Any]) -> None:
-    """Join all finished cases in `results.h5`, file by file, so that memory stays small.
+    """Join all finished cases in one file, file by file, so that memory stays small.
 
     Args:
         folder: the sweep's folder.
@@ -407,7 +418,7 @@ def merge(folder: Path, table: Table, finished: Finished, attributes: dict[str, 
             )  # fmt: skip
             variables[name] = Variable(streamed, ("case", *dims), *label)
     variables |= axis_variables(table, _sizes(variables))
-    write_store(folder / RESULTS, variables, attributes)
+    write_store(folder / JOINED, variables, attributes)
 
 
 def _positions(table: Table, finished: Finished) -> tuple[np.ndarray, np.ndarray]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,12 +16,11 @@ import numpy as np
 from rich.console import Console
 
 from jaxmodel.case import Case
-from jaxmodel.simulate import Result
 from studies import config
 from studies.cases import powered
 from studies.errors import StudyError
 from studies.runs import with_ratio
-from studies.sweeps.executor import Executor, make_executor, own_ratios
+from studies.sweeps.executor import Executor, Running, make_executor, own_ratios
 from studies.sweeps.folder import (
     SweepFolder,
     finished_cases,
@@ -50,22 +50,29 @@ class Plan(NamedTuple):
 
     table: Table
     groups: list[Group]
+    n_before: int  # cases that are done already
 
 
-def make_plan(spec: SweepSpec) -> Plan:
-    """Cases of a sweep, grouped by program.
+def make_plan(spec: SweepSpec, out: Path | None = None) -> Plan:
+    """Cases of a sweep that are still to run, grouped by program.
 
     Args:
         spec: the sweep.
+        out: folder with a part of them, if it is to be resumed.
 
     Raises:
-        StudyError: a fault of the sweep.
+        StudyError: a fault of the sweep, or one that does not fit the folder.
     """
     config.require_configured()
     kept_metrics(spec)
     table = build_table(spec)
-    every = np.arange(len(table))
-    return Plan(table, plan_groups(table, every, len(jax.local_devices()), spec.sweep.metrics))
+    rows = np.arange(len(table))
+    if out is not None:
+        done = finished_cases(out).case_id
+        _check_fit(table, done, out)
+        rows = np.flatnonzero(~np.isin(table.case_id, done))
+    groups = plan_groups(table, rows, len(jax.local_devices()), spec.sweep.metrics)
+    return Plan(table, groups, len(table) - len(rows))
 
 
 def run_sweep(
@@ -98,6 +105,7 @@ def run_sweep(
     with open_folder(out, manifest, is_resumed) as folder:
         finished = finished_cases(out, lambda text: console.print(text, soft_wrap=True))
         _check_fit(table, finished.case_id, out)
+        folder.begin(manifest)
         rows = np.flatnonzero(~np.isin(table.case_id, finished.case_id))
         groups = plan_groups(table, rows, len(jax.local_devices()), spec.sweep.metrics)
         n_before = len(table) - len(rows)
@@ -106,10 +114,11 @@ def run_sweep(
             is_interrupted = _run_groups(table, groups, kept, folder, reporter, stop)
             if not is_interrupted:
                 finished = finished_cases(out)
+                _check_whole(table, finished.case_id, out)
                 attributes = {"title": spec.study.title, **manifest_attributes(manifest)}
                 timings = {"compile_time": reporter.compile_time, "run_time": reporter.run_time}
                 merge(out, table, finished, attributes | timings)
-                folder.remove_chunks()
+                folder.publish()
         return Outcome(
             table, reporter.done, reporter.n_run, reporter.compile_time, reporter.run_time,
             is_interrupted,
@@ -140,6 +149,16 @@ def _check_fit(table: Table, done: np.ndarray, out: Path) -> None:
         )
 
 
+def _check_whole(table: Table, done: np.ndarray, out: Path) -> None:
+    """Somebody may have removed chunks while the sweep ran."""
+    lost = int(np.sum(~np.isin(table.case_id, done)))
+    if lost:
+        raise StudyError(
+            f"{out}: chunks with {lost} of {len(table)} cases disappeared while the sweep ran; "
+            "run them again with --resume"
+        )
+
+
 def _run_groups(
     table: Table,
     groups: list[Group],
@@ -154,11 +173,9 @@ def _run_groups(
         is_own = source[group.rows] == "own_run"
         executor = make_executor(group.structure, group.layout, bool(is_own.any()))
         substeps = group.structure.substeps
-        pending: tuple[np.ndarray, np.ndarray, Callable[[], Result]] | None = None
+        pending: tuple[np.ndarray, np.ndarray, Running] | None = None
         position = 0
         for rows in group.chunks():
-            if stop.is_set():
-                break
             cases = chunk_cases(table, rows, group.structure, group.layout.size)
             is_first = executor.compile_time == 0
             started = start_chunk(executor, table, rows, cases, bool(is_own.any()))
@@ -170,7 +187,12 @@ def _run_groups(
             if pending is not None:
                 _finish(table, pending, substeps, kept, folder, reporter)
             pending = (rows, stiff, started)
+            if stop.is_set():
+                break
         if pending is not None:
+            if stop.is_set() and reporter.n_run:  # the chunk before is safe, this one just begun
+                pending[2].cancel()
+                return True
             _finish(table, pending, substeps, kept, folder, reporter)
         if stop.is_set():
             return reporter.done < reporter.total
@@ -179,7 +201,7 @@ def _run_groups(
 
 def start_chunk(
     executor: Executor, table: Table, rows: np.ndarray, cases: Case, has_own_ratio: bool
-) -> Callable[[], Result]:
+) -> Running:
     """Start a chunk, after its uncontrolled pass where gain ratios come from that.
 
     Args:
@@ -190,7 +212,7 @@ def start_chunk(
         has_own_ratio: whether such a pass is needed.
 
     Returns:
-        Function that waits for the result.
+        Running.
     """
     if has_own_ratio:
         size = max(map(len, jax.tree.leaves(cases)))
@@ -203,11 +225,11 @@ def start_chunk(
 
 
 def _finish(
-    table: Table, pending: tuple[Any, Any, Callable[[], Result]], substeps: int, kept: list[str],
+    table: Table, pending: tuple[Any, Any, Running], substeps: int, kept: list[str],
     folder: SweepFolder, reporter: Reporter,
 ) -> None:  # fmt: skip
-    rows, stiff, wait = pending
-    variables = chunk_variables(table, rows, wait(), stiff, substeps, kept)
+    rows, stiff, running = pending
+    variables = chunk_variables(table, rows, running.wait(), stiff, substeps, kept)
     folder.write_chunk(variables)
     reporter.chunk(variables["status"].data)
 
@@ -223,6 +245,7 @@ def _interrupts() -> Iterator[threading.Event]:
     def ask(*_: object) -> None:
         stop.set()
         signal.signal(signal.SIGINT, before)
+        print("studies: stopping after this chunk; Ctrl-C again: at once", file=sys.stderr)
 
     before = signal.signal(signal.SIGINT, ask)
     try:
@@ -246,9 +269,9 @@ def calibrate(plan: Plan) -> Estimate:
     executor = make_executor(group.structure, group.layout, has_own)
     rows = group.chunks()[0]
     cases = chunk_cases(plan.table, rows, group.structure, group.layout.size)
-    start_chunk(executor, plan.table, rows, cases, has_own)()
+    start_chunk(executor, plan.table, rows, cases, has_own).wait()
     began = time.perf_counter()
-    start_chunk(executor, plan.table, rows, cases, has_own)()
+    start_chunk(executor, plan.table, rows, cases, has_own).wait()
     chunk_time = time.perf_counter() - began
     per_step = chunk_time / (group.layout.size * group.structure.n_steps * group.structure.substeps)
     running = sum(

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import ks_2samp
+from scipy.stats import chi2_contingency, ks_2samp
 
 from jaxmodel import status
 from studies.errors import StudyError
@@ -136,8 +136,8 @@ class Cause(NamedTuple):
     name: str
     distance: float  # between its distributions in failed and in ok cases (Kolmogorov-Smirnov)
     p_value: float
-    low_rate: float  # share of failures where it is in its lowest quarter [1]
-    high_rate: float  # in its highest quarter [1]
+    low: tuple[float, str]  # share of failures in its lowest quarter, a choice: at best; where
+    high: tuple[float, str]  # in its highest quarter, a choice: at worst; where
 
 
 def failure_causes(data: SweepData) -> list[Cause]:
@@ -156,32 +156,52 @@ def failure_causes(data: SweepData) -> list[Cause]:
         value = column[is_run]
         if len(np.unique(value)) < 2:
             continue
+        if value.dtype.kind in "UO":
+            causes.append(_cause_of_choice(name, value.astype(str), is_failed))
+            continue
         test = ks_2samp(value[is_failed], value[~is_failed])
-        low, high = np.quantile(value, (0.25, 0.75))
-        causes.append(
-            Cause(
-                name,
-                float(test.statistic),
-                float(test.pvalue),
-                float(is_failed[value <= low].mean()),
-                float(is_failed[value >= high].mean()),
-            )  # fmt: skip
+        ends = np.quantile(value, (0.25, 0.75))
+        rates = is_failed[value <= ends[0]].mean(), is_failed[value >= ends[1]].mean()
+        low, high = (
+            (float(rate), f"{sign} {end:.4g}")
+            for rate, end, sign in zip(rates, ends, ("<=", ">="), strict=True)
         )
+        causes.append(Cause(name, float(test.statistic), float(test.pvalue), low, high))
     return sorted(causes, key=lambda cause: -cause.distance)
 
 
+def _cause_of_choice(name: str, value: np.ndarray, is_failed: np.ndarray) -> Cause:
+    """The same for texts: total variation instead of the Kolmogorov distance, chi-squared test."""
+    names, which = np.unique(value, return_inverse=True)
+    bad = np.bincount(which, is_failed, len(names))
+    good = np.bincount(which, ~is_failed, len(names))
+    rate = bad / (bad + good)
+    distance = np.abs(bad / bad.sum() - good / good.sum()).sum() / 2
+    best, worst = int(np.argmin(rate)), int(np.argmax(rate))
+    return Cause(
+        name,
+        float(distance),
+        float(chi2_contingency(np.stack([bad, good])).pvalue),
+        (float(rate[best]), str(names[best])),
+        (float(rate[worst]), str(names[worst])),
+    )
+
+
 def _scalar_columns(data: SweepData) -> list[tuple[str, np.ndarray]]:
-    """Numeric axes one number at a time; texts as their order."""
+    """Axes one number, or one text, at a time."""
     found = []
     for name in swept_names(data):
         array = data[name]
         if array.dtype.kind in "UO":
-            array = np.unique(array.astype(str), return_inverse=True)[1]
+            found.append((name, array))
+            continue
         flat = array.reshape(len(array), -1).astype(float)
         for k in range(flat.shape[1]):
             index = np.unravel_index(k, array.shape[1:])
             entry = "".join(f"[{i}]" for i in index) if array.ndim > 1 else ""
-            found.append((name + entry, flat[:, k]))
+            column = flat[:, k]
+            if not np.isnan(column).any():  # lists of different lengths have gaps
+                found.append((name + entry, column))
     return found
 
 

@@ -21,6 +21,8 @@ from studies.sweeps.sensitivity import failure_causes
 DEFAULT_METRIC = "residual_rms"
 #: Digits of a case's id that tables show.
 ID_DIGITS = 8
+#: Rows of a table of failed cases.
+LONGEST_TABLE = 100
 
 
 def reason(code: int) -> str:
@@ -76,7 +78,7 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
     for code, count in sorted(counts.items(), key=lambda item: -item[1]):
         table.add_row(reason(code), str(count), f"{100 * count / n:.1f}")
     console.print(table)
-    if DEFAULT_METRIC in data.variables and data.is_finished.any():
+    if DEFAULT_METRIC in data.variables and (codes == status.OK).any():
         console.print(f"best cases by {DEFAULT_METRIC}, worst link and station:")
         print_cases(data, best_cases(data, DEFAULT_METRIC), [DEFAULT_METRIC], console)
 
@@ -88,11 +90,16 @@ def _print_failed(data: SweepData, codes: np.ndarray, console: Console) -> None:
         return
     names = swept_names(data)
     table = RichTable("case", "id", "status", "from [s]", *names)
-    for k in failed:
+    for k in failed[:LONGEST_TABLE]:
         cells = [shown_value(data, name, int(k)) for name in names]
-        time = f"{data['bad_time'][k]:.4g}"
+        is_whole = codes[k] in status.FINISHED  # it ran to its end
+        time = "" if is_whole else f"{data['bad_time'][k]:.4g}"
         table.add_row(str(k), short_id(data, int(k)), reason(int(codes[k])), time, *cells)
     console.print(table)
+    if len(failed) > LONGEST_TABLE:
+        console.print(
+            f"and {len(failed) - LONGEST_TABLE} more; all of them: studies.load in Python"
+        )
 
 
 def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console: Console) -> None:
@@ -152,14 +159,13 @@ def print_plan(plan: Plan, console: Console) -> None:
     """What a sweep would run, a sample case, and the time it takes, after a short calibration."""
     table = plan.table
     console.print(
-        f"{len(table)} cases ({table.n_dropped} left out by where, {table.n_double} doubles)"
+        f"{len(table)} cases ({table.n_dropped} left out by where, {table.n_double} doubles, "
+        f"{plan.n_before} done before)"
     )
-    axes = RichTable("axis", "values", "from", "to")
+    axes = RichTable("axis", "values", "smallest", "largest")
     for name, column in table.columns.items():
-        if column.ndim == 1 and column.dtype.kind in "fi":
-            span = [f"{column.min():.4g}", f"{column.max():.4g}"]
-        else:
-            span = [_short(column[0]), _short(column[-1])]
+        is_numeric = column.dtype.kind in "fi"
+        span = [f"{column.min():.4g}", f"{column.max():.4g}"] if is_numeric else ["", ""]
         axes.add_row(name, str(len(np.unique(column.astype(str), axis=0))), *span)
     console.print(axes)
     for group in plan.groups:
@@ -174,6 +180,9 @@ def print_plan(plan: Plan, console: Console) -> None:
     middle = len(table) // 2
     values = ", ".join(f"{name} = {_short(c[middle])}" for name, c in table.columns.items())
     console.print(f"sample: case {middle}, id {table.case_id[middle].decode()}: {values}")
+    if not plan.groups:
+        console.print("nothing left to run")
+        return
     found = calibrate(plan)
     console.print(
         f"estimate: {found.total:.0f} s, of which {found.compile_time * len(plan.groups):.0f} s "
@@ -187,11 +196,13 @@ def print_causes(data: SweepData, console: Console) -> None:
     causes = failure_causes(data)
     if not causes:
         return
-    console.print("what the failures depend on (share of failures where it is low and high):")
-    table = RichTable("parameter", "distance", "p", "lowest quarter", "highest quarter")
+    console.print(
+        "what the failures depend on (their share in the lowest and highest quarter of a number, "
+        "and at the best and worst value of a choice):",
+        soft_wrap=True,
+    )
+    table = RichTable("parameter", "distance", "p", "failures at its least", "at its most")
     for cause in causes[:8]:
-        table.add_row(
-            cause.name, f"{cause.distance:.2f}", f"{cause.p_value:.1g}",
-            f"{100 * cause.low_rate:.0f} %", f"{100 * cause.high_rate:.0f} %",
-        )  # fmt: skip
+        low, high = (f"{100 * rate:.0f} % ({at})" for rate, at in (cause.low, cause.high))
+        table.add_row(cause.name, f"{cause.distance:.2f}", f"{cause.p_value:.1g}", low, high)
     console.print(table)

@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from studies.errors import StudyError
+from studies.consistency import SAMPLE_LIMIT
+from studies.errors import StudyError, field_error
 from studies.fields import Columns, Fields, padded, parse_entry
 from studies.spec import Study, parse_study
-from studies.sweeps.axes import ALIASES, known_field, replaced, set_value
+from studies.sweeps.axes import ALIASES, LIMIT, known_field, replaced, set_value
 from studies.sweeps.condition import evaluate
 from studies.sweeps.designs import length, spread
 from studies.sweeps.spec import SweepSpec
@@ -70,6 +71,8 @@ def build_table(spec: SweepSpec) -> Table:
     """
     columns = spread(spec.root, spec.study, spec.sweep.seed)
     _check_shapes(columns)
+    _check_samples(spec.study, columns)
+    _check_moves(spec.study, columns)
     n = length(columns)
     kept = np.arange(n)
     if spec.sweep.where:
@@ -79,6 +82,10 @@ def build_table(spec: SweepSpec) -> Table:
     if len(kept) == 0:
         raise StudyError(f"sweep.where = {spec.sweep.where!r}: true for none of {n} cases")
     repeats = spec.sweep.repeats
+    if len(kept) * repeats > LIMIT:
+        raise field_error(
+            "sweep.repeats", repeats, f"at most {LIMIT // len(kept)} with {len(kept)} cases"
+        )
     index = np.repeat(kept, repeats)
     columns = {name: column[index] for name, column in columns.items()}
     repeat = np.tile(np.arange(repeats), len(kept))
@@ -108,6 +115,8 @@ def values(study: Study, columns: Columns, name: str) -> np.ndarray:
     if not entry.indices or isinstance(value, str):
         return np.array([value])
     array = Fields(study, columns).numbers(entry.field)
+    if array.ndim - 1 != len(entry.indices):
+        raise StudyError(f"{name}: a list in this sweep; name one entry of it, such as {name}[0]")
     chosen = np.moveaxis(array, 0, -1)[entry.indices]
     return chosen > 0 if isinstance(value, bool) else chosen
 
@@ -122,6 +131,34 @@ def _check_shapes(columns: Columns) -> None:
             kinds = {isinstance(value, tuple) for value in columns[name]}
             if len(kinds) > 1:
                 raise StudyError(f"{name}: numbers and lists mixed; use one of them")
+
+
+def _check_samples(study: Study, columns: Columns) -> None:
+    """Runs longer than a program can take."""
+    rate = Fields(study, columns).numbers("electronics.sample_rate_hz")
+    longest = float(np.max(Fields(study, columns).numbers("run.duration") * rate))
+    if longest > SAMPLE_LIMIT:
+        raise StudyError(
+            f"run.duration: a case with {longest:.3g} samples; allowed up to {SAMPLE_LIMIT}"
+        )
+
+
+def _check_moves(study: Study, columns: Columns) -> None:
+    """Times of moves that a case does not have, and locked sliders with a path."""
+    fields = Fields(study, columns)
+    count = np.sum(~np.isnan(fields.numbers("motion.waypoints")[..., 0]), axis=1)
+    for name in ("motion.move_time", "motion.dwell"):
+        times = fields.numbers(name)
+        if times.ndim == 2 and np.any(np.sum(~np.isnan(times), axis=1) != count - 1):
+            raise StudyError(
+                f"{name}: lists and motion.waypoints that do not fit in some cases; allowed: one "
+                "number, or as many as there are moves"
+            )
+    if np.any((fields.numbers("drive.locked") > 0) & (count > 1)):
+        raise StudyError(
+            "drive.locked: true in cases with more than one of motion.waypoints; locked sliders "
+            "follow no path"
+        )
 
 
 def case_study(table: Table, index: int) -> Study:
