@@ -53,6 +53,8 @@ WORKS: dict[str, dict[str, Any]] = {
     "W1": {"link__modes": 3},
     "W8": {"link__modes": 8},
 }
+#: Metrics they accumulate; all of them where not named.
+METRICS = {"W0": ("residual_rms",)}
 EXECUTORS: dict[str, Callable[..., Executor]] = {"kernel": KernelExecutor, "scan": ScanExecutor}
 #: Runs of which the median counts.
 REPEATS = 5
@@ -84,8 +86,7 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
     blocks = max(batch // (devices * lanes), 1) if batch else 2
     layout = Layout(devices, blocks, lanes)
     study = paper_study().change(**WORKS[work])
-    metrics = ("residual_rms",) if work == "W0" else ()
-    structure = build_structure(study)._replace(metrics=metrics)
+    structure = build_structure(study)._replace(metrics=METRICS.get(work, ()))
     gains = np.random.default_rng(0).uniform(0.01, 0.5, layout.size)
     cases = build_cases(study, {"control.gain_factor": gains}, structure)
     real = jax.dtypes.canonicalize_dtype(np.float64)

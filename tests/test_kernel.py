@@ -8,7 +8,10 @@ import pytest
 from jaxmodel import status
 from jaxmodel.trigonometry import sine_cosine
 from studies import kernel
-from studies.sweeps.executor import KernelExecutor, ScanExecutor, make_executor
+from studies.bench import METRICS, WORKS
+from studies.cases import build_cases, build_structure
+from studies.spec import paper_study
+from studies.sweeps.executor import TRACES, KernelExecutor, ScanExecutor, make_executor
 from studies.sweeps.plan import Layout, chunk_cases, plan_groups
 from studies.sweeps.table import build_table
 from tests.sweeps import MIXED, small_spec
@@ -139,3 +142,33 @@ def test_not_a_number_goes_through_limits():
 def test_unknown_operation_is_named():
     with pytest.raises(NotImplementedError, match="'cumsum'"):
         translated(lambda x, c: jnp.cumsum(x), (3,))
+
+
+# --- guards against slow code, which tests cannot time --------------------------------------------
+
+
+def operations_of(work):
+    """Operations of one sample of a workload, by kind."""
+    study = paper_study().change(**WORKS[work], run__duration=0.3)
+    structure = build_structure(study)._replace(metrics=METRICS.get(work, ()))
+    gains = np.linspace(0.1, 0.5, LAYOUT.size)
+    cases = build_cases(study, {"control.gain_factor": gains}, structure)
+    made = KernelExecutor(structure, LAYOUT, False)
+    before = len(TRACES)
+    made.start(cases).wait()
+    made.start(cases).wait()
+    assert len(TRACES) == before + 1  # compiled once for both chunks
+    return made.operations
+
+
+#: Operations, with some room, as docs/performance.md has them.
+MOST = {"W0": 2550, "W1": 3700}
+
+
+@pytest.mark.parametrize("work", MOST)
+def test_a_sample_takes_no_more_operations_than_it_should(work):
+    found = operations_of(work)
+    assert found.pop("read") < 700
+    assert 0.8 * MOST[work] < sum(found.values()) < MOST[work]
+    # four evaluations of the plant: a root and a reciprocal per link, three in the solution
+    assert found["sqrt"] == 12 and found["reciprocal"] == 24

@@ -1,7 +1,7 @@
 """Executors: how the cases of a chunk are run. All call the same physics.
 
 - `KernelExecutor`: the traced kernel of `studies.kernel` on all cores; CPU, needs the extra `fast`.
-- `ScanExecutor`: `lax.scan` under vmap, compiled by XLA; everywhere, and the reference.
+- `ScanExecutor`: `lax.scan` compiled by XLA; everywhere, and the reference.
 
 `make_executor` takes the fastest one that can do the job.
 """
@@ -9,18 +9,20 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.loop import step
-from jaxmodel.simulate import Result, Start, begin, conclude, simulate
+from jaxmodel.loop import Inputs, State, step
+from jaxmodel.simulate import Result, Start, begin, conclude
 from studies import kernel
 from studies.runs import uncontrolled, with_ratio
 from studies.sweeps.plan import Layout
@@ -103,7 +105,7 @@ def _joined(tree: Any, is_varying: tuple[bool, ...], varying: list, shared: list
     return jax.tree.unflatten(tree, [next(sources[varies]) for varies in is_varying])
 
 
-# --- XLA ------------------------------------------------------------------------------------------
+# --- before and after the steps, for both executors ----------------------------------------------
 
 
 class _Program(NamedTuple):
@@ -115,144 +117,12 @@ class _Program(NamedTuple):
     is_varying: tuple[bool, ...]
 
 
-@partial(jax.jit, static_argnums=0)
-def _run(program: _Program, varying: list, shared: list) -> Result:
-    """Results of a chunk; what its cases share goes in unbatched and is computed once for all."""
-    layout = program.layout
-    TRACES.append(program.structure)
-
-    def one(own: list, common: list) -> Result:
-        return simulate(program.structure, _joined(program.tree, program.is_varying, own, common))
-
-    def device(own: list, common: list) -> Result:
-        blocks = [x.reshape((layout.blocks, layout.lanes, *x.shape[1:])) for x in own]
-        done = jax.lax.map(lambda lanes: jax.vmap(one, (0, None))(lanes, common), blocks)
-        return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), done)
-
-    devices = np.array(jax.local_devices()[: layout.devices])
-    each, same = PartitionSpec("cases"), PartitionSpec()
-    return jax.shard_map(
-        device, mesh=Mesh(devices, ("cases",)), in_specs=(each, same), out_specs=each,
-        check_vma=False,
-    )(varying, shared)  # fmt: skip
-
-
-class ScanExecutor:
-    """The reference step in a scan, vectorised over lanes and sharded over devices by XLA."""
-
-    name = "XLA scan"
-
-    def __init__(self, structure: Structure, layout: Layout, has_own_ratio: bool) -> None:
-        self.structure, self.layout, self.has_own_ratio = structure, layout, has_own_ratio
-        self.compile_time = 0.0
-        self._compiled: Any = None
-
-    def start(self, cases: Case) -> Running:
-        split = _split(cases, self.layout, self.structure, self.has_own_ratio)
-        if self._compiled is None:
-            program = _Program(self.structure, self.layout, split.tree, split.is_varying)
-            started = time.perf_counter()
-            self._compiled = _run.lower(program, split.varying, split.shared).compile()
-            self.compile_time = time.perf_counter() - started
-        running = self._compiled(split.varying, split.shared)
-        return Running(lambda: jax.tree.map(np.asarray, running), lambda: None)
-
-
-# --- the traced kernel ----------------------------------------------------------------------------
-
-
 class _Parts(NamedTuple):
     """A Start leaf by leaf: which leaves vary from case to case, and their shapes."""
 
     tree: Any
     is_varying: tuple[bool, ...]
     shapes: tuple[tuple[int, ...], ...]  # of one case
-
-
-class _Steps(NamedTuple):
-    """Compiled for the numbers that all cases of a group share."""
-
-    parts: _Parts
-    shared: list[np.ndarray]  # leaves of a Start that do not vary
-    run: kernel.Kernel
-
-
-_STEPS: dict[tuple, _Steps] = {}
-#: Kernels kept in memory.
-KEPT_KERNELS = 8
-
-
-class KernelExecutor:
-    """Blocks of lanes on a pool of threads: XLA prepares them, the traced kernel steps them."""
-
-    name = "traced kernel"
-
-    def __init__(self, structure: Structure, layout: Layout, has_own_ratio: bool) -> None:
-        self.structure, self.layout, self.has_own_ratio = structure, layout, has_own_ratio
-        self.compile_time = 0.0
-        self._steps: _Steps | None = None
-        self._pool = ThreadPoolExecutor(layout.devices)
-
-    def start(self, cases: Case) -> Running:
-        split = _split(cases, self.layout, self.structure, self.has_own_ratio)
-        program = _Program(self.structure, self.layout, split.tree, split.is_varying)
-        lanes = self.layout.lanes
-        blocks = [
-            [leaf[k : k + lanes] for leaf in split.varying]
-            for k in range(0, self.layout.size, lanes)
-        ]
-        if self._steps is None:
-            started = time.perf_counter()
-            self._steps = _steps(program, split)
-            _prepare(program, self._steps.parts, blocks[0], split.shared)
-            self.compile_time = time.perf_counter() - started
-        steps = self._steps
-        running = [self._pool.submit(_step_block, program, steps, b, split.shared) for b in blocks]
-        return Running(lambda: _concluded(running), lambda: _cancel(running))
-
-
-def _step_block(
-    program: _Program, steps: _Steps, varying: list[np.ndarray], shared: list[np.ndarray]
-) -> Start:
-    """A Start whose state is that after the last step; state and outline lanes last."""
-    lanes, parts = program.layout.lanes, steps.parts
-    own = [np.asarray(x, order="C") for x in _prepare(program, parts, varying, shared)]
-    start: Start = _joined(parts.tree, parts.is_varying, own, steps.shared)  # type: ignore
-    varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
-    state = jax.tree.map(lambda x, v: _wide(x, v, lanes), start.state, varies.state)
-    outline = jax.tree.map(lambda x, v: _wide(x, v, lanes), start.outline, varies.outline)
-    code = state.status.copy()
-    loop = zip(jax.tree.leaves(start.loop), jax.tree.leaves(varies.loop), strict=True)
-    read = [leaf for leaf, is_read in loop if is_read]
-    leaves = [*read, *jax.tree.leaves((start.inputs, state))]
-    steps.run.run(leaves, program.structure.n_steps, lanes)
-    return Start((), code, state, outline)  # type: ignore[arg-type]
-
-
-@jax.jit
-@partial(jax.vmap, in_axes=(-1, -1, -1))
-def _conclude(outline: Any, code: Any, state: Any) -> Result:
-    return conclude(outline, code, state)
-
-
-def _cancel(running: list[Future]) -> None:
-    for future in running:
-        future.cancel()
-
-
-def _concluded(running: list[Future]) -> Result:
-    done = [future.result() for future in running]
-    whole = jax.tree.map(lambda *x: np.concatenate(x, axis=-1), *done)
-    return jax.tree.map(np.asarray, _conclude(whole.outline, whole.inputs, whole.state))
-
-
-def _wide(x: np.ndarray, is_varying: bool, lanes: int) -> np.ndarray:
-    """A copy with one value per lane, lanes last."""
-    wide = x if is_varying else np.broadcast_to(np.asarray(x)[..., None], (*np.shape(x), lanes))
-    return np.array(wide, order="C", copy=True)
-
-
-# --- what comes before the steps
 
 
 def _begin(program: _Program, own: list, common: list) -> Start:
@@ -293,7 +163,156 @@ def _dependence(jaxpr: Any, n_varying: int) -> tuple[bool, ...]:
     return tuple(not hasattr(out, "val") and out in depends for out in jaxpr.outvars)
 
 
-# --- the steps
+@jax.jit
+@partial(jax.vmap, in_axes=(-1, -1, -1))
+def _conclude(outline: Any, code: Any, state: Any) -> Result:
+    return conclude(outline, code, state)
+
+
+# --- XLA ------------------------------------------------------------------------------------------
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _run(program: _Program, parts: _Parts, varying: list, shared: list) -> Result:
+    """Results of a chunk; what its cases share is computed once for all."""
+    layout = program.layout
+    TRACES.append(program.structure)
+
+    def block(own: list, common: list) -> Result:
+        """Cases side by side in the last axis; XLA fuses little of a step under `vmap`."""
+        varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
+        chosen = jax.vmap(partial(_chosen, program, parts, True), (0, None), -1)(own, common)
+        same = _chosen(program, parts, False, [x[0] for x in own], common)
+        joined = _joined(parts.tree, parts.is_varying, chosen, [x[..., None] for x in same])
+        start: Start = joined  # type: ignore[assignment]
+
+        def whole(x: Any, is_wide: bool) -> Any:
+            return x if is_wide else jnp.broadcast_to(x, (*x.shape[:-1], layout.lanes))
+
+        state = jax.tree.map(whole, start.state, varies.state)
+        outline = jax.tree.map(whole, start.outline, varies.outline)
+
+        def body(at: State, inputs: Inputs) -> tuple[State, None]:
+            return step(program.structure, start.loop, at, inputs)[0], None
+
+        last, _ = jax.lax.scan(body, state, start.inputs)
+        return _conclude(outline, state.status, last)
+
+    def device(own: list, common: list) -> Result:
+        blocks = [x.reshape((layout.blocks, layout.lanes, *x.shape[1:])) for x in own]
+        done = jax.lax.map(lambda lanes: block(lanes, common), blocks)
+        return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), done)
+
+    devices = np.array(jax.local_devices()[: layout.devices])
+    each, all_same = PartitionSpec("cases"), PartitionSpec()
+    return jax.shard_map(
+        device, mesh=Mesh(devices, ("cases",)), in_specs=(each, all_same), out_specs=each,
+        check_vma=False,
+    )(varying, shared)  # fmt: skip
+
+
+class ScanExecutor:
+    """The reference step in a scan, vectorised over lanes and sharded over devices by XLA."""
+
+    name = "XLA scan"
+
+    def __init__(self, structure: Structure, layout: Layout, has_own_ratio: bool) -> None:
+        self.structure, self.layout, self.has_own_ratio = structure, layout, has_own_ratio
+        self.compile_time = 0.0
+        self._compiled: Any = None
+
+    def start(self, cases: Case) -> Running:
+        split = _split(cases, self.layout, self.structure, self.has_own_ratio)
+        if self._compiled is None:
+            program = _Program(self.structure, self.layout, split.tree, split.is_varying)
+            started = time.perf_counter()
+            parts = _find_parts(program, [leaf[0] for leaf in split.varying], split.shared)
+            self._compiled = _run.lower(program, parts, split.varying, split.shared).compile()
+            self.compile_time = time.perf_counter() - started
+        running = self._compiled(split.varying, split.shared)
+        return Running(lambda: jax.tree.map(np.asarray, running), lambda: None)
+
+
+# --- the traced kernel ----------------------------------------------------------------------------
+
+
+class _Steps(NamedTuple):
+    """Compiled for the numbers that all cases of a group share."""
+
+    parts: _Parts
+    shared: list[np.ndarray]  # leaves of a Start that do not vary
+    run: kernel.Kernel
+
+
+_STEPS: dict[tuple, _Steps] = {}
+#: Kernels kept in memory.
+KEPT_KERNELS = 8
+
+
+class KernelExecutor:
+    """Blocks of lanes on a pool of threads: XLA prepares them, the traced kernel steps them."""
+
+    name = "traced kernel"
+
+    def __init__(self, structure: Structure, layout: Layout, has_own_ratio: bool) -> None:
+        self.structure, self.layout, self.has_own_ratio = structure, layout, has_own_ratio
+        self.compile_time = 0.0
+        self.operations: Counter[str] = Counter()  # of one sample, by kind
+        self._steps: _Steps | None = None
+        self._pool = ThreadPoolExecutor(layout.devices)
+
+    def start(self, cases: Case) -> Running:
+        split = _split(cases, self.layout, self.structure, self.has_own_ratio)
+        program = _Program(self.structure, self.layout, split.tree, split.is_varying)
+        lanes = self.layout.lanes
+        blocks = [
+            [leaf[k : k + lanes] for leaf in split.varying]
+            for k in range(0, self.layout.size, lanes)
+        ]
+        if self._steps is None:
+            started = time.perf_counter()
+            self._steps = _steps(program, split)
+            _prepare(program, self._steps.parts, blocks[0], split.shared)
+            self.compile_time = time.perf_counter() - started
+        steps = self._steps
+        self.operations = steps.run.operations
+        running = [self._pool.submit(_step_block, program, steps, b, split.shared) for b in blocks]
+        return Running(lambda: _concluded(running), lambda: _cancel(running))
+
+
+def _step_block(
+    program: _Program, steps: _Steps, varying: list[np.ndarray], shared: list[np.ndarray]
+) -> Start:
+    """A Start whose state is that after the last step; state and outline lanes last."""
+    lanes, parts = program.layout.lanes, steps.parts
+    own = [np.asarray(x, order="C") for x in _prepare(program, parts, varying, shared)]
+    start: Start = _joined(parts.tree, parts.is_varying, own, steps.shared)  # type: ignore
+    varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
+    state = jax.tree.map(lambda x, v: _wide(x, v, lanes), start.state, varies.state)
+    outline = jax.tree.map(lambda x, v: _wide(x, v, lanes), start.outline, varies.outline)
+    code = state.status.copy()
+    loop = zip(jax.tree.leaves(start.loop), jax.tree.leaves(varies.loop), strict=True)
+    read = [leaf for leaf, is_read in loop if is_read]
+    leaves = [*read, *jax.tree.leaves((start.inputs, state))]
+    steps.run.run(leaves, program.structure.n_steps, lanes)
+    return Start((), code, state, outline)  # type: ignore[arg-type]
+
+
+def _cancel(running: list[Future]) -> None:
+    for future in running:
+        future.cancel()
+
+
+def _concluded(running: list[Future]) -> Result:
+    done = [future.result() for future in running]
+    whole = jax.tree.map(lambda *x: np.concatenate(x, axis=-1), *done)
+    return jax.tree.map(np.asarray, _conclude(whole.outline, whole.inputs, whole.state))
+
+
+def _wide(x: np.ndarray, is_varying: bool, lanes: int) -> np.ndarray:
+    """A copy with one value per lane, lanes last."""
+    wide = x if is_varying else np.broadcast_to(np.asarray(x)[..., None], (*np.shape(x), lanes))
+    return np.array(wide, order="C", copy=True)
 
 
 def _steps(program: _Program, split: _Split) -> _Steps:
