@@ -13,6 +13,8 @@ import jax
 import numpy as np
 from rich.console import Console
 
+from jaxmodel.case import Case, Structure
+from jaxmodel.simulate import Result
 from studies import config, kernel
 from studies.cases import build_cases, build_structure
 from studies.errors import StudyError, field_error
@@ -88,9 +90,9 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
     study = paper_study().change(**WORKS[work])
     structure = build_structure(study)._replace(metrics=METRICS.get(work, ()))
     gains = np.random.default_rng(0).uniform(0.01, 0.5, layout.size)
-    cases = build_cases(study, {"control.gain_factor": gains}, structure)
+    exact = build_cases(study, {"control.gain_factor": gains}, structure)
     real = jax.dtypes.canonicalize_dtype(np.float64)
-    cases = jax.tree.map(lambda x: x if x.dtype.kind == "i" else x.astype(real), cases)
+    cases = jax.tree.map(lambda x: x if x.dtype.kind == "i" else x.astype(real), exact)
     chosen = EXECUTORS[executor] if executor else None
     made = chosen(structure, layout, False) if chosen else make_executor(structure, layout, False)
     result = made.start(cases).wait()
@@ -100,7 +102,7 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
         result = made.start(cases).wait()
         times.append(time.perf_counter() - began)
     seconds = statistics.median(times)
-    return {
+    figures = {
         "work": work,
         "executor": made.name,
         "configs_per_s": round(layout.size / seconds, 1),
@@ -112,6 +114,21 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
         "batch": layout.size,
         "steps": structure.n_steps,
         "fingerprint": float(np.mean(result.metrics.residual_rms)),
+    }
+    if real != np.float64:
+        figures["error"] = _errors(result, structure, layout, exact)
+    return figures
+
+
+def _errors(result: Result, structure: Structure, layout: Layout, cases: Case) -> dict[str, float]:
+    """Largest error of each metric against double precision, relative to its largest value."""
+    with jax.enable_x64(True):
+        reference = ScanExecutor(structure, layout, False).start(cases).wait()
+    pairs = zip(result.metrics, reference.metrics, strict=True)
+    return {
+        name: float(f"{np.nanmax(np.abs(a - b)) / max(np.nanmax(np.abs(b)), 1e-300):.2g}")
+        for name, (a, b) in zip(result.metrics._fields, pairs, strict=True)
+        if b is not None
     }
 
 

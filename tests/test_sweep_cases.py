@@ -1,5 +1,6 @@
 """From a sweep file to its table of cases: designs, conditions, ids; and what is refused."""
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -379,3 +380,16 @@ def test_any_sweep_is_spread_or_refused(sweep):
         assert str(error) and "\n" not in str(error)
     else:
         assert len(table) >= 1
+
+
+def test_single_precision_keeps_only_metrics_that_it_holds():
+    from studies.sweeps.results import kept_metrics
+
+    axes = {"axes": {"gain": [1.0]}}
+    held = ["structural_rms", "control_energy"]
+    with jax.enable_x64(False):
+        assert kept_metrics(small_spec(axes | {"metrics": held})) == held
+        for metrics, name in (([], "residual_rms"), (["peak_voltage"], "peak_voltage")):
+            with pytest.raises(StudyError, match=f"sweep.metrics = '{name}': allowed with float32"):
+                kept_metrics(small_spec(axes | {"metrics": metrics}))
+    assert "residual_rms" in kept_metrics(small_spec(axes))

@@ -86,8 +86,9 @@ class SweepFolder:
         joined = self.path / JOINED
         manifest = read_manifest(self.path)
         try:
-            # both hashes are good until the new file is in place
-            manifest["results"] = [*manifest.get("results", [])[-1:], file_hash(joined)]
+            # both files are good until the new one is in place
+            old = [file_hash(self.results)] if self.results.is_file() else []
+            manifest["results"] = [*old, file_hash(joined)]
             self._write_manifest(manifest)
             os.replace(joined, self.results)
             _sync(self.path)
