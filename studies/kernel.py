@@ -10,7 +10,7 @@ it XLA runs the same step.
 from __future__ import annotations
 
 import ctypes
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, NamedTuple
@@ -200,8 +200,9 @@ class _Writer:
         sample = self.builder.phi(self.index)
         sample.add_incoming(ir.Constant(self.index, 0), entry)
         at_input = self._places("input", bases, lanes, first, sample)
-        waiting = {change.slot: change for change in changes}
-        unread = {node.place[1] for node in order if node.place and node.place[0] == "state"}
+        due = _due(order, is_fixed, changes)
+        for change in due[None]:
+            self._store(change, slots[change.slot])
         for node in order:
             if is_fixed[id(node)]:
                 continue
@@ -212,9 +213,8 @@ class _Writer:
             else:
                 slot = slots[node.place[1]]
                 self.values[id(node)] = self.builder.load(slot, align=VECTOR_BYTES, typ=self.vector)
-                unread.discard(node.place[1])
-            self._store_ready(waiting, unread, slots)
-        self._store_ready(waiting, set(), slots)
+            for change in due[id(node)]:
+                self._store(change, slots[change.slot])
         following = self.builder.add(sample, ir.Constant(self.index, 1))
         sample.add_incoming(following, self.builder.block)
         again = self.builder.icmp_signed("<", following, n_steps)
@@ -245,31 +245,16 @@ class _Writer:
         return old
 
     def _control(self, name: str, place: Any) -> None:
-        full = f"llvm.x86.sse.{name}"
-        function = self.module.globals.get(full) or ir.Function(
-            self.module, ir.FunctionType(ir.VoidType(), [ir.PointerType()]), full
-        )
-        self.builder.call(function, [place])
+        self._call(f"llvm.x86.sse.{name}", ir.VoidType(), place)
 
-    def _store_ready(
-        self, waiting: dict[int, _Change], unread: set[int], slots: Sequence[Any]
-    ) -> None:
-        """Store what is worked out, where nothing reads the old number any more."""
-        for k, (slot, mask, value) in list(waiting.items()):
-            is_ready = all(is_known(x) or id(x) in self.values for x in (mask, value))
-            if slot in unread or not is_ready:
-                continue
-            del waiting[k]
-            vector = self._widened(value)
-            if is_known(mask):
-                self.builder.store(vector, slots[slot], align=VECTOR_BYTES)
-                continue
-            name = f"llvm.masked.store.v{self.width}f{8 * self.real.itemsize}.p0"
-            arguments = [vector, slots[slot], ir.Constant(ir.IntType(32), VECTOR_BYTES)]
-            arguments.append(self._widened(mask))
-            signature = ir.FunctionType(ir.VoidType(), [x.type for x in arguments])
-            function = self.module.globals.get(name) or ir.Function(self.module, signature, name)
-            self.builder.call(function, arguments)
+    def _store(self, change: _Change, slot: Any) -> None:
+        vector = self._widened(change.value)
+        if is_known(change.mask):
+            self.builder.store(vector, slot, align=VECTOR_BYTES)
+            return
+        name = f"llvm.masked.store.v{self.width}f{8 * self.real.itemsize}.p0"
+        alignment = ir.Constant(ir.IntType(32), VECTOR_BYTES)
+        self._call(name, ir.VoidType(), vector, slot, alignment, self._widened(change.mask))
 
     # --- memory -----------------------------------------------------------------------------------
 
@@ -401,13 +386,12 @@ class _Writer:
     def _tanh(self, node: Node, a: Any) -> Any:
         """One number at a time, by the library."""
         name = "tanh" if self.real.itemsize == 8 else "tanhf"
-        function = self._function(name, self.scalar)
         if not node.is_varying:
-            return self.builder.call(function, [a])
+            return self._call(name, self.scalar, a)
         result = ir.Constant(self.vector, ir.Undefined)
         for k in range(self.width):
             place = ir.Constant(ir.IntType(32), k)
-            one = self.builder.call(function, [self.builder.extract_element(a, place)])
+            one = self._call(name, self.scalar, self.builder.extract_element(a, place))
             result = self.builder.insert_element(result, one, place)
         return result
 
@@ -415,12 +399,14 @@ class _Writer:
         kind = args[0].type
         lanes = f"v{self.width}" if isinstance(kind, ir.VectorType) else ""
         full = f"llvm.{name}.{lanes}f{8 * self.real.itemsize}"
-        return self.builder.call(self._function(full, kind, len(args)), args)
+        return self._call(full, kind, *args)
 
-    def _function(self, name: str, kind: Any, n_args: int = 1) -> Any:
-        return self.module.globals.get(name) or ir.Function(
-            self.module, ir.FunctionType(kind, [kind] * n_args), name
+    def _call(self, name: str, kind: Any, *args: Any) -> Any:
+        """Call a function of LLVM or the library, declared at its first use."""
+        function = self.module.globals.get(name) or ir.Function(
+            self.module, ir.FunctionType(kind, [x.type for x in args]), name
         )
+        return self.builder.call(function, args)
 
 
 #: Comparisons in LLVM's writing.
@@ -444,6 +430,24 @@ def _changes(results: Sequence[Any]) -> list[_Change]:
         elif not _is_state(x, k):
             changes.append(_Change(k, True, x))
     return changes
+
+
+def _due(
+    order: Sequence[Node], is_fixed: dict[int, bool], changes: Sequence[_Change]
+) -> dict[Any, list[_Change]]:
+    """After which node of the loop each change can be stored; None: before all of them.
+
+    That is when it is worked out and nothing reads the old number any more.
+    """
+    at = {id(node): k for k, node in enumerate(order)}
+    read = {node.place[1]: node for node in order if node.place and node.place[0] == "state"}
+    due: dict[Any, list[_Change]] = defaultdict(list)
+    for change in changes:
+        needed = [change.mask, change.value, read.get(change.slot, True)]
+        nodes = [x for x in needed if not is_known(x) and not is_fixed[id(x)]]
+        last = max(nodes, key=lambda x: at[id(x)], default=None)
+        due[None if last is None else id(last)].append(change)
+    return due
 
 
 def _is_state(x: Any, k: int) -> bool:

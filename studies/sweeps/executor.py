@@ -257,9 +257,13 @@ class KernelExecutor:
     def __init__(self, structure: Structure, layout: Layout, has_own_ratio: bool) -> None:
         self.structure, self.layout, self.has_own_ratio = structure, layout, has_own_ratio
         self.compile_time = 0.0
-        self.operations: Counter[str] = Counter()  # of one sample, by kind
         self._steps: _Steps | None = None
         self._pool = ThreadPoolExecutor(layout.devices)
+
+    @property
+    def operations(self) -> Counter[str]:
+        """Operations of one sample by kind; none before the first chunk."""
+        return Counter() if self._steps is None else self._steps.run.operations
 
     def start(self, cases: Case) -> Running:
         split = _split(cases, self.layout, self.structure, self.has_own_ratio)
@@ -275,7 +279,6 @@ class KernelExecutor:
             _prepare(program, self._steps.parts, blocks[0], split.shared)
             self.compile_time = time.perf_counter() - started
         steps = self._steps
-        self.operations = steps.run.operations
         running = [self._pool.submit(_step_block, program, steps, b, split.shared) for b in blocks]
         return Running(lambda: _concluded(running), lambda: _cancel(running))
 

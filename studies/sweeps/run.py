@@ -68,9 +68,7 @@ def make_plan(spec: SweepSpec, out: Path | None = None) -> Plan:
     table = build_table(spec)
     rows = np.arange(len(table))
     if out is not None:
-        done = finished_cases(out).case_id
-        _check_fit(table, done, out)
-        rows = np.flatnonzero(~np.isin(table.case_id, done))
+        rows = _rows_left(table, finished_cases(out).case_id, out)
     groups = plan_groups(table, rows, len(jax.local_devices()), spec.sweep.metrics)
     return Plan(table, groups, len(table) - len(rows))
 
@@ -104,9 +102,8 @@ def run_sweep(
     manifest = make_manifest(spec.data)
     with open_folder(out, manifest, is_resumed) as folder:
         finished = finished_cases(out, lambda text: console.print(text, soft_wrap=True))
-        _check_fit(table, finished.case_id, out)
+        rows = _rows_left(table, finished.case_id, out)
         folder.begin(manifest)
-        rows = np.flatnonzero(~np.isin(table.case_id, finished.case_id))
         groups = plan_groups(table, rows, len(jax.local_devices()), spec.sweep.metrics)
         n_before = len(table) - len(rows)
         with Reporter(console, len(table), n_before, is_quiet) as reporter, _interrupts() as stop:
@@ -137,8 +134,12 @@ def _headline(table: Table, groups: list[Group], n_before: int) -> str:
     return f"{text}; chunks: {chunks}, programs to compile: {len(groups)}"
 
 
-def _check_fit(table: Table, done: np.ndarray, out: Path) -> None:
-    """A resumed sweep may have more cases than the one that is there, but none less."""
+def _rows_left(table: Table, done: np.ndarray, out: Path) -> np.ndarray:
+    """Cases still to run. A resumed sweep may have more than the one that is there, but none less.
+
+    Raises:
+        StudyError: finished cases that are not part of it.
+    """
     strange = int(np.sum(~np.isin(done, table.case_id)))
     if strange:
         raise StudyError(
@@ -147,6 +148,7 @@ def _check_fit(table: Table, done: np.ndarray, out: Path) -> None:
             "more values or points; for a Latin hypercube the same size). Name a new folder for "
             "another sweep"
         )
+    return np.flatnonzero(~np.isin(table.case_id, done))
 
 
 def _check_whole(table: Table, done: np.ndarray, out: Path) -> None:
