@@ -14,7 +14,7 @@ from rich.table import Table
 from typer.exceptions import Abort, TyperException
 
 from studies.config import configure
-from studies.errors import StudyError
+from studies.errors import StudyError, field_error
 from studies.sweeps.commands import add_commands
 
 app = typer.Typer(
@@ -153,7 +153,8 @@ def modes(
 
 @app.command()
 def bench(
-    work: Annotated[str, typer.Option(help="W0, W1, W8 or sweep")] = "W1",
+    what: Annotated[str, typer.Argument(help="runs, or peers: W0 by other means")] = "runs",
+    work: Annotated[str, typer.Option(help="W0, W1, W8, grad or sweep")] = "W1",
     executor: Annotated[str, typer.Option(help="kernel or scan; default: the faster one")] = "",
     batch: Annotated[int, typer.Option(min=0, help="cases of a chunk; 0: a good number")] = 0,
     cases: Annotated[int, typer.Option(min=1, help="cases of the sweep")] = 100_000,
@@ -161,11 +162,21 @@ def bench(
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Measure speed and memory on this machine."""
+    if what not in ("runs", "peers"):
+        raise field_error("bench", what, "'runs' or 'peers'")
     configure(precision)
-    from studies.bench import bench_runs, bench_sweep
+    from studies.bench.works import bench_runs, bench_sweep
 
+    progress = Console(file=sys.stderr, highlight=False, markup=False)
+    if what == "peers":
+        _bench_peers(progress, as_json)
+        return
     if work == "sweep":
-        found = bench_sweep(cases, Console(file=sys.stderr, highlight=False, markup=False))
+        found = bench_sweep(cases, progress)
+    elif work == "grad":
+        from studies.bench.gradients import bench_gradients
+
+        found = bench_gradients(executor, batch)
     else:
         found = bench_runs(work, executor, batch)
     if as_json:
@@ -174,6 +185,21 @@ def bench(
     table = Table(show_header=False)
     for name, value in found.items():
         table.add_row(name, str(value))
+    console.print(table)
+
+
+def _bench_peers(progress: Console, as_json: bool) -> None:
+    from studies.bench.peers import bench_peers
+
+    rows = bench_peers(progress.print)
+    if as_json:
+        print(json.dumps([row._asdict() for row in rows]))
+        return
+    table = Table("W0 by", "configurations/s", "error [share of the largest rms]", "times slower")
+    for row in rows:
+        table.add_row(
+            row.peer, f"{row.configs_per_s:.3g}", f"{row.error:.1e}", f"{row.times_slower:.3g}"
+        )
     console.print(table)
 
 

@@ -110,12 +110,7 @@ class Graph:
         if name == "convert_element_type":
             is_truth = np.dtype(params["new_dtype"]) == bool
             return self._each(lambda x: self._converted(x, is_truth), given, shape)
-        if name in _COMPARE:
-            return self._each(partial(self._compared, name), given, shape)
-        operation = getattr(self, f"_op_{name}", None)
-        if operation is None:
-            raise NotImplementedError(f"operation {name!r} of the step")
-        return self._each(operation, given, shape)
+        return self._each(self.operation(name), given, shape)
 
     def _each(
         self, operation: Callable[..., Any], given: list[np.ndarray], shape: tuple[int, ...]
@@ -133,6 +128,19 @@ class Graph:
         return objects([_tree(join, list(row)) for row in rows], shape)
 
     # --- operations on single numbers -------------------------------------------------------------
+
+    def operation(self, name: str) -> Callable[..., Any]:
+        """What JAX calls `name`, on nodes and numbers.
+
+        Raises:
+            NotImplementedError: unknown here.
+        """
+        if name in _COMPARE:
+            return partial(self._compared, name)
+        found = getattr(self, f"_op_{name}", None)
+        if found is None:
+            raise NotImplementedError(f"operation {name!r} of the step")
+        return found
 
     def _node(self, operation: str, *args: Any, is_truth: bool = False) -> Node:
         names = [(type(x), x) if is_known(x) else id(x) for x in args]

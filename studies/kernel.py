@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import ctypes
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from studies.fusion import count_operations, fused, in_order
 from studies.graph import Graph, Node, is_known, objects
+from studies.tangents import push_forward
 
 try:
     from llvmlite import binding, ir
@@ -39,6 +40,7 @@ class Leaf(NamedTuple):
 
     shape: tuple[int, ...]  # of one case (and of one sample)
     is_varying: bool  # one value per case, lanes last; else one for all
+    is_moving: bool = False  # has tangents; so has every leaf of the state
 
     @property
     def size(self) -> int:
@@ -81,8 +83,13 @@ def build_kernel(
     inputs: Sequence[Leaf],
     state: Sequence[Leaf],
     dtype: Any,
+    directions: int = 0,
 ) -> Kernel:
     """Compile a loop over `step(constants, inputs, state) -> state`, all lists of arrays.
+
+    With directions, the state's tangents are carried along too. Behind the constants, the inputs
+    and the state the kernel then takes the tangents of the moving ones, each like its leaf with
+    the directions before the leaf's own shape, varying.
 
     Args:
         step: elementwise JAX function of one case and one sample.
@@ -90,15 +97,21 @@ def build_kernel(
         inputs: arrays of one sample; in memory one row per sample.
         state: arrays carried from sample to sample; always varying.
         dtype: float64 or float32, of all arrays.
+        directions: tangents of each number.
 
     Raises:
         NotImplementedError: an operation of the step that the kernel does not know.
     """
     real, graph = np.dtype(dtype), Graph()
     read = [leaf for leaf in constants if isinstance(leaf, Leaf)]
+    state = [leaf._replace(is_moving=directions > 0) for leaf in state]
+    stored = {
+        kind: [*leaves, *(_tangent(leaf, directions) for leaf in leaves if leaf.is_moving)]
+        for kind, leaves in (("constant", read), ("input", inputs), ("state", state))
+    }
     places = [
         [graph.read((kind, k), leaf.is_varying) for k, leaf in enumerate(_elements(leaves))]
-        for kind, leaves in (("constant", read), ("input", inputs), ("state", state))
+        for kind, leaves in stored.items()
     ]
     rest = [iter(part) for part in places]
 
@@ -111,12 +124,47 @@ def build_kernel(
         [array(kind, leaf) for leaf in leaves]
         for kind, leaves in enumerate((constants, inputs, state))
     ]
-    traced = graph.trace(step, arguments, real)
-    results = fused([x for part in traced for x in part.flat])
+    results = [x for part in graph.trace(step, arguments, real) for x in part.flat]
+    moving = [
+        [array for leaf, array in zip(leaves, part, strict=True) if getattr(leaf, "is_moving", 0)]
+        for leaves, part in zip((constants, inputs, state), arguments, strict=True)
+    ]
+    results = fused([*results, *_tangents(graph, results, moving, rest, directions)])
     width = VECTOR_BYTES // real.itemsize
-    writer = _Writer(real, width, read, inputs, state)
+    writer = _Writer(real, width, *stored.values())
     engine = _compile(str(writer.write(results)))
     return Kernel(engine, width, np.array(writer.numbers, real), count_operations(results))
+
+
+def _tangent(leaf: Leaf, directions: int) -> Leaf:
+    """Where the tangents of a leaf are read from."""
+    return Leaf((directions, *leaf.shape), True)
+
+
+def _tangents(
+    graph: Graph, results: list, moving: list[list], rest: list[Iterator], directions: int
+) -> list:
+    """Tangents of the results in the order of the state's tangent leaves.
+
+    Args:
+        graph: of the results.
+        results: the new state, leaf by leaf and number by number.
+        moving: arrays of nodes of the moving leaves, for constants, inputs and state.
+        rest: the nodes that their tangents are read from, in the same order.
+        directions: how many.
+    """
+    seeds: list[dict[int, Any]] = [{} for _ in range(directions)]
+    for arrays, nodes in zip(moving, rest, strict=True):
+        for array in arrays:
+            for seed in seeds:
+                seed.update((id(x), next(nodes)) for x in array.flat)
+    pushed = [push_forward(graph, results, seed) for seed in seeds]
+    found, first = [], 0
+    for array in moving[-1]:
+        span = slice(first, first + array.size)
+        found += [x for along in pushed for x in along[span]]
+        first += array.size
+    return found
 
 
 def _elements(leaves: Sequence[Leaf]) -> list[Leaf]:

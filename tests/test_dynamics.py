@@ -12,7 +12,7 @@ from jaxmodel import dynamics, kinematics, status
 from jaxmodel.beam import BASES, build_basis
 from jaxmodel.parameters import ASSEMBLIES, HOME, paper_machine
 from jaxmodel.plant import build_plant
-from tests import reference
+from studies.bench import reference
 
 MACHINE = paper_machine()
 R = 3

@@ -15,9 +15,9 @@ from jaxmodel.kinematics import inverse_kinematics
 from jaxmodel.loop import PlantState, plant_rates, plant_step
 from jaxmodel.parameters import HOME
 from jaxmodel.prepare import prepare
+from studies.bench import reference
 from studies.cases import as_arrays, build_case, build_structure
 from studies.spec import paper_study
-from tests import reference
 
 SAMPLE = 1e-4  # [s]
 MOVE_TIME, MOVE = 0.05, 0.01  # [s], [m]

@@ -8,7 +8,7 @@ import pytest
 from jaxmodel import status
 from jaxmodel.trigonometry import sine_cosine
 from studies import kernel
-from studies.bench import METRICS, WORKS
+from studies.bench.works import METRICS, WORKS
 from studies.cases import build_cases, build_structure
 from studies.spec import paper_study
 from studies.sweeps.executor import TRACES, KernelExecutor, ScanExecutor, make_executor

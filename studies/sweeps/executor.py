@@ -22,10 +22,22 @@ from jax.sharding import Mesh, PartitionSpec
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.loop import Inputs, State, step
-from jaxmodel.simulate import Result, Start, begin, conclude
+from jaxmodel.simulate import Result, Start
 from studies import kernel
-from studies.runs import uncontrolled, with_ratio
+from studies.runs import uncontrolled
 from studies.sweeps.plan import Layout
+from studies.sweeps.program import (
+    Parts,
+    Program,
+    Split,
+    chosen,
+    conclude_all,
+    find_parts,
+    joined,
+    prepare,
+    prepare_shared,
+    split_cases,
+)
 
 #: How often a program was traced in this process; the tests count compilations with it.
 TRACES: list[Structure] = []
@@ -63,10 +75,15 @@ def make_executor(structure: Structure, layout: Layout, has_own_ratio: bool) -> 
         layout: of its chunks.
         has_own_ratio: gain ratios come from an uncontrolled pass for some cases.
     """
-    fits = structure.substeps <= KERNEL_SUBSTEPS and not structure.is_smooth
-    if kernel.is_available() and fits and jax.default_backend() == "cpu":
+    if fits_kernel(structure):
         return KernelExecutor(structure, layout, has_own_ratio)
     return ScanExecutor(structure, layout, has_own_ratio)
+
+
+def fits_kernel(structure: Structure) -> bool:
+    """Whether the traced kernel can run a structure here."""
+    fits = structure.substeps <= KERNEL_SUBSTEPS and not structure.is_smooth
+    return kernel.is_available() and fits and jax.default_backend() == "cpu"
 
 
 def own_ratios(executor: Executor, cases: Case) -> np.ndarray:
@@ -74,106 +91,11 @@ def own_ratios(executor: Executor, cases: Case) -> np.ndarray:
     return np.asarray(executor.start(uncontrolled(cases)).wait().energy_ratio)
 
 
-class _Split(NamedTuple):
-    """Leaves of a Case, those that vary apart from those that all cases share."""
-
-    tree: Any
-    is_varying: tuple[bool, ...]
-    varying: list[np.ndarray]  # cases first
-    shared: list[np.ndarray]
-
-
-def _split(cases: Case, layout: Layout, structure: Structure, has_own_ratio: bool) -> _Split:
-    if has_own_ratio:  # the same program for both passes, which differ in ratios and links
-        shape = (layout.size, 3, structure.n_controlled)
-        cases = with_ratio(cases, np.broadcast_to(cases.control.ratio, shape))
-        links = np.broadcast_to(cases.control.link_mask, shape[:2])
-        cases = cases._replace(control=cases.control._replace(link_mask=links))
-    leaves, tree = jax.tree.flatten(cases)
-    leaves = [np.asarray(leaf) for leaf in leaves]
-    is_varying = tuple(len(leaf) == layout.size for leaf in leaves)
-    return _Split(
-        tree,
-        is_varying,
-        [leaf for leaf, varies in zip(leaves, is_varying, strict=True) if varies],
-        [leaf[0] for leaf, varies in zip(leaves, is_varying, strict=True) if not varies],
-    )
-
-
-def _joined(tree: Any, is_varying: tuple[bool, ...], varying: list, shared: list) -> Case:
-    sources = {True: iter(varying), False: iter(shared)}
-    return jax.tree.unflatten(tree, [next(sources[varies]) for varies in is_varying])
-
-
-# --- before and after the steps, for both executors ----------------------------------------------
-
-
-class _Program(NamedTuple):
-    """What a compiled program depends on; hashable."""
-
-    structure: Structure
-    layout: Layout
-    tree: Any  # of a Case
-    is_varying: tuple[bool, ...]
-
-
-class _Parts(NamedTuple):
-    """A Start leaf by leaf: which leaves vary from case to case, and their shapes."""
-
-    tree: Any
-    is_varying: tuple[bool, ...]
-    shapes: tuple[tuple[int, ...], ...]  # of one case
-
-
-def _begin(program: _Program, own: list, common: list) -> Start:
-    return begin(program.structure, _joined(program.tree, program.is_varying, own, common))
-
-
-def _chosen(program: _Program, parts: _Parts, wanted: bool, own: list, common: list) -> list:
-    leaves = jax.tree.leaves(_begin(program, own, common))
-    return [x for x, varies in zip(leaves, parts.is_varying, strict=True) if varies == wanted]
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def _prepare(program: _Program, parts: _Parts, own: list, common: list) -> list:
-    """The leaves that vary, lanes last."""
-    chosen = partial(_chosen, program, parts, True)
-    return jax.vmap(chosen, (0, None), -1)(own, common)
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def _prepare_shared(program: _Program, parts: _Parts, own: list, common: list) -> list:
-    """The others, of any one case."""
-    return _chosen(program, parts, False, own, common)
-
-
-def _find_parts(program: _Program, own: list, common: list) -> _Parts:
-    traced, shapes = jax.make_jaxpr(partial(_begin, program), return_shape=True)(own, common)
-    is_varying = _dependence(traced.jaxpr, len(own))
-    sizes = tuple(out.aval.shape for out in traced.jaxpr.outvars)
-    return _Parts(jax.tree.structure(shapes), is_varying, sizes)
-
-
-def _dependence(jaxpr: Any, n_varying: int) -> tuple[bool, ...]:
-    """Which results depend on the first `n_varying` arguments."""
-    depends: set[Any] = set(jaxpr.invars[:n_varying])
-    for equation in jaxpr.eqns:
-        if any(not hasattr(atom, "val") and atom in depends for atom in equation.invars):
-            depends.update(equation.outvars)
-    return tuple(not hasattr(out, "val") and out in depends for out in jaxpr.outvars)
-
-
-@jax.jit
-@partial(jax.vmap, in_axes=(-1, -1, -1))
-def _conclude(outline: Any, code: Any, state: Any) -> Result:
-    return conclude(outline, code, state)
-
-
 # --- XLA ------------------------------------------------------------------------------------------
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _run(program: _Program, parts: _Parts, varying: list, shared: list) -> Result:
+def _run(program: Program, parts: Parts, varying: list, shared: list) -> Result:
     """Results of a chunk; what its cases share is computed once for all."""
     layout = program.layout
     TRACES.append(program.structure)
@@ -181,10 +103,10 @@ def _run(program: _Program, parts: _Parts, varying: list, shared: list) -> Resul
     def block(own: list, common: list) -> Result:
         """Cases side by side in the last axis; XLA fuses little of a step under `vmap`."""
         varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
-        chosen = jax.vmap(partial(_chosen, program, parts, True), (0, None), -1)(own, common)
-        same = _chosen(program, parts, False, [x[0] for x in own], common)
-        joined = _joined(parts.tree, parts.is_varying, chosen, [x[..., None] for x in same])
-        start: Start = joined  # type: ignore[assignment]
+        own_parts = jax.vmap(partial(chosen, program, parts, True), (0, None), -1)(own, common)
+        same = chosen(program, parts, False, [x[0] for x in own], common)
+        shared_parts = [x[..., None] for x in same]
+        start: Start = joined(parts.tree, parts.is_varying, own_parts, shared_parts)
 
         def whole(x: Any, is_wide: bool) -> Any:
             return x if is_wide else jnp.broadcast_to(x, (*x.shape[:-1], layout.lanes))
@@ -196,7 +118,7 @@ def _run(program: _Program, parts: _Parts, varying: list, shared: list) -> Resul
             return step(program.structure, start.loop, at, inputs)[0], None
 
         last, _ = jax.lax.scan(body, state, start.inputs)
-        return _conclude(outline, state.status, last)
+        return conclude_all(outline, state.status, last)
 
     def device(own: list, common: list) -> Result:
         blocks = [x.reshape((layout.blocks, layout.lanes, *x.shape[1:])) for x in own]
@@ -222,11 +144,11 @@ class ScanExecutor:
         self._compiled: Any = None
 
     def start(self, cases: Case) -> Running:
-        split = _split(cases, self.layout, self.structure, self.has_own_ratio)
+        split = split_cases(cases, self.layout, self.structure, self.has_own_ratio)
         if self._compiled is None:
-            program = _Program(self.structure, self.layout, split.tree, split.is_varying)
+            program = Program(self.structure, self.layout, split.tree, split.is_varying)
             started = time.perf_counter()
-            parts = _find_parts(program, [leaf[0] for leaf in split.varying], split.shared)
+            parts = find_parts(program, [leaf[0] for leaf in split.varying], split.shared)
             self._compiled = _run.lower(program, parts, split.varying, split.shared).compile()
             self.compile_time = time.perf_counter() - started
         running = self._compiled(split.varying, split.shared)
@@ -236,15 +158,16 @@ class ScanExecutor:
 # --- the traced kernel ----------------------------------------------------------------------------
 
 
-class _Steps(NamedTuple):
+class Steps(NamedTuple):
     """Compiled for the numbers that all cases of a group share."""
 
-    parts: _Parts
+    parts: Parts
     shared: list[np.ndarray]  # leaves of a Start that do not vary
     run: kernel.Kernel
+    directions: int  # tangents that it carries along
 
 
-_STEPS: dict[tuple, _Steps] = {}
+_STEPS: dict[tuple, Steps] = {}
 #: Kernels kept in memory.
 KEPT_KERNELS = 8
 
@@ -257,7 +180,7 @@ class KernelExecutor:
     def __init__(self, structure: Structure, layout: Layout, has_own_ratio: bool) -> None:
         self.structure, self.layout, self.has_own_ratio = structure, layout, has_own_ratio
         self.compile_time = 0.0
-        self._steps: _Steps | None = None
+        self._steps: Steps | None = None
         self._pool = ThreadPoolExecutor(layout.devices)
 
     @property
@@ -266,8 +189,8 @@ class KernelExecutor:
         return Counter() if self._steps is None else self._steps.run.operations
 
     def start(self, cases: Case) -> Running:
-        split = _split(cases, self.layout, self.structure, self.has_own_ratio)
-        program = _Program(self.structure, self.layout, split.tree, split.is_varying)
+        split = split_cases(cases, self.layout, self.structure, self.has_own_ratio)
+        program = Program(self.structure, self.layout, split.tree, split.is_varying)
         lanes = self.layout.lanes
         blocks = [
             [leaf[k : k + lanes] for leaf in split.varying]
@@ -275,8 +198,8 @@ class KernelExecutor:
         ]
         if self._steps is None:
             started = time.perf_counter()
-            self._steps = _steps(program, split)
-            _prepare(program, self._steps.parts, blocks[0], split.shared)
+            self._steps = compile_steps(program, split)
+            prepare(program, self._steps.parts, blocks[0], split.shared)
             self.compile_time = time.perf_counter() - started
         steps = self._steps
         running = [self._pool.submit(_step_block, program, steps, b, split.shared) for b in blocks]
@@ -284,15 +207,15 @@ class KernelExecutor:
 
 
 def _step_block(
-    program: _Program, steps: _Steps, varying: list[np.ndarray], shared: list[np.ndarray]
+    program: Program, steps: Steps, varying: list[np.ndarray], shared: list[np.ndarray]
 ) -> Start:
     """A Start whose state is that after the last step; state and outline lanes last."""
     lanes, parts = program.layout.lanes, steps.parts
-    own = [np.asarray(x, order="C") for x in _prepare(program, parts, varying, shared)]
-    start: Start = _joined(parts.tree, parts.is_varying, own, steps.shared)  # type: ignore
+    own = [np.asarray(x, order="C") for x in prepare(program, parts, varying, shared)]
+    start: Start = joined(parts.tree, parts.is_varying, own, steps.shared)
     varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
-    state = jax.tree.map(lambda x, v: _wide(x, v, lanes), start.state, varies.state)
-    outline = jax.tree.map(lambda x, v: _wide(x, v, lanes), start.outline, varies.outline)
+    state = jax.tree.map(lambda x, v: wide(x, v, lanes), start.state, varies.state)
+    outline = jax.tree.map(lambda x, v: wide(x, v, lanes), start.outline, varies.outline)
     code = state.status.copy()
     loop = zip(jax.tree.leaves(start.loop), jax.tree.leaves(varies.loop), strict=True)
     read = [leaf for leaf, is_read in loop if is_read]
@@ -309,36 +232,46 @@ def _cancel(running: list[Future]) -> None:
 def _concluded(running: list[Future]) -> Result:
     done = [future.result() for future in running]
     whole = jax.tree.map(lambda *x: np.concatenate(x, axis=-1), *done)
-    return jax.tree.map(np.asarray, _conclude(whole.outline, whole.inputs, whole.state))
+    return jax.tree.map(np.asarray, conclude_all(whole.outline, whole.inputs, whole.state))
 
 
-def _wide(x: np.ndarray, is_varying: bool, lanes: int) -> np.ndarray:
+def wide(x: np.ndarray, is_varying: bool, lanes: int) -> np.ndarray:
     """A copy with one value per lane, lanes last."""
-    wide = x if is_varying else np.broadcast_to(np.asarray(x)[..., None], (*np.shape(x), lanes))
-    return np.array(wide, order="C", copy=True)
+    whole = x if is_varying else np.broadcast_to(np.asarray(x)[..., None], (*np.shape(x), lanes))
+    return np.array(whole, order="C", copy=True)
 
 
-def _steps(program: _Program, split: _Split) -> _Steps:
-    """Compile the steps, once per process for the same program and shared numbers."""
+def compile_steps(program: Program, split: Split, directions: int = 0) -> Steps:
+    """Compile the steps, once per process for the same program and shared numbers.
+
+    Args:
+        program: of the cases.
+        split: their leaves.
+        directions: tangents to carry along at once.
+    """
     real = jax.dtypes.canonicalize_dtype(np.float64)
     numbers = tuple((leaf.shape, leaf.tobytes()) for leaf in split.shared)
     shapes = tuple(leaf.shape for leaf in split.varying)
-    key = (program, shapes, numbers, real)
+    key = (program, shapes, numbers, real, directions)
     if key not in _STEPS:
         while len(_STEPS) >= KEPT_KERNELS:
             del _STEPS[next(iter(_STEPS))]
         one = [leaf[0] for leaf in split.varying]
-        parts = _find_parts(program, one, split.shared)
-        found = _prepare_shared(program, parts, one, split.shared)
+        parts = find_parts(program, one, split.shared)
+        found = prepare_shared(program, parts, one, split.shared)
         shared = [np.asarray(leaf, order="C") for leaf in found]
         TRACES.append(program.structure)
-        _STEPS[key] = _Steps(parts, shared, _build(program.structure, parts, shared, real))
+        code = _build(program.structure, parts, shared, real, directions)
+        _STEPS[key] = Steps(parts, shared, code, directions)
     return _STEPS[key]
 
 
-def _build(structure: Structure, parts: _Parts, shared: list[np.ndarray], real: Any) -> Any:
+def _build(
+    structure: Structure, parts: Parts, shared: list[np.ndarray], real: Any, directions: int
+) -> Any:
     """The kernel of a structure, with what is shared written into it."""
-    leaves = [kernel.Leaf(*x) for x in zip(parts.shapes, parts.is_varying, strict=True)]
+    kinds = zip(parts.shapes, parts.is_varying, parts.is_moving, strict=True)
+    leaves = [kernel.Leaf(*kind) for kind in kinds]
     start: Start = jax.tree.unflatten(parts.tree, range(len(leaves)))
     trees = [jax.tree.structure(part) for part in start[:3]]
     known = iter(shared)
@@ -356,7 +289,8 @@ def _build(structure: Structure, parts: _Parts, shared: list[np.ndarray], real: 
     return kernel.build_kernel(
         sample,
         loop,
-        [kernel.Leaf(leaf.shape[1:], leaf.is_varying) for leaf in inputs],
-        [kernel.Leaf(leaf.shape, True) for leaf in state],
+        [leaf._replace(shape=leaf.shape[1:]) for leaf in inputs],
+        [leaf._replace(is_varying=True) for leaf in state],
         real,
+        directions,
     )

@@ -1,4 +1,4 @@
-"""`studies bench`: how fast and how large, on this machine."""
+"""Workloads, and how fast this program runs them."""
 
 from __future__ import annotations
 
@@ -62,6 +62,28 @@ EXECUTORS: dict[str, Callable[..., Executor]] = {"kernel": KernelExecutor, "scan
 REPEATS = 5
 
 
+def check_executor(executor: str) -> None:
+    """Refuse an executor that is unknown or not installed.
+
+    Args:
+        executor: key of EXECUTORS, or "".
+
+    Raises:
+        StudyError: if so.
+    """
+    if executor and executor not in EXECUTORS:
+        raise field_error("--executor", executor, ", ".join(map(repr, EXECUTORS)))
+    if executor == "kernel" and not kernel.is_available():
+        raise StudyError("--executor kernel: needs llvmlite: install flexlink-studies[fast]")
+
+
+def make_layout(batch: int) -> Layout:
+    """A chunk of about so many cases; 0: two blocks of lanes on every device."""
+    devices = len(jax.local_devices())
+    lanes = LANES if not batch else max(8, min(LANES, -(-batch // (8 * devices)) * 8))
+    return Layout(devices, max(batch // (devices * lanes), 1) if batch else 2, lanes)
+
+
 def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
     """Speed of a batch of closed-loop runs that differ in their gains.
 
@@ -77,16 +99,10 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
         StudyError: unknown work or executor, or one that is not installed.
     """
     if work not in WORKS:
-        raise field_error("--work", work, ", ".join(map(repr, (*WORKS, "sweep"))))
-    if executor and executor not in EXECUTORS:
-        raise field_error("--executor", executor, ", ".join(map(repr, EXECUTORS)))
-    if executor == "kernel" and not kernel.is_available():
-        raise StudyError("--executor kernel: needs llvmlite: install flexlink-studies[fast]")
+        raise field_error("--work", work, ", ".join(map(repr, (*WORKS, "grad", "sweep"))))
+    check_executor(executor)
     config.require_configured()
-    devices = len(jax.local_devices())
-    lanes = LANES if not batch else max(8, min(LANES, -(-batch // (8 * devices)) * 8))
-    blocks = max(batch // (devices * lanes), 1) if batch else 2
-    layout = Layout(devices, blocks, lanes)
+    layout = make_layout(batch)
     study = paper_study().change(**WORKS[work])
     structure = build_structure(study)._replace(metrics=METRICS.get(work, ()))
     gains = np.random.default_rng(0).uniform(0.01, 0.5, layout.size)
@@ -109,7 +125,7 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
         "ns_per_step": round(1e9 * seconds / layout.size / structure.n_steps, 1),
         "compile_s": round(made.compile_time, 2),
         "peak_mib": round(peak_memory() / 2**20, 1),
-        "device": f"{devices} x {jax.local_devices()[0].device_kind}",
+        "device": f"{layout.devices} x {jax.local_devices()[0].device_kind}",
         "dtype": str(result.metrics.residual_rms.dtype),
         "batch": layout.size,
         "steps": structure.n_steps,

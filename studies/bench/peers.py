@@ -1,0 +1,341 @@
+"""Work W0 by other means, in one table: what this program's speed is worth.
+
+All of them integrate the same cases: the drive's reference at start, middle and end of each sample,
+voltages from modal velocities, rms deflection in the residual window. Their accuracy is measured
+against this program's own scan at an eighth of the step, and stands beside their speed.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import statistics
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from jaxmodel.beam import build_basis
+from jaxmodel.case import Case, Structure
+from jaxmodel.drive import Reference
+from jaxmodel.loop import PlantState, ideal_voltage, plant_rates
+from jaxmodel.simulate import Start, begin
+from studies import config, kernel
+from studies.bench import reference
+from studies.bench.works import METRICS, WORKS
+from studies.cases import as_arrays, build_cases, build_structure
+from studies.spec import paper_study
+from studies.sweeps.executor import KernelExecutor, ScanExecutor
+from studies.sweeps.plan import LANES, Layout
+
+#: Sample period of W0, and step of the peers with a constant one [s].
+PERIOD = 1e-4
+#: Runs of which the median counts.
+REPEATS = 3
+#: Steps of the reference in one of the peers'.
+FINER = 8
+#: Tolerances of `solve_ivp` that make it as accurate as the others, relative and absolute [m].
+TOLERANCES = (1e-7, 1e-11)
+
+
+class Work(NamedTuple):
+    """W0 for a number of cases."""
+
+    structure: Structure
+    cases: Case  # leading axis 1 or the cases
+    layout: Layout
+
+    def first(self, n: int) -> Case:
+        """The first n cases, all leaves with that leading axis."""
+        wide = (
+            np.broadcast_to(x, (self.layout.size, *x.shape[1:]))
+            for x in jax.tree.leaves(self.cases)
+        )
+        return as_arrays(jax.tree.unflatten(jax.tree.structure(self.cases), [x[:n] for x in wide]))
+
+
+class Row(NamedTuple):
+    """What was measured of a peer."""
+
+    peer: str
+    configs_per_s: float
+    error: float  # largest one of a residual rms, as a share of the largest residual rms
+    times_slower: float  # than the fastest peer
+
+
+class Peer(NamedTuple):
+    """A way to do the work."""
+
+    name: str
+    n_cases: int  # enough to time it, few enough to wait for
+    run: Callable[[], Any]  # residual rms (n_cases, 3, S)
+
+
+def make_work(is_short: bool = False) -> Work:
+    """W0 with gains that differ.
+
+    Args:
+        is_short: one move only and 20 ms after it, to see that all agree.
+    """
+    study = paper_study().change(**WORKS["W0"])
+    if is_short:
+        points = study.motion.waypoints[:2]
+        study = study.change(
+            run__duration=0.15, motion__waypoints=points, metrics__residual_length=0.02
+        )
+    structure = build_structure(study)._replace(metrics=METRICS["W0"])
+    devices = len(jax.local_devices())
+    layout = Layout(devices, 1, 8) if is_short else Layout(devices, 2, LANES)
+    gains = np.random.default_rng(0).uniform(0.01, 0.5, layout.size)
+    return Work(structure, build_cases(study, {"control.gain_factor": gains}, structure), layout)
+
+
+def bench_peers(
+    report: Callable[[str], None], is_short: bool = False, repeats: int = REPEATS
+) -> list[Row]:
+    """Speed and error of every peer that can run here, fastest first.
+
+    Args:
+        report: takes a line on what is going on or left out.
+        is_short: see `make_work`.
+        repeats: runs of which the median counts.
+    """
+    config.require_configured()
+    work = make_work(is_short)
+    finer = work.structure._replace(substeps=FINER)
+    exact = ScanExecutor(finer, work.layout, False).start(work.cases).wait().metrics.residual_rms
+    rows: list[Row] = []
+    for peer in find_peers(work, report):
+        report(f"{peer.name}: {peer.n_cases} cases")
+        found = np.asarray(peer.run())  # compiles
+        times = []
+        for _ in range(repeats):
+            began = time.perf_counter()
+            found = np.asarray(peer.run())
+            times.append(time.perf_counter() - began)
+        right = exact[: peer.n_cases]
+        error = float(np.max(np.abs(found - right)) / np.max(right))
+        speed = peer.n_cases / statistics.median(times)
+        rows.append(Row(peer.name, speed, error, 1.0))
+    rows.sort(key=lambda row: -row.configs_per_s)
+    best = rows[0].configs_per_s
+    return [row._replace(times_slower=best / row.configs_per_s) for row in rows]
+
+
+def find_peers(work: Work, report: Callable[[str], None]) -> list[Peer]:
+    """Those that can run here; `report` hears of the others."""
+    size = work.layout.size
+
+    def own(executor: Any) -> Callable[[], Any]:
+        made = executor(work.structure, work.layout, False)
+        return lambda: made.start(work.cases).wait().metrics.residual_rms
+
+    peers = [
+        Peer("this program, XLA scan", size, own(ScanExecutor)),
+        Peer("closed form, SciPy solve_ivp (DOP853)", 1, by_scipy(work)),
+        Peer("autodiff Lagrangian, RK4 in a scan, vmap", 8, by_lagrangian(work, 8)),
+    ]
+    if kernel.is_available():
+        peers.append(Peer("this program, traced kernel", size, own(KernelExecutor)))
+    else:
+        report("no traced kernel: install flexlink-studies[fast]")
+    try:
+        peers.append(Peer("closed form, diffrax Tsit5, vmap", 8, by_diffrax(work, 8)))
+    except ImportError:
+        report("no diffrax: install flexlink-studies[peers]")
+    compiler = shutil.which("gcc") or shutil.which("clang")
+    if compiler:
+        peers.append(Peer("hand-written C, RK4, vectors of 8", size, by_c(work, compiler)))
+    else:
+        report("no hand-written C: needs gcc or clang")
+    return peers
+
+
+# --- closed form with other integrators ----------------------------------------------------------
+
+
+def _slopes(structure: Structure, start: Start, time: Any, state: PlantState) -> PlantState:
+    """Time derivative of the plant; the reference is a parabola over each sample."""
+    k = jnp.clip(jnp.floor(time / PERIOD + 1e-9).astype(int), 0, structure.n_steps - 1)
+    x = time / PERIOD - k
+    weights = jnp.array([(1 - x) * (1 - 2 * x), 4 * x * (1 - x), x * (2 * x - 1)])
+    inputs = start.inputs
+    wanted = Reference(
+        weights @ inputs.rho[k], weights @ inputs.rho_rate[k], None, inputs.disturbance[k]
+    )
+    found = plant_rates(structure, start.loop, state, wanted, jnp.zeros((3, 3))).acceleration
+    plant = start.loop.plant
+    own = (plant.stiffness * state.q + plant.damping * state.q_rate) / plant.mass
+    return PlantState(state.pose_rate, found.pose, state.q_rate, found.coupling - own, None, None)
+
+
+def _rms(start: Start, q: Any) -> Any:
+    """Residual rms from modal coordinates at all samples, (n, 3, R)."""
+    weight = start.inputs.window.is_residual
+    deflection = jnp.einsum("isr,nir->nis", start.loop.deflection_at, q)
+    return jnp.sqrt(jnp.einsum("n,nis->is", weight, deflection**2) / jnp.sum(weight))
+
+
+def by_diffrax(work: Work, n: int) -> Callable[[], Any]:
+    """diffrax with a constant step of one sample."""
+    import diffrax
+
+    structure, cases = work.structure, work.first(n)
+
+    def one(case: Case) -> Any:
+        start = begin(structure, case)
+        count = structure.n_steps
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda t, y, _: _slopes(structure, start, t, y)),
+            diffrax.Tsit5(), 0.0, count * PERIOD, PERIOD, start.state.plant,
+            saveat=diffrax.SaveAt(ts=PERIOD * jnp.arange(count), fn=lambda t, y, _: y.q),
+            stepsize_controller=diffrax.ConstantStepSize(), max_steps=count + 2,
+        )  # fmt: skip
+        return _rms(start, solution.ys)
+
+    return partial(jax.jit(jax.vmap(one)), cases)
+
+
+def by_scipy(work: Work) -> Callable[[], Any]:
+    """SciPy's integrator, adaptive steps, slopes compiled by JAX."""
+    from scipy.integrate import solve_ivp
+
+    structure = work.structure
+    case = jax.tree.map(lambda x: x[0], work.first(1))
+    start = jax.jit(begin, static_argnums=0)(structure, case)
+    flat, whole = ravel_pytree(start.state.plant)
+
+    @jax.jit
+    def slope(time: Any, y: Any) -> Any:
+        return ravel_pytree(_slopes(structure, start, time, whole(y)))[0]
+
+    def run() -> Any:
+        times = PERIOD * np.arange(structure.n_steps)
+        solution = solve_ivp(
+            lambda t, y: np.asarray(slope(t, y)), (0.0, times[-1]), np.asarray(flat), "DOP853",
+            times, rtol=TOLERANCES[0], atol=TOLERANCES[1],
+        )  # fmt: skip
+        return _rms(start, jax.vmap(whole)(jnp.asarray(solution.y.T)).q)[None]
+
+    return run
+
+
+# --- plain equations ------------------------------------------------------------------------------
+
+
+def by_lagrangian(work: Work, n: int) -> Callable[[], Any]:
+    """Accelerations from the Lagrangian by automatic differentiation, classical Runge-Kutta."""
+    structure, cases = work.structure, work.first(n)
+
+    def one(case: Case) -> Any:
+        start, machine = begin(structure, case), case.machine
+        basis = build_basis(
+            structure.basis, machine.beam, machine.patches, structure.n_modes, case.windows.stations
+        )
+        loop = start.loop
+        mass, drive = loop.plant.mass, loop.drive
+
+        def slope(at: reference.Motion, wanted: tuple) -> reference.Motion:
+            rho, rho_rate = wanted
+            place = partial(reference.close, machine, basis)
+            (now, _), (rate, _) = jax.jvp(place, (at.pose, at.q), (at.pose_rate, at.q_rate))
+            force = drive.kp * (rho - now) + drive.kd * (rho_rate - rate)
+            force = jnp.clip(force, -drive.force_limit, drive.force_limit)
+            voltage = ideal_voltage(structure, loop, at.q, at.q_rate)
+            modal = mass * jnp.einsum("irk,ik->ir", loop.actuator, voltage)
+            loads = reference.Loads(force, modal)
+            pose, q = reference.by_lagrangian(machine, basis, at, loads)
+            return reference.Motion(at.pose_rate, pose, at.q_rate, q)
+
+        def body(at: reference.Motion, wanted: tuple) -> tuple:
+            points = [(wanted[0][k], wanted[1][k]) for k in range(3)]
+            return reference.rk4_step(slope, at, PERIOD, points), at.q
+
+        plant = start.state.plant
+        first = reference.Motion(plant.pose, plant.pose_rate, plant.q, plant.q_rate)
+        kept: Any = jax.lax.scan(body, first, (start.inputs.rho, start.inputs.rho_rate))[1]
+        return _rms(start, kept)
+
+    return partial(jax.jit(jax.vmap(one)), cases)
+
+
+# --- C --------------------------------------------------------------------------------------------
+
+
+def by_c(work: Work, compiler: str) -> Callable[[], Any]:
+    """`w0.c`, a thread for every device."""
+    structure = work.structure
+    each = jax.jit(jax.vmap(partial(_ideal, structure)))(work.first(work.layout.size))
+    start = jax.jit(begin, static_argnums=0)(structure, jax.tree.map(lambda x: x[0], work.first(1)))
+    plant, drive, n = start.loop.plant, start.loop.drive, structure.n_steps
+    fields = (
+        plant.ux, plant.uy, plant.joint_cos, plant.joint_sin, plant.s0, plant.h0, plant.length,
+        plant.slider_link_mass, plant.first_moment, plant.inertia, plant.platform_mass,
+        plant.platform_inertia, plant.mass, plant.stiffness, plant.damping, plant.b, plant.c,
+        start.loop.actuator, start.loop.deflection_at,
+        *(np.broadcast_to(x, (3,)) for x in (drive.kp, drive.kd, drive.force_limit)),
+        start.loop.controller.voltage_limit,
+    )  # fmt: skip
+    machine = np.concatenate([np.ravel(x) for x in fields])
+    wanted = np.ascontiguousarray(np.stack([start.inputs.rho, start.inputs.rho_rate], axis=2))
+    weight = np.asarray(start.inputs.window.is_residual)
+    pose = np.asarray(start.state.plant.pose)
+    home = np.array([*pose, pose[2], np.sin(pose[2]), np.cos(pose[2])])
+    gains = [_aligned(g.reshape(8, -1).T) for g in np.asarray(each).reshape(-1, 8, 27)]
+    function = _compiled(compiler)
+    pool = ThreadPoolExecutor(len(jax.local_devices()))
+
+    def group(gain: np.ndarray) -> np.ndarray:
+        square = _aligned(np.zeros((9, 8)))
+        arrays = (wanted, weight, home, gain, square)
+        function(
+            machine.ctypes.data, n, ctypes.c_double(PERIOD), *(x.ctypes.data for x in arrays)
+        )  # fmt: skip
+        return square.T.reshape(8, 3, 3)
+
+    def run() -> Any:
+        return np.sqrt(np.concatenate(list(pool.map(group, gains))) / weight.sum())
+
+    return run
+
+
+def _ideal(structure: Structure, case: Case) -> Any:
+    """Voltages of modal velocities [V s/m], (3, K, R)."""
+    ideal = begin(structure, case).loop.ideal
+    assert ideal is not None
+    return ideal[0]
+
+
+def _aligned(array: np.ndarray) -> np.ndarray:
+    """A copy at an address that vectors of 64 bytes may have."""
+    room = np.empty(array.size + 8)
+    skip = -room.ctypes.data % 64 // 8
+    copy = room[skip : skip + array.size].reshape(array.shape)
+    copy[...] = array
+    return copy
+
+
+def _compiled(compiler: str) -> Any:
+    """The function `run` of `w0.c`."""
+    source = Path(__file__).with_name("w0.c")
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder) / "w0.so"
+        subprocess.run(
+            [compiler, "-O3", "-march=native", "-ffp-contract=fast", "-Wno-psabi", "-shared",
+             "-fPIC", "-o", str(library), str(source)],
+            check=True, capture_output=True,
+        )  # fmt: skip
+        function = ctypes.CDLL(str(library)).run
+    address = ctypes.c_void_p
+    function.argtypes = [address, ctypes.c_long, ctypes.c_double, *[address] * 5]
+    function.restype = None
+    return function

@@ -1,0 +1,66 @@
+"""`studies bench`: every peer does the same work, every key is there."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from studies import cli
+from studies.bench import peers
+from studies.bench.works import WORKS
+from studies.sweeps.executor import KernelExecutor
+
+KEYS = "work executor configs_per_s compile_s peak_mib device dtype batch steps fingerprint"
+
+
+@pytest.fixture(scope="module")
+def work():
+    return peers.make_work(is_short=True)
+
+
+def check_agreement(rms, work):
+    own = KernelExecutor(work.structure, work.layout, False).start(work.cases).wait()
+    wanted = own.metrics.residual_rms[: len(rms)]
+    assert wanted.min() > 1e-9
+    np.testing.assert_allclose(rms, wanted, atol=2e-6 * wanted.max())
+
+
+def test_hand_written_c_agrees(work):
+    compiler = shutil.which("gcc") or shutil.which("clang")
+    if not compiler:
+        pytest.skip("neither gcc nor clang is installed")
+    check_agreement(peers.by_c(work, compiler)(), work)
+
+
+def test_adaptive_steps_agree(work):
+    check_agreement(peers.by_scipy(work)(), work)
+
+
+@pytest.mark.long
+def test_all_peers_agree():
+    """By closed form, Lagrangian and C; ETDRK4, RK4, Tsit5 and adaptive steps."""
+    lines = []
+    rows = peers.bench_peers(lines.append, is_short=True, repeats=1)
+    assert len(rows) + sum(line.startswith("no ") for line in lines) == 6
+    for row in rows:
+        assert row.error < 2e-6, row
+        assert row.configs_per_s * row.times_slower == pytest.approx(rows[0].configs_per_s)
+
+
+def test_gradient_figures(monkeypatch, capsys):
+    monkeypatch.setitem(WORKS["W0"], "link__modes", 1)
+    monkeypatch.setitem(WORKS["W0"], "control__modes", 1)
+    monkeypatch.setattr("studies.bench.gradients.REPEATS", 1)
+    cli.main(["bench", "--work", "grad", "--batch", "16", "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert set(KEYS.split()) <= set(found)
+    assert found["parameters"] == 3 and found["configs_per_s"] > 0 < found["fingerprint"]
+
+
+@pytest.mark.parametrize("arguments", [["pears"], ["--work", "W2"], ["--work", "grad",
+                                       "--executor", "gpu"]])  # fmt: skip
+def test_unknown_choices_are_refused(arguments, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["bench", *arguments])
+    assert "allowed" in capsys.readouterr().err
