@@ -80,7 +80,7 @@ def configure(
 def info() -> dict[str, Any]:
     """Versions and settings in force, as plain values for `studies info`; starts JAX."""
     kinds = [device.device_kind for device in jax.devices()]
-    folder = settings.jax_compilation_cache_dir if settings.jax_enable_compilation_cache else ""
+    folder = cache_folder()
     return {
         PACKAGE: _version(PACKAGE),
         "python": platform.python_version(),
@@ -91,6 +91,12 @@ def info() -> dict[str, Any]:
         "cache_mib": round(_folder_bytes(folder) / 2**20, 1) if folder else 0.0,
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }
+
+
+def cache_folder() -> str:
+    """Where compiled programs are kept; "" for nowhere."""
+    is_kept = settings.jax_enable_compilation_cache
+    return (is_kept and settings.jax_compilation_cache_dir) or ""
 
 
 _is_configured = False

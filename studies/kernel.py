@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from studies.compilation import ObjectCache, compiling
 from studies.fusion import count_operations, fused, in_order
 from studies.graph import Graph, Node, is_known, objects
 from studies.tangents import push_forward
@@ -180,13 +181,16 @@ def _initialise() -> None:
 
 def _compile(text: str) -> Any:
     _initialise()
-    module = binding.parse_assembly(text)
-    target = binding.Target.from_default_triple().create_target_machine(
-        cpu=binding.get_host_cpu_name(), features=binding.get_host_cpu_features().flatten(),
-        opt=3, jit=True,
-    )  # fmt: skip
-    engine = binding.create_mcjit_compiler(module, target)
-    engine.finalize_object()
+    cpu, features = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
+    triple, version = binding.get_default_triple(), ".".join(map(str, binding.llvm_version_info))
+    kept = ObjectCache(text, cpu, features, triple, version)
+    with compiling():
+        target = binding.Target.from_default_triple().create_target_machine(
+            cpu=cpu, features=features, opt=3, jit=True
+        )
+        engine = binding.create_mcjit_compiler(binding.parse_assembly(text), target)
+        engine.set_object_cache(kept.keep, kept.take)
+        engine.finalize_object()
     return engine
 
 

@@ -51,7 +51,7 @@ def test_all_peers_agree():
 def test_gradient_figures(monkeypatch, capsys):
     monkeypatch.setitem(WORKS["W0"], "link__modes", 1)
     monkeypatch.setitem(WORKS["W0"], "control__modes", 1)
-    monkeypatch.setattr("studies.bench.gradients.REPEATS", 1)
+    monkeypatch.setattr("studies.bench.works.REPEATS", 1)
     cli.main(["bench", "--work", "grad", "--batch", "16", "--json"])
     found = json.loads(capsys.readouterr().out)
     assert set(KEYS.split()) <= set(found)

@@ -7,9 +7,10 @@ import pytest
 
 from jaxmodel import status
 from jaxmodel.trigonometry import sine_cosine
-from studies import kernel
+from studies import compilation, kernel
 from studies.bench.works import METRICS, WORKS
 from studies.cases import build_cases, build_structure
+from studies.compilation import ObjectCache
 from studies.spec import paper_study
 from studies.sweeps.executor import TRACES, KernelExecutor, ScanExecutor, make_executor
 from studies.sweeps.plan import Layout, chunk_cases, plan_groups
@@ -142,6 +143,22 @@ def test_not_a_number_goes_through_limits():
 def test_unknown_operation_is_named():
     with pytest.raises(NotImplementedError, match="'cumsum'"):
         translated(lambda x, c: jnp.cumsum(x), (3,))
+
+
+def test_code_is_kept_and_damage_is_noticed(tmp_path, monkeypatch):
+    """The second compilation reads the first one's code; a spoilt file is compiled anew."""
+    monkeypatch.setattr(compilation, "cache_folder", lambda: str(tmp_path))
+    taken = []
+    take = ObjectCache.take
+    monkeypatch.setattr(ObjectCache, "take", lambda *x: taken.append(take(*x)) or taken[-1])
+    first = translated(every_operation, (3, 4))[0]
+    (file,) = tmp_path.glob("kernel-*")
+    whole = file.read_bytes()
+    np.testing.assert_array_equal(translated(every_operation, (3, 4))[0], first)
+    file.write_bytes(whole[:-1] + b"x")
+    np.testing.assert_array_equal(translated(every_operation, (3, 4))[0], first)
+    assert [code is not None for code in taken] == [False, True, False]
+    assert file.read_bytes() == whole
 
 
 # --- guards against slow code, which tests cannot time --------------------------------------------

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
-import time
 from typing import Any
 
 import jax
@@ -12,7 +10,7 @@ import numpy as np
 from jaxmodel.case import Case
 from jaxmodel.parameters import Array
 from studies import config, kernel
-from studies.bench.works import METRICS, REPEATS, WORKS, check_executor, make_layout
+from studies.bench.works import METRICS, WORKS, check_executor, make_layout, timed
 from studies.cases import build_cases, build_structure
 from studies.spec import paper_study
 from studies.sweeps.gradients import KernelGradients, ScanGradients
@@ -51,21 +49,16 @@ def bench_gradients(executor: str = "", batch: int = 0) -> dict[str, Any]:
     parameters = ratio * random.uniform(0.5, 2.0, (layout.size, ratio.size))
     is_kernel = kernel.is_available() if not executor else executor == "kernel"
     made = (KernelGradients if is_kernel else ScanGradients)(structure, layout, place_gains)
-    found = made.evaluate(cases, parameters)
-    times = []
-    for _ in range(REPEATS):
-        began = time.perf_counter()
-        found = made.evaluate(cases, parameters)
-        times.append(time.perf_counter() - began)
-    seconds = statistics.median(times)
+    found, timing = timed(lambda: made.evaluate(cases, parameters))
     gradient = found.metrics.residual_rms.mean((0, 2, 3))
     return {
         "work": "grad",
         "executor": f"{made.name}, forward",
-        "configs_per_s": round(layout.size / seconds, 1),
+        "configs_per_s": round(layout.size / timing.seconds, 1),
         "parameters": ratio.size,
-        "ns_per_step": round(1e9 * seconds / layout.size / structure.n_steps, 1),
-        "compile_s": round(made.compile_time, 2),
+        "ns_per_step": round(1e9 * timing.seconds / layout.size / structure.n_steps, 1),
+        "compile_s": round(timing.compile_time, 2),
+        "trace_s": round(timing.trace_time, 2),
         "peak_mib": round(peak_memory() / 2**20, 1),
         "device": f"{layout.devices} x {jax.local_devices()[0].device_kind}",
         "dtype": str(found.metrics.residual_rms.dtype),

@@ -7,7 +7,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -17,6 +17,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.simulate import Result
 from studies import config, kernel
 from studies.cases import build_cases, build_structure
+from studies.compilation import compiler_time
 from studies.errors import StudyError, field_error
 from studies.spec import paper_study
 from studies.sweeps.executor import Executor, KernelExecutor, ScanExecutor, make_executor
@@ -84,6 +85,28 @@ def make_layout(batch: int) -> Layout:
     return Layout(devices, max(batch // (devices * lanes), 1) if batch else 2, lanes)
 
 
+class Timing(NamedTuple):
+    """How long it takes."""
+
+    seconds: float  # median of the later runs
+    compile_time: float  # of compilers in the first run [s]
+    trace_time: float  # what the first run took beyond that and the median [s]
+
+
+def timed(run: Callable[[], Any]) -> tuple[Any, Timing]:
+    """Result and timing of something that compiles when it first runs."""
+    before, began = compiler_time(), time.perf_counter()
+    run()
+    first, compiled = time.perf_counter() - began, compiler_time() - before
+    times = []
+    for _ in range(REPEATS):
+        began = time.perf_counter()
+        result = run()
+        times.append(time.perf_counter() - began)
+    seconds = statistics.median(times)
+    return result, Timing(seconds, compiled, max(first - compiled - seconds, 0.0))
+
+
 def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
     """Speed of a batch of closed-loop runs that differ in their gains.
 
@@ -111,19 +134,14 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
     cases = jax.tree.map(lambda x: x if x.dtype.kind == "i" else x.astype(real), exact)
     chosen = EXECUTORS[executor] if executor else None
     made = chosen(structure, layout, False) if chosen else make_executor(structure, layout, False)
-    result = made.start(cases).wait()
-    times = []
-    for _ in range(REPEATS):
-        began = time.perf_counter()
-        result = made.start(cases).wait()
-        times.append(time.perf_counter() - began)
-    seconds = statistics.median(times)
+    result, timing = timed(lambda: made.start(cases).wait())
     figures = {
         "work": work,
         "executor": made.name,
-        "configs_per_s": round(layout.size / seconds, 1),
-        "ns_per_step": round(1e9 * seconds / layout.size / structure.n_steps, 1),
-        "compile_s": round(made.compile_time, 2),
+        "configs_per_s": round(layout.size / timing.seconds, 1),
+        "ns_per_step": round(1e9 * timing.seconds / layout.size / structure.n_steps, 1),
+        "compile_s": round(timing.compile_time, 2),
+        "trace_s": round(timing.trace_time, 2),
         "peak_mib": round(peak_memory() / 2**20, 1),
         "device": f"{layout.devices} x {jax.local_devices()[0].device_kind}",
         "dtype": str(result.metrics.residual_rms.dtype),

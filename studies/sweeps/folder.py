@@ -283,7 +283,7 @@ def code_digest() -> str:
     digest = sha256()
     names = (
         "cases.py", "fields.py", "fusion.py", "graph.py", "kernel.py", "spec.py",
-        "sweeps/executor.py", "sweeps/plan.py", "sweeps/table.py",
+        "sweeps/executor.py", "sweeps/plan.py", "sweeps/program.py", "sweeps/table.py",
     )  # fmt: skip
     sources = sorted((_SOURCES / "jaxmodel").glob("*.py"))
     for path in (*sources, *(_SOURCES / "studies" / name for name in names)):
