@@ -88,9 +88,9 @@ def build_kernel(
 ) -> Kernel:
     """Compile a loop over `step(constants, inputs, state) -> state`, all lists of arrays.
 
-    With directions, the state's tangents are carried along too. Behind the constants, the inputs
-    and the state the kernel then takes the tangents of the moving ones, each like its leaf with
-    the directions before the leaf's own shape, varying.
+    With directions, the state's tangents are carried along too: behind the constants, behind the
+    inputs and behind the state the kernel then takes tangents of those that move, each varying and
+    with the directions before the leaf's own shape.
 
     Args:
         step: elementwise JAX function of one case and one sample.

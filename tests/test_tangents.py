@@ -61,6 +61,8 @@ def test_kernel_and_scan_agree(chunk):
         assert a.shape[:2] == (LAYOUT.size, N_PARAMETERS)
         size = np.abs(b[good]).max()
         assert np.abs(a[good] - b[good]).max() <= 1e-9 * size, name
+    stopped = np.delete(fast.metrics.residual_rms, good, axis=0)
+    assert len(stopped) == 1 and (stopped == 0).all()
     rms = fast.metrics.residual_rms[good]
     assert (np.abs(rms).max((0, 2, 3)) > 0).all()  # by every parameter
 

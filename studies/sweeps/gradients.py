@@ -49,7 +49,7 @@ class Slopes(NamedTuple):
     """A chunk and how it changes; NumPy arrays."""
 
     result: Result  # cases first
-    metrics: Metrics  # derivatives, (cases, p, ...); NaN where a run did not finish
+    metrics: Metrics  # derivatives, (cases, p, ...); 0 where a run did not finish
 
 
 class Gradients(Protocol):
