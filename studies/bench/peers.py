@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import ctypes
 import shutil
-import statistics
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -31,11 +29,11 @@ from jaxmodel.loop import PlantState, ideal_voltage, plant_rates
 from jaxmodel.simulate import Start, begin
 from studies import config, kernel
 from studies.bench import reference
-from studies.bench.works import METRICS, WORKS
-from studies.cases import as_arrays, build_cases, build_structure
+from studies.bench.works import build_work, make_layout, timed
+from studies.cases import as_arrays
 from studies.spec import paper_study
 from studies.sweeps.executor import KernelExecutor, ScanExecutor
-from studies.sweeps.plan import LANES, Layout
+from studies.sweeps.plan import Layout
 
 #: Sample period of W0, and step of the peers with a constant one [s].
 PERIOD = 1e-4
@@ -79,6 +77,10 @@ class Peer(NamedTuple):
     n_cases: int  # enough to time it, few enough to wait for
     run: Callable[[], Any]  # residual rms (n_cases, 3, S)
 
+    def finish(self) -> np.ndarray:
+        """What it finds, once it is there."""
+        return np.asarray(self.run())
+
 
 def make_work(is_short: bool = False) -> Work:
     """W0 with gains that differ.
@@ -86,17 +88,12 @@ def make_work(is_short: bool = False) -> Work:
     Args:
         is_short: one move only and 20 ms after it, to see that all agree.
     """
-    study = paper_study().change(**WORKS["W0"])
-    if is_short:
-        points = study.motion.waypoints[:2]
-        study = study.change(
-            run__duration=0.15, motion__waypoints=points, metrics__residual_length=0.02
-        )
-    structure = build_structure(study)._replace(metrics=METRICS["W0"])
-    devices = len(jax.local_devices())
-    layout = Layout(devices, 1, 8) if is_short else Layout(devices, 2, LANES)
-    gains = np.random.default_rng(0).uniform(0.01, 0.5, layout.size)
-    return Work(structure, build_cases(study, {"control.gain_factor": gains}, structure), layout)
+    short = {
+        "run__duration": 0.15, "motion__waypoints": paper_study().motion.waypoints[:2],
+        "metrics__residual_length": 0.02,
+    }  # fmt: skip
+    layout = make_layout(8 * len(jax.local_devices()) if is_short else 0)
+    return Work(*build_work("W0", layout, **(short if is_short else {})), layout)
 
 
 def bench_peers(
@@ -116,15 +113,10 @@ def bench_peers(
     rows: list[Row] = []
     for peer in find_peers(work, report):
         report(f"{peer.name}: {peer.n_cases} cases")
-        found = np.asarray(peer.run())  # compiles
-        times = []
-        for _ in range(repeats):
-            began = time.perf_counter()
-            found = np.asarray(peer.run())
-            times.append(time.perf_counter() - began)
+        found, timing = timed(peer.finish, repeats)
         right = exact[: peer.n_cases]
         error = float(np.max(np.abs(found - right)) / np.max(right))
-        speed = peer.n_cases / statistics.median(times)
+        speed = peer.n_cases / timing.seconds
         rows.append(Row(peer.name, speed, error, 1.0))
     rows.sort(key=lambda row: -row.configs_per_s)
     best = rows[0].configs_per_s

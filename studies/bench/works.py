@@ -85,6 +85,20 @@ def make_layout(batch: int) -> Layout:
     return Layout(devices, max(batch // (devices * lanes), 1) if batch else 2, lanes)
 
 
+def build_work(work: str, layout: Layout, **changes: Any) -> tuple[Structure, Case]:
+    """Cases of a workload that differ in their gains.
+
+    Args:
+        work: key of WORKS.
+        layout: of their chunk.
+        changes: of the study.
+    """
+    study = paper_study().change(**WORKS[work], **changes)
+    structure = build_structure(study)._replace(metrics=METRICS.get(work, ()))
+    gains = np.random.default_rng(0).uniform(0.01, 0.5, layout.size)
+    return structure, build_cases(study, {"control.gain_factor": gains}, structure)
+
+
 class Timing(NamedTuple):
     """How long it takes."""
 
@@ -93,18 +107,44 @@ class Timing(NamedTuple):
     trace_time: float  # what the first run took beyond that and the median [s]
 
 
-def timed(run: Callable[[], Any]) -> tuple[Any, Timing]:
-    """Result and timing of something that compiles when it first runs."""
+def timed(run: Callable[[], Any], repeats: int | None = None) -> tuple[Any, Timing]:
+    """Result and timing of something that compiles when it first runs.
+
+    Args:
+        run: what to do.
+        repeats: runs of which the median counts; REPEATS unless given.
+    """
     before, began = compiler_time(), time.perf_counter()
     run()
     first, compiled = time.perf_counter() - began, compiler_time() - before
     times = []
-    for _ in range(REPEATS):
+    for _ in range(repeats or REPEATS):
         began = time.perf_counter()
         result = run()
         times.append(time.perf_counter() - began)
     seconds = statistics.median(times)
     return result, Timing(seconds, compiled, max(first - compiled - seconds, 0.0))
+
+
+def describe(layout: Layout, structure: Structure, timing: Timing, dtype: Any) -> dict[str, Any]:
+    """Figures of a chunk by name.
+
+    Args:
+        layout, structure: of the chunk.
+        timing: of it.
+        dtype: of its results.
+    """
+    return {
+        "configs_per_s": round(layout.size / timing.seconds, 1),
+        "ns_per_step": round(1e9 * timing.seconds / layout.size / structure.n_steps, 1),
+        "compile_s": round(timing.compile_time, 2),
+        "trace_s": round(timing.trace_time, 2),
+        "peak_mib": round(peak_memory() / 2**20, 1),
+        "device": f"{layout.devices} x {jax.local_devices()[0].device_kind}",
+        "dtype": str(dtype),
+        "batch": layout.size,
+        "steps": structure.n_steps,
+    }
 
 
 def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
@@ -126,29 +166,16 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
     check_executor(executor)
     config.require_configured()
     layout = make_layout(batch)
-    study = paper_study().change(**WORKS[work])
-    structure = build_structure(study)._replace(metrics=METRICS.get(work, ()))
-    gains = np.random.default_rng(0).uniform(0.01, 0.5, layout.size)
-    exact = build_cases(study, {"control.gain_factor": gains}, structure)
+    structure, exact = build_work(work, layout)
     real = jax.dtypes.canonicalize_dtype(np.float64)
     cases = jax.tree.map(lambda x: x if x.dtype.kind == "i" else x.astype(real), exact)
     chosen = EXECUTORS[executor] if executor else None
     made = chosen(structure, layout, False) if chosen else make_executor(structure, layout, False)
     result, timing = timed(lambda: made.start(cases).wait())
-    figures = {
-        "work": work,
-        "executor": made.name,
-        "configs_per_s": round(layout.size / timing.seconds, 1),
-        "ns_per_step": round(1e9 * timing.seconds / layout.size / structure.n_steps, 1),
-        "compile_s": round(timing.compile_time, 2),
-        "trace_s": round(timing.trace_time, 2),
-        "peak_mib": round(peak_memory() / 2**20, 1),
-        "device": f"{layout.devices} x {jax.local_devices()[0].device_kind}",
-        "dtype": str(result.metrics.residual_rms.dtype),
-        "batch": layout.size,
-        "steps": structure.n_steps,
-        "fingerprint": float(np.mean(result.metrics.residual_rms)),
-    }
+    rms = result.metrics.residual_rms
+    figures: dict[str, Any] = {"work": work, "executor": made.name}
+    figures |= describe(layout, structure, timing, rms.dtype)
+    figures["fingerprint"] = float(np.mean(rms))
     if real != np.float64:
         figures["error"] = _errors(result, structure, layout, exact)
     return figures

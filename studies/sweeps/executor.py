@@ -22,7 +22,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.loop import Inputs, State, step
-from jaxmodel.simulate import Result, Start
+from jaxmodel.simulate import Outline, Result, Start
 from studies import kernel
 from studies.runs import uncontrolled
 from studies.sweeps.plan import Layout
@@ -34,6 +34,7 @@ from studies.sweeps.program import (
     conclude_all,
     find_parts,
     joined,
+    lane_blocks,
     prepare,
     prepare_shared,
     split_cases,
@@ -191,11 +192,7 @@ class KernelExecutor:
     def start(self, cases: Case) -> Running:
         split = split_cases(cases, self.layout, self.structure, self.has_own_ratio)
         program = Program(self.structure, self.layout, split.tree, split.is_varying)
-        lanes = self.layout.lanes
-        blocks = [
-            [leaf[k : k + lanes] for leaf in split.varying]
-            for k in range(0, self.layout.size, lanes)
-        ]
+        blocks = lane_blocks(split, self.layout)
         if self._steps is None:
             started = time.perf_counter()
             self._steps = compile_steps(program, split)
@@ -210,18 +207,47 @@ def _step_block(
     program: Program, steps: Steps, varying: list[np.ndarray], shared: list[np.ndarray]
 ) -> Start:
     """A Start whose state is that after the last step; state and outline lanes last."""
+    ready = start_block(program, steps, varying, shared)
+    code = ready.state.status.copy()
+    leaves = [*ready.loop, *ready.inputs, *jax.tree.leaves(ready.state)]
+    steps.run.run(leaves, program.structure.n_steps, program.layout.lanes)
+    return Start((), code, ready.state, ready.outline)  # type: ignore[arg-type]
+
+
+class Ready(NamedTuple):
+    """A block of lanes before its first step, as the kernel reads it."""
+
+    loop: list[np.ndarray]  # leaves that are not written into the code
+    inputs: list[np.ndarray]
+    state: State  # a copy, lanes last
+    outline: Outline  # lanes last
+
+
+def start_block(
+    program: Program, steps: Steps, varying: list[np.ndarray], shared: list[np.ndarray]
+) -> Ready:
+    """Prepare a block of lanes.
+
+    Args:
+        program: of the cases.
+        steps: compiled for it.
+        varying, shared: leaves of the block's cases.
+    """
     lanes, parts = program.layout.lanes, steps.parts
     own = [np.asarray(x, order="C") for x in prepare(program, parts, varying, shared)]
     start: Start = joined(parts.tree, parts.is_varying, own, steps.shared)
     varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
-    state = jax.tree.map(lambda x, v: wide(x, v, lanes), start.state, varies.state)
-    outline = jax.tree.map(lambda x, v: wide(x, v, lanes), start.outline, varies.outline)
-    code = state.status.copy()
+
+    def widened(tree: Any, variation: Any) -> Any:
+        return jax.tree.map(lambda x, v: _wide(x, v, lanes), tree, variation)
+
     loop = zip(jax.tree.leaves(start.loop), jax.tree.leaves(varies.loop), strict=True)
-    read = [leaf for leaf, is_read in loop if is_read]
-    leaves = [*read, *jax.tree.leaves((start.inputs, state))]
-    steps.run.run(leaves, program.structure.n_steps, lanes)
-    return Start((), code, state, outline)  # type: ignore[arg-type]
+    return Ready(
+        [leaf for leaf, is_read in loop if is_read],
+        jax.tree.leaves(start.inputs),
+        widened(start.state, varies.state),
+        widened(start.outline, varies.outline),
+    )
 
 
 def _cancel(running: list[Future]) -> None:
@@ -235,7 +261,7 @@ def _concluded(running: list[Future]) -> Result:
     return jax.tree.map(np.asarray, conclude_all(whole.outline, whole.inputs, whole.state))
 
 
-def wide(x: np.ndarray, is_varying: bool, lanes: int) -> np.ndarray:
+def _wide(x: np.ndarray, is_varying: bool, lanes: int) -> np.ndarray:
     """A copy with one value per lane, lanes last."""
     whole = x if is_varying else np.broadcast_to(np.asarray(x)[..., None], (*np.shape(x), lanes))
     return np.array(whole, order="C", copy=True)

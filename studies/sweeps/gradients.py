@@ -25,7 +25,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.metrics import Metrics
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import Result, Start, simulate
-from studies.sweeps.executor import TRACES, Steps, compile_steps, fits_kernel, wide
+from studies.sweeps.executor import TRACES, Steps, compile_steps, fits_kernel, start_block
 from studies.sweeps.plan import Layout
 from studies.sweeps.program import (
     Place,
@@ -33,6 +33,7 @@ from studies.sweeps.program import (
     Split,
     conclude_slopes,
     joined,
+    lane_blocks,
     prepare,
     prepare_tangents,
     split_cases,
@@ -111,15 +112,12 @@ class KernelGradients:
     def evaluate(self, cases: Case, parameters: np.ndarray) -> Slopes:
         split = _split(cases, parameters, self.layout, self.structure)
         program = Program(self.structure, self.layout, split.tree, split.is_varying, self.place)
-        lanes = self.layout.lanes
-        blocks = [
-            [leaf[k : k + lanes] for leaf in split.varying]
-            for k in range(0, self.layout.size, lanes)
-        ]
+        blocks = lane_blocks(split, self.layout)
         if self._steps is None:
             started = time.perf_counter()
             self._steps = compile_steps(program, split, min(DIRECTIONS, parameters.shape[1]))
-            _prepared(program, self._steps, blocks[0], split.shared)
+            for part in (prepare, prepare_tangents):
+                part(program, self._steps.parts, blocks[0], split.shared)
             self.compile_time = time.perf_counter() - started
         one = partial(_slopes, program, self._steps, shared=split.shared)
         done = list(self._pool.map(one, blocks))
@@ -127,47 +125,31 @@ class KernelGradients:
         return Slopes(*jax.tree.map(np.asarray, conclude_slopes(*whole)))
 
 
-def _prepared(program: Program, steps: Steps, block: list, shared: list) -> tuple:
-    own = prepare(program, steps.parts, block, shared)
-    return own, prepare_tangents(program, steps.parts, block, shared)
-
-
 def _slopes(program: Program, steps: Steps, block: list, shared: list) -> tuple:
     """(outline, status at the start, last state, tangents of outline and state), lanes last."""
-    lanes, parts = program.layout.lanes, steps.parts
-    given, pushed = _prepared(program, steps, block, shared)
-    own = [np.asarray(x, order="C") for x in given]
-    start: Start = joined(parts.tree, parts.is_varying, own, steps.shared)
-    varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
-    n = block[-1].shape[1]
-    turning = iter(pushed)
+    parts, n = steps.parts, block[-1].shape[1]
+    ready = start_block(program, steps, block, shared)
+    turning = iter(prepare_tangents(program, parts, block, shared))
     found = [next(turning) if moves else None for moves in parts.is_moving]
     turn: Start = jax.tree.unflatten(parts.tree, [_Tangent(x) for x in found])
-
-    def widened(tree: Any, variation: Any) -> Any:
-        return jax.tree.map(lambda x, v: wide(x, v, lanes), tree, variation)
-
-    outline, first = widened(start.outline, varies.outline), widened(start.state, varies.state)
-    slope = jax.tree.map(partial(_filled, n), first, turn.state)
-    leaves = zip(jax.tree.leaves(start.loop), jax.tree.leaves(varies.loop), strict=True)
-    loop = [x for x, is_read in leaves if is_read]
-    state = first
+    slope = jax.tree.map(partial(_filled, n), ready.state, turn.state)
+    state = ready.state
     for k in range(0, n, steps.directions):
-        state = jax.tree.map(np.copy, first)
+        state = jax.tree.map(np.copy, ready.state)
         along = jax.tree.map(lambda x, k=k: _cut(x, k, steps.directions), slope)
         steps.run.run(
             [
-                *loop, *_moving(turn.loop, k, steps.directions),
-                *jax.tree.leaves(start.inputs), *_by_sample(turn.inputs, k, steps.directions),
+                *ready.loop, *_moving(turn.loop, k, steps.directions),
+                *ready.inputs, *_by_sample(turn.inputs, k, steps.directions),
                 *jax.tree.leaves(state), *jax.tree.leaves(along),
             ],
-            program.structure.n_steps, lanes,
+            program.structure.n_steps, program.layout.lanes,
         )  # fmt: skip
         for whole, part in zip(jax.tree.leaves(slope), jax.tree.leaves(along), strict=True):
             whole[k : k + steps.directions] = part[: n - k]
     return (
-        outline, first.status, state, jax.tree.map(partial(_filled, n), outline, turn.outline),
-        slope,
+        ready.outline, ready.state.status, state,
+        jax.tree.map(partial(_filled, n), ready.outline, turn.outline), slope,
     )  # fmt: skip
 
 

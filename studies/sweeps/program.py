@@ -59,6 +59,12 @@ def split_cases(cases: Case, layout: Layout, structure: Structure, has_own_ratio
     )
 
 
+def lane_blocks(split: Split, layout: Layout) -> list[list[np.ndarray]]:
+    """Leaves that vary, cut into blocks of lanes."""
+    starts = range(0, layout.size, layout.lanes)
+    return [[leaf[k : k + layout.lanes] for leaf in split.varying] for k in starts]
+
+
 def joined(tree: Any, is_varying: tuple[bool, ...], varying: list, shared: list) -> Any:
     """The tree of leaves that vary and leaves that do not."""
     sources = {True: iter(varying), False: iter(shared)}
