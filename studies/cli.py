@@ -155,7 +155,9 @@ def modes(
 def bench(
     what: Annotated[str, typer.Argument(help="runs, or peers: W0 by other means")] = "runs",
     work: Annotated[str, typer.Option(help="W0, W1, W8, grad or sweep")] = "W1",
-    executor: Annotated[str, typer.Option(help="kernel or scan; default: the faster one")] = "",
+    executor: Annotated[
+        str, typer.Option(help="kernel, scan or gpu; default: the fastest one")
+    ] = "",
     batch: Annotated[int, typer.Option(min=0, help="cases of a chunk; 0: a good number")] = 0,
     cases: Annotated[int, typer.Option(min=1, help="cases of the sweep")] = 100_000,
     precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",

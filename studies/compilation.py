@@ -1,7 +1,7 @@
 """Time that compilers take in this process, and a folder of what LLVM has compiled before.
 
 JAX keeps its compiled programs in a folder by itself (`studies.config`); the kernels of
-`studies.kernel` are kept beside them, under the hash of their code, compiler and processor.
+`studies.kernels.cpu` are kept beside them, under the hash of their code, compiler and processor.
 """
 
 from __future__ import annotations

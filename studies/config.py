@@ -102,6 +102,13 @@ def cache_folder() -> str:
 _is_configured = False
 
 
+def processor() -> str:
+    """What JAX computes on: "cpu", "cuda" for Nvidia's graphics processors, or another name."""
+    device = jax.local_devices()[0]
+    is_cuda = "cuda" in getattr(device.client, "platform_version", "").lower()
+    return "cuda" if device.platform == "gpu" and is_cuda else str(device.platform)
+
+
 def require_configured() -> None:
     """Raise StudyError unless `configure` has been called: JAX's default is single precision."""
     if not _is_configured:

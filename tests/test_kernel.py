@@ -7,13 +7,18 @@ import pytest
 
 from jaxmodel import status
 from jaxmodel.trigonometry import sine_cosine
-from studies import compilation, kernel
+from studies import compilation
 from studies.bench.works import METRICS, WORKS
 from studies.cases import build_cases, build_structure
 from studies.compilation import ObjectCache
+from studies.kernels import cpu, llvm
+from studies.kernels.traced import Leaf, trace_loop
 from studies.spec import paper_study
-from studies.sweeps.executor import TRACES, KernelExecutor, ScanExecutor, make_executor
+from studies.sweeps.executor import make_executor
+from studies.sweeps.kernels import KernelExecutor
 from studies.sweeps.plan import Layout, chunk_cases, plan_groups
+from studies.sweeps.program import TRACES
+from studies.sweeps.scan import ScanExecutor
 from studies.sweeps.table import build_table
 from tests.sweeps import MIXED, small_spec
 
@@ -88,7 +93,7 @@ def test_without_llvmlite_the_scan_runs(monkeypatch):
     table = build_table(small_spec(MIXED))
     group = plan_groups(table, np.arange(8), 2)[0]
     assert isinstance(make_executor(group.structure, LAYOUT, False), KernelExecutor)
-    monkeypatch.setattr(kernel, "binding", None)
+    monkeypatch.setattr(llvm, "binding", None)
     assert isinstance(make_executor(group.structure, LAYOUT, False), ScanExecutor)
 
 
@@ -100,20 +105,20 @@ def translated(function, shape, dtype=np.float64, lanes=16):
     rng = np.random.default_rng(0)
     x = rng.normal(size=(*shape, lanes)).astype(dtype) * 2
     c = rng.normal(size=shape).astype(dtype)
-    built = kernel.build_kernel(
+    loop = trace_loop(
         lambda constants, row, state: [function(state[0], constants[0]) + 0 * row[0][0]],
-        [c], [kernel.Leaf((1,), False)], [kernel.Leaf(shape, True)], dtype,
+        [c], [Leaf((1,), False)], [Leaf(shape, True)], dtype,
     )  # fmt: skip
     out = x.copy()
-    built.run([np.zeros((1, 1), dtype), out], 1, lanes)
+    cpu.build_kernel(loop).run([np.zeros((1, 1), dtype), out], 1, lanes)
     wanted = np.asarray(jax.vmap(function, (-1, None), -1)(x, c))
     return out, wanted
 
 
-def every_operation(x, c):
+def every_operation(x, c, bend=jnp.tanh):
     """All kinds of operations that a step may use."""
     a = jnp.where(x > c, jnp.sqrt(jnp.abs(x)), jnp.minimum(x, c) / (2 + c * c))
-    a = a + jnp.clip(x, -0.5, 0.5) * jnp.round(x) - jnp.maximum(x, 0.25) ** 3 + jnp.tanh(x)
+    a = a + jnp.clip(x, -0.5, 0.5) * jnp.round(x) - jnp.maximum(x, 0.25) ** 3 + bend(x)
     sine, cosine = sine_cosine(x)
     mixed = jnp.concatenate([a[1:], a[:1]]) + jnp.sum(x, axis=0) * jnp.max(x * c)
     flag = (x < 0) & (c > 0) | ~(x <= 1)

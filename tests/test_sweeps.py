@@ -25,8 +25,8 @@ from studies.errors import StudyError
 from studies.runs import run_study
 from studies.sweeps import plan
 from studies.sweeps import run as run_module
-from studies.sweeps.executor import TRACES
 from studies.sweeps.folder import CHUNKS, finished_cases, make_manifest, open_folder
+from studies.sweeps.program import TRACES
 from studies.sweeps.results import load
 from studies.sweeps.run import make_plan, run_sweep
 from studies.sweeps.show import best_cases

@@ -4,13 +4,14 @@ import jax
 import numpy as np
 import pytest
 
-from studies import kernel
 from studies.cases import build_cases, build_structure
-from studies.graph import Graph, objects
+from studies.kernels.cpu import build_kernel
+from studies.kernels.graph import Graph, objects
+from studies.kernels.tangents import push_forward
+from studies.kernels.traced import Leaf, trace_loop
 from studies.spec import paper_study
 from studies.sweeps.gradients import KernelGradients, ScanGradients, is_forward_cheaper
 from studies.sweeps.plan import Layout
-from studies.tangents import push_forward
 from tests.test_kernel import every_operation, translated
 
 LAYOUT = Layout(devices=1, blocks=1, lanes=16)
@@ -72,11 +73,12 @@ def test_every_operation_is_differentiated():
     random, shape, lanes, directions = np.random.default_rng(1), (3, 4), 16, 2
     x = 2 * random.normal(size=(*shape, lanes))
     c, along = random.normal(size=shape), random.normal(size=(directions, *shape, lanes))
-    built = kernel.build_kernel(
+    loop = trace_loop(
         lambda constants, row, state: [every_operation(state[0], constants[0]) + 0 * row[0][0]],
-        [c], [kernel.Leaf((1,), False)], [kernel.Leaf(shape, True)],
+        [c], [Leaf((1,), False)], [Leaf(shape, True)],
         np.float64, directions,
     )  # fmt: skip
+    built = build_kernel(loop)
     out, pushed = x.copy(), along.copy()
     built.run([np.zeros((1, 1)), out, pushed], 1, lanes)
     whole = jax.vmap(every_operation, (-1, None), -1)

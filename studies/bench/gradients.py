@@ -36,7 +36,7 @@ def bench_gradients(executor: str = "", batch: int = 0) -> dict[str, Any]:
     Raises:
         StudyError: unknown executor, or one that is not installed.
     """
-    check_executor(executor)
+    check_executor(executor, GRADIENTS)
     config.require_configured()
     layout = make_layout(batch)
     structure, cases = build_work("W0", layout)

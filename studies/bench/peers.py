@@ -27,13 +27,15 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.drive import Reference
 from jaxmodel.loop import PlantState, ideal_voltage, plant_rates
 from jaxmodel.simulate import Start, begin
-from studies import config, kernel
+from studies import config
 from studies.bench import reference
 from studies.bench.works import build_work, make_layout, timed
 from studies.cases import as_arrays
+from studies.kernels.llvm import is_available
 from studies.spec import paper_study
-from studies.sweeps.executor import KernelExecutor, ScanExecutor
+from studies.sweeps.kernels import KernelExecutor
 from studies.sweeps.plan import Layout
+from studies.sweeps.scan import ScanExecutor
 
 #: Sample period of W0, and step of the peers with a constant one [s].
 PERIOD = 1e-4
@@ -136,7 +138,7 @@ def find_peers(work: Work, report: Callable[[str], None]) -> list[Peer]:
         Peer("closed form, SciPy solve_ivp (DOP853)", 1, by_scipy(work)),
         Peer("autodiff Lagrangian, RK4 in a scan, vmap", 8, by_lagrangian(work, 8)),
     ]
-    if kernel.is_available():
+    if is_available():
         peers.append(Peer("this program, traced kernel", size, own(KernelExecutor)))
     else:
         report("no traced kernel: install flexlink-studies[fast]")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,15 +15,20 @@ from rich.console import Console
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.simulate import Result
-from studies import config, kernel
+from studies import config
 from studies.cases import build_cases, build_structure
 from studies.compilation import compiler_time
 from studies.errors import StudyError, field_error
+from studies.kernels.gpu import BLOCK
+from studies.kernels.llvm import is_available
 from studies.spec import paper_study
-from studies.sweeps.executor import Executor, KernelExecutor, ScanExecutor, make_executor
-from studies.sweeps.plan import LANES, Layout, peak_memory
+from studies.sweeps.executor import make_executor
+from studies.sweeps.kernels import GpuExecutor, KernelExecutor
+from studies.sweeps.plan import GPU_LANES, LANES, Layout, peak_memory
+from studies.sweeps.program import Executor
 from studies.sweeps.results import load
 from studies.sweeps.run import run_sweep
+from studies.sweeps.scan import ScanExecutor
 from studies.sweeps.spec import parse_sweep
 
 #: A sweep of very short runs: ten samples of a released link, so that the engine itself is timed.
@@ -58,31 +63,42 @@ WORKS: dict[str, dict[str, Any]] = {
 }
 #: Metrics they accumulate; all of them where not named.
 METRICS = {"W0": ("residual_rms",)}
-EXECUTORS: dict[str, Callable[..., Executor]] = {"kernel": KernelExecutor, "scan": ScanExecutor}
+EXECUTORS: dict[str, Callable[..., Executor]] = {
+    "kernel": KernelExecutor,
+    "scan": ScanExecutor,
+    "gpu": GpuExecutor,
+}
 #: Runs of which the median counts.
 REPEATS = 5
 
 
-def check_executor(executor: str) -> None:
-    """Refuse an executor that is unknown or not installed.
+def check_executor(executor: str, known: Iterable[str] = EXECUTORS) -> None:
+    """Refuse an executor that is unknown or cannot run here.
 
     Args:
-        executor: key of EXECUTORS, or "".
+        executor: name, or "".
+        known: the ones to choose from.
 
     Raises:
         StudyError: if so.
     """
-    if executor and executor not in EXECUTORS:
-        raise field_error("--executor", executor, ", ".join(map(repr, EXECUTORS)))
-    if executor == "kernel" and not kernel.is_available():
-        raise StudyError("--executor kernel: needs llvmlite: install flexlink-studies[fast]")
+    if executor and executor not in known:
+        raise field_error("--executor", executor, ", ".join(map(repr, known)))
+    if executor in ("kernel", "gpu") and not is_available():
+        raise StudyError(f"--executor {executor}: needs llvmlite: install flexlink-studies[fast]")
+    if executor == "gpu" and config.processor() != "cuda":
+        raise StudyError(
+            f"--executor gpu: needs an Nvidia graphics processor; JAX computes on "
+            f"{config.processor()!r} here"
+        )
 
 
 def make_layout(batch: int) -> Layout:
-    """A chunk of about so many cases; 0: two blocks of lanes on every device."""
-    devices = len(jax.local_devices())
-    lanes = LANES if not batch else max(8, min(LANES, -(-batch // (8 * devices)) * 8))
-    return Layout(devices, max(batch // (devices * lanes), 1) if batch else 2, lanes)
+    """A chunk of about so many cases; 0: two blocks of lanes on every device, one on a GPU."""
+    devices, is_cpu = len(jax.local_devices()), config.processor() == "cpu"
+    most, unit, blocks = (LANES, 8, 2) if is_cpu else (GPU_LANES, BLOCK, 1)
+    lanes = most if not batch else max(unit, min(most, -(-batch // (unit * devices)) * unit))
+    return Layout(devices, max(batch // (devices * lanes), 1) if batch else blocks, lanes)
 
 
 def build_work(work: str, layout: Layout, **changes: Any) -> tuple[Structure, Case]:
@@ -153,7 +169,7 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
     Args:
         work: key of WORKS.
         executor: key of EXECUTORS; "" for the fastest one at hand.
-        batch: cases in a chunk; 0: two blocks of lanes on every device.
+        batch: cases in a chunk; 0: as `make_layout`.
 
     Returns:
         Figures by name; configurations a second are those of the median run, compiling apart.

@@ -282,8 +282,10 @@ def code_digest() -> str:
     """Hash of the sources that decide a case's numbers."""
     digest = sha256()
     names = (
-        "cases.py", "fields.py", "fusion.py", "graph.py", "kernel.py", "spec.py",
-        "sweeps/executor.py", "sweeps/plan.py", "sweeps/program.py", "sweeps/table.py",
+        "cases.py", "fields.py", "spec.py", "kernels/cpu.py", "kernels/fusion.py",
+        "kernels/gpu.py", "kernels/graph.py", "kernels/llvm.py", "kernels/traced.py",
+        "sweeps/executor.py", "sweeps/kernels.py", "sweeps/plan.py", "sweeps/program.py",
+        "sweeps/scan.py", "sweeps/steps.py", "sweeps/table.py",
     )  # fmt: skip
     sources = sorted((_SOURCES / "jaxmodel").glob("*.py"))
     for path in (*sources, *(_SOURCES / "studies" / name for name in names)):

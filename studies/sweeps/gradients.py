@@ -1,7 +1,7 @@
 """Metrics of a chunk and their derivatives by parameters of each case.
 
 Forward mode: the state's tangents go through the steps beside it, so all metrics are differentiated
-in one pass, no step is stored, and the kernel of `studies.kernel` can do it.
+in one pass, no step is stored, and the kernel of `studies.kernels` can do it.
 
 - `KernelGradients`: the traced kernel, `DIRECTIONS` tangents at once.
 - `ScanGradients`: `jax.jvp` of the reference; everywhere.
@@ -25,9 +25,10 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.metrics import Metrics
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import Result, Start, simulate
-from studies.sweeps.executor import TRACES, Steps, compile_steps, fits_kernel, start_block
+from studies.config import processor
 from studies.sweeps.plan import Layout
 from studies.sweeps.program import (
+    TRACES,
     Place,
     Program,
     Split,
@@ -38,6 +39,7 @@ from studies.sweeps.program import (
     prepare_tangents,
     split_cases,
 )
+from studies.sweeps.steps import Steps, compile_steps, fits_kernel, start_block
 
 #: Tangents that one pass of the kernel carries. More share the state's own arithmetic among more
 #: (1: 31 gradients/s by 9 numbers on a core, 3: 49) but take longer to compile (3 s, 5 s).
@@ -77,7 +79,7 @@ def make_gradients(structure: Structure, layout: Layout, place: Place) -> Gradie
         layout: of its chunks.
         place: puts parameters into a case.
     """
-    if fits_kernel(structure):
+    if processor() == "cpu" and fits_kernel(structure):
         return KernelGradients(structure, layout, place)
     return ScanGradients(structure, layout, place)
 

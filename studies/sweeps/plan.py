@@ -14,8 +14,10 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.prepare import STIFFNESS_LIMIT, drive_rate
 from studies.cases import build_cases, build_structure
+from studies.config import processor
 from studies.errors import StudyError
 from studies.fields import Fields
+from studies.kernels.gpu import BLOCK
 from studies.runs import SUBSTEP_LIMIT, mechanics_at, step_counts
 from studies.sweeps.table import Table, loose_study
 
@@ -29,6 +31,8 @@ _POSITION = "control.position_gain"
 PROGRAM_LIMIT = 32
 #: Cases side by side on one device: enough to fill vectors, few enough to stay in its cache.
 LANES = 64
+#: On a graphics processor: enough for all its threads.
+GPU_LANES = 2**15
 #: Samples times cases in a chunk: a few seconds of work on two cores.
 CHUNK_WORK = 2**22
 #: Most cases in a chunk.
@@ -218,18 +222,21 @@ def _layout(n: int, structure: Structure, devices: int) -> Layout:
     # a case's command takes most of the memory: references at every point of every step
     points = structure.n_steps * (2 * structure.substeps + 1)
     lane_bytes = points * 3 * 8 * 8 + 2**16
-    lanes = LANES
-    while lanes > 8 and devices * lanes * lane_bytes > memory_budget():
+    lanes, unit = (LANES, 8) if processor() == "cpu" else (GPU_LANES, BLOCK)
+    while lanes > unit and devices * lanes * lane_bytes > memory_budget():
         lanes //= 2
     per_device = -(-n // devices)
-    lanes = min(lanes, -(-per_device // 8) * 8)
+    lanes = min(lanes, -(-per_device // unit) * unit)
     wanted = min(max(CHUNK_WORK // (structure.n_steps * structure.substeps), 1), LARGEST_CHUNK)
     blocks = max(min(wanted, n) // (devices * lanes), 1)
     return Layout(devices, blocks, lanes)
 
 
 def memory_budget() -> int:
-    """Memory that the arrays of a chunk may take: a quarter of what the machine has [bytes]."""
+    """Memory that the arrays of a chunk may take: a quarter of what the device has [bytes]."""
+    if processor() != "cpu":
+        devices = jax.local_devices()
+        return len(devices) * (devices[0].memory_stats() or {}).get("bytes_limit", 2**32) // 4
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +21,41 @@ from jaxmodel.simulate import Outline, Result, Start, begin, conclude
 from studies.runs import with_ratio
 from studies.sweeps.plan import Layout
 
+#: How often a program was traced in this process; the tests count compilations with it.
+TRACES: list[Structure] = []
 #: Puts parameters (p,) into a case; the same object every time, or it is compiled anew.
 Place = Callable[[Case, Array], Case]
+
+
+class Running(NamedTuple):
+    """A chunk on its way."""
+
+    wait: Callable[[], Result]  # until it is done; NumPy arrays
+    cancel: Callable[[], None]  # give it up, as far as it has not begun
+
+
+class Executor(Protocol):
+    """Runs chunks of one group."""
+
+    name: str
+    compile_time: float  # [s], 0 before the first chunk
+
+    def __init__(self, structure: Structure, layout: Layout, has_own_ratio: bool) -> None:
+        """
+        Args:
+            structure: of the group.
+            layout: of its chunks.
+            has_own_ratio: EMC ratios come from an uncontrolled pass for some cases.
+        """
+        ...
+
+    def start(self, cases: Case) -> Running:
+        """Start a chunk.
+
+        Args:
+            cases: from `chunk_cases`, `layout.size` of them.
+        """
+        ...
 
 
 class Split(NamedTuple):
@@ -105,6 +138,32 @@ def chosen(program: Program, parts: Parts, wanted: bool, own: list, common: list
     """Those leaves of a case's start that vary, or that do not."""
     leaves = jax.tree.leaves(begin_case(program, own, common))
     return [x for x, varies in zip(leaves, parts.is_varying, strict=True) if varies == wanted]
+
+
+def begin_block(program: Program, parts: Parts, own: list, common: list) -> Start:
+    """The start of a block of cases, lanes last, as part of a compiled program.
+
+    Args:
+        program, parts: of the cases.
+        own: leaves that vary, cases first.
+        common: those that do not.
+
+    Returns:
+        Start with state and outline of every case; what else all cases share has a last axis of 1.
+    """
+    varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
+    lanes = len(own[0])
+    own_parts = jax.vmap(partial(chosen, program, parts, True), (0, None), -1)(own, common)
+    same = chosen(program, parts, False, [x[0] for x in own], common)
+    start: Start = joined(parts.tree, parts.is_varying, own_parts, [x[..., None] for x in same])
+
+    def whole(x: Any, is_wide: bool) -> Any:
+        return x if is_wide else jnp.broadcast_to(x, (*x.shape[:-1], lanes))
+
+    return start._replace(
+        state=jax.tree.map(whole, start.state, varies.state),
+        outline=jax.tree.map(whole, start.outline, varies.outline),
+    )
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -20,7 +20,7 @@ from studies import config
 from studies.cases import powered
 from studies.errors import StudyError
 from studies.runs import with_ratio
-from studies.sweeps.executor import Executor, Running, make_executor, own_ratios
+from studies.sweeps.executor import make_executor, own_ratios
 from studies.sweeps.folder import (
     SweepFolder,
     finished_cases,
@@ -28,6 +28,7 @@ from studies.sweeps.folder import (
     open_folder,
 )  # fmt: skip
 from studies.sweeps.plan import Group, chunk_cases, plan_groups
+from studies.sweeps.program import Executor, Running
 from studies.sweeps.progress import Reporter
 from studies.sweeps.results import chunk_variables, kept_metrics, manifest_attributes, merge
 from studies.sweeps.spec import SweepSpec

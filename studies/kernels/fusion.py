@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from studies.graph import Node, is_known
+from studies.kernels.graph import Node, is_known
 
 _SUMS = ("add", "sub", "neg")
 

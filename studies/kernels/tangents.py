@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from studies.fusion import in_order
-from studies.graph import Graph, is_known
+from studies.kernels.fusion import in_order
+from studies.kernels.graph import Graph, is_known
 
 #: Operations whose results stay the same along any small change.
 _FLAT = ("read", "round", "lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not")

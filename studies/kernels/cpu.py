@@ -1,0 +1,157 @@
+"""The traced loop on this processor: compiled by LLVM, vectors of cases side by side.
+
+XLA cannot do this: it fuses the step into many loops that recompute what they share. llvmlite is
+optional (extra `fast`); without it XLA runs the same step.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections import Counter
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from studies.compilation import ObjectCache, compiling
+from studies.kernels.graph import is_known
+from studies.kernels.llvm import Frame, Writer, binding, ir
+from studies.kernels.traced import Change, TracedLoop
+
+#: Bytes of the vectors: what one register of the widest common instruction set holds.
+VECTOR_BYTES = 64
+
+
+class Kernel:
+    """A compiled loop. Call it with arrays; it runs without Python's lock."""
+
+    def __init__(
+        self, code: Any, width: int, numbers: np.ndarray, operations: Counter[str]
+    ) -> None:
+        self._code = code  # keeps the machine code alive
+        pointers = ctypes.POINTER(ctypes.c_void_p)
+        prototype = ctypes.CFUNCTYPE(None, pointers, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
+        self._function = prototype(code.get_function_address("run"))
+        self.width, self._numbers = width, numbers
+        #: operations of one sample by kind
+        self.operations = operations
+
+    def run(self, leaves: Sequence[np.ndarray], n_steps: int, lanes: int) -> None:
+        """Step all lanes from begin to end; the state's arrays are changed in place.
+
+        Args:
+            leaves: arrays in the order of `build_kernel`, those known left out, contiguous; those
+                of inputs have the samples first, varying ones the lanes last.
+            n_steps: samples.
+            lanes: cases side by side, a multiple of `width`.
+        """
+        arrays = [self._numbers, *leaves]
+        addresses = (ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays))
+        for first in range(0, lanes, self.width):
+            self._function(addresses, n_steps, lanes, first)
+
+
+def build_kernel(loop: TracedLoop) -> Kernel:
+    """Compile a loop.
+
+    Args:
+        loop: from `trace_loop`.
+    """
+    writer = _VectorWriter(loop)
+    engine = _compile(str(writer.write()))
+    return Kernel(engine, writer.width, np.array(writer.numbers, loop.dtype), loop.operations())
+
+
+class _VectorWriter(Writer):
+    """Writes `run(leaves, n_steps, lanes, first)`; the first leaf holds the known numbers."""
+
+    def __init__(self, loop: TracedLoop) -> None:
+        super().__init__(loop, VECTOR_BYTES // loop.dtype.itemsize)
+        self.numbers: list[float] = [0.0]  # known ones, in the order of their use
+
+    def open(self) -> Frame:
+        pointer = ir.PointerType()
+        signature = ir.FunctionType(ir.VoidType(), [pointer, self.index, self.index, self.index])
+        function = ir.Function(self.module, signature, "run")
+        function.attributes.add("nounwind")
+        leaves, n_steps, lanes, first = function.args
+        self.builder = ir.IRBuilder(function.append_basic_block("entry"))
+        self._rounding = self._flush_to_zero()
+        self._table = self._base(leaves, 0)
+        bases, k = {}, 1
+        for kind, part in self.loop.leaves.items():
+            bases[kind] = [self._base(leaves, k + n) for n in range(len(part))]
+            k += len(part)
+        return Frame({**bases, "result": bases["state"]}, n_steps, lanes, first)
+
+    def close(self) -> None:
+        if self._rounding is not None:
+            self._control("ldmxcsr", self._rounding)
+        super().close()
+
+    def _base(self, leaves: Any, k: int) -> Any:
+        place = self.builder.gep(
+            leaves, [ir.Constant(self.index, k)], source_etype=ir.PointerType()
+        )
+        return self.builder.load(place, typ=ir.PointerType())
+
+    def _flush_to_zero(self) -> Any:
+        """Where the processor's old mode is kept, while numbers too small to be normal become 0.
+
+        Working with them takes a hundred times as long, and sums in single precision meet them.
+        """
+        if not binding.get_default_triple().startswith("x86_64"):
+            return None
+        word = ir.IntType(32)
+        old, new = self.builder.alloca(word), self.builder.alloca(word)
+        self._control("stmxcsr", old)
+        mode = self.builder.or_(self.builder.load(old, typ=word), ir.Constant(word, 0x8040))
+        self.builder.store(mode, new)
+        self._control("ldmxcsr", new)
+        return old
+
+    def _control(self, name: str, place: Any) -> None:
+        self._call(f"llvm.x86.sse.{name}", ir.VoidType(), place)
+
+    def _store(self, change: Change, slot: Any) -> None:
+        if is_known(change.mask):
+            super()._store(change, slot)
+            return
+        name = f"llvm.masked.store.v{self.width}f{8 * self.bytes}.p0"
+        alignment = ir.Constant(ir.IntType(32), VECTOR_BYTES)
+        value, mask = self._widened(change.value), self._widened(change.mask)
+        self._call(name, ir.VoidType(), value, slot, alignment, mask)
+
+    def _number(self, x: float) -> Any:
+        """A known number, read anew at each use.
+
+        LLVM would keep every one of them as a whole vector on the stack, more than the cache holds.
+        One of its own in memory costs an instruction nothing: it is spread over the vector as it is
+        read.
+        """
+        place = ir.Constant(self.index, len(self.numbers))
+        self.numbers.append(x)
+        place = self.builder.gep(self._table, [place], source_etype=self.scalar)
+        return self.builder.load(place, align=self.bytes, typ=self.scalar)
+
+
+@cache
+def _initialise() -> None:
+    for part in ("initialize_native_target", "initialize_native_asmprinter"):
+        getattr(binding, part)()
+
+
+def _compile(text: str) -> Any:
+    _initialise()
+    cpu, features = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
+    triple, version = binding.get_default_triple(), ".".join(map(str, binding.llvm_version_info))
+    kept = ObjectCache(text, cpu, features, triple, version)
+    with compiling():
+        target = binding.Target.from_default_triple().create_target_machine(
+            cpu=cpu, features=features, opt=3, jit=True
+        )
+        engine = binding.create_mcjit_compiler(binding.parse_assembly(text), target)
+        engine.set_object_cache(kept.keep, kept.take)
+        engine.finalize_object()
+    return engine

@@ -1,0 +1,137 @@
+"""The traced loop on an Nvidia graphics processor: one thread a case, its state in registers.
+
+XLA alone would launch several small programs a sample and keep the state in memory between them;
+here a case's whole run is one launch. LLVM writes the same instructions as for the CPU, on plain
+numbers, as PTX; XLA hands PTX to the driver by a call target of its own. Pallas would do for small
+loops: the same one written for it gives the same results, but Triton, which compiles it, walks
+through all operations again for every number that is read or written, and was not done with W0's
+2,600 operations after nine minutes (docs/performance.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from studies.compilation import compiling
+from studies.kernels.llvm import Frame, Writer, binding, ir
+from studies.kernels.traced import TracedLoop
+
+#: Cases of one block of threads: two warps, so that registers are shared out in fine portions.
+BLOCK = 64
+#: XLA's name for a call of a program in PTX (jaxlib 0.10).
+TARGET = "__gpu$xla.gpu.ptx"
+#: The oldest processors the PTX is for; the driver compiles it for the one at hand.
+_ARCHITECTURE, _PTX = "sm_70", "+ptx63"
+_TRIPLE = "nvptx64-nvidia-cuda"
+
+
+def build_kernel(
+    loop: TracedLoop, n_steps: int, lanes: int
+) -> Callable[[Sequence[Any]], list[Any]]:
+    """A JAX function of the loop's arrays that returns the state after the last sample.
+
+    Args:
+        loop: from `trace_loop`.
+        n_steps: samples.
+        lanes: cases side by side, a multiple of BLOCK.
+
+    Returns:
+        A function of arrays as `studies.kernels.cpu.Kernel.run` takes them; it may be part of a
+        compiled program.
+    """
+    source = write_ptx(loop, n_steps, lanes)
+    state = loop.leaves["state"]
+    call = jax.ffi.ffi_call(
+        TARGET, [jax.ShapeDtypeStruct((*leaf.shape, lanes), loop.dtype) for leaf in state]
+    )
+    sizes = {"grid_x": lanes // BLOCK, "block_x": BLOCK, "shared_mem_bytes": 0}
+    sizes |= dict.fromkeys(("grid_y", "grid_z", "block_y", "block_z"), 1)
+    numbers = {name: np.int32(size) for name, size in sizes.items()}
+
+    def run(arrays: Sequence[Any]) -> list[Any]:
+        given = [jnp.asarray(x, loop.dtype) for x in arrays]
+        return list(call(*given, name="run", kernel_type="ptx", kernel_data=source, **numbers))
+
+    return run
+
+
+def write_ptx(loop: TracedLoop, n_steps: int, lanes: int) -> str:
+    """The loop as a program in PTX with one entry `run(leaves..., last state...)`.
+
+    Args:
+        loop, n_steps, lanes: as in `build_kernel`.
+    """
+    _initialise()
+    module = ThreadWriter(loop, n_steps, lanes).write()
+    _add_entry(module)
+    with compiling():
+        target = binding.Target.from_triple(_TRIPLE).create_target_machine(
+            cpu=_ARCHITECTURE, features=_PTX, opt=3
+        )
+        parsed = binding.parse_assembly(f'target triple = "{_TRIPLE}"\n{module}')
+        optimise(parsed, target)
+        return target.emit_assembly(parsed)
+
+
+def optimise(module: Any, target: Any) -> None:
+    """LLVM's own passes, which bring the state from the stack to registers.
+
+    Args:
+        module: parsed.
+        target: machine that it is for.
+    """
+    tuning = binding.create_pipeline_tuning_options(speed_level=3)
+    builder = binding.create_pass_builder(target, tuning)
+    builder.getModulePassManager().run(module, builder)
+
+
+class ThreadWriter(Writer):
+    """Writes `case(first, leaves..., last state...)`, the run of one case."""
+
+    def __init__(self, loop: TracedLoop, n_steps: int, lanes: int) -> None:
+        super().__init__(loop, 1)
+        self._n_steps, self._lanes = n_steps, lanes
+
+    def open(self) -> Frame:
+        kinds = {**self.loop.leaves, "result": self.loop.leaves["state"]}
+        count = sum(map(len, kinds.values()))
+        signature = ir.FunctionType(ir.VoidType(), [self.index, *[ir.PointerType()] * count])
+        function = ir.Function(self.module, signature, "case")
+        first, *pointers = function.args
+        for pointer in pointers:
+            pointer.add_attribute("noalias")
+        self.builder = ir.IRBuilder(function.append_basic_block("entry"))
+        rest = iter(pointers)
+        bases = {kind: [next(rest) for _ in leaves] for kind, leaves in kinds.items()}
+        n_steps, lanes = (ir.Constant(self.index, x) for x in (self._n_steps, self._lanes))
+        return Frame(bases, n_steps, lanes, first)
+
+
+def _add_entry(module: Any) -> None:
+    """The function that every thread begins with: it finds its case."""
+    case = module.globals["case"]
+    case.attributes.add("alwaysinline")
+    case.linkage = "internal"
+    index, *pointers = case.function_type.args
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), pointers), "run")
+    function.calling_convention = "ptx_kernel"
+    builder = ir.IRBuilder(function.append_basic_block("entry"))
+    word = ir.IntType(32)
+    reader = ir.FunctionType(word, [])
+    names = (f"llvm.nvvm.read.ptx.sreg.{x}" for x in ("ctaid.x", "tid.x"))
+    block, thread = (builder.call(ir.Function(module, reader, name), []) for name in names)
+    first = builder.add(builder.mul(block, ir.Constant(word, BLOCK)), thread)
+    builder.call(case, [builder.zext(first, index), *function.args])
+    builder.ret_void()
+
+
+@cache
+def _initialise() -> None:
+    binding.initialize_all_targets()
+    binding.initialize_all_asmprinters()

@@ -1,0 +1,159 @@
+"""The kernel for graphics processors, as far as a machine without one can show it.
+
+The code of one case is compiled for this processor and stands in for the launch, so everything but
+the launch itself runs: tracing, instructions, memory addresses, preparation and judgement.
+"""
+
+import ctypes
+import re
+import shutil
+import subprocess
+
+import jax
+import numpy as np
+import pytest
+
+from jaxmodel import status
+from studies import config
+from studies.bench.works import METRICS, WORKS
+from studies.cases import build_cases, build_structure
+from studies.kernels import cpu, gpu, llvm
+from studies.kernels.traced import Leaf, trace_loop
+from studies.spec import paper_study
+from studies.sweeps import kernels
+from studies.sweeps.executor import make_executor
+from studies.sweeps.kernels import GpuExecutor, KernelExecutor
+from studies.sweeps.plan import Layout
+from studies.sweeps.scan import ScanExecutor
+from tests.test_kernel import check_equal, every_operation
+
+LAYOUT = Layout(devices=1, blocks=2, lanes=gpu.BLOCK)
+
+
+def rehearsed(loop, n_steps, lanes):
+    """Stands in for `gpu.build_kernel`: the same code, one case after the other on this CPU."""
+    cpu._initialise()
+    module = gpu.ThreadWriter(loop, n_steps, lanes).write()
+    target = llvm.binding.Target.from_default_triple().create_target_machine(jit=True, opt=3)
+    parsed = llvm.binding.parse_assembly(str(module))
+    gpu.optimise(parsed, target)
+    engine = llvm.binding.create_mcjit_compiler(parsed, target)
+    state = loop.leaves["state"]
+    count = sum(map(len, loop.leaves.values())) + len(state)
+    prototype = ctypes.CFUNCTYPE(None, ctypes.c_int64, *[ctypes.c_void_p] * count)
+    case = prototype(engine.get_function_address("case"))
+    shapes = [jax.ShapeDtypeStruct((*leaf.shape, lanes), loop.dtype) for leaf in state]
+
+    def on_host(*arrays):
+        given = [np.array(x, loop.dtype, order="C") for x in arrays]
+        last = [np.empty(shape.shape, loop.dtype) for shape in shapes]
+        for k in range(lanes):
+            case(k, *(x.ctypes.data for x in (*given, *last)))
+        assert engine
+        return tuple(last)
+
+    return lambda arrays: list(jax.pure_callback(on_host, tuple(shapes), *arrays))
+
+
+def work(name, size=LAYOUT.size):
+    """Structure and cases of a workload over its first move."""
+    study = paper_study().change(
+        **{**WORKS[name], "link__modes": 2}, run__duration=0.06, motion__move_time=0.03,
+        motion__waypoints=paper_study().motion.waypoints[:2],
+        metrics__residual_length=0.01, metrics__residual_delay=0.002,
+    )  # fmt: skip
+    structure = build_structure(study)._replace(metrics=METRICS.get(name, ()))
+    force = np.zeros((size, 3))
+    force[3] = 1e6  # a case that is thrown off its course
+    cases = build_cases(study, {"control.gain_factor": np.linspace(0.1, 0.5, size)}, structure)
+    return structure, cases._replace(drive=cases.drive._replace(pulse_force=force))
+
+
+@pytest.mark.parametrize("name", ["W1", pytest.param("W0", marks=pytest.mark.long)])
+def test_gpu_executor_equals_the_traced_kernel(name, monkeypatch):
+    monkeypatch.setattr(gpu, "build_kernel", rehearsed)
+    structure, cases = work(name)
+    executor = GpuExecutor(structure, LAYOUT, False)
+    found = executor.start(cases).wait()
+    assert executor.name == "GPU kernel" and executor.compile_time > 0
+    wanted = KernelExecutor(structure, LAYOUT, False).start(cases).wait()
+    assert set(wanted.status) == {status.OK, status.DIVERGED}
+    check_equal(found, wanted)
+    rms = wanted.metrics.residual_rms[wanted.status == status.OK]
+    assert rms.min() > 0 and rms.max() > 1.001 * rms.min()
+
+
+def test_wrong_results_are_noticed(monkeypatch):
+    """A kernel that is off by a thousandth is not believed."""
+
+    def wrong(loop, n_steps, lanes):
+        run = rehearsed(loop, n_steps, lanes)
+        return lambda arrays: [1.001 * x for x in run(arrays)]
+
+    monkeypatch.setattr(gpu, "build_kernel", wrong)
+    monkeypatch.setattr(kernels, "ScanExecutor", KernelExecutor)  # compiled already
+    structure, cases = work("W1")
+    executor = GpuExecutor(structure, LAYOUT, False)
+    found = executor.start(cases).wait()
+    assert re.fullmatch(
+        r"XLA scan \(the GPU kernel differs by 0\.001 from the same on the CPU\)", executor.name
+    )
+    assert np.sum(found.status == status.OK) == LAYOUT.size - 1
+
+
+def test_without_the_call_target_the_scan_runs(monkeypatch):
+    """Here XLA knows no call of PTX, as an older or newer one might not."""
+    monkeypatch.setattr(kernels, "ScanExecutor", KernelExecutor)
+    structure, cases = work("W1")
+    executor = GpuExecutor(structure, LAYOUT, False)
+    assert executor.start(cases).wait().status[0] == status.OK
+    assert executor.name.startswith("XLA scan (the GPU kernel failed: ")
+
+
+def test_it_is_chosen_on_a_graphics_processor(monkeypatch):
+    structure, _ = work("W1")
+    monkeypatch.setattr("studies.sweeps.executor.processor", lambda: "cuda")
+    assert isinstance(make_executor(structure, LAYOUT, False), GpuExecutor)
+    slow = structure._replace(is_smooth=True)
+    assert isinstance(make_executor(slow, LAYOUT, False), ScanExecutor)
+    assert config.processor() == "cpu"
+
+
+@pytest.fixture(scope="module")
+def every_loop():
+    """A loop with every kind of operation but tanh, which smooth limits alone need."""
+    return trace_loop(
+        lambda constants, row, state: [
+            every_operation(state[0], constants[0], lambda x: x) + row[0][0] * constants[1]
+        ],
+        [Leaf((3, 4), True), np.ones(1)], [Leaf((1,), False)], [Leaf((3, 4), True)], np.float64,
+    )  # fmt: skip
+
+
+def test_every_operation_becomes_ptx(every_loop):
+    """In registers: the state is read once before the loop and written once after it."""
+    text = gpu.write_ptx(every_loop, 100, 4 * gpu.BLOCK)
+    assert ".visible .entry run(" in text
+    assert len(re.findall(r"ld\.global", text)) == 12 + 12 + 1
+    assert len(re.findall(r"st\.global", text)) == 12
+    assert not re.search(r"\.local|call", text)
+    for instruction in ("fma.rn.f64", "sqrt.rn.f64", "rcp.rn.f64", "selp.f64", "cvt.rni.f64"):
+        assert instruction in text.replace("b64", "f64"), instruction
+
+
+def test_the_call_is_lowered_for_cuda(every_loop):
+    """What JAX hands to XLA: the target's name, the program and the sizes of the launch."""
+    lanes = 4 * gpu.BLOCK
+    run = gpu.build_kernel(every_loop, 100, lanes)
+    shapes = [(3, 4, lanes), (100, 1), (3, 4, lanes)]
+    arrays = [jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes]
+    text = jax.jit(run).trace(arrays).lower(lowering_platforms=("cuda",)).as_text()
+    assert f"@{gpu.TARGET}(" in text and 'kernel_type = "ptx"' in text
+    assert f"block_x = {gpu.BLOCK} : i32" in text and "grid_x = 4 : i32" in text
+
+
+@pytest.mark.skipif(shutil.which("ptxas") is None, reason="needs ptxas of the CUDA toolkit")
+def test_ptx_is_valid(every_loop, tmp_path):
+    source = tmp_path / "run.ptx"
+    source.write_text(gpu.write_ptx(every_loop, 100, 4 * gpu.BLOCK))
+    subprocess.run(["ptxas", "-arch=sm_90", source, "-o", tmp_path / "run.cubin"], check=True)
