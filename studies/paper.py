@@ -16,6 +16,7 @@ from rich.table import Column, Table
 
 from studies.errors import StudyError
 from studies.paper_cases import (
+    EXECUTOR,
     MOVES,
     PaperCase,
     PaperRuns,
@@ -113,6 +114,7 @@ def _print_outcome(out: Path, console: Console, runs: PaperRuns) -> None:
     for case, code in zip(runs.cases, runs.status, strict=True):
         table.add_row(case.name, case.links_text, str(case.modes), describe(int(code)))
     console.print(table)
+    console.print(f"executor: {EXECUTOR}")
     console.print(f"report:  {out / REPORT}")
     console.print(f"figures: {out}{os.sep}*.png and *.pdf")
     console.print(f"data:    {out / DATA}")

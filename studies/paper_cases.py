@@ -25,6 +25,9 @@ from jaxmodel.simulate import Result, simulate
 from studies.runs import check_run, judged_status, run_study
 from studies.spec import Flags, Study
 
+#: How they run. A kernel would take longer to trace than the scan takes for the few cases there are
+#: (docs/performance.md).
+EXECUTOR = "XLA scan, with trajectories"
 #: Cases per call of the compiled program; the last batch is filled up with copies.
 BATCH = 8
 #: The paper's move and a faster one that leaves something to suppress [s].
