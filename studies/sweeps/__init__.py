@@ -2,7 +2,8 @@
 
 A sweep goes one way: `spec` reads the file; `axes` and `designs` spread its axes into a `table` of
 cases; `plan` groups them by program and cuts them into chunks; `program` is what comes before
-and after the steps, `executor` compiles the steps and runs chunks, `gradients` differentiates them;
+and after the steps, `executor` runs chunks, by `scan` or by `kernels` (from `steps`), `gradients`
+differentiates them;
 `folder` keeps each finished chunk, whatever happens, and joins them; `run` drives
 all this; `results` reads it again for `show`, `plots` and `sensitivity`.
 """
