@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from typer.exceptions import Abort, TyperException
 
-from studies.config import configure
+from studies.config import start
 from studies.errors import StudyError, field_error
 from studies.sweeps.commands import add_commands
 
@@ -56,7 +56,7 @@ def paper(
     precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
 ) -> None:
     """Run the paper's study: data, counterparts of its figures, report beside its numbers."""
-    configure(precision)
+    start(precision)
     from studies.paper import run_paper
 
     run_paper(out, console)
@@ -69,7 +69,7 @@ def simulate(
     precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
 ) -> None:
     """Run one study with full trajectories."""
-    configure(precision)
+    start(precision)
     from studies.runs import describe, run_attributes, run_study, run_variables
     from studies.spec import load_study
     from studies.store import check_target, write_store
@@ -99,7 +99,7 @@ def replay(
     out: Annotated[Path | None, typer.Option(help="HDF5 file for the trajectories")] = None,
 ) -> None:
     """Run one case of a sweep again with full trajectories, and compare with what it found."""
-    configure()
+    start()
     from studies.design import deviation, load_design
     from studies.runs import describe, run_attributes, run_study, run_variables
     from studies.store import check_target, write_store
@@ -134,7 +134,7 @@ def modes(
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Natural frequencies and damping ratios of the assembled machine."""
-    configure()
+    start()
     from studies.modes import machine_modes
 
     found = machine_modes(pose, kp, kd, damping, locked, basis, n_modes)
@@ -154,19 +154,22 @@ def modes(
 @app.command()
 def bench(
     what: Annotated[str, typer.Argument(help="runs, or peers: W0 by other means")] = "runs",
-    work: Annotated[str, typer.Option(help="W0, W1, W8, grad or sweep")] = "W1",
+    work: Annotated[str, typer.Option(help="W0, W1, W8, grad or sweep; default: W1")] = "",
     executor: Annotated[
         str, typer.Option(help="kernel, scan or gpu; default: the fastest one")
     ] = "",
-    batch: Annotated[int, typer.Option(min=0, help="cases of a chunk; 0: a good number")] = 0,
-    cases: Annotated[int, typer.Option(min=1, help="cases of the sweep")] = 100_000,
+    batch: Annotated[
+        int, typer.Option(min=0, max=2**20, help="cases of a chunk; 0: a good number")
+    ] = 0,
+    cases: Annotated[int, typer.Option(min=0, help="cases of the sweep; 0: 100,000")] = 0,
     precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Measure speed and memory on this machine."""
     if what not in ("runs", "peers"):
         raise field_error("bench", what, "'runs' or 'peers'")
-    configure(precision)
+    _check_bench(what, work, executor, batch, cases, precision)
+    start(precision)
     from studies.bench.works import bench_runs, bench_sweep
 
     progress = Console(file=sys.stderr, highlight=False, markup=False)
@@ -174,20 +177,43 @@ def bench(
         _bench_peers(progress, as_json)
         return
     if work == "sweep":
-        found = bench_sweep(cases, progress)
+        found = bench_sweep(cases or SWEEP_CASES, progress)
     elif work == "grad":
         from studies.bench.gradients import bench_gradients
 
         found = bench_gradients(executor, batch)
     else:
-        found = bench_runs(work, executor, batch)
+        found = bench_runs(work or "W1", executor, batch)
     if as_json:
         print(json.dumps(found))
         return
     table = Table(show_header=False)
     for name, value in found.items():
-        table.add_row(name, str(value))
+        parts = value if isinstance(value, dict) else {"": value}
+        for part, number in parts.items():
+            table.add_row(f"{name} {part}".strip(), str(number))
     console.print(table)
+
+
+#: Cases of `bench --work sweep`.
+SWEEP_CASES = 100_000
+
+
+def _check_bench(
+    what: str, work: str, executor: str, batch: int, cases: int, precision: str
+) -> None:
+    """Refuse options that would be ignored."""
+    if what == "peers":
+        given = {"--work": work, "--executor": executor, "--batch": batch, "--cases": cases}
+        given["--precision"] = "" if precision == "float64" else precision
+        reason = "with peers, which do W0 in double precision"
+    elif work == "sweep":
+        given, reason = {"--executor": executor, "--batch": batch}, "with --work sweep"
+    else:
+        given, reason = {"--cases": cases}, "but with --work sweep"
+    for name, value in given.items():
+        if value:
+            raise StudyError(f"{name} {value}: not allowed {reason}; leave it out")
 
 
 def _bench_peers(progress: Console, as_json: bool) -> None:
@@ -226,7 +252,7 @@ def init(
 @app.command()
 def info() -> None:
     """Versions, devices, precision, compilation cache."""
-    configure()
+    start()
     from studies.config import info as facts
 
     table = Table(show_header=False)

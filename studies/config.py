@@ -77,6 +77,21 @@ def configure(
     _set_cache(cache)
 
 
+def start(precision: str = "float64") -> None:
+    """Configure and start JAX, as every command does that computes.
+
+    Raises StudyError as `configure`, and where JAX cannot start.
+    """
+    configure(precision)
+    try:
+        jax.local_devices()
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).partition("\n")[0] or "no device of the platform asked for"
+        names = ("JAX_PLATFORMS", "XLA_FLAGS")
+        given = ", ".join(f"{name}={os.environ.get(name, '')!r}" for name in names)
+        raise StudyError(f"JAX cannot start: {reason} ({given})") from None
+
+
 def info() -> dict[str, Any]:
     """Versions and settings in force, as plain values for `studies info`; starts JAX."""
     kinds = [device.device_kind for device in jax.devices()]

@@ -64,3 +64,12 @@ def test_unknown_choices_are_refused(arguments, capsys):
     with pytest.raises(SystemExit, match="2"):
         cli.main(["bench", *arguments])
     assert "allowed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [["peers", "--work", "W8"], ["peers", "--batch", "8"],
+                                       ["--work", "sweep", "--executor", "scan"],
+                                       ["--work", "W1", "--cases", "5"]])  # fmt: skip
+def test_options_that_would_be_ignored_are_refused(arguments, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["bench", *arguments])
+    assert "not allowed" in capsys.readouterr().err

@@ -89,6 +89,22 @@ def test_kernel_equals_scan(sweep, sections):
     check_equal(fast, reference)
 
 
+def test_odd_numbers_of_cases_fill_whole_vectors():
+    """In single precision a vector holds 16 cases; fewer lanes would write beyond the arrays."""
+    for real, unit in ((True, 8), (False, 16)):
+        with jax.enable_x64(real):
+            table = build_table(small_spec(MIXED))
+            for count in (1, 3, 9, 40):
+                group = plan_groups(table, np.arange(count), 2)[0]
+                assert group.layout.lanes % unit == 0 and group.layout.size >= count
+    loop = trace_loop(
+        lambda constants, row, state: [state[0] + row[0]],
+        [], [Leaf((), False)], [Leaf((), True)], np.float32,
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="lanes = 24: allowed multiples of 16"):
+        cpu.build_kernel(loop).run([np.zeros(1, np.float32), np.zeros(24, np.float32)], 1, 24)
+
+
 def test_without_llvmlite_the_scan_runs(monkeypatch):
     table = build_table(small_spec(MIXED))
     group = plan_groups(table, np.arange(8), 2)[0]

@@ -19,12 +19,11 @@ from studies import config
 from studies.cases import build_cases, build_structure
 from studies.compilation import compiler_time
 from studies.errors import StudyError, field_error
-from studies.kernels.gpu import BLOCK
 from studies.kernels.llvm import is_available
 from studies.spec import paper_study
 from studies.sweeps.executor import make_executor
 from studies.sweeps.kernels import GpuExecutor, KernelExecutor
-from studies.sweeps.plan import GPU_LANES, LANES, Layout, peak_memory
+from studies.sweeps.plan import GPU_LANES, LANES, Layout, lane_unit, peak_memory
 from studies.sweeps.program import Executor
 from studies.sweeps.results import load
 from studies.sweeps.run import run_sweep
@@ -96,7 +95,7 @@ def check_executor(executor: str, known: Iterable[str] = EXECUTORS) -> None:
 def make_layout(batch: int) -> Layout:
     """A chunk of about so many cases; 0: two blocks of lanes on every device, one on a GPU."""
     devices, is_cpu = len(jax.local_devices()), config.processor() == "cpu"
-    most, unit, blocks = (LANES, 8, 2) if is_cpu else (GPU_LANES, BLOCK, 1)
+    (most, blocks), unit = ((LANES, 2) if is_cpu else (GPU_LANES, 1)), lane_unit()
     lanes = most if not batch else max(unit, min(most, -(-batch // (unit * devices)) * unit))
     return Layout(devices, max(batch // (devices * lanes), 1) if batch else blocks, lanes)
 
@@ -201,10 +200,14 @@ def _errors(result: Result, structure: Structure, layout: Layout, cases: Case) -
     """Largest error of each metric against double precision, relative to its largest value."""
     with jax.enable_x64(True):
         reference = ScanExecutor(structure, layout, False).start(cases).wait()
-    pairs = zip(result.metrics, reference.metrics, strict=True)
+    names = (*result.metrics._fields, "energy_ratio")
+    pairs = zip(
+        (*result.metrics, result.energy_ratio), (*reference.metrics, reference.energy_ratio),
+        strict=True,
+    )  # fmt: skip
     return {
         name: float(f"{np.nanmax(np.abs(a - b)) / max(np.nanmax(np.abs(b)), 1e-300):.2g}")
-        for name, (a, b) in zip(result.metrics._fields, pairs, strict=True)
+        for name, (a, b) in zip(names, pairs, strict=True)
         if b is not None
     }
 
@@ -224,6 +227,7 @@ def bench_sweep(cases: int, console: Console) -> dict[str, Any]:
         rms = load(out)["residual_rms"]
     return {
         "work": "sweep",
+        "executor": done.executor,
         "cases": done.n_run,
         "configs_per_s": round(done.n_run / done.run_time, 1),
         "run_s": round(done.run_time, 2),

@@ -45,7 +45,12 @@ class Kernel:
                 of inputs have the samples first, varying ones the lanes last.
             n_steps: samples.
             lanes: cases side by side, a multiple of `width`.
+
+        Raises:
+            ValueError: another number of lanes, which would write beyond the arrays.
         """
+        if lanes % self.width:
+            raise ValueError(f"lanes = {lanes}: allowed multiples of {self.width}")
         arrays = [self._numbers, *leaves]
         addresses = (ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays))
         for first in range(0, lanes, self.width):

@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from studies.config import configure
+from studies.config import start
 from studies.errors import StudyError
 
 Folder = Annotated[Path, typer.Argument(help="folder of a sweep")]
@@ -34,7 +34,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
     ) -> None:
         """Run thousands of cases from one file; finished ones survive whatever happens."""
-        configure(precision)
+        start(precision)
         from studies.sweeps.run import make_plan, run_sweep
         from studies.sweeps.show import print_plan
         from studies.sweeps.spec import load_sweep, ready_spec
@@ -66,7 +66,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         failed: Annotated[bool, typer.Option("--failed", help="list failed cases")] = False,
     ) -> None:
         """Overview of a sweep: statuses, best cases; or its failed cases."""
-        configure()
+        start()
         from studies.sweeps.results import load
         from studies.sweeps.show import print_causes
         from studies.sweeps.show import show as show_sweep
@@ -83,7 +83,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         count: Annotated[int, typer.Option(min=1, help="how many")] = 10,
     ) -> None:
         """Best cases of a sweep by a metric."""
-        configure()
+        start()
         from studies.sweeps.results import load
         from studies.sweeps.show import best_cases, print_cases, tell_left_out
 
@@ -100,7 +100,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         out: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG; default: folder")] = None,
     ) -> None:
         """One figure of a sweep; its kind follows from the axes."""
-        configure()
+        start()
         from studies.sweeps.plots import plot as draw
         from studies.sweeps.plots import save_plot
         from studies.sweeps.results import load, variable_name
@@ -119,7 +119,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         by: Annotated[str, typer.Option(help="metric")] = "residual_rms",
     ) -> None:
         """Which parameters matter: from a sweep with method morris or saltelli."""
-        configure()
+        start()
         from studies.sweeps.designs import unit_points
         from studies.sweeps.results import load
         from studies.sweeps.sensitivity import (

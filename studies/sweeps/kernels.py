@@ -19,6 +19,7 @@ from studies.sweeps.program import (
     Parts,
     Program,
     Running,
+    Split,
     begin_block,
     conclude_all,
     lane_blocks,
@@ -116,27 +117,32 @@ class GpuExecutor:
         if self._run is None:
             started = time.perf_counter()
             program = Program(self.structure, self.layout, split.tree, split.is_varying)
-            fault = self._build(program, trace_steps(program, split), blocks[0], split.shared)
+            fault = self._build(program, split, blocks[0])
             if fault:
                 self.name = f"XLA scan (the GPU kernel {fault})"
                 self._instead = ScanExecutor(self.structure, self.layout, self.has_own_ratio)
-                return self._instead.start(cases)
+                running = self._instead.start(cases)
+                self.compile_time = time.perf_counter() - started
+                return running
             self.compile_time = time.perf_counter() - started
         devices = jax.local_devices()[: self.layout.devices]
-        running = [
+        launched = [
             self._run(*jax.device_put((block, split.shared), devices[k % len(devices)])).result
             for k, block in enumerate(blocks)
         ]
-        return Running(lambda: _gathered(running), lambda: None)
+        return Running(lambda: _gathered(launched), lambda: None)
 
-    def _build(self, program: Program, traced: Traced, block: list, shared: list) -> str:
+    def _build(self, program: Program, split: Split, block: list) -> str:
         """Make the program; what is wrong with it, or "" if nothing is."""
         try:
+            traced = trace_steps(program, split)
+            if traced.loop.operations()["tanh"]:
+                return "knows no tanh, which friction needs"
             kernel = gpu.build_kernel(traced.loop, program.structure.n_steps, program.layout.lanes)
             self._run = jax.jit(partial(_run_block, program, traced.parts, kernel))
-            first = self._run(block, shared)
+            first = self._run(block, split.shared)
             jax.block_until_ready(first)
-        except jax.errors.JaxRuntimeError as error:
+        except RuntimeError as error:  # of JAX, LLVM or the tracer
             return f"failed: {str(error).splitlines()[0]}"
         difference = _difference(traced, first, program.structure.n_steps)
         if difference > TOLERANCE[traced.loop.dtype.itemsize]:

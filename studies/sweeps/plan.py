@@ -17,6 +17,7 @@ from studies.cases import build_cases, build_structure
 from studies.config import processor
 from studies.errors import StudyError
 from studies.fields import Fields
+from studies.kernels.cpu import VECTOR_BYTES
 from studies.kernels.gpu import BLOCK
 from studies.runs import SUBSTEP_LIMIT, mechanics_at, step_counts
 from studies.sweeps.table import Table, loose_study
@@ -222,7 +223,7 @@ def _layout(n: int, structure: Structure, devices: int) -> Layout:
     # a case's command takes most of the memory: references at every point of every step
     points = structure.n_steps * (2 * structure.substeps + 1)
     lane_bytes = points * 3 * 8 * 8 + 2**16
-    lanes, unit = (LANES, 8) if processor() == "cpu" else (GPU_LANES, BLOCK)
+    lanes, unit = (LANES if processor() == "cpu" else GPU_LANES), lane_unit()
     while lanes > unit and devices * lanes * lane_bytes > memory_budget():
         lanes //= 2
     per_device = -(-n // devices)
@@ -230,6 +231,13 @@ def _layout(n: int, structure: Structure, devices: int) -> Layout:
     wanted = min(max(CHUNK_WORK // (structure.n_steps * structure.substeps), 1), LARGEST_CHUNK)
     blocks = max(min(wanted, n) // (devices * lanes), 1)
     return Layout(devices, blocks, lanes)
+
+
+def lane_unit() -> int:
+    """Lanes come in multiples of this: one vector of the processor, one block of threads."""
+    if processor() != "cpu":
+        return BLOCK
+    return int(VECTOR_BYTES // jax.dtypes.canonicalize_dtype(np.float64).itemsize)
 
 
 def memory_budget() -> int:

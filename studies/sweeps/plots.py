@@ -25,6 +25,10 @@ FEW = 60
 #: Placements drawn one below the other.
 N_PLACEMENTS = 15
 MAP = "viridis"
+#: Of lines, where the colours begin anew.
+MARKERS = ("o", "^", "s")
+#: More groups than this have no bands, which would cover one another.
+MOST_BANDS = 4
 
 
 def plot(data: SweepData, x: str | None, y: str, hue: str | None) -> Figure:
@@ -56,11 +60,7 @@ def plot(data: SweepData, x: str | None, y: str, hue: str | None) -> Figure:
     with figures.styled():
         figure = Figure(figsize=(5.2, 3.6), layout="constrained")
         ax = figure.subplots()
-        n_left = int(np.sum(~chosen))
-        if n_left:
-            ax.set_title(
-                f"{n_left} of {len(chosen)} cases not ok, left out", fontsize=7.5, loc="left"
-            )
+        _say_left_out(figure, chosen)
         ax.set_xlabel(label(data, x))
         if group is not None and _is_grid(across, group):
             _heat_map(figure, ax, across, group, value[chosen], label(data, y))
@@ -72,6 +72,13 @@ def plot(data: SweepData, x: str | None, y: str, hue: str | None) -> Figure:
         else:
             _points(figure, ax, across, value[chosen], group, "" if hue is None else hue)
     return figure
+
+
+def _say_left_out(figure: Figure, chosen: np.ndarray) -> None:
+    n_left = int(np.sum(~chosen))
+    if n_left:
+        text = f"{n_left} of {len(chosen)} cases not ok, left out"
+        figure.suptitle(text, fontsize=7.5, x=0.01, ha="left")
 
 
 def save_plot(figure: Figure, path: Path) -> None:
@@ -156,18 +163,20 @@ def _lines(
         style: dict[str, Any] = {
             "color": figures.SERIES[k % len(figures.SERIES)],
             "linestyle": figures.DASHES[(k // len(figures.SERIES)) % len(figures.DASHES)],
+            "marker": MARKERS[(k // len(figures.SERIES)) % len(MARKERS)],
         }
         if is_text:
             style["linestyle"] = "none"
         text = None if name is None else f"{hue} = {_short(name)}"
-        ax.plot(position, middle, marker="o", markersize=3, label=text, **style)
+        ax.plot(position, middle, markersize=4, label=text, **style)
         if any(len(v) > 1 for v in inside):
             low, high = [np.min(v) for v in inside], [np.max(v) for v in inside]
             if is_text:
                 ax.vlines(position, low, high, color=style["color"], alpha=0.3)
-            else:
+            elif len(groups) <= MOST_BANDS:
                 ax.fill_between(position, low, high, color=style["color"], alpha=0.1, linewidth=0)
-            ax.set_title("median, smallest to largest", fontsize=7.5, loc="right")
+            span = ", smallest to largest" if is_text or len(groups) <= MOST_BANDS else ""
+            ax.set_title(f"median{span}", fontsize=7.5, loc="right")
         if is_text:
             ax.set_xticks(range(len(wanted)), [str(v) for v in wanted], rotation=30, ha="right")
     if group is not None:
@@ -243,6 +252,7 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
         ax.set_xticks(range(len(names) + 1), [*names, label(data, y)], rotation=15, ha="right")
         ax.set_yticks([])
         ax.set_title("dark: smallest", fontsize=7.5, loc="right")
+        _say_left_out(figure, chosen)
     return figure
 
 
@@ -289,4 +299,5 @@ def _placements(data: SweepData, y: str) -> Figure:
         bottom.set_xlabel("centre of the patch pair along the link [mm]")
         bottom.set_ylabel(label(data, y))
         bottom.legend(fontsize=7, markerscale=3)
+        _say_left_out(figure, is_ok)
     return figure

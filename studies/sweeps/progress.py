@@ -29,6 +29,7 @@ class Reporter:
         self.console, self.total, self.done, self.is_quiet = console, total, done, is_quiet
         self.started, self.compile_time, self.n_run = time.perf_counter(), 0.0, 0
         self.failures: Counter[int] = Counter()
+        self.executor = ""
         self._bar: Progress | None = None
         self._task: TaskID | None = None
 
@@ -54,6 +55,7 @@ class Reporter:
 
     def compiled(self, executor: str, seconds: float) -> None:
         """A program is ready."""
+        self.executor = executor
         self.compile_time += seconds
         self.say(f"executor: {executor}, compiled in {seconds:.1f} s")
 

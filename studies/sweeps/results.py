@@ -86,10 +86,11 @@ def kept_metrics(spec: SweepSpec) -> list[str]:
     kept = list(spec.sweep.metrics) or names
     lost = [name for name in kept if name not in SINGLE_PRECISION]
     if lost and jax.dtypes.canonicalize_dtype(np.float64) == np.float32:
+        written = lost if spec.sweep.metrics else []
         raise field_error(
-            "sweep.metrics", lost[0],
-            f"with float32 only {', '.join(SINGLE_PRECISION)}, which it has within 1 %; leave "
-            "--precision out for the others",
+            "sweep.metrics", written,
+            f"with float32 a list of {', '.join(SINGLE_PRECISION)}, which it has within 1 %; "
+            "leave --precision out for the others",
         )  # fmt: skip
     return kept
 

@@ -44,6 +44,7 @@ class Outcome(NamedTuple):
     compile_time: float  # [s]
     run_time: float  # [s]
     is_interrupted: bool  # by Ctrl-C
+    executor: str  # that ran the last chunks; "" where there were none
 
 
 class Plan(NamedTuple):
@@ -119,7 +120,7 @@ def run_sweep(
                 folder.publish()
         return Outcome(
             table, reporter.done, reporter.n_run, reporter.compile_time, reporter.run_time,
-            is_interrupted,
+            is_interrupted, reporter.executor,
         )  # fmt: skip
 
 
