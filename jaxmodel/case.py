@@ -29,7 +29,9 @@ class Structure(NamedTuple):
     has_friction: bool = False  # Coulomb friction on the sliders
     has_position_gain: bool = True  # feedback of modal positions, not of velocities alone
     metrics: tuple[str, ...] = ()  # to accumulate; (): all of them
-    is_smooth: bool = False  # rounding replaced by equal noise, limits by tanh: for gradients
+    is_smooth: bool = (
+        False  # rounding replaced by equal noise, limits with round corners: for gradients
+    )
 
     @property
     def n_channels(self) -> int:

@@ -53,9 +53,28 @@ def rest_controller(n_channels: int, n_patches: int, dtype) -> ControllerState:
     return ControllerState(zero, (zero, zero), jnp.zeros((3, n_patches), dtype))
 
 
+#: Half-width of a smooth limit's corner, as a share of the limit.
+CORNER = 0.1
+
+
 def soft_limit(x: Array, bound: Array, is_smooth: bool) -> Array:
-    """x limited to +-bound: clipped, or bound tanh(x/bound) where a gradient is wanted."""
-    return bound * jnp.tanh(x / bound) if is_smooth else jnp.clip(x, -bound, bound)
+    """x limited to +-bound: clipped, or with parabolas for corners where a gradient is wanted.
+
+    The smooth limit is x itself up to 0.9 bound and bound from 1.1 bound on; between them, where
+    it is at most bound/40 below the sharp one, its slope falls linearly from 1 to 0.
+
+    Args:
+        x: any unit.
+        bound: in the same unit, positive.
+        is_smooth: see `Structure`.
+    """
+    if not is_smooth:
+        return jnp.clip(x, -bound, bound)
+    share, straight = x / bound, 1 - CORNER
+    beyond = jnp.clip(share - straight, 0.0, 2 * CORNER)
+    beyond = beyond - jnp.clip(-share - straight, 0.0, 2 * CORNER)
+    bent = beyond - beyond * jnp.abs(beyond) / (4 * CORNER)
+    return bound * (jnp.clip(share, -straight, straight) + bent)
 
 
 def convert(controller: Controller, voltage: Array, noise: Array | None, is_smooth: bool):

@@ -28,7 +28,7 @@ def motor_force(drive: Drive, reference: Reference, rho: Array, rho_rate: Array,
         reference: wanted motion.
         rho: slider positions [m], (3,).
         rho_rate: [m/s], (3,).
-        is_smooth: limit by tanh instead of clipping.
+        is_smooth: limit with round corners, see `soft_limit`.
     """
     force = drive.kp * (reference.rho - rho) + drive.kd * (reference.rho_rate - rho_rate)
     if reference.feedforward is not None:

@@ -80,6 +80,71 @@ def _balance(structure: Structure, omega: Array) -> Array:
     return jnp.asarray(size, omega.dtype)
 
 
+#: Squarings for the value and for the gradient of `slowest_decay`.
+SQUARINGS, AVERAGED = 50, 34
+#: Growth per sample that weighs powers in the gradient: the last million of them count.
+GROWTH = 1e-6
+
+
+def slowest_decay(transition: Array, period: Array) -> Array:
+    """Decay rate -ln(rho)/T of the slowest motion, rho the spectral radius; negative if unstable.
+
+    By repeated squaring, rho = lim |M^n|^(1/n), with the norm taken out each time: batched
+    anywhere, where eigenvalues of unsymmetric matrices are not. A complex pair makes |M^n| swing
+    with n, and its derivative with it, however large n is; so the gradient is that of
+    ln(sum over n of |M^n|^2 s^(-2n)) with s just below rho, in which the swings cancel.
+
+    Args:
+        transition: M of x_(k+1) = M x_k, (n, n).
+        period: T [s], ().
+
+    Returns:
+        [1/s], ().
+    """
+    value = jax.lax.stop_gradient(_log_radius(transition))
+    slope = _summed(transition, jnp.exp(value - GROWTH))
+    return -(value + slope - jax.lax.stop_gradient(slope)) / period
+
+
+def _log_radius(matrix: Array) -> Array:
+    """ln(rho), to some 1e-14."""
+
+    def square(carried: tuple[Array, Array], share: Array) -> tuple[tuple[Array, Array], None]:
+        power, total = carried
+        size = jnp.sqrt(jnp.sum(power * power))
+        power = power / size
+        return (power @ power, total + jnp.log(size) * share), None
+
+    shares = jnp.asarray(0.5 ** np.arange(SQUARINGS), matrix.dtype)
+    return jax.lax.scan(square, (matrix, jnp.zeros((), matrix.dtype)), shares)[0][1]
+
+
+def _summed(matrix: Array, size: Array) -> Array:
+    """ln(tr sum_(j < n) B^j B^j')/2m with B = matrix/size and n = 2^AVERAGED, by doubling.
+
+    m is the mean of j as the sum weighs it, so that the derivative is that of ln(rho).
+    """
+
+    def double(carried: tuple, _: None) -> tuple[tuple, None]:
+        power, log_power, total, log_total = carried
+        size = jnp.sqrt(jnp.sum(power * power))
+        power, log_power = power / size, log_power + jnp.log(size)
+        # both terms of total + power total power', without the factor that would be too large
+        most = jnp.maximum(log_power, 0.0)
+        later = jnp.exp(2 * (log_power - most)) * (power @ total @ power.T)
+        total = jnp.exp(-2 * most) * total + later
+        trace = jnp.trace(total)
+        log_total = log_total + 2 * most + jnp.log(trace)
+        return (power @ power, 2 * log_power, total / trace, log_total), None
+
+    zero, one = jnp.zeros((), matrix.dtype), jnp.eye(matrix.shape[0], dtype=matrix.dtype)
+    start = matrix / size, zero, one, zero
+    (*_, log_total), _ = jax.lax.scan(double, start, None, length=AVERAGED)
+    count = 2.0**AVERAGED
+    mean = count / -np.expm1(-2 * GROWTH * count) - 1 / -np.expm1(-2 * GROWTH)
+    return log_total / (2 * mean)
+
+
 class LoopReport(NamedTuple):
     """Judgement of a sampled loop (on the host)."""
 

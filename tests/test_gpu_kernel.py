@@ -114,14 +114,14 @@ def test_it_is_chosen_on_a_graphics_processor(monkeypatch):
     structure, _ = work("W1")
     monkeypatch.setattr("studies.sweeps.executor.processor", lambda: "cuda")
     assert isinstance(make_executor(structure, LAYOUT, False), GpuExecutor)
-    slow = structure._replace(is_smooth=True)
+    slow = structure._replace(substeps=100)
     assert isinstance(make_executor(slow, LAYOUT, False), ScanExecutor)
     assert config.processor() == "cpu"
 
 
 @pytest.fixture(scope="module")
 def every_loop():
-    """A loop with every kind of operation but tanh, which smooth limits alone need."""
+    """A loop with every kind of operation but tanh, which friction alone needs."""
     return trace_loop(
         lambda constants, row, state: [
             every_operation(state[0], constants[0], lambda x: x) + row[0][0] * constants[1]

@@ -5,11 +5,12 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
+import scipy.linalg
 
 from jaxmodel.linear import linearise, natural_modes
 from jaxmodel.parameters import HOME
 from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import closed_loop, gain_margin, loop_report
+from jaxmodel.sampled_loop import closed_loop, gain_margin, loop_report, slowest_decay
 from jaxmodel.simulate import simulate
 from studies.cases import as_arrays, build_case, build_structure
 from studies.spec import paper_study
@@ -244,3 +245,43 @@ def test_decay_of_the_nonlinear_run_is_the_predicted_damping():
     assert len(top) >= 4 and measured > 0.03
     predicted = loop_report(structure, case, HOME_POSE).damping_ratio[0]
     assert np.abs(predicted - measured).min() < 0.05 * measured
+
+
+def test_slowest_decay_is_that_of_the_largest_eigenvalue():
+    """Stable and unstable, of a loop as it is and of a matrix with a repeated eigenvalue."""
+    study = paper_study().change(link__modes=2, control__modes=2)
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    matrices = jax.jit(closed_loop, static_argnums=0)(
+        structure._replace(n_steps=1), case, np.array(HOME)
+    )
+    period = case.electronics.period
+    for factor in (0.0, 1.0, 40.0):
+        whole = np.asarray(matrices.open + factor * matrices.feedback)
+        wanted = -np.log(np.abs(np.linalg.eigvals(whole)).max()) / period
+        assert abs(slowest_decay(whole, period) - wanted) < 1e-3
+    assert wanted < -1  # the last one is unstable
+    jordan = np.array([[0.9, 1.0], [0.0, 0.9]])
+    np.testing.assert_allclose(slowest_decay(jordan, 1.0), -np.log(0.9), atol=1e-6)
+
+
+@pytest.mark.parametrize("swing", [0.3, 0.02, 0.0])
+def test_slowest_decay_has_a_gradient(swing):
+    """Of a complex pair, also a nearly real one, and of a real number, beside faster motions."""
+    random = np.random.default_rng(0)
+    shape = random.normal(size=(4, 4))
+    block = np.zeros((4, 4))
+    block[:2, :2] = [[0.9, swing], [-2 * swing, 0.9 - (swing == 0)]]
+    block[2:, 2:] = np.diag([0.5, -0.4])
+    matrix, change = shape @ block @ np.linalg.inv(shape), random.normal(size=(4, 4))
+    value, left, right = scipy.linalg.eig(matrix, left=True)
+    k = np.argmax(np.abs(value))
+    y, x = left[:, k].conj(), right[:, k]
+    exact = -((y @ change @ x) / (y @ x) / value[k]).real / 0.01
+
+    def decay(e):
+        return slowest_decay(matrix + e * change, 0.01)
+
+    np.testing.assert_allclose(jax.grad(decay)(0.0), exact, rtol=1e-4)
+    np.testing.assert_allclose(jax.jvp(decay, (0.0,), (1.0,))[1], exact, rtol=1e-4)
+    difference = (decay(1e-5) - decay(-1e-5)) / 2e-5
+    np.testing.assert_allclose(difference, exact, rtol=1e-6)

@@ -33,7 +33,7 @@ def place(case, parameters):
 def chunk():
     """A machine that is thrown off its course in one case, after one short move."""
     study = paper_study().change(
-        link__modes=2, control__modes=2, control__feedback="ideal", run__duration=0.06,
+        link__modes=2, control__modes=2, run__smooth=True, run__duration=0.06,
         motion__waypoints=paper_study().motion.waypoints[:2], motion__move_time=0.03,
         metrics__residual_length=0.01, metrics__residual_delay=0.002,
     )  # fmt: skip

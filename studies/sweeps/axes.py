@@ -225,7 +225,7 @@ def _field_axis(name: str, written: Any, study: Study, path: str) -> Axis:
     if written == "all":
         written = _every_choice(name, base, path)
     if isinstance(written, dict):
-        return _range_axis(name, base, _parse_range(written, path), study, path)
+        return _range_axis(name, base, parse_range(written, path), study, path)
     if not isinstance(written, list) or not written:
         raise field_error(path, written, _WRITTEN)
     values = column_of([checked_value(study, name, value, path) for value in written])
@@ -268,7 +268,7 @@ def _is_number(value: Any) -> bool:
     return is_numeric and abs(value) <= LARGEST
 
 
-def _parse_range(written: dict[str, Any], path: str) -> Range:
+def parse_range(written: dict[str, Any], path: str) -> Range:
     allowed = ("from", "to", "count", "scale")
     for key in written:
         if key not in allowed:
@@ -332,7 +332,7 @@ def _mapped(axis: Axis, convert: Callable[[np.ndarray], Columns], name: str) -> 
 def _numbers_axis(written: Any, path: str) -> Axis:
     """Free numbers, named "value"."""
     if isinstance(written, dict):
-        span = _parse_range(written, path)
+        span = parse_range(written, path)
         return _numeric_axis("value", span, span.at)
     is_list = isinstance(written, list) and len(written) > 0
     if not is_list or not all(map(_is_number, written)):

@@ -32,8 +32,7 @@ KERNEL_SUBSTEPS = 4
 
 def fits_kernel(structure: Structure) -> bool:
     """Whether a structure can be written as a kernel here."""
-    fits = structure.substeps <= KERNEL_SUBSTEPS and not structure.is_smooth
-    return llvm.is_available() and fits
+    return llvm.is_available() and structure.substeps <= KERNEL_SUBSTEPS
 
 
 class Traced(NamedTuple):

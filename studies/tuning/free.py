@@ -1,0 +1,326 @@
+"""Free numbers of a design: their names, bounds and scale, and how they get into a `Case`.
+
+A free field is a number of the study file, an entry of a list, or a list, each of whose entries is
+then free by itself. Ready-made ones stand for several numbers:
+
+- `poles.decay` [1/s] and `poles.frequency_hz` [Hz], three entries each: alpha-bar and beta-bar of
+  mode 1 of each link, which become its gains by (22)-(23); they need `control.gain_unit = "1/s"`;
+- `placement`: patch centres on the link and without overlap, whatever the numbers in [0, 1] are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.beam import assembled_frequency
+from jaxmodel.case import Case
+from jaxmodel.control import pole_placement
+from jaxmodel.parameters import Array
+from studies.consistency import patch_centers
+from studies.errors import StudyError, field_error, nearest, shown_name
+from studies.fields import parse_entry
+from studies.spec import Study
+from studies.sweeps.axes import Range, checked_value, known_field, parse_range
+
+TWO_PI = 2 * np.pi
+
+
+class Leaf(NamedTuple):
+    """Where a field of the study lies in a Case."""
+
+    path: str
+    factor: float = 1.0  # the Case's unit in the study's
+
+
+def _same(section: str, inside: str, *names: str) -> dict[str, Leaf]:
+    return {f"{section}.{name}": Leaf(f"{inside}.{name}") for name in names}
+
+
+#: Fields that may be free.
+LEAVES: dict[str, Leaf] = {
+    **_same(
+        "control", "control", "velocity_gain", "position_gain", "gain_factor", "feedthrough_factor"
+    ),
+    "control.ratios": Leaf("control.ratio"),
+    "electronics.highpass_hz": Leaf("electronics.highpass", TWO_PI),
+    "electronics.antialias_hz": Leaf("electronics.antialias", TWO_PI),
+    "electronics.difference_cutoff_hz": Leaf("electronics.difference_cutoff", TWO_PI),
+    **_same("electronics", "electronics", "lowpass_ratio", "lowpass_zeta"),
+    "shaper.frequencies_hz": Leaf("shaping.omega", TWO_PI),
+    "shaper.damping_ratio": Leaf("shaping.zeta"),
+    "shaper.tolerance": Leaf("shaping.tolerance"),
+    "patches.centers": Leaf("machine.patches.center"),
+    **_same("patches", "machine.patches", "sensor_length", "actuator_length", "width", "thickness"),
+    **_same("drive", "drive", "kp", "kd"),
+    **_same("link", "machine.beam", "length", "thickness", "width"),
+    **_same(
+        "machine", "machine.masses", "platform_mass", "platform_inertia", "slider_mass"
+    ),
+}  # fmt: skip
+#: Free names that stand for several numbers of a Case.
+POLES = ("poles.decay", "poles.frequency_hz")
+PLACEMENT = "placement"
+PLACEMENTS = ("same", "per_link")
+
+
+class Free(NamedTuple):
+    """One free number."""
+
+    name: str  # with its index in a list
+    span: Range
+    start: float  # what the study has, nan where it has no such number
+
+
+class Setter(NamedTuple):
+    """Writes one number into a Case; hashable."""
+
+    path: str
+    indices: tuple[int, ...]
+    factor: float
+
+
+class FreeNumbers(NamedTuple):
+    """All free numbers of a design, in the order of the parameter vector."""
+
+    numbers: tuple[Free, ...]
+    place: Callable[[Case, Array], Case]  # puts values (p,) in the study's units into a case
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the numbers, in order."""
+        return tuple(number.name for number in self.numbers)
+
+    def values(self, u: np.ndarray) -> np.ndarray:
+        """Numbers in the study's units, (..., p), from their places between the bounds, 0 to 1."""
+        columns = [free.span.at(u[..., k]) for k, free in enumerate(self.numbers)]
+        return np.stack(columns, axis=-1)
+
+    def slopes(self, u: np.ndarray) -> np.ndarray:
+        """Derivatives of the values by their places, (..., p)."""
+        found = []
+        for k, free in enumerate(self.numbers):
+            low, high = free.span.low, free.span.high
+            width = free.span.at(u[..., k]) * np.log(high / low) if free.span.is_log else high - low
+            found.append(np.broadcast_to(width, u.shape[:-1]))
+        return np.stack(found, axis=-1)
+
+    def places(self) -> np.ndarray:
+        """Where the study itself lies between the bounds, 0 to 1; 1/2 where it does not say."""
+        found = []
+        for _, span, start in self.numbers:
+            if span.is_log:
+                at = np.log(start / span.low) / np.log(span.high / span.low)
+            else:
+                at = (start - span.low) / (span.high - span.low)
+            found.append(0.5 if np.isnan(at) else float(np.clip(at, 0.0, 1.0)))
+        return np.array(found)
+
+
+def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
+    """Free numbers from what the file says.
+
+    Args:
+        written: ranges by name, from `[tune.free]`.
+        study: the design to begin with.
+
+    Raises:
+        StudyError: nothing free, unknown name, bad bounds, a start outside them.
+    """
+    if not written:
+        raise field_error("tune.free", {}, "one free field or more")
+    numbers: list[Free] = []
+    places: list[Callable[[Case, Array], Case]] = []
+    for name, bounds in written.items():
+        path = f"tune.free.{shown_name(name)}"
+        first = len(numbers)
+        if name == PLACEMENT:
+            added, put = _placement(bounds, study, path)
+        elif name in POLES:
+            if name == POLES[1] and POLES[0] in written:
+                continue  # comes with the other one
+            added, put = _poles(written, study)
+        else:
+            added, put = _plain(name, bounds, study, path)
+        numbers += added
+        places.append(partial(_part, put, first, first + len(added)))
+    seen: set[str] = set()
+    for number in numbers:
+        if number.name in seen:
+            raise StudyError(f"tune.free.{number.name}: free twice")
+        seen.add(number.name)
+    return FreeNumbers(tuple(numbers), partial(_place_all, tuple(places)))
+
+
+def _place_all(places: tuple, case: Case, values: Array) -> Case:
+    for place in places:
+        case = place(case, values)
+    return case
+
+
+def _part(put: Callable, first: int, after: int, case: Case, values: Array) -> Case:
+    return put(case, values[first:after])
+
+
+# --- plain fields ---------------------------------------------------------------------------------
+
+
+def _plain(name: str, bounds: Any, study: Study, path: str) -> tuple[list[Free], Callable]:
+    entry = parse_entry(name)
+    value = known_field(name, study, path)  # names the nearest field if there is none
+    assert entry is not None
+    leaf = LEAVES.get(entry.field)
+    if leaf is None:
+        hint = nearest(entry.field, LEAVES)
+        raise StudyError(
+            f"{path}: cannot be free; fields that can are {', '.join(LEAVES)}, {', '.join(POLES)} "
+            f"and {PLACEMENT}" + (f"; did you mean {hint!r}?" if hint else "")
+        )
+    _check_field(entry.field, study, path)
+    span = _span(bounds, path)
+    numbers, setters = [], []
+    for indices, start in _entries(value):
+        whole = (*entry.indices, *indices)
+        label = entry.field + "".join(f"[{k}]" for k in whole)
+        for key, end in (("from", span.low), ("to", span.high)):
+            if entry.field != "patches.centers":  # all of them together may still fit the link
+                checked_value(study, label, end, f"{path}.{key}")
+        if not span.low <= start <= span.high:
+            raise field_error(label, start, f"{span.low:g} to {span.high:g}, the bounds of {path}")
+        numbers.append(Free(label, span, float(start)))
+        setters.append(Setter(leaf.path, whole, leaf.factor))
+    if not numbers:
+        raise field_error(name, value, f"one number or more, where {path} is to be free")
+    return numbers, partial(_set, tuple(setters))
+
+
+def _check_field(field: str, study: Study, path: str) -> None:
+    """What a free field asks of others."""
+    if field == "control.ratios" and study.control.ratio_exponent != 1:
+        raise field_error(
+            "control.ratio_exponent", study.control.ratio_exponent, f"1 where {path} is free", "1"
+        )
+    if field == "control.ratios" and study.control.ratio_source != "given":
+        raise field_error(
+            "control.ratio_source", study.control.ratio_source, f"'given' where {path} is free"
+        )
+
+
+def _span(bounds: Any, path: str) -> Range:
+    allowed = "a range {from = ..., to = ..., scale = 'linear' or 'log'}"
+    if not isinstance(bounds, dict) or "count" in bounds:
+        raise field_error(path, bounds, allowed)
+    return parse_range(bounds, path)
+
+
+def _entries(value: Any, indices: tuple[int, ...] = ()) -> list[tuple[tuple[int, ...], float]]:
+    """Numbers of a nested list with their indices."""
+    if not isinstance(value, tuple):
+        return [(indices, value)]
+    return [found for k, x in enumerate(value) for found in _entries(x, (*indices, k))]
+
+
+def _set(setters: tuple[Setter, ...], case: Case, values: Array) -> Case:
+    for k, setter in enumerate(setters):
+        case = _replaced(case, setter.path.split("."), setter.indices, values[k] * setter.factor)
+    return case
+
+
+def _replaced(tree: Any, path: list[str], indices: tuple[int, ...], value: Array) -> Any:
+    """A tree of named tuples with one number replaced; too few indices mean all that follow."""
+    if not path:
+        return jnp.asarray(tree, value.dtype).at[_widened(indices, jnp.ndim(tree))].set(value)
+    first, *rest = path
+    return tree._replace(**{first: _replaced(getattr(tree, first), rest, indices, value)})
+
+
+def _widened(indices: tuple[int, ...], depth: int) -> Any:
+    """One list of patch centres, or of one number, stands for those of all links."""
+    return (Ellipsis, *indices) if indices and depth > len(indices) else (indices or Ellipsis)
+
+
+# --- ready-made ones ------------------------------------------------------------------------------
+
+
+def _poles(written: dict[str, Any], study: Study) -> tuple[list[Free], Callable]:
+    for one, other in (POLES, POLES[::-1]):
+        if one in written and other not in written:
+            raise StudyError(f"tune.free.{one}: needs {other} beside it, (22)-(23) take both")
+    if study.control.gain_unit != "1/s":
+        raise field_error(
+            "control.gain_unit",
+            study.control.gain_unit,
+            "'1/s' where tune.free.poles.decay is free",
+        )
+    spans = [_span(written[name], f"tune.free.{name}") for name in POLES]
+    if spans[1].low <= 0:
+        raise field_error(f"tune.free.{POLES[1]}.from", spans[1].low, "more than 0", "Hz")
+    numbers = [
+        Free(f"{name}[{k}]", span, np.nan)
+        for name, span in zip(POLES, spans, strict=True)
+        for k in range(3)
+    ]
+    return numbers, _place_poles
+
+
+def _place_poles(case: Case, values: Array) -> Case:
+    belief = case.machine.beam._replace(stiffness_factor=1.0)
+    omega = assembled_frequency(belief, 1)[:, 0]
+    gains = pole_placement(values[:3], TWO_PI * values[3:], omega)
+    control = case.control._replace(velocity_gain=gains.velocity, position_gain=gains.position)
+    return case._replace(control=control)
+
+
+def _placement(bounds: Any, study: Study, path: str) -> tuple[list[Free], Callable]:
+    if not isinstance(bounds, dict) or set(bounds) != {"kind"} or bounds["kind"] not in PLACEMENTS:
+        raise field_error(path, bounds, "{kind = 'same'} or {kind = 'per_link'}")
+    patches, centers = study.patches, patch_centers(study)
+    pitch = max(patches.sensor_length, patches.actuator_length)
+    links, count = (1 if bounds["kind"] == "same" else 3), centers.shape[1]
+    free = study.link.length - count * pitch
+    if free <= 0:
+        raise field_error(path, bounds, f"a link longer than its {count} patches")
+    numbers = []
+    for i in range(links):
+        gaps = np.diff([0.0, *(np.sort(centers[i]) - pitch * (np.arange(count) + 0.5))])
+        starts = _shares(gaps / free)
+        numbers += [
+            Free(f"placement[{i}][{k}]", Range(0.0, 1.0, 0, False), float(starts[k]))
+            for k in range(count)
+        ]
+    return numbers, partial(_place_patches, links, pitch)
+
+
+def _shares(gaps: np.ndarray) -> np.ndarray:
+    """Numbers whose `_place_patches` leaves these gaps, as shares of all that is free."""
+    left, found = 1.0, []
+    for k, gap in enumerate(gaps):
+        kept = np.clip(1 - gap / left, 0.0, 1.0) if left > 0 else 1.0
+        found.append(1 - kept ** (len(gaps) - k))
+        left -= gap
+    return np.array(found)
+
+
+def _place_patches(links: int, pitch: float, case: Case, values: Array) -> Case:
+    """Patches one after the other, each after a gap that is its share of what is still free.
+
+    Of k gaps to come, a number v takes 1 - (1 - v)^(1/k): equal numbers are drawn evenly from all
+    placements.
+    """
+    patches = case.machine.patches
+    count = values.shape[0] // links
+    left = case.machine.beam.length - count * pitch
+    begin, centers = jnp.zeros((links,), values.dtype), []
+    shares = jnp.reshape(values, (links, count))
+    for k in range(count):
+        # the root has no slope at 0, where all that is free is used up
+        kept = jnp.maximum(1 - shares[:, k], 1e-12) ** (1 / (count - k))
+        begin, left = begin + left * (1 - kept), left * kept
+        centers.append(begin + pitch * (k + 0.5))
+    center = jnp.broadcast_to(jnp.stack(centers, axis=-1), (3, count))
+    machine = case.machine._replace(patches=patches._replace(center=center))
+    return case._replace(machine=machine)
