@@ -16,6 +16,7 @@ from typer.exceptions import Abort, TyperException
 from studies.config import start
 from studies.errors import StudyError, field_error
 from studies.sweeps.commands import add_commands
+from studies.tuning.commands import add_commands as add_tuning
 
 app = typer.Typer(
     help="Parameter studies of a planar 3-PRR manipulator with flexible links.",
@@ -262,6 +263,7 @@ def info() -> None:
 
 
 add_commands(app, console)
+add_tuning(app, console)
 
 
 if __name__ == "__main__":

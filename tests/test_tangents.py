@@ -4,13 +4,18 @@ import jax
 import numpy as np
 import pytest
 
-from studies.cases import build_cases, build_structure
+from studies.cases import as_arrays, build_cases, build_structure
 from studies.kernels.cpu import build_kernel
 from studies.kernels.graph import Graph, objects
 from studies.kernels.tangents import push_forward
 from studies.kernels.traced import Leaf, trace_loop
 from studies.spec import paper_study
-from studies.sweeps.gradients import KernelGradients, ScanGradients, is_forward_cheaper
+from studies.sweeps.gradients import (
+    KernelGradients,
+    ScanGradients,
+    is_forward_cheaper,
+    reverse_gradients,
+)
 from studies.sweeps.plan import Layout
 from tests.test_kernel import every_operation, translated
 
@@ -101,3 +106,21 @@ def test_mode_by_rule():
     """Forward for few parameters, reverse for many."""
     for name in ("traced kernel", "XLA scan"):
         assert is_forward_cheaper(1, name) and not is_forward_cheaper(1000, name)
+
+
+@pytest.mark.long
+def test_reverse_mode_agrees_with_forward_mode(chunk):
+    """One number's gradient, by the mode that pays for many parameters."""
+    structure, cases, parameters = chunk
+    forward = ScanGradients(structure, LAYOUT, place).evaluate(cases, parameters)
+    whole = jax.tree.map(lambda x: np.repeat(x, LAYOUT.size // len(x), axis=0), cases)
+    value, slope = reverse_gradients(structure, place, control_energy, as_arrays(whole), parameters)
+    good = forward.result.status == 0
+    wanted, change = forward.result.metrics.control_energy, forward.metrics.control_energy
+    np.testing.assert_allclose(value[good], wanted[good], rtol=1e-9)
+    size = np.abs(change[good]).max()
+    np.testing.assert_allclose(slope[good], change[good], atol=1e-9 * size)
+
+
+def control_energy(metrics):
+    return metrics.control_energy

@@ -5,12 +5,15 @@ import numpy as np
 import pytest
 
 from jaxmodel.sampled_loop import loop_report
+from studies import cli
 from studies.cases import as_arrays, build_case, build_structure
 from studies.errors import StudyError
 from studies.runs import run_study
-from studies.spec import paper_study, parse_study
+from studies.spec import load_study, paper_study, parse_study
 from studies.sweeps.axes import set_value
-from studies.tuning.evaluate import Evaluator, scenarios
+from studies.tuning.evaluate import Evaluator, scenario_columns
+from studies.tuning.optimise import advance, optimise
+from studies.tuning.run import load_progress, save_progress
 from studies.tuning.spec import parse_tuning
 
 HOME = list(paper_study().motion.waypoints[0])
@@ -148,15 +151,21 @@ JUDGED = {
 
 
 @pytest.fixture(scope="module")
-def evaluated():
-    """A tuning with free numbers of several kinds, its evaluator, and five designs' evaluation."""
+def judged():
+    """A tuning with free numbers of several kinds, and its evaluator."""
     free = {
         **GAIN,
         "control.velocity_gain[0]": EVERY_KIND["control.velocity_gain"],
         "drive.kp": EVERY_KIND["drive.kp"],
     }
-    spec = tuning({**free, "placement": {"kind": "same"}}, **JUDGED)
-    evaluator = Evaluator(spec, 13)
+    spec = tuning({**free, "placement": {"kind": "same"}}, **JUDGED, starts=13, iterations=6)
+    return spec, Evaluator(spec, 13)
+
+
+@pytest.fixture(scope="module")
+def evaluated(judged):
+    """The evaluation of a design and of its neighbours along each free number."""
+    spec, evaluator = judged
     u = np.clip(spec.free.places() + 0.02, 0.1, 0.9)
     step = 1e-4 * np.eye(len(u))
     designs = np.concatenate([[u], u + step, u - step])
@@ -179,7 +188,7 @@ def test_gradients_are_those_of_central_differences(evaluated):
 def test_figures_can_be_recomputed_from_runs(evaluated):
     """The objective and the limit from runs of the studies themselves, one by one."""
     spec, _, u, found = evaluated
-    values, columns = spec.free.values(u), scenarios(spec)
+    values, columns = spec.free.values(u), scenario_columns(spec, 2, 0)
     case = as_arrays(build_case(spec.study))
     centers = spec.free.place(case, values).machine.patches.center[0]
     sizes, peaks = [], []
@@ -207,3 +216,106 @@ def test_margin_is_violated_where_the_loop_says_so(evaluated):
     margin = loop_report(build_structure(spec.study), case, np.array(HOME)).gain_margin
     assert (found.limits[0, 1] > 0) == (margin < 3.0)
     assert abs(margin - 3.0) > 0.01
+
+
+# --- downhill -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tuned(judged):
+    """Where an uninterrupted tuning ends, and every iteration of it."""
+    spec, evaluator = judged
+    seen = []
+    return optimise(spec, evaluator, None, seen.append), seen
+
+
+def test_tuning_goes_downhill_within_limits(judged, tuned):
+    spec, _ = judged
+    end, seen = tuned
+    assert int(end.iteration) == len(seen) == spec.tune.iterations
+    k = end.winner
+    assert end.best_limits[k].max() <= 1e-3
+    assert end.best_objective[k] < 0.97 * end.history[0, 0, 0]  # the study's own design
+    assert np.all((end.best_place >= 0) & (end.best_place <= 1))
+
+
+def test_resumed_tuning_equals_an_uninterrupted_one(judged, tuned, tmp_path):
+    """Bit by bit, through the file that is kept."""
+    spec, evaluator = judged
+    end, seen = tuned
+    save_progress(tmp_path / "progress.npz", seen[2])
+    again = optimise(spec, evaluator, load_progress(tmp_path / "progress.npz"), lambda at: None)
+    jax.tree.map(np.testing.assert_array_equal, again, end)
+
+
+def test_a_start_that_fails_spoils_no_other(judged, tuned):
+    spec, evaluator = judged
+    _, seen = tuned
+    at = seen[2]
+    broken = at.place.copy()
+    broken[4, 0] = np.nan
+    wanted, found = (
+        advance(spec, evaluator, at),
+        advance(spec, evaluator, at._replace(place=broken)),
+    )
+    others = np.arange(13) != 4
+    assert found.is_frozen[4] and not found.is_frozen[others].any()
+    np.testing.assert_array_equal(found.place[others], wanted.place[others])
+    np.testing.assert_array_equal(found.best_objective[4], at.best_objective[4])
+    later = advance(spec, evaluator, found)
+    assert later.is_frozen[4] and np.isfinite(later.place[others]).all()
+
+
+def test_a_number_that_changes_nothing_is_named(judged, monkeypatch):
+    spec, evaluator = judged
+    found = evaluator.evaluate(spec.free.values(np.repeat(spec.free.places()[None], 13, axis=0)))
+    found.slope[:, 2], found.limit_slope[:, :, 2] = 0.0, 0.0
+    monkeypatch.setattr(evaluator, "evaluate", lambda values: found)
+    with pytest.raises(StudyError, match=r"neither .* depends on drive.kp; leave that out"):
+        optimise(spec, evaluator, None, lambda at: None)
+
+
+FILE = """
+run = { duration = 0.06 }
+link = { modes = 2 }
+control = { modes = 2, ratios = [[1.0, 0.3], [1.0, 0.3], [1.0, 0.3]] }
+shaper = { kind = "none" }
+metrics = { residual_delay = 0.002, residual_length = 0.02 }
+
+[motion]
+waypoints = [[0.0, 0.0, 0.5235987755982988], [0.0, 0.01, 0.5235987755982988]]
+move_time = 0.03
+
+[tune]
+starts = 2
+iterations = 3
+free = { "control.gain_factor" = { from = 0.05, to = 2.0, scale = "log" } }
+limits = { peak_voltage = 60.0, gain_margin = 2.0 }
+scenarios = { count = 2, check = 3, spread = { "link.youngs_modulus" = 5.0 } }
+"""
+
+
+@pytest.mark.long
+def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
+    file, out = tmp_path / "t.toml", tmp_path / "out"
+    file.write_text(FILE)
+    cli.main(["tune", str(file), "--out", str(out)])
+    text = (out / "report.md").read_text()
+    assert "| objective, mean |" in text and "worst disagreement is" in text
+    tuned = load_study(out / "tuned.toml")
+    assert tuned.control.gain_factor != paper_study().control.gain_factor
+    before = (out / "tune.h5").read_bytes()
+    cli.main(["tune", str(file), "--out", str(out), "--resume", "--quiet"])
+    assert (out / "tune.h5").read_bytes() == before
+    for more, message in (([], "holds a tuning already"), (["--audit"], "")):
+        code = 0
+        try:
+            cli.main(["tune", str(file), "--out", str(out), *more])
+        except SystemExit as end:
+            code = end.code
+        said = capsys.readouterr()
+        assert (code, message in said.err) == ((2, True) if message else (0, True))
+    file.write_text(FILE.replace("iterations = 3", "iterations = 4"))
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["tune", str(file), "--out", str(out), "--resume"])
+    assert "another tuning file" in capsys.readouterr().err

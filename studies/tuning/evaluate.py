@@ -28,7 +28,7 @@ from studies.sweeps.plan import LANES, Layout, lane_unit
 from studies.tuning.spec import LOOP_LIMITS, TuneSpec
 
 #: Slowest motion that counts as stable where `gain_margin` is limited [1/s].
-STABLE = 1.0
+STABLE = 10.0
 
 
 class Evaluation(NamedTuple):
@@ -57,17 +57,23 @@ class Evaluator:
         study = spec.study.change(run__smooth=True)
         checked, self._case = check_run(study)
         self._structure = _structure(spec, checked)
-        columns = scenarios(spec)
-        self.scenarios = spec.tune.scenarios.count
+        asked = spec.tune.scenarios
+        columns = scenario_columns(spec, asked.count, asked.seed)
+        self.scenarios = asked.count
         tiled = {name: np.tile(column, designs) for name, column in columns.items()}
         n = designs * self.scenarios
-        self._layout = _layout(n)
+        self._layout = even_layout(n)
         rows = np.minimum(np.arange(self._layout.size), n - 1)
         padded = {name: column[rows] for name, column in tiled.items()}
         cases = build_cases(study, padded, self._structure)
         real = jax.dtypes.canonicalize_dtype(np.float64)
         self._cases = jax.tree.map(lambda x: x if x.dtype.kind == "i" else x.astype(real), cases)
         self._rows = rows // self.scenarios  # design of every lane
+        self._plain = self._structure._replace(
+            n_steps=1, substeps=1, n_frequencies=1, has_noise=False, metrics=()
+        )
+        self._pose = np.array(study.motion.waypoints[0])
+        self._judge = jax.jit(jax.vmap(partial(_judged, spec)))
         self._gradients = make_gradients(self._structure, self._layout, spec.free.place)
 
     def evaluate(self, values: np.ndarray) -> Evaluation:
@@ -86,8 +92,8 @@ class Evaluator:
         metrics, slopes = (
             jax.tree.map(split, part) for part in (runs.result.metrics, runs.metrics)
         )
-        one = jax.jit(jax.vmap(partial(_judged, self.spec)))
-        objective, slope, limits, limit_slope = jax.tree.map(np.asarray, one(metrics, slopes))
+        judged = self._judge(metrics, slopes)
+        objective, slope, limits, limit_slope = jax.tree.map(np.asarray, judged)
         if any(name in LOOP_LIMITS for name in self.spec.tune.limits):
             found, change = self._loop_limits(values)
             limits = np.concatenate([limits, found], axis=1)
@@ -100,45 +106,67 @@ class Evaluator:
         names = list(self.spec.tune.limits)
         return tuple(sorted(names, key=lambda name: name in LOOP_LIMITS))
 
+    def loop_excess(self, values: np.ndarray) -> np.ndarray:
+        """How far designs are from a stable linearised loop and its limits, (n,); cheap.
+
+        Args:
+            values: (n, p), any number of designs.
+        """
+        if self._structure.feedback != "sampled":
+            return np.zeros(len(values))
+        limits = self.spec.tune.limits
+        wanted = [(name, limits[name]) for name in LOOP_LIMITS if name in limits]
+        found = _loop_values(
+            self._plain, tuple(wanted or [("slowest_decay", STABLE)]), self.spec.free.place,
+            self._case, self._pose, values,
+        )  # fmt: skip
+        worst = np.asarray(found).max(axis=1)
+        return np.where(np.isfinite(worst), worst, np.inf)
+
     def _loop_limits(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         names = [name for name in self.limit_names if name in LOOP_LIMITS]
         wanted = tuple((name, self.spec.tune.limits[name]) for name in names)
-        plain = self._structure._replace(n_steps=1, substeps=1, n_frequencies=1, has_noise=False)
-        pose = np.array(self.spec.study.motion.waypoints[0])
-        found = _loop(plain, wanted, self.spec.free.place, self._case, pose, values)
+        found = _loop(self._plain, wanted, self.spec.free.place, self._case, self._pose, values)
         return np.asarray(found[0]), np.asarray(found[1])
 
 
 def _structure(spec: TuneSpec, structure: Structure) -> Structure:
     """That of all scenarios; whatever may be free is there."""
-    names = {parse_entry(name).field for name in (*spec.tune.objective, *spec.tune.limits)}  # type: ignore[union-attr]
-    kept = tuple(sorted(names - set(LOOP_LIMITS)))
     has_position = any("position_gain" in n or "poles" in n for n in spec.free.names)
     return structure._replace(
-        metrics=kept, has_position_gain=structure.has_position_gain or has_position
+        metrics=metrics_of(spec), has_position_gain=structure.has_position_gain or has_position
     )
 
 
-def _layout(n: int) -> Layout:
+def metrics_of(spec: TuneSpec) -> tuple[str, ...]:
+    """Metrics that objective and limits are made of."""
+    names = [parse_entry(name) for name in (*spec.tune.objective, *spec.tune.limits)]
+    return tuple(sorted({entry.field for entry in names if entry} - set(LOOP_LIMITS)))
+
+
+def even_layout(n: int) -> Layout:
+    """A chunk of n cases or a few more, all devices alike."""
     devices = len(jax.local_devices())
     unit = lane_unit()
     lanes = min(LANES, -(-n // (unit * devices)) * unit)
     return Layout(devices, -(-n // (devices * lanes)), lanes)
 
 
-def scenarios(spec: TuneSpec) -> dict[str, np.ndarray]:
+def scenario_columns(spec: TuneSpec, count: int, seed: int) -> dict[str, np.ndarray]:
     """Columns of the fields that scenarios change, and their seeds; the first is the study itself.
 
     Args:
         spec: of the tuning.
+        count: scenarios.
+        seed: of their shifts and of their noise.
     """
-    asked = spec.tune.scenarios
-    columns = {"run.seed": spec.study.run.seed + np.arange(asked.count)}
-    if asked.spread:
-        sampler = qmc.LatinHypercube(len(asked.spread), rng=asked.seed)
-        shift = 2 * sampler.random(asked.count) - 1
+    spread = spec.tune.scenarios.spread
+    noise = np.random.default_rng(seed).integers(1, 10**9, count)
+    columns = {"run.seed": np.where(np.arange(count) > 0, noise, spec.study.run.seed)}
+    if spread:
+        shift = 2 * qmc.LatinHypercube(len(spread), rng=seed).random(count) - 1
         shift[0] = 0.0
-        for k, (name, percent) in enumerate(asked.spread.items()):
+        for k, (name, percent) in enumerate(spread.items()):
             columns[name] = known_field(name, spec.study) * (1 + percent / 100 * shift[:, k])
     return columns
 
@@ -154,10 +182,10 @@ def _judged(spec: TuneSpec, metrics: Metrics, slopes: Metrics) -> tuple:
 
     def figures(metrics: Metrics) -> tuple[Array, Array]:
         objective = sum(
-            weight * jnp.mean(_size(metrics, name)) for name, weight in spec.tune.objective.items()
+            weight * jnp.mean(size(metrics, name)) for name, weight in spec.tune.objective.items()
         )
         limits = [
-            jnp.max(_largest(metrics, name)) / limit - 1
+            jnp.max(largest(metrics, name)) / limit - 1
             for name, limit in spec.tune.limits.items()
             if name not in LOOP_LIMITS
         ]
@@ -170,7 +198,7 @@ def _judged(spec: TuneSpec, metrics: Metrics, slopes: Metrics) -> tuple:
     return objective, slope, limits, jnp.moveaxis(limit_slope, 0, -1)
 
 
-def _entries(metrics: Metrics, name: str) -> Array:
+def entries(metrics: Metrics, name: str) -> Array:
     """Entries of a metric, (S, n)."""
     entry = parse_entry(name)
     assert entry is not None
@@ -178,33 +206,47 @@ def _entries(metrics: Metrics, name: str) -> Array:
     return jnp.reshape(data[(slice(None), *entry.indices)], (data.shape[0], -1))
 
 
-def _size(metrics: Metrics, name: str) -> Array:
+def size(metrics: Metrics, name: str) -> Array:
     """Root of the mean square of the entries, (S,)."""
-    square = jnp.mean(_entries(metrics, name) ** 2, axis=1)
+    square = jnp.mean(entries(metrics, name) ** 2, axis=1)
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
-def _largest(metrics: Metrics, name: str) -> Array:
-    return jnp.max(_entries(metrics, name), axis=1)
+def largest(metrics: Metrics, name: str) -> Array:
+    """Largest entry, (S,)."""
+    return jnp.max(entries(metrics, name), axis=1)
+
+
+def _loop_figures(
+    structure: Structure, wanted: tuple, place: Any, case: Case, pose: Array, values: Array
+) -> Array:
+    """Limits of one design's linearised sampled loop, (m,), positive where violated.
+
+    x/(1 + |x|) of x = 1 - value/limit: decay rates reach hundreds of the limit on both sides of it.
+    """
+    matrices = closed_loop(structure, place(case, values), pose)
+    found = []
+    for name, limit in wanted:
+        factor = limit if name == "gain_margin" else 1.0
+        needed = STABLE if name == "gain_margin" else limit
+        whole = matrices.open + factor * matrices.feedback
+        lack = 1 - slowest_decay(whole, case.electronics.period) / needed
+        found.append(lack / (1 + jnp.abs(lack)))
+    return jnp.asarray(found)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _loop_values(
+    structure: Structure, wanted: tuple, place: Any, case: Case, pose: Array, values: Array
+) -> Array:
+    """Limits of designs, (designs, m)."""
+    return jax.lax.map(partial(_loop_figures, structure, wanted, place, case, pose), values)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _loop(
     structure: Structure, wanted: tuple, place: Any, case: Case, pose: Array, values: Array
 ) -> tuple[Array, Array]:
-    """Limits of the linearised sampled loop and their derivatives, (designs, m) and (.., m, p)."""
-
-    def figures(values: Array) -> Array:
-        matrices = closed_loop(structure, place(case, values), pose)
-        found = []
-        for name, limit in wanted:
-            factor = limit if name == "gain_margin" else 1.0
-            needed = STABLE if name == "gain_margin" else limit
-            whole = matrices.open + factor * matrices.feedback
-            found.append(1 - slowest_decay(whole, case.electronics.period) / needed)
-        return jnp.asarray(found)
-
-    def one(values: Array) -> tuple[Array, Array]:
-        return figures(values), jax.jacrev(figures)(values)
-
-    return jax.lax.map(one, values)
+    """Limits of designs and their derivatives, (designs, m) and (designs, m, p)."""
+    figures = partial(_loop_figures, structure, wanted, place, case, pose)
+    return jax.lax.map(lambda x: (figures(x), jax.jacrev(figures)(x)), values)

@@ -29,6 +29,7 @@ class Scenarios(Section):
     """Machines that one design must suit."""
 
     count: int = described(1, "1", "scenarios; the first is the study itself", ge=1, le=1000)
+    check: int = described(16, "1", "fresh ones, for the result", ge=1, le=10_000)
     seed: int = described(0, "1", "of the scenarios", ge=0, le=10**9)
     spread: dict[str, Any] = described({}, "-", "field = +-percent of its value")
 
@@ -42,6 +43,9 @@ class Tune(Section):
     )
     limits: dict[str, Any] = described({}, "-", "metric, gain_margin or slowest_decay = limit")
     scenarios: Scenarios = Scenarios()
+    starts: int = described(8, "1", "designs to begin with, the study's own first", ge=1, le=1024)
+    iterations: int = described(60, "1", "steps of each start", ge=1, le=10_000)
+    seed: int = described(0, "1", "of the starts", ge=0, le=10**9)
 
 
 class TuneSpec(NamedTuple):

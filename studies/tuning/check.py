@@ -1,0 +1,112 @@
+"""What a tuned design is worth: with the real converters, on machines it was not tuned on."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxmodel import status
+from jaxmodel.sampled_loop import loop_report
+from studies.cases import as_arrays, build_case, build_cases, build_structure
+from studies.fields import parse_entry
+from studies.spec import Study, parse_study
+from studies.sweeps.axes import replaced
+from studies.sweeps.executor import make_executor
+from studies.tuning.evaluate import even_layout, largest, metrics_of, scenario_columns, size
+from studies.tuning.free import PLACEMENT, POLES
+from studies.tuning.spec import LOOP_LIMITS, TuneSpec
+
+#: Plant modes of the linearised loop that the gain margin is taken from.
+MARGIN_MODES = 12
+
+
+class Judged(NamedTuple):
+    """One design on fresh scenarios, the first of them the study's own machine."""
+
+    objective: np.ndarray  # nan where a run did not finish, (S,)
+    metrics: dict[str, np.ndarray]  # size or largest entry of each metric that counts, (S,)
+    status: np.ndarray  # (S,)
+    gain_margin: float  # of the linearised sampled loop; nan with other feedback [1]
+
+
+def tuned_study(spec: TuneSpec, values: np.ndarray) -> Study:
+    """The study with the free numbers set.
+
+    Args:
+        spec: of the tuning.
+        values: of the free numbers, (p,).
+    """
+    study = spec.study
+    case = spec.free.place(as_arrays(build_case(study)), values)
+    whole = {}
+    if any(name.startswith(PLACEMENT) for name in spec.free.names):
+        whole["patches.centers"] = case.machine.patches.center
+    if any(name.startswith(POLES) for name in spec.free.names):
+        whole["control.velocity_gain"] = case.control.velocity_gain
+        whole["control.position_gain"] = case.control.position_gain
+    plain = zip(spec.free.names, values, strict=True)
+    whole |= {name: v for name, v in plain if not name.startswith((PLACEMENT, *POLES))}
+    data = study.model_dump()
+    for name, value in whole.items():
+        entry = parse_entry(name)
+        assert entry is not None
+        section, _, leaf = entry.field.partition(".")
+        new = np.asarray(value).tolist()
+        data[section][leaf] = replaced(data[section][leaf], entry.indices, new)
+    return parse_study(data)
+
+
+def judge(spec: TuneSpec, designs: list[Study]) -> list[Judged]:
+    """Run designs on scenarios that the tuning has not seen.
+
+    Args:
+        spec: of the tuning.
+        designs: studies that differ from the tuning's own in numbers only.
+    """
+    columns = scenario_columns(spec, spec.tune.scenarios.check, spec.tune.scenarios.seed + 1)
+    count = spec.tune.scenarios.check
+    structure = build_structure(designs[0])
+    has_position = any(any(g != 0 for g in study.control.position_gain) for study in designs)
+    structure = structure._replace(metrics=metrics_of(spec), has_position_gain=has_position)
+    layout = even_layout(count * len(designs))
+    parts = [
+        jax.tree.map(
+            lambda x: np.broadcast_to(x, (count, *x.shape[1:])),
+            build_cases(study, columns, structure),
+        )
+        for study in designs
+    ]
+    whole = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    rows = np.minimum(np.arange(layout.size), count * len(designs) - 1)
+    cases = jax.tree.map(lambda x: x[rows], whole)
+    result = make_executor(structure, layout, False).start(cases).wait()
+    found = []
+    for k, study in enumerate(designs):
+        part = slice(k * count, (k + 1) * count)
+        metrics = jax.tree.map(lambda x: np.asarray(x)[part], result.metrics)  # noqa: B023
+        sizes = {name: np.asarray(size(metrics, name)) for name in spec.tune.objective}
+        objective = sum(weight * sizes[name] for name, weight in spec.tune.objective.items())
+        peaks = {
+            name: np.asarray(largest(metrics, name))
+            for name in spec.tune.limits
+            if name not in LOOP_LIMITS
+        }
+        is_bad = ~np.isin(result.status[part], status.FINISHED)
+        found.append(
+            Judged(
+                np.where(is_bad, np.nan, objective), {**sizes, **peaks}, result.status[part],
+                _gain_margin(study),
+            )
+        )  # fmt: skip
+    return found
+
+
+def _gain_margin(study: Study) -> float:
+    if study.control.feedback != "sampled":
+        return float("nan")
+    larger = study.change(link__modes=max(MARGIN_MODES, study.link.modes))
+    case = as_arrays(build_case(larger))
+    pose = np.array(larger.motion.waypoints[0])
+    return loop_report(build_structure(larger), case, pose).gain_margin

@@ -1,0 +1,59 @@
+"""The command `studies tune`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from studies.config import start
+from studies.errors import StudyError
+from studies.tuning.spec import TuneSpec, load_tuning
+
+
+def add_commands(app: typer.Typer, console: Console) -> None:
+    """Add the command to the command line."""
+
+    @app.command()
+    def tune(
+        spec: Annotated[Path, typer.Argument(help="tuning file (TOML), or `tune`, a ready one")],
+        out: Annotated[Path | None, typer.Option(help="folder for the results")] = None,
+        resume: Annotated[bool, typer.Option("--resume", help="go on with what is there")] = False,
+        audit: Annotated[
+            bool, typer.Option("--audit", help="only compare derivatives with differences")
+        ] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", help="no progress")] = False,
+    ) -> None:
+        """Move free numbers of a study downhill, within limits, for many machines at once."""
+        start()
+        from studies.sweeps.spec import ready_spec
+        from studies.tuning.run import REPORT, TUNED, run_tuning
+
+        asked = load_tuning(ready_spec(spec))
+        if audit:
+            _audit(asked, console)
+            return
+        if out is None:
+            raise StudyError("--out: name a folder for the results")
+        run_tuning(asked, out, resume, console, quiet)
+        console.print(f"report: {out / REPORT}; tuned study: {out / TUNED}", soft_wrap=True)
+
+
+def _audit(spec: TuneSpec, console: Console) -> None:
+    from studies.tuning.audit import ALLOWED, audit, audit_places
+
+    table = Table("free number", "worst for", "derivative", "difference", "disagreement")
+    found = audit(spec, audit_places(spec))
+    for one in found:
+        table.add_row(
+            one.name, one.figure, f"{one.derivative:.6g}", f"{one.difference:.6g}",
+            f"{one.share:.1e}",
+        )  # fmt: skip
+    console.print(table)
+    if max(one.share for one in found) > ALLOWED:
+        console.print(f"disagreement above {ALLOWED:g}")
+        sys.exit(1)
