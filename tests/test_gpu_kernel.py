@@ -32,7 +32,7 @@ LAYOUT = Layout(devices=1, blocks=2, lanes=gpu.BLOCK)
 
 def rehearsed(loop, n_steps, lanes):
     """Stands in for `gpu.build_kernel`: the same code, one case after the other on this CPU."""
-    cpu._initialise()
+    cpu.initialise()
     module = gpu.ThreadWriter(loop, n_steps, lanes).write()
     target = llvm.binding.Target.from_default_triple().create_target_machine(jit=True, opt=3)
     parsed = llvm.binding.parse_assembly(str(module))

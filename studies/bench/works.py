@@ -23,7 +23,7 @@ from studies.kernels.llvm import is_available
 from studies.spec import paper_study
 from studies.sweeps.executor import make_executor
 from studies.sweeps.kernels import GpuExecutor, KernelExecutor
-from studies.sweeps.plan import GPU_LANES, LANES, Layout, lane_unit, peak_memory
+from studies.sweeps.plan import Layout, even_layout, most_lanes, peak_memory
 from studies.sweeps.program import Executor
 from studies.sweeps.results import load
 from studies.sweeps.run import run_sweep
@@ -94,10 +94,8 @@ def check_executor(executor: str, known: Iterable[str] = EXECUTORS) -> None:
 
 def make_layout(batch: int) -> Layout:
     """A chunk of about so many cases; 0: two blocks of lanes on every device, one on a GPU."""
-    devices, is_cpu = len(jax.local_devices()), config.processor() == "cpu"
-    (most, blocks), unit = ((LANES, 2) if is_cpu else (GPU_LANES, 1)), lane_unit()
-    lanes = most if not batch else max(unit, min(most, -(-batch // (unit * devices)) * unit))
-    return Layout(devices, max(batch // (devices * lanes), 1) if batch else blocks, lanes)
+    blocks = 2 if config.processor() == "cpu" else 1
+    return even_layout(batch or blocks * most_lanes() * len(jax.local_devices()))
 
 
 def build_work(work: str, layout: Layout, **changes: Any) -> tuple[Structure, Case]:

@@ -142,13 +142,14 @@ class _VectorWriter(Writer):
 
 
 @cache
-def _initialise() -> None:
+def initialise() -> None:
+    """Make LLVM ready for this processor."""
     for part in ("initialize_native_target", "initialize_native_asmprinter"):
         getattr(binding, part)()
 
 
 def _compile(text: str) -> Any:
-    _initialise()
+    initialise()
     cpu, features = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
     triple, version = binding.get_default_triple(), ".".join(map(str, binding.llvm_version_info))
     kept = ObjectCache(text, cpu, features, triple, version)

@@ -13,7 +13,7 @@ import json
 import os
 import re
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from hashlib import file_digest, sha256
 from pathlib import Path
@@ -141,15 +141,21 @@ def open_folder(path: Path, manifest: dict[str, Any], is_resumed: bool) -> Itera
         yield folder
 
 
-def make_manifest(data: dict[str, Any]) -> dict[str, Any]:
+def make_manifest(data: dict[str, Any], more: Iterable[Path] = ()) -> dict[str, Any]:
     """What decides a sweep's numbers, and what ran it.
 
     Args:
         data: the sweep file as read.
+        more: sources that decide them too.
     """
     facts = config.info()
     keep = (config.PACKAGE, "python", "jax", "jaxlib", "numpy", "h5py", "devices", "precision")
-    return {"spec": data, "code": code_digest(), "git": git_state(), **{k: facts[k] for k in keep}}
+    return {
+        "spec": data,
+        "code": code_digest(more),
+        "git": git_state(),
+        **{k: facts[k] for k in keep},
+    }
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
@@ -278,8 +284,8 @@ def _sync(folder: Path) -> None:
         os.close(descriptor)
 
 
-def code_digest() -> str:
-    """Hash of the sources that decide a case's numbers."""
+def code_digest(more: Iterable[Path] = ()) -> str:
+    """Hash of the sources that decide a case's numbers, and of more of them."""
     digest = sha256()
     names = (
         "cases.py", "fields.py", "spec.py", "kernels/cpu.py", "kernels/fusion.py",
@@ -288,7 +294,7 @@ def code_digest() -> str:
         "sweeps/scan.py", "sweeps/steps.py", "sweeps/table.py",
     )  # fmt: skip
     sources = sorted((_SOURCES / "jaxmodel").glob("*.py"))
-    for path in (*sources, *(_SOURCES / "studies" / name for name in names)):
+    for path in (*sources, *(_SOURCES / "studies" / name for name in names), *more):
         digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -223,7 +223,7 @@ def _layout(n: int, structure: Structure, devices: int) -> Layout:
     # a case's command takes most of the memory: references at every point of every step
     points = structure.n_steps * (2 * structure.substeps + 1)
     lane_bytes = points * 3 * 8 * 8 + 2**16
-    lanes, unit = (LANES if processor() == "cpu" else GPU_LANES), lane_unit()
+    lanes, unit = most_lanes(), lane_unit()
     while lanes > unit and devices * lanes * lane_bytes > memory_budget():
         lanes //= 2
     per_device = -(-n // devices)
@@ -231,6 +231,22 @@ def _layout(n: int, structure: Structure, devices: int) -> Layout:
     wanted = min(max(CHUNK_WORK // (structure.n_steps * structure.substeps), 1), LARGEST_CHUNK)
     blocks = max(min(wanted, n) // (devices * lanes), 1)
     return Layout(devices, blocks, lanes)
+
+
+def even_layout(n: int) -> Layout:
+    """A chunk of n cases, or a few more, shared evenly by all devices.
+
+    Args:
+        n: cases.
+    """
+    devices, unit = len(jax.local_devices()), lane_unit()
+    lanes = min(most_lanes(), -(-n // (unit * devices)) * unit)
+    return Layout(devices, -(-n // (devices * lanes)), lanes)
+
+
+def most_lanes() -> int:
+    """Cases side by side on a device."""
+    return LANES if processor() == "cpu" else GPU_LANES
 
 
 def lane_unit() -> int:

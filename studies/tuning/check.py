@@ -9,12 +9,14 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.sampled_loop import loop_report
+from jaxmodel.simulate import Result
 from studies.cases import as_arrays, build_case, build_cases, build_structure
 from studies.fields import parse_entry
 from studies.spec import Study, parse_study
 from studies.sweeps.axes import replaced
 from studies.sweeps.executor import make_executor
-from studies.tuning.evaluate import even_layout, largest, metrics_of, scenario_columns, size
+from studies.sweeps.plan import even_layout
+from studies.tuning.evaluate import largest, metrics_of, scenario_columns, size
 from studies.tuning.free import PLACEMENT, POLES
 from studies.tuning.spec import LOOP_LIMITS, TuneSpec
 
@@ -65,42 +67,40 @@ def judge(spec: TuneSpec, designs: list[Study]) -> list[Judged]:
         spec: of the tuning.
         designs: studies that differ from the tuning's own in numbers only.
     """
-    columns = scenario_columns(spec, spec.tune.scenarios.check, spec.tune.scenarios.seed + 1)
-    count = spec.tune.scenarios.check
-    structure = build_structure(designs[0])
-    has_position = any(any(g != 0 for g in study.control.position_gain) for study in designs)
-    structure = structure._replace(metrics=metrics_of(spec), has_position_gain=has_position)
-    layout = even_layout(count * len(designs))
-    parts = [
-        jax.tree.map(
-            lambda x: np.broadcast_to(x, (count, *x.shape[1:])),
-            build_cases(study, columns, structure),
-        )
-        for study in designs
-    ]
-    whole = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    rows = np.minimum(np.arange(layout.size), count * len(designs) - 1)
-    cases = jax.tree.map(lambda x: x[rows], whole)
-    result = make_executor(structure, layout, False).start(cases).wait()
-    found = []
+    result = _run(spec, designs)
+    count, found = spec.tune.scenarios.check, []
     for k, study in enumerate(designs):
         part = slice(k * count, (k + 1) * count)
         metrics = jax.tree.map(lambda x: np.asarray(x)[part], result.metrics)  # noqa: B023
         sizes = {name: np.asarray(size(metrics, name)) for name in spec.tune.objective}
-        objective = sum(weight * sizes[name] for name, weight in spec.tune.objective.items())
         peaks = {
             name: np.asarray(largest(metrics, name))
             for name in spec.tune.limits
             if name not in LOOP_LIMITS
         }
-        is_bad = ~np.isin(result.status[part], status.FINISHED)
-        found.append(
-            Judged(
-                np.where(is_bad, np.nan, objective), {**sizes, **peaks}, result.status[part],
-                _gain_margin(study),
-            )
-        )  # fmt: skip
+        objective = sum(weight * sizes[name] for name, weight in spec.tune.objective.items())
+        codes = result.status[part]
+        judged = np.where(np.isin(codes, status.FINISHED), objective, np.nan)
+        found.append(Judged(judged, {**sizes, **peaks}, codes, _gain_margin(study)))
     return found
+
+
+def _run(spec: TuneSpec, designs: list[Study]) -> Result:
+    """All scenarios of the first design, then of the next, in one batch."""
+    count = spec.tune.scenarios.check
+    columns = scenario_columns(spec, count, spec.tune.scenarios.seed + 1)
+    has_position = any(any(g != 0 for g in study.control.position_gain) for study in designs)
+    structure = build_structure(designs[0])._replace(
+        metrics=metrics_of(spec), has_position_gain=has_position
+    )
+    layout = even_layout(count * len(designs))
+    rows = np.minimum(np.arange(layout.size), count * len(designs) - 1)
+    parts = [build_cases(study, columns, structure) for study in designs]
+
+    def joined(*leaves: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.broadcast_to(x, (count, *x.shape[1:])) for x in leaves])[rows]
+
+    return make_executor(structure, layout, False).start(jax.tree.map(joined, *parts)).wait()
 
 
 def _gain_margin(study: Study) -> float:

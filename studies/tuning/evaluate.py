@@ -24,7 +24,7 @@ from studies.fields import parse_entry
 from studies.runs import check_run
 from studies.sweeps.axes import known_field
 from studies.sweeps.gradients import make_gradients
-from studies.sweeps.plan import LANES, Layout, lane_unit
+from studies.sweeps.plan import even_layout
 from studies.tuning.spec import LOOP_LIMITS, TuneSpec
 
 #: Slowest motion that counts as stable where `gain_margin` is limited [1/s].
@@ -142,14 +142,6 @@ def metrics_of(spec: TuneSpec) -> tuple[str, ...]:
     """Metrics that objective and limits are made of."""
     names = [parse_entry(name) for name in (*spec.tune.objective, *spec.tune.limits)]
     return tuple(sorted({entry.field for entry in names if entry} - set(LOOP_LIMITS)))
-
-
-def even_layout(n: int) -> Layout:
-    """A chunk of n cases or a few more, all devices alike."""
-    devices = len(jax.local_devices())
-    unit = lane_unit()
-    lanes = min(LANES, -(-n // (unit * devices)) * unit)
-    return Layout(devices, -(-n // (devices * lanes)), lanes)
 
 
 def scenario_columns(spec: TuneSpec, count: int, seed: int) -> dict[str, np.ndarray]:

@@ -16,7 +16,7 @@ from studies import config
 from studies.errors import StudyError
 from studies.runs import run_attributes
 from studies.store import Variable, check_target, replacing, write_store
-from studies.sweeps.folder import file_hash, make_manifest
+from studies.sweeps.folder import make_manifest
 from studies.template import study_template
 from studies.tuning.audit import audit
 from studies.tuning.check import judge, tuned_study
@@ -48,9 +48,7 @@ def run_tuning(
         StudyError: the folder holds something else or cannot be written to; a fault of the study.
     """
     config.require_configured()
-    manifest = make_manifest(spec.data)
-    for source in sorted(Path(__file__).parent.glob("*.py")):
-        manifest["code"] += file_hash(source)[:4]
+    manifest = make_manifest(spec.data, sorted(Path(__file__).parent.glob("*.py")))
     before = _open(out, manifest, is_resumed)
     evaluator = Evaluator(spec, spec.tune.starts)
 
