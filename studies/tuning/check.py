@@ -16,12 +16,9 @@ from studies.spec import Study, parse_study
 from studies.sweeps.axes import replaced
 from studies.sweeps.executor import make_executor
 from studies.sweeps.plan import even_layout
-from studies.tuning.evaluate import largest, metrics_of, scenario_columns, size
+from studies.tuning.evaluate import largest, metrics_of, scenario_columns, size, with_margin_modes
 from studies.tuning.free import PLACEMENT, POLES
 from studies.tuning.spec import LOOP_LIMITS, TuneSpec
-
-#: Plant modes of the linearised loop that the gain margin is taken from.
-MARGIN_MODES = 12
 
 
 class Judged(NamedTuple):
@@ -106,7 +103,7 @@ def _run(spec: TuneSpec, designs: list[Study]) -> Result:
 def _gain_margin(study: Study) -> float:
     if study.control.feedback != "sampled":
         return float("nan")
-    larger = study.change(link__modes=max(MARGIN_MODES, study.link.modes))
+    larger = with_margin_modes(study)
     case = as_arrays(build_case(larger))
     pose = np.array(larger.motion.waypoints[0])
     return loop_report(build_structure(larger), case, pose).gain_margin

@@ -19,9 +19,10 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.metrics import Metrics
 from jaxmodel.parameters import Array
 from jaxmodel.sampled_loop import closed_loop, slowest_decay
-from studies.cases import build_cases
+from studies.cases import as_arrays, build_case, build_cases
 from studies.fields import parse_entry
 from studies.runs import check_run
+from studies.spec import Study
 from studies.sweeps.axes import known_field
 from studies.sweeps.gradients import make_gradients
 from studies.sweeps.plan import even_layout
@@ -29,6 +30,8 @@ from studies.tuning.spec import LOOP_LIMITS, TuneSpec
 
 #: Slowest motion that counts as stable where `gain_margin` is limited [1/s].
 STABLE = 10.0
+#: Plant modes of the linearised loop at least: modes that nobody controls limit the gains.
+MARGIN_MODES = 12
 
 
 class Evaluation(NamedTuple):
@@ -55,7 +58,7 @@ class Evaluator:
         """
         self.spec, self.designs = spec, designs
         study = spec.study.change(run__smooth=True)
-        checked, self._case = check_run(study)
+        checked, _ = check_run(study)
         self._structure = _structure(spec, checked)
         asked = spec.tune.scenarios
         columns = scenario_columns(spec, asked.count, asked.seed)
@@ -69,9 +72,12 @@ class Evaluator:
         real = jax.dtypes.canonicalize_dtype(np.float64)
         self._cases = jax.tree.map(lambda x: x if x.dtype.kind == "i" else x.astype(real), cases)
         self._rows = rows // self.scenarios  # design of every lane
+        larger = with_margin_modes(study)
+        self._case = as_arrays(build_case(larger))
         self._plain = self._structure._replace(
-            n_steps=1, substeps=1, n_frequencies=1, has_noise=False, metrics=()
-        )
+            n_modes=larger.link.modes, n_steps=1, substeps=1, n_frequencies=1, has_noise=False,
+            metrics=(),
+        )  # fmt: skip
         self._pose = np.array(study.motion.waypoints[0])
         self._judge = jax.jit(jax.vmap(partial(_judged, spec)))
         self._gradients = make_gradients(self._structure, self._layout, spec.free.place)
@@ -138,6 +144,11 @@ def _structure(spec: TuneSpec, structure: Structure) -> Structure:
     )
 
 
+def with_margin_modes(study: Study) -> Study:
+    """The study with as many plant modes as its gain margin is judged with."""
+    return study.change(link__modes=max(MARGIN_MODES, study.link.modes))
+
+
 def metrics_of(spec: TuneSpec) -> tuple[str, ...]:
     """Metrics that objective and limits are made of."""
     names = [parse_entry(name) for name in (*spec.tune.objective, *spec.tune.limits)]
@@ -201,7 +212,8 @@ def entries(metrics: Metrics, name: str) -> Array:
 def size(metrics: Metrics, name: str) -> Array:
     """Root of the mean square of the entries, (S,)."""
     square = jnp.mean(entries(metrics, name) ** 2, axis=1)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    # the root has no slope at 0; what is no number stays none
+    return jnp.where(square == 0, 0.0, jnp.sqrt(jnp.where(square == 0, 1.0, square)))
 
 
 def largest(metrics: Metrics, name: str) -> Array:

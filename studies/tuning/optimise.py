@@ -1,7 +1,8 @@
 """Many starts at once, each downhill by Adam, limits by an augmented Lagrangian.
 
 Everything between the bounds is scaled to [0, 1]; a step that would leave it ends at the bound. A
-start whose runs stop finishing is frozen at its best design and spoils no other.
+start whose runs stop finishing goes half the way back to its best design; one that has none is
+frozen. Neither spoils another.
 """
 
 from __future__ import annotations
@@ -137,7 +138,7 @@ def advance(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> Progress:
     is_better = is_fine & _is_better(found, at)
     at = at._replace(
         iteration=np.array(k + 1),
-        is_frozen=~is_fine,
+        is_frozen=~is_fine & ~np.isfinite(at.best_objective),
         best_place=np.where(is_better[:, None], at.place, at.best_place),
         best_objective=np.where(is_better, found.objective, at.best_objective),
         best_limits=np.where(is_better[:, None], found.limits, at.best_limits),
@@ -149,10 +150,16 @@ def advance(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> Progress:
     steps, state = adam.update(slope, jax.tree.unflatten(tree, at.adam))
     moved = np.clip(at.place + np.asarray(steps), 0.0, 1.0)
     at = at._replace(
-        place=np.where(is_fine[:, None], moved, at.place),
+        place=np.where(is_fine[:, None], moved, _halfway(at)),
         adam=tuple(np.asarray(x) for x in jax.tree.leaves(state)),
     )
     return _updated(at, found, is_fine) if (k + 1) % ROUND == 0 else at
+
+
+def _halfway(at: Progress) -> np.ndarray:
+    """Between where starts are and their best designs, (B, p)."""
+    middle = (at.place + at.best_place) / 2
+    return np.where(np.isfinite(middle), middle, at.best_place)
 
 
 def _is_better(found: Evaluation, at: Progress) -> np.ndarray:
