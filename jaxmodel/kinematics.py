@@ -97,6 +97,18 @@ def link_angle(chain: Chain) -> Array:
     return jnp.arctan2(chain.sine, chain.cosine)
 
 
+def singularity_distance(plant: Plant, pose: Array) -> Array:
+    """Smallest distance of any link angle gamma from 0 and 90 deg [rad], ().
+
+    Args:
+        plant: the machine.
+        pose: of the undeformed machine, (N, 3) [m, m, rad].
+    """
+    lanes = plant._replace(**{name: getattr(plant, name)[:, None] for name in _LINK_FIELDS})
+    gamma = link_angle(close_chain(lanes, pose.T, jnp.zeros_like(pose.T)))
+    return jnp.min(jnp.minimum(gamma, jnp.pi / 2 - gamma))
+
+
 def inverse_kinematics(plant: Plant, pose: Array, pose_rate: Array) -> tuple[Array, Array]:
     """Slider positions [m] and rates [m/s] of the undeformed machine for poses on any time axis.
 

@@ -54,6 +54,7 @@ class Totals(NamedTuple):
     residual_modal_square: Array
     residual_modal_peak: Array
     settled_at: Array  # last time outside the band after the command [s], (3,)
+    ringing: Array  # sum of share outside the band after the command, (3,)
     moving_error_peak: Array  # pose, (3,)
     residual_error_square: Array
     peak_voltage: Array  # (3,)
@@ -79,6 +80,7 @@ class Metrics(NamedTuple):
     residual_modal_peak: Array  # [m], (3, R)
     structural_modal_rms: Array  # plant modes while moving [m], (3, R)
     settling_time: Array  # from the command's end until it stays in the band [s], (3,)
+    ringing_time: Array  # smooth: integral of d^2/(d^2 + band^2) after the command [s], (3,)
     pose_error_peak: Array  # while moving [m, m, rad], (3,)
     pose_error_rms: Array  # in the residual window [m, m, rad], (3,)
     peak_voltage: Array  # [V], (3,)
@@ -101,6 +103,7 @@ NEEDS = {
     "residual_modal_peak": ("residual_modal_peak",),
     "structural_modal_rms": ("moving_count", "moving_modal_square"),
     "settling_time": ("settled_at",),
+    "ringing_time": ("ringing",),
     "pose_error_peak": ("moving_error_peak",),
     "pose_error_rms": ("residual_count", "residual_error_square"),
     "peak_voltage": ("peak_voltage",),
@@ -134,7 +137,8 @@ def zero_totals(
     lines = jnp.zeros((3, n_controlled, n_frequencies), dtype)
     whole = Totals(
         zero, zero, zero, stations, stations, stations, stations, modes, modes, modes, link, link,
-        link, link, zero, zero, zero, link, modes, controlled, zero, (one, 0 * one), (lines, lines),
+        link, link, link, zero, zero, zero, link, modes, controlled, zero, (one, 0 * one),
+        (lines, lines),
     )  # fmt: skip
     names = {*wanted, *ALWAYS} if wanted else NEEDS
     needed = {total for name in names for total in NEEDS[name]}
@@ -179,7 +183,9 @@ def accumulate(
     size = jnp.abs(sample.deflection)
     square = sample.deflection * sample.deflection
     modal_square = sample.q * sample.q
-    is_outside = jnp.max(size, axis=1) > band
+    highest = jnp.max(size, axis=1)
+    is_outside = highest > band
+    is_after = jnp.where(window.after_command > 0, 1.0, 0.0).astype(highest.dtype)
     cosine, sine = (jnp.asarray(x) for x in totals.phasor)
     turn_c, turn_s = rotation
     weighted = (window.taper * sample.modal)[:, :, None]
@@ -197,6 +203,7 @@ def accumulate(
         residual_modal_square=totals.residual_modal_square + residual * modal_square,
         residual_modal_peak=jnp.maximum(totals.residual_modal_peak, residual * jnp.abs(sample.q)),
         settled_at=jnp.where(is_outside, window.after_command, totals.settled_at),
+        ringing=totals.ringing + is_after * highest * highest / (highest * highest + band * band),
         moving_error_peak=jnp.maximum(
             totals.moving_error_peak, moving * jnp.abs(sample.pose_error)
         ),
@@ -247,6 +254,7 @@ def finish(totals: Totals, period: Array) -> Metrics:
         residual_modal_peak=totals.residual_modal_peak,
         structural_modal_rms=_root(totals.moving_modal_square / moving),
         settling_time=totals.settled_at,
+        ringing_time=totals.ringing * period,
         pose_error_peak=totals.moving_error_peak,
         pose_error_rms=_root(totals.residual_error_square / residual),
         peak_voltage=totals.peak_voltage,

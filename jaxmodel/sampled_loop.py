@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import ControllerState, controller_step
-from jaxmodel.linear import linearise
+from jaxmodel.linear import LinearPlant, linearise
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 
@@ -24,11 +24,16 @@ RADIUS_TOLERANCE = 1e-7
 
 
 class LoopMatrices(NamedTuple):
-    """Closed-loop transition matrix over one sample: open + factor * feedback."""
+    """Closed-loop transition matrix over one sample: open + factor * feedback.
+
+    The state is (X, X', q, q', filtered sensor voltages and their rates, controller).
+    """
 
     open: Array  # all gains zero, (n, n)
     feedback: Array  # what the gains add, (n, n)
     plant: Array  # A of the continuous plant without control, for its poles, (m, m)
+    force: Array  # response to slider forces held over the sample, (n, 3)
+    deflection: Array  # chord deflection at the stations [m], rows, (3 S, n)
 
 
 def closed_loop(structure: Structure, case: Case, pose: Array) -> LoopMatrices:
@@ -45,54 +50,85 @@ def closed_loop(structure: Structure, case: Case, pose: Array) -> LoopMatrices:
     smooth = structure._replace(is_smooth=True, feedback="sampled")
     loop = prepare(smooth, case).loop
     plant = linearise(smooth, loop, pose, case.electronics.antialias)
-    n, n_voltages = plant.state.shape[0], plant.voltage.shape[1]
-    held = jnp.zeros((n + n_voltages,) * 2, plant.state.dtype)
-    held = held.at[:n, :n].set(plant.state).at[:n, n:].set(plant.voltage)
+    state, enters = _with_filtered_sensors(smooth, plant, case.electronics.antialias)
+    n, n_inputs = enters.shape
+    held = jnp.zeros((n + n_inputs,) * 2, state.dtype)
+    held = held.at[:n, :n].set(state).at[:n, n:].set(enters)
     # balance velocities against positions, or the exponential loses digits to scaling
-    scale = jnp.concatenate([_balance(smooth, loop.omega), jnp.full((n_voltages,), 1e6)])
+    scale = jnp.concatenate([_balance(smooth, state.dtype), jnp.full((n_inputs,), 1e6)])
     exact = jax.scipy.linalg.expm(held / scale[:, None] * scale * case.electronics.period)
     exact = (exact * scale[:, None] / scale)[:n]
     channels, patches = structure.n_channels, structure.n_patches
+    n_sensors = 3 * patches
 
     def advance(x: Array, factor: Array) -> Array:
-        state, line = x[:n], jnp.reshape(x[n : n + 9 * channels], (3, 3, channels))
+        line = jnp.reshape(x[n : n + 9 * channels], (3, 3, channels))
         voltage = jnp.reshape(x[n + 9 * channels :], (3, patches))
         controller = loop.controller._replace(velocity_gain=factor * loop.controller.velocity_gain)
         if controller.position_gain is not None:
             controller = controller._replace(position_gain=factor * controller.position_gain)
         before = ControllerState(line[0], (line[1], line[2]), voltage)
-        filtered = jnp.reshape(plant.sensor @ state, (3, patches))
+        filtered = jnp.reshape(x[n - 2 * n_sensors : n - n_sensors], (3, patches))
         after, _ = controller_step(controller, before, filtered, None, True)
-        moved = exact @ jnp.concatenate([state, jnp.ravel(voltage)])
+        moved = exact[:, : n + n_sensors] @ jnp.concatenate([x[:n], jnp.ravel(voltage)])
         parts = (moved, after.first, *after.second, after.voltage)
         return jnp.concatenate([jnp.ravel(part) for part in parts])
 
-    start = jnp.zeros((n + 9 * channels + n_voltages,), plant.state.dtype)
+    start = jnp.zeros((n + 9 * channels + n_sensors,), state.dtype)
     jacobian = jax.jacfwd(advance)
     without = jacobian(start, 0.0)
-    return LoopMatrices(without, jacobian(start, 1.0) - without, plant.state)
+    more, kept = start.size - n, n - 2 * n_sensors
+    return LoopMatrices(
+        without,
+        jacobian(start, 1.0) - without,
+        plant.state,
+        jnp.pad(exact[:, n + n_sensors :], ((0, more), (0, 0))),
+        jnp.pad(plant.deflection[:, :kept], ((0, 0), (0, start.size - kept))),
+    )
 
 
-def _balance(structure: Structure, omega: Array) -> Array:
-    """Typical size of each entry of x: velocities are 1000 times positions."""
-    modes = 3 * structure.n_modes
-    size = np.concatenate([np.ones(3), np.full(3, 1e3)] + [np.full(modes, s) for s in (1, 1e3) * 2])
-    return jnp.asarray(size, omega.dtype)
+def _with_filtered_sensors(
+    structure: Structure, plant: LinearPlant, antialias: Array
+) -> tuple[Array, Array]:
+    """A and (B_voltage, B_force) with the anti-alias filter on sensors instead of modes: fewer.
+
+    The filter is the same for all, so filtering before or after adding modes up is one thing.
+    """
+    modes, n_sensors = 3 * structure.n_modes, 3 * structure.n_patches
+    kept = 6 + 2 * modes
+    n = kept + 2 * n_sensors
+    sensed = plant.sensor[:, kept : kept + modes]  # by the filtered modes
+    eye, corner = jnp.eye(n_sensors), jnp.sqrt(2.0) * antialias
+    state = jnp.zeros((n, n), plant.state.dtype)
+    state = state.at[:kept, :kept].set(plant.state[:kept, :kept])
+    state = state.at[kept:-n_sensors, -n_sensors:].set(eye)
+    state = state.at[-n_sensors:, 6 : 6 + modes].set(antialias**2 * sensed)
+    state = state.at[-n_sensors:, kept:-n_sensors].set(-(antialias**2) * eye)
+    state = state.at[-n_sensors:, -n_sensors:].set(-corner * eye)
+    enters = jnp.concatenate([plant.voltage[:kept], plant.force[:kept]], axis=1)
+    return state, jnp.pad(enters, ((0, 2 * n_sensors), (0, 0)))
 
 
-#: Squarings for the value and for the gradient of `slowest_decay`.
-SQUARINGS, AVERAGED = 50, 34
-#: Growth per sample that weighs powers in the gradient: the last million of them count.
-GROWTH = 1e-6
+def _balance(structure: Structure, dtype) -> Array:
+    """Typical size of each entry of x: rates are 1000 times the values."""
+    modes, sensors = 3 * structure.n_modes, 3 * structure.n_patches
+    sizes = [(1.0, 3), (1e3, 3), (1.0, modes), (1e3, modes), (1e4, sensors), (1e7, sensors)]
+    return jnp.asarray(np.concatenate([np.full(count, size) for size, count in sizes]), dtype)
+
+
+#: Squarings of `slowest_decay`: motions whose decay per sample differs by 1e-8 are told apart.
+SQUARINGS = 32
+#: Motions that may share the largest modulus (a pair for each link, and as many again).
+SHARED = 8
 
 
 def slowest_decay(transition: Array, period: Array) -> Array:
     """Decay rate -ln(rho)/T of the slowest motion, rho the spectral radius; negative if unstable.
 
     By repeated squaring, rho = lim |M^n|^(1/n), with the norm taken out each time: batched
-    anywhere, where eigenvalues of unsymmetric matrices are not. A complex pair makes |M^n| swing
-    with n, and its derivative with it, however large n is; so the gradient is that of
-    ln(sum over n of |M^n|^2 s^(-2n)) with s just below rho, in which the swings cancel.
+    anywhere, where eigenvalues of unsymmetric matrices are not. What is left of M^n spans the
+    slowest motions; with bases Y of them and Z of their left counterparts the derivative is
+    d ln(rho) = Re tr((Z'MY)^+ Z' dM Y)/r, r their number.
 
     Args:
         transition: M of x_(k+1) = M x_k, (n, n).
@@ -101,28 +137,65 @@ def slowest_decay(transition: Array, period: Array) -> Array:
     Returns:
         [1/s], ().
     """
-    value = jax.lax.stop_gradient(_log_radius(transition))
-    slope = _summed(transition, jnp.exp(value - GROWTH))
+    value, weight = jax.lax.stop_gradient(_log_radius(jax.lax.stop_gradient(transition)))
+    slope = jnp.sum(weight * transition)
     return -(value + slope - jax.lax.stop_gradient(slope)) / period
 
 
-def _log_radius(matrix: Array) -> Array:
-    """ln(rho), to some 1e-14."""
+def _log_radius(matrix: Array) -> tuple[Array, Array]:
+    """ln(rho) and its derivative by the matrix, (n, n)."""
+    scale = _balancing(matrix)
+    balanced = matrix * scale / scale[:, None]
 
-    def square(carried: tuple[Array, Array], share: Array) -> tuple[tuple[Array, Array], None]:
-        power, total = carried
-        size = jnp.sqrt(jnp.sum(power * power))
-        power = power / size
-        return (power @ power, total + jnp.log(size) * share), None
+    def square(power: Array, _: None) -> tuple[Array, None]:
+        power = power / jnp.sqrt(jnp.sum(power * power))
+        return power @ power, None
 
-    shares = jnp.asarray(0.5 ** np.arange(SQUARINGS), matrix.dtype)
-    return jax.lax.scan(square, (matrix, jnp.zeros((), matrix.dtype)), shares)[0][1]
+    power, _ = jax.lax.scan(square, balanced, None, length=SQUARINGS)
+    n = matrix.shape[0]
+    looks = np.random.default_rng(0).normal(size=(2, n, min(SHARED, n)))
+    right, left = power @ looks[0], power.T @ looks[1]
+    right, left = (x / jnp.sqrt(jnp.sum(x * x)) for x in (right, left))
+    inner, moved = left.T @ right, left.T @ balanced @ right
+    inverse = jnp.linalg.pinv(moved, rtol=1e-6)
+    count = jnp.round(jnp.trace(inverse @ moved))
+    # on the space that is left M^-1 is inner inverse; elsewhere 1 instead of 0, for the determinant
+    rest = jnp.eye(inner.shape[0], dtype=matrix.dtype) - moved @ inverse
+    value = -jnp.linalg.slogdet(inner @ inverse + rest)[1] / count
+    weight = (right @ inverse @ left.T).T / count
+    return value, weight * scale / scale[:, None]
 
 
-def _summed(matrix: Array, size: Array) -> Array:
-    """ln(tr sum_(j < n) B^j B^j')/2m with B = matrix/size and n = 2^AVERAGED, by doubling.
+def _balancing(matrix: Array) -> Array:
+    """Factors d for which rows and columns of M_ij d_j/d_i have nearly equal size, (n,)."""
+    size, scale = jnp.abs(matrix), jnp.ones(matrix.shape[0], matrix.dtype)
+    for _ in range(12):
+        now = size * scale / scale[:, None]
+        row, column = jnp.sum(now, axis=1), jnp.sum(now, axis=0)
+        scale = scale * jnp.where((row > 0) & (column > 0), (row / column) ** 0.25, 1.0)
+    return scale
 
-    m is the mean of j as the sum weighs it, so that the derivative is that of ln(rho).
+
+#: Doublings of `summed_squares`: 8192 samples.
+DOUBLINGS = 13
+
+
+class Summed(NamedTuple):
+    """sum over k of M^k S M'^k, as share * exp(log_size) lest it overflow."""
+
+    share: Array  # trace 1, (n, n)
+    log_size: Array  # ()
+
+
+def summed_squares(matrix: Array, start: Array) -> Summed:
+    """Sum of M^k S M'^k over 8192 samples by doubling; differentiable, also if M is unstable.
+
+    With S = x x' it gives the energy of what comes after x, tr(C . C'); transposed, with S = C'C,
+    that of all starts (the Gramians of linear systems).
+
+    Args:
+        matrix: M, (n, n).
+        start: S, symmetric, not negative, (n, n).
     """
 
     def double(carried: tuple, _: None) -> tuple[tuple, None]:
@@ -137,12 +210,62 @@ def _summed(matrix: Array, size: Array) -> Array:
         log_total = log_total + 2 * most + jnp.log(trace)
         return (power @ power, 2 * log_power, total / trace, log_total), None
 
-    zero, one = jnp.zeros((), matrix.dtype), jnp.eye(matrix.shape[0], dtype=matrix.dtype)
-    start = matrix / size, zero, one, zero
-    (*_, log_total), _ = jax.lax.scan(double, start, None, length=AVERAGED)
-    count = 2.0**AVERAGED
-    mean = count / -np.expm1(-2 * GROWTH * count) - 1 / -np.expm1(-2 * GROWTH)
-    return log_total / (2 * mean)
+    zero, trace = jnp.zeros((), matrix.dtype), jnp.trace(start)
+    first = matrix, zero, start / trace, jnp.log(trace)
+    (*_, share, log_size), _ = jax.lax.scan(double, first, None, length=DOUBLINGS)
+    return Summed(share, log_size)
+
+
+def spillover(structure: Structure, case: Case, matrices: LoopMatrices) -> Array:
+    """By how much control lengthens the ringing of modes that it does not mean to damp [1], ().
+
+    A mode is knocked, sum (j^2 q_j)^2 over all uncontrolled modes is added up until all is quiet,
+    with control and without; the largest ratio of all uncontrolled modes. For a mode that keeps to
+    itself it is the damping ratio without control over that with it; 1: control leaves them alone.
+
+    Args:
+        structure: static choices.
+        case: the numbers.
+        matrices: from `closed_loop`.
+    """
+    modes, n = structure.n_modes, structure.n_controlled
+    control = case.control
+    on = jnp.asarray(control.link_mask)[:, None] * control.mode_mask
+    on = on * (jnp.arange(n) < control.n_active)
+    is_left = jnp.ravel(1.0 - jnp.pad(on, ((0, 0), (0, modes - n))))
+    is_left = is_left * jnp.ravel(jnp.tile(jnp.arange(modes) < case.n_modes, 3))
+    # omega of mode j grows as j^2; fixed weights, so that derivatives are of the loop alone
+    weight = is_left * jnp.tile(jnp.arange(1.0, modes + 1) ** 4, 3)
+    first, last = 6, 6 + 3 * modes
+
+    def ringing(transition: Array) -> tuple[Array, Summed]:
+        outputs = jnp.zeros(transition.shape[0], transition.dtype).at[first:last].set(weight)
+        found = summed_squares(jax.lax.stop_gradient(transition).T, jnp.diag(outputs))
+        return jnp.diagonal(found.share)[first:last], found
+
+    plant = matrices.open[: 6 + 6 * modes, : 6 + 6 * modes]
+    loop = matrices.open + matrices.feedback
+    (without, free), (found, closed) = ringing(plant), ringing(loop)
+    ratio = jnp.where(is_left > 0, found / jnp.where(is_left > 0, without, 1.0), 0.0)
+    mode = jnp.argmax(ratio)
+    log_size = jnp.minimum(closed.log_size - free.log_size, 50.0)
+    value = jax.lax.stop_gradient(ratio[mode] * jnp.exp(log_size))
+    slope = _energy_slope(loop, closed, first + mode) - _energy_slope(plant, free, first + mode)
+    return value * (1 + slope - jax.lax.stop_gradient(slope))
+
+
+def _energy_slope(matrix: Array, gramian: Summed, entry: Array) -> Array:
+    """Something whose derivative is that of ln(Q_jj), Q the solution of Q = M'QM + C'C, ().
+
+    With P = M P M' + e_j e_j' that derivative is tr(2 P M'Q dM)/Q_jj: no need to go back through
+    the doubling. The outputs C are constants.
+    """
+    fixed = jax.lax.stop_gradient(matrix)
+    start = jnp.zeros(matrix.shape[0], matrix.dtype).at[entry].set(1.0)
+    reached = summed_squares(fixed, jnp.outer(start, start))
+    weight = 2 * gramian.share @ fixed @ reached.share / gramian.share[entry, entry]
+    weight = weight * jnp.exp(jnp.minimum(reached.log_size, 50.0))
+    return jnp.sum(jax.lax.stop_gradient(weight) * matrix)
 
 
 class LoopReport(NamedTuple):

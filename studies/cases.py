@@ -104,6 +104,16 @@ def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
     )
 
 
+def in_working_precision(cases: Case) -> Case:
+    """NumPy leaves in the precision that JAX works in (integers stay integers)."""
+    real = np.dtype(jnp.result_type(float))
+
+    def cast(x: np.ndarray) -> np.ndarray:
+        return x if np.issubdtype(x.dtype, np.integer) else x.astype(real)
+
+    return jax.tree.map(cast, cases)
+
+
 def as_arrays(case: Case) -> Case:
     """Every leaf as an array of the working precision (integers stay integers)."""
     real = jnp.result_type(float)

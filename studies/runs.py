@@ -330,6 +330,7 @@ METRIC_LABELS = {
     "residual_modal_peak": (("link", "mode"), "m", "peak of plant modes in the residual window"),
     "structural_modal_rms": (("link", "mode"), "m", "rms of plant modes while moving"),
     "settling_time": (("link",), "s", "from the command's end until all stations stay in the band"),
+    "ringing_time": (("link",), "s", "time outside the band after the command, smooth"),
     "pose_error_peak": (
         ("pose_axis",), "m; m; rad", "peak error from the shaped command while moving"
     ),

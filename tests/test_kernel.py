@@ -209,4 +209,5 @@ def test_a_sample_takes_no_more_operations_than_it_should(work):
     assert found.pop("read") < 700
     assert 0.8 * MOST[work] < sum(found.values()) < MOST[work]
     # four evaluations of the plant: a root and a reciprocal per link, three in the solution
-    assert found["sqrt"] == 12 and found["reciprocal"] == 24
+    # and one per link for `ringing_time`, where all metrics are accumulated
+    assert found["sqrt"] == 12 and found["reciprocal"] == {"W0": 24, "W1": 27}[work]

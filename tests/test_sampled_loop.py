@@ -8,9 +8,17 @@ import pytest
 import scipy.linalg
 
 from jaxmodel.linear import linearise, natural_modes
+from jaxmodel.linear_residual import linear_residual
 from jaxmodel.parameters import HOME
 from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import closed_loop, gain_margin, loop_report, slowest_decay
+from jaxmodel.sampled_loop import (
+    closed_loop,
+    gain_margin,
+    loop_report,
+    slowest_decay,
+    spillover,
+    summed_squares,
+)
 from jaxmodel.simulate import simulate
 from studies.cases import as_arrays, build_case, build_structure
 from studies.spec import paper_study
@@ -219,7 +227,9 @@ def test_nonlinear_run_follows_the_loop_matrix():
     transition = np.asarray(matrices.open + matrices.feedback)
     modes = 3 * structure.n_modes
     state = np.zeros(len(transition))
-    state[[6, 6 + 2 * modes]] = SMALL  # q and the filtered z of mode 1, link 1
+    state[6] = SMALL  # q of mode 1, link 1, and the filters settled on it
+    sensors = np.asarray(prepared(structure, case).loop.sensor)[0, :, 0] * SMALL
+    state[6 + 2 * modes : 6 + 2 * modes + len(sensors)] = sensors
     for k, seen in enumerate(q):
         np.testing.assert_allclose(seen.ravel(), state[6 : 6 + modes], atol=1e-3 * SMALL, err_msg=k)
         state = transition @ state
@@ -285,3 +295,100 @@ def test_slowest_decay_has_a_gradient(swing):
     np.testing.assert_allclose(jax.jvp(decay, (0.0,), (1.0,))[1], exact, rtol=1e-4)
     difference = (decay(1e-5) - decay(-1e-5)) / 2e-5
     np.testing.assert_allclose(difference, exact, rtol=1e-6)
+
+
+# --- sums over all that follows -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("radius", [0.3, 0.99, 1.01])
+def test_sum_of_squares_solves_its_equation(radius):
+    """P = M P M' + S where M is stable; else it is large but a number, and so is its derivative."""
+    random = np.random.default_rng(3)
+    matrix = random.normal(size=(5, 5))
+    matrix *= radius / np.abs(np.linalg.eigvals(matrix)).max()
+    start = np.diag(random.uniform(size=5))
+    found = summed_squares(matrix, start)
+    if radius < 1:
+        whole = found.share * np.exp(found.log_size)
+        np.testing.assert_allclose(whole, scipy.linalg.solve_discrete_lyapunov(matrix, start))
+
+    def log_size(factor):
+        return summed_squares(factor * matrix, start).log_size
+
+    slope = jax.grad(log_size)(1.0)
+    difference = (log_size(1 + 1e-6) - log_size(1 - 1e-6)) / 2e-6
+    assert np.isfinite(slope)
+    np.testing.assert_allclose(slope, difference, rtol=1e-4)
+
+
+def test_optimal_damping_of_one_mode_has_a_closed_form():
+    """sum x^2 of a released oscillator is (1 + 4 zeta^2)/(4 zeta omega T): least at zeta = 1/2."""
+    omega, period = 2 * np.pi * 100, 1e-5
+
+    def energy(zeta):
+        rates = np.array([[0.0, 1.0], [-(omega**2), 0.0]])
+        damped = rates - 2 * omega * zeta * np.array([[0.0, 0.0], [0.0, 1.0]])
+        matrix = jax.scipy.linalg.expm(damped * period)
+        found = summed_squares(matrix, np.diag([1.0, 0.0]))
+        return found.share[0, 0] * jax.numpy.exp(found.log_size) * period
+
+    for zeta in (0.1, 0.5, 0.9):
+        wanted = (1 + 4 * zeta**2) / (4 * zeta * omega)
+        np.testing.assert_allclose(energy(zeta), wanted, rtol=0.01)
+    assert abs(jax.grad(energy)(0.5)) < 0.01 * abs(jax.grad(energy)(0.4))
+
+
+def test_spillover_is_what_damping_of_the_uncontrolled_modes_loses():
+    """1 without gains; with them above 1, and the more the higher the gains."""
+    found = []
+    for factor in (0.0, 0.5, 1.0):
+        structure, case = arrays(control__gain_factor=factor)
+        matrices = loop_matrices(structure, case, HOME_POSE)
+        found.append(float(spillover(structure, case, matrices)))
+        period = float(case.electronics.period)
+        plant, poles = (np.linalg.eigvals(np.asarray(m)) for m in (
+            matrices.plant, matrices.open + matrices.feedback,
+        ))  # fmt: skip
+        weak = plant[(np.abs(plant) > 4**2 * 100 * 2 * np.pi) & (plant.imag > 0)]
+        weak = weak[-weak.real < 0.1 * np.abs(weak)]  # filters are damped well
+        near = np.array([poles[np.argmin(np.abs(poles - np.exp(s * period)))] for s in weak])
+        kept = -np.log(np.abs(near)) / period / -weak.real
+        assert len(weak) == 15
+        np.testing.assert_allclose(found[-1] - 1, 1 / kept.min() - 1, rtol=0.06, atol=1e-6)
+    np.testing.assert_allclose(found[0], 1, atol=1e-6)
+    assert 1.01 < found[1] < found[2]
+
+
+def test_spillover_has_a_gradient():
+    structure, case = arrays(link__modes=5)
+
+    @jax.jit
+    @partial(jax.value_and_grad, argnums=(0, 1))
+    def lengthened(factor, thickness):
+        beam = case.machine.beam._replace(thickness=thickness * case.machine.beam.thickness)
+        changed = case._replace(
+            control=case.control._replace(gain_factor=factor),
+            machine=case.machine._replace(beam=beam),
+        )
+        return spillover(structure, changed, closed_loop(structure, changed, HOME_POSE))
+
+    _, slopes = lengthened(0.7, 1.01)
+    for slope, (a, b) in zip(slopes, ((1e-4, 0.0), (0.0, 1e-4)), strict=True):
+        up, down = lengthened(0.7 + a, 1.01 + b)[0], lengthened(0.7 - a, 1.01 - b)[0]
+        assert abs(slope) > 1e-4
+        np.testing.assert_allclose(slope, (up - down) / 2e-4, rtol=1e-4)
+
+
+def test_linear_residual_agrees_with_the_run():
+    changes = {
+        "run__duration": 0.15, "motion__waypoints": (HOME, (0.0, 0.002, HOME[2])),
+        "motion__move_time": 0.03, "shaper__kind": "none", "metrics__residual_delay": 0.02,
+        "metrics__residual_length": 0.09,
+    }  # fmt: skip
+    study = STUDY.change(**changes)
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    matrices = loop_matrices(structure._replace(n_steps=1), case, HOME_POSE)
+    linear = jax.jit(linear_residual, static_argnums=0)(structure, case, matrices)
+    result = run(structure, case, False)
+    assert result.status == 0
+    np.testing.assert_allclose(linear.rms, result.metrics.residual_rms, rtol=0.1)

@@ -54,6 +54,7 @@ def chunk():
     return structure, cases, parameters
 
 
+@pytest.mark.long  # in short: gradients of tunings (test_tuning.py) are those of differences
 def test_kernel_and_scan_agree(chunk):
     structure, cases, parameters = chunk
     fast, slow = (

@@ -16,7 +16,7 @@ from rich.console import Console
 from jaxmodel.case import Case, Structure
 from jaxmodel.simulate import Result
 from studies import config
-from studies.cases import build_cases, build_structure
+from studies.cases import build_cases, build_structure, in_working_precision
 from studies.compilation import compiler_time
 from studies.errors import StudyError, field_error
 from studies.kernels.llvm import is_available
@@ -181,7 +181,7 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
     layout = make_layout(batch)
     structure, exact = build_work(work, layout)
     real = jax.dtypes.canonicalize_dtype(np.float64)
-    cases = jax.tree.map(lambda x: x if x.dtype.kind == "i" else x.astype(real), exact)
+    cases = in_working_precision(exact)
     chosen = EXECUTORS[executor] if executor else None
     made = chosen(structure, layout, False) if chosen else make_executor(structure, layout, False)
     result, timing = timed(lambda: made.start(cases).wait())

@@ -121,6 +121,26 @@ def open_folder(path: Path, manifest: dict[str, Any], is_resumed: bool) -> Itera
     Raises:
         StudyError: not writable, in use, holds something else, or a sweep that does not fit.
     """
+    with locked_folder(path, "sweep"):
+        folder = SweepFolder(path)
+        _check_content(folder, manifest, is_resumed)
+        for left in (*path.iterdir(), *path.glob(f"{CHUNKS}/*.tmp")):
+            if left.is_file() and (left.parent != path or _LEFTOVER.fullmatch(left.name)):
+                left.unlink()
+        yield folder
+
+
+@contextmanager
+def locked_folder(path: Path, what: str) -> Iterator[None]:
+    """Keep a folder, made where it is missing, to this process alone.
+
+    Args:
+        path: the folder.
+        what: is done there, for messages.
+
+    Raises:
+        StudyError: not writable or in use.
+    """
     try:
         path.mkdir(parents=True, exist_ok=True)
         lock = open(path / LOCK, "a")
@@ -132,13 +152,8 @@ def open_folder(path: Path, manifest: dict[str, Any], is_resumed: bool) -> Itera
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise StudyError(f"--out {path}: another process is running a sweep there") from None
-        folder = SweepFolder(path)
-        _check_content(folder, manifest, is_resumed)
-        for left in (*path.iterdir(), *path.glob(f"{CHUNKS}/*.tmp")):
-            if left.is_file() and (left.parent != path or _LEFTOVER.fullmatch(left.name)):
-                left.unlink()
-        yield folder
+            raise StudyError(f"--out {path}: another process is running a {what} there") from None
+        yield
 
 
 def make_manifest(data: dict[str, Any], more: Iterable[Path] = ()) -> dict[str, Any]:

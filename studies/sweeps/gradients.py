@@ -39,7 +39,7 @@ from studies.sweeps.program import (
     prepare_tangents,
     split_cases,
 )
-from studies.sweeps.steps import Steps, compile_steps, fits_kernel, start_block
+from studies.sweeps.steps import Ready, Steps, compile_steps, fits_kernel, start_block
 
 #: Tangents that one pass of the kernel carries. More share the state's own arithmetic among more
 #: (1: 31 gradients/s by 9 numbers on a core, 3: 49) but take longer to compile (3 s, 5 s).
@@ -61,12 +61,15 @@ class Gradients(Protocol):
     name: str
     compile_time: float  # [s], 0 before the first chunk
 
-    def evaluate(self, cases: Case, parameters: np.ndarray) -> Slopes:
+    def evaluate(
+        self, cases: Case, parameters: np.ndarray, is_used: np.ndarray | None = None
+    ) -> Slopes:
         """Run a chunk.
 
         Args:
             cases: `layout.size` of them; what the parameters set is overwritten.
             parameters: (layout.size, p).
+            is_used: derivatives that are wanted; others may be anything, (layout.size, p).
         """
         ...
 
@@ -111,48 +114,58 @@ class KernelGradients:
         self._steps: Steps | None = None
         self._pool = ThreadPoolExecutor(layout.devices)
 
-    def evaluate(self, cases: Case, parameters: np.ndarray) -> Slopes:
+    def evaluate(
+        self, cases: Case, parameters: np.ndarray, is_used: np.ndarray | None = None
+    ) -> Slopes:
         split = _split(cases, parameters, self.layout, self.structure)
         program = Program(self.structure, self.layout, split.tree, split.is_varying, self.place)
         blocks = lane_blocks(split, self.layout)
         if self._steps is None:
             started = time.perf_counter()
             self._steps = compile_steps(program, split, min(DIRECTIONS, parameters.shape[1]))
-            for part in (prepare, prepare_tangents):
-                part(program, self._steps.parts, blocks[0], split.shared)
+            given = program, self._steps.parts, blocks[0], split.shared
+            prepare(*given)
+            prepare_tangents(*given, np.eye(self._steps.directions, parameters.shape[1]))
             self.compile_time = time.perf_counter() - started
         one = partial(_slopes, program, self._steps, shared=split.shared)
-        done = list(self._pool.map(one, blocks))
+        used = np.ones_like(parameters, bool) if is_used is None else is_used
+        done = list(self._pool.map(one, blocks, np.split(used, len(blocks))))
         whole = jax.tree.map(lambda *x: np.concatenate(x, axis=-1), *done)
         return Slopes(*jax.tree.map(np.asarray, conclude_slopes(*whole)))
 
 
-def _slopes(program: Program, steps: Steps, block: list, shared: list) -> tuple:
+def _slopes(program: Program, steps: Steps, block: list, used: Array, shared: list) -> tuple:
     """(outline, status at the start, last state, tangents of outline and state), lanes last."""
-    parts, n = steps.parts, block[-1].shape[1]
-    ready = start_block(program, steps, block, shared)
-    turning = iter(prepare_tangents(program, parts, block, shared))
-    found = [next(turning) if moves else None for moves in parts.is_moving]
-    turn: Start = jax.tree.unflatten(parts.tree, [_Tangent(x) for x in found])
-    slope = jax.tree.map(partial(_filled, n), ready.state, turn.state)
-    state = ready.state
-    for k in range(0, n, steps.directions):
+    ready, n = start_block(program, steps, block, shared), block[-1].shape[1]
+    passes = [k for k in range(0, n, steps.directions) if used[:, k : k + steps.directions].any()]
+    slope, turn, state = (_zeros(n, x) for x in (ready.state, ready.outline, ready.state))
+    for k in passes or [0]:
         state = jax.tree.map(np.copy, ready.state)
-        along = jax.tree.map(lambda x, k=k: _cut(x, k, steps.directions), slope)
-        steps.run.run(
-            [
-                *ready.loop, *_moving(turn.loop, k, steps.directions),
-                *ready.inputs, *_by_sample(turn.inputs, k, steps.directions),
-                *jax.tree.leaves(state), *jax.tree.leaves(along),
-            ],
-            program.structure.n_steps, program.layout.lanes,
-        )  # fmt: skip
-        for whole, part in zip(jax.tree.leaves(slope), jax.tree.leaves(along), strict=True):
-            whole[k : k + steps.directions] = part[: n - k]
-    return (
-        ready.outline, ready.state.status, state,
-        jax.tree.map(partial(_filled, n), ready.outline, turn.outline), slope,
+        outline, along = _pass(program, steps, block, shared, ready, state, k)
+        for whole, part in ((slope, along), (turn, outline)):
+            for x, y in zip(jax.tree.leaves(whole), jax.tree.leaves(part), strict=True):
+                x[k : k + steps.directions] = y[: n - k]
+    return ready.outline, ready.state.status, state, turn, slope
+
+
+def _pass(
+    program: Program, steps: Steps, block: list, shared: list, ready: Ready, state: Any, k: int
+) -> tuple:
+    """Step a block once, `state` in place; tangents of outline and state from direction k on."""
+    count = steps.directions
+    directions = np.eye(count, block[-1].shape[1], k, dtype=block[-1].dtype)
+    turning = iter(prepare_tangents(program, steps.parts, block, shared, directions))
+    found = [next(turning) if moves else None for moves in steps.parts.is_moving]
+    turn: Start = jax.tree.unflatten(steps.parts.tree, [_Tangent(x) for x in found])
+    along = jax.tree.map(partial(_filled, count), ready.state, turn.state)
+    steps.run.run(
+        [
+            *ready.loop, *_moving(turn.loop), *ready.inputs, *_by_sample(turn.inputs),
+            *jax.tree.leaves(state), *jax.tree.leaves(along),
+        ],
+        program.structure.n_steps, program.layout.lanes,
     )  # fmt: skip
+    return jax.tree.map(partial(_filled, count), ready.outline, turn.outline), along
 
 
 class _Tangent:
@@ -162,27 +175,23 @@ class _Tangent:
         self.array = None if array is None else np.asarray(array, order="C")
 
 
+def _zeros(n: int, tree: Any) -> Any:
+    return jax.tree.map(lambda x: np.zeros((n, *x.shape), x.dtype), tree)
+
+
 def _filled(n: int, x: np.ndarray, tangent: _Tangent) -> np.ndarray:
-    """Tangents of all n directions, zeros where a leaf does not move."""
+    """Tangents along all directions of a pass, zeros where a leaf does not move."""
     return np.zeros((n, *x.shape), x.dtype) if tangent.array is None else tangent.array.copy()
 
 
-def _moving(tree: Any, k: int, directions: int) -> list[np.ndarray]:
+def _moving(tree: Any) -> list[np.ndarray]:
     found = (tangent.array for tangent in jax.tree.leaves(tree))
-    return [_cut(array, k, directions) for array in found if array is not None]
+    return [array for array in found if array is not None]
 
 
-def _by_sample(tree: Any, k: int, directions: int) -> list[np.ndarray]:
+def _by_sample(tree: Any) -> list[np.ndarray]:
     """The same for inputs, of which the kernel reads a row at each sample."""
-    return [np.asarray(x.swapaxes(0, 1), order="C") for x in _moving(tree, k, directions)]
-
-
-def _cut(array: np.ndarray, k: int, directions: int) -> np.ndarray:
-    """Directions from k on, zeros beyond the last one."""
-    part = np.zeros((directions, *array.shape[1:]), array.dtype)
-    given = array[k : k + directions]
-    part[: len(given)] = given
-    return part
+    return [np.asarray(x.swapaxes(0, 1), order="C") for x in _moving(tree)]
 
 
 # --- XLA ------------------------------------------------------------------------------------------
@@ -223,7 +232,9 @@ class ScanGradients:
         self.compile_time = 0.0
         self._compiled: Any = None
 
-    def evaluate(self, cases: Case, parameters: np.ndarray) -> Slopes:
+    def evaluate(
+        self, cases: Case, parameters: np.ndarray, is_used: np.ndarray | None = None
+    ) -> Slopes:
         split = _split(cases, parameters, self.layout, self.structure)
         *own, parameters = split.varying
         if self._compiled is None:

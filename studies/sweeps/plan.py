@@ -8,12 +8,11 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.prepare import STIFFNESS_LIMIT, drive_rate
-from studies.cases import build_cases, build_structure
+from studies.cases import build_cases, build_structure, in_working_precision
 from studies.config import processor
 from studies.errors import StudyError
 from studies.fields import Fields
@@ -155,12 +154,7 @@ def chunk_cases(table: Table, rows: np.ndarray, structure: Structure, size: int)
     filled = np.concatenate([rows, np.full(size - len(rows), rows[-1])])
     columns = {name: column[filled] for name, column in table.fields.items()}
     columns["run.seed"] = table.seed[filled]
-    real = np.dtype(jnp.result_type(float))
-
-    def cast(x: np.ndarray) -> np.ndarray:
-        return x if np.issubdtype(x.dtype, np.integer) else x.astype(real)
-
-    return jax.tree.map(cast, build_cases(table.study, columns, structure))
+    return in_working_precision(build_cases(table.study, columns, structure))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -180,8 +180,10 @@ def prepare_shared(program: Program, parts: Parts, own: list, common: list) -> l
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def prepare_tangents(program: Program, parts: Parts, own: list, common: list) -> list:
-    """Tangents of the leaves that move by each parameter, (p, ..., lanes)."""
+def prepare_tangents(
+    program: Program, parts: Parts, own: list, common: list, directions: Array
+) -> list:
+    """Tangents of the leaves that move along directions (n, p) of parameters, (n, ..., lanes)."""
 
     def one(own: list, common: list) -> list:
         *fixed, parameters = own
@@ -191,8 +193,7 @@ def prepare_tangents(program: Program, parts: Parts, own: list, common: list) ->
             return [x for x, moves in zip(leaves, parts.is_moving, strict=True) if moves]
 
         along = partial(jax.jvp, moving, (parameters,))
-        unit = jnp.eye(parameters.size, dtype=parameters.dtype)
-        return jax.vmap(lambda direction: along((direction,))[1])(unit)
+        return jax.vmap(lambda direction: along((direction,))[1])(directions)
 
     return jax.vmap(one, (0, None), -1)(own, common)
 

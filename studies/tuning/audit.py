@@ -7,11 +7,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import qmc
 
-from studies.tuning.evaluate import Evaluator
+from studies.tuning.evaluate import Evaluation, Evaluator
+from studies.tuning.linear_fidelity import LinearFidelity
+from studies.tuning.optimise import start_families
 from studies.tuning.spec import TuneSpec
 
-#: Step between the bounds, 0 to 1, of differences of fourth order.
-STEP = 2e-4
+#: Steps between the bounds, 0 to 1, of differences of fourth order; the nearer one counts. Rounding
+#: spoils the short one, and the long one may reach over a corner: an impulse of the shaper that
+#: passes a sampling instant, another sample or link that has the largest voltage.
+STEPS = (1e-3, 1e-4)
 #: More disagreement than this fails the audit.
 ALLOWED = 1e-4
 #: Smaller derivatives than this share of the largest one count as if they had its size: what a
@@ -19,10 +23,15 @@ ALLOWED = 1e-4
 SMALLEST = 1e-3
 
 
+#: Smaller ones than this share of the figure itself are rounding.
+NOTHING = 1e-7
+
+
 class Disagreement(NamedTuple):
     """Of the derivatives by one free number, the worst of all points."""
 
     name: str
+    family: str
     figure: str  # "objective", or the limit
     derivative: float  # as a share of the bounds
     difference: float
@@ -32,39 +41,88 @@ class Disagreement(NamedTuple):
 def audit(spec: TuneSpec, places: np.ndarray) -> list[Disagreement]:
     """Compare derivatives with differences; one entry for each free number.
 
+    Each number is looked at in the family that moves most of them of those that move it.
+
     Args:
         spec: of the tuning.
         places: designs to look at, between the bounds, (n, p).
     """
-    p = places.shape[1]
-    steps = STEP * np.concatenate([k * np.eye(p) for k in (-2, -1, 1, 2)])
-    evaluator = Evaluator(spec, 1 + 4 * p)
-    figures = ("objective", *evaluator.limit_names)
-    worst = [Disagreement(name, "objective", 0.0, 0.0, 0.0) for name in spec.free.names]
-    for place in np.clip(places, 2 * STEP, 1 - 2 * STEP):
-        found = evaluator.evaluate(spec.free.values(np.concatenate([place[None], place + steps])))
-        values = np.concatenate([found.objective[:, None], found.limits], axis=1)
-        slopes = np.concatenate([found.slope[:, None], found.limit_slope], axis=1)[0]
-        own = slopes * spec.free.slopes(place)
-        a, b, c, d = values[1:].reshape(4, p, -1)
-        difference = ((a - 8 * b + 8 * c - d) / (12 * STEP)).T
-        least = SMALLEST * np.abs(difference).max(axis=1, keepdims=True)
-        size = np.maximum(np.maximum(np.abs(own), np.abs(difference)), np.maximum(least, 1e-300))
-        share = np.abs(own - difference) / size
-        share = np.where(np.isfinite(share), share, np.inf)
-        for k in range(p):
-            m = int(np.argmax(share[:, k]))
-            if share[m, k] >= worst[k].share:
-                entry = spec.free.names[k], figures[m], own[m, k], difference[m, k], share[m, k]
-                worst[k] = Disagreement(entry[0], entry[1], *map(float, entry[2:]))
-    return worst
+    worst: dict[int, Disagreement] = {}
+    for position, numbers in _covering(spec).items():
+        # as many designs as the tuning has starts, so that it needs no program of its own
+        evaluator = Evaluator(spec, [spec.moving[position]] * len(start_families(spec)))
+        own, exact = [], []
+        for place in np.clip(places, 3 * STEPS[0], 1 - 3 * STEPS[0]):
+            slopes, differences = _compared(spec, evaluator, position, numbers, place)
+            own.append(slopes)
+            exact.append(differences)
+        a, b = np.array(own), np.array(exact)  # (places, figures, numbers)
+        typical = SMALLEST * np.abs(b).max(axis=(0, 2), keepdims=True)
+        size = np.maximum(np.maximum(np.abs(a), np.abs(b)), np.maximum(typical, NOTHING))
+        share = np.where(np.isfinite(a - b), np.abs(a - b) / size, np.inf)
+        for k, number in enumerate(numbers):
+            n, m = np.unravel_index(np.argmax(share[..., k]), share.shape[:2])
+            found = float(a[n, m, k]), float(b[n, m, k]), float(share[n, m, k])
+            figure = ("objective", *spec.limit_names)[m]
+            family = spec.moving[position].name
+            worst[number] = Disagreement(spec.free.names[number], family, figure, *found)
+    return [worst[number] for number in sorted(worst)]
+
+
+def _covering(spec: TuneSpec) -> dict[int, list[int]]:
+    """Families by position, with the numbers to look at in each, so that all are."""
+    left = np.any([family.is_free for family in spec.moving], axis=0)
+    found: dict[int, list[int]] = {}
+    while left.any():
+        counts = [int((family.is_free & left).sum()) for family in spec.moving]
+        best = int(np.argmax(counts))
+        found[best] = [int(k) for k in np.flatnonzero(spec.moving[best].is_free & left)]
+        left = left & ~spec.moving[best].is_free
+    return found
+
+
+def _compared(
+    spec: TuneSpec, evaluator: Evaluator, position: int, numbers: list[int], place: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(derivatives by places, differences) of all figures by some numbers, (figures, numbers)."""
+    own, p = spec.free.places(), len(place)
+    place = np.where(spec.moving[position].is_free, place, own)
+    unit = np.eye(p)[numbers]
+    moved = [k * step * unit for step in STEPS for k in (-2, -1, 1, 2)]
+    found = _evaluated(spec, evaluator, place + np.concatenate([np.zeros((1, p)), *moved]))
+    values = np.concatenate([found.objective[:, None], found.limits], axis=1)
+    slopes = np.concatenate([found.slope[:, None], found.limit_slope], axis=1)[0]
+    slopes = (slopes * spec.free.slopes(place))[:, numbers]
+    differences = []
+    for step, part in zip(STEPS, np.split(values[1:], len(STEPS)), strict=True):
+        a, b, c, d = part.reshape(4, len(numbers), -1)
+        differences.append(((a - 8 * b + 8 * c - d) / (12 * step)).T)
+    nearest = np.argmin(np.abs(np.array(differences) - slopes), axis=0)
+    return slopes, np.take_along_axis(np.array(differences), nearest[None], axis=0)[0]
+
+
+def _evaluated(spec: TuneSpec, evaluator: Evaluator, designs: np.ndarray) -> Evaluation:
+    """Designs of one family, a batch at a time; derivatives of the first one only."""
+    batch, parts = len(evaluator.families), []
+    for first in range(0, len(designs), batch):
+        rows = np.minimum(np.arange(first, first + batch), len(designs) - 1)
+        found = evaluator.evaluate(spec.free.values(designs[rows]), rows == 0)
+        parts.append(Evaluation(*(x[: len(designs) - first] for x in found)))
+    return Evaluation(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
 
 def audit_places(spec: TuneSpec, count: int = 3) -> np.ndarray:
-    """The study itself and points spread over the bounds, those with the most stable loops."""
-    own = spec.free.places()
+    """The study itself and points spread over the bounds, those with the most stable loops.
+
+    Args:
+        spec: of the tuning.
+        count: how many, (count, p).
+    """
+    own, family = spec.free.places(), spec.families[spec.main]
     points = qmc.Sobol(len(own), rng=spec.tune.seed).random(16)
-    excess = Evaluator(spec, 1).loop_excess(spec.free.values(points))
-    order = np.argsort(np.maximum(excess, 0.0), kind="stable")
     # towards the study, so that the points lie where a tuning goes
-    return np.concatenate([own[None], (own + points[order[: count - 1]]) / 2])
+    points = (own + np.where(family.is_free, points, own)) / 2
+    values = np.where(family.is_free, spec.free.values(points), np.nan)
+    excess, _ = LinearFidelity(spec, [family]).screen(0, values)
+    order = np.argsort(np.maximum(excess, 0.0), kind="stable")
+    return np.concatenate([own[None], points[order[: count - 1]]])

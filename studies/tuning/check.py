@@ -1,52 +1,88 @@
-"""What a tuned design is worth: with the real converters, on machines it was not tuned on."""
+"""What designs are worth: with the real converters, on machines they were not tuned on."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import time
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from scipy.stats import qmc
 
 from jaxmodel import status
-from jaxmodel.sampled_loop import loop_report
+from jaxmodel.case import Case
+from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import Result
-from studies.cases import as_arrays, build_case, build_cases, build_structure
+from studies.cases import as_arrays, build_case, build_cases, in_working_precision
 from studies.fields import parse_entry
 from studies.spec import Study, parse_study
 from studies.sweeps.axes import replaced
 from studies.sweeps.executor import make_executor
 from studies.sweeps.plan import even_layout
-from studies.tuning.evaluate import largest, metrics_of, scenario_columns, size, with_margin_modes
+from studies.tuning.evaluate import tuned_structure
 from studies.tuning.free import PLACEMENT, POLES
-from studies.tuning.spec import LOOP_LIMITS, TuneSpec
+from studies.tuning.linear_fidelity import LoopFigures, loop_figures
+from studies.tuning.merit import (
+    allowed_limits,
+    judged,
+    largest,
+    merit_of,
+    objectives,
+    own_limits,
+    size,
+)
+from studies.tuning.optimise import excess
+from studies.tuning.scenarios import lane_columns, scenario_columns
+from studies.tuning.spec import Family, TuneSpec
+
+#: Random designs that are run in one chunk.
+CHUNK = 256
 
 
 class Judged(NamedTuple):
-    """One design on fresh scenarios, the first of them the study's own machine."""
+    """One design on fresh scenarios, machine by machine within each move."""
 
     objective: np.ndarray  # nan where a run did not finish, (S,)
-    metrics: dict[str, np.ndarray]  # size or largest entry of each metric that counts, (S,)
+    metrics: dict[str, np.ndarray]  # size of those of the objective, largest entry of others, (S,)
     status: np.ndarray  # (S,)
-    gain_margin: float  # of the linearised sampled loop; nan with other feedback [1]
+    loop: LoopFigures | None  # None with other feedback than sampled
 
 
-def tuned_study(spec: TuneSpec, values: np.ndarray) -> Study:
-    """The study with the free numbers set.
+class Searched(NamedTuple):
+    """Random designs of the family with most free numbers, on the scenarios of the tuning."""
+
+    objective: np.ndarray  # nan where a run did not finish, (n,)
+    limits: np.ndarray  # largest value over limit - 1 of the metrics with a limit, (n, m)
+    peaks: np.ndarray  # largest values, (n, m)
+    beyond_loop: np.ndarray  # largest excess over limits of the loop (see `screen`); inf where
+    #: other limits are not kept, (n,)
+    linear: np.ndarray  # linear residual vibration, nan there [m], (n,)
+    residual: np.ndarray  # that of the first scenario's run, nan where not judged by it [m], (n,)
+    time: float  # of the runs alone [s]
+    runs: int
+
+
+def tuned_study(spec: TuneSpec, family: Family, values: np.ndarray) -> Study:
+    """The study with what a family sets, and its free numbers.
 
     Args:
         spec: of the tuning.
-        values: of the free numbers, (p,).
+        family: what moves.
+        values: of all free numbers, (p,).
     """
-    study = spec.study
+    study = family.study(spec.study)
+    values = np.where(family.is_free, values, np.nan)
     case = spec.free.place(as_arrays(build_case(study)), values)
-    whole = {}
-    if any(name.startswith(PLACEMENT) for name in spec.free.names):
+    names = list(np.array(spec.free.names)[family.is_free])
+    whole: dict[str, Any] = {}
+    if any(name.startswith(PLACEMENT) for name in names):
         whole["patches.centers"] = case.machine.patches.center
-    if any(name.startswith(POLES) for name in spec.free.names):
+    if any(name.startswith(POLES) for name in names):
         whole["control.velocity_gain"] = case.control.velocity_gain
         whole["control.position_gain"] = case.control.position_gain
-    plain = zip(spec.free.names, values, strict=True)
-    whole |= {name: v for name, v in plain if not name.startswith((PLACEMENT, *POLES))}
+    for name, value in zip(spec.free.names, values, strict=True):
+        if name in names and not name.startswith((PLACEMENT, *POLES)):
+            whole[name] = value
     data = study.model_dump()
     for name, value in whole.items():
         entry = parse_entry(name)
@@ -62,48 +98,93 @@ def judge(spec: TuneSpec, designs: list[Study]) -> list[Judged]:
 
     Args:
         spec: of the tuning.
-        designs: studies that differ from the tuning's own in numbers only.
+        designs: studies that differ from the tuning's own in numbers only; its own comes first.
     """
-    result = _run(spec, designs)
-    count, found = spec.tune.scenarios.check, []
-    for k, study in enumerate(designs):
-        part = slice(k * count, (k + 1) * count)
-        metrics = jax.tree.map(lambda x: np.asarray(x)[part], result.metrics)  # noqa: B023
-        sizes = {name: np.asarray(size(metrics, name)) for name in spec.tune.objective}
-        peaks = {
-            name: np.asarray(largest(metrics, name))
-            for name in spec.tune.limits
-            if name not in LOOP_LIMITS
-        }
-        objective = sum(weight * sizes[name] for name, weight in spec.tune.objective.items())
-        codes = result.status[part]
-        judged = np.where(np.isin(codes, status.FINISHED), objective, np.nan)
-        found.append(Judged(judged, {**sizes, **peaks}, codes, _gain_margin(study)))
-    return found
-
-
-def _run(spec: TuneSpec, designs: list[Study]) -> Result:
-    """All scenarios of the first design, then of the next, in one batch."""
-    count = spec.tune.scenarios.check
-    columns = scenario_columns(spec, count, spec.tune.scenarios.seed + 1)
-    has_position = any(any(g != 0 for g in study.control.position_gain) for study in designs)
-    structure = build_structure(designs[0])._replace(
-        metrics=metrics_of(spec), has_position_gain=has_position
-    )
-    layout = even_layout(count * len(designs))
-    rows = np.minimum(np.arange(layout.size), count * len(designs) - 1)
+    columns = scenario_columns(spec, spec.tune.scenarios.check, spec.tune.scenarios.seed + 1)
+    count, merit, structure = len(columns["run.seed"]), merit_of(spec), tuned_structure(spec)
     parts = [build_cases(study, columns, structure) for study in designs]
 
     def joined(*leaves: np.ndarray) -> np.ndarray:
-        return np.concatenate([np.broadcast_to(x, (count, *x.shape[1:])) for x in leaves])[rows]
+        return np.concatenate([np.broadcast_to(x, (count, *x.shape[1:])) for x in leaves])
 
-    return make_executor(structure, layout, False).start(jax.tree.map(joined, *parts)).wait()
+    result = _run(spec, jax.tree.map(joined, *parts), count * len(designs))
+    each = [_rows(result.metrics, k * count, count) for k in range(len(designs))]
+    found = []
+    for k, (study, metrics) in enumerate(zip(designs, each, strict=True)):
+        codes = result.status[k * count : (k + 1) * count]
+        objective = np.asarray(objectives(merit, metrics, each[0]))
+        figures = {name: np.asarray(size(metrics, name)) for name, _ in merit.objective}
+        figures |= {name: np.asarray(largest(metrics, name)) for name in merit.limits}
+        objective = np.where(np.isin(codes, status.FINISHED), objective, np.nan)
+        loop = loop_figures(study) if study.control.feedback == "sampled" else None
+        found.append(Judged(objective, figures, codes, loop))
+    return found
 
 
-def _gain_margin(study: Study) -> float:
-    if study.control.feedback != "sampled":
-        return float("nan")
-    larger = with_margin_modes(study)
-    case = as_arrays(build_case(larger))
-    pose = np.array(larger.motion.waypoints[0])
-    return loop_report(build_structure(larger), case, pose).gain_margin
+def _rows(metrics: Metrics, first: int, count: int) -> Metrics:
+    return jax.tree.map(lambda x: np.asarray(x)[first : first + count], metrics)
+
+
+def _run(spec: TuneSpec, cases: Case, count: int) -> Result:
+    """Run `count` cases in one chunk with the real converters."""
+    layout = even_layout(count)
+    rows = np.minimum(np.arange(layout.size), count - 1)
+    padded = in_working_precision(jax.tree.map(lambda x: x[rows], cases))
+    result = make_executor(tuned_structure(spec), layout, False).start(padded).wait()
+    return jax.tree.map(lambda x: np.asarray(x)[:count], result)
+
+
+def search(spec: TuneSpec, screen: Any) -> Searched:
+    """Run random designs (Sobol points between the bounds) on the scenarios of the tuning.
+
+    Args:
+        spec: of the tuning.
+        screen: function of values (n, p) of the main family: see `LinearFidelity.screen`.
+    """
+    family = spec.families[spec.main]
+    own_place = spec.free.places()
+    n = spec.tune.samples
+    points = qmc.Sobol(len(own_place), rng=spec.tune.seed + 1).random(1 << (n - 1).bit_length())
+    points = np.where(family.is_free, points[:n], own_place)
+    values = np.where(family.is_free, spec.free.values(points), np.nan)
+    columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)
+    count, structure = len(columns["run.seed"]), tuned_structure(spec)
+    lanes = lane_columns(spec, columns, [None, *[family] * CHUNK])
+    cases = build_cases(spec.study, lanes, structure)
+    layout = even_layout(count * (1 + CHUNK))
+    rows = np.minimum(np.arange(layout.size), count * (1 + CHUNK) - 1)
+    cases = in_working_precision(jax.tree.map(lambda x: x if len(x) == 1 else x[rows], cases))
+    executor = make_executor(structure, layout, False)
+    place = jax.jit(jax.vmap(spec.free.place))
+    found, spent = [], 0.0
+    for first in range(0, n, CHUNK):
+        part = values[np.minimum(np.arange(first, first + CHUNK), n - 1)]
+        part = np.concatenate([np.full((1, part.shape[1]), np.nan), part])
+        whole = jax.tree.map(lambda x: np.broadcast_to(x, (layout.size, *x.shape[1:])), cases)
+        placed = jax.tree.map(np.asarray, place(whole, part[rows // count]))
+        started = time.perf_counter()
+        result = jax.tree.map(np.asarray, executor.start(placed).wait())
+        spent += time.perf_counter() - started
+        own = _rows(result.metrics, 0, count)
+        for k in range(min(CHUNK, n - first)):
+            found.append(_judged_one(spec, family, result, (1 + k) * count, count, own))
+    objective, limits, peaks, residual = (np.array(x) for x in zip(*found, strict=True))
+    spent -= executor.compile_time
+    beyond, linear = np.full(n, np.inf), np.full(n, np.nan)
+    kept = np.isfinite(objective) & (excess(limits) == 0)
+    if kept.any():
+        beyond[kept], linear[kept] = screen(values[kept])
+    return Searched(objective, limits, peaks, beyond, linear, residual, spent, n * count)
+
+
+def _judged_one(
+    spec: TuneSpec, family: Family, result: Result, first: int, count: int, own: Metrics
+) -> tuple:
+    merit = merit_of(spec)
+    metrics = _rows(result.metrics, first, count)
+    allowed = allowed_limits(merit, family, own_limits(merit, own))
+    objective, limits, peaks = judged(merit, metrics, own, allowed)
+    residual = np.nan
+    if metrics.residual_rms is not None:
+        residual = float(np.sqrt(np.mean(np.asarray(metrics.residual_rms[0]) ** 2)))
+    return float(objective), np.asarray(limits), np.asarray(peaks), residual

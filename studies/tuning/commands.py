@@ -31,7 +31,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         """Move free numbers of a study downhill, within limits, for many machines at once."""
         start()
         from studies.sweeps.spec import ready_spec
-        from studies.tuning.run import REPORT, TUNED, run_tuning
+        from studies.tuning.run import REPORT, run_tuning
 
         asked = load_tuning(ready_spec(spec))
         if audit:
@@ -40,17 +40,17 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if out is None:
             raise StudyError("--out: name a folder for the results")
         run_tuning(asked, out, resume, console, quiet)
-        console.print(f"report: {out / REPORT}; tuned study: {out / TUNED}", soft_wrap=True)
+        console.print(f"report: {out / REPORT}; tuned studies beside it", soft_wrap=True)
 
 
 def _audit(spec: TuneSpec, console: Console) -> None:
     from studies.tuning.audit import ALLOWED, audit, audit_places
 
-    table = Table("free number", "worst for", "derivative", "difference", "disagreement")
-    found = audit(spec, audit_places(spec))
+    names = "free number", "family", "worst for", "derivative", "difference", "disagreement"
+    table, found = Table(*names), audit(spec, audit_places(spec))
     for one in found:
         table.add_row(
-            one.name, one.figure, f"{one.derivative:.6g}", f"{one.difference:.6g}",
+            one.name, one.family, one.figure, f"{one.derivative:.6g}", f"{one.difference:.6g}",
             f"{one.share:.1e}",
         )  # fmt: skip
     console.print(table)

@@ -74,6 +74,7 @@ class Free(NamedTuple):
     name: str  # with its index in a list
     span: Range
     start: float  # what the study has, nan where it has no such number
+    key: str  # under which it stands in the file
 
 
 class Setter(NamedTuple):
@@ -88,7 +89,8 @@ class FreeNumbers(NamedTuple):
     """All free numbers of a design, in the order of the parameter vector."""
 
     numbers: tuple[Free, ...]
-    place: Callable[[Case, Array], Case]  # puts values (p,) in the study's units into a case
+    #: Puts values (p,) in the study's units into a case; what is nan stays as it is there.
+    place: Callable[[Case, Array], Case]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -112,7 +114,7 @@ class FreeNumbers(NamedTuple):
     def places(self) -> np.ndarray:
         """Where the study itself lies between the bounds, 0 to 1; 1/2 where it does not say."""
         found = []
-        for _, span, start in self.numbers:
+        for _, span, start, _ in self.numbers:
             if span.is_log:
                 at = np.log(start / span.low) / np.log(span.high / span.low)
             else:
@@ -191,7 +193,7 @@ def _plain(name: str, bounds: Any, study: Study, path: str) -> tuple[list[Free],
                 checked_value(study, label, end, f"{path}.{key}")
         if not span.low <= start <= span.high:
             raise field_error(label, start, f"{span.low:g} to {span.high:g}, the bounds of {path}")
-        numbers.append(Free(label, span, float(start)))
+        numbers.append(Free(label, span, float(start), name))
         setters.append(Setter(leaf.path, whole, leaf.factor))
     if not numbers:
         raise field_error(name, value, f"one number or more, where {path} is to be free")
@@ -233,7 +235,9 @@ def _set(setters: tuple[Setter, ...], case: Case, values: Array) -> Case:
 def _replaced(tree: Any, path: list[str], indices: tuple[int, ...], value: Array) -> Any:
     """A tree of named tuples with one number replaced; too few indices mean all that follow."""
     if not path:
-        return jnp.asarray(tree, value.dtype).at[_widened(indices, jnp.ndim(tree))].set(value)
+        whole = jnp.asarray(tree, value.dtype)
+        at = _widened(indices, whole.ndim)
+        return whole.at[at].set(jnp.where(jnp.isnan(value), whole[at], _safe(value)))
     first, *rest = path
     return tree._replace(**{first: _replaced(getattr(tree, first), rest, indices, value)})
 
@@ -241,6 +245,11 @@ def _replaced(tree: Any, path: list[str], indices: tuple[int, ...], value: Array
 def _widened(indices: tuple[int, ...], depth: int) -> Any:
     """One list of patch centres, or of one number, stands for those of all links."""
     return (Ellipsis, *indices) if indices and depth > len(indices) else (indices or Ellipsis)
+
+
+def _safe(value: Array) -> Array:
+    """Without nan, whose derivatives would spoil those of what is chosen instead."""
+    return jnp.where(jnp.isnan(value), 1.0, value)
 
 
 # --- ready-made ones ------------------------------------------------------------------------------
@@ -260,7 +269,7 @@ def _poles(written: dict[str, Any], study: Study) -> tuple[list[Free], Callable]
     if spans[1].low <= 0:
         raise field_error(f"tune.free.{POLES[1]}.from", spans[1].low, "more than 0", "Hz")
     numbers = [
-        Free(f"{name}[{k}]", span, np.nan)
+        Free(f"{name}[{k}]", span, np.nan, name)
         for name, span in zip(POLES, spans, strict=True)
         for k in range(3)
     ]
@@ -270,8 +279,12 @@ def _poles(written: dict[str, Any], study: Study) -> tuple[list[Free], Callable]
 def _place_poles(case: Case, values: Array) -> Case:
     belief = case.machine.beam._replace(stiffness_factor=1.0)
     omega = assembled_frequency(belief, 1)[:, 0]
+    is_kept, values = jnp.isnan(values[:3] + values[3:]), _safe(values)
     gains = pole_placement(values[:3], TWO_PI * values[3:], omega)
-    control = case.control._replace(velocity_gain=gains.velocity, position_gain=gains.position)
+    control = case.control._replace(
+        velocity_gain=jnp.where(is_kept, case.control.velocity_gain, gains.velocity),
+        position_gain=jnp.where(is_kept, case.control.position_gain, gains.position),
+    )
     return case._replace(control=control)
 
 
@@ -289,7 +302,7 @@ def _placement(bounds: Any, study: Study, path: str) -> tuple[list[Free], Callab
         gaps = np.diff([0.0, *(np.sort(centers[i]) - pitch * (np.arange(count) + 0.5))])
         starts = _shares(gaps / free)
         numbers += [
-            Free(f"placement[{i}][{k}]", Range(0.0, 1.0, 0, False), float(starts[k]))
+            Free(f"placement[{i}][{k}]", Range(0.0, 1.0, 0, False), float(starts[k]), PLACEMENT)
             for k in range(count)
         ]
     return numbers, partial(_place_patches, links, pitch)
@@ -315,12 +328,13 @@ def _place_patches(links: int, pitch: float, case: Case, values: Array) -> Case:
     count = values.shape[0] // links
     left = case.machine.beam.length - count * pitch
     begin, centers = jnp.zeros((links,), values.dtype), []
-    shares = jnp.reshape(values, (links, count))
+    is_kept, shares = jnp.isnan(jnp.sum(values)), jnp.reshape(_safe(values), (links, count))
     for k in range(count):
         # the root has no slope at 0, where all that is free is used up
         kept = jnp.maximum(1 - shares[:, k], 1e-12) ** (1 / (count - k))
         begin, left = begin + left * (1 - kept), left * kept
         centers.append(begin + pitch * (k + 0.5))
     center = jnp.broadcast_to(jnp.stack(centers, axis=-1), (3, count))
+    center = jnp.where(is_kept, patches.center, center)
     machine = case.machine._replace(patches=patches._replace(center=center))
     return case._replace(machine=machine)

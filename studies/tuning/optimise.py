@@ -1,40 +1,45 @@
-"""Many starts at once, each downhill by Adam, limits by an augmented Lagrangian.
+"""Many starts of many families at once, each downhill, limits by an augmented Lagrangian.
 
-Everything between the bounds is scaled to [0, 1]; a step that would leave it ends at the bound. A
-start whose runs stop finishing goes half the way back to its best design; one that has none is
-frozen. Neither spoils another.
+A start whose trial does not finish tries a shorter step; one that has never finished is frozen.
+Neither spoils another. On a front, families hand good designs on to their neighbours.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import numpy as np
-import optax
 from scipy.stats import qmc
 
 from studies.errors import StudyError
+from studies.tuning.descent import Adam, Descent, Lbfgs, Trial
 from studies.tuning.evaluate import Evaluation, Evaluator
-from studies.tuning.spec import TuneSpec
+from studies.tuning.spec import Family, TuneSpec
 
-#: First and last step, as a share of the bounds.
-FIRST_STEP, LAST_STEP = 0.05, 0.002
 #: Iterations between two updates of the multipliers.
 ROUND = 5
 #: A limit counts as kept up to this share of it.
 KEPT = 1e-3
 #: Sobol points that are looked at for each start, by the linearised loop alone.
 LOOKED_AT = 8
+#: A tuning ends when no family has gained this share within so many iterations.
+GAIN, PATIENCE = 1e-3, 12
+#: Penalty of the limits to begin with; the objective counts as 1.
+PENALTY = 10.0
 
 
 class Progress(NamedTuple):
     """Where a tuning stands; NumPy arrays, starts first. What is saved and resumed."""
 
     iteration: np.ndarray  # done, ()
-    scale: np.ndarray  # objective that counts as 1, ()
-    place: np.ndarray  # of the next design between the bounds, 0 to 1, (B, p)
+    family: np.ndarray  # of each start, position in `spec.moving`, (B,)
+    place: np.ndarray  # of the next trial between the bounds, 0 to 1, (B, p)
+    base: np.ndarray  # last accepted one, (B, p)
+    base_objective: np.ndarray  # nan before the first, (B,)
+    base_slope: np.ndarray  # (B, p), by places
+    base_limits: np.ndarray  # (B, m)
+    base_limit_slope: np.ndarray  # (B, m, p), by places
     multiplier: np.ndarray  # of the limits, (B, m)
     penalty: np.ndarray  # (B,)
     worst: np.ndarray  # violation at the last update of the multipliers, (B,)
@@ -42,148 +47,246 @@ class Progress(NamedTuple):
     best_place: np.ndarray  # (B, p)
     best_objective: np.ndarray  # inf before the first, (B,)
     best_limits: np.ndarray  # values over limits - 1, (B, m)
+    best_peaks: np.ndarray  # values of the limited metrics, (B, m)
+    least: np.ndarray  # smallest value of each limit that any design of a family had, (F, m)
+    gained: np.ndarray  # iteration at which each family last gained, (F,)
     history: np.ndarray  # objective, violation, largest one first; nan where not run, (n, B, 2)
-    adam: tuple[np.ndarray, ...]  # leaves of optax's state
+    descent: tuple[np.ndarray, ...]  # state of the method
 
-    @property
-    def winner(self) -> int:
-        """The best start: limits kept first, then the smallest objective."""
-        return int(np.lexsort((self.best_objective, _excess(self.best_limits)))[0])
+    def winner(self, family: int) -> int:
+        """The best start of a family: limits kept first, then the smallest objective."""
+        members = np.flatnonzero(self.family == family)
+        order = np.lexsort((self.best_objective[members], excess(self.best_limits[members])))
+        return int(members[order[0]])
 
 
-def _excess(limits: np.ndarray) -> np.ndarray:
+def excess(limits: np.ndarray) -> np.ndarray:
     """Largest violation beyond what counts as kept, (B,)."""
     worst = limits.max(axis=1, initial=-np.inf) if limits.shape[1] else np.zeros(len(limits))
     return np.maximum(worst - KEPT, 0.0)
 
 
-def first_places(spec: TuneSpec, evaluator: Evaluator) -> np.ndarray:
-    """Where the starts begin: the study itself, then Sobol points, most stable loops first.
+def start_families(spec: TuneSpec) -> np.ndarray:
+    """Family of every start, (B,)."""
+    return np.repeat(np.arange(len(spec.moving)), spec.tune.starts)
 
-    Args:
-        spec: of the tuning.
-        evaluator: of it.
+
+def first_places(spec: TuneSpec, evaluator: Evaluator) -> np.ndarray:
+    """Where the starts begin: in each family the study itself, then Sobol points.
+
+    Of those the ones whose linearised loop keeps the limits come first, the least residual
+    vibration of the linear machine leading.
 
     Returns:
         (B, p) between 0 and 1.
     """
     own, count = spec.free.places(), spec.tune.starts
-    if count == 1:
-        return own[None]
-    sobol = qmc.Sobol(len(own), rng=spec.tune.seed)
-    looked_at = sobol.random(1 << int(np.ceil(np.log2(LOOKED_AT * count))))
-    excess = evaluator.loop_excess(spec.free.values(looked_at))
-    order = np.argsort(np.maximum(excess, 0.0), kind="stable")
-    return np.concatenate([own[None], looked_at[np.sort(order[: count - 1])]])
+    found = []
+    for k, family in enumerate(spec.moving):
+        found.append(own[None])
+        if count == 1:
+            continue
+        sobol = qmc.Sobol(len(own), rng=spec.tune.seed)
+        points = sobol.random(1 << int(np.ceil(np.log2(LOOKED_AT * count))))
+        points = np.where(family.is_free, points, own)
+        values = np.where(family.is_free, spec.free.values(points), np.nan)
+        beyond, residual = evaluator.linear.screen(k * count, values)
+        order = np.lexsort((residual, np.maximum(beyond, 0.0)))
+        found.append(points[np.sort(order[: count - 1])])
+    return np.concatenate(found)
 
 
 def begin(spec: TuneSpec, evaluator: Evaluator) -> Progress:
-    """Before the first iteration.
-
-    Raises:
-        StudyError: nothing depends on a free number.
-    """
+    """Before the first iteration."""
     place = first_places(spec, evaluator)
-    found = evaluator.evaluate(spec.free.values(place))
-    _check_dependence(spec, found)
-    objective = found.objective
-    sizes = objective[np.isfinite(objective) & (objective > 0)]
-    starts, m = len(place), len(evaluator.limit_names)
+    starts, p = place.shape
+    m = len(spec.limit_names)
     return Progress(
         iteration=np.array(0),
-        scale=np.array(sizes[0] if len(sizes) else 1.0),
+        family=start_families(spec),
         place=place,
+        base=place.copy(),
+        base_objective=np.full(starts, np.nan),
+        base_slope=np.zeros((starts, p)),
+        base_limits=np.zeros((starts, m)),
+        base_limit_slope=np.zeros((starts, m, p)),
         multiplier=np.zeros((starts, m)),
-        penalty=np.full(starts, 10.0),
+        penalty=np.full(starts, PENALTY),
         worst=np.full(starts, np.inf),
         is_frozen=np.zeros(starts, bool),
         best_place=place.copy(),
         best_objective=np.full(starts, np.inf),
         best_limits=np.full((starts, m), np.inf),
+        best_peaks=np.full((starts, m), np.nan),
+        least=np.full((len(spec.moving), m), np.inf),
+        gained=np.zeros(len(spec.moving), int),
         history=np.full((spec.tune.iterations, starts, 2), np.nan),
-        adam=tuple(np.asarray(x) for x in jax.tree.leaves(_adam(spec).init(place))),
+        descent=method(spec).begin(place),
     )
 
 
-def _check_dependence(spec: TuneSpec, found: Evaluation) -> None:
-    is_idle = np.all(found.slope == 0, axis=0) & np.all(found.limit_slope == 0, axis=(0, 1))
-    idle = [name for name, is_one in zip(spec.free.names, is_idle, strict=True) if is_one]
-    if idle and np.isfinite(found.objective).any():
-        raise StudyError(
-            f"tune.free: neither the objective nor a limit depends on {', '.join(idle)}; "
-            "leave that out"
-        )
-
-
-def _adam(spec: TuneSpec) -> Any:
-    steps = max(spec.tune.iterations, 1)
-    return optax.adam(optax.cosine_decay_schedule(FIRST_STEP, steps, LAST_STEP / FIRST_STEP))
+def method(spec: TuneSpec) -> Descent:
+    """The way downhill that was asked for."""
+    return Adam(spec.tune.iterations) if spec.tune.method == "adam" else Lbfgs()
 
 
 def advance(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> Progress:
-    """One iteration: evaluate the designs, keep the best, move the others downhill.
+    """One iteration: evaluate the trials, keep the best, move all downhill.
 
     Args:
         spec: of the tuning.
         evaluator: of it.
         at: where it stands.
+
+    Raises:
+        StudyError: in the first iteration, a free number on which nothing depends.
     """
     k = int(at.iteration)
     found = evaluator.evaluate(spec.free.values(at.place))
-    violation = found.limits.max(axis=1, initial=-np.inf)
+    if k == 0:
+        _check_dependence(spec, at, found)
     is_fine = np.isfinite(found.objective) & np.isfinite(found.limits).all(axis=1)
-    is_fine &= np.isfinite(found.slope).all(axis=1) & ~at.is_frozen
-    history = at.history.copy()
-    history[k] = np.where(is_fine[:, None], np.stack([found.objective, violation], axis=1), np.nan)
-    is_better = is_fine & _is_better(found, at)
+    is_fine &= np.isfinite(found.slope).all(axis=1) & np.isfinite(found.limit_slope).all((1, 2))
+    is_fine &= np.isfinite(at.place).all(axis=1) & ~at.is_frozen
+    at = _kept(at, found, is_fine)
+    turn = spec.free.slopes(at.place)  # from values to places
+    slope, limit_slope = found.slope * turn, found.limit_slope * turn[:, None]
+    merit, merit_slope = _lagrangian(at, found.objective, slope, found.limits, limit_slope)
+    base_merit, base_slope = _lagrangian(
+        at, at.base_objective, at.base_slope, at.base_limits, at.base_limit_slope
+    )
+    trial = Trial(
+        at.base, at.place,
+        np.where(np.isfinite(base_merit), base_merit, np.inf), np.where(is_fine, merit, np.nan),
+        base_slope, np.where(is_fine[:, None], merit_slope, 0.0),
+    )  # fmt: skip
+    state, is_taken, place = method(spec).step(at.descent, trial)
+
+    def taken(new: np.ndarray, old: np.ndarray) -> np.ndarray:
+        return np.where(is_taken.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
+
+    free = evaluator.is_free
     at = at._replace(
         iteration=np.array(k + 1),
-        is_frozen=~is_fine & ~np.isfinite(at.best_objective),
-        best_place=np.where(is_better[:, None], at.place, at.best_place),
+        base=taken(at.place, at.base),
+        base_objective=taken(found.objective, at.base_objective),
+        base_slope=taken(slope, at.base_slope),
+        base_limits=taken(found.limits, at.base_limits),
+        base_limit_slope=taken(limit_slope, at.base_limit_slope),
+        place=np.where(free & ~at.is_frozen[:, None], place, at.place),
+        descent=state,
+    )
+    return _handed_on(spec, _updated(at)) if (k + 1) % ROUND == 0 else at
+
+
+def _check_dependence(spec: TuneSpec, at: Progress, found: Evaluation) -> None:
+    for position, family in enumerate(spec.moving):
+        members = (at.family == position) & np.isfinite(found.objective)
+        is_idle = np.all(found.slope[members] == 0, axis=0) & family.is_free
+        is_idle &= np.all(found.limit_slope[members] == 0, axis=(0, 1))
+        idle = [name for name, is_one in zip(spec.free.names, is_idle, strict=True) if is_one]
+        if idle and members.any():
+            raise StudyError(
+                f"tune.free: in family {family.name!r} neither the objective nor a limit depends "
+                f"on {', '.join(idle)}; leave that out"
+            )
+
+
+def _kept(at: Progress, found: Evaluation, is_fine: np.ndarray) -> Progress:
+    """With what this iteration found written down."""
+    k = int(at.iteration)
+    violation = found.limits.max(axis=1, initial=-np.inf)
+    history = at.history.copy()
+    history[k] = np.where(is_fine[:, None], np.stack([found.objective, violation], axis=1), np.nan)
+    new, old = excess(found.limits), excess(at.best_limits)
+    is_better = (new < old) | ((new == old) & (found.objective < at.best_objective))
+    is_better &= is_fine
+    with np.errstate(invalid="ignore"):
+        step = (new < old) | (found.objective < (1 - GAIN) * at.best_objective)
+    gained = at.gained.copy()
+    gained[np.unique(at.family[is_better & step])] = k
+    chosen, least = is_better[:, None], at.least.copy()
+    np.minimum.at(least, at.family[is_fine], found.limits[is_fine])
+    return at._replace(
+        is_frozen=at.is_frozen | (~is_fine & ~np.isfinite(at.best_objective)),
+        best_place=np.where(chosen, at.place, at.best_place),
         best_objective=np.where(is_better, found.objective, at.best_objective),
-        best_limits=np.where(is_better[:, None], found.limits, at.best_limits),
+        best_limits=np.where(chosen, found.limits, at.best_limits),
+        best_peaks=np.where(chosen, found.peaks, at.best_peaks),
+        least=least,
+        gained=gained,
         history=history,
     )
-    slope = _lagrangian_slope(found, at) * spec.free.slopes(at.place)
-    slope = np.where(is_fine[:, None], slope, 0.0)
-    adam, tree = _adam(spec), jax.tree.structure(_adam(spec).init(at.place))
-    steps, state = adam.update(slope, jax.tree.unflatten(tree, at.adam))
-    moved = np.clip(at.place + np.asarray(steps), 0.0, 1.0)
-    at = at._replace(
-        place=np.where(is_fine[:, None], moved, _halfway(at)),
-        adam=tuple(np.asarray(x) for x in jax.tree.leaves(state)),
-    )
-    return _updated(at, found, is_fine) if (k + 1) % ROUND == 0 else at
 
 
-def _halfway(at: Progress) -> np.ndarray:
-    """Between where starts are and their best designs, (B, p)."""
-    middle = (at.place + at.best_place) / 2
-    return np.where(np.isfinite(middle), middle, at.best_place)
+def _lagrangian(
+    at: Progress, objective: np.ndarray, slope: np.ndarray, limits: np.ndarray,
+    limit_slope: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """f + sum (rho/2) max(0, c + lambda/rho)^2 and its slope, (B,) and (B, p)."""
+    force = np.maximum(at.multiplier + at.penalty[:, None] * limits, 0.0)
+    merit = objective + np.sum(force**2, axis=1) / (2 * at.penalty)
+    return merit, slope + np.einsum("bm,bmp->bp", force, limit_slope)
 
 
-def _is_better(found: Evaluation, at: Progress) -> np.ndarray:
-    """Whether designs beat the best so far: first by their limits, then by the objective."""
-    new, old = _excess(found.limits), _excess(at.best_limits)
-    return (new < old) | ((new == old) & (found.objective < at.best_objective))
-
-
-def _lagrangian_slope(found: Evaluation, at: Progress) -> np.ndarray:
-    """Slope of f + sum (rho/2) max(0, c + lambda/rho)^2 by the free numbers, (B, p)."""
-    force = np.maximum(at.multiplier + at.penalty[:, None] * found.limits, 0.0)
-    return found.slope / at.scale + np.einsum("bm,bmp->bp", force, found.limit_slope)
-
-
-def _updated(at: Progress, found: Evaluation, is_fine: np.ndarray) -> Progress:
+def _updated(at: Progress) -> Progress:
     """New multipliers; a larger penalty where the violation has not halved."""
-    multiplier = np.maximum(at.multiplier + at.penalty[:, None] * found.limits, 0.0)
-    worst = np.maximum(found.limits.max(axis=1, initial=0.0), 0.0)
-    is_slow = is_fine & (worst > KEPT) & (worst > at.worst / 2)
+    is_known = np.isfinite(at.base_objective)
+    multiplier = np.maximum(at.multiplier + at.penalty[:, None] * at.base_limits, 0.0)
+    worst = np.maximum(at.base_limits.max(axis=1, initial=0.0), 0.0)
+    is_slow = is_known & (worst > KEPT) & (worst > at.worst / 2)
     return at._replace(
-        multiplier=np.where(is_fine[:, None], multiplier, at.multiplier),
+        multiplier=np.where(is_known[:, None], multiplier, at.multiplier),
         penalty=np.where(is_slow, np.minimum(2 * at.penalty, 1e6), at.penalty),
-        worst=np.where(is_fine, worst, at.worst),
+        worst=np.where(is_known, worst, at.worst),
     )
+
+
+def _handed_on(spec: TuneSpec, at: Progress) -> Progress:
+    """The worst start of a family goes on from another family's design that is better.
+
+    Others are its neighbours on a front, and those that move less of the same study.
+    """
+    for k, family in enumerate(spec.moving):
+        members = np.flatnonzero(at.family == k)
+        given = [at.winner(j) for j, other in enumerate(spec.moving) if _can_take(family, other)]
+        if not given or len(members) < 2:
+            continue
+        mine = at.winner(k)
+        kept = [j for j in given if _keeps(spec, at, j, family)]
+        best = min(kept, key=lambda j: at.best_objective[j], default=mine)
+        if at.best_objective[best] < at.best_objective[mine]:
+            worst = max(members, key=lambda j: at.best_objective[j])
+            at = _moved(spec, at, int(worst), best)
+    return at
+
+
+def _can_take(family: Family, other: Family) -> bool:
+    is_near = bool(family.front) and family.front == other.front
+    is_part = bool((family.is_free | ~other.is_free).all()) and family.limits == other.limits
+    is_same_study = repr(family.columns) == repr(other.columns)
+    return other is not family and is_same_study and (is_near or is_part)
+
+
+def _keeps(spec: TuneSpec, at: Progress, start: int, family: Family) -> bool:
+    """Whether the best design of a start keeps another family's limits."""
+    limits = at.best_limits[start].copy()
+    if family.front:
+        k, allowed = spec.limit_names.index(spec.tune.pareto["limit"]), family.limits
+        limits[k] = at.best_peaks[start, k] / float(allowed[spec.tune.pareto["limit"]]) - 1
+    return bool(np.isfinite(limits).all() and excess(limits[None])[0] == 0)
+
+
+def _moved(spec: TuneSpec, at: Progress, start: int, to: int) -> Progress:
+    """A start put to the best place of another, as if it were new there."""
+    place, base = at.place.copy(), at.base_objective.copy()
+    place[start], base[start] = at.best_place[to], np.nan
+    fresh = method(spec).begin(at.place)
+    state = tuple(np.array(x) for x in at.descent)
+    for now, new in zip(state, fresh, strict=True):
+        if now.ndim and now.shape[0] == len(place):
+            now[start] = new[start]
+    return at._replace(place=place, base_objective=base, descent=state)
 
 
 def optimise(
@@ -192,16 +295,22 @@ def optimise(
     at: Progress | None,
     keep: Callable[[Progress], None],
 ) -> Progress:
-    """Iterate to the end.
+    """Iterate to the end, or until nothing is gained any more.
 
     Args:
         spec: of the tuning.
-        evaluator: for `spec.tune.starts` designs.
+        evaluator: for the families of `start_families`.
         at: where an interrupted one stands; None for a new one.
         keep: called after each iteration.
     """
     at = begin(spec, evaluator) if at is None else at
-    while int(at.iteration) < spec.tune.iterations and not at.is_frozen.all():
+    while int(at.iteration) < spec.tune.iterations and not is_settled(spec, at):
         at = advance(spec, evaluator, at)
         keep(at)
     return at
+
+
+def is_settled(spec: TuneSpec, at: Progress) -> bool:
+    """Whether going on is of no use; Adam's steps are planned to the end."""
+    has_waited = spec.tune.method == "lbfgs" and (at.iteration - at.gained > PATIENCE).all()
+    return bool(at.is_frozen.all() or has_waited)

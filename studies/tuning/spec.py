@@ -1,37 +1,51 @@
 """The file of a tuning: a study plus `[tune]`, which says what is free and what it is for.
 
-The objective is the weighted sum of metrics, each as the root of the mean square of its entries
-(links, stations; an entry like `pose_error_rms[2]` is that one alone), averaged over the scenarios.
-A limit holds for the largest entry of its metric in the worst scenario; `gain_margin` and
-`slowest_decay` are lower limits of the linearised sampled loop at the first way-point.
+Everything is measured against the study itself, machine by machine and move by move:
+
+- objective: sum of weight times the size of a metric (root of the mean square of its entries) over
+  its size in the study's own run of that scenario; of the scenarios, the mean of the worst share;
+- limits: the largest entry of a metric, in no scenario above the limit; "own" stands for what the
+  study itself reaches there. `gain_margin` and `slowest_decay` are lower limits and `spillover` an
+  upper one of the linearised sampled loop at the first way-point; `singularity_distance` is a lower
+  limit on the distance of all link angles from 0 and 90 deg.
 """
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import numpy as np
 from pydantic import ValidationError
 
-from studies.errors import StudyError, field_error, nearest, shown
+from studies.cases import build_structure
+from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.explain import explain
 from studies.fields import parse_entry
+from studies.runs import check_run
 from studies.spec import Section, Study, described, parse_study, read_toml
-from studies.sweeps.axes import known_field
+from studies.sweeps.axes import checked_value, known_field, set_value
 from studies.sweeps.results import metric_names
 from studies.tuning.free import FreeNumbers, free_numbers
 
-#: Limits of the linearised loop, which are lower ones: factor on all gains [1], decay rate [1/s].
-LOOP_LIMITS = ("gain_margin", "slowest_decay")
+#: Limits that no run is needed for; all but `spillover` are lower ones. Those of the loop:
+OF_LOOP = ("gain_margin", "slowest_decay", "spillover")
+#: and with that of the mechanism.
+LOOP_LIMITS = (*OF_LOOP, "singularity_distance")
+#: Limit that stands for what the study itself reaches.
+OWN = "own"
 
 
 class Scenarios(Section):
-    """Machines that one design must suit."""
+    """Machines and moves that one design must suit."""
 
-    count: int = described(1, "1", "scenarios; the first is the study itself", ge=1, le=1000)
+    count: int = described(1, "1", "machines; the first is the study's own", ge=1, le=1000)
     check: int = described(16, "1", "fresh ones, for the result", ge=1, le=10_000)
-    seed: int = described(0, "1", "of the scenarios", ge=0, le=10**9)
+    seed: int = described(0, "1", "of the machines", ge=0, le=10**9)
     spread: dict[str, Any] = described({}, "-", "field = +-percent of its value")
+    each: dict[str, Any] = described({}, "-", "field = values; every machine runs with each")
+    tail: float = described(1.0, "1", "share of worst ones that count", ge=0, le=1)
 
 
 class Tune(Section):
@@ -39,22 +53,69 @@ class Tune(Section):
 
     free: dict[str, Any] = described({}, "-", "field = {from, to, scale}")
     objective: dict[str, Any] = described(
-        {"residual_rms": 1.0}, "-", "metric = weight, in one over the metric's unit", min_length=1
+        {"residual_rms": 1.0}, "-", "metric = weight, of its share in the study's own", min_length=1
     )
-    limits: dict[str, Any] = described({}, "-", "metric, gain_margin or slowest_decay = limit")
+    limits: dict[str, Any] = described({}, "-", "metric or figure of the loop = limit or 'own'")
     scenarios: Scenarios = Scenarios()
-    starts: int = described(8, "1", "designs to begin with, the study's own first", ge=1, le=1024)
-    iterations: int = described(60, "1", "steps of each start", ge=1, le=10_000)
+    families: dict[str, Any] = described({}, "-", "name = {free, set}: what moves, what is changed")
+    pareto: dict[str, Any] = described({}, "-", "{limit, values, family}: a front")
+    method: Literal["lbfgs", "adam"] = described("lbfgs", "-", "how starts go downhill")
+    starts: int = described(8, "1", "designs of each family to begin with", ge=1, le=1024)
+    iterations: int = described(60, "1", "evaluations of each start", ge=1, le=10_000)
+    samples: int = described(0, "1", "random designs to compare with", ge=0, le=10**6)
     seed: int = described(0, "1", "of the starts", ge=0, le=10**9)
+
+
+class Family(NamedTuple):
+    """Designs that move the same numbers under the same limits."""
+
+    name: str
+    is_free: np.ndarray  # which numbers move, (p,)
+    columns: dict[str, Any]  # fields of the study that are set otherwise
+    limits: dict[str, float | str]
+    front: str  # name of the front it is a point of, "" for none
+
+    def study(self, study: Study) -> Study:
+        """The study with what this family sets."""
+        for name, value in self.columns.items():
+            study = parse_study(set_value(study, name, value))
+        return study
 
 
 class TuneSpec(NamedTuple):
     """A tuning as asked for."""
 
-    study: Study  # the design to begin with
+    study: Study  # what everything is measured against
     tune: Tune
     free: FreeNumbers
+    families: tuple[Family, ...]  # those that move something come first
+    moves: tuple[dict[str, Any], ...]  # combinations of `scenarios.each`, {} where there is none
     data: dict[str, Any]  # as read, for the record
+
+    @property
+    def moving(self) -> tuple[Family, ...]:
+        """Families that have something free."""
+        return tuple(family for family in self.families if family.is_free.any())
+
+    @property
+    def main(self) -> int:
+        """The family with most free numbers."""
+        return int(np.argmax([family.is_free.sum() for family in self.families]))
+
+    @property
+    def metric_limits(self) -> tuple[str, ...]:
+        """Limits that runs are judged by."""
+        return tuple(name for name in self.tune.limits if name not in LOOP_LIMITS)
+
+    @property
+    def loop_limits(self) -> tuple[str, ...]:
+        """Limits of the linearised loop."""
+        return tuple(name for name in self.tune.limits if name in LOOP_LIMITS)
+
+    @property
+    def limit_names(self) -> tuple[str, ...]:
+        """All limits, in the order that evaluations have them in."""
+        return (*self.metric_limits, *self.loop_limits)
 
 
 def load_tuning(path: str | Path) -> TuneSpec:
@@ -79,32 +140,63 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
         tune = Tune.model_validate(data["tune"])
     except ValidationError as error:
         raise explain(error, Tune, data["tune"], inside="tune") from None
-    for section, numbers in (("objective", tune.objective), ("limits", tune.limits)):
-        for name, number in numbers.items():
-            _check_metric(name, f"tune.{section}", section == "limits")
-            _check_positive(number, 1e30, f"tune.{section}.{name}")
+    _check_figures(tune)
+    _check_spread(tune, study)
+    _check_feedback(tune, study)
+    free = free_numbers(tune.free, study)
+    moves = _moves(tune, study)
+    families = _families(tune, study, free)
+    for family in families:
+        for move in moves:
+            _check_family(family, move, study)
+    return TuneSpec(study, tune, free, families, moves, data)
+
+
+def _check_figures(tune: Tune) -> None:
+    for name, weight in tune.objective.items():
+        _check_metric(name, "tune.objective", False)
+        _check_positive(weight, 1e30, f"tune.objective.{shown_name(name)}")
+    for name, limit in tune.limits.items():
+        _check_metric(name, "tune.limits", True)
+        if limit != OWN:
+            _check_positive(limit, 1e30, f"tune.limits.{shown_name(name)}", more=" or 'own'")
+    for name in tune.limits:
+        entry = parse_entry(name)
+        if entry is not None and entry.indices and entry.field in tune.limits:
+            whole, part = tune.limits[entry.field], tune.limits[name]
+            if OWN not in (whole, part) and part > whole:
+                raise StudyError(
+                    f"tune.limits: {name} = {part:g} allows more than {entry.field} = {whole:g}, "
+                    "which holds for all its entries; leave one out"
+                )
+
+
+def _check_spread(tune: Tune, study: Study) -> None:
     for name, percent in tune.scenarios.spread.items():
-        path = f"tune.scenarios.spread.{name}"
+        path = f"tune.scenarios.spread.{shown_name(name)}"
         value = known_field(name, study, "tune.scenarios.spread")
         if isinstance(value, bool) or not isinstance(value, float):
             raise field_error(path, percent, f"for a number; {name} is {shown(value)}")
         _check_positive(percent, 99.0, path, "%")
+        if value == 0:
+            raise field_error(name, value, f"not 0 where {path} is a share of it")
+
+
+def _check_feedback(tune: Tune, study: Study) -> None:
     if study.control.ratio_source != "given":
-        raise field_error(
-            "control.ratio_source", study.control.ratio_source, "'given' in a tuning", ""
-        )
-    if study.control.feedback != "sampled" and set(tune.limits) & set(LOOP_LIMITS):
+        raise field_error("control.ratio_source", study.control.ratio_source, "'given' in a tuning")
+    wanted = [name for name in tune.limits if name in OF_LOOP]
+    if study.control.feedback != "sampled" and wanted:
         raise field_error(
             "control.feedback", study.control.feedback,
-            "'sampled' where tune.limits holds " + " or ".join(LOOP_LIMITS),
+            "'sampled' where tune.limits holds " + " or ".join(wanted),
         )  # fmt: skip
-    return TuneSpec(study, tune, free_numbers(tune.free, study), data)
 
 
-def _check_positive(number: Any, most: float, path: str, unit: str = "") -> None:
+def _check_positive(number: Any, most: float, path: str, unit: str = "", more: str = "") -> None:
     is_number = isinstance(number, (int, float)) and not isinstance(number, bool)
     if not is_number or not 0 < number <= most:
-        raise field_error(path, number, f"a number > 0 and <= {most:g}", unit)
+        raise field_error(path, number, f"a number > 0 and <= {most:g}{more}", unit)
 
 
 def _check_metric(name: str, path: str, has_loop: bool) -> None:
@@ -115,3 +207,101 @@ def _check_metric(name: str, path: str, has_loop: bool) -> None:
         raise StudyError(
             f"{path}: {name!r} is no metric" + (f"; did you mean {hint!r}?" if hint else "")
         )
+
+
+def _moves(tune: Tune, study: Study) -> tuple[dict[str, Any], ...]:
+    """Combinations of the values that every machine runs with."""
+    columns = {}
+    for name, values in tune.scenarios.each.items():
+        path = f"tune.scenarios.each.{shown_name(name)}"
+        known_field(name, study, "tune.scenarios.each")
+        if not isinstance(values, list) or not values:
+            raise field_error(path, values, "a list of values")
+        columns[name] = [checked_value(study, name, value, path) for value in values]
+    return tuple(dict(zip(columns, one, strict=True)) for one in product(*columns.values()))
+
+
+def _families(tune: Tune, study: Study, free: FreeNumbers) -> tuple[Family, ...]:
+    everything = np.ones(len(free.numbers), bool)
+    if not tune.families:
+        found = [Family("tuned", everything, {}, dict(tune.limits), "")]
+    else:
+        found = [_family(name, x, tune, study, free) for name, x in tune.families.items()]
+    if not any(family.is_free.any() for family in found):
+        raise field_error("tune.families", list(tune.families), "one with free numbers or more")
+    found.sort(key=lambda family: not family.is_free.any())
+    return tuple(found + _front(tune, found))
+
+
+def _family(name: str, written: Any, tune: Tune, study: Study, free: FreeNumbers) -> Family:
+    path = f"tune.families.{shown_name(name)}"
+    if not isinstance(written, dict) or not set(written) <= {"free", "set"}:
+        raise field_error(path, written, "{free = [names], set = {field = value}}")
+    names = written.get("free", list(tune.free))
+    if not isinstance(names, list) or not all(isinstance(one, str) for one in names):
+        raise field_error(f"{path}.free", names, "a list of names of tune.free")
+    for one in names:
+        if one not in tune.free:
+            hint = nearest(one, tune.free)
+            raise StudyError(
+                f"{path}.free: {one!r} is not in tune.free"
+                + (f"; did you mean {hint!r}?" if hint else "")
+            )
+    changes = written.get("set", {})
+    if not isinstance(changes, dict):
+        raise field_error(f"{path}.set", changes, "{field = value}")
+    columns = {}
+    for field, value in changes.items():
+        known_field(field, study, f"{path}.set")
+        columns[field] = checked_value(study, field, value, f"{path}.set.{shown_name(field)}")
+    is_free = np.array([number.key in names for number in free.numbers])
+    return Family(name, is_free, columns, dict(tune.limits), "")
+
+
+def _front(tune: Tune, families: list[Family]) -> list[Family]:
+    """A family for each point of the front."""
+    if not tune.pareto:
+        return []
+    if set(tune.pareto) - {"limit", "values", "family"} or "limit" not in tune.pareto:
+        raise field_error("tune.pareto", tune.pareto, "{limit, values, family}")
+    limit, values = tune.pareto["limit"], tune.pareto.get("values")
+    if limit not in tune.limits:
+        raise field_error(
+            "tune.pareto.limit", limit, "one of tune.limits: " + ", ".join(tune.limits)
+        )
+    if not isinstance(values, list) or len(values) < 2:
+        raise field_error("tune.pareto.values", values, "a list of two limits or more")
+    for k, value in enumerate(values):
+        _check_positive(value, 1e30, f"tune.pareto.values[{k}]")
+    moving = {family.name: family for family in families if family.is_free.any()}
+    name = tune.pareto.get("family", next(iter(moving)))
+    if name not in moving:
+        raise field_error("tune.pareto.family", name, "one of " + ", ".join(moving))
+    base = moving[name]
+    return [
+        base._replace(
+            name=f"{name}, {limit} {value:g}", limits={**base.limits, limit: float(value)},
+            front=name,
+        )
+        for value in sorted(values)
+    ]  # fmt: skip
+
+
+def _check_family(family: Family, move: dict[str, Any], study: Study) -> None:
+    """What a family sets must run, and by the study's own program."""
+    try:
+        changed = family.study(study)
+        for name, value in move.items():
+            changed = parse_study(set_value(changed, name, value))
+        check_run(changed)
+    except StudyError as error:
+        with_move = "".join(f", {name} = {shown(value)}" for name, value in move.items())
+        raise StudyError(f"tune.families.{shown_name(family.name)}{with_move}: {error}") from None
+    one, other = build_structure(study), build_structure(changed)
+    kept = {"has_position_gain", "has_noise", "substeps"}
+    for field, a, b in zip(one._fields, one, other, strict=True):
+        if a != b and field not in kept:
+            raise StudyError(
+                f"tune.families.{shown_name(family.name)}: {field} = {shown(b)} where the study "
+                f"has {shown(a)}; allowed is what runs by the same program"
+            )

@@ -1,0 +1,72 @@
+"""Residual vibration from the linearised sampled loop: a fast look at a design before any run.
+
+The shaped command moves the linear machine of the first way-point; what is left `residual_delay`
+after its end dies out by itself, and its energy until then comes from a Gramian by doubling
+(H2 norm of an initial state). Converters and their limits are left out.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.parameters import Array
+from jaxmodel.sampled_loop import LoopMatrices, summed_squares
+from jaxmodel.simulate import begin
+
+
+class LinearResidual(NamedTuple):
+    """Vibration after the move."""
+
+    rms: Array  # chord deflection over the residual window if all of it fell in there [m], (3, S)
+    state: Array  # of the loop at the window's start, from its rest after the move, (n,)
+
+
+def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) -> LinearResidual:
+    """H2 norm of what a move leaves behind; differentiable.
+
+    sqrt(sum over k of y_k^2 T/L) with y the chord deflection from the window's start on, T the
+    sample period and L the window's length: the nonlinear run's `residual_rms` where vibration dies
+    out within the window.
+
+    Args:
+        structure: static choices; `n_steps` samples of the command are looked at.
+        case: the numbers.
+        matrices: from `closed_loop` at the first way-point.
+
+    Returns:
+        LinearResidual.
+    """
+    start = begin(structure._replace(has_noise=False), case)
+    inputs, drive = start.inputs, start.loop.drive
+    force = drive.kp * (jnp.mean(inputs.rho, axis=1) - inputs.rho[0, 0])
+    force = force + drive.kd * jnp.mean(inputs.rho_rate, axis=1)
+    if inputs.feedforward is not None:
+        rest = inputs.feedforward[0, 0]
+        force = force + jnp.mean(inputs.feedforward, axis=1) - rest
+    force = force + inputs.disturbance
+    begins = start.outline.command_end + case.windows.residual_delay
+    is_before = inputs.window.time < begins - case.electronics.period / 2
+    transition = matrices.open + matrices.feedback
+
+    def advance(x: Array, at: tuple[Array, Array]) -> tuple[Array, None]:
+        push, is_moving = at
+        return jnp.where(is_moving, transition @ x + matrices.force @ push, x), None
+
+    still = jnp.zeros(transition.shape[0], transition.dtype)
+    x, _ = jax.lax.scan(advance, still, (force, is_before))
+    # the machine comes to rest where the drive then holds it
+    held = matrices.force @ (force[-1] - inputs.disturbance[-1])
+    x = x - jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - transition, held)
+    size = jnp.sqrt(jnp.sum(x * x))
+    size = jnp.where(size > 0, size, 1.0)
+    found = summed_squares(transition, jnp.outer(x, x) / size**2)
+    share = jnp.sum((matrices.deflection @ found.share) * matrices.deflection, axis=1)
+    samples = case.windows.residual_length / case.electronics.period
+    # an unstable loop's sum grows without end: large, but still a number
+    log_square = jnp.minimum(found.log_size, 100.0) + jnp.log(jnp.maximum(share, 1e-300) / samples)
+    rms = size * jnp.exp(log_square / 2)
+    return LinearResidual(jnp.reshape(rms, (3, -1)), x)

@@ -1,0 +1,235 @@
+"""What the linearised sampled loop says of designs: margins, spillover, residual vibration.
+
+No eigenvalues and no runs: repeated squaring and doubling (`jaxmodel.sampled_loop`), so it works in
+batches on any device. The plant has 12 modes or more, because modes that nobody controls limit the
+gains.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.kinematics import singularity_distance
+from jaxmodel.linear_residual import linear_residual
+from jaxmodel.parameters import Array
+from jaxmodel.prepare import prepare
+from jaxmodel.sampled_loop import LoopMatrices, closed_loop, gain_margin, slowest_decay, spillover
+from studies.cases import as_arrays, build_case, build_structure
+from studies.spec import Study
+from studies.tuning.scenarios import nominal
+from studies.tuning.spec import OWN, Family, TuneSpec
+
+#: Decay rate that violations of `gain_margin` are measured in, and which counts as stable where
+#: no limit of the loop is set [1/s].
+STABLE = 10.0
+#: Plant modes at least.
+MARGIN_MODES = 12
+#: Points of each straight move at which its distance from singularities is looked at.
+PATH_POINTS = 17
+#: Designs that are looked at in one call; each core takes one call after the other.
+BATCH = 16
+
+
+class LoopFigures(NamedTuple):
+    """Of a design on the host."""
+
+    gain_margin: float  # largest factor on all gains with every smaller one stable [1]
+    slowest_decay: float  # [1/s]
+    spillover: float  # see `jaxmodel.sampled_loop.spillover` [1]
+    singularity_distance: float  # [rad]
+    residual: float  # linear residual vibration, root of the mean square of all stations [m]
+
+
+def with_margin_modes(study: Study) -> Study:
+    """The study with as many plant modes as its loop is judged with."""
+    return study.change(link__modes=max(MARGIN_MODES, study.link.modes))
+
+
+class LinearFidelity:
+    """Looks at designs of some families."""
+
+    def __init__(self, spec: TuneSpec, families: list[Family]) -> None:
+        """
+        Args:
+            spec: of the tuning.
+            families: of each design, in the order that they are given in.
+        """
+        self._spec, self.names = spec, spec.loop_limits
+        own = nominal(spec, None)
+        larger = with_margin_modes(own)
+        has_position = any("position_gain" in n or "poles" in n for n in spec.free.names)
+        structure = build_structure(larger)
+        self._structure = structure._replace(
+            n_frequencies=1, has_noise=False, metrics=(),
+            has_position_gain=structure.has_position_gain or has_position,
+        )  # fmt: skip
+        self._pose = np.array(own.motion.waypoints[0])
+        known = {
+            f.name: as_arrays(build_case(with_margin_modes(nominal(spec, f)))) for f in families
+        }
+        self._cases = [known[family.name] for family in families]
+        self._own: LoopFigures | None = None
+        self._limits = np.array(
+            [[self._limit(family, name) for name in self.names] for family in families]
+        ).reshape(len(families), len(self.names))
+
+    def _limit(self, family: Family, name: str) -> float:
+        limit = family.limits[name]
+        if limit != OWN:
+            return float(limit)
+        self._own = self._own or loop_figures(self._spec.study)
+        return float(getattr(self._own, name))
+
+    def limits(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far designs are beyond the limits of their loop, with derivatives.
+
+        Args:
+            values: one design for each family given at the start, (designs, p).
+
+        Returns:
+            (x/(1 + |x|) of x = value/limit - 1, positive where violated, (designs, m), its
+            derivatives, (designs, m, p)).
+        """
+        if not self.names:
+            return np.zeros((len(values), 0)), np.zeros((len(values), 0, values.shape[1]))
+        cases = jax.tree.map(lambda *x: jnp.stack(x), *self._cases)
+        found = _limit_slopes(
+            self._plain, self.names, self._spec.free.place, cases, self._pose, self._limits, values
+        )
+        return np.asarray(found[0]), np.asarray(found[1])
+
+    def screen(self, position: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A quick look at designs of one family.
+
+        Args:
+            position: of a design of that family in what was given at the start.
+            values: (n, p), any number of them.
+
+        Returns:
+            (largest excess over the limits of the loop, at least that of a stable one, inf where
+            none is found, (n,); linear residual vibration [m], (n,)).
+        """
+        if self._structure.feedback != "sampled":
+            return np.zeros(len(values)), np.zeros(len(values))
+        names = self.names or ("slowest_decay",)
+        limits = self._limits[position] if self.names else np.array([STABLE])
+        look = partial(
+            _look, self._structure, names, self._spec.free.place, self._cases[position],
+            self._pose, limits,
+        )  # fmt: skip
+        count = len(values)
+        rows = np.minimum(np.arange(-(-count // BATCH) * BATCH), count - 1)
+        parts = np.split(values[rows], len(rows) // BATCH)
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            found = list(pool.map(lambda part: jax.tree.map(np.asarray, look(part)), parts))
+        excess, residual = (np.concatenate(x)[:count] for x in zip(*found, strict=True))
+        worst = excess.max(axis=1)
+        return (
+            np.where(np.isfinite(worst), worst, np.inf),
+            np.where(np.isfinite(residual), residual, np.inf),
+        )
+
+    @property
+    def _plain(self) -> Structure:
+        # what the matrices do not depend on must not cost a compilation
+        return self._structure._replace(n_steps=1, substeps=1)
+
+
+def _excess(
+    structure: Structure, names: tuple, case: Case, matrices: LoopMatrices, limits: Array
+) -> Array:
+    """x/(1 + |x|) for each limit, (m,): decay rates reach hundreds of their limit on both sides.
+
+    x is value/limit - 1, or -decay/STABLE of the loop with all gains times the wanted margin.
+    """
+    period, found = case.electronics.period, []
+    for k, name in enumerate(names):
+        if name == "spillover":
+            x = spillover(structure, case, matrices) / limits[k] - 1
+        elif name == "singularity_distance":
+            x = 1 - _singularity_distance(structure, case) / limits[k]
+        else:
+            factor = limits[k] if name == "gain_margin" else 1.0
+            decay = slowest_decay(matrices.open + factor * matrices.feedback, period)
+            x = -decay / STABLE if name == "gain_margin" else 1 - decay / limits[k]
+        found.append(x / (1 + jnp.abs(x)))
+    return jnp.stack(found)
+
+
+def _singularity_distance(structure: Structure, case: Case) -> Array:
+    """Of the straight lines between way-points [rad], ()."""
+    points, share = case.path.waypoints, jnp.linspace(0.0, 1.0, PATH_POINTS)[:, None, None]
+    line = points[:-1] + share * (points[1:] - points[:-1])
+    pose = jnp.concatenate([points, jnp.reshape(line, (-1, 3))])
+    return singularity_distance(prepare(structure, case).loop.plant, pose)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _limit_slopes(
+    structure: Structure, names: tuple, place: Any, cases: Case, pose: Array, limits: Array,
+    values: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    def figures(x: Array, case: Case, limit: Array) -> Array:
+        placed = place(case, x)
+        return _excess(structure, names, placed, closed_loop(structure, placed, pose), limit)
+
+    def one(given: tuple) -> tuple[Array, Array]:
+        return figures(*given), jax.jacrev(figures)(*given)
+
+    return jax.lax.map(one, (values, cases, limits))
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _look(
+    structure: Structure, names: tuple, place: Any, case: Case, pose: Array, limits: Array,
+    values: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    def one(x: Array) -> tuple[Array, Array]:
+        placed = place(case, x)
+        matrices = closed_loop(structure, placed, pose)
+        rms = linear_residual(structure, placed, matrices).rms
+        excess = _excess(structure, names, placed, matrices, limits)
+        return excess, jnp.sqrt(jnp.mean(rms**2))
+
+    return jax.lax.map(one, values)
+
+
+_closed_loop = jax.jit(closed_loop, static_argnums=0)
+_spillover = jax.jit(spillover, static_argnums=0)
+_distance = jax.jit(_singularity_distance, static_argnums=0)
+_residual = jax.jit(linear_residual, static_argnums=0)
+
+
+def loop_figures(study: Study) -> LoopFigures:
+    """Figures of a study's loop on a plant of 12 modes or more.
+
+    Args:
+        study: with sampled feedback.
+    """
+    larger = with_margin_modes(study)
+    structure, case = build_structure(larger), as_arrays(build_case(larger))
+    structure = structure._replace(n_frequencies=1, has_noise=False, metrics=())
+    plain = structure._replace(n_steps=1, substeps=1)
+    matrices = _closed_loop(plain, case, np.array(larger.motion.waypoints[0]))
+    opened, feedback = np.asarray(matrices.open), np.asarray(matrices.feedback)
+    period = float(case.electronics.period)
+
+    def poles(factor: float) -> np.ndarray:
+        return np.linalg.eigvals(opened + factor * feedback)
+
+    rms = np.asarray(_residual(structure, case, matrices).rms)
+    return LoopFigures(
+        gain_margin(poles),
+        float(-np.log(np.abs(poles(1.0)).max()) / period),
+        float(_spillover(plain, case, matrices)),
+        float(_distance(plain, case)),
+        float(np.sqrt(np.mean(rms**2))),
+    )

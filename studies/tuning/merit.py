@@ -1,0 +1,146 @@
+"""What a design is worth: objective and limits from the metrics of its runs."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.metrics import Metrics
+from jaxmodel.parameters import Array
+from studies.fields import parse_entry
+from studies.tuning.spec import OWN, Family, TuneSpec
+
+
+class Merit(NamedTuple):
+    """What designs are judged by; hashable."""
+
+    objective: tuple[tuple[str, float], ...]  # metric and weight
+    limits: tuple[str, ...]  # metrics with a limit
+    tail: float  # share of worst scenarios that count
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """Fields of `Metrics` that this takes."""
+        names = [parse_entry(name) for name in (*dict(self.objective), *self.limits)]
+        return tuple(sorted({entry.field for entry in names if entry}))
+
+
+def merit_of(spec: TuneSpec) -> Merit:
+    """Of a tuning."""
+    weights = tuple((name, float(weight)) for name, weight in spec.tune.objective.items())
+    return Merit(weights, spec.metric_limits, float(spec.tune.scenarios.tail))
+
+
+def entries(metrics: Metrics, name: str) -> Array:
+    """Entries of a metric, (S, n)."""
+    entry = parse_entry(name)
+    assert entry is not None
+    data = getattr(metrics, entry.field)
+    return jnp.reshape(data[(slice(None), *entry.indices)], (data.shape[0], -1))
+
+
+def size(metrics: Metrics, name: str) -> Array:
+    """Root of the mean square of the entries, (S,)."""
+    square = jnp.mean(entries(metrics, name) ** 2, axis=1)
+    # the root has no slope at 0; what is no number stays none
+    return jnp.where(square == 0, 0.0, jnp.sqrt(jnp.where(square == 0, 1.0, square)))
+
+
+def largest(metrics: Metrics, name: str) -> Array:
+    """Largest entry, (S,)."""
+    return jnp.max(entries(metrics, name), axis=1)
+
+
+def tail_weights(count: int, tail: float) -> np.ndarray:
+    """Weights of scenarios, worst first, that average the worst share of them (CVaR), (S,)."""
+    most = max(tail * count, 1.0)
+    return np.clip(most - np.arange(count), 0.0, 1.0) / most
+
+
+def objectives(merit: Merit, metrics: Metrics, own: Metrics) -> Array:
+    """Objective in each scenario, (S,).
+
+    Args:
+        merit: weights.
+        metrics: of the design, (S, ...).
+        own: of the study itself in the same scenarios, (S, ...).
+    """
+    shares = [weight * size(metrics, x) / size(own, x) for x, weight in merit.objective]
+    return jnp.sum(jnp.stack(shares), axis=0)
+
+
+def judged(
+    merit: Merit, metrics: Metrics, own: Metrics, allowed: Array
+) -> tuple[Array, Array, Array]:
+    """Judge a design.
+
+    Args:
+        merit: what by.
+        metrics: (S, ...).
+        own: of the study itself, (S, ...).
+        allowed: limits in each scenario, (S, m).
+
+    Returns:
+        objective (), largest value over limit - 1 (m,), largest values (m,).
+    """
+    each = objectives(merit, metrics, own)
+    weights = tail_weights(each.shape[0], merit.tail)
+    values = [largest(metrics, name) for name in merit.limits]
+    peaks = jnp.stack(values, axis=1) if values else jnp.zeros((each.shape[0], 0))
+    excess = jnp.max(peaks / allowed - 1, axis=0)
+    return jnp.sum(-jnp.sort(-each) * weights), excess, jnp.max(peaks, axis=0)
+
+
+class Slopes(NamedTuple):
+    """Designs judged, with derivatives by the free numbers."""
+
+    objective: Array  # (designs,)
+    slope: Array  # (designs, p)
+    limits: Array  # largest value over limit - 1, (designs, m)
+    limit_slope: Array  # (designs, m, p)
+    peaks: Array  # largest values, (designs, m)
+
+
+@partial(jax.jit, static_argnums=0)
+def judged_slopes(
+    merit: Merit, metrics: Metrics, slopes: Metrics, own: Metrics, allowed: Array
+) -> Slopes:
+    """Judge designs and differentiate.
+
+    Args:
+        merit: what by.
+        metrics: (designs, S, ...).
+        slopes: derivatives, (designs, S, p, ...).
+        own: of the study itself, (S, ...).
+        allowed: limits in each scenario, (designs, S, m).
+    """
+
+    def one(metrics: Metrics, slopes: Metrics, allowed: Array) -> Slopes:
+        def figures(x: Metrics) -> tuple[Array, Array, Array]:
+            return judged(merit, x, own, allowed)
+
+        along = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), slopes)
+        (objective, limits, peaks), (slope, limit_slope, _) = jax.vmap(
+            lambda x: jax.jvp(figures, (metrics,), (x,)), out_axes=((None, None, None), 0)
+        )(along)
+        return Slopes(objective, slope, limits, jnp.moveaxis(limit_slope, 0, -1), peaks)
+
+    return jax.vmap(one)(metrics, slopes, allowed)
+
+
+def own_limits(merit: Merit, own: Metrics) -> np.ndarray:
+    """What the study itself reaches, (S, m)."""
+    columns = [np.asarray(largest(own, name)) for name in merit.limits]
+    count = len(jax.tree.leaves(own)[0])
+    return np.stack(columns, axis=1) if columns else np.zeros((count, 0))
+
+
+def allowed_limits(merit: Merit, family: Family, own: np.ndarray) -> np.ndarray:
+    """Limits of a family's runs in each scenario, (S, m); `own` is from `own_limits`."""
+    given = [family.limits[name] for name in merit.limits]
+    columns = [own[:, k] if x == OWN else np.full(len(own), float(x)) for k, x in enumerate(given)]
+    return np.stack(columns, axis=1) if columns else own

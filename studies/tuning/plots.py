@@ -1,0 +1,115 @@
+"""Figures of a tuning: the way down, what it gives on each move, and the front."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from studies import figures
+from studies.sweeps.results import metric_label
+from studies.tuning.optimise import KEPT, excess
+from studies.tuning.report import Findings, is_kept
+from studies.tuning.scenarios import move_label
+from studies.tuning.spec import TuneSpec
+
+GREY = "#999999"
+
+
+def descent(spec: TuneSpec, found: Findings) -> Figure:
+    """Best objective that keeps the limits, over iterations, by family; thin: every start."""
+    with figures.styled():
+        figure = Figure(figsize=(7.4, 3.6), layout="constrained")
+        ax: Axes = figure.subplots()
+        history = found.at.history[: int(found.at.iteration)]
+        best = np.fmin.accumulate(np.where(history[..., 1] <= KEPT, history[..., 0], np.nan))
+        iteration = np.arange(1, len(best) + 1)
+        for k, family in enumerate(spec.moving):
+            members = best[:, found.at.family == k]
+            color = figures.SERIES[k % len(figures.SERIES)]
+            dash = figures.DASHES[(k // len(figures.SERIES)) % len(figures.DASHES)]
+            ax.plot(iteration, members, color=color, linewidth=0.4, alpha=0.5)
+            lowest = np.fmin.reduce(members, axis=1)
+            ax.plot(
+                iteration, lowest, color=color, linestyle=dash, linewidth=1.6, label=family.name
+            )
+        ax.set(xlabel="iteration", ylabel="objective, the study itself = 1")
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        figure.legend(loc="outside right upper")
+    return figure
+
+
+def gains(spec: TuneSpec, found: Findings) -> Figure:
+    """Objective of each family on fresh machines, one panel for each move."""
+    with figures.styled():
+        rows = len(spec.families)
+        figure = Figure(figsize=(7.4, 1.2 + 0.3 * rows), layout="constrained")
+        axes = figure.subplots(1, len(spec.moves), squeeze=False, sharey=True)[0]
+        count, weight = spec.tune.scenarios.check, sum(spec.tune.objective.values())
+        for k, (ax, move) in enumerate(zip(axes, spec.moves, strict=True)):
+            for row, one in enumerate(found.judged):
+                value = one.objective[k * count : (k + 1) * count] / weight
+                ax.plot(value, np.full(count, row), "o", color=GREY, markersize=3)
+                ax.plot(value.mean(), row, "D", color=figures.SERIES[0], markersize=6)
+            ax.axvline(1.0, color="black", linewidth=0.8)
+            ax.set(xlabel="objective, the study itself = 1", title=move_label(move))
+            ax.set_xlim(left=0)
+        axes[0].set_yticks(range(rows), [family.name for family in spec.families])
+        axes[0].invert_yaxis()
+    return figure
+
+
+def front(spec: TuneSpec, found: Findings, limit: str) -> Figure:
+    """Objective over a limited metric: random designs, the tuned ones, the study.
+
+    Args:
+        spec: of the tuning.
+        found: what it found.
+        limit: metric along the abscissa, one of `spec.metric_limits`.
+    """
+    with figures.styled():
+        figure = Figure(figsize=(7.4, 4.2), layout="constrained")
+        ax: Axes = figure.subplots()
+        column = spec.metric_limits.index(limit)
+        if found.searched is not None:
+            seen, kept = found.searched, is_kept(spec, found.searched)
+            for chosen, color, label in (
+                (np.isfinite(seen.objective) & ~kept, "#CCCCCC", "random, a limit not kept"),
+                (kept, figures.SERIES[0], "random, all limits kept"),
+            ):
+                if chosen.any():
+                    ax.scatter(
+                        seen.peaks[chosen, column], seen.objective[chosen], s=5, color=color,
+                        linewidths=0, label=label, rasterized=True,
+                    )  # fmt: skip
+        at = found.at
+        done = np.isfinite(at.best_objective) & (excess(at.best_limits) == 0)
+        ax.plot(
+            at.best_peaks[done, column], at.best_objective[done], "x", color=figures.SERIES[1],
+            markersize=4, label="every start",
+        )  # fmt: skip
+        points = [(x.metrics[limit].max(), x.objective.mean()) for x in found.judged]
+        line = np.array(
+            [p for p, family in zip(points, spec.families, strict=True) if family.front]
+        )
+        if len(line):
+            line = line[np.argsort(line[:, 0])]
+            ax.plot(*line.T, "o-", color=figures.SERIES[2], label="front, on fresh machines")
+        marks = iter("^vD*P<>")
+        own = found.own.metrics[limit].max(), found.own.objective.mean()
+        ax.plot(*own, "s", color="black", label="the study itself")
+        for point, family in zip(points, spec.families, strict=True):
+            if not family.front:
+                ax.plot(
+                    *point, next(marks, "h"), color="black", markerfacecolor="white",
+                    label=family.name,
+                )  # fmt: skip
+        ax.set(xlabel=_label(limit), ylabel="objective, the study itself = 1", yscale="log")
+        figure.legend(loc="outside right upper")
+    return figure
+
+
+def _label(metric: str) -> str:
+    _, unit, text = metric_label(metric.partition("[")[0])
+    return f"{text} [{unit}]"

@@ -1,0 +1,75 @@
+"""Machines and moves that designs must suit, as columns of a table of cases."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from studies.fields import Columns
+from studies.spec import Study, parse_study
+from studies.sweeps.axes import column_of, known_field, set_value
+from studies.tuning.spec import Family, TuneSpec
+
+
+def scenario_columns(spec: TuneSpec, count: int, seed: int) -> dict[str, np.ndarray]:
+    """What scenarios change: machine by machine within each move; the first machine is the study's.
+
+    Args:
+        spec: of the tuning.
+        count: machines.
+        seed: of their shifts and of their noise.
+
+    Returns:
+        Columns of `count` rows for each move.
+    """
+    spread, moves = spec.tune.scenarios.spread, len(spec.moves)
+    noise = np.random.default_rng(seed).integers(1, 10**9, count)
+    machines = {"run.seed": np.where(np.arange(count) > 0, noise, spec.study.run.seed)}
+    if spread:
+        shift = 2 * qmc.LatinHypercube(len(spread), rng=seed).random(count) - 1
+        shift[0] = 0.0
+        for k, (name, percent) in enumerate(spread.items()):
+            machines[name] = known_field(name, spec.study) * (1 + percent / 100 * shift[:, k])
+    columns = {name: np.tile(column, moves) for name, column in machines.items()}
+    for name in spec.tune.scenarios.each:
+        columns[name] = np.repeat(column_of([move[name] for move in spec.moves]), count, axis=0)
+    return columns
+
+
+def move_label(move: dict[str, Any]) -> str:
+    """Name of a move, "" where there is only one."""
+    return ", ".join(f"{name} = {value}" for name, value in move.items())
+
+
+def lane_columns(
+    spec: TuneSpec, columns: dict[str, np.ndarray], families: list[Family | None]
+) -> Columns:
+    """Columns for designs times scenarios, design by design.
+
+    Args:
+        spec: of the tuning.
+        columns: from `scenario_columns`.
+        families: of each design; None is the study itself.
+    """
+    count = len(next(iter(columns.values())))
+    lanes = {
+        name: np.tile(column, (len(families),) + (1,) * (column.ndim - 1))
+        for name, column in columns.items()
+    }
+    for name in sorted({name for family in families if family for name in family.columns}):
+        if name in columns:
+            continue  # a move says more than a family
+        own = known_field(name, spec.study)
+        values = [family.columns.get(name, own) if family else own for family in families]
+        lanes[name] = np.repeat(column_of(values), count, axis=0)
+    return lanes
+
+
+def nominal(spec: TuneSpec, family: Family | None) -> Study:
+    """The study's own machine on the first move, with what a family sets."""
+    study = family.study(spec.study) if family else spec.study
+    for name, value in spec.moves[0].items():
+        study = parse_study(set_value(study, name, value))
+    return study
