@@ -1,7 +1,9 @@
 """Tuning by gradient: free numbers of a study, moved until an objective is as small as it gets.
 
-`spec` reads the file; `free` puts free numbers into cases; `evaluate` runs designs under all
-scenarios and differentiates their objective and limits; `optimise` moves many starts downhill;
-`check` runs the result on fresh scenarios with the real converters; `audit` compares derivatives
-with differences; `run` keeps all this in a folder, and `report` tells of it.
+- What is asked: `spec` reads the file, `free` puts free numbers into cases, `scenarios` makes the
+  machines and moves, `merit` says what a design is worth.
+- The way down: `evaluate` runs designs and differentiates them, `linear_fidelity` does the same
+  for the linearised loop, `descent` steps (L-BFGS, Adam), `optimise` leads all starts.
+- What came out: `check` runs it on fresh machines with the real converters, `audit` compares
+  derivatives with differences, `report` and `plots` tell; `run` keeps all this in a folder.
 """

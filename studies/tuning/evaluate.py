@@ -65,7 +65,7 @@ class Evaluator:
         padded = {name: column[rows] for name, column in whole.items()}
         self._cases = in_working_precision(build_cases(study, padded, self._structure))
         self._rows = rows // self.scenarios  # design of every lane, the study itself first
-        self.seconds, self.runs = 0.0, 0
+        self.runs, self.run_time = 0, float("nan")  # how many, and what one of the last took [s]
         self._gradients = make_gradients(self._structure, self._layout, spec.free.place)
 
     def evaluate(self, values: np.ndarray, has_slope: np.ndarray | bool = True) -> Evaluation:
@@ -83,9 +83,9 @@ class Evaluator:
         wanted = np.isfinite(values) & np.reshape(has_slope, (-1, 1))
         used = np.concatenate([np.zeros(own.shape, bool), wanted])[self._rows]
         runs = self._gradients.evaluate(self._cases, whole, used)
-        spent = time.perf_counter() - started - (0 if self.runs else self._gradients.compile_time)
+        if self.runs:  # the first one compiles
+            self.run_time = (time.perf_counter() - started) / self._lanes
         self.runs += self._lanes
-        self.seconds += spent
         shape = (1 + len(values), self.scenarios)
 
         def split(x: Any) -> np.ndarray:
@@ -136,7 +136,8 @@ def _layout(lanes: int) -> Layout:
     """Small blocks: each is differentiated by what its own designs move only."""
     if processor() != "cpu":
         return even_layout(lanes)
-    whole, block = even_layout(lanes), 2 * lane_unit()
+    whole = even_layout(lanes)
+    block = min(2 * lane_unit(), whole.lanes)
     return Layout(whole.devices, -(-lanes // (whole.devices * block)), block)
 
 

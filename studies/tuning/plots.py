@@ -34,7 +34,7 @@ def descent(spec: TuneSpec, found: Findings) -> Figure:
             ax.plot(
                 iteration, lowest, color=color, linestyle=dash, linewidth=1.6, label=family.name
             )
-        ax.set(xlabel="iteration", ylabel="objective, the study itself = 1")
+        ax.set(xlabel="iteration", ylabel="objective, the study itself = 1", yscale="log")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         figure.legend(loc="outside right upper")
     return figure
@@ -45,16 +45,15 @@ def gains(spec: TuneSpec, found: Findings) -> Figure:
     with figures.styled():
         rows = len(spec.families)
         figure = Figure(figsize=(7.4, 1.2 + 0.3 * rows), layout="constrained")
-        axes = figure.subplots(1, len(spec.moves), squeeze=False, sharey=True)[0]
+        axes = figure.subplots(1, len(spec.moves), squeeze=False, sharex=True, sharey=True)[0]
         count, weight = spec.tune.scenarios.check, sum(spec.tune.objective.values())
         for k, (ax, move) in enumerate(zip(axes, spec.moves, strict=True)):
             for row, one in enumerate(found.judged):
                 value = one.objective[k * count : (k + 1) * count] / weight
-                ax.plot(value, np.full(count, row), "o", color=GREY, markersize=3)
-                ax.plot(value.mean(), row, "D", color=figures.SERIES[0], markersize=6)
+                ax.plot(value, np.full(count, row), "o", color=GREY, markersize=3, zorder=3)
+                ax.plot(value.mean(), row, "d", color=figures.SERIES[0], markersize=5)
             ax.axvline(1.0, color="black", linewidth=0.8)
-            ax.set(xlabel="objective, the study itself = 1", title=move_label(move))
-            ax.set_xlim(left=0)
+            ax.set(xlabel="objective, the study itself = 1", xscale="log", title=move_label(move))
         axes[0].set_yticks(range(rows), [family.name for family in spec.families])
         axes[0].invert_yaxis()
     return figure

@@ -139,7 +139,7 @@ def find(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> Findings:
         linear,
         last.residual,
         searched,
-        evaluator.seconds / evaluator.runs,
+        evaluator.run_time,
         evaluator.runs,
     )
 
