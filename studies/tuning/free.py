@@ -123,6 +123,13 @@ class FreeNumbers(NamedTuple):
         return np.array(found)
 
 
+def writes(number: Free) -> tuple[str, ...]:
+    """Fields of the study that a free number decides."""
+    if number.key in POLES:
+        return "control.velocity_gain", "control.position_gain"
+    return ("patches.centers",) if number.key == PLACEMENT else (number.name,)
+
+
 def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
     """Free numbers from what the file says.
 

@@ -59,8 +59,6 @@ def lane_columns(
         for name, column in columns.items()
     }
     for name in sorted({name for family in families if family for name in family.columns}):
-        if name in columns:
-            continue  # a move says more than a family
         own = known_field(name, spec.study)
         values = [family.columns.get(name, own) if family else own for family in families]
         lanes[name] = np.repeat(column_of(values), count, axis=0)

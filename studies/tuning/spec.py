@@ -19,20 +19,23 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
+from jaxmodel.case import Structure
 from studies.cases import build_structure
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.explain import explain
 from studies.fields import parse_entry
-from studies.runs import check_run
+from studies.runs import METRIC_LABELS, check_run
 from studies.spec import Section, Study, described, parse_study, read_toml
 from studies.sweeps.axes import checked_value, known_field, set_value
-from studies.sweeps.results import metric_names
-from studies.tuning.free import FreeNumbers, free_numbers
+from studies.sweeps.results import metric_label
+from studies.tuning.free import FreeNumbers, free_numbers, writes
 
 #: Limits that no run is needed for; all but `spillover` are lower ones. Those of the loop:
 OF_LOOP = ("gain_margin", "slowest_decay", "spillover")
 #: and with that of the mechanism.
 LOOP_LIMITS = (*OF_LOOP, "singularity_distance")
+#: Metrics without a derivative: as limits they only choose between designs.
+STEPPED = ("settling_time", "saturated_fraction", "clipped_fraction")
 #: Limit that stands for what the study itself reaches.
 OWN = "own"
 
@@ -140,24 +143,25 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
         tune = Tune.model_validate(data["tune"])
     except ValidationError as error:
         raise explain(error, Tune, data["tune"], inside="tune") from None
-    _check_figures(tune)
+    _check_figures(tune, study)
     _check_spread(tune, study)
     _check_feedback(tune, study)
     free = free_numbers(tune.free, study)
     moves = _moves(tune, study)
     families = _families(tune, study, free)
+    _check_clashes(tune, free, families)
     for family in families:
         for move in moves:
             _check_family(family, move, study)
     return TuneSpec(study, tune, free, families, moves, data)
 
 
-def _check_figures(tune: Tune) -> None:
+def _check_figures(tune: Tune, study: Study) -> None:
     for name, weight in tune.objective.items():
-        _check_metric(name, "tune.objective", False)
+        _check_metric(name, "tune.objective", False, study)
         _check_positive(weight, 1e30, f"tune.objective.{shown_name(name)}")
     for name, limit in tune.limits.items():
-        _check_metric(name, "tune.limits", True)
+        _check_metric(name, "tune.limits", True, study)
         if limit != OWN:
             _check_positive(limit, 1e30, f"tune.limits.{shown_name(name)}", more=" or 'own'")
     for name in tune.limits:
@@ -199,14 +203,30 @@ def _check_positive(number: Any, most: float, path: str, unit: str = "", more: s
         raise field_error(path, number, f"a number > 0 and <= {most:g}{more}", unit)
 
 
-def _check_metric(name: str, path: str, has_loop: bool) -> None:
+def _check_metric(name: str, path: str, has_loop: bool, study: Study) -> None:
     entry = parse_entry(name)
-    known = [*metric_names(), *(LOOP_LIMITS if has_loop else ())]
+    known = [*METRIC_LABELS, *(LOOP_LIMITS if has_loop else ())]
     if entry is None or entry.field not in known:
         hint = nearest(name, known)
         raise StudyError(
             f"{path}: {name!r} is no metric" + (f"; did you mean {hint!r}?" if hint else "")
         )
+    if not has_loop and entry.field in STEPPED:
+        raise StudyError(
+            f"{path}: {entry.field} moves in steps and has no derivative"
+            + ("; take ringing_time" if entry.field == "settling_time" else "; limit it instead")
+        )
+    axes = () if entry.field in LOOP_LIMITS else metric_label(entry.field)[0]
+    most = {
+        "station": len(study.metrics.stations), "mode": study.link.modes,
+        "controlled_mode": study.control.modes, "spectrum_point": Structure().n_frequencies,
+    }  # fmt: skip
+    sizes = [most.get(axis, 3) for axis in axes]
+    if len(entry.indices) > len(sizes) or any(
+        k >= size for k, size in zip(entry.indices, sizes, strict=False)
+    ):
+        shape = "".join(f"[0 to {size - 1}]" for size in sizes)
+        raise StudyError(f"{path}: {name!r} has no such entry; allowed {entry.field}{shape}")
 
 
 def _moves(tune: Tune, study: Study) -> tuple[dict[str, Any], ...]:
@@ -219,6 +239,30 @@ def _moves(tune: Tune, study: Study) -> tuple[dict[str, Any], ...]:
             raise field_error(path, values, "a list of values")
         columns[name] = [checked_value(study, name, value, path) for value in values]
     return tuple(dict(zip(columns, one, strict=True)) for one in product(*columns.values()))
+
+
+def _check_clashes(tune: Tune, free: FreeNumbers, families: tuple[Family, ...]) -> None:
+    """No field may be set by two."""
+    asked = tune.scenarios
+    for name in asked.spread:
+        if name in asked.each:
+            raise StudyError(f"tune.scenarios: {name} is both in spread and in each")
+    for family in families:
+        numbers = zip(free.numbers, family.is_free, strict=True)
+        moved = {_field(x) for number, is_free in numbers if is_free for x in writes(number)}
+        for where, names in (
+            ("tune.scenarios.spread", asked.spread), ("tune.scenarios.each", asked.each),
+            (f"tune.families.{shown_name(family.name)}.set", family.columns),
+        ):  # fmt: skip
+            for name in names:
+                if _field(name) in moved:
+                    raise StudyError(f"{where}: {name} is free in family {family.name!r}")
+                if names is family.columns and name in {**asked.spread, **asked.each}:
+                    raise StudyError(f"{where}: {name} is in tune.scenarios too")
+
+
+def _field(name: str) -> str:
+    return name.partition("[")[0]
 
 
 def _families(tune: Tune, study: Study, free: FreeNumbers) -> tuple[Family, ...]:
@@ -235,6 +279,10 @@ def _families(tune: Tune, study: Study, free: FreeNumbers) -> tuple[Family, ...]
 
 def _family(name: str, written: Any, tune: Tune, study: Study, free: FreeNumbers) -> Family:
     path = f"tune.families.{shown_name(name)}"
+    if not any(letter.isalnum() for letter in name) or len(name) > 60:
+        raise field_error(
+            "tune.families", name, "names of 1 to 60 characters with a letter or digit"
+        )
     if not isinstance(written, dict) or not set(written) <= {"free", "set"}:
         raise field_error(path, written, "{free = [names], set = {field = value}}")
     names = written.get("free", list(tune.free))
@@ -265,7 +313,7 @@ def _front(tune: Tune, families: list[Family]) -> list[Family]:
     if set(tune.pareto) - {"limit", "values", "family"} or "limit" not in tune.pareto:
         raise field_error("tune.pareto", tune.pareto, "{limit, values, family}")
     limit, values = tune.pareto["limit"], tune.pareto.get("values")
-    if limit not in tune.limits:
+    if not isinstance(limit, str) or limit not in tune.limits:
         raise field_error(
             "tune.pareto.limit", limit, "one of tune.limits: " + ", ".join(tune.limits)
         )
@@ -273,6 +321,8 @@ def _front(tune: Tune, families: list[Family]) -> list[Family]:
         raise field_error("tune.pareto.values", values, "a list of two limits or more")
     for k, value in enumerate(values):
         _check_positive(value, 1e30, f"tune.pareto.values[{k}]")
+        if value in values[:k]:
+            raise field_error(f"tune.pareto.values[{k}]", value, "each limit once")
     moving = {family.name: family for family in families if family.is_free.any()}
     name = tune.pareto.get("family", next(iter(moving)))
     if name not in moving:
@@ -295,8 +345,9 @@ def _check_family(family: Family, move: dict[str, Any], study: Study) -> None:
             changed = parse_study(set_value(changed, name, value))
         check_run(changed)
     except StudyError as error:
-        with_move = "".join(f", {name} = {shown(value)}" for name, value in move.items())
-        raise StudyError(f"tune.families.{shown_name(family.name)}{with_move}: {error}") from None
+        where = [f"tune.families.{shown_name(family.name)}"] if family.columns else []
+        where += [f"{name} = {shown(value)} of tune.scenarios" for name, value in move.items()]
+        raise StudyError(f"{', '.join(where)}: {error}" if where else str(error)) from None
     one, other = build_structure(study), build_structure(changed)
     kept = {"has_position_gain", "has_noise", "substeps"}
     for field, a, b in zip(one._fields, one, other, strict=True):
