@@ -355,7 +355,7 @@ def test_resumed_tuning_equals_an_uninterrupted_one(judged, tuned, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, again, end)
 
 
-@pytest.mark.parametrize("method", ["lbfgs", "adam"])
+@pytest.mark.parametrize("method", ["lbfgs", pytest.param("adam", marks=pytest.mark.long)])
 def test_a_start_that_fails_spoils_no_other(judged, method):
     """A drive that no step carries makes one design's runs diverge."""
     spec, evaluator = judged
