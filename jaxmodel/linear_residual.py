@@ -7,8 +7,6 @@ after its end dies out by itself, and its energy until then comes from a Gramian
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 
@@ -18,14 +16,7 @@ from jaxmodel.sampled_loop import LoopMatrices, summed_squares
 from jaxmodel.simulate import begin
 
 
-class LinearResidual(NamedTuple):
-    """Vibration after the move."""
-
-    rms: Array  # chord deflection over the residual window if all of it fell in there [m], (3, S)
-    state: Array  # of the loop at the window's start, from its rest after the move, (n,)
-
-
-def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) -> LinearResidual:
+def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) -> Array:
     """H2 norm of what a move leaves behind; differentiable.
 
     sqrt(sum over k of y_k^2 T/L) with y the chord deflection from the window's start on, T the
@@ -38,7 +29,7 @@ def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) ->
         matrices: from `closed_loop` at the first way-point.
 
     Returns:
-        LinearResidual.
+        rms of the chord deflection at the stations over the residual window [m], (3, S).
     """
     start = begin(structure._replace(has_noise=False), case)
     inputs, drive = start.inputs, start.loop.drive
@@ -68,5 +59,4 @@ def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) ->
     samples = case.windows.residual_length / case.electronics.period
     # an unstable loop's sum grows without end: large, but still a number
     log_square = jnp.minimum(found.log_size, 100.0) + jnp.log(jnp.maximum(share, 1e-300) / samples)
-    rms = size * jnp.exp(log_square / 2)
-    return LinearResidual(jnp.reshape(rms, (3, -1)), x)
+    return jnp.reshape(size * jnp.exp(log_square / 2), (3, -1))

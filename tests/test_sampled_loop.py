@@ -391,4 +391,4 @@ def test_linear_residual_agrees_with_the_run():
     linear = jax.jit(linear_residual, static_argnums=0)(structure, case, matrices)
     result = run(structure, case, False)
     assert result.status == 0
-    np.testing.assert_allclose(linear.rms, result.metrics.residual_rms, rtol=0.1)
+    np.testing.assert_allclose(linear, result.metrics.residual_rms, rtol=0.1)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from jaxmodel import status
-from jaxmodel.case import Case
+from jaxmodel.case import Case, Structure
 from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import Result
 from studies.cases import as_arrays, build_case, build_cases, in_working_precision
@@ -19,12 +19,12 @@ from studies.spec import Study, parse_study
 from studies.sweeps.axes import replaced
 from studies.sweeps.executor import make_executor
 from studies.sweeps.plan import even_layout
-from studies.tuning.evaluate import tuned_structure
+from studies.tuning.evaluate import first_residual, tuned_structure
 from studies.tuning.free import PLACEMENT, POLES
 from studies.tuning.linear_fidelity import LoopFigures, loop_figures
 from studies.tuning.merit import (
+    all_judged,
     allowed_limits,
-    judged,
     largest,
     merit_of,
     objectives,
@@ -107,7 +107,7 @@ def judge(spec: TuneSpec, designs: list[Study]) -> list[Judged]:
     def joined(*leaves: np.ndarray) -> np.ndarray:
         return np.concatenate([np.broadcast_to(x, (count, *x.shape[1:])) for x in leaves])
 
-    result = _run(spec, jax.tree.map(joined, *parts), count * len(designs))
+    result = _run(structure, jax.tree.map(joined, *parts), count * len(designs))
     each = [_rows(result.metrics, k * count, count) for k in range(len(designs))]
     found = []
     for k, (study, metrics) in enumerate(zip(designs, each, strict=True)):
@@ -125,12 +125,12 @@ def _rows(metrics: Metrics, first: int, count: int) -> Metrics:
     return jax.tree.map(lambda x: np.asarray(x)[first : first + count], metrics)
 
 
-def _run(spec: TuneSpec, cases: Case, count: int) -> Result:
+def _run(structure: Structure, cases: Case, count: int) -> Result:
     """Run `count` cases in one chunk with the real converters."""
     layout = even_layout(count)
     rows = np.minimum(np.arange(layout.size), count - 1)
     padded = in_working_precision(jax.tree.map(lambda x: x[rows], cases))
-    result = make_executor(tuned_structure(spec), layout, False).start(padded).wait()
+    result = make_executor(structure, layout, False).start(padded).wait()
     return jax.tree.map(lambda x: np.asarray(x)[:count], result)
 
 
@@ -155,7 +155,11 @@ def search(spec: TuneSpec, screen: Any) -> Searched:
     rows = np.minimum(np.arange(layout.size), count * (1 + CHUNK) - 1)
     cases = in_working_precision(jax.tree.map(lambda x: x if len(x) == 1 else x[rows], cases))
     executor = make_executor(structure, layout, False)
-    place = jax.jit(jax.vmap(spec.free.place))
+    place, merit = jax.jit(jax.vmap(spec.free.place)), merit_of(spec)
+
+    def split(x: np.ndarray) -> np.ndarray:
+        return x[: count * (1 + CHUNK)].reshape((1 + CHUNK, count, *x.shape[1:]))
+
     found, spent = [], 0.0
     for first in range(0, n, CHUNK):
         part = values[np.minimum(np.arange(first, first + CHUNK), n - 1)]
@@ -165,26 +169,15 @@ def search(spec: TuneSpec, screen: Any) -> Searched:
         started = time.perf_counter()
         result = jax.tree.map(np.asarray, executor.start(placed).wait())
         spent += time.perf_counter() - started
-        own = _rows(result.metrics, 0, count)
-        for k in range(min(CHUNK, n - first)):
-            found.append(_judged_one(spec, family, result, (1 + k) * count, count, own))
-    objective, limits, peaks, residual = (np.array(x) for x in zip(*found, strict=True))
+        metrics = jax.tree.map(split, result.metrics)
+        own, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
+        allowed = allowed_limits(merit, family, own_limits(merit, own))
+        judgement = all_judged(merit, others, own, allowed)
+        found.append((*map(np.asarray, judgement), first_residual(metrics)[1:]))
+    objective, limits, peaks, residual = (np.concatenate(x)[:n] for x in zip(*found, strict=True))
     spent -= executor.compile_time
     beyond, linear = np.full(n, np.inf), np.full(n, np.nan)
     kept = np.isfinite(objective) & (excess(limits) == 0)
     if kept.any():
         beyond[kept], linear[kept] = screen(values[kept])
     return Searched(objective, limits, peaks, beyond, linear, residual, spent, n * count)
-
-
-def _judged_one(
-    spec: TuneSpec, family: Family, result: Result, first: int, count: int, own: Metrics
-) -> tuple:
-    merit = merit_of(spec)
-    metrics = _rows(result.metrics, first, count)
-    allowed = allowed_limits(merit, family, own_limits(merit, own))
-    objective, limits, peaks = judged(merit, metrics, own, allowed)
-    residual = np.nan
-    if metrics.residual_rms is not None:
-        residual = float(np.sqrt(np.mean(np.asarray(metrics.residual_rms[0]) ** 2)))
-    return float(objective), np.asarray(limits), np.asarray(peaks), residual

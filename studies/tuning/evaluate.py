@@ -113,7 +113,7 @@ class Evaluator:
             np.where(self.is_free[:, None], limit_slope, 0.0),
             np.concatenate([found.peaks, np.full(beyond.shape, np.nan)], axis=1),
             codes[1:],
-            _residual(metrics)[1:],
+            first_residual(metrics)[1:],
         )
 
     def _check_own(self, codes: np.ndarray, metrics: Any) -> None:
@@ -141,7 +141,8 @@ def _layout(lanes: int) -> Layout:
     return Layout(whole.devices, -(-lanes // (whole.devices * block)), block)
 
 
-def _residual(metrics: Any) -> np.ndarray:
+def first_residual(metrics: Any) -> np.ndarray:
+    """Residual rms of all stations in the first scenario [m], (designs,); nan if not there."""
     rms = metrics.residual_rms
     if rms is None:
         return np.full(len(metrics.saturated_fraction), np.nan)
@@ -151,10 +152,9 @@ def _residual(metrics: Any) -> np.ndarray:
 def tuned_structure(spec: TuneSpec) -> Structure:
     """Program of all families and scenarios; whatever may be free is there."""
     found = [check_run(nominal(spec, family))[0] for family in (None, *spec.families)]
-    has_position = any("position_gain" in n or "poles" in n for n in spec.free.names)
     return build_structure(spec.study)._replace(
         metrics=merit_of(spec).metrics,
         substeps=max(one.substeps for one in found),
         has_noise=any(one.has_noise for one in found),
-        has_position_gain=has_position or any(one.has_position_gain for one in found),
+        has_position_gain=spec.has_position_gain,
     )

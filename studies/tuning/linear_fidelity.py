@@ -65,12 +65,9 @@ class LinearFidelity:
         self._spec, self.names = spec, spec.loop_limits
         own = nominal(spec, None)
         larger = with_margin_modes(own)
-        has_position = any("position_gain" in n or "poles" in n for n in spec.free.names)
-        structure = build_structure(larger)
-        self._structure = structure._replace(
-            n_frequencies=1, has_noise=False, metrics=(),
-            has_position_gain=structure.has_position_gain or has_position,
-        )  # fmt: skip
+        self._structure = build_structure(larger)._replace(
+            n_frequencies=1, has_noise=False, metrics=(), has_position_gain=spec.has_position_gain
+        )
         self._pose = np.array(own.motion.waypoints[0])
         known = {
             f.name: as_arrays(build_case(with_margin_modes(nominal(spec, f)))) for f in families
@@ -195,7 +192,7 @@ def _look(
     def one(x: Array) -> tuple[Array, Array]:
         placed = place(case, x)
         matrices = closed_loop(structure, placed, pose)
-        rms = linear_residual(structure, placed, matrices).rms
+        rms = linear_residual(structure, placed, matrices)
         excess = _excess(structure, names, placed, matrices, limits)
         return excess, jnp.sqrt(jnp.mean(rms**2))
 
@@ -225,7 +222,7 @@ def loop_figures(study: Study) -> LoopFigures:
     def poles(factor: float) -> np.ndarray:
         return np.linalg.eigvals(opened + factor * feedback)
 
-    rms = np.asarray(_residual(structure, case, matrices).rms)
+    rms = np.asarray(_residual(structure, case, matrices))
     return LoopFigures(
         gain_margin(poles),
         float(-np.log(np.abs(poles(1.0)).max()) / period),

@@ -95,6 +95,14 @@ def judged(
     return jnp.sum(-jnp.sort(-each) * weights), excess, jnp.max(peaks, axis=0)
 
 
+@partial(jax.jit, static_argnums=0)
+def all_judged(
+    merit: Merit, metrics: Metrics, own: Metrics, allowed: Array
+) -> tuple[Array, Array, Array]:
+    """`judged` for designs under the same limits, metrics (designs, S, ...)."""
+    return jax.vmap(lambda x: judged(merit, x, own, allowed))(metrics)
+
+
 class Slopes(NamedTuple):
     """Designs judged, with derivatives by the free numbers."""
 

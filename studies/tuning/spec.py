@@ -106,6 +106,14 @@ class TuneSpec(NamedTuple):
         return int(np.argmax([family.is_free.sum() for family in self.families]))
 
     @property
+    def has_position_gain(self) -> bool:
+        """Whether any design feeds back positions."""
+        if any("position_gain" in x for number in self.free.numbers for x in writes(number)):
+            return True
+        gains = [family.study(self.study).control.position_gain for family in self.families]
+        return bool(np.any([self.study.control.position_gain, *gains]))
+
+    @property
     def metric_limits(self) -> tuple[str, ...]:
         """Limits that runs are judged by."""
         return tuple(name for name in self.tune.limits if name not in LOOP_LIMITS)
