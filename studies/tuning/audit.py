@@ -16,6 +16,9 @@ from studies.tuning.spec import TuneSpec
 #: spoils the short one, and the long one may reach over a corner: an impulse of the shaper that
 #: passes a sampling instant, another sample or link that has the largest voltage.
 STEPS = (1e-3, 1e-4)
+#: Way from the study towards another point of the first place looked at. At the study itself every
+#: limit "own" is reached in all scenarios at once: a corner by construction.
+BESIDE = 1 / 16
 #: More disagreement than this fails the audit.
 ALLOWED = 1e-4
 #: Smaller derivatives than this share of the largest one count as if they had its size: what a
@@ -112,7 +115,7 @@ def _evaluated(spec: TuneSpec, evaluator: Evaluator, designs: np.ndarray) -> Eva
 
 
 def audit_places(spec: TuneSpec, count: int = 3) -> np.ndarray:
-    """The study itself and points spread over the bounds, those with the most stable loops.
+    """Beside the study itself and points spread over the bounds, those with the most stable loops.
 
     Args:
         spec: of the tuning.
@@ -120,9 +123,9 @@ def audit_places(spec: TuneSpec, count: int = 3) -> np.ndarray:
     """
     own, family = spec.free.places(), spec.families[spec.main]
     points = qmc.Sobol(len(own), rng=spec.tune.seed).random(16)
-    # towards the study, so that the points lie where a tuning goes
-    points = (own + np.where(family.is_free, points, own)) / 2
+    way = np.where(family.is_free, points - own, 0.0)
+    points = own + way / 2  # where a tuning goes
     values = np.where(family.is_free, spec.free.values(points), np.nan)
     excess, _ = LinearFidelity(spec, [family]).screen(0, values)
     order = np.argsort(np.maximum(excess, 0.0), kind="stable")
-    return np.concatenate([own[None], points[order[: count - 1]]])
+    return np.concatenate([own + BESIDE * way[order[:1]], points[order[: count - 1]]])
