@@ -41,11 +41,12 @@ def shown_name(name: str) -> str:
     return text if len(text) <= LONGEST else text[: LONGEST - 4] + " ..."
 
 
-def _text(value: object) -> str:
+def _text(value: object, depth: int = LONGEST) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, (tuple, list)):
-        return "[" + ", ".join(_text(entry) for entry in value) + "]"
+        # what is nested deeper than a text is long is not shown anyway
+        return "[" + ", ".join(_text(entry, depth - 1) for entry in value if depth) + "]"
     return repr(value) if isinstance(value, str) else str(value)
 
 

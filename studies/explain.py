@@ -15,6 +15,9 @@ _SIGNS = (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
 _WORDS = {bool: "true or false", str: "text", float: "a finite number", int: "a whole number"}
 _PLURALS = {bool: "values true or false", float: "finite numbers", str: "texts", dict: "tables"}
 
+#: Sections that make more than a study of a file; commands of the same name read them.
+COMMANDS = ("sweep", "tune")
+
 
 def unit_of(info: FieldInfo) -> str:
     """Unit of a field, "" where it has none."""
@@ -127,6 +130,8 @@ def _unknown(
         if name in getattr(info.annotation, "model_fields", ()):
             hint = f"did you mean {f'{section}.{name}'!r}?"
     where = f"in [{prefix.rstrip('.')}]" if prefix else "at the top"
+    if not prefix and name in COMMANDS:
+        hint = f"`studies {name}` reads that; a study alone has none"
     hint = hint or f"allowed {where}: {', '.join(model.model_fields)}"
     return StudyError(f"{shown_name(field)} = {shown(value)}: unknown field; {hint}")
 

@@ -15,6 +15,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from studies.store import replacing
+
 WITHOUT: dict[str, Any] = {"color": "#E69F00", "linewidth": 1.6, "label": "without control"}
 CONTROLLED: dict[str, Any] = {"color": "#0B3C6F", "linewidth": 0.8, "label": "with control"}
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000")
@@ -62,10 +64,12 @@ def legend_above(figure: Figure, ax: Axes) -> None:
 
 
 def save(figure: Figure, folder: Path, name: str) -> None:
-    """Write the figure as PNG and PDF."""
-    figure.savefig(folder / f"{name}.png")
+    """Write the figure as PNG and PDF, each whole or not at all; StudyError where it cannot be."""
+    with replacing(folder / f"{name}.png") as temporary:
+        figure.savefig(temporary, format="png")
     figure.set_layout_engine("none")  # keeps what has been laid out, which takes half a second
-    figure.savefig(folder / f"{name}.pdf")
+    with replacing(folder / f"{name}.pdf") as temporary:
+        figure.savefig(temporary, format="pdf")
 
 
 def _axes(ax: Axes | None) -> Axes:

@@ -6,9 +6,16 @@ same programs, compiled in a third of the time.
 
 import os
 
+import jaxlib
+
 from studies.config import configure
 
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
+FLAGS = "--xla_backend_optimization_level=0"
+if jaxlib.__version__.startswith(
+    "0.10."
+):  # unknown flags stop XLA, so elsewhere compiling is slower
+    FLAGS += " --xla_cpu_use_fusion_emitters=false"
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FLAGS}"
 configure()
 # tables as wide as they need to be, wherever the tests run
 os.environ["COLUMNS"] = "240"

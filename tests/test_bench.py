@@ -16,7 +16,9 @@ KEYS = "work executor configs_per_s compile_s peak_mib device dtype batch steps 
 
 @pytest.fixture(scope="module")
 def work():
-    return peers.make_work(is_short=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(WORKS["W0"], "link__modes", 3)
+        return peers.make_work(is_short=True)
 
 
 def check_agreement(rms, work):

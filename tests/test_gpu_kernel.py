@@ -84,6 +84,7 @@ def test_gpu_executor_equals_the_traced_kernel(name, monkeypatch):
     assert rms.min() > 0 and rms.max() > 1.001 * rms.min()
 
 
+@pytest.mark.long
 def test_wrong_results_are_noticed(monkeypatch):
     """A kernel that is off by a thousandth is not believed."""
 

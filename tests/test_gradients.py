@@ -53,25 +53,34 @@ def point():
     return np.random.default_rng(1).uniform(0.5, 1.5, 15)
 
 
-def test_forward_reverse_and_central_differences_agree(objective, reverse, point):
-    backward = np.asarray(reverse(np.stack([point, point])))[1]
-    directions = jnp.eye(15)
-
-    @jax.jit
-    def forward_and_values(x, steps):
-        push = jax.vmap(lambda d: jax.jvp(objective, (x,), (d,))[1])
-        return push(directions), jax.lax.map(objective, x + steps, batch_size=15)
-
+@pytest.fixture(scope="module")
+def central(objective, point):
+    """Central differences of fourth order, and the scale to judge by."""
     step = 1e-4
     steps = np.concatenate([k * step * np.eye(15) for k in (-2, -1, 1, 2)])
-    forward, value = jax.tree.map(np.asarray, forward_and_values(jnp.asarray(point), steps))
+    value = np.asarray(jax.jit(lambda x: jax.lax.map(objective, x, batch_size=15))(point + steps))
     value = value.reshape(4, 15)
-    central = (value[0] - 8 * value[1] + 8 * value[2] - value[3]) / (12 * step)  # 4th order
-    scale = np.maximum(np.abs(central), 1e-3 * np.abs(central).max())
-    assert np.max(np.abs(backward - forward) / scale) < 1e-8
-    assert np.max(np.abs(forward - central) / scale) < 1e-5
+    found = (value[0] - 8 * value[1] + 8 * value[2] - value[3]) / (12 * step)
     # each kind of parameter matters, so that agreement is not of zeros
-    assert np.all(np.abs(central).reshape(5, 3).max(axis=1) > 1e-6 * np.abs(central).max())
+    assert np.all(np.abs(found).reshape(5, 3).max(axis=1) > 1e-6 * np.abs(found).max())
+    return found, np.maximum(np.abs(found), 1e-3 * np.abs(found).max())
+
+
+def test_reverse_and_central_differences_agree(reverse, central, point):
+    backward = np.asarray(reverse(np.stack([point, point])))[1]
+    found, scale = central
+    assert np.max(np.abs(backward - found) / scale) < 1e-5
+
+
+@pytest.mark.long  # in short: derivatives by the kernel are those of `jax.jvp`, in test_tangents
+def test_forward_and_reverse_agree(objective, reverse, point, central):
+    backward = np.asarray(reverse(np.stack([point, point])))[1]
+
+    @jax.jit
+    def push(x):
+        return jax.vmap(lambda d: jax.jvp(objective, (x,), (d,))[1])(jnp.eye(15))
+
+    assert np.max(np.abs(backward - np.asarray(push(point))) / central[1]) < 1e-8
 
 
 def test_bad_case_leaves_gradients_of_others_alone(reverse, point):

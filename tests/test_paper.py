@@ -20,7 +20,7 @@ from studies.spec import paper_study
 from studies.store import read_store
 
 #: Figures that are written; the others are only drawn.
-FIGURES = ("fig03", "fig14", "shapers")
+FIGURES = ("fig03", "shapers")
 #: Cases left out of the short run: more compilations, or seconds of eigenvalues each.
 LONG = ("ideal", "paper-gains-own-ratios", "paper-ratios", "paper-preset", "difference")
 

@@ -1,213 +1,29 @@
 """Free numbers of a tuning, its objective and limits, and their derivatives."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
-from rich.console import Console
 
 from jaxmodel.sampled_loop import summed_squares
 from jaxmodel.shaper import Impulses, residual_vibration, zv
-from studies import cli
-from studies import spec as spec_module
-from studies.cases import as_arrays, build_case
 from studies.errors import StudyError
 from studies.runs import run_study
-from studies.spec import load_study, paper_study, parse_study, read_toml
-from studies.store import read_store
-from studies.sweeps.axes import Range, set_value
-from studies.sweeps.results import load
-from studies.sweeps.run import run_sweep
-from studies.sweeps.spec import parse_sweep
+from studies.spec import paper_study
+from studies.sweeps.axes import Range
 from studies.tuning import linear_fidelity
 from studies.tuning.check import tuned_study
 from studies.tuning.evaluate import Evaluation
+from studies.tuning.folder import load_progress, save_progress
 from studies.tuning.free import Free, FreeNumbers
 from studies.tuning.linear_fidelity import loop_figures
-from studies.tuning.merit import tail_weights
 from studies.tuning.optimise import advance, begin, optimise, start_families
 from studies.tuning.report import unkept
-from studies.tuning.run import load_progress, make_evaluator, run_tuning, save_progress
+from studies.tuning.run import make_evaluator
 from studies.tuning.scenarios import scenario_columns
-from studies.tuning.spec import Family, Tune, TuneSpec, load_tuning, parse_tuning
-
-HOME = list(paper_study().motion.waypoints[0])
-SMALL = {
-    "run": {"duration": 0.06},
-    "link": {"modes": 2},
-    "control": {"modes": 2, "ratios": [[1.0, 0.3]] * 3},
-    "motion": {"waypoints": [HOME, [0.0, 0.01, HOME[2]]], "move_time": 0.03},
-    "shaper": {"kind": "none"},
-    "metrics": {"residual_delay": 0.002, "residual_length": 0.015},
-}
-
-
-def tuning(free, **tune):
-    """A tuning of a small machine."""
-    return parse_tuning({**SMALL, "tune": {"free": free, **tune}})
-
-
-GAIN = {"control.gain_factor": {"from": 0.05, "to": 2.0, "scale": "log"}}
-EVERY_KIND = {
-    **GAIN,
-    "control.velocity_gain": {"from": 1.0, "to": 100.0, "scale": "log"},
-    "control.ratios[1]": {"from": 0.0, "to": 2.0},
-    "electronics.lowpass_ratio[0]": {"from": 1.0, "to": 5.0},
-    "electronics.highpass_hz": {"from": 20.0, "to": 100.0},
-    "shaper.tolerance": {"from": 0.01, "to": 0.2},
-    "drive.kp": {"from": 1e4, "to": 4e4},
-    "patches.centers[1]": {"from": 0.08, "to": 0.12},
-    "machine.platform_mass": {"from": 0.1, "to": 0.4},
-}
-
-
-# --- free numbers ---------------------------------------------------------------------------------
-
-
-def test_free_numbers_get_to_where_the_study_would_put_them():
-    """Placed into a case they give what a study file with these values gives."""
-    spec = tuning(EVERY_KIND)
-    values = spec.free.values(np.random.default_rng(0).uniform(0.2, 0.8, len(spec.free.names)))
-    study = spec.study
-    for name, value in zip(spec.free.names, values, strict=True):
-        study = parse_study(set_value(study, name, float(value)))
-    placed = spec.free.place(as_arrays(build_case(spec.study)), values)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13),
-        placed, as_arrays(build_case(study)),
-    )  # fmt: skip
-    assert len(values) == 1 + 3 + 2 + 6
-
-
-def test_the_start_is_the_study_itself():
-    spec = tuning(EVERY_KIND)
-    values = dict(zip(spec.free.names, spec.free.values(spec.free.places()), strict=True))
-    assert values["control.gain_factor"] == pytest.approx(spec.study.control.gain_factor)
-    assert values["control.ratios[1][1]"] == pytest.approx(0.3)
-    assert values["drive.kp"] == pytest.approx(2e4)
-
-
-def test_slopes_are_those_of_the_values():
-    spec = tuning(EVERY_KIND)
-    u, step = np.random.default_rng(1).uniform(0.2, 0.8, len(spec.free.names)), 1e-6
-    change = (spec.free.values(u + step) - spec.free.values(u - step)) / (2 * step)
-    np.testing.assert_allclose(spec.free.slopes(u), change, rtol=1e-6)
-
-
-@pytest.mark.parametrize("kind", ["same", "per_link"])
-def test_patches_stay_on_the_link_and_apart(kind):
-    spec = tuning({"placement": {"kind": kind}})
-    case = as_arrays(build_case(spec.study))
-    start = spec.free.place(case, spec.free.values(spec.free.places())).machine.patches.center
-    np.testing.assert_allclose(start, case.machine.patches.center, atol=1e-12)
-    pitch, length = 0.03, 0.2
-    random = np.random.default_rng(0)
-    corners = (np.zeros(len(spec.free.names)), np.ones(len(spec.free.names)))
-    for u in [*corners, *random.uniform(size=(50, len(spec.free.names)))]:
-        center = np.asarray(spec.free.place(case, spec.free.values(u)).machine.patches.center)
-        assert center.shape == (3, 3)
-        assert center.min() >= pitch / 2 - 1e-12 and center.max() <= length - pitch / 2 + 1e-12
-        assert np.diff(center, axis=1).min() >= pitch - 1e-12
-
-
-def test_poles_become_gains():
-    """(22)-(23): k_d = 2 alpha, k_p = alpha^2 + beta^2 - omega^2 with omega of the bare link."""
-    data = {**SMALL, "control": {**SMALL["control"], "gain_unit": "1/s"}}
-    free = {
-        "poles.decay": {"from": 5.0, "to": 50.0},
-        "poles.frequency_hz": {"from": 80.0, "to": 200.0},
-    }
-    spec = parse_tuning({**data, "tune": {"free": free}})
-    values = np.array([10.0, 20.0, 30.0, 100.0, 110.0, 120.0])
-    control = spec.free.place(as_arrays(build_case(spec.study)), values).control
-    np.testing.assert_allclose(control.velocity_gain, 2 * values[:3])
-    link = spec.study.link
-    inertia = link.width * link.thickness**3 / 12
-    mass = link.density * link.width * link.thickness
-    omega = (np.pi / link.length) ** 2 * np.sqrt(link.youngs_modulus * inertia / mass)
-    wanted = values[:3] ** 2 + (2 * np.pi * values[3:]) ** 2 - omega**2
-    np.testing.assert_allclose(control.position_gain, wanted, rtol=1e-9)
-
-
-def test_what_is_no_number_stays_as_it_is():
-    free = {**EVERY_KIND, "placement": {"kind": "same"}}
-    del free["patches.centers[1]"]
-    spec = tuning(free)
-    case = as_arrays(build_case(spec.study))
-    kept = spec.free.place(case, np.full(len(spec.free.names), np.nan))
-    jax.tree.map(np.testing.assert_array_equal, kept, case)
-
-
-EACH = {"each": {"motion.move_time": [0.03, 0.035]}}
-BOTH = {"gains": {"free": ["control.gain_factor"]}, "all": {}}
-
-
-@pytest.mark.parametrize(
-    ("tune", "message"),
-    [
-        ({}, "tune.free = .*: allowed one free field or more"),
-        ({"free": {"control.gainfactor": {}}}, "did you mean 'control.gain_factor'"),
-        ({"free": {"run.duration": {"from": 0.1, "to": 1.0}}}, "cannot be free; fields that can"),
-        ({"free": {"control.gain_factor": {"from": 0.6, "to": 2.0}}},
-         "control.gain_factor = 0.5: allowed 0.6 to 2, the bounds"),
-        ({"free": {"control.gain_factor": {"from": -1.0, "to": 2.0}}}, "a finite number >= 0"),
-        ({"free": {"control.gain_factor": {"from": 2.0, "to": 1.0}}}, "= 1.0: allowed more than"),
-        ({"free": {"poles.decay": {"from": 1.0, "to": 2.0}}}, "needs poles.frequency_hz beside it"),
-        ({"free": {**GAIN, "control.velocity_gain": {"from": 1.0, "to": 100.0},
-                   "control.velocity_gain[0]": {"from": 1.0, "to": 100.0}}}, "free twice"),
-        ({"free": {"placement": {"from": 0, "to": 1}}}, "allowed {kind = 'same'}"),
-        ({"free": GAIN, "objective": {"residual": 1.0}}, "did you mean 'residual_rms'"),
-        ({"free": GAIN, "objective": {"residual_rms": -1.0}}, "allowed a number > 0"),
-        ({"free": GAIN, "objective": {"gain_margin": 1.0}}, "'gain_margin' is no metric"),
-        ({"free": GAIN, "limits": {"peak_volt": 1.0}}, "did you mean 'peak_voltage'"),
-        ({"free": GAIN, "objective": {"residual_rms[3]": 1.0}},
-         r"has no such entry; allowed residual_rms\[0 to 2\]\[0 to 2\]"),
-        ({"free": GAIN, "objective": {"settling_time": 1.0}}, "no derivative; take ringing_time"),
-        ({"free": GAIN, "limits": {"gain_margin[0]": 2.0}}, "no such entry; allowed gain_margin"),
-        ({"free": GAIN, "limits": {"peak_voltage": "mine"}}, "> 0 and <= 1e\\+30 or 'own'"),
-        ({"free": GAIN, "limits": {"peak_voltage": 40.0, "peak_voltage[1]": 50.0}},
-         r"peak_voltage\[1\] = 50 allows more than peak_voltage = 40"),
-        ({"free": GAIN, "scenarios": {"spread": {"link.basis": 5.0}}}, "for a number"),
-        ({"free": GAIN, "scenarios": {"spread": {"electronics.adc_noise": 5.0}}}, "not 0 where"),
-        ({"free": GAIN, "scenarios": {"each": {"motion.move_time": 0.03}}}, "a list of values"),
-        ({"free": GAIN, "scenarios": {"each": {"motion.move_time": [-1.0]}}}, "move_time = -1.0"),
-        ({"free": GAIN, "scenarios": {"tail": 2.0}}, "tune.scenarios.tail = 2.0: allowed"),
-        ({"free": GAIN, "families": {"one": {"free": ["control.gainfactor"]}}},
-         "did you mean 'control.gain_factor'"),
-        ({"free": GAIN, "families": {"one": {"free": []}}}, "one with free numbers or more"),
-        ({"free": GAIN, "families": {"one": {"set": {"link.modes": 3}}}}, "n_modes = 3 where"),
-        ({"free": GAIN, "families": {"one": {"set": {"motion.move_time": 0.06}}}},
-         "tune.families.one: .* run.duration"),
-        ({"free": GAIN, "families": {"..": {}}}, "with a letter or digit"),
-        ({"free": GAIN, "families": {"one": {"sets": {}}}}, "allowed {free = "),
-        ({"free": GAIN, "pareto": {"limit": "peak_voltage", "values": [1.0, 2.0]}},
-         "tune.pareto.limit = 'peak_voltage': allowed one of tune.limits"),
-        ({"free": GAIN, "limits": {"peak_voltage": 50.0},
-          "pareto": {"limit": "peak_voltage", "values": [1.0]}}, "two limits or more"),
-        ({"free": GAIN, "limits": {"peak_voltage": 50.0},
-          "pareto": {"limit": "peak_voltage", "values": [1.0, 1.0]}}, "each limit once"),
-        ({"free": GAIN, "scenarios": {"each": {"link.youngs_modulus": [7e10]},
-                                      "spread": {"link.youngs_modulus": 5.0}}}, "both in spread"),
-        ({"free": GAIN, "scenarios": {"each": {"control.gain_factor": [0.5]}}}, "is free in fam"),
-        ({"free": GAIN, "families": {"one": {"set": {"control.gain_factor": 1.0}}}},
-         "tune.families.one.set: control.gain_factor is free in family 'one'"),
-        ({"free": GAIN, "starts_": 3}, "starts_"),
-    ],
-)  # fmt: skip
-def test_faults_are_named(tune, message):
-    with pytest.raises(StudyError, match=message):
-        parse_tuning({**SMALL, "tune": tune})
-
-
-@pytest.mark.parametrize(
-    ("tail", "weights"),
-    [(1.0, [0.25] * 4), (0.0, [1, 0, 0, 0]), (0.5, [0.5, 0.5, 0, 0]), (0.3, [5 / 6, 1 / 6, 0, 0])],
-)
-def test_tail_goes_from_the_mean_to_the_worst(tail, weights):
-    np.testing.assert_allclose(tail_weights(4, tail), weights)
-
+from studies.tuning.spec import Family, Tune, TuneSpec
+from tests.tunings import EACH, EVERY_KIND, GAIN, tuning
 
 # --- objective and limits -------------------------------------------------------------------------
 
@@ -299,7 +115,7 @@ def test_figures_can_be_recomputed_from_runs(evaluated):
             np.sqrt(np.mean(getattr(after, name) ** 2) / np.mean(getattr(before, name) ** 2))
             for name in ("residual_rms", "control_energy")
         ]
-        objective.append(shares[0] + 0.1 * shares[1])
+        objective.append((shares[0] + 0.1 * shares[1]) / 1.1)
         excess.append(after.peak_voltage.max() / before.peak_voltage.max() - 1)
     assert len(set(objective)) == 4
     np.testing.assert_allclose(part.objective[0], np.mean(objective), rtol=1e-7)
@@ -338,7 +154,7 @@ def test_tuning_goes_downhill_within_limits(judged, tuned):
     for family in (0, 1):
         k = end.winner(family)
         assert end.best_limits[k].max() <= 1e-3
-        assert end.best_objective[k] < 0.97 * sum(JUDGED["objective"].values())
+        assert end.best_objective[k] < 0.97
     assert np.all((end.best_place >= 0) & (end.best_place <= 1))
     still = ~spec.moving[0].is_free
     own = np.broadcast_to(spec.free.places()[still], (STARTS, still.sum()))
@@ -530,92 +346,3 @@ def test_designs_are_handed_on_along_a_front():
     handed = optimise(spec, evaluator, at._replace(place=better), lambda at: None)
     assert abs(spec.free.values(alone.best_place)[alone.winner(1), 0] - 0.23) < 0.02
     assert abs(spec.free.values(handed.best_place)[handed.winner(1), 0] - 0.678) < 0.02
-
-
-FILE = """
-run = { duration = 0.06 }
-link = { modes = 2 }
-control = { modes = 2, ratios = [[1.0, 0.3], [1.0, 0.3], [1.0, 0.3]] }
-shaper = { kind = "none" }
-metrics = { residual_delay = 0.002, residual_length = 0.02 }
-
-[motion]
-waypoints = [[0.0, 0.0, 0.5235987755982988], [0.0, 0.01, 0.5235987755982988]]
-move_time = 0.03
-
-[tune]
-starts = 2
-iterations = 3
-samples = 20
-limits = { peak_voltage = "own", gain_margin = 1.0 }
-pareto = { limit = "peak_voltage", values = [20.0, 40.0], family = "all" }
-scenarios = { count = 2, check = 3, spread = { "link.youngs_modulus" = 5.0 } }
-
-[tune.free]
-"control.gain_factor" = { from = 0.05, to = 2.0, scale = "log" }
-placement = { kind = "same" }
-
-[tune.families]
-gains = { free = ["control.gain_factor"] }
-all = {}
-loud = { free = [], set = { "control.gain_factor" = 1.0 } }
-"""
-
-
-@pytest.mark.long
-def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
-    file, out = tmp_path / "t.toml", tmp_path / "out"
-    file.write_text(FILE)
-    cli.main(["tune", str(file), "--out", str(out)])
-    text = (out / "report.md").read_text()
-    for part in ("| gains |", "| loud |", "| all, peak_voltage 20 |", "worst disagreement is",
-                 "Sobol designs of all", "rank correlation"):  # fmt: skip
-        assert part in text
-    for name in ("descent", "gains", "front"):
-        assert (out / f"{name}.png").stat().st_size > 10_000
-    tuned = load_study(out / "tuned_gains.toml")
-    assert tuned.control.gain_factor != paper_study().control.gain_factor
-    before, _ = read_store(out / "tune.h5")
-    cli.main(["tune", str(file), "--out", str(out), "--resume", "--quiet"])
-    after, _ = read_store(out / "tune.h5")
-    assert set(before) == set(after)
-    for name, variable in before.items():
-        np.testing.assert_array_equal(variable.data, after[name].data, err_msg=name)
-    for more, message in (([], "holds a tuning already"), (["--audit"], "")):
-        code = 0
-        try:
-            cli.main(["tune", str(file), "--out", str(out), *more])
-        except SystemExit as end:
-            code = end.code
-        said = capsys.readouterr()
-        assert (code, message in said.err) == ((2, True) if message else (0, True))
-    file.write_text(FILE.replace("iterations = 3", "iterations = 4"))
-    with pytest.raises(SystemExit, match="2"):
-        cli.main(["tune", str(file), "--out", str(out), "--resume"])
-    assert "another tuning file" in capsys.readouterr().err
-
-
-@pytest.mark.long
-def test_placement_by_gradient_is_as_good_as_the_sweep_in_a_fiftieth_of_its_runs(tmp_path):
-    """The ready sweep's 4,096 placements on the move of `tune_placement`, both as they are run."""
-    specs = Path(spec_module.__file__).parent / "specs"
-    spec = load_tuning(specs / "tune_placement.toml")
-    asked = {**spec.data, "sweep": read_toml(specs / "placement.toml")["sweep"]}
-    del asked["tune"]
-    swept = run_sweep(parse_sweep(asked), tmp_path / "sweep", is_quiet=True)
-    data = load(tmp_path / "sweep")
-    residual = np.sqrt(np.mean(data["residual_rms"] ** 2, axis=(1, 2)))
-    best = np.min(residual[data["status"] == 0])
-    found = run_tuning(spec, tmp_path / "tune", False, Console(quiet=True), True)
-    tuned = load_study(tmp_path / "tune" / "tuned.toml")
-    result = run_study(tuned, has_record=False).result
-    own = np.sqrt(np.mean(result.metrics.residual_rms**2))
-    differentiated = int(found.at.iteration) * (1 + spec.tune.starts)
-    assert result.status == 0 and own <= best
-    # what each costs is measured where compilers do their best: docs/tuning.md
-    assert swept.n_run == len(residual) == 4096 and differentiated <= 4096 // 50
-
-
-def test_ready_tunings_are_valid():
-    for path in sorted(Path(spec_module.__file__).parent.glob("specs/tune*.toml")):
-        assert len(load_tuning(path).free.names) > 1

@@ -180,11 +180,12 @@ def case_variables(table: Table) -> dict[str, Variable]:
         dims = _LIST_AXES.get(field, ())[-(array.ndim - 1) :] if array.ndim > 1 else ()
         if len(dims) != array.ndim - 1:
             dims = tuple(f"{variable_name(name)}_{k}" for k in range(1, array.ndim))
-        variables[variable_name(name)] = Variable(array, (*axis, *dims), _unit(field), name)
+        variables[variable_name(name)] = Variable(array, (*axis, *dims), field_unit(field), name)
     return variables
 
 
-def _unit(field: str) -> str:
+def field_unit(field: str) -> str:
+    """Unit of a field of a study, "1" for none."""
     section, _, leaf = field.partition(".")
     if not leaf:
         return "1"

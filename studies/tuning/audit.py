@@ -12,9 +12,11 @@ from studies.tuning.linear_fidelity import LinearFidelity
 from studies.tuning.optimise import start_families
 from studies.tuning.spec import TuneSpec
 
-#: Steps between the bounds, 0 to 1, of differences of fourth order; the nearer one counts. Rounding
-#: spoils the short one, and the long one may reach over a corner: an impulse of the shaper that
-#: passes a sampling instant, another sample or link that has the largest voltage.
+#: Steps between the bounds, 0 to 1, of differences of fourth order. Rounding spoils the short one,
+#: and the long one may reach over a corner: an impulse of the shaper that passes a sampling
+#: instant, another sample or link that has the largest voltage, another slowest motion.
+#: Where a corner is nearer still, the differences to one side of it, of second order, are right.
+#: The nearest of the four counts.
 STEPS = (1e-3, 1e-4)
 #: Way from the study towards another point of the first place looked at. At the study itself every
 #: limit "own" is reached in all scenarios at once: a corner by construction.
@@ -24,10 +26,13 @@ ALLOWED = 1e-4
 #: Smaller derivatives than this share of the largest one count as if they had its size: what a
 #: difference can resolve.
 SMALLEST = 1e-3
-
-
 #: Smaller ones than this share of the figure itself are rounding.
 NOTHING = 1e-7
+#: What a disagreement is, for a reader.
+MEANING = (
+    "Derivatives along the way from bound to bound. A disagreement is a share of the larger of the "
+    f"two, or of {SMALLEST:g} of the figure's largest derivative where both are smaller."
+)
 
 
 class Disagreement(NamedTuple):
@@ -35,6 +40,7 @@ class Disagreement(NamedTuple):
 
     name: str
     family: str
+    place: int  # which of the designs that were looked at
     figure: str  # "objective", or the limit
     derivative: float  # as a share of the bounds
     difference: float
@@ -65,10 +71,10 @@ def audit(spec: TuneSpec, places: np.ndarray) -> list[Disagreement]:
         share = np.where(np.isfinite(a - b), np.abs(a - b) / size, np.inf)
         for k, number in enumerate(numbers):
             n, m = np.unravel_index(np.argmax(share[..., k]), share.shape[:2])
-            found = float(a[n, m, k]), float(b[n, m, k]), float(share[n, m, k])
-            figure = ("objective", *spec.limit_names)[m]
-            family = spec.moving[position].name
-            worst[number] = Disagreement(spec.free.names[number], family, figure, *found)
+            worst[number] = Disagreement(
+                spec.free.names[number], spec.moving[position].name, int(n),
+                ("objective", *spec.limit_names)[m], *(float(x[n, m, k]) for x in (a, b, share)),
+            )  # fmt: skip
     return [worst[number] for number in sorted(worst)]
 
 
@@ -96,10 +102,13 @@ def _compared(
     values = np.concatenate([found.objective[:, None], found.limits], axis=1)
     slopes = np.concatenate([found.slope[:, None], found.limit_slope], axis=1)[0]
     slopes = (slopes * spec.free.slopes(place))[:, numbers]
-    differences = []
+    differences: list[np.ndarray] = []
     for step, part in zip(STEPS, np.split(values[1:], len(STEPS)), strict=True):
         a, b, c, d = part.reshape(4, len(numbers), -1)
         differences.append(((a - 8 * b + 8 * c - d) / (12 * step)).T)
+    here = values[0]
+    differences.append(((a - 4 * b + 3 * here) / (2 * step)).T)
+    differences.append(((4 * c - d - 3 * here) / (2 * step)).T)
     nearest = np.argmin(np.abs(np.array(differences) - slopes), axis=0)
     return slopes, np.take_along_axis(np.array(differences), nearest[None], axis=0)[0]
 

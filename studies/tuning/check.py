@@ -58,7 +58,7 @@ class Searched(NamedTuple):
     #: other limits are not kept, (n,)
     linear: np.ndarray  # linear residual vibration, nan there [m], (n,)
     residual: np.ndarray  # that of the first scenario's run, nan where not judged by it [m], (n,)
-    time: float  # of the runs alone [s]
+    run_time: float  # of one run, among those of a whole chunk [s]
     runs: int
 
 
@@ -93,6 +93,25 @@ def tuned_study(spec: TuneSpec, family: Family, values: np.ndarray) -> Study:
     return parse_study(data)
 
 
+def patch_centers(spec: TuneSpec, family: Family, values: np.ndarray) -> np.ndarray:
+    """Where the patches of a design are [m], (3, patches).
+
+    Args:
+        spec: of the tuning.
+        family: of the design.
+        values: of the free numbers, (p,).
+    """
+    case: Case = as_arrays(build_case(family.study(spec.study)))
+    placed = spec.free.place(case, np.where(family.is_free, values, np.nan))
+    return np.asarray(placed.machine.patches.center)
+
+
+def fresh_columns(spec: TuneSpec) -> dict[str, np.ndarray]:
+    """Scenarios that the tuning has not seen."""
+    scenarios = spec.tune.scenarios
+    return scenario_columns(spec, scenarios.check, scenarios.seed + 1, is_fresh=True)
+
+
 def judge(spec: TuneSpec, designs: list[Study]) -> list[Judged]:
     """Run designs on scenarios that the tuning has not seen.
 
@@ -100,7 +119,7 @@ def judge(spec: TuneSpec, designs: list[Study]) -> list[Judged]:
         spec: of the tuning.
         designs: studies that differ from the tuning's own in numbers only; its own comes first.
     """
-    columns = scenario_columns(spec, spec.tune.scenarios.check, spec.tune.scenarios.seed + 1)
+    columns = fresh_columns(spec)
     count, merit, structure = len(columns["run.seed"]), merit_of(spec), tuned_structure(spec)
     parts = [build_cases(study, columns, structure) for study in designs]
 
@@ -180,4 +199,5 @@ def search(spec: TuneSpec, screen: Any) -> Searched:
     kept = np.isfinite(objective) & (excess(limits) == 0)
     if kept.any():
         beyond[kept], linear[kept] = screen(values[kept])
-    return Searched(objective, limits, peaks, beyond, linear, residual, spent, n * count)
+    run_time = spent / (-(-n // CHUNK) * count * (1 + CHUNK))
+    return Searched(objective, limits, peaks, beyond, linear, residual, run_time, n * count)

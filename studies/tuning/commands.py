@@ -34,6 +34,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.tuning.run import REPORT, run_tuning
 
         asked = load_tuning(ready_spec(spec))
+        if audit and (out or resume or quiet):
+            raise StudyError("--audit: writes nothing; leave --out, --resume and --quiet out")
         if audit:
             _audit(asked, console)
             return
@@ -44,16 +46,21 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
 
 def _audit(spec: TuneSpec, console: Console) -> None:
-    from studies.tuning.audit import ALLOWED, audit, audit_places
+    from studies.tuning.audit import ALLOWED, MEANING, audit, audit_places
 
-    names = "free number", "family", "worst for", "derivative", "difference", "disagreement"
-    table, found = Table(*names), audit(spec, audit_places(spec))
+    places = audit_places(spec)
+    console.print(f"comparing derivatives with differences at {len(places)} designs")
+    names = "free number", "family", "worst for", "at", "derivative", "difference", "disagreement"
+    table, found = Table(*names), audit(spec, places)
     for one in found:
         table.add_row(
-            one.name, one.family, one.figure, f"{one.derivative:.6g}", f"{one.difference:.6g}",
-            f"{one.share:.1e}",
+            one.name, one.family, one.figure, f"{one.place + 1}", f"{one.derivative:.6g}",
+            f"{one.difference:.6g}", f"{one.share:.1e}",
         )  # fmt: skip
     console.print(table)
-    if max(one.share for one in found) > ALLOWED:
-        console.print(f"disagreement above {ALLOWED:g}")
+    console.print(f"Design 1 lies beside the study. {MEANING}", soft_wrap=True)
+    worst = max(one.share for one in found)
+    is_fine = worst <= ALLOWED
+    console.print(f"worst: {worst:.1e}, {'below' if is_fine else 'above'} {ALLOWED:g}")
+    if not is_fine:
         sys.exit(1)

@@ -22,9 +22,9 @@ from studies.runs import check_run
 from studies.sweeps.gradients import make_gradients
 from studies.sweeps.plan import Layout, even_layout, lane_unit
 from studies.tuning.linear_fidelity import LinearFidelity
-from studies.tuning.merit import allowed_limits, judged_slopes, merit_of, own_limits, size
+from studies.tuning.merit import allowed_limits, judged_slopes, largest, merit_of, own_limits, size
 from studies.tuning.scenarios import lane_columns, nominal, scenario_columns
-from studies.tuning.spec import Family, TuneSpec
+from studies.tuning.spec import OWN, Family, TuneSpec
 
 
 class Evaluation(NamedTuple):
@@ -57,15 +57,16 @@ class Evaluator:
         self._structure = tuned_structure(spec)._replace(is_smooth=True, has_noise=True)
         columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)
         self.scenarios = len(columns["run.seed"])
-        self._lanes = self.scenarios * (1 + len(families))
-        self._layout = _layout(self._lanes)
-        rows = np.minimum(np.arange(self._layout.size), self._lanes - 1)
+        self.lanes = self.scenarios * (1 + len(families))  # runs of a batch
+        self._layout = _layout(self.lanes)
+        rows = np.minimum(np.arange(self._layout.size), self.lanes - 1)
         whole = lane_columns(spec, columns, [None, *families])
         study = spec.study.change(run__smooth=True)
         padded = {name: column[rows] for name, column in whole.items()}
         self._cases = in_working_precision(build_cases(study, padded, self._structure))
         self._rows = rows // self.scenarios  # design of every lane, the study itself first
-        self.runs, self.run_time = 0, float("nan")  # how many, and what one of the last took [s]
+        self.run_time = float("nan")  # what one of the last batch took [s]
+        self._is_compiled = False
         self._gradients = make_gradients(self._structure, self._layout, spec.free.place)
 
     def evaluate(self, values: np.ndarray, has_slope: np.ndarray | bool = True) -> Evaluation:
@@ -83,13 +84,13 @@ class Evaluator:
         wanted = np.isfinite(values) & np.reshape(has_slope, (-1, 1))
         used = np.concatenate([np.zeros(own.shape, bool), wanted])[self._rows]
         runs = self._gradients.evaluate(self._cases, whole, used)
-        if self.runs:  # the first one compiles
-            self.run_time = (time.perf_counter() - started) / self._lanes
-        self.runs += self._lanes
+        if self._is_compiled:
+            self.run_time = (time.perf_counter() - started) / self.lanes
+        self._is_compiled = True
         shape = (1 + len(values), self.scenarios)
 
         def split(x: Any) -> np.ndarray:
-            return np.asarray(x)[: self._lanes].reshape(shape + np.shape(x)[1:])
+            return np.asarray(x)[: self.lanes].reshape(shape + np.shape(x)[1:])
 
         metrics, slopes = (
             jax.tree.map(split, part) for part in (runs.result.metrics, runs.metrics)
@@ -129,6 +130,13 @@ class Evaluator:
                 raise StudyError(
                     f"tune.objective: {name} is 0 in a run of the study itself, so nothing can be "
                     "measured against it; limit it instead"
+                )
+        wanted = {name for one in self.families for name, x in one.limits.items() if x == OWN}
+        for name in wanted & set(self.merit.limits):
+            if (np.asarray(largest(metrics, name)) <= 0).any():
+                raise StudyError(
+                    f"tune.limits.{name} = 'own': the study itself has 0 in a run, of which "
+                    "nothing is a share; give a number"
                 )
 
 

@@ -66,6 +66,9 @@ LEAVES: dict[str, Leaf] = {
 POLES = ("poles.decay", "poles.frequency_hz")
 PLACEMENT = "placement"
 PLACEMENTS = ("same", "per_link")
+#: Fields that a ready-made free number decides, or takes for granted.
+_GAINS = ("control.velocity_gain", "control.position_gain")
+DECIDED = {PLACEMENT: ("patches.", "link.length"), POLES[0]: _GAINS, POLES[1]: _GAINS}
 
 
 class Free(NamedTuple):
@@ -157,12 +160,20 @@ def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
             added, put = _plain(name, bounds, study, path)
         numbers += added
         places.append(partial(_part, put, first, first + len(added)))
-    seen: set[str] = set()
-    for number in numbers:
-        if number.name in seen:
-            raise StudyError(f"tune.free.{number.name}: free twice")
-        seen.add(number.name)
+    _check_twice(numbers)
     return FreeNumbers(tuple(numbers), partial(_place_all, tuple(places)))
+
+
+def _check_twice(numbers: list[Free]) -> None:
+    """Nothing may be moved by two, nor what a ready-made one takes for granted."""
+    names = [number.name for number in numbers]
+    ready = [key for key in DECIDED if any(number.key == key for number in numbers)]
+    for k, (name, _, _, own_key) in enumerate(numbers):
+        if name in names[:k]:
+            raise StudyError(f"tune.free.{name}: free twice")
+        for key in ready:
+            if own_key not in DECIDED and own_key.startswith(DECIDED[key]):
+                raise StudyError(f"tune.free.{own_key}: {key} is free too and decides it")
 
 
 def _place_all(places: tuple, case: Case, values: Array) -> Case:
@@ -179,7 +190,9 @@ def _part(put: Callable, first: int, after: int, case: Case, values: Array) -> C
 
 
 def _plain(name: str, bounds: Any, study: Study, path: str) -> tuple[list[Free], Callable]:
-    entry = parse_entry(name)
+    entry, ready = parse_entry(name), nearest(name, DECIDED)
+    if ready and name.partition(".")[0] not in Study.model_fields:
+        raise StudyError(f"{path}: cannot be free; did you mean {ready!r}?")
     value = known_field(name, study, path)  # names the nearest field if there is none
     assert entry is not None
     leaf = LEAVES.get(entry.field)

@@ -18,7 +18,7 @@ from studies.tuning.spec import OWN, Family, TuneSpec
 class Merit(NamedTuple):
     """What designs are judged by; hashable."""
 
-    objective: tuple[tuple[str, float], ...]  # metric and weight
+    objective: tuple[tuple[str, float], ...]  # metric and weight, 1 in all
     limits: tuple[str, ...]  # metrics with a limit
     tail: float  # share of worst scenarios that count
 
@@ -31,7 +31,8 @@ class Merit(NamedTuple):
 
 def merit_of(spec: TuneSpec) -> Merit:
     """Of a tuning."""
-    weights = tuple((name, float(weight)) for name, weight in spec.tune.objective.items())
+    total = sum(map(float, spec.tune.objective.values()))
+    weights = tuple((name, float(weight) / total) for name, weight in spec.tune.objective.items())
     return Merit(weights, spec.metric_limits, float(spec.tune.scenarios.tail))
 
 
@@ -62,7 +63,7 @@ def tail_weights(count: int, tail: float) -> np.ndarray:
 
 
 def objectives(merit: Merit, metrics: Metrics, own: Metrics) -> Array:
-    """Objective in each scenario, (S,).
+    """Objective in each scenario, (S,); 1 is what the study itself has.
 
     Args:
         merit: weights.

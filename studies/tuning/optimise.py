@@ -23,7 +23,7 @@ ROUND = 5
 KEPT = 1e-3
 #: Sobol points that are looked at for each start, by the linearised loop alone.
 LOOKED_AT = 8
-#: A tuning ends when no family has gained this share within so many iterations.
+#: A tuning ends when no start has gained this share on its own best within so many iterations.
 GAIN, PATIENCE = 1e-3, 12
 #: Penalty of the limits to begin with; the objective counts as 1.
 PENALTY = 10.0
@@ -49,7 +49,7 @@ class Progress(NamedTuple):
     best_limits: np.ndarray  # values over limits - 1, (B, m)
     best_peaks: np.ndarray  # values of the limited metrics, (B, m)
     least: np.ndarray  # smallest value of each limit that any design of a family had, (F, m)
-    gained: np.ndarray  # iteration at which each family last gained, (F,)
+    gained: np.ndarray  # iteration at which a start of each family last gained, (F,)
     history: np.ndarray  # objective, violation, largest one first; nan where not run, (n, B, 2)
     descent: tuple[np.ndarray, ...]  # state of the method
 
@@ -303,11 +303,34 @@ def optimise(
         at: where an interrupted one stands; None for a new one.
         keep: called after each iteration.
     """
-    at = begin(spec, evaluator) if at is None else at
+    at = begin(spec, evaluator) if at is None else _with_room(at, spec.tune.iterations)
     while int(at.iteration) < spec.tune.iterations and not is_settled(spec, at):
         at = advance(spec, evaluator, at)
         keep(at)
     return at
+
+
+def fits(spec: TuneSpec, at: Progress) -> bool:
+    """Whether a kept tuning has the shapes of this one."""
+    starts, p, m = len(start_families(spec)), len(spec.free.names), len(spec.limit_names)
+    shapes = {
+        "place": (starts, p), "base": (starts, p), "base_slope": (starts, p),
+        "best_place": (starts, p), "base_limits": (starts, m), "multiplier": (starts, m),
+        "best_limits": (starts, m), "best_peaks": (starts, m), "base_limit_slope": (starts, m, p),
+        "family": (starts,), "base_objective": (starts,), "penalty": (starts,),
+        "worst": (starts,), "is_frozen": (starts,), "best_objective": (starts,),
+        "least": (len(spec.moving), m), "gained": (len(spec.moving),), "iteration": (),
+    }  # fmt: skip
+    is_alike = all(getattr(at, name).shape == shape for name, shape in shapes.items())
+    is_alike &= at.history.shape[1:] == (starts, 2)
+    return is_alike and len(at.history) >= int(at.iteration)
+
+
+def _with_room(at: Progress, iterations: int) -> Progress:
+    """For another number of iterations than it was begun with."""
+    history = np.full((max(iterations, int(at.iteration)), *at.history.shape[1:]), np.nan)
+    history[: int(at.iteration)] = at.history[: int(at.iteration)]
+    return at._replace(history=history)
 
 
 def is_settled(spec: TuneSpec, at: Progress) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from studies import figures
 from studies.sweeps.results import metric_label
@@ -15,6 +15,7 @@ from studies.tuning.scenarios import move_label
 from studies.tuning.spec import TuneSpec
 
 GREY = "#999999"
+OBJECTIVE = "objective (the study itself: 1)"
 
 
 def descent(spec: TuneSpec, found: Findings) -> Figure:
@@ -34,28 +35,36 @@ def descent(spec: TuneSpec, found: Findings) -> Figure:
             ax.plot(
                 iteration, lowest, color=color, linestyle=dash, linewidth=1.6, label=family.name
             )
-        ax.set(xlabel="iteration", ylabel="objective, the study itself = 1", yscale="log")
+        ax.set(xlabel="iteration", ylabel=OBJECTIVE, xlim=(0.5, len(best) + 0.5))
+        _ratio_scale(ax, "y")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         figure.legend(loc="outside right upper")
     return figure
 
 
 def gains(spec: TuneSpec, found: Findings) -> Figure:
-    """Objective of each family on fresh machines, one panel for each move."""
+    """What each family gains on fresh machines, one panel for each move."""
     with figures.styled():
         rows = len(spec.families)
-        figure = Figure(figsize=(7.4, 1.2 + 0.3 * rows), layout="constrained")
+        figure = Figure(figsize=(7.4, 1.5 + 0.3 * rows), layout="constrained")
         axes = figure.subplots(1, len(spec.moves), squeeze=False, sharex=True, sharey=True)[0]
-        count, weight = spec.tune.scenarios.check, sum(spec.tune.objective.values())
+        count = spec.tune.scenarios.check
         for k, (ax, move) in enumerate(zip(axes, spec.moves, strict=True)):
             for row, one in enumerate(found.judged):
-                value = one.objective[k * count : (k + 1) * count] / weight
-                ax.plot(value, np.full(count, row), "o", color=GREY, markersize=3, zorder=3)
-                ax.plot(value.mean(), row, "d", color=figures.SERIES[0], markersize=5)
+                value, first = one.objective[k * count : (k + 1) * count], row == 0
+                ax.plot(
+                    value, np.full(len(value), row), "|", color=GREY, markersize=9,
+                    label="one fresh machine" if first else None,
+                )  # fmt: skip
+                ax.plot(
+                    value.mean(), row, "d", color=figures.SERIES[0], markersize=5, zorder=3,
+                    label="their mean" if first else None,
+                )  # fmt: skip
             ax.axvline(1.0, color="black", linewidth=0.8)
-            ax.set(xlabel="objective, the study itself = 1", xscale="log", title=move_label(move))
+            ax.set(xlabel=OBJECTIVE, title=move_label(move), ylim=(rows - 0.4, -0.6))
+            _ratio_scale(ax, "x")
         axes[0].set_yticks(range(rows), [family.name for family in spec.families])
-        axes[0].invert_yaxis()
+        figures.legend_above(figure, axes[0])
     return figure
 
 
@@ -86,7 +95,7 @@ def front(spec: TuneSpec, found: Findings, limit: str) -> Figure:
         done = np.isfinite(at.best_objective) & (excess(at.best_limits) == 0)
         ax.plot(
             at.best_peaks[done, column], at.best_objective[done], "x", color=figures.SERIES[1],
-            markersize=4, label="every start",
+            markersize=4, label="every start, machines of the tuning",
         )  # fmt: skip
         points = [(x.metrics[limit].max(), x.objective.mean()) for x in found.judged]
         line = np.array(
@@ -94,7 +103,13 @@ def front(spec: TuneSpec, found: Findings, limit: str) -> Figure:
         )
         if len(line):
             line = line[np.argsort(line[:, 0])]
-            ax.plot(*line.T, "o-", color=figures.SERIES[2], label="front, on fresh machines")
+            ax.plot(
+                *line.T,
+                "o-",
+                markersize=4,
+                color=figures.SERIES[2],
+                label="front, on fresh machines",
+            )
         marks = iter("^vD*P<>")
         own = found.own.metrics[limit].max(), found.own.objective.mean()
         ax.plot(*own, "s", color="black", label="the study itself")
@@ -102,11 +117,26 @@ def front(spec: TuneSpec, found: Findings, limit: str) -> Figure:
             if not family.front:
                 ax.plot(
                     *point, next(marks, "h"), color="black", markerfacecolor="white",
-                    label=family.name,
+                    zorder=3, label=f"{family.name}, fresh machines",
                 )  # fmt: skip
-        ax.set(xlabel=_label(limit), ylabel="objective, the study itself = 1", yscale="log")
+        limits = {family.limits.get(limit) for family in spec.moving if not family.front}
+        for value in sorted(x for x in limits if isinstance(x, float)):
+            ax.axvline(value, color="black", linewidth=0.8, linestyle=":", label="limit")
+        ax.set(xlabel=_label(limit), ylabel=OBJECTIVE)
+        _ratio_scale(ax, "y")
         figure.legend(loc="outside right upper")
     return figure
+
+
+def _ratio_scale(ax: Axes, which: str) -> None:
+    """Logarithmic, with plain numbers, few enough to read."""
+    ax.set(**{f"{which}scale": "log"})
+    axis = ax.xaxis if which == "x" else ax.yaxis
+    low, high = sorted(axis.get_view_interval())
+    is_wide = high / low > 4
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)) if is_wide else MaxNLocator(6))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.3g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _label(metric: str) -> str:

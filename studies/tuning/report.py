@@ -7,14 +7,21 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel import status
-from studies.tuning.audit import Disagreement
-from studies.tuning.check import Judged, Searched
+from studies.sweeps.results import metric_label
+from studies.tuning.audit import ALLOWED, MEANING, Disagreement
+from studies.tuning.check import Judged, Searched, patch_centers
+from studies.tuning.free import PLACEMENT
+from studies.tuning.linear_fidelity import MARGIN_MODES
 from studies.tuning.optimise import KEPT, Progress, excess
 from studies.tuning.scenarios import move_label
 from studies.tuning.spec import LOOP_LIMITS, OWN, Family, TuneSpec
 
 #: A limit nearer than this share counts as active.
 NEAR = 0.02
+#: Starts that end within this share of the best one count as equally good.
+ALIKE = 0.01
+#: Fewer designs, or such with less between the smallest and the largest, have no rank to speak of.
+FEW, NARROW = 8, 0.05
 
 
 class Findings(NamedTuple):
@@ -39,22 +46,45 @@ def report(spec: TuneSpec, found: Findings) -> str:
         found: what it found.
     """
     at = found.at
-    lines = [f"# {spec.study.title}: tuning", ""]
+    lines = [f"# {spec.study.title or 'study'}: tuning", ""]
     lines += [
-        f"{len(at.family)} starts of {len(spec.moving)} families, {int(at.iteration)} iterations "
-        f"({spec.tune.method}), {spec.tune.scenarios.count} machines on {len(spec.moves)} moves"
+        f"{_count(len(at.family), 'start')} of {_count(len(spec.moving), 'family')}, "
+        f"{_count(int(at.iteration), 'iteration')} ({spec.tune.method}), "
+        f"{_count(spec.tune.scenarios.count, 'machine')} on {_count(len(spec.moves), 'move')}"
         + (f"; {at.is_frozen.sum()} starts were frozen." if at.is_frozen.any() else "."), "",
         *_summary(spec, found), *_by_move(spec, found), *_limits(spec, found),
         *_numbers(spec, found), *_search(spec, found), *_fidelity(spec, found),
         "## Derivatives", "",
     ]  # fmt: skip
     worst = max(found.audited, key=lambda entry: entry.share)
+    place = ("half way to the best design", "at the best design")[worst.place]
     lines.append(
-        f"Against central differences at the best design of {spec.families[spec.main].name} and "
-        f"half way to it the worst disagreement is {worst.share:.1e}, of {worst.figure} by "
-        f"{worst.name} ({worst.derivative:.4g} against {worst.difference:.4g})."
-    )
+        f"Against differences at the best design of {spec.families[spec.main].name} and half way "
+        f"to it the worst disagreement is {worst.share:.1e}, of {worst.figure} by {worst.name} "
+        f"{place} ({worst.derivative:.4g} against {worst.difference:.4g}), "
+        + ("below" if worst.share <= ALLOWED else "**above**") + f" {ALLOWED:g}. {MEANING}"
+    )  # fmt: skip
     return "\n".join(lines) + "\n"
+
+
+def _count(n: int, what: str) -> str:
+    many = f"{what.removesuffix('y')}ies" if what.endswith("y") else f"{what}s"
+    return f"{n} {what if n == 1 else many}"
+
+
+def summary(spec: TuneSpec, found: Findings) -> list[str]:
+    """What was gained, a line for each family."""
+    machines = _count(spec.tune.scenarios.check, "fresh machine")
+    lines = []
+    for k, (family, one) in enumerate(zip(spec.families, found.judged, strict=True)):
+        is_moving = k < len(spec.moving)
+        lost = is_moving and excess(found.at.best_limits[[found.at.winner(k)]])[0] > 0
+        lines.append(
+            f"{family.name}: {one.objective.mean():.4f} of the study's objective on {machines}"
+            + (f", worst {one.objective.max():.4f}" if len(one.objective) > 1 else "")
+            + ("; a limit is violated" if lost else "")
+        )
+    return lines
 
 
 def _rows(spec: TuneSpec, found: Findings) -> list[tuple[str, Judged]]:
@@ -64,18 +94,23 @@ def _rows(spec: TuneSpec, found: Findings) -> list[tuple[str, Judged]]:
 
 def _summary(spec: TuneSpec, found: Findings) -> list[str]:
     names = list(found.own.metrics)
+    modes = max(MARGIN_MODES, spec.study.link.modes)
+    heads = [f"{name} [{metric_label(name.partition('[')[0])[1]}]" for name in names]
     lines = [
-        f"On {spec.tune.scenarios.check} machines for each move that the tuning has not seen, with "
-        "the real converters and limits (objective relative to the study itself, metrics the worst "
-        "of all scenarios, figures of the loop on 12 plant modes or more):", "",
-        "| design | objective | worst | " + " | ".join(names) + " | gain margin | slowest decay | "
-        "spillover | statuses |", "|---" * (len(names) + 7) + "|",
+        f"On {_count(spec.tune.scenarios.check, 'machine')} for each move that the tuning has not "
+        "seen, with the real converters and limits. Objective: 1 is the study itself, mean and "
+        "worst of all scenarios. Metrics: the worst of all scenarios, of those in the objective "
+        "the root of the mean square of all entries (links, stations), of limits the largest "
+        f"entry. Figures of the loop: on {modes} plant modes (`studies simulate` takes those of "
+        "the study).", "",
+        "| design | objective | worst | " + " | ".join(heads) + " | gain margin | slowest decay "
+        "[1/s] | spillover | statuses |", "|---" * (len(names) + 7) + "|",
     ]  # fmt: skip
     for name, one in _rows(spec, found):
         loop = "- | - | -"
         if one.loop is not None:
             loop = (
-                f"{one.loop.gain_margin:.4g} | {one.loop.slowest_decay:.4g} 1/s | "
+                f"{one.loop.gain_margin:.4g} | {one.loop.slowest_decay:.4g} | "
                 f"{one.loop.spillover:.4g}"
             )
         metrics = " | ".join(f"{one.metrics[metric].max():.4g}" for metric in names)
@@ -88,14 +123,15 @@ def _summary(spec: TuneSpec, found: Findings) -> list[str]:
 
 def _by_move(spec: TuneSpec, found: Findings) -> list[str]:
     """Change of every figure on each move, mean of the fresh machines."""
-    lines, count = ["## Change against the study itself", ""], spec.tune.scenarios.check
+    count = spec.tune.scenarios.check
+    lines = ["## Change against the study itself", "", "Means of the fresh machines.", ""]
     names = list(found.own.metrics)
     lines += ["| design | move | objective | " + " | ".join(names) + " |"]
     lines += ["|---" * (len(names) + 3) + "|"]
     for name, one in _rows(spec, found)[1:]:
         for k, move in enumerate(spec.moves):
             part = slice(k * count, (k + 1) * count)
-            changes = [_change(1.0, one.objective[part].mean() / sum(spec.tune.objective.values()))]
+            changes = [_change(1.0, one.objective[part].mean())]
             changes += [
                 _change(found.own.metrics[x][part].mean(), one.metrics[x][part].mean())
                 for x in names
@@ -113,39 +149,79 @@ def _limits(spec: TuneSpec, found: Findings) -> list[str]:
         return []
     lines = ["## Limits on the scenarios of the tuning", ""]
     for k, family in enumerate(spec.moving):
-        limits = found.at.best_limits[found.at.winner(k)]
-        told = [
-            f"{name} {'of the study' if family.limits[name] == OWN else f'{family.limits[name]:g}'}"
-            f" {_told(name, float(value))}"
-            for name, value in zip(spec.limit_names, limits, strict=True)
-        ]
+        excesses = found.at.best_limits[found.at.winner(k)]
+        told = []
+        for name, beyond in zip(spec.limit_names, excesses, strict=True):
+            limit = family.limits[name]
+            margin = _loop_margin(found, k, name, limit) if name in LOOP_LIMITS else -float(beyond)
+            wanted = "of the study" if limit == OWN else f"{limit:g}"
+            told.append(f"{name} {wanted} {_told(float(beyond), margin)}")
         lines.append(f"- {family.name}: " + "; ".join(told))
     return [*lines, ""]
 
 
-def _told(name: str, value: float) -> str:
-    if value > KEPT:
-        return "**violated**" + ("" if name in LOOP_LIMITS else f" by {100 * value:.2f} %")
-    state = "active" if value > -NEAR else "not active"
-    return state if name in LOOP_LIMITS else f"{state}, {-100 * value:.2f} % below it"
+def _loop_margin(found: Findings, k: int, name: str, limit: float | str) -> float:
+    """How far a figure of the loop is from its limit, as a share of it; nan if not known."""
+    loop, own = found.judged[k].loop, found.own.loop
+    if loop is None or own is None:
+        return float("nan")
+    allowed = getattr(own, name) if limit == OWN else float(limit)
+    margin = getattr(loop, name) / allowed - 1
+    return -margin if name == "spillover" else margin
+
+
+def _told(beyond: float, margin: float) -> str:
+    far = f" {100 * abs(margin):.2f} %" if np.isfinite(margin) else ""
+    if beyond > KEPT:
+        return "**violated**" + (f" by{far}" if far else "")
+    state = "active" if margin < NEAR else "not active"
+    return state + (f", {far.strip()} left" if far else "")
 
 
 def _numbers(spec: TuneSpec, found: Findings) -> list[str]:
     heads = [family.name for family in spec.moving]
     lines = ["## Numbers", "", "| free number | bounds | study | " + " | ".join(heads) + " |"]
     lines += ["|---" * (len(heads) + 3) + "|"]
-    places = [found.at.best_place[found.at.winner(k)] for k in range(len(heads))]
-    values = [spec.free.values(place) for place in places]
+    at = found.at
+    places = [at.best_place[at.winner(k)] for k in range(len(heads))]
+    alike = [at.best_place[_alike(at, k)] for k in range(len(heads))]
     for n, free in enumerate(spec.free.numbers):
         start = f"{free.start:.4g}" if np.isfinite(free.start) else "-"
-        cells = [
-            f"{values[k][n]:.4g}" + ("*" if places[k][n] in (0.0, 1.0) else "")
-            if family.is_free[n] else "-"
-            for k, family in enumerate(spec.moving)
-        ]  # fmt: skip
+        cells = []
+        for k, family in enumerate(spec.moving):
+            value = spec.free.values(places[k])[n]
+            low, high = (spec.free.values(x)[n] for x in (alike[k].min(0), alike[k].max(0)))
+            mark = "*" if places[k][n] in (0.0, 1.0) else ""
+            cells.append(f"{value:.4g}{mark} ({low:.3g}..{high:.3g})" if family.is_free[n] else "-")
         bounds = f"{free.span.low:g} to {free.span.high:g}"
         lines.append(f"| {free.name} | {bounds} | {start} | " + " | ".join(cells) + " |")
-    return [*lines, "", "`*`: at its bound; `-`: not moved.", ""]
+    told = (
+        f"`*`: at its bound; `-`: not moved; in brackets the range of all starts that end within "
+        f"{100 * ALIKE:g} % of the best: a wide one means that the number hardly matters there. "
+        "`placement` are shares of the room that is left; the patches' centres are:"
+    )
+    if not any(free.key == PLACEMENT for free in spec.free.numbers):
+        return [*lines, "", told.partition(" `placement`")[0], ""]
+    lines += ["", told, "", "| design | centres of the patches [mm] |", "|---|---|"]
+    own = np.full(len(spec.free.numbers), np.nan)
+    designs = [("the study itself", spec.moving[0], own)]
+    designs += [
+        (family.name, family, spec.free.values(place))
+        for family, place in zip(spec.moving, places, strict=True)
+    ]
+    for name, family, values in designs:
+        rows = np.unique(1e3 * patch_centers(spec, family, values), axis=0)
+        text = "; ".join(", ".join(f"{x:.1f}" for x in row) for row in rows)
+        lines.append(f"| {name} | {text} |")
+    return [*lines, ""]
+
+
+def _alike(at: Progress, family: int) -> np.ndarray:
+    """Starts of a family that end as good as its best one, or nearly."""
+    best = at.winner(family)
+    is_near = at.best_objective <= (1 + ALIKE) * at.best_objective[best]
+    is_kept = excess(at.best_limits) <= excess(at.best_limits[[best]])
+    return np.flatnonzero((at.family == family) & is_near & is_kept)
 
 
 def _search(spec: TuneSpec, found: Findings) -> list[str]:
@@ -155,7 +231,7 @@ def _search(spec: TuneSpec, found: Findings) -> list[str]:
     main = spec.families[spec.main]
     order = np.argsort(np.where(is_kept(spec, seen), seen.objective, np.inf))
     best, count = int(order[0]), int(is_kept(spec, seen).sum())
-    cost = found.run_time / (seen.time / seen.runs)
+    cost = found.run_time / seen.run_time
     tuned = found.at.best_objective[found.at.winner(spec.main)]
     lines = [
         "## Against random search", "",
@@ -186,11 +262,15 @@ def _fidelity(spec: TuneSpec, found: Findings) -> list[str]:
         return []
     a, b = linear[is_known], residual[is_known]
     ratio = np.percentile(a / b, [5, 50, 95])
+    spread = b.max() / b.min() - 1
+    rank = f"rank correlation {rank_correlation(a, b):.3f}"
+    if len(b) < FEW or spread < NARROW:
+        rank = f"too few, or too much alike ({100 * spread:.1f} %), to compare their order"
     return [
         "## Linear fidelity", "",
         f"Residual vibration of the linearised loop (H2 norm) over that of the run, {len(a)} "
         f"designs that keep the limits of their loop: median {ratio[1]:.3f}, 90 % between "
-        f"{ratio[0]:.3f} and {ratio[2]:.3f}; rank correlation {rank_correlation(a, b):.3f}.", "",
+        f"{ratio[0]:.3f} and {ratio[2]:.3f}; {rank}.", "",
     ]  # fmt: skip
 
 

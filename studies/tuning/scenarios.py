@@ -13,23 +13,27 @@ from studies.sweeps.axes import column_of, known_field, set_value
 from studies.tuning.spec import Family, TuneSpec
 
 
-def scenario_columns(spec: TuneSpec, count: int, seed: int) -> dict[str, np.ndarray]:
-    """What scenarios change: machine by machine within each move; the first machine is the study's.
+def scenario_columns(
+    spec: TuneSpec, count: int, seed: int, is_fresh: bool = False
+) -> dict[str, np.ndarray]:
+    """What scenarios change: machine by machine within each move.
 
     Args:
         spec: of the tuning.
         count: machines.
         seed: of their shifts and of their noise.
+        is_fresh: all machines differ from the study's own, else it is the first one.
 
     Returns:
         Columns of `count` rows for each move.
     """
     spread, moves = spec.tune.scenarios.spread, len(spec.moves)
     noise = np.random.default_rng(seed).integers(1, 10**9, count)
-    machines = {"run.seed": np.where(np.arange(count) > 0, noise, spec.study.run.seed)}
+    is_own = (np.arange(count) == 0) & (not is_fresh)
+    machines = {"run.seed": np.where(is_own, spec.study.run.seed, noise)}
     if spread:
         shift = 2 * qmc.LatinHypercube(len(spread), rng=seed).random(count) - 1
-        shift[0] = 0.0
+        shift[is_own] = 0.0
         for k, (name, percent) in enumerate(spread.items()):
             machines[name] = known_field(name, spec.study) * (1 + percent / 100 * shift[:, k])
     columns = {name: np.tile(column, moves) for name, column in machines.items()}

@@ -12,6 +12,7 @@ Everything is measured against the study itself, machine by machine and move by 
 
 from __future__ import annotations
 
+import re
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -36,6 +37,8 @@ OF_LOOP = ("gain_margin", "slowest_decay", "spillover")
 LOOP_LIMITS = (*OF_LOOP, "singularity_distance")
 #: Metrics without a derivative: as limits they only choose between designs.
 STEPPED = ("settling_time", "saturated_fraction", "clipped_fraction")
+#: Runs in one batch.
+MOST_RUNS = 50_000
 #: Limit that stands for what the study itself reaches.
 OWN = "own"
 
@@ -158,6 +161,7 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
     moves = _moves(tune, study)
     families = _families(tune, study, free)
     _check_clashes(tune, free, families)
+    _check_size(tune, families, len(moves))
     for family in families:
         for move in moves:
             _check_family(family, move, study)
@@ -192,6 +196,10 @@ def _check_spread(tune: Tune, study: Study) -> None:
         _check_positive(percent, 99.0, path, "%")
         if value == 0:
             raise field_error(name, value, f"not 0 where {path} is a share of it")
+        if name.partition(".")[0] in ("run", "metrics", "motion"):
+            raise field_error(path, percent, "for numbers of the machine and its control")
+        for share in (1 - percent / 100, 1 + percent / 100):
+            checked_value(study, name, value * share, path)
 
 
 def _check_feedback(tune: Tune, study: Study) -> None:
@@ -217,7 +225,8 @@ def _check_metric(name: str, path: str, has_loop: bool, study: Study) -> None:
     if entry is None or entry.field not in known:
         hint = nearest(name, known)
         raise StudyError(
-            f"{path}: {name!r} is no metric" + (f"; did you mean {hint!r}?" if hint else "")
+            f"{path}: {name!r} is no metric; "
+            + (f"did you mean {hint!r}?" if hint else f"allowed {', '.join(known)}")
         )
     if not has_loop and entry.field in STEPPED:
         raise StudyError(
@@ -269,6 +278,22 @@ def _check_clashes(tune: Tune, free: FreeNumbers, families: tuple[Family, ...]) 
                     raise StudyError(f"{where}: {name} is in tune.scenarios too")
 
 
+def _check_size(tune: Tune, families: tuple[Family, ...], moves: int) -> None:
+    """What a machine of some memory can hold in one batch."""
+    moving = sum(bool(family.is_free.any()) for family in families)
+    for what, designs, machines in (
+        (f"tune.starts = {tune.starts} of {moving} families, tune.scenarios.count",
+         1 + tune.starts * moving, tune.scenarios.count),
+        ("tune.scenarios.check", 1 + len(families), tune.scenarios.check),
+    ):  # fmt: skip
+        runs = designs * machines * moves
+        if runs > MOST_RUNS:
+            raise StudyError(
+                f"{what} = {machines}, with {moves} moves: {runs} runs at once; allowed up to "
+                f"{MOST_RUNS}"
+            )
+
+
 def _field(name: str) -> str:
     return name.partition("[")[0]
 
@@ -281,16 +306,30 @@ def _families(tune: Tune, study: Study, free: FreeNumbers) -> tuple[Family, ...]
         found = [_family(name, x, tune, study, free) for name, x in tune.families.items()]
     if not any(family.is_free.any() for family in found):
         raise field_error("tune.families", list(tune.families), "one with free numbers or more")
-    found.sort(key=lambda family: not family.is_free.any())
-    return tuple(found + _front(tune, found))
+    found += _front(tune, found)
+    names = [label(family.name) for family in found]
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            raise field_error(
+                "tune.families", found[k].name,
+                f"names that differ in letters and digits, {found[names.index(name)].name!r} is "
+                "one already",
+            )  # fmt: skip
+    return tuple(sorted(found, key=lambda family: not family.is_free.any()))
+
+
+def label(name: str) -> str:
+    """A family's name as part of a file's, where case may not count; families differ in it."""
+    return re.sub(r"[^a-z0-9.]+", "_", name.lower()).strip("_.")
 
 
 def _family(name: str, written: Any, tune: Tune, study: Study, free: FreeNumbers) -> Family:
     path = f"tune.families.{shown_name(name)}"
-    if not any(letter.isalnum() for letter in name) or len(name) > 60:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9 _.,+=()'-]{0,59}", name):
         raise field_error(
-            "tune.families", name, "names of 1 to 60 characters with a letter or digit"
-        )
+            "tune.families", name,
+            "names of up to 60 letters a to z, digits, spaces and _.,+=()'-, not first a sign",
+        )  # fmt: skip
     if not isinstance(written, dict) or not set(written) <= {"free", "set"}:
         raise field_error(path, written, "{free = [names], set = {field = value}}")
     names = written.get("free", list(tune.free))
@@ -321,10 +360,10 @@ def _front(tune: Tune, families: list[Family]) -> list[Family]:
     if set(tune.pareto) - {"limit", "values", "family"} or "limit" not in tune.pareto:
         raise field_error("tune.pareto", tune.pareto, "{limit, values, family}")
     limit, values = tune.pareto["limit"], tune.pareto.get("values")
-    if not isinstance(limit, str) or limit not in tune.limits:
-        raise field_error(
-            "tune.pareto.limit", limit, "one of tune.limits: " + ", ".join(tune.limits)
-        )
+    known = [name for name in tune.limits if name not in LOOP_LIMITS]
+    if not isinstance(limit, str) or limit not in known:
+        told = "one of the metrics in tune.limits" + (f": {', '.join(known)}" if known else "")
+        raise field_error("tune.pareto.limit", limit, told)
     if not isinstance(values, list) or len(values) < 2:
         raise field_error("tune.pareto.values", values, "a list of two limits or more")
     for k, value in enumerate(values):
@@ -333,12 +372,12 @@ def _front(tune: Tune, families: list[Family]) -> list[Family]:
             raise field_error(f"tune.pareto.values[{k}]", value, "each limit once")
     moving = {family.name: family for family in families if family.is_free.any()}
     name = tune.pareto.get("family", next(iter(moving)))
-    if name not in moving:
+    if not isinstance(name, str) or name not in moving:
         raise field_error("tune.pareto.family", name, "one of " + ", ".join(moving))
     base = moving[name]
     return [
         base._replace(
-            name=f"{name}, {limit} {value:g}", limits={**base.limits, limit: float(value)},
+            name=f"{name}, {limit} {value:.10g}", limits={**base.limits, limit: float(value)},
             front=name,
         )
         for value in sorted(values)

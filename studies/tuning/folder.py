@@ -1,0 +1,106 @@
+"""The folder of a tuning: what was asked for (`tune.json`) and where it stands (`progress.npz`)."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from studies.errors import StudyError
+from studies.store import check_target, replacing
+from studies.sweeps.folder import LOCK, locked_folder
+from studies.tuning.optimise import Progress
+
+MANIFEST, PROGRESS, RESULTS = "tune.json", "progress.npz", "tune.h5"
+#: Entries of the manifest that a resumed tuning must share, to go on bit by bit.
+CHECKED = {"spec": "tuning file", "code": "program", "jaxlib": "jaxlib", "precision": "precision"}
+_LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.tmp")
+
+
+@contextmanager
+def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterator[Progress | None]:
+    """Make or check the folder and lock it; gives where an interrupted tuning stands.
+
+    Raises:
+        StudyError: not writable, in use, holds something else or a tuning that does not fit.
+    """
+    with locked_folder(out, "tuning"):
+        path = out / MANIFEST
+        for left in out.iterdir():
+            if _LEFTOVER.fullmatch(left.name) and left.is_file():
+                left.unlink()
+        if path.is_file():
+            if not is_resumed:
+                raise StudyError(f"--out {out}: holds a tuning already; go on with --resume")
+            try:
+                old = json.loads(path.read_text(encoding="utf-8"))
+            except (ValueError, RecursionError):
+                raise StudyError(f"{path}: damaged; name a new folder") from None
+            now = json.loads(json.dumps(manifest))
+            for key, what in CHECKED.items():
+                if not isinstance(old, dict) or _settled(old.get(key)) != _settled(now[key]):
+                    raise StudyError(
+                        f"--out {out}: was begun with another {what}; name a new folder"
+                    )
+            before = load_progress(out / PROGRESS)
+        elif is_resumed:
+            raise StudyError(f"--out {out}: no tuning to resume there")
+        else:
+            others = sorted(found.name for found in out.iterdir() if found.name != LOCK)
+            if others:
+                raise StudyError(
+                    f"--out {out}: holds other files ({', '.join(others[:3])}); name a new or "
+                    "empty folder"
+                )
+            before = None
+        check_target(out / RESULTS)
+        with replacing(path) as temporary:
+            temporary.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+        try:
+            yield before
+        except StudyError:
+            if not (out / PROGRESS).exists():  # nothing to go on with, so a mended file may start
+                path.unlink(missing_ok=True)
+            raise
+
+
+def _settled(part: Any) -> Any:
+    """What must not change: all but the number of iterations, which Adam's steps depend on."""
+    part = copy.deepcopy(part)
+    if isinstance(part, dict) and isinstance(part.get("tune"), dict):
+        if part["tune"].get("method", "lbfgs") == "lbfgs":
+            part["tune"].pop("iterations", None)
+    return part
+
+
+def save_progress(path: Path, at: Progress) -> None:
+    """Write where a tuning stands, whole or not at all."""
+    arrays = {f"descent_{k}": leaf for k, leaf in enumerate(at.descent)}
+    arrays |= {name: getattr(at, name) for name in at._fields if name != "descent"}
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
+
+
+def load_progress(path: Path) -> Progress | None:
+    """Where a tuning stood; None where nothing is kept.
+
+    Raises:
+        StudyError: damaged.
+    """
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path) as data:
+            count = sum(name.startswith("descent_") for name in data.files)
+            state = tuple(data[f"descent_{k}"] for k in range(count))
+            rest = {name: data[name] for name in Progress._fields if name != "descent"}
+            return Progress(**rest, descent=state)
+    except (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile):
+        raise StudyError(f"{path}: damaged; name a new folder") from None

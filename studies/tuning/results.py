@@ -1,0 +1,154 @@
+"""What a tuning found, as labelled arrays (`tune.h5`) and as study files."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from studies.fields import parse_entry
+from studies.runs import STATUS_LABEL
+from studies.store import Variable
+from studies.sweeps.results import field_unit, metric_label, variable_name
+from studies.sweeps.table import as_numbers
+from studies.tuning.check import Judged, fresh_columns, patch_centers
+from studies.tuning.free import POLES
+from studies.tuning.report import Findings
+from studies.tuning.spec import Family, TuneSpec, label
+
+#: Figures of the linearised loop, and their units.
+LOOP_UNITS = {"gain_margin": "1", "slowest_decay": "s-1", "spillover": "1"}
+
+
+def free_unit(key: str) -> str:
+    """Unit of a free number, by the name it has in the file."""
+    if key in POLES:
+        return ("s-1", "Hz")[POLES.index(key)]
+    entry = parse_entry(key)
+    return field_unit(entry.field) if entry and "." in entry.field else "1"
+
+
+def file_name(spec: TuneSpec, family: Family) -> str:
+    """Of the study that a family gives."""
+    if len(spec.moving) == 1:
+        return "tuned.toml"
+    return f"tuned_{label(family.name)}.toml"
+
+
+def variables(spec: TuneSpec, found: Findings) -> dict[str, Variable]:
+    """All starts, the best design of each family on fresh machines, random designs."""
+    return {
+        **_asked(spec),
+        **_starts(spec, found),
+        **_fresh(spec, found),
+        **_random(found),
+    }
+
+
+def _text(values: list[str], axis: str, what: str) -> Variable:
+    return Variable(np.array(values), (axis,), "1", what)
+
+
+def _asked(spec: TuneSpec) -> dict[str, Variable]:
+    numbers, axis = spec.free.numbers, ("free",)
+    low, high, start = (
+        np.array(x)
+        for x in zip(*((f.span.low, f.span.high, f.start) for f in numbers), strict=True)
+    )
+    asked = {
+        "free": _text([f.name for f in numbers], "free", "free number"),
+        "free_unit": _text([free_unit(f.key) for f in numbers], "free", "unit of the free number"),
+        "free_low": Variable(low, axis, "1", "lower bound, in the number's unit"),
+        "free_high": Variable(high, axis, "1", "upper bound, in the number's unit"),
+        "free_study": Variable(start, axis, "1", "value of the study itself, in the number's unit"),
+        "family": _text([family.name for family in spec.families], "family", "family"),
+    }
+    if spec.limit_names:
+        limits = [[str(x.limits[name]) for name in spec.limit_names] for x in spec.families]
+        asked["limit"] = _text(list(spec.limit_names), "limit", "what is limited")
+        asked["family_limit"] = Variable(
+            np.array(limits), ("family", "limit"), "1", "limit; own: what the study itself reaches"
+        )
+    return asked
+
+
+def _starts(spec: TuneSpec, found: Findings) -> dict[str, Variable]:
+    at = found.at
+    family = [spec.moving[k] for k in at.family]
+    values = spec.free.values(at.best_place)
+    centers = [patch_centers(spec, *pair) for pair in zip(family, values, strict=True)]
+    whole = at.history[: int(at.iteration)]
+    is_best = np.zeros(len(family), bool)
+    is_best[[at.winner(k) for k in range(len(spec.moving))]] = True
+    axis, trial = ("start",), ("iteration", "start")
+    starts = {
+        "start_family": _text([one.name for one in family], "start", "family of the start"),
+        "is_best": Variable(is_best, axis, "1", "best start of its family"),
+        "value": Variable(
+            values, ("start", "free"), "1", "best value of each start, in the number's unit"
+        ),
+        "patch_center": Variable(
+            np.array(centers), ("start", "link", "patch"), "m", "centres of the patches then"
+        ),
+        "objective": Variable(at.best_objective, axis, "1", "best objective of each start"),
+        "is_frozen": Variable(at.is_frozen, axis, "1", "stopped, a run did not finish"),
+        "linear_residual": Variable(
+            found.linear, axis, "m", "linear residual vibration of the best design"
+        ),
+        "trial_objective": Variable(whole[..., 0], trial, "1", "objective of each trial"),
+        "trial_excess": Variable(whole[..., 1], trial, "1", "largest excess of each trial"),
+    }
+    if spec.limit_names:
+        starts["excess"] = Variable(
+            at.best_limits, ("start", "limit"), "1",
+            "negative: kept; value over limit - 1 of a metric, for the loop a smooth figure that "
+            "has the same sign",
+        )  # fmt: skip
+    return starts
+
+
+def _fresh(spec: TuneSpec, found: Findings) -> dict[str, Variable]:
+    axis, both = ("scenario",), ("family", "scenario")
+    fresh = {}
+    for name, column in fresh_columns(spec).items():
+        array = as_numbers(column)
+        dims = tuple(f"{variable_name(name)}_{k}" for k in range(1, array.ndim))
+        entry = parse_entry(name)
+        unit = field_unit(entry.field) if entry else "1"
+        fresh[f"scenario_{variable_name(name)}"] = Variable(array, (*axis, *dims), unit, name)
+
+    def each(take: str) -> np.ndarray:
+        return np.stack([getattr(one, take) for one in found.judged])
+
+    fresh["fresh_objective"] = Variable(each("objective"), both, "1", "objective, fresh machines")
+    fresh["fresh_status"] = Variable(each("status"), both, *STATUS_LABEL)
+    fresh["own_status"] = Variable(found.own.status, axis, *STATUS_LABEL)
+    for name, own in found.own.metrics.items():
+        label, unit = variable_name(name), metric_label(name.partition("[")[0])[1]
+        values = np.stack([one.metrics[name] for one in found.judged])
+        fresh[f"fresh_{label}"] = Variable(values, both, unit, f"{name}, fresh machines")
+        fresh[f"own_{label}"] = Variable(own, axis, unit, f"{name} of the study itself")
+    if found.own.loop is not None:
+        for name, unit in LOOP_UNITS.items():
+            what = f"{name.replace('_', ' ')} of the linearised loop"
+            values = np.array([_loop_figure(one, name) for one in found.judged])
+            fresh[name] = Variable(values, ("family",), unit, what)
+            own = np.array(_loop_figure(found.own, name))
+            fresh[f"own_{name}"] = Variable(own, (), unit, f"{what}, the study itself")
+    return fresh
+
+
+def _loop_figure(judged: Judged, name: str) -> float:
+    return float("nan") if judged.loop is None else float(getattr(judged.loop, name))
+
+
+def _random(found: Findings) -> dict[str, Variable]:
+    seen = found.searched
+    if seen is None:
+        return {}
+    return {
+        "search_objective": Variable(
+            seen.objective, ("sample",), "1", "objective of random designs"
+        ),
+        "search_linear_residual": Variable(
+            seen.linear, ("sample",), "m", "linear residual vibration of random designs"
+        ),
+    }

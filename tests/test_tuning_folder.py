@@ -1,0 +1,227 @@
+"""A tuning from its file to its folder: results, resume, audit, what is refused."""
+
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from studies import cli
+from studies import spec as spec_module
+from studies.errors import StudyError
+from studies.runs import run_study
+from studies.spec import load_study, paper_study, read_toml
+from studies.store import read_store
+from studies.sweeps.results import load
+from studies.sweeps.run import run_sweep
+from studies.sweeps.spec import parse_sweep
+from studies.tuning import audit as audit_module
+from studies.tuning.evaluate import Evaluation, Evaluator
+from studies.tuning.folder import open_tuning
+from studies.tuning.merit import merit_of
+from studies.tuning.optimise import begin, fits
+from studies.tuning.run import run_tuning
+from studies.tuning.spec import load_tuning, parse_tuning
+from tests.tunings import GAIN, SMALL, tuning
+
+FILE = """
+run = { duration = 0.06 }
+link = { modes = 2 }
+control = { modes = 2, ratios = [[1.0, 0.3], [1.0, 0.3], [1.0, 0.3]] }
+shaper = { kind = "none" }
+metrics = { residual_delay = 0.002, residual_length = 0.02 }
+
+[motion]
+waypoints = [[0.0, 0.0, 0.5235987755982988], [0.0, 0.01, 0.5235987755982988]]
+move_time = 0.03
+
+[tune]
+starts = 2
+iterations = 3
+samples = 20
+limits = { peak_voltage = "own", gain_margin = 1.0 }
+pareto = { limit = "peak_voltage", values = [20.0, 40.0], family = "all" }
+scenarios = { count = 2, check = 3, spread = { "link.youngs_modulus" = 5.0 } }
+
+[tune.free]
+"control.gain_factor" = { from = 0.05, to = 2.0, scale = "log" }
+placement = { kind = "same" }
+
+[tune.families]
+gains = { free = ["control.gain_factor"] }
+all = {}
+loud = { free = [], set = { "control.gain_factor" = 1.0 } }
+"""
+
+
+def check_kept(out):
+    """Each family's row is its own: the study that it gives, run on the first fresh machine."""
+    data = read_store(out / "tune.h5")[0]
+    families, fresh = list(data["family"].data), data["fresh_residual_rms"].data
+    assert families[-1] == "loud"  # families that move nothing come last
+    for name in ("gains", "all", "all, peak_voltage 20", "all, peak_voltage 40"):
+        tuned = load_study(out / f"tuned_{name.replace(', ', '_').replace(' ', '_')}.toml")
+        modulus = data["scenario_link_youngs_modulus"].data[0]
+        seed = int(data["scenario_run_seed"].data[0])
+        study = tuned.change(link__youngs_modulus=modulus, run__seed=seed)
+        rms = run_study(study, has_record=False, has_loop=False).result.metrics.residual_rms
+        found = np.sqrt(np.mean(rms**2))
+        np.testing.assert_allclose(fresh[families.index(name), 0], found, rtol=1e-9)
+    own = load_study(out / "study.toml")
+    assert own.control.gain_factor == paper_study().control.gain_factor
+    assert modulus != own.link.youngs_modulus  # even the first machine is a fresh one
+
+
+@pytest.mark.long
+def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
+    file, out = tmp_path / "t.toml", tmp_path / "out"
+    file.write_text(FILE)
+    cli.main(["tune", str(file), "--out", str(out)])
+    text = (out / "report.md").read_text()
+    for part in ("| gains |", "| loud |", "| all, peak_voltage 20 |", "worst disagreement is",
+                 "Sobol designs of all", "rank correlation"):  # fmt: skip
+        assert part in text
+    for name in ("descent", "gains", "front"):
+        assert (out / f"{name}.png").stat().st_size > 10_000
+    tuned = load_study(out / "tuned_gains.toml")
+    assert tuned.control.gain_factor != paper_study().control.gain_factor
+    check_kept(out)
+    before, _ = read_store(out / "tune.h5")
+    cli.main(["tune", str(file), "--out", str(out), "--resume", "--quiet"])
+    after, _ = read_store(out / "tune.h5")
+    assert set(before) == set(after)
+    for name, variable in before.items():
+        np.testing.assert_array_equal(variable.data, after[name].data, err_msg=name)
+    for more, message in (([], "holds a tuning already"), (["--audit"], "")):
+        code = 0
+        try:
+            cli.main(["tune", str(file), "--out", str(out), *more])
+        except SystemExit as end:
+            code = end.code
+        said = capsys.readouterr()
+        assert (code, message in said.err) == ((2, True) if message else (0, True))
+    file.write_text(FILE.replace("iterations = 3", "iterations = 4"))
+    cli.main(["tune", str(file), "--out", str(out), "--resume", "--quiet"])
+    assert read_store(out / "tune.h5")[0]["trial_objective"].data.shape == (4, 8)
+    file.write_text(FILE.replace("starts = 2", "starts = 3"))
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["tune", str(file), "--out", str(out), "--resume"])
+    assert "another tuning file" in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_placement_by_gradient_is_as_good_as_the_sweep_in_a_fiftieth_of_its_runs(tmp_path):
+    """The ready sweep's 4,096 placements on the move of `tune_placement`, both as they are run."""
+    specs = Path(spec_module.__file__).parent / "specs"
+    spec = load_tuning(specs / "tune_placement.toml")
+    asked = {**spec.data, "sweep": read_toml(specs / "placement.toml")["sweep"]}
+    del asked["tune"]
+    swept = run_sweep(parse_sweep(asked), tmp_path / "sweep", is_quiet=True)
+    data = load(tmp_path / "sweep")
+    residual = np.sqrt(np.mean(data["residual_rms"] ** 2, axis=(1, 2)))
+    best = np.min(residual[data["status"] == 0])
+    found = run_tuning(spec, tmp_path / "tune", False, Console(quiet=True), True)
+    tuned = load_study(tmp_path / "tune" / "tuned.toml")
+    result = run_study(tuned, has_record=False).result
+    own = np.sqrt(np.mean(result.metrics.residual_rms**2))
+    differentiated = int(found.at.iteration) * (1 + spec.tune.starts)
+    assert result.status == 0 and own <= best
+    # what each costs is measured where compilers do their best: docs/tuning.md
+    assert swept.n_run == len(residual) == 4096 and differentiated <= 4096 // 50
+
+
+# --- the folder -----------------------------------------------------------------------------------
+
+
+def opened(out, is_resumed, **other):
+    manifest = {"spec": {"tune": {"iterations": 3}}, "code": "a", "jaxlib": "1", "precision": "x"}
+    with open_tuning(out, manifest | other, is_resumed) as before:
+        return before
+
+
+def test_a_folder_of_other_things_is_left_alone(tmp_path):
+    (tmp_path / "report.md").write_text("precious")
+    with pytest.raises(StudyError, match="holds other files .report.md.; name a new or empty"):
+        opened(tmp_path, False)
+    assert [file.name for file in tmp_path.iterdir() if file.name[0] != "."] == ["report.md"]
+
+
+def test_a_folder_belongs_to_its_tuning(tmp_path):
+    assert opened(tmp_path, False) is None
+    (tmp_path / ".tune.h5.0123abcd.tmp").write_text("left by a kill")
+    assert opened(tmp_path, True) is None and not list(tmp_path.glob("*.tmp"))
+    longer = {"tune": {"iterations": 9}}
+    assert opened(tmp_path, True, spec=longer) is None  # more of the same
+    with pytest.raises(StudyError, match="holds a tuning already"):
+        opened(tmp_path, False)
+    for other, word in (
+        ({"spec": {"tune": {"seed": 1}}}, "tuning file"), ({"code": "b"}, "program"),
+        ({"jaxlib": "2"}, "jaxlib"), ({"precision": "y"}, "precision"),
+        ({"spec": {"tune": {"iterations": 9, "method": "adam"}}}, "tuning file"),
+    ):  # fmt: skip
+        with pytest.raises(StudyError, match=f"begun with another {word}"):
+            opened(tmp_path, True, **other)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("tune.json", b"[" * 100_000), ("tune.json", b"\xff"), ("tune.json", b"[]"),
+     ("progress.npz", b""), ("progress.npz", b"PK"), ("progress.npz", "array")],
+)  # fmt: skip
+def test_damaged_files_are_named(tmp_path, name, content):
+    opened(tmp_path, False)
+    if content == "array":
+        with open(tmp_path / name, "wb") as file:
+            np.save(file, np.zeros(3))
+    else:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(StudyError, match=f"{name}: damaged|begun with another"):
+        opened(tmp_path, True)
+
+
+def test_a_tuning_that_fails_at_once_leaves_the_folder_free(tmp_path):
+    manifest = {"spec": {}, "code": "a", "jaxlib": "1", "precision": "x"}
+    with pytest.raises(StudyError, match="nothing depends"):
+        with open_tuning(tmp_path, manifest, False):
+            raise StudyError("nothing depends on it")
+    assert opened(tmp_path, False) is None
+
+
+def test_progress_of_other_shapes_is_damaged():
+    spec = tuning(GAIN, starts=2, iterations=3)
+    linear = SimpleNamespace(screen=lambda k, values: np.zeros((2, len(values))))
+    at = begin(spec, SimpleNamespace(linear=linear))
+    assert fits(spec, at) and fits(spec._replace(tune=spec.tune.model_copy()), at)
+    assert not fits(spec, at._replace(best_place=at.best_place[:1]))
+    assert not fits(tuning(GAIN, starts=3, iterations=3), at)
+
+
+def test_own_limits_need_something_to_be_a_share_of():
+    silent = {**SMALL, "control": {**SMALL["control"], "velocity_gain": [0.0, 0.0, 0.0]}}
+    spec = parse_tuning({**silent, "tune": {"free": {"drive.kp": {"from": 1e4, "to": 4e4}},
+                                            "limits": {"peak_voltage": "own"}}})  # fmt: skip
+    checked = SimpleNamespace(spec=spec, families=list(spec.families), merit=merit_of(spec))
+    metrics = SimpleNamespace(residual_rms=np.ones((1, 3, 3)), peak_voltage=np.zeros((1, 3)))
+    with pytest.raises(StudyError, match="peak_voltage = 'own': the study itself has 0"):
+        Evaluator._check_own(checked, np.array([0]), metrics)
+
+
+def test_neighbours_of_a_corner_do_not_fail_an_audit(monkeypatch):
+    """|x - a| has a derivative wherever x is not a, however near that is; a wrong one is found."""
+    spec = tuning(GAIN, starts=1)
+    own = float(spec.free.places()[0])
+
+    def designs(spec, evaluator, places, sign=1.0):
+        x, zero = places[:, 0], np.zeros((len(places), 0))
+        slope = sign * np.sign(x - own - 2e-5)[:, None] / spec.free.slopes(places)
+        return Evaluation(
+            np.abs(x - own - 2e-5), slope, zero, np.zeros((len(x), 0, 1)), zero, zero, x
+        )
+
+    for sign, is_fine in ((1.0, True), (0.9, False), (-1.0, False)):
+        monkeypatch.setattr(audit_module, "_evaluated", partial(designs, sign=sign))
+        monkeypatch.setattr(audit_module, "Evaluator", lambda spec, families: None)
+        (one,) = audit_module.audit(spec, np.array([[own]]))
+        assert (one.share < audit_module.ALLOWED) == is_fine

@@ -1,0 +1,190 @@
+"""Free numbers of a tuning and what a tuning file may ask for."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from studies import spec as spec_module
+from studies.cases import as_arrays, build_case
+from studies.errors import StudyError
+from studies.spec import parse_study
+from studies.sweeps.axes import set_value
+from studies.tuning.merit import tail_weights
+from studies.tuning.spec import load_tuning, parse_tuning
+from tests.tunings import EVERY_KIND, GAIN, SMALL, tuning
+
+
+def test_free_numbers_get_to_where_the_study_would_put_them():
+    """Placed into a case they give what a study file with these values gives."""
+    spec = tuning(EVERY_KIND)
+    values = spec.free.values(np.random.default_rng(0).uniform(0.2, 0.8, len(spec.free.names)))
+    study = spec.study
+    for name, value in zip(spec.free.names, values, strict=True):
+        study = parse_study(set_value(study, name, float(value)))
+    placed = spec.free.place(as_arrays(build_case(spec.study)), values)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13),
+        placed, as_arrays(build_case(study)),
+    )  # fmt: skip
+    assert len(values) == 1 + 3 + 2 + 6
+
+
+def test_the_start_is_the_study_itself():
+    spec = tuning(EVERY_KIND)
+    values = dict(zip(spec.free.names, spec.free.values(spec.free.places()), strict=True))
+    assert values["control.gain_factor"] == pytest.approx(spec.study.control.gain_factor)
+    assert values["control.ratios[1][1]"] == pytest.approx(0.3)
+    assert values["drive.kp"] == pytest.approx(2e4)
+
+
+def test_slopes_are_those_of_the_values():
+    spec = tuning(EVERY_KIND)
+    u, step = np.random.default_rng(1).uniform(0.2, 0.8, len(spec.free.names)), 1e-6
+    change = (spec.free.values(u + step) - spec.free.values(u - step)) / (2 * step)
+    np.testing.assert_allclose(spec.free.slopes(u), change, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["same", "per_link"])
+def test_patches_stay_on_the_link_and_apart(kind):
+    spec = tuning({"placement": {"kind": kind}})
+    case = as_arrays(build_case(spec.study))
+    start = spec.free.place(case, spec.free.values(spec.free.places())).machine.patches.center
+    np.testing.assert_allclose(start, case.machine.patches.center, atol=1e-12)
+    pitch, length = 0.03, 0.2
+    random = np.random.default_rng(0)
+    corners = (np.zeros(len(spec.free.names)), np.ones(len(spec.free.names)))
+    for u in [*corners, *random.uniform(size=(50, len(spec.free.names)))]:
+        center = np.asarray(spec.free.place(case, spec.free.values(u)).machine.patches.center)
+        assert center.shape == (3, 3)
+        assert center.min() >= pitch / 2 - 1e-12 and center.max() <= length - pitch / 2 + 1e-12
+        assert np.diff(center, axis=1).min() >= pitch - 1e-12
+
+
+def test_poles_become_gains():
+    """(22)-(23): k_d = 2 alpha, k_p = alpha^2 + beta^2 - omega^2 with omega of the bare link."""
+    data = {**SMALL, "control": {**SMALL["control"], "gain_unit": "1/s"}}
+    free = {
+        "poles.decay": {"from": 5.0, "to": 50.0},
+        "poles.frequency_hz": {"from": 80.0, "to": 200.0},
+    }
+    spec = parse_tuning({**data, "tune": {"free": free}})
+    values = np.array([10.0, 20.0, 30.0, 100.0, 110.0, 120.0])
+    control = spec.free.place(as_arrays(build_case(spec.study)), values).control
+    np.testing.assert_allclose(control.velocity_gain, 2 * values[:3])
+    link = spec.study.link
+    inertia = link.width * link.thickness**3 / 12
+    mass = link.density * link.width * link.thickness
+    omega = (np.pi / link.length) ** 2 * np.sqrt(link.youngs_modulus * inertia / mass)
+    wanted = values[:3] ** 2 + (2 * np.pi * values[3:]) ** 2 - omega**2
+    np.testing.assert_allclose(control.position_gain, wanted, rtol=1e-9)
+
+
+def test_what_is_no_number_stays_as_it_is():
+    free = {**EVERY_KIND, "placement": {"kind": "same"}}
+    del free["patches.centers[1]"]
+    spec = tuning(free)
+    case = as_arrays(build_case(spec.study))
+    kept = spec.free.place(case, np.full(len(spec.free.names), np.nan))
+    jax.tree.map(np.testing.assert_array_equal, kept, case)
+
+
+BOTH = {"gains": {"free": ["control.gain_factor"]}, "all": {}}
+
+
+def deep(n):
+    """A list in a list in a list ..."""
+    found = 1.0
+    for _ in range(n):
+        found = [found]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("tune", "message"),
+    [
+        ({}, "tune.free = .*: allowed one free field or more"),
+        ({"free": {"control.gainfactor": {}}}, "did you mean 'control.gain_factor'"),
+        ({"free": {"run.duration": {"from": 0.1, "to": 1.0}}}, "cannot be free; fields that can"),
+        ({"free": {"control.gain_factor": {"from": 0.6, "to": 2.0}}},
+         "control.gain_factor = 0.5: allowed 0.6 to 2, the bounds"),
+        ({"free": {"control.gain_factor": {"from": -1.0, "to": 2.0}}}, "a finite number >= 0"),
+        ({"free": {"control.gain_factor": {"from": 2.0, "to": 1.0}}}, "= 1.0: allowed more than"),
+        ({"free": {"poles.decay": {"from": 1.0, "to": 2.0}}}, "needs poles.frequency_hz beside it"),
+        ({"free": {**GAIN, "control.velocity_gain": {"from": 1.0, "to": 100.0},
+                   "control.velocity_gain[0]": {"from": 1.0, "to": 100.0}}}, "free twice"),
+        ({"free": {"placement": {"from": 0, "to": 1}}}, "allowed {kind = 'same'}"),
+        ({"free": GAIN, "objective": {"residual": 1.0}}, "did you mean 'residual_rms'"),
+        ({"free": GAIN, "objective": {"residual_rms": -1.0}}, "allowed a number > 0"),
+        ({"free": GAIN, "objective": {"gain_margin": 1.0}}, "'gain_margin' is no metric"),
+        ({"free": GAIN, "limits": {"peak_volt": 1.0}}, "did you mean 'peak_voltage'"),
+        ({"free": GAIN, "objective": {"residual_rms[3]": 1.0}},
+         r"has no such entry; allowed residual_rms\[0 to 2\]\[0 to 2\]"),
+        ({"free": GAIN, "objective": {"settling_time": 1.0}}, "no derivative; take ringing_time"),
+        ({"free": GAIN, "limits": {"gain_margin[0]": 2.0}}, "no such entry; allowed gain_margin"),
+        ({"free": GAIN, "limits": {"peak_voltage": "mine"}}, "> 0 and <= 1e\\+30 or 'own'"),
+        ({"free": GAIN, "limits": {"peak_voltage": 40.0, "peak_voltage[1]": 50.0}},
+         r"peak_voltage\[1\] = 50 allows more than peak_voltage = 40"),
+        ({"free": GAIN, "scenarios": {"spread": {"link.basis": 5.0}}}, "for a number"),
+        ({"free": GAIN, "scenarios": {"spread": {"electronics.adc_noise": 5.0}}}, "not 0 where"),
+        ({"free": GAIN, "scenarios": {"each": {"motion.move_time": 0.03}}}, "a list of values"),
+        ({"free": GAIN, "scenarios": {"each": {"motion.move_time": [-1.0]}}}, "move_time = -1.0"),
+        ({"free": GAIN, "scenarios": {"tail": 2.0}}, "tune.scenarios.tail = 2.0: allowed"),
+        ({"free": GAIN, "families": {"one": {"free": ["control.gainfactor"]}}},
+         "did you mean 'control.gain_factor'"),
+        ({"free": GAIN, "families": {"one": {"free": []}}}, "one with free numbers or more"),
+        ({"free": GAIN, "families": {"one": {"set": {"link.modes": 3}}}}, "n_modes = 3 where"),
+        ({"free": GAIN, "families": {"one": {"set": {"motion.move_time": 0.06}}}},
+         "tune.families.one: .* run.duration"),
+        ({"free": GAIN, "families": {"..": {}}}, "not first a sign"),
+        ({"free": GAIN, "families": {"$x$": {}}}, "not first a sign"),
+        ({"free": GAIN, "families": {"a b": {}, "A+B": {}}}, "'a b' is one already"),
+        ({"free": GAIN, "families": {"a": {}, "a, peak_voltage 20": {}},
+          "limits": {"peak_voltage": 50.0},
+          "pareto": {"limit": "peak_voltage", "values": [20.0, 30.0], "family": "a"}},
+         "is one already"),
+        ({"free": GAIN, "limits": {"gain_margin": 2.0},
+          "pareto": {"limit": "gain_margin", "values": [1.0, 2.0]}}, "one of the metrics in"),
+        ({"free": GAIN, "limits": {"peak_voltage": 50.0},
+          "pareto": {"limit": "peak_voltage", "values": [1.0, 2.0], "family": []}}, "one of tuned"),
+        ({"free": GAIN, "scenarios": {"spread": {"run.duration": 5.0}}}, "numbers of the machine"),
+        ({"free": GAIN, "scenarios": {"spread": {"link.damping_ratio": 99.0},
+                                      "each": {"link.damping_ratio": [0.9]}}}, "both in"),
+        ({"free": GAIN, "starts": 1000, "scenarios": {"count": 1000}}, "runs at once; allowed up"),
+        ({"free": {"placement": {"kind": "same"}, "patches.centers": {"from": 0.02, "to": 0.18}}},
+         "patches.centers: placement is free too"),
+        ({"free": {"pole.decay": {"from": 5.0, "to": 50.0}}}, "did you mean 'poles.decay'"),
+        ({"free": GAIN, "objective": {"qqq": 1.0}}, "is no metric; allowed residual_rms, "),
+        ({"free": GAIN, "limits": {"peak_voltage": deep(400)}}, "peak_voltage = .* or 'own'"),
+        ({"free": GAIN, "families": {"one": {"sets": {}}}}, "allowed {free = "),
+        ({"free": GAIN, "pareto": {"limit": "peak_voltage", "values": [1.0, 2.0]}},
+         "tune.pareto.limit = 'peak_voltage': allowed one of the metrics in tune.limits"),
+        ({"free": GAIN, "limits": {"peak_voltage": 50.0},
+          "pareto": {"limit": "peak_voltage", "values": [1.0]}}, "two limits or more"),
+        ({"free": GAIN, "limits": {"peak_voltage": 50.0},
+          "pareto": {"limit": "peak_voltage", "values": [1.0, 1.0]}}, "each limit once"),
+        ({"free": GAIN, "scenarios": {"each": {"link.youngs_modulus": [7e10]},
+                                      "spread": {"link.youngs_modulus": 5.0}}}, "both in spread"),
+        ({"free": GAIN, "scenarios": {"each": {"control.gain_factor": [0.5]}}}, "is free in fam"),
+        ({"free": GAIN, "families": {"one": {"set": {"control.gain_factor": 1.0}}}},
+         "tune.families.one.set: control.gain_factor is free in family 'one'"),
+        ({"free": GAIN, "starts_": 3}, "starts_"),
+    ],
+)  # fmt: skip
+def test_faults_are_named(tune, message):
+    with pytest.raises(StudyError, match=message):
+        parse_tuning({**SMALL, "tune": tune})
+
+
+@pytest.mark.parametrize(
+    ("tail", "weights"),
+    [(1.0, [0.25] * 4), (0.0, [1, 0, 0, 0]), (0.5, [0.5, 0.5, 0, 0]), (0.3, [5 / 6, 1 / 6, 0, 0])],
+)
+def test_tail_goes_from_the_mean_to_the_worst(tail, weights):
+    np.testing.assert_allclose(tail_weights(4, tail), weights)
+
+
+def test_ready_tunings_are_valid():
+    for path in sorted(Path(spec_module.__file__).parent.glob("specs/tune*.toml")):
+        assert len(load_tuning(path).free.names) > 1
