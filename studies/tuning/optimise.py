@@ -243,7 +243,7 @@ def _updated(at: Progress) -> Progress:
 
 
 def _handed_on(spec: TuneSpec, at: Progress) -> Progress:
-    """The worst start of a family goes on from another family's design that is better.
+    """The worst start of a family takes another family's design that is better, and goes on there.
 
     Others are its neighbours on a front, and those that move less of the same study.
     """
@@ -253,11 +253,13 @@ def _handed_on(spec: TuneSpec, at: Progress) -> Progress:
         if not given or len(members) < 2:
             continue
         mine = at.winner(k)
-        kept = [j for j in given if _keeps(spec, at, j, family)]
+        limits = {j: _limits_there(spec, at, j, family) for j in given}
+        kept = [j for j in given if np.isfinite(limits[j]).all() and not excess(limits[j][None])[0]]
         best = min(kept, key=lambda j: at.best_objective[j], default=mine)
-        if at.best_objective[best] < at.best_objective[mine]:
+        is_kept = excess(at.best_limits[[mine]])[0] == 0
+        if best != mine and (at.best_objective[best] < at.best_objective[mine] or not is_kept):
             worst = max(members, key=lambda j: at.best_objective[j])
-            at = _moved(spec, at, int(worst), best)
+            at = _moved(spec, at, int(worst), best, limits[best])
     return at
 
 
@@ -268,25 +270,34 @@ def _can_take(family: Family, other: Family) -> bool:
     return other is not family and is_same_study and (is_near or is_part)
 
 
-def _keeps(spec: TuneSpec, at: Progress, start: int, family: Family) -> bool:
-    """Whether the best design of a start keeps another family's limits."""
+def _limits_there(spec: TuneSpec, at: Progress, start: int, family: Family) -> np.ndarray:
+    """What the best design of a start has of another family's limits, (m,)."""
     limits = at.best_limits[start].copy()
     if family.front:
         k, allowed = spec.limit_names.index(spec.tune.pareto["limit"]), family.limits
         limits[k] = at.best_peaks[start, k] / float(allowed[spec.tune.pareto["limit"]]) - 1
-    return bool(np.isfinite(limits).all() and excess(limits[None])[0] == 0)
+    return limits
 
 
-def _moved(spec: TuneSpec, at: Progress, start: int, to: int) -> Progress:
-    """A start put to the best place of another, as if it were new there."""
+def _moved(spec: TuneSpec, at: Progress, start: int, to: int, limits: np.ndarray) -> Progress:
+    """A start put to the best place of another, whose limits its family sees like this."""
     place, base = at.place.copy(), at.base_objective.copy()
     place[start], base[start] = at.best_place[to], np.nan
+    best = {
+        name: getattr(at, name).copy() for name in ("best_place", "best_objective", "best_peaks")
+    }
+    for array in best.values():
+        array[start] = array[to]
+    best_limits = at.best_limits.copy()
+    best_limits[start] = limits
     fresh = method(spec).begin(at.place)
     state = tuple(np.array(x) for x in at.descent)
     for now, new in zip(state, fresh, strict=True):
         if now.ndim and now.shape[0] == len(place):
             now[start] = new[start]
-    return at._replace(place=place, base_objective=base, descent=state)
+    return at._replace(
+        place=place, base_objective=base, descent=state, best_limits=best_limits, **best
+    )
 
 
 def optimise(
@@ -307,7 +318,7 @@ def optimise(
     while int(at.iteration) < spec.tune.iterations and not is_settled(spec, at):
         at = advance(spec, evaluator, at)
         keep(at)
-    return at
+    return _handed_on(spec, at)
 
 
 def fits(spec: TuneSpec, at: Progress) -> bool:

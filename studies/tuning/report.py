@@ -192,12 +192,14 @@ def _numbers(spec: TuneSpec, found: Findings) -> list[str]:
             value = spec.free.values(places[k])[n]
             low, high = (spec.free.values(x)[n] for x in (alike[k].min(0), alike[k].max(0)))
             mark = "*" if places[k][n] in (0.0, 1.0) else ""
-            cells.append(f"{value:.4g}{mark} ({low:.3g}..{high:.3g})" if family.is_free[n] else "-")
+            span = f" ({low:.3g}..{high:.3g})" if len(alike[k]) > 1 else ""
+            cells.append(f"{value:.4g}{mark}{span}" if family.is_free[n] else "-")
         bounds = f"{free.span.low:g} to {free.span.high:g}"
         lines.append(f"| {free.name} | {bounds} | {start} | " + " | ".join(cells) + " |")
     told = (
-        f"`*`: at its bound; `-`: not moved; in brackets the range of all starts that end within "
-        f"{100 * ALIKE:g} % of the best: a wide one means that the number hardly matters there. "
+        "`*`: at its bound; `-`: not moved; in brackets the range of all starts that end within "
+        f"{100 * ALIKE:g} % of the best, where there are several: a wide one means that the number "
+        "hardly matters there. "
         "`placement` are shares of the room that is left; the patches' centres are:"
     )
     if not any(free.key == PLACEMENT for free in spec.free.numbers):
@@ -239,7 +241,8 @@ def _search(spec: TuneSpec, found: Findings) -> list[str]:
         "limits" + (f", the best of them has objective {seen.objective[best]:.4f}" if count else "")
         + f"; the tuned design has {tuned:.4f} on the same scenarios.", "",
         f"All families together took {found.runs} differentiated runs, each at the cost of "
-        f"{cost:.2f} plain ones (measured): {found.runs * cost:.0f} in all.", "",
+        f"{cost:.2f} plain ones (measured): {found.runs * cost:.0f} in all, "
+        f"{found.runs * cost / len(spec.moving):.0f} for {main.name}.", "",
     ]  # fmt: skip
     return lines
 
