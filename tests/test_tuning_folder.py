@@ -112,7 +112,7 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
 
 
 @pytest.mark.long
-def test_placement_by_gradient_is_as_good_as_the_sweep_in_a_fiftieth_of_its_runs(tmp_path):
+def test_placement_by_gradient_is_as_good_as_the_sweep(tmp_path):
     """The ready sweep's 4,096 placements on the move of `tune_placement`, both as they are run."""
     specs = Path(spec_module.__file__).parent / "specs"
     spec = load_tuning(specs / "tune_placement.toml")

@@ -12,6 +12,7 @@ from studies.errors import StudyError
 from studies.spec import parse_study
 from studies.sweeps.axes import set_value
 from studies.tuning.merit import tail_weights
+from studies.tuning.scenarios import lane_columns, scenario_columns
 from studies.tuning.spec import load_tuning, parse_tuning
 from tests.tunings import EVERY_KIND, GAIN, SMALL, tuning
 
@@ -183,6 +184,16 @@ def test_faults_are_named(tune, message):
 )
 def test_tail_goes_from_the_mean_to_the_worst(tail, weights):
     np.testing.assert_allclose(tail_weights(4, tail), weights)
+
+
+def test_what_all_runs_share_is_no_column():
+    """It is prepared once, which takes longer than a run of some cases."""
+    spec = tuning(GAIN)
+    designs = [None, spec.families[0]]
+    assert lane_columns(spec, scenario_columns(spec, 1, 0), designs) == {}
+    assert list(lane_columns(spec, scenario_columns(spec, 2, 0), designs)) == ["run.seed"]
+    fresh = lane_columns(spec, scenario_columns(spec, 1, 0, is_fresh=True), designs)
+    assert (fresh["run.seed"] != spec.study.run.seed).all()
 
 
 def test_ready_tunings_are_valid():

@@ -52,6 +52,8 @@ def lane_columns(
 ) -> Columns:
     """Columns for designs times scenarios, design by design.
 
+    Those that say what the study says anyway are left out: what all runs share is prepared once.
+
     Args:
         spec: of the tuning.
         columns: from `scenario_columns`.
@@ -66,7 +68,11 @@ def lane_columns(
         own = known_field(name, spec.study)
         values = [family.columns.get(name, own) if family else own for family in families]
         lanes[name] = np.repeat(column_of(values), count, axis=0)
-    return lanes
+    return {
+        name: column
+        for name, column in lanes.items()
+        if not np.array_equal(column, np.broadcast_to(known_field(name, spec.study), column.shape))
+    }
 
 
 def nominal(spec: TuneSpec, family: Family | None) -> Study:
