@@ -149,7 +149,7 @@ def deep(n):
           "pareto": {"limit": "gain_margin", "values": [1.0, 2.0]}}, "one of the metrics in"),
         ({"free": GAIN, "limits": {"peak_voltage": 50.0},
           "pareto": {"limit": "peak_voltage", "values": [1.0, 2.0], "family": []}}, "one of tuned"),
-        ({"free": GAIN, "scenarios": {"spread": {"run.duration": 5.0}}}, "numbers of the machine"),
+        ({"free": GAIN, "scenarios": {"spread": {"run.duration": 5.0}}}, "for the machine and its"),
         ({"free": GAIN, "scenarios": {"spread": {"link.damping_ratio": 99.0},
                                       "each": {"link.damping_ratio": [0.9]}}}, "both in"),
         ({"free": GAIN, "starts": 1000, "scenarios": {"count": 1000}}, "runs at once; allowed up"),

@@ -187,6 +187,10 @@ def read_manifest(path: Path) -> dict[str, Any]:
     except RecursionError:
         raise StudyError(f"{path / MANIFEST}: damaged (nested too deeply)") from None
     except OSError:
+        if (path / "tune.json").is_file():
+            raise StudyError(
+                f"{path}: holds a tuning, no sweep; see its report.md, or tune.h5 with xarray"
+            ) from None
         raise StudyError(f"{path}: no folder of a sweep ({MANIFEST} is missing)") from None
     except ValueError as error:
         raise StudyError(f"{path / MANIFEST}: damaged ({error})") from None

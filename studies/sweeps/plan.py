@@ -53,6 +53,10 @@ class Layout(NamedTuple):
         """Cases in a chunk."""
         return self.devices * self.blocks * self.lanes
 
+    def filled(self, count: int) -> np.ndarray:
+        """Which of `count` cases each place holds: all, then the last one again, (size,)."""
+        return np.minimum(np.arange(self.size), count - 1)
+
 
 class Group(NamedTuple):
     """Cases that share a program."""

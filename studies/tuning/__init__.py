@@ -5,5 +5,6 @@
 - The way down: `evaluate` runs designs and differentiates them, `linear_fidelity` does the same
   for the linearised loop, `descent` steps (L-BFGS, Adam), `optimise` leads all starts.
 - What came out: `check` runs it on fresh machines with the real converters, `audit` compares
-  derivatives with differences, `report` and `plots` tell; `run` keeps all this in a folder.
+  derivatives with differences, `report`, `plots` and `results` tell.
+- `run` leads from the file to the results, `folder` keeps what is done and goes on with it.
 """

@@ -147,7 +147,7 @@ def _rows(metrics: Metrics, first: int, count: int) -> Metrics:
 def _run(structure: Structure, cases: Case, count: int) -> Result:
     """Run `count` cases in one chunk with the real converters."""
     layout = even_layout(count)
-    rows = np.minimum(np.arange(layout.size), count - 1)
+    rows = layout.filled(count)
     padded = in_working_precision(jax.tree.map(lambda x: x[rows], cases))
     result = make_executor(structure, layout, False).start(padded).wait()
     return jax.tree.map(lambda x: np.asarray(x)[:count], result)
@@ -171,7 +171,7 @@ def search(spec: TuneSpec, screen: Any) -> Searched:
     lanes = lane_columns(spec, columns, [None, *[family] * CHUNK])
     cases = build_cases(spec.study, lanes, structure)
     layout = even_layout(count * (1 + CHUNK))
-    rows = np.minimum(np.arange(layout.size), count * (1 + CHUNK) - 1)
+    rows = layout.filled(count * (1 + CHUNK))
     cases = in_working_precision(jax.tree.map(lambda x: x if len(x) == 1 else x[rows], cases))
     executor = make_executor(structure, layout, False)
     place, merit = jax.jit(jax.vmap(spec.free.place)), merit_of(spec)

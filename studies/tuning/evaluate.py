@@ -59,7 +59,7 @@ class Evaluator:
         self.scenarios = len(columns["run.seed"])
         self.lanes = self.scenarios * (1 + len(families))  # runs of a batch
         self._layout = _layout(self.lanes)
-        rows = np.minimum(np.arange(self._layout.size), self.lanes - 1)
+        rows = self._layout.filled(self.lanes)
         whole = lane_columns(spec, columns, [None, *families])
         study = spec.study.change(run__smooth=True)
         padded = {name: column[rows] for name, column in whole.items()}

@@ -171,11 +171,11 @@ def _loop_margin(found: Findings, k: int, name: str, limit: float | str) -> floa
 
 
 def _told(beyond: float, margin: float) -> str:
-    far = f" {100 * abs(margin):.2f} %" if np.isfinite(margin) else ""
     if beyond > KEPT:
-        return "**violated**" + (f" by{far}" if far else "")
-    state = "active" if margin < NEAR else "not active"
-    return state + (f", {far.strip()} left" if far else "")
+        return "**violated**" + (f" by {-100 * margin:.2f} %" if np.isfinite(margin) else "")
+    if np.isnan(margin):
+        return "kept"
+    return ("active" if margin < NEAR else "not active") + f", {100 * margin:.2f} % left"
 
 
 def _numbers(spec: TuneSpec, found: Findings) -> list[str]:
@@ -196,21 +196,23 @@ def _numbers(spec: TuneSpec, found: Findings) -> list[str]:
             cells.append(f"{value:.4g}{mark}{span}" if family.is_free[n] else "-")
         bounds = f"{free.span.low:g} to {free.span.high:g}"
         lines.append(f"| {free.name} | {bounds} | {start} | " + " | ".join(cells) + " |")
-    told = (
+    lines += [
+        "",
         "`*`: at its bound; `-`: not moved; in brackets the range of all starts that end within "
         f"{100 * ALIKE:g} % of the best, where there are several: a wide one means that the number "
-        "hardly matters there. "
-        "`placement` are shares of the room that is left; the patches' centres are:"
-    )
-    if not any(free.key == PLACEMENT for free in spec.free.numbers):
-        return [*lines, "", told.partition(" `placement`")[0], ""]
-    lines += ["", told, "", "| design | centres of the patches [mm] |", "|---|---|"]
-    own = np.full(len(spec.free.numbers), np.nan)
-    designs = [("the study itself", spec.moving[0], own)]
-    designs += [
-        (family.name, family, spec.free.values(place))
-        for family, place in zip(spec.moving, places, strict=True)
+        "hardly matters there.",
+        "",
     ]
+    return lines + (_centers(spec, places) if PLACEMENT in spec.tune.free else [])
+
+
+def _centers(spec: TuneSpec, places: list[np.ndarray]) -> list[str]:
+    """Where the patches are, which shares of the room that is left do not tell."""
+    lines = ["| design | centres of the patches [mm] |", "|---|---|"]
+    own = spec.moving[0]._replace(columns={}), np.full(len(spec.free.numbers), np.nan)
+    designs = [("the study itself", *own)]
+    for family, place in zip(spec.moving, places, strict=True):
+        designs.append((family.name, family, spec.free.values(place)))
     for name, family, values in designs:
         rows = np.unique(1e3 * patch_centers(spec, family, values), axis=0)
         text = "; ".join(", ".join(f"{x:.1f}" for x in row) for row in rows)

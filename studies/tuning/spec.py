@@ -197,7 +197,7 @@ def _check_spread(tune: Tune, study: Study) -> None:
         if value == 0:
             raise field_error(name, value, f"not 0 where {path} is a share of it")
         if name.partition(".")[0] in ("run", "metrics", "motion"):
-            raise field_error(path, percent, "for numbers of the machine and its control")
+            raise field_error(path, percent, "for the machine and its control; each takes others")
         for share in (1 - percent / 100, 1 + percent / 100):
             checked_value(study, name, value * share, path)
 
