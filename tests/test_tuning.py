@@ -340,9 +340,14 @@ def test_designs_are_handed_on_along_a_front():
     evaluator.evaluate = evaluate
     at = begin(spec, evaluator)
     place = np.array([[0.2], [0.25], [0.21], [0.22]])  # the second family is in the wrong valley
-    alone = optimise(spec._replace(families=tuple(f._replace(front="") for f in levels)),
-                     evaluator, at._replace(place=place), lambda at: None)  # fmt: skip
+    single = spec._replace(tune=tune.model_copy(update={"pareto": {}}))
+    alone = optimise(single, evaluator, at._replace(place=place), lambda at: None)
     better = np.array([[0.2], [0.25], [0.21], [0.68]])
     handed = optimise(spec, evaluator, at._replace(place=better), lambda at: None)
     assert abs(spec.free.values(alone.best_place)[alone.winner(1), 0] - 0.23) < 0.02
     assert abs(spec.free.values(handed.best_place)[handed.winner(1), 0] - 0.678) < 0.02
+    # what the first family finds last is the second one's too, with the limit as that sees it
+    cut = optimise(spec, evaluator, at._replace(place=place, iteration=np.array(11)), lambda at: 0)
+    best, taken = cut.winner(0), cut.winner(1)
+    assert cut.best_objective[taken] <= cut.best_objective[best]
+    np.testing.assert_allclose(cut.best_limits[taken, 0], cut.best_peaks[taken, 0] / 0.9 - 1)

@@ -15,7 +15,7 @@ from scipy.stats import qmc
 from studies.errors import StudyError
 from studies.tuning.descent import Adam, Descent, Lbfgs, Trial
 from studies.tuning.evaluate import Evaluation, Evaluator
-from studies.tuning.spec import Family, TuneSpec
+from studies.tuning.spec import OWN, Family, TuneSpec
 
 #: Iterations between two updates of the multipliers.
 ROUND = 5
@@ -245,11 +245,13 @@ def _updated(at: Progress) -> Progress:
 def _handed_on(spec: TuneSpec, at: Progress) -> Progress:
     """The worst start of a family takes another family's design that is better, and goes on there.
 
-    Others are its neighbours on a front, and those that move less of the same study.
+    Others are those that move no more of the same study, also with another limit along a front.
     """
     for k, family in enumerate(spec.moving):
         members = np.flatnonzero(at.family == k)
-        given = [at.winner(j) for j, other in enumerate(spec.moving) if _can_take(family, other)]
+        given = [
+            at.winner(j) for j, other in enumerate(spec.moving) if _can_take(spec, family, other)
+        ]
         if not given or len(members) < 2:
             continue
         mine = at.winner(k)
@@ -263,19 +265,23 @@ def _handed_on(spec: TuneSpec, at: Progress) -> Progress:
     return at
 
 
-def _can_take(family: Family, other: Family) -> bool:
-    is_near = bool(family.front) and family.front == other.front
-    is_part = bool((family.is_free | ~other.is_free).all()) and family.limits == other.limits
+def _can_take(spec: TuneSpec, family: Family, other: Family) -> bool:
+    """Whether designs of another family are such of this one, but for the limit along a front."""
+    is_part = bool((family.is_free | ~other.is_free).all())
     is_same_study = repr(family.columns) == repr(other.columns)
-    return other is not family and is_same_study and (is_near or is_part)
+    differing = {name for name, x in family.limits.items() if other.limits[name] != x}
+    is_known = all(
+        name == spec.tune.pareto.get("limit") and family.limits[name] != OWN for name in differing
+    )
+    return other is not family and is_same_study and is_part and is_known
 
 
 def _limits_there(spec: TuneSpec, at: Progress, start: int, family: Family) -> np.ndarray:
     """What the best design of a start has of another family's limits, (m,)."""
-    limits = at.best_limits[start].copy()
-    if family.front:
-        k, allowed = spec.limit_names.index(spec.tune.pareto["limit"]), family.limits
-        limits[k] = at.best_peaks[start, k] / float(allowed[spec.tune.pareto["limit"]]) - 1
+    limits, along = at.best_limits[start].copy(), spec.tune.pareto.get("limit")
+    if along in spec.limit_names and family.limits[along] != OWN:
+        k = spec.limit_names.index(along)
+        limits[k] = at.best_peaks[start, k] / float(family.limits[along]) - 1
     return limits
 
 
