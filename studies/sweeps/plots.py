@@ -278,7 +278,7 @@ def _placements(data: SweepData, y: str) -> Figure:
                     left = (center - length / 2) * unit
                     top.barh(row, length * unit, height, left, color=color, linewidth=0)
             also = "".join(f", {name} = {shown_value(data, name, case)}" for name in others)
-            texts.append(f"case {case}: {value[case]:.3g}{also}")
+            texts.append(f"case {case}: {value[case]:.4g}{also}")
         top.set_ylim(len(chosen) - 0.4, -0.6)
         top.set_xlim(0, link.length * unit)
         top.set_ylabel("best placements")
