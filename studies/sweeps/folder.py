@@ -197,18 +197,22 @@ def read_manifest(path: Path) -> dict[str, Any]:
     return manifest
 
 
+def refuse_others(path: Path, leftover: re.Pattern[str]) -> None:
+    """Raise StudyError where a new folder holds anything but its lock and leftovers of a kill."""
+    names = [found.name for found in path.iterdir() if found.name != LOCK]
+    others = sorted(name for name in names if not leftover.fullmatch(name))
+    if others:
+        raise StudyError(
+            f"--out {path}: holds other files ({', '.join(others[:3])}); name a new or empty folder"
+        )
+
+
 def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bool) -> None:
     """Refuse a folder of something else, a sweep already there, other code, other precision."""
     if not (folder.path / MANIFEST).exists():
         if is_resumed:
             raise StudyError(f"--resume: {folder.path} holds no sweep; leave --resume out")
-        names = [p.name for p in folder.path.iterdir() if p.name != LOCK]
-        others = [name for name in names if not _LEFTOVER.fullmatch(name)]
-        if others:
-            raise StudyError(
-                f"--out {folder.path}: holds other files ({', '.join(sorted(others)[:3])}); "
-                "name a new or empty folder"
-            )
+        refuse_others(folder.path, _LEFTOVER)
         return
     if not is_resumed:
         raise StudyError(

@@ -71,8 +71,7 @@ def tuned_study(spec: TuneSpec, family: Family, values: np.ndarray) -> Study:
         values: of all free numbers, (p,).
     """
     study = family.study(spec.study)
-    values = np.where(family.is_free, values, np.nan)
-    case = spec.free.place(as_arrays(build_case(study)), values)
+    case = _placed(spec, family, study, values)
     names = list(np.array(spec.free.names)[family.is_free])
     whole: dict[str, Any] = {}
     if any(name.startswith(PLACEMENT) for name in names):
@@ -101,9 +100,14 @@ def patch_centers(spec: TuneSpec, family: Family, values: np.ndarray) -> np.ndar
         family: of the design.
         values: of the free numbers, (p,).
     """
-    case: Case = as_arrays(build_case(family.study(spec.study)))
-    placed = spec.free.place(case, np.where(family.is_free, values, np.nan))
+    placed = _placed(spec, family, family.study(spec.study), values)
     return np.asarray(placed.machine.patches.center)
+
+
+def _placed(spec: TuneSpec, family: Family, study: Study, values: np.ndarray) -> Case:
+    """What a family's study becomes by those of the free numbers (p,) that it moves."""
+    case = as_arrays(build_case(study))
+    return spec.free.place(case, np.where(family.is_free, values, np.nan))
 
 
 def fresh_columns(spec: TuneSpec) -> dict[str, np.ndarray]:

@@ -66,7 +66,6 @@ class Evaluator:
         self._cases = in_working_precision(build_cases(study, padded, self._structure))
         self._rows = rows // self.scenarios  # design of every lane, the study itself first
         self.run_time = float("nan")  # what one of the last batch took [s]
-        self._is_compiled = False
         self._gradients = make_gradients(self._structure, self._layout, spec.free.place)
 
     def evaluate(self, values: np.ndarray, has_slope: np.ndarray | bool = True) -> Evaluation:
@@ -79,14 +78,13 @@ class Evaluator:
         """
         values = np.where(self.is_free, values, np.nan)
         own = np.full((1, values.shape[1]), np.nan)
-        started = time.perf_counter()
+        is_compiled, started = self._gradients.compile_time > 0, time.perf_counter()
         whole = np.concatenate([own, values])[self._rows]
         wanted = np.isfinite(values) & np.reshape(has_slope, (-1, 1))
         used = np.concatenate([np.zeros(own.shape, bool), wanted])[self._rows]
         runs = self._gradients.evaluate(self._cases, whole, used)
-        if self._is_compiled:
+        if is_compiled:
             self.run_time = (time.perf_counter() - started) / self.lanes
-        self._is_compiled = True
         shape = (1 + len(values), self.scenarios)
 
         def split(x: Any) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 
 from studies.errors import StudyError
 from studies.store import check_target, replacing
-from studies.sweeps.folder import LOCK, locked_folder
+from studies.sweeps.folder import locked_folder, refuse_others
 from studies.tuning.optimise import Progress
 
 MANIFEST, PROGRESS, RESULTS = "tune.json", "progress.npz", "tune.h5"
@@ -33,9 +33,6 @@ def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterat
     """
     with locked_folder(out, "tuning"):
         path = out / MANIFEST
-        for left in out.iterdir():
-            if _LEFTOVER.fullmatch(left.name) and left.is_file():
-                left.unlink()
         if path.is_file():
             if not is_resumed:
                 raise StudyError(f"--out {out}: holds a tuning already; go on with --resume")
@@ -53,13 +50,11 @@ def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterat
         elif is_resumed:
             raise StudyError(f"--out {out}: no tuning to resume there")
         else:
-            others = sorted(found.name for found in out.iterdir() if found.name != LOCK)
-            if others:
-                raise StudyError(
-                    f"--out {out}: holds other files ({', '.join(others[:3])}); name a new or "
-                    "empty folder"
-                )
+            refuse_others(out, _LEFTOVER)
             before = None
+        for left in out.iterdir():  # not before it is known whose they are
+            if _LEFTOVER.fullmatch(left.name) and left.is_file():
+                left.unlink()
         check_target(out / RESULTS)
         with replacing(path) as temporary:
             temporary.write_text(json.dumps(manifest, indent=1), encoding="utf-8")

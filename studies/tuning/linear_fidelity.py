@@ -70,9 +70,11 @@ class LinearFidelity:
         )
         self._pose = np.array(own.motion.waypoints[0])
         known = {
-            f.name: as_arrays(build_case(with_margin_modes(nominal(spec, f)))) for f in families
+            name: as_arrays(build_case(with_margin_modes(nominal(spec, family))))
+            for name, family in {family.name: family for family in families}.items()
         }
         self._cases = [known[family.name] for family in families]
+        self._stacked = jax.tree.map(lambda *x: jnp.stack(x), *self._cases)
         self._own: LoopFigures | None = None
         self._limits = np.array(
             [[self._limit(family, name) for name in self.names] for family in families]
@@ -97,10 +99,10 @@ class LinearFidelity:
         """
         if not self.names:
             return np.zeros((len(values), 0)), np.zeros((len(values), 0, values.shape[1]))
-        cases = jax.tree.map(lambda *x: jnp.stack(x), *self._cases)
         found = _limit_slopes(
-            self._plain, self.names, self._spec.free.place, cases, self._pose, self._limits, values
-        )
+            self._plain, self.names, self._spec.free.place, self._stacked, self._pose,
+            self._limits, values,
+        )  # fmt: skip
         return np.asarray(found[0]), np.asarray(found[1])
 
     def screen(self, position: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -59,6 +59,10 @@ class Progress(NamedTuple):
         order = np.lexsort((self.best_objective[members], excess(self.best_limits[members])))
         return int(members[order[0]])
 
+    def beyond(self, start: int) -> float:
+        """By how much a start's best design violates its limits beyond what counts as kept."""
+        return float(excess(self.best_limits[[start]])[0])
+
 
 def excess(limits: np.ndarray) -> np.ndarray:
     """Largest violation beyond what counts as kept, (B,)."""
@@ -98,7 +102,11 @@ def first_places(spec: TuneSpec, evaluator: Evaluator) -> np.ndarray:
 
 def begin(spec: TuneSpec, evaluator: Evaluator) -> Progress:
     """Before the first iteration."""
-    place = first_places(spec, evaluator)
+    return _untried(spec, first_places(spec, evaluator))
+
+
+def _untried(spec: TuneSpec, place: np.ndarray) -> Progress:
+    """Starts at places between the bounds (B, p), of which nothing is known."""
     starts, p = place.shape
     m = len(spec.limit_names)
     return Progress(
@@ -258,7 +266,7 @@ def _handed_on(spec: TuneSpec, at: Progress) -> Progress:
         limits = {j: _limits_there(spec, at, j, family) for j in given}
         kept = [j for j in given if np.isfinite(limits[j]).all() and not excess(limits[j][None])[0]]
         best = min(kept, key=lambda j: at.best_objective[j], default=mine)
-        is_kept = excess(at.best_limits[[mine]])[0] == 0
+        is_kept = at.beyond(mine) == 0
         if best != mine and (at.best_objective[best] < at.best_objective[mine] or not is_kept):
             worst = max(members, key=lambda j: at.best_objective[j])
             at = _moved(spec, at, int(worst), best, limits[best])
@@ -328,19 +336,14 @@ def optimise(
 
 
 def fits(spec: TuneSpec, at: Progress) -> bool:
-    """Whether a kept tuning has the shapes of this one."""
-    starts, p, m = len(start_families(spec)), len(spec.free.names), len(spec.limit_names)
-    shapes = {
-        "place": (starts, p), "base": (starts, p), "base_slope": (starts, p),
-        "best_place": (starts, p), "base_limits": (starts, m), "multiplier": (starts, m),
-        "best_limits": (starts, m), "best_peaks": (starts, m), "base_limit_slope": (starts, m, p),
-        "family": (starts,), "base_objective": (starts,), "penalty": (starts,),
-        "worst": (starts,), "is_frozen": (starts,), "best_objective": (starts,),
-        "least": (len(spec.moving), m), "gained": (len(spec.moving),), "iteration": (),
-    }  # fmt: skip
-    is_alike = all(getattr(at, name).shape == shape for name, shape in shapes.items())
-    is_alike &= at.history.shape[1:] == (starts, 2)
-    return is_alike and len(at.history) >= int(at.iteration)
+    """Whether a kept tuning has the shapes of this one; iterations may differ."""
+
+    def shapes(one: Progress) -> list[tuple[int, ...]]:
+        *arrays, history, descent = one
+        return [np.shape(history)[1:], *map(np.shape, (*arrays, *descent))]
+
+    wanted = _untried(spec, np.zeros((len(start_families(spec)), len(spec.free.names))))
+    return shapes(at) == shapes(wanted) and len(at.history) >= int(at.iteration)
 
 
 def _with_room(at: Progress, iterations: int) -> Progress:

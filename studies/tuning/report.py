@@ -78,7 +78,7 @@ def summary(spec: TuneSpec, found: Findings) -> list[str]:
     lines = []
     for k, (family, one) in enumerate(zip(spec.families, found.judged, strict=True)):
         is_moving = k < len(spec.moving)
-        lost = is_moving and excess(found.at.best_limits[[found.at.winner(k)]])[0] > 0
+        lost = is_moving and found.at.beyond(found.at.winner(k)) > 0
         lines.append(
             f"{family.name}: {one.objective.mean():.4f} of the study's objective on {machines}"
             + (f", worst {one.objective.max():.4f}" if len(one.objective) > 1 else "")
@@ -224,7 +224,7 @@ def _alike(at: Progress, family: int) -> np.ndarray:
     """Starts of a family that end as good as its best one, or nearly."""
     best = at.winner(family)
     is_near = at.best_objective <= (1 + ALIKE) * at.best_objective[best]
-    is_kept = excess(at.best_limits) <= excess(at.best_limits[[best]])
+    is_kept = excess(at.best_limits) <= at.beyond(best)
     return np.flatnonzero((at.family == family) & is_near & is_kept)
 
 
@@ -295,7 +295,7 @@ def unkept(spec: TuneSpec, at: Progress) -> list[str]:
     """What no start of a family keeps, one line for each family; empty where all is well."""
     lines = []
     for k, family in enumerate(spec.moving):
-        if excess(at.best_limits[[at.winner(k)]])[0] == 0:
+        if at.beyond(at.winner(k)) == 0:
             continue
         lines.append(f"{family.name}: {_contradiction(spec, family, at.least[k])}")
     return lines

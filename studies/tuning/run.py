@@ -23,7 +23,7 @@ from studies.tuning.audit import audit
 from studies.tuning.check import judge, search, tuned_study
 from studies.tuning.evaluate import Evaluator
 from studies.tuning.folder import PROGRESS, RESULTS, open_tuning, save_progress
-from studies.tuning.optimise import Progress, excess, fits, optimise, start_families
+from studies.tuning.optimise import Progress, fits, optimise, start_families
 from studies.tuning.report import Findings, report, summary, unkept
 from studies.tuning.results import file_name, variables
 from studies.tuning.spec import TuneSpec
@@ -103,7 +103,7 @@ def _told(spec: TuneSpec, at: Progress) -> str:
         if not np.isfinite(at.best_objective[best]):
             parts.append(f"{family.name} -")
             continue
-        beyond = excess(at.best_limits[[best]])[0]
+        beyond = at.beyond(best)
         mark = f" (limit {100 * beyond:+.1f} %)" if beyond > 0 else ""
         parts.append(f"{family.name} {at.best_objective[best]:.4f}{mark}")
     lost = f"; {at.is_frozen.sum()} starts frozen" if at.is_frozen.any() else ""
