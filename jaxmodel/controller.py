@@ -89,18 +89,34 @@ def convert(controller: Controller, voltage: Array, noise: Array | None, is_smoo
     Returns:
         (measured [V], is_clipped), (3, K) each.
     """
+    if not is_smooth:
+        code, is_clipped = adc_code(controller, voltage, noise)
+        return read_back(controller, code), is_clipped
     level = controller.adc_gain * voltage + controller.adc_bias
-    step, sigma = controller.adc_step, controller.adc_noise
-    if is_smooth:  # uniform rounding error has variance step^2/12
-        sigma = jnp.sqrt(sigma * sigma + step * step / 12)
+    if noise is not None:  # uniform rounding error has variance step^2/12
+        level = level + jnp.sqrt(controller.adc_noise**2 + controller.adc_step**2 / 12) * noise
+    return (level - controller.adc_bias) / controller.adc_gain, jnp.zeros_like(level)
+
+
+def adc_code(controller: Controller, voltage: Array, noise: Array | None) -> tuple[Array, Array]:
+    """Code that conditioner and ADC make of a sensor voltage, and 1 where it clips, else 0.
+
+    Args:
+        controller: coefficients.
+        voltage: filtered sensor voltage [V], (3, K).
+        noise: standard normal numbers, (3, K), or None.
+    """
+    level = controller.adc_gain * voltage + controller.adc_bias
     if noise is not None:
-        level = level + sigma * noise
-    if is_smooth:
-        return (level - controller.adc_bias) / controller.adc_gain, jnp.zeros_like(level)
-    code = jnp.round(level / step)
+        level = level + controller.adc_noise * noise
+    code = jnp.round(level / controller.adc_step)
     clipped = jnp.clip(code, 0.0, controller.adc_top)
-    is_clipped = jnp.where(code == clipped, jnp.zeros_like(code), jnp.ones_like(code))
-    return (clipped * step - controller.adc_bias) / controller.adc_gain, is_clipped
+    return clipped, jnp.where(code == clipped, jnp.zeros_like(code), jnp.ones_like(code))
+
+
+def read_back(controller: Controller, code: Array) -> Array:
+    """Sensor voltage [V] that an ADC code stands for."""
+    return (code * controller.adc_step - controller.adc_bias) / controller.adc_gain
 
 
 def controller_step(

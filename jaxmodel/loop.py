@@ -228,19 +228,50 @@ def step(structure: Structure, loop: Loop, state: State, inputs: Inputs) -> tupl
     Returns:
         (state at the next instant, Record of this one).
     """
-    plant, controller = state.plant, loop.controller
     voltage, clipped = state.controller.voltage, jnp.zeros_like(state.status)
-    next_controller = state.controller
-    if plant.z is not None:
-        filtered = jnp.sum(loop.sensor * plant.z[:, None], axis=2)
-        next_controller, info = controller_step(
-            controller, state.controller, filtered, inputs.adc_noise, structure.is_smooth
-        )
+    after = state.controller
+    if structure.feedback == "sampled":
+        after, info = controller_step(
+            loop.controller, after, filtered_voltage(loop, state.plant), inputs.adc_noise,
+            structure.is_smooth,
+        )  # fmt: skip
         clipped = jnp.max(jnp.max(info.is_clipped, axis=1), axis=0)
     elif structure.feedback == "ideal":
-        voltage = ideal_voltage(structure, loop, plant.q, plant.q_rate)
+        voltage = ideal_voltage(structure, loop, state.plant.q, state.plant.q_rate)
+    return advance(structure, loop, state, inputs, voltage, after, clipped)
 
-    next_plant, rates = _advance(structure, loop, plant, inputs, voltage)
+
+def filtered_voltage(loop: Loop, plant: PlantState) -> Array:
+    """Sensor voltages behind the anti-alias filter [V], (3, K)."""
+    assert plant.z is not None
+    return jnp.sum(loop.sensor * plant.z[:, None], axis=2)
+
+
+def advance(
+    structure: Structure,
+    loop: Loop,
+    state: State,
+    inputs: Inputs,
+    voltage: Array,
+    after: ControllerState,
+    clipped: Array,
+) -> tuple[State, Record]:
+    """Everything of one sample but the controller: plant, metrics and status.
+
+    Args:
+        structure: static choices.
+        loop: constants of the case.
+        state: at the sampling instant.
+        inputs: of this sample.
+        voltage: on the actuators during this sample [V], (3, K).
+        after: the controller's next state, whoever computed it.
+        clipped: 1 where an ADC channel is at its end, else 0, ().
+
+    Returns:
+        (state at the next instant, Record of this one).
+    """
+    plant = state.plant
+    next_plant, rates = _advance_plant(structure, loop, plant, inputs, voltage)
     reference = _reference(inputs, 0)
     motors = motor_force(
         loop.drive, reference, rates.chain.rho, rates.chain.rho_rate, structure.is_smooth
@@ -262,7 +293,7 @@ def step(structure: Structure, loop: Loop, state: State, inputs: Inputs) -> tupl
         actuator_voltage=voltage,
         slider_force=motors,
     )
-    proposed = State(next_plant, next_controller, totals, state.status, state.bad_time)
+    proposed = State(next_plant, after, totals, state.status, state.bad_time)
     return _freeze_if_bad(structure, loop, state, proposed, rates.chain, inputs), record
 
 
@@ -271,7 +302,7 @@ def _reference(inputs: Inputs, point: int) -> Reference:
     return Reference(inputs.rho[point], inputs.rho_rate[point], forward, inputs.disturbance)
 
 
-def _advance(
+def _advance_plant(
     structure: Structure, loop: Loop, plant: PlantState, inputs: Inputs, voltage: Array
 ) -> tuple[PlantState, Rates]:
     """All plant steps of one sample; held inputs stay constant. Returns the rates at its start."""

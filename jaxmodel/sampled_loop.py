@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.controller import ControllerState, controller_step
+from jaxmodel.controller import Controller, ControllerState, controller_step
 from jaxmodel.linear import LinearPlant, linearise
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
@@ -36,19 +36,23 @@ class LoopMatrices(NamedTuple):
     deflection: Array  # chord deflection at the stations [m], rows, (3 S, n)
 
 
-def closed_loop(structure: Structure, case: Case, pose: Array) -> LoopMatrices:
+def closed_loop(
+    structure: Structure, case: Case, pose: Array, law: Controller | None = None
+) -> LoopMatrices:
     """Transition matrix of plant, filters, delay and controller per sample; differentiable.
 
     Args:
         structure: static choices with feedback "sampled".
         case: the numbers; its gains belong to factor 1.
         pose: where to linearise [m, m, rad], (3,).
+        law: controller to judge instead of the case's own, its coefficients rounded for instance.
 
     Returns:
         LoopMatrices.
     """
     smooth = structure._replace(is_smooth=True, feedback="sampled")
     loop = prepare(smooth, case).loop
+    law = loop.controller if law is None else law
     plant = linearise(smooth, loop, pose, case.electronics.antialias)
     state, enters = _with_filtered_sensors(smooth, plant, case.electronics.antialias)
     n, n_inputs = enters.shape
@@ -64,7 +68,7 @@ def closed_loop(structure: Structure, case: Case, pose: Array) -> LoopMatrices:
     def advance(x: Array, factor: Array) -> Array:
         line = jnp.reshape(x[n : n + 9 * channels], (3, 3, channels))
         voltage = jnp.reshape(x[n + 9 * channels :], (3, patches))
-        controller = loop.controller._replace(velocity_gain=factor * loop.controller.velocity_gain)
+        controller = law._replace(velocity_gain=factor * law.velocity_gain)
         if controller.position_gain is not None:
             controller = controller._replace(position_gain=factor * controller.position_gain)
         before = ControllerState(line[0], (line[1], line[2]), voltage)
@@ -286,7 +290,12 @@ _closed_loop = jax.jit(closed_loop, static_argnums=0)
 
 
 def loop_report(
-    structure: Structure, case: Case, pose: Array, n_tracked: int = 3, limit: float = 64.0
+    structure: Structure,
+    case: Case,
+    pose: Array,
+    n_tracked: int = 3,
+    limit: float = 64.0,
+    law: Controller | None = None,
 ) -> LoopReport:
     """Spectral radius, gain margin and damping of the lowest link modes.
 
@@ -298,13 +307,14 @@ def loop_report(
         pose: where to linearise [m, m, rad], (3,).
         n_tracked: J, link modes to follow.
         limit: margins beyond this are reported as it [1].
+        law: controller to judge instead of the case's own.
 
     Returns:
         LoopReport.
     """
     # what the matrices do not depend on must not cost a compilation
     plain = structure._replace(n_steps=1, substeps=1, n_frequencies=1, has_noise=False)
-    matrices = jax.tree.map(np.asarray, _closed_loop(plain, case, pose))
+    matrices = jax.tree.map(np.asarray, _closed_loop(plain, case, pose, law))
     period = float(case.electronics.period)
 
     def poles(factor: float) -> np.ndarray:

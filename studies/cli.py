@@ -15,6 +15,7 @@ from typer.exceptions import Abort, TyperException
 
 from studies.config import start
 from studies.errors import StudyError, field_error
+from studies.export.commands import add_commands as add_export
 from studies.sweeps.commands import add_commands
 from studies.tuning.commands import add_commands as add_tuning
 
@@ -95,7 +96,7 @@ def simulate(
 
 @app.command()
 def replay(
-    design: Annotated[Path, typer.Argument(help="study file, or folder of a sweep")],
+    design: Annotated[Path, typer.Argument(help="study file, folder of a tuning or a sweep")],
     case: Annotated[str | None, typer.Option(help="number, or id: and digits of its id")] = None,
     out: Annotated[Path | None, typer.Option(help="HDF5 file for the trajectories")] = None,
 ) -> None:
@@ -264,6 +265,7 @@ def info() -> None:
 
 add_commands(app, console)
 add_tuning(app, console)
+add_export(app, console)
 
 
 if __name__ == "__main__":

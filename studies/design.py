@@ -1,4 +1,4 @@
-"""A DESIGN: a study file, or a case of a sweep's folder; both end in one checked study."""
+"""A DESIGN: a study file, a family of a tuning or a case of a sweep; each ends in one study."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel import status
-from studies.errors import StudyError
+from studies.errors import StudyError, field_error, nearest
 from studies.runs import Run, metric_variables
 from studies.spec import Study, load_study
-from studies.sweeps.folder import read_manifest
+from studies.sweeps.folder import TUNING, read_manifest
 from studies.sweeps.results import NOT_RUN, SweepData, load, metric_names
 from studies.sweeps.spec import parse_sweep
 from studies.sweeps.table import build_table, case_study
@@ -21,24 +21,27 @@ class Design(NamedTuple):
     """One study and, for a case of a sweep, what the sweep found."""
 
     study: Study
-    stored: dict[str, np.ndarray]  # metrics and status of the sweep; {} for a study file
+    stored: dict[str, np.ndarray]  # metrics and status of the sweep; {} where there is none
+    case_id: str = ""  # of the case in its sweep
 
 
 def load_design(path: Path, case: int | str | None = None) -> Design:
     """Read a DESIGN.
 
     Args:
-        path: study file, or folder of a sweep.
-        case: number of the case, or "id:" and the first digits of its id; with a sweep's folder
-            only.
+        path: study file, folder of a tuning or of a sweep.
+        case: of a sweep the number of the case, or "id:" and the first digits of its id; of a
+            tuning the family, as in the names of its files.
 
     Raises:
         StudyError: not found, case missing or not allowed, or a case that does not stand alone.
     """
     if not path.is_dir():
         if case is not None:
-            raise StudyError(f"--case {case}: {path} is no folder of a sweep; leave --case out")
+            raise StudyError(f"--case {case}: {path} is a file; leave --case out")
         return Design(load_study(path), {})
+    if (path / TUNING).is_file():
+        return Design(load_study(_tuned(path, case)), {})
     data = load(path)
     number = _number(data, str(case), path)
     table = build_table(parse_sweep(read_manifest(path)["spec"]))
@@ -52,10 +55,26 @@ def load_design(path: Path, case: int | str | None = None) -> Design:
     steps = int(data["substeps"][number]) if "substeps" in data.variables else -1
     if steps > 0:
         study = study.change(run__substeps=steps)
+    case_id = str(data["case_id"].astype(str)[number])
     if code == NOT_RUN:
-        return Design(study, {})
+        return Design(study, {}, case_id)
     names = ["status", *(name for name in metric_names() if name in data.variables)]
-    return Design(study, {name: data[name][number] for name in names})
+    return Design(study, {name: data[name][number] for name in names}, case_id)
+
+
+def _tuned(path: Path, case: str | int | None) -> Path:
+    """File of the tuned study that is meant."""
+    files = {file.stem.removeprefix("tuned").lstrip("_"): file for file in path.glob("tuned*.toml")}
+    if not files:
+        raise StudyError(f"{path}: the tuning is not finished; go on with studies tune --resume")
+    if case is None and len(files) == 1:
+        return next(iter(files.values()))
+    if case is None or str(case) not in files:
+        raise field_error(
+            "--case", case or "", f"{', '.join(sorted(filter(None, files)))}, the families of "
+            f"{path}", hint=nearest(str(case), files),
+        )  # fmt: skip
+    return files[str(case)]
 
 
 def _number(data: SweepData, case: str, path: Path) -> int:

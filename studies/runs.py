@@ -67,8 +67,7 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
     """
     structure, case = check_run(study)
     if study.control.ratio_source == "own_run":
-        ratio = _simulate(structure, uncontrolled(case), has_record).energy_ratio
-        case = with_ratio(case, powered(ratio, study.control.ratio_exponent))
+        case = with_ratio(case, _own_ratio(study, structure, case, has_record))
     result = jax.tree.map(np.asarray, _simulate(structure, case, has_record))
     loop, code = None, int(result.status)
     if has_loop and structure.feedback == "sampled":
@@ -78,6 +77,26 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
             return Run(study, structure, case, result, None, code or status.NON_FINITE)
         code = judged_status(code, loop)
     return Run(study, structure, case, result, loop, code)
+
+
+def _own_ratio(study: Study, structure: Structure, case: Case, has_record: bool) -> np.ndarray:
+    """Ratios (24) of the same case's uncontrolled run, (3, C); has_record: as the run after it."""
+    ratio = _simulate(structure, uncontrolled(case), has_record).energy_ratio
+    return powered(ratio, study.control.ratio_exponent)
+
+
+def resolved_study(study: Study) -> Study:
+    """The same study with its EMC ratios given, so that nothing has to run to know them.
+
+    Raises:
+        StudyError: as `run_study`.
+    """
+    if study.control.ratio_source == "given":
+        return study
+    ratio = _own_ratio(study, *check_run(study), False)
+    return study.change(
+        control__ratios=ratio, control__ratio_source="given", control__ratio_exponent=1.0
+    )
 
 
 def uncontrolled(case: Case) -> Case:

@@ -27,6 +27,8 @@ from studies.errors import StudyError
 from studies.store import Variable, replacing, write_store
 
 RESULTS, MANIFEST, CHUNKS, LOCK = "results.h5", "sweep.json", "chunks", ".lock"
+#: What a tuning has in its folder instead.
+TUNING = "tune.json"
 #: The results before they get their name.
 JOINED = ".joined.h5"
 #: What an end at a bad moment may leave behind.
@@ -187,7 +189,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
     except RecursionError:
         raise StudyError(f"{path / MANIFEST}: damaged (nested too deeply)") from None
     except OSError:
-        if (path / "tune.json").is_file():
+        if (path / TUNING).is_file():
             raise StudyError(
                 f"{path}: holds a tuning, no sweep; see its report.md, or tune.h5 with xarray"
             ) from None

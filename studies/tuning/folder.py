@@ -15,10 +15,10 @@ import numpy as np
 
 from studies.errors import StudyError
 from studies.store import check_target, replacing
-from studies.sweeps.folder import locked_folder, refuse_others
+from studies.sweeps.folder import TUNING, locked_folder, refuse_others
 from studies.tuning.optimise import Progress
 
-MANIFEST, PROGRESS, RESULTS = "tune.json", "progress.npz", "tune.h5"
+MANIFEST, PROGRESS, RESULTS = TUNING, "progress.npz", "tune.h5"
 #: Entries of the manifest that a resumed tuning must share, to go on bit by bit.
 CHECKED = {"spec": "tuning file", "code": "program", "jaxlib": "jaxlib", "precision": "precision"}
 _LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.tmp")

@@ -1,0 +1,99 @@
+"""The controller as code wants it: only channels that feed back, gains folded into numerators.
+
+A channel is a controlled mode of a link (modal control) or a patch (strain rate feedback).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxmodel.controller import Controller
+
+
+class Channels(NamedTuple):
+    """M channels in the order of links; numbers in SI units."""
+
+    link: np.ndarray  # from 0, (M,)
+    mode: np.ndarray  # mode or patch, from 0, (M,)
+    filter: np.ndarray  # channel from sensor voltages [m/V] or [1], (M, K)
+    first: np.ndarray  # high-pass b0, b1 and a1, (M, 3)
+    denominator: np.ndarray  # a1, a2 of the second section [1], (M, 2)
+    force: np.ndarray  # its numerator times the gains, sign included [N/m] or [V/V], (M, 3)
+    direct: np.ndarray  # force per channel signal past the filters [N/m] or [V/V], (M,)
+    synthesizer: np.ndarray  # voltages from the channel's force [V/N] or [1], (M, K)
+
+    @property
+    def has_direct(self) -> bool:
+        return bool(np.any(self.direct))
+
+
+def fold(controller: Controller) -> Channels:
+    """Channels of a controller.
+
+    u = -k_d v - k_p x with v and x two outputs of one filter, so one numerator -k_d n_v - k_p n_x.
+
+    Args:
+        controller: NumPy arrays; a channel without gains is left out.
+    """
+    estimator, velocity = controller.estimator, controller.velocity_gain
+    position = controller.position_gain
+    if position is None:
+        position = np.zeros_like(velocity)
+    link, mode = np.nonzero((velocity != 0) | (position != 0))
+    at = link, mode
+
+    def gathered(parts: tuple) -> np.ndarray:
+        return np.stack([np.broadcast_to(part, velocity.shape)[at] for part in parts], axis=1)
+
+    force = -velocity[at][:, None] * gathered(estimator.velocity)
+    force = force - position[at][:, None] * gathered(estimator.position)
+    return Channels(
+        link=link,
+        mode=mode,
+        filter=controller.filter[at],
+        first=gathered(estimator.first),
+        denominator=gathered(estimator.denominator),
+        force=force,
+        direct=-position[at] * np.broadcast_to(estimator.direct, velocity.shape)[at],
+        synthesizer=np.swapaxes(controller.synthesizer, 1, 2)[at],
+    )
+
+
+def unfold(channels: Channels, like: Controller) -> Controller:
+    """A controller that feeds back as the channels do, gains of 1.
+
+    Args:
+        channels: of the same law as `like`, their coefficients rounded for instance.
+        like: what the channels leave open.
+    """
+    at = channels.link, channels.mode
+    gain = np.zeros_like(like.velocity_gain)
+    gain[at] = 1.0
+
+    def spread(values: np.ndarray, rest: np.ndarray) -> np.ndarray:
+        whole = np.array(np.broadcast_to(rest, gain.shape))
+        whole[at] = values
+        return whole
+
+    def columns(table: np.ndarray, rest: tuple) -> tuple:
+        return tuple(spread(column, part) for column, part in zip(table.T, rest, strict=True))
+
+    estimator = like.estimator
+    none = np.zeros_like(gain)
+    taps, back = np.array(like.filter), np.swapaxes(np.array(like.synthesizer), 1, 2)
+    taps[at], back[at] = channels.filter, channels.synthesizer
+    return like._replace(
+        filter=taps,
+        synthesizer=np.swapaxes(back, 1, 2),
+        velocity_gain=gain,
+        position_gain=gain,
+        estimator=estimator._replace(
+            first=columns(channels.first, estimator.first),
+            denominator=columns(channels.denominator, estimator.denominator),
+            velocity=columns(-channels.force, (none,) * 3),
+            position=(none,) * 3,
+            direct=spread(-channels.direct, none),
+        ),
+    )

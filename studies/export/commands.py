@@ -1,0 +1,63 @@
+"""The commands `studies export` and `studies import-gains`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from studies.config import start
+from studies.errors import StudyError
+
+
+def add_commands(app: typer.Typer, console: Console) -> None:
+    """Add the commands to the command line."""
+
+    @app.command()
+    def export(
+        design: Annotated[Path, typer.Argument(help="study file, folder of a tuning or a sweep")],
+        target: Annotated[str, typer.Option(help="json, c, or c-fixed (32-bit fixed point)")],
+        out: Annotated[Path, typer.Option(help="folder for the files")],
+        case: Annotated[
+            str | None, typer.Option(help="of a sweep: number or id:...; of a tuning: its family")
+        ] = None,
+        verify: Annotated[
+            bool | None,
+            typer.Option(
+                "--verify/--no-verify",
+                help="compare with the JAX controller; default: if there is a C compiler",
+            ),
+        ] = None,
+        name: Annotated[str, typer.Option(help="of the files and C functions")] = "flexlink",
+        dac_bits: Annotated[int, typer.Option(help="of the DAC, for c-fixed")] = 12,
+    ) -> None:
+        """Write the controller of a design for a real-time target, with proof."""
+        start()
+        from studies.design import load_design
+        from studies.export.run import export_design
+
+        found = load_design(design, case)
+        if not export_design(found, target, out, verify, name, dac_bits, console):
+            sys.exit(1)
+
+    @app.command("import-gains")
+    def import_gains(
+        file: Annotated[Path, typer.Argument(help="JSON file of studies export")],
+        out: Annotated[Path, typer.Option(help="study file to write")],
+    ) -> None:
+        """Read the study back from an exported JSON file, once its numbers are checked."""
+        start()
+        from studies.export.document import import_study
+        from studies.store import check_target, replacing
+        from studies.template import study_template
+
+        check_target(out)
+        if out.exists():
+            raise StudyError(f"--out {out}: exists already; name a new file")
+        text = study_template(import_study(file))
+        with replacing(out) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        console.print(f"written: {out}", soft_wrap=True)

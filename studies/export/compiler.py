@@ -1,0 +1,119 @@
+"""Exported C code, compiled and callable from Python."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from studies.errors import StudyError
+from studies.export.c_code import Source
+
+#: What exported code must compile under without a word.
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+_NAMES = ("cc", "gcc", "clang")
+
+
+class Code(NamedTuple):
+    """A compiled controller. Each call of `step` runs a whole sequence from rest."""
+
+    library: ctypes.CDLL
+    name: str
+    real: type  # NumPy's type of sensors and actuators
+    reference: type  # and of the shaper
+    n_channels: int
+    shaper_length: int
+    state: ctypes.Array  # room for the controller's state
+
+    def begin(self) -> None:
+        """Forget everything."""
+        getattr(self.library, f"{self.name}_init")(self.state)
+
+    def step(self, sensor: np.ndarray) -> tuple[np.ndarray, int]:
+        """One sample: actuator values and the fault, from sensor values (3 K,)."""
+        given: np.ndarray = np.ascontiguousarray(sensor, self.real).ravel()
+        out: np.ndarray = np.empty(self.n_channels, self.real)
+        fault = getattr(self.library, f"{self.name}_step")(
+            self.state, _at(given), _at(out)
+        )  # fmt: skip
+        return out, fault
+
+    def respond(self, sensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A sequence (T, 3, K) from rest: actuator values (T, 3, K) and faults (T,)."""
+        self.begin()
+        pairs = [self.step(row) for row in sensor]
+        values = np.stack([out for out, _ in pairs]).reshape(sensor.shape)
+        return values, np.array([fault for _, fault in pairs])
+
+    def shape(self, reference: np.ndarray) -> np.ndarray:
+        """A reference (T, 3), shaped, beginning at rest in its first row."""
+        room = ctypes.create_string_buffer(self.shaper_length * 3 * 8 + 64)
+        given: np.ndarray = np.ascontiguousarray(reference, self.reference)
+        getattr(self.library, f"{self.name}_shape_init")(room, _at(given[0]))
+        out = np.empty_like(given)
+        step = getattr(self.library, f"{self.name}_shape_step")
+        for row, shaped in zip(given, out, strict=True):
+            step(room, _at(row), _at(shaped))
+        return out
+
+
+def _at(array: np.ndarray) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+def find_compiler() -> list[str]:
+    """Command of a C compiler, from the variable CC or by name; [] where there is none."""
+    given = shlex.split(os.environ.get("CC", ""))
+    for command in [given] if given else [[name] for name in _NAMES]:
+        if shutil.which(command[0]):
+            return command
+    return []
+
+
+@contextmanager
+def compiled(
+    source: Source, name: str, compiler: list[str], real: type, reference: type, sizes: tuple
+) -> Iterator[Code]:
+    """Compile a controller and load it.
+
+    Args:
+        source: header and code.
+        name: prefix of its functions.
+        compiler: command, from `find_compiler`.
+        real: NumPy's type of sensors and actuators.
+        reference: of the shaper.
+        sizes: channels, modes, and samples that the shaper remembers.
+
+    Raises:
+        StudyError: the compiler finds fault with the code, or does not work.
+    """
+    n_channels, n_modes, length = sizes
+    with tempfile.TemporaryDirectory() as folder:
+        header, code, library = (Path(folder) / f"{name}{end}" for end in (".h", ".c", ".so"))
+        header.write_text(source.header, encoding="utf-8")
+        code.write_text(source.code, encoding="utf-8")
+        single = [f"-D{name.upper()}_REAL=float"] if real is np.float32 else []
+        command = [*compiler, *STRICT, "-O2", *single, "-shared", "-fPIC", "-o", str(library),
+                   str(code)]  # fmt: skip
+        _run(command)
+        # no word per state takes more than 8 bytes
+        room = ctypes.create_string_buffer(8 * (3 * n_modes + 2 * n_channels) + 64)
+        yield Code(ctypes.CDLL(str(library)), name, real, reference, n_channels, length, room)
+
+
+def _run(command: list[str]) -> None:
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise StudyError(f"C compiler {command[0]}: does not work ({error})") from None
+    if done.returncode:
+        raise StudyError(f"C compiler {command[0]}: {done.stderr.strip()[:2000]}")

@@ -1,0 +1,108 @@
+"""What a real-time controller needs of a study: fixed numbers, or why there are none."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.beam import assembled_frequency
+from jaxmodel.case import Case, Structure
+from jaxmodel.controller import Controller
+from jaxmodel.prepare import design_controller, design_taps
+from jaxmodel.shaper import Taps
+from studies.errors import StudyError, field_error
+from studies.runs import check_run, resolved_study
+from studies.spec import Study
+
+
+class FixedController(NamedTuple):
+    """A study and the numbers of its controller, as NumPy arrays in SI units."""
+
+    study: Study  # complete: its ratios are given
+    structure: Structure
+    case: Case
+    controller: Controller
+    taps: Taps  # shaper on the sample grid, one tap per delay, delays rising
+    frequency: np.ndarray  # each channel's velocity estimate is exact there [Hz], (3, C)
+
+    @property
+    def n_links(self) -> int:
+        return self.controller.filter.shape[0]
+
+    @property
+    def n_patches(self) -> int:
+        return self.controller.filter.shape[2]
+
+
+def fixed_controller(study: Study) -> FixedController:
+    """Numbers of a study's controller.
+
+    Args:
+        study: with sampled feedback; ratios from an own run are worked out here.
+
+    Raises:
+        StudyError: nothing to export, or the study cannot run.
+    """
+    _check_exportable(study)
+    study = resolved_study(study)
+    structure, case = check_run(study)
+    controller, taps, omega = _numbers(structure, case)
+    if not np.any(controller.velocity_gain) and not _any(controller.position_gain):
+        raise field_error(
+            "control.gain_factor", study.control.gain_factor,
+            "gains of which at least one is not zero (control.links, control.mode_mask, "
+            "control.velocity_gain, control.ratios)", "1",
+        )  # fmt: skip
+    _check_finite(controller, taps)
+    return FixedController(study, structure, case, controller, _merged(taps), omega / (2 * np.pi))
+
+
+def _check_exportable(study: Study) -> None:
+    control = study.control
+    if control.feedback != "sampled":
+        raise field_error(
+            "control.feedback", control.feedback, "'sampled', a controller that samples"
+        )
+    if not any(control.links):
+        raise field_error("control.links", control.links, "at least one link that is controlled")
+
+
+def _any(gain: np.ndarray | None) -> bool:
+    return gain is not None and bool(np.any(gain))
+
+
+def _numbers(structure: Structure, case: Case) -> tuple[Controller, Taps, np.ndarray]:
+    found = _design(structure._replace(n_steps=1, substeps=1, has_noise=False), case)
+    return jax.tree.map(np.asarray, found)
+
+
+def _design_numbers(structure: Structure, case: Case):
+    controller = design_controller(structure, case).controller
+    belief = case.machine.beam._replace(stiffness_factor=1.0)
+    omega = assembled_frequency(belief, structure.n_controlled)
+    if structure.law == "srf":
+        omega = jnp.broadcast_to(omega[:, :1], (3, structure.n_patches))
+    return controller, design_taps(case), omega
+
+
+_design = jax.jit(_design_numbers, static_argnums=0)
+
+
+def _merged(taps: Taps) -> Taps:
+    """One tap for each delay, none without weight."""
+    weight, sample = (np.asarray(x) for x in taps)
+    delays = np.unique(sample[weight != 0])
+    return Taps(np.array([weight[sample == delay].sum() for delay in delays]), delays.astype(int))
+
+
+def _check_finite(controller: Controller, taps: Taps) -> None:
+    for name, value in {**controller._asdict(), **taps._asdict()}.items():
+        for leaf in jax.tree.leaves(value):
+            if not np.all(np.isfinite(leaf)):
+                raise StudyError(
+                    f"{name} of the controller is not finite; allowed: gains, filters and a shaper "
+                    "whose numbers are (see `studies simulate`)"
+                )

@@ -1,0 +1,293 @@
+"""The JSON file of a controller: its study, and every number with unit, axes and meaning."""
+
+from __future__ import annotations
+
+import json
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from jaxmodel.controller import Controller
+from jaxmodel.estimator import Estimator
+from jaxmodel.shaper import Taps
+from studies import config
+from studies.errors import StudyError, shown
+from studies.export.controller import FixedController, fixed_controller
+from studies.spec import Study, parse_study
+
+FORMAT = "flexlink-controller"
+#: Numbers worked out again on another machine may differ by rounding [relative].
+ROUNDING = 1e-9
+
+
+class Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class Quantity(Part):
+    """Numbers with what they are; `value` is nested as `axes` says, none for a single number."""
+
+    value: float | list[Any] = Field(description="a number, or lists of them")
+    unit: str = Field(description="SI symbol, 1 for none", min_length=1)
+    axes: list[str] = Field(description="meaning of each level of nesting")
+    meaning: str = Field(description="in words", min_length=1)
+
+
+class Masks(Part):
+    """What is controlled."""
+
+    links: list[bool] = Field(min_length=3, max_length=3)
+    modes: list[list[bool]] = Field(description="per link and channel", min_length=3, max_length=3)
+
+
+class Document(Part):
+    """A controller: what happens once per sample, in the order of `steps`."""
+
+    format: Literal["flexlink-controller"]
+    format_version: Literal[1]
+    title: str
+    case_id: str = Field(description="id of the case in its sweep; empty where there is none")
+    study_hash: str = Field(description="SHA-256 of the study below as compact sorted JSON")
+    versions: dict[str, str]
+    law: Literal["imsc", "srf"]
+    estimator: Literal["modal_phase", "difference"]
+    order: str = Field(description="how channels of sensors and actuators are numbered")
+    steps: list[str] = Field(description="the arithmetic of one sample, in words")
+    masks: Masks
+    numbers: dict[str, Quantity]
+    study: dict[str, Any] = Field(description="the complete study, as a study file holds it")
+
+
+ORDER = "channel = patches_per_link * (link - 1) + patch, from 1; patches counted from the slider"
+STEPS = [
+    "sensor = (adc_code * adc_step - conditioner_bias) / conditioner_gain",
+    "sensor = sensor - feedthrough @ command of the last sample",
+    "signal = modal_filter @ sensor",
+    "high = high_pass_b0 * signal + memory; memory = high_pass_b1 * signal - high_pass_a1 * high",
+    "w = high - low_pass_a1 * w1 - low_pass_a2 * w2",
+    "velocity = sum of velocity_numerator * (w, w1, w2); position likewise; then w2 = w1, w1 = w",
+    "force = -velocity_gain * velocity - position_gain * (position + position_direct * signal)",
+    "command = synthesizer @ force, limited to +-voltage_limit; it goes out at the next sample",
+    "reference: shaped pose = sum over taps of shaper_weight * pose shaper_delay samples ago",
+]
+_LINK, _CHANNEL, _PATCH = "link", "channel", "patch"
+_EACH = [_LINK, _CHANNEL]
+
+
+def study_hash(study: Study) -> str:
+    """SHA-256 of a study's values."""
+    text = json.dumps(study.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+    return sha256(text.encode()).hexdigest()
+
+
+def document(found: FixedController, case_id: str = "") -> Document:
+    """The document of a controller; case_id: of the case in its sweep."""
+    study, controller = found.study, found.controller
+    facts = config.info()
+    kept = (config.PACKAGE, "python", "jax", "jaxlib", "numpy")
+    on = (controller.velocity_gain != 0) | (_position_gain(controller) != 0)
+    return Document(
+        format="flexlink-controller",
+        format_version=1,
+        title=study.title,
+        case_id=case_id,
+        study_hash=study_hash(study),
+        versions={name: str(facts[name]) for name in kept},
+        law=study.control.law,
+        estimator=study.electronics.estimator,
+        order=ORDER,
+        steps=STEPS,
+        masks=Masks(links=[bool(x) for x in on.any(axis=1)], modes=on.tolist()),
+        numbers=_numbers(found),
+        study=json.loads(json.dumps(study.model_dump(mode="json"))),
+    )
+
+
+def _position_gain(controller: Controller) -> np.ndarray:
+    gain = controller.position_gain
+    return np.zeros_like(controller.velocity_gain) if gain is None else gain
+
+
+def _numbers(found: FixedController) -> dict[str, Quantity]:
+    """Every number of the controller, by name."""
+    controller, electronics = found.controller, found.study.electronics
+    estimator = controller.estimator
+    is_modal = found.study.control.law == "imsc"
+    to_signal, from_force = ("m/V", "V/N") if is_modal else ("1", "1")
+    on_rate, on_value = ("N s/m", "N/m") if is_modal else ("s", "1")
+    shape = controller.velocity_gain.shape
+    is_phase = electronics.estimator == "modal_phase"
+    # the section that differentiates makes a rate of the signal: the last one of modal_phase
+    rate = "1" if is_phase else "1/s"
+    last = "1/s" if is_phase else "1"
+
+    def one(value: Any, unit: str, meaning: str, axes: list[str] | None = None) -> Quantity:
+        return Quantity(
+            value=np.asarray(value).tolist(), unit=unit, axes=axes or [], meaning=meaning
+        )
+
+    def each(value: Any, unit: str, meaning: str) -> Quantity:
+        return one(np.broadcast_to(value, shape), unit, meaning, _EACH)
+
+    return {
+        "sample_rate": one(electronics.sample_rate_hz, "Hz", "how often a sample is taken"),
+        "antialias": one(
+            electronics.antialias_hz, "Hz",
+            "corner of the analogue second-order Butterworth filter before the ADC",
+        ),
+        "adc_bits": one(float(electronics.adc_bits), "1", "resolution of the ADC"),
+        "adc_step": one(controller.adc_step, "V", "one code at the ADC's input"),
+        "adc_top": one(controller.adc_top, "1", "highest code"),
+        "conditioner_gain": one(controller.adc_gain, "1", "ADC volt per sensor volt"),
+        "conditioner_bias": one(controller.adc_bias, "V", "at the ADC for a sensor at rest"),
+        "feedthrough": one(
+            controller.feedthrough, "1", "sensor volts that an actuator volt causes by modes that "
+            "are not controlled", [_LINK, _PATCH, "actuator"],
+        ),
+        "modal_filter": one(
+            controller.filter, to_signal, "channel signal of each sensor voltage",
+            [*_EACH, _PATCH],
+        ),
+        "channel_frequency": one(found.frequency, "Hz", "velocity estimate is exact there", _EACH),
+        "high_pass_b0": each(estimator.first[0], rate, "first section, numerator"),
+        "high_pass_b1": each(estimator.first[1], rate, "first section, numerator of z^-1"),
+        "high_pass_a1": each(estimator.first[2], "1", "first section, denominator of z^-1"),
+        "low_pass_a1": each(estimator.denominator[0], "1", "second section, denominator of z^-1"),
+        "low_pass_a2": each(estimator.denominator[1], "1", "second section, denominator of z^-2"),
+        "velocity_numerator": one(
+            np.stack([np.broadcast_to(x, shape) for x in estimator.velocity], axis=2), last,
+            "second section, numerator of the velocity", [*_EACH, "power of z^-1"],
+        ),
+        "position_numerator": one(
+            np.stack([np.broadcast_to(x, shape) for x in estimator.position], axis=2), "1",
+            "second section, numerator of the position", [*_EACH, "power of z^-1"],
+        ),
+        "position_direct": each(estimator.direct, "1", "share of the signal in the position"),
+        "velocity_gain": each(
+            controller.velocity_gain, on_rate, "k_d, masks and factors put in"
+        ),
+        "position_gain": each(
+            _position_gain(controller), on_value, "k_p, masks and factors put in"
+        ),
+        "synthesizer": one(
+            controller.synthesizer, from_force, "voltages of a channel's force",
+            [_LINK, _PATCH, _CHANNEL],
+        ),
+        "voltage_limit": one(controller.voltage_limit, "V", "of every actuator, +-"),
+        "shaper_weight": one(found.taps.weight, "1", "of each tap of the input shaper", ["tap"]),
+        "shaper_delay": one(
+            found.taps.sample.astype(float), "1", "of each tap [samples]", ["tap"]
+        ),
+    }  # fmt: skip
+
+
+def controller_of(document: Document) -> tuple[Controller, Taps]:
+    """Controller and shaper built from nothing but a document's numbers."""
+    number = {name: np.array(entry.value) for name, entry in document.numbers.items()}
+    velocity, position = (
+        tuple(np.moveaxis(number[f"{name}_numerator"], 2, 0)) for name in ("velocity", "position")
+    )
+    estimator = Estimator(
+        (number["high_pass_b0"], number["high_pass_b1"], number["high_pass_a1"]),
+        (number["low_pass_a1"], number["low_pass_a2"]),
+        velocity,  # type: ignore[arg-type]
+        position,  # type: ignore[arg-type]
+        number["position_direct"],
+    )
+    controller = Controller(
+        filter=number["modal_filter"],
+        estimator=estimator,
+        velocity_gain=number["velocity_gain"],
+        position_gain=number["position_gain"],
+        synthesizer=number["synthesizer"],
+        feedthrough=number["feedthrough"],
+        voltage_limit=number["voltage_limit"],
+        adc_gain=number["conditioner_gain"],
+        adc_bias=number["conditioner_bias"],
+        adc_step=number["adc_step"],
+        adc_top=number["adc_top"],
+        adc_noise=np.zeros(()),
+    )  # fmt: skip
+    return controller, Taps(number["shaper_weight"], number["shaper_delay"].astype(int))
+
+
+def schema() -> dict[str, Any]:
+    """JSON schema (2020-12) of a document."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema", **Document.model_json_schema()
+    }  # fmt: skip
+
+
+def to_json(part: Document) -> str:
+    """A document as text; numbers keep all their digits."""
+    return json.dumps(part.model_dump(mode="json"), indent=1, ensure_ascii=False) + "\n"
+
+
+def read_document(path: Path) -> Document:
+    """Read what `to_json` wrote.
+
+    Raises:
+        StudyError: unreadable, or no such document; names the first entry that is wrong.
+    """
+    try:
+        data = json.loads(path.read_bytes().decode("utf-8"))
+    except OSError as error:
+        raise StudyError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, RecursionError) as error:
+        raise StudyError(f"{path}: not valid JSON ({error})") from None
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise StudyError(f"{path}: no controller; allowed: a file of studies export --target json")
+    try:
+        return Document.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(entry) for entry in first["loc"])
+        raise StudyError(f"{path}: {where} = {shown(first['input'])}: {first['msg']}") from None
+
+
+def import_study(path: Path) -> Study:
+    """The study of a document, once it is sure that its numbers are those of the document.
+
+    Raises:
+        StudyError: unreadable, no document, changed by hand.
+    """
+    given = read_document(path)
+    study = parse_study(given.study)
+    if study_hash(study) != given.study_hash:
+        raise StudyError(
+            f"{path}: study was changed after the export; allowed: the study as exported (change a "
+            "study file and export it again)"
+        )
+    wanted = _numbers(fixed_controller(study))
+    for name in sorted(set(wanted) | set(given.numbers)):
+        if name not in given.numbers or name not in wanted:
+            raise StudyError(
+                f"{path}: numbers.{name}: {'missing' if name in wanted else 'unknown'}"
+            )
+        _check_equal(path, name, given.numbers[name], wanted[name])
+    return study
+
+
+def _check_equal(path: Path, name: str, given: Quantity, wanted: Quantity) -> None:
+    """Refuse numbers that the study does not give."""
+    try:
+        found, own = np.array(given.value, float), np.array(wanted.value, float)
+    except (ValueError, TypeError):
+        raise StudyError(f"{path}: numbers.{name}: no table of numbers") from None
+    if found.shape != own.shape:
+        raise StudyError(
+            f"{path}: numbers.{name} has the shape {found.shape}: allowed {own.shape}, as its study"
+        )
+    size = np.abs(own).max(initial=0.0)
+    # a number that is not finite differs, too
+    wrong = ~(np.abs(found - own) <= ROUNDING * size)
+    if np.any(wrong):
+        at = tuple(int(k) for k in np.argwhere(wrong)[0])
+        raise StudyError(
+            f"{path}: numbers.{name}{list(at) if at else ''} = {found[at]:.9g}: allowed "
+            f"{own[at]:.9g} [{wanted.unit}], which its study gives; change the study and export it "
+            "again"
+        )

@@ -1,0 +1,456 @@
+"""Fixed point: formats, integer coefficients, error bounds, and the arithmetic itself in NumPy.
+
+Words have 32 bits, sums of products 64. A signal is `base * integer / 2^bits`, so it is per unit
+of a base of its own, the range that the simulation shows; bits are as many as leave room for the
+largest value that any sequence of ADC codes can produce. A coefficient is `integer / 2^shift`
+between the integers of two signals: gains of 570 V/N and filters of 1e-6 m/V end in numbers of like
+size.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import lfilter
+
+from jaxmodel.controller import Controller
+from jaxmodel.shaper import Taps
+from studies.errors import StudyError, field_error
+from studies.export.channels import Channels
+from studies.export.controller import FixedController
+from studies.export.floating import Signals
+
+#: Bits of a word, sign included.
+WORD = 32
+#: A format has room for at least this many times what the simulation shows [1].
+MARGIN = 2
+#: ADC codes travel in 16 bits.
+ADC_BITS = 16
+#: All errors together may be this share of a DAC step.
+ALLOWED_ERROR = 0.5
+#: Samples after which a filter must have forgotten (to 1e-16).
+LONGEST_MEMORY = 2**20
+FORGOTTEN = 1e-16
+#: Time at the end of its range that makes a sensor faulty [s].
+RAIL_TIME = 0.01
+
+
+class Format(NamedTuple):
+    """Meaning of a signal's integers, one entry per channel: base * integer / 2^bits."""
+
+    base: np.ndarray  # one per unit, in the signal's SI unit, (M,)
+    bits: np.ndarray  # fraction bits, (M,)
+    seen: np.ndarray  # largest value in the simulation, (M,)
+    bound: np.ndarray  # largest value that ADC codes can produce, (M,)
+
+    @property
+    def step(self) -> np.ndarray:
+        """What one count stands for, (M,)."""
+        return self.base / 2.0**self.bits
+
+    @property
+    def margin(self) -> np.ndarray:
+        """Largest representable value over the largest one seen; inf where nothing was, (M,)."""
+        largest = self.step * 2.0 ** (WORD - 1)
+        return np.where(self.seen > 0, largest / np.where(self.seen > 0, self.seen, 1.0), np.inf)
+
+
+class Row(NamedTuple):
+    """Coefficients of sums of products: integers / 2^shift."""
+
+    integers: np.ndarray  # (..., n)
+    shift: np.ndarray  # (...,)
+
+    @property
+    def values(self) -> np.ndarray:
+        return self.integers / 2.0 ** self.shift[..., None]
+
+
+class FixedPoint(NamedTuple):
+    """A controller in fixed point. Integers unless said otherwise."""
+
+    link: np.ndarray  # of each channel, from 0, (M,)
+    adc_bits: int  # fraction bits of a sensor signal, whose base is one ADC code
+    adc_top: int
+    bias: int  # of the conditioner, as a sensor signal
+    dac_rest: int  # code of 0 V
+    sensor_step: float  # one count of a sensor signal [V]
+    dac_step: float  # one code [V]
+    signal: Format  # m or V
+    high: Format
+    inner: Format
+    force: Format  # N or V
+    filter: Row  # (M, K)
+    high_pass: Row  # b0, (M, 1)
+    memory: Row  # b1, -a1, (M, 2)
+    low_pass: Row  # scale, -a1, -a2, (M, 3)
+    numerator: Row  # three taps and the direct share, (M, 4)
+    synthesizer: Row  # channels that are not of the link are 0, (3, K, M)
+    feedthrough: Row | None  # sensor counts per DAC code, (3, K, K)
+    error: ErrorBound
+
+
+class ErrorBound(NamedTuple):
+    """Largest differences from exact arithmetic at the actuators, open loop [V], (3, K)."""
+
+    rounding: np.ndarray  # of all signals, all rounded the same wrong way in every sample
+    coefficients: np.ndarray  # of rounded coefficients, at full-scale input
+
+
+class Gains(NamedTuple):
+    """Peak gains of a channel: largest output for inputs within +-1, by impulse responses, (M,)."""
+
+    high: np.ndarray  # from the channel's signal
+    inner: np.ndarray
+    force: np.ndarray
+    force_of_high: np.ndarray  # from what is added to `high`, to the force
+    force_of_inner: np.ndarray  # from what is added to the delay line
+
+
+def rail_samples(rate: float) -> int:
+    """Samples that make a `RAIL_TIME` at a sample rate [Hz]; they are counted in 16 bits."""
+    return min(max(round(RAIL_TIME * rate), 2), 2**15 - 1)
+
+
+def design_fixed(
+    found: FixedController, channels: Channels, seen: Signals, dac_bits: int
+) -> FixedPoint:
+    """Formats and coefficients for a controller.
+
+    Args:
+        found: the controller.
+        channels: the same, folded.
+        seen: signals of the simulated motion, (T, ...).
+        dac_bits: resolution of the DAC, whose codes 1 to 2^bits - 1 span +-voltage_limit.
+
+    Raises:
+        StudyError: what cannot be represented, with the number and the way out.
+    """
+    controller = found.controller
+    bits = found.study.electronics.adc_bits
+    if bits > ADC_BITS:
+        raise field_error(
+            "electronics.adc_bits", bits, f"up to {ADC_BITS} for fixed point: codes are 16-bit "
+            "words (or --target c)", "1",
+        )  # fmt: skip
+    rest = 2 ** (dac_bits - 1)
+    dac_step = float(controller.voltage_limit) / (rest - 1)
+    memory = _memory(found, channels)
+    gains = peak_gains(channels, memory)
+    code = float(controller.adc_step / controller.adc_gain)  # one ADC code at the sensor [V]
+    sensor = _sensor_bound(controller)  # (3, K)
+    adc_bits = int(_bits(sensor.max() / code))
+    step = code / 2.0**adc_bits
+    bound = np.sum(np.abs(channels.filter) * sensor[channels.link], axis=1)
+    signal = _format(seen.signal, bound)
+    high = _format(seen.high, bound * gains.high)
+    inner = _format(seen.inner, bound * gains.inner)
+    force = _format(seen.force, bound * gains.force)
+    b0, b1, a1 = channels.first.T
+    one = np.ones_like(b0)
+    tap = channels.force * (inner.step / force.step)[:, None]
+    back = np.zeros((3, found.n_patches, len(channels.link)))
+    back[channels.link, :, np.arange(len(channels.link))] = channels.synthesizer
+    through = None
+    if np.any(controller.feedthrough):
+        through = _row(controller.feedthrough * dac_step / step, "feed-through")
+    fixed = FixedPoint(
+        link=channels.link,
+        adc_bits=adc_bits,
+        adc_top=int(controller.adc_top),
+        bias=int(round(float(controller.adc_bias) / float(controller.adc_step) * 2**adc_bits)),
+        dac_rest=rest,
+        sensor_step=step,
+        dac_step=dac_step,
+        signal=signal,
+        high=high,
+        inner=inner,
+        force=force,
+        filter=_row(channels.filter * step / signal.step[:, None], "modal filter"),
+        high_pass=_row((b0 * signal.step / high.step)[:, None], "high-pass"),
+        memory=_row(np.stack([b1 * signal.step / high.step, -a1], 1), "high-pass"),
+        low_pass=_row(
+            np.stack([one * high.step / inner.step, *-channels.denominator.T], 1),
+            "low-pass",
+        ),
+        numerator=_row(
+            np.column_stack([tap, channels.direct * signal.step / force.step]), "gains"
+        ),
+        synthesizer=_row(back * force.step / dac_step, "synthesizer"),
+        feedthrough=through,
+        error=ErrorBound(np.zeros(()), np.zeros(())),
+    )  # fmt: skip
+    error = _error_bound(found, channels, fixed, gains, memory)
+    _check_error(found, error, dac_step)
+    return fixed._replace(error=error)
+
+
+def _memory(found: FixedController, channels: Channels) -> int:
+    """Samples after which all filters have forgotten."""
+    worst = 0.0
+    for first, denominator in zip(channels.first, channels.denominator, strict=True):
+        poles = np.roots([1.0, *denominator])
+        worst = max(worst, abs(first[2]), np.abs(poles).max(initial=0.0))
+    electronics = found.study.electronics
+    slowest = 1 + np.log(FORGOTTEN) / LONGEST_MEMORY  # pole that forgets just in time
+    if worst > slowest:
+        rate = electronics.sample_rate_hz
+        lowest = -np.log(slowest) * rate / (2 * np.pi)
+        raise field_error(
+            "electronics.highpass_hz", electronics.highpass_hz,
+            f"from {lowest:.3g} for fixed point at electronics.sample_rate_hz = {rate:g}: a filter "
+            f"with its pole at {worst:.12g} keeps rounding errors for too long (or --target c)",
+            "Hz",
+        )  # fmt: skip
+    return int(np.ceil(np.log(FORGOTTEN) / np.log(max(worst, 0.1)))) + 8
+
+
+def _responses(channels: Channels, m: int, n: int) -> tuple[np.ndarray, ...]:
+    """Impulse responses of channel m: to high, inner, force; from high and inner to force."""
+    impulse = np.zeros(n)
+    impulse[0] = 1.0
+    b0, b1, a1 = channels.first[m]
+    below, numerator = [1.0, *channels.denominator[m]], channels.force[m]
+    high = lfilter([b0, b1], [1.0, a1], impulse)
+    inner = lfilter([1.0], below, high)
+    force = lfilter(numerator, [1.0], inner)
+    force[0] += channels.direct[m]
+    of_inner = lfilter(numerator, below, impulse)
+    of_high = lfilter([1.0], [1.0, a1], of_inner)
+    return high, inner, force, of_high, of_inner
+
+
+def peak_gains(channels: Channels, n: int) -> Gains:
+    """Peak gains of all channels by impulse responses of n samples."""
+    rows = [
+        [np.abs(response).sum() for response in _responses(channels, m, n)]
+        for m in range(len(channels.link))
+    ]
+    return Gains(*np.array(rows).T)
+
+
+def _sensor_bound(controller: Controller) -> np.ndarray:
+    """Largest sensor signals that codes and own feed-through can make [V], (3, K)."""
+    ends = np.array([0.0, float(controller.adc_top)]) * controller.adc_step - controller.adc_bias
+    own = np.abs(controller.feedthrough).sum(axis=2) * controller.voltage_limit
+    return np.abs(ends / controller.adc_gain).max() + own
+
+
+def _bits(largest: np.ndarray) -> np.ndarray:
+    """Fraction bits with room for values up to `largest`, with a little to spare for rounding."""
+    return np.floor(WORD - 1 - np.log2(largest * (1 + 1e-4))).astype(int)
+
+
+def _format(seen: np.ndarray, bound: np.ndarray) -> Format:
+    """Format of a signal, (M,) from its values over time and the most it can be."""
+    peak = np.abs(seen).max(axis=0)
+    # a channel at rest in the simulation has no range of its own
+    base = np.where(peak > bound * 2.0**-20, peak, bound)
+    return Format(base, _bits(np.maximum(bound, MARGIN * peak) / base), peak, bound)
+
+
+def _row(factors: np.ndarray, name: str) -> Row:
+    """Integers and shifts of rows of factors, (..., n)."""
+    total = np.abs(factors).sum(axis=-1)
+    safe = np.where(total > 0, total, 1.0)
+    shift = np.floor(WORD - 1 - np.log2(safe * (1 + 1e-6)))
+    if not np.all(np.isfinite(total)) or shift.min() < 1:
+        raise StudyError(
+            f"{name}: factors add up to {total.max():.3g} between words of {WORD} bits: allowed "
+            f"below {2.0 ** (WORD - 2):.3g}; lower control.gain_factor, or take --target c"
+        )
+    shift = np.minimum(shift, 62).astype(int)
+    return Row(np.round(factors * 2.0 ** shift[..., None]).astype(np.int64), shift)
+
+
+def rounded(fixed: FixedPoint, like: Channels) -> Channels:
+    """The channels that the integers stand for, in SI units."""
+    f = fixed
+    scale = f.low_pass.values[:, 0] * f.inner.step / f.high.step  # 1, rounded
+    numerator = f.numerator.values * f.force.step[:, None]
+    own = np.arange(len(f.link))
+    return like._replace(
+        filter=f.filter.values * f.signal.step[:, None] / f.sensor_step,
+        first=np.stack(
+            [
+                f.high_pass.values[:, 0] * f.high.step / f.signal.step,
+                f.memory.values[:, 0] * f.high.step / f.signal.step,
+                -f.memory.values[:, 1],
+            ],
+            axis=1,
+        ),
+        denominator=-f.low_pass.values[:, 1:],
+        force=numerator[:, :3] * (scale / f.inner.step)[:, None],
+        direct=numerator[:, 3] / f.signal.step,
+        synthesizer=f.synthesizer.values[f.link, :, own] * f.dac_step / f.force.step[:, None],
+    )
+
+
+def _error_bound(
+    found: FixedController, exact: Channels, fixed: FixedPoint, gains: Gains, n: int
+) -> ErrorBound:
+    """Peak errors at the actuators: every rounding through its peak gain, all adding up."""
+    near = rounded(fixed, exact)
+    half = 0.5
+    # bias and feed-through are rounded once each
+    entering = fixed.sensor_step * np.abs(exact.filter).sum(axis=1) + half * fixed.signal.step
+    force = entering * gains.force + half * fixed.force.step
+    force = force + 2 * half * fixed.high.step * gains.force_of_high
+    force = force + half * fixed.inner.step * gains.force_of_inner
+    size, volts = np.abs(exact.synthesizer), _sensor_bound(found.controller)[exact.link]
+    change = np.array([
+        np.abs(_responses(near, m, n)[2] - _responses(exact, m, n)[2]).sum()
+        for m in range(len(exact.link))
+    ])  # fmt: skip
+    signal = np.sum(np.abs(exact.filter) * volts, axis=1)
+    moved = np.sum(np.abs(near.filter - exact.filter) * volts, axis=1)
+    wrong = signal * change + moved * gains.force
+    wrong = wrong[:, None] * size + (signal * gains.force)[:, None] * np.abs(
+        near.synthesizer - exact.synthesizer
+    )
+    rounding, coefficients = np.zeros((2, 3, found.n_patches))
+    np.add.at(rounding, exact.link, force[:, None] * size)
+    np.add.at(coefficients, exact.link, wrong)
+    return ErrorBound(rounding, coefficients)
+
+
+def _check_error(found: FixedController, error: ErrorBound, dac_step: float) -> None:
+    worst = error.rounding + error.coefficients
+    if worst.max() <= ALLOWED_ERROR * dac_step:
+        return
+    link, patch = np.unravel_index(np.argmax(worst), worst.shape)
+    raise StudyError(
+        f"fixed point: rounding can add up to {worst.max():.3g} V at actuator {patch + 1} of link "
+        f"{link + 1}: allowed {ALLOWED_ERROR * dac_step:.3g} [V], half a step of the DAC; lower "
+        f"electronics.sample_rate_hz = {found.study.electronics.sample_rate_hz:g} or the gains, "
+        f"raise electronics.highpass_hz = {found.study.electronics.highpass_hz:g}, choose "
+        "patches.centers whose modal filter is better conditioned, or take --target c"
+    )
+
+
+def shaper_row(taps: Taps) -> Row:
+    """Weights of the shaper in fixed point; they add up to exactly 1 (or to what they add up to).
+
+    Raises:
+        StudyError: weights too large for a word.
+    """
+    row = _row(np.asarray(taps.weight)[None], "input shaper")
+    integers, shift = row.integers[0], int(row.shift[0])
+    left = round(float(np.sum(taps.weight)) * 2**shift) - int(integers.sum())
+    largest = np.argmax(np.abs(integers))
+    integers[largest] += left  # a pose at rest stays where it is
+    return Row(integers[None], row.shift)
+
+
+class Response(NamedTuple):
+    """What the integer arithmetic gives; counts are per sample, (T, ...)."""
+
+    codes: np.ndarray  # of the DAC, (T, ..., 3, K)
+    limited: np.ndarray  # internal signals cut to 32 bits
+    saturated: np.ndarray  # actuators at their limit
+    is_faulty: np.ndarray  # whether actuators are at rest for a faulty sensor
+
+
+def respond(fixed: FixedPoint, codes: np.ndarray, rail: int) -> Response:
+    """The exported arithmetic, bit by bit, on sequences of ADC codes from rest.
+
+    Args:
+        fixed: formats and coefficients.
+        codes: 16-bit words, (T, ..., 3, K); sequences side by side.
+        rail: samples at one end of the range that make a sensor faulty.
+    """
+    many, n = codes.shape[1:-2], len(fixed.link)
+    memory, older, old = np.zeros((3, *many, n), np.int64)
+    command = np.zeros(codes.shape[1:], np.int64)
+    at_end = np.zeros(codes.shape[1:], np.int64)  # samples at the highest code, or minus at 0
+    is_faulty = np.zeros(many, bool)
+    is_used = np.isin(np.arange(3), fixed.link)[:, None]
+    rows = []
+    for code in codes.astype(np.int64):
+        end = (code == fixed.adc_top).astype(np.int64) - (code == 0)
+        at_end = np.where(end * at_end > 0, at_end, 0) + end
+        bad = ((code > fixed.adc_top) | (np.abs(at_end) >= rail)) & is_used
+        is_faulty = is_faulty | bad.any(axis=(-2, -1))
+        cut: list[np.ndarray] = []
+        sensor = _limited(code * 2**fixed.adc_bits - fixed.bias, cut)
+        if fixed.feedthrough is not None:
+            own = _products(fixed.feedthrough, command[..., None, :])
+            sensor = _limited(sensor - own, cut)
+        signal = _limited(_products(fixed.filter, sensor[..., fixed.link, :]), cut)
+        high = _limited(_products(fixed.high_pass, signal[..., None]) + memory, cut)
+        memory = _limited(_products(fixed.memory, np.stack([signal, high], -1)), cut)
+        inner = _limited(_products(fixed.low_pass, np.stack([high, old, older], -1)), cut)
+        taps = np.stack([inner, old, older, signal], -1)
+        force = _limited(_products(fixed.numerator, taps), cut)
+        older, old = old, inner
+        wanted = _limited(_products(fixed.synthesizer, force[..., None, None, :]), cut)
+        command = np.minimum(np.maximum(wanted, 1 - fixed.dac_rest), fixed.dac_rest - 1)
+        rest = is_faulty[..., None]
+        memory, old, older = (np.where(rest, 0, x) for x in (memory, old, older))
+        command = np.where(rest[..., None], 0, command)
+        full = np.sum(np.abs(command) == fixed.dac_rest - 1, axis=(-2, -1))
+        # a faulty sample ends before the arithmetic
+        n_cut = np.where(is_faulty, 0, np.sum(cut, axis=0))
+        rows.append((command + fixed.dac_rest, n_cut, full, is_faulty))
+    return Response(*map(np.stack, zip(*rows, strict=True)))
+
+
+def _limited(x: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
+    """Cut to 32 bits; how many were cut in each sequence goes to `cut`."""
+    inside = np.minimum(np.maximum(x, -(2**31)), 2**31 - 1)
+    # sensors have two axes behind those of the sequences, channels one
+    cut.append(np.sum(x != inside, axis=(-2, -1) if x.shape[-2:-1] == (3,) else -1))
+    return inside
+
+
+def _products(row: Row, x: np.ndarray) -> np.ndarray:
+    """Rounded sums of products along the last axis."""
+    return shifted(np.sum(row.integers * x, axis=-1), row.shift)
+
+
+def shifted(x: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Divide by 2^shift and round to nearest, halves up."""
+    return (x + (np.int64(1) << (shift - 1))) >> shift
+
+
+class Cost(NamedTuple):
+    """What a sample of controller and shaper takes on a DSP without a floating-point unit."""
+
+    products: int  # of 32 by 32 bits
+    roundings: int  # shifts and limits of 64-bit sums
+    cycles: int  # estimate
+    load: float  # share of the time there is, estimate [1]
+    words: int  # of 16 bits, for both states
+
+    @property
+    def text(self) -> str:
+        return (
+            f"{self.products} multiplications a sample, about {self.cycles} cycles: "
+            f"{100 * self.load:.0f} % of a sample at {CLOCK / 1e6:.0f} MHz (estimate)"
+        )
+
+
+#: Clock of a TMS320F2812 [Hz].
+CLOCK = 150e6
+#: Cycles of a product with its loads and the 64-bit addition, of a rounding with limit, of a
+#: channel with its checks, and of a call: instructions counted generously, not measured.
+CYCLES = (12, 30, 30, 200)
+
+
+def cost_of(found: FixedController, fixed: FixedPoint) -> Cost:
+    """Multiplications, cycles, load and memory of a sample."""
+    n, k = fixed.filter.integers.shape
+    n_taps, n_channels = len(found.taps.weight), 3 * k
+    direct = int(np.any(fixed.numerator.integers[:, 3]))
+    # filter, synthesizer, sections; the sensors' unit; three coordinates of the shaper
+    products = n * (2 * k + 1 + 2 + 3 + 3 + direct) + n_channels + 3 * n_taps
+    roundings = 5 * n + 2 * n_channels + 3
+    words = 2 * 3 * n + n_channels + 1 + 2 * (3 * (int(found.taps.sample.max()) + 1) + 1)
+    if fixed.feedthrough is not None:
+        products, roundings = products + n_channels * k, roundings + n_channels
+        words += 2 * n_channels
+    parts = (products, roundings, n_channels, 1)
+    cycles = sum(count * each for count, each in zip(parts, CYCLES, strict=True))
+    load = cycles * found.study.electronics.sample_rate_hz / CLOCK
+    return Cost(products, roundings, cycles, load, words)

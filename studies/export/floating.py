@@ -1,0 +1,56 @@
+"""The exported arithmetic in floating point, in NumPy: what every signal is for given ADC codes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxmodel.controller import Controller
+from studies.export.channels import Channels
+
+
+class Signals(NamedTuple):
+    """Signals of a controller over time; leading axes (T, ...)."""
+
+    sensor: np.ndarray  # feed-through taken off [V], (..., 3, K)
+    signal: np.ndarray  # of the channels [m] or [V], (..., M)
+    high: np.ndarray  # behind the first section, (..., M)
+    inner: np.ndarray  # delay line of the second section, (..., M)
+    force: np.ndarray  # [N] or [V], (..., M)
+    wanted: np.ndarray  # voltage before the limit [V], (..., 3, K)
+    command: np.ndarray  # [V], (..., 3, K)
+
+
+def respond(channels: Channels, controller: Controller, codes: np.ndarray) -> Signals:
+    """Run a controller, from rest, on sequences of ADC codes.
+
+    Args:
+        channels: folded controller.
+        controller: the same, for converters, limit and feed-through; NumPy arrays.
+        codes: of the sensors, (T, ..., 3, K); sequences side by side.
+    """
+    rows = []
+    link, many = channels.link, codes.shape[1:-2]
+    memory = np.zeros((*many, len(link)))
+    line = (memory, memory)
+    command = np.zeros(codes.shape[1:])
+    limit = float(controller.voltage_limit)
+    b0, b1, a1 = channels.first.T
+    d1, d2 = channels.denominator.T
+    c0, c1, c2 = channels.force.T
+    back = np.zeros((3, *channels.synthesizer.shape))
+    back[link, np.arange(len(link))] = channels.synthesizer
+    for code in codes:
+        level = (code * controller.adc_step - controller.adc_bias) / controller.adc_gain
+        sensor = level - np.einsum("ikl,...il->...ik", controller.feedthrough, command)
+        signal = np.einsum("mk,...mk->...m", channels.filter, sensor[..., link, :])
+        high = b0 * signal + memory
+        memory = b1 * signal - a1 * high
+        inner = high - d1 * line[0] - d2 * line[1]
+        force = c0 * inner + c1 * line[0] + c2 * line[1] + channels.direct * signal
+        line = (inner, line[0])
+        wanted = np.einsum("imk,...m->...ik", back, force)
+        command = np.clip(wanted, -limit, limit)
+        rows.append((sensor, signal, high, inner, force, wanted, command))
+    return Signals(*map(np.stack, zip(*rows, strict=True)))

@@ -1,0 +1,107 @@
+"""Software in the loop: the plant in JAX, the controller whatever turns ADC codes into volts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.controller import Controller, adc_code, controller_step, read_back, rest_controller
+from jaxmodel.loop import Inputs, Loop, State, advance, filtered_voltage
+from jaxmodel.simulate import Result, Start, begin, conclude
+
+#: ADC codes (3, K) of a sample to actuator voltages (3, K) [V] of the next one.
+Law = Callable[[np.ndarray], np.ndarray]
+
+
+class LoopRun(NamedTuple):
+    """A run over a case's motion."""
+
+    codes: np.ndarray  # of the ADC, (T, 3, K)
+    voltage: np.ndarray  # commands [V], (T, 3, K)
+    pose: np.ndarray  # [m, m, rad], (T, 3)
+    result: Result  # metrics and status, NumPy arrays
+
+
+def run_in_the_loop(structure: Structure, case: Case, law: Law) -> LoopRun:
+    """Run a case with a controller that stands outside the compiled program.
+
+    Args:
+        structure: static choices, feedback "sampled".
+        case: the numbers.
+        law: called once per sample, in order.
+    """
+    start = _begin(structure, case)
+    state, inputs = start.state, start.inputs
+    code, clipped = _look(start.loop, inputs, 0, state)
+    codes, voltages, poses = [], [], []
+    for k in range(structure.n_steps):
+        code = np.asarray(code)
+        voltage = np.asarray(law(code), code.dtype)
+        codes.append(code)
+        voltages.append(voltage)
+        state, pose, code, clipped = _sample(
+            structure, start.loop, inputs, k, state, voltage, clipped
+        )
+        poses.append(pose)
+    result = jax.tree.map(np.asarray, _conclude(start.outline, start.state.status, state))
+    return LoopRun(np.stack(codes), np.stack(voltages), np.stack(poses), result)
+
+
+_begin: Callable[[Structure, Case], Start] = jax.jit(begin, static_argnums=0)
+_conclude = jax.jit(conclude)
+
+
+def _read(loop: Loop, inputs: Inputs, k, state: State):
+    """ADC codes of a state at sample k, and whether any is clipped."""
+    noise = None if inputs.adc_noise is None else inputs.adc_noise[k]
+    code, is_clipped = adc_code(loop.controller, filtered_voltage(loop, state.plant), noise)
+    return code, is_clipped.max()
+
+
+_look = jax.jit(_read)
+
+
+@partial(jax.jit, static_argnums=0)
+def _sample(structure: Structure, loop: Loop, inputs: Inputs, k, state: State, voltage, clipped):
+    """The plant over sample k; what the ADC reads after it."""
+    own = jax.tree.map(lambda x: x[k], inputs)
+    after = state.controller._replace(voltage=voltage)
+    held = state.controller.voltage
+    following, record = advance(structure, loop, state, own, held, after, clipped)
+    return following, record.pose, *_read(loop, inputs, k + 1, following)
+
+
+def jax_law(controller: Controller, n_channels: int) -> Law:
+    """The JAX controller as a `Law`; it remembers."""
+    controller = jax.tree.map(jnp.asarray, controller)
+    state = rest_controller(n_channels, controller.filter.shape[2], float)
+
+    def law(code: np.ndarray) -> np.ndarray:
+        nonlocal state
+        state = _step(controller, state, code)
+        return np.asarray(state.voltage)
+
+    return law
+
+
+@jax.jit
+def _step(controller: Controller, state, code):
+    return controller_step(controller, state, read_back(controller, code))[0]
+
+
+@partial(jax.jit, static_argnums=1)
+def replay(controller: Controller, n_channels: int, codes):
+    """The JAX controller from rest on a sequence of ADC codes (T, 3, K): voltages (T, 3, K)."""
+
+    def body(state, code):
+        after = _step(controller, state, code)
+        return after, after.voltage
+
+    start = rest_controller(n_channels, controller.filter.shape[2], float)
+    return jax.lax.scan(body, start, codes)[1]

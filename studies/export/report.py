@@ -1,0 +1,120 @@
+"""`verification.md`: what was exported, what was compared, what came out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxmodel.sampled_loop import LoopReport
+from studies.export.c_code import format_lines
+from studies.export.channels import Channels
+from studies.export.controller import FixedController
+from studies.export.fixed import MARGIN, Cost, FixedPoint
+from studies.export.verify import AIM, Verification
+
+
+def report(
+    found: FixedController,
+    channels: Channels,
+    origin: list[str],
+    loop: LoopReport,
+    verified: Verification,
+    fixed: FixedPoint | None = None,
+    cost: Cost | None = None,
+) -> str:
+    """Text of the report, in Markdown.
+
+    Args:
+        found, channels: the controller.
+        origin: lines that say where it comes from.
+        loop: linearised sampled loop with the exported coefficients.
+        verified: what was compared.
+        fixed, cost: formats and cost in fixed point.
+    """
+    verdict = "passed" if verified.is_passed else "FAILED, no code was written"
+    lines = [f"# Verification: {verdict}", "", *(f"- {line}" for line in origin), ""]
+    lines += [
+        f"Linearised sampled loop with the exported coefficients: spectral radius "
+        f"{loop.spectral_radius:.6f}, gain margin {loop.gain_margin:.3f}.", "",
+        "## Comparisons", "",
+        "Relative differences are those of actuator voltages, over the largest one. Open loop: "
+        "both controllers get the same sequence of ADC codes.", "",
+        "| compared | found | allowed | |", "|---|---|---|---|",
+    ]  # fmt: skip
+    for check in verified.checks:
+        mark = "ok" if check.is_met else "**FAILED**"
+        lines.append(f"| {check.what} | {check.found} | {check.allowed} | {mark} |")
+    lines += _in_the_loop(found, verified)
+    if fixed is not None and cost is not None:
+        lines += _fixed(found, channels, fixed, cost, verified)
+    return "\n".join(lines) + "\n"
+
+
+def _in_the_loop(found: FixedController, verified: Verification) -> list[str]:
+    """Runs over the case's motion, each controller with the JAX plant."""
+    lines = [
+        "", "## In the loop", "",
+        f"The case's motion ({found.structure.n_steps} samples), the plant in JAX. One ADC code "
+        "that differs ends exact agreement: from there on both runs are right and different.", "",
+        "| controller | residual rms of links 1, 2, 3 [um] | more than JAX | actuator voltage | "
+        "platform x, y [nm], phi [urad] | ADC codes differ from sample |",
+        "|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for name, run in verified.runs.items():
+        rms = " / ".join(f"{1e6 * x:.5f}" for x in np.max(run.result.metrics.residual_rms, axis=1))
+        if name == "JAX":
+            peak = np.abs(run.voltage).max()
+            lines.append(f"| JAX | {rms} | | peak {peak:.4g} V | | |")
+            continue
+        at = verified.beside(name)
+        x, y, phi = at.pose * (1e9, 1e9, 1e6)
+        first = "never" if at.first_code < 0 else str(at.first_code)
+        lines.append(
+            f"| {name} | {rms} | {100 * at.loss:+.3f} % | differs by {at.voltage:.2e} V | "
+            f"differs by {x:.2e}, {y:.2e}, {phi:.2e} | {first} |"
+        )
+    code = found.controller.adc_step / found.controller.adc_gain
+    deflection = float(code) * np.abs(channel_gain(found)).max()
+    return [
+        *lines, "",
+        f"More than JAX: rms over the three links. One ADC code stands for {1e3 * code:.3g} mV at "
+        f"a sensor, up to {1e6 * deflection:.2g} um in the first controlled channel: residuals far "
+        "below are decided by which code the noise falls on, and differ from run to run.",
+    ]  # fmt: skip
+
+
+def channel_gain(found: FixedController) -> np.ndarray:
+    """First channel's signal per sensor volt, (3, K)."""
+    return found.controller.filter[:, 0]
+
+
+def _fixed(
+    found: FixedController, channels: Channels, fixed: FixedPoint, cost: Cost,
+    verified: Verification,
+) -> list[str]:  # fmt: skip
+    own, dac = (verified.beside(name).loss for name in ("C, fixed point", "JAX behind the DAC"))
+    is_modal = found.study.control.law == "imsc"
+    forms = (fixed.signal, fixed.high, fixed.inner, fixed.force)
+    margin = min(form.margin.min() for form in forms)
+    worst = (fixed.error.rounding.max(), fixed.error.coefficients.max())
+    lines = [
+        "", "## Fixed point", "",
+        f"Residual vibration: {100 * own:+.3f} % against floating point (aim: below "
+        f"{100 * AIM:g} %, {'met' if own < AIM else 'missed'}); {100 * dac:+.3f} % with the JAX "
+        "controller behind the same DAC, so what the DAC costs without fixed point.", "",
+        f"Bounds, open loop, for any ADC codes: rounding {worst[0]:.2e} V, coefficients "
+        f"{worst[1]:.2e} V; one step of the DAC is {fixed.dac_step:.4g} V.", "",
+        "Formats: value = base x integer / 2^Q, base = what the simulation shows. Room: the "
+        "largest value of the word, in units of base; codes: the largest value that any sequence of "
+        f"ADC codes can produce, in the same. Smallest margin over the simulation: {margin:.0f} (at "
+        f"least {MARGIN}).", "", "```", *format_lines(fixed, channels, is_modal), "```", "",
+        f"Cost: {cost.text}; {cost.roundings} roundings with limit, {cost.words} words of 16 bits "
+        "for both states. Cycles are counted generously from instructions, not measured.", "",
+        "| sequence | samples | internal overflow | actuator at its limit | at rest by fault |",
+        "|---|---|---|---|---|",
+    ]  # fmt: skip
+    for name, response in verified.counts.items():
+        lines.append(
+            f"| {name} | {len(response.codes)} | {int(response.limited.sum())} | "
+            f"{int(response.saturated.sum())} | {int(response.is_faulty.sum())} |"
+        )
+    return lines

@@ -1,0 +1,215 @@
+"""From a design to the files of a controller."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from jaxmodel import status
+from jaxmodel.sampled_loop import LoopReport, loop_report
+from studies import config
+from studies.design import Design
+from studies.errors import StudyError, field_error
+from studies.export.c_code import Source, fixed_source, floating_source
+from studies.export.channels import Channels, fold, unfold
+from studies.export.compiler import find_compiler
+from studies.export.controller import FixedController, fixed_controller
+from studies.export.document import document, schema, study_hash, to_json
+from studies.export.fixed import cost_of, design_fixed, rounded
+from studies.export.floating import respond
+from studies.export.in_the_loop import LoopRun
+from studies.export.report import report
+from studies.export.verify import (
+    Verification,
+    reference_run,
+    verify_document,
+    verify_fixed,
+    verify_floating,
+)
+from studies.runs import describe
+from studies.store import replacing
+
+TARGETS = ("json", "c", "c-fixed")
+REPORT = "verification.md"
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,30}")
+_DAC_BITS = (4, 16)
+
+
+def export_design(
+    design: Design, target: str, out: Path, is_verified: bool | None, name: str, dac_bits: int,
+    console: Console,
+) -> bool:  # fmt: skip
+    """Write a controller, verified where asked for.
+
+    Args:
+        design: what to export.
+        target: one of `TARGETS`.
+        out: folder for the files, made where it is missing.
+        is_verified: whether to compare with the JAX controller; None: where there is a compiler.
+        name: of the files, prefix of C functions.
+        dac_bits: resolution of the DAC, for "c-fixed".
+        console: to tell what happens.
+
+    Returns:
+        whether everything agreed; the files are written only then.
+
+    Raises:
+        StudyError: an argument out of range, or a controller that cannot be exported.
+    """
+    _check_arguments(target, name, dac_bits)
+    _check_folder(out)
+    compiler = [] if target == "json" else find_compiler()
+    if target != "json" and not compiler:
+        if is_verified:
+            raise StudyError("--verify: no C compiler found (cc, gcc, clang, or the variable CC)")
+        if is_verified is None:
+            console.print("not verified: no C compiler found (cc, gcc, clang, or the variable CC)")
+        is_verified = False
+    is_verified = True if is_verified is None else is_verified
+
+    found = fixed_controller(design.study)
+    channels, origin = fold(found.controller), _origin(found, design.case_id)
+    loop = _judged(found, channels, "")
+    reference = _reference(found) if is_verified or target == "c-fixed" else None
+    files: dict[str, str]
+    verified, fixed, cost = None, None, None
+    if target == "json":
+        described = document(found, design.case_id)
+        files = {
+            f"{name}.json": to_json(described),
+            f"{name}.schema.json": json.dumps(schema(), indent=1) + "\n",
+        }
+        if is_verified and reference is not None:
+            verified = verify_document(found, reference, described)
+    elif target == "c":
+        source = floating_source(found, channels, name, origin)
+        files = _files(source, name)
+        if is_verified and reference is not None:
+            verified = verify_floating(found, channels, reference, source, name, compiler)
+    else:
+        assert reference is not None
+        seen = respond(channels, found.controller, reference.codes)
+        fixed = design_fixed(found, channels, seen, dac_bits)
+        loop = _judged(found, rounded(fixed, channels), ", coefficients rounded to 32 bits")
+        cost = cost_of(found, fixed)
+        source = fixed_source(found, channels, fixed, name, origin, cost.text)
+        files = _files(source, name)
+        if is_verified:
+            verified = verify_fixed(found, channels, fixed, reference, source, name, compiler)
+        console.print(cost.text)
+    is_good = verified is None or verified.is_passed
+    texts = files if is_good else {}
+    if verified is not None:
+        texts |= {REPORT: report(found, channels, origin, loop, verified, fixed, cost)}
+        _tell(verified, console)
+    _write(out, texts, console, verified is None)
+    return is_good
+
+
+def _check_arguments(target: str, name: str, dac_bits: int) -> None:
+    if target not in TARGETS:
+        raise field_error("--target", target, ", ".join(TARGETS))
+    if not _NAME.fullmatch(name):
+        raise field_error("--name", name, "letters, digits and _, 31 at most, a letter first")
+    low, high = _DAC_BITS
+    if not low <= dac_bits <= high:
+        raise field_error("--dac-bits", dac_bits, f"{low} to {high}", "1")
+
+
+def _check_folder(out: Path) -> None:
+    """Refuse early what cannot become a folder with files."""
+    there = Path(os.path.abspath(out))
+    while not os.path.lexists(there):
+        there = there.parent
+    if not there.is_dir():
+        raise StudyError(f"--out {out}: {there} is not a folder; name another one")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise StudyError(f"--out {out}: no permission to write in {there}")
+
+
+def _origin(found: FixedController, case_id: str) -> list[str]:
+    """Where a controller comes from, for heads of files."""
+    study = found.study
+    links = "+".join(str(i + 1) for i in range(3) if study.control.links[i])
+    package = f"{config.PACKAGE} {config.info()[config.PACKAGE]}"
+    return [
+        f"{study.title}",
+        f"Exported by {package}; study SHA-256 {study_hash(study)}"
+        + (f"; case {case_id} of a sweep" if case_id else ""),
+        f"Law {study.control.law}, basis {study.control.basis}, controlled links {links}, "
+        f"velocity estimate {study.electronics.estimator}, shaper {study.shaper.kind}",
+    ]
+
+
+def _judged(found: FixedController, channels: Channels, note: str) -> LoopReport:
+    """Linearised sampled loop with given coefficients; refused where it is unstable."""
+    home = np.array(found.study.motion.waypoints[0], float)
+    law = unfold(channels, found.controller)
+    law = jax.tree.map(jnp.asarray, law)
+    try:
+        loop = loop_report(found.structure, found.case, home, 1, law=law)
+    except np.linalg.LinAlgError:
+        raise StudyError("the linearised loop is not finite: no controller to export") from None
+    if not loop.is_stable:
+        factor = found.study.control.gain_factor
+        way = f"at most {0.5 * factor * loop.gain_margin:.3g}, half of what is stable"
+        if loop.gain_margin == 0:
+            way = "smaller ones do not help either: see studies simulate and docs/theory.md"
+        raise field_error(
+            "control.gain_factor", factor,
+            f"gains whose sampled loop is stable{note}: its spectral radius is "
+            f"{loop.spectral_radius:.6f}, its gain margin {loop.gain_margin:.3g} ({way})", "1",
+        )  # fmt: skip
+    return loop
+
+
+def _reference(found: FixedController) -> LoopRun:
+    """The case's motion with the JAX controller, which must run to its end."""
+    run = reference_run(found)
+    code = int(run.result.status)
+    if code not in status.FINISHED:
+        raise StudyError(
+            f"{found.study.title}: {describe(code)} at {run.result.bad_time:.4g} s; allowed: a "
+            "study that runs to its end (see studies simulate)"
+        )
+    return run
+
+
+def _files(source: Source, name: str) -> dict[str, str]:
+    return {f"{name}.h": source.header, f"{name}.c": source.code}
+
+
+def _tell(verified: Verification, console: Console) -> None:
+    failed = [check for check in verified.checks if not check.is_met]
+    for check in failed:
+        console.print(f"FAILED: {check.what}: {check.found}, allowed {check.allowed}")
+    if not failed:
+        console.print(f"verified: {len(verified.checks)} comparisons agree")
+    for name in verified.runs:
+        if name != "JAX":
+            at = verified.beside(name)
+            console.print(
+                f"in the loop, {name}: voltage differs by {at.voltage:.2g} V, platform by "
+                f"{1e9 * at.pose[:2].max():.2g} nm, residual vibration by {100 * at.loss:+.2g} %"
+            )
+
+
+def _write(out: Path, texts: dict[str, str], console: Console, drops_report: bool) -> None:
+    """Write the files; a report of an earlier export would speak of other code."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if drops_report:
+            (out / REPORT).unlink(missing_ok=True)
+    except OSError as error:
+        raise StudyError(f"--out {out}: cannot write there ({error.strerror})") from None
+    for name, text in texts.items():
+        with replacing(out / name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        console.print(f"written: {out / name}", soft_wrap=True)

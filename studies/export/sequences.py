@@ -1,0 +1,47 @@
+"""ADC codes that no plant would make, to compare controllers on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+#: Samples of each sequence.
+LENGTH = 3000
+
+
+def hard_sequences(recorded: np.ndarray, top: int, rail: int) -> dict[str, np.ndarray]:
+    """Sequences without a sensor fault, by name.
+
+    Args:
+        recorded: codes of a run, (T, 3, K).
+        top: highest code.
+        rail: samples at an end that make a sensor faulty.
+
+    Returns:
+        each (LENGTH, 3, K) or shorter.
+    """
+    rng = np.random.default_rng(0)
+    shape = (LENGTH, *recorded.shape[1:])
+    sample = np.arange(LENGTH)[:, None, None]
+    # every channel its own period, all short of a fault
+    longest = max(rail - 1, 1)
+    half = np.clip(rng.integers(1, 90, shape[1:]), 1, longest)
+    stuck = np.array(recorded[:LENGTH])
+    stuck[:, 0, 0] = stuck[len(stuck) // 2, 0, 0]
+    stuck[len(stuck) // 2 :, -1, -1] = top // 5
+    slow = (top * (0.5 + 0.499 * np.sin(2 * np.pi * sample / 97))).round()
+    return {
+        "random codes": rng.integers(0, top + 1, shape).astype(float),
+        "full-scale square waves": np.where(sample // half % 2, float(top), 0.0),
+        "full-scale square waves in phase": np.broadcast_to(
+            np.where(sample // min(43, longest) % 2, float(top), 0.0), shape
+        ),
+        "sine of nearly full scale": np.broadcast_to(slow, shape).astype(float),
+        "stuck sensors": stuck,
+    }
+
+
+def stuck_at_end(recorded: np.ndarray, top: int, channel: tuple[int, int]) -> np.ndarray:
+    """A recorded run whose sensor `channel` (link, patch from 0) sticks at the highest code."""
+    codes = np.array(recorded)
+    codes[len(codes) // 3 :, channel[0], channel[1]] = top
+    return codes

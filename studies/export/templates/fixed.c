@@ -1,0 +1,178 @@
+/* Controller and input shaper in fixed point, see $name.h.
+ *
+$origin
+ *
+ * Every signal is a 32-bit integer; its unit is in the table of formats. A sum of products is made in
+ * 64 bits, which it cannot leave (the coefficients of a row add up to less than 2^31), then shifted
+ * right with rounding and limited to 32 bits. So coefficient = integer / 2^shift, and its unit is counts
+ * of the result per count of what it multiplies.
+ *
+ * Formats: value = one per unit * integer / 2^Q. One per unit is the range in the simulated motion.
+ * The word has room for so many times that, and ADC codes can make at most so many times that.
+ *
+$formats
+ *
+ * Each constant: [unit], and the section or field of the study file that it comes from.
+ * $cost
+ */
+#include "$name.h"
+
+$tables
+
+static int32_t limited(int64_t x)
+{
+    return x > INT32_MAX ? INT32_MAX : x < INT32_MIN ? INT32_MIN : (int32_t)x;
+}
+
+/* Round to nearest, halves up. Needs a right shift that keeps the sign, as all compilers have it. */
+static int64_t shifted(int64_t sum, int shift)
+{
+    return (sum + ((int64_t)1 << (shift - 1))) >> shift;
+}
+
+/* Whether a sensor is faulty: its number from 1, else 0. */
+static int check(${name}_state *state, const uint16_t sensor[${NAME}_N_CHANNELS])
+{
+    int16_t *at;
+    int k;
+
+    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
+        if (!IS_USED[k / ${NAME}_N_PATCHES]) {
+            continue;
+        }
+        if (sensor[k] > ADC_TOP) {
+            return k + 1;
+        }
+        at = &state->rail[k];
+        if (sensor[k] == 0) {
+            *at = (int16_t)(*at < 0 ? *at - 1 : -1);
+        } else if (sensor[k] == ADC_TOP) {
+            *at = (int16_t)(*at > 0 ? *at + 1 : 1);
+        } else {
+            *at = 0;
+        }
+        if (*at >= ${NAME}_RAIL_SAMPLES || *at <= -${NAME}_RAIL_SAMPLES) {
+            return k + 1;
+        }
+    }
+    return 0;
+}
+
+static void forget(${name}_state *state)
+{
+    int k;
+
+    for (k = 0; k < ${NAME}_N_MODES; k++) {
+        state->high[k] = 0;
+        state->line[k][0] = 0;
+        state->line[k][1] = 0;
+    }
+    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
+$forget_command        state->rail[k] = 0;
+    }
+}
+
+void ${name}_init(${name}_state *state)
+{
+    forget(state);
+    state->fault = 0;
+}
+
+int ${name}_step(${name}_state *state, const uint16_t sensor[${NAME}_N_CHANNELS],
+    uint16_t actuator[${NAME}_N_CHANNELS])
+{
+    int32_t sensed[${NAME}_N_CHANNELS]; /* sensor signals */
+    int32_t force[${NAME}_N_MODES]; /* channel forces */
+    int64_t sum;
+    int k, m, first;
+
+    if (!state->fault) {
+        state->fault = check(state, sensor);
+    }
+    if (state->fault) {
+        forget(state);
+        for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
+            actuator[k] = (uint16_t)DAC_REST;
+        }
+        return state->fault;
+    }
+    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
+        sensed[k] = limited((int64_t)sensor[k] * ADC_UNIT - BIAS);
+    }
+$subtract_feedthrough    for (m = 0; m < ${NAME}_N_MODES; m++) {
+        int32_t signal, high, inner;
+        int32_t *line = state->line[m];
+
+        first = ${NAME}_N_PATCHES * LINK[m];
+        sum = 0;
+        for (k = 0; k < ${NAME}_N_PATCHES; k++) {
+            sum += (int64_t)FILTER[m][k] * sensed[first + k];
+        }
+        signal = limited(shifted(sum, FILTER_SHIFT[m]));
+        sum = shifted((int64_t)HIGH_PASS[m][0] * signal, HIGH_PASS_SHIFT[m][0]);
+        high = limited(sum + state->high[m]);
+        sum = (int64_t)HIGH_PASS[m][1] * signal + (int64_t)HIGH_PASS[m][2] * high;
+        state->high[m] = limited(shifted(sum, HIGH_PASS_SHIFT[m][1]));
+        sum = (int64_t)LOW_PASS[m][0] * high + (int64_t)LOW_PASS[m][1] * line[0]
+            + (int64_t)LOW_PASS[m][2] * line[1];
+        inner = limited(shifted(sum, LOW_PASS_SHIFT[m]));
+        sum = (int64_t)FORCE[m][0] * inner + (int64_t)FORCE[m][1] * line[0]
+            + (int64_t)FORCE[m][2] * line[1]$direct;
+        force[m] = limited(shifted(sum, FORCE_SHIFT[m]));
+        line[1] = line[0];
+        line[0] = inner;
+    }
+    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
+        int32_t command;
+
+        sum = 0;
+        for (m = FIRST_MODE[k / ${NAME}_N_PATCHES]; m < FIRST_MODE[k / ${NAME}_N_PATCHES + 1]; m++) {
+            sum += (int64_t)SYNTHESIZER[m][k % ${NAME}_N_PATCHES] * force[m];
+        }
+        command = limited(shifted(sum, SYNTHESIZER_SHIFT[k]));
+        if (command > DAC_REST - 1) {
+            command = DAC_REST - 1;
+        } else if (command < 1 - DAC_REST) {
+            command = 1 - DAC_REST;
+        }
+$keep_command        actuator[k] = (uint16_t)(command + DAC_REST);
+    }
+    return 0;
+}
+
+void ${name}_shape_init(${name}_shaper *shaper, const int32_t reference[3])
+{
+    uint32_t k;
+    int axis;
+
+    for (k = 0; k < ${NAME}_SHAPER_LENGTH; k++) {
+        for (axis = 0; axis < 3; axis++) {
+            shaper->past[k][axis] = reference[axis];
+        }
+    }
+    shaper->newest = 0;
+}
+
+void ${name}_shape_step(${name}_shaper *shaper, const int32_t reference[3], int32_t shaped[3])
+{
+    int64_t sum[3] = {0, 0, 0};
+    uint32_t at;
+    int k, axis;
+
+    shaper->newest = (shaper->newest == 0 ? ${NAME}_SHAPER_LENGTH : shaper->newest) - 1;
+    for (axis = 0; axis < 3; axis++) {
+        shaper->past[shaper->newest][axis] = reference[axis];
+    }
+    for (k = 0; k < N_TAPS; k++) {
+        at = shaper->newest + DELAY[k];
+        if (at >= ${NAME}_SHAPER_LENGTH) {
+            at -= ${NAME}_SHAPER_LENGTH;
+        }
+        for (axis = 0; axis < 3; axis++) {
+            sum[axis] += (int64_t)WEIGHT[k] * shaper->past[at][axis];
+        }
+    }
+    for (axis = 0; axis < 3; axis++) {
+        shaped[axis] = limited(shifted(sum[axis], WEIGHT_SHIFT));
+    }
+}

@@ -1,0 +1,340 @@
+"""Whether exported code does what the JAX controller does: open loop, in the loop, under abuse."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.motion import sample_path, shape_path
+from jaxmodel.shaper import Taps
+from studies.export.c_code import Source
+from studies.export.channels import Channels, fold
+from studies.export.compiler import Code, compiled
+from studies.export.controller import FixedController
+from studies.export.document import Document, controller_of
+from studies.export.fixed import FixedPoint, Response, rail_samples, shaper_row, shifted
+from studies.export.fixed import respond as respond_fixed
+from studies.export.floating import respond as respond_floating
+from studies.export.in_the_loop import LoopRun, jax_law, replay, run_in_the_loop
+from studies.export.sequences import hard_sequences, stuck_at_end
+
+#: Double precision against JAX, largest difference over largest value [1].
+DOUBLE = 1e-12
+#: The same in single precision.
+SINGLE = 1e-3
+#: Residual vibration in fixed point may exceed that in floating point by this share [1].
+AIM = 0.01
+#: Counts per metre and radian of the shaper's reference in fixed point.
+REFERENCE_COUNTS = 1e9
+
+
+class Check(NamedTuple):
+    """One comparison."""
+
+    what: str
+    found: str
+    allowed: str
+    is_met: bool
+
+
+class InTheLoop(NamedTuple):
+    """A run in the loop beside that with the JAX controller."""
+
+    voltage: float  # largest difference of an actuator [V]
+    pose: np.ndarray  # of the platform [m, m, rad], (3,)
+    first_code: int  # sample at which an ADC code first differs; -1: never
+    loss: float  # residual vibration, rms over links, over that with JAX, minus 1 [1]
+
+
+class Verification(NamedTuple):
+    """Everything compared."""
+
+    checks: list[Check]
+    runs: dict[str, LoopRun]  # by whose controller it was, that of JAX first
+    counts: dict[str, Response]  # fixed point: by sequence
+
+    def beside(self, name: str) -> InTheLoop:
+        """One of the runs against that with the JAX controller."""
+        wanted, run = self.runs["JAX"], self.runs[name]
+        differing = np.flatnonzero(np.any(run.codes != wanted.codes, axis=(1, 2)))
+        size = vibration(wanted)
+        return InTheLoop(
+            float(np.abs(run.voltage - wanted.voltage).max()),
+            np.abs(run.pose - wanted.pose).max(axis=0),
+            int(differing[0]) if len(differing) else -1,
+            vibration(run) / size - 1 if size > 0 else 0.0,
+        )
+
+    @property
+    def is_passed(self) -> bool:
+        return all(check.is_met for check in self.checks)
+
+
+def vibration(run: LoopRun) -> float:
+    """Residual deflection of the machine: rms over links, worst stations [m]."""
+    worst = np.max(run.result.metrics.residual_rms, axis=1)
+    return float(np.sqrt(np.mean(worst**2)))
+
+
+def reference_run(found: FixedController) -> LoopRun:
+    """The case's motion with the JAX controller."""
+    law = jax_law(found.controller, found.structure.n_channels)
+    return run_in_the_loop(found.structure, found.case, law)
+
+
+def verify_document(found: FixedController, reference: LoopRun, document: Document) -> Verification:
+    """A controller built from nothing but its document, against the JAX controller."""
+    controller, taps = controller_of(document)
+    channels = fold(controller)
+    checks = [
+        _compare(
+            f"open loop, {name}", respond_floating(channels, controller, codes).command,
+            _replayed(found, codes), DOUBLE,
+        )
+        for name, codes in {"recorded codes": reference.codes, **_hard(found, reference)}.items()
+    ]  # fmt: skip
+    _, path, shaped = _references(found)
+    checks.append(_compare("shaper, the case's motion", _shaped(taps, path), shaped, DOUBLE))
+    return Verification(checks, {"JAX": reference}, {})
+
+
+def verify_floating(
+    found: FixedController, channels: Channels, reference: LoopRun, source: Source, name: str,
+    compiler: list[str],
+) -> Verification:  # fmt: skip
+    """C in double and single precision against the JAX controller."""
+    checks, runs = [], {"JAX": reference}
+    with _loaded(found, channels, source, name, compiler, np.float64, np.float64) as code:
+        sequences = {"recorded codes": reference.codes, **_hard(found, reference)}
+        for label, codes in sequences.items():
+            volts, faults = code.respond(codes * float(found.controller.adc_step))
+            wanted = _replayed(found, codes)
+            check = _compare(f"open loop, {label}", volts, wanted, DOUBLE)
+            checks.append(check._replace(is_met=check.is_met and not faults.any()))
+        checks += _faults(found, channels, code, reference)
+        _, path, shaped = _references(found)
+        checks.append(_compare("shaper, the case's motion", code.shape(path), shaped, DOUBLE))
+        step = float(found.controller.adc_step)
+        shape = reference.codes.shape[1:]
+        code.begin()
+        runs["C, double"] = run_in_the_loop(
+            found.structure, found.case, lambda codes: code.step(codes * step)[0].reshape(shape)
+        )
+    with _loaded(found, channels, source, name, compiler, np.float32, np.float32) as code:
+        volts, _ = code.respond(reference.codes * step)
+        checks.append(
+            _compare("open loop, recorded codes, float", volts, reference.voltage, SINGLE)
+        )
+    return Verification([*checks, *_same_status(runs)], runs, {})
+
+
+def verify_fixed(
+    found: FixedController, channels: Channels, fixed: FixedPoint, reference: LoopRun,
+    source: Source, name: str, compiler: list[str],
+) -> Verification:  # fmt: skip
+    """C in fixed point against its integer model, bit by bit, and against the JAX controller."""
+    rail = rail_samples(found.study.electronics.sample_rate_hz)
+    checks, runs = [], {"JAX": reference}
+    law = jax_law(found.controller, found.structure.n_channels)
+    limit = fixed.dac_rest - 1
+
+    def behind_dac(codes: np.ndarray) -> np.ndarray:
+        return np.clip(np.round(law(codes) / fixed.dac_step), -limit, limit) * fixed.dac_step
+
+    runs["JAX behind the DAC"] = run_in_the_loop(found.structure, found.case, behind_dac)
+    shape = reference.codes.shape[1:]
+    with _loaded(found, channels, source, name, compiler, np.uint16, np.int32) as code:
+
+        def in_volts(codes: np.ndarray) -> np.ndarray:
+            out = code.step(codes)[0].reshape(shape).astype(float)
+            return (out - fixed.dac_rest) * fixed.dac_step
+
+        code.begin()
+        runs["C, fixed point"] = own = run_in_the_loop(found.structure, found.case, in_volts)
+        sequences = {
+            "recorded codes": reference.codes, "own run in the loop": own.codes,
+            **_hard(found, reference),
+            "stuck at the end of the range": _stuck(found, channels, reference),
+            "all 16-bit words": np.random.default_rng(1).integers(0, 2**16, (50, *shape)),
+        }  # fmt: skip
+        counts = _modelled(fixed, sequences, rail)
+        for label, codes in sequences.items():
+            given, _ = code.respond(codes)
+            differing = int(np.sum(given != counts[label].codes))
+            checks.append(
+                Check(f"bit by bit, {label}", f"{differing} of {given.size} codes differ", "0",
+                      differing == 0)
+            )  # fmt: skip
+        checks += _faults(found, channels, code, reference)
+        checks.append(_check_shaper(found, code))
+    checks.append(_check_error(found, fixed, reference, counts["recorded codes"]))
+    limited = sum(int(response.limited.sum()) for response in counts.values())
+    checks.append(Check("internal overflow, all sequences", f"{limited} times", "0", limited == 0))
+    return Verification([*checks, *_same_status(runs)], runs, counts)
+
+
+def _modelled(
+    fixed: FixedPoint, sequences: dict[str, np.ndarray], rail: int
+) -> dict[str, Response]:
+    """Response of the integer model to each sequence, all side by side."""
+    longest = max(map(len, sequences.values()))
+    rows = [np.pad(x, ((0, longest - len(x)), (0, 0), (0, 0)), "edge") for x in sequences.values()]
+    found = respond_fixed(fixed, np.stack(rows, axis=1), rail)
+    return {
+        name: Response(*(part[: len(codes), k] for part in found))
+        for k, (name, codes) in enumerate(sequences.items())
+    }
+
+
+@contextmanager
+def _loaded(
+    found: FixedController, channels: Channels, source: Source, name: str, compiler: list[str],
+    real: type, reference: type,
+) -> Iterator[Code]:  # fmt: skip
+    sizes = (3 * found.n_patches, len(channels.link), int(found.taps.sample.max()) + 1)
+    with compiled(source, name, compiler, real, reference, sizes) as code:
+        yield code
+
+
+def _hard(found: FixedController, reference: LoopRun) -> dict[str, np.ndarray]:
+    top = int(found.controller.adc_top)
+    rail = rail_samples(found.study.electronics.sample_rate_hz)
+    return hard_sequences(reference.codes, top, rail)
+
+
+def _replayed(found: FixedController, codes: np.ndarray) -> np.ndarray:
+    return np.asarray(replay(found.controller, found.structure.n_channels, codes))
+
+
+def _compare(what: str, found: np.ndarray, wanted: np.ndarray, allowed: float) -> Check:
+    """Largest difference over the largest value."""
+    size = np.abs(wanted).max()
+    difference = float(np.abs(found - wanted).max() / (size if size > 0 else 1.0))
+    return Check(what, f"{difference:.1e}", f"{allowed:.0e}", difference <= allowed)
+
+
+def _stuck(found: FixedController, channels: Channels, reference: LoopRun) -> np.ndarray:
+    return stuck_at_end(reference.codes, int(found.controller.adc_top), (channels.link[-1], 0))
+
+
+def _faults(
+    found: FixedController, channels: Channels, code: Code, reference: LoopRun
+) -> list[Check]:
+    """A faulty sensor must be named, and all actuators at rest from then on."""
+    link, top = int(channels.link[-1]), float(found.controller.adc_top)
+    rail = rail_samples(found.study.electronics.sample_rate_hz)
+    n = found.n_patches
+    number, begin = link * n + 1, len(reference.codes) // 3
+    is_real = code.real is np.float64
+    scale = float(found.controller.adc_step) if is_real else 1.0
+    rest = 0.0 if is_real else code.step(np.zeros(3 * n))[0][0]  # not yet a fault: code of 0 V
+    faults = {"stuck at the end of the range": (top, rail - 1), "beyond the range": (top + 3, 0)}
+    if is_real:
+        faults |= {"NaN": (np.nan, 0), "infinite": (np.inf, 0)}
+    checks = []
+    for name, (value, delay) in faults.items():
+        codes = np.clip(reference.codes, 1, top - 1)
+        codes[begin : begin + rail + 5, link, 0] = value
+        if is_real:
+            rest = 0.0
+        out, numbers = code.respond(codes * scale)
+        first = begin + delay
+        is_met = not numbers[:first].any() and np.all(numbers[first:] == number)
+        is_met &= np.all(out[first:] == rest) and np.all(np.isfinite(out))
+        at = np.flatnonzero(numbers)
+        text = (
+            f"sensor {numbers[at[0]]} after {at[0] - begin + 1} samples" if len(at) else "nothing"
+        )
+        wanted = f"sensor {number} after {delay + 1} samples, then rest"
+        checks.append(Check(f"faulty sensor: {name}", text, wanted, bool(is_met)))
+    return checks
+
+
+def _references(found: FixedController) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times [s], planned poses and JAX's shaped ones at the samples, (T, 3)."""
+    n, period = found.structure.n_steps, float(found.case.electronics.period)
+    taps = Taps(jnp.asarray(found.taps.weight), jnp.asarray(found.taps.sample))
+    time = period * np.arange(n)
+    planned = np.asarray(_plan(found.case.path, time))
+    shaped = np.asarray(_shape(found.case.path, taps, n, period))
+    return time, planned, shaped
+
+
+@jax.jit
+def _plan(path, time):
+    return sample_path(path, time).position
+
+
+def _shape_path(path, taps, n: int, period):
+    return shape_path(path, taps, n, 1, period).position
+
+
+_shape = jax.jit(_shape_path, static_argnums=2)
+
+
+def _shaped(taps: Taps, path: np.ndarray) -> np.ndarray:
+    """Sum of the path's past."""
+    longest = int(taps.sample.max())
+    padded = np.concatenate([np.repeat(path[:1], longest, axis=0), path])
+    parts = (
+        weight * padded[longest - delay : longest - delay + len(path)]
+        for weight, delay in zip(taps.weight, taps.sample, strict=True)
+    )
+    return sum(parts)
+
+
+def _check_shaper(found: FixedController, code: Code) -> Check:
+    """The shaper in fixed point: bit by bit like its integer model, within a count of JAX's."""
+    _, path, shaped = _references(found)
+    counts = np.round(path * REFERENCE_COUNTS).astype(np.int64)
+    given = code.shape(counts)
+    row = shaper_row(found.taps)
+    longest = int(found.taps.sample.max())
+    padded = np.concatenate([np.repeat(counts[:1], longest, axis=0), counts])
+    total = sum(
+        weight * padded[longest - delay : longest - delay + len(path)]
+        for weight, delay in zip(row.integers[0], found.taps.sample, strict=True)
+    )
+    differing = int(np.sum(given != shifted(total, row.shift[0])))
+    off = np.abs(given / REFERENCE_COUNTS - shaped).max() * REFERENCE_COUNTS
+    # half a count of the reference, half of the result, and what JAX's path differs by
+    return Check(
+        "shaper, the case's motion", f"{differing} counts differ, {off:.2f} counts from JAX's",
+        "0, 1.1", bool(differing == 0 and off <= 1.1),
+    )  # fmt: skip
+
+
+def _check_error(
+    found: FixedController, fixed: FixedPoint, reference: LoopRun, response: Response
+) -> Check:
+    """Fixed point against the JAX controller on the same codes, beside what it may differ by."""
+    volts = (response.codes - fixed.dac_rest) * fixed.dac_step
+    difference = np.abs(volts - reference.voltage).max()
+    bound = fixed.error.rounding + fixed.error.coefficients
+    allowed = 0.5 * fixed.dac_step + bound.max()
+    if np.any(found.controller.feedthrough):  # which acts on what the DAC makes of the command
+        return Check(
+            "open loop against JAX, recorded codes", f"{difference:.3g} V",
+            "no bound: the feed-through of the DAC's rounding comes on top", True,
+        )  # fmt: skip
+    return Check(
+        "open loop against JAX, recorded codes", f"{difference:.4g} V",
+        f"{allowed:.4g} V: half a DAC step and {bound.max():.1e} V of rounding inside",
+        bool(difference <= allowed * (1 + 1e-9)),
+    )  # fmt: skip
+
+
+def _same_status(runs: dict[str, LoopRun]) -> list[Check]:
+    first, *others = runs.items()
+    return [
+        Check(
+            f"status in the loop, {name}", str(int(run.result.status)),
+            str(int(first[1].result.status)), bool(run.result.status == first[1].result.status),
+        )
+        for name, run in others
+    ]  # fmt: skip
