@@ -2,8 +2,9 @@
 
 - What there is to export: `controller` takes the fixed numbers out of a study, or says why not;
   `document` is their JSON file; `channels` orders them as code wants them.
-- Code: `floating` and `fixed` are the arithmetic of both targets in NumPy, with the formats and
-  error bounds of fixed point; `c_code` writes C99 from them into the templates beside it.
+- Code: `floating` is the arithmetic in NumPy; `fixed` finds formats, integer coefficients and error
+  bounds, `integers` is their arithmetic, `cost` what it takes; `c_floating` and `c_fixed` make C99
+  of them, which `c_text` puts into the templates.
 - Proof: `compiler` makes the code callable, `in_the_loop` runs it with the plant, `sequences` are
   inputs that no plant would make, `verify` compares, `report` tells.
 - `run` leads from the design to the files.

@@ -15,8 +15,9 @@ from jaxmodel.controller import Controller
 class Channels(NamedTuple):
     """M channels in the order of links; numbers in SI units."""
 
+    kind: str  # what a channel is, "mode" or "patch"
     link: np.ndarray  # from 0, (M,)
-    mode: np.ndarray  # mode or patch, from 0, (M,)
+    number: np.ndarray  # of the mode or patch, from 0, (M,)
     filter: np.ndarray  # channel from sensor voltages [m/V] or [1], (M, K)
     first: np.ndarray  # high-pass b0, b1 and a1, (M, 3)
     denominator: np.ndarray  # a1, a2 of the second section [1], (M, 2)
@@ -25,24 +26,31 @@ class Channels(NamedTuple):
     synthesizer: np.ndarray  # voltages from the channel's force [V/N] or [1], (M, K)
 
     @property
+    def names(self) -> list[str]:
+        """Of the channels, for people."""
+        pairs = zip(self.link, self.number, strict=True)
+        return [f"link {i + 1}, {self.kind} {j + 1}" for i, j in pairs]
+
+    @property
     def has_direct(self) -> bool:
         return bool(np.any(self.direct))
 
 
-def fold(controller: Controller) -> Channels:
+def fold(controller: Controller, law: str) -> Channels:
     """Channels of a controller.
 
     u = -k_d v - k_p x with v and x two outputs of one filter, so one numerator -k_d n_v - k_p n_x.
 
     Args:
         controller: NumPy arrays; a channel without gains is left out.
+        law: "imsc" or "srf".
     """
     estimator, velocity = controller.estimator, controller.velocity_gain
     position = controller.position_gain
     if position is None:
         position = np.zeros_like(velocity)
-    link, mode = np.nonzero((velocity != 0) | (position != 0))
-    at = link, mode
+    link, number = np.nonzero((velocity != 0) | (position != 0))
+    at = link, number
 
     def gathered(parts: tuple) -> np.ndarray:
         return np.stack([np.broadcast_to(part, velocity.shape)[at] for part in parts], axis=1)
@@ -50,8 +58,9 @@ def fold(controller: Controller) -> Channels:
     force = -velocity[at][:, None] * gathered(estimator.velocity)
     force = force - position[at][:, None] * gathered(estimator.position)
     return Channels(
+        kind="patch" if law == "srf" else "mode",
         link=link,
-        mode=mode,
+        number=number,
         filter=controller.filter[at],
         first=gathered(estimator.first),
         denominator=gathered(estimator.denominator),
@@ -68,7 +77,7 @@ def unfold(channels: Channels, like: Controller) -> Controller:
         channels: of the same law as `like`, their coefficients rounded for instance.
         like: what the channels leave open.
     """
-    at = channels.link, channels.mode
+    at = channels.link, channels.number
     gain = np.zeros_like(like.velocity_gain)
     gain[at] = 1.0
 

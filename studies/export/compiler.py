@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from studies.errors import StudyError
-from studies.export.c_code import Source
+from studies.export.c_text import Source
 
 #: What exported code must compile under without a word.
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")

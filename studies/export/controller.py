@@ -14,6 +14,7 @@ from jaxmodel.controller import Controller
 from jaxmodel.prepare import design_controller, design_taps
 from jaxmodel.shaper import Taps
 from studies.errors import StudyError, field_error
+from studies.export.channels import Channels, fold
 from studies.runs import check_run, resolved_study
 from studies.spec import Study
 
@@ -25,16 +26,18 @@ class FixedController(NamedTuple):
     structure: Structure
     case: Case
     controller: Controller
+    channels: Channels  # the same, folded
     taps: Taps  # shaper on the sample grid, one tap per delay, delays rising
     frequency: np.ndarray  # each channel's velocity estimate is exact there [Hz], (3, C)
 
     @property
-    def n_links(self) -> int:
-        return self.controller.filter.shape[0]
-
-    @property
     def n_patches(self) -> int:
         return self.controller.filter.shape[2]
+
+    @property
+    def is_modal(self) -> bool:
+        """Whether channels are modes, in metres and newtons; volts otherwise."""
+        return self.study.control.law == "imsc"
 
 
 def fixed_controller(study: Study) -> FixedController:
@@ -57,7 +60,10 @@ def fixed_controller(study: Study) -> FixedController:
             "control.velocity_gain, control.ratios)", "1",
         )  # fmt: skip
     _check_finite(controller, taps)
-    return FixedController(study, structure, case, controller, _merged(taps), omega / (2 * np.pi))
+    return FixedController(
+        study, structure, case, controller, fold(controller, study.control.law), _merged(taps),
+        omega / (2 * np.pi),
+    )  # fmt: skip
 
 
 def _check_exportable(study: Study) -> None:

@@ -115,9 +115,8 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
     """Every number of the controller, by name."""
     controller, electronics = found.controller, found.study.electronics
     estimator = controller.estimator
-    is_modal = found.study.control.law == "imsc"
-    to_signal, from_force = ("m/V", "V/N") if is_modal else ("1", "1")
-    on_rate, on_value = ("N s/m", "N/m") if is_modal else ("s", "1")
+    to_signal, from_force = ("m/V", "V/N") if found.is_modal else ("1", "1")
+    on_rate, on_value = ("N s/m", "N/m") if found.is_modal else ("s", "1")
     shape = controller.velocity_gain.shape
     is_phase = electronics.estimator == "modal_phase"
     # the section that differentiates makes a rate of the signal: the last one of modal_phase

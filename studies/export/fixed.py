@@ -1,4 +1,4 @@
-"""Fixed point: formats, integer coefficients, error bounds, and the arithmetic itself in NumPy.
+"""Fixed point: formats, integer coefficients, and bounds of what rounding can do.
 
 Words have 32 bits, sums of products 64. A signal is `base * integer / 2^bits`, so it is per unit
 of a base of its own, the range that the simulation shows; bits are as many as leave room for the
@@ -113,21 +113,18 @@ def rail_samples(rate: float) -> int:
     return min(max(round(RAIL_TIME * rate), 2), 2**15 - 1)
 
 
-def design_fixed(
-    found: FixedController, channels: Channels, seen: Signals, dac_bits: int
-) -> FixedPoint:
+def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedPoint:
     """Formats and coefficients for a controller.
 
     Args:
         found: the controller.
-        channels: the same, folded.
         seen: signals of the simulated motion, (T, ...).
         dac_bits: resolution of the DAC, whose codes 1 to 2^bits - 1 span +-voltage_limit.
 
     Raises:
         StudyError: what cannot be represented, with the number and the way out.
     """
-    controller = found.controller
+    controller, channels = found.controller, found.channels
     bits = found.study.electronics.adc_bits
     if bits > ADC_BITS:
         raise field_error(
@@ -136,7 +133,7 @@ def design_fixed(
         )  # fmt: skip
     rest = 2 ** (dac_bits - 1)
     dac_step = float(controller.voltage_limit) / (rest - 1)
-    memory = _memory(found, channels)
+    memory = _memory(found)
     gains = peak_gains(channels, memory)
     code = float(controller.adc_step / controller.adc_gain)  # one ADC code at the sensor [V]
     sensor = _sensor_bound(controller)  # (3, K)
@@ -181,15 +178,15 @@ def design_fixed(
         feedthrough=through,
         error=ErrorBound(np.zeros(()), np.zeros(())),
     )  # fmt: skip
-    error = _error_bound(found, channels, fixed, gains, memory)
+    error = _error_bound(found, fixed, gains, memory)
     _check_error(found, error, dac_step)
     return fixed._replace(error=error)
 
 
-def _memory(found: FixedController, channels: Channels) -> int:
+def _memory(found: FixedController) -> int:
     """Samples after which all filters have forgotten."""
     worst = 0.0
-    for first, denominator in zip(channels.first, channels.denominator, strict=True):
+    for first, denominator in zip(found.channels.first, found.channels.denominator, strict=True):
         poles = np.roots([1.0, *denominator])
         worst = max(worst, abs(first[2]), np.abs(poles).max(initial=0.0))
     electronics = found.study.electronics
@@ -287,10 +284,9 @@ def rounded(fixed: FixedPoint, like: Channels) -> Channels:
     )
 
 
-def _error_bound(
-    found: FixedController, exact: Channels, fixed: FixedPoint, gains: Gains, n: int
-) -> ErrorBound:
+def _error_bound(found: FixedController, fixed: FixedPoint, gains: Gains, n: int) -> ErrorBound:
     """Peak errors at the actuators: every rounding through its peak gain, all adding up."""
+    exact = found.channels
     near = rounded(fixed, exact)
     half = 0.5
     # bias and feed-through are rounded once each
@@ -341,116 +337,3 @@ def shaper_row(taps: Taps) -> Row:
     largest = np.argmax(np.abs(integers))
     integers[largest] += left  # a pose at rest stays where it is
     return Row(integers[None], row.shift)
-
-
-class Response(NamedTuple):
-    """What the integer arithmetic gives; counts are per sample, (T, ...)."""
-
-    codes: np.ndarray  # of the DAC, (T, ..., 3, K)
-    limited: np.ndarray  # internal signals cut to 32 bits
-    saturated: np.ndarray  # actuators at their limit
-    is_faulty: np.ndarray  # whether actuators are at rest for a faulty sensor
-
-
-def respond(fixed: FixedPoint, codes: np.ndarray, rail: int) -> Response:
-    """The exported arithmetic, bit by bit, on sequences of ADC codes from rest.
-
-    Args:
-        fixed: formats and coefficients.
-        codes: 16-bit words, (T, ..., 3, K); sequences side by side.
-        rail: samples at one end of the range that make a sensor faulty.
-    """
-    many, n = codes.shape[1:-2], len(fixed.link)
-    memory, older, old = np.zeros((3, *many, n), np.int64)
-    command = np.zeros(codes.shape[1:], np.int64)
-    at_end = np.zeros(codes.shape[1:], np.int64)  # samples at the highest code, or minus at 0
-    is_faulty = np.zeros(many, bool)
-    is_used = np.isin(np.arange(3), fixed.link)[:, None]
-    rows = []
-    for code in codes.astype(np.int64):
-        end = (code == fixed.adc_top).astype(np.int64) - (code == 0)
-        at_end = np.where(end * at_end > 0, at_end, 0) + end
-        bad = ((code > fixed.adc_top) | (np.abs(at_end) >= rail)) & is_used
-        is_faulty = is_faulty | bad.any(axis=(-2, -1))
-        cut: list[np.ndarray] = []
-        sensor = _limited(code * 2**fixed.adc_bits - fixed.bias, cut)
-        if fixed.feedthrough is not None:
-            own = _products(fixed.feedthrough, command[..., None, :])
-            sensor = _limited(sensor - own, cut)
-        signal = _limited(_products(fixed.filter, sensor[..., fixed.link, :]), cut)
-        high = _limited(_products(fixed.high_pass, signal[..., None]) + memory, cut)
-        memory = _limited(_products(fixed.memory, np.stack([signal, high], -1)), cut)
-        inner = _limited(_products(fixed.low_pass, np.stack([high, old, older], -1)), cut)
-        taps = np.stack([inner, old, older, signal], -1)
-        force = _limited(_products(fixed.numerator, taps), cut)
-        older, old = old, inner
-        wanted = _limited(_products(fixed.synthesizer, force[..., None, None, :]), cut)
-        command = np.minimum(np.maximum(wanted, 1 - fixed.dac_rest), fixed.dac_rest - 1)
-        rest = is_faulty[..., None]
-        memory, old, older = (np.where(rest, 0, x) for x in (memory, old, older))
-        command = np.where(rest[..., None], 0, command)
-        full = np.sum(np.abs(command) == fixed.dac_rest - 1, axis=(-2, -1))
-        # a faulty sample ends before the arithmetic
-        n_cut = np.where(is_faulty, 0, np.sum(cut, axis=0))
-        rows.append((command + fixed.dac_rest, n_cut, full, is_faulty))
-    return Response(*map(np.stack, zip(*rows, strict=True)))
-
-
-def _limited(x: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
-    """Cut to 32 bits; how many were cut in each sequence goes to `cut`."""
-    inside = np.minimum(np.maximum(x, -(2**31)), 2**31 - 1)
-    # sensors have two axes behind those of the sequences, channels one
-    cut.append(np.sum(x != inside, axis=(-2, -1) if x.shape[-2:-1] == (3,) else -1))
-    return inside
-
-
-def _products(row: Row, x: np.ndarray) -> np.ndarray:
-    """Rounded sums of products along the last axis."""
-    return shifted(np.sum(row.integers * x, axis=-1), row.shift)
-
-
-def shifted(x: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Divide by 2^shift and round to nearest, halves up."""
-    return (x + (np.int64(1) << (shift - 1))) >> shift
-
-
-class Cost(NamedTuple):
-    """What a sample of controller and shaper takes on a DSP without a floating-point unit."""
-
-    products: int  # of 32 by 32 bits
-    roundings: int  # shifts and limits of 64-bit sums
-    cycles: int  # estimate
-    load: float  # share of the time there is, estimate [1]
-    words: int  # of 16 bits, for both states
-
-    @property
-    def text(self) -> str:
-        return (
-            f"{self.products} multiplications a sample, about {self.cycles} cycles: "
-            f"{100 * self.load:.0f} % of a sample at {CLOCK / 1e6:.0f} MHz (estimate)"
-        )
-
-
-#: Clock of a TMS320F2812 [Hz].
-CLOCK = 150e6
-#: Cycles of a product with its loads and the 64-bit addition, of a rounding with limit, of a
-#: channel with its checks, and of a call: instructions counted generously, not measured.
-CYCLES = (12, 30, 30, 200)
-
-
-def cost_of(found: FixedController, fixed: FixedPoint) -> Cost:
-    """Multiplications, cycles, load and memory of a sample."""
-    n, k = fixed.filter.integers.shape
-    n_taps, n_channels = len(found.taps.weight), 3 * k
-    direct = int(np.any(fixed.numerator.integers[:, 3]))
-    # filter, synthesizer, sections; the sensors' unit; three coordinates of the shaper
-    products = n * (2 * k + 1 + 2 + 3 + 3 + direct) + n_channels + 3 * n_taps
-    roundings = 5 * n + 2 * n_channels + 3
-    words = 2 * 3 * n + n_channels + 1 + 2 * (3 * (int(found.taps.sample.max()) + 1) + 1)
-    if fixed.feedthrough is not None:
-        products, roundings = products + n_channels * k, roundings + n_channels
-        words += 2 * n_channels
-    parts = (products, roundings, n_channels, 1)
-    cycles = sum(count * each for count, each in zip(parts, CYCLES, strict=True))
-    load = cycles * found.study.electronics.sample_rate_hz / CLOCK
-    return Cost(products, roundings, cycles, load, words)

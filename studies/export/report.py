@@ -5,16 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from jaxmodel.sampled_loop import LoopReport
-from studies.export.c_code import format_lines
-from studies.export.channels import Channels
+from studies.export.c_fixed import format_lines
 from studies.export.controller import FixedController
-from studies.export.fixed import MARGIN, Cost, FixedPoint
+from studies.export.cost import Cost
+from studies.export.fixed import MARGIN, FixedPoint
 from studies.export.verify import AIM, Verification
 
 
 def report(
     found: FixedController,
-    channels: Channels,
     origin: list[str],
     loop: LoopReport,
     verified: Verification,
@@ -24,7 +23,7 @@ def report(
     """Text of the report, in Markdown.
 
     Args:
-        found, channels: the controller.
+        found: the controller.
         origin: lines that say where it comes from.
         loop: linearised sampled loop with the exported coefficients.
         verified: what was compared.
@@ -45,7 +44,7 @@ def report(
         lines.append(f"| {check.what} | {check.found} | {check.allowed} | {mark} |")
     lines += _in_the_loop(found, verified)
     if fixed is not None and cost is not None:
-        lines += _fixed(found, channels, fixed, cost, verified)
+        lines += _fixed(found, fixed, cost, verified)
     return "\n".join(lines) + "\n"
 
 
@@ -88,11 +87,10 @@ def channel_gain(found: FixedController) -> np.ndarray:
 
 
 def _fixed(
-    found: FixedController, channels: Channels, fixed: FixedPoint, cost: Cost,
+    found: FixedController, fixed: FixedPoint, cost: Cost,
     verified: Verification,
 ) -> list[str]:  # fmt: skip
     own, dac = (verified.beside(name).loss for name in ("C, fixed point", "JAX behind the DAC"))
-    is_modal = found.study.control.law == "imsc"
     forms = (fixed.signal, fixed.high, fixed.inner, fixed.force)
     margin = min(form.margin.min() for form in forms)
     worst = (fixed.error.rounding.max(), fixed.error.coefficients.max())
@@ -104,9 +102,9 @@ def _fixed(
         f"Bounds, open loop, for any ADC codes: rounding {worst[0]:.2e} V, coefficients "
         f"{worst[1]:.2e} V; one step of the DAC is {fixed.dac_step:.4g} V.", "",
         "Formats: value = base x integer / 2^Q, base = what the simulation shows. Room: the "
-        "largest value of the word, in units of base; codes: the largest value that any sequence of "
-        f"ADC codes can produce, in the same. Smallest margin over the simulation: {margin:.0f} (at "
-        f"least {MARGIN}).", "", "```", *format_lines(fixed, channels, is_modal), "```", "",
+        "largest value of the word, in units of base; codes: the largest value that any sequence "
+        "of ADC codes can produce, in the same. Smallest margin over the simulation: "
+        f"{margin:.0f} (at least {MARGIN}).", "", "```", *format_lines(fixed, found), "```", "",
         f"Cost: {cost.text}; {cost.roundings} roundings with limit, {cost.words} words of 16 bits "
         "for both states. Cycles are counted generously from instructions, not measured.", "",
         "| sequence | samples | internal overflow | actuator at its limit | at rest by fault |",

@@ -17,12 +17,15 @@ from jaxmodel.sampled_loop import LoopReport, loop_report
 from studies import config
 from studies.design import Design
 from studies.errors import StudyError, field_error
-from studies.export.c_code import Source, fixed_source, floating_source
-from studies.export.channels import Channels, fold, unfold
+from studies.export.c_fixed import fixed_source
+from studies.export.c_floating import floating_source
+from studies.export.c_text import Source
+from studies.export.channels import Channels, unfold
 from studies.export.compiler import find_compiler
 from studies.export.controller import FixedController, fixed_controller
+from studies.export.cost import cost_of
 from studies.export.document import document, schema, study_hash, to_json
-from studies.export.fixed import cost_of, design_fixed, rounded
+from studies.export.fixed import design_fixed, rounded
 from studies.export.floating import respond
 from studies.export.in_the_loop import LoopRun
 from studies.export.report import report
@@ -75,8 +78,8 @@ def export_design(
     is_verified = True if is_verified is None else is_verified
 
     found = fixed_controller(design.study)
-    channels, origin = fold(found.controller), _origin(found, design.case_id)
-    loop = _judged(found, channels, "")
+    origin = _origin(found, design.case_id)
+    loop = _judged(found, found.channels, "")
     reference = _reference(found) if is_verified or target == "c-fixed" else None
     files: dict[str, str]
     verified, fixed, cost = None, None, None
@@ -89,25 +92,25 @@ def export_design(
         if is_verified and reference is not None:
             verified = verify_document(found, reference, described)
     elif target == "c":
-        source = floating_source(found, channels, name, origin)
+        source = floating_source(found, name, origin)
         files = _files(source, name)
         if is_verified and reference is not None:
-            verified = verify_floating(found, channels, reference, source, name, compiler)
+            verified = verify_floating(found, reference, source, name, compiler)
     else:
         assert reference is not None
-        seen = respond(channels, found.controller, reference.codes)
-        fixed = design_fixed(found, channels, seen, dac_bits)
-        loop = _judged(found, rounded(fixed, channels), ", coefficients rounded to 32 bits")
+        seen = respond(found.channels, found.controller, reference.codes)
+        fixed = design_fixed(found, seen, dac_bits)
+        loop = _judged(found, rounded(fixed, found.channels), ", coefficients rounded to 32 bits")
         cost = cost_of(found, fixed)
-        source = fixed_source(found, channels, fixed, name, origin, cost.text)
+        source = fixed_source(found, fixed, name, origin, cost.text)
         files = _files(source, name)
         if is_verified:
-            verified = verify_fixed(found, channels, fixed, reference, source, name, compiler)
+            verified = verify_fixed(found, fixed, reference, source, name, compiler)
         console.print(cost.text)
     is_good = verified is None or verified.is_passed
     texts = files if is_good else {}
     if verified is not None:
-        texts |= {REPORT: report(found, channels, origin, loop, verified, fixed, cost)}
+        texts |= {REPORT: report(found, origin, loop, verified, fixed, cost)}
         _tell(verified, console)
     _write(out, texts, console, verified is None)
     return is_good

@@ -12,15 +12,16 @@ import numpy as np
 
 from jaxmodel.motion import sample_path, shape_path
 from jaxmodel.shaper import Taps
-from studies.export.c_code import Source
-from studies.export.channels import Channels, fold
+from studies.export.c_text import Source
+from studies.export.channels import fold
 from studies.export.compiler import Code, compiled
 from studies.export.controller import FixedController
 from studies.export.document import Document, controller_of
-from studies.export.fixed import FixedPoint, Response, rail_samples, shaper_row, shifted
-from studies.export.fixed import respond as respond_fixed
+from studies.export.fixed import FixedPoint, rail_samples, shaper_row
 from studies.export.floating import respond as respond_floating
 from studies.export.in_the_loop import LoopRun, jax_law, replay, run_in_the_loop
+from studies.export.integers import Response, shifted
+from studies.export.integers import respond as respond_fixed
 from studies.export.sequences import hard_sequences, stuck_at_end
 
 #: Double precision against JAX, largest difference over largest value [1].
@@ -90,7 +91,7 @@ def reference_run(found: FixedController) -> LoopRun:
 def verify_document(found: FixedController, reference: LoopRun, document: Document) -> Verification:
     """A controller built from nothing but its document, against the JAX controller."""
     controller, taps = controller_of(document)
-    channels = fold(controller)
+    channels = fold(controller, document.law)
     checks = [
         _compare(
             f"open loop, {name}", respond_floating(channels, controller, codes).command,
@@ -104,19 +105,19 @@ def verify_document(found: FixedController, reference: LoopRun, document: Docume
 
 
 def verify_floating(
-    found: FixedController, channels: Channels, reference: LoopRun, source: Source, name: str,
+    found: FixedController, reference: LoopRun, source: Source, name: str,
     compiler: list[str],
 ) -> Verification:  # fmt: skip
     """C in double and single precision against the JAX controller."""
     checks, runs = [], {"JAX": reference}
-    with _loaded(found, channels, source, name, compiler, np.float64, np.float64) as code:
+    with _loaded(found, source, name, compiler, np.float64, np.float64) as code:
         sequences = {"recorded codes": reference.codes, **_hard(found, reference)}
         for label, codes in sequences.items():
             volts, faults = code.respond(codes * float(found.controller.adc_step))
             wanted = _replayed(found, codes)
             check = _compare(f"open loop, {label}", volts, wanted, DOUBLE)
             checks.append(check._replace(is_met=check.is_met and not faults.any()))
-        checks += _faults(found, channels, code, reference)
+        checks += _faults(found, code, reference)
         _, path, shaped = _references(found)
         checks.append(_compare("shaper, the case's motion", code.shape(path), shaped, DOUBLE))
         step = float(found.controller.adc_step)
@@ -125,7 +126,7 @@ def verify_floating(
         runs["C, double"] = run_in_the_loop(
             found.structure, found.case, lambda codes: code.step(codes * step)[0].reshape(shape)
         )
-    with _loaded(found, channels, source, name, compiler, np.float32, np.float32) as code:
+    with _loaded(found, source, name, compiler, np.float32, np.float32) as code:
         volts, _ = code.respond(reference.codes * step)
         checks.append(
             _compare("open loop, recorded codes, float", volts, reference.voltage, SINGLE)
@@ -134,7 +135,7 @@ def verify_floating(
 
 
 def verify_fixed(
-    found: FixedController, channels: Channels, fixed: FixedPoint, reference: LoopRun,
+    found: FixedController, fixed: FixedPoint, reference: LoopRun,
     source: Source, name: str, compiler: list[str],
 ) -> Verification:  # fmt: skip
     """C in fixed point against its integer model, bit by bit, and against the JAX controller."""
@@ -148,7 +149,7 @@ def verify_fixed(
 
     runs["JAX behind the DAC"] = run_in_the_loop(found.structure, found.case, behind_dac)
     shape = reference.codes.shape[1:]
-    with _loaded(found, channels, source, name, compiler, np.uint16, np.int32) as code:
+    with _loaded(found, source, name, compiler, np.uint16, np.int32) as code:
 
         def in_volts(codes: np.ndarray) -> np.ndarray:
             out = code.step(codes)[0].reshape(shape).astype(float)
@@ -159,7 +160,7 @@ def verify_fixed(
         sequences = {
             "recorded codes": reference.codes, "own run in the loop": own.codes,
             **_hard(found, reference),
-            "stuck at the end of the range": _stuck(found, channels, reference),
+            "stuck at the end of the range": _stuck(found, reference),
             "all 16-bit words": np.random.default_rng(1).integers(0, 2**16, (50, *shape)),
         }  # fmt: skip
         counts = _modelled(fixed, sequences, rail)
@@ -170,7 +171,7 @@ def verify_fixed(
                 Check(f"bit by bit, {label}", f"{differing} of {given.size} codes differ", "0",
                       differing == 0)
             )  # fmt: skip
-        checks += _faults(found, channels, code, reference)
+        checks += _faults(found, code, reference)
         checks.append(_check_shaper(found, code))
     checks.append(_check_error(found, fixed, reference, counts["recorded codes"]))
     limited = sum(int(response.limited.sum()) for response in counts.values())
@@ -193,10 +194,10 @@ def _modelled(
 
 @contextmanager
 def _loaded(
-    found: FixedController, channels: Channels, source: Source, name: str, compiler: list[str],
+    found: FixedController, source: Source, name: str, compiler: list[str],
     real: type, reference: type,
 ) -> Iterator[Code]:  # fmt: skip
-    sizes = (3 * found.n_patches, len(channels.link), int(found.taps.sample.max()) + 1)
+    sizes = (3 * found.n_patches, len(found.channels.link), int(found.taps.sample.max()) + 1)
     with compiled(source, name, compiler, real, reference, sizes) as code:
         yield code
 
@@ -218,15 +219,15 @@ def _compare(what: str, found: np.ndarray, wanted: np.ndarray, allowed: float) -
     return Check(what, f"{difference:.1e}", f"{allowed:.0e}", difference <= allowed)
 
 
-def _stuck(found: FixedController, channels: Channels, reference: LoopRun) -> np.ndarray:
-    return stuck_at_end(reference.codes, int(found.controller.adc_top), (channels.link[-1], 0))
+def _stuck(found: FixedController, reference: LoopRun) -> np.ndarray:
+    return stuck_at_end(
+        reference.codes, int(found.controller.adc_top), (found.channels.link[-1], 0)
+    )
 
 
-def _faults(
-    found: FixedController, channels: Channels, code: Code, reference: LoopRun
-) -> list[Check]:
+def _faults(found: FixedController, code: Code, reference: LoopRun) -> list[Check]:
     """A faulty sensor must be named, and all actuators at rest from then on."""
-    link, top = int(channels.link[-1]), float(found.controller.adc_top)
+    link, top = int(found.channels.link[-1]), float(found.controller.adc_top)
     rail = rail_samples(found.study.electronics.sample_rate_hz)
     n = found.n_patches
     number, begin = link * n + 1, len(reference.codes) // 3

@@ -1,0 +1,168 @@
+"""C99 of a controller in 32-bit fixed point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from studies.export.c_text import (
+    Parts,
+    Source,
+    Table,
+    filled,
+    literal,
+    patch_names,
+    shaper_tables,
+    starred,
+    structure_tables,
+)
+from studies.export.controller import FixedController
+from studies.export.fixed import WORD, FixedPoint, Format, Row, shaper_row
+
+_FEEDTHROUGH = """\
+    for (k = 0; k < @_N_CHANNELS; k++) {
+        first = @_N_PATCHES * (k / @_N_PATCHES);
+        sum = 0;
+        for (m = 0; m < @_N_PATCHES; m++) {
+            sum += (int64_t)FEEDTHROUGH[k][m] * state->command[first + m];
+        }
+        sensed[k] = limited(sensed[k] - shifted(sum, FEEDTHROUGH_SHIFT[k]));
+    }
+"""
+_WORD = "int32_t"
+
+
+def fixed_source(
+    found: FixedController,
+    fixed: FixedPoint,
+    name: str,
+    origin: Iterable[str],
+    cost: str,
+) -> Source:
+    """Controller in fixed point.
+
+    Args:
+        found: the controller.
+        fixed: the same in integers.
+        name: prefix of functions and types, and name of the files.
+        origin: lines that say where the numbers come from.
+        cost: what a sample costs, for the file's head.
+    """
+    volts = float(found.controller.voltage_limit)
+    header = {
+        "border": [
+            f"Sensors: codes of the ADC, 0 to {fixed.adc_top}. Actuators: codes of the DAC, 1 to",
+            f"{2 * fixed.dac_rest - 1} for {-volts:g} to {volts:g} V at the piezo patch, "
+            f"{fixed.dac_rest} for 0 V. A sensor is faulty",
+            "if its code is too high or too long at one end of the range.",
+        ],
+        "types": "",
+        "constants": f"#define @_DAC_REST {fixed.dac_rest} /* code of 0 V */\n"
+        f"#define @_DAC_STEP {literal(fixed.dac_step)} /* V per code at the patch */",
+        "members": [
+            f"    {_WORD} high[@_N_MODES]; /* memory of the first section */",
+            f"    {_WORD} line[@_N_MODES][2]; /* delay line of the second section */",
+        ],
+        "faulty": "a code beyond the ADC's, or stuck at one end",
+        "sensor_type": "uint16_t", "actuator_type": "uint16_t",
+        "reference_type": _WORD, "reference_unit": ", each in any unit that fits 32 bits",
+    }  # fmt: skip
+    parts = Parts(
+        template="fixed.c",
+        tables=_tables(found, fixed),
+        header=header,
+        command_type=_WORD,
+        subtract_feedthrough=_FEEDTHROUGH,
+        keep_command="        state->command[k] = command;\n",
+        direct="\n            + (int64_t)DIRECT[m] * signal",
+        more={"formats": starred(format_lines(fixed, found)), "cost": cost},
+    )
+    return filled(parts, found, name, origin)
+
+
+def format_lines(fixed: FixedPoint, found: FixedController) -> list[str]:
+    """Table of formats; room of the word and reach of ADC codes in units of `one per unit`."""
+    value, force = ("m", "N") if found.is_modal else ("V", "V")
+    lines = [
+        f"{'signal':<30}{'format':>7}{'one per unit':>16}{'room':>10}{'codes':>10}",
+        f"{'sensors':<30}{f'Q{fixed.adc_bits}':>7}{'1 code':>16}",
+    ]
+    parts: list[tuple[str, Format, str]] = [
+        ("signal", fixed.signal, value), ("high-passed", fixed.high, value),
+        ("delay line", fixed.inner, value), ("force", fixed.force, force),
+    ]  # fmt: skip
+    for m, name in enumerate(found.channels.names):
+        for text, form, unit in parts:
+            lines.append(
+                f"{f'{text}, {name}':<30}{f'Q{form.bits[m]}':>7}"
+                f"{f'{form.base[m]:.4g} {unit}':>16}{2.0 ** (WORD - 1 - form.bits[m]):>10.0f}"
+                f"{form.bound[m] / form.base[m]:>10.1f}"
+            )
+    return lines
+
+
+def _tables(found: FixedController, fixed: FixedPoint) -> list[Table]:
+    channels, shaper = found.channels, shaper_row(found.taps)
+    names = channels.names
+    back, each = fixed.synthesizer, np.arange(len(channels.link))
+    high = np.hstack([fixed.high_pass.integers, fixed.memory.integers])
+    high_shift = np.stack([fixed.high_pass.shift, fixed.memory.shift], axis=1)
+    numerator = Row(fixed.numerator.integers[:, :3], fixed.numerator.shift)
+    first = np.searchsorted(channels.link, np.arange(4))
+
+    def word(name: str, values: np.ndarray, comment: str, rows: list[str] | None = None) -> Table:
+        return Table(_WORD, name, values, comment, rows or [])
+
+    def shift(name: str, row: Row) -> Table:
+        return Table("uint16_t", f"{name}_SHIFT", row.shift.ravel(), "[bit] of each row")
+
+    tables = [
+        *structure_tables(channels),
+        Table("uint16_t", "FIRST_MODE", first, "first channel of each link, and the end; control"),
+        Table("uint16_t", "ADC_TOP", fixed.adc_top, "[code] highest one; adc_bits"),
+        word("ADC_UNIT", np.array(2**fixed.adc_bits), "[count] of a sensor per code; adc_bits"),
+        Table("int64_t", "BIAS", fixed.bias, "[count] sensor at rest; conditioner_bias"),
+        word("DAC_REST", np.array(fixed.dac_rest), "[code] of 0 V at an actuator; the DAC's bits"),
+        word(
+            "FILTER", fixed.filter.integers, "[signal/sensor] modal filter pinv(lambda_s Phi_s^t); "
+            "control.basis, patches", names,
+        ),
+        shift("FILTER", fixed.filter),
+        word(
+            "HIGH_PASS", high, "[1] b0; b1, -a1 of the first section of the velocity estimate; "
+            "highpass_hz or difference_cutoff_hz", names,
+        ),
+        Table("uint16_t", "HIGH_PASS_SHIFT", high_shift, "[bit] of b0; of b1 and -a1"),
+        word(
+            "LOW_PASS", fixed.low_pass.integers, "[1] scale, -a1, -a2 of the second section; "
+            "lowpass_ratio and lowpass_zeta", names,
+        ),
+        shift("LOW_PASS", fixed.low_pass),
+        word(
+            "FORCE", numerator.integers, "[force/signal] numerator of the second section times the "
+            "gains, -k_d n_v - k_p n_x; control.velocity_gain, position_gain, ratios", names,
+        ),
+        shift("FORCE", numerator),
+        word(
+            "SYNTHESIZER", back.integers[channels.link, :, each], "[code/force] of each actuator "
+            "of the link, pinv(lambda_a Phi_a); control.basis, patches", names,
+        ),
+        Table("uint16_t", "SYNTHESIZER_SHIFT", back.shift.ravel(), "[bit] of each actuator"),
+        *shaper_tables(found, _WORD, shaper.integers[0]),
+        Table("int", "WEIGHT_SHIFT", shaper.shift[0], "[bit] of all weights"),
+    ]  # fmt: skip
+    if channels.has_direct:
+        comment = "[force/signal] force past the filters, shifted as FORCE; control.position_gain"
+        tables.append(word("DIRECT", fixed.numerator.integers[:, 3], comment))
+    if fixed.feedthrough is not None:
+        comment = (
+            "[sensor/code] of each actuator of the link, by modes that are not controlled; "
+            "control.feedthrough_factor"
+        )
+        table = fixed.feedthrough.integers.reshape(-1, found.n_patches)
+        tables += [
+            word("FEEDTHROUGH", table, comment, patch_names(found)),
+            shift("FEEDTHROUGH", fixed.feedthrough),
+        ]
+    return tables

@@ -1,0 +1,156 @@
+"""Text of a C module: constants as tables, put into the templates beside this file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from string import Template
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from studies.export.channels import Channels
+from studies.export.controller import FixedController
+from studies.export.fixed import rail_samples
+
+_TEMPLATES = Path(__file__).parent / "templates"
+
+
+class Source(NamedTuple):
+    """A C module: text of `<name>.h` and `<name>.c`."""
+
+    header: str
+    code: str
+
+
+class Table(NamedTuple):
+    """One static constant."""
+
+    type: str
+    name: str
+    values: Any  # one number, or an array of up to two axes
+    comment: str  # [unit] meaning; where it comes from
+    rows: list[str] = []  # meaning of each row
+
+
+class Parts(NamedTuple):
+    """What sets one kind of arithmetic apart; @ stands for the prefix in capitals."""
+
+    template: str  # file of the code
+    tables: list[Table]
+    header: dict[str, Any]  # for the header's template
+    command_type: str  # of what is remembered of the last command, if anything is
+    subtract_feedthrough: str
+    keep_command: str
+    direct: str  # share of the force past the filters
+    more: dict[str, str] = {}  # for the code's template
+
+
+def patch_names(found: FixedController) -> list[str]:
+    """Names of sensors or actuators, for comments."""
+    return [f"link {i + 1}, patch {k + 1}" for i in range(3) for k in range(found.n_patches)]
+
+
+def structure_tables(channels: Channels) -> list[Table]:
+    """Which links and channels there are."""
+    used = np.isin(np.arange(3), channels.link)
+    return [
+        Table("uint16_t", "IS_USED", used.astype(int), "1: link is controlled; control.links"),
+        Table("uint16_t", "LINK", channels.link, "link of each channel, from 0; control"),
+    ]
+
+
+def shaper_tables(found: FixedController, kind: str, weight: np.ndarray) -> list[Table]:
+    """The input shaper's taps."""
+    name = f"input shaper {found.study.shaper.kind}; shaper"
+    return [
+        Table("macro", "N_TAPS", len(weight), f"taps of the {name}"),
+        Table(kind, "WEIGHT", weight, f"[1] of each tap of the {name}"),
+        Table("uint32_t", "DELAY", found.taps.sample, f"[samples] of each tap of the {name}"),
+    ]
+
+
+def filled(parts: Parts, found: FixedController, name: str, origin: Iterable[str]) -> Source:
+    """Header and code from their templates.
+
+    Args:
+        parts: constants, and what is special.
+        found: the controller.
+        name: prefix of functions and types, and name of the files.
+        origin: lines that say where the numbers come from.
+    """
+    rate = found.study.electronics.sample_rate_hz
+    rail = rail_samples(rate)
+    has_memory = any(table.name == "FEEDTHROUGH" for table in parts.tables)
+    kept = f"    {parts.command_type} command[@_N_CHANNELS]; /* on the actuators now */"
+    members = [*parts.header["members"], *([kept] if has_memory else [])]
+    header = parts.header | {
+        "members": "\n".join(members),
+        "border": starred(parts.header["border"]),
+        "n_links": 3, "n_patches": found.n_patches, "n_channels": 3 * found.n_patches,
+        "n_modes": len(found.channels.link), "rate": f"{rate:g}", "rate_literal": literal(rate),
+        "rail": rail, "rail_ms": f"{1e3 * rail / rate:.3g}",
+        "shaper_length": int(found.taps.sample.max()) + 1,
+    }  # fmt: skip
+    code = parts.more | {
+        "forget_command": "        state->command[k] = 0;\n" if has_memory else "",
+        "subtract_feedthrough": parts.subtract_feedthrough if has_memory else "",
+        "keep_command": parts.keep_command if has_memory else "",
+        "direct": parts.direct if found.channels.has_direct else "",
+        "tables": "\n\n".join(_constant(table) for table in parts.tables),
+    }
+    common = {"name": name, "NAME": name.upper(), "origin": starred(origin)}
+    texts = []
+    for file, values in (("controller.h", header), (parts.template, code)):
+        template = Template((_TEMPLATES / file).read_text(encoding="utf-8"))
+        texts.append(template.substitute(common | values).replace("@_", f"{name.upper()}_"))
+    return Source(*texts)
+
+
+def _constant(table: Table) -> str:
+    """A constant in C."""
+    values = np.asarray(table.values)
+
+    def number(value: Any) -> str:
+        return f"R({literal(value)})" if table.type == "real" else str(int(value))
+
+    comment = f"/* {_plain(table.comment)} */\n"
+    if table.type == "macro":
+        return f"{comment}#define {table.name} {number(values)}"
+    if values.ndim == 0:
+        return f"{comment}static const {table.type} {table.name} = {number(values)};"
+    size = "".join(f"[{n}]" for n in values.shape)
+    start = f"{comment}static const {table.type} {table.name}{size} = {{"
+    if values.ndim == 1:
+        return start + _wrapped([number(value) for value in values]) + "};"
+    rows = table.rows or [""] * len(values)
+    lines = [
+        f"    {{{', '.join(map(number, row))}}}," + (f" /* {note} */" if note else "")
+        for row, note in zip(values, rows, strict=True)
+    ]
+    return "\n".join([start, *lines, "};"])
+
+
+def _wrapped(numbers: list[str]) -> str:
+    if len(numbers) <= 9 and sum(map(len, numbers)) < 60:
+        return ", ".join(numbers)
+    rows = [", ".join(numbers[k : k + 3]) for k in range(0, len(numbers), 3)]
+    return "\n    " + ",\n    ".join(rows) + "\n"
+
+
+def literal(value: Any) -> str:
+    """A double in C, with all its digits."""
+    text = repr(float(value))
+    return text if any(mark in text for mark in ".en") else text + ".0"
+
+
+def starred(lines: Iterable[str]) -> str:
+    """Lines of a C comment."""
+    return "\n".join(f" * {_plain(line)}".rstrip() for line in lines)
+
+
+def _plain(text: str) -> str:
+    """Text that can stand in a comment: printable ASCII that does not end it."""
+    plain = "".join(c if c.isascii() and c.isprintable() else "?" for c in text)
+    plain = plain.replace("*/", "* /").replace("/*", "/ *")
+    return plain.replace("??", "? ?").replace("\\", "/")

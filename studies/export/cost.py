@@ -1,0 +1,52 @@
+"""What a sample costs on a TMS320F2812-class DSP: 32-bit fixed point, no floating-point unit."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from studies.export.controller import FixedController
+from studies.export.fixed import FixedPoint
+
+
+class Cost(NamedTuple):
+    """What a sample of controller and shaper takes on a DSP without a floating-point unit."""
+
+    products: int  # of 32 by 32 bits
+    roundings: int  # shifts and limits of 64-bit sums
+    cycles: int  # estimate
+    load: float  # share of the time there is, estimate [1]
+    words: int  # of 16 bits, for both states
+
+    @property
+    def text(self) -> str:
+        return (
+            f"{self.products} multiplications a sample, about {self.cycles} cycles: "
+            f"{100 * self.load:.0f} % of a sample at {CLOCK / 1e6:.0f} MHz (estimate)"
+        )
+
+
+#: Clock of a TMS320F2812 [Hz].
+CLOCK = 150e6
+#: Cycles of a product with its loads and the 64-bit addition, of a rounding with limit, of a
+#: channel with its checks, and of a call: instructions counted generously, not measured.
+CYCLES = (12, 30, 30, 200)
+
+
+def cost_of(found: FixedController, fixed: FixedPoint) -> Cost:
+    """Multiplications, cycles, load and memory of a sample."""
+    n, k = fixed.filter.integers.shape
+    n_taps, n_channels = len(found.taps.weight), 3 * k
+    direct = int(np.any(fixed.numerator.integers[:, 3]))
+    # filter, synthesizer, sections; the sensors' unit; three coordinates of the shaper
+    products = n * (2 * k + 1 + 2 + 3 + 3 + direct) + n_channels + 3 * n_taps
+    roundings = 5 * n + 2 * n_channels + 3
+    words = 2 * 3 * n + n_channels + 1 + 2 * (3 * (int(found.taps.sample.max()) + 1) + 1)
+    if fixed.feedthrough is not None:
+        products, roundings = products + n_channels * k, roundings + n_channels
+        words += 2 * n_channels
+    parts = (products, roundings, n_channels, 1)
+    cycles = sum(count * each for count, each in zip(parts, CYCLES, strict=True))
+    load = cycles * found.study.electronics.sample_rate_hz / CLOCK
+    return Cost(products, roundings, cycles, load, words)
