@@ -16,6 +16,7 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
+from jaxmodel.controller import Controller
 from jaxmodel.kinematics import path_status
 from jaxmodel.linear import linearise, mechanical
 from jaxmodel.motion import end_of_path, sample_path
@@ -28,7 +29,7 @@ from jaxmodel.prepare import (
     spectrum_frequencies,
 )  # fmt: skip
 from jaxmodel.sampled_loop import LoopReport, loop_report
-from jaxmodel.shaper import last_sample
+from jaxmodel.shaper import Taps, last_sample
 from jaxmodel.simulate import Result, simulate
 from studies import config
 from studies.cases import as_arrays, build_case, build_structure, powered
@@ -133,6 +134,13 @@ class Preflight(NamedTuple):
     condition: Any  # worst condition number of filter and synthesizer [1], ()
     highest: Any  # frequency of the highest plant mode [rad/s], ()
     corner: Any  # highest low-pass corner of the velocity estimate [rad/s], ()
+    controller: Controller
+    taps: Taps  # of the shaper
+
+
+def preflight(structure: Structure, case: Case) -> Preflight:
+    """What is known of a case before it runs, as NumPy arrays."""
+    return jax.tree.map(np.asarray, _preflight(_without_run(structure), case))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -149,7 +157,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
     corner = lowpass_corner(structure, case)
     return Preflight(
         each, code, time[index], poses[index], end, shaper_length, worst,
-        jnp.max(prepared.loop.omega), corner,
+        jnp.max(prepared.loop.omega), corner, prepared.loop.controller, prepared.taps,
     )  # fmt: skip
 
 
@@ -170,7 +178,7 @@ def check_run(study: Study) -> tuple[Structure, Case]:
     check_locked(study)
     structure, case = build_structure(study), as_arrays(build_case(study))
     structure = structure._replace(substeps=_drive_substeps(study, structure, case))
-    known = jax.tree.map(np.asarray, _preflight(_without_run(structure), case))
+    known = preflight(structure, case)
     for k, pose in enumerate(study.motion.waypoints):
         check_pose(f"motion.waypoints.{k}", pose, int(known.pose_status[k]))
     if int(known.path_status) != status.OK:

@@ -68,6 +68,8 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     _, text, _ = run(capsys, "best", out, "--by", "residual_rms", "--count", "1")
     number, name = re.search(r"(\d+) +│ ([0-9a-f]{8}) ", text).groups()
     assert load_design(out, f"id:{name}").study == load_design(out, int(number)).study
+    design = load_design(out, int(number))
+    assert re.fullmatch("[0-9a-f]{16}", design.case_id) and design.case_id.startswith(name)
     assert "fits 40 cases" in refused(capsys, "replay", out, "--case", "id:")
     assert "allowed 0 to 39" in refused(capsys, "replay", out, "--case", "40")
     for options, name in (

@@ -5,17 +5,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.beam import assembled_frequency
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
-from jaxmodel.prepare import design_controller, design_taps
 from jaxmodel.shaper import Taps
 from studies.errors import StudyError, field_error
 from studies.export.channels import Channels, fold
-from studies.runs import check_run, resolved_study
+from studies.runs import check_run, preflight, resolved_study
 from studies.spec import Study
 
 
@@ -52,7 +50,8 @@ def fixed_controller(study: Study) -> FixedController:
     _check_exportable(study)
     study = resolved_study(study)
     structure, case = check_run(study)
-    controller, taps, omega = _numbers(structure, case)
+    known = preflight(structure, case)
+    controller, taps = known.controller, known.taps
     if not np.any(controller.velocity_gain) and not _any(controller.position_gain):
         raise field_error(
             "control.gain_factor", study.control.gain_factor,
@@ -62,7 +61,7 @@ def fixed_controller(study: Study) -> FixedController:
     _check_finite(controller, taps)
     return FixedController(
         study, structure, case, controller, fold(controller, study.control.law), _merged(taps),
-        omega / (2 * np.pi),
+        _frequencies(structure, case),
     )  # fmt: skip
 
 
@@ -80,21 +79,12 @@ def _any(gain: np.ndarray | None) -> bool:
     return gain is not None and bool(np.any(gain))
 
 
-def _numbers(structure: Structure, case: Case) -> tuple[Controller, Taps, np.ndarray]:
-    found = _design(structure._replace(n_steps=1, substeps=1, has_noise=False), case)
-    return jax.tree.map(np.asarray, found)
-
-
-def _design_numbers(structure: Structure, case: Case):
-    controller = design_controller(structure, case).controller
+def _frequencies(structure: Structure, case: Case) -> np.ndarray:
+    """Where the velocity estimate of each channel is exact [Hz], (3, C)."""
     belief = case.machine.beam._replace(stiffness_factor=1.0)
-    omega = assembled_frequency(belief, structure.n_controlled)
-    if structure.law == "srf":
-        omega = jnp.broadcast_to(omega[:, :1], (3, structure.n_patches))
-    return controller, design_taps(case), omega
-
-
-_design = jax.jit(_design_numbers, static_argnums=0)
+    hertz = np.asarray(assembled_frequency(belief, structure.n_controlled)) / (2 * np.pi)
+    is_modal = structure.law == "imsc"
+    return hertz if is_modal else np.repeat(hertz[:, :1], structure.n_patches, axis=1)
 
 
 def _merged(taps: Taps) -> Taps:

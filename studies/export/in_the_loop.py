@@ -36,6 +36,8 @@ def run_in_the_loop(structure: Structure, case: Case, law: Law) -> LoopRun:
         case: the numbers.
         law: called once per sample, in order.
     """
+    # the controller is outside: its kind must not cost another compilation
+    structure = structure._replace(has_position_gain=False)
     start = _begin(structure, case)
     state, inputs = start.state, start.inputs
     code, clipped = _look(start.loop, inputs, 0, state)

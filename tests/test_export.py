@@ -1,0 +1,295 @@
+"""Exports of whole designs, by command: each does what the JAX controller does."""
+
+import json
+import re
+import subprocess
+
+import jsonschema
+import numpy as np
+import pytest
+
+from studies.export import run as export_run
+from studies.export import sequences
+from studies.export.compiler import STRICT
+from studies.export.controller import fixed_controller
+from studies.export.document import document, import_study, study_hash
+from studies.spec import load_study
+from tests.exports import (
+    DESIGNS,
+    needs_compiler,
+    needs_cpp,
+    needs_sanitizers,
+    write_study,
+)
+from tests.test_cli import refused, run
+
+TARGETS = ("json", "c", "c-fixed")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_sequences():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sequences, "LENGTH", 600)
+        yield
+
+
+@pytest.fixture(scope="module")
+def designs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("designs")
+    return {name: write_study(folder / f"{name}.toml", data) for name, data in DESIGNS.items()}
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """Where a design's export is, by design and target; filled by the tests below."""
+    return tmp_path_factory.mktemp("exports")
+
+
+def exported(capsys, designs, folders, name, target):
+    """Folder with an export, made once, and what the command said."""
+    out = folders / f"{name}-{target}"
+    if target != "json":
+        needs_compiler()
+    if not out.is_dir():
+        code, text, _ = run(capsys, "export", designs[name], "--target", target, "--out", out)
+        assert code == 0, text
+        (folders / f"{out.name}.txt").write_text(text)
+    return out, (folders / f"{out.name}.txt").read_text()
+
+
+@pytest.mark.parametrize("target", TARGETS)
+@pytest.mark.parametrize("name", DESIGNS)
+def test_export_is_verified(capsys, designs, folders, name, target):
+    out, text = exported(capsys, designs, folders, name, target)
+    report = (out / "verification.md").read_text()
+    assert report.startswith("# Verification: passed") and "FAILED" not in report
+    assert "comparisons agree" in text
+    files = {"json": {"flexlink.json", "flexlink.schema.json"}}.get(
+        target, {"flexlink.h", "flexlink.c"}
+    )
+    assert {path.name for path in out.iterdir()} == files | {"verification.md"}
+    if target == "c-fixed":
+        assert "multiplications a sample" in text
+        assert re.search(r"\| bit by bit, recorded codes \| 0 of \d+ codes differ", report)
+    else:
+        found = [
+            float(x) for x in re.findall(r"open loop, [^|]*codes \| ([\d.e+-]+) \| 1e-12", report)
+        ]
+        assert len(found) >= 2 and max(found) < 1e-12
+    if target == "c":
+        assert re.search(r"faulty sensor: NaN \| sensor \d after 1 samples", report)
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+@pytest.mark.parametrize("target", ["c", "c-fixed"])
+def test_code_compiles_as_cpp_and_under_more_warnings(
+    capsys, designs, folders, name, target, tmp_path
+):
+    out, _ = exported(capsys, designs, folders, name, target)
+    strict = [*STRICT, "-Wconversion", "-Wsign-conversion", "-Wshadow", "-Wstrict-prototypes"]
+    made = ["-c", "-o", tmp_path / "object.o"]
+    subprocess.run([*needs_compiler(), *strict, *made, out / "flexlink.c"], check=True)
+    flags = ["-std=c++11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", *made, "-x", "c++"]
+    subprocess.run([*needs_cpp(), *flags, out / "flexlink.c"], check=True)
+
+
+def fuzz(out, target, folder, samples, seeds, single=False):
+    """Samples of anything at all under sanitizers; the last line that the program prints."""
+    flags = ["-std=c99", "-O1", "-g", "-I", out]
+    flags += ["-DFIXED"] if target == "c-fixed" else []
+    flags += ["-DFLEXLINK_REAL=float"] if single else []
+    program = folder / "fuzz"
+    sources = ["tests/data/fuzz.c", out / "flexlink.c"]
+    subprocess.run([*needs_sanitizers(folder), *flags, "-o", program, *sources], check=True)
+    for seed in range(seeds):
+        done = subprocess.run(
+            [program, str(samples), str(seed)], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr[-3000:]
+        assert re.fullmatch(rf"{samples} samples, [1-9]\d* faults\n", done.stdout)
+
+
+@pytest.mark.parametrize(
+    "name, target", [("single", "c"), ("single", "c-fixed"), ("tuned", "c-fixed")]
+)
+def test_fuzzing_finds_nothing(capsys, designs, folders, name, target, tmp_path):
+    out, _ = exported(capsys, designs, folders, name, target)
+    fuzz(out, target, tmp_path, 100_000, 1)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", DESIGNS)
+@pytest.mark.parametrize("target", ["c", "c-fixed"])
+def test_long_fuzzing_finds_nothing(capsys, designs, folders, name, target, tmp_path):
+    out, _ = exported(capsys, designs, folders, name, target)
+    fuzz(out, target, tmp_path, 3_000_000, 3)
+    if target == "c":
+        fuzz(out, target, tmp_path, 3_000_000, 1, single=True)
+
+
+def test_fuzzing_notices_a_fault(capsys, designs, folders, tmp_path):
+    out, _ = exported(capsys, designs, folders, "single", "c")
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "flexlink.h").write_text((out / "flexlink.h").read_text())
+    code = (out / "flexlink.c").read_text()
+    (broken / "flexlink.c").write_text(code.replace("wanted[k] = LIMIT;", "wanted[k] = 2 * LIMIT;"))
+    with pytest.raises(AssertionError, match="out of range"):
+        fuzz(broken, "c", tmp_path, 10_000, 1)
+
+
+def test_wrong_code_is_not_written(capsys, designs, tmp_path, monkeypatch):
+    needs_compiler()
+    right = export_run.floating_source
+
+    def wrong(*arguments):
+        source = right(*arguments)
+        return source._replace(code=re.sub(r"R\((-?\d\.\d{8})\d+", r"R(\1", source.code))
+
+    monkeypatch.setattr(export_run, "floating_source", wrong)
+    out = tmp_path / "wrong"
+    code, text, _ = run(capsys, "export", designs["paper"], "--target", "c", "--out", out)
+    assert code == 1 and "FAILED: open loop, recorded codes" in text
+    assert [path.name for path in out.iterdir()] == ["verification.md"]
+    assert "no code was written" in (out / "verification.md").read_text()
+
+
+def test_json_follows_its_schema_and_says_what_everything_is(capsys, designs, folders):
+    out, _ = exported(capsys, designs, folders, "tuned", "json")
+    data = json.loads((out / "flexlink.json").read_text())
+    schema = json.loads((out / "flexlink.schema.json").read_text())
+    jsonschema.validate(data, schema)
+    for name, number in data["numbers"].items():
+        assert number["unit"] and number["meaning"], name
+        assert np.ndim(number["value"]) == len(number["axes"]), name
+    assert data["masks"]["links"] == [True] * 3 and data["numbers"]["voltage_limit"]["value"] == 100
+    assert data["study_hash"] == study_hash(load_study(designs["tuned"]))
+    weights = data["numbers"]["shaper_weight"]["value"]
+    assert sum(weights) == pytest.approx(1.0, abs=1e-14)
+    del data["numbers"]["sample_rate"]["unit"]
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(data, schema)
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_import_gives_the_study_back_exactly(capsys, designs, folders, name, tmp_path):
+    out, _ = exported(capsys, designs, folders, name, "json")
+    back = tmp_path / "back.toml"
+    assert run(capsys, "import-gains", out / "flexlink.json", "--out", back)[0] == 0
+    assert load_study(back) == load_study(designs[name])
+    again = tmp_path / "again"
+    arguments = ("--target", "json", "--no-verify", "--out", again)
+    assert run(capsys, "export", back, *arguments)[0] == 0
+    assert {p.name for p in again.iterdir()} == {"flexlink.json", "flexlink.schema.json"}
+    assert (again / "flexlink.json").read_bytes() == (out / "flexlink.json").read_bytes()
+
+
+def change(value):
+    """A number next to the given one, anywhere in nested lists."""
+    return [change(value[0]), *value[1:]] if isinstance(value, list) else value + 1e-3
+
+
+@pytest.mark.parametrize("name", ["velocity_gain", "modal_filter", "low_pass_a1", "shaper_weight"])
+def test_import_refuses_changed_numbers(capsys, designs, folders, name, tmp_path):
+    out, _ = exported(capsys, designs, folders, "paper", "json")
+    data = json.loads((out / "flexlink.json").read_text())
+    data["numbers"][name]["value"] = change(data["numbers"][name]["value"])
+    (tmp_path / "changed.json").write_text(json.dumps(data))
+    arguments = ("import-gains", tmp_path / "changed.json", "--out", tmp_path / "back.toml")
+    message = refused(capsys, *arguments)
+    assert f"numbers.{name}[0" in message and "export it again" in message
+    assert not (tmp_path / "back.toml").exists()
+
+
+@pytest.mark.parametrize(
+    "edit, message",
+    [
+        (lambda data: data["study"]["control"].update(gain_factor=0.7), "study was changed after"),
+        (lambda data: data["study"]["control"].update(gain_factr=0.7), "gain_factr"),
+        (lambda data: data["numbers"].pop("adc_step"), "numbers.adc_step: missing"),
+        (lambda data: data["numbers"]["adc_step"].update(value=[1.0, "x"]), "adc_step"),
+        (lambda data: data["numbers"]["adc_step"].update(value=[1.0]), "shape"),
+        (lambda data: data.update(format_version=2), "format_version = 2"),
+        (lambda data: data.update(format="other"), "no controller"),
+        (lambda data: data.pop("masks"), "masks"),
+    ],
+)
+def test_import_refuses_other_files(capsys, designs, folders, edit, message, tmp_path):
+    out, _ = exported(capsys, designs, folders, "paper", "json")
+    data = json.loads((out / "flexlink.json").read_text())
+    edit(data)
+    (tmp_path / "changed.json").write_text(json.dumps(data))
+    assert message in refused(
+        capsys, "import-gains", tmp_path / "changed.json", "--out", tmp_path / "back.toml"
+    )
+
+
+@pytest.mark.parametrize("content", [b"{", b"\xff\xfe", b"[]", b"[" * 100_000, b'{"format": NaN}'])
+def test_import_refuses_what_is_no_json(capsys, content, tmp_path):
+    (tmp_path / "bad.json").write_bytes(content)
+    refused(capsys, "import-gains", tmp_path / "bad.json", "--out", tmp_path / "back.toml")
+
+
+def test_import_refuses_targets(capsys, designs, folders, tmp_path):
+    out, _ = exported(capsys, designs, folders, "paper", "json")
+    (tmp_path / "there.toml").write_text("")
+    there = ("import-gains", out / "flexlink.json", "--out", tmp_path / "there.toml")
+    assert "exists already" in refused(capsys, *there)
+    missing = ("import-gains", tmp_path / "missing.json", "--out", tmp_path / "back.toml")
+    assert "cannot be read" in refused(capsys, *missing)
+    assert import_study(out / "flexlink.json").title == "paper's gains"
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("--target", "cpp"), "json, c, c-fixed"),
+        (("--target", "c", "--name", "2x"), "--name"),
+        (("--target", "c", "--name", "a b"), "--name"),
+        (("--target", "c-fixed", "--dac-bits", "3"), "--dac-bits"),
+        (("--target", "c", "--case", "4"), "leave --case out"),
+    ],
+)
+def test_export_refuses_arguments(capsys, designs, arguments, message, tmp_path):
+    out = tmp_path / "out"
+    assert message in refused(capsys, "export", designs["paper"], *arguments, "--out", out)
+    assert not out.exists()
+
+
+def test_export_refuses_folders_it_cannot_write(capsys, designs, tmp_path):
+    (tmp_path / "file").write_text("")
+    arguments = ("export", designs["paper"], "--target", "json", "--out")
+    assert "is not a folder" in refused(capsys, *arguments, tmp_path / "file")
+    assert "is not a folder" in refused(capsys, *arguments, tmp_path / "file" / "deeper")
+
+
+def test_without_a_compiler_code_is_written_and_said_to_be_unverified(
+    capsys, designs, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(export_run, "find_compiler", lambda: [])
+    arguments = ("export", designs["paper"], "--target", "c", "--out", tmp_path / "out")
+    assert "no C compiler" in refused(capsys, *arguments, "--verify")
+    code, text, _ = run(capsys, *arguments)
+    assert code == 0 and "not verified: no C compiler" in text
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"flexlink.h", "flexlink.c"}
+
+
+def test_designs_of_a_tuning(capsys, designs, tmp_path):
+    folder = tmp_path / "tune"
+    folder.mkdir()
+    (folder / "tune.json").write_text("{}")
+    arguments = ("export", folder, "--target", "json", "--no-verify", "--out", tmp_path / "out")
+    assert "not finished" in refused(capsys, *arguments)
+    (folder / "tuned_gains.toml").write_text(designs["tuned"].read_text())
+    (folder / "study.toml").write_text(designs["paper"].read_text())
+    assert run(capsys, *arguments)[0] == 0
+    (folder / "tuned_filters.toml").write_text(designs["paper"].read_text())
+    assert "filters, gains, the families of" in refused(capsys, *arguments)
+    assert "did you mean 'gains'" in refused(capsys, *arguments, "--case", "gain")
+    assert run(capsys, *arguments, "--case", "gains")[0] == 0
+    assert json.loads((tmp_path / "out" / "flexlink.json").read_text())["title"] == "tuned"
+
+
+def test_document_names_the_case_of_a_sweep(designs):
+    found = fixed_controller(load_study(designs["paper"]))
+    assert document(found, "0123456789abcdef").case_id == "0123456789abcdef"

@@ -1,0 +1,266 @@
+"""Arithmetic of exported controllers: formats, error bounds, rest, what does not fit."""
+
+import numpy as np
+import pytest
+
+from studies.errors import StudyError
+from studies.export import fixed as fixed_point
+from studies.export.channels import fold, unfold
+from studies.export.controller import fixed_controller
+from studies.export.fixed import design_fixed, peak_gains, rounded, shaper_row
+from studies.export.floating import respond as respond_floating
+from studies.export.in_the_loop import replay
+from studies.export.integers import respond
+from studies.export.run import _judged
+from studies.export.verify import reference_run
+from studies.runs import run_study
+from studies.spec import parse_study
+from tests.exports import PAPER, SINGLE, TUNED
+
+RAIL = 100
+
+
+def changed(data, **sections):
+    """A design with other values in some sections."""
+    merged = {name: {**data.get(name, {}), **values} for name, values in sections.items()}
+    return {**data, **merged}
+
+
+#: Kinds of controllers: laws, estimators, position gains, feed-through, converters.
+KINDS = {
+    "paper": PAPER,
+    "tuned": TUNED,
+    "feed-through": SINGLE,
+    "difference and position gain": changed(
+        PAPER,
+        electronics={"estimator": "difference"},
+        control={"gain_factor": 0.02, "position_gain": [100.0, 50.0, 0.0]},
+    ),
+    "strain rate feedback": changed(
+        PAPER, control={"law": "srf", "velocity_gain": [0.001] * 3, "gain_factor": 0.5}
+    ),
+    "other converters": changed(
+        PAPER,
+        electronics={"conditioner_bias": 1.234, "adc_bits": 10, "voltage_limit": 30.0,
+                     "conditioner_gain": 0.7},
+    ),
+}  # fmt: skip
+
+
+def found_and_codes(data, length=500):
+    """A controller with ADC codes around its bias, no matter what plant makes them."""
+    found = fixed_controller(parse_study(data))
+    middle = float(found.controller.adc_bias / found.controller.adc_step)
+    top = float(found.controller.adc_top)
+    rng = np.random.default_rng(0)
+    time = np.arange(length)[:, None, None]
+    phase, frequency = rng.uniform(0, 6, (3, 3)), rng.uniform(0.02, 0.4, (3, 3))
+    wave = middle + 0.2 * top * np.sin(frequency * time + phase) + rng.normal(size=(length, 3, 3))
+    return found, np.clip(np.round(wave), 1, top - 1)
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def kind(request):
+    found, codes = found_and_codes(KINDS[request.param])
+    seen = respond_floating(found.channels, found.controller, codes)
+    return found, codes, seen, design_fixed(found, seen, 12)
+
+
+def test_floating_arithmetic_is_the_jax_controller(kind):
+    found, codes, seen, _ = kind
+    wanted = np.asarray(replay(found.controller, found.structure.n_channels, codes))
+    assert np.abs(wanted).max() > 0
+    np.testing.assert_allclose(seen.command, wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
+
+
+def test_fixed_point_stays_within_its_bound(kind):
+    found, codes, seen, fixed = kind
+    bound = fixed.error.rounding + fixed.error.coefficients
+    used = np.isin(np.arange(3), found.channels.link)
+    assert np.all((bound > 0) == used[:, None]) and bound.max() < 0.5 * fixed.dac_step
+    if np.any(found.controller.feedthrough):  # acts on what the DAC makes of a command
+        return
+    volts = (respond(fixed, codes, RAIL).codes - fixed.dac_rest) * fixed.dac_step
+    difference = np.abs(volts - seen.command).max(axis=0)
+    assert np.all(difference <= 0.5 * fixed.dac_step + bound + 1e-12)
+
+
+def test_no_sequence_of_codes_overflows(kind):
+    found, codes, _, fixed = kind
+    worst = worst_codes(found, fixed)
+    for sequence in (codes, worst):
+        response = respond(fixed, sequence, len(sequence) + 1)
+        assert response.limited.sum() == 0 and not response.is_faulty.any()
+    # the bound is not idle either: these codes nearly reach it
+    signals = respond_floating(found.channels, found.controller, worst)
+    if np.any(found.controller.feedthrough):
+        return
+    for part, form in ((signals.signal, fixed.signal), (signals.force, fixed.force)):
+        reached = np.abs(part).max(axis=0) / form.bound
+        assert reached.max() > 0.8 and reached.max() <= 1 + 1e-9
+
+
+def worst_codes(found, fixed):
+    """Codes that drive the force of the first channel as far as codes can."""
+    channels, n = found.channels, 400
+    response = fixed_point._responses(channels, 0, n)[2]
+    sign = np.sign(response[::-1])[:, None] * np.sign(channels.filter[0])
+    codes = np.full((n, 3, found.n_patches), round(fixed.bias / 2**fixed.adc_bits), float)
+    codes[:, channels.link[0]] = np.where(sign > 0, fixed.adc_top, 0)
+    return codes
+
+
+def test_comes_to_rest_after_any_input(kind):
+    found, _, _, fixed = kind
+    top, middle = fixed.adc_top, round(fixed.bias / 2**fixed.adc_bits)
+    loud = np.where(np.arange(300)[:, None, None] // 17 % 2, top, 0) * np.ones((1, 3, 3))
+    codes = np.concatenate([loud, np.full((3000, 3, 3), middle)])
+    out = respond(fixed, codes, RAIL).codes
+    assert np.any(out[:300] != fixed.dac_rest)
+    floating = respond_floating(found.channels, found.controller, codes).command[-1]
+    # no limit cycle; what is left is what the bias between two codes leaves in floating point
+    assert np.all(out[-500:] == out[-1])
+    assert np.abs((out[-1] - fixed.dac_rest) * fixed.dac_step - floating).max() < fixed.dac_step
+
+
+def test_formats_leave_the_stated_margin(kind):
+    _, _, _, fixed = kind
+    for form in (fixed.signal, fixed.high, fixed.inner, fixed.force):
+        assert np.all(form.margin >= fixed_point.MARGIN)
+        assert np.all(form.step * 2.0**31 > form.bound)
+
+
+def test_unfolded_channels_are_the_controller(kind):
+    found, codes, seen, fixed = kind
+    law = unfold(found.channels, found.controller)
+    again = respond_floating(fold(law, found.study.control.law), law, codes)
+    np.testing.assert_allclose(again.force, seen.force, rtol=1e-12)
+    near = rounded(fixed, found.channels)
+    error = np.abs(near.force - found.channels.force).max(axis=1)
+    # rounded with the factor between two formats, which has some bits less than a word
+    assert np.all(error < 1e-7 * np.abs(found.channels.force).max(axis=1))
+    assert np.any(near.force != found.channels.force)
+
+
+def test_a_coefficient_off_by_little_breaks_the_bound():
+    found, codes = found_and_codes(PAPER)
+    seen = respond_floating(found.channels, found.controller, codes)
+    fixed = design_fixed(found, seen, 16)
+    integers = fixed.numerator.integers * (1 + 1e-4)
+    wrong = fixed._replace(numerator=fixed.numerator._replace(integers=integers.astype(np.int64)))
+    volts = (respond(wrong, codes, RAIL).codes - fixed.dac_rest) * fixed.dac_step
+    bound = 0.5 * fixed.dac_step + (fixed.error.rounding + fixed.error.coefficients).max()
+    assert np.abs(volts - seen.command).max() > bound
+
+
+def test_faulty_sensors_are_noticed_where_they_are_used():
+    found, codes = found_and_codes(SINGLE)
+    seen = respond_floating(found.channels, found.controller, codes)
+    fixed = design_fixed(found, seen, 12)
+    for link in range(3):
+        bad = codes.copy()
+        bad[100:, link, 1] = fixed.adc_top
+        response = respond(fixed, bad, RAIL)
+        assert response.is_faulty.any() == (link == 1)
+        if link == 1:
+            assert np.flatnonzero(response.is_faulty)[0] == 100 + RAIL - 1
+            assert np.all(response.codes[100 + RAIL - 1 :] == fixed.dac_rest)
+    # from end to end is no sensor that is stuck
+    bad = codes.copy()
+    bad[100:, 1, 1] = np.where(np.arange(len(codes) - 100) // (RAIL - 1) % 2, fixed.adc_top, 0)
+    assert not respond(fixed, bad, RAIL).is_faulty.any()
+
+
+@pytest.mark.parametrize("shaper", [{"kind": "ei3"}, {"frequencies_hz": [60.0, 114.0]}, {}])
+def test_fixed_shaper_leaves_a_pose_at_rest_where_it_is(shaper):
+    found = fixed_controller(parse_study(changed(TUNED, shaper=shaper, run={"duration": 0.2})))
+    row = shaper_row(found.taps)
+    assert row.integers.sum() == 2 ** int(row.shift[0])
+    np.testing.assert_allclose(row.values[0], found.taps.weight, rtol=0, atol=1e-8)
+
+
+def test_peak_gains_are_those_of_the_filters():
+    channels = found_and_codes(PAPER)[0].channels
+    gains = peak_gains(channels, 3000)
+    b0, _, a1 = channels.first.T
+    # |b0| + |b0 (1 + a1)| sum |a1|^k for b1 = -b0, a1 in (-1, 0)
+    np.testing.assert_allclose(gains.high, b0 + b0 * (1 + a1) / (1 + a1), rtol=1e-9)
+
+
+def test_the_loop_with_the_controller_outside_is_the_loop():
+    study = parse_study(TUNED)
+    found = fixed_controller(study)
+    outside = reference_run(found)
+    inside = run_study(study, has_loop=False).result
+    np.testing.assert_allclose(outside.pose, inside.record.pose, rtol=0, atol=1e-12)
+    held = np.asarray(inside.record.actuator_voltage)  # a command is held in the next sample
+    np.testing.assert_allclose(outside.voltage[:-1], held[1:], rtol=0, atol=1e-9)
+    for name in ("residual_rms", "peak_voltage", "settling_time"):
+        mine, own = (getattr(result.metrics, name) for result in (outside.result, inside))
+        np.testing.assert_allclose(mine, own, rtol=1e-6)
+
+
+REFUSED = {
+    "no sampled controller": (changed(PAPER, control={"feedback": "ideal"}), "control.feedback"),
+    "no link": (changed(PAPER, control={"links": [False] * 3}), "control.links"),
+    "no gain": (changed(PAPER, control={"gain_factor": 0.0}), "control.gain_factor"),
+    "masked": (changed(PAPER, control={"mode_mask": [[False] * 3] * 3}), "mode_mask"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_controller_is_refused(name):
+    data, message = REFUSED[name]
+    with pytest.raises(StudyError, match=message):
+        fixed_controller(parse_study(data))
+
+
+UNFIT = {
+    "codes too long": (changed(PAPER, electronics={"adc_bits": 20}), "adc_bits = 20: allowed up"),
+    "filter too slow": (
+        changed(PAPER, electronics={"highpass_hz": 1e-3}),
+        r"highpass_hz = 0.001: allowed from 0.0\d+ .*--target c",
+    ),
+    "rounding too loud": (
+        changed(PAPER, electronics={"voltage_limit": 1e-7}),
+        r"can add up to .* V at actuator \d of link \d: allowed .*--target c",
+    ),
+    "too high a rate": (
+        changed(
+            PAPER,
+            electronics={"sample_rate_hz": 1e6, "antialias_hz": 2e5, "highpass_hz": 5.0},
+            run={"duration": 0.08},
+        ),
+        "electronics.sample_rate_hz = 1e",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", UNFIT)
+def test_what_does_not_fit_words_is_refused(name):
+    data, message = UNFIT[name]
+    found, codes = found_and_codes(data, 50)
+    seen = respond_floating(found.channels, found.controller, codes)
+    with pytest.raises(StudyError, match=message):
+        design_fixed(found, seen, 12)
+
+
+def test_factors_beyond_a_word_are_refused():
+    with pytest.raises(StudyError, match=r"gains: factors add up to 3e\+09 .* allowed below"):
+        fixed_point._row(np.array([[1e9, 2e9, 0.0]]), "gains")
+    with pytest.raises(StudyError, match="nan"):
+        fixed_point._row(np.array([[np.nan, 1.0]]), "gains")
+
+
+def test_unstable_loops_are_refused_with_their_margin():
+    found = fixed_controller(parse_study(changed(PAPER, control={"gain_factor": 4.0})))
+    with pytest.raises(
+        StudyError, match=r"gain_factor = 4.0: .* spectral radius is 1\.\d+.*margin"
+    ):
+        _judged(found, found.channels, "")
+    # a design that is stable, until its filters are rounded to a few bits
+    found = fixed_controller(parse_study(PAPER))
+    assert _judged(found, found.channels, "").is_stable
+    coarse = found.channels._replace(denominator=np.round(found.channels.denominator * 4) / 4)
+    with pytest.raises(StudyError, match="coefficients rounded"):
+        _judged(found, coarse, ", coefficients rounded")
