@@ -96,6 +96,12 @@ class ErrorBound(NamedTuple):
 
     rounding: np.ndarray  # of all signals, all rounded the same wrong way in every sample
     coefficients: np.ndarray  # of rounded coefficients, at full-scale input
+    total: np.ndarray  # both with the DAC's own rounding, which a feed-through brings back
+
+    @property
+    def inside(self) -> np.ndarray:
+        """Of the arithmetic alone, (3, K)."""
+        return self.rounding + self.coefficients
 
 
 class Gains(NamedTuple):
@@ -176,7 +182,7 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
         ),
         synthesizer=_row(back * force.step / dac_step, "synthesizer"),
         feedthrough=through,
-        error=ErrorBound(np.zeros(()), np.zeros(())),
+        error=ErrorBound(*np.zeros((3, 3, found.n_patches))),
     )  # fmt: skip
     error = _error_bound(found, fixed, gains, memory)
     _check_error(found, error, dac_step)
@@ -308,11 +314,27 @@ def _error_bound(found: FixedController, fixed: FixedPoint, gains: Gains, n: int
     rounding, coefficients = np.zeros((2, 3, found.n_patches))
     np.add.at(rounding, exact.link, force[:, None] * size)
     np.add.at(coefficients, exact.link, wrong)
-    return ErrorBound(rounding, coefficients)
+    inside = rounding + coefficients + half * fixed.dac_step
+    return ErrorBound(rounding, coefficients, _brought_back(found, gains, inside))
+
+
+def _brought_back(found: FixedController, gains: Gains, error: np.ndarray) -> np.ndarray:
+    """Errors e of commands with what feed-through D makes of them, (1 - |G||D|)^-1 e, (3, K).
+
+    G holds the peak gains from sensors to actuators. Infinite where the sum does not converge.
+    """
+    channels, through = found.channels, np.abs(found.controller.feedthrough)
+    gain = np.zeros_like(through)
+    pairs = np.abs(channels.synthesizer)[:, :, None] * np.abs(channels.filter)[:, None, :]
+    np.add.at(gain, channels.link, pairs * gains.force[:, None, None])
+    loop = gain @ through
+    if np.abs(np.linalg.eigvals(loop)).max() >= 1:
+        return np.full_like(error, np.inf)
+    return np.linalg.solve(np.eye(loop.shape[1]) - loop, error[..., None])[..., 0]
 
 
 def _check_error(found: FixedController, error: ErrorBound, dac_step: float) -> None:
-    worst = error.rounding + error.coefficients
+    worst = error.inside
     if worst.max() <= ALLOWED_ERROR * dac_step:
         return
     link, patch = np.unravel_index(np.argmax(worst), worst.shape)

@@ -8,6 +8,9 @@ import numpy as np
 
 from studies.export.fixed import FixedPoint, Row
 
+#: Axes of one sequence's numbers.
+SENSORS, CHANNELS = (-2, -1), (-1,)
+
 
 class Response(NamedTuple):
     """What the integer arithmetic gives; counts are per sample, (T, ...)."""
@@ -38,11 +41,11 @@ def respond(fixed: FixedPoint, codes: np.ndarray, rail: int) -> Response:
         at_end = np.where(end * at_end > 0, at_end, 0) + end
         bad = ((code > fixed.adc_top) | (np.abs(at_end) >= rail)) & is_used
         is_faulty = is_faulty | bad.any(axis=(-2, -1))
-        cut: list[np.ndarray] = []
-        sensor = _limited(code * 2**fixed.adc_bits - fixed.bias, cut)
+        cut: list[np.ndarray] = []  # per sequence, numbers cut to 32 bits
+        sensor = _limited(code * 2**fixed.adc_bits - fixed.bias, cut, SENSORS)
         if fixed.feedthrough is not None:
             own = _products(fixed.feedthrough, command[..., None, :])
-            sensor = _limited(sensor - own, cut)
+            sensor = _limited(sensor - own, cut, SENSORS)
         signal = _limited(_products(fixed.filter, sensor[..., fixed.link, :]), cut)
         high = _limited(_products(fixed.high_pass, signal[..., None]) + memory, cut)
         memory = _limited(_products(fixed.memory, np.stack([signal, high], -1)), cut)
@@ -50,7 +53,7 @@ def respond(fixed: FixedPoint, codes: np.ndarray, rail: int) -> Response:
         taps = np.stack([inner, old, older, signal], -1)
         force = _limited(_products(fixed.numerator, taps), cut)
         older, old = old, inner
-        wanted = _limited(_products(fixed.synthesizer, force[..., None, None, :]), cut)
+        wanted = _limited(_products(fixed.synthesizer, force[..., None, None, :]), cut, SENSORS)
         command = np.minimum(np.maximum(wanted, 1 - fixed.dac_rest), fixed.dac_rest - 1)
         rest = is_faulty[..., None]
         memory, old, older = (np.where(rest, 0, x) for x in (memory, old, older))
@@ -62,11 +65,10 @@ def respond(fixed: FixedPoint, codes: np.ndarray, rail: int) -> Response:
     return Response(*map(np.stack, zip(*rows, strict=True)))
 
 
-def _limited(x: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
+def _limited(x: np.ndarray, cut: list[np.ndarray], axes: tuple[int, ...] = CHANNELS) -> np.ndarray:
     """Cut to 32 bits; how many were cut in each sequence goes to `cut`."""
     inside = np.minimum(np.maximum(x, -(2**31)), 2**31 - 1)
-    # sensors have two axes behind those of the sequences, channels one
-    cut.append(np.sum(x != inside, axis=(-2, -1) if x.shape[-2:-1] == (3,) else -1))
+    cut.append(np.sum(x != inside, axis=axes))
     return inside
 
 

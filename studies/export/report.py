@@ -100,7 +100,9 @@ def _fixed(
         f"{100 * AIM:g} %, {'met' if own < AIM else 'missed'}); {100 * dac:+.3f} % with the JAX "
         "controller behind the same DAC, so what the DAC costs without fixed point.", "",
         f"Bounds, open loop, for any ADC codes: rounding {worst[0]:.2e} V, coefficients "
-        f"{worst[1]:.2e} V; one step of the DAC is {fixed.dac_step:.4g} V.", "",
+        f"{worst[1]:.2e} V; one step of the DAC is {fixed.dac_step:.4g} V."
+        + ("" if np.all(np.isfinite(fixed.error.total)) else " With its feed-through the DAC's "
+           "rounding comes back, and no bound holds for the whole."), "",
         "Formats: value = base x integer / 2^Q, base = what the simulation shows. Room: the "
         "largest value of the word, in units of base; codes: the largest value that any sequence "
         "of ADC codes can produce, in the same. Smallest margin over the simulation: "

@@ -80,7 +80,7 @@ def export_design(
     found = fixed_controller(design.study)
     origin = _origin(found, design.case_id)
     loop = _judged(found, found.channels, "")
-    reference = _reference(found) if is_verified or target == "c-fixed" else None
+    reference = _reference(found, console) if is_verified or target == "c-fixed" else None
     files: dict[str, str]
     verified, fixed, cost = None, None, None
     if target == "json":
@@ -175,8 +175,9 @@ def _judged(found: FixedController, channels: Channels, note: str) -> LoopReport
     return loop
 
 
-def _reference(found: FixedController) -> LoopRun:
+def _reference(found: FixedController, console: Console) -> LoopRun:
     """The case's motion with the JAX controller, which must run to its end."""
+    console.print(f"in the loop: {found.structure.n_steps} samples for each controller")
     run = reference_run(found)
     code = int(run.result.status)
     if code not in status.FINISHED:
