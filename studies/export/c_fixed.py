@@ -24,10 +24,12 @@ _FEEDTHROUGH = """\
     for (k = 0; k < @_N_CHANNELS; k++) {
         first = @_N_PATCHES * (k / @_N_PATCHES);
         sum = 0;
-        for (m = 0; m < @_N_PATCHES; m++) {
+        for (m = 0; IS_USED[k / @_N_PATCHES] && m < @_N_PATCHES; m++) {
             sum += (int64_t)FEEDTHROUGH[k][m] * state->command[first + m];
         }
-        sensed[k] = limited(sensed[k] - shifted(sum, FEEDTHROUGH_SHIFT[k]));
+        if (IS_USED[k / @_N_PATCHES]) {
+            sensed[k] = limited(sensed[k] - shifted(sum, FEEDTHROUGH_SHIFT[k]));
+        }
     }
 """
 _WORD = "int32_t"

@@ -37,15 +37,15 @@ CYCLES = (12, 30, 30, 200)
 def cost_of(found: FixedController, fixed: FixedPoint) -> Cost:
     """Multiplications, cycles, load and memory of a sample."""
     n, k = fixed.filter.integers.shape
-    n_taps, n_channels = len(found.taps.weight), 3 * k
+    n_taps, n_channels = len(found.taps.weight), k * len(np.unique(fixed.link))
     direct = int(np.any(fixed.numerator.integers[:, 3]))
-    # filter, synthesizer, sections; the sensors' unit; three coordinates of the shaper
+    # filter, synthesizer, sections; codes to counts; three coordinates of the shaper
     products = n * (2 * k + 1 + 2 + 3 + 3 + direct) + n_channels + 3 * n_taps
     roundings = 5 * n + 2 * n_channels + 3
-    words = 2 * 3 * n + n_channels + 1 + 2 * (3 * (int(found.taps.sample.max()) + 1) + 1)
+    words = 2 * 3 * n + 3 * k + 1 + 2 * (3 * (int(found.taps.sample.max()) + 1) + 1)
     if fixed.feedthrough is not None:
         products, roundings = products + n_channels * k, roundings + n_channels
-        words += 2 * n_channels
+        words += 2 * 3 * k
     parts = (products, roundings, n_channels, 1)
     cycles = sum(count * each for count, each in zip(parts, CYCLES, strict=True))
     load = cycles * found.study.electronics.sample_rate_hz / CLOCK

@@ -97,7 +97,9 @@ int ${name}_step(${name}_state *state, const uint16_t sensor[${NAME}_N_CHANNELS]
         return state->fault;
     }
     for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
-        sensed[k] = limited((int64_t)sensor[k] * ADC_UNIT - BIAS);
+        if (IS_USED[k / ${NAME}_N_PATCHES]) {
+            sensed[k] = limited((int64_t)sensor[k] * ADC_UNIT - BIAS);
+        }
     }
 $subtract_feedthrough    for (m = 0; m < ${NAME}_N_MODES; m++) {
         int32_t signal, high, inner;
