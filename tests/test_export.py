@@ -77,7 +77,8 @@ def test_export_is_verified(capsys, designs, folders, name, target):
         ]
         assert len(found) >= 2 and max(found) < 1e-12
     if target == "c":
-        assert re.search(r"faulty sensor: NaN \| sensor \d after 1 samples", report)
+        assert "With float, recorded codes" in text and "precise enough" in text
+        assert re.search(r"faulty sensor: NaN \| sensor \d, sample 1 ", report)
 
 
 @pytest.mark.parametrize("name", DESIGNS)
@@ -293,3 +294,13 @@ def test_designs_of_a_tuning(capsys, designs, tmp_path):
 def test_document_names_the_case_of_a_sweep(designs):
     found = fixed_controller(load_study(designs["paper"]))
     assert document(found, "0123456789abcdef").case_id == "0123456789abcdef"
+
+
+@pytest.mark.parametrize("bias", [0.0, 3.0])
+def test_a_motion_at_the_end_of_the_adc_is_refused(capsys, tmp_path, bias):
+    data = {**DESIGNS["paper"], "electronics": {"conditioner_bias": bias}}
+    path = write_study(tmp_path / "clipped.toml", data)
+    out = tmp_path / "out"
+    text = refused(capsys, "export", path, "--target", "json", "--out", out)
+    assert "conditioner_gain = 0.1" in text and "taken for a broken sensor" in text
+    assert not out.exists()

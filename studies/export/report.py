@@ -42,6 +42,7 @@ def report(
     for check in verified.checks:
         mark = "ok" if check.is_met else "**FAILED**"
         lines.append(f"| {check.what} | {check.found} | {check.allowed} | {mark} |")
+    lines += [*([""] if verified.notes else []), *verified.notes]
     lines += _in_the_loop(found, verified)
     if fixed is not None and cost is not None:
         lines += _fixed(found, fixed, cost, verified)

@@ -25,7 +25,7 @@ from studies.export.compiler import find_compiler
 from studies.export.controller import FixedController, fixed_controller
 from studies.export.cost import cost_of
 from studies.export.document import document, schema, study_hash, to_json
-from studies.export.fixed import design_fixed, rounded
+from studies.export.fixed import design_fixed, rail_samples, rounded
 from studies.export.floating import respond
 from studies.export.in_the_loop import LoopRun
 from studies.export.report import report
@@ -185,7 +185,28 @@ def _reference(found: FixedController, console: Console) -> LoopRun:
             f"{found.study.title}: {describe(code)} at {run.result.bad_time:.4g} s; allowed: a "
             "study that runs to its end (see studies simulate)"
         )
+    _check_clipping(found, run)
     return run
+
+
+def _check_clipping(found: FixedController, run: LoopRun) -> None:
+    """Refuse a motion that the exported code would take for a broken sensor."""
+    electronics = found.study.electronics
+    rail = rail_samples(electronics.sample_rate_hz)
+    used = np.isin(np.arange(3), found.channels.link)[:, None]
+    for end in (0.0, float(found.controller.adc_top)):
+        length = np.zeros(run.codes.shape[1:])
+        for k, code in enumerate(run.codes):
+            length = np.where((code == end) & used, length + 1, 0)
+            if length.max() >= rail:
+                link, patch = np.unravel_index(np.argmax(length), length.shape)
+                raise field_error(
+                    "electronics.conditioner_gain", electronics.conditioner_gain,
+                    f"so small that the motion does not hold sensor {patch + 1} of link {link + 1} "
+                    f"at an end of the ADC's range for {1e3 * rail / electronics.sample_rate_hz:g} "
+                    f"ms, as until t = {k / electronics.sample_rate_hz:.4g} s: that is taken for a "
+                    "broken sensor (see electronics.conditioner_bias, too)", "1",
+                )  # fmt: skip
 
 
 def _files(source: Source, name: str) -> dict[str, str]:
@@ -198,6 +219,8 @@ def _tell(verified: Verification, console: Console) -> None:
         console.print(f"FAILED: {check.what}: {check.found}, allowed {check.allowed}")
     if not failed:
         console.print(f"verified: {len(verified.checks)} comparisons agree")
+    for note in verified.notes:
+        console.print(note, soft_wrap=True)
     for name in verified.runs:
         if name != "JAX":
             at = verified.beside(name)

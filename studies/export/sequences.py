@@ -25,17 +25,17 @@ def hard_sequences(recorded: np.ndarray, top: int, rail: int) -> dict[str, np.nd
     # every channel its own period, all short of a fault
     longest = max(rail - 1, 1)
     half = np.clip(rng.integers(1, 90, shape[1:]), 1, longest)
-    stuck = np.array(recorded[:LENGTH])
+    stuck = np.clip(recorded[:LENGTH], 1, top - 1)
     stuck[:, 0, 0] = stuck[len(stuck) // 2, 0, 0]
     stuck[len(stuck) // 2 :, -1, -1] = top // 5
-    slow = (top * (0.5 + 0.499 * np.sin(2 * np.pi * sample / 97))).round()
+    slow = np.clip(np.round(top * (0.5 + 0.5 * np.sin(2 * np.pi * sample / 97))), 1, top - 1)
     return {
-        "random codes": rng.integers(0, top + 1, shape).astype(float),
+        "random codes": rng.integers(1, top, shape).astype(float),
         "full-scale square waves": np.where(sample // half % 2, float(top), 0.0),
         "full-scale square waves in phase": np.broadcast_to(
             np.where(sample // min(43, longest) % 2, float(top), 0.0), shape
         ),
-        "sine of nearly full scale": np.broadcast_to(slow, shape).astype(float),
+        "sine of nearly full scale": np.broadcast_to(slow, shape),
         "stuck sensors": stuck,
     }
 
