@@ -3,16 +3,19 @@
 import json
 import re
 import subprocess
+from pathlib import Path
 
 import jsonschema
 import numpy as np
 import pytest
 
+import studies
 from studies.export import run as export_run
 from studies.export import sequences
 from studies.export.compiler import STRICT
 from studies.export.controller import fixed_controller
 from studies.export.document import document, import_study, study_hash
+from studies.export.verify import AIM
 from studies.spec import load_study
 from tests.exports import (
     DESIGNS,
@@ -70,6 +73,8 @@ def test_export_is_verified(capsys, designs, folders, name, target):
     assert {path.name for path in out.iterdir()} == files | {"verification.md"}
     if target == "c-fixed":
         assert "multiplications a sample" in text
+        loss = float(re.search(r"Residual vibration: ([+-][\d.]+) % against", report)[1])
+        assert abs(loss) < 100 * AIM
         assert re.search(r"\| bit by bit, recorded codes \| 0 of \d+ codes differ", report)
     else:
         found = [
@@ -79,6 +84,17 @@ def test_export_is_verified(capsys, designs, folders, name, target):
     if target == "c":
         assert "With float, recorded codes" in text and "precise enough" in text
         assert re.search(r"faulty sensor: NaN \| sensor \d, sample 1 ", report)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("target", ["c", "c-fixed"])
+def test_the_papers_study_at_full_size(capsys, tmp_path, target):
+    needs_compiler()
+    paper = Path(studies.__file__).parent / "specs" / "paper.toml"
+    code, text, _ = run(capsys, "export", paper, "--target", target, "--out", tmp_path / "out")
+    assert code == 0 and "comparisons agree" in text
+    loss = float(re.search(r"in the loop, C.*residual vibration by ([+-][\d.e-]+) %", text)[1])
+    assert abs(loss) < (100 * AIM if target == "c-fixed" else 1e-6)
 
 
 @pytest.mark.parametrize("name", DESIGNS)

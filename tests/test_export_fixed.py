@@ -5,9 +5,12 @@ import pytest
 
 from studies.errors import StudyError
 from studies.export import fixed as fixed_point
+from studies.export.c_fixed import fixed_source
+from studies.export.c_floating import floating_source
 from studies.export.channels import fold, unfold
+from studies.export.compiler import compiled
 from studies.export.controller import fixed_controller
-from studies.export.fixed import design_fixed, peak_gains, rounded, shaper_row
+from studies.export.fixed import design_fixed, peak_gains, rail_samples, rounded, shaper_row
 from studies.export.floating import respond as respond_floating
 from studies.export.in_the_loop import replay
 from studies.export.integers import respond
@@ -15,7 +18,7 @@ from studies.export.run import _judged
 from studies.export.verify import reference_run
 from studies.runs import run_study
 from studies.spec import parse_study
-from tests.exports import PAPER, SINGLE, TUNED
+from tests.exports import PAPER, SINGLE, TUNED, needs_compiler
 
 RAIL = 100
 
@@ -262,3 +265,79 @@ def test_unstable_loops_are_refused_with_their_margin():
     coarse = found.channels._replace(denominator=np.round(found.channels.denominator * 4) / 4)
     with pytest.raises(StudyError, match="coefficients rounded"):
         _judged(found, coarse, ", coefficients rounded")
+
+
+def random_design(rng):
+    """A design far from the usual ones; many of them are refused."""
+
+    def log(low, high, size=None):
+        return np.exp(rng.uniform(np.log(low), np.log(high), size))
+
+    links = rng.random(3) < 0.7
+    rate = float(rng.choice([2e3, 5e3, 1e4, 2e4, 5e4]))
+    return changed(
+        PAPER,
+        shaper={"kind": str(rng.choice(["none", "zv", "ei", "ei3"]))},
+        run={"duration": 0.1},
+        control={
+            "gain_factor": float(log(1e-3, 10)),
+            "links": links.tolist() if links.any() else [True, False, True],
+            "velocity_gain": (rng.choice([-1, 1, 1], 3) * log(0.1, 10, 3)).tolist(),
+            "position_gain": (rng.choice([-1, 0, 1], 3) * log(1, 1e4, 3)).tolist(),
+            "mode_mask": (rng.random((3, 3)) < 0.8).tolist(),
+            "feedthrough_factor": float(rng.choice([0.0, 0.0, 0.3, 1.0])),
+        },
+        electronics={
+            "sample_rate_hz": rate,
+            "antialias_hz": rate * float(rng.uniform(0.05, 0.45)),
+            "estimator": str(rng.choice(["modal_phase", "modal_phase", "difference"])),
+            "highpass_hz": float(log(1, 300)),
+            "lowpass_ratio": log(0.3, 3, 3).tolist(),
+            "lowpass_zeta": log(0.02, 2, 3).tolist(),
+            "adc_bits": int(rng.integers(4, 19)),
+            "conditioner_gain": float(log(1e-2, 10)),
+            "conditioner_bias": float(rng.uniform(0, 3)),
+            "voltage_limit": float(log(0.1, 1e3)),
+        },
+    )
+
+
+def check_random_designs(count, seed):
+    """Each one is refused in words, or its C code is what its models are; returns how many ran."""
+    compiler, n_run = needs_compiler(), 0
+    for k in range(count):
+        rng = np.random.default_rng([seed, k])
+        try:
+            found, codes = found_and_codes(random_design(rng), 300)
+            seen = respond_floating(found.channels, found.controller, codes)
+            fixed = design_fixed(found, seen, int(rng.integers(4, 17)))
+        except StudyError as error:
+            assert "allowed" in str(error), (k, error)
+            continue
+        n_run += 1
+        wild = rng.integers(0, fixed.adc_top + 1, (400, 3, 3)).astype(float)
+        rail = rail_samples(found.study.electronics.sample_rate_hz)
+        sizes = (9, len(found.channels.link), int(found.taps.sample.max()) + 1)
+        source = fixed_source(found, fixed, "flexlink", ["random"], "")
+        with compiled(source, "flexlink", compiler, np.uint16, np.int32, sizes) as code:
+            for sequence in (codes, wild):
+                response = respond(fixed, sequence, rail)
+                np.testing.assert_array_equal(code.respond(sequence)[0], response.codes, str(k))
+                assert response.limited.sum() == 0, k
+        volts = (respond(fixed, codes, rail).codes - fixed.dac_rest) * fixed.dac_step
+        off = np.abs(volts - seen.command).max(axis=0)
+        assert np.all(off <= fixed.error.total * (1 + 1e-9) + 1e-12), k
+        source = floating_source(found, "flexlink", ["random"])
+        with compiled(source, "flexlink", compiler, np.float64, np.float64, sizes) as code:
+            out = code.respond(codes * float(found.controller.adc_step))[0]
+        assert np.abs(out - seen.command).max() <= 1e-12 * np.abs(seen.command).max(), k
+    return n_run
+
+
+def test_random_designs():
+    assert check_random_designs(8, 0) >= 1
+
+
+@pytest.mark.long
+def test_many_random_designs():
+    assert check_random_designs(150, 1) >= 30
