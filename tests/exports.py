@@ -35,9 +35,10 @@ TUNED = {
         "lowpass_zeta": [0.6518003818380292, 0.7000050347175182, 0.7000006412791807],
     },
 }
-#: Two modes on one link, with the modes it does not control compensated for.
+#: Two modes on one link, with the modes it does not control compensated for, and a 16-bit ADC.
 SINGLE = {
     **_SHORT,
+    "electronics": {"adc_bits": 16},
     "title": "two modes, one link",
     "control": {"modes": 2, "links": [False, True, False], "feedthrough_factor": 0.7},
 }

@@ -167,8 +167,12 @@ def test_wrong_code_is_not_written(capsys, designs, tmp_path, monkeypatch):
     out = tmp_path / "wrong"
     code, text, _ = run(capsys, "export", designs["paper"], "--target", "c", "--out", out)
     assert code == 1 and "FAILED: open loop, recorded codes" in text
-    assert [path.name for path in out.iterdir()] == ["verification.md"]
-    assert "no code was written" in (out / "verification.md").read_text()
+    assert [path.name for path in out.iterdir()] == ["verification-failed.md"]
+    assert "no code was written" in (out / "verification-failed.md").read_text()
+    monkeypatch.undo()
+    code, text, _ = run(capsys, "export", designs["paper"], "--target", "c", "--out", out)
+    assert code == 0
+    assert {path.name for path in out.iterdir()} == {"flexlink.h", "flexlink.c", "verification.md"}
 
 
 def test_json_follows_its_schema_and_says_what_everything_is(capsys, designs, folders):
@@ -229,6 +233,14 @@ def test_import_refuses_changed_numbers(capsys, designs, folders, name, tmp_path
         (lambda data: data.update(format_version=2), "format_version = 2"),
         (lambda data: data.update(format="other"), "no controller"),
         (lambda data: data.pop("masks"), "masks"),
+        (lambda data: data["masks"].update(links=[False] * 3), "masks = "),
+        (lambda data: data.update(law="srf"), "law = 'srf'"),
+        (lambda data: data.update(title="other"), "title = 'other'"),
+        (lambda data: data["numbers"]["adc_step"].update(unit="mV"), "adc_step.unit = 'mV'"),
+        (lambda data: data["numbers"]["adc_step"].update(axes=["x"]), "adc_step.axes"),
+        (lambda data: data["numbers"]["adc_step"].update(value="0.1"), "adc_step"),
+        (lambda data: data["numbers"]["shaper_weight"].update(value=[10**400]), "shaper_weight"),
+        (lambda data: data["study"].update(run=5), "changed.json: study: run = 5"),
     ],
 )
 def test_import_refuses_other_files(capsys, designs, folders, edit, message, tmp_path):
@@ -241,7 +253,9 @@ def test_import_refuses_other_files(capsys, designs, folders, edit, message, tmp
     )
 
 
-@pytest.mark.parametrize("content", [b"{", b"\xff\xfe", b"[]", b"[" * 100_000, b'{"format": NaN}'])
+@pytest.mark.parametrize(
+    "content", [b"{", b'{"a": 1, "a": 1}', b"\xff\xfe", b"[]", b"[" * 100_000, b'{"format": NaN}']
+)
 def test_import_refuses_what_is_no_json(capsys, content, tmp_path):
     (tmp_path / "bad.json").write_bytes(content)
     refused(capsys, "import-gains", tmp_path / "bad.json", "--out", tmp_path / "back.toml")
@@ -312,11 +326,38 @@ def test_document_names_the_case_of_a_sweep(designs):
     assert document(found, "0123456789abcdef").case_id == "0123456789abcdef"
 
 
-@pytest.mark.parametrize("bias", [0.0, 3.0])
-def test_a_motion_at_the_end_of_the_adc_is_refused(capsys, tmp_path, bias):
-    data = {**DESIGNS["paper"], "electronics": {"conditioner_bias": bias}}
+def test_a_motion_at_the_end_of_the_adc_is_refused(capsys, tmp_path):
+    data = {**DESIGNS["paper"], "electronics": {"conditioner_gain": 30.0}}
+    data["control"] = {"gain_factor": 0.001}
     path = write_study(tmp_path / "clipped.toml", data)
     out = tmp_path / "out"
     text = refused(capsys, "export", path, "--target", "json", "--out", out)
-    assert "conditioner_gain = 0.1" in text and "taken for a broken sensor" in text
+    assert "conditioner_gain = 30.0" in text and "taken for a broken sensor" in text
     assert not out.exists()
+
+
+@pytest.mark.parametrize("title", ["*\\ int evil; ", "a ???/", "/* */ */ \n #error", "*/ ü"])
+def test_a_title_stays_a_comment(capsys, tmp_path, title):
+    path = write_study(tmp_path / "titled.toml", {**DESIGNS["paper"], "title": title})
+    arguments = ("--target", "c", "--no-verify", "--out", tmp_path / "out")
+    assert run(capsys, "export", path, *arguments)[0] == 0
+    made = ["-c", "-o", tmp_path / "object.o", tmp_path / "out" / "flexlink.c"]
+    subprocess.run([*needs_compiler(), *STRICT, *made], check=True)
+    assert "evil" not in re.sub(
+        r"/\*.*?\*/", "", (tmp_path / "out" / "flexlink.c").read_text(), flags=re.S
+    )
+
+
+@pytest.mark.parametrize("command", ["gcc 'unclosed", "true", "nonsense-compiler", "false"])
+def test_a_bad_compiler_is_named(capsys, designs, tmp_path, monkeypatch, command):
+    monkeypatch.setenv("CC", command)
+    arguments = ("--target", "c", "--verify", "--out", tmp_path / "out")
+    text = refused(capsys, "export", designs["paper"], *arguments)
+    assert "CC" in text and not (tmp_path / "out").exists()
+
+
+def test_files_are_written_together_or_not_at_all(capsys, designs, tmp_path):
+    (tmp_path / "flexlink.c").mkdir()
+    arguments = ("--target", "c", "--no-verify", "--out", tmp_path)
+    assert "is a folder" in refused(capsys, "export", designs["paper"], *arguments)
+    assert [path.name for path in tmp_path.iterdir()] == ["flexlink.c"]

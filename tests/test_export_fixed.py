@@ -81,7 +81,7 @@ def test_fixed_point_stays_within_its_bound(kind):
     inside, total = fixed.error.inside, fixed.error.total
     used = np.isin(np.arange(3), found.channels.link)
     assert np.all((inside > 0) == used[:, None]) and inside.max() < 0.5 * fixed.dac_step
-    assert np.all(total >= 0.5 * fixed.dac_step + inside)
+    assert np.all(total >= 0.5 * fixed.dac_step + inside) and np.all(np.isfinite(total))
     volts = (respond(fixed, codes, RAIL).codes - fixed.dac_rest) * fixed.dac_step
     difference = np.abs(volts - seen.command).max(axis=0)
     assert np.all(difference <= total * (1 + 1e-9))
@@ -205,6 +205,10 @@ REFUSED = {
     "no sampled controller": (changed(PAPER, control={"feedback": "ideal"}), "control.feedback"),
     "no link": (changed(PAPER, control={"links": [False] * 3}), "control.links"),
     "no gain": (changed(PAPER, control={"gain_factor": 0.0}), "control.gain_factor"),
+    "sensors at rest at the end": (
+        changed(PAPER, electronics={"conditioner_bias": 3.0}),
+        "conditioner_bias = 3.0: allowed",
+    ),
     "masked": (changed(PAPER, control={"mode_mask": [[False] * 3] * 3}), "mode_mask"),
 }
 

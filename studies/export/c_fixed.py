@@ -60,7 +60,8 @@ def fixed_source(
             "if its code is too high or too long at one end of the range.",
         ],
         "types": "",
-        "constants": f"#define @_DAC_REST {fixed.dac_rest} /* code of 0 V */\n"
+        "constants": f"#define @_ADC_TOP {fixed.adc_top} /* highest code */\n"
+        f"#define @_DAC_REST {fixed.dac_rest} /* code of 0 V */\n"
         f"#define @_DAC_STEP {literal(fixed.dac_step)} /* V per code at the patch */",
         "members": [
             f"    {_WORD} high[@_N_MODES]; /* memory of the first section */",

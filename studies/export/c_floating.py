@@ -52,7 +52,8 @@ def floating_source(found: FixedController, name: str, origin: Iterable[str]) ->
             "at one end of it.",
         ],
         "types": _TYPES.format(name=name),
-        "constants": f"#define @_ADC_STEP {literal(controller.adc_step)} /* V per code */\n"
+        "constants": f"#define @_ADC_TOP {int(controller.adc_top)} /* highest code */\n"
+        f"#define @_ADC_STEP {literal(controller.adc_step)} /* V per code */\n"
         f"#define @_LIMIT {literal(controller.voltage_limit)} /* V, of every actuator, +- */",
         "members": [
             f"    {real} high[@_N_MODES]; /* memory of the first section */",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from string import Template
@@ -152,5 +153,6 @@ def starred(lines: Iterable[str]) -> str:
 def _plain(text: str) -> str:
     """Text that can stand in a comment: printable ASCII that does not end it."""
     plain = "".join(c if c.isascii() and c.isprintable() else "?" for c in text)
-    plain = plain.replace("*/", "* /").replace("/*", "/ *")
-    return plain.replace("??", "? ?").replace("\\", "/")
+    # no line that goes on, no trigraph, no end of the comment
+    plain = re.sub(r"\?(?=\?)", "? ", plain.replace("\\", "/"))
+    return plain.replace("*/", "* /").replace("/*", "/ *")

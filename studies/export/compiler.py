@@ -21,6 +21,8 @@ from studies.export.c_text import Source
 #: What exported code must compile under without a word.
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 _NAMES = ("cc", "gcc", "clang")
+_WANTED = "allowed: a C99 compiler for this machine, named by the variable CC; or --no-verify"
+NO_COMPILER = "no C compiler found (the command in the variable CC if it is set, or cc, gcc, clang)"
 
 
 class Code(NamedTuple):
@@ -72,7 +74,10 @@ def _at(array: np.ndarray) -> ctypes.c_void_p:
 
 def find_compiler() -> list[str]:
     """Command of a C compiler, from the variable CC or by name; [] where there is none."""
-    given = shlex.split(os.environ.get("CC", ""))
+    try:
+        given = shlex.split(os.environ.get("CC", ""))
+    except ValueError as error:
+        raise StudyError(f"CC = {os.environ['CC']!r}: no command ({error})") from None
     for command in [given] if given else [[name] for name in _NAMES]:
         if shutil.which(command[0]):
             return command
@@ -107,13 +112,20 @@ def compiled(
         _run(command)
         # no word per state takes more than 8 bytes
         room = ctypes.create_string_buffer(8 * (3 * n_modes + 2 * n_channels) + 64)
-        yield Code(ctypes.CDLL(str(library)), name, real, reference, n_channels, length, room)
+        try:
+            loaded = ctypes.CDLL(str(library))
+        except OSError as error:
+            raise StudyError(
+                f"C compiler {shlex.join(compiler)}: its code does not run here ({error}); "
+                f"{_WANTED}"
+            ) from None
+        yield Code(loaded, name, real, reference, n_channels, length, room)
 
 
 def _run(command: list[str]) -> None:
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise StudyError(f"C compiler {command[0]}: does not work ({error})") from None
+        raise StudyError(f"C compiler {command[0]}: does not work ({error}); {_WANTED}") from None
     if done.returncode:
-        raise StudyError(f"C compiler {command[0]}: {done.stderr.strip()[:2000]}")
+        raise StudyError(f"C compiler {command[0]}: {done.stderr.strip()[:2000]}; {_WANTED}")

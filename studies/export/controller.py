@@ -66,7 +66,14 @@ def fixed_controller(study: Study) -> FixedController:
 
 
 def _check_exportable(study: Study) -> None:
-    control = study.control
+    control, electronics = study.control, study.electronics
+    step = electronics.adc_range / 2**electronics.adc_bits
+    if not step < electronics.conditioner_bias < electronics.adc_range - 2 * step:
+        raise field_error(
+            "electronics.conditioner_bias", electronics.conditioner_bias,
+            f"inside the ADC's range, {step:.4g} to {electronics.adc_range - 2 * step:.4g}: a "
+            "sensor at rest at an end of it is taken for a broken one", "V",
+        )  # fmt: skip
     if control.feedback != "sampled":
         raise field_error(
             "control.feedback", control.feedback, "'sampled', a controller that samples"

@@ -19,8 +19,9 @@ from studies.export.controller import FixedController, fixed_controller
 from studies.spec import Study, parse_study
 
 FORMAT = "flexlink-controller"
-#: Numbers worked out again on another machine may differ by rounding [relative].
-ROUNDING = 1e-9
+#: Numbers worked out again on another machine may differ by so much of themselves, and by so much
+#: of the largest one in their table.
+ROUNDING, CANCELLED = 1e-9, 1e-12
 
 
 class Part(BaseModel):
@@ -30,7 +31,7 @@ class Part(BaseModel):
 class Quantity(Part):
     """Numbers with what they are; `value` is nested as `axes` says, none for a single number."""
 
-    value: float | list[Any] = Field(description="a number, or lists of them")
+    value: float | list[float] | list[list[float]] | list[list[list[float]]]
     unit: str = Field(description="SI symbol, 1 for none", min_length=1)
     axes: list[str] = Field(description="meaning of each level of nesting")
     meaning: str = Field(description="in words", min_length=1)
@@ -225,6 +226,14 @@ def to_json(part: Document) -> str:
     return json.dumps(part.model_dump(mode="json"), indent=1, ensure_ascii=False) + "\n"
 
 
+def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    names = [name for name, _ in pairs]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{name} is there twice")
+    return dict(pairs)
+
+
 def read_document(path: Path) -> Document:
     """Read what `to_json` wrote.
 
@@ -232,7 +241,8 @@ def read_document(path: Path) -> Document:
         StudyError: unreadable, or no such document; names the first entry that is wrong.
     """
     try:
-        data = json.loads(path.read_bytes().decode("utf-8"))
+        text = path.read_bytes().decode("utf-8")
+        data = json.loads(text, object_pairs_hook=_without_doubles)
     except OSError as error:
         raise StudyError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, RecursionError) as error:
@@ -254,27 +264,42 @@ def import_study(path: Path) -> Study:
         StudyError: unreadable, no document, changed by hand.
     """
     given = read_document(path)
-    study = parse_study(given.study)
+    try:
+        study = parse_study(given.study)
+    except StudyError as error:
+        raise StudyError(f"{path}: study: {error}") from None
     if study_hash(study) != given.study_hash:
         raise StudyError(
             f"{path}: study was changed after the export; allowed: the study as exported (change a "
             "study file and export it again)"
         )
-    wanted = _numbers(fixed_controller(study))
-    for name in sorted(set(wanted) | set(given.numbers)):
-        if name not in given.numbers or name not in wanted:
-            raise StudyError(
-                f"{path}: numbers.{name}: {'missing' if name in wanted else 'unknown'}"
-            )
-        _check_equal(path, name, given.numbers[name], wanted[name])
+    wanted = document(fixed_controller(study), given.case_id)
+    for field in ("title", "law", "estimator", "masks"):
+        mine, own = getattr(given, field), getattr(wanted, field)
+        if mine != own:
+            raise StudyError(f"{path}: {field} = {shown(mine)}: allowed {shown(own)}, {_AS_STUDY}")
+    for name in sorted(set(wanted.numbers) | set(given.numbers)):
+        if name not in given.numbers or name not in wanted.numbers:
+            fault = "missing" if name in wanted.numbers else "unknown"
+            raise StudyError(f"{path}: numbers.{name}: {fault}")
+        _check_equal(path, name, given.numbers[name], wanted.numbers[name])
     return study
+
+
+_AS_STUDY = "which its study gives; change the study and export it again"
 
 
 def _check_equal(path: Path, name: str, given: Quantity, wanted: Quantity) -> None:
     """Refuse numbers that the study does not give."""
+    for label in ("unit", "axes"):
+        mine, right = getattr(given, label), getattr(wanted, label)
+        if mine != right:
+            raise StudyError(
+                f"{path}: numbers.{name}.{label} = {shown(mine)}: allowed {shown(right)}"
+            )
     try:
         found, own = np.array(given.value, float), np.array(wanted.value, float)
-    except (ValueError, TypeError):
+    except ValueError:  # lists of unequal length
         raise StudyError(f"{path}: numbers.{name}: no table of numbers") from None
     if found.shape != own.shape:
         raise StudyError(
@@ -282,11 +307,10 @@ def _check_equal(path: Path, name: str, given: Quantity, wanted: Quantity) -> No
         )
     size = np.abs(own).max(initial=0.0)
     # a number that is not finite differs, too
-    wrong = ~(np.abs(found - own) <= ROUNDING * size)
+    wrong = ~(np.abs(found - own) <= ROUNDING * np.abs(own) + CANCELLED * size)
     if np.any(wrong):
         at = tuple(int(k) for k in np.argwhere(wrong)[0])
         raise StudyError(
             f"{path}: numbers.{name}{list(at) if at else ''} = {found[at]:.9g}: allowed "
-            f"{own[at]:.9g} [{wanted.unit}], which its study gives; change the study and export it "
-            "again"
+            f"{own[at]:.9g} [{wanted.unit}], {_AS_STUDY}"
         )

@@ -19,7 +19,7 @@ from jaxmodel.shaper import Taps
 from studies.errors import StudyError, field_error
 from studies.export.channels import Channels
 from studies.export.controller import FixedController
-from studies.export.floating import Signals
+from studies.export.floating import Signals, respond_from
 
 #: Bits of a word, sign included.
 WORD = 32
@@ -32,6 +32,8 @@ ALLOWED_ERROR = 0.5
 #: Samples after which a filter must have forgotten (to 1e-16).
 LONGEST_MEMORY = 2**20
 FORGOTTEN = 1e-16
+#: Samples in which what a feed-through brings back must die out.
+ECHO = 4000
 #: Time at the end of its range that makes a sensor faulty [s].
 RAIL_TIME = 0.01
 
@@ -96,7 +98,7 @@ class ErrorBound(NamedTuple):
 
     rounding: np.ndarray  # of all signals, all rounded the same wrong way in every sample
     coefficients: np.ndarray  # of rounded coefficients, at full-scale input
-    total: np.ndarray  # both with the DAC's own rounding, which a feed-through brings back
+    total: np.ndarray  # both with the DAC's rounding, and what a feed-through brings back
 
     @property
     def inside(self) -> np.ndarray:
@@ -144,6 +146,12 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
     code = float(controller.adc_step / controller.adc_gain)  # one ADC code at the sensor [V]
     sensor = _sensor_bound(controller)  # (3, K)
     adc_bits = int(_bits(sensor.max() / code))
+    if adc_bits < 0:
+        raise StudyError(
+            f"fixed point: sensor signals can be {sensor.max() / code:.3g} ADC codes: allowed "
+            f"{2.0 ** (WORD - 1):.3g}; lower control.feedthrough_factor or "
+            "electronics.voltage_limit, or take --target c"
+        )
     step = code / 2.0**adc_bits
     bound = np.sum(np.abs(channels.filter) * sensor[channels.link], axis=1)
     signal = _format(seen.signal, bound)
@@ -315,22 +323,32 @@ def _error_bound(found: FixedController, fixed: FixedPoint, gains: Gains, n: int
     np.add.at(rounding, exact.link, force[:, None] * size)
     np.add.at(coefficients, exact.link, wrong)
     inside = rounding + coefficients + half * fixed.dac_step
-    return ErrorBound(rounding, coefficients, _brought_back(found, gains, inside))
+    return ErrorBound(rounding, coefficients, _brought_back(found, inside))
 
 
-def _brought_back(found: FixedController, gains: Gains, error: np.ndarray) -> np.ndarray:
-    """Errors e of commands with what feed-through D makes of them, (1 - |G||D|)^-1 e, (3, K).
+def _brought_back(found: FixedController, error: np.ndarray) -> np.ndarray:
+    """Errors of commands with what feed-through makes of them, (3, K).
 
-    G holds the peak gains from sensors to actuators. Infinite where the sum does not converge.
+    An error of a command enters the sensors in the next sample, and so the next command. Peak gains
+    of that recursion by its impulse response; they hold while no actuator is at its limit. Infinite
+    where it does not die out.
     """
-    channels, through = found.channels, np.abs(found.controller.feedthrough)
-    gain = np.zeros_like(through)
-    pairs = np.abs(channels.synthesizer)[:, :, None] * np.abs(channels.filter)[:, None, :]
-    np.add.at(gain, channels.link, pairs * gains.force[:, None, None])
-    loop = gain @ through
-    if np.abs(np.linalg.eigvals(loop)).max() >= 1:
+    controller = found.controller
+    if not np.any(controller.feedthrough):
+        return error
+    n = found.n_patches
+    kick = np.broadcast_to(np.eye(n)[:, None], (n, 3, n))  # one actuator of each link at a time
+    linear = controller._replace(
+        voltage_limit=np.inf, adc_bias=np.zeros(()), adc_step=np.ones(()), adc_gain=np.ones(())
+    )
+    silent = np.zeros((ECHO, n, 3, n))
+    with np.errstate(over="ignore", invalid="ignore"):
+        echo = respond_from(found.channels, linear, silent, kick).command
+    peak = np.abs(echo)
+    if not np.all(np.isfinite(peak)) or peak[-ECHO // 10 :].max() > 1e-6 * peak.max():
         return np.full_like(error, np.inf)
-    return np.linalg.solve(np.eye(loop.shape[1]) - loop, error[..., None])[..., 0]
+    gain = peak.sum(axis=0)  # (kicked actuator, link, actuator)
+    return error + np.einsum("lik,il->ik", gain, error)
 
 
 def _check_error(found: FixedController, error: ErrorBound, dac_step: float) -> None:

@@ -30,11 +30,17 @@ def respond(channels: Channels, controller: Controller, codes: np.ndarray) -> Si
         controller: the same, for converters, limit and feed-through; NumPy arrays.
         codes: of the sensors, (T, ..., 3, K); sequences side by side.
     """
+    return respond_from(channels, controller, codes, np.zeros(codes.shape[1:]))
+
+
+def respond_from(
+    channels: Channels, controller: Controller, codes: np.ndarray, command: np.ndarray
+) -> Signals:
+    """The same with voltages on the actuators at the beginning [V], (..., 3, K)."""
     rows = []
     link, many = channels.link, codes.shape[1:-2]
     memory = np.zeros((*many, len(link)))
     line = (memory, memory)
-    command = np.zeros(codes.shape[1:])
     limit = float(controller.voltage_limit)
     b0, b1, a1 = channels.first.T
     d1, d2 = channels.denominator.T

@@ -79,15 +79,25 @@ def _sample(structure: Structure, loop: Loop, inputs: Inputs, k, state: State, v
     return following, record.pose, *_read(loop, inputs, k + 1, following)
 
 
-def jax_law(controller: Controller, n_channels: int) -> Law:
-    """The JAX controller as a `Law`; it remembers."""
+def jax_law(controller: Controller, n_channels: int, dac_step: float | None = None) -> Law:
+    """The JAX controller as a `Law`; it remembers.
+
+    Args:
+        controller: coefficients.
+        n_channels: of each link.
+        dac_step: round commands to multiples of it [V]; None: leave them.
+    """
     controller = jax.tree.map(jnp.asarray, controller)
     state = rest_controller(n_channels, controller.filter.shape[2], float)
 
     def law(code: np.ndarray) -> np.ndarray:
         nonlocal state
         state = _step(controller, state, code)
-        return np.asarray(state.voltage)
+        if dac_step is None:
+            return np.asarray(state.voltage)
+        voltage = np.round(np.asarray(state.voltage) / dac_step) * dac_step
+        state = state._replace(voltage=voltage)
+        return voltage
 
     return law
 

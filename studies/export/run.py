@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from contextlib import ExitStack
 from pathlib import Path
 
 import jax
@@ -21,7 +22,7 @@ from studies.export.c_fixed import fixed_source
 from studies.export.c_floating import floating_source
 from studies.export.c_text import Source
 from studies.export.channels import Channels, unfold
-from studies.export.compiler import find_compiler
+from studies.export.compiler import NO_COMPILER, find_compiler
 from studies.export.controller import FixedController, fixed_controller
 from studies.export.cost import cost_of
 from studies.export.document import document, schema, study_hash, to_json
@@ -40,7 +41,7 @@ from studies.runs import describe
 from studies.store import replacing
 
 TARGETS = ("json", "c", "c-fixed")
-REPORT = "verification.md"
+REPORT, FAILED = "verification.md", "verification-failed.md"
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,30}")
 _DAC_BITS = (4, 16)
 
@@ -71,9 +72,9 @@ def export_design(
     compiler = [] if target == "json" else find_compiler()
     if target != "json" and not compiler:
         if is_verified:
-            raise StudyError("--verify: no C compiler found (cc, gcc, clang, or the variable CC)")
+            raise StudyError(f"--verify: {NO_COMPILER}")
         if is_verified is None:
-            console.print("not verified: no C compiler found (cc, gcc, clang, or the variable CC)")
+            console.print(f"not verified: {NO_COMPILER}")
         is_verified = False
     is_verified = True if is_verified is None else is_verified
 
@@ -108,18 +109,20 @@ def export_design(
             verified = verify_fixed(found, fixed, reference, source, name, compiler)
         console.print(cost.text)
     is_good = verified is None or verified.is_passed
-    texts = files if is_good else {}
+    texts = files if is_good else {}  # what an earlier export has left stays as it is
     if verified is not None:
-        texts |= {REPORT: report(found, origin, loop, verified, fixed, cost)}
+        name = REPORT if is_good else FAILED
+        texts |= {name: report(found, origin, loop, verified, fixed, cost)}
         _tell(verified, console)
-    _write(out, texts, console, verified is None)
+    stale = tuple(name for name in (REPORT, FAILED) if name not in texts) if is_good else ()
+    _write(out, texts, stale, console)
     return is_good
 
 
 def _check_arguments(target: str, name: str, dac_bits: int) -> None:
     if target not in TARGETS:
         raise field_error("--target", target, ", ".join(TARGETS))
-    if not _NAME.fullmatch(name):
+    if not _NAME.fullmatch(name) or name == "stdint":  # the header that the code includes
         raise field_error("--name", name, "letters, digits and _, 31 at most, a letter first")
     low, high = _DAC_BITS
     if not low <= dac_bits <= high:
@@ -230,15 +233,17 @@ def _tell(verified: Verification, console: Console) -> None:
             )
 
 
-def _write(out: Path, texts: dict[str, str], console: Console, drops_report: bool) -> None:
-    """Write the files; a report of an earlier export would speak of other code."""
+def _write(out: Path, texts: dict[str, str], stale: tuple[str, ...], console: Console) -> None:
+    """Write all files or none; `stale` are reports that would speak of other code."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        if drops_report:
-            (out / REPORT).unlink(missing_ok=True)
     except OSError as error:
         raise StudyError(f"--out {out}: cannot write there ({error.strerror})") from None
-    for name, text in texts.items():
-        with replacing(out / name) as temporary:
+    with ExitStack() as stack:
+        for name, text in texts.items():
+            temporary = stack.enter_context(replacing(out / name))
             temporary.write_text(text, encoding="utf-8")
+    for name in stale:
+        (out / name).unlink(missing_ok=True)
+    for name in texts:
         console.print(f"written: {out / name}", soft_wrap=True)

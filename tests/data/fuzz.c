@@ -23,11 +23,11 @@ typedef int32_t reference_t;
 
 static sensor_t sensor(uint64_t kind)
 {
-    uint16_t code = (uint16_t)(any() & 4095);
+    uint16_t code = (uint16_t)(any() % (FLEXLINK_ADC_TOP + 1));
     switch (kind) {
     case 0: return (uint16_t)any(); /* beyond the ADC, mostly */
     case 1: return 0;
-    case 2: return 4095;
+    case 2: return FLEXLINK_ADC_TOP;
     default: return code;
     }
 }
@@ -63,8 +63,8 @@ static sensor_t sensor(uint64_t kind)
     switch (kind) {
     case 0: return bits();
     case 1: return 0;
-    case 2: return (sensor_t)(4095 * FLEXLINK_ADC_STEP);
-    default: return (sensor_t)((double)(any() & 4095) * FLEXLINK_ADC_STEP);
+    case 2: return (sensor_t)(FLEXLINK_ADC_TOP * FLEXLINK_ADC_STEP);
+    default: return (sensor_t)((double)(any() % (FLEXLINK_ADC_TOP + 1)) * FLEXLINK_ADC_STEP);
     }
 }
 
@@ -82,7 +82,7 @@ static int is_bad(sensor_t value)
 int main(int count, char **words)
 {
     long samples = count > 1 ? atol(words[1]) : 100000, k;
-    long faults = 0;
+    long faults = 0, held = 0;
     flexlink_state controller;
     flexlink_shaper shaper;
     sensor_t in[FLEXLINK_N_CHANNELS], out[FLEXLINK_N_CHANNELS];
@@ -98,9 +98,15 @@ int main(int count, char **words)
     }
     flexlink_shape_init(&shaper, pose);
     for (k = 0; k < samples; k++) {
-        uint64_t phase = (any() >> 20) % 4096; /* 0: anything at all in every channel */
-        for (c = 0; c < FLEXLINK_N_CHANNELS; c++) {
-            in[c] = sensor(phase == 0 ? any() % 3 : 1 + any() % 3);
+        uint64_t phase = (any() >> 20) % 4096; /* 0: anything at all, 1: stuck at an end */
+        if (held > 0) {
+            held--;
+        } else {
+            uint64_t end = 1 + any() % 2;
+            for (c = 0; c < FLEXLINK_N_CHANNELS; c++) {
+                in[c] = sensor(phase == 0 ? any() % 3 : phase == 1 ? end : 1 + any() % 3);
+            }
+            held = phase == 1 ? 2 * FLEXLINK_RAIL_SAMPLES : 0;
         }
         fault = flexlink_step(&controller, in, out);
         if (fault < 0 || fault > FLEXLINK_N_CHANNELS) {

@@ -27,7 +27,7 @@ static int check(${name}_state *state, const real sensor[${NAME}_N_CHANNELS])
         at = &state->rail[k];
         if (sensor[k] < ADC_STEP / 2) {
             *at = (int16_t)(*at < 0 ? *at - 1 : -1);
-        } else if (sensor[k] > ADC_TOP - ADC_STEP / 2) {
+        } else if (sensor[k] >= ADC_TOP - ADC_STEP / 2) {
             *at = (int16_t)(*at > 0 ? *at + 1 : 1);
         } else {
             *at = 0;
