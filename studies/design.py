@@ -43,6 +43,11 @@ def load_design(path: Path, case: int | str | None = None) -> Design:
     if (path / TUNING).is_file():
         return Design(load_study(_tuned(path, case)), {})
     data = load(path)
+    if case is None:
+        raise StudyError(
+            f"--case is missing: allowed 0 to {data.n_cases - 1}, the cases of {path}, or id: and "
+            "the first digits of a case's id"
+        )
     number = _number(data, str(case), path)
     table = build_table(parse_sweep(read_manifest(path)["spec"]))
     code = int(data["status"][number])
@@ -69,11 +74,11 @@ def _tuned(path: Path, case: str | int | None) -> Path:
         raise StudyError(f"{path}: the tuning is not finished; go on with studies tune --resume")
     if case is None and len(files) == 1:
         return next(iter(files.values()))
-    if case is None or str(case) not in files:
-        raise field_error(
-            "--case", case or "", f"{', '.join(sorted(filter(None, files)))}, the families of "
-            f"{path}", hint=nearest(str(case), files),
-        )  # fmt: skip
+    known = f"{', '.join(sorted(filter(None, files)))}, the families of {path}"
+    if case is None:
+        raise StudyError(f"--case is missing: allowed {known}")
+    if str(case) not in files:
+        raise field_error("--case", case, known, hint=nearest(str(case), files))
     return files[str(case)]
 
 

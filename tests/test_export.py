@@ -110,6 +110,33 @@ def test_code_compiles_as_cpp_and_under_more_warnings(
     subprocess.run([*needs_cpp(), *flags, out / "flexlink.c"], check=True)
 
 
+STUBS = """
+#include <stdint.h>
+static void dac_write(const uint16_t *x) { (void)x; }
+static void adc_read(uint16_t *x) { x[0] = 2048; }
+static void amplifiers(int on) { (void)on; }
+static void command_sliders(const int32_t *x) { (void)x; }
+void start(const int32_t pose[3]);
+void sample_interrupt(void);
+"""
+
+
+def test_the_example_of_the_documentation_compiles(capsys, designs, folders, tmp_path):
+    out, _ = exported(capsys, designs, folders, "paper", "c-fixed")
+    page = (Path(__file__).parents[1] / "docs" / "export.md").read_text()
+    example = re.search(r"```c\n(#include.*?)```", page, re.S)[1]
+    (tmp_path / "main.c").write_text(STUBS + example)
+    made = ["-I", out, "-c", "-o", tmp_path / "main.o", tmp_path / "main.c"]
+    subprocess.run([*needs_compiler(), *STRICT, *made], check=True)
+
+
+def test_code_refuses_to_be_compiled_without_nan(capsys, designs, folders, tmp_path):
+    out, _ = exported(capsys, designs, folders, "paper", "c")
+    command = [*needs_compiler(), "-ffast-math", "-c", "-o", tmp_path / "o.o", out / "flexlink.c"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode and "leave out the check for NaN" in done.stderr
+
+
 def fuzz(out, target, folder, samples, seeds, single=False):
     """Samples of anything at all under sanitizers; the last line that the program prints."""
     flags = ["-std=c99", "-O1", "-g", "-I", out]
@@ -279,6 +306,8 @@ def test_import_refuses_targets(capsys, designs, folders, tmp_path):
         (("--target", "c", "--name", "a b"), "--name"),
         (("--target", "c-fixed", "--dac-bits", "3"), "--dac-bits"),
         (("--target", "c", "--case", "4"), "leave --case out"),
+        (("--target", "c", "--dac-bits", "12"), "not allowed with --target c"),
+        (("--target", "c", "--name", "stdint"), "--name"),
     ],
 )
 def test_export_refuses_arguments(capsys, designs, arguments, message, tmp_path):

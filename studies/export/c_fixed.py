@@ -7,12 +7,14 @@ from collections.abc import Iterable
 import numpy as np
 
 from studies.export.c_text import (
+    GAINS,
     Parts,
     Source,
     Table,
     filled,
     literal,
     patch_names,
+    section_comments,
     shaper_tables,
     starred,
     structure_tables,
@@ -79,17 +81,22 @@ def fixed_source(
         subtract_feedthrough=_FEEDTHROUGH,
         keep_command="        state->command[k] = command;\n",
         direct="\n            + (int64_t)DIRECT[m] * signal",
-        more={"formats": starred(format_lines(fixed, found)), "cost": cost},
+        more={
+            "formats": starred(format_lines(fixed, found)),
+            "cost": cost,
+            "code": f"{fixed.sensor_step * 2.0**fixed.adc_bits:.9g}",
+            "dac": f"{fixed.dac_step:.9g}",
+        },
     )
     return filled(parts, found, name, origin)
 
 
 def format_lines(fixed: FixedPoint, found: FixedController) -> list[str]:
-    """Table of formats; room of the word and reach of ADC codes in units of `one per unit`."""
+    """Table of formats; room of the word and reach of ADC codes in units of the base."""
     value, force = ("m", "N") if found.is_modal else ("V", "V")
     lines = [
-        f"{'signal':<30}{'format':>7}{'one per unit':>16}{'room':>10}{'codes':>10}",
-        f"{'sensors':<30}{f'Q{fixed.adc_bits}':>7}{'1 code':>16}",
+        f"{'signal':<30}{'Q':>4}{'base':>20}{'room':>9}{'reach':>9}",
+        f"{'sensors':<30}{fixed.adc_bits:>4}{'1 code':>20}",
     ]
     parts: list[tuple[str, Format, str]] = [
         ("signal", fixed.signal, value), ("high-passed", fixed.high, value),
@@ -98,16 +105,15 @@ def format_lines(fixed: FixedPoint, found: FixedController) -> list[str]:
     for m, name in enumerate(found.channels.names):
         for text, form, unit in parts:
             lines.append(
-                f"{f'{text}, {name}':<30}{f'Q{form.bits[m]}':>7}"
-                f"{f'{form.base[m]:.4g} {unit}':>16}{2.0 ** (WORD - 1 - form.bits[m]):>10.0f}"
-                f"{form.bound[m] / form.base[m]:>10.1f}"
+                f"{f'{text}, {name}':<30}{form.bits[m]:>4}{f'{form.base[m]:.9e} {unit}':>20}"
+                f"{2.0 ** (WORD - 1 - form.bits[m]):>9.0f}{form.bound[m] / form.base[m]:>9.1f}"
             )
     return lines
 
 
 def _tables(found: FixedController, fixed: FixedPoint) -> list[Table]:
     channels, shaper = found.channels, shaper_row(found.taps)
-    names = channels.names
+    names, section = channels.names, section_comments(found)
     back, each = fixed.synthesizer, np.arange(len(channels.link))
     high = np.hstack([fixed.high_pass.integers, fixed.memory.integers])
     high_shift = np.stack([fixed.high_pass.shift, fixed.memory.shift], axis=1)
@@ -122,7 +128,7 @@ def _tables(found: FixedController, fixed: FixedPoint) -> list[Table]:
 
     tables = [
         *structure_tables(channels),
-        Table("uint16_t", "FIRST_MODE", first, "first channel of each link, and the end; control"),
+        Table("uint16_t", "FIRST_MODE", first, "first mode of each link, and the end; control"),
         Table("uint16_t", "ADC_TOP", fixed.adc_top, "[code] highest one; adc_bits"),
         word("ADC_UNIT", np.array(2**fixed.adc_bits), "[count] of a sensor per code; adc_bits"),
         Table("int64_t", "BIAS", fixed.bias, "[count] sensor at rest; conditioner_bias"),
@@ -133,18 +139,19 @@ def _tables(found: FixedController, fixed: FixedPoint) -> list[Table]:
         ),
         shift("FILTER", fixed.filter),
         word(
-            "HIGH_PASS", high, "[1] b0; b1, -a1 of the first section of the velocity estimate; "
-            "highpass_hz or difference_cutoff_hz", names,
+            "HIGH_PASS", high, "[high/signal; high/signal, 1] b0; b1, -a1 of the velocity "
+            f"estimate's first section: {section[0]}", names,
         ),
         Table("uint16_t", "HIGH_PASS_SHIFT", high_shift, "[bit] of b0; of b1 and -a1"),
         word(
-            "LOW_PASS", fixed.low_pass.integers, "[1] scale, -a1, -a2 of the second section; "
-            "lowpass_ratio and lowpass_zeta", names,
+            "LOW_PASS", fixed.low_pass.integers, "[delay line/high, 1, 1] scale, -a1, -a2 of its "
+            f"second section: {section[1]}", names,
         ),
         shift("LOW_PASS", fixed.low_pass),
         word(
-            "FORCE", numerator.integers, "[force/signal] numerator of the second section times the "
-            "gains, -k_d n_v - k_p n_x; control.velocity_gain, position_gain, ratios", names,
+            "FORCE", numerator.integers,
+            "[force/delay line] its numerator times the gains, " + GAINS,
+            names,
         ),
         shift("FORCE", numerator),
         word(

@@ -7,12 +7,14 @@ from collections.abc import Iterable
 import numpy as np
 
 from studies.export.c_text import (
+    GAINS,
     Parts,
     Source,
     Table,
     filled,
     literal,
     patch_names,
+    section_comments,
     shaper_tables,
     structure_tables,
 )
@@ -77,7 +79,7 @@ def floating_source(found: FixedController, name: str, origin: Iterable[str]) ->
 
 def _tables(found: FixedController) -> list[Table]:
     controller, channels = found.controller, found.channels
-    names = channels.names
+    names, (first, second) = channels.names, section_comments(found)
     to_signal, force, to_volt = ("m/V", "N/m", "V/N") if found.is_modal else ("1", "1", "1")
     rate = "1" if found.study.electronics.estimator == "modal_phase" else "1/s"
 
@@ -96,16 +98,14 @@ def _tables(found: FixedController) -> list[Table]:
             "per volt of each sensor of the link; control.basis, patches", names,
         ),
         real(
-            "HIGH_PASS", channels.first, f"[{rate}; {rate}; 1] b0, b1, a1 of the first section of "
-            "the velocity estimate; highpass_hz or difference_cutoff_hz", names,
+            "HIGH_PASS", channels.first, f"[{rate}; {rate}; 1] b0, b1, a1 of the velocity "
+            f"estimate's first section: {first}", names,
         ),
         real(
-            "LOW_PASS", channels.denominator, "[1] a1, a2 of the second section; lowpass_ratio and "
-            "lowpass_zeta", names,
+            "LOW_PASS", channels.denominator, f"[1] a1, a2 of its second section: {second}", names,
         ),
         real(
-            "FORCE", channels.force, f"[{force}] numerator of the second section times the gains, "
-            "-k_d n_v - k_p n_x; control.velocity_gain, position_gain, ratios", names,
+            "FORCE", channels.force, f"[{force}] its numerator times the gains, {GAINS}", names,
         ),
         real(
             "SYNTHESIZER", channels.synthesizer, f"[{to_volt}] voltage of each actuator of the "

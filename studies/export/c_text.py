@@ -34,6 +34,23 @@ class Table(NamedTuple):
     rows: list[str] = []  # meaning of each row
 
 
+def section_comments(found: FixedController) -> tuple[str, str]:
+    """What the two sections of the velocity estimate are, and where their numbers come from."""
+    if found.study.electronics.estimator == "difference":
+        return (
+            "difference behind a low-pass; electronics.difference_cutoff_hz",
+            "no second section for the estimator `difference`",
+        )
+    return (
+        "high-pass; electronics.highpass_hz",
+        "low-pass; electronics.lowpass_ratio, lowpass_zeta, antialias_hz",
+    )
+
+
+#: Where the gains come from.
+GAINS = "-k_d n_v - k_p n_x; control.gain_factor, velocity_gain, position_gain, ratios, gain_unit"
+
+
 class Parts(NamedTuple):
     """What sets one kind of arithmetic apart; @ stands for the prefix in capitals."""
 
@@ -57,7 +74,7 @@ def structure_tables(channels: Channels) -> list[Table]:
     used = np.isin(np.arange(3), channels.link)
     return [
         Table("uint16_t", "IS_USED", used.astype(int), "1: link is controlled; control.links"),
-        Table("uint16_t", "LINK", channels.link, "link of each channel, from 0; control"),
+        Table("uint16_t", "LINK", channels.link, "link of each controlled mode, from 0; control"),
     ]
 
 
@@ -80,7 +97,8 @@ def filled(parts: Parts, found: FixedController, name: str, origin: Iterable[str
         name: prefix of functions and types, and name of the files.
         origin: lines that say where the numbers come from.
     """
-    rate = found.study.electronics.sample_rate_hz
+    electronics = found.study.electronics
+    rate = electronics.sample_rate_hz
     rail = rail_samples(rate)
     has_memory = any(table.name == "FEEDTHROUGH" for table in parts.tables)
     kept = f"    {parts.command_type} command[@_N_CHANNELS]; /* on the actuators now */"
@@ -89,6 +107,11 @@ def filled(parts: Parts, found: FixedController, name: str, origin: Iterable[str
         "members": "\n".join(members),
         "border": starred(parts.header["border"]),
         "n_links": 3, "n_patches": found.n_patches, "n_channels": 3 * found.n_patches,
+        "kind": f"{found.channels.kind}s".replace("patchs", "patches"),
+        "settle": found.channels.memory(1e-4),
+        "adc_bits": electronics.adc_bits, "adc_range": f"{electronics.adc_range:g}",
+        "gain": f"{electronics.conditioner_gain:g}", "bias": f"{electronics.conditioner_bias:g}",
+        "antialias": f"{electronics.antialias_hz:g}",
         "n_modes": len(found.channels.link), "rate": f"{rate:g}", "rate_literal": literal(rate),
         "rail": rail, "rail_ms": f"{1e3 * rail / rate:.3g}",
         "shaper_length": int(found.taps.sample.max()) + 1,

@@ -32,6 +32,16 @@ class Channels(NamedTuple):
         return [f"link {i + 1}, {self.kind} {j + 1}" for i, j in pairs]
 
     @property
+    def slowest_pole(self) -> float:
+        """Largest modulus of a pole of the filters [1]."""
+        poles = [np.roots([1.0, *denominator]) for denominator in self.denominator]
+        return float(max(np.abs([*self.first[:, 2], *np.concatenate(poles)])))
+
+    def memory(self, share: float) -> int:
+        """Samples after which only a share of the start is left, for a pole below 1."""
+        return int(np.ceil(np.log(share) / np.log(max(self.slowest_pole, 0.1)))) + 8
+
+    @property
     def has_direct(self) -> bool:
         return bool(np.any(self.direct))
 

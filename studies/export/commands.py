@@ -32,7 +32,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             ),
         ] = None,
         name: Annotated[str, typer.Option(help="of the files and C functions")] = "flexlink",
-        dac_bits: Annotated[int, typer.Option(help="of the DAC, for c-fixed")] = 12,
+        dac_bits: Annotated[
+            int | None, typer.Option(help="of the DAC, for c-fixed; default: 12")
+        ] = None,
     ) -> None:
         """Write the controller of a design for a real-time target, with proof."""
         start()

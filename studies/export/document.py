@@ -41,7 +41,9 @@ class Masks(Part):
     """What is controlled."""
 
     links: list[bool] = Field(min_length=3, max_length=3)
-    modes: list[list[bool]] = Field(description="per link and channel", min_length=3, max_length=3)
+    modes: list[list[bool]] = Field(
+        description="per link and mode (or patch)", min_length=3, max_length=3
+    )
 
 
 class Document(Part):
@@ -55,15 +57,16 @@ class Document(Part):
     versions: dict[str, str]
     law: Literal["imsc", "srf"]
     estimator: Literal["modal_phase", "difference"]
-    order: str = Field(description="how channels of sensors and actuators are numbered")
+    order: str = Field(description="how wires of sensors and actuators are numbered")
     steps: list[str] = Field(description="the arithmetic of one sample, in words")
     masks: Masks
     numbers: dict[str, Quantity]
     study: dict[str, Any] = Field(description="the complete study, as a study file holds it")
 
 
-ORDER = "channel = patches_per_link * (link - 1) + patch, from 1; patches counted from the slider"
+ORDER = "wire = patches_per_link * (link - 1) + patch, from 1; patches counted from the slider"
 STEPS = [
+    "for each link by itself; memory, w1, w2 and the last command are 0 at the start",
     "sensor = (adc_code * adc_step - conditioner_bias) / conditioner_gain",
     "sensor = sensor - feedthrough @ command of the last sample",
     "signal = modal_filter @ sensor",
@@ -72,10 +75,11 @@ STEPS = [
     "velocity = sum of velocity_numerator * (w, w1, w2); position likewise; then w2 = w1, w1 = w",
     "force = -velocity_gain * velocity - position_gain * (position + position_direct * signal)",
     "command = synthesizer @ force, limited to +-voltage_limit; it goes out at the next sample",
+    "a sensor that is no number, out of range or 10 ms at one end of it: all commands 0, until "
+    "started again",
     "reference: shaped pose = sum over taps of shaper_weight * pose shaper_delay samples ago",
 ]
-_LINK, _CHANNEL, _PATCH = "link", "channel", "patch"
-_EACH = [_LINK, _CHANNEL]
+_LINK, _PATCH = "link", "patch"
 
 
 def study_hash(study: Study) -> str:
@@ -124,13 +128,16 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
     rate = "1" if is_phase else "1/s"
     last = "1/s" if is_phase else "1"
 
+    channel = found.channels.kind
+    each_axes = [_LINK, channel]
+
     def one(value: Any, unit: str, meaning: str, axes: list[str] | None = None) -> Quantity:
         return Quantity(
             value=np.asarray(value).tolist(), unit=unit, axes=axes or [], meaning=meaning
         )
 
     def each(value: Any, unit: str, meaning: str) -> Quantity:
-        return one(np.broadcast_to(value, shape), unit, meaning, _EACH)
+        return one(np.broadcast_to(value, shape), unit, meaning, each_axes)
 
     return {
         "sample_rate": one(electronics.sample_rate_hz, "Hz", "how often a sample is taken"),
@@ -149,9 +156,9 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
         ),
         "modal_filter": one(
             controller.filter, to_signal, "channel signal of each sensor voltage",
-            [*_EACH, _PATCH],
+            [*each_axes, _PATCH],
         ),
-        "channel_frequency": one(found.frequency, "Hz", "velocity estimate is exact there", _EACH),
+        "channel_frequency": each(found.frequency, "Hz", "the velocity estimate is exact there"),
         "high_pass_b0": each(estimator.first[0], rate, "first section, numerator"),
         "high_pass_b1": each(estimator.first[1], rate, "first section, numerator of z^-1"),
         "high_pass_a1": each(estimator.first[2], "1", "first section, denominator of z^-1"),
@@ -159,11 +166,11 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
         "low_pass_a2": each(estimator.denominator[1], "1", "second section, denominator of z^-2"),
         "velocity_numerator": one(
             np.stack([np.broadcast_to(x, shape) for x in estimator.velocity], axis=2), last,
-            "second section, numerator of the velocity", [*_EACH, "power of z^-1"],
+            "second section, numerator of the velocity", [*each_axes, "power of z^-1"],
         ),
         "position_numerator": one(
             np.stack([np.broadcast_to(x, shape) for x in estimator.position], axis=2), "1",
-            "second section, numerator of the position", [*_EACH, "power of z^-1"],
+            "second section, numerator of the position", [*each_axes, "power of z^-1"],
         ),
         "position_direct": each(estimator.direct, "1", "share of the signal in the position"),
         "velocity_gain": each(
@@ -174,7 +181,7 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
         ),
         "synthesizer": one(
             controller.synthesizer, from_force, "voltages of a channel's force",
-            [_LINK, _PATCH, _CHANNEL],
+            [_LINK, _PATCH, channel],
         ),
         "voltage_limit": one(controller.voltage_limit, "V", "of every actuator, +-"),
         "shaper_weight": one(found.taps.weight, "1", "of each tap of the input shaper", ["tap"]),

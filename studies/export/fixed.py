@@ -133,15 +133,10 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
         StudyError: what cannot be represented, with the number and the way out.
     """
     controller, channels = found.controller, found.channels
-    bits = found.study.electronics.adc_bits
-    if bits > ADC_BITS:
-        raise field_error(
-            "electronics.adc_bits", bits, f"up to {ADC_BITS} for fixed point: codes are 16-bit "
-            "words (or --target c)", "1",
-        )  # fmt: skip
+    check_words(found)
     rest = 2 ** (dac_bits - 1)
     dac_step = float(controller.voltage_limit) / (rest - 1)
-    memory = _memory(found)
+    memory = channels.memory(FORGOTTEN)
     gains = peak_gains(channels, memory)
     code = float(controller.adc_step / controller.adc_gain)  # one ADC code at the sensor [V]
     sensor = _sensor_bound(controller)  # (3, K)
@@ -197,24 +192,28 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
     return fixed._replace(error=error)
 
 
-def _memory(found: FixedController) -> int:
-    """Samples after which all filters have forgotten."""
-    worst = 0.0
-    for first, denominator in zip(found.channels.first, found.channels.denominator, strict=True):
-        poles = np.roots([1.0, *denominator])
-        worst = max(worst, abs(first[2]), np.abs(poles).max(initial=0.0))
+def check_words(found: FixedController) -> None:
+    """Refuse converters and filters that words cannot carry, before anything runs.
+
+    Raises:
+        StudyError: codes too long, or a filter that keeps rounding errors for too long.
+    """
     electronics = found.study.electronics
+    if electronics.adc_bits > ADC_BITS:
+        raise field_error(
+            "electronics.adc_bits", electronics.adc_bits, f"up to {ADC_BITS} for fixed point: "
+            "codes are 16-bit words (or --target c)", "1",
+        )  # fmt: skip
     slowest = 1 + np.log(FORGOTTEN) / LONGEST_MEMORY  # pole that forgets just in time
-    if worst > slowest:
+    if found.channels.slowest_pole > slowest:
         rate = electronics.sample_rate_hz
         lowest = -np.log(slowest) * rate / (2 * np.pi)
         raise field_error(
             "electronics.highpass_hz", electronics.highpass_hz,
             f"from {lowest:.3g} for fixed point at electronics.sample_rate_hz = {rate:g}: a filter "
-            f"with its pole at {worst:.12g} keeps rounding errors for too long (or --target c)",
-            "Hz",
+            f"with its pole at {found.channels.slowest_pole:.12g} keeps rounding errors for too "
+            "long (or --target c)", "Hz",
         )  # fmt: skip
-    return int(np.ceil(np.log(FORGOTTEN) / np.log(max(worst, 0.1)))) + 8
 
 
 def _responses(channels: Channels, m: int, n: int) -> tuple[np.ndarray, ...]:

@@ -33,7 +33,8 @@ def report(
     lines = [f"# Verification: {verdict}", "", *(f"- {line}" for line in origin), ""]
     lines += [
         f"Linearised sampled loop with the exported coefficients: spectral radius "
-        f"{loop.spectral_radius:.6f}, gain margin {loop.gain_margin:.3f}.", "",
+        f"{loop.spectral_radius:.6f}, gain margin {loop.gain_margin:.3f} "
+        f"({20 * np.log10(loop.gain_margin):.1f} dB).", "",
         "## Comparisons", "",
         "Relative differences are those of actuator voltages, over the largest one. Open loop: "
         "both controllers get the same sequence of ADC codes.", "",
@@ -43,7 +44,8 @@ def report(
         mark = "ok" if check.is_met else "**FAILED**"
         lines.append(f"| {check.what} | {check.found} | {check.allowed} | {mark} |")
     lines += [*([""] if verified.notes else []), *verified.notes]
-    lines += _in_the_loop(found, verified)
+    if len(verified.runs) > 1:
+        lines += _in_the_loop(found, verified)
     if fixed is not None and cost is not None:
         lines += _fixed(found, fixed, cost, verified)
     return "\n".join(lines) + "\n"
@@ -55,7 +57,7 @@ def _in_the_loop(found: FixedController, verified: Verification) -> list[str]:
         "", "## In the loop", "",
         f"The case's motion ({found.structure.n_steps} samples), the plant in JAX. One ADC code "
         "that differs ends exact agreement: from there on both runs are right and different.", "",
-        "| controller | residual rms of links 1, 2, 3 [um] | more than JAX | actuator voltage | "
+        "| controller | residual rms of links 1, 2, 3 [um] | against JAX | actuator voltage | "
         "platform x, y [nm], phi [urad] | ADC codes differ from sample |",
         "|---|---|---|---|---|---|",
     ]  # fmt: skip
@@ -63,7 +65,8 @@ def _in_the_loop(found: FixedController, verified: Verification) -> list[str]:
         rms = " / ".join(f"{1e6 * x:.5f}" for x in np.max(run.result.metrics.residual_rms, axis=1))
         if name == "JAX":
             peak = np.abs(run.voltage).max()
-            lines.append(f"| JAX | {rms} | | peak {peak:.4g} V | | |")
+            share = 100 * peak / float(found.controller.voltage_limit)
+            lines.append(f"| JAX | {rms} | | peak {peak:.4g} V, {share:.2g} % of the limit | | |")
             continue
         at = verified.beside(name)
         x, y, phi = at.pose * (1e9, 1e9, 1e6)
@@ -76,7 +79,7 @@ def _in_the_loop(found: FixedController, verified: Verification) -> list[str]:
     deflection = float(code) * np.abs(channel_gain(found)).max()
     return [
         *lines, "",
-        f"More than JAX: rms over the three links. One ADC code stands for {1e3 * code:.3g} mV at "
+        f"Against JAX: rms over the three links. One ADC code stands for {1e3 * code:.3g} mV at "
         f"a sensor, up to {1e6 * deflection:.2g} um in the first controlled channel: residuals far "
         "below are decided by which code the noise falls on, and differ from run to run.",
     ]  # fmt: skip
@@ -105,17 +108,18 @@ def _fixed(
         + ("" if np.all(np.isfinite(fixed.error.total)) else " With its feed-through the DAC's "
            "rounding comes back, and no bound holds for the whole."), "",
         "Formats: value = base x integer / 2^Q, base = what the simulation shows. Room: the "
-        "largest value of the word, in units of base; codes: the largest value that any sequence "
+        "largest value of the word, in units of base; reach: the largest value that any sequence "
         "of ADC codes can produce, in the same. Smallest margin over the simulation: "
         f"{margin:.0f} (at least {MARGIN}).", "", "```", *format_lines(fixed, found), "```", "",
         f"Cost: {cost.text}; {cost.roundings} roundings with limit, {cost.words} words of 16 bits "
         "for both states. Cycles are counted generously from instructions, not measured.", "",
-        "| sequence | samples | internal overflow | actuator at its limit | at rest by fault |",
+        "| sequence | samples | overflows inside | samples with an actuator at its limit | "
+        "samples at rest by a fault |",
         "|---|---|---|---|---|",
     ]  # fmt: skip
     for name, response in verified.counts.items():
         lines.append(
             f"| {name} | {len(response.codes)} | {int(response.limited.sum())} | "
-            f"{int(response.saturated.sum())} | {int(response.is_faulty.sum())} |"
+            f"{int(np.sum(response.saturated > 0))} | {int(response.is_faulty.sum())} |"
         )
     return lines

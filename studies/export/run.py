@@ -26,7 +26,7 @@ from studies.export.compiler import NO_COMPILER, find_compiler
 from studies.export.controller import FixedController, fixed_controller
 from studies.export.cost import cost_of
 from studies.export.document import document, schema, study_hash, to_json
-from studies.export.fixed import design_fixed, rail_samples, rounded
+from studies.export.fixed import check_words, design_fixed, rail_samples, rounded
 from studies.export.floating import respond
 from studies.export.in_the_loop import LoopRun
 from studies.export.report import report
@@ -44,10 +44,12 @@ TARGETS = ("json", "c", "c-fixed")
 REPORT, FAILED = "verification.md", "verification-failed.md"
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,30}")
 _DAC_BITS = (4, 16)
+DAC_BITS = 12
 
 
 def export_design(
-    design: Design, target: str, out: Path, is_verified: bool | None, name: str, dac_bits: int,
+    design: Design, target: str, out: Path, is_verified: bool | None, name: str,
+    dac_bits: int | None,
     console: Console,
 ) -> bool:  # fmt: skip
     """Write a controller, verified where asked for.
@@ -58,7 +60,7 @@ def export_design(
         out: folder for the files, made where it is missing.
         is_verified: whether to compare with the JAX controller; None: where there is a compiler.
         name: of the files, prefix of C functions.
-        dac_bits: resolution of the DAC, for "c-fixed".
+        dac_bits: resolution of the DAC, for "c-fixed" alone; None: `DAC_BITS`.
         console: to tell what happens.
 
     Returns:
@@ -80,6 +82,8 @@ def export_design(
 
     found = fixed_controller(design.study)
     origin = _origin(found, design.case_id)
+    if target == "c-fixed":
+        check_words(found)
     loop = _judged(found, found.channels, "")
     reference = _reference(found, console) if is_verified or target == "c-fixed" else None
     files: dict[str, str]
@@ -100,7 +104,7 @@ def export_design(
     else:
         assert reference is not None
         seen = respond(found.channels, found.controller, reference.codes)
-        fixed = design_fixed(found, seen, dac_bits)
+        fixed = design_fixed(found, seen, dac_bits or DAC_BITS)
         loop = _judged(found, rounded(fixed, found.channels), ", coefficients rounded to 32 bits")
         cost = cost_of(found, fixed)
         source = fixed_source(found, fixed, name, origin, cost.text)
@@ -119,11 +123,15 @@ def export_design(
     return is_good
 
 
-def _check_arguments(target: str, name: str, dac_bits: int) -> None:
+def _check_arguments(target: str, name: str, dac_bits: int | None) -> None:
     if target not in TARGETS:
         raise field_error("--target", target, ", ".join(TARGETS))
     if not _NAME.fullmatch(name) or name == "stdint":  # the header that the code includes
         raise field_error("--name", name, "letters, digits and _, 31 at most, a letter first")
+    if dac_bits is None:
+        return
+    if target != "c-fixed":
+        raise StudyError(f"--dac-bits {dac_bits}: not allowed with --target {target}; leave it out")
     low, high = _DAC_BITS
     if not low <= dac_bits <= high:
         raise field_error("--dac-bits", dac_bits, f"{low} to {high}", "1")

@@ -23,6 +23,7 @@ from studies.export.in_the_loop import LoopRun, jax_law, replay, run_in_the_loop
 from studies.export.integers import Response, shifted
 from studies.export.integers import respond as respond_fixed
 from studies.export.sequences import hard_sequences, stuck_at_end
+from studies.runs import describe
 
 #: Double precision against JAX, largest difference over largest value [1].
 DOUBLE = 1e-12
@@ -160,7 +161,7 @@ def verify_fixed(
             "recorded codes": reference.codes, "own run in the loop": own.codes,
             **_hard(found, reference),
             "stuck at the end of the range": _stuck(found, reference),
-            "all 16-bit words": np.random.default_rng(1).integers(0, 2**16, (50, *shape)),
+            "words beyond the ADC's codes": np.random.default_rng(1).integers(0, 2**16, (50, *shape)),
         }  # fmt: skip
         counts = _modelled(fixed, sequences, rail)
         for label, codes in sequences.items():
@@ -344,8 +345,8 @@ def _same_status(runs: dict[str, LoopRun]) -> list[Check]:
     first, *others = runs.items()
     return [
         Check(
-            f"status in the loop, {name}", str(int(run.result.status)),
-            str(int(first[1].result.status)), bool(run.result.status == first[1].result.status),
+            f"status in the loop, {name}", describe(int(run.result.status)),
+            describe(int(first[1].result.status)), bool(run.result.status == first[1].result.status),
         )
         for name, run in others
     ]  # fmt: skip

@@ -7,8 +7,12 @@ $origin
  *   2. call ${name}_step; its actuator values go out at the next sample.
  * That one sample of delay is part of the design. Begin with ${name}_init.
  *
- * Channels: $n_patches patch pairs per link, link 1 first, each from the slider to the platform.
+ * Wires: $n_patches patch pairs per link, link 1 first, each link's from the slider to the platform.
+ * Front end: ADC of $adc_bits bits for 0 to $adc_range V; before it a conditioner of gain $gain and bias
+ * $bias V, and a second-order Butterworth filter at $antialias Hz, which the design counts on.
+ * Polarity: a positive voltage at actuator n must raise sensor n.
 $border
+ * Start: amplifiers off, ${name}_init, then ${name}_step for ${NAME}_SETTLE_SAMPLES samples.
  *
  * No allocation, no recursion, no library; all memory is in the two structures below.
  */
@@ -25,16 +29,17 @@ $types
 #define ${NAME}_N_LINKS $n_links
 #define ${NAME}_N_PATCHES $n_patches
 #define ${NAME}_N_CHANNELS $n_channels
-#define ${NAME}_N_MODES $n_modes /* controlled channels of all links together */
+#define ${NAME}_N_MODES $n_modes /* controlled $kind of all links together */
 #define ${NAME}_SAMPLE_RATE $rate_literal /* Hz */
-#define ${NAME}_RAIL_SAMPLES $rail /* $rail_ms ms at the end of its range make a sensor faulty */
+#define ${NAME}_RAIL_SAMPLES $rail /* $rail_ms ms at one end of its range: a faulty sensor */
+#define ${NAME}_SETTLE_SAMPLES $settle /* until the filters have forgotten 99.99 % of the start */
 #define ${NAME}_SHAPER_LENGTH $shaper_length /* samples that the shaper remembers */
 $constants
 
 /* What the controller remembers from sample to sample. */
 typedef struct {
 $members
-    int16_t rail[${NAME}_N_CHANNELS]; /* samples at the highest value, minus those at 0 */
+    int16_t rail[${NAME}_N_CHANNELS]; /* consecutive samples at the top, or minus those at 0 */
     int fault; /* number of the first faulty sensor, from 1; 0: none */
 } ${name}_state;
 

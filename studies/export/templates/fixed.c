@@ -7,8 +7,10 @@ $origin
  * right with rounding and limited to 32 bits. So coefficient = integer / 2^shift, and its unit is counts
  * of the result per count of what it multiplies.
  *
- * Formats: value = one per unit * integer / 2^Q. One per unit is the range in the simulated motion.
- * The word has room for so many times that, and ADC codes can make at most so many times that.
+ * Formats: value = base * integer / 2^Q. The base is the largest value in the simulated motion; a word
+ * has room for `room` times that, and no ADC codes can make more than `reach` times that. A coefficient
+ * from signal a to signal b, in SI units, is integer / 2^shift * (base_b / 2^Q_b) / (base_a / 2^Q_a);
+ * one ADC code is $code V at a sensor, one DAC code $dac V at an actuator.
  *
 $formats
  *

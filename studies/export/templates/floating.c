@@ -6,6 +6,10 @@ $origin
  */
 #include "$name.h"
 
+#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
+#error "compile without -ffast-math and -ffinite-math-only: they leave out the check for NaN"
+#endif
+
 typedef ${name}_real real;
 #define R(x) ((real)(x))
 
