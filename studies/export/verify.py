@@ -161,7 +161,9 @@ def verify_fixed(
             "recorded codes": reference.codes, "own run in the loop": own.codes,
             **_hard(found, reference),
             "stuck at the end of the range": _stuck(found, reference),
-            "words beyond the ADC's codes": np.random.default_rng(1).integers(0, 2**16, (50, *shape)),
+            "words beyond the ADC's codes": np.random.default_rng(1).integers(
+                0, 2**16, (50, *shape)
+            ),
         }  # fmt: skip
         counts = _modelled(fixed, sequences, rail)
         for label, codes in sequences.items():
@@ -342,11 +344,10 @@ def _check_error(fixed: FixedPoint, reference: LoopRun, response: Response) -> C
 
 
 def _same_status(runs: dict[str, LoopRun]) -> list[Check]:
-    first, *others = runs.items()
+    """Every run must end as that with the JAX controller."""
+    wanted, *others = (describe(int(run.result.status)) for run in runs.values())
+    names = list(runs)[1:]
     return [
-        Check(
-            f"status in the loop, {name}", describe(int(run.result.status)),
-            describe(int(first[1].result.status)), bool(run.result.status == first[1].result.status),
-        )
-        for name, run in others
-    ]  # fmt: skip
+        Check(f"status in the loop, {name}", found, wanted, found == wanted)
+        for name, found in zip(names, others, strict=True)
+    ]
