@@ -7,6 +7,7 @@ import os
 import re
 from contextlib import ExitStack
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,9 +25,9 @@ from studies.export.c_text import Source
 from studies.export.channels import Channels, unfold
 from studies.export.compiler import NO_COMPILER, find_compiler
 from studies.export.controller import FixedController, fixed_controller
-from studies.export.cost import cost_of
+from studies.export.cost import Cost, cost_of
 from studies.export.document import document, schema, study_hash, to_json
-from studies.export.fixed import check_words, design_fixed, rail_samples, rounded
+from studies.export.fixed import FixedPoint, check_words, design_fixed, rail_samples, rounded
 from studies.export.floating import respond
 from studies.export.in_the_loop import LoopRun
 from studies.export.report import report
@@ -49,8 +50,7 @@ DAC_BITS = 12
 
 def export_design(
     design: Design, target: str, out: Path, is_verified: bool | None, name: str,
-    dac_bits: int | None,
-    console: Console,
+    dac_bits: int | None, console: Console,
 ) -> bool:  # fmt: skip
     """Write a controller, verified where asked for.
 
@@ -81,46 +81,84 @@ def export_design(
     is_verified = True if is_verified is None else is_verified
 
     found = fixed_controller(design.study)
-    origin = _origin(found, design.case_id)
-    if target == "c-fixed":
-        check_words(found)
-    loop = _judged(found, found.channels, "")
-    reference = _reference(found, console) if is_verified or target == "c-fixed" else None
-    files: dict[str, str]
-    verified, fixed, cost = None, None, None
-    if target == "json":
-        described = document(found, design.case_id)
-        files = {
-            f"{name}.json": to_json(described),
-            f"{name}.schema.json": json.dumps(schema(), indent=1) + "\n",
-        }
-        if is_verified and reference is not None:
-            verified = verify_document(found, reference, described)
-    elif target == "c":
-        source = floating_source(found, name, origin)
-        files = _files(source, name)
-        if is_verified and reference is not None:
-            verified = verify_floating(found, reference, source, name, compiler)
-    else:
-        assert reference is not None
-        seen = respond(found.channels, found.controller, reference.codes)
-        fixed = design_fixed(found, seen, dac_bits or DAC_BITS)
-        loop = _judged(found, rounded(fixed, found.channels), ", coefficients rounded to 32 bits")
-        cost = cost_of(found, fixed)
-        source = fixed_source(found, fixed, name, origin, cost.text)
-        files = _files(source, name)
-        if is_verified:
-            verified = verify_fixed(found, fixed, reference, source, name, compiler)
-        console.print(cost.text)
+    job = _Job(
+        found, name, _origin(found, design.case_id), design.case_id, compiler, is_verified,
+        dac_bits or DAC_BITS, console,
+    )  # fmt: skip
+    made = {"json": _as_json, "c": _as_floating, "c-fixed": _as_fixed}[target](job)
+    verified = made.verified
     is_good = verified is None or verified.is_passed
-    texts = files if is_good else {}  # what an earlier export has left stays as it is
+    texts = made.files if is_good else {}  # what an earlier export has left stays as it is
     if verified is not None:
-        name = REPORT if is_good else FAILED
-        texts |= {name: report(found, origin, loop, verified, fixed, cost)}
+        text = report(found, job.origin, made.loop, verified, made.fixed, made.cost)
+        texts |= {REPORT if is_good else FAILED: text}
         _tell(verified, console)
-    stale = tuple(name for name in (REPORT, FAILED) if name not in texts) if is_good else ()
+    stale = tuple(file for file in (REPORT, FAILED) if file not in texts) if is_good else ()
     _write(out, texts, stale, console)
     return is_good
+
+
+class _Job(NamedTuple):
+    """What is to be exported, and how."""
+
+    found: FixedController
+    name: str
+    origin: list[str]
+    case_id: str
+    compiler: list[str]
+    is_verified: bool
+    dac_bits: int
+    console: Console
+
+
+class _Made(NamedTuple):
+    """What came out."""
+
+    files: dict[str, str]
+    loop: LoopReport  # with the exported coefficients
+    verified: Verification | None
+    fixed: FixedPoint | None = None
+    cost: Cost | None = None
+
+
+def _as_json(job: _Job) -> _Made:
+    loop = _judged(job.found, job.found.channels, "")
+    described = document(job.found, job.case_id)
+    files = {
+        f"{job.name}.json": to_json(described),
+        f"{job.name}.schema.json": json.dumps(schema(), indent=1) + "\n",
+    }
+    if not job.is_verified:
+        return _Made(files, loop, None)
+    return _Made(files, loop, verify_document(job.found, _reference(job), described))
+
+
+def _as_floating(job: _Job) -> _Made:
+    loop = _judged(job.found, job.found.channels, "")
+    source = floating_source(job.found, job.name, job.origin)
+    files = _files(source, job.name)
+    if not job.is_verified:
+        return _Made(files, loop, None)
+    reference = _reference(job)
+    verified = verify_floating(job.found, reference, source, job.name, job.compiler)
+    return _Made(files, loop, verified)
+
+
+def _as_fixed(job: _Job) -> _Made:
+    found = job.found
+    check_words(found)
+    _judged(found, found.channels, "")
+    reference = _reference(job)
+    seen = respond(found.channels, found.controller, reference.codes)
+    fixed = design_fixed(found, seen, job.dac_bits)
+    loop = _judged(found, rounded(fixed, found.channels), ", coefficients rounded to 32 bits")
+    cost = cost_of(found, fixed)
+    job.console.print(cost.text)
+    source = fixed_source(found, fixed, job.name, job.origin, cost.text)
+    verified = None
+    if job.is_verified:
+        verified = verify_fixed(found, fixed, reference, source, job.name, job.compiler)
+    return _Made(_files(source, job.name), loop, verified, fixed, cost)
 
 
 def _check_arguments(target: str, name: str, dac_bits: int | None) -> None:
@@ -186,9 +224,10 @@ def _judged(found: FixedController, channels: Channels, note: str) -> LoopReport
     return loop
 
 
-def _reference(found: FixedController, console: Console) -> LoopRun:
+def _reference(job: _Job) -> LoopRun:
     """The case's motion with the JAX controller, which must run to its end."""
-    console.print(f"in the loop: {found.structure.n_steps} samples for each controller")
+    found = job.found
+    job.console.print(f"in the loop: {found.structure.n_steps} samples for each controller")
     run = reference_run(found)
     code = int(run.result.status)
     if code not in status.FINISHED:
