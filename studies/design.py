@@ -43,12 +43,7 @@ def load_design(path: Path, case: int | str | None = None) -> Design:
     if (path / TUNING).is_file():
         return Design(load_study(_tuned(path, case)), {})
     data = load(path)
-    if case is None:
-        raise StudyError(
-            f"--case is missing: allowed 0 to {data.n_cases - 1}, the cases of {path}, or id: and "
-            "the first digits of a case's id"
-        )
-    number = _number(data, str(case), path)
+    number = _number(data, None if case is None else str(case), path)
     table = build_table(parse_sweep(read_manifest(path)["spec"]))
     code = int(data["status"][number])
     try:
@@ -60,7 +55,7 @@ def load_design(path: Path, case: int | str | None = None) -> Design:
     steps = int(data["substeps"][number]) if "substeps" in data.variables else -1
     if steps > 0:
         study = study.change(run__substeps=steps)
-    case_id = str(data["case_id"].astype(str)[number])
+    case_id = str(data["case_id"][number])
     if code == NOT_RUN:
         return Design(study, {}, case_id)
     names = ["status", *(name for name in metric_names() if name in data.variables)]
@@ -82,8 +77,14 @@ def _tuned(path: Path, case: str | int | None) -> Path:
     return files[str(case)]
 
 
-def _number(data: SweepData, case: str, path: Path) -> int:
+def _number(data: SweepData, case: str | None, path: Path) -> int:
     """Number of the case that is meant."""
+    known = (
+        f"allowed 0 to {data.n_cases - 1}, the cases of {path}, or id: and the first digits of a "
+        "case's id"
+    )
+    if case is None:
+        raise StudyError(f"--case is missing: {known}")
     if case.startswith("id:"):
         ids = data["case_id"].astype(str)
         found = np.flatnonzero(np.char.startswith(ids, case.removeprefix("id:").lower()))
@@ -92,10 +93,7 @@ def _number(data: SweepData, case: str, path: Path) -> int:
         return int(found[0])
     is_number = case.isascii() and case.isdigit() and len(case) < 20
     if not is_number or int(case) >= data.n_cases:
-        raise StudyError(
-            f"--case {case}: allowed 0 to {data.n_cases - 1}, the cases of {path}, or id: and the "
-            "first digits of a case's id"
-        )
+        raise StudyError(f"--case {case}: {known}")
     return int(case)
 
 

@@ -26,7 +26,7 @@ NO_COMPILER = "no C compiler found (the command in the variable CC if it is set,
 
 
 class Code(NamedTuple):
-    """A compiled controller. Each call of `step` runs a whole sequence from rest."""
+    """A compiled controller, with room for its state."""
 
     library: ctypes.CDLL
     name: str

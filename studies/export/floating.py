@@ -6,19 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxmodel.controller import Controller
+from jaxmodel.controller import Controller, read_back
 from studies.export.channels import Channels
 
 
 class Signals(NamedTuple):
     """Signals of a controller over time; leading axes (T, ...)."""
 
-    sensor: np.ndarray  # feed-through taken off [V], (..., 3, K)
     signal: np.ndarray  # of the channels [m] or [V], (..., M)
     high: np.ndarray  # behind the first section, (..., M)
     inner: np.ndarray  # delay line of the second section, (..., M)
     force: np.ndarray  # [N] or [V], (..., M)
-    wanted: np.ndarray  # voltage before the limit [V], (..., 3, K)
     command: np.ndarray  # [V], (..., 3, K)
 
 
@@ -48,15 +46,14 @@ def respond_from(
     back = np.zeros((3, *channels.synthesizer.shape))
     back[link, np.arange(len(link))] = channels.synthesizer
     for code in codes:
-        level = (code * controller.adc_step - controller.adc_bias) / controller.adc_gain
-        sensor = level - np.einsum("ikl,...il->...ik", controller.feedthrough, command)
+        own = np.einsum("ikl,...il->...ik", controller.feedthrough, command)
+        sensor = read_back(controller, code) - own
         signal = np.einsum("mk,...mk->...m", channels.filter, sensor[..., link, :])
         high = b0 * signal + memory
         memory = b1 * signal - a1 * high
         inner = high - d1 * line[0] - d2 * line[1]
         force = c0 * inner + c1 * line[0] + c2 * line[1] + channels.direct * signal
         line = (inner, line[0])
-        wanted = np.einsum("imk,...m->...ik", back, force)
-        command = np.clip(wanted, -limit, limit)
-        rows.append((sensor, signal, high, inner, force, wanted, command))
+        command = np.clip(np.einsum("imk,...m->...ik", back, force), -limit, limit)
+        rows.append((signal, high, inner, force, command))
     return Signals(*map(np.stack, zip(*rows, strict=True)))

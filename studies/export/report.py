@@ -76,18 +76,13 @@ def _in_the_loop(found: FixedController, verified: Verification) -> list[str]:
             f"differs by {x:.2e}, {y:.2e}, {phi:.2e} | {first} |"
         )
     code = found.controller.adc_step / found.controller.adc_gain
-    deflection = float(code) * np.abs(channel_gain(found)).max()
+    deflection = float(code) * np.abs(found.controller.filter[:, 0]).max()
     return [
         *lines, "",
         f"Against JAX: rms over the three links. One ADC code stands for {1e3 * code:.3g} mV at "
         f"a sensor, up to {1e6 * deflection:.2g} um in the first controlled channel: residuals far "
         "below are decided by which code the noise falls on, and differ from run to run.",
     ]  # fmt: skip
-
-
-def channel_gain(found: FixedController) -> np.ndarray:
-    """First channel's signal per sensor volt, (3, K)."""
-    return found.controller.filter[:, 0]
 
 
 def _fixed(

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 import jax
@@ -201,14 +200,12 @@ def _modelled(
     }
 
 
-@contextmanager
 def _loaded(
     found: FixedController, source: Source, name: str, compiler: list[str],
     real: type, reference: type,
-) -> Iterator[Code]:  # fmt: skip
+) -> AbstractContextManager[Code]:  # fmt: skip
     sizes = (3 * found.n_patches, len(found.channels.link), int(found.taps.sample.max()) + 1)
-    with compiled(source, name, compiler, real, reference, sizes) as code:
-        yield code
+    return compiled(source, name, compiler, real, reference, sizes)
 
 
 def _hard(found: FixedController, reference: LoopRun) -> dict[str, np.ndarray]:
@@ -310,12 +307,7 @@ def _check_shaper(found: FixedController, code: Code) -> Check:
     counts = np.round(path * scale).astype(np.int64)
     given = code.shape(counts)
     row = shaper_row(found.taps)
-    longest = int(found.taps.sample.max())
-    padded = np.concatenate([np.repeat(counts[:1], longest, axis=0), counts])
-    total = sum(
-        weight * padded[longest - delay : longest - delay + len(path)]
-        for weight, delay in zip(row.integers[0], found.taps.sample, strict=True)
-    )
+    total = _shaped(found.taps._replace(weight=row.integers[0]), counts)
     differing = int(np.sum(given != shifted(total, row.shift[0])))
     off = np.abs(given / scale - shaped).max() * scale
     # half a count of the reference, half of the result, and what JAX's path differs by
