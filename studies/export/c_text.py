@@ -116,19 +116,26 @@ def filled(parts: Parts, found: FixedController, name: str, origin: Iterable[str
         "rail": rail, "rail_ms": f"{1e3 * rail / rate:.3g}",
         "shaper_length": int(found.taps.sample.max()) + 1,
     }  # fmt: skip
-    code = parts.more | {
+    common = {
+        "name": name, "NAME": name.upper(), "origin": starred(origin),
         "forget_command": "        state->command[k] = 0;\n" if has_memory else "",
+    }  # fmt: skip
+    code = parts.more | {
+        "state": _template("state.c").substitute(common | header).rstrip(),
         "subtract_feedthrough": parts.subtract_feedthrough if has_memory else "",
         "keep_command": parts.keep_command if has_memory else "",
         "direct": parts.direct if found.channels.has_direct else "",
         "tables": "\n\n".join(_constant(table) for table in parts.tables),
     }
-    common = {"name": name, "NAME": name.upper(), "origin": starred(origin)}
-    texts = []
-    for file, values in (("controller.h", header), (parts.template, code)):
-        template = Template((_TEMPLATES / file).read_text(encoding="utf-8"))
-        texts.append(template.substitute(common | values).replace("@_", f"{name.upper()}_"))
+    texts = (
+        _template(file).substitute(common | values).replace("@_", f"{name.upper()}_")
+        for file, values in (("controller.h", header), (parts.template, code))
+    )
     return Source(*texts)
+
+
+def _template(file: str) -> Template:
+    return Template((_TEMPLATES / file).read_text(encoding="utf-8"))
 
 
 def _constant(table: Table) -> str:

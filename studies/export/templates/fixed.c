@@ -60,25 +60,7 @@ static int check(${name}_state *state, const uint16_t sensor[${NAME}_N_CHANNELS]
     return 0;
 }
 
-static void forget(${name}_state *state)
-{
-    int k;
-
-    for (k = 0; k < ${NAME}_N_MODES; k++) {
-        state->high[k] = 0;
-        state->line[k][0] = 0;
-        state->line[k][1] = 0;
-    }
-    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
-$forget_command        state->rail[k] = 0;
-    }
-}
-
-void ${name}_init(${name}_state *state)
-{
-    forget(state);
-    state->fault = 0;
-}
+$state
 
 int ${name}_step(${name}_state *state, const uint16_t sensor[${NAME}_N_CHANNELS],
     uint16_t actuator[${NAME}_N_CHANNELS])
@@ -142,19 +124,6 @@ $subtract_feedthrough    for (m = 0; m < ${NAME}_N_MODES; m++) {
 $keep_command        actuator[k] = (uint16_t)(command + DAC_REST);
     }
     return 0;
-}
-
-void ${name}_shape_init(${name}_shaper *shaper, const int32_t reference[3])
-{
-    uint32_t k;
-    int axis;
-
-    for (k = 0; k < ${NAME}_SHAPER_LENGTH; k++) {
-        for (axis = 0; axis < 3; axis++) {
-            shaper->past[k][axis] = reference[axis];
-        }
-    }
-    shaper->newest = 0;
 }
 
 void ${name}_shape_step(${name}_shaper *shaper, const int32_t reference[3], int32_t shaped[3])
