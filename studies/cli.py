@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from typer.exceptions import Abort, TyperException
 
+from studies.atlas.commands import add_commands as add_atlas
 from studies.config import start
 from studies.errors import StudyError, field_error
 from studies.export.commands import add_commands as add_export
@@ -266,6 +267,7 @@ def info() -> None:
 add_commands(app, console)
 add_tuning(app, console)
 add_export(app, console)
+add_atlas(app, console)
 
 
 if __name__ == "__main__":

@@ -223,7 +223,7 @@ def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:
         ideal_runs = [side.submit(_run_ideal, base, case, tell) for case in ideal]
         built = [build_paper_case(base, case) for case in off]
         structure = built[0][0]
-        frame = _frame(structure, built[0][1])
+        frame = frame_of(structure, built[0][1])
         results = [run_batches(structure, [arrays for _, arrays in built], tell)]
         energy_ratio = results[0].energy_ratio
         by_counterpart = {case.counterpart: energy_ratio[k] for k, case in enumerate(off)}
@@ -301,7 +301,8 @@ def _prepare_frame(structure: Structure, case: Case) -> Frame:
     return Frame(loop.modal_omega, shape, one_step / largest)
 
 
-def _frame(structure: Structure, case: Case) -> Frame:
+def frame_of(structure: Structure, case: Case) -> Frame:
+    """Modes of the controller and its ADC step, which all cases of one machine share."""
     return jax.tree.map(np.asarray, _prepare_frame(structure, case))
 
 

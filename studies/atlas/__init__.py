@@ -1,0 +1,26 @@
+"""How the links of one machine couple, and who gains when one of them is controlled.
+
+`subsets` runs every subset of controlled links and modes through the engine of sweeps, and
+`attribution` turns their residuals into effects, interactions and Shapley shares. `workspace` looks
+at natural modes on a grid of poses, `platform` splits the platform's error and takes frequency
+responses. `claims` holds the paper's statements against all that. `findings` is what they found;
+`plots`, `drawing` and `figures` show it, `report` writes it down, and `run` is `studies atlas`.
+"""
+
+from studies.atlas.attribution import effects, interaction, shapley
+from studies.atlas.platform import platform_error, responses
+from studies.atlas.subsets import Subsets, atlas_sweep, read_subsets
+from studies.atlas.workspace import map_workspace, natural_modes_at
+
+__all__ = [
+    "Subsets",
+    "atlas_sweep",
+    "effects",
+    "interaction",
+    "map_workspace",
+    "natural_modes_at",
+    "platform_error",
+    "read_subsets",
+    "responses",
+    "shapley",
+]

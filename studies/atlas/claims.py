@@ -1,0 +1,84 @@
+"""The paper's statements on coupling, held against all subsets."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from studies.atlas.subsets import Subsets, link_label
+from studies.report import TABLE_1
+
+#: Columns of Table 1 after the uncontrolled one: links 1 to 3, links 1 and 2, link 1.
+TABLE_1_LINKS = (0b111, 0b011, 0b001)
+#: Changes smaller than this are no change, in counts of signs [1].
+NO_CHANGE = 1e-3
+
+
+class Signs(NamedTuple):
+    """Table 1: change of the spectral peak of mode 1."""
+
+    paper: np.ndarray  # [1], (3 columns, 3 links)
+    ours: np.ndarray  # [1], (settings, 3, 3)
+    is_controlled: np.ndarray  # whether the column controls the link, (3, 3)
+
+    @property
+    def agree(self) -> np.ndarray:
+        """Whether both fall or both rise, (settings, 3, 3)."""
+        return np.sign(self.ours) == np.sign(self.paper)
+
+
+def table_1_signs(subsets: Subsets) -> Signs:
+    """Table 1 again: three links with two modes each, the others with the first mode only."""
+    table = np.array(TABLE_1).T
+    columns = [_modes_of(subsets, TABLE_1_LINKS[0], 2)]
+    columns += [_modes_of(subsets, links, 1) for links in TABLE_1_LINKS[1:]]
+    peak = subsets.peak[:, 0, :, :, 0]
+    on = (np.array(TABLE_1_LINKS)[:, None] >> np.arange(3)) & 1
+    return Signs(table[1:] / table[0] - 1, peak[:, columns] / peak[:, :1] - 1, on.astype(bool))
+
+
+def _modes_of(subsets: Subsets, links: int, count: int) -> int:
+    """Number of the subset with the first modes of some links."""
+    modes = subsets.modes
+    players = (i * modes + j for i in range(3) if links >> i & 1 for j in range(min(count, modes)))
+    return sum(1 << player for player in players)
+
+
+class Steps(NamedTuple):
+    """One more controlled link: all 12 steps between the 8 choices of links."""
+
+    labels: list[str]  # "1 -> 1+3", (12,)
+    is_controlled: np.ndarray  # which links are, after the step, (12, 3)
+    change: np.ndarray  # of the rms by TARGETS [1], (settings, windows, 5, 12)
+
+    @property
+    def rises(self) -> np.ndarray:
+        """How many of the 12 steps make it worse, (settings, windows, 5)."""
+        return np.sum(self.change > NO_CHANGE, axis=-1)
+
+
+def one_more_link(subsets: Subsets) -> Steps:
+    """Change of every residual when one more link is controlled."""
+    left = np.sqrt(np.maximum(1 - subsets.removed()[..., subsets.link_subsets], 0.0))
+    steps = [(a, a | 1 << i) for a in range(8) for i in range(3) if not a >> i & 1]
+    labels = [f"{link_label(a)} -> {link_label(b)}" for a, b in steps]
+    before, after = (left[..., [step[k] for step in steps]] for k in (0, 1))
+    on = (np.array(steps)[:, 1:] >> np.arange(3)) & 1
+    return Steps(labels, on.astype(bool), after / before - 1)
+
+
+class Halved(NamedTuple):
+    """Two controlled links: change of the platform's residual error."""
+
+    labels: list[str]  # "1+2", (3,)
+    change: np.ndarray  # [1], (settings, windows, 3)
+
+
+def two_links(subsets: Subsets) -> Halved:
+    """The paper's claim: with two links controlled the residual error falls by more than 50 %."""
+    pairs = [1 << i | 1 << k for i, k in combinations(range(3), 2)]
+    error = subsets.platform[..., subsets.link_subsets]
+    change = error[..., pairs] / error[..., :1] - 1
+    return Halved([link_label(pair) for pair in pairs], change)

@@ -1,0 +1,50 @@
+"""The command `studies atlas`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from studies.config import start
+
+
+def add_commands(app: typer.Typer, console: Console) -> None:
+    """Add the command to the command line."""
+
+    @app.command()
+    def atlas(
+        out: Annotated[Path, typer.Option(help="folder for data, figures and report")],
+        design: Annotated[
+            Path | None, typer.Argument(help="study file, folder of a tuning or a sweep; "
+                                             "default: the paper's design")
+        ] = None,
+        case: Annotated[
+            str | None, typer.Option(help="of a sweep: number or id:...; of a tuning: its family")
+        ] = None,
+        resume: Annotated[bool, typer.Option("--resume", help="go on with what is there")] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", help="no progress")] = False,
+    ) -> None:  # fmt: skip
+        """Every subset of controlled links and modes; modes over the workspace; platform error."""
+        start()
+        from studies.atlas.run import run_atlas
+        from studies.design import load_design
+        from studies.errors import StudyError
+        from studies.spec import paper_study
+
+        if design is not None:
+            study = load_design(design, case).study
+        elif case is not None:
+            raise StudyError(f"--case {case}: belongs to a DESIGN; name one, or leave --case out")
+        else:  # as in the paper, every run's ratios come from its own uncontrolled counterpart
+            study = paper_study().change(control__ratio_source="own_run")
+        if not run_atlas(study, out, resume, console, quiet):
+            print(
+                f"studies: interrupted; finished runs are safe, go on with --resume --out {out}",
+                file=sys.stderr,
+            )
+            sys.exit(130)
+        console.print(f"report: {out / 'report.md'}", soft_wrap=True)

@@ -1,0 +1,191 @@
+"""The mechanism drawn: guides, sliders, bent links, platform; still, as mode shapes, and moving."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxmodel.beam import build_basis
+from jaxmodel.case import Case, Structure
+from jaxmodel.dynamics import modal_chain
+from jaxmodel.parameters import Array
+from jaxmodel.prepare import prepare
+from studies.figures import SERIES, styled
+from studies.runs import check_run
+from studies.spec import Study
+
+#: Points along a link.
+_POINTS = 41
+#: Largest drawn deflection of a link, as a share of its length [1].
+DRAWN = 0.12
+#: Largest drawn displacement of the platform in a mode shape, as a share of a link's length [1].
+DRAWN_POSE = 0.05
+
+
+class Skeleton(NamedTuple):
+    """Where everything is, (T, ...) in metres."""
+
+    guide: np.ndarray  # ends of the guides, (3, 2, 2)
+    slider: np.ndarray  # B, (T, 3, 2)
+    joint: np.ndarray  # C, (T, 3, 2)
+    link: np.ndarray  # points along the links, (T, 3, points, 2)
+
+
+def skeleton(study: Study, pose: np.ndarray, q: np.ndarray, exaggeration: float) -> Skeleton:
+    """Positions of the machine's parts, with bending drawn larger than it is.
+
+    Args:
+        study: the machine.
+        pose: (x, y, phi) [m, m, rad], (T, 3).
+        q: modal coordinates of the plant [m], (T, 3, R).
+        exaggeration: factor on the bending [1].
+    """
+    structure, case = check_run(study.change(link__modes=q.shape[-1], control__feedback="none"))
+    slider, joint, link = (
+        np.asarray(part)
+        for part in _positions(structure._replace(n_steps=1), case, pose, q, exaggeration)
+    )
+    side = study.machine.guide_side
+    direction = np.array([[np.cos(a), np.sin(a)] for a in case.machine.geometry.guide_angle])
+    inward = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
+    start = -side / np.sqrt(12.0) * inward - side / 2 * direction
+    return Skeleton(np.stack([start, start + side * direction], axis=1), slider, joint, link)
+
+
+@partial(jax.jit, static_argnums=0)
+def _positions(
+    structure: Structure, case: Case, pose: Array, q: Array, exaggeration: Array
+) -> tuple[Array, Array, Array]:
+    plant = prepare(structure, case).loop.plant
+    machine = case.machine
+    along = jnp.linspace(0.0, 1.0, _POINTS)
+    shape = build_basis(
+        structure.basis, machine.beam, machine.patches, structure.n_modes,
+        along * machine.beam.length,
+    ).deflection_at  # fmt: skip
+    u = jnp.stack([plant.ux, plant.uy], axis=1)
+    n = jnp.stack([-plant.uy, plant.ux], axis=1)
+    corner = -plant.h0[:, None] * n - plant.s0[:, None] * u
+
+    def one(pose: Array, q: Array) -> tuple[Array, Array, Array]:
+        chain = modal_chain(plant, pose, jnp.zeros_like(pose), q, jnp.zeros_like(q))
+        slider = corner + chain.rho[:, None] * u
+        joint = pose[:2] + chain.cu[:, None] * u + chain.cn[:, None] * n
+        chord = joint - slider
+        across = jnp.stack([-chord[:, 1], chord[:, 0]], axis=1) / plant.length[:, None]
+        bent = exaggeration * jnp.einsum("isr,ir->is", shape, q)
+        straight = slider[:, None] + along[:, None] * chord[:, None]
+        return slider, joint, straight + bent[..., None] * across[:, None]
+
+    return jax.vmap(one)(pose, q)
+
+
+def draw_machine(
+    parts: Skeleton, k: int, ax: Axes | None = None, color: str = SERIES[0], alpha: float = 1.0
+) -> Axes:
+    """The machine at instant k of a `skeleton`.
+
+    Args:
+        parts: where everything is [m].
+        k: which instant.
+        ax: where to draw; a new figure where left out.
+        color: of links and platform.
+        alpha: opacity [1].
+    """
+    ax = plt.subplots(layout="constrained")[1] if ax is None else ax
+    for start, end in parts.guide:
+        ax.plot(*zip(1e3 * start, 1e3 * end, strict=True), color="#AAAAAA", linewidth=2.5, zorder=0)
+    ax.fill(*(1e3 * parts.joint[k].T), color=color, alpha=0.25 * alpha, linewidth=0)
+    for link in parts.link[k]:
+        ax.plot(*(1e3 * link.T), color=color, linewidth=1.6, alpha=alpha)
+    ax.plot(*(1e3 * parts.slider[k].T), "s", color="#333333", markersize=4, alpha=alpha)
+    ax.plot(*(1e3 * parts.joint[k].T), "o", color="#333333", markersize=2.5, alpha=alpha)
+    ax.set_aspect("equal")
+    ax.set_xlabel("x [mm]")
+    ax.set_ylabel("y [mm]")
+    return ax
+
+
+def mode_skeleton(study: Study, pose: np.ndarray, shape: np.ndarray) -> Skeleton:
+    """A natural mode at its two turning points and at rest, drawn large.
+
+    Args:
+        study: the machine.
+        pose: at rest [m, m, rad], (3,).
+        shape: of the mode over (X, q), (3 + 3R,).
+    """
+    length, q = study.link.length, shape[3:].reshape(3, -1)
+    size = np.abs(shape[:3]) * [1, 1, study.machine.joint_radius]
+    factor = min(
+        DRAWN * length / max(np.abs(q).max(), 1e-300), DRAWN_POSE * length / max(size.max(), 1e-300)
+    )
+    turn = np.array([0.0, 1.0, -1.0])
+    moved = pose + factor * turn[:, None] * shape[:3]
+    return skeleton(study, moved, factor * turn[:, None, None] * q, 1.0)
+
+
+def draw_mode(parts: Skeleton, ax: Axes | None = None) -> Axes:
+    """A `mode_skeleton`: at rest pale, at its turning points in two colours."""
+    ax = draw_machine(parts, 0, ax, "#999999", 0.6)
+    draw_machine(parts, 1, ax, SERIES[0])
+    return draw_machine(parts, 2, ax, SERIES[1], 0.8)
+
+
+class Clip(NamedTuple):
+    """Two motions of one machine, side by side."""
+
+    time: np.ndarray  # from the end of the command [s], (T,)
+    parts: tuple[Skeleton, Skeleton]
+    titles: tuple[str, str]
+    exaggeration: float
+
+
+def animate(clip: Clip, path: Path) -> None:
+    """Write the clip as a GIF.
+
+    Args:
+        clip: what moves.
+        path: file, whose name ends in .gif.
+    """
+    with styled():
+        figure = Figure(figsize=(7.4, 3.9), layout="constrained")
+        axes = figure.subplots(1, 2)
+        label = figure.supxlabel(" ", fontsize=9)
+        lines = [_moving(parts, ax) for parts, ax in zip(clip.parts, axes, strict=True)]
+        for ax, title in zip(axes, clip.titles, strict=True):
+            ax.set_title(title)
+            ax.set_axis_off()
+
+        def frame(k: int) -> list:
+            label.set_text(
+                f"{1e3 * clip.time[k]:+.0f} ms from the end of the command; bending drawn "
+                f"{clip.exaggeration:.0f} times"
+            )
+            for parts, (links, sliders, joints, plate) in zip(clip.parts, lines, strict=True):
+                for line, points in zip(links, parts.link[k], strict=True):
+                    line.set_data(*(1e3 * points.T))
+                sliders.set_data(*(1e3 * parts.slider[k].T))
+                joints.set_data(*(1e3 * parts.joint[k].T))
+                plate.set_xy(1e3 * parts.joint[k])
+            return []
+
+        frame(0)
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # laying out every frame anew takes most of the time
+        film = FuncAnimation(figure, frame, frames=len(clip.time), interval=50, blit=False)
+        film.save(path, writer=PillowWriter(fps=20), dpi=80)
+
+
+def _moving(parts: Skeleton, ax: Axes) -> tuple:
+    draw_machine(parts, 0, ax)
+    links = ax.lines[3:6]
+    return links, ax.lines[6], ax.lines[7], ax.patches[0]

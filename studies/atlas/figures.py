@@ -1,0 +1,309 @@
+"""The atlas's figures, put together from its plots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from studies.atlas import plots
+from studies.atlas.attribution import effects, interaction, shapley
+from studies.atlas.drawing import Clip, animate, draw_mode, mode_skeleton, skeleton
+from studies.atlas.findings import Findings
+from studies.atlas.platform import LINK_SETS
+from studies.atlas.platform import SETTINGS as RUNS
+from studies.atlas.subsets import TARGETS, link_label, player_labels, setting_label
+from studies.figures import CONTROLLED, SERIES, WITHOUT, comparison, legend_above, new_figure
+
+#: Place of the late window.
+LATE = -1
+#: The animation: from before the command's end to after it, and its frames [s].
+CLIP = (-0.02, 0.07, 1e-3)
+#: Largest drawn deflection after the command, as a share of a link's length [1].
+CLIP_SIZE = 0.12
+ANIMATION = "machine.gif"
+
+
+_COLUMNS = ["link 1", "link 2", "link 3", "platform"]
+
+
+class AtlasFigure(NamedTuple):
+    """A figure and what it shows."""
+
+    caption: str
+    draw: Callable[[Findings], Figure]
+
+
+def _subsets(found: Findings) -> Figure:
+    subsets = found.subsets
+    figure, axes = _panels(found, 2.2)
+    rows = [link_label(k) for k in range(1, 8)]
+    for ax, change in zip(axes, _link_changes(found), strict=True):
+        image = plots.change_map(change[1:], rows, _COLUMNS, ax)
+    for ax in axes[: len(subsets.setting) : 2]:
+        ax.set_ylabel("controlled links")
+    figure.colorbar(image, ax=list(axes), shrink=0.5, label="change of residual rms [%]")
+    return figure
+
+
+def _link_changes(found: Findings) -> np.ndarray:
+    """Change of the late residual of links 1 to 3 and platform, (settings, 8, 4)."""
+    subsets = found.subsets
+    chosen = subsets.link_subsets
+    residual = np.concatenate(
+        [subsets.link[:, LATE, chosen], subsets.platform[:, LATE, chosen, None]], axis=-1
+    )
+    return residual / residual[:, :1] - 1
+
+
+def _panels(found: Findings, height: float) -> tuple[Figure, np.ndarray]:
+    """Two panels a row, one for each setting."""
+    settings = found.subsets.setting
+    figure, axes = new_figure(-(-len(settings) // 2), min(len(settings), 2), height, False)
+    for ax, setting in zip(axes.flat, settings, strict=False):
+        ax.set_title(setting_label(setting))
+    for ax in axes.flat[len(settings) :]:
+        ax.remove()
+    return figure, axes.ravel()[: len(settings)]
+
+
+def _lattice(found: Findings) -> Figure:
+    subsets = found.subsets
+    figure, axes = _panels(found, 1.9)
+    every = np.sqrt(np.mean(subsets.link[:, LATE, subsets.link_subsets] ** 2, axis=-1))
+    for ax, residual in zip(axes, every, strict=True):
+        plots.lattice(residual, ax)
+    return figure
+
+
+def _helps(found: Findings) -> Figure:
+    figure, axes = _panels(found, 1.5)
+    for ax, change in zip(axes, _link_changes(found), strict=True):
+        image = plots.change_map(effects(1 + change), _COLUMNS[:3], _COLUMNS, ax)
+    for ax in axes[::2]:
+        ax.set_ylabel("controlled alone")
+    figure.colorbar(image, ax=list(axes), shrink=0.6, label="change of residual rms [%]")
+    return figure
+
+
+def _shares(found: Findings) -> Figure:
+    subsets = found.subsets
+    share = shapley(subsets.removed()[:, LATE]).reshape(-1, len(TARGETS), 3, subsets.modes)
+    figure, axes = new_figure(len(subsets.setting), len(TARGETS), 1.3, False)
+    for row, setting in enumerate(subsets.setting):
+        for column, target in enumerate(TARGETS):
+            ax = axes[row, column]
+            plots.share_map(share[row, column], ax)
+            ax.set_xticks(range(subsets.modes), [str(j + 1) for j in range(subsets.modes)])
+            ax.set_yticks(range(3), ["1", "2", "3"])
+            if row == 0:
+                ax.set_title(target)
+            if row == len(subsets.setting) - 1:
+                ax.set_xlabel("mode")
+        axes[row, 0].set_ylabel(f"{setting_label(setting)}\nlink", fontsize=7)
+    return figure
+
+
+def _interactions(found: Findings) -> Figure:
+    subsets = found.subsets
+    figure, axes = _panels(found, 2.4)
+    every = interaction(subsets.removed()[:, LATE, TARGETS.index("all links")])
+    limit = float(np.nanmax(np.abs(every)))
+    for ax, index in zip(axes, every, strict=True):
+        image = plots.interaction_map(index, player_labels(subsets.modes), limit, ax)
+    figure.colorbar(
+        image, ax=list(axes), shrink=0.5,
+        label="interaction [% of the mean square],\npositive: more is removed together",
+    )  # fmt: skip
+    return figure
+
+
+def _workspace(found: Findings) -> Figure:
+    chart = found.map
+    figure, axes = new_figure(3, len(chart.phi), 1.8, False)
+    rows = (
+        (chart.frequency[..., 0], "lowest frequency [Hz]"),
+        (100 * chart.spread, "spread of the first\nbending modes [%]"),
+        (100 * chart.coupling.max(axis=-1), "largest coupling of\ntwo links [%]"),
+    )
+    path = np.array(found.study.motion.waypoints)
+    for row, (value, label) in enumerate(rows):
+        limits = (float(np.nanpercentile(value, 1)), float(np.nanpercentile(value, 99)))
+        for column, phi in enumerate(chart.phi):
+            ax = axes[row, column]
+            is_own = np.allclose(path[:, 2], phi)
+            image = plots.workspace_map(
+                chart.x, chart.y, value[column], chart.margin[column],
+                path[:, :2] if is_own else None, ax, limits,
+            )  # fmt: skip
+            if row == 0:
+                ax.set_title(f"φ = {np.degrees(phi):.0f}°")
+            if row == 2:
+                ax.set_xlabel("x [mm]")
+        axes[row, 0].set_ylabel("y [mm]")
+        figure.colorbar(image, ax=list(axes[row]), label=label, extend="both")
+    return figure
+
+
+def _participation(found: Findings) -> Figure:
+    """Who bends in each of the three first bending modes, over the workspace."""
+    chart = found.map
+    turn = len(chart.phi) // 2
+    figure, axes = new_figure(3, 3, 1.8, False)
+    for row in range(3):
+        for link in range(3):
+            ax = axes[row, link]
+            value = 100 * chart.share[turn, :, :, row, link]
+            image = plots.workspace_map(
+                chart.x, chart.y, value, chart.margin[turn], None, ax, (0.0, 100.0)
+            )
+            rows, columns = np.nonzero(np.isfinite(value))
+            ax.set_xlim(1e3 * chart.x[columns.min() - 1], 1e3 * chart.x[columns.max() + 1])
+            ax.set_ylim(1e3 * chart.y[rows.min() - 1], 1e3 * chart.y[rows.max() + 1])
+            if row == 0:
+                ax.set_title(f"link {link + 1}")
+            if row == 2:
+                ax.set_xlabel("x [mm]")
+        axes[row, 0].set_ylabel(f"bending mode {row + 1}\ny [mm]")
+    figure.colorbar(image, ax=list(axes.flat), label="share of the strain energy [%]", shrink=0.5)
+    return figure
+
+
+def _modes(found: Findings) -> Figure:
+    figure, axes = new_figure(3, 3, 2.2, False)
+    home, far = found.poses
+    first = np.sort(np.argsort(-found.modes.order_share[:, :, 0], axis=1)[:, :3], axis=1)
+    chosen = [(0, k) for k in range(3)] + [(0, k) for k in first[0]] + [(1, k) for k in first[1]]
+    for ax, (place, k) in zip(axes.flat, chosen, strict=True):
+        parts = mode_skeleton(found.study, (home, far)[place], found.modes.shape[place, :, k])
+        draw_mode(parts, ax)
+        share = found.modes.share[place, k]
+        names = [f"{100 * s:.0f} %" for s in share[:3]]
+        ax.set_title(
+            f"{found.modes.frequency[place, k]:.1f} Hz; "
+            + (f"links {', '.join(names)}" if share[3] < 0.5 else f"drive {100 * share[3]:.0f} %"),
+            fontsize=8,
+        )
+        ax.set_xlabel("")
+        ax.set_ylabel("")
+        ax.set_xticks([])
+        ax.set_yticks([])
+        ax.grid(False)
+        ax.spines[:].set_visible(False)
+    place = f"({1e3 * far[0]:.0f}, {1e3 * far[1]:.0f}) mm: bending"
+    for row, text in enumerate(("first pose: on the drive", "first pose: bending", place)):
+        axes[row, 0].set_ylabel(text)
+    return figure
+
+
+def _platform(found: Findings) -> Figure:
+    """Drive error above, what the bending of the links adds below."""
+    runs = found.platform
+    figure, axes = new_figure(4, len(RUNS), 1.7)
+    for column, setting in enumerate(RUNS):
+        axes[0, column].set_title(setting_label(setting))
+        for k, name in enumerate("xy"):
+            axes[0, column].plot(
+                runs.time, 1e6 * runs.drive[column, :, k], color=SERIES[k], linewidth=1.0,
+                linestyle=("-", "--")[k], label=name,
+            )  # fmt: skip
+        for k, (label, unit) in enumerate((("x [nm]", 1e9), ("y [nm]", 1e9), ("φ [nrad]", 1e9))):
+            ax = axes[k + 1, column]
+            error = unit * runs.vibration[column, :, :, k]
+            comparison(runs.time, error[0], error[-1], f"vibration error\n{label}", ax)
+            ax.axvline(runs.command_end[column], color="#888888", linewidth=0.8, linestyle=":")
+        axes[3, column].set_xlabel("time [s]")
+        axes[0, column].legend(loc="upper right")
+    axes[0, 0].set_ylabel("drive error [µm]")
+    legend_above(figure, axes[1, 0])
+    return figure
+
+
+def _vibration_after(found: Findings) -> Figure:
+    """Vibration error once the command has ended, for the paper's choices of links."""
+    runs = found.platform
+    figure, axes = new_figure(3, len(RUNS), 1.9)
+    names = [link_label(sum(1 << i for i in range(3) if links[i])) for links in LINK_SETS]
+    for column, setting in enumerate(RUNS):
+        axes[0, column].set_title(setting_label(setting))
+        end = runs.command_end[column]
+        part = (runs.time >= end) & (runs.time <= end + 0.15)
+        late = (runs.time >= end + 0.04) & part
+        for k, label in enumerate(("x [nm]", "y [nm]", "φ [nrad]")):
+            ax = axes[k, column]
+            error = 1e9 * runs.vibration[column, :, :, k]
+            styles = (WITHOUT, {"color": SERIES[2]}, {"color": SERIES[3]}, CONTROLLED)
+            for name, one, style in zip(names, error, styles, strict=True):
+                text = "no link controlled" if name == "none" else f"links {name}"
+                ax.plot(runs.time[part] - end, one[part], **{**style, "label": text})
+            top = 1.5 * np.abs(error[:, late]).max()
+            ax.set_ylim(-top, top)
+            ax.margins(x=0.01)
+            if column == 0:
+                ax.set_ylabel(f"vibration error\n{label}")
+        axes[2, column].set_xlabel("time after the command [s]")
+    legend_above(figure, axes[0, 0])
+    return figure
+
+
+def _responses(found: Findings) -> Figure:
+    size = np.abs(found.responses.value)
+    figure, axes = new_figure(2, 2, 2.3)
+    shown = (
+        ("slider 1 to mid-span\nof link 1 [m/N]", 0, 0),
+        ("slider 1 to mid-span\nof link 2 [m/N]", 1, 0),
+        ("platform y to mid-span\nof link 1 [m/N]", 0, 4),
+        ("platform y to y\n[m/N]", 4, 4),
+    )
+    names = [link_label(sum(1 << i for i in range(3) if links[i])) for links in LINK_SETS]
+    texts = ["no link controlled" if name == "none" else f"links {name}" for name in names]
+    for ax, (label, output, source) in zip(axes.flat, shown, strict=True):
+        curves = {text: size[k, :, output, source] for k, text in enumerate(texts)}
+        plots.response(found.responses.frequency, curves, label, ax)
+    for ax in axes[-1]:
+        ax.set_xlabel("frequency [Hz]")
+    legend_above(figure, axes[0, 0])
+    return figure
+
+
+FIGURES = {
+    "subsets": AtlasFigure("which links are controlled, and what that does to each", _subsets),
+    "helps": AtlasFigure("who helps or hurts whom: one link controlled", _helps),
+    "lattice": AtlasFigure(
+        "residual of all links, one more link a step; dashed: it gets worse", _lattice
+    ),
+    "shares": AtlasFigure(
+        "Shapley shares of links and modes in what control removes [% of the mean square]", _shares
+    ),
+    "interactions": AtlasFigure("pairs of links and modes that do more or less together",
+                                _interactions),
+    "workspace": AtlasFigure(
+        "natural modes over the workspace; orange: singular border, white: distance of the "
+        "nearest link angle from it, black: the path", _workspace,
+    ),
+    "participation": AtlasFigure("who bends in the three first bending modes", _participation),
+    "modes": AtlasFigure("natural modes, drawn large, and links' shares of the strain energy",
+                         _modes),
+    "platform": AtlasFigure("error of the platform: drive, and what bending links add", _platform),
+    "vibration": AtlasFigure("vibration error of the platform after the command",
+                             _vibration_after),
+    "responses": AtlasFigure("frequency responses of the sampled loop", _responses),
+}  # fmt: skip
+
+
+def write_animation(found: Findings, folder: Path) -> None:
+    """The machine after its faster move, without control and with all links controlled."""
+    runs, which = found.platform, len(RUNS) - 1
+    end = runs.command_end[which]
+    wanted = end + np.arange(*CLIP)
+    index = np.searchsorted(runs.time, wanted - 1e-9)
+    index = index[index < len(runs.time)]
+    q = runs.modal[which, :, index]
+    peak = np.abs(runs.modal[which, 0, runs.time >= end, :, 0]).max()
+    factor = float(f"{CLIP_SIZE * found.study.link.length / peak:.1g}")
+    off, on = (skeleton(found.study, runs.pose[which, k, index], q[:, k], factor) for k in (0, -1))
+    titles = ("without control", "three links controlled")
+    animate(Clip(runs.time[index] - end, (off, on), titles, factor), folder / ANIMATION)

@@ -1,0 +1,67 @@
+"""Everything the atlas found, as its figures and its report read it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from studies.atlas.platform import PlatformError, Responses, platform_error, responses
+from studies.atlas.subsets import Subsets
+from studies.atlas.workspace import Map, PoseModes, map_workspace, natural_modes_at
+from studies.paper_cases import frame_of
+from studies.runs import check_run
+from studies.spec import Study
+
+#: The pose near the border is at least this far from a singularity [rad].
+NEAR = np.radians(5.0)
+#: Of the responses [Hz].
+FREQUENCY = np.linspace(2.0, 600.0, 300)
+
+#: Says what is being done: text, then share of the work since the last call.
+Tell = Callable[[str, float], None]
+
+
+class Findings(NamedTuple):
+    """What the atlas found."""
+
+    study: Study
+    subsets: Subsets
+    platform: PlatformError
+    responses: Responses
+    map: Map
+    poses: np.ndarray  # the first of the path, and one near the border [m, m, rad], (2, 3)
+    modes: PoseModes  # at these poses
+    adc_step: np.ndarray  # of one ADC step, in the deflection of mode 1 [m], (3,)
+
+
+def look_around(study: Study, subsets: Subsets, tell: Tell) -> Findings:
+    """All of the atlas but the runs of the subsets.
+
+    Args:
+        study: the design.
+        subsets: from `read_subsets`.
+        tell: called with what is done.
+
+    Raises:
+        StudyError: as `check_run`.
+    """
+    runs = platform_error(study, tell)
+    tell("frequency responses", 0.0)
+    linear = responses(study, FREQUENCY)
+    tell("natural modes over the workspace", 1.0)
+    chart = map_workspace(study)
+    poses = np.stack([np.array(study.motion.waypoints[0]), _far_pose(chart)])
+    modes = natural_modes_at(study, poses)
+    tell("natural modes over the workspace", 1.0)
+    step = frame_of(*check_run(study)).adc_step
+    return Findings(study, subsets, runs, linear, chart, poses, modes, step)
+
+
+def _far_pose(chart: Map) -> np.ndarray:
+    """The pose whose links differ most, not too near a singularity and at the path's own turn."""
+    spread = np.where(chart.margin >= NEAR, chart.spread, -1.0)
+    turn = int(np.argmin(np.abs(chart.phi - np.median(chart.phi))))
+    row, column = np.unravel_index(int(np.argmax(spread[turn])), spread[turn].shape)
+    return np.array([chart.x[column], chart.y[row], chart.phi[turn]])

@@ -1,0 +1,162 @@
+"""Rigid and elastic: where the platform's error comes from, and what forces do to it.
+
+Drive error is what the same drive leaves on the same machine with rigid links; what the flexible
+machine has beyond that is vibration error (the paper's figures 5, 6, 8, 10 show the sum).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.kinematics import close_chain
+from jaxmodel.parameters import Array
+from jaxmodel.prepare import prepare
+from jaxmodel.sampled_loop import LoopMatrices, closed_loop
+from studies.atlas.subsets import WINDOWS, long_enough, residual_window
+from studies.cases import powered
+from studies.paper_cases import run_batches
+from studies.runs import check_run, resolved_study, with_ratio
+from studies.spec import Study
+
+#: Controlled links of the paper's cases.
+LINK_SETS = ((False, False, False), (True, False, False), (True, True, False), (True, True, True))
+#: Move time [s] and shaper of the runs: the paper's, and a fast move without shaper.
+SETTINGS = ((0.1, "ei"), (0.05, "none"))
+#: Forces of `Responses`, in order.
+SOURCES = ("slider 1 [N]", "slider 2 [N]", "slider 3 [N]", "platform x [N]", "platform y [N]",
+           "platform turn [N m]")  # fmt: skip
+#: Their effects, in order.
+OUTPUTS = ("link 1 [m]", "link 2 [m]", "link 3 [m]", "x [m]", "y [m]", "phi [rad]")
+
+
+class PlatformError(NamedTuple):
+    """Leading axis: SETTINGS; second one of `vibration`: LINK_SETS."""
+
+    time: np.ndarray  # [s], (T,)
+    command_end: np.ndarray  # [s], (s,)
+    window: np.ndarray  # whether a sample is in each of WINDOWS, (s, 2, T)
+    drive: np.ndarray  # error with rigid links [m, m, rad], (s, T, 3)
+    vibration: np.ndarray  # error beyond that [m, m, rad], (s, 4, T, 3)
+    pose: np.ndarray  # of the platform [m, m, rad], (s, 4, T, 3)
+    modal: np.ndarray  # modal coordinates of the plant [m], (s, 4, T, 3, R)
+
+    def rms(self, error: np.ndarray) -> np.ndarray:
+        """Root mean square of an error (s, ..., T, 3) over each window, (s, ..., 2, 3)."""
+        total = np.einsum("s...ta,swt->s...wa", error**2, self.window)
+        count = self.window.sum(axis=-1).reshape(len(total), *(1,) * (error.ndim - 3), -1, 1)
+        return np.sqrt(total / count)
+
+
+def platform_error(study: Study, tell: Any = None) -> PlatformError:
+    """Run the paper's choices of links, and the machine with rigid links, with trajectories.
+
+    Args:
+        study: the design; move time, shaper and links are replaced.
+        tell: called with what is running and the share of the work since the last call.
+
+    Raises:
+        StudyError: as `check_run`.
+    """
+    tell = tell or (lambda text, share: None)
+    study = long_enough(study, SETTINGS)
+    built = [
+        check_run(study.change(motion__move_time=t, shaper__kind=kind)) for t, kind in SETTINGS
+    ]
+    structure = built[0][0]._replace(substeps=max(one.substeps for one, _ in built))
+    first = [one for _, case in built for one in (_with_links(case, LINK_SETS[0]), _rigid(case))]
+    quiet = run_batches(structure, first, tell)
+    cases = []
+    for k, (_, case) in enumerate(built):
+        if study.control.ratio_source == "own_run":
+            own = powered(quiet.energy_ratio[2 * k], study.control.ratio_exponent)
+            case = with_ratio(case, own)
+        cases += [_with_links(case, links) for links in LINK_SETS[1:]]
+    active = run_batches(structure, cases, tell)
+    assert quiet.record is not None and active.record is not None
+    count = len(SETTINGS)
+
+    def joined(name: str) -> np.ndarray:
+        off = getattr(quiet.record, name)[::2, None]
+        on = getattr(active.record, name)
+        return np.concatenate([off, on.reshape(count, len(LINK_SETS) - 1, *on.shape[1:])], axis=1)
+
+    drive, time = quiet.record.pose_error[1::2], quiet.record.time[0]
+    end = np.asarray(quiet.command_end[::2])
+    tick = 0.5 / study.electronics.sample_rate_hz
+    begin, length = np.array([residual_window(study, name) for name in WINDOWS]).T
+    since = time - end[:, None, None] - begin[:, None]
+    window = (since > -tick) & (since < length[:, None] - tick)
+    return PlatformError(
+        time, end, window, drive, joined("pose_error") - drive[:, None], joined("pose"),
+        joined("modal_coordinate"),
+    )  # fmt: skip
+
+
+def _rigid(case: Case) -> Case:
+    """The same machine with rigid links: modes that are off couple to nothing."""
+    return case._replace(n_modes=0 * case.n_modes)
+
+
+def _with_links(case: Case, links: tuple[bool, ...]) -> Case:
+    mask = jnp.asarray(links, case.control.link_mask.dtype)
+    return case._replace(control=case.control._replace(link_mask=mask))
+
+
+class Responses(NamedTuple):
+    """Linearised sampled loop: effects of forces held over a sample."""
+
+    frequency: np.ndarray  # [Hz], (F,)
+    value: np.ndarray  # complex, by LINK_SETS, OUTPUTS and SOURCES, (4, F, 6, 6)
+
+
+def responses(study: Study, frequency: np.ndarray) -> Responses:
+    """Frequency responses from forces on sliders and platform to links (mid-span) and platform.
+
+    A force on the platform acts like the slider forces J^-T W, J the Jacobian of the sliders'
+    positions by the pose: exact where links do not bend at C (Y_j(L) = 0), else NaN.
+
+    Args:
+        study: the design, linearised at the first pose of its path.
+        frequency: [Hz], below half the sample rate, (F,).
+
+    Raises:
+        StudyError: as `check_run`.
+    """
+    study = resolved_study(study).change(metrics__stations=(study.link.length / 2,))
+    structure, case = check_run(study)
+    structure = structure._replace(n_steps=1, substeps=1, n_frequencies=1, has_noise=False)
+    pose = jnp.asarray(study.motion.waypoints[0], case.electronics.period.dtype)
+    value = []
+    for links in LINK_SETS:
+        matrices, jacobian = _linear(structure, _with_links(case, links), pose)
+        value.append(_response(matrices, jacobian, frequency / study.electronics.sample_rate_hz))
+    return Responses(frequency, np.stack(value))
+
+
+@partial(jax.jit, static_argnums=0)
+def _linear(structure: Structure, case: Case, pose: Array) -> tuple[LoopMatrices, Array]:
+    """Loop at a pose, and d rho/d X there, (3, 3); NaN where a force at C bends the link."""
+    plant = prepare(structure, case).loop.plant
+    jacobian = jax.jacfwd(lambda at: close_chain(plant, at, jnp.zeros_like(at)).rho)(pose)
+    known = jacobian if plant.tip is None else jnp.nan * jacobian
+    return closed_loop(structure, case, pose), known
+
+
+def _response(matrices: LoopMatrices, jacobian: Array, share: np.ndarray) -> np.ndarray:
+    """C (z - M)^-1 B for frequencies as shares of the sample rate, (F, 6, 6)."""
+    transition = np.asarray(matrices.open + matrices.feedback)
+    force = np.asarray(matrices.force)
+    jacobian = np.asarray(jacobian)
+    platform = force @ (np.linalg.inv(jacobian).T if np.isfinite(jacobian).all() else jacobian)
+    source = np.concatenate([force, platform], axis=1)
+    pose = np.eye(3, len(transition))
+    output = np.concatenate([np.asarray(matrices.deflection), pose])
+    turn = np.exp(2j * np.pi * share)
+    return np.stack([output @ np.linalg.solve(z * np.eye(len(transition)) - transition, source)
+                     for z in turn])  # fmt: skip

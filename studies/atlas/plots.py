@@ -1,0 +1,198 @@
+"""Figures of the atlas. Each function draws given data; units are all it computes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import TwoSlopeNorm
+
+from studies.atlas.subsets import link_label
+from studies.figures import SERIES
+
+#: Changes: blue is less vibration, orange is more.
+CHANGES = "PuOr_r"
+BETTER, WORSE = "#4C3F91", "#D9730D"
+
+
+def _axes(ax: Axes | None) -> Axes:
+    return plt.subplots(layout="constrained")[1] if ax is None else ax
+
+
+def length_text(value: float) -> str:
+    """A small length [m] in µm, or in nm below 0.1 µm."""
+    return f"{1e6 * value:.3g} µm" if value >= 1e-7 else f"{1e9 * value:.3g} nm"
+
+
+def _whole(value: float, sign: str = "+") -> str:
+    """A whole number with its sign; no sign at zero."""
+    text = f"{value:{sign}.0f}"
+    return "0" if text in ("+0", "-0") else text
+
+
+def change_map(
+    change: np.ndarray,
+    rows: list[str],
+    columns: list[str],
+    ax: Axes | None = None,
+    limit: float = 1.0,
+) -> Any:
+    """Changes as a map of numbers.
+
+    Args:
+        change: relative change [1], (rows, columns).
+        rows, columns: their names.
+        ax: where to draw; a new figure where left out.
+        limit: change of the full colour [1].
+
+    Returns:
+        The image, for a colour bar.
+    """
+    ax = _axes(ax)
+    image = ax.imshow(
+        100 * change, cmap=CHANGES, norm=TwoSlopeNorm(0, -100 * limit, 100 * limit), aspect="auto"
+    )
+    for (row, column), value in np.ndenumerate(100 * change):
+        is_dark = abs(value) > 65 * limit
+        ax.text(
+            column, row, _whole(value), ha="center", va="center", fontsize=7,
+            color="white" if is_dark else "black",
+        )  # fmt: skip
+    ax.set_xticks(range(len(columns)), columns)
+    ax.set_yticks(range(len(rows)), rows)
+    ax.tick_params(length=0)
+    ax.grid(False)
+    return image
+
+
+def lattice(residual: np.ndarray, ax: Axes | None = None) -> Axes:
+    """The 8 choices of links, each joined to those with one link more.
+
+    Args:
+        residual: of each choice, bit i is link i [m], (8,).
+        ax: where to draw; a new figure where left out.
+    """
+    ax = _axes(ax)
+    place = {
+        0: (0, 1), 1: (1, 2), 2: (1, 1), 4: (1, 0), 3: (2, 2), 5: (2, 1), 6: (2, 0), 7: (3, 1),
+    }  # fmt: skip
+    for a in range(8):
+        for b in (a | 1 << i for i in range(3) if not a >> i & 1):
+            is_better = residual[b] <= residual[a]
+            ax.plot(
+                *zip(place[a], place[b], strict=True), color=BETTER if is_better else WORSE,
+                linestyle="-" if is_better else "--", linewidth=1.6, zorder=0,
+            )  # fmt: skip
+    for subset, (x, y) in place.items():
+        ax.text(
+            x, y, f"{link_label(subset)}\n{length_text(residual[subset])}", ha="center",
+            va="center", fontsize=8, bbox={"boxstyle": "round", "fc": "white", "ec": "#888888"},
+        )  # fmt: skip
+    ax.set_xlim(-0.5, 3.5)
+    ax.set_ylim(-0.5, 2.5)
+    ax.set_xticks(range(4), ["no link", "one", "two", "three"])
+    ax.set_yticks([])
+    ax.grid(False)
+    ax.spines[:].set_visible(False)
+    ax.tick_params(length=0)
+    return ax
+
+
+def share_map(share: np.ndarray, ax: Axes | None = None) -> Axes:
+    """Shapley shares of links and modes.
+
+    Args:
+        share: of the mean square without control [1], (3, C).
+        ax: where to draw; a new figure where left out.
+    """
+    modes = [f"mode {j + 1}" for j in range(share.shape[1])]
+    ax = _axes(ax)
+    change_map(-share, [f"link {i + 1}" for i in range(3)], modes, ax)
+    for text, value in zip(ax.texts, 100 * share.ravel(), strict=True):
+        text.set_text(_whole(value, "-"))
+    return ax
+
+
+def interaction_map(index: np.ndarray, labels: list[str], limit: float, ax: Axes | None = None):
+    """Interaction of pairs of players.
+
+    Args:
+        index: share of the mean square without control [1], (n, n), symmetric.
+        labels: of the players.
+        limit: value of the full colour [1].
+        ax: where to draw; a new figure where left out.
+
+    Returns:
+        The image, for a colour bar.
+    """
+    ax = _axes(ax)
+    norm = TwoSlopeNorm(0, -100 * limit, 100 * limit)
+    image = ax.imshow(100 * index, cmap=CHANGES.removesuffix("_r"), norm=norm)
+    ax.set_xticks(range(len(labels)), labels, rotation=90, fontsize=7)
+    ax.set_yticks(range(len(labels)), labels, fontsize=7)
+    ax.grid(False)
+    ax.tick_params(length=0)
+    return image
+
+
+def workspace_map(
+    x: np.ndarray,
+    y: np.ndarray,
+    value: np.ndarray,
+    margin: np.ndarray,
+    path: np.ndarray | None = None,
+    ax: Axes | None = None,
+    limits: tuple[float, float] | None = None,
+) -> Any:
+    """A quantity over the poses that can be reached.
+
+    Args:
+        x, y: grid lines [m], (n,), (m,).
+        value: in the unit of the colour bar; NaN out of reach, (m, n).
+        margin: distance of the nearest link angle from a singularity [rad], NaN out of reach,
+            (m, n).
+        path: of the platform [m], (k, 2), or None.
+        ax: where to draw; a new figure where left out.
+        limits: of the colours.
+
+    Returns:
+        The image, for a colour bar.
+    """
+    ax = _axes(ax)
+    low, high = limits or (float(np.nanmin(value)), float(np.nanmax(value)))
+    image = ax.pcolormesh(
+        1e3 * x, 1e3 * y, value, cmap="cividis", vmin=low, vmax=high, rasterized=True
+    )
+    reach = np.where(np.isnan(margin), 0.0, 1.0)
+    ax.contour(1e3 * x, 1e3 * y, reach, [0.5], colors="#D55E00", linewidths=1.5)
+    lines = ax.contour(
+        1e3 * x, 1e3 * y, np.degrees(margin), [5, 10, 20], colors="white", linewidths=0.7
+    )
+    ax.clabel(lines, fmt="%g°", fontsize=6)
+    if path is not None:
+        ax.plot(*(1e3 * path.T), color="black", linewidth=1.2)
+    ax.set_aspect("equal")
+    ax.grid(False)
+    return image
+
+
+def response(
+    frequency: np.ndarray, curves: dict[str, np.ndarray], label: str, ax: Axes | None = None
+) -> Axes:
+    """Magnitudes of frequency responses.
+
+    Args:
+        frequency: [Hz], (F,).
+        curves: magnitudes in the unit of the label by name, (F,) each.
+        label: quantity and unit of the ordinate.
+        ax: where to draw; a new figure where left out.
+    """
+    ax = _axes(ax)
+    styles = zip(("#E69F00", *SERIES[1:3], "#0B3C6F"), (1.6, 1.1, 1.1, 0.9), strict=True)
+    for (name, curve), (color, width) in zip(curves.items(), styles, strict=False):
+        ax.semilogy(frequency, curve, color=color, linewidth=width, label=name)
+    ax.set_ylabel(label)
+    ax.margins(x=0.01)
+    return ax

@@ -1,0 +1,222 @@
+"""`studies atlas`: `runs/` (the sweep of all subsets), `atlas.h5`, figures, animation, report."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from jaxmodel import status
+from studies import config
+from studies.atlas.attribution import interaction, shapley
+from studies.atlas.figures import FIGURES, write_animation
+from studies.atlas.findings import Findings, look_around
+from studies.atlas.platform import LINK_SETS
+from studies.atlas.platform import SETTINGS as RUNS
+from studies.atlas.report import report
+from studies.atlas.subsets import (
+    TARGETS,
+    WINDOWS,
+    Subsets,
+    atlas_sweep,
+    link_label,
+    player_labels,
+    read_subsets,
+    setting_label,
+)
+from studies.atlas.workspace import PAIRS
+from studies.errors import StudyError
+from studies.figures import save, styled
+from studies.runs import run_attributes
+from studies.spec import Study
+from studies.store import Variable, write_store
+from studies.sweeps.results import load
+from studies.sweeps.run import run_sweep
+
+DATA, RUNS_FOLDER = "atlas.h5", "runs"
+
+
+def run_atlas(
+    study: Study, out: Path, is_resumed: bool, console: Console, is_quiet: bool = False
+) -> bool:
+    """Run all subsets of a design, look at its workspace and platform, and write it all down.
+
+    Args:
+        study: the design.
+        out: folder.
+        is_resumed: go on with the runs that are there; everything else is made anew.
+        console: where progress goes.
+        is_quiet: no progress.
+
+    Returns:
+        Whether it has been finished (False: interrupted by Ctrl-C, finished runs are kept).
+
+    Raises:
+        StudyError: a fault of the design or of the folder; no setting in which all cases run.
+    """
+    config.require_configured()
+    spec = atlas_sweep(study)
+    if run_sweep(spec, out / RUNS_FOLDER, is_resumed, console, is_quiet).is_interrupted:
+        return False
+
+    def tell(text: str, share: float) -> None:
+        if not is_quiet:
+            console.print(text, soft_wrap=True)
+
+    subsets, dropped = sound_settings(read_subsets(load(out / RUNS_FOLDER)))
+    found = look_around(study, subsets, tell)
+    try:
+        with tempfile.TemporaryDirectory(dir=out, prefix=".unfinished-") as folder:
+            staging = Path(folder)
+            write_store(staging / DATA, variables(found), run_attributes(study))
+            tell("drawing", 0.0)
+            with styled():
+                for name, figure in FIGURES.items():
+                    save(figure.draw(found), staging, name)
+            write_animation(found, staging)
+            (staging / "report.md").write_text(report(found, dropped), encoding="utf-8")
+            for file in sorted(staging.iterdir()):
+                os.replace(file, out / file.name)
+    except OSError as error:
+        raise StudyError(f"--out {out}: cannot write there ({error})") from error
+    return True
+
+
+def sound_settings(subsets: Subsets) -> tuple[Subsets, list[str]]:
+    """Settings in which every case ran to its end, and in words what is wrong with the others.
+
+    Raises:
+        StudyError: there is none.
+    """
+    good = np.isin(subsets.status, (status.OK, status.SATURATED))
+    is_sound = [bool(part.all()) for part in good]
+    dropped = []
+    for setting, codes, fine in zip(subsets.setting, subsets.status, is_sound, strict=True):
+        if fine:
+            continue
+        bad, counts = np.unique(codes[codes != status.OK], return_counts=True)
+        texts = [f"{n} {status.REASONS[int(k)]}" for k, n in zip(bad, counts, strict=True)]
+        dropped.append(f"{setting_label(setting)}: of {codes.size} runs {', '.join(texts)}.")
+    if not any(is_sound):
+        raise StudyError(f"atlas: no setting in which all cases run; {' '.join(dropped)}")
+    kept = tuple(s for s, fine in zip(subsets.setting, is_sound, strict=True) if fine)
+    arrays = {name: getattr(subsets, name)[is_sound] for name in Subsets._fields[2:]}
+    return subsets._replace(setting=kept, **arrays), dropped
+
+
+def variables(found: Findings) -> dict[str, Variable]:
+    """Everything `atlas.h5` holds."""
+    return {**_subset_variables(found.subsets), **_map_variables(found), **_run_variables(found)}
+
+
+def _names(values: list[str], axis: str, text: str) -> Variable:
+    return Variable(np.array(values), (axis,), "1", text)
+
+
+def _subset_variables(subsets: Subsets) -> dict[str, Variable]:
+    game = subsets.removed()
+    axes = ("setting", "window", "subset")
+    per_link = (*axes, "link")
+    return {
+        "setting": _names([setting_label(s) for s in subsets.setting], "setting", "move, shaper"),
+        "window": _names(list(WINDOWS), "window", "residual window"),
+        "subset": Variable(
+            np.arange(game.shape[-1]), ("subset",), "1",
+            "which players are controlled: bit p for player p",
+        ),
+        "player": _names(player_labels(subsets.modes), "player", "link.mode"),
+        "target": _names(list(TARGETS), "target", "whose residual"),
+        "link": Variable(np.arange(1, 4), ("link",), "1", "link number"),
+        "links": _names([link_label(k) for k in range(8)], "links", "whole links controlled"),
+        "links_subset": Variable(subsets.link_subsets, ("links",), "1", "their subset"),
+        "residual_rms": Variable(
+            subsets.station, (*per_link, "station"), "m", "rms chord deflection in the window"
+        ),
+        "pose_error_rms": Variable(
+            subsets.pose, (*axes, "pose_axis"), "m; m; rad", "rms error in the window"
+        ),
+        "spectral_peak": Variable(
+            subsets.peak, (*per_link, "controlled_mode"), "m2/Hz",
+            "largest spectral density near each mode of the controller",
+        ),
+        "settling_time": Variable(subsets.settling, per_link, "s", "after the command"),
+        "peak_voltage": Variable(subsets.voltage, per_link, "V", "peak actuator voltage"),
+        "removed": Variable(
+            game, ("setting", "window", "target", "subset"), "1",
+            "share of the uncontrolled mean square that control takes away",
+        ),
+        "shapley_share": Variable(
+            shapley(game), ("setting", "window", "target", "player"), "1",
+            "Shapley share of it",
+        ),
+        "interaction": Variable(
+            interaction(game), ("setting", "window", "target", "player", "other_player"), "1",
+            "Shapley interaction index of pairs",
+        ),
+    }  # fmt: skip
+
+
+def _map_variables(found: Findings) -> dict[str, Variable]:
+    chart = found.map
+    grid = ("map_phi", "map_y", "map_x")
+    pairs = [f"{i + 1}-{k + 1}" for i, k in PAIRS]
+    return {
+        "map_x": Variable(chart.x, ("map_x",), "m", "platform x"),
+        "map_y": Variable(chart.y, ("map_y",), "m", "platform y"),
+        "map_phi": Variable(chart.phi, ("map_phi",), "rad", "platform turn"),
+        "map_status": Variable(chart.status, grid, "1", "pose", status.REASONS),
+        "gamma": Variable(chart.gamma, (*grid, "link"), "rad", "link angles"),
+        "natural_frequency": Variable(
+            chart.frequency, (*grid, "natural_mode"), "Hz", "of the machine on its drive"
+        ),
+        "bending_frequency": Variable(
+            chart.bending, (*grid, "bending_mode"), "Hz", "the three first bending modes"
+        ),
+        "strain_share": Variable(
+            chart.share, (*grid, "bending_mode", "part"), "1", "strain energy in links and drive"
+        ),
+        "pair": _names(pairs, "pair", "two links"),
+        "inertial_coupling": Variable(
+            chart.coupling, (*grid, "pair"), "1", "of the links' first modes, pose condensed out"
+        ),
+        "pose_of_modes": Variable(found.poses, ("mode_pose", "pose_axis"), "m; m; rad", "pose"),
+        "mode_frequency": Variable(
+            found.modes.frequency, ("mode_pose", "natural_mode"), "Hz", "at these poses"
+        ),
+        "mode_shape": Variable(
+            found.modes.shape, ("mode_pose", "coordinate", "natural_mode"), "m; m; rad; m ...",
+            "pose and modal coordinates, largest entry 1",
+        ),
+    }  # fmt: skip
+
+
+def _run_variables(found: Findings) -> dict[str, Variable]:
+    runs, answers = found.platform, found.responses
+    sets = [link_label(sum(1 << i for i in range(3) if links[i])) for links in LINK_SETS]
+    series = ("run", "run_links", "time", "pose_axis")
+    return {
+        "run": _names([setting_label(s) for s in RUNS], "run", "move, shaper"),
+        "run_links": _names(sets, "run_links", "controlled links"),
+        "time": Variable(runs.time, ("time",), "s", "time"),
+        "command_end": Variable(runs.command_end, ("run",), "s", "end of the shaped command"),
+        "drive_error": Variable(
+            runs.drive, ("run", "time", "pose_axis"), "m; m; rad", "pose error with rigid links"
+        ),
+        "vibration_error": Variable(
+            runs.vibration, series, "m; m; rad", "pose error beyond that of rigid links"
+        ),
+        "response_frequency": Variable(
+            answers.frequency, ("response_frequency",), "Hz", "of the responses"
+        ),
+        "response_size": Variable(
+            np.abs(answers.value), ("run_links", "response_frequency", "output", "source"),
+            "m/N and alike", "magnitude of the response of the sampled loop",
+        ),
+        "response_phase": Variable(
+            np.angle(answers.value), ("run_links", "response_frequency", "output", "source"),
+            "rad", "its phase",
+        ),
+    }  # fmt: skip

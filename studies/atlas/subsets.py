@@ -1,0 +1,224 @@
+"""Every subset of controlled links and modes, as the cases of one sweep, and what comes back.
+
+Player p = i C + j stands for mode j of link i, C the number of controlled modes; bit p of a
+subset's number says whether it is controlled.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from studies.errors import field_error
+from studies.paper_measures import EARLY_PART
+from studies.runs import resolved_study
+from studies.spec import Study
+from studies.sweeps.results import NOT_RUN, SweepData
+from studies.sweeps.spec import SweepSpec, parse_sweep
+
+#: Time of a move [s] and input shaper: the paper's move, and faster ones, which leave more.
+SETTINGS = tuple((time, shaper) for time in (0.1, 0.05, 0.03) for shaper in ("ei", "none"))
+#: The residual window as the design has it, and without the part in which the drive settles.
+WINDOWS = ("whole", "late")
+#: More controlled modes have too many subsets.
+MODE_LIMIT = 3
+#: Longest shaper of the atlas [s].
+SHAPER_TIME = 0.02
+_KEPT = (
+    "residual_rms", "pose_error_rms", "spectral_density", "settling_time", "peak_voltage",
+)  # fmt: skip
+
+
+class Subsets(NamedTuple):
+    """Residuals of all subsets; leading axes: setting, window, subset."""
+
+    setting: tuple[tuple[float, str], ...]  # move time [s], shaper
+    modes: int  # C, controlled modes per link
+    status: np.ndarray  # codes of `jaxmodel.status`, (n, 2, 2^(3C))
+    station: np.ndarray  # residual chord deflection, rms [m], (..., 3, S)
+    pose: np.ndarray  # residual pose error, rms [m, m, rad], (..., 3)
+    peak: np.ndarray  # largest spectral density near each mode [m2/Hz], (..., 3, C)
+    settling: np.ndarray  # [s], (..., 3)
+    voltage: np.ndarray  # peak [V], (..., 3)
+
+    @property
+    def link(self) -> np.ndarray:
+        """Residual chord deflection, rms over window and stations [m], (..., 3)."""
+        return np.sqrt(np.mean(self.station**2, axis=-1))
+
+    @property
+    def platform(self) -> np.ndarray:
+        """Residual error of the platform's centre, rms [m], (...)."""
+        return np.hypot(self.pose[..., 0], self.pose[..., 1])
+
+    @property
+    def link_subsets(self) -> np.ndarray:
+        """Subset numbers of the 8 choices of whole links; bit i of the position is link i, (8,)."""
+        whole = 2**self.modes - 1
+        shifts = whole << (self.modes * np.arange(3))
+        return ((np.arange(8)[:, None] >> np.arange(3)) & 1) @ shifts
+
+    def removed(self) -> np.ndarray:
+        """Mean square that each subset takes away, by TARGETS.
+
+        Returns:
+            Share of what is there without control [1], (..., 5, 2^(3C)): a game of `attribution`.
+        """
+        link = np.moveaxis(self.link, -1, -2) ** 2
+        total = link.sum(axis=-2, keepdims=True)
+        square = np.concatenate([link, total, self.platform[..., None, :] ** 2], axis=-2)
+        first = square[..., :1]
+        return 1 - square / np.where(first > 0, first, np.nan)
+
+
+#: What `Subsets.removed` counts, in order.
+TARGETS = ("link 1", "link 2", "link 3", "all links", "platform")
+
+
+def link_label(subset: int) -> str:
+    """Links of one of the 8 choices in words: "none", "1", "1+3"."""
+    return "+".join(str(i + 1) for i in range(3) if subset >> i & 1) or "none"
+
+
+def player_labels(modes: int) -> list[str]:
+    """Short names of the players, "2.1" for mode 1 of link 2."""
+    return [f"{i + 1}.{j + 1}" for i in range(3) for j in range(modes)]
+
+
+def setting_label(setting: tuple[float, str]) -> str:
+    """Move time and shaper in words."""
+    time, shaper = setting
+    return f"{time:g} s, " + {"none": "no shaper"}.get(shaper, f"{shaper.upper()} shaper")
+
+
+def atlas_sweep(
+    study: Study,
+    settings: tuple[tuple[float, str], ...] = SETTINGS,
+    windows: tuple[str, ...] = WINDOWS,
+    has_modes: bool = True,
+) -> SweepSpec:
+    """The sweep of all subsets of a design.
+
+    Args:
+        study: the design; its links, masks, move time and shaper are replaced. Where its ratios
+            come from its own uncontrolled run, that of each setting is run here.
+        settings: time of every move of its path [s], and shaper.
+        windows: of WINDOWS.
+        has_modes: all subsets of links and modes; else the 8 of links.
+
+    Raises:
+        StudyError: too many controlled modes, no motion, no sampled modal controller.
+    """
+    _check(study)
+    modes = study.control.modes
+    masks = _masks(modes) if has_modes else _masks(modes)[_whole_links(modes)]
+    study = long_enough(study, settings).change(
+        title=f"{study.title}: subsets of controlled links and modes",
+        control__links=(True,) * 3, control__mode_mask=(),
+    )  # fmt: skip
+    cases = []
+    for time, shaper in settings:
+        moved = study.change(motion__move_time=time, shaper__kind=shaper)
+        # the same on every machine, so that a sweep can be resumed
+        ratios = np.vectorize(_rounded)(resolved_study(moved).control.ratios)
+        for window in windows:
+            delay, length = residual_window(study, window)
+            cases.append({
+                "motion.move_time": time, "shaper.kind": shaper,
+                "metrics.residual_delay": delay, "metrics.residual_length": length,
+                "control.ratios": ratios.tolist(),
+            })  # fmt: skip
+    data = study.model_dump(mode="json")
+    data["control"] |= {"ratio_source": "given", "ratio_exponent": 1.0}
+    data["sweep"] = {
+        "axes": {"control.mode_mask": masks.tolist()},
+        "blocks": [{"method": "list", "cases": cases}],
+        "metrics": list(_KEPT),
+    }
+    return parse_sweep(data)
+
+
+def _rounded(x: float) -> float:
+    return float(f"{x:.10g}")
+
+
+def residual_window(study: Study, window: str) -> tuple[float, float]:
+    """Begin after the command's end and length of one of WINDOWS [s]."""
+    delay, length = study.metrics.residual_delay, study.metrics.residual_length
+    early = EARLY_PART * length if window == "late" else 0.0
+    return delay + early, length - early
+
+
+def long_enough(study: Study, settings: tuple[tuple[float, str], ...]) -> Study:
+    """The study with a run that is long enough for the slowest setting and its windows."""
+    moves = len(study.motion.waypoints) - 1
+    dwell = float(np.broadcast_to(study.motion.dwell, (moves,)).sum())
+    slowest = moves * max(time for time, _ in settings) + dwell + SHAPER_TIME
+    needed = slowest + study.metrics.residual_delay + study.metrics.residual_length
+    return study.change(run__duration=max(study.run.duration, float(np.ceil(100 * needed) / 100)))
+
+
+def _check(study: Study) -> None:
+    control, motion = study.control, study.motion
+    if control.modes > MODE_LIMIT:
+        raise field_error(
+            "control.modes", control.modes,
+            f"1 to {MODE_LIMIT}, whose {2 ** (3 * MODE_LIMIT)} subsets can all be run", "1",
+        )  # fmt: skip
+    if len(motion.waypoints) < 2:
+        raise field_error("motion.waypoints", motion.waypoints, "a path of two poses or more", "m")
+    for name, value, allowed in (
+        ("control.feedback", control.feedback, "sampled"), ("control.law", control.law, "imsc"),
+    ):  # fmt: skip
+        if value != allowed:
+            raise field_error(name, value, f"{allowed!r}, whose links and modes can be chosen")
+
+
+def _masks(modes: int) -> np.ndarray:
+    """mode_mask of every subset, (2^(3C), 3, C)."""
+    players = np.arange(3 * modes)
+    on = (np.arange(2 ** (3 * modes))[:, None] >> players) & 1
+    return on.astype(bool).reshape(-1, 3, modes)
+
+
+def _whole_links(modes: int) -> np.ndarray:
+    """Which subsets are made of whole links."""
+    masks = _masks(modes)
+    return np.flatnonzero((masks == masks[..., :1]).all(axis=(1, 2)))
+
+
+def read_subsets(data: SweepData) -> Subsets:
+    """Residuals of a finished `atlas_sweep`.
+
+    Args:
+        data: from `studies.load`.
+
+    Returns:
+        Subsets; NaN where a case did not finish, or where only whole links were run.
+    """
+    mask = data["control_mode_mask"].astype(bool)
+    modes = mask.shape[2]
+    setting = list(zip(data["motion_move_time"].tolist(), data["shaper_kind"].tolist(),
+                       strict=True))  # fmt: skip
+    settings = list(dict.fromkeys(setting))
+    windows, window = np.unique(data["metrics_residual_delay"], return_inverse=True)
+    subset = mask.reshape(len(mask), -1) @ 2 ** np.arange(3 * modes)
+    index = (np.array([settings.index(one) for one in setting]), window, subset)
+    shape = (len(settings), len(windows), 2 ** (3 * modes))
+
+    def placed(values: np.ndarray, fill: Any = np.nan) -> np.ndarray:
+        whole = np.full(shape + values.shape[1:], fill, values.dtype)
+        whole[index] = values
+        return whole
+
+    return Subsets(
+        tuple(settings),
+        modes,
+        placed(data["status"], NOT_RUN),
+        placed(data["residual_rms"]),
+        placed(data["pose_error_rms"]),
+        placed(data["spectral_density"].max(axis=-1)),
+        placed(data["settling_time"]),
+        placed(data["peak_voltage"]),
+    )

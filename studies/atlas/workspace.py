@@ -1,0 +1,225 @@
+"""Natural modes of the machine on a grid of poses: frequencies, shapes, who takes part, coupling.
+
+The sliders are held by their drive, damping is left out. Coupling is that of the links' first
+modes through platform and sliders: with the pose condensed out of the mass matrix,
+M_c = M_qq - M_qX M_XX^-1 M_Xq, it is |M_c,ik|/sqrt(M_c,ii M_c,kk) for links i and k.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel import status
+from jaxmodel.case import Case, Structure
+from jaxmodel.dynamics import kinetic_energy, modal_chain
+from jaxmodel.kinematics import chain_status, close_chain, link_angle
+from jaxmodel.linear import linearise, mechanical
+from jaxmodel.parameters import Array
+from jaxmodel.prepare import prepare
+from studies.runs import check_pose, check_run
+from studies.spec import Study
+
+#: Modes per link in these matrices; assembled frequencies converge with the first one.
+MAP_MODES = 3
+#: Turns of the platform against the path's first pose [rad].
+TURNS = (-np.pi / 18, 0.0, np.pi / 18)
+#: Points of the map along x and y.
+GRID = 61
+#: Pairs of links, as in the last axis of `Map.coupling`.
+PAIRS = ((0, 1), (0, 2), (1, 2))
+#: Poses that one call of the compiled program takes.
+_BATCH = 512
+
+
+class PoseModes(NamedTuple):
+    """Natural modes at poses (leading axes), ascending in frequency."""
+
+    frequency: np.ndarray  # [Hz], (..., m)
+    shape: np.ndarray  # of (X [m, m, rad], q [m]), largest entry 1, one per column, (..., m, m)
+    share: np.ndarray  # strain energy in links 1, 2, 3 and drive, sum 1, (..., m, 4)
+    order_share: np.ndarray  # strain energy in the first, second, ... modes of links, (..., m, R)
+    coupling: np.ndarray  # of the links' first modes, by PAIRS [1], (..., 3)
+
+
+class Map(NamedTuple):
+    """Axes: phi, y, x; NaN where the machine cannot stand."""
+
+    x: np.ndarray  # [m], (n,)
+    y: np.ndarray  # [m], (n,)
+    phi: np.ndarray  # [rad], (p,)
+    status: np.ndarray  # code of the pose, (p, n, n)
+    gamma: np.ndarray  # link angles [rad], (p, n, n, 3)
+    frequency: np.ndarray  # all natural frequencies [Hz], (p, n, n, m)
+    bending: np.ndarray  # the three that are mostly first bending of links [Hz], (p, n, n, 3)
+    share: np.ndarray  # their strain energy in links 1, 2, 3 and drive [1], (p, n, n, 3, 4)
+    coupling: np.ndarray  # of the links' first modes, by PAIRS [1], (p, n, n, 3)
+
+    @property
+    def margin(self) -> np.ndarray:
+        """Distance of the nearest link angle from 0 and 90 deg [rad], (p, n, n)."""
+        return np.minimum(self.gamma, np.pi / 2 - self.gamma).min(axis=-1)
+
+    @property
+    def spread(self) -> np.ndarray:
+        """Width of the first bending triple over its mean [1], (p, n, n)."""
+        return np.ptp(self.bending, axis=-1) / self.bending.mean(axis=-1)
+
+
+def natural_modes_at(study: Study, poses: Any) -> PoseModes:
+    """Natural modes at given poses.
+
+    Args:
+        study: the machine and its drive.
+        poses: (x, y, phi) [m, m, rad], (n, 3).
+
+    Returns:
+        PoseModes with leading axis n.
+
+    Raises:
+        StudyError: a pose out of reach or singular.
+    """
+    structure, case = _machine(study)
+    poses = np.asarray(poses, float)
+    codes, _ = _stand(structure, case, poses)
+    for pose, code in zip(poses, np.asarray(codes), strict=True):
+        check_pose("pose", tuple(pose.tolist()), int(code))
+    return _solve(structure, case, poses)
+
+
+def map_workspace(study: Study, count: int = GRID, turns: tuple[float, ...] = TURNS) -> Map:
+    """Natural modes over all that the platform can reach.
+
+    Args:
+        study: the machine and its drive.
+        count: points along x and along y.
+        turns: of the platform against the first pose of the study's path [rad].
+
+    Returns:
+        Map.
+    """
+    structure, case = _machine(study)
+    phi = study.motion.waypoints[0][2] + np.array(turns)
+    x, y = _extent(structure, case, study, phi, count)
+    grid = np.stack(np.meshgrid(phi, y, x, indexing="ij")[::-1], axis=-1)
+    poses = grid.reshape(-1, 3)
+    codes, gamma = (np.asarray(part) for part in _stand(structure, case, poses))
+    good = codes == status.OK
+    found = _solve(structure, case, poses[good])
+    chosen = np.sort(np.argsort(-found.order_share[..., 0], axis=1)[:, :3], axis=1)
+
+    def placed(values: np.ndarray) -> np.ndarray:
+        whole = np.full((len(poses), *values.shape[1:]), np.nan)
+        whole[good] = values
+        return whole.reshape(*grid.shape[:-1], *values.shape[1:])
+
+    return Map(
+        x, y, phi,
+        codes.astype(int).reshape(grid.shape[:-1]),
+        placed(gamma[good]),
+        placed(found.frequency),
+        placed(np.take_along_axis(found.frequency, chosen, axis=1)),
+        placed(np.take_along_axis(found.share, chosen[..., None], axis=1)),
+        placed(found.coupling),
+    )  # fmt: skip
+
+
+def _machine(study: Study) -> tuple[Structure, Case]:
+    """The machine with few modes and without anything that controls or shapes."""
+    plain = study.change(
+        link__modes=min(study.link.modes, MAP_MODES), control__feedback="none",
+        shaper__kind="none", control__ratio_source="given",
+    )  # fmt: skip
+    structure, case = check_run(plain)
+    return structure._replace(n_steps=1, substeps=1), case
+
+
+def _extent(
+    structure: Structure, case: Case, study: Study, phi: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Grid lines that hold all poses where the machine can stand."""
+    look = np.linspace(-0.6, 0.6, 121) * study.machine.guide_side
+    grid = np.stack(np.meshgrid(phi, look, look, indexing="ij")[::-1], axis=-1)
+    codes, _ = _stand(structure, case, grid.reshape(-1, 3))
+    good = (np.asarray(codes) == status.OK).reshape(grid.shape[:-1]).any(axis=0)
+    step = look[1] - look[0]
+    rows, columns = (look[np.flatnonzero(good.any(axis=k))] for k in (1, 0))
+    return tuple(  # type: ignore[return-value]
+        np.linspace(lines[0] - step, lines[-1] + step, count) for lines in (columns, rows)
+    )
+
+
+@partial(jax.jit, static_argnums=0)
+def _stand(structure: Structure, case: Case, poses: Array) -> tuple[Array, Array]:
+    """Status and link angles [rad] of poses, (n,) and (n, 3)."""
+    plant = prepare(structure, case).loop.plant
+
+    def one(pose: Array) -> tuple[Array, Array]:
+        chain = close_chain(plant, pose, jnp.zeros_like(pose))
+        return chain_status(plant, chain), link_angle(chain)
+
+    return jax.vmap(one)(poses)
+
+
+@partial(jax.jit, static_argnums=0)
+def _matrices(structure: Structure, case: Case, poses: Array) -> tuple[Array, Array, Array]:
+    """Mass and stiffness matrices in (X, q), and k_j of the links, (n, m, m) twice, (3, R)."""
+    loop = prepare(structure, case).loop
+    plant, size = loop.plant, 3 + 3 * structure.n_modes
+
+    def one(pose: Array) -> tuple[Array, Array]:
+        rest = jnp.zeros((3, structure.n_modes), pose.dtype)
+
+        def energy(rates: Array) -> Array:
+            pose_rate, q_rate = rates[:3], rates[3:].reshape(rest.shape)
+            chain = modal_chain(plant, pose, pose_rate, rest, q_rate)
+            return kinetic_energy(plant, chain, pose_rate, rest, q_rate)
+
+        mass = jax.hessian(energy)(jnp.zeros(size, pose.dtype))
+        state = mechanical(linearise(structure, loop, pose, case.electronics.antialias))
+        stiffness = -mass @ state[size:, :size]
+        return mass, (stiffness + stiffness.T) / 2
+
+    return *jax.vmap(one)(poses), plant.stiffness
+
+
+def _solve(structure: Structure, case: Case, poses: np.ndarray) -> PoseModes:
+    """Modes at sound poses, batch by batch of one compiled program."""
+    parts = []
+    for start in range(0, len(poses), _BATCH):
+        batch = poses[start : start + _BATCH]
+        filled = np.concatenate([batch, np.repeat(batch[-1:], _BATCH - len(batch), axis=0)])
+        mass, stiffness, own = (np.asarray(x) for x in _matrices(structure, case, filled))
+        parts.append(_modes(mass[: len(batch)], stiffness[: len(batch)], own))
+    return PoseModes(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def _modes(mass: np.ndarray, stiffness: np.ndarray, own: np.ndarray) -> PoseModes:
+    """Natural modes of stacked matrices; own: k_j of the links [N/m], (3, R)."""
+    inverse = np.linalg.inv(np.linalg.cholesky(mass))
+    square, vector = np.linalg.eigh(inverse @ stiffness @ np.swapaxes(inverse, 1, 2))
+    shape = np.swapaxes(inverse, 1, 2) @ vector  # x'Mx = 1, so x'Kx = omega^2
+    strain = own[..., None] * shape[:, 3:].reshape(-1, *own.shape, shape.shape[-1]) ** 2
+    total = np.einsum("nam,nab,nbm->nm", shape, stiffness, shape)
+    strain = np.moveaxis(strain / total[:, None, None], -1, 1)  # (n, m, 3, R)
+    link = strain.sum(axis=3)
+    peak = np.take_along_axis(shape, np.abs(shape).argmax(axis=1)[:, None], axis=1)
+    return PoseModes(
+        np.sqrt(np.maximum(square, 0.0)) / (2 * np.pi),
+        shape / peak,
+        np.concatenate([link, 1 - link.sum(axis=2, keepdims=True)], axis=2),
+        strain.sum(axis=2),
+        _coupling(mass, own.shape[1]),
+    )
+
+
+def _coupling(mass: np.ndarray, modes: int) -> np.ndarray:
+    rigid, cross, bent = mass[:, :3, :3], mass[:, :3, 3:], mass[:, 3:, 3:]
+    left = bent - np.swapaxes(cross, 1, 2) @ np.linalg.solve(rigid, cross)
+    first = left[:, ::modes, ::modes]
+    size = np.sqrt(np.einsum("nii->ni", first))
+    return np.stack([np.abs(first[:, i, k]) / (size[:, i] * size[:, k]) for i, k in PAIRS], axis=1)

@@ -1,0 +1,249 @@
+"""The atlas: shares against their definition, modes and responses against the machine's own."""
+
+import io
+from functools import partial
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+from PIL import Image
+from rich.console import Console
+
+import studies
+from studies.atlas import attribution, claims, figures, findings, run, subsets, workspace
+from studies.atlas.platform import LINK_SETS, responses
+from studies.errors import StudyError
+from studies.modes import machine_modes
+from studies.runs import run_study
+from studies.spec import paper_study
+
+SETTINGS = ((0.05, "ei"), (0.03, "none"))
+
+
+def small_study(**fields):
+    """One move, one controlled mode."""
+    home = paper_study().motion.waypoints[0]
+    return paper_study().change(
+        link__modes=2, control__modes=1, control__ratio_source="own_run", run__duration=0.13,
+        metrics__residual_length=0.06, motion__move_time=0.05,
+        motion__waypoints=(home, (0.0, 0.01, home[2])),
+    ).change(**fields)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def atlas(tmp_path_factory):
+    """A small atlas with few figures: its folder and what was found."""
+    folder, kept = tmp_path_factory.mktemp("atlas") / "out", {}
+
+    def look(*arguments):
+        kept["found"] = findings.look_around(*arguments)
+        return kept["found"]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "atlas_sweep", partial(subsets.atlas_sweep, settings=SETTINGS))
+        patch.setattr(run, "look_around", look)
+        patch.setattr(run, "FIGURES", {n: figures.FIGURES[n] for n in ("subsets", "modes")})
+        patch.setattr(figures, "CLIP", (-0.002, 0.002, 1e-3))
+        patch.setattr(findings, "map_workspace", partial(workspace.map_workspace, count=9))
+        patch.setattr(findings, "FREQUENCY", np.array([1.0, 50.0, 114.0, 300.0]))
+        console = Console(file=io.StringIO())
+        assert run.run_atlas(small_study(), folder, False, console)
+    return folder, kept["found"]
+
+
+def shapley_by_orders(value, count):
+    """Mean of what each player adds, over all orders of arrival."""
+    share = np.zeros(count)
+    orders = list(permutations(range(count)))
+    for order in orders:
+        subset = 0
+        for player in order:
+            share[player] += value[subset | 1 << player] - value[subset]
+            subset |= 1 << player
+    return share / len(orders)
+
+
+def test_shapley_shares_are_those_of_all_orders_of_arrival():
+    value = np.random.default_rng(0).normal(size=16)
+    share = attribution.shapley(value)
+    np.testing.assert_allclose(share, shapley_by_orders(value, 4), rtol=1e-12)
+    assert share.sum() == pytest.approx(value[-1] - value[0], rel=1e-12)
+
+
+def test_dividends_add_up_to_the_value():
+    value = np.random.default_rng(1).normal(size=(2, 8))
+    dividend = attribution.dividends(value)
+    parts = [[t for t in range(8) if t & s == t] for s in range(8)]
+    again = np.stack([dividend[:, part].sum(axis=1) for part in parts], axis=1)
+    np.testing.assert_allclose(again, value, rtol=1e-12, atol=1e-12)
+
+
+def test_interaction_is_what_a_pair_adds_by_being_one():
+    size = np.array([bin(s).count("1") for s in range(8)])
+    pair = ((np.arange(8) & 0b011) == 0b011).astype(float)
+    index = attribution.interaction(size + 5 * pair)
+    expected = np.zeros((3, 3))
+    expected[0, 1] = expected[1, 0] = 5
+    np.testing.assert_allclose(index, expected, atol=1e-12)
+
+
+def test_values_that_are_no_game_are_refused():
+    with pytest.raises(ValueError, match="6 values: allowed 2\\^n"):
+        attribution.shapley(np.zeros(6))
+
+
+def test_shares_of_the_atlas_sum_to_what_is_removed(atlas):
+    folder, found = atlas
+    game = found.subsets.removed()
+    with xarray.open_dataset(folder / run.DATA) as data:
+        total = data.shapley_share.sum("player").values
+        np.testing.assert_allclose(total, game[..., -1], rtol=1e-9, atol=1e-12)
+        assert np.abs(game[..., -1]).max() > 0.5
+        assert np.all(np.isfinite(data.interaction))
+
+
+def test_a_case_of_the_atlas_is_the_run_of_its_study(atlas):
+    seen = atlas[1].subsets
+    where = seen.setting.index((0.03, "none"))
+    moved = small_study(
+        motion__move_time=0.03, shaper__kind="none", control__links=(True, False, True)
+    )
+    metrics = run_study(moved, has_record=False, has_loop=False).result.metrics
+    subset = seen.link_subsets[0b101]
+    np.testing.assert_allclose(seen.station[where, 0, subset], metrics.residual_rms, rtol=1e-6)
+    np.testing.assert_allclose(seen.pose[where, 0, subset], metrics.pose_error_rms, rtol=1e-6)
+
+
+def test_atlas_writes_what_its_report_shows(atlas):
+    folder = atlas[0]
+    text = (folder / "report.md").read_text(encoding="utf-8")
+    assert text.startswith("# Coupling atlas")
+    for name in ("subsets.png", "modes.png", "modes.pdf", figures.ANIMATION, run.DATA):
+        assert (folder / name).stat().st_size > 1000
+    for name in figures.FIGURES:
+        assert f"({name}.png)" in text
+    assert "nan" not in text.lower()
+    with Image.open(folder / figures.ANIMATION) as film:
+        assert film.n_frames == 4
+    assert not list(folder.glob(".unfinished*"))
+
+
+def test_vibration_and_drive_add_up_to_the_error_of_a_run(atlas):
+    runs = atlas[1].platform
+    moved = small_study(shaper__kind="none", control__links=LINK_SETS[1])
+    record = run_study(moved, has_loop=False).result.record
+    total = runs.drive[1] + runs.vibration[1, 1]
+    total = total[: len(record.time)]
+    size = np.abs(record.pose_error).max(axis=0)
+    assert np.all(np.abs(total - record.pose_error).max(axis=0) <= 1e-6 * size)
+    assert np.all(np.abs(runs.vibration[1, 1]).max(axis=0) > 1e-6 * size)
+
+
+def test_stiff_links_leave_drive_error_alone():
+    found = [_vibration(small_study(link__youngs_modulus=e)) for e in (70e9, 280e9)]
+    # quasi-static bending falls as 1/E
+    assert 2.5 < found[0] / found[1] < 6
+
+
+def _vibration(study):
+    from studies.atlas.platform import platform_error
+
+    runs = platform_error(study)
+    moving = runs.time < runs.command_end[0]
+    return np.sqrt(np.mean(runs.vibration[0, 0, moving, 1] ** 2))
+
+
+def test_static_response_is_the_drive_s_stiffness():
+    study = small_study(drive__kp=3e4)
+    found = responses(study, np.array([0.01]))
+    x, y, phi = study.motion.waypoints[0]
+    size = np.abs(found.value[0, 0])
+    # slider force over Kp is the slider's way; on the platform (J'Kp J)^-1
+    jacobian = np.linalg.inv(np.real(found.value[0, 0, 3:, :3]) * 3e4)
+    compliance = np.linalg.inv(jacobian.T @ jacobian) / 3e4
+    np.testing.assert_allclose(np.real(found.value[0, 0, 3:, 3:]), compliance, rtol=1e-3, atol=1e-9)
+    assert size[:3].max() < 1e-9  # links bend under acceleration only
+
+
+def test_map_at_home_is_that_of_the_machine(atlas):
+    found = workspace.natural_modes_at(paper_study(), [paper_study().motion.waypoints[0]])
+    np.testing.assert_allclose(found.frequency[0], machine_modes().frequency, rtol=1e-8)
+    np.testing.assert_allclose(found.share.sum(axis=-1), 1.0, rtol=1e-9)
+    # three-fold symmetry: the bending mode with all links in step shares evenly
+    even = np.argmin(np.ptp(found.share[0, 3:6, :3], axis=1)) + 3
+    np.testing.assert_allclose(found.share[0, even, :3], found.share[0, even, 0], rtol=1e-4)
+    np.testing.assert_allclose(found.coupling[0], found.coupling[0, 0], rtol=1e-6)
+
+    chart = atlas[1].map
+    assert 0 < np.isfinite(chart.margin).mean() < 1
+    assert np.all(np.isfinite(chart.bending) == np.isfinite(chart.margin)[..., None])
+    inside = chart.bending[np.isfinite(chart.bending)]
+    assert 110 < inside.min() and inside.max() < 125
+
+
+def test_a_pose_out_of_reach_is_refused():
+    with pytest.raises(StudyError, match="pose = .*gamma is inside"):
+        workspace.natural_modes_at(paper_study(), [(0.2, 0.0, 0.5)])
+
+
+def made_up(link, platform):
+    """Subsets of one controlled mode with given late residuals of 8 choices."""
+    both = np.stack([link, link])[None]
+    pose = np.stack([platform, 0 * platform, 0 * platform], axis=-1)
+    return subsets.Subsets(
+        ((0.1, "ei"),), 1, np.zeros((1, 2, 8), int), both[..., None], np.stack([pose, pose])[None],
+        both[..., None] ** 2, both, both,
+    )  # fmt: skip
+
+
+def test_claims_are_counted():
+    on = (np.arange(8)[:, None] >> np.arange(3)) & 1
+    link = 1.0 - 0.5 * on
+    platform = np.array([1.0, 0.8, 0.8, 0.4, 0.8, 0.45, 0.6, 0.7])  # three worse than two
+    seen = made_up(link, platform)
+    steps = claims.one_more_link(seen)
+    assert steps.rises[0, 1].tolist() == [0, 0, 0, 0, 3]
+    assert np.argmax(steps.change[0, 1, 4]) == steps.labels.index("1+2 -> 1+2+3")
+    np.testing.assert_allclose(claims.two_links(seen).change[0, 1], [-0.6, -0.55, -0.4])
+    signs = claims.table_1_signs(seen)
+    assert np.all(signs.agree[:, signs.is_controlled])
+    np.testing.assert_allclose(signs.ours[0][signs.is_controlled], -0.75)
+    np.testing.assert_allclose(signs.ours[0][~signs.is_controlled], 0.0)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"control__feedback": "ideal"}, "control.feedback = 'ideal': allowed 'sampled'"),
+        ({"control__law": "srf"}, "control.law = 'srf': allowed 'imsc'"),
+        ({"motion__waypoints": ((0.0, 0.0, 0.5),)}, "motion.waypoints"),
+    ],
+)
+def test_designs_without_subsets_are_refused(fields, message):
+    with pytest.raises(StudyError, match=message):
+        subsets.atlas_sweep(small_study().change(**fields))
+
+
+def test_settings_with_failed_runs_are_left_out_in_words():
+    seen = made_up(np.ones((8, 3)), np.ones(8))
+    twice = seen._replace(
+        setting=(*seen.setting, (0.03, "none")),
+        **{n: np.concatenate([getattr(seen, n)] * 2) for n in subsets.Subsets._fields[2:]},
+    )
+    twice.status[1, 0, 3] = 1
+    kept, dropped = run.sound_settings(twice)
+    assert kept.setting == seen.setting and kept.station.shape[0] == 1
+    assert "0.03 s, no shaper: of 16 runs 1 " in dropped[0]
+    twice.status[:] = 1
+    with pytest.raises(StudyError, match="no setting"):
+        run.sound_settings(twice)
+
+
+def test_atlas_goes_on_after_an_interrupt_and_refuses_to_start_over(atlas, tmp_path):
+    folder = atlas[0]
+    assert studies.load(folder / run.RUNS_FOLDER).is_finished.all()
+    with pytest.raises(StudyError, match="add --resume"):
+        run.run_atlas(small_study(), folder, False, Console(file=io.StringIO()))
+    assert Path(folder / "report.md").is_file()
