@@ -9,15 +9,17 @@ import xarray
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from studies import paper, paper_cases, paper_figures, report, report_context
+from studies import load, paper, paper_cases, paper_figures, report, report_context
+from studies.atlas import atlas_sweep, read_subsets
 from studies.cli import main
 from studies.errors import StudyError
 from studies.figures import comparison
-from studies.paper_cases import ALL, OFF, run_cases
+from studies.paper_cases import ALL, MOVES, OFF, ONE, SHAPERS, TWO, run_cases
 from studies.paper_measures import measure
 from studies.runs import run_study
 from studies.spec import paper_study
 from studies.store import read_store
+from studies.sweeps.run import run_sweep
 
 #: Figures that are written; the others are only drawn.
 FIGURES = ("fig03", "shapers")
@@ -118,6 +120,33 @@ def test_controlled_cases_take_ratios_of_their_uncontrolled_counterpart(short):
     assert not runs.ratio[off].any()
     two = runs.where(modes=2, links=ALL)
     assert (runs.ratio[two, :, 1] > 0).all() and not runs.ratio[two, :, 2].any()
+
+
+def test_atlas_has_the_numbers_of_the_paper_s_cases(short, tmp_path):
+    """The subsets of the atlas go through the engine of sweeps, the paper's cases do not."""
+    study = short.runs.study.change(control__ratio_source="own_run")
+    settings = tuple((time, shaper) for time in MOVES.values() for shaper in SHAPERS)
+    quiet = Console(file=io.StringIO())
+    run_sweep(atlas_sweep(study, settings, has_modes=False), tmp_path / "runs", console=quiet)
+    seen = read_subsets(load(tmp_path / "runs"))
+    late = np.zeros((4, 4, 3))
+    for place, (time, shaper) in enumerate(settings):
+        move = next(name for name, value in MOVES.items() if value == time)
+        for which, links in enumerate((OFF, ONE, TWO, ALL)):
+            k = short.runs.where(move=move, shaper=shaper, modes=3, links=links)
+            subset = seen.link_subsets[sum(1 << i for i in range(3) if links[i])]
+            metrics = short.runs.result.metrics
+            np.testing.assert_allclose(
+                seen.station[place, 0, subset], metrics.residual_rms[k], rtol=1e-6
+            )
+            np.testing.assert_allclose(
+                seen.pose[place, 0, subset], metrics.pose_error_rms[k], rtol=1e-6
+            )
+            late[place, which] = seen.station[place, 1, subset, :, 1]
+            np.testing.assert_allclose(
+                late[place, which], short.measures.late_deflection[k], rtol=1e-6
+            )
+    assert late.min() > 0
 
 
 def test_control_acts_where_it_is_and_off_means_off(short):

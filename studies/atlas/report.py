@@ -140,9 +140,9 @@ def _more_links(found: Findings) -> list[str]:
         f"in {int(is_worse.sum())} of {is_worse.size} cases a step makes a single link worse, "
         f"{left_alone} times one that is not controlled. Nor does it hold while the drive settles "
         "(whole window): there the links bend with the drive, far below their own frequency, where "
-        f"the velocity estimate has another phase: at {found.modes.frequency[0, 0]:.3g} Hz, the drive's lowest "
-        "mode, control of all links multiplies the response of link 1 to slider 1 by "
-        f"{_below(found):.2f}.",
+        f"the velocity estimate has another phase: at {found.modes.frequency[0, 0]:.3g} Hz, the "
+        "drive's lowest mode, control of all links multiplies the response of link 1 to slider 1 "
+        f"by {_below(found):.2f}.",
     ]  # fmt: skip
 
 
