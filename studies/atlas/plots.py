@@ -168,7 +168,7 @@ def workspace_map(
     reach = np.where(np.isnan(margin), 0.0, 1.0)
     ax.contour(1e3 * x, 1e3 * y, reach, [0.5], colors="#D55E00", linewidths=1.5)
     lines = ax.contour(
-        1e3 * x, 1e3 * y, np.degrees(margin), [5, 10, 20], colors="white", linewidths=0.7
+        1e3 * x, 1e3 * y, np.degrees(margin), [10, 20], colors="white", linewidths=0.7
     )
     ax.clabel(lines, fmt="%g°", fontsize=6)
     if path is not None:
