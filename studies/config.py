@@ -108,6 +108,13 @@ def info() -> dict[str, Any]:
     }
 
 
+def origin() -> dict[str, str]:
+    """What results are labelled with: versions, devices and precision; starts JAX."""
+    facts = info()
+    names = (PACKAGE, "python", "jax", "jaxlib", "numpy", "h5py", "devices", "precision")
+    return {name: str(facts[name]) for name in names}
+
+
 def cache_folder() -> str:
     """Where compiled programs are kept; "" for nowhere."""
     is_kept = settings.jax_enable_compilation_cache

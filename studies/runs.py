@@ -472,12 +472,10 @@ def chord_deflection(run: Run) -> np.ndarray:
 
 def run_attributes(study: Study) -> dict[str, Any]:
     """What a file must say about its origin: the study, versions, device, precision."""
-    facts = config.info()
-    keep = (config.PACKAGE, "python", "jax", "jaxlib", "numpy", "h5py", "devices", "precision")
     return {
         "title": study.title,
         "study": json.dumps(study.model_dump(mode="json")),
-        **{name.replace("-", "_"): str(facts[name]) for name in keep},
+        **{name.replace("-", "_"): fact for name, fact in config.origin().items()},
     }
 
 

@@ -165,13 +165,11 @@ def make_manifest(data: dict[str, Any], more: Iterable[Path] = ()) -> dict[str, 
         data: the sweep file as read.
         more: sources that decide them too.
     """
-    facts = config.info()
-    keep = (config.PACKAGE, "python", "jax", "jaxlib", "numpy", "h5py", "devices", "precision")
     return {
         "spec": data,
         "code": code_digest(more),
         "git": git_state(),
-        **{k: facts[k] for k in keep},
+        **config.origin(),
     }
 
 

@@ -1,0 +1,107 @@
+"""Reading web pages of reports as strictly as a browser is lenient, for tests of any report."""
+
+import re
+import shutil
+import subprocess
+from base64 import b64decode
+from html.parser import HTMLParser
+from io import BytesIO
+
+import pytest
+from PIL import Image
+
+#: A title that would be more than text, in HTML and in Markdown.
+TITLE = "<script>alert(1)</script> *fast* | 10 mm ![x](http://e.org/x.png) &amp; a_b"
+
+VOID = ("img", "meta", "br", "hr")
+#: Nothing of a report needs one of these.
+FORBIDDEN = ("script", "link", "iframe", "object", "embed", "base", "form", "svg", "video")
+
+
+class Page(HTMLParser):
+    """A page as parsed; asserts that tags nest and that nothing outside the file is loaded."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.tags, self.text, self.title, self.rows = [], [], "", "", []
+        self.images = []  # size in pixels and description of each
+        assert text.startswith('<!DOCTYPE html>\n<html lang="en">')
+        self.feed(text)
+        self.close()
+        assert self.open == [], f"not closed: {self.open}"
+
+    def handle_starttag(self, tag, attributes):
+        assert tag not in FORBIDDEN, tag
+        values = dict(attributes)
+        loading = [name for name in values if name in ("src", "srcset", "background", "style")]
+        assert loading == (["src"] if tag == "img" else []), (tag, loading)
+        assert not [name for name in values if name.startswith("on")], values
+        if tag == "img":
+            kind, _, data = values["src"].partition(",")
+            assert kind == "data:image/png;base64", kind
+            image = b64decode(data, validate=True)
+            assert image.startswith(b"\x89PNG\r\n\x1a\n")
+            self.images.append((Image.open(BytesIO(image)).size, values["alt"]))
+        if tag == "table":
+            self.rows.append([])
+        if tag == "tr":
+            self.rows[-1].append(0)
+        if tag in ("td", "th"):
+            self.rows[-1][-1] += 1
+        self.tags.append(tag)
+        if tag not in VOID:
+            assert not (tag == "figure" and "p" in self.open)
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open and self.open.pop() == tag, f"</{tag}> closes something else"
+        if tag == "table":
+            assert len(set(self.rows[-1])) == 1, f"cells of a table's rows: {self.rows[-1]}"
+
+    def handle_data(self, data):
+        if self.open[-1:] == ["style"]:
+            assert "url(" not in data and "@import" not in data
+        elif self.open[-1:] == ["title"]:
+            self.title += data
+        else:
+            self.text += data
+
+
+def parsed(text):
+    """The page of an HTML text; asserts that it is whole and stands alone."""
+    page = Page(text)
+    assert page.tags.count("h1") == 1 and page.tags.count("figure") == len(page.images)
+    assert page.tags.count("figcaption") == len(page.images)
+    assert all(size[0] > 300 and description for size, description in page.images)
+    return page
+
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "microsoft-edge")
+PROBE = """<script>
+addEventListener("load", () => {
+  const root = document.documentElement, images = [...document.images];
+  const broken = images.filter(image => image.naturalWidth === 0).length;
+  const over = root.scrollWidth - root.clientWidth;
+  root.setAttribute("data-found", `${images.length} ${broken} ${over}`);
+});
+</script>"""
+
+
+def rendered(html, folder, width):
+    """What a browser with a window of this width says; skips the test where there is none.
+
+    Returns images, broken ones among them, and pixels by which the page is too wide.
+    """
+    command = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if command is None:
+        pytest.skip(f"no browser here ({', '.join(BROWSERS)})")
+    path = folder / "probed.html"
+    path.write_text(html.replace("</body>", f"{PROBE}</body>"), encoding="utf-8")
+    options = ("--headless", "--disable-gpu", "--no-sandbox", "--dump-dom")
+    own = f"--user-data-dir={folder / 'browser'}", f"--window-size={width},800"
+    done = subprocess.run(
+        [command, *options, *own, path.as_uri()], capture_output=True, text=True, timeout=120
+    )
+    found = re.search(r'data-found="(\d+) (\d+) (-?\d+)"', done.stdout)
+    assert found, done.stderr
+    return tuple(map(int, found.groups()))

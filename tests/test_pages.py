@@ -1,0 +1,106 @@
+"""Reports as web pages: whole and self-contained, whatever users write into them.
+
+Pages that commands write are tested where the commands are.
+"""
+
+import io
+import tomllib
+from pathlib import Path
+
+import pytest
+from matplotlib.figure import Figure
+
+from studies import spec as spec_module
+from studies.pages import literal, page, picture, report_files, table
+from studies.template import toml_text
+from tests.pages import TITLE, parsed, rendered
+from tests.sweeps import MIXED, small
+
+VERSIONS = {"python": "3", "jax": "<1>"}
+
+
+def png(width=400):
+    image = io.BytesIO()
+    Figure(figsize=(width / 100, 2), dpi=100).savefig(image, format="png")
+    return image.getvalue()
+
+
+def test_a_text_becomes_a_whole_page():
+    lines = [f"# {literal(TITLE)}: study", "", "E = ω²q² in <b>µm</b>, 5 %", ""]
+    lines += [*table(("", "x [µm]"), [["a", "1.2 †"], [literal("b | c"), "`k`"]]), ""]
+    lines += [picture("my run 100%.png", "Bending of `link`, *all*")]
+    files = {"Study file": 'title = "</pre><script>"\n'}
+    html = page("\n".join(lines), {"my run 100%.png": png()}, files, VERSIONS)
+    found = parsed(html)
+    assert found.title == f"{TITLE}: study" and TITLE in found.text
+    assert found.images == [((400, 200), "Bending of link, all")]
+    assert found.rows == [[2, 2, 2], [2, 2]]
+    for part in (
+        "E = ω²q² in <b>µm</b>, 5\xa0%",
+        "1.2\xa0†",
+        "b | c",
+        "<1>",
+        '"</pre><script>"',
+    ):
+        assert part in found.text
+    assert "<figcaption>Bending of <code>link</code>, <em>all</em></figcaption>" in html
+    assert '<div class="table">\n<table>' in html and '<meta charset="utf-8">' in html
+
+
+def test_a_figure_without_its_image_is_a_fault_of_the_program(tmp_path):
+    with pytest.raises(ValueError, match="'none.png'"):
+        report_files(tmp_path, f"# Title\n\n{picture('none.png', 'none')}", {})
+
+
+@pytest.mark.parametrize(
+    "text",
+    [TITLE, "# x", "- 1. x", "1. x", "12) y", "+", "===", "--- a", "***", "~~~", "> q", "-0.5",
+     "[x]: http://e", "[a][b] [c](d)", "a\\*b", "`x`", "<http://e.org>", "_a_ b_c", "&lt;"],
+)  # fmt: skip
+def test_texts_of_users_are_shown_as_they_are(text):
+    for before in ("# ", "- ", "| a |\n| --- |\n| ", "# a\n\n"):
+        found = parsed(
+            page(f"{before}{literal(text)}" + "\n\n# b" * (before[0] != "#"), {}, {}, VERSIONS)
+        )
+        assert text in found.text.splitlines()
+        assert set(found.tags) <= {*"html head meta title style body main h1 h2 p".split(), "div",
+                                   *"table thead tbody tr th td ul li".split()}  # fmt: skip
+
+
+HEAD = '<!DOCTYPE html>\n<html lang="en"><body><h1>a</h1>'
+
+
+@pytest.mark.parametrize(
+    "inside",
+    ["<p>", "<b><i></b></i>", "<script></script>", "<link>", '<img src="http://e.org/x.png">',
+     '<img src="data:image/png;base64,AAAA" alt="x">', "<style>@import 'x'</style>", "<h1>b</h1>",
+     "<table><tr><td></td></tr><tr></tr></table>", '<p onclick="x()"></p>', "<figure></figure>"],
+)  # fmt: skip
+def test_the_parser_of_these_tests_finds_faults(inside):
+    parsed(HEAD + "</body></html>")
+    with pytest.raises(AssertionError):
+        parsed(HEAD + inside + "</body></html>")
+
+
+def test_toml_is_read_back():
+    files = sorted(Path(spec_module.__file__).parent.glob("specs/*.toml"))
+    assert len(files) > 5
+    written = [tomllib.loads(path.read_text()) for path in files]
+    odd = {"title": 'a "b"\n', "a": {"b.c": {"x": [{"y": 1}], "z": {}}, "t": {"u": {"v": True}}}}
+    for data in (*written, small(MIXED), odd):
+        assert tomllib.loads(toml_text(data)) == data
+
+
+@pytest.mark.parametrize("width", [1280, 600])
+def test_a_wide_report_fits_a_browsers_window(tmp_path, width):
+    wide = table([f"column {k}" for k in range(30)], [["123456789"] * 30])
+    lines = ["# Title", "", "a" * 300, "", *wide, "", picture("a.png", "a figure")]
+    files = {"Study file": "x = " + "1" * 500}
+    html = page("\n".join(lines), {"a.png": png(3000)}, files, VERSIONS)
+    assert rendered(html, tmp_path, width) == (1, 0, 0)
+
+
+def test_a_browser_finds_faults(tmp_path):
+    bad = '<img src="data:image/png;base64,AAAA"><p style="width: 3000px">wide</p>'
+    images, broken, over = rendered(HEAD + bad + "</body></html>", tmp_path, 1280)
+    assert (images, broken) == (1, 1) and over > 1000
