@@ -1,6 +1,7 @@
 """`studies paper`: the paper's sections 4 and 5 from one command, into one folder.
 
-The folder gets `paper.h5` (all runs), the counterparts of the paper's figures, and `report.md`.
+The folder gets `paper.h5` (all runs), the counterparts of the paper's figures, and the report,
+as Markdown and as a web page.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 
 from studies.errors import StudyError
+from studies.pages import write_report
 from studies.paper_cases import (
     EXECUTOR,
     MOVES,
@@ -27,12 +29,12 @@ from studies.paper_cases import (
 )  # fmt: skip
 from studies.paper_figures import PAPER_FIGURES, draw_figure
 from studies.paper_measures import Measures, measure, middle_station
-from studies.report import write_report
+from studies.report import report
 from studies.runs import STATUS_LABEL, describe, metric_variables, run_attributes
 from studies.spec import Study, paper_study
 from studies.store import Variable, check_target, write_store
 
-DATA, REPORT = "paper.h5", "report.md"
+DATA, REPORT = "paper.h5", "report.html"
 
 
 def run_paper(out: Path, console: Console) -> None:
@@ -90,7 +92,7 @@ def _write(out: Path, runs: PaperRuns, measures: Measures, tell: Tell) -> None:
         for name in PAPER_FIGURES:
             tell(f"drawing {name}", 0.25)
             draw_figure(name, runs, measures, staging)
-        write_report(staging / REPORT, runs, measures)
+        write_report(staging, report(runs, measures), runs.study)
         for file in sorted(staging.iterdir()):
             os.replace(file, out / file.name)
 

@@ -1,15 +1,15 @@
-"""`report.md` of the paper's study: the paper's numbers and ours side by side, and why they differ.
+"""The report of the paper's study: the paper's numbers and ours side by side, and why they differ.
 
 Numbers of ours, and what is said of them, come from the runs; the paper's stand here as constants.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from studies.pages import picture, table
 from studies.paper_cases import ALL, MOVES, OFF, PAPER_RATIOS, PaperRuns
 from studies.paper_figures import PAPER_FIGURES
 from studies.paper_measures import EARLY_PART, PEAK_SPAN, SETTLED, Measures, middle_station
@@ -22,7 +22,6 @@ from studies.report_context import (
     residual,
     settings,
     span,
-    table,
 )  # fmt: skip
 
 #: (27), experiment, two modes.
@@ -35,14 +34,13 @@ MODE_2 = (-48.33, -49.62, -52.21)
 PAPER_SETTLING = 0.07
 
 
-def write_report(path: Path, runs: PaperRuns, measures: Measures) -> None:
-    """Write the report as Markdown."""
+def report(runs: PaperRuns, measures: Measures) -> str:
+    """Markdown text; its figures are PAPER_FIGURES."""
     context = Context(runs, measures)
     sections = (
         _head, _ratios, _table_1, _mode_2, _settling, platform, variants, differences, _figures,
     )  # fmt: skip
-    lines = [line for section in sections for line in (*section(context), "")]
-    path.write_text("\n".join(lines), encoding="utf-8")
+    return "\n".join(line for section in sections for line in (*section(context), ""))
 
 
 def _head(context: Context) -> list[str]:
@@ -263,8 +261,12 @@ def _window_words(context: Context, pairs: list[tuple[int, int, str]]) -> list[s
 
 
 def _figures(context: Context) -> list[str]:
-    rows = [
-        [name, figure.caption, f"[PNG]({name}.png)", f"[PDF]({name}.pdf)"]
-        for name, figure in PAPER_FIGURES.items()
-    ]
-    return ["## Figures", "", *table(("figure", "shows", "", ""), rows)]
+    lines = [
+        "## Figures", "",
+        "`fig03` is the counterpart of the paper's figure 3, and so on. Of two columns the left "
+        "one is the paper's move with its EI shaper, the right one the faster move without shaper. "
+        "Each figure is also a PDF of its name.",
+    ]  # fmt: skip
+    for name, figure in PAPER_FIGURES.items():
+        lines += ["", picture(f"{name}.png", f"`{name}`: {figure.caption}")]
+    return lines

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from studies.pages import table
 from studies.paper_cases import HIGH_DAMPING, MOVES, OFF, TWO
-from studies.report_context import PLACES, Context, change, move_text, settings, table
+from studies.report_context import PLACES, Context, change, move_text, settings
 from studies.runs import describe
 
 

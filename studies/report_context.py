@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,16 +35,6 @@ class Context(NamedTuple):
         """Change of the spectral peak of a mode against no control, per link."""
         peak, off = self.measures.spectral_peak[:, :, mode - 1], self.measures.counterpart[k]
         return [change(peak[k, i], peak[off, i]) for i in range(3)]
-
-
-def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
-    """A Markdown table."""
-    names = list(header)
-    return [_row(names), _row(["---"] * len(names)), *(_row(row) for row in rows)]
-
-
-def _row(cells: Iterable[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
 
 
 def change(value: float, reference: float) -> str:

@@ -70,7 +70,7 @@ def test_export_is_verified(capsys, designs, folders, name, target):
     files = {"json": {"flexlink.json", "flexlink.schema.json"}}.get(
         target, {"flexlink.h", "flexlink.c"}
     )
-    assert {path.name for path in out.iterdir()} == files | {"verification.md"}
+    assert {path.name for path in out.iterdir()} == files | {"verification.md", "verification.html"}
     if target == "c-fixed":
         assert "multiplications a sample" in text
         loss = float(re.search(r"Residual vibration: ([+-][\d.]+) % against", report)[1])
@@ -194,12 +194,14 @@ def test_wrong_code_is_not_written(capsys, designs, tmp_path, monkeypatch):
     out = tmp_path / "wrong"
     code, text, _ = run(capsys, "export", designs["paper"], "--target", "c", "--out", out)
     assert code == 1 and "FAILED: open loop, recorded codes" in text
-    assert [path.name for path in out.iterdir()] == ["verification-failed.md"]
+    failed = {"verification-failed.md", "verification-failed.html"}
+    assert {path.name for path in out.iterdir()} == failed
     assert "no code was written" in (out / "verification-failed.md").read_text()
     monkeypatch.undo()
     code, text, _ = run(capsys, "export", designs["paper"], "--target", "c", "--out", out)
     assert code == 0
-    assert {path.name for path in out.iterdir()} == {"flexlink.h", "flexlink.c", "verification.md"}
+    files = {"flexlink.h", "flexlink.c", "verification.md", "verification.html"}
+    assert {path.name for path in out.iterdir()} == files
 
 
 def test_json_follows_its_schema_and_says_what_everything_is(capsys, designs, folders):

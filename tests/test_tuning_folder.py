@@ -24,6 +24,7 @@ from studies.tuning.merit import merit_of
 from studies.tuning.optimise import begin, fits
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import load_tuning, parse_tuning
+from tests.pages import parsed
 from tests.tunings import GAIN, SMALL, tuning
 
 FILE = """
@@ -83,8 +84,10 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
     for part in ("| gains |", "| loud |", "| all, peak_voltage 20 |", "worst disagreement is",
                  "Sobol designs of all", "Linear fidelity"):  # fmt: skip
         assert part in text
+    page = parsed((out / "report.html").read_text())
     for name in ("descent", "gains", "front"):
-        assert (out / f"{name}.png").stat().st_size > 10_000
+        assert (out / f"{name}.png").stat().st_size > 10_000 and f"({name}.png)" in text
+    assert len(page.images) == 3 and "[tune.free]" in page.text
     tuned = load_study(out / "tuned_gains.toml")
     assert tuned.control.gain_factor != paper_study().control.gain_factor
     check_kept(out)

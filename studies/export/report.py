@@ -1,4 +1,4 @@
-"""`verification.md`: what was exported, what was compared, what came out."""
+"""The report of an export: what was exported, what was compared, what came out."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from studies.export.controller import FixedController
 from studies.export.cost import Cost
 from studies.export.fixed import MARGIN, FixedPoint
 from studies.export.verify import AIM, Verification
+from studies.pages import literal
 
 
 def report(
@@ -30,7 +31,7 @@ def report(
         fixed, cost: formats and cost in fixed point.
     """
     verdict = "passed" if verified.is_passed else "FAILED, no code was written"
-    lines = [f"# Verification: {verdict}", "", *(f"- {line}" for line in origin), ""]
+    lines = [f"# Verification: {verdict}", "", *(f"- {literal(line)}" for line in origin), ""]
     lines += [
         f"Linearised sampled loop with the exported coefficients: spectral radius "
         f"{loop.spectral_radius:.6f}, gain margin {loop.gain_margin:.3f} "

@@ -38,11 +38,12 @@ from studies.export.verify import (
     verify_fixed,
     verify_floating,
 )
+from studies.pages import report_files
 from studies.runs import describe
 from studies.store import replacing
 
 TARGETS = ("json", "c", "c-fixed")
-REPORT, FAILED = "verification.md", "verification-failed.md"
+REPORT, FAILED = "verification", "verification-failed"
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,30}")
 _DAC_BITS = (4, 16)
 DAC_BITS = 12
@@ -91,9 +92,10 @@ def export_design(
     texts = made.files if is_good else {}  # what an earlier export has left stays as it is
     if verified is not None:
         text = report(found, job.origin, made.loop, verified, made.fixed, made.cost)
-        texts |= {REPORT if is_good else FAILED: text}
+        texts |= report_files(out, text, found.study, REPORT if is_good else FAILED)
         _tell(verified, console)
-    stale = tuple(file for file in (REPORT, FAILED) if file not in texts) if is_good else ()
+    reports = [f"{name}.{kind}" for name in (REPORT, FAILED) for kind in ("md", "html")]
+    stale = [file for file in reports if file not in texts] if is_good else []
     _write(out, texts, stale, console)
     return is_good
 
@@ -280,7 +282,7 @@ def _tell(verified: Verification, console: Console) -> None:
             )
 
 
-def _write(out: Path, texts: dict[str, str], stale: tuple[str, ...], console: Console) -> None:
+def _write(out: Path, texts: dict[str, str], stale: list[str], console: Console) -> None:
     """Write all files or none; `stale` are reports that would speak of other code."""
     try:
         out.mkdir(parents=True, exist_ok=True)

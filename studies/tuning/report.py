@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel import status
+from studies.pages import literal, picture
 from studies.sweeps.results import metric_label
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
 from studies.tuning.check import Judged, Searched, patch_centers
@@ -46,7 +47,7 @@ def report(spec: TuneSpec, found: Findings) -> str:
         found: what it found.
     """
     at = found.at
-    lines = [f"# {spec.study.title or 'study'}: tuning", ""]
+    lines = [f"# {literal(spec.study.title) or 'study'}: tuning", ""]
     lines += [
         f"{_count(len(at.family), 'start')} of {_count(len(spec.moving), 'family')}, "
         f"{_count(int(at.iteration), 'iteration')} ({spec.tune.method}), "
@@ -118,7 +119,11 @@ def _summary(spec: TuneSpec, found: Findings) -> list[str]:
             f"| {name} | {one.objective.mean():.4f} | {one.objective.max():.4f} | {metrics} | "
             f"{loop} | {_codes(one)} |"
         )
-    return [*lines, ""]
+    caption = (
+        "Best objective that keeps the limits, over iterations, on the machines of the tuning; "
+        "thin: every start"
+    )
+    return [*lines, "", picture("descent.png", caption), ""]
 
 
 def _by_move(spec: TuneSpec, found: Findings) -> list[str]:
@@ -137,7 +142,7 @@ def _by_move(spec: TuneSpec, found: Findings) -> list[str]:
                 for x in names
             ]
             lines.append(f"| {name} | {move_label(move) or '-'} | " + " | ".join(changes) + " |")
-    return [*lines, ""]
+    return [*lines, "", picture("gains.png", "Objective on each fresh machine, by move"), ""]
 
 
 def _change(before: float, after: float) -> str:
@@ -157,6 +162,14 @@ def _limits(spec: TuneSpec, found: Findings) -> list[str]:
             wanted = "of the study" if limit == OWN else f"{limit:g}"
             told.append(f"{name} {wanted} {_told(float(beyond), margin)}")
         lines.append(f"- {family.name}: " + "; ".join(told))
+    if spec.metric_limits:
+        limit = spec.tune.pareto.get("limit", spec.metric_limits[0])
+        lines += [
+            "",
+            picture(
+                "front.png", f"Objective over {limit}: random designs, tuned ones, the study itself"
+            ),
+        ]
     return [*lines, ""]
 
 

@@ -1,6 +1,7 @@
 """A tuning in its folder: `tune.json` (what was asked for), `progress.npz` (where it stands),
 `tune.h5` (every start), `study.toml` (what everything is measured against), `tuned.toml` (the study
-with the best numbers, one file for each family), `report.md` and its figures.
+with the best numbers, one file for each family), the report (`report.md`, `report.html`) and its
+figures.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ from rich.console import Console
 from studies import config
 from studies.errors import StudyError
 from studies.figures import save
+from studies.pages import write_report
 from studies.runs import run_attributes
 from studies.store import replacing, write_store
 from studies.sweeps.folder import make_manifest
-from studies.template import study_template
+from studies.template import study_template, toml_text
 from studies.tuning import plots
 from studies.tuning.audit import audit
 from studies.tuning.check import judge, search, tuned_study
@@ -28,7 +30,7 @@ from studies.tuning.report import Findings, report, summary, unkept
 from studies.tuning.results import file_name, variables
 from studies.tuning.spec import TuneSpec
 
-REPORT = "report.md"
+REPORT = "report.html"
 
 
 def make_evaluator(spec: TuneSpec) -> Evaluator:
@@ -165,5 +167,5 @@ def _write(spec: TuneSpec, found: Findings, out: Path) -> None:
     save(plots.gains(spec, found), out, "gains")
     for limit in spec.metric_limits[:1]:
         save(plots.front(spec, found, spec.tune.pareto.get("limit", limit)), out, "front")
-    with replacing(out / REPORT) as temporary:
-        temporary.write_text(report(spec, found), encoding="utf-8")
+    files = {"Tuning file": toml_text(spec.data), "Study file": study_template(spec.study)}
+    write_report(out, report(spec, found), files)
