@@ -34,6 +34,8 @@ console = Console(
 )
 
 
+REPORT_HELP = "write a report with figures, Markdown and HTML, beside it"
+
 #: Exit code after Ctrl-C.
 INTERRUPTED = 130
 
@@ -69,18 +71,19 @@ def paper(
 def simulate(
     study: Annotated[Path, typer.Argument(help="study file (TOML)")],
     out: Annotated[Path, typer.Option(help="HDF5 file to write")],
+    report: Annotated[bool, typer.Option("--report", help=REPORT_HELP)] = False,
     precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
 ) -> None:
     """Run one study with full trajectories."""
     start(precision)
-    from studies.runs import describe, run_attributes, run_study, run_variables
+    from studies.run_report import check_results, write_results
+    from studies.runs import describe, run_study
     from studies.spec import load_study
-    from studies.store import check_target, write_store
 
     spec = load_study(study)
-    check_target(out)
+    check_results(out, report)
     run = run_study(spec)
-    write_store(out, run_variables(run), run_attributes(spec))
+    written = write_results(out, run, report)
     metrics = run.result.metrics
     console.print(f"status: {describe(run.status)}")
     table = Table("link", "residual rms, worst station [um]", "settling [ms]", "peak voltage [V]")
@@ -92,7 +95,7 @@ def simulate(
     console.print(table)
     if run.loop is not None:
         console.print(f"gain margin of the linearised sampled loop: {run.loop.gain_margin:.4g}")
-    console.print(f"written: {out}", soft_wrap=True)
+    console.print(written, soft_wrap=True)
 
 
 @app.command()
@@ -100,27 +103,31 @@ def replay(
     design: Annotated[Path, typer.Argument(help="study file, folder of a tuning or a sweep")],
     case: Annotated[str | None, typer.Option(help="number, or id: and digits of its id")] = None,
     out: Annotated[Path | None, typer.Option(help="HDF5 file for the trajectories")] = None,
+    report: Annotated[bool, typer.Option("--report", help=REPORT_HELP)] = False,
 ) -> None:
     """Run one case of a sweep again with full trajectories, and compare with what it found."""
     start()
     from studies.design import deviation, load_design
-    from studies.runs import describe, run_attributes, run_study, run_variables
-    from studies.store import check_target, write_store
+    from studies.run_report import check_results, write_results
+    from studies.runs import describe, run_study
 
+    if report and out is None:
+        raise StudyError("--report: is written beside the trajectories; name their file by --out")
     found = load_design(design, case)
     if out is not None:
-        check_target(out)
+        check_results(out, report)
     run = run_study(found.study)
     console.print(f"{found.study.title}: {describe(run.status)}")
+    notes = []
     if found.stored:
         difference, name = deviation(run, found.stored)
-        console.print(
+        notes = [
             f"sweep: {describe(int(found.stored['status']))}; largest difference of a metric "
             f"{difference:.1e} of its size{f' ({name})' if name else ''}"
-        )
+        ]
+        console.print(*notes)
     if out is not None:
-        write_store(out, run_variables(run), run_attributes(found.study))
-        console.print(f"written: {out}", soft_wrap=True)
+        console.print(write_results(out, run, report, notes), soft_wrap=True)
 
 
 @app.command()

@@ -65,15 +65,42 @@ def legend_above(figure: Figure, ax: Axes) -> None:
 
 def save(figure: Figure, folder: Path, name: str) -> None:
     """Write the figure as PNG and PDF, each whole or not at all; StudyError where it cannot be."""
-    with replacing(folder / f"{name}.png") as temporary:
-        figure.savefig(temporary, format="png")
+    write_figure(figure, folder / f"{name}.png")
     figure.set_layout_engine("none")  # keeps what has been laid out, which takes half a second
-    with replacing(folder / f"{name}.pdf") as temporary:
-        figure.savefig(temporary, format="pdf")
+    write_figure(figure, folder / f"{name}.pdf")
+
+
+def write_figure(figure: Figure, path: Path) -> None:
+    """Write the figure in the format of its file's ending; errors as `save`."""
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format=path.suffix[1:])
 
 
 def _axes(ax: Axes | None) -> Axes:
     return plt.subplots(layout="constrained")[1] if ax is None else ax
+
+
+def traces(
+    time: np.ndarray, values: np.ndarray, names: list[str], label: str, ax: Axes | None = None
+) -> Axes:
+    """Some quantities of one kind over time.
+
+    Args:
+        time: [s], (T,).
+        values: in the unit of the label, (T, n).
+        names: of the quantities, for a legend; [] for none.
+        label: quantity and unit of the ordinate.
+        ax: where to draw; a new figure where left out.
+    """
+    ax = _axes(ax)
+    for k, curve in enumerate(values.T):
+        ax.plot(
+            time, curve, color=SERIES[k % len(SERIES)], linestyle=DASHES[k % len(DASHES)],
+            linewidth=0.9, label=names[k] if names else None,
+        )  # fmt: skip
+    ax.set_ylabel(label)
+    ax.margins(x=0.01)
+    return ax
 
 
 def comparison(

@@ -13,6 +13,7 @@ import pytest
 import xarray
 
 from studies.cli import main
+from tests.pages import TITLE, parsed, rendered
 
 HOME_PHI = math.pi / 6
 SHORT = f"""
@@ -58,15 +59,22 @@ def refused_study(capsys, folder, text):
 
 
 @pytest.fixture(scope="module")
-def short_run(tmp_path_factory):
+def short_folder(tmp_path_factory):
+    """A run with its report, under a name with a blank."""
     folder = tmp_path_factory.mktemp("run")
-    (folder / "short.toml").write_text('title = "short"\n' + SHORT)
+    (folder / "short.toml").write_text(f"title = '{TITLE}'\n{SHORT}")
     shown = io.StringIO()
+    out = folder / "my run.h5"
     with contextlib.redirect_stdout(shown):
-        main(["simulate", str(folder / "short.toml"), "--out", str(folder / "run.h5")])
+        main(["simulate", str(folder / "short.toml"), "--out", str(out), "--report"])
     assert "status: ok" in shown.getvalue() and "[um]" in shown.getvalue()
-    assert f"written: {folder / 'run.h5'}\n" in shown.getvalue()
-    with xarray.open_dataset(folder / "run.h5", engine="h5netcdf") as data:
+    assert f"written: {out}\nreport: {folder / 'my run.html'}\n" in shown.getvalue()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def short_run(short_folder):
+    with xarray.open_dataset(short_folder / "my run.h5", engine="h5netcdf") as data:
         return data.load()
 
 
@@ -101,7 +109,7 @@ def test_simulate_writes_a_consistent_run(short_run):
     np.testing.assert_allclose(short_run.station, [0.05, 0.10, 0.15])
     assert list(short_run.pose_axis.values) == ["x", "y", "phi"]
     assert int(short_run.status) == 0 and float(short_run.gain_margin) > 1
-    assert json.loads(short_run.attrs["study"])["title"] == "short"
+    assert json.loads(short_run.attrs["study"])["title"] == TITLE
     # the platform arrives (2 mm within 50 um), and middle and mid-span station are one place
     np.testing.assert_allclose(short_run.pose[-1], [0, 0.002, HOME_PHI], rtol=0, atol=5e-5)
     middle = short_run.chord_deflection_stations.sel(station=0.10)
@@ -117,6 +125,40 @@ def test_the_metrics_agree_with_the_trajectories(short_run):
     np.testing.assert_allclose(short_run.residual_rms, rms, rtol=1e-9)
     peak = abs(short_run.actuator_voltage).max(("time", "patch"))
     np.testing.assert_allclose(short_run.peak_voltage, peak, rtol=1e-12)
+
+
+def test_the_report_of_a_run_is_whole(short_folder, short_run):
+    names = {f"my run{end}" for end in (".h5", ".md", ".html")}
+    figures = {f"my run-{name}.png" for name in ("deflection", "error", "voltage")}
+    assert {path.name for path in short_folder.iterdir()} == names | figures | {"short.toml"}
+    found = parsed((short_folder / "my run.html").read_text(encoding="utf-8"))
+    assert found.title == f"{TITLE}: one run" and TITLE in found.text
+    # links, platform, two tracked modes, versions
+    assert len(found.images) == 3 and found.rows == [[7] * 4, [3] * 4, [3] * 3, [2] * 8]
+    rms = f"{1e6 * float(short_run.residual_rms[1].max()):.4g}"
+    margin = f"gain margin {float(short_run.gain_margin):.4g}, spectral radius"
+    for part in ("Status: ok.", f"\n2\n{rms}\n", margin, "settling time [ms]", "φ [µrad]",
+                 "flexlink-studies", "residual_length = 0.02"):  # fmt: skip
+        assert part in found.text
+    assert "/" not in found.text.partition("Versions")[2].partition("Study file")[0]  # no path
+
+
+@pytest.mark.parametrize("width", [1280, 600])
+def test_a_browser_shows_all_of_a_report(short_folder, tmp_path, width):
+    html = (short_folder / "my run.html").read_text(encoding="utf-8")
+    assert rendered(html, tmp_path, width) == (3, 0, 0)
+
+
+def test_reports_that_cannot_be_are_refused_before_the_run(capsys, tmp_path):
+    study = tmp_path / "short.toml"
+    study.write_text(SHORT)
+    assert "name their file by --out" in refused(capsys, "replay", study, "--report")
+    arguments = ("simulate", study, "--report", "--out")
+    for name in ("run.html", "run.md"):
+        assert "name it *.h5" in refused(capsys, *arguments, tmp_path / name)
+    (tmp_path / "run.md").mkdir()
+    assert "run.md: cannot write there, it is a" in refused(capsys, *arguments, tmp_path / "run.h5")
+    assert {path.name for path in tmp_path.iterdir()} == {"short.toml", "run.md"}
 
 
 def test_modes_as_json_and_as_table(capsys):

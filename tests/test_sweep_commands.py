@@ -1,13 +1,18 @@
 """The commands of sweeps, in one process: sweep, dry run, show, best, plot, sensitivity, replay."""
 
+import dataclasses
 import re
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from studies.design import load_design
 from studies.sweeps import plan
+from studies.sweeps.report import report
+from studies.sweeps.results import load
 from studies.template import toml_value
+from tests.pages import parsed
 from tests.sweeps import BASE
 from tests.test_cli import refused, run
 
@@ -49,8 +54,10 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     code, text, _ = run(capsys, "sweep", spec, "--dry-run")
     assert code == 0 and "40 cases" in text and "estimate:" in text and "sample: case 20" in text
     assert not out.exists()
-    code, text, _ = run(capsys, "sweep", spec, "--out", out)
+    code, text, _ = run(capsys, "sweep", spec, "--out", out, "--report")
     assert code == 0 and "40/40 cases" in text and "compiled in" in text and "results.h5" in text
+    assert f"report: {out / 'report.html'}\n" in text
+    check_report(out)
     code, text, _ = run(capsys, "show", out)
     assert code == 0 and "ok" in text and "best cases by residual_rms" in text
     assert "residual_rms [m]" in text
@@ -62,9 +69,13 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     assert code == 0 and "V2 s" in text
     code, text, _ = run(capsys, "sensitivity", out, "--by", "control_energy")
     assert code == 0 and "placement" in text and "first" in text
-    code, text, _ = run(capsys, "replay", out, "--case", "3", "--out", tmp_path / "run.h5")
+    code, text, _ = run(
+        capsys, "replay", out, "--case", "3", "--out", tmp_path / "run.h5", "--report"
+    )
     assert code == 0 and "largest difference of a metric" in text
     assert (tmp_path / "run.h5").stat().st_size > 10_000
+    page = parsed((tmp_path / "run.html").read_text(encoding="utf-8"))
+    assert len(page.images) == 3 and "sweep: ok; largest difference of a metric" in page.text
     _, text, _ = run(capsys, "best", out, "--by", "residual_rms", "--count", "1")
     number, name = re.search(r"(\d+) +│ ([0-9a-f]{8}) ", text).groups()
     assert load_design(out, f"id:{name}").study == load_design(out, int(number)).study
@@ -82,6 +93,36 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     assert Image.open(tmp_path / "placement.png").size[0] > 600
 
 
+def check_report(folder):
+    """The report of the sweep against its data; then with other outcomes."""
+    html = (folder / "report.html").read_text(encoding="utf-8")
+    page, text = parsed(html), (folder / "report.md").read_text(encoding="utf-8")
+    data = load(folder)
+    code, gain = data["status"], data["control_gain_factor"]
+    count = int(np.sum(code == 0))
+    for part in ("- 8 base points of a Saltelli design of", "0.05 to 1, log scale", "40 cases.",
+                 "| drive.kp | N/m |", f"| ok | {count} | {count / 0.4:.1f} |"):  # fmt: skip
+        assert part in text
+    assert page.title == "small: sweep" and len(page.images) == 1 and "[sweep.axes]" in page.text
+    value = np.where(code == 0, np.nanmax(data["residual_rms"], axis=(1, 2)), np.inf)
+    best = text.partition("## Best cases by residual_rms")[2].partition("\n## ")[0]
+    rows = [int(k) for k in re.findall(r"(?m)^\| (\d+) ", best)]
+    assert rows == np.argsort(value, kind="stable")[: min(count, 10)].tolist()
+
+    def told(code, has_figure):
+        changed = {**data.variables, "status": data.variables["status"]._replace(data=code)}
+        return report(dataclasses.replace(data, variables=changed), "residual_rms", has_figure)
+
+    loud = int(np.sum(gain > 0.5))
+    text = told(np.where(gain > 0.5, 4, 0), True)
+    assert 0 < loud < 40 and f"| non-finite number | {loud} | {loud / 0.4:.1f} |" in text
+    first = text.partition("## What the failures depend on")[2].split("\n| ")[3]
+    assert first.startswith("control_gain_factor | 1.00 |") and "| 0 % (<=" in first
+    text = told(np.full(40, 4), False)
+    assert "No case of status ok has it." in text and "![" not in text
+    assert "depend on" not in text  # where nothing is ok there is nothing to compare
+
+
 def test_quiet_says_nothing(capsys, spec, tmp_path):
     code, text, err = run(capsys, "sweep", spec, "--out", tmp_path / "s", "--quiet")
     assert (code, text, err) == (0, "", "")
@@ -97,6 +138,7 @@ def test_quiet_says_nothing(capsys, spec, tmp_path):
         (("replay", "nowhere.toml", "--case", "1"), "leave --case out"),
         (("sweep", "nowhere.toml", "--out", "x"), "cannot be read"),
         (("sweep", "gains"), "--out: name a folder"),
+        (("sweep", "gains", "--dry-run", "--report"), "a --dry-run has no results"),
     ],
 )
 def test_commands_refuse(capsys, tmp_path, monkeypatch, arguments, words):

@@ -31,6 +31,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             bool, typer.Option("--dry-run", help="say what would be run, and how long it takes")
         ] = False,
         quiet: Annotated[bool, typer.Option("--quiet", help="no progress")] = False,
+        report: Annotated[
+            bool, typer.Option("--report", help="write report.html of the results, too")
+        ] = False,
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
     ) -> None:
         """Run thousands of cases from one file; finished ones survive whatever happens."""
@@ -40,6 +43,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.sweeps.spec import load_sweep, ready_spec
 
         asked = load_sweep(ready_spec(spec))
+        if dry_run and report:
+            raise StudyError("--report: a --dry-run has no results; leave one of them out")
         if dry_run:
             print_plan(make_plan(asked, out if resume else None), console)
             return
@@ -59,6 +64,12 @@ def add_commands(app: typer.Typer, console: Console) -> None:
                 f"compiling; results: {out / 'results.h5'}",
                 soft_wrap=True,
             )
+        if report:
+            from studies.sweeps.report import REPORT, write_sweep_report
+
+            write_sweep_report(out)
+            if not quiet:
+                console.print(f"report: {out / REPORT}", soft_wrap=True)
 
     @app.command()
     def show(

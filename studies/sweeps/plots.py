@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from jaxmodel import status
 from studies import figures
 from studies.errors import StudyError
-from studies.store import replacing
 from studies.sweeps.results import SweepData, metric_values, swept_names
 from studies.sweeps.show import best_cases, label, shown_value
 
@@ -89,8 +88,8 @@ def save_plot(figure: Figure, path: Path) -> None:
     """
     if path.suffix not in (".png", ".pdf", ".svg"):
         raise StudyError(f"--out {path}: allowed endings .png, .pdf, .svg")
-    with replacing(path) as temporary, figures.styled():
-        figure.savefig(temporary, format=path.suffix[1:])
+    with figures.styled():
+        figures.write_figure(figure, path)
 
 
 def _is_grid(a: np.ndarray, b: np.ndarray) -> bool:

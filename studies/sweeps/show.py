@@ -1,9 +1,9 @@
-"""What `studies show`, `studies best` and `studies sweep --dry-run` print."""
+"""What `studies show`, `studies best` and `studies sweep --dry-run` print, and tables of it."""
 
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -11,11 +11,20 @@ from rich.table import Table as RichTable
 
 from jaxmodel import status
 from studies.errors import StudyError
+from studies.fields import parse_entry
 from studies.sweeps.condition import evaluate
 from studies.sweeps.plan import peak_memory
-from studies.sweeps.results import NOT_RUN, SweepData, metric_values, swept_names, variable_name
+from studies.sweeps.results import (
+    NOT_RUN,
+    SweepData,
+    field_unit,
+    metric_values,
+    swept_names,
+    variable_name,
+)
 from studies.sweeps.run import Plan, calibrate
 from studies.sweeps.sensitivity import failure_causes
+from studies.sweeps.table import Table
 
 #: What `show` ranks cases by unless told otherwise.
 DEFAULT_METRIC = "residual_rms"
@@ -23,6 +32,25 @@ DEFAULT_METRIC = "residual_rms"
 ID_DIGITS = 8
 #: Rows of a table of failed cases.
 LONGEST_TABLE = 100
+#: What the last columns of `cause_rows` are.
+SHARES = (
+    "their share in the lowest and highest quarter of a number, and at the best and worst value of "
+    "a choice"
+)
+
+
+class Rows(NamedTuple):
+    """A table to be printed, or written into a report."""
+
+    heads: list[str]
+    rows: list[list[str]]
+
+
+def _print(found: Rows, console: Console) -> None:
+    table = RichTable(*found.heads)
+    for row in found.rows:
+        table.add_row(*row)
+    console.print(table)
 
 
 def reason(code: int) -> str:
@@ -71,16 +99,18 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
     if is_failed:
         _print_failed(data, codes, console)
         return
-    counts = Counter(codes.tolist())
-    n = data.n_cases
-    console.print(f"{data.spec.study.title}: {n} cases, {', '.join(swept_names(data))}")
-    table = RichTable("status", "cases", "share [%]")
-    for code, count in sorted(counts.items(), key=lambda item: -item[1]):
-        table.add_row(reason(code), str(count), f"{100 * count / n:.1f}")
-    console.print(table)
+    console.print(f"{data.spec.study.title}: {data.n_cases} cases, {', '.join(swept_names(data))}")
+    _print(status_rows(data), console)
     if DEFAULT_METRIC in data.variables and (codes == status.OK).any():
         console.print(f"best cases by {DEFAULT_METRIC}, worst link and station:")
         print_cases(data, best_cases(data, DEFAULT_METRIC), [DEFAULT_METRIC], console)
+
+
+def status_rows(data: SweepData) -> Rows:
+    """How many cases ended in which way."""
+    counts = Counter(data["status"].tolist()).most_common()
+    rows = [[reason(code), str(n), f"{100 * n / data.n_cases:.1f}"] for code, n in counts]
+    return Rows(["status", "cases", "share [%]"], rows)
 
 
 def _print_failed(data: SweepData, codes: np.ndarray, console: Console) -> None:
@@ -89,13 +119,13 @@ def _print_failed(data: SweepData, codes: np.ndarray, console: Console) -> None:
         console.print("no failed case")
         return
     names = swept_names(data)
-    table = RichTable("case", "id", "status", "from [s]", *names)
+    rows = []
     for k in failed[:LONGEST_TABLE]:
         cells = [shown_value(data, name, int(k)) for name in names]
         is_whole = codes[k] in status.FINISHED  # it ran to its end
         time = "" if is_whole else f"{data['bad_time'][k]:.4g}"
-        table.add_row(str(k), short_id(data, int(k)), reason(int(codes[k])), time, *cells)
-    console.print(table)
+        rows.append([str(k), short_id(data, int(k)), reason(int(codes[k])), time, *cells])
+    _print(Rows(["case", "id", "status", "from [s]", *names], rows), console)
     if len(failed) > LONGEST_TABLE:
         console.print(
             f"and {len(failed) - LONGEST_TABLE} more; all of them: studies.load in Python"
@@ -103,16 +133,20 @@ def _print_failed(data: SweepData, codes: np.ndarray, console: Console) -> None:
 
 
 def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console: Console) -> None:
-    """A table of cases with what varies and some metrics."""
+    """Print `case_rows`."""
+    _print(case_rows(data, cases, metrics), console)
+
+
+def case_rows(data: SweepData, cases: np.ndarray, metrics: list[str]) -> Rows:
+    """Cases with what varies and some metrics."""
     names = swept_names(data)
-    heads = [label(data, name) for name in metrics]
-    table = RichTable("case", "id", *names, *heads)
     columns = [metric_values(data, name) for name in metrics]
+    rows = []
     for k in cases:
         cells = [shown_value(data, name, k) for name in names]
         numbers = (f"{column[k]:.4g}" for column in columns)
-        table.add_row(str(k), short_id(data, k), *cells, *numbers)
-    console.print(table)
+        rows.append([str(k), short_id(data, k), *cells, *numbers])
+    return Rows(["case", "id", *names, *(label(data, name) for name in metrics)], rows)
 
 
 def short_id(data: SweepData, case: int) -> str:
@@ -162,12 +196,7 @@ def print_plan(plan: Plan, console: Console) -> None:
         f"{len(table)} cases ({table.n_dropped} left out by where, {table.n_double} doubles, "
         f"{plan.n_before} done before)"
     )
-    axes = RichTable("axis", "values", "smallest", "largest")
-    for name, column in table.columns.items():
-        is_numeric = column.dtype.kind in "fi"
-        span = [f"{column.min():.4g}", f"{column.max():.4g}"] if is_numeric else ["", ""]
-        axes.add_row(name, str(len(np.unique(column.astype(str), axis=0))), *span)
-    console.print(axes)
+    _print(axis_rows(table), console)
     for group in plan.groups:
         layout, structure = group.layout, group.structure
         console.print(
@@ -191,18 +220,30 @@ def print_plan(plan: Plan, console: Console) -> None:
     )
 
 
+def axis_rows(table: Table) -> Rows:
+    """How many values each column of a sweep takes, and between which ends."""
+    rows = []
+    for name, column in table.columns.items():
+        entry = parse_entry(name)
+        unit = field_unit(entry.field if entry else name)
+        is_numeric = column.dtype.kind in "fi"
+        ends = [f"{column.min():.4g}", f"{column.max():.4g}"] if is_numeric else ["", ""]
+        rows.append([name, unit, str(len(np.unique(column.astype(str), axis=0))), *ends])
+    return Rows(["axis", "unit", "values", "smallest", "largest"], rows)
+
+
 def print_causes(data: SweepData, console: Console) -> None:
-    """Which parameters go with the failures, if any do."""
-    causes = failure_causes(data)
-    if not causes:
-        return
-    console.print(
-        "what the failures depend on (their share in the lowest and highest quarter of a number, "
-        "and at the best and worst value of a choice):",
-        soft_wrap=True,
-    )
-    table = RichTable("parameter", "distance", "p", "failures at its least", "at its most")
-    for cause in causes[:8]:
+    """Print which parameters go with the failures, if any do."""
+    found = cause_rows(data)
+    if found.rows:
+        console.print(f"what the failures depend on ({SHARES}):", soft_wrap=True)
+        _print(found, console)
+
+
+def cause_rows(data: SweepData) -> Rows:
+    """Which parameters go with the failures; no rows where none or all failed."""
+    rows = []
+    for cause in failure_causes(data)[:8]:
         low, high = (f"{100 * rate:.0f} % ({at})" for rate, at in (cause.low, cause.high))
-        table.add_row(cause.name, f"{cause.distance:.2f}", f"{cause.p_value:.1g}", low, high)
-    console.print(table)
+        rows.append([cause.name, f"{cause.distance:.2f}", f"{cause.p_value:.1g}", low, high])
+    return Rows(["parameter", "distance", "p", "failures at its least", "at its most"], rows)

@@ -1,0 +1,177 @@
+"""Files of one run: its data, and its report with metrics, judgement of the loop and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from studies import figures
+from studies.errors import StudyError
+from studies.pages import literal, picture, table, write_report
+from studies.runs import Run, chord_deflection, describe, run_attributes, run_variables
+from studies.store import check_target, write_store
+
+#: Captions of what is drawn, by the end of the file's name.
+FIGURES = {
+    "deflection": "Deflection of the links' middle from the chord between their ends",
+    "error": "Platform: pose minus shaped command",
+    "voltage": "Voltages of the actuators, numbered from the slider on",
+}
+_POSE = ("x [µm]", "y [µm]", "φ [µrad]")
+
+
+def check_results(out: Path, has_report: bool) -> None:
+    """Raise StudyError unless the files of a run can be written; call it before long work.
+
+    Args:
+        out: file of the run.
+        has_report: whether its report is to be written beside it.
+
+    Raises:
+        StudyError: a file cannot be written, or `out` has the name of one of the report.
+    """
+    check_target(out)
+    names = [f"{out.stem}.html", f"{out.stem}.md", *(_figure(out, name) for name in FIGURES)]
+    for name in names if has_report else []:
+        if name == out.name:
+            raise StudyError(f"--out {out}: --report writes a file of this name; name it *.h5")
+        check_target(out.with_name(name))
+
+
+def write_results(out: Path, run: Run, has_report: bool, notes: Sequence[str] = ()) -> str:
+    """Write a run to its file and, if asked for, its report beside it.
+
+    Args:
+        out: file of the run.
+        run: with trajectories.
+        has_report: whether to write the report.
+        notes: sentences that it adds to what it says of the run's status.
+
+    Returns:
+        What has been written, in words.
+
+    Raises:
+        StudyError: a file cannot be written.
+    """
+    write_store(out, run_variables(run), run_attributes(run.study))
+    if not has_report:
+        return f"written: {out}"
+    with figures.styled():
+        for name, figure in draw(run).items():
+            figures.write_figure(figure, out.with_name(_figure(out, name)))
+    write_report(out.parent, report(out, run, notes), run.study, out.stem)
+    return f"written: {out}\nreport: {out.with_name(out.stem)}.html"
+
+
+def _figure(out: Path, name: str) -> str:
+    """File of one of FIGURES."""
+    return f"{out.stem}-{name}.png"
+
+
+def report(out: Path, run: Run, notes: Sequence[str]) -> str:
+    """Markdown text; arguments of `write_results`."""
+    lines = [
+        f"# {literal(run.study.title) or 'study'}: one run", "",
+        _status(run, notes), "",
+        "## Links", "",
+        *_links(run), "",
+        "## Platform", "",
+        *_platform(run), "",
+        "## Control loop", "",
+        *_loop(run), "",
+        "## Over time", "",
+        f"Dotted: the end of the shaped command at {run.result.command_end:.4g} s.",
+    ]  # fmt: skip
+    for name, caption in FIGURES.items():
+        lines += ["", picture(_figure(out, name), caption)]
+    return "\n".join(lines) + "\n"
+
+
+def _status(run: Run, notes: Sequence[str]) -> str:
+    bad = float(run.result.bad_time)
+    since = f" from {bad:.4g} s on" if bad > 0 else ""
+    return " ".join([f"Status: **{describe(run.status)}**{since}.", *map(literal, notes)])
+
+
+def _links(run: Run) -> list[str]:
+    metrics, own = run.result.metrics, run.study.metrics
+    rows = [
+        [
+            str(i + 1), f"{1e6 * metrics.residual_rms[i].max():.4g}",
+            f"{1e6 * metrics.residual_peak[i].max():.4g}",
+            f"{1e6 * metrics.structural_peak[i].max():.4g}",
+            f"{1e3 * metrics.settling_time[i]:.4g}", f"{metrics.peak_voltage[i]:.4g}",
+            f"{metrics.peak_force[i]:.4g}",
+        ]
+        for i in range(3)
+    ]  # fmt: skip
+    stations = ", ".join(f"{1e3 * x:g}" for x in own.stations)
+    heads = (
+        "link", "residual rms [µm]", "residual peak [µm]", "peak while moving [µm]",
+        "settling time [ms]", "peak voltage [V]", "peak motor force [N]",
+    )  # fmt: skip
+    return [
+        f"Deflections: the largest of the stations at {stations} mm. Residual window: "
+        f"{own.residual_length:g} s, from {own.residual_delay:g} s after the shaped command. "
+        f"Settled: within {1e6 * own.settling_band:g} µm.", "",
+        *table(heads, rows),
+    ]  # fmt: skip
+
+
+def _platform(run: Run) -> list[str]:
+    metrics = run.result.metrics
+    errors = metrics.pose_error_peak, metrics.pose_error_rms
+    rows = [[name, *(f"{1e6 * error[k]:.4g}" for error in errors)] for k, name in enumerate(_POSE)]
+    return [
+        "Pose minus shaped command.", "",
+        *table(("", "largest while moving", "rms in the residual window"), rows),
+    ]  # fmt: skip
+
+
+def _loop(run: Run) -> list[str]:
+    metrics = run.result.metrics
+    lines = [
+        f"Samples with an actuator at its limit: {100 * metrics.saturated_fraction:.3g} %; with an "
+        f"ADC channel at its end: {100 * metrics.clipped_fraction:.3g} %.",
+    ]
+    if run.loop is None:
+        return lines
+    modes = zip(run.loop.frequency_hz, run.loop.damping_ratio, strict=True)
+    rows = [
+        [str(k + 1), ", ".join(f"{f:.2f}" for f in frequency), ", ".join(f"{z:.4f}" for z in zeta)]
+        for k, (frequency, zeta) in enumerate(modes)
+    ]
+    return [
+        *lines, "",
+        f"Linearised at the first pose: gain margin {run.loop.gain_margin:.4g}, spectral radius "
+        f"{run.loop.spectral_radius:.6f}. The lowest modes of the links with control, three of "
+        "each order:", "",
+        *table(("order", "frequencies [Hz]", "damping ratios [1]"), rows),
+    ]  # fmt: skip
+
+
+def draw(run: Run) -> dict[str, Figure]:
+    """FIGURES of a run, three panels each, in the style of the caller."""
+    record, end = run.result.record, float(run.result.command_end)
+    assert record is not None
+    pairs = [f"pair {k + 1}" for k in range(record.actuator_voltage.shape[2])]
+    bent, error, links = 1e6 * chord_deflection(run), 1e6 * record.pose_error, range(3)
+    panels: dict[str, list[tuple[np.ndarray, list[str], str]]] = {
+        "deflection": [(bent[:, [i]], [], f"link {i + 1} [µm]") for i in links],
+        "error": [(error[:, [k]], [], label) for k, label in enumerate(_POSE)],
+        "voltage": [(record.actuator_voltage[:, i], pairs, f"link {i + 1} [V]") for i in links],
+    }
+    drawn = {}
+    for name, rows in panels.items():
+        figure, axes = figures.new_figure(3, 1, 1.3)
+        for ax, (values, names, label) in zip(axes[:, 0], rows, strict=True):
+            figures.traces(record.time, values, names, label, ax)
+            ax.axvline(end, color="#888888", linewidth=0.8, linestyle=":")
+        axes[-1, 0].set_xlabel("time [s]")
+        if name == "voltage":
+            figures.legend_above(figure, axes[0, 0])
+        drawn[name] = figure
+    return drawn
