@@ -11,6 +11,7 @@ from base64 import b64encode
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from html import escape
+from mimetypes import guess_type
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
@@ -98,7 +99,7 @@ def picture(name: str, caption: str) -> str:
     """Line of a figure, to stand alone.
 
     Args:
-        name: of its PNG file, which lies beside the text.
+        name: of its PNG or GIF file, which lies beside the text.
         caption: Markdown.
     """
     return f"![{caption}]({quote(name)})"
@@ -111,7 +112,7 @@ def page(
 
     Args:
         text: with figures in paragraphs of their own (`picture`); HTML in it is shown, not obeyed.
-        images: PNG bytes of each figure, by the name it has in the text.
+        images: bytes of each figure, PNG or GIF, by the name it has in the text.
         files: texts to append, by title.
         facts: versions and the like, for a table before them.
 
@@ -166,7 +167,8 @@ def _arranged(tokens: list[Token], images: Mapping[str, bytes]) -> list[Token]:
 def _data_uri(name: str, images: Mapping[str, bytes]) -> str:
     if name not in images:
         raise ValueError(f"the report shows {name!r}, which is not among its images")
-    return "data:image/png;base64," + b64encode(images[name]).decode()
+    kind = guess_type(name)[0] or "image/png"
+    return f"data:{kind};base64,{b64encode(images[name]).decode()}"
 
 
 def _title(tokens: list[Token]) -> str:

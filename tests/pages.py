@@ -13,6 +13,11 @@ from PIL import Image
 #: A title that would be more than text, in HTML and in Markdown.
 TITLE = "<script>alert(1)</script> *fast* | 10 mm ![x](http://e.org/x.png) &amp; a_b"
 
+#: Images that a page may hold, and how they begin.
+FIRST_BYTES = {
+    "data:image/png;base64": b"\x89PNG\r\n\x1a\n",
+    "data:image/gif;base64": b"GIF89a",
+}
 VOID = ("img", "meta", "br", "hr")
 #: Nothing of a report needs one of these.
 FORBIDDEN = ("script", "link", "iframe", "object", "embed", "base", "form", "svg", "video")
@@ -38,9 +43,9 @@ class Page(HTMLParser):
         assert not [name for name in values if name.startswith("on")], values
         if tag == "img":
             kind, _, data = values["src"].partition(",")
-            assert kind == "data:image/png;base64", kind
+            assert kind in FIRST_BYTES, kind
             image = b64decode(data, validate=True)
-            assert image.startswith(b"\x89PNG\r\n\x1a\n")
+            assert image.startswith(FIRST_BYTES[kind])
             self.images.append((Image.open(BytesIO(image)).size, values["alt"]))
         if tag == "table":
             self.rows.append([])

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
@@ -18,6 +19,7 @@ from studies.errors import StudyError
 from studies.modes import machine_modes
 from studies.runs import run_study
 from studies.spec import paper_study
+from tests.pages import Page
 
 SETTINGS = ((0.05, "ei"), (0.03, "none"))
 
@@ -32,9 +34,16 @@ def small_study(**fields):
     ).change(**fields)  # fmt: skip
 
 
+def drawn(name):
+    """Two figures as they are, an empty one for each of the others."""
+    if name in ("subsets", "modes"):
+        return figures.FIGURES[name]
+    return figures.FIGURES[name]._replace(draw=lambda found: Figure(figsize=(1, 1)))
+
+
 @pytest.fixture(scope="module")
 def atlas(tmp_path_factory):
-    """A small atlas with few figures: its folder and what was found."""
+    """A small atlas with few real figures: its folder and what was found."""
     folder, kept = tmp_path_factory.mktemp("atlas") / "out", {}
 
     def look(*arguments):
@@ -44,7 +53,7 @@ def atlas(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "atlas_sweep", partial(subsets.atlas_sweep, settings=SETTINGS))
         patch.setattr(run, "look_around", look)
-        patch.setattr(run, "FIGURES", {n: figures.FIGURES[n] for n in ("subsets", "modes")})
+        patch.setattr(run, "FIGURES", {n: drawn(n) for n in figures.FIGURES})
         patch.setattr(figures, "CLIP", (-0.002, 0.002, 1e-3))
         patch.setattr(findings, "map_workspace", partial(workspace.map_workspace, count=9))
         patch.setattr(findings, "FREQUENCY", np.array([1.0, 50.0, 114.0, 300.0]))
@@ -125,6 +134,9 @@ def test_atlas_writes_what_its_report_shows(atlas):
     for name in figures.FIGURES:
         assert f"({name}.png)" in text
     assert "nan" not in text.lower()
+    page = Page((folder / "report.html").read_text(encoding="utf-8"))
+    assert len(page.images) == len(figures.FIGURES) + 1
+    assert page.title == "Coupling atlas"
     with Image.open(folder / figures.ANIMATION) as film:
         assert film.n_frames == 4
     assert not list(folder.glob(".unfinished*"))

@@ -47,4 +47,4 @@ def add_commands(app: typer.Typer, console: Console) -> None:
                 file=sys.stderr,
             )
             sys.exit(130)
-        console.print(f"report: {out / 'report.md'}", soft_wrap=True)
+        console.print(f"report: {out / 'report.html'}", soft_wrap=True)

@@ -13,7 +13,8 @@ from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.plots import length_text
 from studies.atlas.subsets import TARGETS, WINDOWS, link_label, setting_label
 from studies.atlas.workspace import MAP_MODES
-from studies.report_context import span, table
+from studies.pages import literal, picture, table
+from studies.report_context import span
 
 LATE = WINDOWS.index("late")
 
@@ -32,7 +33,7 @@ def report(found: Findings, dropped: list[str]) -> str:
 
 
 def _figure(name: str) -> list[str]:
-    return [f"![{FIGURES[name].caption}]({name}.png)", ""]
+    return [picture(f"{name}.png", FIGURES[name].caption), ""]
 
 
 def _percent(value: float) -> str:
@@ -45,7 +46,8 @@ def _head(found: Findings) -> list[str]:
     delay, length = study.metrics.residual_delay, study.metrics.residual_length
     return [
         "# Coupling atlas", "",
-        f"{study.title}: {count} subsets of controlled links and modes ({subsets.modes} a link), "
+        f"{literal(study.title)}: {count} subsets of controlled links and modes "
+        f"({subsets.modes} a link), "
         f"{len(subsets.setting)} settings of move time and shaper, {subsets.status.size} runs; "
         f"gain factor {study.control.gain_factor:g}, ratios "
         + ("by (24) from each setting's uncontrolled run."
@@ -292,5 +294,5 @@ def _motion(found: Findings) -> list[str]:
         "## The machine moving", "",
         f"The last milliseconds of the {setting_label(RUNS[-1])} move and what is left after it, "
         "slowed down 50 times.", "",
-        f"![the machine without control and with three links controlled]({ANIMATION})",
+        picture(ANIMATION, "the machine without control and with three links controlled"),
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""`studies atlas`: `runs/` (the sweep of all subsets), `atlas.h5`, figures, animation, report."""
+"""`studies atlas`: `runs/` (the sweep of all subsets), `atlas.h5`, figures, a film, report."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ from studies.atlas.subsets import (
 from studies.atlas.workspace import PAIRS
 from studies.errors import StudyError
 from studies.figures import save, styled
+from studies.pages import write_report
 from studies.runs import run_attributes
 from studies.spec import Study
 from studies.store import Variable, write_store
@@ -77,7 +78,7 @@ def run_atlas(
                 for name, figure in FIGURES.items():
                     save(figure.draw(found), staging, name)
             write_animation(found, staging)
-            (staging / "report.md").write_text(report(found, dropped), encoding="utf-8")
+            write_report(staging, report(found, dropped), study)
             for file in sorted(staging.iterdir()):
                 os.replace(file, out / file.name)
     except OSError as error:
