@@ -157,6 +157,7 @@ def _arranged(tokens: list[Token], images: Mapping[str, bytes]) -> list[Token]:
             if child.type == "text":  # a number and its sign stay on one line
                 child.content = re.sub(" (?=[%†])", "\N{NO-BREAK SPACE}", child.content)
             if child.type == "image":
+                child.children = [Token("text", "", 0, content=_plain(child.children))]
                 child.attrSet("src", _data_uri(unquote(str(child.attrs["src"])), images))
         arranged.append(token)
         if token.type == "table_close":
@@ -175,8 +176,13 @@ def _title(tokens: list[Token]) -> str:
     """Text of the first heading."""
     for k, token in enumerate(tokens):
         if token.type == "heading_open":
-            return "".join(child.content for child in tokens[k + 1].children or [])
+            return _plain(tokens[k + 1].children)
     return "report"
+
+
+def _plain(inline: list[Token] | None) -> str:
+    """Text without marks, for places that take nothing else."""
+    return "".join(token.content for token in inline or [])
 
 
 def report_files(
