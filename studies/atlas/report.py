@@ -123,7 +123,7 @@ def _more_links(found: Findings) -> list[str]:
                 cells.append(
                     f"{int(steps.rises[k, window, TARGETS.index(target)])} of {change.size}"
                     + (f" ({steps.labels[worst]}: {_percent(change[worst])})"
-                       if change[worst] > 0 else "")
+                       if change[worst] > NO_CHANGE else "")
                 )  # fmt: skip
         rows.append([_setting(found, k), *cells])
     late = steps.rises[:, LATE, [TARGETS.index("all links"), TARGETS.index("platform")]]
