@@ -7,7 +7,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help study test test-long check clean venv
+.PHONY: help study explore test test-long check clean venv
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 16
@@ -18,6 +18,13 @@ study: .venv/installed  ## run the study of the paper and a sweep of patch place
 	$(BIN)/studies sweep placement --out results/placement
 	$(BIN)/studies best results/placement --by residual_rms --count 5
 	$(BIN)/studies plot results/placement --out results/placement/best.png
+
+explore: .venv/installed  ## coupling of the links, spillover of three designs, all notebooks
+	rm -rf results/atlas
+	$(BIN)/studies atlas --out results/atlas
+	for design in paper paper_gains difference; do \
+	  $(BIN)/studies spillover $$design --out results/spillover-$$design; [ $$? -lt 2 ] || exit 2; done
+	$(PYTEST) tests/test_notebooks.py
 
 test: .venv/installed  ## run the tests
 	$(PYTEST)

@@ -13,7 +13,7 @@ from studies.runs import Run, metric_variables
 from studies.spec import Study, load_study
 from studies.sweeps.folder import TUNING, read_manifest
 from studies.sweeps.results import NOT_RUN, SweepData, load, metric_names
-from studies.sweeps.spec import parse_sweep
+from studies.sweeps.spec import parse_sweep, ready_spec
 from studies.sweeps.table import build_table, case_study
 
 
@@ -29,13 +29,14 @@ def load_design(path: Path, case: int | str | None = None) -> Design:
     """Read a DESIGN.
 
     Args:
-        path: study file, folder of a tuning or of a sweep.
+        path: study file, name of a ready one, folder of a tuning or of a sweep.
         case: of a sweep the number of the case, or "id:" and the first digits of its id; of a
             tuning the family, as in the names of its files.
 
     Raises:
         StudyError: not found, case missing or not allowed, or a case that does not stand alone.
     """
+    path = ready_spec(path)
     if not path.is_dir():
         if case is not None:
             raise StudyError(f"--case {case}: {path} is a file; leave --case out")
