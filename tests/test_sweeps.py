@@ -97,6 +97,9 @@ def test_every_case_equals_its_replay(mixed):
         assert found.status == design.stored["status"]
         difference, name = deviation(found, design.stored)
         assert 0 < difference < 1e-9, name
+        for name in ("sensor_condition", "actuator_condition"):
+            wanted = getattr(found.result, name)
+            np.testing.assert_allclose(data[name][case], wanted, rtol=1e-9, err_msg=name)
 
 
 def test_results_open_in_xarray_and_in_plain_hdf5(mixed):
@@ -482,6 +485,9 @@ def test_best_cases_obey_conditions(mixed):
     limited = best_cases(data, "residual_rms[1]", "peak_voltage < 1 and control.modes == 2", 99)
     assert len(limited) and np.all(data["peak_voltage"][limited].max(axis=1) < 1)
     assert np.all(data["control_modes"][limited] == 2)
+    worst = data["sensor_condition"].max(axis=1)
+    apart = best_cases(data, "residual_rms", f"sensor_condition < {np.median(worst)}", 99)
+    assert len(apart) < is_ok.sum() and worst[apart].max() < np.median(worst)
     with pytest.raises(StudyError, match="did you mean 'peak_voltage'"):
         best_cases(data, "voltage_peak")
     with pytest.raises(StudyError, match="true for no case"):

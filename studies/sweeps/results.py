@@ -50,11 +50,14 @@ _LIST_AXES = {
     "drive.pulse_force": ("slider_axis",),
     "metrics.stations": ("station",),
 }
+#: What every case has, finished or not: axes after `case`, unit, long name and any flags.
 _PER_CASE: dict[str, tuple] = {
-    "status": (*STATUS_LABEL[:2], {NOT_RUN: "not run", **STATUS_LABEL[2]}),
-    "bad_time": ("s", "when the status appeared, 0 if ok"),
-    "command_end": ("s", "end of the shaped command"),
-    "substeps": ("1", "plant steps per sample"),
+    "status": ((), *STATUS_LABEL[:2], {NOT_RUN: "not run", **STATUS_LABEL[2]}),
+    "bad_time": ((), "s", "when the status appeared, 0 if ok"),
+    "command_end": ((), "s", "end of the shaped command"),
+    "substeps": ((), "1", "plant steps per sample"),
+    "sensor_condition": (("link",), "1", "condition number of the modal filter"),
+    "actuator_condition": (("link",), "1", "condition number of the synthesizer"),
 }
 
 
@@ -122,13 +125,12 @@ def chunk_variables(
     is_finished = np.isin(code, status.FINISHED)
     modes, controlled = (table.values(name)[rows] for name in ("link.modes", "control.modes"))
     variables = {
-        "case_id": Variable(table.case_id[rows].astype(str), ("case",), "1", "hash of the case"),
-        "status": Variable(code, ("case",), *_PER_CASE["status"]),
-        "substeps": Variable(np.full(count, substeps), ("case",), *_PER_CASE["substeps"]),
+        "case_id": Variable(table.case_id[rows].astype(str), ("case",), "1", "hash of the case")
     }
-    for name in ("bad_time", "command_end"):
-        data = np.asarray(getattr(result, name))[:count]
-        variables[name] = Variable(data, ("case",), *_PER_CASE[name])
+    known = {"status": code, "substeps": np.full(count, substeps)}
+    for name, (dims, *about) in _PER_CASE.items():
+        data = known[name] if name in known else np.asarray(getattr(result, name))[:count]
+        variables[name] = Variable(data, ("case", *dims), *about)
     for name in kept:
         source = result if name == "energy_ratio" else result.metrics
         data = np.array(getattr(source, name), copy=True)[:count]
@@ -328,16 +330,16 @@ def gather(table: Table, finished: Finished) -> dict[str, Variable]:
                 variables[name].data[inside] = data[finished.row[chosen]]
     if "status" not in variables:
         empty = np.full(n, NOT_RUN)
-        variables["status"] = Variable(empty, ("case",), *_PER_CASE["status"])
+        variables["status"] = Variable(empty, ("case",), *_PER_CASE["status"][1:])
     return variables
 
 
 def metric_values(data: SweepData, name: str) -> np.ndarray:
     """One number per case: a metric, an entry of it, or a field, (n,).
 
-    A metric with more axes counts with its largest value: `residual_rms` is that of the worst link
-    and station, `residual_rms[0]` that of the worst station of link 1. A field that does not vary
-    has its value in every case.
+    A metric or condition number with more axes counts with its largest value: `residual_rms` is
+    that of the worst link and station, `residual_rms[0]` that of the worst station of link 1. A
+    field that does not vary has its value in every case.
 
     Raises:
         StudyError: unknown name or entry.
@@ -384,7 +386,7 @@ def _entry(variable: Variable, name: str, indices: tuple[int, ...], candidate: s
         array = array[:, index]
     if array.ndim == 1:
         return array
-    if candidate not in metric_names():
+    if candidate not in (*metric_names(), *_PER_CASE):
         raise StudyError(f"{name!r}: a list; name one entry of it, such as {name}[0]")
     flat = array.reshape(len(array), -1)
     if flat.dtype.kind != "f":
@@ -472,4 +474,4 @@ def _fitted(data: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 def _label(name: str) -> tuple:
     """Axes after `case`, unit, long name and any flags of what a chunk holds."""
-    return ((), *_PER_CASE[name]) if name in _PER_CASE else metric_label(name)
+    return _PER_CASE[name] if name in _PER_CASE else metric_label(name)
