@@ -50,8 +50,8 @@ DAC_BITS = 12
 
 
 def export_design(
-    design: Design, target: str, out: Path, is_verified: bool | None, name: str,
-    dac_bits: int | None, console: Console,
+    design: Design, target: str, out: Path, is_verified: bool | None = None,
+    name: str = "flexlink", dac_bits: int | None = None, console: Console | None = None,
 ) -> bool:  # fmt: skip
     """Write a controller, verified where asked for.
 
@@ -62,7 +62,7 @@ def export_design(
         is_verified: whether to compare with the JAX controller; None: where there is a compiler.
         name: of the files, prefix of C functions.
         dac_bits: resolution of the DAC, for "c-fixed" alone; None: `DAC_BITS`.
-        console: to tell what happens.
+        console: to tell what happens; default: standard output.
 
     Returns:
         whether everything agreed; the files are written only then.
@@ -72,6 +72,7 @@ def export_design(
     """
     _check_arguments(target, name, dac_bits)
     _check_folder(out)
+    console = console or Console(highlight=False, markup=False)
     compiler = [] if target == "json" else find_compiler()
     if target != "json" and not compiler:
         if is_verified:

@@ -39,7 +39,11 @@ def make_evaluator(spec: TuneSpec) -> Evaluator:
 
 
 def run_tuning(
-    spec: TuneSpec, out: Path, is_resumed: bool, console: Console, is_quiet: bool = False
+    spec: TuneSpec,
+    out: Path,
+    is_resumed: bool = False,
+    console: Console | None = None,
+    is_quiet: bool = False,
 ) -> Findings:
     """Tune, check the result on fresh scenarios, and write it.
 
@@ -47,7 +51,7 @@ def run_tuning(
         spec: what is free and what for.
         out: folder.
         is_resumed: go on with the tuning that is there.
-        console: where progress goes.
+        console: where progress goes; default: standard output.
         is_quiet: no progress.
 
     Returns:
@@ -58,6 +62,7 @@ def run_tuning(
             limits that contradict one another (everything is written all the same).
     """
     config.require_configured()
+    console = console or Console(highlight=False, markup=False)
     manifest = make_manifest(spec.data, sorted(Path(__file__).parent.glob("*.py")))
 
     def say(text: str) -> None:
