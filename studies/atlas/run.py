@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
+from threadpoolctl import threadpool_limits
 
 from jaxmodel import status
 from studies import config
@@ -68,7 +69,8 @@ def run_atlas(
             console.print(text, soft_wrap=True)
 
     subsets, dropped = sound_settings(read_subsets(load(out / RUNS_FOLDER)))
-    found = look_around(study, subsets, tell)
+    with threadpool_limits(1, "blas"):  # many small matrices: more threads only get in the way
+        found = look_around(study, subsets, tell)
     try:
         with tempfile.TemporaryDirectory(dir=out, prefix=".unfinished-") as folder:
             staging = Path(folder)
