@@ -38,6 +38,23 @@ def pole_placement(decay: Array, damped_frequency: Array, omega: Array) -> PoleG
     return PoleGains(decay**2 + damped_frequency**2 - omega**2, 2 * decay)
 
 
+def optimal_gains(omega: Array, control_weight: Array) -> PoleGains:
+    """Gains that minimise int omega^2 q^2 + q'^2 + R u^2 dt of q'' + omega^2 q = u (IMSC-LQR).
+
+    k_p = omega sqrt(omega^2 + 1/R) - omega^2 and k_d = sqrt(2 k_p + 1/R): the closed-form solution
+    of the mode's Riccati equation (Meirovitch 1990, Dynamics and Control of Structures).
+
+    Args:
+        omega: natural frequency of the mode [rad/s].
+        control_weight: R, weight of the squared control per unit modal mass [s2].
+
+    Returns:
+        PoleGains per unit modal mass.
+    """
+    position = omega * jnp.sqrt(omega**2 + 1 / control_weight) - omega**2
+    return PoleGains(position, jnp.sqrt(2 * position + 1 / control_weight))
+
+
 def efficient_modal_control(energy: Array, omega: Array) -> Array:
     """EMC ratios k_dj : k_d1 = (E_j/E_1) (omega_1/omega_j), (24).
 

@@ -29,6 +29,9 @@ class Controller(NamedTuple):
     adc_step: Array  # one code [V], ()
     adc_top: Array  # highest code [1], ()
     adc_noise: Array  # rms at the ADC input [V], ()
+    # [rad/s], (3, C): of the channels of a link where it is above 0 only the one of highest modal
+    # energy acts (modified IMSC); None: all act
+    rival_omega: Array | None = None
 
 
 class ControllerState(NamedTuple):
@@ -119,6 +122,23 @@ def read_back(controller: Controller, code: Array) -> Array:
     return (code * controller.adc_step - controller.adc_bias) / controller.adc_gain
 
 
+def strongest(omega: Array, value: Array, rate: Array) -> Array:
+    """1 for the channel of highest modal energy (omega q)^2 + q'^2 of each link, 0 for its rivals.
+
+    Modified IMSC (Baz and Poh 1988): all actuators of a link serve one mode at a time. A channel
+    with omega = 0 is nobody's rival and always acts.
+
+    Args:
+        omega: frequency of each channel [rad/s], (3, C).
+        value: estimated q [m], (3, C).
+        rate: estimated q' [m/s], (3, C).
+    """
+    is_rival = omega > 0
+    energy = jnp.where(is_rival, (omega * value) ** 2 + rate**2, 0.0)
+    is_first = energy >= jnp.max(energy, axis=1, keepdims=True)
+    return jnp.where(is_rival & ~is_first, 0.0, 1.0).astype(energy.dtype)
+
+
 def controller_step(
     controller: Controller,
     state: ControllerState,
@@ -150,9 +170,13 @@ def controller_step(
     line = (newest, state.second[0], state.second[1])
     rate = sum(n * x for n, x in zip(estimator.velocity, line, strict=True))
     force = -controller.velocity_gain * rate
-    if controller.position_gain is not None:
+    if controller.position_gain is not None or controller.rival_omega is not None:
         value = sum(n * x for n, x in zip(estimator.position, line, strict=True))
-        force = force - controller.position_gain * (value + estimator.direct * channel)
+        value = value + estimator.direct * channel
+        if controller.position_gain is not None:
+            force = force - controller.position_gain * value
+        if controller.rival_omega is not None:
+            force = force * strongest(controller.rival_omega, value, rate)
     wanted = jnp.sum(controller.synthesizer * force[:, None], axis=2)
     command = soft_limit(wanted, controller.voltage_limit, is_smooth)
     after = ControllerState(b1 * channel - a1 * high, (newest, state.second[0]), command)

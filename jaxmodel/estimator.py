@@ -82,6 +82,23 @@ def measurement_chain(omega: Array, period: Array, antialias: Array) -> Array:
     return hold * jnp.exp(-1.5j * omega * period) / (s * s + jnp.sqrt(2.0) * s + 1)
 
 
+def second_order(corner: Array, zeta: Array, period: Array) -> tuple[Array, Array, Array]:
+    """Low-pass w^2/(s^2 + 2 zeta w s + w^2) by Tustin, s = c (z-1)/(z+1), exact at w.
+
+    Args:
+        corner: w [rad/s], below half the sample rate.
+        zeta: damping [1].
+        period: sample time T [s].
+
+    Returns:
+        (low, a1, a2) of low (1 + z^-1)^2/(1 + a1 z^-1 + a2 z^-2).
+    """
+    warp = jnp.tan(corner * period / 2)  # w/c
+    lead = 1 + 2 * zeta * warp + warp * warp
+    a1, a2 = 2 * (warp * warp - 1) / lead, (1 - 2 * zeta * warp + warp * warp) / lead
+    return warp * warp / lead, a1, a2
+
+
 def _modal_phase(
     omega: Array, period: Array, antialias: Array, highpass: Array, kappa: Array, zeta: Array
 ) -> Estimator:
@@ -90,11 +107,8 @@ def _modal_phase(
     half = highpass * period / 2
     gain, pole = 1 / (1 + half), (half - 1) / (1 + half)
     first = (gain * jnp.ones_like(omega), -gain * jnp.ones_like(omega), pole * jnp.ones_like(omega))
-    # low-pass w^2/(s^2 + 2 zeta w s + w^2), s = c (z-1)/(z+1), prewarped at w = kappa omega
-    warp = jnp.tan(kappa * omega * period / 2)  # w/c
-    lead = 1 + 2 * zeta * warp + warp * warp
-    a1, a2 = 2 * (warp * warp - 1) / lead, (1 - 2 * zeta * warp + warp * warp) / lead
-    low = warp * warp / lead  # numerator low (1 + z^-1)^2; that of s LP is c low (1 - z^-2)
+    # its numerator is low (1 + z^-1)^2; that of s LP is c low (1 - z^-2)
+    low, a1, a2 = second_order(kappa * omega, zeta, period)
 
     z = jnp.exp(-1j * omega * period)  # z^-1 on the unit circle
     high_response = first[0] * (1 - z) / (1 + first[2] * z)

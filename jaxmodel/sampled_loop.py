@@ -7,6 +7,7 @@ own `controller_step`, linear once rounding and limits are left out.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax
@@ -357,27 +358,46 @@ def gain_margin(poles, limit: float = 64.0) -> float:
     return float(low)
 
 
-def _follow(matrices: LoopMatrices, poles, period: float, n_tracked: int) -> np.ndarray:
-    """Discrete poles of the first link modes at full gain, (J, 3)."""
-    start = _link_poles(matrices.plant, n_tracked)
-    tracked = np.exp(start.ravel() * period)
-    velocity = np.zeros_like(tracked)
-    for factor in np.linspace(0, 1, 41)[1:]:
-        candidates = list(poles(factor))
-        guess, found = tracked + velocity, []
-        for wanted in guess:
+def follow_poles(start: np.ndarray, sets: Iterable[np.ndarray]) -> np.ndarray:
+    """Where poles go while the loop changes step by step.
+
+    Each is sought next to where its last step would take it again; none is taken twice.
+
+    Args:
+        start: poles to follow, (m,).
+        sets: all poles of the loop after each step, (n,) each.
+
+    Returns:
+        the poles after each step, (steps, m).
+    """
+    tracked, velocity, path = start, np.zeros_like(start), []
+    for candidates in map(list, sets):
+        found = []
+        for wanted in tracked + velocity:
             nearest = int(np.argmin(np.abs(np.array(candidates) - wanted)))
             found.append(candidates.pop(nearest))
         velocity, tracked = np.array(found) - tracked, np.array(found)
+        path.append(tracked)
+    return np.array(path)
+
+
+def _follow(matrices: LoopMatrices, poles, period: float, n_tracked: int) -> np.ndarray:
+    """Discrete poles of the first link modes at full gain, (J, 3)."""
+    start = np.exp(link_poles(matrices.plant, n_tracked).ravel() * period)
+    tracked = follow_poles(start, map(poles, np.linspace(0, 1, 41)[1:]))[-1]
     return np.pad(
         tracked.reshape(-1, 3), ((0, n_tracked - tracked.size // 3), (0, 0)), constant_values=np.nan
     )
 
 
-def _link_poles(state: np.ndarray, n_tracked: int) -> np.ndarray:
-    """Poles of the uncontrolled link modes, grouped by three in ascending frequency, (J, 3).
+def link_poles(state: np.ndarray, n_tracked: int) -> np.ndarray:
+    """Poles [rad/s] of the uncontrolled link modes, by three in ascending frequency, (J, 3).
 
     They are the eigenvalues whose eigenvectors live in the modal coordinates.
+
+    Args:
+        state: A of the plant, `LoopMatrices.plant`.
+        n_tracked: J at most; overdamped modes have no such pole.
     """
     modes = (state.shape[0] - 6) // 4
     keep = np.r_[0:6, 6 : 6 + 2 * modes]
@@ -389,5 +409,5 @@ def _link_poles(state: np.ndarray, n_tracked: int) -> np.ndarray:
     n_rigid = value.size - modes
     flexible = np.sort_complex(1j * value[np.argsort(weight)[: value.size - max(n_rigid, 0)]])
     flexible = flexible[np.argsort(np.abs(flexible))] / 1j
-    kept = min(flexible.size // 3, n_tracked)  # overdamped modes have no such pole
+    kept = min(flexible.size // 3, n_tracked)
     return flexible[: 3 * kept].reshape(kept, 3)

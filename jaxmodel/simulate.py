@@ -12,6 +12,7 @@ import numpy as np
 from jaxmodel import metrics, status
 from jaxmodel.case import Case, Structure
 from jaxmodel.control import efficient_modal_control
+from jaxmodel.controller import Controller
 from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.kinematics import inverse_kinematics, path_status
 from jaxmodel.loop import Inputs, Loop, Record, State, initial_state, step
@@ -171,12 +172,13 @@ class Start(NamedTuple):
     outline: Outline
 
 
-def begin(structure: Structure, case: Case) -> Start:
+def begin(structure: Structure, case: Case, law: Controller | None = None) -> Start:
     """Everything before the first step.
 
     Args:
         structure: static choices.
         case: the numbers.
+        law: controller instead of the case's own.
 
     Returns:
         Start.
@@ -185,6 +187,8 @@ def begin(structure: Structure, case: Case) -> Start:
     outside = command(structure, case, prepared)
     code = jnp.where(prepared.status == status.OK, outside.status, prepared.status)
     loop = prepared.loop
+    if law is not None:
+        loop = loop._replace(controller=law)
     return Start(
         loop,
         outside.inputs,
@@ -237,18 +241,21 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
     )
 
 
-def simulate(structure: Structure, case: Case, has_record: bool = False) -> Result:
+def simulate(
+    structure: Structure, case: Case, has_record: bool = False, law: Controller | None = None
+) -> Result:
     """Run one case: the reference executor, a scan; other executors share all but that.
 
     Args:
         structure: static choices.
         case: the numbers; `jax.vmap` over any of them.
         has_record: return trajectories too (static).
+        law: controller instead of the case's own, as for `sampled_loop.closed_loop`.
 
     Returns:
         Result. Nothing is raised inside: `status` says what went wrong.
     """
-    start = begin(structure, case)
+    start = begin(structure, case, law)
 
     def body(state, inputs):
         after, record = step(structure, start.loop, state, inputs)

@@ -1,0 +1,61 @@
+"""Positive position feedback (Goh and Caughey 1985; Fanson and Caughey 1990).
+
+A second-order filter per channel pushes along with its output, f = +g eta with
+eta'' + 2 zeta_f omega_f eta' + omega_f^2 eta = omega_f^2 q. Where the filter lags by 90 degrees
+that is a force against q'. In a sampled loop anti-alias filter, delay and hold lag as well, so the
+filter is tuned for all of them together.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from jaxmodel.estimator import Estimator, measurement_chain, second_order
+from jaxmodel.parameters import Array
+
+#: Highest corner over the assembled frequency, for where the chain lags by 90 degrees itself [1].
+HIGHEST_RATIO = 3.0
+#: Highest corner over half the sample rate [1].
+HIGHEST_SHARE = 0.9
+
+
+class PositionFilter(NamedTuple):
+    """Filters of positive position feedback, (3, C) each."""
+
+    estimator: Estimator  # its position is the filter's output
+    corner: Array  # omega_f [rad/s]
+    damping: Array  # k_d at the assembled frequency per unit of g, delays included [s]
+
+
+def design_position_filter(
+    omega: Array, zeta: Array, period: Array, antialias: Array
+) -> PositionFilter:
+    """Filters that lag by 90 degrees at omega together with the measurement chain.
+
+    With x = omega/omega_f and t = tan(90 degrees - lag of the chain), 2 zeta_f x = t (1 - x^2);
+    omega_f at most `HIGHEST_RATIO` omega.
+
+    Args:
+        omega: assembled frequency of each channel [rad/s], (3, C).
+        zeta: zeta_f, damping of the filters [1], ().
+        period: sample time T [s], ().
+        antialias: corner of the analogue Butterworth filter [rad/s], ().
+
+    Returns:
+        PositionFilter; where `damping` is not positive the chain lags too much for this law.
+    """
+    share = omega / antialias
+    lag = jnp.arctan2(jnp.sqrt(2.0) * share, 1 - share**2) + 1.5 * omega * period
+    least = jnp.arctan(2 * zeta * HIGHEST_RATIO / (HIGHEST_RATIO**2 - 1))
+    slope = jnp.tan(jnp.maximum(jnp.pi / 2 - lag, least))
+    corner = omega * slope / (jnp.sqrt(zeta**2 + slope**2) - zeta)
+    corner = jnp.minimum(corner, HIGHEST_SHARE * jnp.pi / period)
+    low, a1, a2 = second_order(corner, zeta, period)
+    one, zero = jnp.ones_like(corner), jnp.zeros_like(corner)
+    estimator = Estimator((one, zero, zero), (a1, a2), (zero,) * 3, (low, 2 * low, low), zero)
+    z = jnp.exp(-1j * omega * period)  # z^-1 on the unit circle
+    response = low * (1 + z) ** 2 / (1 + a1 * z + a2 * z * z)
+    whole = measurement_chain(omega, period, antialias) * response
+    return PositionFilter(estimator, corner, -jnp.imag(whole) / omega)

@@ -1,0 +1,155 @@
+"""Spillover certificate: one design's controller judged on many plants that it does not know."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxmodel.beam import BASES
+from jaxmodel.sampled_loop import RADIUS_TOLERANCE
+from studies.errors import StudyError, field_error
+from studies.export.controller import FixedController, fixed_controller
+from studies.spec import Study
+from studies.spillover.judgement import Judgement, judge
+from studies.spillover.plants import LENGTHS, LoopMaker, Plant, all_plants, widened
+
+
+class Certificate(NamedTuple):
+    """What was found. Axes: B bases, S sensor lengths, A actuator lengths, N numbers of modes.
+
+    Numbers of plants that do not exist (patches overlap, ...) are NaN, their texts "".
+    """
+
+    study: Study
+    required: float  # margin that every plant must leave [1]
+    n_controlled: int  # r_c, controlled modes per link
+    plants: np.ndarray  # `Plant`, (B, S, A, N)
+    exists: np.ndarray  # (B, S, A, N)
+    radius: np.ndarray  # spectral radius at the design's gains [1], (B, S, A, N)
+    margin: np.ndarray  # largest common gain factor, all smaller ones stable [1], (B, S, A, N)
+    frequency_hz: np.ndarray  # of each link mode, three of each order, (B, S, A, N, R, 3)
+    damping_ratio: np.ndarray  # [1], (B, S, A, N, R, 3)
+    weakest: np.ndarray  # the mode of least damping, in words, (B, S, A, N)
+    breaking: np.ndarray  # what goes unstable beyond the margin, in words, (B, S, A, N)
+    observation: np.ndarray  # channel signal per plant mode, (B, S, A, 3, C, R), see `Leakage`
+    actuation: np.ndarray  # modal force per channel force, (B, S, A, 3, R, C)
+    notes: tuple[str, ...]  # what was left out, and why
+
+    @property
+    def least_damping(self) -> np.ndarray:
+        """Smallest damping ratio of all link modes [1], (B, S, A, N)."""
+        known = np.where(np.isnan(self.damping_ratio), np.inf, self.damping_ratio)
+        least = known.min(axis=(4, 5))
+        return np.where(np.isfinite(least), least, np.nan)
+
+    @property
+    def passes(self) -> np.ndarray:
+        """Which plants are stable and leave the margin, (B, S, A, N)."""
+        return (self.radius <= 1 + RADIUS_TOLERANCE) & (self.margin >= self.required)
+
+    @property
+    def is_passed(self) -> bool:
+        """Whether all of them do."""
+        return bool(self.passes[self.exists].all())
+
+    @property
+    def worst(self) -> tuple[int, ...]:
+        """Where the smallest margin is; of nearly equal ones the plant with the fewest modes."""
+        near = np.argwhere(self.margin <= np.nanmin(self.margin) * (1 + 1e-3))
+        return tuple(int(k) for k in min(near.tolist(), key=lambda at: at[3]))
+
+    @property
+    def fails_from(self) -> int:
+        """Fewest plant modes per link with which a plant does not pass, 0 where all do."""
+        failing = self.plants[self.exists & ~self.passes]
+        return min((plant.n_modes for plant in failing), default=0)
+
+
+def certify(
+    study: Study,
+    margin: float = 2.0,
+    bases: tuple[str, ...] = BASES,
+    sizes: tuple[int, ...] = (),
+    lengths: tuple[float, ...] = LENGTHS,
+) -> Certificate:
+    """Judge a study's controller on plants that differ from what it believes.
+
+    Its coefficients are those of the study as it stands. Each plant is linearised at the first
+    way-point, with delay, hold and anti-alias filter.
+
+    Args:
+        study: with sampled feedback.
+        margin: gain margin that every plant must leave [1], above 1.
+        bases: modal bases of the plant.
+        sizes: plant modes per link; empty: from the controlled ones to 10.
+        lengths: true over believed patch lengths, of sensors and of actuators in all pairs [1].
+
+    Raises:
+        StudyError: no controller to judge (ideal feedback, no link controlled, gains of zero), a
+            study that cannot run, or an argument out of range.
+    """
+    if not 1 < margin <= 32:
+        raise field_error("--margin", margin, "more than 1, up to 32", "1")
+    found = fixed_controller(study)
+    smallest = found.structure.n_controlled
+    plants = all_plants(bases, sizes, lengths, smallest)
+    if any(plant.n_modes < smallest for plant in plants.ravel()):
+        raise StudyError(f"sizes = {sizes}: allowed {smallest}, the controlled modes, or more")
+    maker = LoopMaker(found)
+    faults = np.vectorize(maker.fault, otypes=[object])(plants)
+    exists = faults == ""
+    if not exists.any():
+        raise StudyError(f"no plant to judge on: {'; '.join(dict.fromkeys(faults.ravel()))}")
+    judgements = _judged(found, maker, plants[exists].tolist())
+    return _collected(found, margin, maker, plants, faults, judgements)
+
+
+def _judged(
+    found: FixedController, maker: LoopMaker, plants: list[Plant]
+) -> dict[Plant, Judgement]:
+    """Judgement of every plant, on as many threads as there are cores."""
+    law = widened(found.controller, found.n_patches)
+    try:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            done = list(pool.map(lambda plant: judge(maker.loop(plant, law)), plants))
+    except np.linalg.LinAlgError:
+        raise StudyError("a linearised loop is not finite: nothing to judge") from None
+    return dict(zip(plants, done, strict=True))
+
+
+def _collected(
+    found: FixedController,
+    margin: float,
+    maker: LoopMaker,
+    plants: np.ndarray,
+    faults: np.ndarray,
+    judgements: dict[Plant, Judgement],
+) -> Certificate:
+    shape, largest = plants.shape, max(plant.n_modes for plant in plants.ravel())
+    exists = faults == ""
+    law = widened(found.controller, found.n_patches)
+    channels = found.controller.velocity_gain.shape[1]
+
+    radius, limit = np.full((2, *shape), np.nan)
+    frequency, zeta = np.full((2, *shape, largest, 3), np.nan)
+    weakest, breaking = np.full((2, *shape), "", object)
+    observation = np.full((*shape[:3], 3, channels, largest), np.nan)
+    actuation = np.full((*shape[:3], 3, largest, channels), np.nan)
+    for at in map(tuple, np.argwhere(exists)):
+        one, n = judgements[plants[at]], plants[at].n_modes
+        radius[at], limit[at] = one.radius, one.margin
+        frequency[at][:n], zeta[at][:n] = one.frequency_hz, one.damping_ratio
+        weakest[at], breaking[at] = one.weakest, one.breaking
+    for at in map(tuple, np.argwhere(exists.any(axis=3))):
+        plant = plants[at][0]._replace(n_modes=largest)
+        leakage = maker.leakage(plant, law)
+        observation[at] = leakage.observation[:, :channels]
+        actuation[at] = leakage.actuation[:, :, :channels]
+    return Certificate(
+        found.study, margin, found.structure.n_controlled, plants, exists, radius, limit,
+        frequency, zeta, weakest.astype(str), breaking.astype(str), observation, actuation,
+        tuple(dict.fromkeys(f"left out: {fault}" for fault in faults.ravel() if fault)),
+    )  # fmt: skip

@@ -1,0 +1,180 @@
+"""The laws side by side: as strong as the required margin lets them be, then on one fast move."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.controller import Controller
+from jaxmodel.simulate import Result, simulate
+from studies.export.controller import FixedController, fixed_controller
+from studies.runs import check_run
+from studies.spec import Study
+from studies.spillover.judgement import (
+    HIGHEST,
+    STEPS,
+    breaking_motion,
+    damping,
+    follow,
+    gain_limit,
+)
+from studies.spillover.laws import Law, all_laws
+from studies.spillover.plants import LARGEST, LoopMaker, Plant
+
+#: The fast move has the acceleration of a move as long as the first in the time of the second.
+FAST = (0.01, 0.03)  # [m], [s]
+#: The drives settle this long after the command; then the residual window begins [s].
+SETTLING = 0.02
+#: Length of the residual window [s].
+WINDOW = 0.15
+#: Modes whose damping is told.
+SHOWN = 3
+GIVEN, WITHOUT = "design as given", "no control"
+
+
+class Comparison(NamedTuple):
+    """Laws, L of them: without control, the design as given, then each law at its own factor."""
+
+    study: Study  # of the runs: the design's first move made fast
+    required: float  # margin that sets the factors [1]
+    plant: Plant  # whose damping is told, and the basis of all
+    names: tuple[str, ...]
+    factor: np.ndarray  # on the gains of each law, 1: as strong on mode 1 as the design [1], (L,)
+    damping_ratio: np.ndarray  # of modes 1.., the smallest of the links [1], (L, J)
+    margin: np.ndarray  # smallest over the numbers of plant modes at that factor [1], (L,)
+    breaking: tuple[str, ...]  # what goes unstable beyond it
+    residual_rms: np.ndarray  # worst station of each link [m], (L, 3)
+    peak_voltage: np.ndarray  # [V], (L,)
+    control_energy: np.ndarray  # integral of summed squared voltages [V2 s], (L,)
+    status: np.ndarray  # of the run, code of `jaxmodel.status`, (L,)
+
+
+def compare_laws(study: Study, margin: float = 2.0, sizes: tuple[int, ...] = ()) -> Comparison:
+    """Compare control laws on a study's machine.
+
+    The factor on a law's gains is the largest that leaves the margin on the design's own plants,
+    but no more than damps mode 1 as the design as given does, or as it can be damped. Modified IMSC switches and so is not
+    linear: its loops are judged with each mode alone, which proves nothing about switching.
+
+    Args:
+        study: the design, with sampled feedback.
+        margin: gain margin that the factors leave [1].
+        sizes: plant modes per link; empty: from the controlled ones to 10.
+
+    Raises:
+        StudyError: as `certify`, or a design that does not damp mode 1.
+    """
+    found = fixed_controller(study)
+    smallest = found.structure.n_controlled
+    sizes = sizes or tuple(range(smallest, LARGEST + 1))
+    own = min(max(found.study.link.modes, smallest), max(sizes))
+    plant = Plant(found.study.link.basis, own, 1.0, 1.0)
+    laws = all_laws(found, LoopMaker(found), plant)
+    views = [_View(found, law, plant, sizes) for law in laws]
+    given = views[0 if found.is_modal else 1]
+    target = given.damping(1.0)[0]
+    rows = [(WITHOUT, given, 0.0), (GIVEN, given, 1.0)]
+    rows += [(view.law.name, view, view.fair(margin, target)) for view in views]
+    moved, result = _run(found, [view.law.at(factor) for _, view, factor in rows])
+    metrics = result.metrics
+    return Comparison(
+        moved,
+        margin,
+        plant,
+        tuple(name for name, _, _ in rows),
+        np.array([factor for _, _, factor in rows]),
+        np.array([view.damping(factor) for _, view, factor in rows]),
+        np.array([min(view.limit / f, HIGHEST) if f else np.nan for _, view, f in rows]),
+        tuple(view.breaking if factor else "" for _, view, factor in rows),
+        metrics.residual_rms.max(axis=2),
+        metrics.peak_voltage.max(axis=1),
+        metrics.control_energy,
+        result.status,
+    )
+
+
+class _View:
+    """A law on the design's own plants."""
+
+    def __init__(
+        self, found: FixedController, law: Law, plant: Plant, sizes: tuple[int, ...]
+    ) -> None:
+        self.law, self._parts, maker = law, [], LoopMaker(found)
+        self.limit, self.breaking = HIGHEST, ""
+        for modes, part in law.linear_parts:
+            self._parts.append((modes, maker.loop(plant, part)))
+            for n in sorted(sizes, reverse=True):  # where the limit is lowest, as a rule
+                loop = maker.loop(plant._replace(n_modes=n), part)
+                limit = gain_limit(loop.poles, highest=self.limit)
+                if limit < self.limit:
+                    self.limit, self.breaking = limit, breaking_motion(loop, limit)
+
+    def damping(self, factor: float) -> np.ndarray:
+        """Smallest damping ratio of the links, modes 1 to `SHOWN`, NaN where there is none."""
+        return self._path(factor * STEPS)[-1]
+
+    def fair(self, margin: float, target: float) -> float:
+        """Largest factor with the margin, but no further than mode 1's damping grows to a target.
+
+        Args:
+            margin: that the factor leaves [1].
+            target: damping ratio of mode 1 [1].
+        """
+        highest = self.limit / margin
+        if highest == 0:
+            return 0.0
+        # 1 among them, for the design's own law
+        factors = np.union1d(highest * STEPS, [min(1.0, highest)])
+        first = np.append(self.damping(0.0)[0], self._path(factors)[:, 0])
+        factors = np.append(0.0, factors)
+        most = int(np.argmax(first))
+        if not first[0] < target <= first[most]:
+            return float(factors[most])
+        k = int(np.flatnonzero(first >= target)[0])
+        return float(np.interp(target, first[k - 1 : k + 1], factors[k - 1 : k + 1]))
+
+    def _path(self, factors: np.ndarray) -> np.ndarray:
+        """The same while the gains grow through factors, (steps, `SHOWN`)."""
+        found = np.full((len(factors), SHOWN), np.nan)
+        for modes, loop in self._parts:
+            tracked = follow(loop, factors, loop.poles)
+            zeta = damping(loop, tracked)[1].min(axis=2)[:, :SHOWN]
+            found[:, : zeta.shape[1]][:, modes] = zeta[:, modes]
+        return found
+
+
+def _run(found: FixedController, laws: list[Controller]) -> tuple[Study, Result]:
+    """The design's first move made fast under each law, and the study of it."""
+    study = _made_fast(found.study)
+    structure, case = check_run(study)
+    # a channel for each patch, whatever the law
+    structure = structure._replace(
+        law="srf", n_frequencies=1, metrics=("residual_rms", "peak_voltage", "control_energy")
+    )
+    stacked = jax.tree.map(lambda *x: np.stack(x), *laws)
+    return study, jax.tree.map(np.asarray, _simulate(structure, case, stacked))
+
+
+@partial(jax.jit, static_argnums=0)
+def _simulate(structure: Structure, case: Case, laws: Controller) -> Result:
+    return jax.vmap(lambda law: simulate(structure, case, False, law))(laws)
+
+
+def _made_fast(study: Study) -> Study:
+    """The same with nothing but its first move, at the acceleration of `FAST`, without shaper."""
+    points = study.motion.waypoints[:2]
+    distance = float(np.hypot(*np.subtract(points[-1], points[0])[:2]))
+    time = study.motion.move_time
+    time = time if isinstance(time, float) else time[0]
+    if distance > 0:
+        time = max(FAST[1] * np.sqrt(distance / FAST[0]), 1e-3)
+    moving = time if len(points) > 1 else 0.0
+    return study.change(
+        motion__waypoints=points, motion__move_time=float(time), motion__dwell=0.0,
+        shaper__kind="none", metrics__residual_delay=SETTLING, metrics__residual_length=WINDOW,
+        run__duration=moving + SETTLING + WINDOW + 0.01,
+    )  # fmt: skip

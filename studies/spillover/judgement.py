@@ -1,0 +1,191 @@
+"""What the poles of one loop say: damping of its modes, gain margin, and the mode that breaks it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import brentq
+
+from jaxmodel.sampled_loop import RADIUS_TOLERANCE, follow_poles
+from studies.spillover.plants import SampledLoop
+
+#: Gain factors at which modes are followed from no control to the design's gains.
+STEPS = np.linspace(0, 1, 25)[1:]
+#: Margins beyond this are given as it, and those below the other as 0 [1].
+HIGHEST, LOWEST = 64.0, 0.01
+#: Gain factors that are looked at are no further apart than this [1].
+STRIDE = 1.25
+#: A link with this share of the largest one's part takes part in a motion [1].
+PART = 0.5
+
+
+class Judgement(NamedTuple):
+    """Of one loop."""
+
+    radius: float  # spectral radius at the given gains [1]
+    margin: float  # largest common factor on all gains with every smaller one stable [1]
+    frequency_hz: np.ndarray  # of the link modes at the given gains, (r, 3), NaN: overdamped
+    damping_ratio: np.ndarray  # [1], (r, 3)
+    weakest: str  # the mode of least damping
+    breaking: str  # what goes unstable first, "" where nothing does up to `HIGHEST`
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether this loop and every one with smaller gains is stable."""
+        return self.radius <= 1 + RADIUS_TOLERANCE and self.margin >= 1
+
+
+def judge(loop: SampledLoop) -> Judgement:
+    """Judge a loop.
+
+    Args:
+        loop: the loop; its gains belong to factor 1.
+    """
+    poles = cache(loop.poles)
+    tracked = follow(loop, STEPS, poles)[-1]
+    frequency, zeta = damping(loop, tracked)
+    weakest = ""
+    if not np.all(np.isnan(zeta)):
+        at = np.unravel_index(np.nanargmin(zeta), zeta.shape)
+        weakest = name_motion(loop, 1.0, tracked[at])
+    margin = gain_limit(poles, STEPS)
+    return Judgement(
+        float(np.abs(poles(1.0)).max()), margin, frequency, zeta, weakest,
+        breaking_motion(loop, margin),
+    )  # fmt: skip
+
+
+def follow(
+    loop: SampledLoop, factors: np.ndarray, poles: Callable[[float], np.ndarray]
+) -> np.ndarray:
+    """Discrete poles of the link modes while the gains grow.
+
+    Args:
+        loop: the loop.
+        factors: gain factors, rising from near 0 [1], (steps,).
+        poles: `loop.poles`, or what has them already.
+
+    Returns:
+        (steps, r, 3), NaN where modes are overdamped without control.
+    """
+    start = np.exp(loop.mode_poles * loop.period)
+    path = follow_poles(start.ravel(), map(poles, map(float, factors)))
+    path = path.reshape(len(path), -1, 3)
+    missing = loop.n_modes - path.shape[1]
+    return np.pad(path, ((0, 0), (0, missing), (0, 0)), constant_values=np.nan)
+
+
+def damping(loop: SampledLoop, tracked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Frequency [Hz] and damping ratio of followed modes.
+
+    A pole z of a mode above half the sample rate stands for exp(s T) of an s that is 2 pi/T away
+    from ln(z)/T, or several times that: the one next to the mode without control is meant.
+
+    Args:
+        loop: the loop.
+        tracked: discrete poles, (..., r, 3).
+
+    Returns:
+        two arrays (..., r, 3).
+    """
+    missing = loop.n_modes - len(loop.mode_poles)
+    start = np.pad(loop.mode_poles, ((0, missing), (0, 0)), constant_values=np.nan)
+    rate = np.log(tracked) / loop.period
+    turn = 2j * np.pi / loop.period
+    rate = rate + turn * np.round((start.imag - rate.imag) / turn.imag)
+    return np.abs(rate) / (2 * np.pi), -rate.real / np.abs(rate)
+
+
+def gain_limit(
+    poles: Callable[[float], np.ndarray],
+    first: np.ndarray | None = None,
+    highest: float = HIGHEST,
+) -> float:
+    """Largest factor on all gains with every smaller one stable, as `sampled_loop.gain_margin`.
+
+    Args:
+        poles: discrete poles by factor.
+        first: factors to begin with, rising [1]; default: `LOWEST` alone.
+        highest: where to stop [1].
+
+    Returns:
+        [1], within 1e-4 of itself; 0 where even `LOWEST` is unstable.
+    """
+
+    @cache
+    def excess(factor: float) -> float:
+        return float(np.log(np.abs(poles(factor)).max()) - np.log1p(RADIUS_TOLERANCE))
+
+    first = np.array([LOWEST]) if first is None else first
+    count = int(np.ceil(np.log(highest / first[-1]) / np.log(STRIDE)))
+    low = 0.0
+    for high in map(float, [*first[:-1], *np.geomspace(first[-1], highest, count + 1)]):
+        if excess(high) > 0:
+            break
+        low = high
+    else:
+        return highest
+    if low == 0.0:
+        if high <= LOWEST or excess(LOWEST) > 0:
+            return 0.0
+        low = LOWEST
+    return float(brentq(excess, low, high, xtol=2e-5 * low, rtol=2e-5))
+
+
+def breaking_motion(loop: SampledLoop, margin: float) -> str:
+    """What goes unstable just beyond the margin, "" where that is `HIGHEST`."""
+    if margin >= HIGHEST:
+        return ""
+    factor = max(1.001 * margin, LOWEST)
+    poles = loop.poles(factor)
+    return name_motion(loop, factor, poles[np.argmax(np.abs(poles))])
+
+
+def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
+    """What moves at a pole: "mode 7 of links 1+2, 5605 Hz", or the drive of the sliders.
+
+    The link mode is the one with most of the energy omega^2 |q|^2 + |q'|^2 in the eigenvector.
+    Whose motion it is at all, a link's, the drive's or a filter's, participation factors tell,
+    products of entries of left and right eigenvector (Perez-Arriaga, Verghese and Schweppe 1982):
+    modes far above the poles of a filter can carry these beyond the unit circle. The frequency of
+    a mode is that without control.
+
+    Args:
+        loop: the loop.
+        factor: on all gains [1].
+        pole: one of its poles then.
+    """
+    right, left = _eigenvectors(loop.open + factor * loop.feedback, pole)
+    r = loop.n_modes
+    last = 6 + 6 * r  # what follows is sensors behind their filters and the controller
+    share = left * right
+    drive, links, filters = (
+        abs(part.sum()) for part in (share[:6], share[6:last], share[last:])
+    )
+    hertz = abs(np.log(pole)) / loop.period / (2 * np.pi)
+    if drive > max(links, filters):
+        return f"drive of the sliders, {hertz:.0f} Hz"
+    q, q_rate = np.abs(right[6:last].reshape(2, 3, r))
+    energy = (loop.omega * q) ** 2 + q_rate**2
+    mode = int(np.argmax(energy.sum(axis=0)))
+    of_link = energy[:, mode]
+    numbers = [str(i + 1) for i in range(3) if of_link[i] >= PART * of_link.max()]
+    many = "s" if len(numbers) > 1 else ""
+    known = loop.mode_poles if mode < len(loop.mode_poles) else loop.omega.T
+    text = f"mode {mode + 1} of link{many} {'+'.join(numbers)}"
+    text += f", {np.abs(known[mode]).mean() / (2 * np.pi):.0f} Hz"
+    return text if links > filters else f"{text}, by a filter at {hertz:.0f} Hz"
+
+
+def _eigenvectors(matrix: np.ndarray, pole: complex) -> tuple[np.ndarray, np.ndarray]:
+    """Right and left eigenvector of a pole by inverse iteration, (n,) each."""
+    # a little beside the pole lest the matrix be singular
+    shifted = matrix - pole * (1 + 1e-9) * np.eye(len(matrix))
+    right = left = np.ones(len(matrix), complex)
+    for _ in range(3):
+        right = np.linalg.solve(shifted, right / np.linalg.norm(right))
+        left = np.linalg.solve(shifted.T, left / np.linalg.norm(left))
+    return right, left
