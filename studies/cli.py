@@ -17,6 +17,7 @@ from studies.atlas.commands import add_commands as add_atlas
 from studies.config import start
 from studies.errors import StudyError, field_error
 from studies.export.commands import add_commands as add_export
+from studies.spillover.commands import add_commands as add_spillover
 from studies.sweeps.commands import add_commands
 from studies.tuning.commands import add_commands as add_tuning
 
@@ -275,6 +276,7 @@ add_commands(app, console)
 add_tuning(app, console)
 add_export(app, console)
 add_atlas(app, console)
+add_spillover(app, console)
 
 
 if __name__ == "__main__":

@@ -176,6 +176,17 @@ def check_target(path: str | Path) -> None:
         raise StudyError(f"{path}: cannot write there, the file is write-protected")
 
 
+def check_folder(out: Path) -> None:
+    """Raise StudyError where `out` cannot be a folder with files; call it before long work."""
+    there = Path(os.path.abspath(out))
+    while not os.path.lexists(there):
+        there = there.parent
+    if not there.is_dir():
+        raise StudyError(f"--out {out}: {there} is not a folder; name another one")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise StudyError(f"--out {out}: no permission to write in {there}")
+
+
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path that becomes `path` on success, and is removed on any failure.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from contextlib import ExitStack
 from pathlib import Path
@@ -40,7 +39,7 @@ from studies.export.verify import (
 )
 from studies.pages import report_files
 from studies.runs import describe
-from studies.store import replacing
+from studies.store import check_folder, replacing
 
 TARGETS = ("json", "c", "c-fixed")
 REPORT, FAILED = "verification", "verification-failed"
@@ -71,7 +70,7 @@ def export_design(
         StudyError: an argument out of range, or a controller that cannot be exported.
     """
     _check_arguments(target, name, dac_bits)
-    _check_folder(out)
+    check_folder(out)
     console = console or Console(highlight=False, markup=False)
     compiler = [] if target == "json" else find_compiler()
     if target != "json" and not compiler:
@@ -176,17 +175,6 @@ def _check_arguments(target: str, name: str, dac_bits: int | None) -> None:
     low, high = _DAC_BITS
     if not low <= dac_bits <= high:
         raise field_error("--dac-bits", dac_bits, f"{low} to {high}", "1")
-
-
-def _check_folder(out: Path) -> None:
-    """Refuse early what cannot become a folder with files."""
-    there = Path(os.path.abspath(out))
-    while not os.path.lexists(there):
-        there = there.parent
-    if not there.is_dir():
-        raise StudyError(f"--out {out}: {there} is not a folder; name another one")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise StudyError(f"--out {out}: no permission to write in {there}")
 
 
 def _origin(found: FixedController, case_id: str) -> list[str]:

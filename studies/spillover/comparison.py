@@ -57,8 +57,9 @@ def compare_laws(study: Study, margin: float = 2.0, sizes: tuple[int, ...] = ())
     """Compare control laws on a study's machine.
 
     The factor on a law's gains is the largest that leaves the margin on the design's own plants,
-    but no more than damps mode 1 as the design as given does, or as it can be damped. Modified IMSC switches and so is not
-    linear: its loops are judged with each mode alone, which proves nothing about switching.
+    but no more than damps mode 1 as the design as given does, or as well as it can be damped.
+    Modified IMSC switches and so is not linear: its loops are judged with each mode alone, which
+    proves nothing about switching.
 
     Args:
         study: the design, with sampled feedback.

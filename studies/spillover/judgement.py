@@ -1,4 +1,4 @@
-"""What the poles of one loop say: damping of its modes, gain margin, and the mode that breaks it."""
+"""What the poles of one loop say: damping of its modes, gain margin, the mode that breaks it."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ STEPS = np.linspace(0, 1, 25)[1:]
 HIGHEST, LOWEST = 64.0, 0.01
 #: Gain factors that are looked at are no further apart than this [1].
 STRIDE = 1.25
-#: A link with this share of the largest one's part takes part in a motion [1].
-PART = 0.5
+#: A mode or link with this share of the largest one's energy is named beside it [1].
+PART = 1 / 3
 
 
 class Judgement(NamedTuple):
@@ -145,13 +145,13 @@ def breaking_motion(loop: SampledLoop, margin: float) -> str:
 
 
 def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
-    """What moves at a pole: "mode 7 of links 1+2, 5605 Hz", or the drive of the sliders.
+    """What moves at a pole: "mode 7 of links 1+2 (5606 Hz)", or the drive of the sliders.
 
-    The link mode is the one with most of the energy omega^2 |q|^2 + |q'|^2 in the eigenvector.
+    The link modes named are those with most of the energy omega^2 |q|^2 + |q'|^2 of the eigenvector.
     Whose motion it is at all, a link's, the drive's or a filter's, participation factors tell,
     products of entries of left and right eigenvector (Perez-Arriaga, Verghese and Schweppe 1982):
-    modes far above the poles of a filter can carry these beyond the unit circle. The frequency of
-    a mode is that without control.
+    what leaves the unit circle can be a filter's pole, fed through by a mode that is far stiffer
+    and merely follows. The frequency of a mode is that without control.
 
     Args:
         loop: the loop.
@@ -162,22 +162,27 @@ def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
     r = loop.n_modes
     last = 6 + 6 * r  # what follows is sensors behind their filters and the controller
     share = left * right
-    drive, links, filters = (
-        abs(part.sum()) for part in (share[:6], share[6:last], share[last:])
-    )
+    drive, links, filters = (abs(part.sum()) for part in (share[:6], share[6:last], share[last:]))
     hertz = abs(np.log(pole)) / loop.period / (2 * np.pi)
     if drive > max(links, filters):
-        return f"drive of the sliders, {hertz:.0f} Hz"
+        return f"drive of the sliders ({hertz:.0f} Hz)"
     q, q_rate = np.abs(right[6:last].reshape(2, 3, r))
     energy = (loop.omega * q) ** 2 + q_rate**2
-    mode = int(np.argmax(energy.sum(axis=0)))
-    of_link = energy[:, mode]
-    numbers = [str(i + 1) for i in range(3) if of_link[i] >= PART * of_link.max()]
-    many = "s" if len(numbers) > 1 else ""
-    known = loop.mode_poles if mode < len(loop.mode_poles) else loop.omega.T
-    text = f"mode {mode + 1} of link{many} {'+'.join(numbers)}"
-    text += f", {np.abs(known[mode]).mean() / (2 * np.pi):.0f} Hz"
-    return text if links > filters else f"{text}, by a filter at {hertz:.0f} Hz"
+    modes = _leading(energy.sum(axis=0))
+    known = [*loop.mode_poles, *loop.omega.T[len(loop.mode_poles) :]]
+    own = ", ".join(f"{np.abs(known[j]).mean() / (2 * np.pi):.0f}" for j in modes)
+    text = f"{_listed('mode', modes)} of {_listed('link', _leading(energy.sum(axis=1)))} ({own} Hz)"
+    return text if links > filters else f"{text}, through a filter at {hertz:.0f} Hz"
+
+
+def _leading(energy: np.ndarray) -> list[int]:
+    """The largest and all that have at least `PART` of it."""
+    return [int(k) for k in np.flatnonzero(energy >= PART * energy.max())]
+
+
+def _listed(name: str, numbers: list[int]) -> str:
+    """Like "links 1+2", numbers from 0."""
+    return f"{name}{'s' if len(numbers) > 1 else ''} {'+'.join(str(k + 1) for k in numbers)}"
 
 
 def _eigenvectors(matrix: np.ndarray, pole: complex) -> tuple[np.ndarray, np.ndarray]:

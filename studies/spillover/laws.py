@@ -115,7 +115,7 @@ def _even(law: Controller, n_channels: int) -> Controller:
 
 
 def _scaled(law: Controller, wanted: np.ndarray, has: np.ndarray) -> Controller:
-    """Velocity gains of each link times wanted/has, (3,) each; 0 where there is nothing to scale."""
+    """Velocity gains of each link times wanted/has, (3,) each; 0 where there are none."""
     is_there = has != 0
     factor = np.where(is_there, wanted / np.where(is_there, has, 1.0), 0.0)
     return law._replace(velocity_gain=factor[:, None] * law.velocity_gain)
@@ -169,6 +169,4 @@ def _position_feedback(found: FixedController, imsc: Controller, omega: np.ndarr
     )
     is_fit = filters.damping > 0
     gain = np.where(is_fit, imsc.velocity_gain / np.where(is_fit, filters.damping, 1.0), 0.0)
-    return imsc._replace(
-        estimator=filters.estimator, velocity_gain=0 * gain, position_gain=-gain
-    )
+    return imsc._replace(estimator=filters.estimator, velocity_gain=0 * gain, position_gain=-gain)

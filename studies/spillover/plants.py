@@ -67,8 +67,8 @@ class SampledLoop(NamedTuple):
 class Leakage(NamedTuple):
     """What passes between channels and plant modes, in the plant basis' own scale."""
 
-    observation: np.ndarray  # channel signal per modal coordinate, filter x sensor, (3, C, R)
-    actuation: np.ndarray  # modal force per channel force, actuator x synthesizer, (3, R, C)
+    observation: Array  # channel signal per modal coordinate, filter x sensor, (3, C, R)
+    actuation: Array  # modal force per channel force, actuator x synthesizer, (3, R, C)
 
 
 class LoopMaker:
@@ -112,7 +112,7 @@ class LoopMaker:
         )
 
     def leakage(self, plant: Plant, law: Controller) -> Leakage:
-        """What a controller's channels (those of `widened`) see of a plant's modes, and do to them."""
+        """What the channels of a controller as `widened` see of a plant's modes, and do to them."""
         _, _, (observation, actuation) = self._look(plant, law)
         return Leakage(observation[:, :, : plant.n_modes], actuation[:, : plant.n_modes])
 

@@ -1,0 +1,13 @@
+"""Spillover: a controller on plants with modes that it does not know, and laws side by side.
+
+- `plants` says which plants and makes their linearised loops, `judgement` reads their poles,
+  `certificate` puts them together: `certify(study)`.
+- `laws` are control laws of equal strength, `comparison` judges and runs them:
+  `compare_laws(study)`.
+- `report`, `plots` and `run` write all of it into a folder, `commands` is `studies spillover`.
+"""
+
+from studies.spillover.certificate import Certificate, certify
+from studies.spillover.comparison import Comparison, compare_laws
+
+__all__ = ["Certificate", "Comparison", "certify", "compare_laws"]

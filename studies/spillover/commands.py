@@ -1,0 +1,35 @@
+"""The command `studies spillover`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from studies.config import start
+
+
+def add_commands(app: typer.Typer, console: Console) -> None:
+    """Add the command to the command line."""
+
+    @app.command()
+    def spillover(
+        design: Annotated[Path, typer.Argument(help="study file, folder of a tuning or a sweep")],
+        out: Annotated[Path, typer.Option(help="folder for report, data and figures")],
+        case: Annotated[
+            str | None, typer.Option(help="of a sweep: number or id:...; of a tuning: its family")
+        ] = None,
+        margin: Annotated[
+            float, typer.Option(help="gain margin that every plant must leave [1]")
+        ] = 2.0,
+    ) -> None:
+        """Certify a controller on plants with more modes, other bases and patch lengths."""
+        start()
+        from studies.design import load_design
+        from studies.spillover.run import spillover_design
+
+        if not spillover_design(load_design(design, case), out, margin, console):
+            sys.exit(1)

@@ -1,0 +1,177 @@
+"""Figures of a spillover certificate and of the laws beside it."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
+
+from studies import figures
+from studies.spillover.certificate import Certificate
+from studies.spillover.comparison import WITHOUT, Comparison
+from studies.spillover.judgement import HIGHEST
+
+#: Leakage from here on has its own colour [1].
+FLOOR = 0.01
+
+
+def _own(ax: Axes | None, height: float = 3.4) -> Axes:
+    """The axes to draw on: those given, or new ones."""
+    if ax is not None:
+        return ax
+    return Figure(figsize=(7.4, height), layout="constrained").subplots()
+
+
+def margins(found: Certificate, ax: Axes | None = None) -> Axes:
+    """Gain margin over the number of plant modes: range over the lengths, and true lengths.
+
+    Args:
+        found: the certificate.
+        ax: where to draw; a new figure where left out.
+    """
+    ax = _own(ax)
+    for b, color, dash in zip(
+        range(len(found.plants)), figures.SERIES, figures.DASHES, strict=False
+    ):
+        sizes = [plant.n_modes for plant in found.plants[b, 0, 0]]
+        values = found.margin[b].reshape(-1, len(sizes))
+        if np.all(np.isnan(values)):
+            continue
+        low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
+        ax.fill_between(sizes, low, high, color=color, alpha=0.15, linewidth=0)
+        as_believed = [p.sensor == 1 and p.actuator == 1 for p in found.plants[b, :, :, 0].ravel()]
+        if any(as_believed):
+            line, name = values[as_believed.index(True)], found.plants[b, 0, 0, 0].basis
+            ax.plot(sizes, line, color=color, linestyle=dash, marker="o", markersize=3, label=name)
+    ax.axhline(found.required, color="black", linewidth=0.9, linestyle="--")
+    ax.annotate(
+        "required", (1, found.required), xycoords=("axes fraction", "data"), ha="right",
+        va="bottom", fontsize=8,
+    )  # fmt: skip
+    ax.axhline(1, color="black", linewidth=0.9)
+    ax.annotate(
+        "unstable below", (1, 1), xycoords=("axes fraction", "data"), ha="right", va="bottom",
+        fontsize=8,
+    )  # fmt: skip
+    ax.set(xlabel="plant modes per link [1]", ylabel="gain margin [1]", yscale="log")
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    ax.yaxis.set_minor_formatter(NullFormatter())
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.legend(title="plant basis (shaded: all patch lengths)", loc="upper right")
+    return ax
+
+
+def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
+    """Damping ratio over frequency of every link mode at the design's gains, largest plants.
+
+    Args:
+        found: the certificate.
+        ax: where to draw; a new figure where left out.
+    """
+    ax = _own(ax)
+    structural = found.study.link.damping_ratio
+    frequency, zeta = found.frequency_hz[:, :, :, -1], found.damping_ratio[:, :, :, -1]
+    for b, color, marker in zip(range(len(frequency)), figures.SERIES, "osD^v", strict=False):
+        ax.plot(
+            frequency[b].ravel(), zeta[b].ravel(), marker, color=color, markersize=3, alpha=0.6,
+            markeredgewidth=0, label=found.plants[b, 0, 0, 0].basis,
+        )  # fmt: skip
+    ax.axhline(structural, color="black", linewidth=0.9, linestyle="--")
+    ax.annotate(
+        "without control", (1, structural), xycoords=("axes fraction", "data"), ha="right",
+        va="bottom", fontsize=8,
+    )  # fmt: skip
+    ax.set_xscale("log")
+    ax.set_yscale("symlog", linthresh=0.02, linscale=1.5)
+    if np.nanmin(zeta) < 0:
+        ax.axhline(0, color="black", linewidth=0.9)
+        ax.axhspan(ax.get_ylim()[0], 0, color=figures.SERIES[1], alpha=0.1, linewidth=0)
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        axis.set_minor_formatter(NullFormatter())
+    size = found.plants[0, 0, 0, -1].n_modes
+    ax.set(
+        xlabel=f"frequency [Hz], plants of {size} modes a link, all patch lengths",
+        ylabel="damping ratio [1]",
+    )
+    ax.legend(loc="upper right")
+    return ax
+
+
+def leakage_map(
+    factor: np.ndarray, n_controlled: int, title: str = "", ax: Axes | None = None
+) -> Axes:
+    """What each plant mode adds to each estimated mode.
+
+    Args:
+        factor: size of the leakage [1], (C, R).
+        n_controlled: the first ones are meant to be seen.
+        title: of the panel.
+        ax: where to draw; a new figure where left out.
+    """
+    ax = _own(ax, 2.0)
+    channels, modes = factor.shape
+    shown = np.where(factor >= FLOOR, factor, np.nan)
+    edges = [np.arange(n + 1) + 0.5 for n in (modes, channels)]
+    ax.pcolormesh(*edges, shown, cmap="YlOrBr", norm=LogNorm(FLOOR, 100.0), rasterized=True)
+    for (j, r), value in np.ndenumerate(factor):
+        text = f"{value:.2g}" if value >= FLOOR else "·"
+        color = "white" if value > 10 else "black"
+        ax.text(r + 1, j + 1, text, ha="center", va="center", fontsize=7.5, color=color)
+    ax.axvline(n_controlled + 0.5, color="black", linewidth=1.2)
+    ax.grid(False)
+    ax.invert_yaxis()
+    ax.set_xticks(range(1, modes + 1))
+    ax.set_yticks(range(1, channels + 1), [rf"$\hat q_{{{j + 1}}}$" for j in range(channels)])
+    ax.set_xlabel("plant mode [1]")
+    ax.set_title(title, loc="left")
+    return ax
+
+
+def leakage(found: Certificate) -> Figure:
+    """`leakage_map` for each basis: the largest of all links and patch lengths."""
+    size = np.abs(found.observation)
+    bases = [b for b in range(len(size)) if not np.all(np.isnan(size[b]))]
+    with figures.styled():
+        figure, axes = figures.new_figure(len(bases), 1, 0.55 + 0.28 * size.shape[4])
+        for b, ax in zip(bases, axes[:, 0], strict=True):
+            name = found.plants[b, 0, 0, 0].basis
+            leakage_map(np.nanmax(size[b], axis=(0, 1, 2)), found.n_controlled, name, ax)
+        for ax in axes[:-1, 0]:
+            ax.set_xlabel("")
+    return figure
+
+
+def law_bars(found: Comparison, ax: Axes | None = None) -> Axes:
+    """Residual vibration of each law on the fast move, with its margin and voltage.
+
+    Args:
+        found: the comparison.
+        ax: where to draw; a new figure where left out.
+    """
+    ax = _own(ax)
+    rows = np.arange(len(found.names))
+    height = 0.25
+    for i in range(3):
+        ax.barh(
+            rows + (i - 1) * height, 1e6 * found.residual_rms[:, i], height,
+            color=figures.SERIES[i], label=f"link {i + 1}",
+        )  # fmt: skip
+    most = 1e6 * np.nanmax(found.residual_rms)
+    for k, name in enumerate(found.names):
+        if name == WITHOUT:
+            continue
+        margin = f"{found.margin[k]:.3g}" if found.margin[k] < HIGHEST else f"over {HIGHEST:g}"
+        end = 1e6 * np.nanmax(found.residual_rms[k], initial=0.0)
+        text = f"margin {margin}, peak {found.peak_voltage[k]:.3g} V"
+        text = text if np.isfinite(found.margin[k]) else "no stable gains"
+        ax.text(end + 0.01 * most, k, text, va="center", fontsize=8)
+    ax.set_yticks(rows, found.names)
+    ax.invert_yaxis()
+    ax.margins(x=0.2)
+    ax.grid(axis="y", visible=False)
+    ax.set_xlabel("residual rms of the chord deflection, worst station [µm]")
+    ax.legend(loc="lower right")
+    return ax

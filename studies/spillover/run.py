@@ -1,0 +1,144 @@
+"""From a design to the folder of its certificate."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from studies import figures
+from studies.design import Design
+from studies.errors import StudyError
+from studies.runs import STATUS_LABEL, run_attributes
+from studies.spillover import plots
+from studies.spillover.certificate import Certificate, certify
+from studies.spillover.comparison import Comparison, compare_laws
+from studies.spillover.report import document, report, verdict
+from studies.store import Variable, check_folder, replacing, write_store
+
+REPORT, DOCUMENT, DATA = "report.md", "certificate.json", "spillover.h5"
+
+
+def spillover_design(design: Design, out: Path, margin: float, console: Console) -> bool:
+    """Write the certificate of a design, and the comparison of laws on its machine.
+
+    Args:
+        design: what to judge.
+        out: folder for the files, made where it is missing.
+        margin: gain margin that every plant must leave [1].
+        console: to tell what happens.
+
+    Returns:
+        whether the design passes.
+
+    Raises:
+        StudyError: as `certify`, or a folder that cannot be written to.
+    """
+    check_folder(out)
+    console.print("judging the controller on plants that differ from what it believes")
+    found = certify(design.study, margin)
+    console.print(verdict(found), soft_wrap=True)
+    console.print("comparing laws")
+    laws = None
+    try:
+        laws = compare_laws(found.study, margin)
+    except StudyError as error:
+        found = found._replace(notes=(*found.notes, f"laws are not compared: {error}"))
+    _write(out, found, laws)
+    for note in found.notes:
+        console.print(note, soft_wrap=True)
+    console.print(f"written: {out / REPORT}, data and figures beside it", soft_wrap=True)
+    return found.is_passed
+
+
+def _write(out: Path, found: Certificate, laws: Comparison | None) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StudyError(f"--out {out}: cannot write there ({error.strerror})") from None
+    with figures.styled():
+        drawn = {
+            "margins": _figure(plots.margins(found)),
+            "damping": _figure(plots.mode_damping(found)),
+        }
+        if found.study.control.law == "imsc":
+            drawn["leakage"] = plots.leakage(found)
+        if laws is not None:
+            drawn["laws"] = _figure(plots.law_bars(laws))
+        for name, figure in drawn.items():
+            figures.save(figure, out, name)
+    write_store(out / DATA, variables(found, laws), run_attributes(found.study))
+    with ExitStack() as stack:
+        for name, text in {REPORT: report(found, laws), DOCUMENT: document(found, laws)}.items():
+            temporary = stack.enter_context(replacing(out / name))
+            temporary.write_text(text, encoding="utf-8")
+
+
+def _figure(ax: Any) -> Figure:
+    figure: Figure = ax.figure
+    return figure
+
+
+def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable]:
+    """Labelled numbers of a certificate and of the laws beside it."""
+    plants = ("basis", "sensor_factor", "actuator_factor", "plant_modes")
+    modes = (*plants, "link_mode", "pole")
+    place = plants[:3]
+    axes = found.plants
+    part = {
+        "basis": Variable(
+            np.array([p.basis for p in axes[:, 0, 0, 0]]), ("basis",), "1", "of the plant"
+        ),
+        "sensor_factor": Variable(
+            np.array([p.sensor for p in axes[0, :, 0, 0]]), ("sensor_factor",), "1",
+            "true over believed sensor length",
+        ),
+        "actuator_factor": Variable(
+            np.array([p.actuator for p in axes[0, 0, :, 0]]), ("actuator_factor",), "1",
+            "true over believed actuator length",
+        ),
+        "plant_modes": Variable(
+            np.array([p.n_modes for p in axes[0, 0, 0]]), ("plant_modes",), "1", "per link"
+        ),
+        "passes": Variable(found.passes, plants, "1", "stable with the margin required"),
+        "spectral_radius": Variable(found.radius, plants, "1", "of the loop at its own gains"),
+        "gain_margin": Variable(found.margin, plants, "1", "common gain factor before instability"),
+        "frequency": Variable(
+            found.frequency_hz, modes, "Hz", "of link modes under control, three of each order"
+        ),
+        "damping_ratio": Variable(found.damping_ratio, modes, "1", "their damping ratios"),
+        "least_damped": Variable(found.weakest, plants, "1", "mode of least damping"),
+        "broken_by": Variable(found.breaking, plants, "1", "what goes unstable beyond the margin"),
+        "observation": Variable(
+            found.observation, (*place, "link", "channel", "link_mode"), "1",
+            "channel signal per modal coordinate of the plant (SRF: V/m)",
+        ),
+        "actuation": Variable(
+            found.actuation, (*place, "link", "link_mode", "channel"), "1",
+            "modal force on the plant per force of a channel (SRF: N/V)",
+        ),
+        "required_margin": Variable(np.array(found.required), (), "1", "gain margin required"),
+    }  # fmt: skip
+    if laws is None:
+        return part
+    law = ("law",)
+    return part | {
+        "law": Variable(np.array(laws.names), law, "1", "control law"),
+        "law_factor": Variable(laws.factor, law, "1", "factor on its gains"),
+        "law_damping_ratio": Variable(
+            laws.damping_ratio, ("law", "lowest_mode"), "1", "smallest of the links"
+        ),
+        "law_margin": Variable(laws.margin, law, "1", "smallest over the numbers of plant modes"),
+        "law_residual_rms": Variable(
+            laws.residual_rms, ("law", "link"), "m", "worst station after the fast move"
+        ),
+        "law_peak_voltage": Variable(laws.peak_voltage, law, "V", "peak actuator voltage"),
+        "law_control_energy": Variable(
+            laws.control_energy, law, "V2 s", "integral of the summed squared actuator voltages"
+        ),
+        "law_status": Variable(laws.status, law, *STATUS_LABEL),
+    }
