@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxmodel.beam import BASES
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
+from studies.blas import one_thread
 from studies.errors import StudyError, field_error
 from studies.export.controller import FixedController, fixed_controller
 from studies.spec import Study
 from studies.spillover.judgement import Judgement, judge
-from studies.spillover.plants import LENGTHS, LoopMaker, Plant, all_plants, widened
+from studies.spillover.plants import LENGTHS, LoopMaker, Plant, all_plants, plant_sizes, widened
 
 
 class Certificate(NamedTuple):
@@ -94,10 +93,7 @@ def certify(
     if not 1 < margin <= 32:
         raise field_error("--margin", margin, "more than 1, up to 32", "1")
     found = fixed_controller(study)
-    smallest = found.structure.n_controlled
-    plants = all_plants(bases, sizes, lengths, smallest)
-    if any(plant.n_modes < smallest for plant in plants.ravel()):
-        raise StudyError(f"sizes = {sizes}: allowed {smallest}, the controlled modes, or more")
+    plants = all_plants(bases, plant_sizes(found, sizes), lengths)
     maker = LoopMaker(found)
     faults = np.vectorize(maker.fault, otypes=[object])(plants)
     exists = faults == ""
@@ -110,14 +106,13 @@ def certify(
 def _judged(
     found: FixedController, maker: LoopMaker, plants: list[Plant]
 ) -> dict[Plant, Judgement]:
-    """Judgement of every plant, on as many threads as there are cores."""
+    """Judgement of every plant."""
     law = widened(found.controller, found.n_patches)
     try:
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            done = list(pool.map(lambda plant: judge(maker.loop(plant, law)), plants))
+        with one_thread():
+            return {plant: judge(maker.loop(plant, law)) for plant in plants}
     except np.linalg.LinAlgError:
         raise StudyError("a linearised loop is not finite: nothing to judge") from None
-    return dict(zip(plants, done, strict=True))
 
 
 def _collected(

@@ -11,11 +11,13 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
 from jaxmodel.simulate import Result, simulate
+from studies.blas import one_thread
 from studies.export.controller import FixedController, fixed_controller
 from studies.runs import check_run
 from studies.spec import Study
 from studies.spillover.judgement import (
     HIGHEST,
+    LOWEST,
     STEPS,
     breaking_motion,
     damping,
@@ -23,7 +25,7 @@ from studies.spillover.judgement import (
     gain_limit,
 )
 from studies.spillover.laws import Law, all_laws
-from studies.spillover.plants import LARGEST, LoopMaker, Plant
+from studies.spillover.plants import LoopMaker, Plant, plant_sizes
 
 #: The fast move has the acceleration of a move as long as the first in the time of the second.
 FAST = (0.01, 0.03)  # [m], [s]
@@ -45,7 +47,7 @@ class Comparison(NamedTuple):
     names: tuple[str, ...]
     factor: np.ndarray  # on the gains of each law, 1: as strong on mode 1 as the design [1], (L,)
     damping_ratio: np.ndarray  # of modes 1.., the smallest of the links [1], (L, J)
-    margin: np.ndarray  # smallest over the numbers of plant modes at that factor [1], (L,)
+    margin: np.ndarray  # smallest over the plants, 0 where no gains are stable [1], (L,)
     breaking: tuple[str, ...]  # what goes unstable beyond it
     residual_rms: np.ndarray  # worst station of each link [m], (L, 3)
     peak_voltage: np.ndarray  # [V], (L,)
@@ -70,16 +72,17 @@ def compare_laws(study: Study, margin: float = 2.0, sizes: tuple[int, ...] = ())
         StudyError: as `certify`, or a design that does not damp mode 1.
     """
     found = fixed_controller(study)
-    smallest = found.structure.n_controlled
-    sizes = sizes or tuple(range(smallest, LARGEST + 1))
-    own = min(max(found.study.link.modes, smallest), max(sizes))
+    sizes = plant_sizes(found, sizes)
+    own = min(max(found.study.link.modes, sizes[0]), sizes[-1])
     plant = Plant(found.study.link.basis, own, 1.0, 1.0)
     laws = all_laws(found, LoopMaker(found), plant)
-    views = [_View(found, law, plant, sizes) for law in laws]
-    given = views[0 if found.is_modal else 1]
-    target = given.damping(1.0)[0]
-    rows = [(WITHOUT, given, 0.0), (GIVEN, given, 1.0)]
-    rows += [(view.law.name, view, view.fair(margin, target)) for view in views]
+    with one_thread():
+        views = [_View(found, law, plant, sizes) for law in laws]
+        given = views[0 if found.is_modal else 1]
+        target = given.damping(1.0)[0]
+        rows = [(WITHOUT, given, 0.0), (GIVEN, given, 1.0)]
+        rows += [(view.law.name, view, view.fair(margin, target)) for view in views]
+        zeta = np.array([view.damping(factor) for _, view, factor in rows])
     moved, result = _run(found, [view.law.at(factor) for _, view, factor in rows])
     metrics = result.metrics
     return Comparison(
@@ -88,9 +91,9 @@ def compare_laws(study: Study, margin: float = 2.0, sizes: tuple[int, ...] = ())
         plant,
         tuple(name for name, _, _ in rows),
         np.array([factor for _, _, factor in rows]),
-        np.array([view.damping(factor) for _, view, factor in rows]),
-        np.array([min(view.limit / f, HIGHEST) if f else np.nan for _, view, f in rows]),
-        tuple(view.breaking if factor else "" for _, view, factor in rows),
+        zeta,
+        np.array([np.nan, *(view.margin(factor) for _, view, factor in rows[1:])]),
+        ("", *(view.breaking for _, view, _ in rows[1:])),
         metrics.residual_rms.max(axis=2),
         metrics.peak_voltage.max(axis=1),
         metrics.control_energy,
@@ -104,15 +107,22 @@ class _View:
     def __init__(
         self, found: FixedController, law: Law, plant: Plant, sizes: tuple[int, ...]
     ) -> None:
-        self.law, self._parts, maker = law, [], LoopMaker(found)
+        self.law, maker = law, LoopMaker(found)
         self.limit, self.breaking = HIGHEST, ""
-        for modes, part in law.linear_parts:
-            self._parts.append((modes, maker.loop(plant, part)))
+        parts = law.linear_parts
+        self._parts = [(modes, maker.loop(plant, part)) for modes, part in parts]
+        for _, part in parts:
             for n in sorted(sizes, reverse=True):  # where the limit is lowest, as a rule
+                if self.limit <= LOWEST:
+                    return
                 loop = maker.loop(plant._replace(n_modes=n), part)
                 limit = gain_limit(loop.poles, highest=self.limit)
                 if limit < self.limit:
                     self.limit, self.breaking = limit, breaking_motion(loop, limit)
+
+    def margin(self, factor: float) -> float:
+        """Smallest one of all plants with all gains times a factor; 0 where no gains are stable."""
+        return min(self.limit / factor, HIGHEST) if factor else 0.0
 
     def damping(self, factor: float) -> np.ndarray:
         """Smallest damping ratio of the links, modes 1 to `SHOWN`, NaN where there is none."""

@@ -13,7 +13,7 @@ from jaxmodel.sampled_loop import RADIUS_TOLERANCE, follow_poles
 from studies.spillover.plants import SampledLoop
 
 #: Gain factors at which modes are followed from no control to the design's gains.
-STEPS = np.linspace(0, 1, 25)[1:]
+STEPS = np.linspace(0, 1, 17)[1:]
 #: Margins beyond this are given as it, and those below the other as 0 [1].
 HIGHEST, LOWEST = 64.0, 0.01
 #: Gain factors that are looked at are no further apart than this [1].
@@ -147,8 +147,8 @@ def breaking_motion(loop: SampledLoop, margin: float) -> str:
 def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
     """What moves at a pole: "mode 7 of links 1+2 (5606 Hz)", or the drive of the sliders.
 
-    The link modes named are those with most of the energy omega^2 |q|^2 + |q'|^2 of the eigenvector.
-    Whose motion it is at all, a link's, the drive's or a filter's, participation factors tell,
+    The link modes named hold most of the energy omega^2 |q|^2 + |q'|^2 of the eigenvector. Whose
+    motion it is at all, a link's, the drive's or a filter's, participation factors tell,
     products of entries of left and right eigenvector (Perez-Arriaga, Verghese and Schweppe 1982):
     what leaves the unit circle can be a filter's pole, fed through by a mode that is far stiffer
     and merely follows. The frequency of a mode is that without control.

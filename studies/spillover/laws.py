@@ -126,6 +126,9 @@ def _design(structure: Structure, case: Case) -> Controller:
     return design_controller(structure, case).controller
 
 
+_filters = jax.jit(design_position_filter)
+
+
 def _designed(found: FixedController, law: str) -> Controller:
     """The study's controller by another law, NumPy arrays."""
     structure = found.structure._replace(law=law, n_steps=1)
@@ -163,10 +166,8 @@ def _optimal(imsc: Controller, mass: np.ndarray, omega: np.ndarray) -> Controlle
 def _position_feedback(found: FixedController, imsc: Controller, omega: np.ndarray) -> Controller:
     """Positive position feedback that damps each assembled mode as much as IMSC."""
     electronics = found.case.electronics
-    filters = jax.tree.map(
-        np.asarray,
-        design_position_filter(omega, FILTER_ZETA, electronics.period, electronics.antialias),
-    )
+    period, antialias = electronics.period, electronics.antialias
+    filters = jax.tree.map(np.asarray, _filters(omega, FILTER_ZETA, period, antialias))
     is_fit = filters.damping > 0
     gain = np.where(is_fit, imsc.velocity_gain / np.where(is_fit, filters.damping, 1.0), 0.0)
     return imsc._replace(estimator=filters.estimator, velocity_gain=0 * gain, position_gain=-gain)

@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import placement_faults
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, link_poles
+from studies.errors import field_error
 from studies.export.controller import FixedController
 
 #: Plant modes per link at most.
@@ -191,21 +191,31 @@ def widened(law: Controller, n_channels: int) -> Controller:
     )
 
 
+def plant_sizes(found: FixedController, sizes: tuple[int, ...] = ()) -> tuple[int, ...]:
+    """Numbers of plant modes per link, rising; by default from the controlled ones to `LARGEST`.
+
+    Raises:
+        StudyError: fewer than are controlled, or more than `LARGEST`.
+    """
+    smallest = found.structure.n_controlled
+    if smallest > LARGEST:
+        raise field_error("control.modes", smallest, f"1 to {LARGEST}, the plant modes looked at")
+    sizes = tuple(sorted(sizes or range(smallest, LARGEST + 1)))
+    if not smallest <= sizes[0] <= sizes[-1] <= LARGEST:
+        raise field_error("sizes", sizes, f"{smallest}, as many as are controlled, to {LARGEST}")
+    return sizes
+
+
 def all_plants(
-    bases: tuple[str, ...] = BASES,
-    sizes: tuple[int, ...] = (),
-    lengths: tuple[float, ...] = LENGTHS,
-    smallest: int = 1,
+    bases: tuple[str, ...], sizes: tuple[int, ...], lengths: tuple[float, ...]
 ) -> np.ndarray:
     """Plants of every basis, sensor length, actuator length and size, (B, S, A, N) of `Plant`.
 
     Args:
         bases: modal bases of the plant.
-        sizes: modes per link; empty: `smallest` to `LARGEST`.
+        sizes: modes per link.
         lengths: true lengths over believed ones, of sensors and of actuators [1].
-        smallest: modes that the controller controls.
     """
-    sizes = sizes or tuple(range(smallest, LARGEST + 1))
     plants = np.empty((len(bases), len(lengths), len(lengths), len(sizes)), object)
     for at in np.ndindex(plants.shape):
         b, s, a, n = at

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from studies import figures
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import WITHOUT, Comparison
-from studies.spillover.judgement import HIGHEST
+from studies.spillover.judgement import HIGHEST, LOWEST
 
 #: Leakage from here on has its own colour [1].
 FLOOR = 0.01
@@ -22,6 +23,13 @@ def _own(ax: Axes | None, height: float = 3.4) -> Axes:
     if ax is not None:
         return ax
     return Figure(figsize=(7.4, height), layout="constrained").subplots()
+
+
+def _plain_ticks(axis: Axis) -> None:
+    """Plain numbers on a logarithmic axis, few enough to read."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def margins(found: Certificate, ax: Axes | None = None) -> Axes:
@@ -36,7 +44,7 @@ def margins(found: Certificate, ax: Axes | None = None) -> Axes:
         range(len(found.plants)), figures.SERIES, figures.DASHES, strict=False
     ):
         sizes = [plant.n_modes for plant in found.plants[b, 0, 0]]
-        values = found.margin[b].reshape(-1, len(sizes))
+        values = np.maximum(found.margin[b], LOWEST).reshape(-1, len(sizes))
         if np.all(np.isnan(values)):
             continue
         low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
@@ -56,8 +64,7 @@ def margins(found: Certificate, ax: Axes | None = None) -> Axes:
         fontsize=8,
     )  # fmt: skip
     ax.set(xlabel="plant modes per link [1]", ylabel="gain margin [1]", yscale="log")
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-    ax.yaxis.set_minor_formatter(NullFormatter())
+    _plain_ticks(ax.yaxis)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.legend(title="plant basis (shaded: all patch lengths)", loc="upper right")
     return ax
@@ -85,12 +92,18 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
     )  # fmt: skip
     ax.set_xscale("log")
     ax.set_yscale("symlog", linthresh=0.02, linscale=1.5)
+    ax.set_ylim(1.3 * min(np.nanmin(zeta), -0.001), 1.3 * np.nanmax(zeta))
     if np.nanmin(zeta) < 0:
         ax.axhline(0, color="black", linewidth=0.9)
         ax.axhspan(ax.get_ylim()[0], 0, color=figures.SERIES[1], alpha=0.1, linewidth=0)
-    for axis in (ax.xaxis, ax.yaxis):
-        axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-        axis.set_minor_formatter(NullFormatter())
+    low, high = ax.get_ylim()
+    ticks = [
+        sign * tick for tick in (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0) for sign in (1, -1)
+    ]
+    ax.set_yticks([tick for tick in ticks if low <= tick <= high], minor=False)
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    ax.yaxis.set_minor_locator(NullLocator())
+    _plain_ticks(ax.xaxis)
     size = found.plants[0, 0, 0, -1].n_modes
     ax.set(
         xlabel=f"frequency [Hz], plants of {size} modes a link, all patch lengths",
@@ -166,7 +179,7 @@ def law_bars(found: Comparison, ax: Axes | None = None) -> Axes:
         margin = f"{found.margin[k]:.3g}" if found.margin[k] < HIGHEST else f"over {HIGHEST:g}"
         end = 1e6 * np.nanmax(found.residual_rms[k], initial=0.0)
         text = f"margin {margin}, peak {found.peak_voltage[k]:.3g} V"
-        text = text if np.isfinite(found.margin[k]) else "no stable gains"
+        text = text if found.margin[k] > 0 else "no stable gains"
         ax.text(end + 0.01 * most, k, text, va="center", fontsize=8)
     ax.set_yticks(rows, found.names)
     ax.invert_yaxis()

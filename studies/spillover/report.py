@@ -35,8 +35,8 @@ _LAW_NOTES = (
     "*Positive position feedback*: a second-order filter per mode, tuned so that it lags by 90° "
     "together with delay and anti-alias filter. It also answers to quasi-static bending during the "
     "move, hence its voltage.",
-    "*Strain rate feedback* (16)–(18): every patch by itself, no modal filter; its rate is exact at "
-    "mode 1 only.",
+    "*Strain rate feedback* (16)–(18): every patch by itself, no modal filter; its rate is exact "
+    "at mode 1 only.",
 )
 
 
@@ -142,9 +142,8 @@ def _leakage(found: Certificate) -> list[str]:
             continue
         worst = np.nanmax(size[b], axis=(0, 1, 2))[:, first:]
         for j, values in enumerate(worst):
-            rows.append([
-                found.plants[b, 0, 0, 0].basis, f"q^{j + 1}", *(f"{x:.2g}" if x > TINY else "0" for x in values)
-            ])  # fmt: skip
+            cells = (f"{x:.2g}" if x > TINY else "0" for x in values)
+            rows.append([found.plants[b, 0, 0, 0].basis, f"q^{j + 1}", *cells])
     if not rows:
         return ["## Leakage", "", "No plant has more modes than are controlled."]
     pushed = np.where(np.isnan(found.actuation), 0.0, np.abs(found.actuation))[..., first:, :]

@@ -1,0 +1,420 @@
+"""Spillover certificates and control laws: known designs, closed forms, and the nonlinear run."""
+
+import json
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+import scipy.linalg
+import xarray
+
+from jaxmodel.control import optimal_gains
+from jaxmodel.controller import ControllerState, controller_step, rest_controller, strongest
+from jaxmodel.estimator import measurement_chain
+from jaxmodel.ppf import HIGHEST_RATIO, design_position_filter
+from jaxmodel.sampled_loop import gain_margin, loop_report
+from studies.blas import _controls, one_thread
+from studies.cases import as_arrays, build_case, build_structure
+from studies.errors import StudyError
+from studies.export.controller import fixed_controller
+from studies.runs import run_study
+from studies.spec import paper_study
+from studies.spillover import certify, compare_laws
+from studies.spillover import run as spillover_run
+from studies.spillover.judgement import LOWEST, gain_limit
+from studies.spillover.laws import all_laws
+from studies.spillover.plants import LoopMaker, Plant, all_plants, widened
+from studies.template import study_template
+from tests.test_cli import refused, run
+
+#: One move of a small plant: what the run needs; certificates have plants of their own.
+STUDY = paper_study().change(link__modes=3, motion__waypoints=paper_study().motion.waypoints[:2])
+#: The paper's gains with a plain difference for the velocity: known to be unstable.
+DIFFERENCE = {
+    "control__gain_factor": 1.0,
+    "electronics__estimator": "difference",
+    "electronics__antialias_hz": 1000.0,
+    "electronics__difference_cutoff_hz": 1e5,
+}
+SAME = {"bases": ("pinned_pinned",), "lengths": (1.0,)}
+#: Where the default design has its smallest margin of all plants.
+HARD = {"bases": ("pinned_pinned",), "lengths": (0.8,), "sizes": (8, 9)}
+
+
+def certified(changes, **plants):
+    return certify(STUDY.change(**changes), **plants)
+
+
+@pytest.fixture(scope="module")
+def difference():
+    return certified(DIFFERENCE, sizes=(6, 7), **SAME)
+
+
+# --- certificates ---------------------------------------------------------------------------------
+
+
+def test_the_certificate_fails_what_is_known_to_be_unstable(difference):
+    assert not difference.is_passed and difference.fails_from == 7
+    np.testing.assert_array_equal(difference.passes.ravel(), [True, False])
+    assert difference.margin[0, 0, 0, 0] > 5 and difference.margin[0, 0, 0, 1] < 0.2
+    assert difference.radius[0, 0, 0, 1] > 1.1
+    assert difference.breaking[difference.worst] == "mode 7 of link 2 (5606 Hz)"
+    assert difference.least_damping[difference.worst] < 0
+    assert difference.weakest[difference.worst].startswith("mode 7 of link 2")
+
+
+def test_verdicts_of_the_ladder_of_gains():
+    """A quarter and a half of the paper's gains pass; the whole does not, because of 9 modes."""
+    found = {f: certified({"control__gain_factor": f}, **HARD) for f in (0.25, 0.5, 1.0)}
+    assert [one.is_passed for one in found.values()] == [True, True, False]
+    worst = [one.margin[one.worst] for one in found.values()]
+    # the same loops, so margins go as 1/f
+    np.testing.assert_allclose(np.array(worst) * list(found), worst[2], rtol=2e-4)
+    np.testing.assert_allclose(worst[2], 1.249, atol=2e-3)
+    paper = found[1.0]
+    assert paper.fails_from == 9 and np.all(paper.radius < 1)
+    assert paper.breaking[paper.worst].startswith("modes 7+9 of link 2 (5606, 9266 Hz)")
+    assert paper.margin[0, 0, 0, 0] > 2
+
+
+def test_a_required_margin_decides():
+    strict = certified({}, margin=2.6, **HARD)
+    assert not strict.is_passed and strict.required == 2.6
+    with pytest.raises(StudyError, match="--margin = 1.0: allowed more than 1"):
+        certified({}, margin=1.0, **HARD)
+
+
+def test_margins_and_damping_are_those_of_the_loop_report():
+    one = certified({}, sizes=(3, 8), **SAME)
+    structure = build_structure(STUDY)
+    home = np.array(STUDY.motion.waypoints[0])
+    report = loop_report(structure, as_arrays(build_case(STUDY)), home)
+    np.testing.assert_allclose(one.margin[0, 0, 0, 0], report.gain_margin, rtol=2e-4)
+    np.testing.assert_allclose(one.radius[0, 0, 0, 0], report.spectral_radius, rtol=1e-9)
+    for own, wanted in (
+        (one.damping_ratio, report.damping_ratio), (one.frequency_hz, report.frequency_hz),
+    ):  # fmt: skip
+        own = np.sort(own[0, 0, 0, 0, :3], axis=1)
+        np.testing.assert_allclose(own, np.sort(wanted, axis=1), rtol=1e-6)
+    # and, with eight modes, those computed elsewhere
+    np.testing.assert_allclose(20 * np.log10(one.margin[0, 0, 0, 1]), 12.9, atol=0.1)
+    zeta = one.damping_ratio[0, 0, 0, 1].min(axis=1)
+    np.testing.assert_allclose(zeta[:3], [0.248, 0.028, 0.011], atol=1e-3)
+    # modes above half the sample rate keep their true frequency
+    np.testing.assert_allclose(one.frequency_hz[0, 0, 0, 1, 7].mean(), 64 * 114.4, rtol=0.01)
+    np.testing.assert_allclose(zeta[7], 0.01, rtol=0.01)
+
+
+def test_longer_actuators_take_margin_and_give_damping():
+    found = certified({}, sizes=(3,), bases=("pinned_pinned",), lengths=(1.0, 1.25))
+    margin = found.margin[0, :, :, 0]
+    assert np.all(margin[:, 1] < 0.9 * margin[:, 0])
+    # the plant sees the true length, the controller divides by what it believes: 1.2 times q^_1
+    seen = np.abs(found.observation[0, 0, 0, 0, 0, 0]), np.abs(found.actuation[0, 0, :, 0, 0, 0])
+    np.testing.assert_allclose(seen[0], 1, atol=1e-9)
+    ratio = np.sin(np.pi * 0.0375 / 2 / 0.2) / np.sin(np.pi * 0.03 / 2 / 0.2)
+    np.testing.assert_allclose(seen[1], [1, ratio], rtol=1e-9)
+
+
+def test_leakage_of_the_papers_filter():
+    """In its own basis and on pinned-pinned plants: the numbers known beforehand."""
+    changes = {"control__basis": "pinned_free"}
+    found = certified(changes, sizes=(8,), bases=("pinned_free", "pinned_pinned"), lengths=(1.0,))
+    own, other = found.observation[:, 0, 0, 0, 0]
+    np.testing.assert_allclose(own[:3], [1, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(own[3:6], [0.21, 1.29, 10.4], atol=0.04)
+    np.testing.assert_allclose(other[4:7], [-1.1, 6.5, 41], rtol=0.02)
+    np.testing.assert_allclose(other[[3, 7]], 0, atol=1e-9)
+    np.testing.assert_allclose(found.actuation[0, 0, 0, 0, :3], np.eye(3), atol=1e-9)
+
+
+def test_plants_that_do_not_exist_are_left_out():
+    centers = (0.05, 0.085, 0.15)
+    found = certify(STUDY.change(patches__centers=centers), sizes=(3,), bases=SAME["bases"],
+                    lengths=(1.0, 1.25))  # fmt: skip
+    np.testing.assert_array_equal(found.exists[0, :, :, 0], [[True, False]] * 2)
+    assert np.all(np.isnan(found.margin[~found.exists])) and found.breaking[0, 0, 1, 0] == ""
+    assert found.notes[0] == "left out: sensors x 1, actuators x 1.25: patches overlap"
+    assert len(found.notes) == 2
+    locked = STUDY.change(drive__locked=True, motion__waypoints=STUDY.motion.waypoints[:1])
+    maker = LoopMaker(fixed_controller(STUDY)._replace(study=locked))
+    plants = all_plants(("pinned_free", "loaded"), (3,), (1.0,)).ravel()
+    assert "locked" in maker.fault(plants[0]) and maker.fault(plants[1]) == ""
+
+
+def test_gain_limit_is_the_gain_margin():
+    """Of a loop with one frequency only, unstable above a known gain."""
+
+    def poles(factor):
+        return np.array([0.5, 0.9 + 0.1 * factor / 0.37])
+
+    for first in (None, np.array([0.2, 0.6, 1.0])):
+        np.testing.assert_allclose(gain_limit(poles, first), 0.37, rtol=1e-4)
+    np.testing.assert_allclose(gain_limit(poles), gain_margin(poles), rtol=2e-4)
+    assert gain_limit(lambda factor: np.array([1.1])) == 0
+    assert gain_limit(lambda factor: np.array([0.9]), highest=3.0) == 3
+    found = gain_limit(lambda factor: np.array([0.99 + factor]), np.array([0.5]))
+    np.testing.assert_allclose(found, LOWEST, rtol=1e-4)
+
+
+def test_linear_algebra_runs_on_one_thread_for_a_while():
+    found = _controls()
+    if found is None:
+        pytest.skip("another linear algebra library than OpenBLAS")
+    before = found[0]()
+    with one_thread():
+        assert found[0]() == 1
+    assert found[0]() == before
+
+
+# --- laws -----------------------------------------------------------------------------------------
+
+
+def test_optimal_gains_solve_the_riccati_equation():
+    for omega, weight in ((719.0, 2e-5), (6468.0, 1e-3), (50.0, 1e-7)):
+        a = np.array([[0.0, 1.0], [-(omega**2), 0.0]])
+        b, state = np.array([[0.0], [1.0]]), np.diag([omega**2, 1.0])
+        solution = scipy.linalg.solve_continuous_are(a, b, state, np.array([[weight]]))
+        gains = optimal_gains(omega, weight)
+        found = [gains.position, gains.velocity]
+        np.testing.assert_allclose(found, (b.T @ solution / weight)[0], rtol=1e-6)
+
+
+def test_position_filter_is_its_continuous_formula_at_its_own_frequency():
+    omega = 2 * np.pi * np.array([[114.4, 457.6, 1029.5]] * 3)
+    period, antialias, zeta = 1e-4, 2 * np.pi * 2000, 0.5
+    filters = jax.jit(design_position_filter)(omega, zeta, period, antialias)
+    filters = jax.tree.map(np.asarray, filters)
+    d1, d2 = filters.estimator.denominator
+
+    def response(at):
+        z = np.exp(-1j * at * period)
+        n0, n1, n2 = filters.estimator.position
+        return (n0 + n1 * z + n2 * z * z) / (1 + d1 * z + d2 * z * z)
+
+    corner = filters.corner
+    np.testing.assert_allclose(response(corner), 1 / (2j * zeta), rtol=1e-9)
+    np.testing.assert_allclose(response(0 * corner), 1, rtol=1e-9)
+    # with the chain it lags by 90 degrees, as far as a corner of three times omega allows
+    whole = np.asarray(measurement_chain(omega, period, antialias)) * response(omega)
+    lag = -np.degrees(np.angle(whole))[0]
+    np.testing.assert_allclose(lag[:1], 90, atol=1)
+    np.testing.assert_allclose(corner[0, 2], HIGHEST_RATIO * omega[0, 2], rtol=1e-9)
+    np.testing.assert_allclose(filters.damping, -whole.imag / omega, rtol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def laws():
+    """All laws of the default design, by name."""
+    found = fixed_controller(STUDY)
+    plant = Plant("pinned_pinned", 8, 1.0, 1.0)
+    return {law.name: law for law in all_laws(found, LoopMaker(found), plant)}
+
+
+def test_laws_are_equally_strong_on_mode_1(laws):
+    found = fixed_controller(STUDY)
+    maker, plant = LoopMaker(found), Plant("pinned_pinned", 8, 1.0, 1.0)
+
+    def strength(name):
+        seen, driven = maker.leakage(plant, laws[name].controller)
+        gain = laws[name].controller.velocity_gain
+        return np.einsum("ic,ic,ic->i", driven[:, 0], gain, seen[:, :, 0])
+
+    own = strength("IMSC")
+    np.testing.assert_allclose(own, 0.5 * np.array([3.1, 3.5, 3.4]), rtol=1e-9)
+    np.testing.assert_allclose(strength("strain rate feedback"), own, rtol=1e-9)
+    # one weight for all links, so only their mean is the design's
+    np.testing.assert_allclose(strength("IMSC-LQR"), own.mean(), rtol=1e-6)
+    push = laws["positive position feedback"].controller
+    assert np.all(push.position_gain < 0) and not np.any(push.velocity_gain)
+
+
+def stepped(law, n_samples=40):
+    """Commands of a controller on random sensor voltages, and the states it went through."""
+    random = np.random.default_rng(1)
+    law = jax.tree.map(np.asarray, law)
+    state, commands, states = rest_controller(3, 3, float), [], []
+    step = jax.jit(controller_step, static_argnames="is_smooth")
+    for voltage in random.normal(size=(n_samples, 3, 3)):
+        states.append(state)
+        state, info = step(law, state, voltage, is_smooth=True)
+        commands.append(np.asarray(info.command))
+    return np.array(commands), states
+
+
+def test_modified_control_of_one_mode_is_plain_control(laws):
+    law = laws["modified IMSC"].controller
+    one = np.arange(3) == 0
+    alone = law._replace(velocity_gain=one * law.velocity_gain, rival_omega=one * law.rival_omega)
+    plain = alone._replace(rival_omega=None)
+    found, _ = stepped(alone)
+    np.testing.assert_allclose(found, stepped(plain)[0], atol=1e-12)
+    assert np.abs(found).max() > 0
+
+
+def test_modified_control_acts_on_one_mode_of_a_link_at_a_time(laws):
+    law = laws["modified IMSC"].controller
+    commands, _ = stepped(law)
+    # as if forces of one column only
+    force = np.linalg.solve(np.asarray(law.synthesizer)[None], commands[..., None])[..., 0]
+    size = np.abs(force) / np.abs(force).max(axis=2, keepdims=True)
+    assert np.all(np.sort(size, axis=2)[..., :2] < 1e-9)
+    acting = np.argmax(size, axis=2)
+    assert len(np.unique(acting)) > 1 and np.any(acting[:, 0] != acting[:, 1])
+
+
+def test_the_strongest_is_that_of_highest_energy_and_others_are_no_rivals():
+    omega = np.array([[1.0, 2.0, 3.0], [1.0, 0.0, 3.0], [0.0, 0.0, 0.0]])
+    value = np.array([[1.0, 0.1, 0.2], [1.0, 9.0, 0.1], [1.0, 2.0, 3.0]])
+    rate = np.array([[0.0, 1.1, 0.1], [0.0, 0.0, 0.1], [0.0, 0.0, 0.0]])
+    wanted = [[0, 1, 0], [1, 1, 0], [1, 1, 1]]
+    np.testing.assert_array_equal(strongest(omega, value, rate), wanted)
+
+
+def test_parts_of_the_modified_law_are_its_channels(laws):
+    parts = laws["modified IMSC"].linear_parts
+    whole = laws["modified IMSC"].controller.velocity_gain
+    np.testing.assert_allclose(sum(part.velocity_gain for _, part in parts), whole)
+    assert [modes.start for modes, _ in parts] == [0, 1, 2]
+    assert len(laws["IMSC"].linear_parts) == 1
+
+
+def test_idle_channels_change_nothing():
+    whole = fixed_controller(STUDY).controller
+    plain = whole._replace(
+        filter=whole.filter[:, :2],
+        estimator=jax.tree.map(lambda x: x[:, :2], whole.estimator),
+        velocity_gain=whole.velocity_gain[:, :2],
+        position_gain=whole.position_gain[:, :2],
+        synthesizer=whole.synthesizer[:, :, :2],
+    )
+    wide = widened(plain, 3)
+    state = rest_controller(2, 3, float)
+    more = rest_controller(3, 3, float)
+    step = jax.jit(controller_step)
+    for voltage in np.random.default_rng(2).normal(size=(20, 3, 3)):
+        state, info = step(plain, state, voltage)
+        more, wider = step(wide, more, voltage)
+        np.testing.assert_allclose(wider.command, info.command, atol=1e-12)
+    assert isinstance(more, ControllerState) and more.first.shape == (3, 3)
+
+
+# --- beside each other, and the command -----------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def comparison():
+    return compare_laws(STUDY, sizes=(3,))
+
+
+def test_factors_keep_the_margin_and_the_designs_damping(comparison):
+    names = comparison.names
+    assert names[:2] == ("no control", "design as given") and len(names) == 7
+    given, laws = 1, slice(2, None)
+    assert np.all(comparison.margin[laws] > 2 - 1e-3)
+    zeta = comparison.damping_ratio[:, 0]
+    assert np.all(zeta[laws] < zeta[given] * 1.02)
+    # the design passes here, so it is its own law
+    own = names.index("IMSC")
+    np.testing.assert_allclose(comparison.factor[own], 1, atol=1e-9)
+    for numbers in (comparison.damping_ratio, comparison.margin, comparison.residual_rms):
+        np.testing.assert_allclose(numbers[own], numbers[given], rtol=1e-9)
+    np.testing.assert_allclose(comparison.margin[given], 5.559, atol=2e-3)
+    # optimal gains are nearly alike for all modes, the paper's fall off
+    assert np.all(comparison.damping_ratio[names.index("IMSC-LQR"), 1:] > 2 * 0.01)
+
+
+def test_control_reduces_vibration_at_the_price_of_voltage(comparison):
+    assert np.all(comparison.status[:2] == 0)
+    off, given = comparison.residual_rms[:2]
+    assert np.all(given < 0.1 * off) and comparison.peak_voltage[0] == 0
+    one = comparison.names.index("modified IMSC")
+    assert np.all(comparison.residual_rms[one] < 0.1 * off)
+    assert comparison.control_energy[one] > 0
+
+
+def test_a_law_given_to_the_run_is_the_law_that_runs(comparison):
+    """The design's coefficients handed over, against a run of its study."""
+    metrics = run_study(comparison.study, has_record=False, has_loop=False).result.metrics
+    given = comparison.names.index("design as given")
+    np.testing.assert_allclose(
+        comparison.residual_rms[given], metrics.residual_rms.max(axis=1), rtol=1e-9
+    )
+    np.testing.assert_allclose(comparison.control_energy[given], metrics.control_energy, rtol=1e-9)
+    np.testing.assert_allclose(
+        comparison.peak_voltage[given], metrics.peak_voltage.max(), rtol=1e-9
+    )
+
+
+def test_laws_need_a_gain_to_be_compared_by():
+    changes = {"control__velocity_gain": (0.0,) * 3, "control__position_gain": (1.0,) * 3}
+    with pytest.raises(StudyError, match="control.velocity_gain = .*damp mode 1"):
+        compare_laws(STUDY.change(**changes), sizes=(3,))
+
+
+def few(monkeypatch, comparison):
+    """A command that looks at few plants."""
+    chosen = {"bases": ("pinned_pinned",), "lengths": (0.8, 1.0), "sizes": (3, 9)}
+    monkeypatch.setattr(spillover_run, "certify", partial(certify, **chosen))
+    monkeypatch.setattr(spillover_run, "compare_laws", comparison)
+
+
+def write(folder, **changes):
+    path = folder / "design.toml"
+    path.write_text(study_template(STUDY.change(**changes)))
+    return path
+
+
+def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_path, comparison):
+    few(monkeypatch, lambda study, margin: comparison)
+    design, out = write(tmp_path), tmp_path / "deep" / "out"
+    code, text, _ = run(capsys, "spillover", design, "--out", out)
+    assert code == 0 and "passed: gain margin 2.5, 2 required" in text
+    figures = [f"{name}.{kind}" for name in ("margins", "damping", "leakage", "laws")
+               for kind in ("png", "pdf")]  # fmt: skip
+    files = {"report.md", "certificate.json", "spillover.h5", *figures}
+    assert {path.name for path in out.iterdir()} == files
+    report = (out / "report.md").read_text()
+    assert report.startswith("# Spillover certificate passed: gain margin 2.5, 2 required")
+    assert all(f"({name}.png)" in report for name in ("margins", "damping", "leakage", "laws"))
+    assert "| modified IMSC |" in report and "Not covered" in report
+    data = json.loads((out / "certificate.json").read_text())
+    assert data["is_passed"] and len(data["plants"]) == 8 and len(data["laws"]) == 7
+    assert all(plant["passes"] for plant in data["plants"])
+    with xarray.open_dataset(out / "spillover.h5") as store:
+        margin = store.gain_margin.sel(basis="pinned_pinned", plant_modes=9)
+        assert float(margin.min()) == pytest.approx(data["smallest_margin"])
+        assert store.law.values.tolist() == list(comparison.names)
+
+
+def test_command_fails_a_design(capsys, monkeypatch, tmp_path):
+    def refuse(study, margin):
+        raise StudyError("not today")
+
+    few(monkeypatch, refuse)
+    monkeypatch.setattr(spillover_run.figures, "save", lambda *_: None)
+    design, out = write(tmp_path, **DIFFERENCE), tmp_path / "out"
+    code, text, _ = run(capsys, "spillover", design, "--out", out, "--margin", "1.5")
+    assert code == 1 and "failed by mode" in text and "unstable" in text
+    assert "laws are not compared: not today" in text
+    report = (out / "report.md").read_text()
+    assert report.startswith("# Spillover certificate failed by mode") and "## Laws" not in report
+    assert "| **no** |" in report and "- laws are not compared: not today" in report
+    assert not json.loads((out / "certificate.json").read_text())["is_passed"]
+
+
+@pytest.mark.parametrize(
+    ("study", "more", "message"),
+    [
+        ({"control__feedback": "ideal"}, (), "control.feedback = 'ideal': allowed 'sampled'"),
+        ({"control__links": (False,) * 3}, (), "at least one link"),
+        ({"control__gain_factor": 0.0}, (), "at least one is not zero"),
+        ({}, ("--margin", "0.5"), "--margin = 0.5: allowed more than 1"),
+        ({}, ("--case", "3"), "leave --case out"),
+    ],
+)
+def test_what_cannot_be_judged_is_refused_in_words(capsys, tmp_path, study, more, message):
+    design = write(tmp_path, **study)
+    said = refused(capsys, "spillover", design, "--out", tmp_path / "out", *more)
+    assert message in said and not (tmp_path / "out").exists()
