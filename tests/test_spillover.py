@@ -14,7 +14,6 @@ from jaxmodel.controller import ControllerState, controller_step, rest_controlle
 from jaxmodel.estimator import measurement_chain
 from jaxmodel.ppf import HIGHEST_RATIO, design_position_filter
 from jaxmodel.sampled_loop import gain_margin, loop_report
-from studies.blas import _controls, one_thread
 from studies.cases import as_arrays, build_case, build_structure
 from studies.errors import StudyError
 from studies.export.controller import fixed_controller
@@ -26,6 +25,7 @@ from studies.spillover.judgement import LOWEST, gain_limit
 from studies.spillover.laws import all_laws
 from studies.spillover.plants import LoopMaker, Plant, all_plants, widened
 from studies.template import study_template
+from tests.pages import parsed
 from tests.test_cli import refused, run
 
 #: One move of a small plant: what the run needs; certificates have plants of their own.
@@ -156,16 +156,6 @@ def test_gain_limit_is_the_gain_margin():
     assert gain_limit(lambda factor: np.array([0.9]), highest=3.0) == 3
     found = gain_limit(lambda factor: np.array([0.99 + factor]), np.array([0.5]))
     np.testing.assert_allclose(found, LOWEST, rtol=1e-4)
-
-
-def test_linear_algebra_runs_on_one_thread_for_a_while():
-    found = _controls()
-    if found is None:
-        pytest.skip("another linear algebra library than OpenBLAS")
-    before = found[0]()
-    with one_thread():
-        assert found[0]() == 1
-    assert found[0]() == before
 
 
 # --- laws -----------------------------------------------------------------------------------------
@@ -373,12 +363,14 @@ def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_
     assert code == 0 and "passed: gain margin 2.5, 2 required" in text
     figures = [f"{name}.{kind}" for name in ("margins", "damping", "leakage", "laws")
                for kind in ("png", "pdf")]  # fmt: skip
-    files = {"report.md", "certificate.json", "spillover.h5", *figures}
+    files = {"report.md", "report.html", "certificate.json", "spillover.h5", *figures}
     assert {path.name for path in out.iterdir()} == files
     report = (out / "report.md").read_text()
     assert report.startswith("# Spillover certificate passed: gain margin 2.5, 2 required")
     assert all(f"({name}.png)" in report for name in ("margins", "damping", "leakage", "laws"))
     assert "| modified IMSC |" in report and "Not covered" in report
+    page = parsed((out / "report.html").read_text())
+    assert len(page.images) == 4 and page.title.startswith("Spillover certificate passed")
     data = json.loads((out / "certificate.json").read_text())
     assert data["is_passed"] and len(data["plants"]) == 8 and len(data["laws"]) == 7
     assert all(plant["passes"] for plant in data["plants"])
@@ -393,7 +385,9 @@ def test_command_fails_a_design(capsys, monkeypatch, tmp_path):
         raise StudyError("not today")
 
     few(monkeypatch, refuse)
-    monkeypatch.setattr(spillover_run.figures, "save", lambda *_: None)
+    monkeypatch.setattr(
+        spillover_run.figures, "save", lambda _, out, name: (out / f"{name}.png").write_bytes(b"-")
+    )
     design, out = write(tmp_path, **DIFFERENCE), tmp_path / "out"
     code, text, _ = run(capsys, "spillover", design, "--out", out, "--margin", "1.5")
     assert code == 1 and "failed by mode" in text and "unstable" in text

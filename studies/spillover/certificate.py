@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from jaxmodel.beam import BASES
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
-from studies.blas import one_thread
 from studies.errors import StudyError, field_error
 from studies.export.controller import FixedController, fixed_controller
 from studies.spec import Study
@@ -109,7 +109,7 @@ def _judged(
     """Judgement of every plant."""
     law = widened(found.controller, found.n_patches)
     try:
-        with one_thread():
+        with threadpool_limits(1, "blas"):
             return {plant: judge(maker.loop(plant, law)) for plant in plants}
     except np.linalg.LinAlgError:
         raise StudyError("a linearised loop is not finite: nothing to judge") from None

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
 from jaxmodel.simulate import Result, simulate
-from studies.blas import one_thread
 from studies.export.controller import FixedController, fixed_controller
 from studies.runs import check_run
 from studies.spec import Study
@@ -76,7 +76,7 @@ def compare_laws(study: Study, margin: float = 2.0, sizes: tuple[int, ...] = ())
     own = min(max(found.study.link.modes, sizes[0]), sizes[-1])
     plant = Plant(found.study.link.basis, own, 1.0, 1.0)
     laws = all_laws(found, LoopMaker(found), plant)
-    with one_thread():
+    with threadpool_limits(1, "blas"):
         views = [_View(found, law, plant, sizes) for law in laws]
         given = views[0 if found.is_modal else 1]
         target = given.damping(1.0)[0]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
-from studies.report_context import table
+from studies.pages import literal, picture, table
 from studies.runs import describe
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import FAST, GIVEN, SETTLING, WINDOW, WITHOUT, Comparison
@@ -83,7 +83,7 @@ def _head(found: Certificate) -> list[str]:
         told += f" With fewer than {found.fails_from} plant modes a link all of them pass."
     return [
         f"# Spillover certificate {verdict(found)}", "",
-        f"{study.title or 'study'}: law {control.law}, basis {control.basis}, {found.n_controlled} "
+        f"{literal(study.title) or 'study'}: law {control.law}, basis {control.basis}, {found.n_controlled} "
         f"controlled modes on links {links}, gain factor {control.gain_factor:g}; "
         f"{electronics.sample_rate_hz:g} Hz, anti-alias filter {electronics.antialias_hz:g} Hz, "
         f"one sample of delay, velocity estimate {electronics.estimator}.", "", told,
@@ -119,8 +119,8 @@ def _margins(found: Certificate) -> list[str]:
         "the one that holds most energy of the motion; \"through a filter\" says that the pole is "
         "one of the controller's filters, which the mode, far stiffer, feeds.", "",
         *table(names, rows), "",
-        "![Gain margin over the number of plant modes](margins.png)", "",
-        "![Damping ratio of every link mode at the design's gains](damping.png)",
+        picture("margins.png", "Gain margin over the number of plant modes"), "",
+        picture("damping.png", "Damping ratio of every link mode at the design's gains"),
     ]  # fmt: skip
 
 
@@ -158,7 +158,7 @@ def _leakage(found: Certificate) -> list[str]:
         f"controlled mode pushes others by up to {pushed.max():.3g} of itself (mode {j + 1} on "
         f"mode {r + first + 1}, {basis}).", "",
         *table(("basis", "estimate", *names), rows), "",
-        "![Leakage of plant modes into the estimated ones](leakage.png)",
+        picture("leakage.png", "Leakage of plant modes into the estimated ones"),
     ]  # fmt: skip
 
 
@@ -203,7 +203,7 @@ def _laws(laws: Comparison) -> list[str]:
         f"s), no shaper; residual over {WINDOW:g} s from {SETTLING:g} s after the command on, when "
         "the drives have nearly settled.", "",
         *table(names, rows), "",
-        "![Residual vibration of the laws](laws.png)", "",
+        picture("laws.png", "Residual vibration of the laws"), "",
         *(f"- {note}" for note in _LAW_NOTES),
     ]  # fmt: skip
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from rich.console import Console
 from studies import figures
 from studies.design import Design
 from studies.errors import StudyError
+from studies.pages import write_report
 from studies.runs import STATUS_LABEL, run_attributes
 from studies.spillover import plots
 from studies.spillover.certificate import Certificate, certify
@@ -20,7 +20,7 @@ from studies.spillover.comparison import Comparison, compare_laws
 from studies.spillover.report import document, report, verdict
 from studies.store import Variable, check_folder, replacing, write_store
 
-REPORT, DOCUMENT, DATA = "report.md", "certificate.json", "spillover.h5"
+DOCUMENT, DATA = "certificate.json", "spillover.h5"
 
 
 def spillover_design(design: Design, out: Path, margin: float, console: Console) -> bool:
@@ -51,7 +51,7 @@ def spillover_design(design: Design, out: Path, margin: float, console: Console)
     _write(out, found, laws)
     for note in found.notes:
         console.print(note, soft_wrap=True)
-    console.print(f"written: {out / REPORT}, data and figures beside it", soft_wrap=True)
+    console.print(f"written: {out / 'report.html'}, data and figures beside it", soft_wrap=True)
     return found.is_passed
 
 
@@ -72,10 +72,9 @@ def _write(out: Path, found: Certificate, laws: Comparison | None) -> None:
         for name, figure in drawn.items():
             figures.save(figure, out, name)
     write_store(out / DATA, variables(found, laws), run_attributes(found.study))
-    with ExitStack() as stack:
-        for name, text in {REPORT: report(found, laws), DOCUMENT: document(found, laws)}.items():
-            temporary = stack.enter_context(replacing(out / name))
-            temporary.write_text(text, encoding="utf-8")
+    with replacing(out / DOCUMENT) as temporary:
+        temporary.write_text(document(found, laws), encoding="utf-8")
+        write_report(out, report(found, laws), found.study)
 
 
 def _figure(ax: Any) -> Figure:
