@@ -83,8 +83,8 @@ def _head(found: Certificate) -> list[str]:
         told += f" With fewer than {found.fails_from} plant modes a link all of them pass."
     return [
         f"# Spillover certificate {verdict(found)}", "",
-        f"{literal(study.title) or 'study'}: law {control.law}, basis {control.basis}, {found.n_controlled} "
-        f"controlled modes on links {links}, gain factor {control.gain_factor:g}; "
+        f"{literal(study.title) or 'study'}: law {control.law}, basis {control.basis}, "
+        f"{found.n_controlled} controlled modes on links {links}, gain factor {control.gain_factor:g}; "
         f"{electronics.sample_rate_hz:g} Hz, anti-alias filter {electronics.antialias_hz:g} Hz, "
         f"one sample of delay, velocity estimate {electronics.estimator}.", "", told,
     ]  # fmt: skip
