@@ -84,8 +84,9 @@ def _head(found: Certificate) -> list[str]:
     return [
         f"# Spillover certificate {verdict(found)}", "",
         f"{literal(study.title) or 'study'}: law {control.law}, basis {control.basis}, "
-        f"{found.n_controlled} controlled modes on links {links}, gain factor {control.gain_factor:g}; "
-        f"{electronics.sample_rate_hz:g} Hz, anti-alias filter {electronics.antialias_hz:g} Hz, "
+        f"{found.n_controlled} controlled modes on links {links}, gain factor "
+        f"{control.gain_factor:g}; {electronics.sample_rate_hz:g} Hz, anti-alias filter "
+        f"{electronics.antialias_hz:g} Hz, "
         f"one sample of delay, velocity estimate {electronics.estimator}.", "", told,
     ]  # fmt: skip
 
