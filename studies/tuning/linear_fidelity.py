@@ -176,12 +176,14 @@ def _limit_slopes(
     structure: Structure, names: tuple, place: Any, cases: Case, pose: Array, limits: Array,
     values: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
-    def figures(x: Array, case: Case, limit: Array) -> Array:
+    def figures(x: Array, case: Case, limit: Array) -> tuple[Array, Array]:
         placed = place(case, x)
-        return _excess(structure, names, placed, closed_loop(structure, placed, pose), limit)
+        found = _excess(structure, names, placed, closed_loop(structure, placed, pose), limit)
+        return found, found
 
     def one(given: tuple) -> tuple[Array, Array]:
-        return figures(*given), jax.jacrev(figures)(*given)
+        slope, found = jax.jacrev(figures, has_aux=True)(*given)  # the figures come with it
+        return found, slope
 
     return jax.lax.map(one, (values, cases, limits))
 
