@@ -36,8 +36,8 @@ def load_design(path: Path, case: int | str | None = None) -> Design:
     Raises:
         StudyError: not found, case missing or not allowed, or a case that does not stand alone.
     """
-    path = ready_spec(path)
     if not path.is_dir():
+        path = ready_spec(path)
         if case is not None:
             raise StudyError(f"--case {case}: {path} is a file; leave --case out")
         return Design(load_study(path), {})

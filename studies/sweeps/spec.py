@@ -69,7 +69,7 @@ class SweepSpec(NamedTuple):
 def ready_spec(name: Path) -> Path:
     """A file, or the ready-made one of that name where there is no such file."""
     ready = Path(__file__).parents[1] / "specs" / f"{name.stem}.toml"
-    is_name = not name.exists() and len(name.parts) == 1 and name.suffix in ("", ".toml")
+    is_name = not name.is_file() and len(name.parts) == 1 and name.suffix in ("", ".toml")
     return ready if is_name and ready.is_file() else name
 
 
