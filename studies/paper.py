@@ -7,7 +7,6 @@ as Markdown and as a web page.
 from __future__ import annotations
 
 import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +31,7 @@ from studies.paper_measures import Measures, measure, middle_station
 from studies.report import report
 from studies.runs import STATUS_LABEL, describe, metric_variables, run_attributes
 from studies.spec import Study, paper_study
-from studies.store import Variable, check_target, write_store
+from studies.store import Variable, check_target, staged, write_store
 
 DATA, REPORT = "paper.h5", "report.html"
 
@@ -84,8 +83,7 @@ def write_paper(out: Path, console: Console, study: Study, cases: list[PaperCase
 
 def _write(out: Path, runs: PaperRuns, measures: Measures, tell: Tell) -> None:
     """Write everything beside its place first: an interrupted run leaves the old files whole."""
-    with tempfile.TemporaryDirectory(dir=out, prefix=".unfinished-") as folder:
-        staging = Path(folder)
+    with staged(out) as staging:
         tell("writing data", 0.0)
         write_store(staging / DATA, paper_variables(runs, measures), run_attributes(runs.study))
         tell("writing data", 1.0)
@@ -93,8 +91,6 @@ def _write(out: Path, runs: PaperRuns, measures: Measures, tell: Tell) -> None:
             tell(f"drawing {name}", 0.25)
             draw_figure(name, runs, measures, staging)
         write_report(staging, report(runs, measures), runs.study)
-        for file in sorted(staging.iterdir()):
-            os.replace(file, out / file.name)
 
 
 def _open_folder(out: Path) -> None:

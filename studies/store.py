@@ -10,6 +10,7 @@ import os
 import re
 import secrets
 import shutil
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
@@ -25,6 +26,8 @@ from studies.errors import StudyError, field_error
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 # What the words of flag_meanings may not contain.
 _NO_FLAG = re.compile(r"[^A-Za-z0-9_.+@-]+")
+#: How folders of `staged` begin.
+_STAGED = ".unfinished-"
 _TEXT = h5py.string_dtype("utf-8")
 
 
@@ -185,6 +188,23 @@ def check_folder(out: Path) -> None:
         raise StudyError(f"--out {out}: {there} is not a folder; name another one")
     if not os.access(there, os.W_OK | os.X_OK):
         raise StudyError(f"--out {out}: no permission to write in {there}")
+
+
+@contextmanager
+def staged(out: Path) -> Iterator[Path]:
+    """Yield a folder inside `out` whose files move there at the end, so that a failure moves none.
+
+    What a kill left of an earlier one is removed.
+
+    Args:
+        out: folder that exists.
+    """
+    for left in out.glob(f"{_STAGED}*"):
+        shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=out, prefix=_STAGED) as folder:
+        yield Path(folder)
+        for file in sorted(Path(folder).iterdir()):
+            os.replace(file, out / file.name)
 
 
 @contextmanager

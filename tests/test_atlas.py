@@ -231,6 +231,7 @@ def test_claims_are_counted():
         ({"control__feedback": "ideal"}, "control.feedback = 'ideal': allowed 'sampled'"),
         ({"control__law": "srf"}, "control.law = 'srf': allowed 'imsc'"),
         ({"motion__waypoints": ((0.0, 0.0, 0.5),)}, "motion.waypoints"),
+        ({"control__gain_factor": 0.0}, "control.gain_factor = 0.0: allowed gains that do"),
     ],
 )
 def test_designs_without_subsets_are_refused(fields, message):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +32,7 @@ from studies.figures import save, styled
 from studies.pages import write_report
 from studies.runs import run_attributes
 from studies.spec import Study
-from studies.store import Variable, write_store
+from studies.store import Variable, staged, write_store
 from studies.sweeps.results import load
 from studies.sweeps.run import run_sweep
 
@@ -72,8 +70,7 @@ def run_atlas(
     with threadpool_limits(1, "blas"):  # many small matrices: more threads only get in the way
         found = look_around(study, subsets, tell)
     try:
-        with tempfile.TemporaryDirectory(dir=out, prefix=".unfinished-") as folder:
-            staging = Path(folder)
+        with staged(out) as staging:
             write_store(staging / DATA, variables(found), run_attributes(study))
             tell("drawing", 0.0)
             with styled():
@@ -81,8 +78,6 @@ def run_atlas(
                     save(figure.draw(found), staging, name)
             write_animation(found, staging)
             write_report(staging, report(found, dropped), study)
-            for file in sorted(staging.iterdir()):
-                os.replace(file, out / file.name)
     except OSError as error:
         raise StudyError(f"--out {out}: cannot write there ({error})") from error
     return True

@@ -168,6 +168,10 @@ def _check(study: Study) -> None:
         )  # fmt: skip
     if len(motion.waypoints) < 2:
         raise field_error("motion.waypoints", motion.waypoints, "a path of two poses or more", "m")
+    gains = (*control.velocity_gain, *control.position_gain)
+    if control.gain_factor == 0 or not any(gains):
+        name = "control.gain_factor" if control.gain_factor == 0 else "control.velocity_gain"
+        raise field_error(name, 0.0, "gains that do something, whose effect can be shared out")
     for name, value, allowed in (
         ("control.feedback", control.feedback, "sampled"), ("control.law", control.law, "imsc"),
     ):  # fmt: skip
