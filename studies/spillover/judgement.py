@@ -172,7 +172,9 @@ def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
     known = [*loop.mode_poles, *loop.omega.T[len(loop.mode_poles) :]]
     own = ", ".join(f"{np.abs(known[j]).mean() / (2 * np.pi):.0f}" for j in modes)
     text = f"{_listed('mode', modes)} of {_listed('link', _leading(energy.sum(axis=1)))} ({own} Hz)"
-    return text if links > filters else f"{text}, through a filter at {hertz:.0f} Hz"
+    if links > filters:
+        return text
+    return f"{text}, " + (f"through a filter at {hertz:.0f} Hz" if hertz >= 1 else "statically")
 
 
 def _leading(energy: np.ndarray) -> list[int]:

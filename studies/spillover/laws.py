@@ -90,18 +90,20 @@ def all_laws(found: FixedController, maker: LoopMaker, plant: Plant) -> list[Law
         srf = _scaled(srf, wanted, strength(srf))
     else:
         imsc = _scaled(imsc, wanted, strength(imsc))
-    omega = assembled_omega(found)
+    omega, is_on = _assembled_omega(found), imsc.velocity_gain != 0
+    if imsc.position_gain is not None:
+        is_on = is_on | (imsc.position_gain != 0)
     laws = {
         "IMSC": imsc,
         "strain rate feedback": srf,
         "IMSC-LQR": _optimal(imsc, _modal_mass(found), omega),
-        "modified IMSC": imsc._replace(rival_omega=np.where(imsc.velocity_gain != 0, omega, 0.0)),
+        "modified IMSC": imsc._replace(rival_omega=np.where(is_on, omega, 0.0)),
         "positive position feedback": _position_feedback(found, imsc, omega),
     }
     return [Law(name, _even(law, found.n_patches)) for name, law in laws.items()]
 
 
-def assembled_omega(found: FixedController) -> np.ndarray:
+def _assembled_omega(found: FixedController) -> np.ndarray:
     """Frequencies of the controlled modes as the controller believes [rad/s], (3, C)."""
     belief = found.case.machine.beam._replace(stiffness_factor=1.0)
     return np.asarray(assembled_frequency(belief, found.structure.n_controlled))

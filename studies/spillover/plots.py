@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -18,11 +19,9 @@ from studies.spillover.judgement import HIGHEST, LOWEST
 FLOOR = 0.01
 
 
-def _own(ax: Axes | None, height: float = 3.4) -> Axes:
+def _own(ax: Axes | None) -> Axes:
     """The axes to draw on: those given, or new ones."""
-    if ax is not None:
-        return ax
-    return Figure(figsize=(7.4, height), layout="constrained").subplots()
+    return plt.subplots(layout="constrained")[1] if ax is None else ax
 
 
 def _plain_ticks(axis: Axis) -> None:
@@ -87,20 +86,20 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
         )  # fmt: skip
     ax.axhline(structural, color="black", linewidth=0.9, linestyle="--")
     ax.annotate(
-        "without control", (1, structural), xycoords=("axes fraction", "data"), ha="right",
-        va="bottom", fontsize=8,
+        "without control", (0.02, structural), xycoords=("axes fraction", "data"), va="bottom",
+        fontsize=8,
     )  # fmt: skip
     ax.set_xscale("log")
     ax.set_yscale("symlog", linthresh=0.02, linscale=1.5)
     ax.set_ylim(1.3 * min(np.nanmin(zeta), -0.001), 1.3 * np.nanmax(zeta))
     if np.nanmin(zeta) < 0:
         ax.axhline(0, color="black", linewidth=0.9)
+        ax.annotate("unstable", (0.02, 0.02), xycoords="axes fraction", fontsize=8)
         ax.axhspan(ax.get_ylim()[0], 0, color=figures.SERIES[1], alpha=0.1, linewidth=0)
     low, high = ax.get_ylim()
-    ticks = [
-        sign * tick for tick in (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0) for sign in (1, -1)
-    ]
-    ax.set_yticks([tick for tick in ticks if low <= tick <= high], minor=False)
+    sizes = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+    ticks = [*(-tick for tick in sizes), 0.0, *sizes]
+    ax.set_yticks([tick for tick in ticks if low <= tick <= high])
     ax.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     ax.yaxis.set_minor_locator(NullLocator())
     _plain_ticks(ax.xaxis)
@@ -124,7 +123,7 @@ def leakage_map(
         title: of the panel.
         ax: where to draw; a new figure where left out.
     """
-    ax = _own(ax, 2.0)
+    ax = _own(ax)
     channels, modes = factor.shape
     shown = np.where(factor >= FLOOR, factor, np.nan)
     edges = [np.arange(n + 1) + 0.5 for n in (modes, channels)]
@@ -183,7 +182,7 @@ def law_bars(found: Comparison, ax: Axes | None = None) -> Axes:
         ax.text(end + 0.01 * most, k, text, va="center", fontsize=8)
     ax.set_yticks(rows, found.names)
     ax.invert_yaxis()
-    ax.margins(x=0.2)
+    ax.margins(x=0.32)
     ax.grid(axis="y", visible=False)
     ax.set_xlabel("residual rms of the chord deflection, worst station [µm]")
     ax.legend(loc="lower right")

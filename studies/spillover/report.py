@@ -45,7 +45,7 @@ def verdict(found: Certificate) -> str:
     at = found.worst
     margin, breaking = _margin(found.margin[at]), found.breaking[at]
     if found.is_passed:
-        first = f"; beyond it {breaking} goes unstable" if breaking else ""
+        first = f"; first to go unstable beyond it: {breaking}" if breaking else ""
         return f"passed: gain margin {margin}, {found.required:g} required{first}"
     state = "" if found.radius[at] <= 1 + RADIUS_TOLERANCE else "unstable, "
     return f"failed by {breaking}: {state}gain margin {margin}, {found.required:g} required"

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from rich.console import Console
 
 from studies import figures
@@ -60,26 +60,22 @@ def _write(out: Path, found: Certificate, laws: Comparison | None) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StudyError(f"--out {out}: cannot write there ({error.strerror})") from None
+    drawn: list[tuple[str, Callable[..., Any], Any]] = [
+        ("margins", plots.margins, found), ("damping", plots.mode_damping, found),
+    ]  # fmt: skip
+    if laws is not None:
+        drawn.append(("laws", plots.law_bars, laws))
     with figures.styled():
-        drawn = {
-            "margins": _figure(plots.margins(found)),
-            "damping": _figure(plots.mode_damping(found)),
-        }
-        if found.study.control.law == "imsc":
-            drawn["leakage"] = plots.leakage(found)
-        if laws is not None:
-            drawn["laws"] = _figure(plots.law_bars(laws))
-        for name, figure in drawn.items():
+        for name, plot, data in drawn:
+            figure, axes = figures.new_figure(1, 1, 2.65)
+            plot(data, axes[0, 0])
             figures.save(figure, out, name)
+        if found.study.control.law == "imsc":
+            figures.save(plots.leakage(found), out, "leakage")
     write_store(out / DATA, variables(found, laws), run_attributes(found.study))
     with replacing(out / DOCUMENT) as temporary:
         temporary.write_text(document(found, laws), encoding="utf-8")
         write_report(out, report(found, laws), found.study)
-
-
-def _figure(ax: Any) -> Figure:
-    figure: Figure = ax.figure
-    return figure
 
 
 def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable]:
