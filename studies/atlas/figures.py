@@ -13,10 +13,9 @@ from studies.atlas import plots
 from studies.atlas.attribution import effects, interaction, shapley
 from studies.atlas.drawing import Clip, animate, draw_mode, mode_skeleton, skeleton
 from studies.atlas.findings import Findings
-from studies.atlas.platform import LINK_SETS
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.subsets import TARGETS, link_label, player_labels, setting_label
-from studies.figures import CONTROLLED, SERIES, WITHOUT, comparison, legend_above, new_figure
+from studies.figures import SERIES, comparison, legend_above, new_figure
 
 #: Place of the late window.
 LATE = -1
@@ -27,6 +26,8 @@ CLIP_SIZE = 0.12
 ANIMATION = "machine.gif"
 
 
+#: LINK_SETS in words.
+_SETS = ("no link controlled", "link 1", "links 1+2", "links 1+2+3")
 _COLUMNS = ["link 1", "link 2", "link 3", "platform"]
 
 
@@ -45,7 +46,9 @@ def _subsets(found: Findings) -> Figure:
         image = plots.change_map(change[1:], rows, _COLUMNS, ax)
     for ax in axes[: len(subsets.setting) : 2]:
         ax.set_ylabel("controlled links")
-    figure.colorbar(image, ax=list(axes), shrink=0.5, label="change of residual rms [%]")
+    figure.colorbar(
+        image, ax=list(axes), shrink=0.5, extend="both", label="change of residual rms [%]"
+    )
     return figure
 
 
@@ -63,8 +66,8 @@ def _panels(found: Findings, height: float) -> tuple[Figure, np.ndarray]:
     """Two panels a row, one for each setting."""
     settings = found.subsets.setting
     figure, axes = new_figure(-(-len(settings) // 2), min(len(settings), 2), height, False)
-    for ax, setting in zip(axes.flat, settings, strict=False):
-        ax.set_title(setting_label(setting))
+    for k, ax in enumerate(axes.flat[: len(settings)]):
+        ax.set_title(found.setting(k))
     for ax in axes.flat[len(settings) :]:
         ax.remove()
     return figure, axes.ravel()[: len(settings)]
@@ -85,7 +88,9 @@ def _helps(found: Findings) -> Figure:
         image = plots.change_map(effects(1 + change), _COLUMNS[:3], _COLUMNS, ax)
     for ax in axes[::2]:
         ax.set_ylabel("controlled alone")
-    figure.colorbar(image, ax=list(axes), shrink=0.6, label="change of residual rms [%]")
+    figure.colorbar(
+        image, ax=list(axes), shrink=0.6, extend="both", label="change of residual rms [%]"
+    )
     return figure
 
 
@@ -93,7 +98,7 @@ def _shares(found: Findings) -> Figure:
     subsets = found.subsets
     share = shapley(subsets.removed()[:, LATE]).reshape(-1, len(TARGETS), 3, subsets.modes)
     figure, axes = new_figure(len(subsets.setting), len(TARGETS), 1.3, False)
-    for row, setting in enumerate(subsets.setting):
+    for row in range(len(subsets.setting)):
         for column, target in enumerate(TARGETS):
             ax = axes[row, column]
             plots.share_map(share[row, column], ax)
@@ -103,7 +108,7 @@ def _shares(found: Findings) -> Figure:
                 ax.set_title(target)
             if row == len(subsets.setting) - 1:
                 ax.set_xlabel("mode")
-        axes[row, 0].set_ylabel(f"{setting_label(setting)}\nlink", fontsize=7)
+        axes[row, 0].set_ylabel(f"{found.setting(row)}\nlink", fontsize=7)
     return figure
 
 
@@ -111,7 +116,7 @@ def _interactions(found: Findings) -> Figure:
     subsets = found.subsets
     figure, axes = _panels(found, 2.4)
     every = interaction(subsets.removed()[:, LATE, TARGETS.index("all links")])
-    limit = float(np.nanmax(np.abs(every)))
+    limit = float(np.max(np.abs(np.nan_to_num(every)), initial=1e-6))
     for ax, index in zip(axes, every, strict=True):
         image = plots.interaction_map(index, player_labels(subsets.modes), limit, ax)
     figure.colorbar(
@@ -226,7 +231,6 @@ def _vibration_after(found: Findings) -> Figure:
     """Vibration error once the command has ended, for the paper's choices of links."""
     runs = found.platform
     figure, axes = new_figure(3, len(RUNS), 1.9)
-    names = [link_label(sum(1 << i for i in range(3) if links[i])) for links in LINK_SETS]
     for column, setting in enumerate(RUNS):
         axes[0, column].set_title(setting_label(setting))
         end = runs.command_end[column]
@@ -235,9 +239,7 @@ def _vibration_after(found: Findings) -> Figure:
         for k, label in enumerate(("x [nm]", "y [nm]", "φ [nrad]")):
             ax = axes[k, column]
             error = 1e9 * runs.vibration[column, :, :, k]
-            styles = (WITHOUT, {"color": SERIES[2]}, {"color": SERIES[3]}, CONTROLLED)
-            for name, one, style in zip(names, error, styles, strict=True):
-                text = "no link controlled" if name == "none" else f"links {name}"
+            for text, one, style in zip(_SETS, error, plots.SET_STYLES, strict=True):
                 ax.plot(runs.time[part] - end, one[part], **{**style, "label": text})
             top = 1.5 * np.abs(error[:, late]).max()
             ax.set_ylim(-top, top)
@@ -258,10 +260,8 @@ def _responses(found: Findings) -> Figure:
         ("platform y to mid-span\nof link 1 [m/N]", 0, 4),
         ("platform y to y\n[m/N]", 4, 4),
     )
-    names = [link_label(sum(1 << i for i in range(3) if links[i])) for links in LINK_SETS]
-    texts = ["no link controlled" if name == "none" else f"links {name}" for name in names]
     for ax, (label, output, source) in zip(axes.flat, shown, strict=True):
-        curves = {text: size[k, :, output, source] for k, text in enumerate(texts)}
+        curves = {text: size[k, :, output, source] for k, text in enumerate(_SETS)}
         plots.response(found.responses.frequency, curves, label, ax)
     for ax in axes[-1]:
         ax.set_xlabel("frequency [Hz]")
@@ -302,7 +302,7 @@ def write_animation(found: Findings, folder: Path) -> None:
     index = np.searchsorted(runs.time, wanted - 1e-9)
     index = index[index < len(runs.time)]
     q = runs.modal[which, :, index]
-    peak = np.abs(runs.modal[which, 0, runs.time >= end, :, 0]).max()
+    peak = np.abs(runs.modal[which, 0, runs.time >= end, :, 0]).max(initial=1e-9)
     factor = float(f"{CLIP_SIZE * found.study.link.length / peak:.1g}")
     off, on = (skeleton(found.study, runs.pose[which, k, index], q[:, k], factor) for k in (0, -1))
     titles = ("without control", "three links controlled")

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from studies.atlas.platform import PlatformError, Responses, platform_error, responses
-from studies.atlas.subsets import Subsets
+from studies.atlas.subsets import Subsets, setting_label
 from studies.atlas.workspace import Map, PoseModes, map_workspace, natural_modes_at
 from studies.paper_cases import frame_of
 from studies.runs import check_run
@@ -18,6 +18,8 @@ from studies.spec import Study
 NEAR = np.radians(5.0)
 #: Of the responses [Hz].
 FREQUENCY = np.linspace(2.0, 600.0, 300)
+#: Points round each resonance, in half widths of it [1].
+_ROUND = np.linspace(-3.0, 3.0, 13)
 
 #: Says what is being done: text, then share of the work since the last call.
 Tell = Callable[[str, float], None]
@@ -35,6 +37,11 @@ class Findings(NamedTuple):
     modes: PoseModes  # at these poses
     adc_step: np.ndarray  # of one ADC step, in the deflection of mode 1 [m], (3,)
 
+    def setting(self, k: int) -> str:
+        """A setting in words, with † where a link has less than an ADC step left uncontrolled."""
+        is_small = (self.subsets.link[k, -1, 0] < self.adc_step).any()
+        return setting_label(self.subsets.setting[k]) + (" †" if is_small else "")
+
 
 def look_around(study: Study, subsets: Subsets, tell: Tell) -> Findings:
     """All of the atlas but the runs of the subsets.
@@ -49,7 +56,8 @@ def look_around(study: Study, subsets: Subsets, tell: Tell) -> Findings:
     """
     runs = platform_error(study, tell)
     tell("frequency responses", 0.0)
-    linear = responses(study, FREQUENCY)
+    own = natural_modes_at(study, [study.motion.waypoints[0]]).frequency[0]
+    linear = responses(study, _frequencies(study, own))
     tell("natural modes over the workspace", 1.0)
     chart = map_workspace(study)
     poses = np.stack([np.array(study.motion.waypoints[0]), _far_pose(chart)])
@@ -57,6 +65,14 @@ def look_around(study: Study, subsets: Subsets, tell: Tell) -> Findings:
     tell("natural modes over the workspace", 1.0)
     step = frame_of(*check_run(study)).adc_step
     return Findings(study, subsets, runs, linear, chart, poses, modes, step)
+
+
+def _frequencies(study: Study, own: np.ndarray) -> np.ndarray:
+    """FREQUENCY with enough points round each natural frequency, below half the sample rate."""
+    width = max(study.link.damping_ratio, 1e-5)
+    fine = (own[:, None] * (1 + width * _ROUND)).ravel()
+    every = np.unique(np.concatenate([FREQUENCY, fine[fine <= FREQUENCY[-1]]]))
+    return every[(every > 0) & (every < 0.45 * study.electronics.sample_rate_hz)]
 
 
 def _far_pose(chart: Map) -> np.ndarray:

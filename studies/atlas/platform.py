@@ -17,7 +17,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.kinematics import close_chain
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import LoopMatrices, closed_loop
+from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
 from studies.atlas.subsets import WINDOWS, long_enough, residual_window
 from studies.cases import powered
 from studies.paper_cases import run_batches
@@ -112,7 +112,13 @@ class Responses(NamedTuple):
     """Linearised sampled loop: effects of forces held over a sample."""
 
     frequency: np.ndarray  # [Hz], (F,)
-    value: np.ndarray  # complex, by LINK_SETS, OUTPUTS and SOURCES, (4, F, 6, 6)
+    value: np.ndarray  # complex, by LINK_SETS, OUTPUTS and SOURCES; NaN if unstable, (4, F, 6, 6)
+    radius: np.ndarray  # spectral radius of the sampled loop at the design's gains [1], (4,)
+
+    @property
+    def is_stable(self) -> np.ndarray:
+        """By LINK_SETS, (4,)."""
+        return self.radius <= 1 + RADIUS_TOLERANCE
 
 
 def responses(study: Study, frequency: np.ndarray) -> Responses:
@@ -132,11 +138,14 @@ def responses(study: Study, frequency: np.ndarray) -> Responses:
     structure, case = check_run(study)
     structure = structure._replace(n_steps=1, substeps=1, n_frequencies=1, has_noise=False)
     pose = jnp.asarray(study.motion.waypoints[0], case.electronics.period.dtype)
-    value = []
+    value, radius = [], []
     for links in LINK_SETS:
         matrices, jacobian = _linear(structure, _with_links(case, links), pose)
-        value.append(_response(matrices, jacobian, frequency / study.electronics.sample_rate_hz))
-    return Responses(frequency, np.stack(value))
+        transition = np.asarray(matrices.open + matrices.feedback)
+        radius.append(np.abs(np.linalg.eigvals(transition)).max())
+        found = _response(matrices, jacobian, frequency / study.electronics.sample_rate_hz)
+        value.append(found if radius[-1] <= 1 + RADIUS_TOLERANCE else np.nan * found)
+    return Responses(frequency, np.stack(value), np.array(radius))
 
 
 @partial(jax.jit, static_argnums=0)

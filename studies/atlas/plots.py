@@ -10,10 +10,15 @@ from matplotlib.axes import Axes
 from matplotlib.colors import TwoSlopeNorm
 
 from studies.atlas.subsets import link_label
-from studies.figures import SERIES
+from studies.figures import CONTROLLED, SERIES, WITHOUT
 
 #: Changes: blue is less vibration, orange is more.
 CHANGES = "PuOr_r"
+#: No link, one, two and three of them controlled.
+SET_STYLES: tuple[dict[str, Any], ...] = (
+    WITHOUT, {"color": SERIES[2], "linewidth": 1.2}, {"color": SERIES[3], "linewidth": 1.2},
+    CONTROLLED,
+)  # fmt: skip
 BETTER, WORSE = "#4C3F91", "#D9730D"
 
 
@@ -55,7 +60,7 @@ def change_map(
         100 * change, cmap=CHANGES, norm=TwoSlopeNorm(0, -100 * limit, 100 * limit), aspect="auto"
     )
     for (row, column), value in np.ndenumerate(100 * change):
-        is_dark = abs(value) > 65 * limit
+        is_dark = abs(value) > 50 * limit
         ax.text(
             column, row, _whole(value), ha="center", va="center", fontsize=7,
             color="white" if is_dark else "black",
@@ -190,9 +195,8 @@ def response(
         ax: where to draw; a new figure where left out.
     """
     ax = _axes(ax)
-    styles = zip(("#E69F00", *SERIES[1:3], "#0B3C6F"), (1.6, 1.1, 1.1, 0.9), strict=True)
-    for (name, curve), (color, width) in zip(curves.items(), styles, strict=False):
-        ax.semilogy(frequency, curve, color=color, linewidth=width, label=name)
+    for (name, curve), style in zip(curves.items(), SET_STYLES, strict=False):
+        ax.semilogy(frequency, curve, **{**style, "label": name})
     ax.set_ylabel(label)
     ax.margins(x=0.01)
     return ax

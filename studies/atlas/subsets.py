@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from studies.cases import as_arrays, build_case, build_structure
 from studies.errors import field_error
 from studies.paper_measures import EARLY_PART
-from studies.runs import resolved_study
+from studies.runs import preflight, resolved_study
 from studies.spec import Study
 from studies.sweeps.results import NOT_RUN, SweepData
 from studies.sweeps.spec import SweepSpec, parse_sweep
@@ -23,8 +24,6 @@ SETTINGS = tuple((time, shaper) for time in (0.1, 0.05, 0.03) for shaper in ("ei
 WINDOWS = ("whole", "late")
 #: More controlled modes have too many subsets.
 MODE_LIMIT = 3
-#: Longest shaper of the atlas [s].
-SHAPER_TIME = 0.02
 _KEPT = (
     "residual_rms", "pose_error_rms", "spectral_density", "settling_time", "peak_voltage",
 )  # fmt: skip
@@ -114,7 +113,7 @@ def atlas_sweep(
     modes = study.control.modes
     masks = _masks(modes) if has_modes else _masks(modes)[_whole_links(modes)]
     study = long_enough(study, settings).change(
-        title=f"{study.title}: subsets of controlled links and modes",
+        title=f"{study.title[:150]}: subsets of controlled links and modes",
         control__links=(True,) * 3, control__mode_mask=(),
     )  # fmt: skip
     cases = []
@@ -152,10 +151,12 @@ def residual_window(study: Study, window: str) -> tuple[float, float]:
 
 def long_enough(study: Study, settings: tuple[tuple[float, str], ...]) -> Study:
     """The study with a run that is long enough for the slowest setting and its windows."""
-    moves = len(study.motion.waypoints) - 1
-    dwell = float(np.broadcast_to(study.motion.dwell, (moves,)).sum())
-    slowest = moves * max(time for time, _ in settings) + dwell + SHAPER_TIME
-    needed = slowest + study.metrics.residual_delay + study.metrics.residual_length
+    ends = []
+    for time, shaper in settings:
+        moved = study.change(motion__move_time=time, shaper__kind=shaper)
+        known = preflight(build_structure(moved), as_arrays(build_case(moved)))
+        ends.append(float(known.motion_end + known.shaper_length))
+    needed = max(ends) + study.metrics.residual_delay + study.metrics.residual_length
     return study.change(run__duration=max(study.run.duration, float(np.ceil(100 * needed) / 100)))
 
 
@@ -166,8 +167,9 @@ def _check(study: Study) -> None:
             "control.modes", control.modes,
             f"1 to {MODE_LIMIT}, whose {2 ** (3 * MODE_LIMIT)} subsets can all be run", "1",
         )  # fmt: skip
-    if len(motion.waypoints) < 2:
-        raise field_error("motion.waypoints", motion.waypoints, "a path of two poses or more", "m")
+    if len(set(motion.waypoints)) < 2:
+        allowed = "a path of two different poses or more"
+        raise field_error("motion.waypoints", motion.waypoints, allowed, "m, m, rad")
     gains = (*control.velocity_gain, *control.position_gain)
     if control.gain_factor == 0 or not any(gains):
         name = "control.gain_factor" if control.gain_factor == 0 else "control.velocity_gain"
