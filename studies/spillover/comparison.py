@@ -46,7 +46,7 @@ class Comparison(NamedTuple):
     plant: Plant  # whose damping is told, and the basis of all
     names: tuple[str, ...]
     factor: np.ndarray  # on the gains of each law, 1: as strong on mode 1 as the design [1], (L,)
-    damping_ratio: np.ndarray  # of modes 1.., the smallest of the links [1], (L, J)
+    damping_ratio: np.ndarray  # modes 1.., smallest of the controlled links [1], (L, J)
     margin: np.ndarray  # smallest over the plants, 0 where no gains are stable [1], (L,)
     breaking: tuple[str, ...]  # what goes unstable beyond it
     residual_rms: np.ndarray  # worst station of each link [m], (L, 3)
@@ -109,6 +109,7 @@ class _View:
     ) -> None:
         self.law, maker = law, LoopMaker(found)
         self.limit, self.breaking = HIGHEST, ""
+        self._n_links = sum(found.study.control.links)
         parts = law.linear_parts
         self._parts = [(modes, maker.loop(plant, part)) for modes, part in parts]
         for _, part in parts:
@@ -125,7 +126,7 @@ class _View:
         return min(self.limit / factor, HIGHEST) if factor else 0.0
 
     def damping(self, factor: float) -> np.ndarray:
-        """Smallest damping ratio of the links, modes 1 to `SHOWN`, NaN where there is none."""
+        """Smallest damping ratio of the controlled links, modes 1 to `SHOWN`, NaN: no such mode."""
         return self._path(factor * STEPS)[-1]
 
     def fair(self, margin: float, target: float) -> float:
@@ -153,7 +154,8 @@ class _View:
         found = np.full((len(factors), SHOWN), np.nan)
         for modes, loop in self._parts:
             tracked = follow(loop, factors, loop.poles)
-            zeta = damping(loop, tracked)[1].min(axis=2)[:, :SHOWN]
+            # the three poles of a mode belong to no link, but uncontrolled links keep the weak ones
+            zeta = -np.sort(-damping(loop, tracked)[1][:, :SHOWN], axis=2)[..., self._n_links - 1]
             found[:, : zeta.shape[1]][:, modes] = zeta[:, modes]
         return found
 

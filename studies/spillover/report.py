@@ -192,17 +192,21 @@ def _laws(laws: Comparison) -> list[str]:
         "law", "factor", *modes, "margin", "broken by", "residual rms of links 1 / 2 / 3 [µm]",
         "of no control", "peak [V]", "energy [V² s]", "run",
     )  # fmt: skip
-    time = laws.study.motion.move_time
+    motion = "the study's own start, without a move"
+    if len(laws.study.motion.waypoints) > 1:
+        motion = (
+            f"the design's first move in {laws.study.motion.move_time:.3g} s (as fast as "
+            f"{1e3 * FAST[0]:g} mm in {FAST[1]:g} s), no shaper"
+        )
     return [
         "## Laws", "",
         "The same machine, patches, electronics and controlled modes. Factor 1 is the design's own "
         "damping constant of mode 1. Each law has the largest factor that leaves a margin of "
         f"{laws.required:g} on the design's own plants ({laws.plant.basis}, patches as believed), "
         f'but no more than damps mode 1 as "{GIVEN}" does, or as well as it can. Damping ratios: '
-        f"the smallest of the links with {laws.plant.n_modes} modes a link. Run: the design's "
-        f"first move, nonlinear, in {time:.3g} s (as fast as {1e3 * FAST[0]:g} mm in {FAST[1]:g} "
-        f"s), no shaper; residual over {WINDOW:g} s from {SETTLING:g} s after the command on, when "
-        "the drives have nearly settled.", "",
+        f"the smallest of the controlled links with {laws.plant.n_modes} modes a link. Run, "
+        f"nonlinear: {motion}; residual over {WINDOW:g} s from {SETTLING:g} s after the command "
+        "on, when the drives have nearly settled.", "",
         *table(names, rows), "",
         picture("laws.png", "Residual vibration of the laws"), "",
         *(f"- {note}" for note in _LAW_NOTES),
