@@ -15,7 +15,17 @@ def test_there_are_notebooks():
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+#: Minutes of compiling; in short: the same functions in test_tuning and test_tuning_folder.
+LONG = "4_gradient_tuning"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, marks=[pytest.mark.long] if path.stem == LONG else [], id=path.stem)
+        for path in NOTEBOOKS
+    ],
+)
 def test_notebook_is_stripped_and_runs(path):
     notebook = nbformat.read(path, as_version=4)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]

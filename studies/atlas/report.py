@@ -130,8 +130,8 @@ def _table_1(found: Findings) -> list[str]:
         + (", all of them further than the paper's: the gains add more damping here "
            "(docs/theory.md). " if deeper else ". ")
         + f"Signs of the uncontrolled ones agree in {int(signs.agree[:, ~on].sum())} of "
-        f"{signs.agree[:, ~on].size} cases. Ours change by up to {100 * largest:.0f} %, the paper's "
-        f"by {100 * np.abs(paper[~on]).max():.1f} %.",
+        f"{signs.agree[:, ~on].size} cases. Ours change by up to {100 * largest:.0f} %, "
+        f"the paper's by {100 * np.abs(paper[~on]).max():.1f} %.",
     ]  # fmt: skip
 
 
@@ -172,7 +172,7 @@ def _more_links(found: Findings) -> list[str]:
 
 
 def _at_drive(found: Findings) -> str:
-    """What control does to link 1 at the lowest mode that is mostly the drive's, if it can be said."""
+    """What control does to link 1 at the drive's lowest mode, if it can be said."""
     share, frequency = found.modes.share[0, :, 3], found.modes.frequency[0]
     at_drive = frequency[share > 0.5]
     if not len(at_drive) or not found.responses.is_stable[[0, -1]].all():
@@ -198,9 +198,9 @@ def _halved(found: Findings) -> list[str]:
         *table(("setting", *(f"{w}: links {', '.join(halved.labels)}" for w in WINDOWS)), rows),
         "",
         f"Late: {_verdict(int(np.sum(late < -0.5)), late.size).lower()}, in "
-        f"{int(np.sum(late < -0.5))} of {late.size} cases (changes of {span(100 * late, '.0f')} %). "
+        f"{int(np.sum(late < -0.5))} of {late.size} cases (by {span(100 * late, '.0f')} %). "
         f"Whole window: {_verdict(int(np.sum(whole < -0.5)), whole.size).lower()}, in "
-        f"{int(np.sum(whole < -0.5))} of {whole.size} (changes of {span(100 * whole, '.2g')} %).",
+        f"{int(np.sum(whole < -0.5))} of {whole.size} (by {span(100 * whole, '.2g')} %).",
     ]  # fmt: skip
 
 
@@ -258,7 +258,8 @@ def _workspace(found: Findings) -> list[str]:
         f"At φ = {np.degrees(chart.phi[turn]):.0f}° the lowest mode lies at "
         f"{_reach(chart.frequency[turn, ..., 0])} Hz, the three first bending modes at "
         f"{_reach(chart.bending[turn])} Hz, {_reach(spread)} % apart; coupling of two links' first "
-        f"modes through platform and sliders is {_reach(coupling, '.2f')} %. Left alone, energy would go from link to link and back in "
+        f"modes through platform and sliders is {_reach(coupling, '.2f')} %. "
+        "Left alone, energy would go from link to link and back in "
         f"{_beat(modes.frequency[0], modes.order_share[0])} s; {_decay(found)}.", "",
         *_figure("workspace"), *_figure("participation"), *_figure("modes"),
     ]  # fmt: skip
