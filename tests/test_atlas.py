@@ -28,7 +28,7 @@ def small_study(**fields):
     """One move, one controlled mode."""
     home = paper_study().motion.waypoints[0]
     return paper_study().change(
-        link__modes=2, control__modes=1, control__ratio_source="own_run", run__duration=0.13,
+        link__modes=2, control__modes=1, control__ratio_source="own_run", run__duration=0.18,
         metrics__residual_length=0.06, motion__move_time=0.05,
         motion__waypoints=(home, (0.0, 0.01, home[2])),
     ).change(**fields)  # fmt: skip
