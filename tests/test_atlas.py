@@ -254,6 +254,14 @@ def test_settings_with_failed_runs_are_left_out_in_words():
         run.sound_settings(twice)
 
 
+def test_atlas_leaves_a_folder_of_something_else_alone(tmp_path):
+    mine = tmp_path / "report.html"
+    mine.write_text("mine")
+    with pytest.raises(StudyError, match="holds other files"):
+        run.run_atlas(small_study(), tmp_path, False, Console(file=io.StringIO()))
+    assert mine.read_text() == "mine"
+
+
 def test_atlas_goes_on_after_an_interrupt_and_refuses_to_start_over(atlas, tmp_path):
     folder = atlas[0]
     assert studies.load(folder / run.RUNS_FOLDER).is_finished.all()

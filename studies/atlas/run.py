@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from jaxmodel import status
 from studies import config
 from studies.atlas.attribution import interaction, shapley
 from studies.atlas.figures import FIGURES, write_animation
-from studies.atlas.findings import Findings, look_around
+from studies.atlas.findings import Findings, Tell, look_around
 from studies.atlas.platform import LINK_SETS
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.report import report
@@ -33,10 +34,13 @@ from studies.pages import write_report
 from studies.runs import run_attributes
 from studies.spec import Study
 from studies.store import Variable, staged, write_store
+from studies.sweeps.folder import locked_folder, refuse_others
 from studies.sweeps.results import load
 from studies.sweeps.run import run_sweep
 
 DATA, RUNS_FOLDER = "atlas.h5", "runs"
+#: What an end at a bad moment may leave behind.
+_LEFTOVER = re.compile(r"\.unfinished-.*")
 
 
 def run_atlas(
@@ -58,14 +62,25 @@ def run_atlas(
         StudyError: a fault of the design or of the folder; no setting in which all cases run.
     """
     config.require_configured()
-    spec = atlas_sweep(study)
-    if run_sweep(spec, out / RUNS_FOLDER, is_resumed, console, is_quiet).is_interrupted:
-        return False
+    with locked_folder(out, "atlas"):
+        if not (out / RUNS_FOLDER).is_dir():
+            refuse_others(out, _LEFTOVER)
+        spec = atlas_sweep(study)
+        if run_sweep(spec, out / RUNS_FOLDER, is_resumed, console, is_quiet).is_interrupted:
+            return False
+        _finish(study, out, (lambda text, share: None) if is_quiet else _teller(console))
+    return True
 
+
+def _teller(console: Console) -> Tell:
     def tell(text: str, share: float) -> None:
-        if not is_quiet:
-            console.print(text, soft_wrap=True)
+        console.print(text, soft_wrap=True)
 
+    return tell
+
+
+def _finish(study: Study, out: Path, tell: Tell) -> None:
+    """Everything after the runs of the subsets."""
     subsets, dropped = sound_settings(read_subsets(load(out / RUNS_FOLDER)))
     with threadpool_limits(1, "blas"):  # many small matrices: more threads only get in the way
         found = look_around(study, subsets, tell)
@@ -80,7 +95,6 @@ def run_atlas(
             write_report(staging, report(found, dropped), study)
     except OSError as error:
         raise StudyError(f"--out {out}: cannot write there ({error})") from error
-    return True
 
 
 def sound_settings(subsets: Subsets) -> tuple[Subsets, list[str]]:
