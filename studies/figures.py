@@ -76,7 +76,8 @@ def write_figure(figure: Figure, path: Path) -> None:
         figure.savefig(temporary, format=path.suffix[1:])
 
 
-def _axes(ax: Axes | None) -> Axes:
+def axes_or_new(ax: Axes | None) -> Axes:
+    """The axes to draw on: those given, or new ones."""
     return plt.subplots(layout="constrained")[1] if ax is None else ax
 
 
@@ -92,7 +93,7 @@ def traces(
         label: quantity and unit of the ordinate.
         ax: where to draw; a new figure where left out.
     """
-    ax = _axes(ax)
+    ax = axes_or_new(ax)
     for k, curve in enumerate(values.T):
         ax.plot(
             time, curve, color=SERIES[k % len(SERIES)], linestyle=DASHES[k % len(DASHES)],
@@ -119,7 +120,7 @@ def comparison(
         label: quantity and unit of the ordinate.
         ax: where to draw; a new figure where left out.
     """
-    ax = _axes(ax)
+    ax = axes_or_new(ax)
     ax.plot(time, without, **WITHOUT)
     ax.plot(time, controlled, **CONTROLLED)
     ax.set_ylabel(label)
@@ -169,7 +170,7 @@ def spectrum(
         label: quantity and unit of the ordinate.
         ax: where to draw; a new figure where left out.
     """
-    ax = _axes(ax)
+    ax = axes_or_new(ax)
     ax.axvline(mode_hz, color="#888888", linewidth=0.8, linestyle=":")
     ax.semilogy(frequency[1:], without[1:], **WITHOUT)
     if controlled is not None:
@@ -190,7 +191,7 @@ def sensitivity(
         level: tolerated residual vibration, marked [1].
         ax: where to draw; a new figure where left out.
     """
-    ax = _axes(ax)
+    ax = axes_or_new(ax)
     ax.axhline(100 * level, color="#888888", linewidth=0.8, linestyle=":")
     for k, (name, curve) in enumerate(curves.items()):
         ax.plot(ratio, 100 * curve, color=SERIES[k], linestyle=DASHES[k], linewidth=1.3, label=name)

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
@@ -19,7 +18,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.dynamics import modal_chain
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
-from studies.figures import SERIES, styled
+from studies.figures import SERIES, axes_or_new, styled
 from studies.runs import check_run
 from studies.spec import Study
 
@@ -101,7 +100,7 @@ def draw_machine(
         color: of links and platform.
         alpha: opacity [1].
     """
-    ax = plt.subplots(layout="constrained")[1] if ax is None else ax
+    ax = axes_or_new(ax)
     for start, end in parts.guide:
         ax.plot(*zip(1e3 * start, 1e3 * end, strict=True), color="#AAAAAA", linewidth=2.5, zorder=0)
     ax.fill(*(1e3 * parts.joint[k].T), color=color, alpha=0.25 * alpha, linewidth=0)

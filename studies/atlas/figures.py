@@ -28,6 +28,8 @@ ANIMATION = "machine.gif"
 
 #: LINK_SETS in words.
 _SETS = ("no link controlled", "link 1", "links 1+2", "links 1+2+3")
+#: Components of the platform's error.
+_ERRORS = ("x [nm]", "y [nm]", "φ [nrad]")
 _COLUMNS = ["link 1", "link 2", "link 3", "platform"]
 
 
@@ -215,9 +217,9 @@ def _platform(found: Findings) -> Figure:
                 runs.time, 1e6 * runs.drive[column, :, k], color=SERIES[k], linewidth=1.0,
                 linestyle=("-", "--")[k], label=name,
             )  # fmt: skip
-        for k, (label, unit) in enumerate((("x [nm]", 1e9), ("y [nm]", 1e9), ("φ [nrad]", 1e9))):
+        for k, label in enumerate(_ERRORS):
             ax = axes[k + 1, column]
-            error = unit * runs.vibration[column, :, :, k]
+            error = 1e9 * runs.vibration[column, :, :, k]
             comparison(runs.time, error[0], error[-1], f"vibration error\n{label}", ax)
             ax.axvline(runs.command_end[column], color="#888888", linewidth=0.8, linestyle=":")
         axes[3, column].set_xlabel("time [s]")
@@ -236,7 +238,7 @@ def _vibration_after(found: Findings) -> Figure:
         end = runs.command_end[column]
         part = (runs.time >= end) & (runs.time <= end + 0.15)
         late = (runs.time >= end + 0.04) & part
-        for k, label in enumerate(("x [nm]", "y [nm]", "φ [nrad]")):
+        for k, label in enumerate(_ERRORS):
             ax = axes[k, column]
             error = 1e9 * runs.vibration[column, :, :, k]
             for text, one, style in zip(_SETS, error, plots.SET_STYLES, strict=True):

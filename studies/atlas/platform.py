@@ -18,7 +18,7 @@ from jaxmodel.kinematics import close_chain
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
-from studies.atlas.subsets import WINDOWS, long_enough, residual_window
+from studies.atlas.subsets import WINDOWS, link_label, long_enough, residual_window
 from studies.cases import powered
 from studies.paper_cases import run_batches
 from studies.runs import check_run, resolved_study, with_ratio
@@ -26,6 +26,8 @@ from studies.spec import Study
 
 #: Controlled links of the paper's cases.
 LINK_SETS = ((False, False, False), (True, False, False), (True, True, False), (True, True, True))
+#: The same in short: "none", "1", "1+2", "1+2+3".
+LINK_LABELS = tuple(link_label(sum(1 << i for i in range(3) if links[i])) for links in LINK_SETS)
 #: Move time [s] and shaper of the runs: the paper's, and a fast move without shaper.
 SETTINGS = ((0.1, "ei"), (0.05, "none"))
 #: Forces of `Responses`, in order.
@@ -143,7 +145,9 @@ def responses(study: Study, frequency: np.ndarray) -> Responses:
         matrices, jacobian = _linear(structure, _with_links(case, links), pose)
         transition = np.asarray(matrices.open + matrices.feedback)
         radius.append(np.abs(np.linalg.eigvals(transition)).max())
-        found = _response(matrices, jacobian, frequency / study.electronics.sample_rate_hz)
+        found = _response(
+            matrices, transition, jacobian, frequency / study.electronics.sample_rate_hz
+        )
         value.append(found if radius[-1] <= 1 + RADIUS_TOLERANCE else np.nan * found)
     return Responses(frequency, np.stack(value), np.array(radius))
 
@@ -157,9 +161,10 @@ def _linear(structure: Structure, case: Case, pose: Array) -> tuple[LoopMatrices
     return closed_loop(structure, case, pose), known
 
 
-def _response(matrices: LoopMatrices, jacobian: Array, share: np.ndarray) -> np.ndarray:
+def _response(
+    matrices: LoopMatrices, transition: np.ndarray, jacobian: Array, share: np.ndarray
+) -> np.ndarray:
     """C (z - M)^-1 B for frequencies as shares of the sample rate, (F, 6, 6)."""
-    transition = np.asarray(matrices.open + matrices.feedback)
     force = np.asarray(matrices.force)
     jacobian = np.asarray(jacobian)
     platform = force @ (np.linalg.inv(jacobian).T if np.isfinite(jacobian).all() else jacobian)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import TwoSlopeNorm
 
 from studies.atlas.subsets import link_label
-from studies.figures import CONTROLLED, SERIES, WITHOUT
+from studies.figures import CONTROLLED, SERIES, WITHOUT, axes_or_new
 
 #: Changes: blue is less vibration, orange is more.
 CHANGES = "PuOr_r"
@@ -20,10 +19,6 @@ SET_STYLES: tuple[dict[str, Any], ...] = (
     CONTROLLED,
 )  # fmt: skip
 BETTER, WORSE = "#4C3F91", "#D9730D"
-
-
-def _axes(ax: Axes | None) -> Axes:
-    return plt.subplots(layout="constrained")[1] if ax is None else ax
 
 
 def length_text(value: float) -> str:
@@ -38,11 +33,7 @@ def _whole(value: float, sign: str = "+") -> str:
 
 
 def change_map(
-    change: np.ndarray,
-    rows: list[str],
-    columns: list[str],
-    ax: Axes | None = None,
-    limit: float = 1.0,
+    change: np.ndarray, rows: list[str], columns: list[str], ax: Axes | None = None
 ) -> Any:
     """Changes as a map of numbers.
 
@@ -50,17 +41,15 @@ def change_map(
         change: relative change [1], (rows, columns).
         rows, columns: their names.
         ax: where to draw; a new figure where left out.
-        limit: change of the full colour [1].
 
     Returns:
         The image, for a colour bar.
     """
-    ax = _axes(ax)
-    image = ax.imshow(
-        100 * change, cmap=CHANGES, norm=TwoSlopeNorm(0, -100 * limit, 100 * limit), aspect="auto"
-    )
+    ax = axes_or_new(ax)
+    norm = TwoSlopeNorm(0, -100, 100)
+    image = ax.imshow(100 * change, cmap=CHANGES, norm=norm, aspect="auto")
     for (row, column), value in np.ndenumerate(100 * change):
-        is_dark = abs(value) > 50 * limit
+        is_dark = abs(value) > 50
         ax.text(
             column, row, _whole(value), ha="center", va="center", fontsize=7,
             color="white" if is_dark else "black",
@@ -79,7 +68,7 @@ def lattice(residual: np.ndarray, ax: Axes | None = None) -> Axes:
         residual: of each choice, bit i is link i [m], (8,).
         ax: where to draw; a new figure where left out.
     """
-    ax = _axes(ax)
+    ax = axes_or_new(ax)
     place = {
         0: (0, 1), 1: (1, 2), 2: (1, 1), 4: (1, 0), 3: (2, 2), 5: (2, 1), 6: (2, 0), 7: (3, 1),
     }  # fmt: skip
@@ -113,7 +102,7 @@ def share_map(share: np.ndarray, ax: Axes | None = None) -> Axes:
         ax: where to draw; a new figure where left out.
     """
     modes = [f"mode {j + 1}" for j in range(share.shape[1])]
-    ax = _axes(ax)
+    ax = axes_or_new(ax)
     change_map(-share, [f"link {i + 1}" for i in range(3)], modes, ax)
     for text, value in zip(ax.texts, 100 * share.ravel(), strict=True):
         text.set_text(_whole(value, "-"))
@@ -132,7 +121,7 @@ def interaction_map(index: np.ndarray, labels: list[str], limit: float, ax: Axes
     Returns:
         The image, for a colour bar.
     """
-    ax = _axes(ax)
+    ax = axes_or_new(ax)
     norm = TwoSlopeNorm(0, -100 * limit, 100 * limit)
     image = ax.imshow(100 * index, cmap=CHANGES.removesuffix("_r"), norm=norm)
     ax.set_xticks(range(len(labels)), labels, rotation=90, fontsize=7)
@@ -165,7 +154,7 @@ def workspace_map(
     Returns:
         The image, for a colour bar.
     """
-    ax = _axes(ax)
+    ax = axes_or_new(ax)
     low, high = limits or (float(np.nanmin(value)), float(np.nanmax(value)))
     image = ax.pcolormesh(
         1e3 * x, 1e3 * y, value, cmap="cividis", vmin=low, vmax=high, rasterized=True
@@ -194,7 +183,7 @@ def response(
         label: quantity and unit of the ordinate.
         ax: where to draw; a new figure where left out.
     """
-    ax = _axes(ax)
+    ax = axes_or_new(ax)
     for (name, curve), style in zip(curves.items(), SET_STYLES, strict=False):
         ax.semilogy(frequency, curve, **{**style, "label": name})
     ax.set_ylabel(label)

@@ -8,7 +8,7 @@ from studies.atlas.attribution import shapley
 from studies.atlas.claims import NO_CHANGE, one_more_link, table_1_signs, two_links
 from studies.atlas.figures import ANIMATION, FIGURES
 from studies.atlas.findings import Findings
-from studies.atlas.platform import LINK_SETS, OUTPUTS
+from studies.atlas.platform import LINK_LABELS, OUTPUTS
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.plots import length_text
 from studies.atlas.subsets import TARGETS, WINDOWS, link_label, setting_label
@@ -71,15 +71,12 @@ def _stability(found: Findings) -> list[str]:
         return ["The linearised sampled loop is stable at the path's first pose with no link, link "
                 f"1, links 1 and 2, and all links controlled (spectral radius {radius.max():.5f} "
                 "at most)."]  # fmt: skip
-    bad = [name for name, fine in zip(_sets(), found.responses.is_stable, strict=True) if not fine]
+    bad = [
+        name for name, fine in zip(LINK_LABELS, found.responses.is_stable, strict=True) if not fine
+    ]
     return [f"**Unstable**: the linearised sampled loop with controlled links {', '.join(bad)} "
             f"(spectral radius {radius.max():.5f}). Runs stay bounded by the actuators' limit; "
             "what follows describes limit cycles, not a design to use."]  # fmt: skip
-
-
-def _sets() -> list[str]:
-    """LINK_SETS in short."""
-    return [link_label(sum(1 << i for i in range(3) if links[i])) for links in LINK_SETS]
 
 
 def _verdict(kept: int, count: int) -> str:
@@ -292,10 +289,9 @@ def _decay(found: Findings) -> str:
 def _platform(found: Findings) -> list[str]:
     runs = found.platform
     drive, vibration = runs.rms(runs.drive), runs.rms(runs.vibration)
-    names = _sets()
     rows = []
     for k, setting in enumerate(RUNS):
-        for name, one in (("drive", drive[k]), *zip(names, vibration[k], strict=True)):
+        for name, one in (("drive", drive[k]), *zip(LINK_LABELS, vibration[k], strict=True)):
             what = "drive error" if name == "drive" else f"vibration error, controlled: {name}"
             size = np.hypot(one[:, 0], one[:, 1])
             cells = (f"{1e9 * x:.3g}" for x in (*size, *one[:, 2]))
@@ -319,7 +315,7 @@ def _platform(found: Findings) -> list[str]:
         *_figure("platform"), *_figure("vibration"),
         "Largest values of the frequency responses to forces on slider and platform [m/N], sampled "
         "loop linearised at the path's first pose:", "",
-        *table(("from, to", *(f"controlled: {name}" for name in names)), fall), "",
+        *table(("from, to", *(f"controlled: {name}" for name in LINK_LABELS)), fall), "",
         "A dash: the loop is unstable, or a force on the platform bends the links at once, for "
         "which there is no number here.", "",
         *_figure("responses"),

@@ -14,7 +14,7 @@ from studies import config
 from studies.atlas.attribution import interaction, shapley
 from studies.atlas.figures import FIGURES, write_animation
 from studies.atlas.findings import Findings, Tell, look_around
-from studies.atlas.platform import LINK_SETS
+from studies.atlas.platform import LINK_LABELS
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.report import report
 from studies.atlas.subsets import (
@@ -207,11 +207,10 @@ def _map_variables(found: Findings) -> dict[str, Variable]:
 
 def _run_variables(found: Findings) -> dict[str, Variable]:
     runs, answers = found.platform, found.responses
-    sets = [link_label(sum(1 << i for i in range(3) if links[i])) for links in LINK_SETS]
     series = ("run", "run_links", "time", "pose_axis")
     return {
         "run": _names([setting_label(s) for s in RUNS], "run", "move, shaper"),
-        "run_links": _names(sets, "run_links", "controlled links"),
+        "run_links": _names(list(LINK_LABELS), "run_links", "controlled links"),
         "time": Variable(runs.time, ("time",), "s", "time"),
         "command_end": Variable(runs.command_end, ("run",), "s", "end of the shaped command"),
         "drive_error": Variable(

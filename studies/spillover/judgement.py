@@ -32,11 +32,6 @@ class Judgement(NamedTuple):
     weakest: str  # the mode of least damping
     breaking: str  # what goes unstable first, "" where nothing does up to `HIGHEST`
 
-    @property
-    def is_stable(self) -> bool:
-        """Whether this loop and every one with smaller gains is stable."""
-        return self.radius <= 1 + RADIUS_TOLERANCE and self.margin >= 1
-
 
 def judge(loop: SampledLoop) -> Judgement:
     """Judge a loop.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -19,11 +18,6 @@ from studies.spillover.judgement import HIGHEST, LOWEST
 FLOOR = 0.01
 
 
-def _own(ax: Axes | None) -> Axes:
-    """The axes to draw on: those given, or new ones."""
-    return plt.subplots(layout="constrained")[1] if ax is None else ax
-
-
 def _plain_ticks(axis: Axis) -> None:
     """Plain numbers on a logarithmic axis, few enough to read."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -38,7 +32,7 @@ def margins(found: Certificate, ax: Axes | None = None) -> Axes:
         found: the certificate.
         ax: where to draw; a new figure where left out.
     """
-    ax = _own(ax)
+    ax = figures.axes_or_new(ax)
     for b, color, dash in zip(
         range(len(found.plants)), figures.SERIES, figures.DASHES, strict=False
     ):
@@ -76,7 +70,7 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
         found: the certificate.
         ax: where to draw; a new figure where left out.
     """
-    ax = _own(ax)
+    ax = figures.axes_or_new(ax)
     structural = found.study.link.damping_ratio
     frequency, zeta = found.frequency_hz[:, :, :, -1], found.damping_ratio[:, :, :, -1]
     for b, color, marker in zip(range(len(frequency)), figures.SERIES, "osD^v", strict=False):
@@ -123,7 +117,7 @@ def leakage_map(
         title: of the panel.
         ax: where to draw; a new figure where left out.
     """
-    ax = _own(ax)
+    ax = figures.axes_or_new(ax)
     channels, modes = factor.shape
     shown = np.where(factor >= FLOOR, factor, np.nan)
     edges = [np.arange(n + 1) + 0.5 for n in (modes, channels)]
@@ -163,7 +157,7 @@ def law_bars(found: Comparison, ax: Axes | None = None) -> Axes:
         found: the comparison.
         ax: where to draw; a new figure where left out.
     """
-    ax = _own(ax)
+    ax = figures.axes_or_new(ax)
     rows = np.arange(len(found.names))
     height = 0.25
     for i in range(3):
