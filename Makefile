@@ -15,7 +15,7 @@ help:  ## this list
 study: .venv/installed  ## run the study of the paper and a sweep of patch placements
 	$(BIN)/studies paper --out results/paper
 	rm -rf results/placement
-	$(BIN)/studies sweep placement --out results/placement
+	$(BIN)/studies sweep placement --out results/placement --report
 	$(BIN)/studies best results/placement --by residual_rms --count 5
 	$(BIN)/studies plot results/placement --out results/placement/best.png
 

@@ -15,7 +15,7 @@ from jaxmodel.loop import step
 from jaxmodel.parameters import HOME, Machine, paper_machine
 from jaxmodel.plant import build_plant
 from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import closed_loop, loop_report
+from jaxmodel.sampled_loop import closed_loop
 from jaxmodel.simulate import Result, command, simulate
 
 __all__ = [
@@ -37,7 +37,6 @@ __all__ = [
     "inverse_kinematics",
     "kinetic_energy",
     "linearise",
-    "loop_report",
     "natural_modes",
     "paper_machine",
     "pole_placement",

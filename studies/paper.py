@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 
+from studies.batches import Tell
 from studies.errors import StudyError
 from studies.pages import write_report
 from studies.paper_cases import (
@@ -21,7 +22,6 @@ from studies.paper_cases import (
     MOVES,
     PaperCase,
     PaperRuns,
-    Tell,
     paper_cases,
     run_cases,
     work_of,

@@ -7,7 +7,6 @@ only, so one program, compiled once for a fixed number of cases, runs them all.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
@@ -20,16 +19,15 @@ from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.loop import Record
 from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import LoopReport, loop_report
-from jaxmodel.simulate import Result, simulate
+from jaxmodel.simulate import Result
+from studies.batches import BATCH, Tell, run_batches
 from studies.runs import check_run, judged_status, run_study
 from studies.spec import Flags, Study
+from studies.stability import LoopReport, loop_report
 
 #: How they run. A kernel would take longer to trace than the scan takes for the few cases there are
 #: (docs/performance.md).
 EXECUTOR = "XLA scan, with trajectories"
-#: Cases per call of the compiled program; the last batch is filled up with copies.
-BATCH = 8
 #: The paper's move and a faster one that leaves something to suppress [s].
 MOVES = {"paper": 0.1, "fast": 0.05}
 SHAPERS = ("ei", "none")
@@ -40,9 +38,6 @@ PAPER_RATIOS = ((1.0, 0.345, 0.045), (1.0, 0.304, 0.041), (1.0, 0.321, 0.038))
 FIRST_MODE = ((1.0, 0.0, 0.0),) * 3
 #: Structural damping that would explain the decay the paper sees without control [1].
 HIGH_DAMPING = 0.05
-
-#: Says what is running: text, then share of the work since the last call.
-Tell = Callable[[str, float], None]
 
 
 class PaperCase(NamedTuple):
@@ -179,24 +174,6 @@ def build_paper_case(
     structure, arrays = check_run(case_study(base, case, ratio))
     count = jnp.asarray(case.modes, arrays.control.n_active.dtype)
     return structure, arrays._replace(control=arrays.control._replace(n_active=count))
-
-
-@partial(jax.jit, static_argnums=0)
-def _simulate_batch(structure: Structure, cases: Case) -> Result:
-    return jax.vmap(lambda case: simulate(structure, case, True))(cases)
-
-
-def run_batches(structure: Structure, cases: list[Case], tell: Tell) -> Result:
-    """Run cases of one structure, BATCH at a time, with trajectories; arrays are NumPy's."""
-    parts = []
-    for start in range(0, len(cases), BATCH):
-        batch = cases[start : start + BATCH]
-        tell(f"simulating {len(batch)} cases", 0.0)
-        filled = batch + [batch[-1]] * (BATCH - len(batch))
-        result = _simulate_batch(structure, jax.tree.map(lambda *x: jnp.stack(x), *filled))
-        parts.append(jax.tree.map(lambda x: np.asarray(x)[: len(batch)], result))  # noqa: B023
-        tell(f"simulated {len(batch)} cases", 1.0)
-    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
 def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:

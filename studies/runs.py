@@ -28,7 +28,6 @@ from jaxmodel.prepare import (
     prepare,
     spectrum_frequencies,
 )  # fmt: skip
-from jaxmodel.sampled_loop import LoopReport, loop_report
 from jaxmodel.shaper import Taps, last_sample
 from jaxmodel.simulate import Result, simulate
 from studies import config
@@ -36,6 +35,7 @@ from studies.cases import as_arrays, build_case, build_structure, powered
 from studies.consistency import check_locked
 from studies.errors import field_error
 from studies.spec import Study
+from studies.stability import LoopReport, loop_report
 from studies.store import Variable
 
 #: More plant steps per sample than this are refused.

@@ -4,6 +4,7 @@ import io
 from functools import partial
 from itertools import permutations
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from studies.modes import machine_modes
 from studies.runs import run_study
 from studies.spec import paper_study
 from tests.pages import Page
+from tests.test_cli import run as command
 
 SETTINGS = ((0.05, "ei"), (0.03, "none"))
 
@@ -268,3 +270,13 @@ def test_atlas_goes_on_after_an_interrupt_and_refuses_to_start_over(atlas, tmp_p
     with pytest.raises(StudyError, match="add --resume"):
         run.run_atlas(small_study(), folder, False, Console(file=io.StringIO()))
     assert Path(folder / "report.md").is_file()
+
+
+def test_an_interrupted_drawing_says_how_to_go_on(tmp_path, monkeypatch, capsys):
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run, "run_sweep", lambda *arguments: SimpleNamespace(is_interrupted=False))
+    monkeypatch.setattr(run, "_finish", stop)
+    code, _, err = command(capsys, "atlas", "--out", tmp_path / "out")
+    assert code == 130 and f"go on with --resume --out {tmp_path / 'out'}" in err

@@ -13,8 +13,6 @@ from jaxmodel.parameters import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import (
     closed_loop,
-    gain_margin,
-    loop_report,
     slowest_decay,
     spillover,
     summed_squares,
@@ -22,6 +20,7 @@ from jaxmodel.sampled_loop import (
 from jaxmodel.simulate import simulate
 from studies.cases import as_arrays, build_case, build_structure
 from studies.spec import paper_study
+from studies.stability import LOWEST, gain_margin, loop_report
 
 STUDY = paper_study()
 HOME_POSE = np.array(HOME)
@@ -126,9 +125,20 @@ def test_gain_margin_stops_at_the_first_unstable_gap():
     def poles(factor):  # stable again above 3: a conditional margin does not count
         return np.array([0.5, 1.5 if 2 < factor < 3 else 0.9])
 
-    np.testing.assert_allclose(gain_margin(poles), 2, rtol=2e-4)
-    assert gain_margin(lambda factor: np.array([0.9])) == 64
+    np.testing.assert_allclose(gain_margin(poles), 2, rtol=1e-4)
+
+
+def test_gain_margin_of_known_poles():
+    def poles(factor):
+        return np.array([0.5, 0.9 + 0.1 * factor / 0.37])
+
+    for first in (None, np.array([0.2, 0.6, 1.0])):
+        np.testing.assert_allclose(gain_margin(poles, first), 0.37, rtol=1e-4)
     assert gain_margin(lambda factor: np.array([1.1])) == 0
+    assert gain_margin(lambda factor: np.array([0.9])) == 64
+    assert gain_margin(lambda factor: np.array([0.9]), highest=3.0) == 3
+    found = gain_margin(lambda factor: np.array([0.99 + factor]), np.array([0.5]))
+    np.testing.assert_allclose(found, LOWEST, rtol=1e-4)
 
 
 # --- ideal feedback: units and limits of the gains ------------------------------------------------

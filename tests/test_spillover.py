@@ -13,7 +13,6 @@ from jaxmodel.control import optimal_gains
 from jaxmodel.controller import ControllerState, controller_step, rest_controller, strongest
 from jaxmodel.estimator import measurement_chain
 from jaxmodel.ppf import HIGHEST_RATIO, design_position_filter
-from jaxmodel.sampled_loop import gain_margin, loop_report
 from studies.cases import as_arrays, build_case, build_structure
 from studies.errors import StudyError
 from studies.export.controller import fixed_controller
@@ -21,9 +20,9 @@ from studies.runs import run_study
 from studies.spec import paper_study
 from studies.spillover import certify, compare_laws
 from studies.spillover import run as spillover_run
-from studies.spillover.judgement import LOWEST, gain_limit
 from studies.spillover.laws import all_laws
 from studies.spillover.plants import LoopMaker, Plant, all_plants, widened
+from studies.stability import loop_report
 from studies.template import study_template
 from tests.pages import parsed
 from tests.test_cli import refused, run
@@ -143,21 +142,6 @@ def test_plants_that_do_not_exist_are_left_out():
     maker = LoopMaker(fixed_controller(STUDY)._replace(study=locked))
     plants = all_plants(("pinned_free", "loaded"), (3,), (1.0,)).ravel()
     assert "locked" in maker.fault(plants[0]) and maker.fault(plants[1]) == ""
-
-
-def test_gain_limit_is_the_gain_margin():
-    """Of a loop with one frequency only, unstable above a known gain."""
-
-    def poles(factor):
-        return np.array([0.5, 0.9 + 0.1 * factor / 0.37])
-
-    for first in (None, np.array([0.2, 0.6, 1.0])):
-        np.testing.assert_allclose(gain_limit(poles, first), 0.37, rtol=1e-4)
-    np.testing.assert_allclose(gain_limit(poles), gain_margin(poles), rtol=2e-4)
-    assert gain_limit(lambda factor: np.array([1.1])) == 0
-    assert gain_limit(lambda factor: np.array([0.9]), highest=3.0) == 3
-    found = gain_limit(lambda factor: np.array([0.99 + factor]), np.array([0.5]))
-    np.testing.assert_allclose(found, LOWEST, rtol=1e-4)
 
 
 # --- laws -----------------------------------------------------------------------------------------

@@ -114,6 +114,17 @@ def draw_machine(
     return ax
 
 
+def number_links(parts: Skeleton, k: int, ax: Axes) -> None:
+    """Link numbers beside the sliders, on the side away from the machine."""
+    away = parts.slider[k] - parts.joint[k].mean(axis=0)
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    for i, (slider, side) in enumerate(zip(parts.slider[k], away, strict=True)):
+        ax.annotate(
+            str(i + 1), 1e3 * slider, 10 * side, textcoords="offset points", fontsize=8,
+            ha="center", va="center",
+        )  # fmt: skip
+
+
 def mode_skeleton(study: Study, pose: np.ndarray, shape: np.ndarray) -> Skeleton:
     """A natural mode at its two turning points and at rest, drawn large.
 
@@ -135,6 +146,7 @@ def mode_skeleton(study: Study, pose: np.ndarray, shape: np.ndarray) -> Skeleton
 def draw_mode(parts: Skeleton, ax: Axes | None = None) -> Axes:
     """A `mode_skeleton`: at rest pale, at its turning points in two colours."""
     ax = draw_machine(parts, 0, ax, "#999999", 0.6)
+    number_links(parts, 0, ax)
     draw_machine(parts, 1, ax, SERIES[0])
     return draw_machine(parts, 2, ax, SERIES[1], 0.8)
 
@@ -163,6 +175,8 @@ def animate(clip: Clip, path: Path) -> None:
         for ax, title in zip(axes, clip.titles, strict=True):
             ax.set_title(title)
             ax.set_axis_off()
+        for parts, ax in zip(clip.parts, axes, strict=True):
+            number_links(parts, 0, ax)
 
         def frame(k: int) -> list:
             label.set_text(

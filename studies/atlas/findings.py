@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from studies.atlas.platform import PlatformError, Responses, platform_error, responses
 from studies.atlas.subsets import Subsets, setting_label
 from studies.atlas.workspace import Map, PoseModes, map_workspace, natural_modes_at
+from studies.batches import Tell
 from studies.paper_cases import frame_of
 from studies.runs import check_run
 from studies.spec import Study
@@ -20,9 +20,6 @@ NEAR = np.radians(5.0)
 FREQUENCY = np.linspace(2.0, 600.0, 300)
 #: Points round each resonance, in half widths of it [1].
 _ROUND = np.linspace(-3.0, 3.0, 13)
-
-#: Says what is being done: text, then share of the work since the last call.
-Tell = Callable[[str, float], None]
 
 
 class Findings(NamedTuple):

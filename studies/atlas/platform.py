@@ -19,8 +19,8 @@ from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
 from studies.atlas.subsets import WINDOWS, link_label, long_enough, residual_window
+from studies.batches import run_batches
 from studies.cases import powered
-from studies.paper_cases import run_batches
 from studies.runs import check_run, resolved_study, with_ratio
 from studies.spec import Study
 

@@ -42,13 +42,14 @@ def _percent(value: float) -> str:
 
 def _head(found: Findings) -> list[str]:
     study, subsets = found.study, found.subsets
-    count = subsets.status.shape[-1]
+    count, settings = subsets.status.shape[-1], len(subsets.setting)
     delay, length = study.metrics.residual_delay, study.metrics.residual_length
     return [
         "# Coupling atlas", "",
         f"{literal(study.title)}: {count} subsets of controlled links and modes "
         f"({subsets.modes} a link), "
-        f"{len(subsets.setting)} settings of move time and shaper, {subsets.status.size} runs; "
+        f"{settings} setting{'s' if settings > 1 else ''} of move time and shaper, "
+        f"{subsets.status.size} runs; "
         f"gain factor {study.control.gain_factor:g}, ratios "
         + ("by (24) from each setting's uncontrolled run."
            if study.control.ratio_source == "own_run" else "as given."), "",

@@ -13,7 +13,7 @@ from jaxmodel import status
 from studies import config
 from studies.atlas.attribution import interaction, shapley
 from studies.atlas.figures import FIGURES, write_animation
-from studies.atlas.findings import Findings, Tell, look_around
+from studies.atlas.findings import Findings, look_around
 from studies.atlas.platform import LINK_LABELS
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.report import report
@@ -28,6 +28,7 @@ from studies.atlas.subsets import (
     setting_label,
 )
 from studies.atlas.workspace import PAIRS
+from studies.batches import Tell
 from studies.errors import StudyError
 from studies.figures import save, styled
 from studies.pages import write_report
@@ -68,7 +69,10 @@ def run_atlas(
         spec = atlas_sweep(study)
         if run_sweep(spec, out / RUNS_FOLDER, is_resumed, console, is_quiet).is_interrupted:
             return False
-        _finish(study, out, (lambda text, share: None) if is_quiet else _teller(console))
+        try:
+            _finish(study, out, (lambda text, share: None) if is_quiet else _teller(console))
+        except KeyboardInterrupt:
+            return False
     return True
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxmodel.sampled_loop import LoopReport
 from studies.export.c_fixed import format_lines
 from studies.export.controller import FixedController
 from studies.export.cost import Cost
 from studies.export.fixed import MARGIN, FixedPoint
 from studies.export.verify import AIM, Verification
 from studies.pages import literal
+from studies.stability import LoopReport
 
 
 def report(

@@ -14,7 +14,6 @@ import numpy as np
 from rich.console import Console
 
 from jaxmodel import status
-from jaxmodel.sampled_loop import LoopReport, loop_report
 from studies import config
 from studies.design import Design
 from studies.errors import StudyError, field_error
@@ -39,6 +38,7 @@ from studies.export.verify import (
 )
 from studies.pages import report_files
 from studies.runs import describe
+from studies.stability import LoopReport, loop_report
 from studies.store import check_folder, replacing
 
 TARGETS = ("json", "c", "c-fixed")

@@ -15,17 +15,10 @@ from jaxmodel.simulate import Result, simulate
 from studies.export.controller import FixedController, fixed_controller
 from studies.runs import check_run
 from studies.spec import Study
-from studies.spillover.judgement import (
-    HIGHEST,
-    LOWEST,
-    STEPS,
-    breaking_motion,
-    damping,
-    follow,
-    gain_limit,
-)
+from studies.spillover.judgement import STEPS, breaking_motion, damping, follow
 from studies.spillover.laws import Law, all_laws
 from studies.spillover.plants import LoopMaker, Plant, plant_sizes
+from studies.stability import HIGHEST, LOWEST, gain_margin
 
 #: The fast move has the acceleration of a move as long as the first in the time of the second.
 FAST = (0.01, 0.03)  # [m], [s]
@@ -117,7 +110,7 @@ class _View:
                 if self.limit <= LOWEST:
                     return
                 loop = maker.loop(plant._replace(n_modes=n), part)
-                limit = gain_limit(loop.poles, highest=self.limit)
+                limit = gain_margin(loop.poles, highest=self.limit)
                 if limit < self.limit:
                     self.limit, self.breaking = limit, breaking_motion(loop, limit)
 

@@ -7,17 +7,12 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 
-from jaxmodel.sampled_loop import RADIUS_TOLERANCE, follow_poles
 from studies.spillover.plants import SampledLoop
+from studies.stability import HIGHEST, LOWEST, follow_poles, gain_margin
 
 #: Gain factors at which modes are followed from no control to the design's gains.
 STEPS = np.linspace(0, 1, 17)[1:]
-#: Margins beyond this are given as it, and those below the other as 0 [1].
-HIGHEST, LOWEST = 64.0, 0.01
-#: Gain factors that are looked at are no further apart than this [1].
-STRIDE = 1.25
 #: A mode or link with this share of the largest one's energy is named beside it [1].
 PART = 1 / 3
 
@@ -46,7 +41,7 @@ def judge(loop: SampledLoop) -> Judgement:
     if not np.all(np.isnan(zeta)):
         at = np.unravel_index(np.nanargmin(zeta), zeta.shape)
         weakest = name_motion(loop, 1.0, tracked[at])
-    margin = gain_limit(poles, STEPS)
+    margin = gain_margin(poles, STEPS)
     return Judgement(
         float(np.abs(poles(1.0)).max()), margin, frequency, zeta, weakest,
         breaking_motion(loop, margin),
@@ -92,42 +87,6 @@ def damping(loop: SampledLoop, tracked: np.ndarray) -> tuple[np.ndarray, np.ndar
     turn = 2j * np.pi / loop.period
     rate = rate + turn * np.round((start.imag - rate.imag) / turn.imag)
     return np.abs(rate) / (2 * np.pi), -rate.real / np.abs(rate)
-
-
-def gain_limit(
-    poles: Callable[[float], np.ndarray],
-    first: np.ndarray | None = None,
-    highest: float = HIGHEST,
-) -> float:
-    """Largest factor on all gains with every smaller one stable, as `sampled_loop.gain_margin`.
-
-    Args:
-        poles: discrete poles by factor.
-        first: factors to begin with, rising [1]; default: `LOWEST` alone.
-        highest: where to stop [1].
-
-    Returns:
-        [1], within 1e-4 of itself; 0 where even `LOWEST` is unstable.
-    """
-
-    @cache
-    def excess(factor: float) -> float:
-        return float(np.log(np.abs(poles(factor)).max()) - np.log1p(RADIUS_TOLERANCE))
-
-    first = np.array([LOWEST]) if first is None else first
-    count = int(np.ceil(np.log(highest / first[-1]) / np.log(STRIDE)))
-    low = 0.0
-    for high in map(float, [*first[:-1], *np.geomspace(first[-1], highest, count + 1)]):
-        if excess(high) > 0:
-            break
-        low = high
-    else:
-        return highest
-    if low == 0.0:
-        if high <= LOWEST or excess(LOWEST) > 0:
-            return 0.0
-        low = LOWEST
-    return float(brentq(excess, low, high, xtol=2e-5 * low, rtol=2e-5))
 
 
 def breaking_motion(loop: SampledLoop, margin: float) -> str:

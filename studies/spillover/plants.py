@@ -18,9 +18,10 @@ from jaxmodel.controller import Controller
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import placement_faults
 from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import LoopMatrices, closed_loop, link_poles
+from jaxmodel.sampled_loop import LoopMatrices, closed_loop
 from studies.errors import field_error
 from studies.export.controller import FixedController
+from studies.stability import link_poles
 
 #: Plant modes per link at most.
 LARGEST = 10

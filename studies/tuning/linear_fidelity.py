@@ -21,9 +21,10 @@ from jaxmodel.kinematics import singularity_distance
 from jaxmodel.linear_residual import linear_residual
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import LoopMatrices, closed_loop, gain_margin, slowest_decay, spillover
+from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spillover
 from studies.cases import as_arrays, build_case, build_structure
 from studies.spec import Study
+from studies.stability import gain_margin
 from studies.tuning.scenarios import nominal
 from studies.tuning.spec import OWN, Family, TuneSpec
 

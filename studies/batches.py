@@ -1,0 +1,46 @@
+"""A few cases of one structure with their trajectories, in batches that share one compilation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.simulate import Result, simulate
+
+#: Cases per call of the compiled program; the last batch is filled up with copies.
+BATCH = 8
+
+#: Says what is running: text, then share of the work since the last call.
+Tell = Callable[[str, float], None]
+
+
+@partial(jax.jit, static_argnums=0)
+def _simulate_batch(structure: Structure, cases: Case) -> Result:
+    return jax.vmap(lambda case: simulate(structure, case, True))(cases)
+
+
+def run_batches(structure: Structure, cases: list[Case], tell: Tell) -> Result:
+    """Run cases, `BATCH` at a time, with trajectories.
+
+    Args:
+        structure: of all of them.
+        cases: one or more.
+        tell: called with what is running.
+
+    Returns:
+        Result of NumPy arrays, (cases, ...).
+    """
+    parts = []
+    for start in range(0, len(cases), BATCH):
+        batch = cases[start : start + BATCH]
+        tell(f"simulating {len(batch)} cases", 0.0)
+        filled = batch + [batch[-1]] * (BATCH - len(batch))
+        result = _simulate_batch(structure, jax.tree.map(lambda *x: jnp.stack(x), *filled))
+        parts.append(jax.tree.map(lambda x: np.asarray(x)[: len(batch)], result))  # noqa: B023
+        tell(f"simulated {len(batch)} cases", 1.0)
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)

@@ -1,0 +1,169 @@
+"""Stability of a linearised sampled loop: spectral radius, gain margin, damping of its modes.
+
+Eigenvalues of small matrices, on the host: `jaxmodel.sampled_loop` makes the matrices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import cache
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from scipy.optimize import brentq
+from threadpoolctl import threadpool_limits
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.controller import Controller
+from jaxmodel.parameters import Array
+from jaxmodel.sampled_loop import RADIUS_TOLERANCE, closed_loop
+
+#: Margins beyond this are given as it, and those below the other as 0 [1].
+HIGHEST, LOWEST = 64.0, 0.01
+#: Gain factors that are looked at are no further apart than this [1].
+STRIDE = 1.25
+#: Gain factors at which modes are followed from no control to the given gains [1].
+STEPS = np.linspace(0, 1, 41)[1:]
+
+
+class LoopReport(NamedTuple):
+    """Judgement of a sampled loop."""
+
+    spectral_radius: float  # of the closed loop [1]
+    gain_margin: float  # largest common factor on all gains with every smaller one stable [1]
+    frequency_hz: np.ndarray  # of the tracked link modes with control [Hz], (J, 3)
+    damping_ratio: np.ndarray  # [1], (J, 3): three assembled modes per link mode
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether this loop and every one with smaller gains is stable."""
+        return self.spectral_radius <= 1 + RADIUS_TOLERANCE and self.gain_margin >= 1
+
+
+_closed_loop = jax.jit(closed_loop, static_argnums=0)
+
+
+def loop_report(
+    structure: Structure,
+    case: Case,
+    pose: Array,
+    n_tracked: int = 3,
+    law: Controller | None = None,
+) -> LoopReport:
+    """Spectral radius, gain margin and damping of the lowest link modes.
+
+    Modes are followed from zero gain to full gain, so that filter poles are not mistaken for them.
+
+    Args:
+        structure: static choices.
+        case: the numbers.
+        pose: where to linearise [m, m, rad], (3,).
+        n_tracked: J, link modes to follow.
+        law: controller to judge instead of the case's own.
+
+    Raises:
+        LinAlgError: an entry of the loop's matrices is not finite.
+    """
+    # what the matrices do not depend on must not cost a compilation
+    plain = structure._replace(n_steps=1, substeps=1, n_frequencies=1, has_noise=False)
+    matrices = jax.tree.map(np.asarray, _closed_loop(plain, case, pose, law))
+    period = float(case.electronics.period)
+
+    @cache
+    def poles(factor: float) -> np.ndarray:
+        return np.linalg.eigvals(matrices.open + factor * matrices.feedback)
+
+    with threadpool_limits(1, "blas"):  # many small matrices: more threads only get in the way
+        start = np.exp(link_poles(matrices.plant, n_tracked).ravel() * period)
+        tracked = follow_poles(start, map(poles, map(float, STEPS)))[-1].reshape(-1, 3)
+        decay = np.log(tracked) / period
+        missing = ((0, n_tracked - len(tracked)), (0, 0))
+        frequency, zeta = (
+            np.pad(x, missing, constant_values=np.nan)
+            for x in (np.abs(decay) / (2 * np.pi), -decay.real / np.abs(decay))
+        )
+        radius = float(np.abs(poles(1.0)).max())
+        return LoopReport(radius, gain_margin(poles, STEPS), frequency, zeta)
+
+
+def gain_margin(
+    poles: Callable[[float], np.ndarray],
+    first: np.ndarray | None = None,
+    highest: float = HIGHEST,
+) -> float:
+    """Largest factor on all gains with every smaller one stable.
+
+    Args:
+        poles: discrete poles by factor; those at a factor already known had better be kept.
+        first: factors to begin with, rising [1]; default: `LOWEST` alone.
+        highest: where to stop [1].
+
+    Returns:
+        [1], within 1e-4 of itself; 0 where even `LOWEST` is unstable.
+    """
+
+    @cache
+    def excess(factor: float) -> float:
+        return float(np.log(np.abs(poles(factor)).max()) - np.log1p(RADIUS_TOLERANCE))
+
+    first = np.array([LOWEST]) if first is None else first
+    count = int(np.ceil(np.log(highest / first[-1]) / np.log(STRIDE)))
+    low = 0.0
+    for high in map(float, [*first[:-1], *np.geomspace(first[-1], highest, count + 1)]):
+        if excess(high) > 0:
+            break
+        low = high
+    else:
+        return highest
+    if low == 0.0:
+        if high <= LOWEST or excess(LOWEST) > 0:
+            return 0.0
+        low = LOWEST
+    return float(brentq(excess, low, high, xtol=2e-5 * low, rtol=2e-5))
+
+
+def follow_poles(start: np.ndarray, sets: Iterable[np.ndarray]) -> np.ndarray:
+    """Where poles go while the loop changes step by step.
+
+    Each is sought next to where its last step would take it again; none is taken twice.
+
+    Args:
+        start: poles to follow, (m,).
+        sets: all poles of the loop after each step, (n,) each.
+
+    Returns:
+        the poles after each step, (steps, m).
+    """
+    tracked, velocity, path = start, np.zeros_like(start), []
+    for candidates in map(list, sets):
+        found = []
+        for wanted in tracked + velocity:
+            nearest = int(np.argmin(np.abs(np.array(candidates) - wanted)))
+            found.append(candidates.pop(nearest))
+        velocity, tracked = np.array(found) - tracked, np.array(found)
+        path.append(tracked)
+    return np.array(path)
+
+
+def link_poles(state: np.ndarray, n_tracked: int) -> np.ndarray:
+    """Poles [rad/s] of the uncontrolled link modes, by three in ascending frequency, (J, 3).
+
+    They are the eigenvalues whose eigenvectors live in the modal coordinates.
+
+    Args:
+        state: A of the plant, `LoopMatrices.plant`.
+        n_tracked: J at most; overdamped modes have no such pole.
+    """
+    modes = (state.shape[0] - 6) // 4
+    keep = np.r_[0:6, 6 : 6 + 2 * modes]
+    value, vector = np.linalg.eig(state[np.ix_(keep, keep)])
+    upper = value.imag > 0
+    vector, value = vector[:, upper], value[upper]
+    weight = np.abs(vector[:3]).max(axis=0) / np.abs(vector[6 : 6 + modes]).max(axis=0)
+    # at most three pairs belong to the pose on its drive: the ones with the largest pose share
+    n_rigid = value.size - modes
+    flexible = np.sort_complex(1j * value[np.argsort(weight)[: value.size - max(n_rigid, 0)]])
+    flexible = flexible[np.argsort(np.abs(flexible))] / 1j
+    kept = min(flexible.size // 3, n_tracked)
+    return flexible[: 3 * kept].reshape(kept, 3)
