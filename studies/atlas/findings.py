@@ -55,11 +55,10 @@ def look_around(study: Study, subsets: Subsets, tell: Tell) -> Findings:
     tell("frequency responses", 0.0)
     own = natural_modes_at(study, [study.motion.waypoints[0]]).frequency[0]
     linear = responses(study, _frequencies(study, own))
-    tell("natural modes over the workspace", 1.0)
+    tell("natural modes over the workspace", 0.0)
     chart = map_workspace(study)
     poses = np.stack([np.array(study.motion.waypoints[0]), _far_pose(chart)])
     modes = natural_modes_at(study, poses)
-    tell("natural modes over the workspace", 1.0)
     step = frame_of(*check_run(study)).adc_step
     return Findings(study, subsets, runs, linear, chart, poses, modes, step)
 

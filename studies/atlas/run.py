@@ -78,7 +78,8 @@ def run_atlas(
 
 def _teller(console: Console) -> Tell:
     def tell(text: str, share: float) -> None:
-        console.print(text, soft_wrap=True)
+        if share == 0:  # what begins; its end says nothing more
+            console.print(text, soft_wrap=True)
 
     return tell
 
