@@ -24,7 +24,7 @@ explore: .venv/installed  ## coupling of the links, spillover of three designs, 
 	$(BIN)/studies atlas --out results/atlas
 	for design in paper paper_gains difference; do \
 	  $(BIN)/studies spillover $$design --out results/spillover-$$design; [ $$? -lt 2 ] || exit 2; done
-	$(PYTEST) tests/test_notebooks.py
+	$(PYTEST) -m "long or not long" tests/test_notebooks.py
 
 test: .venv/installed  ## run the tests
 	$(PYTEST)
