@@ -11,7 +11,7 @@ from jaxmodel import status
 from studies.errors import StudyError, field_error, nearest
 from studies.runs import Run, metric_variables
 from studies.spec import Study, load_study
-from studies.sweeps.folder import TUNING, read_manifest
+from studies.sweeps.folder import MANIFEST, TUNING, read_manifest
 from studies.sweeps.results import NOT_RUN, SweepData, load, metric_names
 from studies.sweeps.spec import parse_sweep, ready_spec
 from studies.sweeps.table import build_table, case_study
@@ -36,7 +36,10 @@ def load_design(path: Path, case: int | str | None = None) -> Design:
     Raises:
         StudyError: not found, case missing or not allowed, or a case that does not stand alone.
     """
-    if not path.is_dir():
+    is_folder = path.is_dir()
+    if is_folder and not any((path / name).is_file() for name in (MANIFEST, TUNING)):
+        is_folder = ready_spec(path) == path  # "paper" may be the report's folder, too
+    if not is_folder:
         path = ready_spec(path)
         if case is not None:
             raise StudyError(f"--case {case}: {path} is a file; leave --case out")

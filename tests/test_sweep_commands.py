@@ -2,12 +2,14 @@
 
 import dataclasses
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from studies.design import load_design
+from studies.errors import StudyError
 from studies.sweeps import plan
 from studies.sweeps.report import report
 from studies.sweeps.results import load
@@ -121,6 +123,18 @@ def check_report(folder):
     text = told(np.full(40, 4), False)
     assert "No case of status ok has it." in text and "![" not in text
     assert "depend on" not in text  # where nothing is ok there is nothing to compare
+
+
+def test_a_folder_of_other_things_does_not_hide_a_ready_study(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    name = Path("paper_gains")
+    ready = load_design(name)
+    name.mkdir()  # as left by studies spillover paper_gains --out paper_gains
+    (name / "report.md").write_text("-")
+    assert load_design(name) == ready
+    (name / "sweep.json").write_text("-")  # a sweep of that name is what is meant
+    with pytest.raises(StudyError, match="damaged"):
+        load_design(name)
 
 
 def test_quiet_says_nothing(capsys, spec, tmp_path):
