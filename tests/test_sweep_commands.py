@@ -55,7 +55,7 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     out = tmp_path / "s"
     code, text, _ = run(capsys, "sweep", spec, "--dry-run")
     assert code == 0 and "40 cases" in text and "estimate:" in text and "sample: case 20" in text
-    assert not out.exists()
+    assert not out.exists() and "cannot run" not in text
     code, text, _ = run(capsys, "sweep", spec, "--out", out, "--report")
     assert code == 0 and "40/40 cases" in text and "compiled in" in text and "results.h5" in text
     assert f"report: {out / 'report.html'}\n" in text
@@ -123,6 +123,13 @@ def check_report(folder):
     text = told(np.full(40, 4), False)
     assert "No case of status ok has it." in text and "![" not in text
     assert "depend on" not in text  # where nothing is ok there is nothing to compare
+
+
+def test_a_dry_run_says_why_its_sample_cannot_run(capsys, tmp_path):
+    spec = tmp_path / "short.toml"
+    spec.write_text("run.duration = 0.15\n[sweep.axes]\ngain = [0.1, 0.2]\n")
+    code, text, _ = run(capsys, "sweep", spec, "--dry-run")
+    assert code == 0 and "the sample cannot run: run.duration = 0.15: allowed at least" in text
 
 
 def test_a_folder_of_other_things_does_not_hide_a_ready_study(tmp_path, monkeypatch):

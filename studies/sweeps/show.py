@@ -12,6 +12,7 @@ from rich.table import Table as RichTable
 from jaxmodel import status
 from studies.errors import StudyError
 from studies.fields import parse_entry
+from studies.runs import check_run
 from studies.sweeps.condition import evaluate
 from studies.sweeps.plan import peak_memory
 from studies.sweeps.results import (
@@ -24,7 +25,7 @@ from studies.sweeps.results import (
 )
 from studies.sweeps.run import Plan, calibrate
 from studies.sweeps.sensitivity import failure_causes
-from studies.sweeps.table import Table
+from studies.sweeps.table import Table, case_study
 
 #: What `show` ranks cases by unless told otherwise.
 DEFAULT_METRIC = "residual_rms"
@@ -209,6 +210,10 @@ def print_plan(plan: Plan, console: Console) -> None:
     middle = len(table) // 2
     values = ", ".join(f"{name} = {_short(c[middle])}" for name, c in table.columns.items())
     console.print(f"sample: case {middle}, id {table.case_id[middle].decode()}: {values}")
+    try:
+        check_run(case_study(table, middle))
+    except StudyError as error:
+        console.print(f"the sample cannot run: {error}")
     if not plan.groups:
         console.print("nothing left to run")
         return
