@@ -206,7 +206,8 @@ def _laws(laws: Comparison) -> list[str]:
         f'but no more than damps mode 1 as "{GIVEN}" does, or as well as it can. Damping ratios: '
         f"the smallest of the controlled links with {laws.plant.n_modes} modes a link. Run, "
         f"nonlinear: {motion}; residual over {WINDOW:g} s from {SETTLING:g} s after the command "
-        "on, when the drives have nearly settled.", "",
+        "on, when the drives have nearly settled; of no control: mean of the three links' shares.",
+        "",
         *table(names, rows), "",
         picture("laws.png", "Residual vibration of the laws"), "",
         *(f"- {note}" for note in _LAW_NOTES),
