@@ -25,6 +25,11 @@ def _plain_ticks(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
+def _has_lengths(found: Certificate) -> bool:
+    """Whether patches differ in length from plant to plant."""
+    return found.plants[0, :, :, 0].size > 1
+
+
 def margins(found: Certificate, ax: Axes | None = None) -> Axes:
     """Gain margin over the number of plant modes: range over the lengths, and true lengths.
 
@@ -59,7 +64,8 @@ def margins(found: Certificate, ax: Axes | None = None) -> Axes:
     ax.set(xlabel="plant modes per link [1]", ylabel="gain margin [1]", yscale="log")
     _plain_ticks(ax.yaxis)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.legend(title="plant basis (shaded: all patch lengths)", loc="upper right")
+    shaded = " (shaded: all patch lengths)" if _has_lengths(found) else ""
+    ax.legend(title=f"plant basis{shaded}", loc="upper right")
     return ax
 
 
@@ -98,8 +104,9 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
     ax.yaxis.set_minor_locator(NullLocator())
     _plain_ticks(ax.xaxis)
     size = found.plants[0, 0, 0, -1].n_modes
+    lengths = ", all patch lengths" if _has_lengths(found) else ""
     ax.set(
-        xlabel=f"frequency [Hz], plants of {size} modes a link, all patch lengths",
+        xlabel=f"frequency [Hz], plants of {size} modes a link{lengths}",
         ylabel="damping ratio [1]",
     )
     ax.legend(loc="upper right")
