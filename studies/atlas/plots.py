@@ -159,8 +159,10 @@ def workspace_map(
     image = ax.pcolormesh(
         1e3 * x, 1e3 * y, value, cmap="cividis", vmin=low, vmax=high, rasterized=True
     )
-    reach = np.where(np.isnan(margin), 0.0, 1.0)
-    ax.contour(1e3 * x, 1e3 * y, reach, [0.5], colors="#D55E00", linewidths=1.5)
+    # one more grid line round the map closes the border where poses reach the map's edge
+    reach = np.pad(np.where(np.isnan(margin), 0.0, 1.0), 1)
+    around = (np.pad(1e3 * line, 1, mode="reflect", reflect_type="odd") for line in (x, y))
+    ax.contour(*around, reach, [0.5], colors="#D55E00", linewidths=1.5)
     lines = ax.contour(
         1e3 * x, 1e3 * y, np.degrees(margin), [10, 20], colors="white", linewidths=0.7
     )
