@@ -280,8 +280,10 @@ FIGURES = {
     "shares": AtlasFigure(
         "Shapley shares of links and modes in what control removes [% of the mean square]", _shares
     ),
-    "interactions": AtlasFigure("pairs of links and modes that do more or less together",
-                                _interactions),
+    "interactions": AtlasFigure(
+        "pairs of links and modes that do more or less together; 2.1: mode 1 of link 2",
+        _interactions,
+    ),
     "workspace": AtlasFigure(
         "natural modes over the workspace; orange: singular border, white: distance of the "
         "nearest link angle from it, black: the path", _workspace,

@@ -37,7 +37,8 @@ def _figure(name: str) -> list[str]:
 
 
 def _percent(value: float) -> str:
-    return f"{100 * value:+.1f} %"
+    text = f"{100 * value:+.1f}"
+    return f"{text if float(text) else '0.0'} %"
 
 
 def _head(found: Findings) -> list[str]:
