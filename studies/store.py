@@ -198,12 +198,18 @@ def staged(out: Path) -> Iterator[Path]:
 
     Args:
         out: folder that exists.
+
+    Raises:
+        StudyError: a file cannot be put there; then none is.
     """
     for left in out.glob(f"{_STAGED}*"):
         shutil.rmtree(left, ignore_errors=True)
     with tempfile.TemporaryDirectory(dir=out, prefix=_STAGED) as folder:
         yield Path(folder)
-        for file in sorted(Path(folder).iterdir()):
+        files = sorted(Path(folder).iterdir())
+        for file in files:
+            check_target(out / file.name)
+        for file in files:
             os.replace(file, out / file.name)
 
 

@@ -384,6 +384,20 @@ def test_command_fails_a_design(capsys, monkeypatch, tmp_path):
     assert not json.loads((out / "certificate.json").read_text())["is_passed"]
 
 
+def test_a_certificate_is_written_whole_or_not_at_all(capsys, monkeypatch, tmp_path, comparison):
+    few(monkeypatch, lambda study, margin: comparison)
+    monkeypatch.setattr(
+        spillover_run.figures, "save", lambda _, out, name: (out / f"{name}.png").write_bytes(b"-")
+    )
+    design, out = write(tmp_path), tmp_path / "out"
+    (out / "report.md").mkdir(parents=True)
+    (out / ".unfinished-killed").mkdir()
+    (out / "notes.txt").write_text("mine")
+    said = run(capsys, "spillover", design, "--out", out)[2]
+    assert said.startswith("studies: ") and "report.md: cannot write there, it is a folder" in said
+    assert {path.name for path in out.iterdir()} == {"report.md", "notes.txt"}
+
+
 @pytest.mark.parametrize(
     ("study", "more", "message"),
     [

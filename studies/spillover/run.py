@@ -18,7 +18,7 @@ from studies.spillover import plots
 from studies.spillover.certificate import Certificate, certify
 from studies.spillover.comparison import Comparison, compare_laws
 from studies.spillover.report import document, report, verdict
-from studies.store import Variable, check_folder, replacing, write_store
+from studies.store import Variable, check_folder, staged, write_store
 
 DOCUMENT, DATA = "certificate.json", "spillover.h5"
 
@@ -58,8 +58,16 @@ def spillover_design(design: Design, out: Path, margin: float, console: Console)
 def _write(out: Path, found: Certificate, laws: Comparison | None) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
+        with staged(out) as staging:  # an end in the midst of it leaves the old files whole
+            _draw(staging, found, laws)
+            write_store(staging / DATA, variables(found, laws), run_attributes(found.study))
+            (staging / DOCUMENT).write_text(document(found, laws), encoding="utf-8")
+            write_report(staging, report(found, laws), found.study)
     except OSError as error:
-        raise StudyError(f"--out {out}: cannot write there ({error.strerror})") from None
+        raise StudyError(f"--out {out}: cannot write there ({error})") from error
+
+
+def _draw(folder: Path, found: Certificate, laws: Comparison | None) -> None:
     drawn: list[tuple[str, Callable[..., Any], Any]] = [
         ("margins", plots.margins, found), ("damping", plots.mode_damping, found),
     ]  # fmt: skip
@@ -69,13 +77,9 @@ def _write(out: Path, found: Certificate, laws: Comparison | None) -> None:
         for name, plot, data in drawn:
             figure, axes = figures.new_figure(1, 1, 2.65)
             plot(data, axes[0, 0])
-            figures.save(figure, out, name)
+            figures.save(figure, folder, name)
         if found.study.control.law == "imsc":
-            figures.save(plots.leakage(found), out, "leakage")
-    write_store(out / DATA, variables(found, laws), run_attributes(found.study))
-    with replacing(out / DOCUMENT) as temporary:
-        temporary.write_text(document(found, laws), encoding="utf-8")
-        write_report(out, report(found, laws), found.study)
+            figures.save(plots.leakage(found), folder, "leakage")
 
 
 def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable]:
