@@ -51,8 +51,10 @@ def optimal_gains(omega: Array, control_weight: Array) -> PoleGains:
     Returns:
         PoleGains per unit modal mass.
     """
-    position = omega * jnp.sqrt(omega**2 + 1 / control_weight) - omega**2
-    return PoleGains(position, jnp.sqrt(2 * position + 1 / control_weight))
+    share = 1 / control_weight
+    # without the difference of two large numbers where control is expensive
+    position = omega * share / (jnp.sqrt(omega**2 + share) + omega)
+    return PoleGains(position, jnp.sqrt(2 * position + share))
 
 
 def efficient_modal_control(energy: Array, omega: Array) -> Array:

@@ -157,6 +157,14 @@ def test_optimal_gains_solve_the_riccati_equation():
         np.testing.assert_allclose(found, (b.T @ solution / weight)[0], rtol=1e-6)
 
 
+def test_optimal_gains_keep_their_digits_where_control_is_expensive():
+    # k_p = 1/(2 R) and k_d = sqrt(2/R), but for shares of 1/(R omega^2)
+    gains = jax.jit(optimal_gains)(1000.0, 1e10)
+    np.testing.assert_allclose(
+        [gains.position, gains.velocity], [0.5e-10, 2**0.5 * 1e-5], rtol=1e-9
+    )
+
+
 def test_position_filter_is_its_continuous_formula_at_its_own_frequency():
     omega = 2 * np.pi * np.array([[114.4, 457.6, 1029.5]] * 3)
     period, antialias, zeta = 1e-4, 2 * np.pi * 2000, 0.5
