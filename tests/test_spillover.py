@@ -20,9 +20,11 @@ from studies.runs import run_study
 from studies.spec import paper_study
 from studies.spillover import certify, compare_laws
 from studies.spillover import run as spillover_run
+from studies.spillover.comparison import _controlled_links, _View
+from studies.spillover.judgement import damping, follow
 from studies.spillover.laws import all_laws
 from studies.spillover.plants import LoopMaker, Plant, all_plants, widened
-from studies.stability import loop_report
+from studies.stability import HIGHEST, loop_report
 from studies.template import study_template
 from tests.pages import parsed
 from tests.test_cli import refused, run
@@ -335,6 +337,39 @@ def test_laws_need_a_gain_to_be_compared_by():
     changes = {"control__velocity_gain": (0.0,) * 3, "control__position_gain": (1.0,) * 3}
     with pytest.raises(StudyError, match="control.velocity_gain = .*damp mode 1"):
         compare_laws(STUDY.change(**changes), sizes=(3,))
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"control__mode_mask": ((False, True, True),) * 3}, "control.velocity_gain"),
+        ({"control__velocity_gain": (3.1, -3.1, 3.1)}, "control.velocity_gain"),
+        ({"control__law": "srf", "control__mode_mask": ((False,) * 3,) * 3}, "control.ratios"),
+        ({"control__law": "srf", "control__ratios": ((0.0,),) * 3}, "control.ratios"),
+    ],
+)
+def test_laws_are_not_compared_by_rounding(changes, field):
+    with pytest.raises(StudyError, match=f"{field} = .*control.mode_mask"):
+        compare_laws(STUDY.change(**changes), sizes=(3,))
+
+
+def test_damping_is_that_of_links_that_control_the_mode():
+    """Mode 1 of link 1 alone: the strongest of its three; link 2 has mode 2, and none mode 3."""
+    mask = ((True, False, False), (False, True, False), (False, False, False))
+    found = fixed_controller(STUDY.change(control__mode_mask=mask))
+    np.testing.assert_array_equal(_controlled_links(found.controller), [1, 1, 2])
+    maker, plant = LoopMaker(found), Plant("pinned_pinned", 3, 1.0, 1.0)
+    law = all_laws(found, maker, plant)[0]
+    view = _View(found, law, plant, (3,))
+    loop = maker.loop(plant, law.controller)
+    tracked = follow(loop, np.linspace(0.1, 1, 16), loop.poles)[-1]
+    zeta = damping(loop, tracked)[1]
+    np.testing.assert_allclose(view.damping(1.0)[:2], zeta[:2].max(axis=1), rtol=1e-6)
+    assert view.damping(1.0)[0] > 0.2 and view.damping(0.0)[0] < 0.02
+    # as much as the design damps it takes the design's gains
+    np.testing.assert_allclose(view.fair(2.0, view.damping(1.0)[0]), 1, rtol=1e-9)
+    # no gains at all leave every margin
+    assert view.margin(0.0) == HIGHEST
 
 
 def few(monkeypatch, comparison):

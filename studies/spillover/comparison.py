@@ -39,7 +39,7 @@ class Comparison(NamedTuple):
     plant: Plant  # whose damping is told, and the basis of all
     names: tuple[str, ...]
     factor: np.ndarray  # on the gains of each law, 1: as strong on mode 1 as the design [1], (L,)
-    damping_ratio: np.ndarray  # modes 1.., smallest of the controlled links [1], (L, J)
+    damping_ratio: np.ndarray  # modes 1.., smallest of the links that control it [1], (L, J)
     margin: np.ndarray  # smallest over the plants, 0 where no gains are stable [1], (L,)
     breaking: tuple[str, ...]  # what goes unstable beyond it
     residual_rms: np.ndarray  # worst station of each link [m], (L, 3)
@@ -102,7 +102,7 @@ class _View:
     ) -> None:
         self.law, maker = law, LoopMaker(found)
         self.limit, self.breaking = HIGHEST, ""
-        self._n_links = sum(found.study.control.links)
+        self._n_links = _controlled_links(found.controller)
         parts = law.linear_parts
         self._parts = [(modes, maker.loop(plant, part)) for modes, part in parts]
         for _, part in parts:
@@ -116,10 +116,10 @@ class _View:
 
     def margin(self, factor: float) -> float:
         """Smallest one of all plants with all gains times a factor; 0 where no gains are stable."""
-        return min(self.limit / factor, HIGHEST) if factor else 0.0
+        return float(min(self.limit / factor, HIGHEST)) if factor else HIGHEST * (self.limit > 0)
 
     def damping(self, factor: float) -> np.ndarray:
-        """Smallest damping ratio of the controlled links, modes 1 to `SHOWN`, NaN: no such mode."""
+        """Smallest damping ratio of the links that control it, modes 1 to `SHOWN`, NaN: none."""
         return self._path(factor * STEPS)[-1]
 
     def fair(self, margin: float, target: float) -> float:
@@ -148,9 +148,21 @@ class _View:
         for modes, loop in self._parts:
             tracked = follow(loop, factors, loop.poles)
             # the three poles of a mode belong to no link, but uncontrolled links keep the weak ones
-            zeta = -np.sort(-damping(loop, tracked)[1][:, :SHOWN], axis=2)[..., self._n_links - 1]
+            zeta = -np.sort(-damping(loop, tracked)[1][:, :SHOWN], axis=2)
+            last = self._n_links[None, : zeta.shape[1], None] - 1
+            zeta = np.take_along_axis(zeta, last, axis=2)[..., 0]
             found[:, : zeta.shape[1]][:, modes] = zeta[:, modes]
         return found
+
+
+def _controlled_links(law: Controller) -> np.ndarray:
+    """How many links control each of modes 1 to `SHOWN`; of one that none does, all with gains."""
+    is_on = law.velocity_gain != 0
+    if law.position_gain is not None:
+        is_on = is_on | (law.position_gain != 0)
+    is_on, n_links = is_on[:, :SHOWN], is_on.any(axis=1).sum()
+    count = np.pad(is_on.sum(axis=0), (0, SHOWN - is_on.shape[1]))
+    return np.where(count > 0, count, n_links)
 
 
 def _run(found: FixedController, laws: list[Controller]) -> tuple[Study, Result]:

@@ -24,6 +24,8 @@ from studies.spillover.plants import LoopMaker, Plant, widened
 
 #: Damping of the filters of positive position feedback [1].
 FILTER_ZETA = 0.5
+#: Damping of mode 1 below this share of that of other modes is rounding [1].
+ROUNDING = 1e-9
 
 
 class Law(NamedTuple):
@@ -68,7 +70,7 @@ def all_laws(found: FixedController, maker: LoopMaker, plant: Plant) -> list[Law
         plant: where strength is compared.
 
     Raises:
-        StudyError: no velocity gain that damps mode 1, so nothing to compare strength by.
+        StudyError: velocity gains that do not damp mode 1, so nothing to compare strength by.
     """
     given, has_modes = found.controller, found.is_modal
     imsc = given if has_modes else _designed(found, "imsc")
@@ -78,18 +80,26 @@ def all_laws(found: FixedController, maker: LoopMaker, plant: Plant) -> list[Law
         """Damping constant that a law gives mode 1 of each link [N s/m], (3,)."""
         seen, driven = maker.leakage(plant, widened(law, found.n_patches))
         gain = widened(law, found.n_patches).velocity_gain
-        return np.einsum("ic,ic,ic->i", driven[:, 0], gain, seen[:, :, 0])
+        every = np.einsum("irc,ic,icr->ir", driven, gain, seen)
+        return np.where(np.abs(every[:, 0]) > ROUNDING * np.abs(every).max(), every[:, 0], 0.0)
 
-    wanted = strength(given)
-    if not np.any(wanted > 0):
+    control, wanted = found.study.control, strength(given)
+    if not np.any(wanted > 0) or np.any(wanted < 0):
         raise field_error(
-            "control.velocity_gain", found.study.control.velocity_gain,
-            "gains that damp mode 1, to compare laws of equal strength",
+            "control.velocity_gain", control.velocity_gain,
+            "with control.ratios and control.mode_mask, gains that damp mode 1, to compare laws of "
+            "equal strength",
         )  # fmt: skip
     if has_modes:
         srf = _scaled(srf, wanted, strength(srf))
     else:
-        imsc = _scaled(imsc, wanted, strength(imsc))
+        has = strength(imsc)
+        if np.any((wanted > 0) & (has == 0)):
+            raise field_error(
+                "control.ratios", control.ratios,
+                "with control.mode_mask, mode 1 on, to compare with IMSC of equal strength",
+            )  # fmt: skip
+        imsc = _scaled(imsc, wanted, has)
     omega, is_on = _assembled_omega(found), imsc.velocity_gain != 0
     if imsc.position_gain is not None:
         is_on = is_on | (imsc.position_gain != 0)
@@ -152,13 +162,14 @@ def _modal_mass(found: FixedController) -> np.ndarray:
 def _optimal(imsc: Controller, mass: np.ndarray, omega: np.ndarray) -> Controller:
     """Optimal gains of every mode with one weight, which gives the first mode its own k_d.
 
-    From k_d^2 = 2 k_p + 1/R: sqrt(omega^2 + 1/R) = sqrt(k_d^2 + 4 omega^2) - omega.
+    From k_d^2 = 2 k_p + 1/R: 1/R = h (h - 2 omega) with h^2 = k_d^2 + 4 omega^2.
     """
     is_on = imsc.velocity_gain != 0
     first = int(np.flatnonzero(is_on.any(axis=0))[0])
     gain = (imsc.velocity_gain / mass)[is_on[:, first], first].mean()
     at = omega[is_on[:, first], first].mean()
-    weight = 1 / ((np.hypot(gain, 2 * at) - at) ** 2 - at**2)
+    size = np.hypot(gain, 2 * at)
+    weight = (1 + 2 * at / size) / gain**2
     gains = jax.tree.map(np.asarray, optimal_gains(omega, weight))
     return imsc._replace(
         velocity_gain=is_on * mass * gains.velocity, position_gain=is_on * mass * gains.position

@@ -63,7 +63,7 @@ def report(found: Certificate, laws: Comparison | None) -> str:
         sections.append(_laws(laws))
     sections.append(["## What this covers", "", _COVERED])
     if found.notes:
-        sections[-1] += ["", *(f"- {note}" for note in found.notes)]
+        sections[-1] += ["", *(f"- {literal(note)}" for note in found.notes)]
     return "\n".join(line for section in sections for line in (*section, ""))
 
 
@@ -204,7 +204,7 @@ def _laws(laws: Comparison) -> list[str]:
         "damping constant of mode 1. Each law has the largest factor that leaves a margin of "
         f"{laws.required:g} on the design's own plants ({laws.plant.basis}, patches as believed), "
         f'but no more than damps mode 1 as "{GIVEN}" does, or as well as it can. Damping ratios: '
-        f"the smallest of the controlled links with {laws.plant.n_modes} modes a link. Run, "
+        f"the smallest of the links that control the mode, {laws.plant.n_modes} modes a link. Run, "
         f"nonlinear: {motion}; residual over {WINDOW:g} s from {SETTLING:g} s after the command "
         "on, when the drives have nearly settled; of no control: mean of the three links' shares.",
         "",

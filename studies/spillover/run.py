@@ -129,7 +129,7 @@ def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable
         "law": Variable(np.array(laws.names), law, "1", "control law"),
         "law_factor": Variable(laws.factor, law, "1", "factor on its gains"),
         "law_damping_ratio": Variable(
-            laws.damping_ratio, ("law", "lowest_mode"), "1", "smallest of the controlled links"
+            laws.damping_ratio, ("law", "lowest_mode"), "1", "smallest of the links that control it"
         ),
         "law_margin": Variable(laws.margin, law, "1", "smallest over the numbers of plant modes"),
         "law_residual_rms": Variable(
