@@ -158,6 +158,10 @@ def test_quiet_says_nothing(capsys, spec, tmp_path):
         (("replay", "nowhere.toml"), "cannot be read"),
         (("replay", "nowhere.toml", "--case", "1"), "leave --case out"),
         (("sweep", "nowhere.toml", "--out", "x"), "cannot be read"),
+        (
+            ("spillover", "papr", "--out", "x"),
+            "papr: cannot be read (no such file); did you mean 'paper'?",
+        ),
         (("sweep", "gains"), "--out: name a folder"),
         (("sweep", "gains", "--dry-run", "--report"), "a --dry-run has no results"),
     ],

@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import ValidationError
 
-from studies.errors import StudyError, field_error
+from studies.errors import StudyError, field_error, nearest
 from studies.explain import explain
 from studies.spec import Section, Study, described, parse_study, read_toml
 
@@ -67,10 +67,17 @@ class SweepSpec(NamedTuple):
 
 
 def ready_spec(name: Path) -> Path:
-    """A file, or the ready-made one of that name where there is no such file."""
-    ready = Path(__file__).parents[1] / "specs" / f"{name.stem}.toml"
-    is_name = not name.is_file() and len(name.parts) == 1 and name.suffix in ("", ".toml")
-    return ready if is_name and ready.is_file() else name
+    """A file, or the ready-made one of that name where there is no such file.
+
+    Raises:
+        StudyError: neither, but a ready one of nearly that name.
+    """
+    if name.exists() or len(name.parts) > 1 or name.suffix not in ("", ".toml"):
+        return name
+    ready = {path.stem: path for path in (Path(__file__).parents[1] / "specs").glob("*.toml")}
+    if name.stem not in ready and (hint := nearest(name.stem, ready)):
+        raise StudyError(f"{name}: cannot be read (no such file); did you mean {hint!r}?")
+    return ready.get(name.stem, name)
 
 
 def load_sweep(path: str | Path) -> SweepSpec:
