@@ -144,6 +144,18 @@ def test_atlas_writes_what_its_report_shows(atlas):
     assert not list(folder.glob(".unfinished*"))
 
 
+def test_vibration_after_a_command_that_ends_the_run(atlas):
+    found = atlas[1]
+    runs, end = found.platform, found.platform.command_end.max()
+    kept = runs.time < end + 0.02
+    short = runs._replace(time=runs.time[kept], vibration=runs.vibration[:, :, kept])
+    figure = figures.FIGURES["vibration"].draw(found._replace(platform=short))
+    late = (short.time >= end + 0.01) & (short.time < end + 0.015)
+    column = int(np.argmax(runs.command_end))
+    for k, ax in enumerate(figure.axes[column:6:2]):
+        assert ax.get_ylim()[1] >= 1.4e9 * np.abs(short.vibration[column, :, late, k]).max() > 0
+
+
 def test_vibration_and_drive_add_up_to_the_error_of_a_run(atlas):
     runs = atlas[1].platform
     moved = small_study(shaper__kind="none", control__links=LINK_SETS[1])

@@ -236,8 +236,9 @@ def _vibration_after(found: Findings) -> Figure:
     for column, setting in enumerate(RUNS):
         axes[0, column].set_title(setting_label(setting))
         end = runs.command_end[column]
-        part = (runs.time >= end) & (runs.time <= end + 0.15)
-        late = (runs.time >= end + 0.04) & part
+        shown = min(0.15, runs.time[-1] - end)
+        part = (runs.time >= end) & (runs.time <= end + shown)
+        late = (runs.time >= end + shown * 4 / 15) & part  # the drive has nearly settled
         for k, label in enumerate(_ERRORS):
             ax = axes[k, column]
             error = 1e9 * runs.vibration[column, :, :, k]
