@@ -248,9 +248,10 @@ def test_claims_are_counted():
         ({"control__gain_factor": 0.0}, "control.gain_factor = 0.0: allowed gains that do"),
     ],
 )
-def test_designs_without_subsets_are_refused(fields, message):
+def test_designs_without_subsets_are_refused(tmp_path, fields, message):
     with pytest.raises(StudyError, match=message):
-        subsets.atlas_sweep(small_study().change(**fields))
+        run.run_atlas(small_study(**fields), tmp_path / "out", False, Console(file=io.StringIO()))
+    assert not (tmp_path / "out").exists()
 
 
 def test_settings_with_failed_runs_are_left_out_in_words():

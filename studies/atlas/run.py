@@ -63,10 +63,10 @@ def run_atlas(
         StudyError: a fault of the design or of the folder; no setting in which all cases run.
     """
     config.require_configured()
+    spec = atlas_sweep(study)
     with locked_folder(out, "atlas"):
         if not (out / RUNS_FOLDER).is_dir():
             refuse_others(out, _LEFTOVER)
-        spec = atlas_sweep(study)
         if run_sweep(spec, out / RUNS_FOLDER, is_resumed, console, is_quiet).is_interrupted:
             return False
         try:
