@@ -72,10 +72,11 @@ def ready_spec(name: Path) -> Path:
     Raises:
         StudyError: neither, but a ready one of nearly that name.
     """
-    if name.exists() or len(name.parts) > 1 or name.suffix not in ("", ".toml"):
+    if name.is_file() or len(name.parts) > 1 or name.suffix not in ("", ".toml"):
         return name
     ready = {path.stem: path for path in (Path(__file__).parents[1] / "specs").glob("*.toml")}
-    if name.stem not in ready and (hint := nearest(name.stem, ready)):
+    hint = nearest(name.stem, ready)
+    if name.stem not in ready and hint and not name.exists():
         raise StudyError(f"{name}: cannot be read (no such file); did you mean {hint!r}?")
     return ready.get(name.stem, name)
 
