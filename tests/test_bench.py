@@ -50,6 +50,7 @@ def test_all_peers_agree():
         assert row.configs_per_s * row.times_slower == pytest.approx(rows[0].configs_per_s)
 
 
+@pytest.mark.long
 def test_gradient_figures(monkeypatch, capsys):
     monkeypatch.setitem(WORKS["W0"], "link__modes", 1)
     monkeypatch.setitem(WORKS["W0"], "control__modes", 1)
