@@ -77,12 +77,16 @@ def configure(
     _set_cache(cache)
 
 
-def start(precision: str = "float64") -> None:
+def start(precision: str = "float64", cpu_only: bool = False) -> None:
     """Configure and start JAX, as every command does that computes.
+
+    cpu_only: leave graphics processors alone, to which others have a better right.
 
     Raises StudyError as `configure`, and where JAX cannot start.
     """
     configure(precision)
+    if cpu_only:
+        settings.update("jax_platforms", "cpu")
     try:
         jax.local_devices()
     except (RuntimeError, AssertionError) as error:
@@ -157,7 +161,7 @@ def _extended(present: str, devices: int | None, flags: bool) -> str:
     wanted = dict(COMPILER_FLAGS) if flags else {}
     if devices is not None:
         present = re.sub(rf"{DEVICE_FLAG}=\S*", "", present)
-    wanted[DEVICE_FLAG] = str(devices or _usable_cores())
+    wanted[DEVICE_FLAG] = str(devices or usable_cores())
     missing = [f"{name}={value}" for name, value in wanted.items() if name not in present]
     return " ".join(present.split() + missing)
 
@@ -206,7 +210,8 @@ def _default_cache_folder() -> Path:
     return Path(base) / PACKAGE if base else Path.home() / ".cache" / PACKAGE
 
 
-def _usable_cores() -> int:
+def usable_cores() -> int:
+    """Cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -16,7 +16,7 @@ from studies.kernels.traced import Leaf, trace_loop
 from studies.spec import paper_study
 from studies.sweeps.executor import make_executor
 from studies.sweeps.kernels import KernelExecutor
-from studies.sweeps.plan import Layout, chunk_cases, plan_groups
+from studies.sweeps.plan import Layout, chunk_cases, local_layout, plan_groups
 from studies.sweeps.program import TRACES
 from studies.sweeps.scan import ScanExecutor
 from studies.sweeps.table import build_table
@@ -43,7 +43,7 @@ ALL_SORTS = {
 def both(spec):
     """Results of the same cases by kernel and by scan."""
     table = build_table(spec)
-    group = plan_groups(table, np.arange(len(table)), 2)[0]
+    group = plan_groups(table, np.arange(len(table)), local_layout)[0]
     cases = chunk_cases(table, np.arange(len(table)), group.structure, LAYOUT.size)
     return [
         executor(group.structure, LAYOUT, False).start(cases).wait()
@@ -95,7 +95,7 @@ def test_odd_numbers_of_cases_fill_whole_vectors():
         with jax.enable_x64(real):
             table = build_table(small_spec(MIXED))
             for count in (1, 3, 9, 40):
-                group = plan_groups(table, np.arange(count), 2)[0]
+                group = plan_groups(table, np.arange(count), local_layout)[0]
                 assert group.layout.lanes % unit == 0 and group.layout.size >= count
     loop = trace_loop(
         lambda constants, row, state: [state[0] + row[0]],
@@ -107,7 +107,7 @@ def test_odd_numbers_of_cases_fill_whole_vectors():
 
 def test_without_llvmlite_the_scan_runs(monkeypatch):
     table = build_table(small_spec(MIXED))
-    group = plan_groups(table, np.arange(8), 2)[0]
+    group = plan_groups(table, np.arange(8), local_layout)[0]
     assert isinstance(make_executor(group.structure, LAYOUT, False), KernelExecutor)
     monkeypatch.setattr(llvm, "binding", None)
     assert isinstance(make_executor(group.structure, LAYOUT, False), ScanExecutor)

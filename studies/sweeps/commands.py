@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +12,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from studies.cluster.connect import LocalWorkers, Scheduler, Workers, WorkerTimeout, runner_for
 from studies.config import start
 from studies.errors import StudyError
 
@@ -35,14 +37,20 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             bool, typer.Option("--report", help="write report.html of the results, too")
         ] = False,
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
+        scheduler: Scheduler = None,
+        local_workers: LocalWorkers = None,
+        worker_timeout: WorkerTimeout = 600.0,
     ) -> None:
         """Run thousands of cases from one file; finished ones survive whatever happens."""
-        start(precision)
+        workers = Workers(scheduler, local_workers, worker_timeout)
+        start(precision, cpu_only=workers.are_named)
         from studies.sweeps.run import make_plan, run_sweep
         from studies.sweeps.show import print_plan
         from studies.sweeps.spec import load_sweep, ready_spec
 
         asked = load_sweep(ready_spec(spec))
+        if dry_run and workers.are_named:
+            raise StudyError("--dry-run: plans for this process; leave the workers out")
         if dry_run and report:
             raise StudyError("--report: a --dry-run has no results; leave one of them out")
         if dry_run:
@@ -50,7 +58,15 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             return
         if out is None:
             raise StudyError("--out: name a folder for the results")
-        done = run_sweep(asked, out, resume, console, quiet)
+        tell = partial(console.print, soft_wrap=True)
+        with runner_for(asked, workers, tell) as runner:
+            done = run_sweep(asked, out, resume, console, quiet, runner)
+        if len(done.lost):
+            print(
+                f"studies: {len(done.lost)} of {len(done.table)} cases are left out, see above; "
+                f"try them again with --resume --out {out}",
+                file=sys.stderr,
+            )
         if done.is_interrupted:
             print(
                 f"studies: interrupted; {done.n_done} of {len(done.table)} cases are safe; go on "
@@ -70,6 +86,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             write_sweep_report(out)
             if not quiet:
                 console.print(f"report: {out / REPORT}", soft_wrap=True)
+        if len(done.lost):
+            sys.exit(1)
 
     @app.command()
     def show(

@@ -27,6 +27,8 @@ from studies.errors import StudyError
 from studies.store import Variable, replacing, write_store
 
 RESULTS, MANIFEST, CHUNKS, LOCK = "results.h5", "sweep.json", "chunks", ".lock"
+#: Where the manifest lists chunks that were given up.
+GIVEN_UP = "given_up"
 #: What a tuning has in its folder instead.
 TUNING = "tune.json"
 #: The results before they get their name.
@@ -82,6 +84,17 @@ class SweepFolder:
         """From here on the folder holds this sweep, or the one that was there extended to it."""
         old = read_manifest(self.path) if (self.path / MANIFEST).is_file() else {}
         self._write_manifest({**manifest, "results": old.get("results", [])})
+
+    def give_up(self, rows: np.ndarray, reason: str) -> None:
+        """Write down that cases are left out, until a resumed sweep tries them again.
+
+        Args:
+            rows: numbers of the cases, (k,).
+            reason: why.
+        """
+        manifest = read_manifest(self.path)
+        entry = {"cases": ranges(rows), "reason": reason}
+        self._write_manifest({**manifest, GIVEN_UP: [*manifest.get(GIVEN_UP, []), entry]})
 
     def publish(self) -> None:
         """Give the joined file its name; chunks that it holds go."""
@@ -286,6 +299,12 @@ def check_results(path: Path) -> None:
         )
 
 
+def ranges(numbers: np.ndarray) -> str:
+    """Numbers, rising, in short: "3, 8-11"."""
+    parts = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
+    return ", ".join(str(p[0]) if len(p) == 1 else f"{p[0]}-{p[-1]}" for p in parts if len(p))
+
+
 def file_hash(path: Path) -> str:
     """First 16 digits of a file's SHA-256."""
     with open(path, "rb") as file:
@@ -313,8 +332,8 @@ def code_digest(more: Iterable[Path] = ()) -> str:
     names = (
         "cases.py", "fields.py", "spec.py", "kernels/cpu.py", "kernels/fusion.py",
         "kernels/gpu.py", "kernels/graph.py", "kernels/llvm.py", "kernels/traced.py",
-        "sweeps/executor.py", "sweeps/kernels.py", "sweeps/plan.py", "sweeps/program.py",
-        "sweeps/scan.py", "sweeps/steps.py", "sweeps/table.py",
+        "sweeps/chunks.py", "sweeps/executor.py", "sweeps/kernels.py", "sweeps/plan.py",
+        "sweeps/program.py", "sweeps/scan.py", "sweeps/steps.py", "sweeps/table.py",
     )  # fmt: skip
     sources = sorted((_SOURCES / "jaxmodel").glob("*.py"))
     for path in (*sources, *(_SOURCES / "studies" / name for name in names), *more):

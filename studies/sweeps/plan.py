@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import resource
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -58,6 +59,13 @@ class Layout(NamedTuple):
         return np.minimum(np.arange(self.size), count - 1)
 
 
+class Chunk(NamedTuple):
+    """Cases that are run together."""
+
+    rows: np.ndarray  # of the table, (k,)
+    is_too_stiff: np.ndarray  # as in `Group`, (k,)
+
+
 class Group(NamedTuple):
     """Cases that share a program."""
 
@@ -66,22 +74,27 @@ class Group(NamedTuple):
     is_too_stiff: np.ndarray  # drive or ideal feedback that no allowed step carries, (m,)
     layout: Layout
 
-    def chunks(self) -> list[np.ndarray]:
-        """Rows of the table, chunk by chunk."""
+    def chunks(self) -> list[Chunk]:
+        """All of them, chunk by chunk."""
+        size = self.layout.size
         return [
-            self.rows[k : k + self.layout.size] for k in range(0, len(self.rows), self.layout.size)
+            Chunk(self.rows[k : k + size], self.is_too_stiff[k : k + size])
+            for k in range(0, len(self.rows), size)
         ]
 
 
 def plan_groups(
-    table: Table, rows: np.ndarray, devices: int, metrics: tuple[str, ...] = ()
+    table: Table,
+    rows: np.ndarray,
+    lay_out: Callable[[int, Structure], Layout],
+    metrics: tuple[str, ...] = (),
 ) -> list[Group]:
     """Group cases by program and lay out their chunks.
 
     Args:
         table: all cases.
         rows: those to run.
-        devices: how many devices share a chunk.
+        lay_out: shape of the chunks of so many cases of a structure.
         metrics: those that are kept; () for all.
 
     Raises:
@@ -112,7 +125,7 @@ def plan_groups(
         for count in np.unique(counts[place]):
             chosen = counts[place] == count
             stepped = structure._replace(substeps=int(count))
-            layout = _layout(int(chosen.sum()), stepped, devices)
+            layout = lay_out(int(chosen.sum()), stepped)
             groups.append(Group(stepped, wanted[chosen], is_too_stiff[place][chosen], layout))
     return groups
 
@@ -217,7 +230,14 @@ def _pole_decay(table: Table, structure: Structure, members: np.ndarray) -> np.n
     return fastest
 
 
-def _layout(n: int, structure: Structure, devices: int) -> Layout:
+def local_layout(n: int, structure: Structure) -> Layout:
+    """Shape of the chunks that suits this process.
+
+    Args:
+        n: cases.
+        structure: of them.
+    """
+    devices = len(jax.local_devices())
     # a case's command takes most of the memory: references at every point of every step
     points = structure.n_steps * (2 * structure.substeps + 1)
     lane_bytes = points * 3 * 8 * 8 + 2**16

@@ -17,6 +17,7 @@ from rich.progress import (
 )
 
 from jaxmodel import status
+from studies.sweeps.folder import ranges
 
 
 class Reporter:
@@ -70,6 +71,10 @@ class Reporter:
         else:
             left = (self.total - self.done) / max(self.rate, 1e-9)
             self.say(f"{self.done}/{self.total} cases, {text}, {left:.0f} s left")
+
+    def lost(self, rows: np.ndarray, reason: str) -> None:
+        """A chunk is given up; rows are the numbers of its cases."""
+        self.console.print(f"cases {ranges(rows)} are left out: {reason}", soft_wrap=True)
 
     @property
     def run_time(self) -> float:

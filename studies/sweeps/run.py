@@ -9,26 +9,22 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import numpy as np
 from rich.console import Console
 
-from jaxmodel.case import Case
 from studies import config
-from studies.cases import powered
 from studies.errors import StudyError
-from studies.runs import with_ratio
-from studies.sweeps.executor import make_executor, own_ratios
+from studies.sweeps.chunks import Done, Here, Lost, Runner, has_own_ratio, start_chunk
+from studies.sweeps.executor import make_executor
 from studies.sweeps.folder import (
     SweepFolder,
     finished_cases,
     make_manifest,
     open_folder,
 )  # fmt: skip
-from studies.sweeps.plan import Group, chunk_cases, plan_groups
-from studies.sweeps.program import Executor, Running
+from studies.sweeps.plan import Group, chunk_cases, local_layout, plan_groups
 from studies.sweeps.progress import Reporter
 from studies.sweeps.results import chunk_variables, kept_metrics, manifest_attributes, merge
 from studies.sweeps.spec import SweepSpec
@@ -45,6 +41,7 @@ class Outcome(NamedTuple):
     run_time: float  # [s]
     is_interrupted: bool  # by Ctrl-C
     executor: str  # that ran the last chunks; "" where there were none
+    lost: np.ndarray  # numbers of cases that were given up, with the reason in the folder
 
 
 class Plan(NamedTuple):
@@ -71,7 +68,7 @@ def make_plan(spec: SweepSpec, out: Path | None = None) -> Plan:
     rows = np.arange(len(table))
     if out is not None:
         rows = _rows_left(table, finished_cases(out).case_id, out)
-    groups = plan_groups(table, rows, len(jax.local_devices()), spec.sweep.metrics)
+    groups = plan_groups(table, rows, local_layout, spec.sweep.metrics)
     return Plan(table, groups, len(table) - len(rows))
 
 
@@ -81,6 +78,7 @@ def run_sweep(
     is_resumed: bool = False,
     console: Console | None = None,
     is_quiet: bool = False,
+    runner: Runner | None = None,
 ) -> Outcome:
     """Run a sweep into a folder.
 
@@ -90,6 +88,7 @@ def run_sweep(
         is_resumed: go on with, or extend, the sweep that is there.
         console: where progress goes; default: standard output.
         is_quiet: no progress.
+        runner: where chunks are run; default: here.
 
     Returns:
         Outcome; `results.h5` is there unless the run was interrupted.
@@ -98,6 +97,7 @@ def run_sweep(
         StudyError: a fault of the sweep, the folder or the disk. Finished chunks stay.
     """
     config.require_configured()
+    runner = runner or Here()
     kept = kept_metrics(spec)
     table = build_table(spec)
     console = console or Console(highlight=False, markup=False)
@@ -106,21 +106,23 @@ def run_sweep(
         finished = finished_cases(out, lambda text: console.print(text, soft_wrap=True))
         rows = _rows_left(table, finished.case_id, out)
         folder.begin(manifest)
-        groups = plan_groups(table, rows, len(jax.local_devices()), spec.sweep.metrics)
+        groups = plan_groups(table, rows, runner.layout, spec.sweep.metrics)
         n_before = len(table) - len(rows)
         with Reporter(console, len(table), n_before, is_quiet) as reporter, _interrupts() as stop:
             reporter.say(_headline(table, groups, n_before))
-            is_interrupted = _run_groups(table, groups, kept, folder, reporter, stop)
+            chunks = runner.run(table, groups, reporter, stop)
+            lost = _run_chunks(chunks, table, kept, folder, reporter)
+            is_interrupted = stop.is_set() and reporter.done + len(lost) < reporter.total
             if not is_interrupted:
                 finished = finished_cases(out)
-                _check_whole(table, finished.case_id, out)
+                _check_whole(table, np.union1d(finished.case_id, table.case_id[lost]), out)
                 attributes = {"title": spec.study.title, **manifest_attributes(manifest)}
                 timings = {"compile_time": reporter.compile_time, "run_time": reporter.run_time}
                 merge(out, table, finished, attributes | timings)
                 folder.publish()
         return Outcome(
             table, reporter.done, reporter.n_run, reporter.compile_time, reporter.run_time,
-            is_interrupted, reporter.executor,
+            is_interrupted, reporter.executor, lost,
         )  # fmt: skip
 
 
@@ -163,79 +165,28 @@ def _check_whole(table: Table, done: np.ndarray, out: Path) -> None:
         )
 
 
-def _run_groups(
+def _run_chunks(
+    done: Iterator[Done | Lost],
     table: Table,
-    groups: list[Group],
     kept: list[str],
     folder: SweepFolder,
     reporter: Reporter,
-    stop: threading.Event,
-) -> bool:
-    """Run all chunks; whether Ctrl-C ended it."""
-    source = table.values("control.ratio_source")
-    for group in groups:
-        is_own = source[group.rows] == "own_run"
-        executor = make_executor(group.structure, group.layout, bool(is_own.any()))
-        substeps = group.structure.substeps
-        pending: tuple[np.ndarray, np.ndarray, Running] | None = None
-        position = 0
-        for rows in group.chunks():
-            cases = chunk_cases(table, rows, group.structure, group.layout.size)
-            is_first = executor.compile_time == 0
-            started = start_chunk(executor, table, rows, cases, bool(is_own.any()))
-            if is_first:
-                reporter.compiled(executor.name, executor.compile_time)
-            stiff = group.is_too_stiff[position : position + len(rows)]
-            position += len(rows)
-            # the device computes this chunk while the one before is written
-            if pending is not None:
-                _finish(table, pending, substeps, kept, folder, reporter)
-            pending = (rows, stiff, started)
-            if stop.is_set():
-                break
-        if pending is not None:
-            if stop.is_set() and reporter.n_run:  # the chunk before is safe, this one just begun
-                pending[2].cancel()
-                return True
-            _finish(table, pending, substeps, kept, folder, reporter)
-        if stop.is_set():
-            return reporter.done < reporter.total
-    return False
-
-
-def start_chunk(
-    executor: Executor, table: Table, rows: np.ndarray, cases: Case, has_own_ratio: bool
-) -> Running:
-    """Start a chunk, after its uncontrolled pass where gain ratios come from that.
-
-    Args:
-        executor: of the group.
-        table: all cases.
-        rows: those of the chunk.
-        cases: from `chunk_cases`.
-        has_own_ratio: whether such a pass is needed.
-
-    Returns:
-        Running.
-    """
-    if has_own_ratio:
-        size = max(map(len, jax.tree.leaves(cases)))
-        filled = np.concatenate([rows, np.full(size - len(rows), rows[-1])])
-        is_own = table.values("control.ratio_source")[filled] == "own_run"
-        exponent = table.values("control.ratio_exponent")[filled][:, None, None]
-        own = powered(own_ratios(executor, cases), exponent)
-        cases = with_ratio(cases, np.where(is_own[:, None, None], own, cases.control.ratio))
-    return executor.start(cases)
-
-
-def _finish(
-    table: Table, pending: tuple[Any, Any, Running], substeps: int, kept: list[str],
-    folder: SweepFolder, reporter: Reporter,
-) -> None:  # fmt: skip
-    rows, stiff, running = pending
-    variables = chunk_variables(table, rows, running.wait(), stiff, substeps, kept)
-    folder.write_chunk(variables)
-    reporter.chunk(variables["status"].data)
+) -> np.ndarray:
+    """Keep what chunks give; rows of the table that were given up."""
+    lost = [np.empty(0, int)]
+    for one in done:
+        if isinstance(one, Lost):
+            lost.append(one.chunk.rows)
+            folder.give_up(one.chunk.rows, one.reason)
+            reporter.lost(one.chunk.rows, one.reason)
+            continue
+        chunk = one.chunk
+        variables = chunk_variables(
+            table, chunk.rows, one.result, chunk.is_too_stiff, one.substeps, kept
+        )
+        folder.write_chunk(variables)
+        reporter.chunk(variables["status"].data)
+    return np.concatenate(lost)
 
 
 @contextmanager
@@ -269,9 +220,9 @@ class Estimate(NamedTuple):
 def calibrate(plan: Plan) -> Estimate:
     """Compile the first program and time one chunk of it."""
     group = plan.groups[0]
-    has_own = bool((plan.table.values("control.ratio_source")[group.rows] == "own_run").any())
+    has_own = has_own_ratio(plan.table, group)
     executor = make_executor(group.structure, group.layout, has_own)
-    rows = group.chunks()[0]
+    rows = group.chunks()[0].rows
     cases = chunk_cases(plan.table, rows, group.structure, group.layout.size)
     start_chunk(executor, plan.table, rows, cases, has_own).wait()
     began = time.perf_counter()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +11,13 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from studies.cluster.connect import (
+    LocalWorkers,
+    Scheduler,
+    Workers,
+    WorkerTimeout,
+    evaluator_for,
+)
 from studies.config import start
 from studies.errors import StudyError
 from studies.tuning.spec import TuneSpec, load_tuning
@@ -27,21 +35,29 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             bool, typer.Option("--audit", help="only compare derivatives with differences")
         ] = False,
         quiet: Annotated[bool, typer.Option("--quiet", help="no progress")] = False,
+        scheduler: Scheduler = None,
+        local_workers: LocalWorkers = None,
+        worker_timeout: WorkerTimeout = 600.0,
     ) -> None:
         """Move free numbers of a study downhill, within limits, for many machines at once."""
-        start()
+        workers = Workers(scheduler, local_workers, worker_timeout)
+        start(cpu_only=workers.are_named)
         from studies.sweeps.spec import ready_spec
         from studies.tuning.run import REPORT, run_tuning
 
         asked = load_tuning(ready_spec(spec))
-        if audit and (out or resume or quiet):
-            raise StudyError("--audit: writes nothing; leave --out, --resume and --quiet out")
+        if audit and (out or resume or quiet or workers.are_named):
+            raise StudyError(
+                "--audit: writes nothing, here; leave --out, --resume, --quiet and workers out"
+            )
         if audit:
             _audit(asked, console)
             return
         if out is None:
             raise StudyError("--out: name a folder for the results")
-        run_tuning(asked, out, resume, console, quiet)
+        tell = partial(console.print, soft_wrap=True)
+        with evaluator_for(asked, workers, tell) as evaluator:
+            run_tuning(asked, out, resume, console, quiet, evaluator)
         console.print(f"report: {out / REPORT}; tuned studies beside it", soft_wrap=True)
 
 

@@ -44,6 +44,7 @@ def run_tuning(
     is_resumed: bool = False,
     console: Console | None = None,
     is_quiet: bool = False,
+    evaluator: Evaluator | None = None,
 ) -> Findings:
     """Tune, check the result on fresh scenarios, and write it.
 
@@ -53,6 +54,7 @@ def run_tuning(
         is_resumed: go on with the tuning that is there.
         console: where progress goes; default: standard output.
         is_quiet: no progress.
+        evaluator: what evaluates all starts; default: this process, as `make_evaluator`.
 
     Returns:
         What was found.
@@ -75,7 +77,7 @@ def run_tuning(
         if before is not None:
             say(f"going on after iteration {int(before.iteration)}")
         say("compiling, and looking for starts by the linear loop")
-        evaluator = make_evaluator(spec)
+        evaluator = evaluator or make_evaluator(spec)
 
         def keep(at: Progress) -> None:
             save_progress(out / PROGRESS, at)

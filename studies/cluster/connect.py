@@ -1,0 +1,223 @@
+"""The way to the workers: a scheduler that is there, or workers of our own on this machine."""
+
+from __future__ import annotations
+
+import glob
+import json
+import logging
+import os
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
+
+from studies.config import usable_cores
+from studies.errors import StudyError, field_error
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+    from studies.sweeps.chunks import Runner
+    from studies.sweeps.spec import SweepSpec
+    from studies.tuning.evaluate import Evaluator
+    from studies.tuning.spec import TuneSpec
+
+#: Options of the commands that can use workers.
+Scheduler = Annotated[
+    str | None, typer.Option(help="work on a Dask cluster: tcp://HOST:PORT or its JSON file")
+]
+LocalWorkers = Annotated[int | None, typer.Option(help="work on so many processes of this machine")]
+WorkerTimeout = Annotated[
+    float, typer.Option(help="a worker that is busy for longer without an answer is restarted [s]")
+]
+
+#: A scheduler answers, and its first worker comes, within these times [s].
+PATIENCE, WORKER_PATIENCE = 15, 300
+#: Ctrl-C on a terminal reaches the workers too, but it is the client that ends in good order.
+_DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+
+
+class Workers(NamedTuple):
+    """Where work is to be done, as asked for on the command line."""
+
+    scheduler: str | None  # address (tcp://host:8786, tls://...) or the scheduler's file (JSON)
+    local: int | None  # or how many processes to start on this machine
+    timeout: float  # a worker that is busy for longer without an answer is restarted [s]
+
+    @property
+    def are_named(self) -> bool:
+        """Whether there are any; else work is done by this process."""
+        return self.scheduler is not None or self.local is not None
+
+
+@contextmanager
+def runner_for(
+    spec: SweepSpec, workers: Workers, tell: Callable[[str], None]
+) -> Iterator[Runner | None]:
+    """What runs a sweep on workers, None for this process.
+
+    Raises:
+        StudyError: as `connected`.
+    """
+    if not workers.are_named:
+        yield None
+        return
+    with connected(workers, tell) as client:
+        from studies.cluster.runner import ClusterRunner
+
+        yield ClusterRunner(client, spec, workers.timeout)
+
+
+@contextmanager
+def evaluator_for(
+    spec: TuneSpec, workers: Workers, tell: Callable[[str], None]
+) -> Iterator[Evaluator | None]:
+    """What evaluates the designs of a tuning on workers, None for this process.
+
+    Raises:
+        StudyError: as `connected`.
+    """
+    if not workers.are_named:
+        yield None
+        return
+    with connected(workers, tell) as client:
+        from studies.cluster.designs import ClusterEvaluator
+
+        yield ClusterEvaluator(client, spec, workers.timeout, tell)
+
+
+@contextmanager
+def connected(workers: Workers, tell: Callable[[str], None]) -> Iterator[Client]:
+    """A client of a cluster whose workers fit.
+
+    Args:
+        workers: which ones.
+        tell: called with what is going on.
+
+    Raises:
+        StudyError: no extra `cluster`, no such scheduler, no worker, workers of other versions.
+    """
+    option = "--local-workers" if workers.scheduler is None else "--scheduler"
+    if workers.scheduler is not None and workers.local is not None:
+        raise StudyError("--scheduler, --local-workers: name one of them")
+    if not workers.timeout > 0:
+        raise field_error("--worker-timeout", workers.timeout, "more than 0", "s")
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise StudyError(
+            f"{option}: Dask's distributed is missing: install flexlink-studies[cluster]"
+        ) from None
+    # what users should know is said by this package
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    found = (
+        _started(workers.local or 0) if workers.scheduler is None else _joined(workers.scheduler)
+    )
+    with found as client:
+        if not client.ncores():
+            tell("waiting for a worker to join")
+        wait_for_workers(client)
+        refuse_other_versions(client)
+        yield client
+
+
+@contextmanager
+def _joined(scheduler: str) -> Iterator[Client]:
+    from distributed import Client
+    from distributed.security import Security
+
+    address = scheduler if "://" in scheduler else _written_address(scheduler)
+    if not re.fullmatch(r"(tcp|tls)://[^/]+:\d+", address):
+        raise field_error("--scheduler", address, "tcp://HOST:PORT or tls://HOST:PORT")
+    # Dask would not clean up after these
+    context = Security().get_connection_args("client").get("ssl_context")
+    if address.startswith("tls://") and context is None:
+        raise StudyError(
+            f"--scheduler {address}: no certificates of a client; set them for Dask "
+            "(distributed.comm.tls, docs/cluster.md)"
+        )
+    try:
+        client = Client(address, timeout=PATIENCE, set_as_default=False)
+    except (OSError, ValueError, RuntimeError) as error:  # timeouts are among the first
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise StudyError(f"--scheduler {scheduler}: no scheduler answers ({reason})") from None
+    with client:
+        yield client
+
+
+def _written_address(file: str) -> str:
+    """Address in the file of a scheduler."""
+    try:
+        address = json.loads(Path(file).read_text(encoding="utf-8"))["address"]
+    except FileNotFoundError:
+        allowed = "tcp://HOST:PORT, tls://HOST:PORT, or a scheduler's JSON file"
+        raise field_error("--scheduler", file, allowed) from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise StudyError(f"--scheduler {file}: no file of a scheduler ({error})") from None
+    return str(address)
+
+
+@contextmanager
+def _started(count: int) -> Iterator[Client]:
+    """Workers on this machine that share its cores, or have a graphics processor each."""
+    from distributed import Client, Nanny, Scheduler, SpecCluster
+
+    cores = usable_cores()
+    if not 1 <= count <= cores:
+        raise field_error("--local-workers", count, f"1 to {cores}, the cores of this machine")
+    options = {
+        "nthreads": cores // count, "host": "127.0.0.1", "silence_logs": logging.CRITICAL,
+        "preload": [_DEAF],
+    }  # fmt: skip
+    workers = {k: {"cls": Nanny, "options": options | {"env": _graphics(k)}} for k in range(count)}
+    heart = {"cls": Scheduler, "options": {"host": "127.0.0.1", "port": 0, "dashboard": False}}
+    with (
+        SpecCluster(workers, heart, silence_logs=logging.CRITICAL) as cluster,
+        Client(cluster, timeout=PATIENCE, set_as_default=False) as client,
+    ):
+        client.wait_for_workers(count, timeout=WORKER_PATIENCE)
+        yield client
+
+
+def _graphics(number: int) -> dict[str, str]:
+    """Environment that shows a worker one of the graphics processors; empty where there is none."""
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    found = [str(k) for k in range(len(glob.glob("/dev/nvidia[0-9]*")))]
+    devices = named.split(",") if named else found
+    return {"CUDA_VISIBLE_DEVICES": devices[number % len(devices)]} if devices else {}
+
+
+def wait_for_workers(client: Client) -> None:
+    """Raise StudyError where no worker joins in time."""
+    try:
+        client.wait_for_workers(1, timeout=WORKER_PATIENCE)
+    except TimeoutError:
+        raise StudyError(f"no worker has joined within {WORKER_PATIENCE} s") from None
+
+
+def refuse_other_versions(client: Client) -> None:
+    """Raise StudyError where a worker has other versions than this process."""
+    from studies.cluster.worker import difference, identity
+
+    wanted, faults = identity(), []
+    try:
+        answers = client.run(identity, on_error="return")
+    except Exception as error:  # Dask cannot hand on every fault of a worker
+        raise StudyError(
+            f"workers cannot be asked for their versions ({error or type(error).__name__}); is "
+            "flexlink-studies installed there?"
+        ) from None
+    for address, found in answers.items():
+        if isinstance(found, Exception):
+            faults.append(f"{address}: {str(found) or type(found).__name__}")
+        elif difference(found, wanted):
+            faults.append(f"{address}: {difference(found, wanted)}")
+    if faults:
+        more = f" (and {len(faults) - 3} more)" if len(faults) > 3 else ""
+        raise StudyError(
+            f"workers do not fit this client: {'; '.join(faults[:3])}{more}; install the same "
+            "versions everywhere"
+        )

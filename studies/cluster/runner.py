@@ -1,0 +1,116 @@
+"""Chunks of a sweep on the workers of a cluster: few in flight, none lost, none twice.
+
+Dask runs a chunk elsewhere when its worker dies. A chunk whose workers keep dying, or that fails
+there, is tried once more with nothing else in flight, since what dies beside a bad chunk is not
+bad itself; then it is given up.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import deque
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
+
+from jaxmodel.case import Structure
+from studies import config
+from studies.cluster.connect import wait_for_workers
+from studies.cluster.watch import Watch
+from studies.cluster.worker import Answer, Job, chunk_size, identity, run_chunk
+from studies.errors import StudyError
+from studies.sweeps.chunks import Done, Lost, has_own_ratio
+from studies.sweeps.plan import Chunk, Group, Layout
+from studies.sweeps.progress import Reporter
+from studies.sweeps.spec import SweepSpec
+from studies.sweeps.table import Table
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+#: Chunks in flight for each worker: one that it runs, one that is there when it is ready.
+AHEAD = 2
+#: Chunks for each worker at least, so that none waits long for the last ones.
+LEAST_CHUNKS = 4
+
+
+class Flight(NamedTuple):
+    """A chunk that is under way."""
+
+    group: Group
+    chunk: Chunk
+    is_alone: bool  # nothing else is in flight
+
+
+class ClusterRunner:
+    """Runs the chunks of one sweep on a cluster; a `studies.sweeps.chunks.Runner`."""
+
+    def __init__(self, client: Client, spec: SweepSpec, timeout: float) -> None:
+        """
+        Args:
+            client: from `connected`.
+            spec: the sweep.
+            timeout: a worker that is busy for longer without an answer is restarted [s].
+        """
+        self._client, self._timeout = client, timeout
+        self._spec, self._identity = json.dumps(spec.data), identity()
+        self._precision = config.origin()["precision"]
+
+    def layout(self, n: int, structure: Structure) -> Layout:
+        wait_for_workers(self._client)
+        share = -(-n // (LEAST_CHUNKS * max(len(self._client.ncores()), 1)))
+        asked = chunk_size, share, structure, self._precision
+        answers = list(self._client.run(*asked, on_error="return").values())
+        sizes = [size for size in answers if isinstance(size, int)]
+        if not sizes:
+            raise StudyError(f"no worker is ready: {answers[0] if answers else 'all have gone'}")
+        return Layout(1, 1, min(sizes))
+
+    def run(
+        self, table: Table, groups: list[Group], reporter: Reporter, stop: threading.Event
+    ) -> Iterator[Done | Lost]:
+        watch = Watch(self._client, self._timeout, reporter.say)
+        reporter.say(f"workers: {watch.n_workers}")
+        waiting = (Flight(group, chunk, False) for group in groups for chunk in group.chunks())
+        has_own = {group.structure: has_own_ratio(table, group) for group in groups}
+        suspects: deque[Flight] = deque()
+        flying: dict[Future, Flight] = {}
+        compiled: set[Structure] = set()
+
+        def begin(flight: Flight | None) -> bool:
+            if flight is None or stop.is_set():
+                return False
+            flying[self._submit(flight, has_own[flight.group.structure])] = flight
+            return True
+
+        try:
+            while True:
+                while len(flying) < AHEAD * max(watch.n_workers, 1) and begin(next(waiting, None)):
+                    pass
+                if not flying and suspects:
+                    begin(suspects.popleft())
+                if not flying or (stop.is_set() and not watch.n_workers):
+                    return
+                for future in watch.landed(flying):
+                    flight = flying.pop(future)
+                    structure = flight.group.structure
+                    answer = watch.outcome(future)
+                    if isinstance(answer, Answer):
+                        if answer.compile_time and structure not in compiled:
+                            compiled.add(structure)
+                            reporter.compiled(answer.executor, answer.compile_time)
+                        yield Done(flight.chunk, structure.substeps, answer.result)
+                    elif flight.is_alone:
+                        yield Lost(flight.chunk, answer)
+                    else:
+                        suspects.append(flight._replace(is_alone=True))
+        finally:
+            if flying:
+                self._client.cancel(list(flying))
+
+    def _submit(self, flight: Flight, has_own: bool) -> Future:
+        job = Job(
+            self._identity, self._precision, self._spec, flight.group.structure, has_own,
+            flight.group.layout.size, flight.chunk.rows,
+        )  # fmt: skip
+        return self._client.submit(run_chunk, job, pure=False)

@@ -1,0 +1,100 @@
+"""Work under way on a cluster: what came of it, and which workers hang."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
+
+from studies.errors import StudyError
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+#: How often workers are looked at [s].
+LOOK = 1.0
+#: Time for a worker that hangs to be stopped [s].
+KILL_TIME = 10
+
+
+class Watch:
+    """Waits for work, counts workers, restarts those that are busy for too long."""
+
+    def __init__(self, client: Client, timeout: float, tell: Callable[[str], None]) -> None:
+        """
+        Args:
+            client: from `connected`.
+            timeout: a worker that is busy for longer without an answer is restarted [s].
+            tell: called with what users should know.
+        """
+        self._client, self._timeout, self._tell = client, timeout, tell
+        self._idle: dict[str, float] = {}  # when a worker last had nothing to do, or answered
+        self._looked = 0.0
+        self.n_workers = len(client.ncores())
+
+    def landed(self, flying: Iterable[Future]) -> list[Future]:
+        """What needs no more waiting for; after a while without any, nothing."""
+        from distributed import CancelledError, wait
+
+        futures = list(flying)
+        try:
+            with self._client.as_current():
+                wait(futures, timeout=LOOK, return_when="FIRST_COMPLETED")
+        except (TimeoutError, CancelledError):
+            pass
+        self._look({future.key for future in futures})
+        return [future for future in futures if future.status != "pending"]
+
+    def outcome(self, future: Future) -> Any:
+        """What a worker answered, or a text that says why there is nothing.
+
+        Raises:
+            StudyError: the worker refuses the work, or the scheduler is gone.
+        """
+        from distributed import CancelledError, KilledWorker
+
+        try:
+            answer = future.result()
+        except StudyError:
+            raise
+        except (CancelledError, OSError):
+            raise StudyError(
+                "the scheduler is gone; what is finished is safe, go on with --resume"
+            ) from None
+        except KilledWorker:
+            return "the workers that ran it died"
+        except Exception as error:  # of JAX, LLVM, memory: whatever may go wrong there
+            return f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
+        self._idle[answer.worker] = time.monotonic()
+        return answer
+
+    def _look(self, keys: set[Any]) -> None:
+        now = time.monotonic()
+        if now - self._looked < LOOK:
+            return
+        self._looked = now
+        try:
+            busy = self._client.processing()
+        except OSError:
+            return  # the work itself will tell
+        if len(busy) != self.n_workers:
+            self.n_workers = len(busy)
+            self._tell(f"workers: {self.n_workers}")
+        for address, processing in busy.items():
+            if not keys.intersection(processing):
+                self._idle[address] = now
+            elif now - self._idle.setdefault(address, now) > self._timeout:
+                self._tell(
+                    f"worker {address} has not answered for {self._timeout:g} s; its work is done "
+                    "elsewhere"
+                )
+                self._restart(address)
+                self._idle[address] = now
+
+    def _restart(self, address: str) -> None:
+        """Stop a worker; its nanny starts another, where it has one."""
+        call: Any = self._client.scheduler.restart_workers
+        self._client.sync(
+            call, workers=[address], timeout=KILL_TIME, wait_for_workers=False,
+            on_error="return", stimulus_id=f"studies-overdue-{time.monotonic()}",
+        )  # fmt: skip

@@ -1,0 +1,122 @@
+"""What runs on a worker: a chunk from the sweep's file and row numbers alone.
+
+A worker process runs one chunk at a time, on as many cores as it has threads or on the graphics
+processors it sees, and keeps its table and its programs for the next one.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from functools import lru_cache
+from importlib.metadata import version
+from threading import RLock
+from typing import NamedTuple
+
+import numpy as np
+from distributed import Worker, get_worker
+
+from jaxmodel.case import Structure
+from jaxmodel.simulate import Result
+from studies import config
+from studies.errors import StudyError
+from studies.sweeps.chunks import start_chunk
+from studies.sweeps.executor import make_executor
+from studies.sweeps.folder import code_digest
+from studies.sweeps.plan import chunk_cases, even_layout, local_layout
+from studies.sweeps.program import Executor
+from studies.sweeps.spec import parse_sweep
+from studies.sweeps.table import Table, build_table
+
+#: One chunk at a time: it takes all that the worker has.
+alone = RLock()
+
+
+class Job(NamedTuple):
+    """A chunk, by what decides its numbers."""
+
+    identity: dict[str, str]  # of the client, see `identity`
+    precision: str
+    spec: str  # the sweep as JSON
+    structure: Structure  # of the chunk's group
+    has_own_ratio: bool  # EMC ratios come from an uncontrolled pass
+    size: int  # cases in a full chunk, for one program whatever is left for the last one
+    rows: np.ndarray  # of the sweep's table, (k,)
+
+
+class Answer(NamedTuple):
+    """What a worker has made of a job."""
+
+    result: Result  # padded, NumPy arrays
+    executor: str
+    compile_time: float  # [s], 0 where the program was there already
+    worker: str  # address
+
+
+def identity() -> dict[str, str]:
+    """What must be the same on client and workers; more would do no harm to be different."""
+    return {
+        "code": code_digest(),
+        "python": ".".join(platform.python_version_tuple()[:2]),
+        **{name: version(name) for name in ("jax", "jaxlib", "numpy")},
+    }
+
+
+def difference(found: dict[str, str], wanted: dict[str, str]) -> str:
+    """In what a worker differs from the client, "" for nothing."""
+    parts = [
+        f"{name} {found.get(name)} (client: {value})"
+        for name, value in wanted.items()
+        if found.get(name) != value
+    ]
+    return ", ".join(parts)
+
+
+def refuse_difference(wanted: dict[str, str], worker: Worker) -> None:
+    """Raise StudyError where this worker, which may have come late, differs from the client."""
+    found = difference(identity(), wanted)
+    if found:
+        raise StudyError(f"worker {worker.address}: {found}; install the same there")
+
+
+def get_ready(precision: str, worker: Worker) -> None:
+    """Start JAX on the worker's share of the machine: a core for each of its threads."""
+    config.configure(precision, worker.state.nthreads)
+    config.start(precision)
+
+
+def chunk_size(n: int, structure: Structure, precision: str, dask_worker: Worker) -> int:
+    """How many cases of n the worker would like to run at once; Dask adds the last argument."""
+    with alone:
+        get_ready(precision, dask_worker)
+        return local_layout(n, structure).size
+
+
+def run_chunk(job: Job) -> Answer:
+    """Run a chunk.
+
+    Raises:
+        StudyError: the worker has other versions than the client.
+    """
+    with alone:
+        worker = get_worker()
+        refuse_difference(job.identity, worker)
+        get_ready(job.precision, worker)
+        table = _table(job.spec)
+        executor = _executor(job.precision, job.structure, job.size, job.has_own_ratio)
+        is_first = executor.compile_time == 0
+        size = even_layout(job.size).size
+        cases = chunk_cases(table, job.rows, job.structure, size)
+        result = start_chunk(executor, table, job.rows, cases, job.has_own_ratio).wait()
+        compile_time = executor.compile_time if is_first else 0.0
+        return Answer(result, executor.name, compile_time, worker.address)
+
+
+@lru_cache(maxsize=1)
+def _table(spec: str) -> Table:
+    return build_table(parse_sweep(json.loads(spec)))
+
+
+@lru_cache(maxsize=8)
+def _executor(precision: str, structure: Structure, size: int, has_own_ratio: bool) -> Executor:
+    return make_executor(structure, even_layout(size), has_own_ratio)

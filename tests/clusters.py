@@ -1,0 +1,110 @@
+"""A scheduler and workers on this machine, each a process of its own, with trouble on demand."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import psutil
+
+import studies
+from studies.cluster.connect import Workers, connected
+
+#: Chunks of 16 cases as in the other tests, and what the file `trouble` asks for.
+PRELOAD = """
+import json, os, time
+from pathlib import Path
+from studies.cluster import worker
+from studies.sweeps import plan
+
+plan.LANES, plan.LARGEST_CHUNK = 8, 16
+trouble = Path(os.environ["TROUBLE"])
+# this file may be run twice
+start, identity = worker.__dict__.setdefault("plain", (worker.start_chunk, worker.identity))
+
+def started(executor, table, rows, *more):
+    asked = json.loads(trouble.read_text())
+    if asked.get("kill") in rows:
+        os._exit(9)
+    if asked.get("fail") in rows:
+        raise MemoryError("no room")
+    if asked.get("hang") in rows:
+        trouble.write_text("{}")
+        time.sleep(1000)
+    return start(executor, table, rows, *more)
+
+worker.start_chunk = started
+worker.identity = lambda: identity() | json.loads(trouble.read_text()).get("identity", {})
+"""
+
+
+class Machines:
+    """Processes of a cluster."""
+
+    def __init__(self, folder, threads=1, is_small=True):
+        self._threads, self._is_small = threads, is_small
+        self.scheduler, self._trouble = folder / "scheduler.json", folder / "trouble"
+        self._preload = folder / "preload.py"
+        self._preload.write_text(PRELOAD)
+        root = str(Path(studies.__file__).parents[1])
+        self._environment = os.environ | {
+            "TROUBLE": str(self._trouble), "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
+            "DASK_TEMPORARY_DIRECTORY": str(folder), "PYTHONPATH": root,
+        }  # fmt: skip
+        self.processes = []
+        self.trouble()
+        self._start("dask_scheduler", "--port", "0", "--no-dashboard", "--no-show")
+        deadline = time.monotonic() + 60
+        while not self.scheduler.exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+
+    def trouble(self, **asked):
+        """What goes wrong from now on: `kill`, `fail` or `hang` with a case, other `identity`."""
+        self._trouble.write_text(json.dumps(asked))
+
+    def add_worker(self):
+        """Start a worker with its nanny."""
+        small = ["--preload", self._preload] if self._is_small else []
+        self._start("dask_worker", "--nthreads", self._threads, "--no-dashboard", *small)
+
+    def pids(self):
+        """Of the workers, whose parents are their nannies."""
+        found = []
+        for nanny in self.processes[1:]:
+            for child in psutil.Process(nanny.pid).children(recursive=True):
+                with suppress(psutil.Error):
+                    found += [child.pid] * ("spawn_main" in " ".join(child.cmdline()))
+        return sorted(found)
+
+    def _start(self, program, *options):
+        command = [sys.executable, "-m", f"distributed.cli.{program}", *map(str, options)]
+        command += ["--scheduler-file", str(self.scheduler), "--host", "127.0.0.1"]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        self.processes.append(subprocess.Popen(command, env=self._environment, **quiet))
+
+    def stop(self):
+        """End them all at once."""
+        every = [psutil.Process(process.pid) for process in self.processes]
+        for process in [*every, *(c for one in every for c in one.children(recursive=True))]:
+            with suppress(psutil.Error):
+                process.kill()
+        for process in self.processes:
+            process.wait()
+
+
+@contextmanager
+def machines(folder, workers=2, **options):
+    """A scheduler with workers, and a client of them."""
+    found = Machines(folder, **options)
+    try:
+        for _ in range(workers):
+            found.add_worker()
+        with connected(Workers(str(found.scheduler), None, 60.0), print) as client:
+            client.wait_for_workers(workers, timeout=120)
+            found.client = client
+            yield found
+    finally:
+        found.stop()

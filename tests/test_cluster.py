@@ -1,0 +1,252 @@
+"""Sweeps and tunings on a real scheduler and two real workers: the same numbers, whatever dies."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import ExitStack
+from itertools import islice
+
+import jax
+import numpy as np
+import pytest
+from rich.console import Console
+
+from studies.cluster import connect
+from studies.cluster.connect import Workers, connected
+from studies.cluster.designs import ClusterEvaluator
+from studies.cluster.runner import ClusterRunner
+from studies.cluster.worker import identity
+from studies.errors import StudyError
+from studies.sweeps import plan
+from studies.sweeps.chunks import Here
+from studies.sweeps.folder import CHUNKS, finished_cases, read_manifest
+from studies.sweeps.results import NOT_RUN, load
+from studies.sweeps.run import run_sweep
+from studies.tuning.run import make_evaluator
+from tests.clusters import machines
+from tests.sweeps import MIXED, small_spec
+from tests.test_cli import refused
+from tests.test_sweeps import arrays, assert_same
+from tests.tunings import GAIN, tuning
+
+SPEC = small_spec(MIXED | {"blocks": [MIXED["blocks"][0] | {"count": 8}]})
+CASES = 144
+
+
+@pytest.fixture(autouse=True, scope="module")
+def small_chunks():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "LANES", 8)
+        patch.setattr(plan, "LARGEST_CHUNK", 16)
+        yield
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    """A scheduler and two workers, and a client of them."""
+    with machines(tmp_path_factory.mktemp("cluster")) as found:
+        yield found
+
+
+@pytest.fixture(autouse=True)
+def two_workers_without_trouble(cluster):
+    cluster.trouble()
+    cluster.client.wait_for_workers(2, timeout=120)
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory):
+    """Folder of the same sweep run here."""
+    out = tmp_path_factory.mktemp("local") / "sweep"
+    run_sweep(SPEC, out, is_quiet=True)
+    return out
+
+
+def told(cluster, out, *more, timeout=60.0):
+    """Run the sweep on the cluster; the outcome and what was said."""
+    console = Console(record=True, width=200, file=open(os.devnull, "w"))  # noqa: SIM115
+    runner = ClusterRunner(cluster.client, SPEC, timeout)
+    outcome = run_sweep(SPEC, out, *more, console=console, runner=runner)
+    return outcome, console.export_text()
+
+
+def test_numbers_are_those_of_the_local_run(cluster, local, tmp_path):
+    outcome, text = told(cluster, tmp_path / "out")
+    assert outcome.n_run == CASES and len(outcome.lost) == 0
+    assert_same(arrays(local), arrays(tmp_path / "out"), 1e-12)
+    assert "workers: 2" in text and "144/144 cases" in text
+
+
+def test_from_here_to_the_cluster_and_back(cluster, local, tmp_path):
+    class Stopped(ClusterRunner):
+        def run(self, *arguments):
+            yield from islice(super().run(*arguments), 2)
+
+    out = tmp_path / "out"
+    run_sweep(small_spec(), out, is_quiet=True)  # half of the cases
+    with pytest.raises(StudyError, match="disappeared"):
+        run_sweep(SPEC, out, True, is_quiet=True, runner=Stopped(cluster.client, SPEC, 60.0))
+    assert len(list((out / CHUNKS).glob("*.h5"))) == 2
+    done = len(finished_cases(out).case_id)
+    assert CASES / 2 < done < CASES
+    again = run_sweep(SPEC, out, True, is_quiet=True)
+    assert again.n_run == CASES - done
+    assert_same(arrays(local), arrays(out), 1e-12)
+
+
+def test_a_chunk_that_fails_costs_no_worker(cluster, tmp_path):
+    cluster.trouble(fail=3)
+    before = cluster.pids()
+    outcome, text = told(cluster, tmp_path / "out")
+    assert outcome.n_run == CASES - 16 and "MemoryError: no room" in text
+    assert cluster.pids() == before
+
+
+def test_other_versions_are_refused(cluster, tmp_path):
+    cluster.trouble(identity={"jaxlib": "0.1", "code": "f00"})
+    with (
+        pytest.raises(StudyError, match="do not fit this client: tcp://.*: code f00 .client: "),
+        connected(Workers(str(cluster.scheduler), None, 60.0), print),
+    ):
+        pass
+    with pytest.raises(StudyError, match=f"jaxlib 0.1 .client: {identity()['jaxlib']}"):
+        told(cluster, tmp_path / "late")  # a worker that came after the others were compared
+
+
+def test_a_tuning_has_the_same_slopes(cluster):
+    spec = tuning(GAIN, starts=3)
+    here = make_evaluator(spec)
+    there = ClusterEvaluator(cluster.client, spec, 60.0, lambda text: None)
+    values = spec.free.values(np.array([[0.2], [0.5], [0.8]]))
+    wanted, found = here.evaluate(values), there.evaluate(values)
+    for name, x, y in zip(wanted._fields, wanted, found, strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-12, err_msg=name)
+    assert np.abs(found.slope).min() > 0
+
+
+def test_bad_options_are_refused(capsys, tmp_path, cluster, monkeypatch):
+    monkeypatch.setattr(connect, "PATIENCE", 2)
+    spec, out = "placement", tmp_path / "out"
+    sweep = ("sweep", spec, "--out", out)
+    both = ("--scheduler", "tcp://127.0.0.1:1", "--local-workers", 2)
+    assert "name one of them" in refused(capsys, *sweep, *both)
+    assert "no scheduler answers" in refused(capsys, *sweep, *both[:2])
+    assert "tcp://HOST:PORT" in refused(capsys, *sweep, "--scheduler", "nowhere.json")
+    assert "no certificates" in refused(capsys, *sweep, "--scheduler", "tls://127.0.0.1:1")
+    assert "allowed 1 to " in refused(capsys, *sweep, "--local-workers", 0)
+    scheduler = ("--scheduler", cluster.scheduler)
+    assert "--worker-timeout = 0.0" in refused(capsys, *sweep, *scheduler, "--worker-timeout", 0)
+    assert "plans for this process" in refused(capsys, *sweep, *scheduler, "--dry-run")
+    assert not out.exists()
+
+
+def test_without_dask_the_options_say_what_to_install(tmp_path):
+    code = (
+        "import sys; sys.modules['distributed'] = None\n"
+        "from studies.cli import main; main(sys.argv[1:])"
+    )
+    command = ["sweep", "placement", "--out", str(tmp_path / "out"), "--local-workers", "2"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *command], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 2 and not (tmp_path / "out").exists()
+    assert done.stderr.startswith("studies: --local-workers: ")
+    assert "install flexlink-studies[cluster]" in done.stderr
+
+
+def test_a_worker_that_hangs_is_restarted(cluster, local, tmp_path):
+    told(cluster, tmp_path / "warm")  # compiling must not count as hanging
+    cluster.trouble(hang=100)
+    outcome, text = told(cluster, tmp_path / "out", timeout=4.0)
+    assert "has not answered for 4 s" in text and outcome.n_run == CASES
+    assert_same(arrays(local), arrays(tmp_path / "out"), 1e-12)
+
+
+def killing(cluster, out, kills, seed):
+    """A thread that kills a worker whenever a few more chunks are there."""
+    rng = random.Random(seed)
+    killed = []
+
+    def kill():
+        wanted = 0
+        for _ in range(kills):
+            wanted += rng.randint(1, 2)
+            while len(list((out / CHUNKS).glob("*.h5"))) < wanted:
+                time.sleep(0.01)
+                if (out / "results.h5").exists():
+                    return
+            os.kill(rng.choice(cluster.pids()), signal.SIGKILL)
+            killed.append(wanted)
+
+    thread = threading.Thread(target=kill, daemon=True)
+    thread.start()
+    return thread, killed
+
+
+def check_kills(cluster, local, out, kills, seed):
+    thread, killed = killing(cluster, out, kills, seed)
+    outcome, _ = told(cluster, out)
+    thread.join(timeout=60)
+    assert killed and outcome.n_run == CASES and len(outcome.lost) == 0
+    assert_same(arrays(local), arrays(out), 1e-12)
+
+
+def test_killed_workers_lose_nothing(cluster, local, tmp_path):
+    check_kills(cluster, local, tmp_path / "out", 2, 0)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(1, 6))
+def test_many_killed_workers_lose_nothing(cluster, local, tmp_path, seed):
+    check_kills(cluster, local, tmp_path / "out", 4, seed)
+
+
+def test_a_chunk_that_kills_workers_is_left_out_until_resumed(cluster, local, tmp_path):
+    cluster.trouble(kill=70)
+    out = tmp_path / "out"
+    outcome, text = told(cluster, out)
+    assert 70 in outcome.lost and len(outcome.lost) == 16
+    assert outcome.n_run == CASES - 16 and not outcome.is_interrupted
+    (entry,) = read_manifest(out)["given_up"]
+    first, last = map(int, entry["cases"].split("-"))
+    assert first <= 70 <= last == first + 15 and "died" in entry["reason"]
+    assert f"cases {entry['cases']} are left out" in text
+    status = load(out)["status"]
+    np.testing.assert_array_equal(np.flatnonzero(status == NOT_RUN), outcome.lost)
+    cluster.trouble()
+    again = run_sweep(SPEC, out, True, is_quiet=True)  # here
+    assert again.n_run == 16 and "given_up" not in read_manifest(out)
+    assert_same(arrays(local), arrays(out), 1e-12)
+
+
+@pytest.mark.long
+def test_overhead_and_scaling(tmp_path, monkeypatch):
+    """Chunks of a second, programs compiled before; medians of five rounds, side by side."""
+    monkeypatch.setattr(plan, "LANES", 64)
+    monkeypatch.setattr(plan, "LARGEST_CHUNK", 1024)
+    gain = {"gain": {"from": 0.1, "to": 1.0, "count": 8192}}
+    spec = small_spec({"axes": gain}, run={"duration": 0.4})
+    cores = len(jax.local_devices())
+    with ExitStack() as stack:
+        found = {"here": Here()}
+        for name, workers, threads in (("whole", 1, cores), ("one", 1, 1), ("two", 2, 1)):
+            (tmp_path / name).mkdir()
+            options = {"workers": workers, "threads": threads, "is_small": False}
+            group = stack.enter_context(machines(tmp_path / name, **options))
+            found[name] = ClusterRunner(group.client, spec, 600.0)
+        times = {name: [] for name in found}
+        for k in range(6):
+            for name, runner in found.items():
+                out = tmp_path / f"{name}{k}"
+                done = run_sweep(spec, out, is_quiet=True, runner=runner)
+                assert done.n_run == 8192
+                times[name] += [done.run_time] * (k > 0)
+    here, whole, one, two = (float(np.median(x)) for x in times.values())
+    print(f"here {here:.2f} s, one worker with all cores {whole:.2f} s ({whole / here - 1:+.1%});")
+    print(f"one worker with one core {one:.2f} s, two {two:.2f} s ({one / two:.2f} times faster)")
+    assert whole / here < 1.1
+    assert one / two > 1.5
