@@ -200,7 +200,7 @@ def _interrupts() -> Iterator[threading.Event]:
     def ask(*_: object) -> None:
         stop.set()
         signal.signal(signal.SIGINT, before)
-        print("studies: stopping after this chunk; Ctrl-C again: at once", file=sys.stderr)
+        print("studies: stopping after what is under way; Ctrl-C again: at once", file=sys.stderr)
 
     before = signal.signal(signal.SIGINT, ask)
     try:
