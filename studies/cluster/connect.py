@@ -7,8 +7,10 @@ import json
 import logging
 import os
 import re
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -36,8 +38,6 @@ WorkerTimeout = Annotated[
 
 #: A scheduler answers, and its first worker comes, within these times [s].
 PATIENCE, WORKER_PATIENCE = 15, 300
-#: Ctrl-C on a terminal reaches the workers too, but it is the client that ends in good order.
-_DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 
 
 class Workers(NamedTuple):
@@ -112,7 +112,8 @@ def connected(workers: Workers, tell: Callable[[str], None]) -> Iterator[Client]
             f"{option}: Dask's distributed is missing: install flexlink-studies[cluster]"
         ) from None
     # what users should know is said by this package
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     found = (
         _started(workers.local or 0) if workers.scheduler is None else _joined(workers.scheduler)
     )
@@ -170,16 +171,32 @@ def _started(count: int) -> Iterator[Client]:
         raise field_error("--local-workers", count, f"1 to {cores}, the cores of this machine")
     options = {
         "nthreads": cores // count, "host": "127.0.0.1", "silence_logs": logging.CRITICAL,
-        "preload": [_DEAF],
     }  # fmt: skip
     workers = {k: {"cls": Nanny, "options": options | {"env": _graphics(k)}} for k in range(count)}
-    heart = {"cls": Scheduler, "options": {"host": "127.0.0.1", "port": 0, "dashboard": False}}
-    with (
-        SpecCluster(workers, heart, silence_logs=logging.CRITICAL) as cluster,
-        Client(cluster, timeout=PATIENCE, set_as_default=False) as client,
-    ):
-        client.wait_for_workers(count, timeout=WORKER_PATIENCE)
+    ports = {"host": "127.0.0.1", "port": 0, "dashboard": False, "dashboard_address": "127.0.0.1:0"}
+    heart = {"cls": Scheduler, "options": ports}
+    with _deaf():
+        try:
+            cluster = SpecCluster(workers, heart, silence_logs=logging.CRITICAL)
+        except (OSError, RuntimeError) as error:  # timeouts are among the first
+            reason = str(error).partition("\n")[0] or type(error).__name__
+            raise StudyError(f"--local-workers: they do not start ({reason})") from None
+    with cluster, Client(cluster, timeout=PATIENCE, set_as_default=False) as client:
         yield client
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Threads and processes begun within it, and theirs, never hear of Ctrl-C.
+
+    On a terminal it reaches the workers too, but it is the client that ends in good order.
+    """
+    resource_tracker.ensure_running()  # which would let it through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _graphics(number: int) -> dict[str, str]:
