@@ -23,7 +23,7 @@ from studies.cluster.worker import identity
 from studies.errors import StudyError
 from studies.sweeps import plan
 from studies.sweeps.chunks import Here
-from studies.sweeps.folder import CHUNKS, finished_cases, read_manifest
+from studies.sweeps.folder import CHUNKS, SweepFolder, finished_cases, read_manifest
 from studies.sweeps.results import NOT_RUN, load
 from studies.sweeps.run import run_sweep
 from studies.tuning.run import make_evaluator
@@ -98,11 +98,30 @@ def test_from_here_to_the_cluster_and_back(cluster, local, tmp_path):
     assert_same(arrays(local), arrays(out), 1e-12)
 
 
+def test_a_full_disk_leaves_nothing_under_way(cluster, tmp_path, monkeypatch):
+    def write(*_):
+        raise StudyError("no space")
+
+    class Closed(ClusterRunner):
+        def run(self, *arguments):
+            try:
+                yield from super().run(*arguments)
+            finally:
+                closed.append(True)
+
+    closed = []
+    monkeypatch.setattr(SweepFolder, "write_chunk", write)
+    runner = Closed(cluster.client, SPEC, 60.0)
+    with pytest.raises(StudyError, match="no space") as raised:
+        run_sweep(SPEC, tmp_path / "out", is_quiet=True, runner=runner)
+    assert closed and raised.tb  # which keeps the frames: it is no matter of collecting garbage
+
+
 def test_a_chunk_that_fails_costs_no_worker(cluster, tmp_path):
     cluster.trouble(fail=3)
     before = cluster.pids()
     outcome, text = told(cluster, tmp_path / "out")
-    assert outcome.n_run == CASES - 16 and "MemoryError: no room" in text
+    assert outcome.n_run == CASES - 16 and "OSError: no room" in text
     assert cluster.pids() == before
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import TYPE_CHECKING, NamedTuple
 
 from jaxmodel.case import Structure
@@ -68,7 +68,7 @@ class ClusterRunner:
 
     def run(
         self, table: Table, groups: list[Group], reporter: Reporter, stop: threading.Event
-    ) -> Iterator[Done | Lost]:
+    ) -> Generator[Done | Lost]:
         watch = Watch(self._client, self._timeout, reporter.say)
         reporter.say(f"workers: {watch.n_workers}")
         waiting = (Flight(group, chunk, False) for group in groups for chunk in group.chunks())

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -110,8 +110,8 @@ def run_sweep(
         n_before = len(table) - len(rows)
         with Reporter(console, len(table), n_before, is_quiet) as reporter, _interrupts() as stop:
             reporter.say(_headline(table, groups, n_before))
-            chunks = runner.run(table, groups, reporter, stop)
-            lost = _run_chunks(chunks, table, kept, folder, reporter)
+            with closing(runner.run(table, groups, reporter, stop)) as chunks:
+                lost = _run_chunks(chunks, table, kept, folder, reporter)
             is_interrupted = stop.is_set() and reporter.done + len(lost) < reporter.total
             if not is_interrupted:
                 finished = finished_cases(out)
