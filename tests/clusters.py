@@ -30,7 +30,7 @@ def started(executor, table, rows, *more):
     if asked.get("kill") in rows:
         os._exit(9)
     if asked.get("fail") in rows:
-        raise MemoryError("no room")
+        raise OSError("no room")
     if asked.get("hang") in rows:
         trouble.write_text("{}")
         time.sleep(1000)

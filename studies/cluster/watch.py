@@ -51,19 +51,20 @@ class Watch:
         Raises:
             StudyError: the worker refuses the work, or the scheduler is gone.
         """
-        from distributed import CancelledError, KilledWorker
+        from distributed import KilledWorker
 
         try:
             answer = future.result()
         except StudyError:
             raise
-        except (CancelledError, OSError):
-            raise StudyError(
-                "the scheduler is gone; what is finished is safe, go on with --resume"
-            ) from None
         except KilledWorker:
             return "the workers that ran it died"
-        except Exception as error:  # of JAX, LLVM, memory: whatever may go wrong there
+        except Exception as error:
+            if future.status != "error":  # no worker has raised it
+                raise StudyError(
+                    "the scheduler is gone; what is finished is safe, go on with --resume"
+                ) from None
+            # of JAX, LLVM, memory, disk: whatever may go wrong there
             return f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
         self._idle[answer.worker] = time.monotonic()
         return answer
