@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -58,7 +57,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             return
         if out is None:
             raise StudyError("--out: name a folder for the results")
-        tell = partial(console.print, soft_wrap=True)
+
+        def tell(text: str) -> None:
+            if not quiet:
+                console.print(text, soft_wrap=True)
+
         with runner_for(asked, workers, tell) as runner:
             done = run_sweep(asked, out, resume, console, quiet, runner)
         if len(done.lost):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -55,7 +54,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             return
         if out is None:
             raise StudyError("--out: name a folder for the results")
-        tell = partial(console.print, soft_wrap=True)
+
+        def tell(text: str) -> None:
+            if not quiet:
+                console.print(text, soft_wrap=True)
+
         with evaluator_for(asked, workers, tell) as evaluator:
             run_tuning(asked, out, resume, console, quiet, evaluator)
         console.print(f"report: {out / REPORT}; tuned studies beside it", soft_wrap=True)
