@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from jaxmodel.case import Structure
 from studies import config
 from studies.cluster.connect import wait_for_workers
-from studies.cluster.watch import Watch
+from studies.cluster.watch import GONE, Watch
 from studies.cluster.worker import Answer, Job, chunk_size, identity, run_chunk
 from studies.errors import StudyError
 from studies.sweeps.chunks import Done, Lost, has_own_ratio
@@ -60,7 +60,10 @@ class ClusterRunner:
         wait_for_workers(self._client)
         share = -(-n // (LEAST_CHUNKS * max(len(self._client.ncores()), 1)))
         asked = chunk_size, share, structure, self._precision
-        answers = list(self._client.run(*asked, on_error="return").values())
+        try:
+            answers = list(self._client.run(*asked, on_error="return").values())
+        except OSError:
+            raise StudyError(GONE) from None
         sizes = [size for size in answers if isinstance(size, int)]
         if not sizes:
             raise StudyError(f"no worker is ready: {answers[0] if answers else 'all have gone'}")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from studies.errors import StudyError
@@ -11,6 +12,8 @@ from studies.errors import StudyError
 if TYPE_CHECKING:
     from distributed import Client, Future
 
+#: Nobody answers any more.
+GONE = "the scheduler is gone; what is finished is safe, go on with --resume"
 #: How often workers are looked at [s].
 LOOK = 1.0
 #: Time for a worker that hangs to be stopped [s].
@@ -61,9 +64,7 @@ class Watch:
             return "the workers that ran it died"
         except Exception as error:
             if future.status != "error":  # no worker has raised it
-                raise StudyError(
-                    "the scheduler is gone; what is finished is safe, go on with --resume"
-                ) from None
+                raise StudyError(GONE) from None
             # of JAX, LLVM, memory, disk: whatever may go wrong there
             return f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
         self._idle[answer.worker] = time.monotonic()
@@ -74,10 +75,11 @@ class Watch:
         if now - self._looked < LOOK:
             return
         self._looked = now
-        try:
-            busy = self._client.processing()
-        except OSError:
-            return  # the work itself will tell
+        with suppress(OSError):  # the work itself will tell of a scheduler that is gone
+            self._judge(self._client.processing(), keys, now)
+
+    def _judge(self, busy: Mapping[str, Any], keys: set[Any], now: float) -> None:
+        """Count workers; restart those that are overdue."""
         if len(busy) != self.n_workers:
             self.n_workers = len(busy)
             self._tell(f"workers: {self.n_workers}")
