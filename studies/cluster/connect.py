@@ -48,6 +48,12 @@ class Workers(NamedTuple):
     timeout: float  # a worker that is busy for longer without an answer is restarted [s]
 
     @property
+    def options(self) -> str:
+        """The same on the command line, "" for none."""
+        named = (("--scheduler", self.scheduler), ("--local-workers", self.local))
+        return "".join(f" {name} {value}" for name, value in named if value is not None)
+
+    @property
     def are_named(self) -> bool:
         """Whether there are any; else work is done by this process."""
         return self.scheduler is not None or self.local is not None
@@ -154,8 +160,10 @@ def _written_address(file: str) -> str:
     try:
         address = json.loads(Path(file).read_text(encoding="utf-8"))["address"]
     except FileNotFoundError:
-        allowed = "tcp://HOST:PORT, tls://HOST:PORT, or a scheduler's JSON file"
-        raise field_error("--scheduler", file, allowed) from None
+        raise StudyError(
+            f"--scheduler {file}: no such file; allowed tcp://HOST:PORT, tls://HOST:PORT, or a "
+            "scheduler's JSON file"
+        ) from None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StudyError(f"--scheduler {file}: no file of a scheduler ({error})") from None
     return str(address)

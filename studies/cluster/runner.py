@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from jaxmodel.case import Structure
 from studies import config
 from studies.cluster.connect import wait_for_workers
-from studies.cluster.watch import GONE, Watch
+from studies.cluster.watch import Watch
 from studies.cluster.worker import Answer, Job, chunk_size, identity, run_chunk
 from studies.errors import StudyError
 from studies.sweeps.chunks import Done, Lost, has_own_ratio
@@ -59,21 +59,21 @@ class ClusterRunner:
     def layout(self, n: int, structure: Structure) -> Layout:
         wait_for_workers(self._client)
         share = -(-n // (LEAST_CHUNKS * max(len(self._client.ncores()), 1)))
-        asked = chunk_size, share, structure, self._precision
+        asked = self._client.submit(chunk_size, share, structure, self._precision, pure=False)
         try:
-            answers = list(self._client.run(*asked, on_error="return").values())
-        except OSError:
-            raise StudyError(GONE) from None
-        sizes = [size for size in answers if isinstance(size, int)]
-        if not sizes:
-            raise StudyError(f"no worker is ready: {answers[0] if answers else 'all have gone'}")
-        return Layout(1, 1, min(sizes))
+            size: int = asked.result(timeout=self._timeout)
+        except StudyError:
+            raise
+        except Exception as error:  # too late, cancelled, the worker died
+            reason = str(error) or type(error).__name__
+            raise StudyError(f"no worker is ready: {reason.partition(chr(10))[0]}") from None
+        return Layout(1, 1, size)
 
     def run(
         self, table: Table, groups: list[Group], reporter: Reporter, stop: threading.Event
     ) -> Generator[Done | Lost]:
         watch = Watch(self._client, self._timeout, reporter.say)
-        reporter.say(f"workers: {watch.n_workers}")
+        reporter.say(f"workers: {watch.n_workers}; each compiles before its first chunk")
         waiting = (Flight(group, chunk, False) for group in groups for chunk in group.chunks())
         has_own = {group.structure: has_own_ratio(table, group) for group in groups}
         suspects: deque[Flight] = deque()

@@ -82,7 +82,8 @@ class Watch:
         """Count workers; restart those that are overdue."""
         if len(busy) != self.n_workers:
             self.n_workers = len(busy)
-            self._tell(f"workers: {self.n_workers}")
+            wait = "" if busy else "; waiting for one to join"
+            self._tell(f"workers: {self.n_workers}{wait}")
         for address, processing in busy.items():
             if not keys.intersection(processing):
                 self._idle[address] = now

@@ -88,10 +88,10 @@ def get_ready(precision: str, worker: Worker) -> None:
     config.start(precision)
 
 
-def chunk_size(n: int, structure: Structure, precision: str, dask_worker: Worker) -> int:
-    """How many cases of n the worker would like to run at once; Dask adds the last argument."""
+def chunk_size(n: int, structure: Structure, precision: str) -> int:
+    """How many cases of n this worker would like to run at once."""
     with alone:
-        get_ready(precision, dask_worker)
+        get_ready(precision, get_worker())
         return local_layout(n, structure).size
 
 

@@ -73,7 +73,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if done.is_interrupted:
             print(
                 f"studies: interrupted; {done.n_done} of {len(done.table)} cases are safe; go on "
-                f"with: studies sweep {spec} --out {out} --resume",
+                f"with: studies sweep {spec} --out {out} --resume{workers.options}",
                 file=sys.stderr,
             )
             sys.exit(130)

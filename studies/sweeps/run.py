@@ -74,7 +74,7 @@ def make_plan(spec: SweepSpec, out: Path | None = None) -> Plan:
 
 def run_sweep(
     spec: SweepSpec,
-    out: Path,
+    out: str | Path,
     is_resumed: bool = False,
     console: Console | None = None,
     is_quiet: bool = False,
@@ -97,7 +97,7 @@ def run_sweep(
         StudyError: a fault of the sweep, the folder or the disk. Finished chunks stay.
     """
     config.require_configured()
-    runner = runner or Here()
+    runner, out = runner or Here(), Path(out)
     kept = kept_metrics(spec)
     table = build_table(spec)
     console = console or Console(highlight=False, markup=False)
