@@ -177,6 +177,7 @@ def test_without_dask_the_options_say_what_to_install(tmp_path):
     assert "install flexlink-studies[cluster]" in done.stderr
 
 
+@pytest.mark.long
 def test_a_worker_that_hangs_is_restarted(cluster, local, tmp_path):
     told(cluster, tmp_path / "warm")  # compiling must not count as hanging
     cluster.trouble(hang=100)
