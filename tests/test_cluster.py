@@ -81,6 +81,17 @@ def test_numbers_are_those_of_the_local_run(cluster, local, tmp_path):
     assert "workers: 2" in text and "144/144 cases" in text
 
 
+def test_workers_do_not_mix_up_sweeps(cluster, tmp_path):
+    """Same shapes, another number that all cases share: it is written into the program."""
+    for kp in (1e4, 4e4):
+        spec = small_spec(drive={"kp": kp})
+        here, there = tmp_path / f"here{kp:g}", tmp_path / f"there{kp:g}"
+        run_sweep(spec, here, is_quiet=True)
+        runner = ClusterRunner(cluster.client, spec, 60.0)
+        run_sweep(spec, there, is_quiet=True, runner=runner)
+        assert_same(arrays(here), arrays(there), 1e-12)
+
+
 def test_from_here_to_the_cluster_and_back(cluster, local, tmp_path):
     class Stopped(ClusterRunner):
         def run(self, *arguments):

@@ -39,7 +39,8 @@ class Flight(NamedTuple):
 
     group: Group
     chunk: Chunk
-    is_alone: bool  # nothing else is in flight
+    has_own_ratio: bool  # of the group
+    is_alone: bool = False  # nothing else is in flight
 
 
 class ClusterRunner:
@@ -74,8 +75,12 @@ class ClusterRunner:
     ) -> Generator[Done | Lost]:
         watch = Watch(self._client, self._timeout, reporter.say)
         reporter.say(f"workers: {watch.n_workers}; each compiles before its first chunk")
-        waiting = (Flight(group, chunk, False) for group in groups for chunk in group.chunks())
-        has_own = {group.structure: has_own_ratio(table, group) for group in groups}
+        owns = [has_own_ratio(table, group) for group in groups]  # structures may be alike
+        waiting = (
+            Flight(group, chunk, own)
+            for group, own in zip(groups, owns, strict=True)
+            for chunk in group.chunks()
+        )
         suspects: deque[Flight] = deque()
         flying: dict[Future, Flight] = {}
         compiled: set[Structure] = set()
@@ -83,7 +88,7 @@ class ClusterRunner:
         def begin(flight: Flight | None) -> bool:
             if flight is None or stop.is_set():
                 return False
-            flying[self._submit(flight, has_own[flight.group.structure])] = flight
+            flying[self._submit(flight)] = flight
             return True
 
         try:
@@ -111,9 +116,10 @@ class ClusterRunner:
             if flying:
                 self._client.cancel(list(flying))
 
-    def _submit(self, flight: Flight, has_own: bool) -> Future:
+    def _submit(self, flight: Flight) -> Future:
+        group = flight.group
         job = Job(
-            self._identity, self._precision, self._spec, flight.group.structure, has_own,
-            flight.group.layout.size, flight.chunk.rows,
+            self._identity, self._precision, self._spec, group.structure, flight.has_own_ratio,
+            group.layout.size, flight.chunk.rows,
         )  # fmt: skip
         return self._client.submit(run_chunk, job, pure=False)

@@ -106,7 +106,7 @@ def run_chunk(job: Job) -> Answer:
         refuse_difference(job.identity, worker)
         get_ready(job.precision, worker)
         table = _table(job.spec)
-        executor = _executor(job.precision, job.structure, job.size, job.has_own_ratio)
+        executor = _executor(job.precision, job.spec, job.structure, job.size, job.has_own_ratio)
         is_first = executor.compile_time == 0
         size = even_layout(job.size).size
         cases = chunk_cases(table, job.rows, job.structure, size)
@@ -121,5 +121,8 @@ def _table(spec: str) -> Table:
 
 
 @lru_cache(maxsize=8)
-def _executor(precision: str, structure: Structure, size: int, has_own_ratio: bool) -> Executor:
+def _executor(
+    precision: str, spec: str, structure: Structure, size: int, has_own_ratio: bool
+) -> Executor:
+    """One for each sweep: numbers that all its cases share are written into its program."""
     return make_executor(structure, even_layout(size), has_own_ratio)
