@@ -26,9 +26,13 @@ BASES = ("pinned_pinned", "pinned_free", "loaded")
 class ModalBasis(NamedTuple):
     """What the dynamics needs to know of three links with R modes each."""
 
-    mass: Array  # m_j = int rhoA Y_j^2 [kg], (3, R)
+    # m_j = int rhoA Y_j^2 [kg], (3, R); shapes are scaled so that it is the same for every mode
+    mass: Array
     stiffness: Array  # k_j [N/m], (3, R)
     tip: Array | None  # Y_j(L) [1], (3, R); None where it is zero for every mode
+    # S_jk = int Y_j' Y_k' dx: a bent link's chord is shorter than the link by 1/2 sum S_jk q_j q_k
+    shortening: Array | None  # S_jj [1/m], (3, R); None where the ends are not on the chord
+    mixed_shortening: Array | None  # S_jk, zero for j = k [1/m], (3, R, R); None where all zero
     b: Array  # int rhoA Y_j [kg], (3, R)
     c: Array  # int rhoA x Y_j (and joint inertia) [kg m], (3, R)
     link_mass: Array  # m_b [kg], (3,)
@@ -74,8 +78,14 @@ def build_basis(
 
     basis = jax.vmap(one_link)(beam, centers)
     mask = jnp.broadcast_to(jnp.asarray(mode_mask, basis.mass.dtype), (n_modes,))
+
+    def kept(x: Array | None, mask: Array) -> Array | None:
+        return None if x is None else x * mask
+
     return basis._replace(
-        tip=None if basis.tip is None else basis.tip * mask,
+        tip=kept(basis.tip, mask),
+        shortening=kept(basis.shortening, mask),
+        mixed_shortening=kept(basis.mixed_shortening, mask * mask[:, None]),
         b=basis.b * mask,
         c=basis.c * mask,
         deflection_at=basis.deflection_at * mask,
@@ -134,6 +144,8 @@ def _pinned_pinned(beam: Beam, patches: Patches, n_modes: int, stations: Array) 
         mass=jnp.full((n_modes,), 0.5) * mass,
         stiffness=stiffness,
         tip=None,
+        shortening=wave**2 * beam.length / 2,
+        mixed_shortening=None,
         b=line_mass * (1 + sign) / wave,
         c=line_mass * beam.length * sign / wave,
         link_mass=mass,
@@ -165,6 +177,8 @@ def _pinned_free(beam: Beam, patches: Patches, n_modes: int, stations: Array) ->
         mass=jnp.full((n_modes,), 0.25) * mass,
         stiffness=bare_stiffness(beam) * beam.stiffness_factor * wave**4 * beam.length / 4,
         tip=jnp.ones((n_modes,)),
+        shortening=None,
+        mixed_shortening=None,
         b=line_mass * (jnp.tan(root / 2) + jnp.tanh(root / 2)) / (2 * wave),
         c=jnp.zeros((n_modes,)) * mass,
         link_mass=mass,
@@ -244,12 +258,16 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
     def slope(x: Array) -> Array:
         return (_ritz(x / length, n_sines)[1] @ coefficient).T / length
 
+    steepness = _ritz(whole_x, n_sines)[1] @ coefficient
+    shortening = (steepness.T * whole_w) @ steepness / length
     x_patches = length * xi[whole_x.size :]
     patch_w = mass_w[whole_x.size :]
     return ModalBasis(
         mass=jnp.full((n_modes,), 0.5) * total_mass,
         stiffness=squared[:n_modes] * total_mass / 2,
         tip=None,
+        shortening=jnp.diagonal(shortening),
+        mixed_shortening=shortening * (1 - jnp.eye(n_modes)),
         b=mass_w @ value @ coefficient,
         c=(mass_w * xi * length) @ value @ coefficient + joint @ ends @ coefficient,
         link_mass=total_mass,

@@ -21,6 +21,9 @@ class Structure(NamedTuple):
     substeps: int = 1  # plant steps per sample
     n_frequencies: int = 9  # points of the power spectral density per controlled mode
     basis: str = "pinned_pinned"  # of the plant
+    has_shortening: bool = True  # bent links have shorter chords (none in basis pinned_free)
+    is_coupled: bool = True  # False: kineto-elastodynamics, bending does not act back
+    has_wrench: bool = False  # force and moment on the platform
     controller_basis: str = "pinned_pinned"
     feedback: str = "sampled"  # "sampled", "ideal" or "none"
     law: str = "imsc"  # "imsc" or "srf"
@@ -97,6 +100,15 @@ class Drive(NamedTuple):
     is_locked: Array  # 1: sliders held (bases with Y(L) = 0), ()
 
 
+class Load(NamedTuple):
+    """Force and moment on the platform at its reference point [N, N, N m]."""
+
+    wrench: Array  # steady; the run starts in equilibrium with it, (3,)
+    pulse: Array  # disturbance on top, (3,)
+    pulse_start: Array  # [s], ()
+    pulse_length: Array  # [s], ()
+
+
 class Initial(NamedTuple):
     """State at t = 0 beyond rest at the first way-point."""
 
@@ -126,6 +138,7 @@ class Case(NamedTuple):
     control: Control
     electronics: Electronics
     drive: Drive
+    load: Load
     initial: Initial
     windows: Windows
     seed: Array  # of ADC noise and ripple, ()

@@ -16,8 +16,9 @@ class Reference(NamedTuple):
 
     rho: Array  # [m]
     rho_rate: Array  # [m/s]
-    feedforward: Array | None  # computed-torque force [N]
+    feedforward: Array | None  # force beside PD: computed torque, or what holds a steady load [N]
     disturbance: Array  # force from outside, held over the sample [N]
+    wrench: Array | None = None  # on the platform, held over the sample [N, N, N m]
 
 
 def motor_force(drive: Drive, reference: Reference, rho: Array, rho_rate: Array, is_smooth: bool):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from jaxmodel.kinematics import Chain, close_chain
+from jaxmodel.kinematics import Bend, Chain, close_chain
 from jaxmodel.parameters import Array
 from jaxmodel.plant import Plant
 
@@ -25,10 +25,19 @@ class Accelerations(NamedTuple):
     coupling: Array  # q'' + (k q + d q')/m: all but the oscillator itself [m/s2], (3, R)
     rho: Array  # rho'' [m/s2], (3,)
     gamma: Array  # gamma'' [rad/s2], (3,)
+    axial: Array  # N, tension in the link that works on its bending [N], (3,)
+
+
+def shortening_row(plant: Plant, q: Array) -> Array:
+    """(S q)_j, by which the chord shortens per modal coordinate [1], (3, R)."""
+    row = plant.shortening * q
+    if plant.mixed_shortening is not None:
+        row = row + jnp.sum(plant.mixed_shortening * q[:, None], axis=2)
+    return row
 
 
 def modal_chain(plant: Plant, pose: Array, pose_rate: Array, q: Array, q_rate: Array) -> Chain:
-    """`close_chain` of the bent machine: w = sum_j Y_j(L) q_j (4), (6).
+    """`close_chain` of the bent machine (4), (6): w = sum Y_j(L) q_j, d = 1/2 sum S_jk q_j q_k.
 
     Args:
         plant: the machine.
@@ -37,19 +46,33 @@ def modal_chain(plant: Plant, pose: Array, pose_rate: Array, q: Array, q_rate: A
         q: modal coordinates [m], (3, R).
         q_rate: [m/s], (3, R).
     """
-    if plant.tip is None:
+    if plant.tip is not None:
+        tip, tip_rate = jnp.sum(plant.tip * q, axis=1), jnp.sum(plant.tip * q_rate, axis=1)
+        return close_chain(plant, pose, pose_rate, Bend(tip, tip_rate))
+    if plant.shortening is None:
         return close_chain(plant, pose, pose_rate)
-    tip, tip_rate = jnp.sum(plant.tip * q, axis=1), jnp.sum(plant.tip * q_rate, axis=1)
-    return close_chain(plant, pose, pose_rate, tip, tip_rate)
+    row = shortening_row(plant, q)
+    shorter, rate = jnp.sum(row * q, axis=1) / 2, jnp.sum(row * q_rate, axis=1)
+    return close_chain(plant, pose, pose_rate, Bend(shortening=shorter, shortening_rate=rate))
 
 
 class _Link(NamedTuple):
-    """Reduced 2x2 system of a link in (rho, gamma): K (rho0'', gamma0'') + load."""
+    """A link's inertia and load in (rho, gamma), its modes eliminated: K (rho'', gamma'') + load."""
 
     k_rr: Array
     k_rg: Array
     k_gg: Array
     load_r: Array
+    load_g: Array
+
+
+class _Joint(NamedTuple):
+    """What a link asks of the platform at C along f and g: W C'' + load."""
+
+    ff: Array  # W [kg]
+    fg: Array
+    gg: Array
+    load_f: Array  # [N]
     load_g: Array
 
 
@@ -61,150 +84,218 @@ def accelerations(
     q_rate: Array,
     slider_force: Array,
     piezo: Array,
+    wrench: Array | None = None,
+    is_coupled: bool = True,
 ) -> Accelerations:
     """Accelerations of pose and modes, (7) solved.
 
     Args:
         plant: the machine.
-        chain: closure at this state, from `modal_chain`.
+        chain: closure at this state, from `modal_chain`; without coupling that of straight links.
         pose_rate: (3,).
         q: modal coordinates [m], (3, R).
         q_rate: [m/s], (3, R).
         slider_force: along the guides [N], (3,).
         piezo: generalised piezo forces (14) over the modal masses, Q_j/m_j [m/s2], (3, R).
+        wrench: force and moment on the platform at its reference point [N, N, N m], (3,), or None.
+        is_coupled: False: kineto-elastodynamics in two passes (static): the machine moves as if its
+            links were rigid, the motion and the axial forces bend them, and nothing acts back.
 
     Returns:
         Accelerations.
     """
-    sine, cosine, rate, inverse = chain.sine, chain.cosine, chain.gamma_rate, 1 / chain.root
-    phi2, rate2 = pose_rate[2] * pose_rate[2], rate * rate
-    lever = chain.h * inverse
-    # velocity terms of gamma'' and rho'' at X'' = 0, w'' = 0
-    gamma_0 = lever * rate2 - inverse * (chain.cn * phi2)
-    rho_0 = chain.h_rate * rate - chain.cu * phi2
-    if plant.tip is not None:
-        slip = chain.tip_rate * inverse
-        gamma_0 = gamma_0 + slip * (sine * rate + rate * (lever * cosine - chain.tip * inverse))
-        rho_0 = rho_0 + cosine * rate * chain.tip_rate
-    rho_0 = rho_0 + chain.h * gamma_0
+    swing = _swing(plant, chain, q_rate)
     # modal accelerations without inertia: of piezos and rotation, and of the oscillator itself
-    push = piezo + q * rate2[:, None]
-    own = (plant.stiffness / plant.mass) * q + (plant.damping / plant.mass) * q_rate
+    mass = plant.modal_mass[:, None]
+    push = piezo + q * (chain.gamma_rate * chain.gamma_rate)[:, None]
+    own = (plant.stiffness / mass) * q + (plant.damping / mass) * q_rate
     pull = own - push
-
-    b_m, c_m, mq = plant.b / plant.mass, plant.c / plant.mass, plant.mass * q
-    bq, bq_rate = jnp.sum(plant.b * q, axis=1), jnp.sum(plant.b * q_rate, axis=1)
-    moment = plant.first_moment
-    link = _Link(
-        k_rr=plant.slider_link_mass - sine * sine * jnp.sum(b_m * plant.b, axis=1),
-        k_rg=sine * (jnp.sum(b_m * plant.c, axis=1) - moment) - cosine * bq,
-        k_gg=plant.inertia - jnp.sum(c_m * plant.c, axis=1) + jnp.sum(mq * q, axis=1),
-        load_r=sine * (jnp.sum(plant.b * pull, axis=1) + bq * rate2)
-        - cosine * (moment * rate2 + 2 * rate * bq_rate)
-        - slider_force,
-        load_g=2 * rate * jnp.sum(mq * q_rate, axis=1) - jnp.sum(plant.c * pull, axis=1),
-    )
-    if plant.tip is None:
-        tip_system, reduced = None, link
+    end = None
+    if is_coupled:
+        joint = _joint(chain, _link(plant, chain, swing, q, q_rate, pull, slider_force))
+        if not _is_rigid(plant):
+            end, joint = _release_end(plant, chain, joint, q, pull)
     else:
-        tip_system, reduced = _eliminate_tip(plant, chain, link, pull)
-    force_r = reduced.k_rr * rho_0 + reduced.k_rg * gamma_0 + reduced.load_r
-    force_g = reduced.k_rg * rho_0 + reduced.k_gg * gamma_0 + reduced.load_g
-    pose_acc = _pose_acceleration(plant, chain, reduced, force_r, force_g, lever, inverse)
-    pose_acc = plant.free * pose_acc
+        joint = _joint(chain, _rigid_link(plant, chain, swing, slider_force))
+    phi2 = pose_rate[2] * pose_rate[2]
+    rates = swing.f - phi2 * chain.frame.c_f, swing.g - phi2 * chain.frame.c_g
+    pose_acc = _pose_acceleration(plant, chain, joint, rates, wrench)
 
-    along = plant.ux * pose_acc[0] + plant.uy * pose_acc[1] - chain.cn * pose_acc[2]
-    across = plant.ux * pose_acc[1] - plant.uy * pose_acc[0] + chain.cu * pose_acc[2]
-    gamma_acc = across * inverse + gamma_0
-    rho_acc = along + lever * across + rho_0
-    if tip_system is not None:
-        tip_acc, multiplier = tip_system(rho_acc, gamma_acc)
-        rho_acc = rho_acc - chain.tip * inverse * tip_acc
-        gamma_acc = gamma_acc - cosine * inverse * tip_acc
-    coupling = b_m * (sine * rho_acc)[:, None] - c_m * gamma_acc[:, None] + push
-    if tip_system is not None:
-        coupling = coupling + plant.tip / plant.mass * multiplier[:, None]
-    return Accelerations(pose_acc, coupling - own, coupling, rho_acc, gamma_acc)
+    acc_f, acc_g = (a + b for a, b in zip(rates, chain.frame.joint_motion(pose_acc), strict=True))
+    force_f = joint.ff * acc_f + joint.fg * acc_g + joint.load_f
+    force_g = joint.fg * acc_f + joint.gg * acc_g + joint.load_g
+    coupling = push
+    if end is not None:
+        reaction = end.force[0] + end.force[1] * acc_f + end.force[2] * acc_g
+        acc_f = end.motion[1] * acc_f + end.motion[2] * acc_g - end.motion[0]
+        coupling = coupling - end.row * (reaction / plant.modal_mass)[:, None]
+    rho_acc, gamma_acc = chain.frame.link_motion(acc_f, acc_g)
+    coupling = coupling + (plant.b / mass) * (chain.sine * rho_acc)[:, None]
+    coupling = coupling - (plant.c / mass) * gamma_acc[:, None]
+    # the mass between mid-span and C takes its share of the force at C
+    tension = force_f if plant.tip is None else force_g
+    axial = tension - plant.tip_mass * chain.cosine * rho_acc
+    if not is_coupled and plant.shortening is not None:
+        coupling = coupling - shortening_row(plant, q) * (axial / plant.modal_mass)[:, None]
+    return Accelerations(pose_acc, coupling - own, coupling, rho_acc, gamma_acc, axial)
 
 
-def _eliminate_tip(plant: Plant, chain: Chain, link: _Link, pull: Array):
-    """Take the link's tip acceleration w'' and its reaction out of the 2x2 system.
+def _is_rigid(plant: Plant) -> bool:
+    """Whether bending leaves the distance of a link's joints as it is."""
+    return plant.tip is None and plant.shortening is None
 
-    The tip moves with rho'' = rho0'' - alpha w'', gamma'' = gamma0'' - kappa w'' (alpha = w/P,
-    kappa = cos gamma/P), which gives two linear equations in w'' and the reaction Lambda:
-    D w'' = y.x0 - f_y + Y_y Lambda, D Lambda = beta.(M x0 + load) - (beta.M beta) w''.
+
+class _Swing(NamedTuple):
+    """What gamma' and bending make of C'' [m/s2], (3,) each."""
+
+    f: Array  # along f and g, sign reversed: what rho'' and gamma'' must give
+    g: Array
+    inward: Array  # gamma'^2 c + e2, along the chord
+    across: Array  # 2 gamma' d', of a point that moves in along the chord
+
+
+def _swing(plant: Plant, chain: Chain, q_rate: Array) -> _Swing:
+    """In the link C is at (c, w) and moves by (-d', w'), which makes C'' by velocities alone
+
+    -gamma'^2 (c, w) + 2 gamma' (-w', -d') + (-e2, 0), e2 = sum S_jk q_j' q_k'.
     """
-    tip_m = plant.tip / plant.mass
-    alpha, kappa = chain.tip / chain.root, chain.cosine / chain.root
-    y_r = chain.sine * jnp.sum(tip_m * plant.b, axis=1)
-    y_g = -jnp.sum(tip_m * plant.c, axis=1)
-    tip_force = jnp.sum(plant.tip * pull, axis=1)
-    compliance = jnp.sum(tip_m * plant.tip, axis=1)
-    m_r = alpha * link.k_rr + kappa * link.k_rg
-    m_g = alpha * link.k_rg + kappa * link.k_gg
-    beta_m_beta = alpha * m_r + kappa * m_g
-    beta_load = alpha * link.load_r + kappa * link.load_g
-    lead = 1 + y_r * alpha + y_g * kappa
-    determinant = lead * lead + compliance * beta_m_beta
+    rate, bend = chain.gamma_rate, chain.bend
+    rate2 = rate * rate
+    inward, across = chain.chord * rate2, jnp.zeros_like(rate)
+    if bend.shortening_rate is not None:
+        inward = inward + jnp.sum(shortening_row(plant, q_rate) * q_rate, axis=1)
+        across = 2 * rate * bend.shortening_rate
+    if bend.tip is None:
+        return _Swing(inward, across, inward, across)
+    outward = inward + 2 * rate * bend.tip_rate
+    return _Swing(-bend.tip * rate2, outward, inward, across)  # f = -n_t, g = t
 
-    def tip_system(rho_0: Array, gamma_0: Array) -> tuple[Array, Array]:
-        push = y_r * rho_0 + y_g * gamma_0 - tip_force
-        pull = m_r * rho_0 + m_g * gamma_0 + beta_load
-        return (
-            (lead * push + compliance * pull) / determinant,
-            (lead * pull - beta_m_beta * push) / determinant,
-        )
 
-    tip_0 = (compliance * beta_load - lead * tip_force) / determinant
-    multiplier_0 = (lead * beta_load + beta_m_beta * tip_force) / determinant
-
-    def reduced_term(m_a: Array, y_a: Array, m_b: Array, y_b: Array) -> Array:
-        mixed = lead * (m_a * y_b + y_a * m_b)
-        return (mixed + compliance * m_a * m_b - beta_m_beta * y_a * y_b) / determinant
-
-    return tip_system, _Link(
-        k_rr=link.k_rr - reduced_term(m_r, y_r, m_r, y_r),
-        k_rg=link.k_rg - reduced_term(m_r, y_r, m_g, y_g),
-        k_gg=link.k_gg - reduced_term(m_g, y_g, m_g, y_g),
-        load_r=link.load_r - m_r * tip_0 - y_r * multiplier_0,
-        load_g=link.load_g - m_g * tip_0 - y_g * multiplier_0,
+def _link(
+    plant: Plant,
+    chain: Chain,
+    swing: _Swing,
+    q: Array,
+    q_rate: Array,
+    pull: Array,
+    slider_force: Array,
+) -> _Link:
+    """Slider and link after q'' has been eliminated, but for what the modes do to C."""
+    sine, cosine, rate, mass = chain.sine, chain.cosine, chain.gamma_rate, plant.modal_mass
+    bq, bq_rate = jnp.sum(plant.b * q, axis=1), jnp.sum(plant.b * q_rate, axis=1)
+    # the centre of mass moves in with half the shortening
+    across = jnp.sum(plant.b * pull, axis=1) + bq * (rate * rate) + plant.tip_mass * swing.across
+    along = plant.tip_mass * swing.inward + 2 * rate * bq_rate
+    bb, bc, cc = (
+        jnp.sum(x * y, axis=1) / mass
+        for x, y in ((plant.b, plant.b), (plant.b, plant.c), (plant.c, plant.c))
     )
+    return _Link(
+        k_rr=plant.slider_link_mass - sine * sine * bb,
+        k_rg=sine * (bc - plant.tip_mass * chain.chord) - cosine * bq,
+        k_gg=plant.inertia - cc + mass * jnp.sum(q * q, axis=1),
+        load_r=sine * across - cosine * along - slider_force,
+        load_g=2 * rate * (mass * jnp.sum(q * q_rate, axis=1)) - jnp.sum(plant.c * pull, axis=1),
+    )
+
+
+def _rigid_link(plant: Plant, chain: Chain, swing: _Swing, slider_force: Array) -> _Link:
+    """Slider and link that does not bend."""
+    return _Link(
+        k_rr=plant.slider_link_mass,
+        k_rg=-plant.tip_mass * chain.chord * chain.sine,
+        k_gg=plant.inertia,
+        load_r=-plant.tip_mass * chain.cosine * swing.inward - slider_force,
+        load_g=jnp.zeros_like(slider_force),
+    )
+
+
+def _joint(chain: Chain, link: _Link) -> _Joint:
+    """Carry a link to its joint: W = T^t K T, T = rows (rho_f, rho_g), (gamma_f, gamma_g)."""
+    frame = chain.frame
+    # momenta in rho and gamma of a unit motion of C along f, and along g
+    r_f = link.k_rr * frame.rho_f + link.k_rg * frame.gamma_f
+    g_f = link.k_rg * frame.rho_f + link.k_gg * frame.gamma_f
+    r_g, g_g = link.k_rg * frame.gamma_g, link.k_gg * frame.gamma_g
+    if frame.rho_g is not None:
+        r_g, g_g = r_g + link.k_rr * frame.rho_g, g_g + link.k_rg * frame.rho_g
+    ff, fg = frame.joint_force(r_f, g_f)
+    gg = frame.joint_force(r_g, g_g)[1]
+    return _Joint(ff, fg, gg, *frame.joint_force(link.load_r, link.load_g))
+
+
+class _End(NamedTuple):
+    """What the modes do to the far joint of a link, and it to them."""
+
+    row: Array  # motion of C along f per modal coordinate, sign reversed [1], (3, R)
+    # C'' along f that slider and link feel: -motion[0] + motion[1] C''_f + motion[2] C''_g
+    motion: tuple[Array, Array, Array]
+    # reaction on row_j of every mode [N]: force[0] + force[1] C''_f + force[2] C''_g
+    force: tuple[Array, Array, Array]
+
+
+def _release_end(
+    plant: Plant, chain: Chain, still: _Joint, q: Array, pull: Array
+) -> tuple[_End, _Joint]:
+    """Let the modes move C along f: by shortening of the chord (row S q) or by row Y_j(L).
+
+    tau = sum row_j q_j'' adds to C'' along f, and a reaction N acts on the modes, -row_j N; in the
+    chord's direction it is the axial force. With g = T^t (sin gamma sum row_j b_j, -sum row_j c_j)/m,
+    B = sum row_j^2/m, mu the mass that moves in with the chord, A = W_ff - 2 mu and D = 1 - g_f:
+
+    D tau = g.C'' - B N - sum row_j pull_j,  D N = (W_ff - mu, W_fg).C'' + A tau + load_f.
+    """
+    row, mu = (shortening_row(plant, q), plant.tip_mass) if plant.tip is None else (plant.tip, 0.0)
+    mass = plant.modal_mass[:, None]
+    g_f, g_g = chain.frame.joint_force(
+        chain.sine * jnp.sum(row * (plant.b / mass), axis=1),
+        jnp.sum(row * (-plant.c / mass), axis=1),
+    )
+    lead, stiff = 1 - g_f, still.ff - 2 * mu
+    soft = jnp.sum(row * row, axis=1) / plant.modal_mass
+    scale = 1 / (lead * lead + soft * stiff)
+    lead, stiff, soft = lead * scale, stiff * scale, soft * scale
+    pulled, fg, load = jnp.sum(row * pull, axis=1), still.fg, still.load_f
+    motion = lead * pulled + soft * load, lead - mu * soft, lead * g_g - soft * fg
+    force = lead * load - stiff * pulled, stiff + mu * lead, lead * fg + stiff * g_g
+    joint = _Joint(
+        ff=mu * motion[1] + force[1],
+        fg=mu * motion[2] + force[2],
+        gg=still.gg + fg * motion[2] + g_g * force[2],
+        load_f=force[0] - mu * motion[0],
+        load_g=still.load_g - fg * motion[0] + g_g * force[0],
+    )
+    return _End(row, motion, force), joint
 
 
 def _pose_acceleration(
-    plant: Plant,
-    chain: Chain,
-    link: _Link,
-    force_r: Array,
-    force_g: Array,
-    lever: Array,
-    inverse: Array,
+    plant: Plant, chain: Chain, joint: _Joint, rates: tuple[Array, Array], wrench: Array | None
 ) -> Array:
-    """Assemble sum_i T_i^t K_i T_i X'' = -sum_i T_i^t (force_r, force_g) and solve it.
-
-    T = rows (a + (h/P) d, d/P); s'' = a.X'' and h'' = d.X'' at rest, a = (ux, uy, -cn) and
-    d = (-uy, ux, cu). Per link the sum is k a a^t + v (a d^t + d a^t) + z d d^t.
-    """
-    ux, uy, cn, cu = plant.ux, plant.uy, chain.cn, chain.cu
-    xx, xy, yy = ux * ux, ux * uy, uy * uy
-    k, w = link.k_rr, link.k_rg * inverse
-    v = k * lever + w
-    z = lever * (v + w) + link.k_gg * (inverse * inverse)
-    a_phi, d_phi = v * cu - k * cn, z * cu - v * cn  # how X'' along a and d meets phi''
+    """Solve M_p X'' + sum J^t (W (J X'' + rates) + load) = wrench over the links, J X'' = C''."""
+    x, y, cx, cy = chain.frame.x, chain.frame.y, chain.cx, chain.cy
+    # W in the plane's axes
+    f_x, g_x = x * joint.ff - y * joint.fg, x * joint.fg - y * joint.gg
+    w_xx, w_xy = x * f_x - y * g_x, y * f_x + x * g_x
+    w_yy = joint.ff + joint.gg - w_xx
+    turn_x, turn_y = cx * w_xy - cy * w_xx, cx * w_yy - cy * w_xy  # how phi'' meets x'' and y''
     matrix = (
-        plant.platform_mass + jnp.sum(xx * k + yy * z - (2 * xy) * v, axis=0),
-        jnp.sum(xy * (k - z) + (xx - yy) * v, axis=0),
-        jnp.sum(ux * a_phi - uy * d_phi, axis=0),
-        plant.platform_mass + jnp.sum(yy * k + xx * z + (2 * xy) * v, axis=0),
-        jnp.sum(uy * a_phi + ux * d_phi, axis=0),
-        plant.platform_inertia + jnp.sum(cu * d_phi - cn * a_phi, axis=0),
+        plant.platform_mass + jnp.sum(w_xx, axis=0),
+        jnp.sum(w_xy, axis=0),
+        jnp.sum(turn_x, axis=0),
+        plant.platform_mass + jnp.sum(w_yy, axis=0),
+        jnp.sum(turn_y, axis=0),
+        plant.platform_inertia + jnp.sum(cx * turn_y - cy * turn_x, axis=0),
     )
-    force_d = lever * force_r + inverse * force_g
+    force_f = joint.ff * rates[0] + joint.fg * rates[1] + joint.load_f
+    force_g = joint.fg * rates[0] + joint.gg * rates[1] + joint.load_g
+    force_x, force_y = y * force_g - x * force_f, -(y * force_f + x * force_g)  # on the platform
     load = (
-        jnp.sum(uy * force_d - ux * force_r, axis=0),
-        jnp.sum(-uy * force_r - ux * force_d, axis=0),
-        jnp.sum(cn * force_r - cu * force_d, axis=0),
+        jnp.sum(force_x, axis=0),
+        jnp.sum(force_y, axis=0),
+        jnp.sum(cx * force_y - cy * force_x, axis=0),
     )
+    if wrench is not None:
+        load = tuple(own + wrench[k] for k, own in enumerate(load))
     return solve_symmetric_3(matrix, load)
 
 
@@ -231,40 +322,41 @@ def solve_symmetric_3(matrix: tuple[Array, ...], right: tuple[Array, ...]) -> Ar
     return jnp.stack([right[0] / m00 - l10 * x1 - l20 * x2, x1, x2])
 
 
-def inverse_dynamics(plant: Plant, pose: Array, pose_rate: Array, pose_acc: Array) -> Array:
+def inverse_dynamics(
+    plant: Plant, pose: Array, pose_rate: Array, pose_acc: Array, wrench: Array | None = None
+) -> Array:
     """Slider forces [N] that give the unbent machine a wanted pose acceleration (computed torque).
 
-    sum_i T_i^t (K_i x_i'' + load_i) + M_p X'' = J^t F with J rows a + (h/P) d.
+    M_p X'' + sum J^t T^t (K (rho'', gamma'') + load) = wrench + sum J^t T^t (F, 0) over the links.
 
     Args:
         plant: the machine.
         pose: (3,) [m, m, rad].
         pose_rate: (3,).
         pose_acc: (3,).
+        wrench: force and moment on the platform [N, N, N m], (3,), or None.
 
     Returns:
         (3,).
     """
     chain = close_chain(plant, pose, pose_rate)
-    rate, lever = chain.gamma_rate, chain.h / chain.root
-    phi2 = pose_rate[2] * pose_rate[2]
-    a = jnp.stack([plant.ux, plant.uy, -chain.cn])
-    d = jnp.stack([-plant.uy, plant.ux, chain.cu])
-    along = jnp.sum(a * pose_acc[:, None], axis=0) - chain.cu * phi2
-    across = jnp.sum(d * pose_acc[:, None], axis=0) - chain.cn * phi2
-    gamma_acc = (across + rate * rate * chain.h) / chain.root
-    rho_acc = along + chain.h_rate * rate + chain.h * gamma_acc
-    swing = plant.first_moment * chain.sine
-    force_r = (
+    frame, rate2, phi2 = chain.frame, chain.gamma_rate**2, pose_rate[2] ** 2
+    acc_f, acc_g = frame.joint_motion(pose_acc)
+    acc_f = acc_f + chain.chord * rate2 - phi2 * frame.c_f
+    rho_acc, gamma_acc = frame.link_motion(acc_f, acc_g - phi2 * frame.c_g)
+    moment = plant.tip_mass * plant.length
+    on_rho = (
         plant.slider_link_mass * rho_acc
-        - swing * gamma_acc
-        - plant.first_moment * chain.cosine * rate * rate
+        - moment * (chain.sine * gamma_acc + chain.cosine * rate2)
     )
-    force_g = plant.inertia * gamma_acc - swing * rho_acc
-    jacobian = a + lever * d
+    on_gamma = plant.inertia * gamma_acc - moment * chain.sine * rho_acc
+    force_f, force_g = frame.joint_force(on_rho, on_gamma)
+    to_f = jnp.stack([frame.x, frame.y, -frame.c_g])
+    to_g = jnp.stack([-frame.y, frame.x, frame.c_f])
     platform = jnp.stack([plant.platform_mass, plant.platform_mass, plant.platform_inertia])
-    load = platform * pose_acc + jnp.sum(jacobian * force_r + d * force_g / chain.root, axis=1)
-    return jnp.linalg.solve(jacobian, load)
+    load = platform * pose_acc + jnp.sum(to_f * force_f + to_g * force_g, axis=1)
+    load = load if wrench is None else load - wrench
+    return jnp.linalg.solve(frame.rho_f * to_f, load)
 
 
 def kinetic_energy(plant: Plant, chain: Chain, pose_rate: Array, q: Array, q_rate: Array) -> Array:
@@ -278,15 +370,18 @@ def kinetic_energy(plant: Plant, chain: Chain, pose_rate: Array, q: Array, q_rat
         q_rate: [m/s], (3, R).
     """
     bq, bq_rate = jnp.sum(plant.b * q, axis=1), jnp.sum(plant.b * q_rate, axis=1)
-    swing = plant.first_moment * chain.sine + chain.cosine * bq
-    rotary = plant.inertia + jnp.sum(plant.mass * q * q, axis=1)
+    swing = plant.tip_mass * chain.chord * chain.sine + chain.cosine * bq
+    push = chain.sine * bq_rate
+    if chain.bend.shortening_rate is not None:
+        push = push + plant.tip_mass * chain.cosine * chain.bend.shortening_rate
+    rotary = plant.inertia + plant.modal_mass * jnp.sum(q * q, axis=1)
     links = (
         plant.slider_link_mass * chain.rho_rate**2 / 2
         + rotary * chain.gamma_rate**2 / 2
-        + jnp.sum(plant.mass * q_rate**2, axis=1) / 2
+        + plant.modal_mass * jnp.sum(q_rate**2, axis=1) / 2
         + chain.gamma_rate * jnp.sum(plant.c * q_rate, axis=1)
         - chain.rho_rate * chain.gamma_rate * swing
-        - chain.rho_rate * chain.sine * bq_rate
+        - chain.rho_rate * push
     )
     platform = (
         plant.platform_mass * (pose_rate[0] ** 2 + pose_rate[1] ** 2)

@@ -1,7 +1,9 @@
 """The closed chain (6) in closed form: slider positions and link angles from pose and bending.
 
-With s = u.(C - A), h = n.(C - A), w = sum_j Y_j(L) q_j, l2 = L^2 + w^2 and P = sqrt(l2 - h^2):
-rho = s - P, sin gamma = (h L - w P)/l2, cos gamma = (L P + w h)/l2, gamma = beta - alpha.
+In the frame of a link's chord (along t, across n_t) its far joint C lies at (c, w): w = sum Y_j(L) q_j
+is zero in bases whose ends lie on the chord, and there c = L - d is shorter than the link by
+d = 1/2 sum S_jk q_j q_k. With s = u.(C - A), h = n.(C - A), l2 = c^2 + w^2 and P = sqrt(l2 - h^2):
+rho = s - P, sin gamma = (h c - w P)/l2, cos gamma = (c P + w h)/l2, gamma = beta - alpha.
 Shapes as in `jaxmodel.plant`: structure first, lanes last.
 """
 
@@ -20,67 +22,140 @@ from jaxmodel.trigonometry import sine_cosine
 SINGULAR_MARGIN = 1e-3
 
 
+class Bend(NamedTuple):
+    """What bending does to a link's far joint, (3,) each; None: nothing."""
+
+    tip: Array | None = None  # w, deflection of C from the link's tangent frame [m]
+    tip_rate: Array | None = None  # [m/s]
+    shortening: Array | None = None  # d, by which the chord is shorter than the link [m]
+    shortening_rate: Array | None = None  # [m/s]
+
+
+class Frame(NamedTuple):
+    """Axes f and g (f turned by +90 deg) at the joints C, (3,) each.
+
+    f points where bending lets C go in its link: along t, by which a chord grows shorter, or along
+    -n_t where Y_j(L) is not zero. When C moves by (f, g), then rho by rho_f f + rho_g g and gamma by
+    gamma_f f + gamma_g g, were the link rigid.
+    """
+
+    x: Array  # direction of f in the plane [1]
+    y: Array
+    c_f: Array  # C - X along f [m]
+    c_g: Array
+    rho_f: Array  # [1]
+    rho_g: Array | None  # None: zero
+    gamma_f: Array  # [1/m]
+    gamma_g: Array
+
+    def link_motion(self, along_f: Array, along_g: Array) -> tuple[Array, Array]:
+        """Rates of rho and gamma from those of C."""
+        rho = self.rho_f * along_f
+        if self.rho_g is not None:
+            rho = rho + self.rho_g * along_g
+        return rho, self.gamma_f * along_f + self.gamma_g * along_g
+
+    def joint_force(self, on_rho: Array, on_gamma: Array) -> tuple[Array, Array]:
+        """Force at C along f and g that does the work of forces on rho and gamma."""
+        g = self.gamma_g * on_gamma
+        if self.rho_g is not None:
+            g = g + self.rho_g * on_rho
+        return self.rho_f * on_rho + self.gamma_f * on_gamma, g
+
+    def joint_motion(self, pose_rate: Array) -> tuple[Array, Array]:
+        """Velocity of C along f and g from that of the pose (accelerations without phi'^2)."""
+        x_rate, y_rate, turn = pose_rate[0], pose_rate[1], pose_rate[2]
+        return (
+            self.x * x_rate + self.y * y_rate - self.c_g * turn,
+            self.x * y_rate - self.y * x_rate + self.c_f * turn,
+        )
+
+
 class Chain(NamedTuple):
     """Positions and rates of the chain at one instant, per link, (3,) each."""
 
-    cu: Array  # u.(C - X) [m]
-    cn: Array  # n.(C - X) [m]
+    bend: Bend
+    frame: Frame
+    cx: Array  # C - X in the plane [m]
+    cy: Array
+    s: Array  # u.(C - A) [m]
     h: Array  # n.(C - A) [m]
-    root: Array  # P, safe: never below SINGULAR_MARGIN L [m]
+    chord: Array  # c [m]
     root_squared: Array  # l2 - h^2, as it is [m2]
     sine: Array  # sin gamma [1]
     cosine: Array  # cos gamma [1]
-    tip: Array  # w, deflection of C from the link's tangent frame [m]
-    tip_rate: Array  # [m/s]
     rho: Array  # slider position [m]
     rho_rate: Array  # [m/s]
     gamma_rate: Array  # [rad/s]
-    h_rate: Array  # [m/s]
 
 
-def close_chain(
-    plant: Plant, pose: Array, pose_rate: Array, tip: Array = 0.0, tip_rate: Array = 0.0
-) -> Chain:
+def close_chain(plant: Plant, pose: Array, pose_rate: Array, bend: Bend | None = None) -> Chain:
     """Solve the closure (6) and its rate.
 
-    gamma' = (h' - cos(gamma) w')/P, rho' = s' + h gamma' + sin(gamma) w'.
+    gamma' = (h' - cos(gamma) w' + sin(gamma) d')/P,
+    rho' = s' + h gamma' + sin(gamma) w' + cos(gamma) d'.
 
     Args:
         plant: the machine.
         pose: (x, y, phi) [m, m, rad], (3,).
         pose_rate: its rate, (3,).
-        tip: w = sum_j Y_j(L) q_j [m], (3,) or 0.
-        tip_rate: w' [m/s], (3,) or 0.
+        bend: of the links; None: straight.
 
     Returns:
         Chain. Out of reach or at a singular pose P is replaced by a safe value, so the numbers are
         finite there but meaningless: `chain_status` tells.
     """
+    bend = Bend() if bend is None else bend
     sine, cosine = sine_cosine(pose[2])
-    cu = plant.joint_cos * cosine - plant.joint_sin * sine
-    cn = plant.joint_sin * cosine + plant.joint_cos * sine
-    ux, uy, length = plant.ux, plant.uy, plant.length
-    s = ux * pose[0] + uy * pose[1] + cu + plant.s0
-    h = ux * pose[1] - uy * pose[0] + cn + plant.h0
-    s_rate = ux * pose_rate[0] + uy * pose_rate[1] - cn * pose_rate[2]
-    h_rate = ux * pose_rate[1] - uy * pose_rate[0] + cu * pose_rate[2]
-    squared = length * length + tip * tip
+    cx = plant.joint_cos * cosine - plant.joint_sin * sine
+    cy = plant.joint_sin * cosine + plant.joint_cos * sine
+    x, y = pose[0] + cx, pose[1] + cy
+    s = plant.ux * x + plant.uy * y + plant.s0
+    h = plant.ux * y - plant.uy * x + plant.h0
+    chord = plant.length if bend.shortening is None else plant.length - bend.shortening
+    squared = chord * chord
+    if bend.tip is not None:
+        squared = squared + bend.tip * bend.tip
     root_squared = squared - h * h
-    floor = (SINGULAR_MARGIN * length) ** 2
+    floor = (SINGULAR_MARGIN * plant.length) ** 2
     root = jnp.sqrt(jnp.maximum(root_squared, floor))
-    sin_gamma = (h * length - tip * root) / squared
-    cos_gamma = (length * root + tip * h) / squared
-    gamma_rate = (h_rate - cos_gamma * tip_rate) / root
-    rho_rate = s_rate + h * gamma_rate + sin_gamma * tip_rate
+    if bend.tip is None:
+        product = 1 / (chord * root)  # one division for 1/c and 1/P
+        inverse, over = chord * product, root * product
+        sin_gamma, cos_gamma = h * over, root * over
+        f_u, f_n = cos_gamma, sin_gamma
+        ways = (chord * inverse, None, sin_gamma * inverse, over)
+    else:
+        inverse = 1 / root
+        sin_gamma = (h * chord - bend.tip * root) / squared
+        cos_gamma = (chord * root + bend.tip * h) / squared
+        f_u, f_n = sin_gamma, -cos_gamma
+        ways = tuple(inverse * x for x in (-bend.tip, chord, -cos_gamma, sin_gamma))
+    f_x, f_y = plant.ux * f_u - plant.uy * f_n, plant.uy * f_u + plant.ux * f_n
+    frame = Frame(f_x, f_y, f_x * cx + f_y * cy, f_x * cy - f_y * cx, *ways)
+    along_f, along_g = frame.joint_motion(pose_rate)
+    for rate in (bend.tip_rate, bend.shortening_rate):
+        along_f = along_f if rate is None else along_f + rate
+    rho_rate, gamma_rate = frame.link_motion(along_f, along_g)
     return Chain(
-        cu, cn, h, root, root_squared, sin_gamma, cos_gamma,
-        jnp.zeros_like(h) + tip, jnp.zeros_like(h) + tip_rate,
-        s - root, rho_rate, gamma_rate, h_rate,
-    )  # fmt: skip
+        bend=bend,
+        frame=frame,
+        cx=cx,
+        cy=cy,
+        s=s,
+        h=h,
+        chord=chord,
+        root_squared=root_squared,
+        sine=sin_gamma,
+        cosine=cos_gamma,
+        rho=s - root,
+        rho_rate=rho_rate,
+        gamma_rate=gamma_rate,
+    )
 
 
 def chain_status(plant: Plant, chain: Chain) -> Array:
-    """Status of the pose: OK, OUT_OF_REACH (h^2 > l2) or SINGULAR (gamma at 0 or 90 deg).
+    """Status of the pose: OK, OUT_OF_REACH (h^2 > l2, with the chord as it is) or SINGULAR (gamma at 0 or 90 deg).
 
     Returns:
         () code of `jaxmodel.status`, as a floating-point number.
@@ -150,19 +225,17 @@ def path_status(plant: Plant, pose: Array) -> Array:
     return codes[index], index
 
 
-def closure_residual(plant: Plant, pose: Array, chain: Chain, gamma: Array) -> Array:
+def closure_residual(chain: Chain, gamma: Array) -> Array:
     """Residual of (6) [m], (2, 3): C from the platform minus C from slider and bent link.
 
     Args:
-        plant: the machine.
-        pose: (3,).
-        chain: supplies rho and w.
+        chain: supplies C, rho, c and w.
         gamma: link angles [rad], (3,).
 
     Returns:
         components along u and n.
     """
-    along = chain.rho + plant.length * jnp.cos(gamma) - chain.tip * jnp.sin(gamma)
-    across = plant.length * jnp.sin(gamma) + chain.tip * jnp.cos(gamma)
-    s = plant.ux * pose[0] + plant.uy * pose[1] + chain.cu + plant.s0
-    return jnp.stack([s - along, chain.h - across])
+    tip = 0.0 if chain.bend.tip is None else chain.bend.tip
+    along = chain.rho + chain.chord * jnp.cos(gamma) - tip * jnp.sin(gamma)
+    across = chain.chord * jnp.sin(gamma) + tip * jnp.cos(gamma)
+    return jnp.stack([chain.s - along, chain.h - across])

@@ -1,7 +1,8 @@
 """Linearisation at a pose: frequencies, damping, mode shapes, frequency response.
 
-The state is x = (X, X', q, q', z, z'), flattened, about the resting machine at that pose with the
-drive holding it there. Matrices come from forward-mode differentiation of the loop's own plant.
+The state is x = (X, X', q, q', z, z'), flattened, about the machine at that pose with straight links,
+resting or in motion, the drive giving the forces that keep it so: what acts along the links then
+changes their stiffness. Matrices come from forward-mode differentiation of the loop's own plant.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Structure
-from jaxmodel.drive import Reference
+from jaxmodel.drive import Reference, slider_force
+from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.kinematics import close_chain
 from jaxmodel.loop import Loop, PlantState, plant_rates
 from jaxmodel.parameters import Array
@@ -40,28 +42,47 @@ def unflatten(x: Array, n_modes: int) -> PlantState:
     return PlantState(x[:3], x[3:6], *modes)
 
 
-def linearise(structure: Structure, loop: Loop, pose: Array, antialias: Array) -> LinearPlant:
-    """Linear plant at a resting pose; with ideal feedback in `structure` its loop is closed in A.
+class Moment(NamedTuple):
+    """An instant of a motion under load, (3,) each."""
+
+    rate: Array  # X' [m/s, m/s, rad/s]
+    acceleration: Array  # X'' [m/s2, m/s2, rad/s2]
+    wrench: Array  # on the platform [N, N, N m]
+
+
+def linearise(
+    structure: Structure, loop: Loop, pose: Array, antialias: Array, moment: Moment | None = None
+) -> LinearPlant:
+    """Linear plant at a pose; with ideal feedback in `structure` its loop is closed in A.
 
     Args:
         structure: static choices.
         loop: constants of the case.
         pose: (x, y, phi) [m, m, rad], (3,).
         antialias: corner of the anti-alias filter [rad/s], ().
+        moment: motion and load there, as if they lasted; None: at rest without load.
 
     Returns:
         LinearPlant.
     """
     pose = jnp.asarray(pose, loop.omega.dtype)
     still = jnp.zeros_like(pose)
-    rho = close_chain(loop.plant, pose, still).rho
+    rate = still if moment is None else jnp.asarray(moment.rate, pose.dtype)
+    chain = close_chain(loop.plant, pose, rate)
     zero = jnp.zeros_like(loop.omega)
-    rest = flatten(PlantState(pose, still, zero, zero, zero, zero))
+    rest = flatten(PlantState(pose, rate, zero, zero, zero, zero))
+    forward = still if structure.has_feedforward or structure.has_wrench else None
+    wanted = Reference(chain.rho, chain.rho_rate, forward, still)
+    if moment is not None:
+        held = inverse_dynamics(loop.plant, pose, rate, moment.acceleration, moment.wrench)
+        given = slider_force(
+            loop.drive, wanted, chain.rho, chain.rho_rate, structure.has_friction, True
+        )
+        wanted = wanted._replace(disturbance=held - given, wrench=moment.wrench)
 
     def derivative(x: Array, voltage: Array, force: Array) -> Array:
         at = unflatten(x, structure.n_modes)
-        forward = jnp.zeros_like(rho) if structure.has_feedforward else None
-        reference = Reference(rho, jnp.zeros_like(rho), forward, force)
+        reference = wanted._replace(disturbance=wanted.disturbance + force)
         rates = plant_rates(structure, loop, at, reference, jnp.reshape(voltage, (3, -1)))
         z_acc = antialias**2 * (at.q - at.z) - jnp.sqrt(2.0) * antialias * at.z_rate
         return flatten(

@@ -7,10 +7,13 @@ after its end dies out by itself, and its energy until then comes from a Gramian
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.parameters import Array
 from jaxmodel.sampled_loop import LoopMatrices, summed_squares
 from jaxmodel.simulate import begin
@@ -35,6 +38,11 @@ def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) ->
     inputs, drive = start.inputs, start.loop.drive
     force = drive.kp * (jnp.mean(inputs.rho, axis=1) - inputs.rho[0, 0])
     force = force + drive.kd * jnp.mean(inputs.rho_rate, axis=1)
+    if structure.has_wrench:  # a pulse on the platform acts like slider forces that hold against it
+        pulse = inputs.wrench - case.load.wrench
+        still = jnp.zeros_like(start.state.plant.pose)
+        held = partial(inverse_dynamics, start.loop.plant, start.state.plant.pose, still, still)
+        force = force - jax.vmap(held)(pulse)
     if inputs.feedforward is not None:
         rest = inputs.feedforward[0, 0]
         force = force + jnp.mean(inputs.feedforward, axis=1) - rest

@@ -24,7 +24,7 @@ from jaxmodel.controller import (
 from jaxmodel.drive import Reference, motor_force, slider_force
 from jaxmodel.dynamics import Accelerations, accelerations, modal_chain
 from jaxmodel.integrator import Exponential
-from jaxmodel.kinematics import Chain, chain_status
+from jaxmodel.kinematics import Chain, chain_status, close_chain
 from jaxmodel.parameters import Array
 from jaxmodel.plant import Plant
 
@@ -82,6 +82,7 @@ class Inputs(NamedTuple):
     feedforward: Array | None  # [N], (P, 3)
     pose: Array  # wanted pose at the start [m, m, rad], (3,)
     disturbance: Array  # slider force held over the sample [N], (3,)
+    wrench: Array | None  # on the platform, held over the sample [N, N, N m], (3,)
     adc_noise: Array | None  # standard normal, (3, K)
     window: metrics.Window
 
@@ -123,7 +124,10 @@ def plant_rates(
     Returns:
         Rates.
     """
-    chain = modal_chain(loop.plant, state.pose, state.pose_rate, state.q, state.q_rate)
+    if structure.is_coupled:
+        chain = modal_chain(loop.plant, state.pose, state.pose_rate, state.q, state.q_rate)
+    else:
+        chain = close_chain(loop.plant, state.pose, state.pose_rate)
     force = slider_force(
         loop.drive, reference, chain.rho, chain.rho_rate, structure.has_friction,
         structure.is_smooth,
@@ -131,7 +135,10 @@ def plant_rates(
     if structure.feedback == "ideal":
         voltage = ideal_voltage(structure, loop, state.q, state.q_rate)
     piezo = jnp.sum(loop.actuator * voltage[:, None], axis=2)
-    rates = accelerations(loop.plant, chain, state.pose_rate, state.q, state.q_rate, force, piezo)
+    rates = accelerations(
+        loop.plant, chain, state.pose_rate, state.q, state.q_rate, force, piezo, reference.wrench,
+        structure.is_coupled,
+    )  # fmt: skip
     return Rates(chain, rates)
 
 
@@ -299,7 +306,9 @@ def advance(
 
 def _reference(inputs: Inputs, point: int) -> Reference:
     forward = None if inputs.feedforward is None else inputs.feedforward[point]
-    return Reference(inputs.rho[point], inputs.rho_rate[point], forward, inputs.disturbance)
+    return Reference(
+        inputs.rho[point], inputs.rho_rate[point], forward, inputs.disturbance, inputs.wrench
+    )
 
 
 def _advance_plant(
@@ -319,8 +328,9 @@ def _advance_plant(
         rho, rho_rate, forward = points
         start, middle, end = (
             Reference(
-                rho[k], rho_rate[k], None if forward is None else forward[k], inputs.disturbance
-            )
+                rho[k], rho_rate[k], None if forward is None else forward[k], inputs.disturbance,
+                inputs.wrench,
+            )  # fmt: skip
             for k in range(3)
         )
         return plant_step(structure, loop, at, (start, middle, end), voltage)

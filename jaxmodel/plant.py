@@ -19,32 +19,38 @@ from jaxmodel.parameters import Array, Machine
 class Plant(NamedTuple):
     """Machine and modal basis in the form the equations of motion use (shapes as above)."""
 
-    # guides in the frame (u, n): s = u.X + cu + s0, h = n.X + cn + h0
+    # guides: s = u.C + s0, h = n.C + h0
     ux: Array  # direction of guide i [1], (3,)
     uy: Array
-    joint_cos: Array  # |PC| cos(psi - alpha) [m], (3,)
-    joint_sin: Array  # |PC| sin(psi - alpha) [m], (3,)
+    joint_cos: Array  # |PC| cos(psi) [m], (3,)
+    joint_sin: Array  # |PC| sin(psi) [m], (3,)
     s0: Array  # -u.A [m], (3,)
     h0: Array  # -n.A [m], (3,)
     length: Array  # L [m], (3,)
     # rigid inertia
     slider_link_mass: Array  # m_b + m_s [kg], (3,)
-    first_moment: Array  # e [kg m], (3,)
+    tip_mass: Array  # e/L: share of the link's mass that moves with C [kg], (3,)
     inertia: Array  # J0 [kg m2], (3,)
     platform_mass: Array  # [kg], ()
     platform_inertia: Array  # [kg m2], ()
     # modes
-    mass: Array  # m_j [kg], (3, R)
+    modal_mass: Array  # m, the same for all modes of a link [kg], (3,)
     stiffness: Array  # k_j [N/m], (3, R)
     damping: Array  # d_j = 2 zeta sqrt(k m) [N s/m], (3, R)
     tip: Array | None  # Y_j(L) [1], (3, R), None where zero
+    shortening: Array | None  # S_jj [1/m], (3, R), None where the chord keeps its length
+    mixed_shortening: Array | None  # S_jk, zero for j = k [1/m], (3, R, R), None where all zero
     b: Array  # [kg], (3, R)
     c: Array  # [kg m], (3, R)
-    # 1 where the machine may move, 0 where the sliders are locked (bases with Y(L) = 0 only)
-    free: Array  # [1], ()
 
 
-def build_plant(machine: Machine, basis: ModalBasis, is_locked: Array = False) -> Plant:
+#: Mass added to sliders that are locked [kg]: 1 N for 1 s moves it by 0.5 nm.
+LOCK_MASS = 1e9
+
+
+def build_plant(
+    machine: Machine, basis: ModalBasis, is_locked: Array = False, has_shortening: bool = True
+) -> Plant:
     """Collect machine and basis into a `Plant`.
 
     Guide i starts at A_i = -r_in n_i - (a/2) u_i, r_in = a/(2 sqrt 3), u_i = (cos, sin) alpha_i,
@@ -53,8 +59,8 @@ def build_plant(machine: Machine, basis: ModalBasis, is_locked: Array = False) -
     Args:
         machine: physical description.
         basis: modal basis of the links.
-        is_locked: hold all sliders. With Y_j(L) = 0 the pose is then held too; the caller refuses
-            bases with Y_j(L) != 0.
+        is_locked: hold all sliders, by `LOCK_MASS`.
+        has_shortening: bent links have shorter chords (static); False: as in the paper.
 
     Returns:
         Plant.
@@ -70,21 +76,24 @@ def build_plant(machine: Machine, basis: ModalBasis, is_locked: Array = False) -
     return Plant(
         ux=jnp.cos(angle),
         uy=jnp.sin(angle),
-        joint_cos=link(geometry.joint_radius) * jnp.cos(psi - angle),
-        joint_sin=link(geometry.joint_radius) * jnp.sin(psi - angle),
+        joint_cos=link(geometry.joint_radius) * jnp.cos(psi),
+        joint_sin=link(geometry.joint_radius) * jnp.sin(psi),
         s0=link(geometry.guide_side / 2),
         h0=link(geometry.guide_side / jnp.sqrt(12.0)),
         length=link(beam.length),
-        slider_link_mass=link(masses.slider_mass) + basis.link_mass,
-        first_moment=basis.first_moment,
+        slider_link_mass=link(masses.slider_mass)
+        + basis.link_mass
+        + LOCK_MASS * jnp.asarray(is_locked, basis.mass.dtype),
+        tip_mass=basis.first_moment / link(beam.length),
         inertia=basis.inertia,
         platform_mass=jnp.asarray(masses.platform_mass),
         platform_inertia=jnp.asarray(masses.platform_inertia),
-        mass=basis.mass,
+        modal_mass=basis.mass[:, 0],
         stiffness=basis.stiffness,
         damping=2 * damping_ratio[:, None] * jnp.sqrt(basis.stiffness * basis.mass),
         tip=basis.tip,
+        shortening=basis.shortening if has_shortening else None,
+        mixed_shortening=basis.mixed_shortening if has_shortening else None,
         b=basis.b,
         c=basis.c,
-        free=1.0 - jnp.asarray(is_locked, basis.mass.dtype),
     )

@@ -66,7 +66,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         structure.basis, machine.beam, machine.patches, structure.n_modes,
         case.windows.stations, mask,
     )  # fmt: skip
-    plant = build_plant(machine, basis, case.drive.is_locked)
+    plant = build_plant(machine, basis, case.drive.is_locked, structure.has_shortening)
     design = design_controller(structure, case)
     omega = jnp.sqrt(basis.stiffness / basis.mass)
     zeta = plant.damping / (2 * basis.mass * omega)

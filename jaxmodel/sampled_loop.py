@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, ControllerState, controller_step
-from jaxmodel.linear import LinearPlant, linearise
+from jaxmodel.linear import LinearPlant, Moment, linearise
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 
@@ -37,7 +37,11 @@ class LoopMatrices(NamedTuple):
 
 
 def closed_loop(
-    structure: Structure, case: Case, pose: Array, law: Controller | None = None
+    structure: Structure,
+    case: Case,
+    pose: Array,
+    law: Controller | None = None,
+    moment: Moment | None = None,
 ) -> LoopMatrices:
     """Transition matrix of plant, filters, delay and controller per sample; differentiable.
 
@@ -46,6 +50,7 @@ def closed_loop(
         case: the numbers; its gains belong to factor 1.
         pose: where to linearise [m, m, rad], (3,).
         law: controller to judge instead of the case's own, its coefficients rounded for instance.
+        moment: motion and load at that pose; None: at rest under the case's steady load.
 
     Returns:
         LoopMatrices.
@@ -53,7 +58,9 @@ def closed_loop(
     smooth = structure._replace(is_smooth=True, feedback="sampled")
     loop = prepare(smooth, case).loop
     law = loop.controller if law is None else law
-    plant = linearise(smooth, loop, pose, case.electronics.antialias)
+    if moment is None and structure.has_wrench:
+        moment = Moment(jnp.zeros(3), jnp.zeros(3), case.load.wrench)
+    plant = linearise(smooth, loop, pose, case.electronics.antialias, moment)
     state, enters = _with_filtered_sensors(smooth, plant, case.electronics.antialias)
     n, n_inputs = enters.shape
     held = jnp.zeros((n + n_inputs,) * 2, state.dtype)

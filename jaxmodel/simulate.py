@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel import metrics, status
-from jaxmodel.case import Case, Structure
+from jaxmodel.axial import axial_force, critical_force
+from jaxmodel.case import Case, Load, Structure
 from jaxmodel.control import efficient_modal_control
 from jaxmodel.controller import Controller
 from jaxmodel.dynamics import inverse_dynamics
@@ -18,6 +19,7 @@ from jaxmodel.kinematics import inverse_kinematics, path_status
 from jaxmodel.loop import Inputs, Loop, Record, State, initial_state, step
 from jaxmodel.motion import end_of_path, shape_path
 from jaxmodel.parameters import Array
+from jaxmodel.plant import Plant
 from jaxmodel.prepare import Prepared, prepare
 from jaxmodel.shaper import last_sample
 
@@ -61,14 +63,23 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
     grid = n * per_sample + 1
     wanted = shape_path(case.path, prepared.taps, grid, per_sample, period / per_sample)
     rho, rho_rate = inverse_kinematics(plant, wanted.position, wanted.velocity)
+    wrench = case.load.wrench if structure.has_wrench else None
     forward = None
     if structure.has_feedforward:
-        forward = _points(jax.vmap(inverse_dynamics, (None, 0, 0, 0))(plant, *wanted), n)
+        each = jax.vmap(inverse_dynamics, (None, 0, 0, 0, None))
+        forward = _points(each(plant, *wanted, wrench), n)
+    elif structure.has_wrench:  # what the drive's integrators have settled on
+        still = jnp.zeros_like(wanted.position[0])
+        held = inverse_dynamics(plant, wanted.position[0], still, still, wrench)
+        forward = jnp.broadcast_to(held, (n, per_sample + 1, 3))
 
+    is_buckled = jnp.any(steady_load(structure, case, plant) >= 1)
     time = period * jnp.arange(n)
     end = end_of_path(case.path) + last_sample(prepared.taps) * period
     code, index = path_status(plant, wanted.position)
     bad_time = index * period / per_sample
+    code = jnp.where(is_buckled, float(status.BUCKLED), code)
+    bad_time = jnp.where(is_buckled, 0.0, bad_time)
     is_long = end > n * period
     code = jnp.where((code == status.OK) & is_long, float(status.SHAPER_TOO_LONG), code)
     left = n * period - end - case.windows.residual_delay
@@ -84,10 +95,35 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
         feedforward=forward,
         pose=wanted.position[:-1:per_sample],
         disturbance=disturbance,
+        wrench=_wrench(case.load, time) if structure.has_wrench else None,
         adc_noise=adc_noise,
         window=_windows(structure, case, time, end),
     )
     return Command(inputs, wanted.position[0], end, code, bad_time)
+
+
+def steady_load(structure: Structure, case: Case, plant: Plant) -> Array:
+    """Compression of the links by the steady load at the way-points, over N_cr [1], (n, 3)."""
+    poses = jnp.asarray(case.path.waypoints)
+    if not structure.has_wrench:
+        return jnp.zeros(poses.shape)
+    still = jnp.zeros_like(poses[0])
+    forces = jax.vmap(axial_force, (None, 0, None, None, None))(
+        plant, poses, still, still, case.load.wrench
+    )
+    return -forces / critical_force(plant)
+
+
+def _wrench(load: Load, time: Array) -> Array:
+    """Force and moment on the platform [N, N, N m], (n_steps, 3)."""
+    is_on = _is_on(time, load.pulse_start, load.pulse_length)
+    return load.wrench + jnp.where(is_on[:, None], load.pulse, 0.0)
+
+
+def _is_on(time: Array, start: Array, length: Array) -> Array:
+    """Where a pulse acts."""
+    since = time - start
+    return (since >= -1e-12) & (since < length - 1e-12)
 
 
 def _points(x: Array, n: int) -> Array:
@@ -114,8 +150,7 @@ def _windows(structure: Structure, case: Case, time: Array, end: Array) -> metri
 def _disturbance(structure: Structure, case: Case, prepared: Prepared, time: Array):
     """(standard normal ADC noise or None, slider disturbance [N])."""
     drive, n = prepared.loop.drive, structure.n_steps
-    since = time - drive.pulse_start
-    is_on = (since >= -1e-12) & (since < drive.pulse_length - 1e-12)
+    is_on = _is_on(time, drive.pulse_start, drive.pulse_length)
     force = jnp.where(is_on[:, None], jnp.broadcast_to(drive.pulse_force, (n, 3)), 0.0)
     if not structure.has_noise:
         return None, force

@@ -21,6 +21,7 @@ TOO_FAST = 13
 STATION_OFF_LINK = 14
 TOO_STIFF = 15
 CLIPPED = 16
+BUCKLED = 17
 
 #: A case with one of these ran to its end, and its metrics hold.
 FINISHED = (OK, SATURATED, UNSTABLE, CLIPPED)
@@ -43,4 +44,5 @@ REASONS = {
     STATION_OFF_LINK: "station off the link",
     TOO_STIFF: "drive or ideal feedback too stiff for the step",
     CLIPPED: "ADC clipped too often",
+    BUCKLED: "steady load on a link beyond its critical force",
 }

@@ -19,6 +19,7 @@ from jaxmodel.case import (
     Drive,
     Electronics,
     Initial,
+    Load,
     Shaping,
     Structure,
     Windows,
@@ -50,6 +51,9 @@ def build_structure(study: Study, substeps: int | None = None) -> Structure:
         n_steps=max(steps, 1),
         substeps=study.run.substeps or substeps or 1,
         basis=study.link.basis,
+        has_shortening=study.link.shortening,
+        is_coupled=study.run.model == "coupled",
+        has_wrench=any(x != 0 for x in (*study.load.wrench, *study.load.pulse)),
         controller_basis=study.control.basis,
         feedback=study.control.feedback,
         law=study.control.law,
@@ -87,6 +91,7 @@ def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
         control=_control(fields, structure),
         electronics=_electronics(fields, structure),
         drive=_drive(fields),
+        load=Load(*(number(f"load.{name}") for name in Load._fields)),
         initial=Initial(
             _filled(number("initial.modal"), (3, structure.n_modes), 0.0),
             number("initial.load_station"),
@@ -138,7 +143,9 @@ def _machine(fields: Fields) -> Machine:
             np.array(list(ASSEMBLIES.values()))[outward],
         ),
         Masses(
-            *(number("machine", f) for f in ("platform_mass", "platform_inertia", "slider_mass"))
+            number("machine", "platform_mass") + number("load", "mass"),
+            number("machine", "platform_inertia") + number("load", "inertia"),
+            number("machine", "slider_mass"),
         ),
         Beam(*(number("link", name) for name in Beam._fields)),
         Patches(

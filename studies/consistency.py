@@ -77,6 +77,11 @@ def check_consistency(study: Study) -> None:
         raise field_error(
             "link.basis", link.basis, "pinned_pinned or loaded, where drive.locked is true"
         )
+    if study.run.model == "ked" and link.basis == "pinned_free":
+        raise field_error(
+            "link.basis", link.basis,
+            "pinned_pinned or loaded, where run.model is ked: rigid motion prescribes both ends",
+        )  # fmt: skip
     stations = ("metrics.stations", study.metrics.stations)
     for name, values in (stations, ("initial.load_station", (study.initial.load_station,))):
         for value in values:

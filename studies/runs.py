@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel import status
+from jaxmodel.axial import critical_force
 from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
@@ -29,7 +30,7 @@ from jaxmodel.prepare import (
     spectrum_frequencies,
 )  # fmt: skip
 from jaxmodel.shaper import Taps, last_sample
-from jaxmodel.simulate import Result, simulate
+from jaxmodel.simulate import Result, simulate, steady_load
 from studies import config
 from studies.cases import as_arrays, build_case, build_structure, powered
 from studies.consistency import check_locked
@@ -134,6 +135,8 @@ class Preflight(NamedTuple):
     condition: Any  # worst condition number of filter and synthesizer [1], ()
     highest: Any  # frequency of the highest plant mode [rad/s], ()
     corner: Any  # highest low-pass corner of the velocity estimate [rad/s], ()
+    steady_load: Any  # compression of the links at way-points over their critical force [1], (n, 3)
+    critical_force: Any  # [N], (3,)
     controller: Controller
     taps: Taps  # of the shaper
 
@@ -157,13 +160,17 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
     corner = lowpass_corner(structure, case)
     return Preflight(
         each, code, time[index], poses[index], end, shaper_length, worst,
-        jnp.max(prepared.loop.omega), corner, prepared.loop.controller, prepared.taps,
+        jnp.max(prepared.loop.omega), corner, steady_load(structure, case, plant),
+        critical_force(plant), prepared.loop.controller, prepared.taps,
     )  # fmt: skip
 
 
 def _without_run(structure: Structure) -> Structure:
     """Only what describes machine and controller, so that runs of any kind share a compilation."""
-    kept = ("n_modes", "n_controlled", "n_patches", "basis", "controller_basis", "law")
+    kept = (
+        "n_modes", "n_controlled", "n_patches", "basis", "has_shortening", "is_coupled",
+        "has_wrench", "controller_basis", "law",
+    )  # fmt: skip
     fields = {name: getattr(structure, name) for name in kept}
     return Structure(n_steps=1, feedback="none", **fields)
 
@@ -189,6 +196,7 @@ def check_run(study: Study) -> tuple[Structure, Case]:
             "a path on which every link angle gamma stays inside (0, 90) deg "
             f"(here: {status.REASONS[int(known.path_status)]})", "m, m, rad",
         )  # fmt: skip
+    _check_load(study, known)
     _check_duration(study, structure, known)
     is_modal = structure.law == "imsc" and structure.feedback != "none"
     if is_modal and known.condition > study.metrics.condition_limit:
@@ -221,6 +229,19 @@ def check_pose(field: str, pose: tuple[float, float, float], code: int) -> None:
             "a pose where every link angle gamma is inside (0, 90) deg "
             f"(here: {status.REASONS[code]})", "m, m, rad",
         )  # fmt: skip
+
+
+def _check_load(study: Study, known: Preflight) -> None:
+    if np.all(known.steady_load < 1):
+        return
+    at, link = np.unravel_index(np.argmax(known.steady_load), known.steady_load.shape)
+    critical = known.critical_force[link]
+    raise field_error(
+        "load.wrench", study.load.wrench,
+        f"a load that compresses no link by its critical force, {critical:.4g} N (here link "
+        f"{link + 1}: {known.steady_load[at, link] * critical:.4g} N at way-point {at + 1})",
+        "N, N, N m",
+    )  # fmt: skip
 
 
 def _check_duration(study: Study, structure: Structure, known: Preflight) -> None:

@@ -25,6 +25,7 @@ Basis = Literal["pinned_pinned", "pinned_free", "loaded"]
 Coordinate = Annotated[float, Field(ge=-10, le=10)]
 Deflection = Annotated[float, Field(ge=-0.1, le=0.1)]
 Force = Annotated[float, Field(ge=-1e4, le=1e4)]
+Wrench = tuple[Force, Force, Force]
 Gain = Annotated[float, Field(ge=-1e9, le=1e9)]
 Time = Annotated[float, Field(ge=1e-4, le=100)]
 Pause = Annotated[float, Field(ge=0, le=100)]
@@ -42,12 +43,15 @@ class Section(BaseModel):
 
 
 class Run(Section):
-    """How long and how finely."""
+    """How long, how finely, and by which model."""
 
     duration: float = described(0.8, "s", "length of the run", gt=0, le=100)
     seed: int = described(0, "1", "of ADC noise and force ripple", ge=0, le=10**9)
     substeps: int = described(0, "1", "plant steps per sample; 0: as many as needed", ge=0, le=200)
     smooth: bool = described(False, "-", "smooth limits, noise instead of rounding (for gradients)")
+    model: Literal["coupled", "ked"] = described(
+        "coupled", "-", "ked: rigid motion bends the links, nothing acts back (two passes)"
+    )
 
 
 class Machine(Section):
@@ -68,6 +72,11 @@ class Link(Section):
 
     basis: Basis = described("pinned_pinned", "-", "modal basis of the plant")
     modes: int = described(8, "1", "plant modes per link", ge=1, le=16)
+    shortening: bool = described(
+        True,
+        "-",
+        "a bent link's chord is shorter: axial force acts on bending (not in pinned_free)",
+    )
     length: float = described(0.2, "m", "L", ge=1e-3, le=10)
     thickness: float = described(2e-3, "m", "t_b", ge=1e-5, le=0.1)
     width: float = described(10e-3, "m", "width", ge=1e-4, le=1)
@@ -229,6 +238,19 @@ class Drive(Section):
     locked: bool = described(False, "-", "hold the sliders (bases with Y(L) = 0)")
 
 
+class Load(Section):
+    """What the platform carries and what acts on it, at its reference point (the pose)."""
+
+    mass: float = described(0.0, "kg", "payload, added to m_p", ge=0, le=1e3)
+    inertia: float = described(0.0, "kg m2", "payload, added to I_p", ge=0, le=1e2)
+    wrench: Wrench = described(
+        (0.0, 0.0, 0.0), "N, N, N m", "steady force and moment; the run starts in equilibrium"
+    )
+    pulse: Wrench = described((0.0, 0.0, 0.0), "N, N, N m", "disturbance on top")
+    pulse_start: float = described(0.0, "s", "its start", ge=0, le=100)
+    pulse_length: float = described(0.001, "s", "its length", ge=0, le=100)
+
+
 class Initial(Section):
     """State at t = 0."""
 
@@ -275,6 +297,7 @@ class Study(Section):
     control: Control = Control()
     electronics: Electronics = Electronics()
     drive: Drive = Drive()
+    load: Load = Load()
     initial: Initial = Initial()
     metrics: Metrics = Metrics()
 

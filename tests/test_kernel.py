@@ -33,7 +33,7 @@ ALL_SORTS = {
         "link_subsets": "all",
         "gain": {"from": 0.01, "to": 0.1},
         "shaper": ["none", "zv"],
-        "initial.load_deflection[0]": [0.0, 0.0, 0.0, 0.1],
+        "initial.load_deflection[0]": [0.0, 0.0, 0.0, 0.03],
         "drive.kp": {"from": 1e4, "to": 3e4},
         "machine.platform_mass": {"from": 0.2, "to": 0.3},
     },
@@ -200,7 +200,7 @@ def operations_of(work):
 
 
 #: Operations, with some room, as docs/performance.md has them.
-MOST = {"W0": 2510, "W1": 3200}
+MOST = {"W0": 3590, "W1": 4290}
 
 
 @pytest.mark.parametrize("work", ["W0", pytest.param("W1", marks=pytest.mark.long)])
@@ -208,6 +208,6 @@ def test_a_sample_takes_no_more_operations_than_it_should(work):
     found = operations_of(work)
     assert found.pop("read") < 700
     assert 0.8 * MOST[work] < sum(found.values()) < MOST[work]
-    # four evaluations of the plant: a root and a reciprocal per link, three in the solution
+    # four evaluations of the plant: a root and two reciprocals per link, three in the solution
     # and one per link for `ringing_time`, where all metrics are accumulated
-    assert found["sqrt"] == 12 and found["reciprocal"] == {"W0": 24, "W1": 27}[work]
+    assert found["sqrt"] == 12 and found["reciprocal"] == {"W0": 36, "W1": 39}[work]

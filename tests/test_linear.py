@@ -156,5 +156,6 @@ def test_released_link_moves_like_the_finite_element_link():
     record = jax.jit(simulate, static_argnums=(0, 2))(structure, case, True).record
     deflection = np.asarray(record.chord_deflection_stations)[:, :, 0]
     np.testing.assert_allclose(record.time[::2], given[:, 0], atol=1e-12)
-    np.testing.assert_allclose(deflection[::2, 0], given[:, 1], atol=0.01 * 5e-5)
-    assert not deflection[:, 1:].any()
+    np.testing.assert_allclose(deflection[::2, 0], given[:, 1], atol=0.001 * 5e-5)
+    # the neighbours feel that its chord grows and shrinks by 31 nm
+    assert 0 < np.abs(deflection[:, 1:]).max() < 1e-3 * 5e-5

@@ -29,7 +29,7 @@ REFUSED = [
     ("[run]\nsmooth = 1", "run.smooth = 1: allowed true or false"),
     ("[run]\nduration = 1979-05-27", "run.duration = 1979-05-27: allowed a finite number"),
     ("title = 3", "title = 3: allowed text of at most 200 characters"),
-    ("link = 3", "link = 3: allowed a section with fields basis, modes, length"),
+    ("link = 3", "link = 3: allowed a section with fields basis, modes, shortening"),
     ("[[run]]\nduration = 1", "run = [{'duration': 1}]: allowed a section with fields duration"),
     ("[run.duration]\nx = 1", "run.duration = {'x': 1}: allowed a finite number"),
     ('[motion]\nmove_time = "a"', "move_time = 'a': allowed a finite number >= 0.0001 and <= 100,"),

@@ -78,7 +78,7 @@ def _positions(
     def one(pose: Array, q: Array) -> tuple[Array, Array, Array]:
         chain = modal_chain(plant, pose, jnp.zeros_like(pose), q, jnp.zeros_like(q))
         slider = corner + chain.rho[:, None] * u
-        joint = pose[:2] + chain.cu[:, None] * u + chain.cn[:, None] * n
+        joint = pose[:2] + jnp.stack([chain.cx, chain.cy], axis=1)
         chord = joint - slider
         across = jnp.stack([-chord[:, 1], chord[:, 0]], axis=1) / plant.length[:, None]
         bent = exaggeration * jnp.einsum("isr,ir->is", shape, q)

@@ -168,7 +168,7 @@ def _slopes(structure: Structure, start: Start, time: Any, state: PlantState) ->
     )
     found = plant_rates(structure, start.loop, state, wanted, jnp.zeros((3, 3))).acceleration
     plant = start.loop.plant
-    own = (plant.stiffness * state.q + plant.damping * state.q_rate) / plant.mass
+    own = (plant.stiffness * state.q + plant.damping * state.q_rate) / plant.modal_mass[:, None]
     return PlantState(state.pose_rate, found.pose, state.q_rate, found.coupling - own, None, None)
 
 
@@ -236,7 +236,7 @@ def by_lagrangian(work: Work, n: int) -> Callable[[], Any]:
             structure.basis, machine.beam, machine.patches, structure.n_modes, case.windows.stations
         )
         loop = start.loop
-        mass, drive = loop.plant.mass, loop.drive
+        mass, drive = loop.plant.modal_mass[:, None], loop.drive
 
         def slope(at: reference.Motion, wanted: tuple) -> reference.Motion:
             rho, rho_rate = wanted
@@ -273,8 +273,9 @@ def by_c(work: Work, compiler: str) -> Callable[[], Any]:
     plant, drive, n = start.loop.plant, start.loop.drive, structure.n_steps
     fields = (
         plant.ux, plant.uy, plant.joint_cos, plant.joint_sin, plant.s0, plant.h0, plant.length,
-        plant.slider_link_mass, plant.first_moment, plant.inertia, plant.platform_mass,
-        plant.platform_inertia, plant.mass, plant.stiffness, plant.damping, plant.b, plant.c,
+        plant.slider_link_mass, plant.tip_mass, plant.inertia, plant.platform_mass,
+        plant.platform_inertia, plant.modal_mass, plant.stiffness, plant.damping, plant.b, plant.c,
+        plant.shortening,
         start.loop.actuator, start.loop.deflection_at,
         *(np.broadcast_to(x, (3,)) for x in (drive.kp, drive.kd, drive.force_limit)),
         start.loop.controller.voltage_limit,

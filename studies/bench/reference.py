@@ -50,21 +50,32 @@ def tip_deflection(basis, q):
     return jnp.zeros(3) if basis.tip is None else jnp.sum(basis.tip * q, axis=1)
 
 
+def chord_length(machine, basis, q):
+    """c = L - 1/2 q^t S q [m], (3,): a bent link's ends are closer."""
+    length = jnp.broadcast_to(machine.beam.length, (3,))
+    if basis.shortening is None:
+        return length
+    slopes = jax.vmap(jnp.diag)(jnp.asarray(basis.shortening))
+    if basis.mixed_shortening is not None:
+        slopes = slopes + basis.mixed_shortening
+    return length - jnp.einsum("ij,ijk,ik->i", q, slopes, q) / 2
+
+
 def link_tips(machine, basis, rho, gamma, q):
     """Joints C_i [m] from the side of slider and bent link, (3, 2)."""
     corner, u, _ = guides(machine.geometry)
     beta = gamma + machine.geometry.guide_angle
     along = jnp.stack([jnp.cos(beta), jnp.sin(beta)], axis=1)
     across = jnp.stack([-jnp.sin(beta), jnp.cos(beta)], axis=1)
-    tip = tip_deflection(basis, q)
-    return corner + rho[:, None] * u + machine.beam.length * along + tip[:, None] * across
+    tip, chord = tip_deflection(basis, q), chord_length(machine, basis, q)
+    return corner + rho[:, None] * u + chord[:, None] * along + tip[:, None] * across
 
 
 def close(machine, basis, pose, q):
     """(rho [m], gamma [rad]), (3,) each, from the triangle of slider, joint and guide."""
     corner, u, n = guides(machine.geometry)
     to_joint = platform_joints(machine.geometry, pose) - corner
-    tip, length = tip_deflection(basis, q), machine.beam.length
+    tip, length = tip_deflection(basis, q), chord_length(machine, basis, q)
     distance = jnp.sqrt(length**2 + tip**2)
     slant = jnp.arcsin(jnp.sum(to_joint * n, axis=1) / distance)
     rho = jnp.sum(to_joint * u, axis=1) - distance * jnp.cos(slant)
@@ -72,7 +83,11 @@ def close(machine, basis, pose, q):
 
 
 def kinetic_energy(machine, basis, gamma, q, rho_rate, gamma_rate, pose_rate, q_rate):
-    """T [J] from the velocity a + x b + sum_j Y_j(x) c_j of the points of a link."""
+    """T [J] from the velocity a + x b + sum_j Y_j(x) c_j of the points of a link.
+
+    The centre of mass moves in along the chord with half of what the chord shortens by; squares of
+    that motion are left out.
+    """
     along = jnp.stack([jnp.cos(gamma), jnp.sin(gamma)], axis=1)  # in the guide's frame
     across = jnp.stack([-jnp.sin(gamma), jnp.cos(gamma)], axis=1)
     a = rho_rate[:, None] * jnp.array([1.0, 0.0])
@@ -81,10 +96,13 @@ def kinetic_energy(machine, basis, gamma, q, rho_rate, gamma_rate, pose_rate, q_
     c = q_rate[:, :, None] * across[:, None] - turning[:, :, None] * along[:, None]
     a_dot_c = jnp.einsum("id,ijd->ij", a, c)
     b_dot_c = jnp.einsum("id,ijd->ij", b, c)
+    length = jnp.broadcast_to(machine.beam.length, (3,))
+    chord, shrinking = jax.jvp(lambda q: chord_length(machine, basis, q), (q,), (q_rate,))
+    inward = shrinking[:, None] * along
     links = (
         (basis.link_mass + machine.masses.slider_mass) * jnp.sum(a * a, axis=1)
         + basis.inertia * jnp.sum(b * b, axis=1)
-        + 2 * basis.first_moment * jnp.sum(a * b, axis=1)
+        + 2 * basis.first_moment / length * jnp.sum(a * (chord[:, None] * b + inward), axis=1)
         + jnp.sum(basis.mass * jnp.sum(c * c, axis=2), axis=1)
         + 2 * jnp.sum(basis.b * a_dot_c + basis.c * b_dot_c, axis=1)
     )

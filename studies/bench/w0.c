@@ -1,6 +1,6 @@
 /* Work W0 written by hand: the yardstick of `studies bench peers`.
 
-   Pinned-pinned links (w = 0), PD drive, voltages from modal velocities, RK4 with the vibration in
+   Pinned-pinned links whose chords shorten (w = 0), PD drive, voltages from modal velocities, RK4 with the vibration in
    the same step; 8 cases side by side in the vectors of gcc and clang. One call runs 8 cases. */
 
 typedef double v8 __attribute__((vector_size(64)));
@@ -10,10 +10,10 @@ enum { LINKS = 3, MODES = 3, PATCHES = 3, STATIONS = 3 };
 
 struct machine {
   double ux[LINKS], uy[LINKS], joint_cos[LINKS], joint_sin[LINKS], s0[LINKS], h0[LINKS];
-  double length[LINKS], slider_link_mass[LINKS], first_moment[LINKS], inertia[LINKS];
+  double length[LINKS], slider_link_mass[LINKS], tip_mass[LINKS], inertia[LINKS];
   double platform_mass, platform_inertia;
-  double mass[LINKS][MODES], stiffness[LINKS][MODES], damping[LINKS][MODES];
-  double b[LINKS][MODES], c[LINKS][MODES];
+  double modal_mass[LINKS], stiffness[LINKS][MODES], damping[LINKS][MODES];
+  double b[LINKS][MODES], c[LINKS][MODES], shortening[LINKS][MODES];
   double actuator[LINKS][MODES][PATCHES]; /* acceleration of a voltage [m/s2/V] */
   double deflection_at[LINKS][STATIONS][MODES];
   double kp[LINKS], kd[LINKS], force_limit[LINKS], voltage_limit;
@@ -52,56 +52,79 @@ static void turn(v8 angle, double home_sin, double home_cos, v8 *sine, v8 *cosin
 static void rates(const struct machine *m, const double *wanted, const v8 *gain,
                   const struct state *at, const double *home, struct state *out) {
   v8 sine, cosine, A[3][3] = {{{0}}}, g[3] = {{0}};
-  v8 a[LINKS][3], d[LINKS][3], t[LINKS], S[LINKS], C[LINKS], inverse[LINKS], rs[LINKS], gs[LINKS];
-  v8 force[LINKS][MODES];
+  v8 force[LINKS][MODES], row[LINKS][MODES], S[LINKS];
+  v8 Jf[LINKS][3], Jg[LINKS][3]; /* motion of joint C along the chord and across it */
+  v8 to_rho[LINKS], to_gamma[LINKS], turn_gamma[LINKS], vf[LINKS], vg[LINKS];
+  v8 tau[LINKS][3], N[LINKS][3];
   turn(at->x[2] - home[0], home[1], home[2], &sine, &cosine);
   for (int i = 0; i < LINKS; i++) {
-    v8 cu = m->joint_cos[i] * cosine - m->joint_sin[i] * sine;
-    v8 cn = m->joint_cos[i] * sine + m->joint_sin[i] * cosine;
-    v8 s = m->ux[i] * at->x[0] + m->uy[i] * at->x[1] + cu + m->s0[i];
-    v8 h = -m->uy[i] * at->x[0] + m->ux[i] * at->x[1] + cn + m->h0[i];
-    double L = m->length[i];
-    v8 P = root(L * L - h * h), over = 1.0 / P;
-    a[i][0] = all(m->ux[i]), a[i][1] = all(m->uy[i]), a[i][2] = -cn;
-    d[i][0] = all(-m->uy[i]), d[i][1] = all(m->ux[i]), d[i][2] = cu;
-    v8 s_rate = m->ux[i] * at->v[0] + m->uy[i] * at->v[1] - cn * at->v[2];
-    v8 h_rate = -m->uy[i] * at->v[0] + m->ux[i] * at->v[1] + cu * at->v[2];
-    v8 gr = h_rate * over, g2 = gr * gr, f2 = at->v[2] * at->v[2];
-    S[i] = h * (1 / L), C[i] = P * (1 / L), t[i] = h * over, inverse[i] = over;
-    gs[i] = (h * g2 - cn * f2) * over;
-    rs[i] = h * gs[i] + P * g2 - cu * f2;
-    v8 motor = m->kp[i] * (wanted[i] - (s - P)) + m->kd[i] * (wanted[LINKS + i] - (s_rate + h * gr));
-    v8 F = limited(motor, m->force_limit[i]);
+    double ux = m->ux[i], uy = m->uy[i], mass = m->modal_mass[i], mu = m->tip_mass[i];
+    v8 cx = m->joint_cos[i] * cosine - m->joint_sin[i] * sine;
+    v8 cy = m->joint_cos[i] * sine + m->joint_sin[i] * cosine;
+    v8 X = at->x[0] + cx, Y = at->x[1] + cy;
+    v8 s = ux * X + uy * Y + m->s0[i], h = ux * Y - uy * X + m->h0[i];
     v8 volt[PATCHES];
     for (int k = 0; k < PATCHES; k++) {
       v8 sum = {0};
       for (int j = 0; j < MODES; j++) sum += gain[(i * PATCHES + k) * MODES + j] * at->p[i][j];
       volt[k] = limited(sum, m->voltage_limit);
     }
-    v8 bb = {0}, bc = {0}, cc = {0}, fb = {0}, fc = {0}, Bq = {0}, Bp = {0}, mqq = {0}, mqp = {0};
+    v8 d = {0}, d_rate = {0}, e2 = {0};
     for (int j = 0; j < MODES; j++) {
-      double mass = m->mass[i][j], b = m->b[i][j], c = m->c[i][j];
-      v8 q = at->q[i][j], p = at->p[i][j], piezo = {0};
-      for (int k = 0; k < PATCHES; k++) piezo += m->actuator[i][j][k] * volt[k];
-      v8 f = (m->stiffness[i][j] / mass - g2) * q + m->damping[i][j] / mass * p - piezo;
-      force[i][j] = f;
-      bb += b * b / mass, bc += b * c / mass, cc += c * c / mass;
-      fb += b * f, fc += c * f, Bq += b * q, Bp += b * p;
-      mqq += mass * q * q, mqp += mass * q * p;
+      v8 q = at->q[i][j], p = at->p[i][j], r = m->shortening[i][j] * q;
+      row[i][j] = r;
+      d += r * q, d_rate += r * p, e2 += m->shortening[i][j] * p * p;
     }
-    double e = m->first_moment[i];
+    v8 c = m->length[i] - 0.5 * d, P = root(c * c - h * h), product = 1.0 / (c * P);
+    v8 over = P * product, inverse = c * product, C = P * over;
+    S[i] = h * over;
+    v8 fx = ux * C - uy * S[i], fy = uy * C + ux * S[i];
+    v8 cf = fx * cx + fy * cy, cg = fx * cy - fy * cx;
+    Jf[i][0] = fx, Jf[i][1] = fy, Jf[i][2] = -cg, Jg[i][0] = -fy, Jg[i][1] = fx, Jg[i][2] = cf;
+    to_rho[i] = c * inverse, to_gamma[i] = S[i] * inverse, turn_gamma[i] = over;
+    v8 along = d_rate, across = {0};
+    for (int r = 0; r < 3; r++) along += Jf[i][r] * at->v[r], across += Jg[i][r] * at->v[r];
+    v8 rho_rate = to_rho[i] * along, rate = to_gamma[i] * along + over * across;
+    v8 rate2 = rate * rate, f2 = at->v[2] * at->v[2];
+    v8 inward = c * rate2 + e2, slip = 2 * rate * d_rate;
+    vf[i] = inward - f2 * cf, vg[i] = slip - f2 * cg;
+    v8 motor = m->kp[i] * (wanted[i] - (s - P)) + m->kd[i] * (wanted[LINKS + i] - rho_rate);
+    v8 F = limited(motor, m->force_limit[i]);
+    v8 bb = {0}, bc = {0}, cc = {0}, fb = {0}, fc = {0}, fr = {0}, rb = {0}, rc = {0}, rr = {0};
+    v8 Bq = {0}, Bp = {0}, qq = {0}, qp = {0};
+    for (int j = 0; j < MODES; j++) {
+      double bj = m->b[i][j], cj = m->c[i][j];
+      v8 q = at->q[i][j], p = at->p[i][j], r = row[i][j], piezo = {0};
+      for (int k = 0; k < PATCHES; k++) piezo += m->actuator[i][j][k] * volt[k];
+      v8 f = (m->stiffness[i][j] / mass - rate2) * q + m->damping[i][j] / mass * p - piezo;
+      force[i][j] = f;
+      bb += all(bj * bj / mass), bc += all(bj * cj / mass), cc += all(cj * cj / mass);
+      fb += bj * f, fc += cj * f, fr += r * f;
+      rb += bj / mass * r, rc += cj / mass * r, rr += r * r;
+      Bq += bj * q, Bp += bj * p, qq += q * q, qp += q * p;
+    }
     v8 Mrr = m->slider_link_mass[i] - bb * S[i] * S[i];
-    v8 Mrg = S[i] * (bc - e) - C[i] * Bq, Mgg = m->inertia[i] - cc + mqq;
-    v8 er = Mrr * rs[i] + Mrg * gs[i] + (S[i] * Bq - e * C[i]) * g2 - 2 * C[i] * gr * Bp - F
-            + S[i] * fb;
-    v8 eg = Mrg * rs[i] + Mgg * gs[i] + 2 * gr * mqp - fc;
-    v8 w = Mrr * t[i] + Mrg * over;
-    v8 z = t[i] * (w + Mrg * over) + Mgg * over * over, y = t[i] * er + eg * over;
+    v8 Mrg = S[i] * (bc - mu * c) - C * Bq, Mgg = m->inertia[i] - cc + mass * qq;
+    v8 er = S[i] * (fb + Bq * rate2 + mu * slip) - C * (mu * inward + 2 * rate * Bp) - F;
+    v8 eg = 2 * rate * mass * qp - fc;
+    /* carried to the joint: W = T' M T */
+    v8 pr = Mrr * to_rho[i] + Mrg * to_gamma[i], pg = Mrg * to_rho[i] + Mgg * to_gamma[i];
+    v8 Wff = to_rho[i] * pr + to_gamma[i] * pg, Wfg = over * pg, Wgg = Mgg * over * over;
+    v8 lf = to_rho[i] * er + to_gamma[i] * eg, lg = over * eg;
+    /* the modes shorten the chord */
+    v8 gf = to_rho[i] * S[i] * rb - to_gamma[i] * rc, gg = -over * rc;
+    v8 D = 1 - gf, K = Wff - 2 * mu, B = rr * (1 / mass), scale = 1.0 / (D * D + B * K);
+    D *= scale, K *= scale, B *= scale;
+    tau[i][0] = D * fr + B * lf, tau[i][1] = D - mu * B, tau[i][2] = D * gg - B * Wfg;
+    N[i][0] = D * lf - K * fr, N[i][1] = K + mu * D, N[i][2] = D * Wfg + K * gg;
+    v8 ff = mu * tau[i][1] + N[i][1], fg = mu * tau[i][2] + N[i][2];
+    v8 last = Wgg + Wfg * tau[i][2] + gg * N[i][2];
+    v8 yf = N[i][0] - mu * tau[i][0] + ff * vf[i] + fg * vg[i];
+    v8 yg = lg - Wfg * tau[i][0] + gg * N[i][0] + fg * vf[i] + last * vg[i];
     for (int r = 0; r < 3; r++) {
-      g[r] += a[i][r] * er + d[i][r] * y;
-      for (int k = 0; k <= r; k++)
-        A[r][k] += Mrr * a[i][r] * a[i][k] + w * (a[i][r] * d[i][k] + d[i][r] * a[i][k])
-                   + z * d[i][r] * d[i][k];
+      v8 u = ff * Jf[i][r] + fg * Jg[i][r], w = fg * Jf[i][r] + last * Jg[i][r];
+      g[r] += Jf[i][r] * yf + Jg[i][r] * yg;
+      for (int k = 0; k <= r; k++) A[r][k] += u * Jf[i][k] + w * Jg[i][k];
     }
   }
   A[0][0] += m->platform_mass, A[1][1] += m->platform_mass, A[2][2] += m->platform_inertia;
@@ -115,13 +138,16 @@ static void rates(const struct machine *m, const double *wanted, const v8 *gain,
   U[2] = over * (c20 * g[0] + c21 * g[1] + c22 * g[2]);
   for (int r = 0; r < 3; r++) out->x[r] = at->v[r], out->v[r] = U[r];
   for (int i = 0; i < LINKS; i++) {
-    v8 aU = a[i][0] * U[0] + a[i][1] * U[1] + a[i][2] * U[2];
-    v8 dU = d[i][0] * U[0] + d[i][1] * U[1] + d[i][2] * U[2];
-    v8 rho = aU + t[i] * dU + rs[i], gamma = dU * inverse[i] + gs[i];
+    v8 f = vf[i], gc = vg[i];
+    for (int r = 0; r < 3; r++) f += Jf[i][r] * U[r], gc += Jg[i][r] * U[r];
+    v8 pull = N[i][0] + N[i][1] * f + N[i][2] * gc;
+    v8 felt = tau[i][1] * f + tau[i][2] * gc - tau[i][0];
+    v8 rho = to_rho[i] * felt, gamma = to_gamma[i] * felt + turn_gamma[i] * gc;
+    double mass = m->modal_mass[i];
     for (int j = 0; j < MODES; j++) {
-      double mass = m->mass[i][j];
       out->q[i][j] = at->p[i][j];
-      out->p[i][j] = m->b[i][j] / mass * S[i] * rho - m->c[i][j] / mass * gamma - force[i][j];
+      out->p[i][j] = m->b[i][j] / mass * S[i] * rho - m->c[i][j] / mass * gamma
+                     - row[i][j] * (1 / mass) * pull - force[i][j];
     }
   }
 }

@@ -122,9 +122,10 @@ class LoopMaker:
         # nothing that only a controller's own design depends on: one program for all laws
         structure = Structure(
             n_modes=LARGEST, n_controlled=known.n_controlled, n_patches=known.n_patches,
-            n_steps=1, n_frequencies=1, basis=plant.basis, law="srf",
+            n_steps=1, n_frequencies=1, basis=plant.basis, has_shortening=known.has_shortening,
+            law="srf",
             has_feedforward=known.has_feedforward, has_friction=known.has_friction,
-            has_position_gain=False,
+            has_position_gain=False, is_coupled=known.is_coupled, has_wrench=known.has_wrench,
         )  # fmt: skip
         law = jax.tree.map(jnp.asarray, law)
         return jax.tree.map(np.asarray, _look(structure, self._placed(plant), self._pose, law))
@@ -146,7 +147,7 @@ def _look(
 ) -> tuple[LoopMatrices, Array, Leakage]:
     loop = prepare(structure, case).loop
     observation = jnp.einsum("ick,ikr->icr", law.filter, loop.sensor)
-    force = loop.plant.mass[:, :, None] * loop.actuator
+    force = loop.plant.modal_mass[:, None, None] * loop.actuator
     actuation = jnp.einsum("irk,ikc->irc", force, law.synthesizer)
     leakage = Leakage(observation, actuation)
     return closed_loop(structure, case, pose, law), loop.omega, leakage

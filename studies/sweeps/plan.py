@@ -24,10 +24,11 @@ from studies.sweeps.table import Table, loose_study
 
 #: Fields that change the program; each combination of their values is compiled by itself.
 STATIC = (
-    "link.basis", "control.basis", "control.feedback", "control.law", "drive.kind",
+    "run.model", "link.basis", "link.shortening", "control.basis", "control.feedback", "control.law", "drive.kind",
     "run.substeps", "run.smooth", "run.duration", "electronics.sample_rate_hz",
 )  # fmt: skip
 _POSITION = "control.position_gain"
+_WRENCH = ("load.wrench", "load.pulse")
 #: More programs than this are refused.
 PROGRAM_LIMIT = 32
 #: Cases side by side on one device: enough to fill vectors, few enough to stay in its cache.
@@ -147,12 +148,14 @@ def _structure(table: Table, members: np.ndarray) -> Structure:
 
     one = build_structure(loose_study(table, int(members[0])))
     noisy = (column("electronics.adc_noise") > 0).any() | (column("drive.ripple") > 0).any()
+    fields = Fields(table.study, table.fields)
     return one._replace(
         n_modes=int(column("link.modes").max()),
         n_controlled=min(int(column("control.modes").max()), one.n_patches),
         has_noise=bool(noisy) or one.is_smooth,
         has_friction=bool((column("drive.coulomb_friction") > 0).any()),
-        has_position_gain=bool(np.any(Fields(table.study, table.fields).numbers(_POSITION) != 0)),
+        has_position_gain=bool(np.any(fields.numbers(_POSITION) != 0)),
+        has_wrench=any(np.any(fields.numbers(name) != 0) for name in _WRENCH),
     )
 
 

@@ -1,0 +1,106 @@
+"""Forces along the links: what they do to the bending, and by how much they stretch the links.
+
+A tension N stiffens bending, f_j = f_j0 sqrt(1 + N/(j^2 N_cr)) for a uniform link, and at N = -N_cr
+the link buckles; N_cr = pi^2 EI/L^2. The dynamics has this through the shortening of the chord. The
+links do not stretch there; `stretch_error` says by how much that would move the platform.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from jaxmodel.dynamics import accelerations, inverse_dynamics
+from jaxmodel.kinematics import Chain, close_chain
+from jaxmodel.parameters import Array, Beam
+from jaxmodel.plant import Plant
+
+
+def critical_force(plant: Plant) -> Array:
+    """N_cr, the smallest compression at which K - N S is singular [N], (3,).
+
+    Infinite where the chord keeps its length.
+    """
+    if plant.shortening is None:
+        return jnp.full((3,), jnp.inf)
+    scale = 1 / jnp.sqrt(plant.stiffness)
+    softest = scale[:, :, None] * _slopes(plant) * scale[:, None, :]
+    return 1 / jnp.linalg.eigvalsh(softest)[:, -1]
+
+
+def loaded_frequency(plant: Plant, axial: Array) -> Array:
+    """Frequencies of links whose ends are held, under axial forces [rad/s], (3, R).
+
+    Args:
+        plant: the machine.
+        axial: N, tension [N], (3,).
+
+    Returns:
+        ascending; 0 for modes that have buckled.
+    """
+    stiffness = plant.stiffness[:, :, None] * jnp.eye(plant.stiffness.shape[1])
+    if plant.shortening is not None:
+        stiffness = stiffness + jnp.asarray(axial)[:, None, None] * _slopes(plant)
+    squared = jnp.linalg.eigvalsh(stiffness / plant.modal_mass[:, None, None])
+    is_stable = squared > 0
+    return jnp.where(is_stable, jnp.sqrt(jnp.where(is_stable, squared, 1.0)), 0.0)
+
+
+def _slopes(plant: Plant) -> Array:
+    """S as a matrix [1/m], (3, R, R)."""
+    slopes = plant.shortening[:, :, None] * jnp.eye(plant.shortening.shape[1])
+    return slopes if plant.mixed_shortening is None else slopes + plant.mixed_shortening
+
+
+def axial_force(
+    plant: Plant, pose: Array, pose_rate: Array, pose_acc: Array, wrench: Array | None = None
+) -> Array:
+    """Tension at mid-span of straight links that are moved as wanted [N], (3,).
+
+    Args:
+        plant: the machine.
+        pose: (3,) [m, m, rad].
+        pose_rate: (3,).
+        pose_acc: (3,).
+        wrench: force and moment on the platform [N, N, N m], (3,), or None.
+    """
+    still = jnp.zeros_like(plant.b)
+    force = inverse_dynamics(plant, pose, pose_rate, pose_acc, wrench)
+    found = accelerations(
+        plant, close_chain(plant, pose, pose_rate), pose_rate, still, still, force, still, wrench,
+        is_coupled=False,
+    )  # fmt: skip
+    return found.axial
+
+
+def axial_compliance(beam: Beam) -> Array:
+    """L/(E A) of the bare links [m/N], (3,)."""
+    section = jnp.asarray(beam.youngs_modulus) * beam.width * beam.thickness
+    return jnp.broadcast_to(beam.length / section, (3,))
+
+
+def stretch_error(chain: Chain, stretch: Array) -> Array:
+    """By how much links that stretch move the platform while the sliders stay [m, m, rad], (3,).
+
+    Each joint C moves by the stretch along its link: t.J X = stretch, three equations for X.
+
+    Args:
+        chain: at this pose, of a basis whose ends lie on the chord.
+        stretch: N L/(E A) of each link [m], (3,).
+    """
+    frame = chain.frame
+    x, y, turn = frame.x, frame.y, -frame.c_g
+    cross = (
+        y[1] * turn[2] - y[2] * turn[1],
+        y[2] * turn[0] - y[0] * turn[2],
+        y[0] * turn[1] - y[1] * turn[0],
+    )
+    over = 1 / (x[0] * cross[0] + x[1] * cross[1] + x[2] * cross[2])
+    return over * jnp.stack([
+        stretch[0] * cross[0] + stretch[1] * cross[1] + stretch[2] * cross[2],
+        stretch[0] * (turn[1] * x[2] - turn[2] * x[1])
+        + stretch[1] * (turn[2] * x[0] - turn[0] * x[2])
+        + stretch[2] * (turn[0] * x[1] - turn[1] * x[0]),
+        stretch[0] * (x[1] * y[2] - x[2] * y[1])
+        + stretch[1] * (x[2] * y[0] - x[0] * y[2])
+        + stretch[2] * (x[0] * y[1] - x[1] * y[0]),
+    ])  # fmt: skip

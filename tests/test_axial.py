@@ -1,0 +1,226 @@
+"""Forces along the links: fast moves against finite elements, preload, buckling, stretch, KED."""
+
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from jaxmodel import axial, status
+from jaxmodel.kinematics import close_chain
+from jaxmodel.linear import Moment, linearise, natural_modes
+from jaxmodel.parameters import HOME
+from jaxmodel.prepare import prepare
+from jaxmodel.simulate import simulate
+from studies.bench import reference
+from studies.cases import as_arrays, build_case, build_structure
+from studies.errors import StudyError
+from studies.runs import check_run
+from studies.spec import paper_study
+
+DATA = Path(__file__).parent / "data"
+HOME_POSE = np.array(HOME)
+BARE = paper_study().change(
+    link__damping_ratio=0.0, control__feedback="none", drive__kd=0.0, link__modes=3
+)
+N_CR = np.pi**2 * 70e9 * (0.01 * 0.002**3 / 12) / 0.2**2  # 115 N
+
+
+def arrays(study):
+    return build_structure(study), as_arrays(build_case(study))
+
+
+@partial(jax.jit, static_argnums=0)
+def plant_of(structure, case):
+    return prepare(structure, case).loop.plant
+
+
+@partial(jax.jit, static_argnums=0)
+def linear_at(structure, case, pose, moment):
+    loop = prepare(structure, case).loop
+    return linearise(structure, loop, pose, case.electronics.antialias, moment)
+
+
+def bending(study, wrench=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, 0.0)):
+    """Frequencies above the drive's [Hz], of the machine at home under a load."""
+    moment = Moment(np.zeros(3), np.array(acceleration), np.array(wrench))
+    plant = jax.tree.map(np.asarray, linear_at(*arrays(study), HOME_POSE, moment))
+    found = natural_modes(plant).frequency
+    return found[found > 80]
+
+
+def statics(wrench):
+    """Tension in each link at home from the platform's equilibrium alone [N]."""
+    machine = jax.tree.map(np.asarray, as_arrays(build_case(BARE)).machine)
+    angle = np.asarray(machine.geometry.guide_angle) + np.pi / 3  # gamma = 60 deg
+    axis = np.stack([np.cos(angle), np.sin(angle)])
+    arm = np.asarray(reference.platform_joints(machine.geometry, HOME_POSE)) - HOME_POSE[:2]
+    moment = arm[:, 0] * axis[1] - arm[:, 1] * axis[0]
+    # a link in tension pulls the platform towards its slider, against its axis
+    return np.linalg.solve(np.vstack([axis, moment]), np.array(wrench))
+
+
+@pytest.mark.parametrize("modes", [3, 8])
+def test_fast_moves_equal_finite_elements(modes):
+    """Square of 10 mm in 0.05 s a move, no shaper, no damping, PD drive."""
+    given = np.genfromtxt(DATA / "fast_50ms.csv", delimiter=",", skip_header=3)
+    study = BARE.change(
+        link__modes=modes, drive__kd=60.0, motion__move_time=0.05, shaper__kind="none",
+        run__duration=0.3001, metrics__stations=(0.1,), metrics__residual_length=0.1,
+    )  # fmt: skip
+    result = jax.jit(simulate, static_argnums=(0, 2))(*arrays(study), True)
+    at = np.round(given[:, 0] / 1e-4).astype(int)
+    deflection = np.asarray(result.record.chord_deflection_stations)[at, :, 0]
+    wanted = given[:, 1:4]
+    assert (np.abs(deflection - wanted).max(axis=0) < 1e-3 * np.abs(wanted).max(axis=0)).all()
+    is_after = given[:, 0] > 0.2
+    rms, true = (np.sqrt(np.mean(x[is_after] ** 2, axis=0)) for x in (deflection, wanted))
+    np.testing.assert_allclose(rms, true, rtol=5e-3)
+    pose = np.asarray(result.record.pose)[at]
+    np.testing.assert_allclose(pose[:, :2], given[:, 4:6], atol=150e-9)
+    np.testing.assert_allclose(pose[:, 2], given[:, 6], atol=2e-6)
+
+
+def test_the_model_without_shortening_is_far_off_on_fast_moves():
+    """What the comparison above must notice: 5 % of the peak."""
+    given = np.genfromtxt(DATA / "fast_50ms.csv", delimiter=",", skip_header=3)
+    study = BARE.change(
+        link__shortening=False, drive__kd=60.0, motion__move_time=0.05, shaper__kind="none",
+        run__duration=0.3001, metrics__stations=(0.1,), metrics__residual_length=0.1,
+    )  # fmt: skip
+    result = jax.jit(simulate, static_argnums=(0, 2))(*arrays(study), True)
+    at = np.round(given[:, 0] / 1e-4).astype(int)
+    error = np.asarray(result.record.chord_deflection_stations)[at, :, 0] - given[:, 1:4]
+    assert np.abs(error).max() > 0.03 * np.abs(given[:, 1:4]).max()
+
+
+HELD = BARE.change(drive__locked=True, machine__platform_mass=1e3, machine__platform_inertia=1e2)
+
+
+@pytest.mark.parametrize("wrench", [(40.0, 0.0, 0.0), (-40.0, 25.0, 0.0), (0.0, 0.0, 5.0)])
+def test_axial_force_changes_the_frequency_of_a_link_between_held_ends(wrench):
+    tension = statics(wrench)
+    assert np.abs(tension).max() > 20
+    structure, case = arrays(HELD)
+    plant = plant_of(structure, case)
+    still = np.zeros(3)
+    found = axial.axial_force(plant, HOME_POSE, still, still, np.array(wrench))
+    np.testing.assert_allclose(found, tension, atol=1e-9)
+    np.testing.assert_allclose(axial.critical_force(plant), N_CR, rtol=1e-12)
+    first = 1 + tension[:, None] / (np.arange(1, 4) ** 2 * N_CR)
+    wanted = np.sort((114.388 * np.arange(1, 4) ** 2 * np.sqrt(first)).ravel())
+    scale = 114.388 / (np.asarray(plant.stiffness / plant.modal_mass[:, None])[0, 0] ** 0.5)
+    np.testing.assert_allclose(
+        np.sort(np.ravel(axial.loaded_frequency(plant, found))) * scale, wanted, rtol=1e-12
+    )
+    # the whole machine, its ends held by inertia, has the same frequencies
+    held = bending(HELD, wrench)[:9] * 2 * np.pi * scale
+    np.testing.assert_allclose(held, wanted, rtol=1e-6)
+
+
+def test_static_preload_equals_finite_elements():
+    """20 N on the platform at home, sliders on springs: 108.19, 118.16, 118.47 Hz."""
+    found = bending(BARE, (20.0, 0.0, 0.0))[:3]
+    np.testing.assert_allclose(found, [108.19, 118.16, 118.47], atol=0.02)
+    without = bending(BARE.change(link__shortening=False), (20.0, 0.0, 0.0))[:3]
+    np.testing.assert_allclose(without, [114.73, 115.19, 115.20], atol=0.01)
+
+
+@pytest.mark.parametrize(("share", "code"), [(0.99, status.OK), (1.01, status.BUCKLED)])
+def test_a_load_beyond_the_critical_force_is_a_status(share, code):
+    """The moment that compresses all links alike up to N_cr, and a little beyond."""
+    moment = -share * N_CR * 5.0 / statics((0.0, 0.0, 5.0))[0]
+    study = BARE.change(
+        run__duration=0.02, metrics__residual_length=0.001, shaper__kind="none",
+        motion__waypoints=(HOME,),
+    )  # fmt: skip
+    structure, case = arrays(study)
+    load = case.load._replace(wrench=np.array([0.0, 0.0, moment]))
+    result = jax.jit(simulate, static_argnums=0)(
+        structure._replace(has_wrench=True), case._replace(load=load)
+    )
+    assert result.status == code
+    assert np.isfinite(result.metrics.residual_rms).all() == (code == status.OK)
+    if code == status.BUCKLED:
+        with pytest.raises(StudyError, match=r"load.wrench.*115.1 N .here link .: 116.3 N"):
+            check_run(study.change(load__wrench=(0.0, 0.0, moment)))
+
+
+def test_a_steady_load_is_held_and_a_pulse_moves_the_platform():
+    study = BARE.change(
+        drive__kd=60.0, run__duration=0.1, metrics__residual_length=0.02, shaper__kind="none",
+        motion__waypoints=(HOME,), load__wrench=(20.0, 0.0, 0.1), link__damping_ratio=0.01,
+    )  # fmt: skip
+    run = jax.jit(simulate, static_argnums=(0, 2))
+    held = run(*arrays(study), True)
+    np.testing.assert_allclose(held.record.pose, np.tile(HOME, (1000, 1)), atol=1e-12)
+    # a long pulse: the platform sags as on the springs of the drive, dX = (J^t Kp J)^-1 W
+    pushed = run(*arrays(study.change(load__pulse=(5.0, 0.0, 0.0), load__pulse_length=0.1)), True)
+    plant = plant_of(*arrays(study))
+    jacobian = jax.jacfwd(lambda at: close_chain(plant, at, np.zeros(3)).rho)(HOME_POSE)
+    sag = np.linalg.solve(jacobian.T @ jacobian * 2e4, [5.0, 0.0, 0.0])
+    moved = np.asarray(pushed.record.pose[-1]) - HOME_POSE
+    np.testing.assert_allclose(moved[:2], sag[:2], atol=0.02 * sag[0])
+    assert abs(moved[2]) < 5e-6  # what is left is bending and second order
+
+
+# --- axial compliance -----------------------------------------------------------------------------
+
+
+def test_stretch_error_is_the_geometry_of_longer_links():
+    plant = plant_of(*arrays(BARE))
+    stretch = 1e-6 * np.array([3.0, -2.0, 1.0])
+    still = np.zeros(3)
+    chain = close_chain(plant, HOME_POSE, still)
+    found = np.asarray(axial.stretch_error(chain, stretch))
+    longer = plant._replace(length=plant.length + stretch)
+    moved = close_chain(longer, HOME_POSE + found, still)
+    np.testing.assert_allclose(moved.rho, chain.rho, atol=1e-10)  # the sliders stay
+    np.testing.assert_allclose(axial.axial_compliance(arrays(BARE)[1].machine.beam), 0.2 / 1.4e6)
+
+
+# --- kineto-elastodynamics ------------------------------------------------------------------------
+
+
+def test_ked_has_no_coupled_frequencies():
+    """No split of 114.7 and 115.2 Hz: every link rings as between held ends."""
+    found = bending(BARE.change(run__model="ked"))
+    np.testing.assert_allclose(found, np.repeat([114.388, 457.552, 1029.49], 3), rtol=1e-5)
+    assert np.ptp(bending(BARE)[:3]) > 0.4
+
+
+def test_ked_leaves_uncontrolled_links_as_they_are():
+    """Table 1 would read exactly 0 %: control of link 1 changes links 2 and 3 by nothing."""
+    study = paper_study().change(
+        link__modes=3, motion__move_time=0.03, shaper__kind="none", run__duration=0.2,
+        metrics__residual_length=0.03, metrics__residual_delay=0.05,
+    )  # fmt: skip
+    run = jax.jit(simulate, static_argnums=0)
+
+    def residual(links, model):
+        made = study.change(control__links=links, run__model=model)
+        return np.asarray(run(*arrays(made)).metrics.residual_rms)[:, 1]
+
+    none, one = ((False,) * 3, (True, False, False))
+    before, after = (residual(links, "ked") for links in (none, one))
+    np.testing.assert_array_equal(after[1:], before[1:])
+    assert after[0] < 0.9 * before[0]
+    coupled = residual(one, "coupled") / residual(none, "coupled") - 1
+    assert np.abs(coupled[1:]).min() > 0.005
+
+
+def test_ked_bends_links_by_the_rigid_motion_alone():
+    """A heavy, stiffly driven machine follows its command, and both models bend alike."""
+    study = paper_study().change(
+        link__modes=3, motion__move_time=0.1, shaper__kind="none", run__duration=0.5,
+        metrics__residual_length=0.05, control__feedback="none", drive__kp=1e7, drive__kd=3e3,
+        machine__slider_mass=20.0, machine__platform_mass=50.0, machine__platform_inertia=0.05,
+        link__shortening=False,
+    )  # fmt: skip
+    run = jax.jit(simulate, static_argnums=0)
+    ked, coupled = (
+        np.asarray(run(*arrays(study.change(run__model=m))).metrics.structural_peak)
+        for m in ("ked", "coupled")
+    )
+    np.testing.assert_allclose(ked, coupled, rtol=0.03)
