@@ -5,7 +5,8 @@ The data's way: `Machine` and `Case` (physical numbers) -> `prepare` (matrices, 
 `Result`. Importing this package has no effect; set precision and devices before the first call.
 """
 
-from jaxmodel.beam import BASES, assembled_frequency, build_basis
+from jaxmodel.bases import find_bases
+from jaxmodel.beam import BASES, build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.control import efficient_modal_control, pole_placement
 from jaxmodel.dynamics import accelerations, kinetic_energy, potential_energy
@@ -26,13 +27,13 @@ __all__ = [
     "Result",
     "Structure",
     "accelerations",
-    "assembled_frequency",
     "build_basis",
     "build_plant",
     "close_chain",
     "closed_loop",
     "command",
     "efficient_modal_control",
+    "find_bases",
     "frequency_response",
     "inverse_kinematics",
     "kinetic_energy",

@@ -7,12 +7,16 @@ links do not stretch there; `stretch_error` says by how much that would move the
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 
 from jaxmodel.dynamics import accelerations, inverse_dynamics
 from jaxmodel.kinematics import Chain, close_chain
 from jaxmodel.parameters import Array, Beam
 from jaxmodel.plant import Plant
+
+#: Squarings of `critical_force`: eigenvalues that differ by 1 % are told apart.
+SQUARINGS = 12
 
 
 def critical_force(plant: Plant) -> Array:
@@ -22,9 +26,18 @@ def critical_force(plant: Plant) -> Array:
     """
     if plant.shortening is None:
         return jnp.full((3,), jnp.inf)
+    if plant.mixed_shortening is None:
+        return jnp.min(plant.stiffness / plant.shortening, axis=1)
     scale = 1 / jnp.sqrt(plant.stiffness)
-    softest = scale[:, :, None] * _slopes(plant) * scale[:, None, :]
-    return 1 / jnp.linalg.eigvalsh(softest)[:, -1]
+    softness = scale[:, :, None] * _slopes(plant) * scale[:, None, :]
+
+    def square(power: Array, _: None) -> tuple[Array, None]:
+        power = power @ power
+        return power / jnp.trace(power, axis1=1, axis2=2)[:, None, None], None
+
+    # its largest eigenvalue by repeated squaring: batched on any executor
+    power, _ = jax.lax.scan(square, softness, None, length=SQUARINGS)
+    return 1 / jnp.trace(power @ softness, axis1=1, axis2=2)
 
 
 def loaded_frequency(plant: Plant, axial: Array) -> Array:
@@ -47,6 +60,7 @@ def loaded_frequency(plant: Plant, axial: Array) -> Array:
 
 def _slopes(plant: Plant) -> Array:
     """S as a matrix [1/m], (3, R, R)."""
+    assert plant.shortening is not None
     slopes = plant.shortening[:, :, None] * jnp.eye(plant.shortening.shape[1])
     return slopes if plant.mixed_shortening is None else slopes + plant.mixed_shortening
 
@@ -84,11 +98,13 @@ def stretch_error(chain: Chain, stretch: Array) -> Array:
     Each joint C moves by the stretch along its link: t.J X = stretch, three equations for X.
 
     Args:
-        chain: at this pose, of a basis whose ends lie on the chord.
+        chain: at this pose.
         stretch: N L/(E A) of each link [m], (3,).
     """
     frame = chain.frame
     x, y, turn = frame.x, frame.y, -frame.c_g
+    if chain.bend.tip is not None:  # f = -n_t, g = t
+        x, y, turn = -frame.y, frame.x, frame.c_f
     cross = (
         y[1] * turn[2] - y[2] * turn[1],
         y[2] * turn[0] - y[0] * turn[2],

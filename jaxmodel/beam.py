@@ -46,12 +46,12 @@ class ModalBasis(NamedTuple):
 def build_basis(
     kind: str, beam: Beam, patches: Patches, n_modes: int, stations: Array, mode_mask: Array = 1.0
 ) -> ModalBasis:
-    """Modal basis of all three links.
+    """Modal basis of all links, three of them as a rule.
 
     Args:
         kind: one of `BASES` (static).
         beam: link data, () or (3,) fields.
-        patches: patch data.
+        patches: patch data; one row of centres per link.
         n_modes: R, modes per link (static).
         stations: positions where the chord deflection is wanted [m], (S,).
         mode_mask: 1 for modes that exist, 0 for modes switched off, () or (R,). A mode that is off
@@ -68,16 +68,24 @@ def build_basis(
     if n_modes < 1:
         raise ValueError(f"n_modes = {n_modes}: allowed 1 or more [1]")
     link = {"pinned_pinned": _pinned_pinned, "pinned_free": _pinned_free, "loaded": _loaded}[kind]
-    beam = Beam(*(jnp.broadcast_to(jnp.asarray(field), (3,)) for field in beam))
-    stations = jnp.asarray(stations)
     centers = jnp.asarray(patches.center)
+    beam = _each_link(beam, len(centers))
+    stations = jnp.asarray(stations)
     shared = patches._replace(center=None)
 
     def one_link(beam_i: Beam, center_i: Array) -> ModalBasis:
         return link(beam_i, shared._replace(center=center_i), n_modes, stations)
 
-    basis = jax.vmap(one_link)(beam, centers)
-    mask = jnp.broadcast_to(jnp.asarray(mode_mask, basis.mass.dtype), (n_modes,))
+    return mask_modes(jax.vmap(one_link)(beam, centers), mode_mask)
+
+
+def _each_link(beam: Beam, n_links: int) -> Beam:
+    return Beam(*(jnp.broadcast_to(jnp.asarray(field), (n_links,)) for field in beam))
+
+
+def mask_modes(basis: ModalBasis, mode_mask: Array) -> ModalBasis:
+    """Switch modes off, see `build_basis`."""
+    mask = jnp.broadcast_to(jnp.asarray(mode_mask, basis.mass.dtype), basis.mass.shape[1:])
 
     def kept(x: Array | None, mask: Array) -> Array | None:
         return None if x is None else x * mask
@@ -94,19 +102,24 @@ def build_basis(
     )
 
 
-def assembled_frequency(beam: Beam, n_modes: int) -> Array:
-    """Frequencies omega_j = (j pi)^2 sqrt(E I/(rhoA L^4)) [rad/s] of the pinned-pinned bare link.
+def held_frequency(kind: str, beam: Beam, basis: ModalBasis) -> Array:
+    """Frequencies of links between held ends [rad/s], (3, R).
 
-    The links of the assembled machine vibrate like this (docs/theory.md), so controller and shaper
-    use these. `stiffness_factor` is left out on purpose: it is what they do not know.
+    The links of the assembled machine vibrate like this (docs/theory.md). A basis whose ends lie on
+    the chord has them itself; `pinned_free` belongs to links that no platform holds, so the bare
+    link's (j pi)^2 sqrt(E I/(rhoA L^4)) stand for it.
 
-    Returns:
-        (3, n_modes).
+    Args:
+        kind: modal basis (static).
+        beam: link data, () or (3,) fields.
+        basis: of that kind and beam.
     """
-    beam = Beam(*(jnp.broadcast_to(jnp.asarray(field), (3,)) for field in beam))
-    order = jnp.arange(1, n_modes + 1)
+    if kind != "pinned_free":
+        return jnp.sqrt(basis.stiffness / basis.mass)
+    beam = _each_link(beam, basis.mass.shape[0])
+    order = jnp.arange(1, basis.mass.shape[1] + 1)
     line_mass = beam.density * beam.width * beam.thickness
-    root = jnp.sqrt(bare_stiffness(beam) / line_mass) / beam.length**2
+    root = jnp.sqrt(bare_stiffness(beam) * beam.stiffness_factor / line_mass) / beam.length**2
     return (order * np.pi) ** 2 * root[:, None]
 
 

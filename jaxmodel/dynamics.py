@@ -57,7 +57,7 @@ def modal_chain(plant: Plant, pose: Array, pose_rate: Array, q: Array, q_rate: A
 
 
 class _Link(NamedTuple):
-    """A link's inertia and load in (rho, gamma), its modes eliminated: K (rho'', gamma'') + load."""
+    """A link in (rho, gamma), its modes eliminated: K (rho'', gamma'') + load."""
 
     k_rr: Array
     k_rg: Array
@@ -239,8 +239,8 @@ def _release_end(
 ) -> tuple[_End, _Joint]:
     """Let the modes move C along f: by shortening of the chord (row S q) or by row Y_j(L).
 
-    tau = sum row_j q_j'' adds to C'' along f, and a reaction N acts on the modes, -row_j N; in the
-    chord's direction it is the axial force. With g = T^t (sin gamma sum row_j b_j, -sum row_j c_j)/m,
+    tau = sum row_j q_j'' adds to C'' along f, and a reaction N acts on the modes, -row_j N; along
+    the chord it is the axial force. With g = T^t (sin gamma sum row_j b_j, -sum row_j c_j)/m,
     B = sum row_j^2/m, mu the mass that moves in with the chord, A = W_ff - 2 mu and D = 1 - g_f:
 
     D tau = g.C'' - B N - sum row_j pull_j,  D N = (W_ff - mu, W_fg).C'' + A tau + load_f.

@@ -1,9 +1,10 @@
 """The closed chain (6) in closed form: slider positions and link angles from pose and bending.
 
-In the frame of a link's chord (along t, across n_t) its far joint C lies at (c, w): w = sum Y_j(L) q_j
-is zero in bases whose ends lie on the chord, and there c = L - d is shorter than the link by
-d = 1/2 sum S_jk q_j q_k. With s = u.(C - A), h = n.(C - A), l2 = c^2 + w^2 and P = sqrt(l2 - h^2):
-rho = s - P, sin gamma = (h c - w P)/l2, cos gamma = (c P + w h)/l2, gamma = beta - alpha.
+In the frame of a link's chord (along t, across n_t) its far joint C lies at (c, w):
+w = sum Y_j(L) q_j is zero in bases whose ends lie on the chord, and there c = L - d is shorter than
+the link by d = 1/2 sum S_jk q_j q_k. With s = u.(C - A), h = n.(C - A), l2 = c^2 + w^2 and
+P = sqrt(l2 - h^2): rho = s - P, sin gamma = (h c - w P)/l2, cos gamma = (c P + w h)/l2, and
+gamma = beta - alpha.
 Shapes as in `jaxmodel.plant`: structure first, lanes last.
 """
 
@@ -35,8 +36,8 @@ class Frame(NamedTuple):
     """Axes f and g (f turned by +90 deg) at the joints C, (3,) each.
 
     f points where bending lets C go in its link: along t, by which a chord grows shorter, or along
-    -n_t where Y_j(L) is not zero. When C moves by (f, g), then rho by rho_f f + rho_g g and gamma by
-    gamma_f f + gamma_g g, were the link rigid.
+    -n_t where Y_j(L) is not zero. When C of a rigid link moves by (f, g), then rho by
+    rho_f f + rho_g g and gamma by gamma_f f + gamma_g g.
     """
 
     x: Array  # direction of f in the plane [1]
@@ -155,7 +156,9 @@ def close_chain(plant: Plant, pose: Array, pose_rate: Array, bend: Bend | None =
 
 
 def chain_status(plant: Plant, chain: Chain) -> Array:
-    """Status of the pose: OK, OUT_OF_REACH (h^2 > l2, with the chord as it is) or SINGULAR (gamma at 0 or 90 deg).
+    """Status of the pose: OK, OUT_OF_REACH (h^2 > l2) or SINGULAR (gamma at 0 or 90 deg).
+
+    Of the machine as it is: bent links reach less far.
 
     Returns:
         () code of `jaxmodel.status`, as a floating-point number.

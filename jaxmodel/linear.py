@@ -1,8 +1,9 @@
 """Linearisation at a pose: frequencies, damping, mode shapes, frequency response.
 
-The state is x = (X, X', q, q', z, z'), flattened, about the machine at that pose with straight links,
-resting or in motion, the drive giving the forces that keep it so: what acts along the links then
-changes their stiffness. Matrices come from forward-mode differentiation of the loop's own plant.
+The state is x = (X, X', q, q', z, z'), flattened, about the machine at that pose with straight
+links, resting or in motion, the drive giving the forces that keep it so: what acts along the links
+then changes their stiffness. Matrices come from forward-mode differentiation of the loop's own
+plant.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxmodel import metrics, status
+from jaxmodel.axial import stretch_error
 from jaxmodel.case import Drive, Structure
 from jaxmodel.controller import (
     Controller,
@@ -48,8 +49,9 @@ class Loop(NamedTuple):
     ideal: tuple[Array, Array | None] | None  # voltage of q' [V s/m] and q [V/m], (3, K, R) each
     observer: Array  # controlled modes of the true deflection, modal filter x sensor [1], (3, C, R)
     modal_omega: Array  # frequencies of the controller's modes [rad/s], (3, C)
-    rotation: tuple[Array, Array]  # of the spectra's phasors per sample, (C, n_frequencies)
+    rotation: tuple[Array, Array]  # of the spectra's phasors per sample, (3, C, n_frequencies)
     drive: Drive
+    axial_compliance: Array  # L/(E A) of the links [m/N], (3,)
     settling_band: Array  # [m], ()
 
 
@@ -283,7 +285,7 @@ def advance(
     motors = motor_force(
         loop.drive, reference, rates.chain.rho, rates.chain.rho_rate, structure.is_smooth
     )
-    sample = _sample(loop, plant, inputs, voltage, clipped, motors)
+    sample = _sample(loop, plant, inputs, voltage, clipped, motors, rates)
     totals = metrics.accumulate(
         state.totals, sample, inputs.window, loop.omega, loop.modal_omega, loop.rotation,
         loop.settling_band,
@@ -341,10 +343,18 @@ def _advance_plant(
 
 
 def _sample(
-    loop: Loop, plant: PlantState, inputs: Inputs, voltage: Array, clipped: Array, motors: Array
+    loop: Loop,
+    plant: PlantState,
+    inputs: Inputs,
+    voltage: Array,
+    clipped: Array,
+    motors: Array,
+    rates: Rates,
 ) -> metrics.Sample:
     limit = loop.controller.voltage_limit * (1 - 1e-9)
     highest = jnp.max(jnp.max(jnp.abs(voltage), axis=1), axis=0)
+    axial = rates.acceleration.axial
+    is_full = jnp.any(jnp.abs(motors) >= loop.drive.force_limit * (1 - 1e-9), axis=0)
     return metrics.Sample(
         deflection=jnp.sum(loop.deflection_at * plant.q[:, None], axis=2),
         q=plant.q,
@@ -356,6 +366,9 @@ def _sample(
         is_saturated=jnp.where(highest >= limit, 1.0, 0.0).astype(voltage.dtype),
         is_clipped=clipped,
         motor_force=motors,
+        is_motor_saturated=jnp.where(is_full, 1.0, 0.0).astype(voltage.dtype),
+        axial_force=axial,
+        stretch_error=stretch_error(rates.chain, loop.axial_compliance * axial),
     )
 
 

@@ -28,6 +28,9 @@ class Sample(NamedTuple):
     is_saturated: Array  # share of this sample with an actuator at its limit, 0 or 1, ()
     is_clipped: Array  # 1 where any ADC channel clips, ()
     motor_force: Array  # [N], (3,)
+    is_motor_saturated: Array  # share of this sample with a motor at its limit, 0 or 1, ()
+    axial_force: Array  # tension in the links [N], (3,)
+    stretch_error: Array  # of the platform if links stretched [m, m, rad], (3,)
 
 
 class Window(NamedTuple):
@@ -62,10 +65,14 @@ class Totals(NamedTuple):
     saturated: Array  # ()
     clipped: Array  # ()
     peak_force: Array  # (3,)
+    motor_saturated: Array  # ()
+    peak_tension: Array  # (3,)
+    peak_compression: Array  # (3,)
+    stretch_peak: Array  # (3,)
     plant_energy: Array  # sum while moving, (3, R)
     modal_energy: Array  # the same in the controller's modes, (3, C)
     taper_square: Array  # ()
-    phasor: tuple[Array, Array]  # cos and sin of omega t, (C, n_frequencies)
+    phasor: tuple[Array, Array]  # cos and sin of omega t, (3, C, n_frequencies)
     spectrum: tuple[Array, Array]  # sum of taper q cos, q sin, (3, C, n_frequencies)
 
 
@@ -88,6 +95,10 @@ class Metrics(NamedTuple):
     clipped_fraction: Array  # samples with any ADC channel at its end [1], ()
     control_energy: Array  # integral of sum V_a^2 over the run [V2 s], ()
     peak_force: Array  # of the motors [N], (3,)
+    motor_saturated_fraction: Array  # samples with any motor at its limit [1], ()
+    peak_tension: Array  # in the links [N], (3,)
+    peak_compression: Array  # [N], (3,)
+    stretch_error_peak: Array  # of the platform if links stretched [m, m, rad], (3,)
     plant_energy: Array  # mean of omega^2 q^2 + q'^2 while moving, plant modes [m2/s2], (3, R)
     modal_energy: Array  # the same, controller's modes, for EMC (24) [m2/s2], (3, C)
     spectral_density: Array  # one-sided PSD of the controller's modes [m2/Hz], (3, C, n)
@@ -111,12 +122,18 @@ NEEDS = {
     "clipped_fraction": ("count", "clipped"),
     "control_energy": ("voltage_square",),
     "peak_force": ("peak_force",),
+    "motor_saturated_fraction": ("count", "motor_saturated"),
+    "peak_tension": ("peak_tension",),
+    "peak_compression": ("peak_compression",),
+    "stretch_error_peak": ("stretch_peak",),
     "plant_energy": ("moving_count", "plant_energy"),
     "modal_energy": ("moving_count", "modal_energy"),
     "spectral_density": ("taper_square", "phasor", "spectrum"),
 }
 #: Metrics that the status of a run depends on.
-ALWAYS = ("saturated_fraction", "clipped_fraction")
+ALWAYS = (
+    "saturated_fraction", "clipped_fraction", "motor_saturated_fraction", "pose_error_rms"
+)  # fmt: skip
 
 
 def zero_totals(
@@ -133,12 +150,11 @@ def zero_totals(
     zero, link = jnp.zeros((), dtype), jnp.zeros((3,), dtype)
     stations, modes = jnp.zeros((3, n_stations), dtype), jnp.zeros((3, n_modes), dtype)
     controlled = jnp.zeros((3, n_controlled), dtype)
-    one = jnp.ones((n_controlled, n_frequencies), dtype)
     lines = jnp.zeros((3, n_controlled, n_frequencies), dtype)
     whole = Totals(
         zero, zero, zero, stations, stations, stations, stations, modes, modes, modes, link, link,
-        link, link, link, zero, zero, zero, link, modes, controlled, zero, (one, 0 * one),
-        (lines, lines),
+        link, link, link, zero, zero, zero, link, zero, link, link, link, modes, controlled, zero,
+        (1 + lines, lines), (lines, lines),
     )  # fmt: skip
     names = {*wanted, *ALWAYS} if wanted else NEEDS
     needed = {total for name in names for total in NEEDS[name]}
@@ -172,7 +188,7 @@ def accumulate(
         window: the instant's weights.
         omega: plant modes [rad/s], (3, R).
         modal_omega: controller's modes [rad/s], (3, C).
-        rotation: cos and sin of (frequency x period), (C, n_frequencies).
+        rotation: cos and sin of (frequency x period), (3, C, n_frequencies).
         band: settling band [m], ().
 
     Returns:
@@ -215,13 +231,17 @@ def accumulate(
         saturated=totals.saturated + sample.is_saturated,
         clipped=totals.clipped + sample.is_clipped,
         peak_force=jnp.maximum(totals.peak_force, jnp.abs(sample.motor_force)),
+        motor_saturated=totals.motor_saturated + sample.is_motor_saturated,
+        peak_tension=jnp.maximum(totals.peak_tension, sample.axial_force),
+        peak_compression=jnp.maximum(totals.peak_compression, -sample.axial_force),
+        stretch_peak=jnp.maximum(totals.stretch_peak, jnp.abs(sample.stretch_error)),
         plant_energy=totals.plant_energy + moving * plant_energy,
         modal_energy=totals.modal_energy + moving * modal_energy,
         taper_square=totals.taper_square + window.taper * window.taper,
         phasor=(cosine * turn_c - sine * turn_s, sine * turn_c + cosine * turn_s),
         spectrum=(
-            totals.spectrum[0] + weighted * cosine[None],
-            totals.spectrum[1] + weighted * sine[None],
+            totals.spectrum[0] + weighted * cosine,
+            totals.spectrum[1] + weighted * sine,
         ),
     )
     return Totals._make(None if a is None else b for a, b in zip(given, new, strict=True))
@@ -262,6 +282,10 @@ def finish(totals: Totals, period: Array) -> Metrics:
         clipped_fraction=totals.clipped / count,
         control_energy=totals.voltage_square * period,
         peak_force=totals.peak_force,
+        motor_saturated_fraction=totals.motor_saturated / count,
+        peak_tension=totals.peak_tension,
+        peak_compression=totals.peak_compression,
+        stretch_error_peak=totals.stretch_peak,
         plant_energy=totals.plant_energy / moving,
         modal_energy=totals.modal_energy / moving,
         spectral_density=2 * period * power / taper,

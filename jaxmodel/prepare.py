@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxmodel import shaper, status
-from jaxmodel.beam import ModalBasis, assembled_frequency, build_basis
+from jaxmodel.axial import axial_compliance
+from jaxmodel.bases import Bases, find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.control import active_modes, condition_number, force_gains, left_inverse
 from jaxmodel.controller import Controller
@@ -61,19 +62,16 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         Prepared; `status` says what makes the case unfit, the numbers stay finite all the same.
     """
     machine, electronics = case.machine, case.electronics
-    mask = (jnp.arange(structure.n_modes) < case.n_modes).astype(jnp.result_type(float))
-    basis = build_basis(
-        structure.basis, machine.beam, machine.patches, structure.n_modes,
-        case.windows.stations, mask,
-    )  # fmt: skip
+    bases = find_bases(structure, case)
+    basis = bases.plant
     plant = build_plant(machine, basis, case.drive.is_locked, structure.has_shortening)
-    design = design_controller(structure, case)
+    design = design_controller(structure, case, bases)
     omega = jnp.sqrt(basis.stiffness / basis.mass)
     zeta = plant.damping / (2 * basis.mass * omega)
     step = electronics.period / structure.substeps
     lambda_s, lambda_a = _constants(case)
     sensor = lambda_s[:, None, None] * jnp.swapaxes(basis.sensor_slope, 1, 2)
-    angle = 2 * jnp.pi * electronics.period * spectrum_frequencies(structure, case)
+    angle = 2 * jnp.pi * electronics.period * spectrum_frequencies(structure, bases)
     loop = Loop(
         plant=plant,
         omega=omega,
@@ -93,15 +91,16 @@ def prepare(structure: Structure, case: Case) -> Prepared:
                 for name in _PER_LINK_DRIVE
             }
         ),
+        axial_compliance=axial_compliance(machine.beam),
         settling_band=jnp.asarray(case.windows.settling_band),
     )
     return Prepared(
         loop,
-        design_taps(case),
-        _initial_modes(structure, case, basis, mask),
+        design_taps(case, bases),
+        _initial_modes(structure, case, bases),
         design.sensor_condition,
         design.actuator_condition,
-        _static_status(structure, case, design, omega * mask * step),
+        _static_status(structure, case, bases, design, omega * step),
     )
 
 
@@ -122,11 +121,10 @@ _PER_LINK_DRIVE = (
 )  # fmt: skip
 
 
-def spectrum_frequencies(structure: Structure, case: Case) -> Array:
-    """Frequencies [Hz] at which `Metrics.spectral_density` is taken, (C, n_frequencies)."""
-    omega = assembled_frequency(case.machine.beam, structure.n_controlled)
+def spectrum_frequencies(structure: Structure, bases: Bases) -> Array:
+    """Where spectra are taken, round the plant's own frequencies [Hz], (3, C, n_frequencies)."""
     span = jnp.linspace(1 - SPECTRUM_SPAN, 1 + SPECTRUM_SPAN, structure.n_frequencies)
-    return jnp.mean(omega, axis=0)[:, None] * span / (2 * jnp.pi)
+    return bases.plant_omega[:, :, None] * span / (2 * jnp.pi)
 
 
 def _constants(case: Case) -> tuple[Array, Array]:
@@ -135,24 +133,23 @@ def _constants(case: Case) -> tuple[Array, Array]:
     return lambda_s, jnp.broadcast_to(actuator_constant(beam, patches), (3,))
 
 
-def design_controller(structure: Structure, case: Case) -> ControllerDesign:
-    """Controller of a case from what it believes: the controller basis at nominal stiffness.
+def design_controller(structure: Structure, case: Case, bases: Bases) -> ControllerDesign:
+    """Controller of a case from what it believes, `Bases.model`.
 
     IMSC: modal filter pinv(lambda_s Phi_s^t), synthesizer pinv(lambda_a Phi_a), gains (20) with
     ratios (24). SRF (16): every patch feeds back the rate of its own voltage.
 
     Args:
-        structure: static choices; `law`, `controller_basis` and sizes are read.
+        structure: static choices; `law` and sizes are read.
         case: the numbers.
+        bases: of plant and belief.
 
     Returns:
         ControllerDesign.
     """
-    control, patches, electronics = case.control, case.machine.patches, case.electronics
-    belief = case.machine.beam._replace(stiffness_factor=1.0)
-    n = structure.n_controlled
-    known = max(structure.n_modes, n)
-    model = build_basis(structure.controller_basis, belief, patches, known, case.windows.stations)
+    control, electronics = case.control, case.electronics
+    model, assembled, n = bases.model, bases.believed_omega, structure.n_controlled
+    known = model.mass.shape[1]
     lambda_s, lambda_a = _constants(case)
     sensor = lambda_s[:, None, None] * jnp.swapaxes(model.sensor_slope, 1, 2)  # (3, K, known)
     actuator = lambda_a[:, None, None] * model.actuator_slope  # (3, known, K)
@@ -162,7 +159,6 @@ def design_controller(structure: Structure, case: Case) -> ControllerDesign:
     inverse = jax.vmap(left_inverse, (0, None))(jnp.concatenate([seen, driven]), mask)
     observer, synthesizer = inverse[:3], jnp.swapaxes(inverse[3:], 1, 2)
 
-    assembled = assembled_frequency(belief, n)
     on = jnp.asarray(control.link_mask)[:, None] * control.gain_factor
     if structure.law == "srf":
         eye = jnp.broadcast_to(jnp.eye(structure.n_patches), (3,) + (structure.n_patches,) * 2)
@@ -212,13 +208,13 @@ def design_controller(structure: Structure, case: Case) -> ControllerDesign:
     )
 
 
-def design_taps(case: Case) -> shaper.Taps:
+def design_taps(case: Case, bases: Bases) -> shaper.Taps:
     """Shaper of the case on its sample grid; each frequency split for its own mode, in series.
 
-    A frequency of zero stands for mode 1 of the assembled links.
+    A frequency of zero stands for mode 1 as the controller believes it, the mean of the links.
     """
     shaping, period = case.shaping, case.electronics.period
-    known = assembled_frequency(case.machine.beam, 1)[0, 0]
+    known = jnp.mean(bases.believed_omega[:, 0])
 
     def one(omega: Array, zeta: Array) -> shaper.Taps:
         omega = jnp.where(omega > 0, omega, known)
@@ -230,32 +226,27 @@ def design_taps(case: Case) -> shaper.Taps:
     return reduce(shaper.in_series, map(one, jnp.asarray(shaping.omega), jnp.asarray(shaping.zeta)))
 
 
-def _initial_modes(structure: Structure, case: Case, basis: ModalBasis, mask: Array) -> Array:
+def _initial_modes(structure: Structure, case: Case, bases: Bases) -> Array:
     """Modal coordinates at t = 0: given ones plus a static load F at x, q_j = Y_j(x) F/k_j."""
-    initial = case.initial
-    station = jnp.asarray(initial.load_station)[None]
-    machine = case.machine
-    at = build_basis(
-        structure.basis, machine.beam, machine.patches, structure.n_modes, station, mask
-    ).deflection_at[:, 0]
-    compliance = jnp.sum(at * at / basis.stiffness, axis=1)
+    initial, at, stiffness = case.initial, bases.at_load, bases.plant.stiffness
+    compliance = jnp.sum(at * at / stiffness, axis=1)
     load = jnp.asarray(initial.load_deflection) / jnp.where(compliance > 0, compliance, 1.0)
-    return mask * jnp.asarray(initial.modal) + at / basis.stiffness * load[:, None]
+    given = jnp.where(jnp.arange(structure.n_modes) < case.n_modes, initial.modal, 0.0)
+    return given + at / stiffness * load[:, None]
 
 
-def lowpass_corner(structure: Structure, case: Case) -> Array:
+def lowpass_corner(structure: Structure, case: Case, bases: Bases) -> Array:
     """Highest low-pass corner of the velocity estimate among the controlled modes [rad/s], ()."""
-    ratio = case.electronics.lowpass_ratio
     is_used = jnp.arange(structure.n_controlled) < case.control.n_active
-    return jnp.max(
-        jnp.where(is_used, ratio * assembled_frequency(case.machine.beam, ratio.size), 0)
-    )
+    corner = case.electronics.lowpass_ratio * bases.believed_omega
+    return jnp.max(jnp.where(is_used, corner, 0))
 
 
 def _static_status(
-    structure: Structure, case: Case, design: ControllerDesign, mode_step: Array
+    structure: Structure, case: Case, bases: Bases, design: ControllerDesign, mode_step: Array
 ) -> Array:
-    """Status before the run; mode_step is omega h of the plant modes in use [1], (3, R)."""
+    """Status before the run; mode_step is omega h of the plant modes [1], (3, R)."""
+    mode_step = jnp.where(jnp.arange(structure.n_modes) < case.n_modes, mode_step, 0.0)
     patches, windows, control = case.machine.patches, case.windows, case.control
     length = case.machine.beam.length
     is_off, is_overlapping = placement_faults(patches, length)
@@ -265,7 +256,10 @@ def _static_status(
         ((control.n_active > structure.n_patches) & is_modal, status.TOO_MANY_MODES),
         (is_overlapping, status.PATCHES_OVERLAP),
         (is_off, status.PATCH_OFF_LINK),
-        (_is_too_fast(structure, case) | jnp.any(mode_step > MODE_STEP_LIMIT), status.TOO_FAST),
+        (
+            _is_too_fast(structure, case, bases) | jnp.any(mode_step > MODE_STEP_LIMIT),
+            status.TOO_FAST,
+        ),
         (
             drive_rate(case) * case.electronics.period / structure.substeps > STIFFNESS_LIMIT,
             status.TOO_STIFF,
@@ -303,7 +297,7 @@ def _is_ill_conditioned(structure: Structure, case: Case, design: ControllerDesi
     return (worst > case.windows.condition_limit) & uses_filter
 
 
-def _is_too_fast(structure: Structure, case: Case) -> Array:
+def _is_too_fast(structure: Structure, case: Case, bases: Bases) -> Array:
     """Whether a filter or the shaper is beyond half the sample rate."""
     half = jnp.pi / case.electronics.period
     is_shaped = case.shaping.kind != shaper.KINDS.index("none")
@@ -311,5 +305,5 @@ def _is_too_fast(structure: Structure, case: Case) -> Array:
     if structure.feedback != "sampled":
         return is_fast
     has_lowpass = case.electronics.estimator == KINDS.index("modal_phase")
-    is_fast |= (lowpass_corner(structure, case) >= half) & has_lowpass
+    is_fast |= (lowpass_corner(structure, case, bases) >= half) & has_lowpass
     return is_fast | (case.electronics.antialias >= half)

@@ -15,7 +15,7 @@ from jaxmodel.case import Case, Load, Structure
 from jaxmodel.control import efficient_modal_control
 from jaxmodel.controller import Controller
 from jaxmodel.dynamics import inverse_dynamics
-from jaxmodel.kinematics import inverse_kinematics, path_status
+from jaxmodel.kinematics import inverse_kinematics, path_status, singularity_distance
 from jaxmodel.loop import Inputs, Loop, Record, State, initial_state, step
 from jaxmodel.motion import end_of_path, shape_path
 from jaxmodel.parameters import Array
@@ -33,6 +33,7 @@ class Result(NamedTuple):
     command_end: Array  # end of the shaped command [s], ()
     sensor_condition: Array  # condition number of the modal filter per link [1], (3,)
     actuator_condition: Array  # of the synthesizer [1], (3,)
+    singularity_distance: Array  # of link angles from 0 and 90 deg on the path [rad], ()
     energy_ratio: Array  # EMC ratios (24) that this run's modal energies give [1], (3, C)
     record: Record | None  # trajectories, leading axis (n_steps,), if asked for
 
@@ -45,6 +46,7 @@ class Command(NamedTuple):
     end: Array  # end of the shaped command [s], ()
     status: Array  # reach, singularity or length fault of the command, as a float, ()
     bad_time: Array  # when it appears [s], ()
+    singularity_distance: Array  # of the link angles from 0 and 90 deg on the path [rad], ()
 
 
 def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
@@ -80,6 +82,7 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
     bad_time = index * period / per_sample
     code = jnp.where(is_buckled, float(status.BUCKLED), code)
     bad_time = jnp.where(is_buckled, 0.0, bad_time)
+    distance = singularity_distance(plant, wanted.position)
     is_long = end > n * period
     code = jnp.where((code == status.OK) & is_long, float(status.SHAPER_TOO_LONG), code)
     left = n * period - end - case.windows.residual_delay
@@ -99,7 +102,7 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
         adc_noise=adc_noise,
         window=_windows(structure, case, time, end),
     )
-    return Command(inputs, wanted.position[0], end, code, bad_time)
+    return Command(inputs, wanted.position[0], end, code, bad_time, distance)
 
 
 def steady_load(structure: Structure, case: Case, plant: Plant) -> Array:
@@ -196,6 +199,10 @@ class Outline(NamedTuple):
     modal_omega: Array  # of the controller's modes [rad/s], (3, C)
     period: Array  # [s], ()
     saturation_limit: Array  # [1], ()
+    arrival_tolerance: Array  # [m], ()
+    joint_radius: Array  # largest distance of a joint from the platform's reference point [m], ()
+    singularity_distance: Array  # [rad], ()
+    singularity_margin: Array  # [rad], ()
 
 
 class Start(NamedTuple):
@@ -236,6 +243,10 @@ def begin(structure: Structure, case: Case, law: Controller | None = None) -> St
             loop.modal_omega,
             jnp.asarray(case.electronics.period),
             jnp.asarray(case.windows.saturation_limit),
+            jnp.asarray(case.windows.arrival_tolerance),
+            jnp.max(jnp.asarray(case.machine.geometry.joint_radius)),
+            outside.singularity_distance,
+            jnp.asarray(case.windows.singularity_margin),
         ),
     )
 
@@ -254,11 +265,16 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
     """
     result = metrics.finish(last.totals, outline.period)
     final = last.status
-    for share, bad in (
-        (result.saturated_fraction, status.SATURATED), (result.clipped_fraction, status.CLIPPED)
-    ):  # fmt: skip
-        is_often = (final == status.OK) & (share > outline.saturation_limit)
-        final = jnp.where(is_often, float(bad), final)
+    limit, error = outline.saturation_limit, result.pose_error_rms
+    miss = jnp.sqrt(error[0] ** 2 + error[1] ** 2) + outline.joint_radius * error[2]
+    for is_wrong, bad in (
+        (miss > outline.arrival_tolerance, status.NOT_ARRIVED),
+        (result.motor_saturated_fraction > limit, status.MOTORS_SATURATED),
+        (result.saturated_fraction > limit, status.SATURATED),
+        (result.clipped_fraction > limit, status.CLIPPED),
+        (outline.singularity_distance < outline.singularity_margin, status.NEAR_SINGULAR),
+    ):
+        final = jnp.where((final == status.OK) & is_wrong, float(bad), final)
     # zeros of a run that stopped would look like a perfect one
     is_finished = reduce(jnp.logical_or, (final == code for code in status.FINISHED))
     result = jax.tree.map(lambda x: jnp.where(is_finished, x, jnp.nan), result)
@@ -269,6 +285,7 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
         command_end=outline.command_end,
         sensor_condition=outline.sensor_condition,
         actuator_condition=outline.actuator_condition,
+        singularity_distance=outline.singularity_distance,
         energy_ratio=None
         if result.modal_energy is None
         else efficient_modal_control(result.modal_energy, outline.modal_omega),

@@ -22,9 +22,12 @@ STATION_OFF_LINK = 14
 TOO_STIFF = 15
 CLIPPED = 16
 BUCKLED = 17
+MOTORS_SATURATED = 18
+NOT_ARRIVED = 19
+NEAR_SINGULAR = 20
 
 #: A case with one of these ran to its end, and its metrics hold.
-FINISHED = (OK, SATURATED, UNSTABLE, CLIPPED)
+FINISHED = (OK, SATURATED, UNSTABLE, CLIPPED, MOTORS_SATURATED, NOT_ARRIVED, NEAR_SINGULAR)
 
 REASONS = {
     OK: "ok",
@@ -45,4 +48,7 @@ REASONS = {
     TOO_STIFF: "drive or ideal feedback too stiff for the step",
     CLIPPED: "ADC clipped too often",
     BUCKLED: "steady load on a link beyond its critical force",
+    MOTORS_SATURATED: "motors saturated too often",
+    NOT_ARRIVED: "platform not where it was sent",
+    NEAR_SINGULAR: "path close to a singular pose",
 }

@@ -102,6 +102,8 @@ def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
             number("metrics.residual_length"),
             number("metrics.settling_band"),
             number("metrics.saturation_limit"),
+            number("metrics.arrival_tolerance"),
+            number("metrics.singularity_margin"),
             number("metrics.condition_limit"),
             number("metrics.stations"),
         ),
@@ -149,17 +151,15 @@ def _machine(fields: Fields) -> Machine:
         ),
         Beam(*(number("link", name) for name in Beam._fields)),
         Patches(
-            center=_centers(number("patches", "centers")),
+            center=_per_link(number("patches", "centers")),
             **{name: number("patches", name) for name in Patches._fields if name != "center"},
         ),
     )
 
 
-def _centers(centers: np.ndarray) -> np.ndarray:
+def _per_link(lists: np.ndarray) -> np.ndarray:
     """One list for all links, or three, as (m, 3, K)."""
-    if centers.ndim == 2:
-        centers = np.repeat(centers[:, None], 3, axis=1)
-    return centers
+    return np.repeat(lists[:, None], 3, axis=1) if lists.ndim == 2 else lists
 
 
 def _path(fields: Fields) -> motion.Path:
@@ -186,7 +186,7 @@ def _path(fields: Fields) -> motion.Path:
 def _shaping(fields: Fields) -> Shaping:
     given = TWO_PI * fields.numbers("shaper.frequencies_hz")
     if given.shape[1] == 0:
-        given = np.zeros((len(given), 1))  # that of the assembled links, see `design_taps`
+        given = np.zeros((len(given), 1))  # as the controller believes, see `design_taps`
     zeta = fields.numbers("shaper.damping_ratio")
     return Shaping(
         fields.choices("shaper.kind", shaper.KINDS),
@@ -206,6 +206,7 @@ def _control(fields: Fields, structure: Structure) -> Control:
         n_active=number("control.modes"),
         link_mask=number("control.links"),
         mode_mask=_filled(number("control.mode_mask"), shape, 1.0),
+        omega=TWO_PI * _filled(_per_link(number("control.frequencies_hz")), shape, 0.0),
         velocity_gain=number("control.velocity_gain"),
         position_gain=number("control.position_gain"),
         ratio=powered(ratio, exponent),

@@ -27,6 +27,9 @@ PRECISIONS = ("float64", "float32")
 COMPILER_FLAGS = {
     # XLA stops at 256 bits by itself; twice the cases per instruction where the CPU has 512.
     "--xla_cpu_prefer_vector_width": "512",
+    # Side by side, factorisations of small matrices now and then never end (jax 0.10): programs
+    # with eigenvalue problems in them (basis loaded) then hang.
+    "--xla_cpu_enable_concurrency_optimized_scheduler": "false",
     "--xla_backend_extra_options": ",".join(
         (
             # Without it each state output recomputes the expressions that it shares with the rest.

@@ -145,6 +145,11 @@ def _check_sampling(study: Study) -> None:
         )
 
 
+def _nested(lists: tuple) -> tuple:
+    """A table of three lists; empty where one list serves all links."""
+    return lists if lists and isinstance(lists[0], tuple) else ()
+
+
 def _check_lists(study: Study) -> None:
     moves = len(study.motion.waypoints) - 1
     for name in ("move_time", "dwell"):
@@ -158,7 +163,13 @@ def _check_lists(study: Study) -> None:
         ("control.ratios", control.ratios, control.modes, "1"),
         ("control.mode_mask", control.mode_mask, control.modes, ""),
         ("initial.modal", study.initial.modal, study.link.modes, "m"),
+        ("control.frequencies_hz", _nested(control.frequencies_hz), control.modes, "Hz"),
     )
+    given = control.frequencies_hz
+    if len(given) > control.modes and not isinstance(given[0], tuple):
+        raise field_error(
+            "control.frequencies_hz", given, f"at most control.modes = {control.modes}", "Hz"
+        )
     for name, table, _width, unit in tables:
         if table and len(table) != 3:
             raise field_error(name, table, "three lists, one per link", unit)

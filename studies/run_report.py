@@ -125,11 +125,15 @@ def _links(run: Run) -> list[str]:
 
 def _platform(run: Run) -> list[str]:
     metrics = run.result.metrics
-    errors = metrics.pose_error_peak, metrics.pose_error_rms
+    errors = metrics.pose_error_peak, metrics.pose_error_rms, metrics.stretch_error_peak
     rows = [[name, *(f"{1e6 * error[k]:.4g}" for error in errors)] for k, name in enumerate(_POSE)]
     return [
-        "Pose minus shaped command.", "",
-        *table(("", "largest while moving", "rms in the residual window"), rows),
+        "Pose minus shaped command; links that stretched by N L/(E A) would add the last column. "
+        f"Largest tension in a link {np.max(metrics.peak_tension):.4g} N, largest compression "
+        f"{np.max(metrics.peak_compression):.4g} N.", "",
+        *table(
+            ("", "largest while moving", "rms in the residual window", "stretch of the links"), rows
+        ),
     ]  # fmt: skip
 
 
@@ -149,10 +153,20 @@ def _loop(run: Run) -> list[str]:
     return [
         *lines, "",
         f"Linearised at the first pose: gain margin {run.loop.gain_margin:.4g}, spectral radius "
-        f"{run.loop.spectral_radius:.6f}. The lowest modes of the links with control, three of "
-        "each order:", "",
+        f"{run.loop.spectral_radius:.6f}. {_motion(run)}The lowest modes of the links with "
+        "control, three of each order:", "",
         *table(("order", "frequencies [Hz]", "damping ratios [1]"), rows),
     ]  # fmt: skip
+
+
+def _motion(run: Run) -> str:
+    if run.motion is None:
+        return ""
+    margin, force = run.motion.gain_margin, run.motion.axial_force
+    return (
+        f"With the forces that the motion puts on the links ({force.min():.3g} to "
+        f"{force.max():.3g} N) the margin goes from {margin.min():.4g} to {margin.max():.4g}. "
+    )
 
 
 def draw(run: Run) -> dict[str, Figure]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.axial import critical_force
+from jaxmodel.bases import find_bases
 from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
@@ -36,7 +37,7 @@ from studies.cases import as_arrays, build_case, build_structure, powered
 from studies.consistency import check_locked
 from studies.errors import field_error
 from studies.spec import Study
-from studies.stability import LoopReport, loop_report
+from studies.stability import LoopReport, MotionReport, loop_report, motion_report
 from studies.store import Variable
 
 #: More plant steps per sample than this are refused.
@@ -53,6 +54,7 @@ class Run(NamedTuple):
     case: Case
     result: Result  # NumPy arrays
     loop: LoopReport | None  # linearised sampled loop, where there is one
+    motion: MotionReport | None  # the same with the forces of the motion
     status: int  # code of `jaxmodel.status`; UNSTABLE comes from the linearised loop
 
 
@@ -71,14 +73,15 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
     if study.control.ratio_source == "own_run":
         case = with_ratio(case, _own_ratio(study, structure, case, has_record))
     result = jax.tree.map(np.asarray, _simulate(structure, case, has_record))
-    loop, code = None, int(result.status)
+    loop, motion, code = None, None, int(result.status)
     if has_loop and structure.feedback == "sampled":
         try:
             loop = loop_report(structure, case, _home(study), min(3, structure.n_modes))
+            motion = motion_report(structure, case)
         except np.linalg.LinAlgError:  # an entry that is not finite
-            return Run(study, structure, case, result, None, code or status.NON_FINITE)
+            return Run(study, structure, case, result, None, None, code or status.NON_FINITE)
         code = judged_status(code, loop)
-    return Run(study, structure, case, result, loop, code)
+    return Run(study, structure, case, result, loop, motion, code)
 
 
 def _own_ratio(study: Study, structure: Structure, case: Case, has_record: bool) -> np.ndarray:
@@ -115,8 +118,7 @@ def with_ratio(case: Case, ratio: Any) -> Case:
 
 def judged_status(code: int, loop: LoopReport) -> int:
     """Status of a run, UNSTABLE where its loop is and it did not stop for another reason."""
-    is_bounded = code in (status.OK, status.SATURATED)
-    return status.UNSTABLE if is_bounded and not loop.is_stable else code
+    return status.UNSTABLE if code in status.FINISHED and not loop.is_stable else code
 
 
 def _home(study: Study) -> np.ndarray:
@@ -157,7 +159,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
     poses = sample_path(case.path, time).position
     code, index = path_status(plant, poses)
     worst = jnp.maximum(prepared.sensor_condition.max(), prepared.actuator_condition.max())
-    corner = lowpass_corner(structure, case)
+    corner = lowpass_corner(structure, case, find_bases(structure, case))
     return Preflight(
         each, code, time[index], poses[index], end, shaper_length, worst,
         jnp.max(prepared.loop.omega), corner, steady_load(structure, case, plant),
@@ -388,6 +390,12 @@ METRIC_LABELS = {
     "clipped_fraction": ((), "1", "samples with an ADC channel at its end"),
     "control_energy": ((), "V2 s", "integral of the summed squared actuator voltages"),
     "peak_force": (("slider_axis",), "N", "peak motor force"),
+    "motor_saturated_fraction": ((), "1", "samples with a motor at its limit"),
+    "peak_tension": (("link",), "N", "largest tension in a link"),
+    "peak_compression": (("link",), "N", "largest compression of a link"),
+    "stretch_error_peak": (
+        ("pose_axis",), "m; m; rad", "peak pose error that stretching links would add, N L/(E A)"
+    ),
     "plant_energy": (("link", "mode"), "m2/s2", "mean of omega^2 q^2 + q'^2 while moving"),
     "modal_energy": (("link", "controlled_mode"), "m2/s2", "the same in the controller's modes"),
     "spectral_density": (
@@ -422,16 +430,22 @@ _RECORD_LABELS = {
 }  # fmt: skip
 
 
+@partial(jax.jit, static_argnums=0)
+def _spectrum_frequencies(structure: Structure, case: Case) -> Any:
+    return spectrum_frequencies(structure, find_bases(structure, case))
+
+
 def run_variables(run: Run) -> dict[str, Variable]:
     """Everything a run's file holds: axes, trajectories (where kept), metrics, judgement."""
     stations = np.array(run.study.metrics.stations)
-    frequency = np.asarray(spectrum_frequencies(run.structure, run.case))
+    frequency = np.asarray(_spectrum_frequencies(run.structure, run.case))
     variables = {
         "station": Variable(stations, ("station",), "m", "position along the link"),
         "link": Variable(np.arange(1, 4), ("link",), "1", "link number"),
         "pose_axis": Variable(np.array(["x", "y", "phi"]), ("pose_axis",), "1", "pose component"),
         "spectrum_frequency": Variable(
-            frequency, ("controlled_mode", "spectrum_point"), "Hz", "frequency of spectral_density"
+            frequency, ("link", "controlled_mode", "spectrum_point"), "Hz",
+            "frequency of spectral_density",
         ),
         "status": Variable(np.array(run.status), (), *STATUS_LABEL),
         "bad_time": Variable(run.result.bad_time, (), "s", "when the status appeared, 0 if ok"),
@@ -441,6 +455,9 @@ def run_variables(run: Run) -> dict[str, Variable]:
         ),
         "actuator_condition": Variable(
             run.result.actuator_condition, ("link",), "1", "condition number of the synthesizer"
+        ),
+        "singularity_distance": Variable(
+            run.result.singularity_distance, (), "rad", "of link angles from 0 and 90 deg"
         ),
         "energy_ratio": Variable(
             run.result.energy_ratio,
@@ -469,6 +486,19 @@ def run_variables(run: Run) -> dict[str, Variable]:
                 ("tracked_mode", "tracked_pole"),
                 "1",
                 "their damping ratios",
+            ),
+        }
+    if run.motion is not None:
+        instants = ("instant",)
+        variables |= {
+            "motion_time": Variable(
+                run.motion.time, instants, "s", "start of the unshaped motion, and extremes of N"
+            ),
+            "motion_axial_force": Variable(
+                run.motion.axial_force, ("instant", "link"), "N", "tension N in the links then"
+            ),
+            "motion_gain_margin": Variable(
+                run.motion.gain_margin, instants, "1", "gain margin as if the instant lasted"
             ),
         }
     if run.result.record is not None:

@@ -27,6 +27,7 @@ Deflection = Annotated[float, Field(ge=-0.1, le=0.1)]
 Force = Annotated[float, Field(ge=-1e4, le=1e4)]
 Wrench = tuple[Force, Force, Force]
 Gain = Annotated[float, Field(ge=-1e9, le=1e9)]
+Hertz = Annotated[float, Field(ge=0.1, le=1e5)]
 Time = Annotated[float, Field(ge=1e-4, le=100)]
 Pause = Annotated[float, Field(ge=0, le=100)]
 Flags = tuple[bool, bool, bool]
@@ -137,10 +138,10 @@ class Shaper(Section):
     kind: Literal["none", "zv", "zvd", "zvdd", "ei", "ei_damped", "ei2", "ei3"] = described(
         "ei", "-", "ei is the paper's (13)"
     )
-    frequencies_hz: tuple[Annotated[float, Field(ge=0.1, le=1e5)], ...] = described(
+    frequencies_hz: tuple[Hertz, ...] = described(
         (),
         "Hz",
-        "modes to shape for, in series; empty: mode 1 of the assembled links",
+        "modes to shape for, in series; empty: mode 1 as the controller believes it",
         max_length=3,
     )
     damping_ratio: float = described(0.01, "1", "zeta the shaper assumes", ge=0, lt=0.9)
@@ -159,6 +160,12 @@ class Control(Section):
     )
     basis: Basis = described("pinned_pinned", "-", "modal basis the controller believes in")
     modes: int = described(3, "1", "controlled modes per link", ge=1, le=12)
+    frequencies_hz: tuple[Hertz, ...] | tuple[tuple[Hertz, ...], ...] = described(
+        (),
+        "Hz",
+        "assembled links as measured, by mode; one list for all links, or three; "
+        "empty: those of control.basis",
+    )
     links: Flags = described((True, True, True), "-", "controlled links")
     mode_mask: tuple[tuple[bool, ...], ...] = described(
         (), "-", "on/off per link and controlled mode; empty: all on"
@@ -274,7 +281,17 @@ class Metrics(Section):
         1e-6, "m", "chord deflection that counts as settled", gt=0, le=0.1
     )
     saturation_limit: float = described(
-        0.05, "1", "tolerated share of saturated samples", ge=0, le=1
+        0.05,
+        "1",
+        "tolerated share of samples with an actuator, motor or ADC channel at its limit",
+        ge=0,
+        le=1,
+    )
+    arrival_tolerance: float = described(
+        1e-3, "m", "tolerated rms error of the platform's joints in the residual window", gt=0, le=1
+    )
+    singularity_margin: float = described(
+        0.05, "rad", "tolerated distance of link angles from 0 and 90 deg", ge=0, le=0.7
     )
     condition_limit: float = described(
         1e3, "1", "tolerated condition number of filter and synthesizer", ge=1, le=1e6

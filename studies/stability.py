@@ -6,17 +6,22 @@ Eigenvalues of small matrices, on the host: `jaxmodel.sampled_loop` makes the ma
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import brentq
 from threadpoolctl import threadpool_limits
 
+from jaxmodel.axial import axial_force
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
+from jaxmodel.linear import Moment
+from jaxmodel.motion import PathSample, end_of_path, sample_path
 from jaxmodel.parameters import Array
+from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, closed_loop
 
 #: Margins beyond this are given as it, and those below the other as 0 [1].
@@ -41,7 +46,61 @@ class LoopReport(NamedTuple):
         return self.spectral_radius <= 1 + RADIUS_TOLERANCE and self.gain_margin >= 1
 
 
+class MotionReport(NamedTuple):
+    """How the forces of a motion move the margin: at rest, and where they are largest."""
+
+    time: np.ndarray  # [s], (k,)
+    axial_force: np.ndarray  # tension in the links [N], (k, 3)
+    gain_margin: np.ndarray  # of the loop as if the instant lasted [1], (k,)
+
+
 _closed_loop = jax.jit(closed_loop, static_argnums=0)
+#: Instants of a motion whose axial forces are looked at.
+INSTANTS = 401
+
+
+@partial(jax.jit, static_argnums=0)
+def _forces(structure: Structure, case: Case) -> tuple[Array, PathSample, Array]:
+    """Instants of the unshaped motion, and the tension in the links [N], (n, 3)."""
+    plant = prepare(structure, case).loop.plant
+    time = jnp.linspace(0.0, 1.0, INSTANTS) * end_of_path(case.path)
+    sample = sample_path(case.path, time)
+    each = jax.vmap(axial_force, (None, 0, 0, 0, None))
+    return time, sample, each(plant, *sample, case.load.wrench)
+
+
+def motion_report(structure: Structure, case: Case) -> MotionReport:
+    """Gain margins with the forces that act during the unshaped motion.
+
+    Linearised at its start and where the tension in a link is largest or smallest, as if that
+    instant lasted.
+
+    Args:
+        structure: static choices, feedback "sampled".
+        case: the numbers.
+
+    Raises:
+        LinAlgError: an entry of the loop's matrices is not finite.
+    """
+    plain = _judged(structure)
+    time, sample, force = jax.tree.map(np.asarray, _forces(plain, case))
+    chosen = np.unique([0, *force.argmin(axis=0), *force.argmax(axis=0)])
+    wrench = np.asarray(case.load.wrench, force.dtype)
+
+    def margin(k: int) -> float:
+        moment = Moment(sample.velocity[k], sample.acceleration[k], wrench)
+        matrices = _closed_loop(plain, case, sample.position[k], None, moment)
+        still, moved = np.asarray(matrices.open), np.asarray(matrices.feedback)
+        return gain_margin(cache(lambda factor: np.linalg.eigvals(still + factor * moved)))
+
+    with threadpool_limits(1, "blas"):
+        margins = [margin(k) for k in chosen]
+    return MotionReport(time[chosen], force[chosen], np.array(margins))
+
+
+def _judged(structure: Structure) -> Structure:
+    """Without what the matrices do not depend on, which must not cost a compilation."""
+    return structure._replace(n_steps=1, substeps=1, n_frequencies=1, has_noise=False)
 
 
 def loop_report(
@@ -65,8 +124,7 @@ def loop_report(
     Raises:
         LinAlgError: an entry of the loop's matrices is not finite.
     """
-    # what the matrices do not depend on must not cost a compilation
-    plain = structure._replace(n_steps=1, substeps=1, n_frequencies=1, has_noise=False)
+    plain = _judged(structure)
     matrices = jax.tree.map(np.asarray, _closed_loop(plain, case, pose, law))
     period = float(case.electronics.period)
 

@@ -7,7 +7,9 @@ import jax
 import numpy as np
 import pytest
 
+import studies
 from jaxmodel import axial, status
+from jaxmodel.bases import find_bases
 from jaxmodel.kinematics import close_chain
 from jaxmodel.linear import Moment, linearise, natural_modes
 from jaxmodel.parameters import HOME
@@ -17,9 +19,11 @@ from studies.bench import reference
 from studies.cases import as_arrays, build_case, build_structure
 from studies.errors import StudyError
 from studies.runs import check_run
-from studies.spec import paper_study
+from studies.spec import load_study, paper_study
+from studies.stability import loop_report, motion_report
 
 DATA = Path(__file__).parent / "data"
+SPECS = Path(studies.__file__).parent / "specs"
 HOME_POSE = np.array(HOME)
 BARE = paper_study().change(
     link__damping_ratio=0.0, control__feedback="none", drive__kd=0.0, link__modes=3
@@ -224,3 +228,67 @@ def test_ked_bends_links_by_the_rigid_motion_alone():
         for m in ("ked", "coupled")
     )
     np.testing.assert_allclose(ked, coupled, rtol=0.03)
+
+
+# --- along the path -------------------------------------------------------------------------------
+
+
+def test_margins_move_with_the_forces_of_the_motion():
+    study = paper_study().change(motion__move_time=0.03)
+    structure, case = arrays(study)
+    found = motion_report(structure, case)
+    at_rest = loop_report(structure, case, HOME_POSE).gain_margin
+    np.testing.assert_allclose(found.gain_margin[0], at_rest, rtol=1e-3)
+    assert found.time[0] == 0 and np.abs(found.axial_force[0]).max() < 1e-9
+    assert 8 < np.abs(found.axial_force).max() < 14
+    moved = np.abs(found.gain_margin / at_rest - 1).max()
+    assert 1e-4 < moved < 0.02  # mode 7 decides, which hardly feels N
+
+
+def test_frequencies_move_with_the_forces_of_the_motion():
+    """A heavy platform that accelerates by 0.04 m/s2 pulls and pushes with 40 N."""
+    plant, acceleration = plant_of(*arrays(HELD)), np.array([0.0, 0.04, 0.0])
+    tension = axial.axial_force(plant, HOME_POSE, np.zeros(3), acceleration)
+    np.testing.assert_allclose(tension, statics((0.0, -40.0, 0.0)), atol=0.01)  # and the links' own
+    wanted = np.sort(np.ravel(axial.loaded_frequency(plant, tension))) / (2 * np.pi)
+    np.testing.assert_allclose(bending(HELD, acceleration=acceleration)[:9], wanted, rtol=1e-6)
+
+
+# --- the machine as it was measured ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("modes", [8, 12])
+def test_the_measured_machine_has_a_margin(modes):
+    """Patches and joint inertia in the plant, measured frequencies in the controller."""
+    study = load_study(SPECS / "measured.toml").change(link__modes=modes)
+    found = loop_report(*arrays(study), HOME_POSE)
+    assert found.gain_margin > 2.5 and found.is_stable
+    assert 92 < found.frequency_hz[0].min() < 97 and found.damping_ratio[0].min() > 0.08
+
+
+def test_spectra_of_the_measured_machine_stand_on_their_peaks():
+    study = load_study(SPECS / "measured.toml").change(
+        motion__move_time=0.03, control__links=(False,) * 3, shaper__kind="none",
+        run__duration=0.5, metrics__residual_length=0.1,
+    )  # fmt: skip
+    result = jax.jit(simulate, static_argnums=0)(*arrays(study))
+    density = np.asarray(result.metrics.spectral_density)
+    assert (np.abs(density[:, 0].argmax(axis=-1) - 4) <= 1).all()  # of 9 points, +-10 %
+    bases = jax.jit(find_bases, static_argnums=0)(*arrays(study))
+    held = np.asarray(bases.plant_omega) / (2 * np.pi)
+    np.testing.assert_allclose(held, np.tile([92.7, 240.5], (3, 1)), rtol=1e-3)
+
+
+def test_one_step_per_sample_is_enough_for_the_fastest_moves():
+    """20 mm in 0.03 s, actuators at their limit, 8 modes: a step against eight."""
+    study = paper_study().change(
+        motion__waypoints=(HOME, (0.0, 0.02, HOME[2])), motion__move_time=0.03,
+        shaper__kind="none", run__duration=0.08, metrics__residual_length=0.02,
+        control__gain_factor=1.0, run__smooth=True,
+    )  # fmt: skip
+    run = jax.jit(simulate, static_argnums=(0, 2))
+    one, eight = (run(*arrays(study.change(run__substeps=n)), True) for n in (1, 8))
+    assert eight.metrics.peak_voltage.max() > 90
+    signals = (np.asarray(x.record.chord_deflection_stations) for x in (one, eight))
+    coarse, fine = signals
+    assert np.abs(coarse - fine).max() < 1e-5 * np.abs(fine).max()

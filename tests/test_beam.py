@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxmodel import piezo
-from jaxmodel.beam import BASES, assembled_frequency, build_basis, pinned_free_roots
+from jaxmodel.beam import BASES, build_basis, held_frequency, pinned_free_roots
 from jaxmodel.parameters import paper_machine
 
 MACHINE = paper_machine()
@@ -118,12 +118,14 @@ def test_pinned_free_roots_and_frequencies():
     np.testing.assert_allclose(frequencies_hz(basis)[0], [178.7, 579, 1208], rtol=5e-4)
 
 
-def test_assembled_frequencies_are_pinned_pinned_and_ignore_the_stiffness_factor():
+def test_frequencies_of_held_ends():
     soft = BEAM._replace(stiffness_factor=np.array([1.0, 0.8, 0.8]))
-    assembled = np.asarray(assembled_frequency(soft, 3)) / (2 * np.pi)
-    np.testing.assert_allclose(assembled, np.tile([114.39, 457.55, 1029.5], (3, 1)), rtol=5e-5)
-    true = frequencies_hz(low_basis("pinned_pinned", soft))
-    np.testing.assert_allclose(true, assembled * np.sqrt([[1.0], [0.8], [0.8]]), rtol=1e-13)
+    for kind, like in (("pinned_pinned", "pinned_pinned"), ("pinned_free", "pinned_pinned"),
+                       ("loaded", "loaded")):  # fmt: skip
+        found = np.asarray(held_frequency(kind, soft, low_basis(kind, soft))) / (2 * np.pi)
+        np.testing.assert_allclose(found, frequencies_hz(low_basis(like, soft)), rtol=1e-12)
+    bare = np.asarray(held_frequency("pinned_free", BEAM, low_basis("pinned_free"))) / (2 * np.pi)
+    np.testing.assert_allclose(bare, np.tile([114.39, 457.55, 1029.5], (3, 1)), rtol=5e-5)
 
 
 def test_high_pinned_free_modes_do_not_overflow():

@@ -93,8 +93,9 @@ def test_import_sets_nothing_and_configure_does(tmp_path):
     untouched, started, flags, facts = seen
     assert untouched == [f"--xla_cpu_prefer_vector_width=256 {DEVICE_FLAG}=2", False, "", False]
     assert started is False
-    extra = f"--xla_backend_extra_options={COMPILER_FLAGS['--xla_backend_extra_options']}"
-    assert flags.split() == ["--xla_cpu_prefer_vector_width=256", extra, f"{DEVICE_FLAG}=3"]
+    width, *others = COMPILER_FLAGS
+    added = [f"{name}={COMPILER_FLAGS[name]}" for name in others]
+    assert flags.split() == [f"{width}=256", *added, f"{DEVICE_FLAG}=3"]
     assert facts["devices"].startswith("3 x ")
     assert facts["precision"] == "float32"
     assert facts["cache"] == str(tmp_path / "flexlink-studies")

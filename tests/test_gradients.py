@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmodel.beam import assembled_frequency
+from jaxmodel.bases import find_bases
 from jaxmodel.control import pole_placement
 from jaxmodel.simulate import simulate
 from studies.cases import as_arrays, build_case, build_structure
@@ -22,7 +22,7 @@ def objective():
     # what nobody asks for must not cost a compilation
     structure = build_structure(study)._replace(metrics=("residual_rms",), n_frequencies=1)
     case = as_arrays(build_case(study))
-    omega = assembled_frequency(case.machine.beam, 1)[:, 0]
+    omega = find_bases(structure, case).believed_omega[:, 0]
 
     def run(x):
         gain, ratio, decay, frequency, center = jnp.split(x, 5)

@@ -501,3 +501,34 @@ def test_background_threads_may_run_sweeps(tmp_path):
     thread.start()
     thread.join()
     assert found[0].n_done == 72
+
+
+LOADED = """
+[run]
+duration = 0.05
+[link]
+basis = "loaded"
+[control]
+basis = "loaded"
+[motion]
+waypoints = [[0.0, 0.0, 0.5236], [0.0, 0.01, 0.5236]]
+move_time = 0.03
+[shaper]
+kind = "none"
+[metrics]
+residual_length = 0.01
+[[sweep.blocks]]
+method = "random"
+count = 256
+axes = { gain = { from = 0.01, to = 0.1 }, "link.joint_inertia_c" = { from = 1e-6, to = 1e-5 } }
+"""
+
+
+@pytest.mark.long
+def test_sweeps_of_loaded_links_end(tmp_path):
+    """Eigenvalue problems side by side used to hang XLA's CPU client two times out of three."""
+    (tmp_path / "loaded.toml").write_text(LOADED)
+    plain = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    for k in range(4):
+        command = [sys.executable, "-m", "studies", "sweep", "loaded.toml", "--out", f"out{k}"]
+        subprocess.run(command, cwd=tmp_path, env=plain, check=True, timeout=120)

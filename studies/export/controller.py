@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxmodel.beam import assembled_frequency
+from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
 from jaxmodel.shaper import Taps
@@ -88,8 +88,7 @@ def _any(gain: np.ndarray | None) -> bool:
 
 def _frequencies(structure: Structure, case: Case) -> np.ndarray:
     """Where the velocity estimate of each channel is exact [Hz], (3, C)."""
-    belief = case.machine.beam._replace(stiffness_factor=1.0)
-    hertz = np.asarray(assembled_frequency(belief, structure.n_controlled)) / (2 * np.pi)
+    hertz = np.asarray(find_bases(structure, case).believed_omega) / (2 * np.pi)
     is_modal = structure.law == "imsc"
     return hertz if is_modal else np.repeat(hertz[:, :1], structure.n_patches, axis=1)
 

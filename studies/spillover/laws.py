@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxmodel.beam import assembled_frequency
+from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.control import optimal_gains
 from jaxmodel.controller import Controller
@@ -115,8 +115,7 @@ def all_laws(found: FixedController, maker: LoopMaker, plant: Plant) -> list[Law
 
 def _assembled_omega(found: FixedController) -> np.ndarray:
     """Frequencies of the controlled modes as the controller believes [rad/s], (3, C)."""
-    belief = found.case.machine.beam._replace(stiffness_factor=1.0)
-    return np.asarray(assembled_frequency(belief, found.structure.n_controlled))
+    return np.asarray(find_bases(found.structure, found.case).believed_omega)
 
 
 def _even(law: Controller, n_channels: int) -> Controller:
@@ -135,7 +134,7 @@ def _scaled(law: Controller, wanted: np.ndarray, has: np.ndarray) -> Controller:
 
 @partial(jax.jit, static_argnums=0)
 def _design(structure: Structure, case: Case) -> Controller:
-    return design_controller(structure, case).controller
+    return design_controller(structure, case, find_bases(structure, case)).controller
 
 
 _filters = jax.jit(design_position_filter)

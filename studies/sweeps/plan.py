@@ -24,8 +24,9 @@ from studies.sweeps.table import Table, loose_study
 
 #: Fields that change the program; each combination of their values is compiled by itself.
 STATIC = (
-    "run.model", "link.basis", "link.shortening", "control.basis", "control.feedback", "control.law", "drive.kind",
-    "run.substeps", "run.smooth", "run.duration", "electronics.sample_rate_hz",
+    "run.model", "link.basis", "link.shortening", "control.basis", "control.feedback",
+    "control.law", "drive.kind", "run.substeps", "run.smooth", "run.duration",
+    "electronics.sample_rate_hz",
 )  # fmt: skip
 _POSITION = "control.position_gain"
 _WRENCH = ("load.wrench", "load.pulse")

@@ -47,7 +47,10 @@ _LIST_AXES = {
     "control.ratios": ("link", "ratios_entry"),
     "control.velocity_gain": ("link",),
     "control.position_gain": ("link",),
+    "control.frequencies_hz": ("link", "frequencies_hz_entry"),
     "drive.pulse_force": ("slider_axis",),
+    "load.wrench": ("pose_axis",),
+    "load.pulse": ("pose_axis",),
     "metrics.stations": ("station",),
 }
 #: What every case has, finished or not: axes after `case`, unit, long name and any flags.
@@ -58,6 +61,7 @@ _PER_CASE: dict[str, tuple] = {
     "substeps": ((), "1", "plant steps per sample"),
     "sensor_condition": (("link",), "1", "condition number of the modal filter"),
     "actuator_condition": (("link",), "1", "condition number of the synthesizer"),
+    "singularity_distance": ((), "rad", "of link angles from 0 and 90 deg on the path"),
 }
 
 
@@ -65,7 +69,8 @@ _PER_CASE: dict[str, tuple] = {
 #: prints the errors. Small vibration after a move is lost in the rounding of the pose.
 SINGLE_PRECISION = (
     "structural_rms", "structural_peak", "structural_modal_rms", "pose_error_peak",
-    "saturated_fraction", "clipped_fraction", "control_energy", "peak_force", "plant_energy",
+    "saturated_fraction", "clipped_fraction", "motor_saturated_fraction", "control_energy",
+    "peak_force", "peak_tension", "peak_compression", "stretch_error_peak", "plant_energy",
     "modal_energy", "energy_ratio",
 )  # fmt: skip
 

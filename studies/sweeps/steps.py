@@ -5,6 +5,7 @@ Numbers that all cases of a chunk share are written into the code.
 
 from __future__ import annotations
 
+from threading import Lock
 from typing import Any, NamedTuple
 
 import jax
@@ -52,6 +53,9 @@ class Steps(NamedTuple):
     directions: int  # tangents that it carries along
 
 
+#: One at a time: of two runs of a program with an eigenvalue problem in it (basis loaded) XLA's
+#: CPU client now and then never ends one (jax 0.10).
+_PREPARING = Lock()
 _STEPS: dict[tuple, Steps] = {}
 #: Kernels kept in memory.
 KEPT_KERNELS = 8
@@ -144,7 +148,8 @@ def start_block(
         varying, shared: leaves of the block's cases.
     """
     lanes, parts = program.layout.lanes, steps.parts
-    own = [np.asarray(x, order="C") for x in prepare(program, parts, varying, shared)]
+    with _PREPARING:
+        own = [np.asarray(x, order="C") for x in prepare(program, parts, varying, shared)]
     start: Start = joined(parts.tree, parts.is_varying, own, steps.shared)
     varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
 

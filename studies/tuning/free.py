@@ -17,10 +17,11 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.beam import assembled_frequency
-from jaxmodel.case import Case
+from jaxmodel.bases import find_bases
+from jaxmodel.case import Case, Structure
 from jaxmodel.control import pole_placement
 from jaxmodel.parameters import Array
+from studies.cases import build_structure
 from studies.consistency import patch_centers
 from studies.errors import StudyError, field_error, nearest, shown_name
 from studies.fields import parse_entry
@@ -293,12 +294,11 @@ def _poles(written: dict[str, Any], study: Study) -> tuple[list[Free], Callable]
         for name, span in zip(POLES, spans, strict=True)
         for k in range(3)
     ]
-    return numbers, _place_poles
+    return numbers, partial(_place_poles, build_structure(study))
 
 
-def _place_poles(case: Case, values: Array) -> Case:
-    belief = case.machine.beam._replace(stiffness_factor=1.0)
-    omega = assembled_frequency(belief, 1)[:, 0]
+def _place_poles(structure: Structure, case: Case, values: Array) -> Case:
+    omega = find_bases(structure, case).believed_omega[:, 0]
     is_kept, values = jnp.isnan(values[:3] + values[3:]), _safe(values)
     gains = pole_placement(values[:3], TWO_PI * values[3:], omega)
     control = case.control._replace(

@@ -1,0 +1,91 @@
+"""The modal bases of a case: the links as they are, and as the controller believes them to be."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxmodel.beam import ModalBasis, build_basis, held_frequency, mask_modes
+from jaxmodel.case import Case, Structure
+from jaxmodel.parameters import Array, Beam, Patches
+
+
+class Bases(NamedTuple):
+    """Links and belief."""
+
+    plant: ModalBasis  # R modes
+    at_load: Array  # deflection of the plant's modes at the static load [1], (3, R)
+    plant_omega: Array  # frequencies of the links between held ends [rad/s], (3, C)
+    model: ModalBasis  # what the controller believes, max(R, C) modes
+    believed_omega: Array  # what its filters and shaper are designed for [rad/s], (3, C)
+
+
+def find_bases(structure: Structure, case: Case) -> Bases:
+    """Bases of plant and controller.
+
+    The belief has nominal stiffness; given frequencies (measured, perhaps) replace its own. Patches
+    and joint inertia are in a belief of basis `loaded`.
+
+    Args:
+        structure: static choices; bases and sizes are read.
+        case: the numbers.
+    """
+    beam, patches, n = case.machine.beam, case.machine.patches, structure.n_controlled
+    belief = beam._replace(stiffness_factor=1.0)
+    size = max(structure.n_modes, n)
+    stations = jnp.append(jnp.asarray(case.windows.stations), case.initial.load_station)
+    both = structure.basis, structure.controller_basis
+    if both == ("loaded", "loaded"):
+        plant, model = _side_by_side(beam, belief, patches, size, stations)
+    else:
+        plant = build_basis(both[0], beam, patches, size, stations)
+        model = build_basis(both[1], belief, patches, size, stations)
+    own = held_frequency(both[1], belief, model)[:, :n]
+    given = case.control.omega
+    is_there = (jnp.arange(structure.n_modes) < case.n_modes).astype(plant.mass.dtype)
+    cut = _first_modes(plant, structure.n_modes)
+    return Bases(
+        mask_modes(cut._replace(deflection_at=cut.deflection_at[:, :-1]), is_there),
+        cut.deflection_at[:, -1] * is_there,
+        held_frequency(both[0], beam, plant)[:, :n],
+        model._replace(deflection_at=model.deflection_at[:, :-1]),
+        jnp.where(given > 0, given, own),
+    )
+
+
+def _side_by_side(
+    one: Beam, other: Beam, patches: Patches, size: int, stations: Array
+) -> tuple[ModalBasis, ModalBasis]:
+    """Two loaded bases by one eigenvalue problem.
+
+    Two of them in one program now and then never end on CPUs (jax 0.10): XLA loses the second.
+    """
+    pairs = zip(one, other, strict=True)
+    beam = Beam(*(jnp.concatenate([jnp.broadcast_to(x, (3,)) for x in pair]) for pair in pairs))
+    centers = jnp.concatenate([jnp.asarray(patches.center)] * 2)
+    six = build_basis("loaded", beam, patches._replace(center=centers), size, stations)
+    return jax.tree.map(lambda x: x[:3], six), jax.tree.map(lambda x: x[3:], six)
+
+
+def _first_modes(basis: ModalBasis, n_modes: int) -> ModalBasis:
+    """A basis with fewer modes."""
+    n = n_modes
+
+    def first(x: Array | None) -> Array | None:
+        return None if x is None else x[:, :n]
+
+    mixed = basis.mixed_shortening
+    return basis._replace(
+        mass=basis.mass[:, :n],
+        stiffness=basis.stiffness[:, :n],
+        tip=first(basis.tip),
+        shortening=first(basis.shortening),
+        mixed_shortening=None if mixed is None else mixed[:, :n, :n],
+        b=basis.b[:, :n],
+        c=basis.c[:, :n],
+        deflection_at=basis.deflection_at[:, :, :n],
+        sensor_slope=basis.sensor_slope[:, :n],
+        actuator_slope=basis.actuator_slope[:, :n],
+    )
