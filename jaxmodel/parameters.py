@@ -48,7 +48,6 @@ class Beam(NamedTuple):
     density: Array  # [kg/m3]
     youngs_modulus: Array  # E [Pa]
     stiffness_factor: Array  # true bending stiffness over the one controller and shaper believe [1]
-    damping_ratio: Array  # zeta of every link mode [1]
     joint_inertia_b: Array  # rotary inertia J_B at the slider joint [kg m2]
     joint_inertia_c: Array  # rotary inertia J_C at the platform joint [kg m2]
 
@@ -67,6 +66,18 @@ class Patches(NamedTuple):
     density: Array  # [kg/m3], ()
 
 
+class Damping(NamedTuple):
+    """Structural damping of the links' modes: given ratios, and how they go on.
+
+    Beyond the modes given zeta_j = zeta_n (omega_j/omega_n)^p of the last one, n: p = 0 for a
+    constant ratio, -1 for damping in proportion to mass, 1 to stiffness.
+    """
+
+    ratio: Array  # zeta by mode, the last one repeated where a link has fewer [1], (3, n)
+    count: Array  # how many are given, (3,)
+    exponent: Array  # p [1], ()
+
+
 class Machine(NamedTuple):
     """Everything physical about the mechanism with its patches."""
 
@@ -74,6 +85,7 @@ class Machine(NamedTuple):
     masses: Masses
     beam: Beam
     patches: Patches
+    damping: Damping
 
 
 def paper_machine() -> Machine:
@@ -97,7 +109,6 @@ def paper_machine() -> Machine:
             density=2750.0,
             youngs_modulus=70e9,
             stiffness_factor=1.0,
-            damping_ratio=0.01,
             joint_inertia_b=0.0,
             joint_inertia_c=0.0,
         ),
@@ -112,4 +123,5 @@ def paper_machine() -> Machine:
             relative_permittivity=1750.0,
             density=7800.0,
         ),
+        damping=Damping(ratio=np.full((3, 1), 0.01), count=np.ones(3, int), exponent=0.0),
     )

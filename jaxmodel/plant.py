@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from jaxmodel.beam import ModalBasis
-from jaxmodel.parameters import Array, Machine
+from jaxmodel.parameters import Array, Damping, Machine
 
 
 class Plant(NamedTuple):
@@ -44,6 +44,15 @@ class Plant(NamedTuple):
     c: Array  # [kg m], (3, R)
 
 
+def damping_ratio(damping: Damping, omega: Array) -> Array:
+    """Ratios of all modes [1], (3, R), omega their frequencies [rad/s]."""
+    order = jnp.arange(omega.shape[1])
+    own = jnp.minimum(order, jnp.asarray(damping.count, int)[:, None] - 1)
+    ratio = jnp.asarray(damping.ratio)
+    known = jnp.take_along_axis(ratio, jnp.minimum(own, ratio.shape[1] - 1), axis=1)
+    return known * (omega / jnp.take_along_axis(omega, own, axis=1)) ** damping.exponent
+
+
 #: Mass added to sliders that are locked [kg]: 1 N for 1 s moves it by 0.5 nm.
 LOCK_MASS = 1e9
 
@@ -68,7 +77,6 @@ def build_plant(
     geometry, masses, beam = machine.geometry, machine.masses, machine.beam
     angle = jnp.asarray(geometry.guide_angle)
     psi = jnp.asarray(geometry.joint_angle)
-    damping_ratio = jnp.broadcast_to(jnp.asarray(beam.damping_ratio), (3,))
 
     def link(x: Array) -> Array:
         return jnp.broadcast_to(jnp.asarray(x), (3,))
@@ -90,7 +98,9 @@ def build_plant(
         platform_inertia=jnp.asarray(masses.platform_inertia),
         modal_mass=basis.mass[:, 0],
         stiffness=basis.stiffness,
-        damping=2 * damping_ratio[:, None] * jnp.sqrt(basis.stiffness * basis.mass),
+        damping=2
+        * damping_ratio(machine.damping, jnp.sqrt(basis.stiffness / basis.mass))
+        * jnp.sqrt(basis.stiffness * basis.mass),
         tip=basis.tip,
         shortening=basis.shortening if has_shortening else None,
         mixed_shortening=basis.mixed_shortening if has_shortening else None,

@@ -24,7 +24,7 @@ from jaxmodel.case import (
     Structure,
     Windows,
 )  # fmt: skip
-from jaxmodel.parameters import ASSEMBLIES, Beam, Geometry, Machine, Masses, Patches
+from jaxmodel.parameters import ASSEMBLIES, Beam, Damping, Geometry, Machine, Masses, Patches
 from studies.consistency import patch_centers
 from studies.fields import Columns, Fields
 from studies.spec import Study
@@ -154,7 +154,17 @@ def _machine(fields: Fields) -> Machine:
             center=_per_link(number("patches", "centers")),
             **{name: number("patches", name) for name in Patches._fields if name != "center"},
         ),
+        _damping(fields),
     )
+
+
+def _damping(fields: Fields) -> Damping:
+    ratio = fields.numbers("link.damping_ratio")
+    ratio = _per_link(ratio[:, None] if ratio.ndim == 1 else ratio)  # (m, 3, n)
+    count = np.maximum(np.sum(~np.isnan(ratio), axis=2), 1)
+    given = np.minimum(np.arange(ratio.shape[2]), count[:, :, None] - 1)
+    law = fields.choices("link.damping_law", ("mass", "constant", "stiffness"))
+    return Damping(np.take_along_axis(ratio, given, axis=2), count, law - 1.0)
 
 
 def _per_link(lists: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -145,9 +145,9 @@ def _check_sampling(study: Study) -> None:
         )
 
 
-def _nested(lists: tuple) -> tuple:
-    """A table of three lists; empty where one list serves all links."""
-    return lists if lists and isinstance(lists[0], tuple) else ()
+def _nested(lists: Any) -> tuple:
+    """A table of three lists; empty where one number or list serves all links."""
+    return lists if isinstance(lists, tuple) and lists and isinstance(lists[0], tuple) else ()
 
 
 def _check_lists(study: Study) -> None:
@@ -164,7 +164,11 @@ def _check_lists(study: Study) -> None:
         ("control.mode_mask", control.mode_mask, control.modes, ""),
         ("initial.modal", study.initial.modal, study.link.modes, "m"),
         ("control.frequencies_hz", _nested(control.frequencies_hz), control.modes, "Hz"),
+        ("link.damping_ratio", _nested(study.link.damping_ratio), study.link.modes, "1"),
     )
+    damping = study.link.damping_ratio
+    if damping == () or any(row == () for row in _nested(damping)):
+        raise field_error("link.damping_ratio", damping, "at least one number per link", "1")
     given = control.frequencies_hz
     if len(given) > control.modes and not isinstance(given[0], tuple):
         raise field_error(

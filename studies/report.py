@@ -58,7 +58,7 @@ def _head(context: Context) -> list[str]:
         f"only). {note}",
         "",
         f"Plant: {study.link.modes} modes per link ({study.link.basis}), structural damping "
-        f"{study.link.damping_ratio:g}, E = {study.link.youngs_modulus / 1e9:g} GPa, slider drive "
+        f"{study.link.first_damping:g}, E = {study.link.youngs_modulus / 1e9:g} GPa, slider drive "
         f"Kp = {study.drive.kp:g} N/m, Kd = {study.drive.kd:g} N s/m. Control: sampled at "
         f"{loop.sample_rate_hz / 1e3:g} kHz, {loop.adc_bits} bit, one sample of delay, velocity by "
         f"{loop.estimator}, gains {', '.join(f'{k:g}' for k in control.velocity_gain)} N s/m of "
@@ -203,7 +203,7 @@ def _settling(context: Context) -> list[str]:
         (context.find(m, s, 3, OFF), context.find(m, s, 3, ALL), move_text(m, s))
         for m, s in settings()
     ]
-    high = [k for k, c in enumerate(runs.cases) if c.damping_ratio != runs.study.link.damping_ratio]
+    high = [k for k, c in enumerate(runs.cases) if c.damping_ratio != runs.study.link.first_damping]
     if len(high) == 2:
         zeta = runs.cases[high[0]].damping_ratio
         pairs.append((high[0], high[1], f"{move_text('fast', 'none')}, damping {zeta:g}"))

@@ -21,7 +21,7 @@ class Context(NamedTuple):
 
     def find(self, move: str, shaper: str, modes: int, links: tuple[bool, ...]) -> int:
         """Index of a case at the default structural damping."""
-        damping = self.runs.study.link.damping_ratio
+        damping = self.runs.study.link.first_damping
         return self.runs.where(
             move=move, shaper=shaper, modes=modes, links=links, damping_ratio=damping
         )

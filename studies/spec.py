@@ -28,6 +28,7 @@ Force = Annotated[float, Field(ge=-1e4, le=1e4)]
 Wrench = tuple[Force, Force, Force]
 Gain = Annotated[float, Field(ge=-1e9, le=1e9)]
 Hertz = Annotated[float, Field(ge=0.1, le=1e5)]
+Zeta = Annotated[float, Field(ge=0, lt=1)]
 Time = Annotated[float, Field(ge=1e-4, le=100)]
 Pause = Annotated[float, Field(ge=0, le=100)]
 Flags = tuple[bool, bool, bool]
@@ -90,13 +91,27 @@ class Link(Section):
         ge=1e-3,
         le=10,
     )
-    damping_ratio: float = described(0.01, "1", "of every link mode", ge=0, lt=1)
+    damping_ratio: Zeta | tuple[Zeta, ...] | tuple[tuple[Zeta, ...], ...] = described(
+        0.01, "1", "of mode 1; or by mode as measured, one list for all links, or three"
+    )
+    damping_law: Literal["constant", "mass", "stiffness"] = described(
+        "constant", "-", "of the modes beyond: same ratio, falling with frequency, or rising"
+    )
     joint_inertia_b: float = described(
         0.0, "kg m2", "at the slider joint (basis loaded)", ge=0, le=1
     )
     joint_inertia_c: float = described(
         0.0, "kg m2", "at the platform joint (basis loaded)", ge=0, le=1
     )
+
+
+    @property
+    def first_damping(self) -> float:
+        """Damping ratio of mode 1 of link 1 [1]."""
+        ratio: Any = self.damping_ratio
+        while isinstance(ratio, tuple):
+            ratio = ratio[0]
+        return ratio
 
 
 class Patches(Section):

@@ -10,7 +10,8 @@ import pytest
 
 from jaxmodel import piezo
 from jaxmodel.beam import BASES, build_basis, held_frequency, pinned_free_roots
-from jaxmodel.parameters import paper_machine
+from jaxmodel.parameters import Damping, paper_machine
+from jaxmodel.plant import damping_ratio
 
 MACHINE = paper_machine()
 BEAM, PATCHES = MACHINE.beam, MACHINE.patches
@@ -245,3 +246,16 @@ def test_faults_name_value_and_allowed_range():
         build_basis("pinned_pined", BEAM, PATCHES, 3, np.array([0.1]))
     with pytest.raises(ValueError, match="n_modes = 0"):
         build_basis("loaded", BEAM, PATCHES, 0, np.array([0.1]))
+
+
+def test_damping_goes_on_from_the_modes_given():
+    """Measured ratios of two modes; beyond them as mass or stiffness would have it."""
+    omega = np.array([[1.0, 4.0, 9.0, 16.0]] * 3)
+    ratio, count = np.array([[0.02, 0.01], [0.03, 0.03], [0.01, 0.05]]), np.array([2, 1, 2])
+    for power, wanted in (
+        (0, [[0.02, 0.01, 0.01, 0.01], [0.03, 0.03, 0.03, 0.03]]),
+        (-1, [[0.02, 0.01, 0.04 / 9, 0.0025], [0.03, 0.03 / 4, 0.03 / 9, 0.03 / 16]]),
+        (1, [[0.02, 0.01, 0.0225, 0.04], [0.03, 0.12, 0.27, 0.48]]),
+    ):
+        found = damping_ratio(Damping(ratio, count, float(power)), omega)
+        np.testing.assert_allclose(found[:2], wanted, rtol=1e-12)

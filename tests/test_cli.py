@@ -190,7 +190,7 @@ def test_modes_at_another_pose_differ(capsys):
         (("--kp", -1), "drive.kp = -1.0: allowed a finite number >= 0 and <= 1e+08 [N/m]"),
         (("--kp", "stiff"), "Invalid value for '--kp'"),
         (("--kd", "inf"), "drive.kd = inf: allowed a finite number"),
-        (("--damping", 1.5), "link.damping_ratio = 1.5: allowed a finite number >= 0 and < 1 [1]"),
+        (("--damping", 1.5), "link.damping_ratio = 1.5: allowed a finite number >= 0 and < 1,"),
         (("--modes", 0), "link.modes = 0: allowed a whole number >= 1 and <= 16 [1]"),
         (("--modes", 17), "link.modes = 17: allowed a whole number >= 1 and <= 16 [1]"),
         (("--basis", "pinned_pined"), "did you mean 'pinned_pinned'?"),

@@ -2,12 +2,15 @@
 
 import tomllib
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxmodel.prepare import prepare
 from studies import Study, StudyError, load_study, paper_study, parse_study
+from studies.cases import as_arrays, build_case, build_structure
 from studies.explain import allowed_values
 from studies.template import study_template, toml_value
 
@@ -224,3 +227,17 @@ def test_a_study_survives_being_written(fields):
 def test_what_is_no_study_is_refused(data):
     with pytest.raises(StudyError):
         parse_study(data)
+
+
+def test_damping_by_mode_and_link_reaches_the_plant():
+    measured = [[0.02, 0.01], [0.03], [0.01, 0.02]]
+    study = paper_study().change(link__damping_ratio=measured, link__damping_law="stiffness")
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    plant = jax.jit(prepare, static_argnums=0)(structure, case).loop.plant
+    zeta = plant.damping / (2 * np.sqrt(plant.stiffness * plant.modal_mass[:, None]))
+    np.testing.assert_allclose(zeta[0, :3], [0.02, 0.01, 0.01 * 9 / 4], rtol=1e-9)
+    np.testing.assert_allclose(zeta[1, :3], [0.03, 0.12, 0.27], rtol=1e-9)
+    assert study.link.first_damping == 0.02
+    for bad, words in ((((0.01,), (0.02,)), "three lists"), ((), "at least one number")):
+        with pytest.raises(StudyError, match=f"link.damping_ratio.*{words}"):
+            paper_study().change(link__damping_ratio=bad)

@@ -65,7 +65,7 @@ def look_around(study: Study, subsets: Subsets, tell: Tell) -> Findings:
 
 def _frequencies(study: Study, own: np.ndarray) -> np.ndarray:
     """FREQUENCY with enough points round each natural frequency, below half the sample rate."""
-    width = max(study.link.damping_ratio, 1e-5)
+    width = max(study.link.first_damping, 1e-5)
     fine = (own[:, None] * (1 + width * _ROUND)).ravel()
     every = np.unique(np.concatenate([FREQUENCY, fine[fine <= FREQUENCY[-1]]]))
     return every[(every > 0) & (every < 0.45 * study.electronics.sample_rate_hz)]

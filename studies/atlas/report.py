@@ -284,7 +284,7 @@ def _border(chart: Map) -> str:
 
 def _decay(found: Findings) -> str:
     """How fast structural damping ends the first bending modes."""
-    rate = found.study.link.damping_ratio * 2 * np.pi * np.nanmedian(found.map.bending)
+    rate = found.study.link.first_damping * 2 * np.pi * np.nanmedian(found.map.bending)
     return f"damping ends it in about {1 / rate:.2g} s" if rate > 0 else "nothing damps it"
 
 

@@ -113,7 +113,7 @@ def kinetic_energy(machine, basis, gamma, q, rho_rate, gamma_rate, pose_rate, q_
 
 def modal_load(machine, basis, q, q_rate, force):
     """Generalised forces of the modes: actuators, structural damping and stiffness, (3, R)."""
-    damping = 2 * machine.beam.damping_ratio * jnp.sqrt(basis.stiffness * basis.mass)
+    damping = 2 * machine.damping.ratio * jnp.sqrt(basis.stiffness * basis.mass)
     return force - damping * q_rate - basis.stiffness * q
 
 

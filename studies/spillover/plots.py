@@ -77,7 +77,7 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
         ax: where to draw; a new figure where left out.
     """
     ax = figures.axes_or_new(ax)
-    structural = found.study.link.damping_ratio
+    structural = found.study.link.first_damping
     frequency, zeta = found.frequency_hz[:, :, :, -1], found.damping_ratio[:, :, :, -1]
     for b, color, marker in zip(range(len(frequency)), figures.SERIES, "osD^v", strict=False):
         ax.plot(

@@ -116,7 +116,7 @@ def _margins(found: Certificate) -> list[str]:
         "## Margins and damping", "",
         "For each basis and number of plant modes per link: the smallest gain margin of all patch "
         "lengths and what goes unstable beyond it, and the least damping ratio of all link modes "
-        f"at the design's gains (without control: {found.study.link.damping_ratio:g}). The mode is "
+        f"at the design's gains (without control: {found.study.link.first_damping:g}). The mode is "
         "the one that holds most energy of the motion; \"through a filter\" says that the pole is "
         "one of the controller's filters, which the mode, far stiffer, feeds.", "",
         *table(names, rows), "",

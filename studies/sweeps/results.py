@@ -48,6 +48,7 @@ _LIST_AXES = {
     "control.velocity_gain": ("link",),
     "control.position_gain": ("link",),
     "control.frequencies_hz": ("link", "frequencies_hz_entry"),
+    "link.damping_ratio": ("link", "damping_ratio_entry"),
     "drive.pulse_force": ("slider_axis",),
     "load.wrench": ("pose_axis",),
     "load.pulse": ("pose_axis",),
