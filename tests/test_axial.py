@@ -230,6 +230,30 @@ def test_ked_bends_links_by_the_rigid_motion_alone():
     np.testing.assert_allclose(ked, coupled, rtol=0.03)
 
 
+@pytest.mark.parametrize(("kp", "peak", "residual"), [(2e4, 0.01, 0.15), (1e5, 0.08, None)])
+def test_ked_fails_where_the_drive_rings_with_the_links(kp, peak, residual):
+    """Two cells of the map of docs/exploring.md: 10 mm in 0.05 s."""
+    study = load_study(SPECS / "paper.toml").change(
+        motion__waypoints=(HOME, (0.0, 0.01, HOME[2])), motion__move_time=0.05, link__modes=3,
+        shaper__kind="none", control__feedback="none", run__duration=0.2,
+        metrics__residual_length=0.1, drive__kp=kp,
+    )  # fmt: skip
+    run = jax.jit(simulate, static_argnums=0)
+    coupled, ked = (
+        run(*arrays(study.change(run__model=model))).metrics for model in ("coupled", "ked")
+    )
+
+    def error(name):
+        right, found = (np.asarray(getattr(m, name)) for m in (coupled, ked))
+        return np.abs(found - right).max() / right.max()
+
+    assert error("structural_peak") < peak
+    if residual is None:
+        assert error("structural_peak") > 0.02 and error("residual_rms") > 0.3
+    else:
+        assert error("residual_rms") < residual
+
+
 # --- along the path -------------------------------------------------------------------------------
 
 
