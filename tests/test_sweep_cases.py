@@ -211,14 +211,18 @@ def test_designs_for_sensitivity():
     assert np.all(np.sum(step > 0, axis=1) == 1)
 
 
-@pytest.mark.parametrize("name", ["placement", "gains", "links", "spillover", "robustness", "models"])
-def test_ready_sweeps_are_valid(name):
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [
+        ("placement", 4096), ("gains", 216), ("links", 48), ("spillover", 120),
+        ("robustness", 400), ("models", 90),
+    ],
+)  # fmt: skip
+def test_ready_sweeps_are_valid(name, count):
     from pathlib import Path
 
     table = build_table(load_sweep(ready_spec(Path(name))))
-    assert len(table) == {
-        "placement": 4096, "gains": 216, "links": 48, "spillover": 120, "robustness": 400, "models": 90,
-    }[name]  # fmt: skip
+    assert len(table) == count
     case_study(table, len(table) - 1)
 
 
