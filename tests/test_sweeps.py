@@ -530,5 +530,6 @@ def test_sweeps_of_loaded_links_end(tmp_path):
     (tmp_path / "loaded.toml").write_text(LOADED)
     plain = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     for k in range(4):
-        command = [sys.executable, "-m", "studies", "sweep", "loaded.toml", "--out", f"out{k}"]
+        studies_command = str(Path(sys.executable).with_name("studies"))
+        command = [studies_command, "sweep", "loaded.toml", "--out", f"out{k}"]
         subprocess.run(command, cwd=tmp_path, env=plain, check=True, timeout=120)
