@@ -133,7 +133,7 @@ def accelerations(
     coupling = coupling + (plant.b / mass) * (chain.sine * rho_acc)[:, None]
     coupling = coupling - (plant.c / mass) * gamma_acc[:, None]
     # the mass between mid-span and C takes its share of the force at C
-    tension = force_f if plant.tip is None else force_g
+    tension = force_f if chain.bend.tip is None else force_g
     axial = tension - plant.tip_mass * chain.cosine * rho_acc
     if not is_coupled and plant.shortening is not None:
         coupling = coupling - shortening_row(plant, q) * (axial / plant.modal_mass)[:, None]

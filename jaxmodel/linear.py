@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.case import Structure
+from jaxmodel.case import Case, Structure
 from jaxmodel.drive import Reference, slider_force
 from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.kinematics import close_chain
@@ -49,6 +49,14 @@ class Moment(NamedTuple):
     rate: Array  # X' [m/s, m/s, rad/s]
     acceleration: Array  # X'' [m/s2, m/s2, rad/s2]
     wrench: Array  # on the platform [N, N, N m]
+
+
+def resting(structure: Structure, case: Case) -> Moment | None:
+    """The machine at rest under the case's steady load; None where there is none."""
+    if not structure.has_wrench:
+        return None
+    still = jnp.zeros_like(jnp.asarray(case.load.wrench))
+    return Moment(still, still, case.load.wrench)
 
 
 def linearise(

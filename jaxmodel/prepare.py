@@ -33,6 +33,7 @@ class Prepared(NamedTuple):
     """A case ready to run."""
 
     loop: Loop
+    bases: Bases  # what it was made from
     taps: shaper.Taps  # shaper on the sample grid
     initial_q: Array  # [m], (3, R)
     sensor_condition: Array  # condition number of the modal filter per link [1], (3,)
@@ -96,6 +97,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     )
     return Prepared(
         loop,
+        bases,
         design_taps(case, bases),
         _initial_modes(structure, case, bases),
         design.sensor_condition,

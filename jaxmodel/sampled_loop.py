@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, ControllerState, controller_step
-from jaxmodel.linear import LinearPlant, Moment, linearise
+from jaxmodel.linear import LinearPlant, Moment, linearise, resting
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 
@@ -58,8 +58,7 @@ def closed_loop(
     smooth = structure._replace(is_smooth=True, feedback="sampled")
     loop = prepare(smooth, case).loop
     law = loop.controller if law is None else law
-    if moment is None and structure.has_wrench:
-        moment = Moment(jnp.zeros(3), jnp.zeros(3), case.load.wrench)
+    moment = resting(structure, case) if moment is None else moment
     plant = linearise(smooth, loop, pose, case.electronics.antialias, moment)
     state, enters = _with_filtered_sensors(smooth, plant, case.electronics.antialias)
     n, n_inputs = enters.shape

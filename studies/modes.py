@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.kinematics import path_status
-from jaxmodel.linear import NaturalModes, linearise, natural_modes
+from jaxmodel.linear import NaturalModes, linearise, natural_modes, resting
 from jaxmodel.prepare import prepare
 from studies.cases import as_arrays, build_case, build_structure
 from studies.runs import check_pose
@@ -75,4 +75,6 @@ def machine_modes(
 def _at_pose(structure: Structure, case: Case, pose: np.ndarray):
     loop = prepare(structure, case).loop
     code, _ = path_status(loop.plant, pose[None])
-    return code, linearise(structure, loop, pose, case.electronics.antialias)
+    return code, linearise(
+        structure, loop, pose, case.electronics.antialias, resting(structure, case)
+    )

@@ -20,7 +20,7 @@ from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
 from jaxmodel.kinematics import path_status
-from jaxmodel.linear import linearise, mechanical
+from jaxmodel.linear import linearise, mechanical, resting
 from jaxmodel.motion import end_of_path, sample_path
 from jaxmodel.prepare import (
     MODE_STEP_LIMIT,
@@ -159,7 +159,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
     poses = sample_path(case.path, time).position
     code, index = path_status(plant, poses)
     worst = jnp.maximum(prepared.sensor_condition.max(), prepared.actuator_condition.max())
-    corner = lowpass_corner(structure, case, find_bases(structure, case))
+    corner = lowpass_corner(structure, case, prepared.bases)
     return Preflight(
         each, code, time[index], poses[index], end, shaper_length, worst,
         jnp.max(prepared.loop.omega), corner, steady_load(structure, case, plant),
@@ -303,7 +303,8 @@ def pole_decay(structure: Structure, case: Case, pose: Any) -> float:
 def mechanics_at(structure: Structure, case: Case, pose: Any) -> Any:
     """State matrix of the plant (with ideal feedback, where the structure has it) at a pose."""
     loop = prepare(structure, case).loop
-    return mechanical(linearise(structure, loop, pose, case.electronics.antialias))
+    at_rest = resting(structure, case)
+    return mechanical(linearise(structure, loop, pose, case.electronics.antialias, at_rest))
 
 
 _mechanics_at = jax.jit(mechanics_at, static_argnums=0)

@@ -121,6 +121,16 @@ def test_axial_force_changes_the_frequency_of_a_link_between_held_ends(wrench):
     np.testing.assert_allclose(held, wanted, rtol=1e-6)
 
 
+def test_axial_force_of_straight_links_is_the_same_in_every_basis():
+    wrench, acceleration = np.array([7.0, -3.0, 0.2]), np.array([5.0, 20.0, -30.0])
+    forces = [
+        axial.axial_force(plant_of(*arrays(BARE.change(link__basis=kind))), HOME_POSE,
+                          np.array([0.2, 0.1, 0.5]), acceleration, wrench)
+        for kind in ("pinned_pinned", "pinned_free")
+    ]  # fmt: skip
+    np.testing.assert_allclose(forces[1], forces[0], rtol=1e-9)
+
+
 def test_static_preload_equals_finite_elements():
     """20 N on the platform at home, sliders on springs: 108.19, 118.16, 118.47 Hz."""
     found = bending(BARE, (20.0, 0.0, 0.0))[:3]

@@ -18,7 +18,7 @@ from jaxmodel import status
 from jaxmodel.case import Case, Structure
 from jaxmodel.dynamics import kinetic_energy, modal_chain
 from jaxmodel.kinematics import chain_status, close_chain, link_angle
-from jaxmodel.linear import linearise, mechanical
+from jaxmodel.linear import linearise, mechanical, resting
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from studies.runs import check_pose, check_run
@@ -180,7 +180,10 @@ def _matrices(structure: Structure, case: Case, poses: Array) -> tuple[Array, Ar
             return kinetic_energy(plant, chain, pose_rate, rest, q_rate)
 
         mass = jax.hessian(energy)(jnp.zeros(size, pose.dtype))
-        state = mechanical(linearise(structure, loop, pose, case.electronics.antialias))
+        at_rest = resting(structure, case)
+        state = mechanical(
+            linearise(structure, loop, pose, case.electronics.antialias, at_rest)
+        )
         stiffness = -mass @ state[size:, :size]
         return mass, (stiffness + stiffness.T) / 2
 
