@@ -28,6 +28,8 @@ class Structure(NamedTuple):
     feedback: str = "sampled"  # "sampled", "ideal" or "none"
     law: str = "imsc"  # "imsc" or "srf"
     has_feedforward: bool = False  # computed torque on top of PD
+    has_sensor_highpass: bool = False  # patches drained by their amplifiers' inputs
+    has_amplifier: bool = False  # actuators behind amplifiers of finite bandwidth
     has_noise: bool = False  # seeded ADC noise and force ripple
     has_friction: bool = False  # Coulomb friction on the sliders
     has_position_gain: bool = True  # feedback of modal positions, not of velocities alone
@@ -62,6 +64,8 @@ class Electronics(NamedTuple):
 
     period: Array  # T [s], ()
     antialias: Array  # corner of the Butterworth filter [rad/s], ()
+    sensor_highpass: Array  # corner 1/(R C) of a patch into its amplifier [rad/s], ()
+    amplifier_lag: Array  # time constant of the actuators' amplifiers [s], ()
     conditioner_gain: Array  # ADC volt per sensor volt [1], ()
     conditioner_bias: Array  # [V], ()
     adc_range: Array  # full scale, from 0 [V], ()

@@ -345,9 +345,8 @@ def inverse_dynamics(
     acc_f = acc_f + chain.chord * rate2 - phi2 * frame.c_f
     rho_acc, gamma_acc = frame.link_motion(acc_f, acc_g - phi2 * frame.c_g)
     moment = plant.tip_mass * plant.length
-    on_rho = (
-        plant.slider_link_mass * rho_acc
-        - moment * (chain.sine * gamma_acc + chain.cosine * rate2)
+    on_rho = plant.slider_link_mass * rho_acc - moment * (
+        chain.sine * gamma_acc + chain.cosine * rate2
     )
     on_gamma = plant.inertia * gamma_acc - moment * chain.sine * rho_acc
     force_f, force_g = frame.joint_force(on_rho, on_gamma)

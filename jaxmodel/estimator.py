@@ -4,7 +4,7 @@ Every estimator is a first-order section followed by a second-order one, so that
 numbers only. The second section keeps its state before the numerators and so serves two outputs.
 
 - `modal_phase`: high-pass (Tustin) times low-pass (Tustin, prewarped) whose output a q + b q' is
-  chosen so that anti-alias filter, delay, hold and filter together are exactly j omega at the
+  chosen so that analogue electronics, delay, hold and filter together are exactly j omega at the
   assembled frequency omega of the mode: right amplitude and phase where the vibration is.
 - `difference`: backward difference behind a first-order low-pass. A warning, not a proposal: it
   destabilises the paper's gains on a plant with seven modes or more.
@@ -16,6 +16,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
+from jaxmodel.case import Electronics
+from jaxmodel.electronics import measurement_chain
 from jaxmodel.parameters import Array
 
 KINDS = ("modal_phase", "difference")
@@ -32,33 +34,22 @@ class Estimator(NamedTuple):
 
 
 def design_estimator(
-    kind: Array,
-    omega: Array,
-    period: Array,
-    antialias: Array,
-    highpass: Array,
-    lowpass_ratio: Array,
-    lowpass_zeta: Array,
-    difference_cutoff: Array,
+    omega: Array, electronics: Electronics, lowpass_ratio: Array, lowpass_zeta: Array
 ) -> Estimator:
     """Estimator of either kind, selected by a traced index.
 
     Args:
-        kind: index in `KINDS`, ().
         omega: assembled frequency the chain is exact at [rad/s], (3, C).
-        period: sample time T [s], ().
-        antialias: corner of the analogue Butterworth filter [rad/s], ().
-        highpass: corner of the high-pass [rad/s], ().
-        lowpass_ratio: kappa, low-pass corner over omega [1], (C,).
-        lowpass_zeta: damping of the low-pass [1], (C,).
-        difference_cutoff: low-pass corner of the `difference` kind [rad/s], ().
+        electronics: kind, sample time, filters; what lies between command and sample.
+        lowpass_ratio: kappa, low-pass corner over omega [1], () or (C,).
+        lowpass_zeta: damping of the low-pass [1], () or (C,).
 
     Returns:
         Estimator.
     """
-    phase = _modal_phase(omega, period, antialias, highpass, lowpass_ratio, lowpass_zeta)
-    plain = _difference(omega, period, difference_cutoff)
-    is_phase = jnp.asarray(kind) == 0
+    phase = _modal_phase(omega, electronics, lowpass_ratio, lowpass_zeta)
+    plain = _difference(omega, electronics.period, electronics.difference_cutoff)
+    is_phase = jnp.asarray(electronics.estimator) == KINDS.index("modal_phase")
 
     def choose(a, b):
         return jnp.where(is_phase, a, b)
@@ -70,16 +61,6 @@ def design_estimator(
         tuple(map(choose, phase.position, plain.position)),
         choose(phase.direct, plain.direct),
     )
-
-
-def measurement_chain(omega: Array, period: Array, antialias: Array) -> Array:
-    """Response of anti-alias filter, one-sample delay and hold at omega [rad/s].
-
-    R = AA(j omega) exp(-j omega T (1/2 + 1)) sinc(omega T/2).
-    """
-    s = 1j * omega / antialias
-    hold = jnp.sin(omega * period / 2) / (omega * period / 2)
-    return hold * jnp.exp(-1.5j * omega * period) / (s * s + jnp.sqrt(2.0) * s + 1)
 
 
 def second_order(corner: Array, zeta: Array, period: Array) -> tuple[Array, Array, Array]:
@@ -99,12 +80,11 @@ def second_order(corner: Array, zeta: Array, period: Array) -> tuple[Array, Arra
     return warp * warp / lead, a1, a2
 
 
-def _modal_phase(
-    omega: Array, period: Array, antialias: Array, highpass: Array, kappa: Array, zeta: Array
-) -> Estimator:
+def _modal_phase(omega: Array, electronics: Electronics, kappa: Array, zeta: Array) -> Estimator:
+    period = electronics.period
     zeta = jnp.broadcast_to(zeta, omega.shape)
     # high-pass s/(s + w) by Tustin
-    half = highpass * period / 2
+    half = electronics.highpass * period / 2
     gain, pole = 1 / (1 + half), (half - 1) / (1 + half)
     first = (gain * jnp.ones_like(omega), -gain * jnp.ones_like(omega), pole * jnp.ones_like(omega))
     # its numerator is low (1 + z^-1)^2; that of s LP is c low (1 - z^-2)
@@ -113,7 +93,7 @@ def _modal_phase(
     z = jnp.exp(-1j * omega * period)  # z^-1 on the unit circle
     high_response = first[0] * (1 - z) / (1 + first[2] * z)
     low_response = low * (1 + z) ** 2 / (1 + a1 * z + a2 * z * z)
-    chain = measurement_chain(omega, period, antialias) * high_response * low_response
+    chain = measurement_chain(omega, electronics) * high_response * low_response
     rate = jnp.tan(omega * period / 2)  # (z-1)/(z+1) = j tan(omega T/2)
 
     def numerator(target: Array) -> tuple[Array, Array, Array]:

@@ -4,7 +4,9 @@ In (q, q') a mode is a damped oscillator with constant coefficients; everything 
 small. ETDRK4 (Cox and Matthews 2002) therefore solves the oscillator exactly and treats the rest
 as forcing, one step per controller sample for any number of modes. The filter is linear and equal
 on every sensor channel, so each modal coordinate q is filtered (to z) instead of each voltage:
-z'' = omega_f^2 (q - z) - sqrt(2) omega_f z' (Butterworth). One 4x4 block (q, q', z, z') per mode.
+z'' = omega_f^2 (q - z) - sqrt(2) omega_f z' (Butterworth). One 4x4 block (q, q', z, z') per mode;
+where patches are drained by their amplifiers a fifth entry, s' = omega_h (q - s), is taken off q
+before the filter.
 """
 
 from __future__ import annotations
@@ -22,15 +24,17 @@ _TERMS = 10
 
 
 class Exponential(NamedTuple):
-    """Coefficients of one step of length h; rows and columns are (q, q', z, z')."""
+    """Coefficients of one step of length h; n rows and columns (q, q', z, z'), maybe s."""
 
     half: Array  # exp(A h/2), upper left block, (2, 2, 3, R)
     half_force: Array  # h/2 phi_1(A h/2) times the force direction, (2, 3, R)
-    full: Array  # exp(A h), (4, 4, 3, R)
-    full_force: Array  # ETDRK4 weights of N(u), N(a) + N(b), N(c), (3, 4, 3, R)
+    full: Array  # exp(A h), (n, n, 3, R)
+    full_force: Array  # ETDRK4 weights of N(u), N(a) + N(b), N(c), (3, n, 3, R)
 
 
-def exponential_step(omega: Array, zeta: Array, step: Array, filter_omega: Array) -> Exponential:
+def exponential_step(
+    omega: Array, zeta: Array, step: Array, filter_omega: Array, highpass: Array | None = None
+) -> Exponential:
     """Coefficients of ETDRK4 for q'' = -omega^2 q - 2 zeta omega q' + N and its filter.
 
     phi_k are computed by their series at h/2^8 and doubled: phi_k(2x) from phi_0..phi_k(x), which
@@ -41,20 +45,24 @@ def exponential_step(omega: Array, zeta: Array, step: Array, filter_omega: Array
         zeta: damping ratio [1], (3, R).
         step: h [s], ().
         filter_omega: corner of the anti-alias filter [rad/s], ().
+        highpass: corner of the patches into their amplifiers [rad/s], (); None: not drained.
 
     Returns:
         Exponential.
     """
     zero, corner = jnp.zeros_like(omega), jnp.full_like(omega, 1.0) * filter_omega
-    # balanced variables (q, q'/omega, z, z'/omega_f) keep every entry of the order omega
+    drain = zero if highpass is None else zero + highpass
+    # balanced variables (q, q'/omega, z, z'/omega_f, s) keep every entry of the order omega
     rows = (
-        (zero, omega, zero, zero),
-        (-omega, -2 * zeta * omega, zero, zero),
-        (zero, zero, zero, corner),
-        (corner, zero, -corner, -np.sqrt(2.0) * corner),
+        (zero, omega, zero, zero, zero),
+        (-omega, -2 * zeta * omega, zero, zero, zero),
+        (zero, zero, zero, corner, zero),
+        (corner, zero, -corner, -np.sqrt(2.0) * corner, -corner),
+        (drain, zero, zero, zero, -drain),
     )
-    balanced = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-    scale = jnp.stack([jnp.ones_like(omega), omega, jnp.ones_like(omega), corner], axis=-1)
+    n, one = (4 if highpass is None else 5), jnp.ones_like(omega)
+    balanced = jnp.stack([jnp.stack(row[:n], axis=-1) for row in rows[:n]], axis=-2)
+    scale = jnp.stack((one, omega, one, corner, one)[:n], axis=-1)
 
     phi = _series(balanced * (step / 2**_DOUBLINGS))
     for _ in range(_DOUBLINGS - 1):
@@ -82,7 +90,7 @@ def exponential_step(omega: Array, zeta: Array, step: Array, filter_omega: Array
 
 def _series(x: Array) -> list[Array]:
     """phi_0..phi_3 of a small matrix, phi_k = sum x^n/(n + k)!, by Horner."""
-    identity = jnp.eye(4, dtype=x.dtype) + 0 * x
+    identity = jnp.eye(x.shape[-1], dtype=x.dtype) + 0 * x
     result = []
     for k in range(4):
         total = identity / float(factorial(_TERMS + k))

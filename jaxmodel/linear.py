@@ -1,9 +1,9 @@
 """Linearisation at a pose: frequencies, damping, mode shapes, frequency response.
 
-The state is x = (X, X', q, q', z, z'), flattened, about the machine at that pose with straight
-links, resting or in motion, the drive giving the forces that keep it so: what acts along the links
-then changes their stiffness. Matrices come from forward-mode differentiation of the loop's own
-plant.
+The state is x = (X, X', q, q'), flattened, about the machine at that pose with straight links,
+resting or in motion, the drive giving the forces that keep it so: what acts along the links then
+changes their stiffness. Matrices come from forward-mode differentiation of the loop's own plant;
+`jaxmodel.sampled_loop` adds electronics and controller.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from jaxmodel.parameters import Array
 class LinearPlant(NamedTuple):
     """x' = A x + B_voltage V_a + B_force F; outputs are rows to multiply with x."""
 
-    state: Array  # A [1/s and mixed], (n, n), n = 6 + 12 R
+    state: Array  # A [1/s and mixed], (n, n), n = 6 + 6 R
     voltage: Array  # B_voltage, (n, 3 K)
     force: Array  # B_force, disturbance on the sliders, (n, 3)
     deflection: Array  # chord deflection at the stations [m], (3 S, n)
-    sensor: Array  # anti-alias filtered sensor voltages [V], (3 K, n)
+    sensor: Array  # voltages of the sensors, open-circuit [V], (3 K, n)
 
 
 def flatten(state: PlantState) -> Array:
-    """x = (X, X', q, q', z, z') as a vector, (6 + 12 R,)."""
-    return jnp.concatenate([jnp.ravel(jnp.asarray(part)) for part in state])
+    """x = (X, X', q, q') as a vector, (6 + 6 R,)."""
+    return jnp.concatenate([jnp.ravel(jnp.asarray(part)) for part in state[:4]])
 
 
 def unflatten(x: Array, n_modes: int) -> PlantState:
     """Inverse of `flatten`."""
-    modes = jnp.reshape(x[6:], (4, 3, n_modes))
+    modes = jnp.reshape(x[6:], (2, 3, n_modes))
     return PlantState(x[:3], x[3:6], *modes)
 
 
@@ -60,7 +60,7 @@ def resting(structure: Structure, case: Case) -> Moment | None:
 
 
 def linearise(
-    structure: Structure, loop: Loop, pose: Array, antialias: Array, moment: Moment | None = None
+    structure: Structure, loop: Loop, pose: Array, moment: Moment | None = None
 ) -> LinearPlant:
     """Linear plant at a pose; with ideal feedback in `structure` its loop is closed in A.
 
@@ -68,7 +68,6 @@ def linearise(
         structure: static choices.
         loop: constants of the case.
         pose: (x, y, phi) [m, m, rad], (3,).
-        antialias: corner of the anti-alias filter [rad/s], ().
         moment: motion and load there, as if they lasted; None: at rest without load.
 
     Returns:
@@ -79,7 +78,7 @@ def linearise(
     rate = still if moment is None else jnp.asarray(moment.rate, pose.dtype)
     chain = close_chain(loop.plant, pose, rate)
     zero = jnp.zeros_like(loop.omega)
-    rest = flatten(PlantState(pose, rate, zero, zero, zero, zero))
+    rest = flatten(PlantState(pose, rate, zero, zero))
     forward = still if structure.has_feedforward or structure.has_wrench else None
     wanted = Reference(chain.rho, chain.rho_rate, forward, still)
     if moment is not None:
@@ -93,13 +92,8 @@ def linearise(
         at = unflatten(x, structure.n_modes)
         reference = wanted._replace(disturbance=wanted.disturbance + force)
         rates = plant_rates(structure, loop, at, reference, jnp.reshape(voltage, (3, -1)))
-        z_acc = antialias**2 * (at.q - at.z) - jnp.sqrt(2.0) * antialias * at.z_rate
-        return flatten(
-            PlantState(
-                at.pose_rate, rates.acceleration.pose, at.q_rate, rates.acceleration.modal,
-                at.z_rate, z_acc,
-            )
-        )  # fmt: skip
+        moves = rates.acceleration
+        return flatten(PlantState(at.pose_rate, moves.pose, at.q_rate, moves.modal))
 
     n_voltages = 3 * structure.n_patches
     a, b_voltage, b_force = jax.jacfwd(derivative, (0, 1, 2))(
@@ -109,24 +103,21 @@ def linearise(
         a,
         b_voltage,
         b_force,
-        _rows(loop.deflection_at, 0, structure.n_modes),
-        _rows(loop.sensor, 2, structure.n_modes),
+        _rows(loop.deflection_at, structure.n_modes),
+        _rows(loop.sensor, structure.n_modes),
     )
 
 
-def _rows(matrix: Array, block: int, n_modes: int) -> Array:
-    """Per-link output matrix (3, m, R) of modal block 0..3 (q, q', z, z') as rows over x."""
+def _rows(matrix: Array, n_modes: int) -> Array:
+    """Per-link outputs of q, (3, m, R), as rows over x."""
     m = matrix.shape[1]
     wide = jnp.einsum("imr,il->imlr", matrix, jnp.eye(3)).reshape(3 * m, 3 * n_modes)
-    before = 6 + 3 * n_modes * block
-    after = 3 * n_modes * (3 - block)
-    return jnp.pad(wide, ((0, 0), (before, after)))
+    return jnp.pad(wide, ((0, 0), (6, 3 * n_modes)))
 
 
 def mechanical(plant: LinearPlant) -> Array:
-    """The rows and columns of A that belong to (X, q, X', q'), without the filters, (2 m, 2 m)."""
-    n = plant.state.shape[0]
-    r3 = (n - 6) // 4
+    """A with rows and columns in the order (X, q, X', q'), (2 m, 2 m)."""
+    r3 = (plant.state.shape[0] - 6) // 2
     position = np.r_[0:3, 6 : 6 + r3]
     velocity = np.r_[3:6, 6 + r3 : 6 + 2 * r3]
     index = np.r_[position, velocity]

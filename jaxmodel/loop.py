@@ -24,6 +24,7 @@ from jaxmodel.controller import (
 )
 from jaxmodel.drive import Reference, motor_force, slider_force
 from jaxmodel.dynamics import Accelerations, accelerations, modal_chain
+from jaxmodel.electronics import Amplifier
 from jaxmodel.integrator import Exponential
 from jaxmodel.kinematics import Chain, chain_status, close_chain
 from jaxmodel.parameters import Array
@@ -42,6 +43,7 @@ class Loop(NamedTuple):
     omega: Array  # plant modes [rad/s], (3, R)
     exponential: Exponential
     plant_step: Array  # length of one plant step [s], ()
+    amplifier: Amplifier | None  # None: commands are on the actuators at once
     sensor: Array  # V_s of a modal coordinate, lambda_s Phi_s^t [V/m], (3, K, R)
     actuator: Array  # modal acceleration of a voltage, lambda_a Phi_a/m [m/s2/V], (3, R, K)
     deflection_at: Array  # chord deflection at the stations [1], (3, S, R)
@@ -56,14 +58,19 @@ class Loop(NamedTuple):
 
 
 class PlantState(NamedTuple):
-    """Mechanism and modes; z is the anti-alias filtered modal coordinate, None if not sampled."""
+    """Mechanism, modes and analogue electronics, which are None where there are none.
+
+    Patches and filters are alike, so modal coordinates are filtered instead of voltages.
+    """
 
     pose: Array  # [m, m, rad], (3,)
     pose_rate: Array  # (3,)
     q: Array  # [m], (3, R)
     q_rate: Array  # [m/s], (3, R)
-    z: Array | None  # [m], (3, R)
-    z_rate: Array | None  # [m/s], (3, R)
+    z: Array | None = None  # anti-alias filtered q - s [m], (3, R)
+    z_rate: Array | None = None  # [m/s], (3, R)
+    s: Array | None = None  # slow part of q, which the amplifiers' inputs drain [m], (3, R)
+    voltage: Array | None = None  # on the actuators, behind their amplifiers [V], (3, K)
 
 
 class State(NamedTuple):
@@ -100,7 +107,7 @@ class Record(NamedTuple):
     controlled_coordinate: Array  # controller's modes, noise-free [m], (3, C)
     chord_deflection_stations: Array  # [m], (3, S)
     sensor_voltage: Array  # raw V_s [V], (3, K)
-    actuator_voltage: Array  # on the actuators [V], (3, K)
+    actuator_voltage: Array  # command of this sample [V], (3, K)
     slider_force: Array  # of the motors [N], (3,)
 
 
@@ -168,17 +175,18 @@ def plant_step(
         loop: constants.
         state: at the start.
         references: at start, middle and end of the step.
-        voltage: held over the step [V], (3, K).
+        voltage: command held over the step [V], (3, K).
 
     Returns:
         (state at the end, rates at the start).
     """
+    volts, last_voltage = _amplified(loop.amplifier, state.voltage, voltage)
     h, coefficients = loop.plant_step, loop.exponential
     e, f = coefficients.half, coefficients.half_force
     start, middle, end = references
 
-    def rates(at: PlantState, reference: Reference) -> Rates:
-        return plant_rates(structure, loop, at, reference, voltage)
+    def rates(at: PlantState, reference: Reference, volt: Array) -> Rates:
+        return plant_rates(structure, loop, at, reference, volt)
 
     def stage(origin: PlantState, x: tuple, slope: tuple, length: Array, push: Array) -> PlantState:
         """exp(A h/2) on the modes of `origin`, Euler from x along `slope` for the pose."""
@@ -191,36 +199,58 @@ def plant_step(
         )
 
     x = (state.pose, state.pose_rate)
-    first = rates(state, start)
+    first = rates(state, start, volts[0])
     n1, slope1 = first.acceleration.coupling, (state.pose_rate, first.acceleration.pose)
     a = stage(state, x, slope1, h / 2, n1)
-    second = rates(a, middle).acceleration
+    second = rates(a, middle, volts[1]).acceleration
     n2, slope2 = second.coupling, (a.pose_rate, second.pose)
     b = stage(state, x, slope2, h / 2, n2)
-    third = rates(b, middle).acceleration
+    third = rates(b, middle, volts[1]).acceleration
     n3, slope3 = third.coupling, (b.pose_rate, third.pose)
     c = stage(a, x, slope3, h, 2 * n3 - n1)
-    fourth = rates(c, end).acceleration
+    fourth = rates(c, end, volts[2]).acceleration
     n4, slope4 = fourth.coupling, (c.pose_rate, fourth.pose)
 
     def combine(k: int) -> Array:
         return slope1[k] + 2 * (slope2[k] + slope3[k]) + slope4[k]
 
     full, weight = coefficients.full, coefficients.full_force
-    old = (state.q, state.q_rate, state.z, state.z_rate)
+    old = (state.q, state.q_rate, state.z, state.z_rate, state.s)
 
-    def mode(row: int) -> Array:
+    def mode(row: int) -> Array | None:
+        if old[row] is None:
+            return None
         forced = weight[0, row] * n1 + weight[1, row] * (n2 + n3) + weight[2, row] * n4
-        width = 2 if row < 2 else 4  # the filter does not act back on the mode
-        return forced + sum(full[row, k] * old[k] for k in range(width))
+        read = (old[k] if k in _READS[row] else None for k in range(len(old)))
+        return forced + sum(full[row, k] * x for k, x in enumerate(read) if x is not None)
 
-    is_filtered = state.z is not None
     after = PlantState(
         state.pose + h / 6 * combine(0),
         state.pose_rate + h / 6 * combine(1),
-        *(mode(row) if row < 2 or is_filtered else None for row in range(4)),
+        mode(0),
+        mode(1),
+        mode(2),
+        mode(3),
+        mode(4),
+        last_voltage,
     )
     return after, first
+
+
+#: What each of (q, q', z, z', s) reads of them: electronics do not act back on a mode.
+_READS = ((0, 1), (0, 1), (0, 1, 2, 3, 4), (0, 1, 2, 3, 4), (0, 1, 4))
+
+
+def _amplified(
+    amplifier: Amplifier | None, before: Array | None, command: Array
+) -> tuple[tuple[Array, Array, Array], Array | None]:
+    """Voltages [V] on the actuators at start, middle and end of a step, and what it leaves."""
+    if amplifier is None or before is None:
+        return (command, command, command), None
+    change = before - command
+    course = amplifier.course
+    start, middle, end = (command + course[k] * change for k in range(3))
+    return (start, middle, end), command + amplifier.left * change
 
 
 def step(structure: Structure, loop: Loop, state: State, inputs: Inputs) -> tuple[State, Record]:
@@ -272,7 +302,7 @@ def advance(
         loop: constants of the case.
         state: at the sampling instant.
         inputs: of this sample.
-        voltage: on the actuators during this sample [V], (3, K).
+        voltage: command of this sample [V], (3, K).
         after: the controller's next state, whoever computed it.
         clipped: 1 where an ADC channel is at its end, else 0, ().
 
@@ -290,6 +320,7 @@ def advance(
         state.totals, sample, inputs.window, loop.omega, loop.modal_omega, loop.rotation,
         loop.settling_band,
     )  # fmt: skip
+    seen = plant.q if plant.s is None else plant.q - plant.s
     record = Record(
         time=inputs.window.time,
         pose=plant.pose,
@@ -298,7 +329,7 @@ def advance(
         modal_coordinate=plant.q,
         controlled_coordinate=sample.modal,
         chord_deflection_stations=sample.deflection,
-        sensor_voltage=jnp.sum(loop.sensor * plant.q[:, None], axis=2),
+        sensor_voltage=jnp.sum(loop.sensor * seen[:, None], axis=2),
         actuator_voltage=voltage,
         slider_force=motors,
     )
@@ -330,7 +361,10 @@ def _advance_plant(
         rho, rho_rate, forward = points
         start, middle, end = (
             Reference(
-                rho[k], rho_rate[k], None if forward is None else forward[k], inputs.disturbance,
+                rho[k],
+                rho_rate[k],
+                None if forward is None else forward[k],
+                inputs.disturbance,
                 inputs.wrench,
             )  # fmt: skip
             for k in range(3)
@@ -403,7 +437,7 @@ def initial_state(structure: Structure, loop: Loop, pose: Array, q: Array, code:
         structure: static choices.
         loop: constants, only for sizes.
         pose: (3,).
-        q: [m], (3, R); the anti-alias filter starts settled on it.
+        q: [m], (3, R); the electronics start settled on it.
         code: status known before the run, as a float, ().
 
     Returns:
@@ -411,14 +445,25 @@ def initial_state(structure: Structure, loop: Loop, pose: Array, q: Array, code:
     """
     zero, still = jnp.zeros_like(q), jnp.zeros_like(pose)
     is_sampled = structure.feedback == "sampled"
+    is_drained = is_sampled and structure.has_sensor_highpass
+    controller = rest_controller(structure.n_channels, structure.n_patches, q.dtype)
     n_stations = loop.deflection_at.shape[1]
     totals = metrics.zero_totals(
         n_stations, structure.n_modes, structure.n_controlled, structure.n_frequencies, q.dtype,
         structure.metrics,
     )  # fmt: skip
     return State(
-        PlantState(pose, still, q, zero, *((q, zero) if is_sampled else (None, None))),
-        rest_controller(structure.n_channels, structure.n_patches, q.dtype),
+        PlantState(
+            pose,
+            still,
+            q,
+            zero,
+            z=(zero if is_drained else q) if is_sampled else None,
+            z_rate=zero if is_sampled else None,
+            s=q if is_drained else None,
+            voltage=controller.voltage if is_sampled and structure.has_amplifier else None,
+        ),
+        controller,
         totals,
         code,
         jnp.zeros_like(code),

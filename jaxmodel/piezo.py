@@ -61,19 +61,26 @@ def actuator_constant(beam: Beam, patches: Patches) -> Array:
     return patches.width * patches.youngs_modulus * jnp.abs(patches.d31) * arm
 
 
-def sensor_constant(beam: Beam, patches: Patches) -> Array:
-    """lambda_s [V/rad] of (15): open-circuit voltage per slope difference over the sensor.
+def sensor_capacitance(patches: Patches) -> Array:
+    """Capacitance C [F] of a clamped sensor, eps33T (1 - k31^2) b_p l_s/t_p; 6.7 nF by default.
 
-    lambda_s = b_p E_p |d31| z_s/C with z_s = (t_b + t_p)/2, since the actuator covers the other
-    face, and the clamped capacitance C = eps33T (1 - k31^2) b_p l_s/t_p, k31^2 = d31^2 E_p/eps33T.
+    k31^2 = d31^2 E_p/eps33T. Into an amplifier's input R it makes a high-pass of corner 1/(R C).
     """
     permittivity = patches.relative_permittivity * VACUUM_PERMITTIVITY
     coupling = patches.d31**2 * patches.youngs_modulus / permittivity
     area = patches.width * patches.sensor_length
-    capacitance = permittivity * (1 - coupling) * area / patches.thickness
+    return permittivity * (1 - coupling) * area / patches.thickness
+
+
+def sensor_constant(beam: Beam, patches: Patches) -> Array:
+    """lambda_s [V/rad] of (15): open-circuit voltage per slope difference over the sensor.
+
+    lambda_s = b_p E_p |d31| z_s/C with z_s = (t_b + t_p)/2, since the actuator covers the other
+    face, and the clamped capacitance C.
+    """
     arm = (beam.thickness + patches.thickness) / 2
     charge = patches.width * patches.youngs_modulus * jnp.abs(patches.d31) * arm
-    return charge / capacitance
+    return charge / sensor_capacitance(patches)
 
 
 def patch_ends(center: Array, length: Array) -> tuple[Array, Array]:

@@ -12,7 +12,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from jaxmodel.estimator import Estimator, measurement_chain, second_order
+from jaxmodel.case import Electronics
+from jaxmodel.electronics import measurement_chain
+from jaxmodel.estimator import Estimator, second_order
 from jaxmodel.parameters import Array
 
 #: Highest corner over the assembled frequency, for where the chain lags by 90 degrees itself [1].
@@ -29,9 +31,7 @@ class PositionFilter(NamedTuple):
     damping: Array  # k_d at the assembled frequency per unit of g, delays included [s]
 
 
-def design_position_filter(
-    omega: Array, zeta: Array, period: Array, antialias: Array
-) -> PositionFilter:
+def design_position_filter(omega: Array, zeta: Array, electronics: Electronics) -> PositionFilter:
     """Filters that lag by 90 degrees at omega together with the measurement chain.
 
     With x = omega/omega_f and t = tan(90 degrees - lag of the chain), 2 zeta_f x = t (1 - x^2);
@@ -40,14 +40,15 @@ def design_position_filter(
     Args:
         omega: assembled frequency of each channel [rad/s], (3, C).
         zeta: zeta_f, damping of the filters [1], ().
-        period: sample time T [s], ().
-        antialias: corner of the analogue Butterworth filter [rad/s], ().
+        electronics: what lies between command and sample.
 
     Returns:
         PositionFilter; where `damping` is not positive the chain lags too much for this law.
     """
-    share = omega / antialias
+    period, share = electronics.period, omega / electronics.antialias
     lag = jnp.arctan2(jnp.sqrt(2.0) * share, 1 - share**2) + 1.5 * omega * period
+    lag = lag + jnp.arctan(omega * electronics.amplifier_lag)
+    lag = lag - jnp.arctan(electronics.sensor_highpass / omega)
     least = jnp.arctan(2 * zeta * HIGHEST_RATIO / (HIGHEST_RATIO**2 - 1))
     slope = jnp.tan(jnp.maximum(jnp.pi / 2 - lag, least))
     corner = omega * slope / (jnp.sqrt(zeta**2 + slope**2) - zeta)
@@ -57,5 +58,5 @@ def design_position_filter(
     estimator = Estimator((one, zero, zero), (a1, a2), (zero,) * 3, (low, 2 * low, low), zero)
     z = jnp.exp(-1j * omega * period)  # z^-1 on the unit circle
     response = low * (1 + z) ** 2 / (1 + a1 * z + a2 * z * z)
-    whole = measurement_chain(omega, period, antialias) * response
+    whole = measurement_chain(omega, electronics) * response
     return PositionFilter(estimator, corner, -jnp.imag(whole) / omega)

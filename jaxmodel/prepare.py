@@ -14,6 +14,7 @@ from jaxmodel.bases import Bases, find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.control import active_modes, condition_number, force_gains, left_inverse
 from jaxmodel.controller import Controller
+from jaxmodel.electronics import design_amplifier
 from jaxmodel.estimator import KINDS, design_estimator
 from jaxmodel.integrator import exponential_step
 from jaxmodel.loop import Loop
@@ -76,8 +77,17 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     loop = Loop(
         plant=plant,
         omega=omega,
-        exponential=exponential_step(omega, zeta, step, electronics.antialias),
+        exponential=exponential_step(
+            omega,
+            zeta,
+            step,
+            electronics.antialias,
+            electronics.sensor_highpass if structure.has_sensor_highpass else None,
+        ),
         plant_step=step,
+        amplifier=(
+            design_amplifier(step, electronics.amplifier_lag) if structure.has_amplifier else None
+        ),
         sensor=sensor,
         actuator=lambda_a[:, None, None] * basis.actuator_slope / basis.mass[:, :, None],
         deflection_at=basis.deflection_at,
@@ -185,10 +195,7 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
     feedthrough = jnp.einsum("ikr,ir,irl->ikl", sensor, residual, actuator)
     controller = Controller(
         filter=channel_filter,
-        estimator=design_estimator(
-            electronics.estimator, channel_omega, electronics.period, electronics.antialias,
-            electronics.highpass, ratio, zeta, electronics.difference_cutoff,
-        ),
+        estimator=design_estimator(channel_omega, electronics, ratio, zeta),
         velocity_gain=velocity,
         position_gain=position if structure.has_position_gain else None,
         synthesizer=synthesizer,

@@ -1,7 +1,7 @@
 """The linearised sampled loop: exact discretisation, spectral radius, modal damping, gain margin.
 
 Stability is judged here and never from a run: saturation keeps an unstable loop bounded. Plant with
-drive and anti-alias filter is discretised exactly for held voltages; the controller is the loop's
+drive and electronics is discretised exactly for held commands; the controller is the loop's
 own `controller_step`, linear once rounding and limits are left out.
 """
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, ControllerState, controller_step
+from jaxmodel.electronics import FASTEST
 from jaxmodel.linear import LinearPlant, Moment, linearise, resting
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
@@ -26,7 +27,7 @@ RADIUS_TOLERANCE = 1e-7
 class LoopMatrices(NamedTuple):
     """Closed-loop transition matrix over one sample: open + factor * feedback.
 
-    The state is (X, X', q, q', filtered sensor voltages and their rates, controller).
+    The state is (X, X', q, q', electronics, controller).
     """
 
     open: Array  # all gains zero, (n, n)
@@ -59,13 +60,13 @@ def closed_loop(
     loop = prepare(smooth, case).loop
     law = loop.controller if law is None else law
     moment = resting(structure, case) if moment is None else moment
-    plant = linearise(smooth, loop, pose, case.electronics.antialias, moment)
-    state, enters = _with_filtered_sensors(smooth, plant, case.electronics.antialias)
-    n, n_inputs = enters.shape
-    held = jnp.zeros((n + n_inputs,) * 2, state.dtype)
-    held = held.at[:n, :n].set(state).at[:n, n:].set(enters)
+    plant = linearise(smooth, loop, pose, moment)
+    analogue = _with_electronics(smooth, plant, case)
+    n, n_inputs = analogue.enters.shape
+    held = jnp.zeros((n + n_inputs,) * 2, analogue.state.dtype)
+    held = held.at[:n, :n].set(analogue.state).at[:n, n:].set(analogue.enters)
     # balance velocities against positions, or the exponential loses digits to scaling
-    scale = jnp.concatenate([_balance(smooth, state.dtype), jnp.full((n_inputs,), 1e6)])
+    scale = jnp.concatenate([analogue.size, jnp.full((n_inputs,), 1e6)])
     exact = jax.scipy.linalg.expm(held / scale[:, None] * scale * case.electronics.period)
     exact = (exact * scale[:, None] / scale)[:n]
     channels, patches = structure.n_channels, structure.n_patches
@@ -78,52 +79,75 @@ def closed_loop(
         if controller.position_gain is not None:
             controller = controller._replace(position_gain=factor * controller.position_gain)
         before = ControllerState(line[0], (line[1], line[2]), voltage)
-        filtered = jnp.reshape(x[n - 2 * n_sensors : n - n_sensors], (3, patches))
+        filtered = jnp.reshape(x[analogue.filtered], (3, patches))
         after, _ = controller_step(controller, before, filtered, None, True)
         moved = exact[:, : n + n_sensors] @ jnp.concatenate([x[:n], jnp.ravel(voltage)])
         parts = (moved, after.first, *after.second, after.voltage)
         return jnp.concatenate([jnp.ravel(part) for part in parts])
 
-    start = jnp.zeros((n + 9 * channels + n_sensors,), state.dtype)
+    start = jnp.zeros((n + 9 * channels + n_sensors,), analogue.state.dtype)
     jacobian = jax.jacfwd(advance)
     without = jacobian(start, 0.0)
-    more, kept = start.size - n, n - 2 * n_sensors
     return LoopMatrices(
         without,
         jacobian(start, 1.0) - without,
         plant.state,
-        jnp.pad(exact[:, n + n_sensors :], ((0, more), (0, 0))),
-        jnp.pad(plant.deflection[:, :kept], ((0, 0), (0, start.size - kept))),
+        jnp.pad(exact[:, n + n_sensors :], ((0, start.size - n), (0, 0))),
+        jnp.pad(plant.deflection, ((0, 0), (0, start.size - plant.deflection.shape[1]))),
     )
 
 
-def _with_filtered_sensors(
-    structure: Structure, plant: LinearPlant, antialias: Array
-) -> tuple[Array, Array]:
-    """A and (B_voltage, B_force) with the anti-alias filter on sensors instead of modes: fewer.
+class _Analogue(NamedTuple):
+    """Plant and electronics between two samples."""
 
-    The filter is the same for all, so filtering before or after adding modes up is one thing.
+    state: Array  # A, (n, n)
+    enters: Array  # B of commands and slider forces, (n, 3 K + 3)
+    filtered: slice  # of the state: what the converters see
+    size: Array  # typical size of each entry of the state, (n,)
+
+
+def _with_electronics(structure: Structure, plant: LinearPlant, case: Case) -> _Analogue:
+    """The plant with filters, and where there are any, drained patches and amplifiers.
+
+    Filters are alike, so filtering before or after adding modes up is one thing, and there are
+    fewer sensors than modes.
     """
-    modes, n_sensors = 3 * structure.n_modes, 3 * structure.n_patches
-    kept = 6 + 2 * modes
-    n = kept + 2 * n_sensors
-    sensed = plant.sensor[:, kept : kept + modes]  # by the filtered modes
-    eye, corner = jnp.eye(n_sensors), jnp.sqrt(2.0) * antialias
-    state = jnp.zeros((n, n), plant.state.dtype)
-    state = state.at[:kept, :kept].set(plant.state[:kept, :kept])
-    state = state.at[kept:-n_sensors, -n_sensors:].set(eye)
-    state = state.at[-n_sensors:, 6 : 6 + modes].set(antialias**2 * sensed)
-    state = state.at[-n_sensors:, kept:-n_sensors].set(-(antialias**2) * eye)
-    state = state.at[-n_sensors:, -n_sensors:].set(-corner * eye)
-    enters = jnp.concatenate([plant.voltage[:kept], plant.force[:kept]], axis=1)
-    return state, jnp.pad(enters, ((0, 2 * n_sensors), (0, 0)))
+    electronics, n_plant = case.electronics, plant.state.shape[0]
+    n_sensors, n_modes = 3 * structure.n_patches, 3 * structure.n_modes
+    sizes = [(1.0, 3), (1e3, 3), (1.0, n_modes), (1e3, n_modes)]
+    blocks = {"z": 1e4, "z_rate": 1e7}
+    if structure.has_sensor_highpass:
+        blocks["s"] = 1e4
+    if structure.has_amplifier:
+        blocks["voltage"] = 1e6
+    begins = n_plant + n_sensors * np.arange(len(blocks) + 1)
+    at = {name: slice(*ends) for name, *ends in zip(blocks, begins, begins[1:], strict=False)}
+    n, eye, corner = begins[-1], jnp.eye(n_sensors), electronics.antialias
 
-
-def _balance(structure: Structure, dtype) -> Array:
-    """Typical size of each entry of x: rates are 1000 times the values."""
-    modes, sensors = 3 * structure.n_modes, 3 * structure.n_patches
-    sizes = [(1.0, 3), (1e3, 3), (1.0, modes), (1e3, modes), (1e4, sensors), (1e7, sensors)]
-    return jnp.asarray(np.concatenate([np.full(count, size) for size, count in sizes]), dtype)
+    state = jnp.zeros((n, n), plant.state.dtype).at[:n_plant, :n_plant].set(plant.state)
+    state = state.at[at["z"], at["z_rate"]].set(eye)
+    state = state.at[at["z_rate"], :n_plant].set(corner**2 * plant.sensor)
+    state = state.at[at["z_rate"], at["z"]].set(-(corner**2) * eye)
+    state = state.at[at["z_rate"], at["z_rate"]].set(-jnp.sqrt(2.0) * corner * eye)
+    if "s" in at:
+        highpass = electronics.sensor_highpass
+        state = state.at[at["z_rate"], at["s"]].set(-(corner**2) * eye)
+        state = state.at[at["s"], :n_plant].set(highpass * plant.sensor)
+        state = state.at[at["s"], at["s"]].set(-highpass * eye)
+    commands = jnp.zeros((n, n_sensors), state.dtype)
+    if "voltage" in at:
+        # as fast as `design_amplifier` takes it where a batch has cases without an amplifier
+        shortest = electronics.period / structure.substeps / FASTEST
+        rate = 1 / jnp.maximum(electronics.amplifier_lag, shortest)
+        state = state.at[:n_plant, at["voltage"]].set(plant.voltage)
+        state = state.at[at["voltage"], at["voltage"]].set(-rate * eye)
+        commands = commands.at[at["voltage"]].set(rate * eye)
+    else:
+        commands = commands.at[:n_plant].set(plant.voltage)
+    forces = jnp.pad(plant.force, ((0, n - n_plant), (0, 0)))
+    sizes += [(size, n_sensors) for size in blocks.values()]
+    size = jnp.asarray(np.concatenate([np.full(count, x) for x, count in sizes]), state.dtype)
+    return _Analogue(state, jnp.concatenate([commands, forces], axis=1), at["z"], size)
 
 
 #: Squarings of `slowest_decay`: motions whose decay per sample differs by 1e-8 are told apart.

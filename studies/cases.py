@@ -58,6 +58,8 @@ def build_structure(study: Study, substeps: int | None = None) -> Structure:
         feedback=study.control.feedback,
         law=study.control.law,
         has_feedforward=study.drive.kind == "computed_torque",
+        has_sensor_highpass=study.electronics.sensor_highpass_hz > 0,
+        has_amplifier=study.electronics.amplifier_hz > 0,
         has_noise=noisy,
         has_friction=study.drive.coulomb_friction > 0,
         has_position_gain=any(gain != 0 for gain in study.control.position_gain),
@@ -252,9 +254,12 @@ def _electronics(fields: Fields, structure: Structure) -> Electronics:
         index = np.minimum(np.arange(structure.n_controlled), last[:, None])
         return np.take_along_axis(values, index, axis=1)
 
+    bandwidth = TWO_PI * number("electronics.amplifier_hz")
     return Electronics(
         period=1 / number("electronics.sample_rate_hz"),
         antialias=TWO_PI * number("electronics.antialias_hz"),
+        sensor_highpass=TWO_PI * number("electronics.sensor_highpass_hz"),
+        amplifier_lag=np.where(bandwidth > 0, 1 / np.where(bandwidth > 0, bandwidth, 1.0), 0.0),
         conditioner_gain=number("electronics.conditioner_gain"),
         conditioner_bias=number("electronics.conditioner_bias"),
         adc_range=number("electronics.adc_range"),

@@ -75,6 +75,4 @@ def machine_modes(
 def _at_pose(structure: Structure, case: Case, pose: np.ndarray):
     loop = prepare(structure, case).loop
     code, _ = path_status(loop.plant, pose[None])
-    return code, linearise(
-        structure, loop, pose, case.electronics.antialias, resting(structure, case)
-    )
+    return code, linearise(structure, loop, pose, resting(structure, case))

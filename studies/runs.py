@@ -303,8 +303,7 @@ def pole_decay(structure: Structure, case: Case, pose: Any) -> float:
 def mechanics_at(structure: Structure, case: Case, pose: Any) -> Any:
     """State matrix of the plant (with ideal feedback, where the structure has it) at a pose."""
     loop = prepare(structure, case).loop
-    at_rest = resting(structure, case)
-    return mechanical(linearise(structure, loop, pose, case.electronics.antialias, at_rest))
+    return mechanical(linearise(structure, loop, pose, resting(structure, case)))
 
 
 _mechanics_at = jax.jit(mechanics_at, static_argnums=0)
@@ -445,7 +444,9 @@ def run_variables(run: Run) -> dict[str, Variable]:
         "link": Variable(np.arange(1, 4), ("link",), "1", "link number"),
         "pose_axis": Variable(np.array(["x", "y", "phi"]), ("pose_axis",), "1", "pose component"),
         "spectrum_frequency": Variable(
-            frequency, ("link", "controlled_mode", "spectrum_point"), "Hz",
+            frequency,
+            ("link", "controlled_mode", "spectrum_point"),
+            "Hz",
             "frequency of spectral_density",
         ),
         "status": Variable(np.array(run.status), (), *STATUS_LABEL),

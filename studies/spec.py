@@ -104,7 +104,6 @@ class Link(Section):
         0.0, "kg m2", "at the platform joint (basis loaded)", ge=0, le=1
     )
 
-
     @property
     def first_damping(self) -> float:
         """Damping ratio of mode 1 of link 1 [1]."""
@@ -215,6 +214,13 @@ class Electronics(Section):
 
     sample_rate_hz: float = described(10_000.0, "Hz", "f_s", gt=100, le=1e6)
     antialias_hz: float = described(2_000.0, "Hz", "2nd-order Butterworth corner", gt=10, le=1e6)
+    sensor_highpass_hz: float = described(
+        0.0, "Hz", "corner 1/(2 pi R C) of a patch's capacitance C into its amplifier's input R",
+        ge=0, le=1e5,
+    )  # fmt: skip
+    amplifier_hz: float = described(
+        0.0, "Hz", "bandwidth (-3 dB) of the actuators' amplifiers; 0: no limit", ge=0, le=1e6
+    )
     estimator: Literal["modal_phase", "difference"] = described(
         "modal_phase", "-", "velocity estimate"
     )

@@ -213,9 +213,8 @@ def link_poles(state: np.ndarray, n_tracked: int) -> np.ndarray:
         state: A of the plant, `LoopMatrices.plant`.
         n_tracked: J at most; overdamped modes have no such pole.
     """
-    modes = (state.shape[0] - 6) // 4
-    keep = np.r_[0:6, 6 : 6 + 2 * modes]
-    value, vector = np.linalg.eig(state[np.ix_(keep, keep)])
+    modes = (state.shape[0] - 6) // 2
+    value, vector = np.linalg.eig(state)
     upper = value.imag > 0
     vector, value = vector[:, upper], value[upper]
     weight = np.abs(vector[:3]).max(axis=0) / np.abs(vector[6 : 6 + modes]).max(axis=0)

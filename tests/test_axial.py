@@ -43,7 +43,7 @@ def plant_of(structure, case):
 @partial(jax.jit, static_argnums=0)
 def linear_at(structure, case, pose, moment):
     loop = prepare(structure, case).loop
-    return linearise(structure, loop, pose, case.electronics.antialias, moment)
+    return linearise(structure, loop, pose, moment)
 
 
 def bending(study, wrench=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, 0.0)):

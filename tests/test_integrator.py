@@ -30,15 +30,16 @@ STUDY = paper_study().change(control__feedback="none")
 OMEGA_H = [1e-4, 1e-2, 0.3, 1.0, 4.6, 12.0]
 
 
-def oscillator(omega, zeta):
-    """A and force direction of (q, q'/omega, z, z'/omega_f): states of one size."""
+def oscillator(omega, zeta, drain):
+    """A and force direction of (q, q'/omega, z, z'/omega_f, s): states of one size."""
     a = np.array([
-        [0, omega, 0, 0],
-        [-omega, -2 * zeta * omega, 0, 0],
-        [0, 0, 0, CORNER],
-        [CORNER, 0, -CORNER, -np.sqrt(2) * CORNER],
+        [0, omega, 0, 0, 0],
+        [-omega, -2 * zeta * omega, 0, 0, 0],
+        [0, 0, 0, CORNER, 0],
+        [CORNER, 0, -CORNER, -np.sqrt(2) * CORNER, -CORNER],
+        [drain, 0, 0, 0, -drain],
     ])  # fmt: skip
-    return a, np.array([0, 1 / omega, 0, 0]), np.array([1, omega, 1, CORNER])
+    return a, np.array([0, 1 / omega, 0, 0, 0]), np.array([1, omega, 1, CORNER, 1])
 
 
 def phi_functions(a, force):
@@ -51,11 +52,15 @@ def phi_functions(a, force):
     return full[:n, :n], *full[:n, n:].T
 
 
+@pytest.mark.parametrize("drain", [None, 150.0])
 @pytest.mark.parametrize("omega_h", OMEGA_H)
-def test_coefficients_equal_augmented_exponentials(omega_h):
+def test_coefficients_equal_augmented_exponentials(omega_h, drain):
     omega, zeta = omega_h / SAMPLE, 0.01
-    found = exponential_step(np.full((3, 1), omega), np.full((3, 1), zeta), SAMPLE, CORNER)
-    a, force, scale = oscillator(omega, zeta)
+    found = exponential_step(np.full((3, 1), omega), np.full((3, 1), zeta), SAMPLE, CORNER, drain)
+    n = found.full.shape[0]
+    assert n == (4 if drain is None else 5)
+    a, force, scale = (x[:n] for x in oscillator(omega, zeta, drain or 0.0))
+    a = a[:, :n]
     e, p1, p2, p3 = phi_functions(a * SAMPLE, force)
     e_half, p1_half, _, _ = phi_functions(a * SAMPLE / 2, force)
     weights = SAMPLE * np.array([p1 - 3 * p2 + 4 * p3, 2 * p2 - 4 * p3, 4 * p3 - p2])

@@ -36,6 +36,8 @@ ALL_SORTS = {
         "initial.load_deflection[0]": [0.0, 0.0, 0.0, 0.03],
         "drive.kp": {"from": 1e4, "to": 3e4},
         "machine.platform_mass": {"from": 0.2, "to": 0.3},
+        "electronics.sensor_highpass_hz": [0.0, 24.0],
+        "electronics.amplifier_hz": [0.0, 500.0, 5e3],
     },
 }
 
@@ -63,7 +65,7 @@ def check_equal(fast, reference):
 OTHER_SORTS = {
     "link": {"modes": 2, "basis": "pinned_free"},
     "control": {"law": "srf", "velocity_gain": [1e-6, 2e-6, 1e-6]},
-    "electronics": {"adc_noise": 0.01},
+    "electronics": {"adc_noise": 0.01, "sensor_highpass_hz": 5.0, "amplifier_hz": 2e3},
     "drive": {
         "coulomb_friction": 0.5, "friction_speed": 0.05, "kind": "computed_torque", "kd": 6e3
     },

@@ -58,7 +58,7 @@ def prepared(structure, case):
 @partial(jax.jit, static_argnums=0)
 def linear_plant(structure, case):
     loop = prepare(structure, case).loop
-    return linearise(structure, loop, HOME_POSE, case.electronics.antialias)
+    return linearise(structure, loop, HOME_POSE)
 
 
 loop_matrices = jax.jit(closed_loop, static_argnums=0)

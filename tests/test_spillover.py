@@ -11,7 +11,7 @@ import xarray
 
 from jaxmodel.control import optimal_gains
 from jaxmodel.controller import ControllerState, controller_step, rest_controller, strongest
-from jaxmodel.estimator import measurement_chain
+from jaxmodel.electronics import measurement_chain
 from jaxmodel.ppf import HIGHEST_RATIO, design_position_filter
 from studies.cases import as_arrays, build_case, build_structure
 from studies.errors import StudyError
@@ -169,8 +169,9 @@ def test_optimal_gains_keep_their_digits_where_control_is_expensive():
 
 def test_position_filter_is_its_continuous_formula_at_its_own_frequency():
     omega = 2 * np.pi * np.array([[114.4, 457.6, 1029.5]] * 3)
-    period, antialias, zeta = 1e-4, 2 * np.pi * 2000, 0.5
-    filters = jax.jit(design_position_filter)(omega, zeta, period, antialias)
+    electronics, zeta = as_arrays(build_case(STUDY)).electronics, 0.5
+    period = electronics.period
+    filters = jax.jit(design_position_filter)(omega, zeta, electronics)
     filters = jax.tree.map(np.asarray, filters)
     d1, d2 = filters.estimator.denominator
 
@@ -183,7 +184,7 @@ def test_position_filter_is_its_continuous_formula_at_its_own_frequency():
     np.testing.assert_allclose(response(corner), 1 / (2j * zeta), rtol=1e-9)
     np.testing.assert_allclose(response(0 * corner), 1, rtol=1e-9)
     # with the chain it lags by 90 degrees, as far as a corner of three times omega allows
-    whole = np.asarray(measurement_chain(omega, period, antialias)) * response(omega)
+    whole = np.asarray(measurement_chain(omega, electronics)) * response(omega)
     lag = -np.degrees(np.angle(whole))[0]
     np.testing.assert_allclose(lag[:1], 90, atol=1)
     np.testing.assert_allclose(corner[0, 2], HIGHEST_RATIO * omega[0, 2], rtol=1e-9)

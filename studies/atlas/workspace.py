@@ -180,10 +180,7 @@ def _matrices(structure: Structure, case: Case, poses: Array) -> tuple[Array, Ar
             return kinetic_energy(plant, chain, pose_rate, rest, q_rate)
 
         mass = jax.hessian(energy)(jnp.zeros(size, pose.dtype))
-        at_rest = resting(structure, case)
-        state = mechanical(
-            linearise(structure, loop, pose, case.electronics.antialias, at_rest)
-        )
+        state = mechanical(linearise(structure, loop, pose, resting(structure, case)))
         stiffness = -mass @ state[size:, :size]
         return mass, (stiffness + stiffness.T) / 2
 

@@ -177,9 +177,7 @@ def _optimal(imsc: Controller, mass: np.ndarray, omega: np.ndarray) -> Controlle
 
 def _position_feedback(found: FixedController, imsc: Controller, omega: np.ndarray) -> Controller:
     """Positive position feedback that damps each assembled mode as much as IMSC."""
-    electronics = found.case.electronics
-    period, antialias = electronics.period, electronics.antialias
-    filters = jax.tree.map(np.asarray, _filters(omega, FILTER_ZETA, period, antialias))
+    filters = jax.tree.map(np.asarray, _filters(omega, FILTER_ZETA, found.case.electronics))
     is_fit = filters.damping > 0
     gain = np.where(is_fit, imsc.velocity_gain / np.where(is_fit, filters.damping, 1.0), 0.0)
     return imsc._replace(estimator=filters.estimator, velocity_gain=0 * gain, position_gain=-gain)

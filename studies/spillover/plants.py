@@ -126,6 +126,7 @@ class LoopMaker:
             law="srf",
             has_feedforward=known.has_feedforward, has_friction=known.has_friction,
             has_position_gain=False, is_coupled=known.is_coupled, has_wrench=known.has_wrench,
+            has_sensor_highpass=known.has_sensor_highpass, has_amplifier=known.has_amplifier,
         )  # fmt: skip
         law = jax.tree.map(jnp.asarray, law)
         return jax.tree.map(np.asarray, _look(structure, self._placed(plant), self._pose, law))
@@ -156,13 +157,13 @@ def _look(
 def _kept(matrices: LoopMatrices, n_modes: int) -> tuple[np.ndarray, np.ndarray]:
     """Entries of the loop's and of the plant's state that a plant with fewer modes has."""
 
-    def entries(size: int, blocks: int) -> np.ndarray:
+    def entries(size: int) -> np.ndarray:
         is_kept = np.ones(size, bool)
-        modes = is_kept[6 : 6 + 3 * LARGEST * blocks].reshape(3 * blocks, LARGEST)
+        modes = is_kept[6 : 6 + 6 * LARGEST].reshape(6, LARGEST)
         modes[:, n_modes:] = False
         return np.flatnonzero(is_kept)
 
-    return entries(len(matrices.open), 2), entries(len(matrices.plant), 4)
+    return entries(len(matrices.open)), entries(len(matrices.plant))
 
 
 def widened(law: Controller, n_channels: int) -> Controller:

@@ -153,6 +153,8 @@ def _structure(table: Table, members: np.ndarray) -> Structure:
     return one._replace(
         n_modes=int(column("link.modes").max()),
         n_controlled=min(int(column("control.modes").max()), one.n_patches),
+        has_sensor_highpass=bool((column("electronics.sensor_highpass_hz") > 0).any()),
+        has_amplifier=bool((column("electronics.amplifier_hz") > 0).any()),
         has_noise=bool(noisy) or one.is_smooth,
         has_friction=bool((column("drive.coulomb_friction") > 0).any()),
         has_position_gain=bool(np.any(fields.numbers(_POSITION) != 0)),

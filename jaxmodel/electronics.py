@@ -1,0 +1,77 @@
+"""The analogue electronics between patches and converters, and what they do to a vibration.
+
+A sensor patch is a capacitance C that its amplifier's input R drains: the controller sees the
+voltage behind a high-pass of corner 1/(R C), then behind the anti-alias filter. A command passes
+an amplifier, a first-order lag, before it bends a link.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.case import Electronics
+from jaxmodel.parameters import Array
+
+#: Steps over the amplifier's lag beyond which it follows at once as far as a plant step can tell.
+FASTEST = 1e3
+_SERIES = 20  # terms for arguments up to 1
+
+
+class Amplifier(NamedTuple):
+    """What is left of a change of command during one plant step, 1 at its start [1]."""
+
+    course: Array  # at start, middle and end of a parabola with the same effect, (3,)
+    left: Array  # at the end, exp(-h/lag), ()
+
+
+def measurement_chain(omega: Array, electronics: Electronics) -> Array:
+    """Response from the command wanted to the signal sampled at omega [rad/s], links left out.
+
+    R = A H B exp(-j omega T (1/2 + 1)) sinc(omega T/2): amplifier 1/(1 + j omega lag), high-pass
+    j omega/(j omega + omega_h), Butterworth anti-alias filter, delay of one sample, hold.
+    """
+    period = electronics.period
+    s = 1j * omega / electronics.antialias
+    hold = jnp.sin(omega * period / 2) / (omega * period / 2)
+    late = hold * jnp.exp(-1.5j * omega * period) / (s * s + jnp.sqrt(2.0) * s + 1)
+    seen = 1j * omega / (1j * omega + electronics.sensor_highpass)
+    return late * seen / (1 + 1j * omega * electronics.amplifier_lag)
+
+
+def design_amplifier(step: Array, lag: Array) -> Amplifier:
+    """Amplifier over one plant step.
+
+    exp(-t/lag) is replaced by the parabola that equals it in its first three moments over the
+    step, so that links feel the right impulse however short the lag is: the values of the
+    exponential itself at the three instants would leave a fast amplifier a sixth of a step behind.
+
+    Args:
+        step: h [s], ().
+        lag: time constant of the amplifier [s], (); 0 stands for h/1000.
+
+    Returns:
+        Amplifier.
+    """
+    rate = step / jnp.maximum(lag, step / FASTEST)
+    # int_0^1 exp(-rate (1 - s)) s^(k-1)/(k-1)! ds, the moments about the end of the step
+    phi = _phi(rate)
+    a, b, c = phi[0], phi[1], 2 * phi[2]
+    backwards = (9 * a - 36 * b + 30 * c, -1.5 * a + 15 * b - 15 * c, 3 * a - 24 * b + 30 * c)
+    return Amplifier(jnp.stack(backwards[::-1]), jnp.exp(-rate))
+
+
+def _phi(rate: Array) -> list[Array]:
+    """phi_1..phi_3(-rate) with phi_k(x) = sum x^n/(n + k)!, rate > 0."""
+    small, large = jnp.minimum(rate, 1.0), jnp.maximum(rate, 1.0)
+    result, last = [], jnp.exp(-large)
+    factorial = np.cumprod([1.0, *range(1, _SERIES + 3)])
+    for k in (1, 2, 3):
+        last = (1 / factorial[k - 1] - last) / large
+        series = jnp.zeros_like(small)
+        for n in reversed(range(_SERIES)):
+            series = series * -small + 1 / factorial[n + k]
+        result.append(jnp.where(rate < 1, series, last))
+    return result

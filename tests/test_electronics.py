@@ -1,0 +1,122 @@
+"""Drained patches and amplifiers of finite bandwidth."""
+
+from functools import cache
+
+import jax
+import numpy as np
+import pytest
+
+from jaxmodel.electronics import design_amplifier, measurement_chain
+from jaxmodel.piezo import sensor_capacitance
+from jaxmodel.prepare import prepare
+from jaxmodel.sampled_loop import closed_loop
+from jaxmodel.simulate import simulate
+from studies.cases import as_arrays, build_case, build_structure
+from studies.spec import paper_study
+from studies.stability import loop_report
+
+HERTZ = 2 * np.pi
+STUDY = paper_study().change(electronics__sensor_highpass_hz=24.0, electronics__amplifier_hz=800.0)
+run = jax.jit(simulate, static_argnums=(0, 2))
+MODES = HERTZ * np.array([114.4, 457.6, 1029.5])
+
+
+def electronics(**changes):
+    study = paper_study().change(**{f"electronics__{name}": x for name, x in changes.items()})
+    return as_arrays(build_case(study)).electronics
+
+
+def test_patch_into_one_megohm_is_a_high_pass_of_24_hz():
+    capacitance = float(sensor_capacitance(build_case(STUDY).machine.patches))
+    assert capacitance == pytest.approx(6.68e-9, rel=1e-3)
+    corner = 1 / (1e6 * capacitance) / HERTZ
+    assert corner == pytest.approx(23.8, abs=0.1)
+    drained = measurement_chain(MODES, electronics(sensor_highpass_hz=corner))
+    shift = np.degrees(np.angle(drained / measurement_chain(MODES, electronics())))
+    np.testing.assert_allclose(shift, np.degrees(np.arctan(HERTZ * corner / MODES)), rtol=1e-9)
+    assert shift[0] == pytest.approx(11.8, abs=0.1)
+
+
+def test_amplifier_is_a_first_order_lag():
+    slowed = measurement_chain(MODES, electronics(amplifier_hz=800.0))
+    ratio = slowed / measurement_chain(MODES, electronics())
+    np.testing.assert_allclose(ratio, 1 / (1 + 1j * MODES / (HERTZ * 800)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("rate", [1e-6, 1e-2, 0.5, 0.999, 1.001, 3.0, 30.0, 1e3])
+def test_course_of_the_amplifier_has_the_moments_of_its_exponential(rate):
+    found = jax.jit(design_amplifier)(1e-4, 1e-4 / rate)
+    start, middle, end = np.asarray(found.course)
+    parabola = np.polynomial.Polynomial(
+        [start, 4 * middle - 3 * start - end, 2 * start + 2 * end - 4 * middle]
+    )
+    # exact on the exponential's own scale, and beyond it there is nothing left
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    length = min(1.0, 40 / rate)
+    s, w = length * (nodes + 1) / 2, length * weights / 2
+    for k in range(3):
+        moment = (parabola * np.polynomial.Polynomial.basis(k)).integ()(1)
+        assert moment == pytest.approx(np.sum(w * s**k * np.exp(-rate * s)), abs=1e-13)
+    assert found.left == pytest.approx(np.exp(-rate), rel=1e-9)
+
+
+def test_an_amplifier_without_lag_is_none():
+    course = np.asarray(design_amplifier(1e-4, 0.0).course)
+    assert np.all(np.abs(course) < 0.01)
+
+
+RELEASED = {
+    "run__duration": 0.05, "run__smooth": True, "electronics__adc_bits": 32,
+    "motion__waypoints": ((0.0, 0.0, np.pi / 6),), "shaper__kind": "none",
+    "initial__modal": ((1e-7,), (), ()),
+}  # fmt: skip
+
+
+@cache
+def released():
+    """Structure, case and record after letting link 1 go."""
+    study = STUDY.change(**RELEASED)
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    result = run(structure, case, True)
+    assert result.status == 0
+    return structure, case, jax.tree.map(np.asarray, result.record)
+
+
+def test_run_follows_the_loop_matrix():
+    structure, case, record = released()
+    look = jax.jit(closed_loop, static_argnums=0)
+    pose = np.array([0.0, 0.0, np.pi / 6])
+    matrices = look(structure._replace(n_steps=1), case, pose)
+    transition = np.asarray(matrices.open + matrices.feedback)
+    modes = 3 * structure.n_modes
+    state = np.zeros(len(transition))
+    state[6] = 1e-7
+    # the patches are drained before the release: filters see nothing, s all of it
+    sensor = np.asarray(prepare(structure, case).loop.sensor)
+    n_sensors = sensor.shape[0] * sensor.shape[1]
+    before = 6 + 2 * modes + 2 * n_sensors
+    state[before : before + 3] = sensor[0, :, 0] * 1e-7
+    for k, seen in enumerate(record.modal_coordinate):
+        np.testing.assert_allclose(seen.ravel(), state[6 : 6 + modes], atol=1e-10, err_msg=k)
+        state = transition @ state
+
+
+def test_sensors_show_what_is_left_of_the_charge():
+    """At first nothing of a steady bend; of the vibration after the release nearly all."""
+    structure, case, record = released()
+    sensor = np.asarray(prepare(structure, case).loop.sensor)[0, :, 0]
+    first, later = record.sensor_voltage[0, 0], record.sensor_voltage[1:, 0]
+    np.testing.assert_allclose(first, 0, atol=1e-15)
+    assert np.abs(later).max() > 0.9 * np.abs(sensor).max() * 1e-7
+
+
+def test_estimates_stay_exact_with_known_electronics():
+    """The loop damps mode 1 as well with electronics that its design knows as without."""
+
+    def damping(study):
+        structure, case = build_structure(study), as_arrays(build_case(study))
+        return loop_report(structure, case, np.array([0.0, 0.0, np.pi / 6])).damping_ratio[0].min()
+
+    plain = damping(paper_study().change(control__gain_factor=0.1))
+    known = damping(STUDY.change(control__gain_factor=0.1, electronics__amplifier_hz=2000.0))
+    assert known == pytest.approx(plain, rel=0.1)
