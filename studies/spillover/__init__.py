@@ -9,5 +9,6 @@
 
 from studies.spillover.certificate import Certificate, certify
 from studies.spillover.comparison import Comparison, compare_laws
+from studies.spillover.plants import Departure, patch_lengths
 
-__all__ = ["Certificate", "Comparison", "certify", "compare_laws"]
+__all__ = ["Certificate", "Comparison", "Departure", "certify", "compare_laws", "patch_lengths"]

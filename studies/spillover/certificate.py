@@ -13,11 +13,19 @@ from studies.errors import StudyError, field_error
 from studies.export.controller import FixedController, fixed_controller
 from studies.spec import Study
 from studies.spillover.judgement import Judgement, judge
-from studies.spillover.plants import LENGTHS, LoopMaker, Plant, all_plants, plant_sizes, widened
+from studies.spillover.plants import (
+    DEPARTURES,
+    Departure,
+    LoopMaker,
+    Plant,
+    all_plants,
+    plant_sizes,
+    widened,
+)
 
 
 class Certificate(NamedTuple):
-    """What was found. Axes: B bases, S sensor lengths, A actuator lengths, N numbers of modes.
+    """What was found. Axes: B bases, D departures, N numbers of modes.
 
     Numbers of plants that do not exist (patches overlap, ...) are NaN, their texts "".
     """
@@ -25,28 +33,28 @@ class Certificate(NamedTuple):
     study: Study
     required: float  # margin that every plant must leave [1]
     n_controlled: int  # r_c, controlled modes per link
-    plants: np.ndarray  # `Plant`, (B, S, A, N)
-    exists: np.ndarray  # (B, S, A, N)
-    radius: np.ndarray  # spectral radius at the design's gains [1], (B, S, A, N)
-    margin: np.ndarray  # largest common gain factor, all smaller ones stable [1], (B, S, A, N)
-    frequency_hz: np.ndarray  # of each link mode, three of each order, (B, S, A, N, R, 3)
-    damping_ratio: np.ndarray  # [1], (B, S, A, N, R, 3)
-    weakest: np.ndarray  # the mode of least damping, in words, (B, S, A, N)
-    breaking: np.ndarray  # what goes unstable beyond the margin, in words, (B, S, A, N)
-    observation: np.ndarray  # channel signal per plant mode, (B, S, A, 3, C, R), see `Leakage`
-    actuation: np.ndarray  # modal force per channel force, (B, S, A, 3, R, C)
+    plants: np.ndarray  # `Plant`, (B, D, N)
+    exists: np.ndarray  # (B, D, N)
+    radius: np.ndarray  # spectral radius at the design's gains [1], (B, D, N)
+    margin: np.ndarray  # largest common gain factor, all smaller ones stable [1], (B, D, N)
+    frequency_hz: np.ndarray  # of each link mode, three of each order, (B, D, N, R, 3)
+    damping_ratio: np.ndarray  # [1], (B, D, N, R, 3)
+    weakest: np.ndarray  # the mode of least damping, in words, (B, D, N)
+    breaking: np.ndarray  # what goes unstable beyond the margin, in words, (B, D, N)
+    observation: np.ndarray  # channel signal per plant mode, (B, D, 3, C, R), see `Leakage`
+    actuation: np.ndarray  # modal force per channel force, (B, D, 3, R, C)
     notes: tuple[str, ...]  # what was left out, and why
 
     @property
     def least_damping(self) -> np.ndarray:
-        """Smallest damping ratio of all link modes [1], (B, S, A, N)."""
+        """Smallest damping ratio of all link modes [1], (B, D, N)."""
         known = np.where(np.isnan(self.damping_ratio), np.inf, self.damping_ratio)
-        least = known.min(axis=(4, 5))
+        least = known.min(axis=(3, 4))
         return np.where(np.isfinite(least), least, np.nan)
 
     @property
     def passes(self) -> np.ndarray:
-        """Which plants are stable and leave the margin, (B, S, A, N)."""
+        """Which plants are stable and leave the margin, (B, D, N)."""
         return (self.radius <= 1 + RADIUS_TOLERANCE) & (self.margin >= self.required)
 
     @property
@@ -58,7 +66,7 @@ class Certificate(NamedTuple):
     def worst(self) -> tuple[int, ...]:
         """Where the smallest margin is; of nearly equal ones the plant with the fewest modes."""
         near = np.argwhere(self.margin <= np.nanmin(self.margin) * (1 + 1e-3))
-        return tuple(int(k) for k in min(near.tolist(), key=lambda at: at[3]))
+        return tuple(int(k) for k in min(near.tolist(), key=lambda at: at[2]))
 
     @property
     def fails_from(self) -> int:
@@ -72,7 +80,7 @@ def certify(
     margin: float = 2.0,
     bases: tuple[str, ...] = BASES,
     sizes: tuple[int, ...] = (),
-    lengths: tuple[float, ...] = LENGTHS,
+    departures: tuple[Departure, ...] = DEPARTURES,
 ) -> Certificate:
     """Judge a study's controller on plants that differ from what it believes.
 
@@ -84,7 +92,7 @@ def certify(
         margin: gain margin that every plant must leave [1], above 1.
         bases: modal bases of the plant.
         sizes: plant modes per link; empty: from the controlled ones to 10.
-        lengths: true over believed patch lengths, of sensors and of actuators in all pairs [1].
+        departures: from what the controller believes; joints in basis "loaded" only.
 
     Raises:
         StudyError: no controller to judge (ideal feedback, no link controlled, gains of zero), a
@@ -93,7 +101,9 @@ def certify(
     if not 1 < margin <= 32:
         raise field_error("--margin", margin, "more than 1, up to 32", "1")
     found = fixed_controller(study)
-    plants = all_plants(bases, plant_sizes(found, sizes), lengths)
+    believed = found.study.link.joint_inertia_c
+    departures = tuple(d for d in departures if d.joint_inertia != believed)
+    plants = all_plants(bases, departures, plant_sizes(found, sizes))
     maker = LoopMaker(found)
     faults = np.vectorize(maker.fault, otypes=[object])(plants)
     exists = faults == ""
@@ -131,14 +141,14 @@ def _collected(
     radius, limit = np.full((2, *shape), np.nan)
     frequency, zeta = np.full((2, *shape, largest, 3), np.nan)
     weakest, breaking = np.full((2, *shape), "", object)
-    observation = np.full((*shape[:3], 3, channels, largest), np.nan)
-    actuation = np.full((*shape[:3], 3, largest, channels), np.nan)
+    observation = np.full((*shape[:2], 3, channels, largest), np.nan)
+    actuation = np.full((*shape[:2], 3, largest, channels), np.nan)
     for at in map(tuple, np.argwhere(exists)):
         one, n = judgements[plants[at]], plants[at].n_modes
         radius[at], limit[at] = one.radius, one.margin
         frequency[at][:n], zeta[at][:n] = one.frequency_hz, one.damping_ratio
         weakest[at], breaking[at] = one.weakest, one.breaking
-    for at in map(tuple, np.argwhere(exists.any(axis=3))):
+    for at in map(tuple, np.argwhere(exists.any(axis=2))):
         plant = plants[at][0]._replace(n_modes=largest)
         leakage = maker.leakage(plant, law)
         observation[at] = leakage.observation[:, :channels]

@@ -1,12 +1,13 @@
 """The plants that a design is judged on, and the linearised loops with its controller.
 
 The controller's coefficients stay what the design makes them; the plants differ in their number of
-modes, their modal basis and the lengths that the patches really have.
+modes, their modal basis and in one thing each that is not as the controller believes.
 """
 
 from __future__ import annotations
 
 from functools import partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax
@@ -25,8 +26,40 @@ from studies.stability import link_poles
 
 #: Plant modes per link at most.
 LARGEST = 10
-#: True length of sensors and of actuators over what the controller believes [1].
-LENGTHS = (0.8, 1.0, 1.25)
+#: The only basis with rotary inertia at the joints.
+WITH_JOINTS = "loaded"
+
+
+class Departure(NamedTuple):
+    """In what a plant is not as the controller believes."""
+
+    sensor: float = 1.0  # true sensor length over the one that the controller believes [1]
+    actuator: float = 1.0  # the same for actuators [1]
+    frequency: float = 1.0  # true frequencies of the bare links over those of the study [1]
+    joint_inertia: float | None = None  # true J_C [kg m2]; None: the study's
+
+    def __str__(self) -> str:
+        words = []
+        if (self.sensor, self.actuator) != (1, 1):
+            words.append(f"sensors x {self.sensor:g}, actuators x {self.actuator:g}")
+        if self.frequency != 1:
+            words.append(f"frequencies x {self.frequency:g}")
+        if self.joint_inertia is not None:
+            words.append(f"J_C = {self.joint_inertia:g} kg m2")
+        return ", ".join(words) or "as believed"
+
+
+def patch_lengths(lengths: tuple[float, ...]) -> tuple[Departure, ...]:
+    """Sensors and actuators of any of these lengths over the believed ones [1]."""
+    return tuple(Departure(*pair) for pair in product(lengths, repeat=2))
+
+
+#: What may be otherwise: patches, the links' stiffness, the joints (none, and as was measured).
+DEPARTURES = (
+    *patch_lengths((0.8, 1.0, 1.25)),
+    Departure(frequency=0.9), Departure(frequency=1.1),
+    Departure(joint_inertia=0.0), Departure(joint_inertia=1.1e-5),
+)  # fmt: skip
 
 
 class Plant(NamedTuple):
@@ -34,16 +67,10 @@ class Plant(NamedTuple):
 
     basis: str
     n_modes: int  # per link
-    sensor: float  # true sensor length over the one that the controller believes [1]
-    actuator: float  # the same for actuators [1]
-
-    @property
-    def lengths(self) -> str:
-        """In words."""
-        return f"sensors x {self.sensor:g}, actuators x {self.actuator:g}"
+    departure: Departure = Departure()
 
     def __str__(self) -> str:
-        return f"{self.basis}, {self.n_modes} modes a link, {self.lengths}"
+        return f"{self.basis}, {self.n_modes} modes a link, {self.departure}"
 
 
 class SampledLoop(NamedTuple):
@@ -88,16 +115,17 @@ class LoopMaker:
 
     def fault(self, plant: Plant) -> str:
         """Why there is no such plant, "" where there is one."""
-        study, patches = self._found.study, self._placed(plant).machine.patches
-        is_off, is_overlapping = placement_faults(patches, study.link.length)
+        study, machine = self._found.study, self._placed(plant).machine
+        is_off, is_overlapping = placement_faults(machine.patches, study.link.length)
         if is_off or is_overlapping:
             what = "patches leave the link" if is_off else "patches overlap"
-            return f"{plant.lengths}: {what}"
+            return f"{plant.departure}: {what}"
         if plant.basis == "pinned_free" and study.drive.locked:
             return f"{plant.basis}: its sliders cannot be locked"
-        has_inertia = study.link.joint_inertia_b or study.link.joint_inertia_c
-        if plant.basis != "loaded" and has_inertia:
-            return f"{plant.basis}: it has no rotary inertia at the joints"
+        link, joint = study.link, plant.departure.joint_inertia
+        if plant.basis != WITH_JOINTS and (link.joint_inertia_b or link.joint_inertia_c or joint):
+            at_all = f" of {joint:g} kg m2" if joint else ""
+            return f"{plant.basis}: it has no rotary inertia{at_all} at the joints"
         return ""
 
     def loop(self, plant: Plant, law: Controller) -> SampledLoop:
@@ -132,13 +160,19 @@ class LoopMaker:
         return jax.tree.map(np.asarray, _look(structure, self._placed(plant), self._pose, law))
 
     def _placed(self, plant: Plant) -> Case:
-        machine = self._case.machine
-        patches = machine.patches._replace(
-            sensor_length=plant.sensor * machine.patches.sensor_length,
-            actuator_length=plant.actuator * machine.patches.actuator_length,
+        machine, true = self._case.machine, plant.departure
+        patches, beam = machine.patches, machine.beam
+        patches = patches._replace(
+            sensor_length=true.sensor * patches.sensor_length,
+            actuator_length=true.actuator * patches.actuator_length,
         )
+        beam = beam._replace(stiffness_factor=true.frequency**2 * beam.stiffness_factor)
+        if true.joint_inertia is not None:
+            joint = np.full_like(beam.joint_inertia_c, true.joint_inertia)
+            beam = beam._replace(joint_inertia_c=joint)
         return self._case._replace(
-            machine=machine._replace(patches=patches), n_modes=jnp.asarray(plant.n_modes)
+            machine=machine._replace(patches=patches, beam=beam),
+            n_modes=jnp.asarray(plant.n_modes),
         )
 
 
@@ -210,17 +244,16 @@ def plant_sizes(found: FixedController, sizes: tuple[int, ...] = ()) -> tuple[in
 
 
 def all_plants(
-    bases: tuple[str, ...], sizes: tuple[int, ...], lengths: tuple[float, ...]
+    bases: tuple[str, ...], departures: tuple[Departure, ...], sizes: tuple[int, ...]
 ) -> np.ndarray:
-    """Plants of every basis, sensor length, actuator length and size, (B, S, A, N) of `Plant`.
+    """Plants of every basis, departure and size, (B, D, N) of `Plant`.
 
     Args:
         bases: modal bases of the plant.
+        departures: from what the controller believes.
         sizes: modes per link.
-        lengths: true lengths over believed ones, of sensors and of actuators [1].
     """
-    plants = np.empty((len(bases), len(lengths), len(lengths), len(sizes)), object)
-    for at in np.ndindex(plants.shape):
-        b, s, a, n = at
-        plants[at] = Plant(bases[b], sizes[n], lengths[s], lengths[a])
+    plants = np.empty((len(bases), len(departures), len(sizes)), object)
+    for b, d, n in np.ndindex(plants.shape):
+        plants[b, d, n] = Plant(bases[b], sizes[n], departures[d])
     return plants

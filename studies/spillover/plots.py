@@ -13,6 +13,7 @@ from studies import figures
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import WITHOUT, Comparison
 from studies.spillover.judgement import HIGHEST, LOWEST
+from studies.spillover.plants import Departure
 
 #: Leakage from here on has its own colour [1].
 FLOOR = 0.01
@@ -25,13 +26,13 @@ def _plain_ticks(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _has_lengths(found: Certificate) -> bool:
-    """Whether patches differ in length from plant to plant."""
-    return found.plants[0, :, :, 0].size > 1
+def _has_departures(found: Certificate) -> bool:
+    """Whether there are plants of one basis and size that differ."""
+    return found.plants.shape[1] > 1
 
 
 def margins(found: Certificate, ax: Axes | None = None) -> Axes:
-    """Gain margin over the number of plant modes: range over the lengths, and true lengths.
+    """Gain margin over the number of plant modes: range of all departures, and without any.
 
     Args:
         found: the certificate.
@@ -41,15 +42,15 @@ def margins(found: Certificate, ax: Axes | None = None) -> Axes:
     for b, color, dash in zip(
         range(len(found.plants)), figures.SERIES, figures.DASHES, strict=False
     ):
-        sizes = [plant.n_modes for plant in found.plants[b, 0, 0]]
-        values = np.maximum(found.margin[b], LOWEST).reshape(-1, len(sizes))
+        sizes = [plant.n_modes for plant in found.plants[b, 0]]
+        values = np.maximum(found.margin[b], LOWEST)
         if np.all(np.isnan(values)):
             continue
         low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
         ax.fill_between(sizes, low, high, color=color, alpha=0.15, linewidth=0)
-        as_believed = [p.sensor == 1 and p.actuator == 1 for p in found.plants[b, :, :, 0].ravel()]
+        as_believed = [plant.departure == Departure() for plant in found.plants[b, :, 0]]
         if any(as_believed):
-            line, name = values[as_believed.index(True)], found.plants[b, 0, 0, 0].basis
+            line, name = values[as_believed.index(True)], found.plants[b, 0, 0].basis
             ax.plot(sizes, line, color=color, linestyle=dash, marker="o", markersize=3, label=name)
     ax.axhline(found.required, color="black", linewidth=0.9, linestyle="--")
     ax.annotate(
@@ -64,7 +65,7 @@ def margins(found: Certificate, ax: Axes | None = None) -> Axes:
     ax.set(xlabel="plant modes per link [1]", ylabel="gain margin [1]", yscale="log")
     _plain_ticks(ax.yaxis)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    shaded = " (shaded: all patch lengths)" if _has_lengths(found) else ""
+    shaded = " (shaded: departures from belief)" if _has_departures(found) else ""
     ax.legend(title=f"plant basis{shaded}", loc="upper right")
     return ax
 
@@ -78,11 +79,13 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
     """
     ax = figures.axes_or_new(ax)
     structural = found.study.link.first_damping
-    frequency, zeta = found.frequency_hz[:, :, :, -1], found.damping_ratio[:, :, :, -1]
+    frequency, zeta = found.frequency_hz[:, :, -1], found.damping_ratio[:, :, -1]
     for b, color, marker in zip(range(len(frequency)), figures.SERIES, "osD^v", strict=False):
+        if np.all(np.isnan(zeta[b])):
+            continue
         ax.plot(
             frequency[b].ravel(), zeta[b].ravel(), marker, color=color, markersize=3, alpha=0.6,
-            markeredgewidth=0, label=found.plants[b, 0, 0, 0].basis,
+            markeredgewidth=0, label=found.plants[b, 0, 0].basis,
         )  # fmt: skip
     ax.axhline(structural, color="black", linewidth=0.9, linestyle="--")
     ax.annotate(
@@ -103,10 +106,10 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
     ax.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     ax.yaxis.set_minor_locator(NullLocator())
     _plain_ticks(ax.xaxis)
-    size = found.plants[0, 0, 0, -1].n_modes
-    lengths = ", all patch lengths" if _has_lengths(found) else ""
+    size = found.plants[0, 0, -1].n_modes
+    which = ", all departures" if _has_departures(found) else ""
     ax.set(
-        xlabel=f"frequency [Hz], plants of {size} modes a link{lengths}",
+        xlabel=f"frequency [Hz], plants of {size} modes a link{which}",
         ylabel="damping ratio [1]",
     )
     ax.legend(loc="upper right")
@@ -144,14 +147,14 @@ def leakage_map(
 
 
 def leakage(found: Certificate) -> Figure:
-    """`leakage_map` for each basis: the largest of all links and patch lengths."""
+    """`leakage_map` for each basis: the largest of all links and departures."""
     size = np.abs(found.observation)
     bases = [b for b in range(len(size)) if not np.all(np.isnan(size[b]))]
     with figures.styled():
-        figure, axes = figures.new_figure(len(bases), 1, 0.55 + 0.28 * size.shape[4])
+        figure, axes = figures.new_figure(len(bases), 1, 0.55 + 0.28 * size.shape[3])
         for b, ax in zip(bases, axes[:, 0], strict=True):
-            name = found.plants[b, 0, 0, 0].basis
-            leakage_map(np.nanmax(size[b], axis=(0, 1, 2)), found.n_controlled, name, ax)
+            name = found.plants[b, 0, 0].basis
+            leakage_map(np.nanmax(size[b], axis=(0, 1)), found.n_controlled, name, ax)
         for ax in axes[:-1, 0]:
             ax.set_xlabel("")
     return figure

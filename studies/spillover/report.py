@@ -13,18 +13,20 @@ from studies.runs import describe
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import FAST, GIVEN, SETTLING, WINDOW, WITHOUT, Comparison
 from studies.spillover.judgement import HIGHEST
+from studies.spillover.plants import Plant
 
 #: Leakage below this is rounding [1].
 TINY = 1e-9
 _COVERED = """\
 Covered: delay, hold and anti-alias filter, exactly; the controller's own filters; every
-combination of the bases, patch lengths and numbers of modes above. A margin counts only as far as
-every smaller gain is stable, too.
+combination of the bases, departures and numbers of modes above, one departure at a time. A margin
+counts only as far as every smaller gain is stable, too.
 
-Not covered: more plant modes than that; other frequencies and damping than the study's; patches in
-other places, or of different lengths on each link; poses other than the first way-point; rounding,
-saturation and the limits of the converters; whatever bends or moves beyond the model
-(docs/theory.md). A large margin on these plants is no proof for others."""
+Not covered: more plant modes than that; other damping than the study's; patches in other places, or
+links that depart differently; poses other than the first way-point, and the forces of the motion
+(the run's own report has those); rounding, saturation and the limits of the converters; whatever
+bends or moves beyond the model (docs/theory.md). A large margin on these plants is no proof for
+others."""
 
 _LAW_NOTES = (
     "*IMSC-LQR*: the optimal gains of each mode, one weight of control for all; at factor 1 it "
@@ -77,7 +79,7 @@ def _head(found: Certificate) -> list[str]:
         f"means that they are stable and stay so with all gains times up to {found.required:g}. "
         f"Smallest margin {_margin(found.margin[at])}, on {found.plants[at]}."
     )
-    if found.fails_from == found.plants[0, 0, 0, 0].n_modes:
+    if found.fails_from == found.plants[0, 0, 0].n_modes:
         told += " It fails with the fewest plant modes already."
     elif found.fails_from:
         told += f" With fewer than {found.fails_from} plant modes a link all of them pass."
@@ -93,29 +95,30 @@ def _head(found: Certificate) -> list[str]:
 
 def _margins(found: Certificate) -> list[str]:
     rows = []
-    for b, n in np.ndindex(found.plants.shape[0], found.plants.shape[3]):
-        exists = found.exists[b, :, :, n]
+    for b, n in np.ndindex(found.plants.shape[0], found.plants.shape[2]):
+        exists = found.exists[b, :, n]
         if not exists.any():
             continue
-        margin = np.where(exists, found.margin[b, :, :, n], np.inf)
-        zeta = np.where(exists, found.least_damping[b, :, :, n], np.inf)
-        low = np.unravel_index(np.argmin(margin), margin.shape)
-        weak = np.unravel_index(np.argmin(zeta), zeta.shape)
-        plant = found.plants[b, :, :, n][low]
+        margin = np.where(exists, found.margin[b, :, n], np.inf)
+        zeta = np.where(exists, found.least_damping[b, :, n], np.inf)
+        low, weak = int(np.argmin(margin)), int(np.argmin(zeta))
+        plant = found.plants[b, low, n]
         rows.append([
             plant.basis, str(plant.n_modes), _margin(margin[low]),
-            f"{plant.sensor:g}, {plant.actuator:g}", found.breaking[b, :, :, n][low] or "-",
-            f"{zeta[weak]:.3g}", found.weakest[b, :, :, n][weak],
-            "yes" if found.passes[b, :, :, n][exists].all() else "**no**",
+            str(plant.departure), found.breaking[b, low, n] or "-",
+            f"{zeta[weak]:.3g}", found.weakest[b, weak, n],
+            "yes" if found.passes[b, :, n][exists].all() else "**no**",
         ])  # fmt: skip
     names = (
-        "basis", "modes", "smallest margin", "sensors, actuators times", "broken by",
+        "basis", "modes", "smallest margin", "where", "broken by",
         "least damping ratio", "of", "all pass",
     )  # fmt: skip
     return [
         "## Margins and damping", "",
-        "For each basis and number of plant modes per link: the smallest gain margin of all patch "
-        "lengths and what goes unstable beyond it, and the least damping ratio of all link modes "
+        "For each basis and number of plant modes per link: the smallest gain margin of all "
+        "departures from what the controller believes (sensors and actuators of other lengths, "
+        "links of other stiffness, joints of other inertia), what goes unstable beyond it, and the "
+        "least damping ratio of all link modes "
         f"at the design's gains (without control: {found.study.link.first_damping:g}). The mode is "
         "the one that holds most energy of the motion; \"through a filter\" says that the pole is "
         "one of the controller's filters, which the mode, far stiffer, feeds.", "",
@@ -139,22 +142,22 @@ def _leakage(found: Certificate) -> list[str]:
     size = np.abs(found.observation)
     rows = []
     for b in range(len(size)):
-        if np.all(np.isnan(size[b])) or size.shape[5] <= first:
+        if np.all(np.isnan(size[b])) or size.shape[4] <= first:
             continue
-        worst = np.nanmax(size[b], axis=(0, 1, 2))[:, first:]
+        worst = np.nanmax(size[b], axis=(0, 1))[:, first:]
         for j, values in enumerate(worst):
             cells = (f"{x:.2g}" if x > TINY else "0" for x in values)
-            rows.append([found.plants[b, 0, 0, 0].basis, f"q^{j + 1}", *cells])
+            rows.append([found.plants[b, 0, 0].basis, f"q^{j + 1}", *cells])
     if not rows:
         return ["## Leakage", "", "No plant has more modes than are controlled."]
     pushed = np.where(np.isnan(found.actuation), 0.0, np.abs(found.actuation))[..., first:, :]
     at = np.unravel_index(np.argmax(pushed), pushed.shape)
-    r, j, basis = int(at[4]), int(at[5]), found.plants[at[0], 0, 0, 0].basis
-    names = [f"mode {r + 1}" for r in range(first, size.shape[5])]
+    r, j, basis = int(at[3]), int(at[4]), found.plants[at[0], 0, 0].basis
+    names = [f"mode {r + 1}" for r in range(first, size.shape[4])]
     return [
         "## Leakage", "",
         "What a unit of a mode that is not controlled adds to the estimate q^j of a controlled one "
-        "(modal filter times sensors): the largest of all links and patch lengths, in the scale of "
+        "(modal filter times sensors): the largest of all links and departures, in the scale of "
         f"the plant's basis. {_worst_leak(found)} The other way round a force on a "
         f"controlled mode pushes others by up to {pushed.max():.3g} of itself (mode {j + 1} on "
         f"mode {r + first + 1}, {basis}).", "",
@@ -166,10 +169,10 @@ def _leakage(found: Certificate) -> list[str]:
 def _worst_leak(found: Certificate) -> str:
     size = np.where(np.isnan(found.observation), 0.0, np.abs(found.observation))
     size = size[..., found.n_controlled :]
-    b, s, a, i, j, r = np.unravel_index(np.argmax(size), size.shape)
+    b, d, _, j, r = np.unravel_index(np.argmax(size), size.shape)
     return (
         f"Worst: mode {r + found.n_controlled + 1} in q^{j + 1} with {size.max():.3g} "
-        f"({found.plants[b, s, a, 0].basis}, {found.plants[b, s, a, 0].lengths})."
+        f"({found.plants[b, d, 0].basis}, {found.plants[b, d, 0].departure})."
     )
 
 
@@ -202,7 +205,7 @@ def _laws(laws: Comparison) -> list[str]:
         "## Laws", "",
         "The same machine, patches, electronics and controlled modes. Factor 1 is the design's own "
         "damping constant of mode 1. Each law has the largest factor that leaves a margin of "
-        f"{laws.required:g} on the design's own plants ({laws.plant.basis}, patches as believed), "
+        f"{laws.required:g} on the design's own plants ({laws.plant.basis}, as believed), "
         f'but no more than damps mode 1 as "{GIVEN}" does, or as well as it can. Damping ratios: '
         f"the smallest of the links that control the mode, {laws.plant.n_modes} modes a link. Run, "
         f"nonlinear: {motion}; residual over {WINDOW:g} s from {SETTLING:g} s after the command "
@@ -218,7 +221,7 @@ def document(found: Certificate, laws: Comparison | None) -> str:
     """JSON text: the verdict and every number, null where there is none."""
     whole: dict[str, Any] = {
         "format": "flexlink-spillover",
-        "format_version": 1,
+        "format_version": 2,
         "title": found.study.title,
         "is_passed": found.is_passed,
         "verdict": verdict(found),
@@ -238,8 +241,10 @@ def _plant(found: Certificate, at: tuple[int, ...]) -> dict[str, Any]:
     return {
         "basis": plant.basis,
         "modes": plant.n_modes,
-        "sensor_length_factor": plant.sensor,
-        "actuator_length_factor": plant.actuator,
+        "sensor_length_factor": plant.departure.sensor,
+        "actuator_length_factor": plant.departure.actuator,
+        "frequency_factor": plant.departure.frequency,
+        "joint_inertia_c_kg_m2": _joint(found, plant),
         "passes": bool(found.passes[at]),
         "spectral_radius": found.radius[at],
         "gain_margin": found.margin[at],
@@ -248,6 +253,12 @@ def _plant(found: Certificate, at: tuple[int, ...]) -> dict[str, Any]:
         "frequency_hz": found.frequency_hz[at][: plant.n_modes],
         "damping_ratio": found.damping_ratio[at][: plant.n_modes],
     }
+
+
+def _joint(found: Certificate, plant: Plant) -> float:
+    """True J_C [kg m2]."""
+    known = plant.departure.joint_inertia
+    return found.study.link.joint_inertia_c if known is None else known
 
 
 def _law(laws: Comparison, k: int) -> dict[str, Any]:

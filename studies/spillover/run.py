@@ -84,24 +84,30 @@ def _draw(folder: Path, found: Certificate, laws: Comparison | None) -> None:
 
 def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable]:
     """Labelled numbers of a certificate and of the laws beside it."""
-    plants = ("basis", "sensor_factor", "actuator_factor", "plant_modes")
+    plants = ("basis", "departure", "plant_modes")
     modes = (*plants, "link_mode", "pole")
-    place = plants[:3]
-    axes = found.plants
+    place, axes = plants[:2], found.plants
+    true = [plant.departure for plant in axes[0, :, 0]]
     part = {
         "basis": Variable(
-            np.array([p.basis for p in axes[:, 0, 0, 0]]), ("basis",), "1", "of the plant"
+            np.array([p.basis for p in axes[:, 0, 0]]), ("basis",), "1", "of the plant"
+        ),
+        "departure": Variable(
+            np.array([str(d) for d in true]), ("departure",), "1",
+            "from what the controller believes",
         ),
         "sensor_factor": Variable(
-            np.array([p.sensor for p in axes[0, :, 0, 0]]), ("sensor_factor",), "1",
-            "true over believed sensor length",
+            np.array([d.sensor for d in true]), ("departure",), "1", "true over believed length"
         ),
         "actuator_factor": Variable(
-            np.array([p.actuator for p in axes[0, 0, :, 0]]), ("actuator_factor",), "1",
-            "true over believed actuator length",
+            np.array([d.actuator for d in true]), ("departure",), "1", "true over believed length"
+        ),
+        "frequency_factor": Variable(
+            np.array([d.frequency for d in true]), ("departure",), "1",
+            "true frequencies of the links over the study's",
         ),
         "plant_modes": Variable(
-            np.array([p.n_modes for p in axes[0, 0, 0]]), ("plant_modes",), "1", "per link"
+            np.array([p.n_modes for p in axes[0, 0]]), ("plant_modes",), "1", "per link"
         ),
         "passes": Variable(found.passes, plants, "1", "stable with the margin required"),
         "spectral_radius": Variable(found.radius, plants, "1", "of the loop at its own gains"),
