@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import reduce
+from functools import partial, reduce
 from typing import NamedTuple
 
 import jax
@@ -305,8 +305,29 @@ def simulate(
         law: controller instead of the case's own, as for `sampled_loop.closed_loop`.
 
     Returns:
-        Result. Nothing is raised inside: `status` says what went wrong.
+        Result. Nothing is raised inside: `status` says what went wrong. Its derivatives are those
+        of the smooth loop: converters without rounding, limits with round corners.
     """
+    has_converters = structure.feedback == "sampled" and not structure.is_smooth
+    run = _rounded if has_converters else _run
+    return run(structure, has_record, case, law)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _rounded(structure: Structure, has_record: bool, case: Case, law: Controller | None) -> Result:
+    return _run(structure, has_record, case, law)
+
+
+@_rounded.defjvp
+def _smooth_tangent(
+    structure: Structure, has_record: bool, primals: tuple, tangents: tuple
+) -> tuple[Result, Result]:
+    """What rounds has the derivative 0, and the loop closed through it one that means nothing."""
+    smooth = partial(_run, structure._replace(is_smooth=True), has_record)
+    return _run(structure, has_record, *primals), jax.jvp(smooth, primals, tangents)[1]
+
+
+def _run(structure: Structure, has_record: bool, case: Case, law: Controller | None) -> Result:
     start = begin(structure, case, law)
 
     def body(state, inputs):

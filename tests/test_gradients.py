@@ -1,5 +1,8 @@
 """Gradients of the residual vibration agree with central differences, forward and reverse."""
 
+import re
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -92,3 +95,27 @@ def test_bad_case_leaves_gradients_of_others_alone(reverse, point):
     after = np.asarray(reverse(np.stack([point, broken])))
     np.testing.assert_allclose(after[0], good, rtol=1e-12)
     assert np.all(np.isfinite(after[1]))
+
+
+def fourth_order(f, x, step):
+    """Central difference."""
+    a, b, c, d = (float(f(x + k * step)) for k in (-2, -1, 1, 2))
+    return (a - 8 * b + 8 * c - d) / (12 * step)
+
+
+def test_rounded_loops_have_the_slope_of_the_smooth_loop():
+    """The code of the README: values with real converters, derivatives by smooth differences."""
+    text = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+    (code,) = (x for x in re.findall(r"```python\n(.*?)```", text, re.S) if "value_and_grad" in x)
+    names = {}
+    exec(code, names)
+    many, value, slope = (np.asarray(names[name]) for name in ("many", "value", "slope"))
+    assert many.shape == (8,) and np.all(many > 0)
+    assert many[3] < value < many[4]
+
+    names["structure"] = names["structure"]._replace(is_smooth=True)
+    residual = names["residual"]
+    smooth = jax.jit(lambda factor: residual(factor))
+    assert slope == pytest.approx(fourth_order(smooth, 0.5, 1e-3), rel=1e-6)
+    # rounding shows in the value: these are not the same loop
+    assert abs(float(smooth(0.5)) / value - 1) > 1e-6
