@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxmodel.dynamics import accelerations, inverse_dynamics
 from jaxmodel.kinematics import Chain, close_chain
 from jaxmodel.parameters import Array, Beam
+from jaxmodel.piezo import bare_stiffness
 from jaxmodel.plant import Plant
 
 #: Squarings of `critical_force`: eigenvalues that differ by 1 % are told apart.
@@ -38,6 +39,12 @@ def critical_force(plant: Plant) -> Array:
     # its largest eigenvalue by repeated squaring: batched on any executor
     power, _ = jax.lax.scan(square, softness, None, length=SQUARINGS)
     return 1 / jnp.trace(power @ softness, axis1=1, axis2=2)
+
+
+def euler_force(beam: Beam) -> Array:
+    """N_cr of the bare links, pi^2 E I/L^2 [N], (3,): a bound where the model has no buckling."""
+    force = jnp.pi**2 * bare_stiffness(beam) * beam.stiffness_factor / beam.length**2
+    return jnp.broadcast_to(jnp.asarray(force), (3,))
 
 
 def loaded_frequency(plant: Plant, axial: Array) -> Array:

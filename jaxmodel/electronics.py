@@ -15,7 +15,7 @@ import numpy as np
 from jaxmodel.case import Electronics
 from jaxmodel.parameters import Array
 
-#: Steps over the amplifier's lag beyond which it follows at once as far as a plant step can tell.
+#: Samples over the lag from which on the linearised loop takes an amplifier for infinitely fast.
 FASTEST = 1e3
 _SERIES = 20  # terms for arguments up to 1
 
@@ -50,22 +50,26 @@ def design_amplifier(step: Array, lag: Array) -> Amplifier:
 
     Args:
         step: h [s], ().
-        lag: time constant of the amplifier [s], (); 0 stands for h/1000.
+        lag: time constant of the amplifier [s], (); 0: it follows at once.
 
     Returns:
         Amplifier.
     """
-    rate = step / jnp.maximum(lag, step / FASTEST)
+    is_slow = lag > 0
+    rate = step / jnp.where(is_slow, lag, step)
     # int_0^1 exp(-rate (1 - s)) s^(k-1)/(k-1)! ds, the moments about the end of the step
     phi = _phi(rate)
     a, b, c = phi[0], phi[1], 2 * phi[2]
     backwards = (9 * a - 36 * b + 30 * c, -1.5 * a + 15 * b - 15 * c, 3 * a - 24 * b + 30 * c)
-    return Amplifier(jnp.stack(backwards[::-1]), jnp.exp(-rate))
+    return Amplifier(
+        jnp.where(is_slow, jnp.stack(backwards[::-1]), 0.0), jnp.where(is_slow, jnp.exp(-rate), 0.0)
+    )
 
 
 def _phi(rate: Array) -> list[Array]:
     """phi_1..phi_3(-rate) with phi_k(x) = sum x^n/(n + k)!, rate > 0."""
-    small, large = jnp.minimum(rate, 1.0), jnp.maximum(rate, 1.0)
+    is_small = rate < 1
+    small, large = jnp.where(is_small, rate, 1.0), jnp.where(is_small, 1.0, rate)
     result, last = [], jnp.exp(-large)
     factorial = np.cumprod([1.0, *range(1, _SERIES + 3)])
     for k in (1, 2, 3):
@@ -73,5 +77,5 @@ def _phi(rate: Array) -> list[Array]:
         series = jnp.zeros_like(small)
         for n in reversed(range(_SERIES)):
             series = series * -small + 1 / factorial[n + k]
-        result.append(jnp.where(rate < 1, series, last))
+        result.append(jnp.where(is_small, series, last))
     return result

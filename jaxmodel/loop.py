@@ -430,7 +430,9 @@ def _freeze_if_bad(
     )
 
 
-def initial_state(structure: Structure, loop: Loop, pose: Array, q: Array, code: Array) -> State:
+def initial_state(
+    structure: Structure, loop: Loop, pose: Array, q: Array, code: Array, highpass: Array
+) -> State:
     """State at rest at a pose with given modal coordinates.
 
     Args:
@@ -439,6 +441,7 @@ def initial_state(structure: Structure, loop: Loop, pose: Array, q: Array, code:
         pose: (3,).
         q: [m], (3, R); the electronics start settled on it.
         code: status known before the run, as a float, ().
+        highpass: corner of the patches into their amplifiers [rad/s], (); 0: not drained.
 
     Returns:
         State.
@@ -446,6 +449,7 @@ def initial_state(structure: Structure, loop: Loop, pose: Array, q: Array, code:
     zero, still = jnp.zeros_like(q), jnp.zeros_like(pose)
     is_sampled = structure.feedback == "sampled"
     is_drained = is_sampled and structure.has_sensor_highpass
+    drained = jnp.where(highpass > 0, q, zero)
     controller = rest_controller(structure.n_channels, structure.n_patches, q.dtype)
     n_stations = loop.deflection_at.shape[1]
     totals = metrics.zero_totals(
@@ -458,9 +462,9 @@ def initial_state(structure: Structure, loop: Loop, pose: Array, q: Array, code:
             still,
             q,
             zero,
-            z=(zero if is_drained else q) if is_sampled else None,
+            z=(q - drained if is_drained else q) if is_sampled else None,
             z_rate=zero if is_sampled else None,
-            s=q if is_drained else None,
+            s=drained if is_drained else None,
             voltage=controller.voltage if is_sampled and structure.has_amplifier else None,
         ),
         controller,

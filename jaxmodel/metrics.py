@@ -132,7 +132,8 @@ NEEDS = {
 }
 #: Metrics that the status of a run depends on.
 ALWAYS = (
-    "saturated_fraction", "clipped_fraction", "motor_saturated_fraction", "pose_error_rms"
+    "saturated_fraction", "clipped_fraction", "motor_saturated_fraction", "pose_error_rms",
+    "peak_compression",
 )  # fmt: skip
 
 

@@ -112,7 +112,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         _initial_modes(structure, case, bases),
         design.sensor_condition,
         design.actuator_condition,
-        _static_status(structure, case, bases, design, omega * step),
+        _static_status(structure, case, bases, design, omega * step, zeta),
     )
 
 
@@ -252,10 +252,16 @@ def lowpass_corner(structure: Structure, case: Case, bases: Bases) -> Array:
 
 
 def _static_status(
-    structure: Structure, case: Case, bases: Bases, design: ControllerDesign, mode_step: Array
+    structure: Structure,
+    case: Case,
+    bases: Bases,
+    design: ControllerDesign,
+    mode_step: Array,
+    zeta: Array,
 ) -> Array:
-    """Status before the run; mode_step is omega h of the plant modes [1], (3, R)."""
-    mode_step = jnp.where(jnp.arange(structure.n_modes) < case.n_modes, mode_step, 0.0)
+    """Status before the run; of the plant modes omega h and the damping ratio [1], (3, R)."""
+    is_used = jnp.arange(structure.n_modes) < case.n_modes
+    mode_step, zeta = (jnp.where(is_used, x, 0.0) for x in (mode_step, zeta))
     patches, windows, control = case.machine.patches, case.windows, case.control
     length = case.machine.beam.length
     is_off, is_overlapping = placement_faults(patches, length)
@@ -273,6 +279,7 @@ def _static_status(
             drive_rate(case) * case.electronics.period / structure.substeps > STIFFNESS_LIMIT,
             status.TOO_STIFF,
         ),
+        (jnp.any(zeta >= 1), status.OVERDAMPED),
         (~jnp.all((windows.stations > 0) & (windows.stations < length)), status.STATION_OFF_LINK),
         (~_is_finite(case), status.NON_FINITE),
     )
@@ -315,4 +322,5 @@ def _is_too_fast(structure: Structure, case: Case, bases: Bases) -> Array:
         return is_fast
     has_lowpass = case.electronics.estimator == KINDS.index("modal_phase")
     is_fast |= (lowpass_corner(structure, case, bases) >= half) & has_lowpass
+    is_fast |= case.electronics.sensor_highpass >= half
     return is_fast | (case.electronics.antialias >= half)

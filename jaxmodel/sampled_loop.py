@@ -136,8 +136,8 @@ def _with_electronics(structure: Structure, plant: LinearPlant, case: Case) -> _
         state = state.at[at["s"], at["s"]].set(-highpass * eye)
     commands = jnp.zeros((n, n_sensors), state.dtype)
     if "voltage" in at:
-        # as fast as `design_amplifier` takes it where a batch has cases without an amplifier
-        shortest = electronics.period / structure.substeps / FASTEST
+        # a batch may have cases without an amplifier
+        shortest = electronics.period / FASTEST
         rate = 1 / jnp.maximum(electronics.amplifier_lag, shortest)
         state = state.at[:n_plant, at["voltage"]].set(plant.voltage)
         state = state.at[at["voltage"], at["voltage"]].set(-rate * eye)

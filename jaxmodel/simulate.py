@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel import metrics, status
-from jaxmodel.axial import axial_force, critical_force
+from jaxmodel.axial import axial_force, critical_force, euler_force
 from jaxmodel.case import Case, Load, Structure
 from jaxmodel.control import efficient_modal_control
 from jaxmodel.controller import Controller
@@ -119,14 +119,15 @@ def steady_load(structure: Structure, case: Case, plant: Plant) -> Array:
 
 def _wrench(load: Load, time: Array) -> Array:
     """Force and moment on the platform [N, N, N m], (n_steps, 3)."""
-    is_on = _is_on(time, load.pulse_start, load.pulse_length)
-    return load.wrench + jnp.where(is_on[:, None], load.pulse, 0.0)
+    share = _share_on(time, load.pulse_start, load.pulse_length)
+    return load.wrench + share[:, None] * load.pulse
 
 
-def _is_on(time: Array, start: Array, length: Array) -> Array:
-    """Where a pulse acts."""
-    since = time - start
-    return (since >= -1e-12) & (since < length - 1e-12)
+def _share_on(time: Array, start: Array, length: Array) -> Array:
+    """Share of each sample in which a pulse acts, so that none of its impulse is lost, (n,)."""
+    period = time[1] - time[0] if time.size > 1 else jnp.maximum(length, 1.0)
+    since = jnp.clip(time + period - start, 0.0, length) - jnp.clip(time - start, 0.0, length)
+    return since / period
 
 
 def _points(x: Array, n: int) -> Array:
@@ -153,8 +154,8 @@ def _windows(structure: Structure, case: Case, time: Array, end: Array) -> metri
 def _disturbance(structure: Structure, case: Case, prepared: Prepared, time: Array):
     """(standard normal ADC noise or None, slider disturbance [N])."""
     drive, n = prepared.loop.drive, structure.n_steps
-    is_on = _is_on(time, drive.pulse_start, drive.pulse_length)
-    force = jnp.where(is_on[:, None], jnp.broadcast_to(drive.pulse_force, (n, 3)), 0.0)
+    share = _share_on(time, drive.pulse_start, drive.pulse_length)
+    force = share[:, None] * jnp.broadcast_to(drive.pulse_force, (n, 3))
     if not structure.has_noise:
         return None, force
     adc_key, ripple_key = jax.random.split(jax.random.key(case.seed))
@@ -200,6 +201,7 @@ class Outline(NamedTuple):
     period: Array  # [s], ()
     saturation_limit: Array  # [1], ()
     arrival_tolerance: Array  # [m], ()
+    critical_force: Array  # N_cr of the links [N], (3,)
     joint_radius: Array  # largest distance of a joint from the platform's reference point [m], ()
     singularity_distance: Array  # [rad], ()
     singularity_margin: Array  # [rad], ()
@@ -234,7 +236,14 @@ def begin(structure: Structure, case: Case, law: Controller | None = None) -> St
     return Start(
         loop,
         outside.inputs,
-        initial_state(structure, loop, outside.start_pose, prepared.initial_q, code),
+        initial_state(
+            structure,
+            loop,
+            outside.start_pose,
+            prepared.initial_q,
+            code,
+            case.electronics.sensor_highpass,
+        ),
         Outline(
             jnp.where(prepared.status == status.OK, outside.bad_time, 0.0),
             outside.end,
@@ -244,11 +253,19 @@ def begin(structure: Structure, case: Case, law: Controller | None = None) -> St
             jnp.asarray(case.electronics.period),
             jnp.asarray(case.windows.saturation_limit),
             jnp.asarray(case.windows.arrival_tolerance),
+            _allowed_compression(case, loop.plant),
             jnp.max(jnp.asarray(case.machine.geometry.joint_radius)),
             outside.singularity_distance,
             jnp.asarray(case.windows.singularity_margin),
         ),
     )
+
+
+def _allowed_compression(case: Case, plant: Plant) -> Array:
+    """Critical force of the links, also where the model leaves buckling out [N], (3,)."""
+    if plant.shortening is None:
+        return euler_force(case.machine.beam)
+    return critical_force(plant)
 
 
 def conclude(outline: Outline, code: Array, last: State, record: Record | None = None) -> Result:
@@ -267,7 +284,9 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
     final = last.status
     limit, error = outline.saturation_limit, result.pose_error_rms
     miss = jnp.sqrt(error[0] ** 2 + error[1] ** 2) + outline.joint_radius * error[2]
+    is_overloaded = jnp.any(result.peak_compression > outline.critical_force)
     for is_wrong, bad in (
+        (is_overloaded, status.OVERLOADED),
         (miss > outline.arrival_tolerance, status.NOT_ARRIVED),
         (result.motor_saturated_fraction > limit, status.MOTORS_SATURATED),
         (result.saturated_fraction > limit, status.SATURATED),

@@ -25,9 +25,13 @@ BUCKLED = 17
 MOTORS_SATURATED = 18
 NOT_ARRIVED = 19
 NEAR_SINGULAR = 20
+OVERLOADED = 21
+OVERDAMPED = 22
 
 #: A case with one of these ran to its end, and its metrics hold.
-FINISHED = (OK, SATURATED, UNSTABLE, CLIPPED, MOTORS_SATURATED, NOT_ARRIVED, NEAR_SINGULAR)
+FINISHED = (
+    OK, SATURATED, UNSTABLE, CLIPPED, MOTORS_SATURATED, NOT_ARRIVED, NEAR_SINGULAR, OVERLOADED
+)  # fmt: skip
 
 REASONS = {
     OK: "ok",
@@ -51,4 +55,6 @@ REASONS = {
     MOTORS_SATURATED: "motors saturated too often",
     NOT_ARRIVED: "platform not where it was sent",
     NEAR_SINGULAR: "path close to a singular pose",
+    OVERLOADED: "a link compressed beyond its critical force on the way",
+    OVERDAMPED: "a link mode with a damping ratio of 1 or more",
 }

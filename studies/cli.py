@@ -77,9 +77,10 @@ def simulate(
 ) -> None:
     """Run one study with full trajectories."""
     start(precision)
-    from studies.run_report import check_results, write_results
+    from studies.run_report import check_results, settling_text, write_results
     from studies.runs import describe, run_study
     from studies.spec import load_study
+    from studies.stability import margin_text
 
     spec = load_study(study)
     check_results(out, report)
@@ -91,11 +92,12 @@ def simulate(
     for i in range(3):
         table.add_row(
             str(i + 1), f"{1e6 * metrics.residual_rms[i].max():.4g}",
-            f"{1e3 * metrics.settling_time[i]:.4g}", f"{metrics.peak_voltage[i]:.4g}",
+            settling_text(run, i), f"{metrics.peak_voltage[i]:.4g}",
         )  # fmt: skip
     console.print(table)
     if run.loop is not None:
-        console.print(f"gain margin of the linearised sampled loop: {run.loop.gain_margin:.4g}")
+        margin = margin_text(run.loop.gain_margin)
+        console.print(f"gain margin of the linearised sampled loop: {margin}")
     console.print(written, soft_wrap=True)
 
 

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 #: A run of more plant steps than this would not fit into memory with its trajectories.
 SAMPLE_LIMIT = 2_000_000
+#: Bandwidth of the slowest amplifier [Hz].
+SLOWEST_AMPLIFIER = 1.0
 
 
 def patch_centers(study: Study) -> np.ndarray:
@@ -90,6 +92,7 @@ def check_consistency(study: Study) -> None:
                     name, value, f"between 0 and link.length = {link.length:g}, exclusive", "m"
                 )
     _check_sampling(study)
+    _check_pulses(study)
     _check_coupling(study)
 
 
@@ -119,16 +122,30 @@ def _check_coupling(study: Study) -> None:
         )  # fmt: skip
 
 
+def _check_pulses(study: Study) -> None:
+    """A pulse that begins after the run would do nothing, without a word."""
+    for name, pulse, start in (
+        ("drive.pulse_start", study.drive.pulse_force, study.drive.pulse_start),
+        ("load.pulse_start", study.load.pulse, study.load.pulse_start),
+    ):
+        if any(pulse) and start >= study.run.duration:
+            raise field_error(name, start, f"below run.duration = {study.run.duration:g}", "s")
+
+
 def _check_sampling(study: Study) -> None:
     """What must fit the sample rate."""
-    rate = study.electronics.sample_rate_hz
-    if study.electronics.antialias_hz >= rate / 2:
+    electronics, rate = study.electronics, study.electronics.sample_rate_hz
+    for name in ("antialias_hz", "sensor_highpass_hz"):
+        value = getattr(electronics, name)
+        if value >= rate / 2:
+            raise field_error(
+                f"electronics.{name}", value, f"below half the sample rate, {rate / 2:g}", "Hz"
+            )
+    if 0 < electronics.amplifier_hz < SLOWEST_AMPLIFIER:
         raise field_error(
-            "electronics.antialias_hz",
-            study.electronics.antialias_hz,
-            f"below half the sample rate, {rate / 2:g}",
-            "Hz",
-        )
+            "electronics.amplifier_hz", electronics.amplifier_hz,
+            f"0 (no limit) or {SLOWEST_AMPLIFIER:g} and more", "Hz",
+        )  # fmt: skip
     for value in study.shaper.frequencies_hz:
         if value >= rate / 2:
             raise field_error(
@@ -170,10 +187,16 @@ def _check_lists(study: Study) -> None:
     if damping == () or any(row == () for row in _nested(damping)):
         raise field_error("link.damping_ratio", damping, "at least one number per link", "1")
     given = control.frequencies_hz
-    if len(given) > control.modes and not isinstance(given[0], tuple):
-        raise field_error(
-            "control.frequencies_hz", given, f"at most control.modes = {control.modes}", "Hz"
-        )
+    for row in _nested(given) or (given,):
+        if any(b <= a for a, b in zip(row, row[1:], strict=False)):
+            raise field_error("control.frequencies_hz", given, "rising from mode to mode", "Hz")
+    for name, flat, most, unit in (
+        ("control.frequencies_hz", given, "control.modes", "Hz"),
+        ("link.damping_ratio", damping, "link.modes", "1"),
+    ):
+        many = control.modes if most == "control.modes" else study.link.modes
+        if isinstance(flat, tuple) and not _nested(flat) and len(flat) > many:
+            raise field_error(name, flat, f"at most {most} = {many} entries", unit)
     for name, table, _width, unit in tables:
         if table and len(table) != 3:
             raise field_error(name, table, "three lists, one per link", unit)

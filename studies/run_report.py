@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from jaxmodel.axial import euler_force
 from studies import figures
 from studies.errors import StudyError
 from studies.pages import literal, picture, table, write_report
 from studies.runs import Run, chord_deflection, describe, run_attributes, run_variables
+from studies.stability import margin_text
 from studies.store import check_target, write_store
 
 #: Captions of what is drawn, by the end of the file's name.
@@ -103,7 +105,7 @@ def _links(run: Run) -> list[str]:
             str(i + 1), f"{1e6 * metrics.residual_rms[i].max():.4g}",
             f"{1e6 * metrics.residual_peak[i].max():.4g}",
             f"{1e6 * metrics.structural_peak[i].max():.4g}",
-            f"{1e3 * metrics.settling_time[i]:.4g}", f"{metrics.peak_voltage[i]:.4g}",
+            settling_text(run, i), f"{metrics.peak_voltage[i]:.4g}",
             f"{metrics.peak_force[i]:.4g}",
         ]
         for i in range(3)
@@ -123,14 +125,25 @@ def _links(run: Run) -> list[str]:
     ]  # fmt: skip
 
 
+def settling_text(run: Run, link: int) -> str:
+    """Settling time of a link [ms], or that it was outside the band to the end."""
+    seconds = float(run.result.metrics.settling_time[link])
+    last = run.study.run.duration - float(run.result.command_end)
+    if seconds >= last - 1.5 / run.study.electronics.sample_rate_hz > 0:
+        return f"not within {1e3 * last:.4g}"
+    return f"{1e3 * seconds:.4g}"
+
+
 def _platform(run: Run) -> list[str]:
-    metrics = run.result.metrics
+    metrics, critical = run.result.metrics, euler_force(run.case.machine.beam)
     errors = metrics.pose_error_peak, metrics.pose_error_rms, metrics.stretch_error_peak
     rows = [[name, *(f"{1e6 * error[k]:.4g}" for error in errors)] for k, name in enumerate(_POSE)]
     return [
-        "Pose minus shaped command; links that stretched by N L/(E A) would add the last column. "
+        "Pose minus shaped command. The links of the model do not stretch; the last column is what "
+        "stretching by N L/(E A) would add. "
         f"Largest tension in a link {np.max(metrics.peak_tension):.4g} N, largest compression "
-        f"{np.max(metrics.peak_compression):.4g} N.", "",
+        f"{np.max(metrics.peak_compression):.4g} N (a bare link buckles at {np.min(critical):.4g} "
+        "N).", "",
         *table(
             ("", "largest while moving", "rms in the residual window", "stretch of the links"), rows
         ),
@@ -141,7 +154,9 @@ def _loop(run: Run) -> list[str]:
     metrics = run.result.metrics
     lines = [
         f"Samples with an actuator at its limit: {100 * metrics.saturated_fraction:.3g} %; with an "
-        f"ADC channel at its end: {100 * metrics.clipped_fraction:.3g} %.",
+        f"ADC channel at its end: {100 * metrics.clipped_fraction:.3g} %; with a motor at its "
+        f"limit of {run.study.drive.force_limit:g} N: "
+        f"{100 * metrics.motor_saturated_fraction:.3g} %.",
     ]
     if run.loop is None:
         return lines
@@ -152,8 +167,8 @@ def _loop(run: Run) -> list[str]:
     ]
     return [
         *lines, "",
-        f"Linearised at the first pose: gain margin {run.loop.gain_margin:.4g}, spectral radius "
-        f"{run.loop.spectral_radius:.6f}. {_motion(run)}The lowest modes of the links with "
+        f"Linearised at the first pose: gain margin {margin_text(run.loop.gain_margin)}, spectral "
+        f"radius {run.loop.spectral_radius:.6f}. {_motion(run)}The lowest modes of the links with "
         "control, three of each order:", "",
         *table(("order", "frequencies [Hz]", "damping ratios [1]"), rows),
     ]  # fmt: skip
@@ -163,10 +178,14 @@ def _motion(run: Run) -> str:
     if run.motion is None:
         return ""
     margin, force = run.motion.gain_margin, run.motion.axial_force
-    return (
-        f"With the forces that the motion puts on the links ({force.min():.3g} to "
-        f"{force.max():.3g} N) the margin goes from {margin.min():.4g} to {margin.max():.4g}. "
+    told = (
+        f"With the forces that the planned motion puts on the links ({force.min():.3g} to "
+        f"{force.max():.3g} N; the drive's own ringing and pulses come on top, see the table) the "
+        f"margin goes from {margin_text(margin.min())} to {margin_text(margin.max())}. "
     )
+    if margin.min() == 0:
+        told += "0: at that instant the loop is unstable at any gain, as of a link that buckles. "
+    return told
 
 
 def draw(run: Run) -> dict[str, Figure]:

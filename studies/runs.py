@@ -136,6 +136,7 @@ class Preflight(NamedTuple):
     shaper_length: Any  # [s], ()
     condition: Any  # worst condition number of filter and synthesizer [1], ()
     highest: Any  # frequency of the highest plant mode [rad/s], ()
+    damping: Any  # largest damping ratio of a link mode [1], ()
     corner: Any  # highest low-pass corner of the velocity estimate [rad/s], ()
     steady_load: Any  # compression of the links at way-points over their critical force [1], (n, 3)
     critical_force: Any  # [N], (3,)
@@ -160,9 +161,11 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
     code, index = path_status(plant, poses)
     worst = jnp.maximum(prepared.sensor_condition.max(), prepared.actuator_condition.max())
     corner = lowpass_corner(structure, case, prepared.bases)
+    rate = plant.damping / plant.modal_mass[:, None]
+    damping = jnp.max(rate / (2 * prepared.loop.omega))
     return Preflight(
         each, code, time[index], poses[index], end, shaper_length, worst,
-        jnp.max(prepared.loop.omega), corner, steady_load(structure, case, plant),
+        jnp.max(prepared.loop.omega), damping, corner, steady_load(structure, case, plant),
         critical_force(plant), prepared.loop.controller, prepared.taps,
     )  # fmt: skip
 
@@ -273,6 +276,12 @@ def _check_duration(study: Study, structure: Structure, known: Preflight) -> Non
 
 def _check_rates(study: Study, structure: Structure, known: Preflight) -> None:
     """Plant modes that the step can carry, and low-passes that the sample rate can carry."""
+    if known.damping >= 1:
+        raise field_error(
+            "link.damping_ratio", study.link.damping_ratio,
+            f"ratios that with link.damping_law = {study.link.damping_law!r} stay below 1 for all "
+            f"link.modes = {study.link.modes} (here up to {known.damping:.3g})", "1",
+        )  # fmt: skip
     rate = study.electronics.sample_rate_hz
     needed = known.highest / MODE_STEP_LIMIT
     if needed > rate * structure.substeps:

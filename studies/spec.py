@@ -178,7 +178,7 @@ class Control(Section):
         (),
         "Hz",
         "assembled links as measured, by mode; one list for all links, or three; "
-        "empty: those of control.basis",
+        "modes not given: those of control.basis",
     )
     links: Flags = described((True, True, True), "-", "controlled links")
     mode_mask: tuple[tuple[bool, ...], ...] = described(
@@ -215,7 +215,8 @@ class Electronics(Section):
     sample_rate_hz: float = described(10_000.0, "Hz", "f_s", gt=100, le=1e6)
     antialias_hz: float = described(2_000.0, "Hz", "2nd-order Butterworth corner", gt=10, le=1e6)
     sensor_highpass_hz: float = described(
-        0.0, "Hz", "corner 1/(2 pi R C) of a patch's capacitance C into its amplifier's input R",
+        0.0, "Hz", "corner 1/(2 pi R C) of a patch's capacitance C (6.7 nF by default) into its "
+        "amplifier's input R; 0: none",
         ge=0, le=1e5,
     )  # fmt: skip
     amplifier_hz: float = described(

@@ -32,6 +32,11 @@ STRIDE = 1.25
 STEPS = np.linspace(0, 1, 41)[1:]
 
 
+def margin_text(value: float, digits: int = 4) -> str:
+    """A gain margin in words; beyond `HIGHEST` nobody looks."""
+    return f"> {HIGHEST:g}" if value >= HIGHEST else f"{value:.{digits}g}"
+
+
 class LoopReport(NamedTuple):
     """Judgement of a sampled loop."""
 

@@ -60,11 +60,6 @@ def test_course_of_the_amplifier_has_the_moments_of_its_exponential(rate):
     assert found.left == pytest.approx(np.exp(-rate), rel=1e-9)
 
 
-def test_an_amplifier_without_lag_is_none():
-    course = np.asarray(design_amplifier(1e-4, 0.0).course)
-    assert np.all(np.abs(course) < 0.01)
-
-
 RELEASED = {
     "run__duration": 0.05, "run__smooth": True, "electronics__adc_bits": 32,
     "motion__waypoints": ((0.0, 0.0, np.pi / 6),), "shaper__kind": "none",
@@ -108,6 +103,29 @@ def test_sensors_show_what_is_left_of_the_charge():
     first, later = record.sensor_voltage[0, 0], record.sensor_voltage[1:, 0]
     np.testing.assert_allclose(first, 0, atol=1e-15)
     assert np.abs(later).max() > 0.9 * np.abs(sensor).max() * 1e-7
+
+
+def test_without_electronics_a_mixed_batch_changes_nothing():
+    """Cases with corner and lag 0 among others, the links bent at the start."""
+    study = paper_study().change(**RELEASED | {"run__smooth": False, "run__duration": 0.01})
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    assert not structure.has_sensor_highpass and not structure.has_amplifier
+    mixed = structure._replace(has_sensor_highpass=True, has_amplifier=True)
+    alone, among = (run(one, case, True).record for one in (structure, mixed))
+    for name in ("modal_coordinate", "actuator_voltage", "sensor_voltage"):
+        wanted = np.asarray(getattr(alone, name))
+        size = np.abs(wanted).max()
+        assert size > 0
+        np.testing.assert_allclose(getattr(among, name), wanted, atol=1e-10 * size)
+
+
+@pytest.mark.parametrize("lag", [1e-4, 0.99e-4])
+def test_course_has_a_slope_by_the_lag(lag):
+    """Also where series and closed form meet, lag = step."""
+    slope = np.asarray(jax.jacfwd(lambda x: design_amplifier(1e-4, x).course)(lag))
+    step = 1e-9
+    ends = [np.asarray(design_amplifier(1e-4, lag + k * step).course) for k in (-1, 1)]
+    np.testing.assert_allclose(slope, (ends[1] - ends[0]) / (2 * step), rtol=1e-5)
 
 
 def test_estimates_stay_exact_with_known_electronics():

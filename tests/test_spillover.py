@@ -173,6 +173,27 @@ def test_links_that_are_softer_and_joints_with_inertia():
         )  # fmt: skip
 
 
+def test_plants_that_buckle_by_themselves_are_left_out():
+    """103 N of compression: links of 90 % of the frequency hold 81 % of 115 N."""
+    study = STUDY.change(load__wrench=(0.0, 0.0, -18.5))
+    true = (Departure(), Departure(frequency=0.9))
+    found = certify(study, sizes=(3,), bases=SAME["bases"], departures=true)
+    assert found.notes == (
+        "left out: pinned_pinned, frequencies x 0.9: it buckles without control",
+    )
+    np.testing.assert_array_equal(found.exists[0, :, 0], [True, False])
+    with pytest.raises(StudyError, match="no plant to judge on: .*buckles"):
+        certify(study, sizes=(3,), bases=SAME["bases"], departures=true[1:])
+
+
+def test_damping_stands_beside_that_without_control():
+    ratios = ((0.005, 0.02), (0.01, 0.03), (0.02, 0.01))
+    found = certified({"link__damping_ratio": ratios}, sizes=(3,), **SAME)
+    free = found.free_damping[0, 0, 0, :2]
+    np.testing.assert_allclose(np.sort(free[1]), [0.01, 0.02, 0.03], rtol=0.03)
+    assert np.all(np.sort(found.damping_ratio[0, 0, 0, 0]) > 5 * np.sort(free[0]))
+
+
 # --- laws -----------------------------------------------------------------------------------------
 
 
@@ -435,6 +456,17 @@ def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_
         margin = store.gain_margin.sel(basis="pinned_pinned", plant_modes=9)
         assert float(margin.min()) == pytest.approx(data["smallest_margin"])
         assert store.law.values.tolist() == list(comparison.names)
+
+
+def test_another_design_s_certificate_is_left_alone(capsys, monkeypatch, tmp_path, comparison):
+    few(monkeypatch, lambda study, margin: comparison)
+    out = tmp_path / "out"
+    out.mkdir()
+    kept = json.dumps({"study": STUDY.change(control__gain_factor=0.1).model_dump(mode="json")})
+    (out / "certificate.json").write_text(kept)
+    said = refused(capsys, "spillover", write(tmp_path), "--out", out)
+    assert "has the certificate of another design" in said
+    assert (out / "certificate.json").read_text() == kept
 
 
 def test_command_fails_a_design(capsys, monkeypatch, tmp_path):

@@ -1,10 +1,14 @@
 """Statuses of runs that end, but not as a designer would have it."""
 
+import jax
 import numpy as np
 import pytest
 
 from jaxmodel import status
 from jaxmodel.parameters import HOME
+from jaxmodel.simulate import _share_on, simulate
+from studies.cases import as_arrays, build_case, build_structure
+from studies.errors import StudyError
 from studies.runs import run_study
 from studies.spec import paper_study
 
@@ -38,6 +42,18 @@ def test_a_sound_run_is_ok_and_says_how_far_it_stays_from_singular_poses():
             status.NEAR_SINGULAR,
         ),
         ({"metrics__arrival_tolerance": 1e-9}, status.NOT_ARRIVED),
+        (
+            {"load__mass": 2.5, "motion__move_time": 0.03, "control__feedback": "none"},
+            status.OVERLOADED,
+        ),
+        (  # a model that cannot buckle says so, too
+            {
+                "load__wrench": (200.0, 0.0, 0.0),
+                "link__shortening": False,
+                "control__feedback": "none",
+            },
+            status.OVERLOADED,
+        ),
         ({"metrics__singularity_margin": 0.5}, status.NEAR_SINGULAR),
     ],
 )
@@ -45,6 +61,30 @@ def test_a_run_that_ends_badly_says_so(changes, code):
     found = run(**changes)
     assert found.status == code
     assert np.isfinite(found.result.metrics.residual_rms).all()  # its numbers stay
+
+
+def test_modes_damped_beyond_critical_are_refused():
+    changes = {"link__modes": 8, "link__damping_ratio": 0.02, "link__damping_law": "stiffness"}
+    with pytest.raises(StudyError, match="link.damping_ratio = 0.02: allowed ratios .* up to 1.28"):
+        run(**changes)
+    study = STUDY.change(**changes)
+    found = jax.jit(simulate, static_argnums=0)(
+        build_structure(study), as_arrays(build_case(study))
+    )
+    assert found.status == status.OVERDAMPED
+
+
+@pytest.mark.parametrize(
+    ("start", "length"), [(0.01, 0.0), (0.01, 1e-5), (0.01003, 1e-5), (0.01, 1.5e-4), (0.0, 1.0)]
+)
+def test_pulses_keep_their_impulse(start, length):
+    time = 1e-4 * np.arange(400)
+    share = np.asarray(_share_on(time, start, length))
+    acts = min(start + length, 0.04) - start
+    np.testing.assert_allclose(share.sum() * 1e-4, acts, rtol=1e-9, atol=1e-15)
+    assert np.all((share >= 0) & (share <= 1 + 1e-9))
+    first = np.flatnonzero(share)
+    assert first.size == 0 or time[first[0]] <= start + 1e-12
 
 
 def test_forces_along_the_links_are_those_of_the_rigid_motion():

@@ -39,6 +39,7 @@ class Certificate(NamedTuple):
     margin: np.ndarray  # largest common gain factor, all smaller ones stable [1], (B, D, N)
     frequency_hz: np.ndarray  # of each link mode, three of each order, (B, D, N, R, 3)
     damping_ratio: np.ndarray  # [1], (B, D, N, R, 3)
+    free_damping: np.ndarray  # without control [1], (B, D, N, R, 3)
     weakest: np.ndarray  # the mode of least damping, in words, (B, D, N)
     breaking: np.ndarray  # what goes unstable beyond the margin, in words, (B, D, N)
     observation: np.ndarray  # channel signal per plant mode, (B, D, 3, C, R), see `Leakage`
@@ -110,17 +111,23 @@ def certify(
     if not exists.any():
         raise StudyError(f"no plant to judge on: {'; '.join(dict.fromkeys(faults.ravel()))}")
     judgements = _judged(found, maker, plants[exists].tolist())
+    for at in map(tuple, np.argwhere(exists)):
+        if plants[at] not in judgements:
+            faults[at] = f"{plants[at].basis}, {plants[at].departure}: it buckles without control"
+    if not judgements:
+        raise StudyError(f"no plant to judge on: {'; '.join(dict.fromkeys(faults[exists]))}")
     return _collected(found, margin, maker, plants, faults, judgements)
 
 
 def _judged(
     found: FixedController, maker: LoopMaker, plants: list[Plant]
 ) -> dict[Plant, Judgement]:
-    """Judgement of every plant."""
+    """Judgement of every plant that stands by itself."""
     law = widened(found.controller, found.n_patches)
     try:
         with threadpool_limits(1, "blas"):
-            return {plant: judge(maker.loop(plant, law)) for plant in plants}
+            loops = {plant: maker.loop(plant, law) for plant in plants}
+            return {plant: judge(loop) for plant, loop in loops.items() if loop.stands}
     except np.linalg.LinAlgError:
         raise StudyError("a linearised loop is not finite: nothing to judge") from None
 
@@ -139,7 +146,7 @@ def _collected(
     channels = found.controller.velocity_gain.shape[1]
 
     radius, limit = np.full((2, *shape), np.nan)
-    frequency, zeta = np.full((2, *shape, largest, 3), np.nan)
+    frequency, zeta, free = np.full((3, *shape, largest, 3), np.nan)
     weakest, breaking = np.full((2, *shape), "", object)
     observation = np.full((*shape[:2], 3, channels, largest), np.nan)
     actuation = np.full((*shape[:2], 3, largest, channels), np.nan)
@@ -147,6 +154,7 @@ def _collected(
         one, n = judgements[plants[at]], plants[at].n_modes
         radius[at], limit[at] = one.radius, one.margin
         frequency[at][:n], zeta[at][:n] = one.frequency_hz, one.damping_ratio
+        free[at][:n] = one.free_damping
         weakest[at], breaking[at] = one.weakest, one.breaking
     for at in map(tuple, np.argwhere(exists.any(axis=2))):
         plant = plants[at][0]._replace(n_modes=largest)
@@ -155,6 +163,6 @@ def _collected(
         actuation[at] = leakage.actuation[:, :, :channels]
     return Certificate(
         found.study, margin, found.structure.n_controlled, plants, exists, radius, limit,
-        frequency, zeta, weakest.astype(str), breaking.astype(str), observation, actuation,
+        frequency, zeta, free, weakest.astype(str), breaking.astype(str), observation, actuation,
         tuple(dict.fromkeys(f"left out: {fault}" for fault in faults.ravel() if fault)),
     )  # fmt: skip

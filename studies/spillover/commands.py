@@ -17,7 +17,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command()
     def spillover(
-        design: Annotated[Path, typer.Argument(help="study file, folder of a tuning or a sweep")],
+        design: Annotated[
+            Path, typer.Argument(help="study file, ready design, folder of a tuning or a sweep")
+        ],
         out: Annotated[Path, typer.Option(help="folder for report, data and figures")],
         case: Annotated[
             str | None, typer.Option(help="of a sweep: number or id:...; of a tuning: its family")
@@ -26,7 +28,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             float, typer.Option(help="gain margin that every plant must leave [1]")
         ] = 2.0,
     ) -> None:
-        """Certify a controller on plants with more modes, other bases and patch lengths."""
+        """Certify a controller on plants that are not as it believes."""
         start()
         from studies.design import load_design
         from studies.spillover.run import spillover_design

@@ -24,6 +24,7 @@ class Judgement(NamedTuple):
     margin: float  # largest common factor on all gains with every smaller one stable [1]
     frequency_hz: np.ndarray  # of the link modes at the given gains, (r, 3), NaN: overdamped
     damping_ratio: np.ndarray  # [1], (r, 3)
+    free_damping: np.ndarray  # without control [1], (r, 3)
     weakest: str  # the mode of least damping
     breaking: str  # what goes unstable first, "" where nothing does up to `HIGHEST`
 
@@ -37,13 +38,17 @@ def judge(loop: SampledLoop) -> Judgement:
     poles = cache(loop.poles)
     tracked = follow(loop, STEPS, poles)[-1]
     frequency, zeta = damping(loop, tracked)
+    free = np.pad(
+        -loop.mode_poles.real / np.abs(loop.mode_poles),
+        ((0, loop.n_modes - len(loop.mode_poles)), (0, 0)), constant_values=np.nan,
+    )  # fmt: skip
     weakest = ""
     if not np.all(np.isnan(zeta)):
         at = np.unravel_index(np.nanargmin(zeta), zeta.shape)
         weakest = name_motion(loop, 1.0, tracked[at])
     margin = gain_margin(poles, STEPS)
     return Judgement(
-        float(np.abs(poles(1.0)).max()), margin, frequency, zeta, weakest,
+        float(np.abs(poles(1.0)).max()), margin, frequency, zeta, free, weakest,
         breaking_motion(loop, margin),
     )  # fmt: skip
 

@@ -19,7 +19,7 @@ from jaxmodel.controller import Controller
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import placement_faults
 from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import LoopMatrices, closed_loop
+from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
 from studies.errors import field_error
 from studies.export.controller import FixedController
 from studies.stability import link_poles
@@ -86,6 +86,11 @@ class SampledLoop(NamedTuple):
     def n_modes(self) -> int:
         """r of each link."""
         return self.omega.shape[1]
+
+    @property
+    def stands(self) -> bool:
+        """Whether the plant is stable without control: no link beyond its critical force."""
+        return bool(np.abs(self.poles(0.0)).max() <= 1 + RADIUS_TOLERANCE)
 
     def poles(self, factor: float) -> np.ndarray:
         """Discrete poles with all gains times a factor, (n,)."""

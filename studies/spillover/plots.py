@@ -9,7 +9,9 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
+from jaxmodel import status
 from studies import figures
+from studies.runs import describe
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import WITHOUT, Comparison
 from studies.spillover.judgement import HIGHEST, LOWEST
@@ -66,7 +68,7 @@ def margins(found: Certificate, ax: Axes | None = None) -> Axes:
     _plain_ticks(ax.yaxis)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     shaded = " (shaded: departures from belief)" if _has_departures(found) else ""
-    ax.legend(title=f"plant basis{shaded}", loc="upper right")
+    ax.legend(title=f"plant basis{shaded}", loc="best")
     return ax
 
 
@@ -78,7 +80,6 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
         ax: where to draw; a new figure where left out.
     """
     ax = figures.axes_or_new(ax)
-    structural = found.study.link.first_damping
     frequency, zeta = found.frequency_hz[:, :, -1], found.damping_ratio[:, :, -1]
     for b, color, marker in zip(range(len(frequency)), figures.SERIES, "osD^v", strict=False):
         if np.all(np.isnan(zeta[b])):
@@ -87,10 +88,9 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
             frequency[b].ravel(), zeta[b].ravel(), marker, color=color, markersize=3, alpha=0.6,
             markeredgewidth=0, label=found.plants[b, 0, 0].basis,
         )  # fmt: skip
-    ax.axhline(structural, color="black", linewidth=0.9, linestyle="--")
-    ax.annotate(
-        "without control", (0.02, structural), xycoords=("axes fraction", "data"), va="bottom",
-        fontsize=8,
+    ax.plot(
+        frequency.ravel(), found.free_damping[:, :, -1].ravel(), "_", color="black", markersize=4,
+        label="without control",
     )  # fmt: skip
     ax.set_xscale("log")
     ax.set_yscale("symlog", linthresh=0.02, linscale=1.5)
@@ -112,7 +112,7 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
         xlabel=f"frequency [Hz], plants of {size} modes a link{which}",
         ylabel="damping ratio [1]",
     )
-    ax.legend(loc="upper right")
+    ax.legend(loc="best")
     return ax
 
 
@@ -183,6 +183,8 @@ def law_bars(found: Comparison, ax: Axes | None = None) -> Axes:
         end = 1e6 * np.nanmax(found.residual_rms[k], initial=0.0)
         text = f"margin {margin}, peak {found.peak_voltage[k]:.3g} V"
         text = text if found.margin[k] > 0 else "no stable gains"
+        if found.status[k] != status.OK:
+            text += f"; {describe(int(found.status[k]))}"
         ax.text(end + 0.01 * most, k, text, va="center", fontsize=8)
     ax.set_yticks(rows, found.names)
     ax.invert_yaxis()

@@ -12,8 +12,8 @@ from studies.pages import literal, picture, table
 from studies.runs import describe
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import FAST, GIVEN, SETTLING, WINDOW, WITHOUT, Comparison
-from studies.spillover.judgement import HIGHEST
 from studies.spillover.plants import Plant
+from studies.stability import margin_text
 
 #: Leakage below this is rounding [1].
 TINY = 1e-9
@@ -45,7 +45,7 @@ _LAW_NOTES = (
 def verdict(found: Certificate) -> str:
     """One line: passed or failed, and what decides."""
     at = found.worst
-    margin, breaking = _margin(found.margin[at]), found.breaking[at]
+    margin, breaking = margin_text(found.margin[at], 3), found.breaking[at]
     if found.is_passed:
         first = f"; first to go unstable beyond it: {breaking}" if breaking else ""
         return f"passed: gain margin {margin}, {found.required:g} required{first}"
@@ -77,7 +77,7 @@ def _head(found: Certificate) -> list[str]:
     told = (
         f"Its coefficients were kept while the plant changed: {good} of {total} plants pass, which "
         f"means that they are stable and stay so with all gains times up to {found.required:g}. "
-        f"Smallest margin {_margin(found.margin[at])}, on {found.plants[at]}."
+        f"Smallest margin {margin_text(found.margin[at], 3)}, on {found.plants[at]}."
     )
     if found.fails_from == found.plants[0, 0, 0].n_modes:
         told += " It fails with the fewest plant modes already."
@@ -104,7 +104,7 @@ def _margins(found: Certificate) -> list[str]:
         low, weak = int(np.argmin(margin)), int(np.argmin(zeta))
         plant = found.plants[b, low, n]
         rows.append([
-            plant.basis, str(plant.n_modes), _margin(margin[low]),
+            plant.basis, str(plant.n_modes), margin_text(margin[low], 3),
             str(plant.departure), found.breaking[b, low, n] or "-",
             f"{zeta[weak]:.3g}", found.weakest[b, weak, n],
             "yes" if found.passes[b, :, n][exists].all() else "**no**",
@@ -119,7 +119,7 @@ def _margins(found: Certificate) -> list[str]:
         "departures from what the controller believes (sensors and actuators of other lengths, "
         "links of other stiffness, joints of other inertia), what goes unstable beyond it, and the "
         "least damping ratio of all link modes "
-        f"at the design's gains (without control: {found.study.link.first_damping:g}). The mode is "
+        f"at the design's gains (without control: {_free(found)}). The mode is "
         "the one that holds most energy of the motion; \"through a filter\" says that the pole is "
         "one of the controller's filters, which the mode, far stiffer, feeds.", "",
         *table(names, rows), "",
@@ -128,8 +128,10 @@ def _margins(found: Certificate) -> list[str]:
     ]  # fmt: skip
 
 
-def _margin(value: float) -> str:
-    return f"> {HIGHEST:g}" if value >= HIGHEST else f"{value:.3g}"
+def _free(found: Certificate) -> str:
+    """Damping ratios of the plants without control."""
+    low, high = np.nanmin(found.free_damping), np.nanmax(found.free_damping)
+    return f"{low:.3g}" if high - low < 0.1 * high else f"{low:.3g} to {high:.3g}"
 
 
 def _leakage(found: Certificate) -> list[str]:
@@ -184,7 +186,7 @@ def _laws(laws: Comparison) -> list[str]:
         rows.append([
             name, f"{laws.factor[k]:.3g}",
             *(f"{zeta:.3g}" if np.isfinite(zeta) else "-" for zeta in laws.damping_ratio[k]),
-            _margin(laws.margin[k]) if np.isfinite(laws.margin[k]) else "-",
+            margin_text(laws.margin[k], 3) if np.isfinite(laws.margin[k]) else "-",
             laws.breaking[k] or "-", " / ".join(f"{1e6 * x:.3g}" for x in rms),
             f"{100 * np.mean(rms / off):.3g} %" if np.all(off > 0) else "-",
             f"{laws.peak_voltage[k]:.3g}", f"{laws.control_energy[k]:.3g}",
@@ -252,6 +254,7 @@ def _plant(found: Certificate, at: tuple[int, ...]) -> dict[str, Any]:
         "least_damped": str(found.weakest[at]),
         "frequency_hz": found.frequency_hz[at][: plant.n_modes],
         "damping_ratio": found.damping_ratio[at][: plant.n_modes],
+        "damping_ratio_without_control": found.free_damping[at][: plant.n_modes],
     }
 
 

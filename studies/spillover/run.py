@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from studies.design import Design
 from studies.errors import StudyError
 from studies.pages import write_report
 from studies.runs import STATUS_LABEL, run_attributes
+from studies.spec import Study
 from studies.spillover import plots
 from studies.spillover.certificate import Certificate, certify
 from studies.spillover.comparison import Comparison, compare_laws
@@ -39,6 +41,7 @@ def spillover_design(design: Design, out: Path, margin: float, console: Console)
         StudyError: as `certify`, or a folder that cannot be written to.
     """
     check_folder(out)
+    _check_whose(out, design.study)
     console.print("judging the controller on plants that differ from what it believes")
     found = certify(design.study, margin)
     console.print(verdict(found), soft_wrap=True)
@@ -53,6 +56,22 @@ def spillover_design(design: Design, out: Path, margin: float, console: Console)
         console.print(note, soft_wrap=True)
     console.print(f"written: {out / 'report.html'}, data and figures beside it", soft_wrap=True)
     return found.is_passed
+
+
+def _check_whose(out: Path, study: Study) -> None:
+    """Leave another design's certificate alone.
+
+    Raises:
+        StudyError: there is one.
+    """
+    try:
+        kept = json.loads((out / DOCUMENT).read_text(encoding="utf-8"))["study"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    if kept != json.loads(study.model_dump_json()):
+        raise StudyError(
+            f"--out {out}: has the certificate of another design; give another folder, or delete it"
+        )
 
 
 def _write(out: Path, found: Certificate, laws: Comparison | None) -> None:
@@ -116,6 +135,7 @@ def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable
             found.frequency_hz, modes, "Hz", "of link modes under control, three of each order"
         ),
         "damping_ratio": Variable(found.damping_ratio, modes, "1", "their damping ratios"),
+        "free_damping_ratio": Variable(found.free_damping, modes, "1", "without control"),
         "least_damped": Variable(found.weakest, plants, "1", "mode of least damping"),
         "broken_by": Variable(found.breaking, plants, "1", "what goes unstable beyond the margin"),
         "observation": Variable(
