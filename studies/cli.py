@@ -70,7 +70,7 @@ def paper(
 
 @app.command()
 def simulate(
-    study: Annotated[Path, typer.Argument(help="study file (TOML)")],
+    study: Annotated[Path, typer.Argument(help="study file (TOML) or ready design")],
     out: Annotated[Path, typer.Option(help="HDF5 file to write")],
     report: Annotated[bool, typer.Option("--report", help=REPORT_HELP)] = False,
     precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
@@ -81,8 +81,9 @@ def simulate(
     from studies.runs import describe, run_study
     from studies.spec import load_study
     from studies.stability import margin_text
+    from studies.sweeps.spec import ready_spec
 
-    spec = load_study(study)
+    spec = load_study(ready_spec(study))
     check_results(out, report)
     run = run_study(spec)
     written = write_results(out, run, report)
@@ -135,22 +136,34 @@ def replay(
 
 @app.command()
 def modes(
-    pose: Annotated[
-        tuple[float, float, float] | None, typer.Option(help="x [m] y [m] phi [rad]; default home")
+    study: Annotated[
+        Path | None,
+        typer.Argument(help="study file or ready design; default: the paper's machine, undamped"),
     ] = None,
-    kp: Annotated[float, typer.Option(help="drive stiffness [N/m], 0 = free sliders")] = 2e4,
-    kd: Annotated[float, typer.Option(help="drive damping [N s/m]")] = 0.0,
-    damping: Annotated[float, typer.Option(help="structural damping ratio [1]")] = 0.0,
-    locked: Annotated[bool, typer.Option("--locked", help="hold the sliders")] = False,
-    basis: Annotated[str, typer.Option(help="modal basis of the links")] = "pinned_pinned",
-    n_modes: Annotated[int, typer.Option("--modes", help="modes per link")] = 3,
+    pose: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="x [m] y [m] phi [rad]; default: the first"),
+    ] = None,
+    kp: Annotated[
+        float | None, typer.Option(help="drive stiffness [N/m], 0 = free sliders")
+    ] = None,
+    kd: Annotated[float | None, typer.Option(help="drive damping [N s/m]")] = None,
+    damping: Annotated[float | None, typer.Option(help="structural damping ratio [1]")] = None,
+    locked: Annotated[bool | None, typer.Option("--locked", help="hold the sliders")] = None,
+    basis: Annotated[str | None, typer.Option(help="modal basis of the links")] = None,
+    n_modes: Annotated[int | None, typer.Option("--modes", help="modes per link")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Natural frequencies and damping ratios of the assembled machine."""
     start()
     from studies.modes import machine_modes
+    from studies.spec import load_study
+    from studies.sweeps.spec import ready_spec
 
-    found = machine_modes(pose, kp, kd, damping, locked, basis, n_modes)
+    found = machine_modes(
+        None if study is None else load_study(ready_spec(study)),
+        pose=pose, kp=kp, kd=kd, damping=damping, locked=locked, basis=basis, n_modes=n_modes,
+    )  # fmt: skip
     if as_json:
         text = {
             "frequencies_hz": found.frequency.tolist(),

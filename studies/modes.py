@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,56 +18,49 @@ from studies.spec import Study, parse_study
 
 
 def modes_study(
-    pose: tuple[float, float, float] | None,
-    kp: float,
-    kd: float,
-    damping: float,
-    locked: bool,
-    basis: str,
-    n_modes: int,
+    study: Study | None = None,
+    pose: tuple[float, float, float] | None = None,
+    kp: float | None = None,
+    kd: float | None = None,
+    damping: float | None = None,
+    locked: bool | None = None,
+    basis: str | None = None,
+    n_modes: int | None = None,
 ) -> Study:
     """The study whose linearisation is wanted; bad values are refused as in a study file."""
-    data: dict = {
-        "link": {"basis": basis, "modes": n_modes, "damping_ratio": damping},
-        "drive": {"kp": kp, "kd": kd, "locked": locked},
-        "control": {"feedback": "none"},
-        "shaper": {"kind": "none"},
-    }
+    undamped = {"link": {"modes": 3, "damping_ratio": 0.0}, "drive": {"kd": 0.0}}
+    data: dict = undamped if study is None else study.model_dump(mode="json", exclude_unset=True)
     if pose is not None:
         data["motion"] = {"waypoints": [list(pose)]}
+    given = (
+        ("link", "basis", basis), ("link", "modes", n_modes), ("link", "damping_ratio", damping),
+        ("drive", "kp", kp), ("drive", "kd", kd), ("drive", "locked", locked),
+        ("control", "feedback", "none"), ("shaper", "kind", "none"),
+    )  # fmt: skip
+    for section, name, value in given:
+        if value is not None:
+            data[section] = data.get(section, {}) | {name: value}
     return parse_study(data)
 
 
-def machine_modes(
-    pose: tuple[float, float, float] | None = None,
-    kp: float = 2e4,
-    kd: float = 0.0,
-    damping: float = 0.0,
-    locked: bool = False,
-    basis: str = "pinned_pinned",
-    n_modes: int = 3,
-) -> NaturalModes:
-    """Natural modes of the machine held by its drive at a pose.
+def machine_modes(study: Study | None = None, **changes: Any) -> NaturalModes:
+    """Natural modes of the machine held by its drive at a pose, under the study's steady load.
 
     Args:
-        pose: (x, y, phi) [m, m, rad]; None: home.
-        kp: drive stiffness [N/m].
-        kd: drive damping [N s/m].
-        damping: structural damping ratio [1].
-        locked: sliders held.
-        basis: modal basis of the links.
-        n_modes: modes per link.
+        study: whose machine and damping, at its first way-point; None: the paper's machine at home
+            with three modes a link, undamped.
+        changes: what is to differ, by the names of `modes_study`.
 
     Raises:
         StudyError: value out of range, pose out of reach or singular.
     """
-    study = modes_study(pose, kp, kd, damping, locked, basis, n_modes)
+    study = modes_study(study, **changes)
     structure, case = build_structure(study), as_arrays(build_case(study))
     where = study.motion.waypoints[0]
     code, plant = _at_pose(structure, case, np.array(where))
     check_pose("pose", where, int(code))
     found = natural_modes(plant)
-    if locked:  # the three coordinates that the sliders hold are no modes
+    if study.drive.locked:  # the three coordinates that the sliders hold are no modes
         found = NaturalModes(found.frequency[3:], found.damping_ratio[3:], found.shape[:, 3:])
     return found
 

@@ -184,6 +184,21 @@ def test_modes_at_another_pose_differ(capsys):
     assert 1e-4 < np.max(np.abs(moved / home - 1)) < 0.2
 
 
+def test_modes_of_a_study_are_those_of_its_own_machine(capsys, tmp_path):
+    """Patches, joint inertia and damping; a load changes the links' frequencies."""
+    out = run(capsys, "modes", "measured", "--locked", "--json")[1]
+    found = json.loads(out)
+    frequency = np.array(found["frequencies_hz"]).reshape(-1, 3)
+    np.testing.assert_allclose(frequency[:2, 0], [92.7, 240.5], atol=0.1)
+    np.testing.assert_allclose(found["damping_ratios"], 0.01, rtol=1e-6)
+    study = tmp_path / "loaded.toml"
+    study.write_text("[load]\nwrench = [20, 0, 0]\n[motion]\nmove_time = [0.1, 0.1, 0.1, 0.2]\n")
+    out = run(capsys, "modes", study, "--kd", 0, "--pose", 0, 0, np.pi / 6, "--json")[1]
+    np.testing.assert_allclose(
+        json.loads(out)["frequencies_hz"][3:6], [108.19, 118.16, 118.47], rtol=2e-4
+    )  # finite elements
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
