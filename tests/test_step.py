@@ -27,7 +27,12 @@ def parts():
         prepared = prepare(structure, case)
         outside = command(structure, case, prepared)
         start = initial_state(
-            structure, prepared.loop, outside.start_pose, prepared.initial_q, outside.status
+            structure,
+            prepared.loop,
+            outside.start_pose,
+            prepared.initial_q,
+            outside.status,
+            case.electronics.sensor_highpass,
         )
         return prepared.loop, start, jax.tree.map(lambda x: x[100], outside.inputs)
 
