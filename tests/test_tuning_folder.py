@@ -10,6 +10,7 @@ from rich.console import Console
 
 from studies import cli
 from studies import spec as spec_module
+from studies.design import load_design
 from studies.errors import StudyError
 from studies.runs import run_study
 from studies.spec import load_study, paper_study, read_toml
@@ -124,13 +125,20 @@ def test_placement_by_gradient_is_as_good_as_the_sweep(tmp_path):
     swept = run_sweep(parse_sweep(asked), tmp_path / "sweep", is_quiet=True)
     data = load(tmp_path / "sweep")
     residual = np.sqrt(np.mean(data["residual_rms"] ** 2, axis=(1, 2)))
-    best = np.min(residual[data["status"] == 0])
+    best = int(np.argmin(np.where(data["status"] == 0, residual, np.inf)))
     found = run_tuning(spec, tmp_path / "tune", False, Console(quiet=True), True)
     tuned = load_study(tmp_path / "tune" / "tuned.toml")
-    result = run_study(tuned, has_record=False).result
-    own = np.sqrt(np.mean(result.metrics.residual_rms**2))
+
+    def left(study, **changes):
+        result = run_study(study.change(**changes), has_record=False, has_loop=False).result
+        assert result.status == 0
+        return np.sqrt(np.mean(result.metrics.residual_rms**2))
+
+    # a tuning has no rounding; by chance rounding favours one of 4,096 placements by 2e-4
+    fine = {"electronics__adc_bits": 32}
+    assert left(tuned, **fine) <= left(load_design(tmp_path / "sweep", best).study, **fine)
+    assert left(tuned) <= residual[best] * (1 + 1e-3)
     differentiated = int(found.at.iteration) * (1 + spec.tune.starts)
-    assert result.status == 0 and own <= best
     # what each costs is measured where compilers do their best: docs/tuning.md
     assert swept.n_run == len(residual) == 4096 and differentiated <= 4096 // 50
 
