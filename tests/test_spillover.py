@@ -469,6 +469,18 @@ def test_another_design_s_certificate_is_left_alone(capsys, monkeypatch, tmp_pat
     assert (out / "certificate.json").read_text() == kept
 
 
+def test_a_certificate_is_made_again_in_its_folder(capsys, monkeypatch, tmp_path, comparison):
+    """Also that of a design whose ratios come from its own run and are written as numbers."""
+    few(monkeypatch, lambda study, margin: comparison)
+    monkeypatch.setattr(
+        spillover_run.figures, "save", lambda _, out, name: (out / f"{name}.png").write_bytes(b"-")
+    )
+    design, out = write(tmp_path, control__ratio_source="own_run"), tmp_path / "out"
+    for _ in range(2):
+        assert run(capsys, "spillover", design, "--out", out)[0] in (0, 1)
+    assert (out / "certificate.json").exists()
+
+
 def test_command_fails_a_design(capsys, monkeypatch, tmp_path):
     def refuse(study, margin):
         raise StudyError("not today")

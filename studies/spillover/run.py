@@ -14,7 +14,7 @@ from studies import figures
 from studies.design import Design
 from studies.errors import StudyError
 from studies.pages import write_report
-from studies.runs import STATUS_LABEL, run_attributes
+from studies.runs import STATUS_LABEL, resolved_study, run_attributes
 from studies.spec import Study
 from studies.spillover import plots
 from studies.spillover.certificate import Certificate, certify
@@ -41,9 +41,10 @@ def spillover_design(design: Design, out: Path, margin: float, console: Console)
         StudyError: as `certify`, or a folder that cannot be written to.
     """
     check_folder(out)
-    _check_whose(out, design.study)
+    study = resolved_study(design.study)
+    _check_whose(out, study)
     console.print("judging the controller on plants that differ from what it believes")
-    found = certify(design.study, margin)
+    found = certify(study, margin)
     console.print(verdict(found), soft_wrap=True)
     console.print("comparing laws")
     laws = None
@@ -68,7 +69,7 @@ def _check_whose(out: Path, study: Study) -> None:
         kept = json.loads((out / DOCUMENT).read_text(encoding="utf-8"))["study"]
     except (OSError, ValueError, KeyError, TypeError):
         return
-    if kept != json.loads(study.model_dump_json()):
+    if kept != study.model_dump(mode="json"):
         raise StudyError(
             f"--out {out}: has the certificate of another design; give another folder, or delete it"
         )
