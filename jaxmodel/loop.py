@@ -7,6 +7,7 @@ and its first status code. Shapes: structure first, lanes last (see `jaxmodel.pl
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -185,8 +186,7 @@ def plant_step(
     e, f = coefficients.half, coefficients.half_force
     start, middle, end = references
 
-    def rates(at: PlantState, reference: Reference, volt: Array) -> Rates:
-        return plant_rates(structure, loop, at, reference, volt)
+    rates = partial(plant_rates, structure, loop)
 
     def stage(origin: PlantState, x: tuple, slope: tuple, length: Array, push: Array) -> PlantState:
         """exp(A h/2) on the modes of `origin`, Euler from x along `slope` for the pose."""
@@ -366,7 +366,7 @@ def _advance_plant(
                 None if forward is None else forward[k],
                 inputs.disturbance,
                 inputs.wrench,
-            )  # fmt: skip
+            )
             for k in range(3)
         )
         return plant_step(structure, loop, at, (start, middle, end), voltage)

@@ -190,13 +190,12 @@ def _check_lists(study: Study) -> None:
     for row in _nested(given) or (given,):
         if any(b <= a for a, b in zip(row, row[1:], strict=False)):
             raise field_error("control.frequencies_hz", given, "rising from mode to mode", "Hz")
-    for name, flat, most, unit in (
-        ("control.frequencies_hz", given, "control.modes", "Hz"),
-        ("link.damping_ratio", damping, "link.modes", "1"),
+    for name, flat, most, limit, unit in (
+        ("control.frequencies_hz", given, "control.modes", control.modes, "Hz"),
+        ("link.damping_ratio", damping, "link.modes", study.link.modes, "1"),
     ):
-        many = control.modes if most == "control.modes" else study.link.modes
-        if isinstance(flat, tuple) and not _nested(flat) and len(flat) > many:
-            raise field_error(name, flat, f"at most {most} = {many} entries", unit)
+        if isinstance(flat, tuple) and not _nested(flat) and len(flat) > limit:
+            raise field_error(name, flat, f"at most {most} = {limit} entries", unit)
     for name, table, _width, unit in tables:
         if table and len(table) != 3:
             raise field_error(name, table, "three lists, one per link", unit)

@@ -111,7 +111,6 @@ def _links(run: Run) -> list[str]:
         for i in range(3)
     ]  # fmt: skip
     stations = ", ".join(f"{1e3 * x:g}" for x in own.stations)
-    watched = run.study.run.duration - float(run.result.command_end)
     heads = (
         "link", "residual rms [µm]", "residual peak [µm]", "peak while moving [µm]",
         "settling time [ms]", "peak voltage [V]", "peak motor force [N]",
@@ -120,15 +119,20 @@ def _links(run: Run) -> list[str]:
         f"Deflections: the largest of the stations at {stations} mm. Residual window: "
         f"{own.residual_length:g} s, from {own.residual_delay:g} s after the shaped command. "
         f"Settled: within {1e6 * own.settling_band:g} µm from then to the end of the run, "
-        f"{1e3 * watched:.4g} ms after the shaped command.", "",
+        f"{1e3 * _watched(run):.4g} ms after the shaped command.", "",
         *table(heads, rows),
     ]  # fmt: skip
+
+
+def _watched(run: Run) -> float:
+    """From the end of the shaped command to that of the run [s]."""
+    return run.study.run.duration - float(run.result.command_end)
 
 
 def settling_text(run: Run, link: int) -> str:
     """Settling time of a link [ms], or that it was outside the band to the end."""
     seconds = float(run.result.metrics.settling_time[link])
-    last = run.study.run.duration - float(run.result.command_end)
+    last = _watched(run)
     if seconds >= last - 1.5 / run.study.electronics.sample_rate_hz > 0:
         return f"not within {1e3 * last:.4g}"
     return f"{1e3 * seconds:.4g}"

@@ -22,6 +22,7 @@ from jaxmodel.controller import Controller
 from jaxmodel.kinematics import path_status
 from jaxmodel.linear import linearise, mechanical, resting
 from jaxmodel.motion import end_of_path, sample_path
+from jaxmodel.plant import damping_ratio
 from jaxmodel.prepare import (
     MODE_STEP_LIMIT,
     STIFFNESS_LIMIT,
@@ -161,8 +162,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
     code, index = path_status(plant, poses)
     worst = jnp.maximum(prepared.sensor_condition.max(), prepared.actuator_condition.max())
     corner = lowpass_corner(structure, case, prepared.bases)
-    rate = plant.damping / plant.modal_mass[:, None]
-    damping = jnp.max(rate / (2 * prepared.loop.omega))
+    damping = jnp.max(damping_ratio(case.machine.damping, prepared.loop.omega))
     return Preflight(
         each, code, time[index], poses[index], end, shaper_length, worst,
         jnp.max(prepared.loop.omega), damping, corner, steady_load(structure, case, plant),

@@ -107,15 +107,12 @@ def certify(
     plants = all_plants(bases, departures, plant_sizes(found, sizes))
     maker = LoopMaker(found)
     faults = np.vectorize(maker.fault, otypes=[object])(plants)
-    exists = faults == ""
-    if not exists.any():
-        raise StudyError(f"no plant to judge on: {'; '.join(dict.fromkeys(faults.ravel()))}")
-    judgements = _judged(found, maker, plants[exists].tolist())
-    for at in map(tuple, np.argwhere(exists)):
+    judgements = _judged(found, maker, plants[faults == ""].tolist())
+    for at in map(tuple, np.argwhere(faults == "")):
         if plants[at] not in judgements:
             faults[at] = f"{plants[at].basis}, {plants[at].departure}: it buckles without control"
     if not judgements:
-        raise StudyError(f"no plant to judge on: {'; '.join(dict.fromkeys(faults[exists]))}")
+        raise StudyError(f"no plant to judge on: {'; '.join(dict.fromkeys(faults.ravel()))}")
     return _collected(found, margin, maker, plants, faults, judgements)
 
 
@@ -126,8 +123,9 @@ def _judged(
     law = widened(found.controller, found.n_patches)
     try:
         with threadpool_limits(1, "blas"):
-            loops = {plant: maker.loop(plant, law) for plant in plants}
-            return {plant: judge(loop) for plant, loop in loops.items() if loop.stands}
+            return {
+                plant: judge(loop) for plant in plants if (loop := maker.loop(plant, law)).stands
+            }
     except np.linalg.LinAlgError:
         raise StudyError("a linearised loop is not finite: nothing to judge") from None
 

@@ -129,8 +129,8 @@ class LoopMaker:
             return f"{plant.basis}: its sliders cannot be locked"
         link, joint = study.link, plant.departure.joint_inertia
         if plant.basis != WITH_JOINTS and (link.joint_inertia_b or link.joint_inertia_c or joint):
-            at_all = f" of {joint:g} kg m2" if joint else ""
-            return f"{plant.basis}: it has no rotary inertia{at_all} at the joints"
+            size = f" of {joint:g} kg m2" if joint else ""
+            return f"{plant.basis}: it has no rotary inertia{size} at the joints"
         return ""
 
     def loop(self, plant: Plant, law: Controller) -> SampledLoop:

@@ -14,8 +14,9 @@ from studies import figures
 from studies.runs import describe
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import WITHOUT, Comparison
-from studies.spillover.judgement import HIGHEST, LOWEST
+from studies.spillover.judgement import LOWEST
 from studies.spillover.plants import Departure
+from studies.stability import margin_text
 
 #: Leakage from here on has its own colour [1].
 FLOOR = 0.01
@@ -179,7 +180,7 @@ def law_bars(found: Comparison, ax: Axes | None = None) -> Axes:
     for k, name in enumerate(found.names):
         if name == WITHOUT:
             continue
-        margin = f"{found.margin[k]:.3g}" if found.margin[k] < HIGHEST else f"over {HIGHEST:g}"
+        margin = margin_text(found.margin[k], 3)
         end = 1e6 * np.nanmax(found.residual_rms[k], initial=0.0)
         text = f"margin {margin}, peak {found.peak_voltage[k]:.3g} V"
         text = text if found.margin[k] > 0 else "no stable gains"
