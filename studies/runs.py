@@ -38,7 +38,13 @@ from studies.cases import as_arrays, build_case, build_structure, powered
 from studies.consistency import check_locked
 from studies.errors import field_error
 from studies.spec import Study
-from studies.stability import LoopReport, MotionReport, loop_report, motion_report
+from studies.stability import (
+    MARGIN_MODES,
+    LoopReport,
+    MotionReport,
+    loop_report,
+    motion_report,
+)
 from studies.store import Variable
 
 #: More plant steps per sample than this are refused.
@@ -484,7 +490,10 @@ def run_variables(run: Run) -> dict[str, Variable]:
                 np.array(run.loop.spectral_radius), (), "1", "of the linearised sampled loop"
             ),
             "gain_margin": Variable(
-                np.array(run.loop.gain_margin), (), "1", "common gain factor before instability"
+                np.array(run.loop.gain_margin),
+                (),
+                "1",
+                f"common gain factor before instability, {MARGIN_MODES} plant modes or more",
             ),
             "loop_frequency": Variable(
                 run.loop.frequency_hz,

@@ -24,12 +24,30 @@ from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, closed_loop
 
+#: Plant modes that a margin rests on at least: modes that nobody controls limit the gains [1].
+MARGIN_MODES = 12
 #: Margins beyond this are given as it, and those below the other as 0 [1].
 HIGHEST, LOWEST = 64.0, 0.01
 #: Gain factors that are looked at are no further apart than this [1].
 STRIDE = 1.25
 #: Gain factors at which modes are followed from no control to the given gains [1].
 STEPS = np.linspace(0, 1, 41)[1:]
+
+
+def with_margin_modes(
+    structure: Structure, case: Case, least: int = MARGIN_MODES
+) -> tuple[Structure, Case]:
+    """The same loop, or loops, with at least so many plant modes, before any motion."""
+    n_modes = max(least, structure.n_modes)
+    modes = np.maximum(least, np.asarray(case.n_modes))
+    still = np.zeros((*np.shape(case.initial.modal)[:-1], n_modes))
+    case = case._replace(n_modes=modes, initial=case.initial._replace(modal=still))
+    # nothing that a loop about rest does not depend on, which would cost a compilation
+    structure = structure._replace(
+        n_modes=n_modes, n_steps=1, substeps=1, n_frequencies=1, has_noise=False, metrics=(),
+        is_smooth=True, feedback="sampled", has_position_gain=True,
+    )  # fmt: skip
+    return structure, case
 
 
 def margin_text(value: float, digits: int = 4) -> str:
@@ -78,7 +96,7 @@ def motion_report(structure: Structure, case: Case) -> MotionReport:
     """Gain margins with the forces that act during the unshaped motion.
 
     Linearised at its start and where the tension in a link is largest or smallest, as if that
-    instant lasted.
+    instant lasted, with `MARGIN_MODES` plant modes or more.
 
     Args:
         structure: static choices, feedback "sampled".
@@ -87,7 +105,7 @@ def motion_report(structure: Structure, case: Case) -> MotionReport:
     Raises:
         LinAlgError: an entry of the loop's matrices is not finite.
     """
-    plain = _judged(structure)
+    plain, case = with_margin_modes(structure, case)
     time, sample, force = jax.tree.map(np.asarray, _forces(plain, case))
     chosen = np.unique([0, *force.argmin(axis=0), *force.argmax(axis=0)])
     wrench = np.asarray(case.load.wrench, force.dtype)
@@ -103,17 +121,13 @@ def motion_report(structure: Structure, case: Case) -> MotionReport:
     return MotionReport(time[chosen], force[chosen], np.array(margins))
 
 
-def _judged(structure: Structure) -> Structure:
-    """Without what the matrices do not depend on, which must not cost a compilation."""
-    return structure._replace(n_steps=1, substeps=1, n_frequencies=1, has_noise=False)
-
-
 def loop_report(
     structure: Structure,
     case: Case,
     pose: Array,
     n_tracked: int = 3,
     law: Controller | None = None,
+    n_modes: int = MARGIN_MODES,
 ) -> LoopReport:
     """Spectral radius, gain margin and damping of the lowest link modes.
 
@@ -125,11 +139,12 @@ def loop_report(
         pose: where to linearise [m, m, rad], (3,).
         n_tracked: J, link modes to follow.
         law: controller to judge instead of the case's own.
+        n_modes: plant modes per link at least.
 
     Raises:
         LinAlgError: an entry of the loop's matrices is not finite.
     """
-    plain = _judged(structure)
+    plain, case = with_margin_modes(structure, case, n_modes)
     matrices = jax.tree.map(np.asarray, _closed_loop(plain, case, pose, law))
     period = float(case.electronics.period)
 

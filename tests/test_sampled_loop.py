@@ -69,7 +69,8 @@ lengthening = jax.jit(spillover, static_argnums=0)
 def reports():
     """Loop reports of the table at eight plant modes."""
     return {
-        name: loop_report(*arrays(**changes), HOME_POSE) for name, (changes, _, _) in TABLE.items()
+        name: loop_report(*arrays(**changes), HOME_POSE, n_modes=8)
+        for name, (changes, _, _) in TABLE.items()
     }
 
 

@@ -92,7 +92,7 @@ def test_margins_and_damping_are_those_of_the_loop_report():
     one = certified({}, sizes=(3, 8), **SAME)
     structure = build_structure(STUDY)
     home = np.array(STUDY.motion.waypoints[0])
-    report = loop_report(structure, as_arrays(build_case(STUDY)), home)
+    report = loop_report(structure, as_arrays(build_case(STUDY)), home, n_modes=3)
     np.testing.assert_allclose(one.margin[0, 0, 0], report.gain_margin, rtol=2e-4)
     np.testing.assert_allclose(one.radius[0, 0, 0], report.spectral_radius, rtol=1e-9)
     for own, wanted in (
@@ -165,7 +165,7 @@ def test_links_that_are_softer_and_joints_with_inertia():
     for at, changes in other.items():
         study = STUDY.change(link__modes=10, **changes)
         structure, case = build_structure(study), as_arrays(build_case(study))
-        report = loop_report(structure, case, home, law=law)
+        report = loop_report(structure, case, home, law=law, n_modes=10)
         np.testing.assert_allclose(found.margin[at][0], report.gain_margin, rtol=2e-4)
         np.testing.assert_allclose(
             np.sort(found.frequency_hz[at][0, :3], axis=1), np.sort(report.frequency_hz, axis=1),

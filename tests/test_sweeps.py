@@ -27,9 +27,9 @@ from studies.sweeps import plan
 from studies.sweeps import run as run_module
 from studies.sweeps.folder import CHUNKS, finished_cases, make_manifest, open_folder
 from studies.sweeps.program import TRACES
-from studies.sweeps.results import load
+from studies.sweeps.results import load, metric_values
 from studies.sweeps.run import make_plan, run_sweep
-from studies.sweeps.show import best_cases
+from studies.sweeps.show import best_cases, case_rows, margin_warning
 from tests.sweeps import MIXED, small, small_spec
 
 SILENT = Console(file=open(os.devnull, "w"))  # noqa: SIM115
@@ -80,7 +80,8 @@ def test_mode_counts_subsets_and_placements_share_one_compilation(mixed):
     assert traces == 1
     data = load(folder)
     assert data.n_cases == 72 and not (folder / CHUNKS).exists()
-    assert set(np.unique(data["status"])) <= {status.OK, status.SATURATED}
+    assert set(np.unique(data["status"])) <= {status.OK, status.SATURATED, status.UNSTABLE}
+    np.testing.assert_array_equal(data["status"] == status.UNSTABLE, data["gain_margin"] < 1)
     rms = data["residual_modal_rms"]
     assert np.isnan(rms[data["link_modes"] == 2][:, :, 2]).all()  # a mode that does not exist
     assert np.isfinite(rms[data["link_modes"] == 3]).all()
@@ -479,7 +480,7 @@ def _mount(folder, options):
 def test_best_cases_obey_conditions(mixed):
     data = studies.load(mixed[0])
     first = best_cases(data, "residual_rms", count=5)
-    value = data["residual_rms"].reshape(72, -1).max(axis=1)
+    value = data["residual_rms"].max(axis=(1, 2))
     is_ok = data["status"] == status.OK
     assert value[first[0]] == value[is_ok].min() and np.all(np.diff(value[first]) >= 0)
     limited = best_cases(data, "residual_rms[1]", "peak_voltage < 1 and control.modes == 2", 99)
@@ -488,10 +489,28 @@ def test_best_cases_obey_conditions(mixed):
     worst = data["sensor_condition"].max(axis=1)
     apart = best_cases(data, "residual_rms", f"sensor_condition < {np.median(worst)}", 99)
     assert len(apart) < is_ok.sum() and worst[apart].max() < np.median(worst)
+    second = data["residual_rms"][:, 1].max(axis=1)
+    named = best_cases(data, "residual_rms[link=2]", "peak_voltage[link=1] > 0", 99)
+    assert np.all(np.diff(second[named]) >= 0) and np.all(data["peak_voltage"][named, 0] > 0)
+    np.testing.assert_array_equal(
+        metric_values(data, "residual_rms[station=2][link=3]"), data["residual_rms"][:, 2, 1]
+    )
+    with pytest.raises(StudyError, match="allowed link = 1 to 3, station = 1 to 3"):
+        best_cases(data, "residual_rms[link=4]")
     with pytest.raises(StudyError, match="did you mean 'peak_voltage'"):
         best_cases(data, "voltage_peak")
     with pytest.raises(StudyError, match="true for no case"):
         best_cases(data, "residual_rms", "peak_voltage < 0")
+
+
+def test_small_margins_are_not_passed_over(mixed):
+    data = studies.load(mixed[0])
+    order = np.argsort(data["gain_margin"])
+    warned, fine = margin_warning(data, order[:3]), margin_warning(data, order[-1:])
+    assert f"smallest {data['gain_margin'].min():.3g}" in warned and "gain_margin > 2" in warned
+    assert (fine == "") == (data["gain_margin"].max() >= 2)
+    table = case_rows(data, order[:1], ["residual_rms"])
+    assert table.heads[-1] == "gain_margin" and float(table.rows[0][-1]) < 2
 
 
 def test_background_threads_may_run_sweeps(tmp_path):

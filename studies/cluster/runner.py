@@ -107,7 +107,7 @@ class ClusterRunner:
                         if answer.compile_time and structure not in compiled:
                             compiled.add(structure)
                             reporter.compiled(answer.executor, answer.compile_time)
-                        yield Done(flight.chunk, structure.substeps, answer.result)
+                        yield Done(flight.chunk, structure.substeps, answer.outcome)
                     elif flight.is_alone:
                         yield Lost(flight.chunk, answer)
                     else:

@@ -7,11 +7,15 @@ optional (extra `fast`); without it XLA runs the same step.
 from __future__ import annotations
 
 import ctypes
+import hashlib
+import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from studies.compilation import ObjectCache, compiling
@@ -33,7 +37,7 @@ class Kernel:
         pointers = ctypes.POINTER(ctypes.c_void_p)
         prototype = ctypes.CFUNCTYPE(None, pointers, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
         self._function = prototype(code.get_function_address("run"))
-        self.width, self._numbers = width, numbers
+        self.width, self.numbers = width, numbers
         #: operations of one sample by kind
         self.operations = operations
 
@@ -51,7 +55,7 @@ class Kernel:
         """
         if lanes % self.width:
             raise ValueError(f"lanes = {lanes}: allowed multiples of {self.width}")
-        arrays = [self._numbers, *leaves]
+        arrays = [self.numbers, *leaves]
         addresses = (ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays))
         for first in range(0, lanes, self.width):
             self._function(addresses, n_steps, lanes, first)
@@ -63,9 +67,50 @@ def build_kernel(loop: TracedLoop) -> Kernel:
     Args:
         loop: from `trace_loop`.
     """
+    return _build(loop)[0]
+
+
+def _build(loop: TracedLoop) -> tuple[Kernel, bytes]:
+    """The kernel, and its machine code."""
     writer = _VectorWriter(loop)
-    engine = _compile(str(writer.write()))
-    return Kernel(engine, writer.width, np.array(writer.numbers, loop.dtype), loop.operations())
+    engine, code = _compile(str(writer.write()))
+    numbers = np.array(writer.numbers, loop.dtype)
+    return Kernel(engine, writer.width, numbers, loop.operations()), code
+
+
+def kept_kernel(name: str, make: Callable[[], TracedLoop]) -> Kernel:
+    """The kernel of a loop that `name` and the code of model and kernels decide alone.
+
+    Found in the cache's folder it need not even be traced.
+
+    Args:
+        name: of the loop, with all sizes.
+        make: traces it.
+    """
+    kept = ObjectCache("loop", name, _source_digest(), jax.__version__, *_target())
+    found = kept.take(None)
+    if found is None:
+        kernel, code = _build(make())
+        facts = [kernel.width, kernel.numbers.tolist(), kernel.operations]
+        kept.keep(None, json.dumps(facts).encode() + b"\n" + code)
+        return kernel
+    head, code = found.split(b"\n", 1)
+    width, numbers, operations = json.loads(head)
+    initialise()
+    engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine())
+    engine.add_object_file(binding.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    dtype = np.dtype(f"f{VECTOR_BYTES // width}")
+    return Kernel(engine, width, np.array(numbers, dtype), Counter(operations))
+
+
+@cache
+def _source_digest() -> str:
+    """Of the code that a traced loop comes from."""
+    top = Path(__file__).parents[2]
+    files = [*(top / "jaxmodel").glob("*.py"), *Path(__file__).parent.glob("*.py")]
+    texts = [path.read_bytes() for path in sorted(files)]
+    return hashlib.sha256(b"\0".join(texts)).hexdigest()
 
 
 class _VectorWriter(Writer):
@@ -148,16 +193,37 @@ def initialise() -> None:
         getattr(binding, part)()
 
 
-def _compile(text: str) -> Any:
+def _target() -> tuple[str, ...]:
+    """What machine code depends on besides its text."""
+    features, version = binding.get_host_cpu_features().flatten(), binding.llvm_version_info
+    triple = binding.get_default_triple()
+    return binding.get_host_cpu_name(), features, triple, ".".join(map(str, version))
+
+
+def _machine() -> Any:
+    cpu, features, *_ = _target()
+    return binding.Target.from_default_triple().create_target_machine(
+        cpu=cpu, features=features, opt=3, jit=True
+    )
+
+
+def _compile(text: str) -> tuple[Any, bytes]:
+    """The engine that holds the machine code of a module, and that code."""
     initialise()
-    cpu, features = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
-    triple, version = binding.get_default_triple(), ".".join(map(str, binding.llvm_version_info))
-    kept = ObjectCache(text, cpu, features, triple, version)
+    kept, code = ObjectCache(text, *_target()), []
+
+    def keep(module: Any, made: bytes) -> None:
+        code.append(made)
+        kept.keep(module, made)
+
+    def take(module: Any) -> bytes | None:
+        found = kept.take(module)
+        if found is not None:
+            code.append(found)
+        return found
+
     with compiling():
-        target = binding.Target.from_default_triple().create_target_machine(
-            cpu=cpu, features=features, opt=3, jit=True
-        )
-        engine = binding.create_mcjit_compiler(binding.parse_assembly(text), target)
-        engine.set_object_cache(kept.keep, kept.take)
+        engine = binding.create_mcjit_compiler(binding.parse_assembly(text), _machine())
+        engine.set_object_cache(keep, take)
         engine.finalize_object()
-    return engine
+    return engine, code[-1]

@@ -157,6 +157,8 @@ class Graph:
             return b if _is(a, 0) else a
         return self._node("add", a, b)
 
+    _op_add_any = _op_add  # of tangents
+
     def _op_sub(self, a: Any, b: Any) -> Any:
         if is_known(a) and is_known(b):
             return a - b

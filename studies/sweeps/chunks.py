@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import NamedTuple, Protocol
 
 import jax
@@ -12,10 +12,12 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.simulate import Result
 from studies.cases import powered
+from studies.compilation import compiler_time
 from studies.runs import with_ratio
 from studies.sweeps.executor import make_executor, own_ratios
+from studies.sweeps.margins import LoopFigures, judge_loops
 from studies.sweeps.plan import Chunk, Group, Layout, chunk_cases, local_layout
-from studies.sweeps.program import Executor, Running
+from studies.sweeps.program import Executor
 from studies.sweeps.progress import Reporter
 from studies.sweeps.table import Table
 
@@ -25,7 +27,21 @@ class Done(NamedTuple):
 
     chunk: Chunk
     substeps: int  # plant steps per sample of its program
-    result: Result  # padded
+    outcome: Outcome  # padded
+
+
+class Outcome(NamedTuple):
+    """What is known of a chunk's cases after it."""
+
+    result: Result
+    loop: LoopFigures
+
+
+class Started(NamedTuple):
+    """A chunk on its way; as `Running`, with the judgement of its loops."""
+
+    wait: Callable[[], Outcome]
+    cancel: Callable[[], None]
 
 
 class Lost(NamedTuple):
@@ -68,7 +84,7 @@ class Here:
         for group in groups:
             has_own = has_own_ratio(table, group)
             executor = make_executor(group.structure, group.layout, has_own)
-            pending: tuple[Chunk, Running] | None = None
+            pending: tuple[Chunk, Started] | None = None
             for chunk in group.chunks():
                 is_first = executor.compile_time == 0
                 cases = chunk_cases(table, chunk.rows, group.structure, group.layout.size)
@@ -90,7 +106,7 @@ class Here:
                 return
 
 
-def _waited(group: Group, chunk: Chunk, running: Running) -> Done:
+def _waited(group: Group, chunk: Chunk, running: Started) -> Done:
     return Done(chunk, group.structure.substeps, running.wait())
 
 
@@ -101,8 +117,10 @@ def has_own_ratio(table: Table, group: Group) -> bool:
 
 def start_chunk(
     executor: Executor, table: Table, rows: np.ndarray, cases: Case, has_own_ratio: bool
-) -> Running:
-    """Start a chunk, after its uncontrolled pass where gain ratios come from that.
+) -> Started:
+    """Judge the loops of a chunk and start its runs.
+
+    Where gain ratios come from an uncontrolled pass, that is done first.
 
     Args:
         executor: of the group.
@@ -111,6 +129,7 @@ def start_chunk(
         cases: from `chunk_cases`.
         has_own_ratio: whether such a pass is needed.
     """
+    is_first = executor.compile_time == 0
     if has_own_ratio:
         size = max(map(len, jax.tree.leaves(cases)))
         filled = np.concatenate([rows, np.full(size - len(rows), rows[-1])])
@@ -118,4 +137,10 @@ def start_chunk(
         exponent = table.values("control.ratio_exponent")[filled][:, None, None]
         own = powered(own_ratios(executor, cases), exponent)
         cases = with_ratio(cases, np.where(is_own[:, None, None], own, cases.control.ratio))
-    return executor.start(cases)
+    before = compiler_time()
+    loop = judge_loops(executor.structure, cases)
+    spent = compiler_time() - before
+    running = executor.start(cases)
+    if is_first:
+        executor.compile_time += spent
+    return Started(lambda: Outcome(running.wait(), loop), running.cancel)

@@ -8,6 +8,7 @@ Everything is evaluated for all cases at once; nothing else can be written, so n
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Callable
 from functools import reduce
 from typing import Any
@@ -18,6 +19,9 @@ from studies.errors import StudyError, shown
 
 #: A longer condition is refused [characters].
 LONGEST = 1000
+
+#: `[link=1]`, which is no Python.
+_NAMED_INDEX = re.compile(r"\[(\w+)=(\d+)\]")
 
 Lookup = Callable[[str], np.ndarray]
 
@@ -66,7 +70,7 @@ def evaluate(text: str, lookup: Lookup, field: str) -> np.ndarray:
         raise StudyError(f"{field}: {len(text)} characters; allowed up to {LONGEST}")
     said = shown(text)
     try:
-        tree = ast.parse(text.strip(), mode="eval").body
+        tree = ast.parse(_NAMED_INDEX.sub(r'["\1=\2"]', text.strip()), mode="eval").body
         with np.errstate(all="ignore"):
             value = np.asarray(_value(tree, lookup))
     except StudyError as error:
@@ -141,5 +145,7 @@ def _name(node: ast.AST) -> str:
         return f"{_name(node.value)}.{node.attr}"
     if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
         if type(node.slice.value) is int:
+            return f"{_name(node.value)}[{node.slice.value}]"
+        if isinstance(node.slice.value, str):  # an index that names its axis
             return f"{_name(node.value)}[{node.slice.value}]"
     raise StudyError(f"{ast.unparse(node)!r} is no name of a field")

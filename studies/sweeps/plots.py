@@ -17,7 +17,7 @@ from jaxmodel import status
 from studies import figures
 from studies.errors import StudyError
 from studies.sweeps.results import SweepData, metric_values, swept_names
-from studies.sweeps.show import best_cases, label, shown_value
+from studies.sweeps.show import ENOUGH, MARGIN, best_cases, label, shown_value
 
 #: More distinct values than this are no grid.
 FEW = 60
@@ -59,7 +59,7 @@ def plot(data: SweepData, x: str | None, y: str, hue: str | None) -> Figure:
     with figures.styled():
         figure = Figure(figsize=(5.2, 3.6), layout="constrained")
         ax = figure.subplots()
-        _say_left_out(figure, chosen)
+        _say_left_out(figure, data, chosen)
         ax.set_xlabel(label(data, x))
         if group is not None and _is_grid(across, group):
             _heat_map(figure, ax, across, group, value[chosen], label(data, y))
@@ -73,11 +73,16 @@ def plot(data: SweepData, x: str | None, y: str, hue: str | None) -> Figure:
     return figure
 
 
-def _say_left_out(figure: Figure, chosen: np.ndarray) -> None:
-    n_left = int(np.sum(~chosen))
+def _say_left_out(figure: Figure, data: SweepData, chosen: np.ndarray) -> None:
+    n_left, parts = int(np.sum(~chosen)), []
     if n_left:
-        text = f"{n_left} of {len(chosen)} cases not ok, left out"
-        figure.suptitle(text, fontsize=7.5, x=0.01, ha="left")
+        parts.append(f"{n_left} of {len(chosen)} cases not ok, left out")
+    if MARGIN in data.variables:
+        n_low = int(np.sum(data[MARGIN][chosen] < ENOUGH))
+        if n_low:
+            parts.append(f"{n_low} of those shown with a gain margin below {ENOUGH:g}")
+    if parts:
+        figure.suptitle("; ".join(parts), fontsize=7.5, x=0.01, ha="left")
 
 
 def save_plot(figure: Figure, path: Path) -> None:
@@ -251,7 +256,7 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
         ax.set_xticks(range(len(names) + 1), [*names, label(data, y)], rotation=15, ha="right")
         ax.set_yticks([])
         ax.set_title("dark: smallest", fontsize=7.5, loc="right")
-        _say_left_out(figure, chosen)
+        _say_left_out(figure, data, chosen)
     return figure
 
 
@@ -298,5 +303,5 @@ def _placements(data: SweepData, y: str) -> Figure:
         bottom.set_xlabel("centre of the patch pair along the link [mm]")
         bottom.set_ylabel(label(data, y))
         bottom.legend(fontsize=7, markerscale=3)
-        _say_left_out(figure, is_ok)
+        _say_left_out(figure, data, is_ok)
     return figure

@@ -38,6 +38,7 @@ class Executor(Protocol):
     """Runs chunks of one group."""
 
     name: str
+    structure: Structure
     compile_time: float  # [s], 0 before the first chunk
 
     def __init__(self, structure: Structure, layout: Layout, has_own_ratio: bool) -> None:

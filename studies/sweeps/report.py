@@ -22,6 +22,7 @@ from studies.sweeps.show import (
     case_rows,
     cause_rows,
     label,
+    margin_warning,
     status_rows,
 )
 from studies.sweeps.spec import Node
@@ -142,10 +143,13 @@ def _counts(data: SweepData, cases: Table) -> list[str]:
 def _best(data: SweepData, metric: str) -> list[str]:
     if not np.isfinite(metric_values(data, metric)[data["status"] == status.OK]).any():
         return ["No case of status ok has it."]
+    best = best_cases(data, metric)
+    warning = margin_warning(data, best)
     return [
         f"Cases of status ok, smallest {label(data, metric)} first; a metric of several links or "
-        "stations counts with its largest.", "",
-        *_table(case_rows(data, best_cases(data, metric), [metric])),
+        "stations counts with the largest of the controlled links.", "",
+        *([f"**{literal(warning)}**", ""] if warning else []),
+        *_table(case_rows(data, best, [metric])),
     ]  # fmt: skip
 
 

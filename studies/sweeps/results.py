@@ -16,14 +16,15 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.prepare import SPECTRUM_SPAN
-from jaxmodel.simulate import Result
 from studies.errors import StudyError, field_error, nearest
 from studies.explain import unit_of
-from studies.fields import field_value, parse_entry
+from studies.fields import Fields, field_value, parse_entry
 from studies.runs import METRIC_LABELS, STATUS_LABEL
 from studies.spec import Study
+from studies.stability import HIGHEST, MARGIN_MODES
 from studies.store import Streamed, Variable, read_store, variable_labels, write_store
 from studies.sweeps.axes import LABELS, SHOWN_AS, known_field
+from studies.sweeps.chunks import Outcome
 from studies.sweeps.folder import (
     CHUNKS,
     JOINED,
@@ -33,6 +34,7 @@ from studies.sweeps.folder import (
     finished_cases,
     read_manifest,
 )
+from studies.sweeps.margins import LoopFigures
 from studies.sweeps.spec import SweepSpec, parse_sweep
 from studies.sweeps.table import Table, as_numbers, build_table
 
@@ -63,7 +65,17 @@ _PER_CASE: dict[str, tuple] = {
     "sensor_condition": (("link",), "1", "condition number of the modal filter"),
     "actuator_condition": (("link",), "1", "condition number of the synthesizer"),
     "singularity_distance": ((), "rad", "of link angles from 0 and 90 deg on the path"),
-}
+    "gain_margin": (
+        (), "1", "largest factor on all gains with every smaller one stable, at the first "
+        f"way-point with {MARGIN_MODES} plant modes or more; {HIGHEST:g}: that or more",
+    ),
+    "breaking_frequency": ((), "Hz", "of what goes unstable at the gain margin, NaN: nothing"),
+    "breaking_mode": (
+        (), "1", "order of the link mode nearest to that frequency, 0: the drive, NaN: nothing"
+    ),
+}  # fmt: skip
+#: Those of them that come from the linearised loop.
+OF_LOOP = LoopFigures._fields
 
 
 #: Metrics that single precision has within 1 %: `studies bench --work W1 --precision float32`
@@ -107,7 +119,7 @@ def kept_metrics(spec: SweepSpec) -> list[str]:
 def chunk_variables(
     table: Table,
     rows: np.ndarray,
-    result: Result,
+    outcome: Outcome,
     is_too_stiff: np.ndarray,
     substeps: int,
     kept: list[str],
@@ -117,7 +129,7 @@ def chunk_variables(
     Args:
         table: all cases.
         rows: those of the chunk.
-        result: of the chunk, padded.
+        outcome: of the chunk, padded.
         is_too_stiff: per case of the chunk.
         substeps: plant steps per sample of its program.
         kept: metrics to keep.
@@ -125,9 +137,11 @@ def chunk_variables(
     Returns:
         Variables; metrics of a case that did not finish, and of modes that it does not have, NaN.
     """
-    count = len(rows)
+    count, (result, loop) = len(rows), outcome
+    margin = np.asarray(loop.gain_margin)[:count]
     code = np.asarray(result.status)[:count].copy()
     code[is_too_stiff] = status.TOO_STIFF
+    code[np.isin(code, status.FINISHED) & (margin < 1)] = status.UNSTABLE
     is_finished = np.isin(code, status.FINISHED)
     modes, controlled = (table.values(name)[rows] for name in ("link.modes", "control.modes"))
     variables = {
@@ -135,7 +149,11 @@ def chunk_variables(
     }
     known = {"status": code, "substeps": np.full(count, substeps)}
     for name, (dims, *about) in _PER_CASE.items():
-        data = known[name] if name in known else np.asarray(getattr(result, name))[:count]
+        if name in known:
+            data = known[name]
+        else:
+            source: Any = loop if name in OF_LOOP else result
+            data = np.asarray(getattr(source, name))[:count]
         variables[name] = Variable(data, ("case", *dims), *about)
     for name in kept:
         source = result if name == "energy_ratio" else result.metrics
@@ -340,16 +358,24 @@ def gather(table: Table, finished: Finished) -> dict[str, Variable]:
     return variables
 
 
+#: An index that names its axis and counts from 1, as the files do: `residual_rms[link=1]`.
+_NAMED_INDEX = re.compile(r"\[(\w+)=(\d{1,6})\]")
+
+
 def metric_values(data: SweepData, name: str) -> np.ndarray:
     """One number per case: a metric, an entry of it, or a field, (n,).
 
-    A metric or condition number with more axes counts with its largest value: `residual_rms` is
-    that of the worst link and station, `residual_rms[0]` that of the worst station of link 1. A
-    field that does not vary has its value in every case.
+    A metric or condition number with more axes counts with its largest value, of the links that
+    some case controls: `residual_rms` is that of the worst of them and its worst station,
+    `residual_rms[link=3]` that of the worst station of link 3, controlled or not. Indices without
+    a name count from 0. A field that does not vary has its value in every case.
 
     Raises:
         StudyError: unknown name or entry.
     """
+    named = _NAMED_INDEX.findall(name)
+    if named:
+        return _of_axes(data, _NAMED_INDEX.sub("", name), named)
     entry = parse_entry(name)
     if entry is not None and entry.field in SHOWN_AS:
         name = SHOWN_AS[entry.field] + name[len(entry.field) :]
@@ -358,7 +384,7 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
     variables = data.variables
     for candidate in (variable_name(name), variable_name(key)):
         if candidate in variables and variables[candidate].dims[:1] == ("case",):
-            return _entry(variables[candidate], name, entry.indices if entry else (), candidate)
+            return _entry(data, name, entry.indices if entry else (), candidate)
     if "." in key:
         value = known_field(name, data.spec.study)
         if isinstance(value, tuple):
@@ -370,14 +396,60 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
     raise StudyError(f"{name!r}: unknown metric or axis; {hint}")
 
 
+def _of_axes(data: SweepData, name: str, named: list[tuple[str, str]]) -> np.ndarray:
+    """Values of a metric at numbers of some of its axes, counted from 1."""
+    if name not in data.variables or name not in (*metric_names(), *_PER_CASE):
+        metric_values(data, name)  # says what is wrong with it
+        raise StudyError(f"{name!r}: indices that name an axis are for metrics")
+    variable = data.variables[name]
+    array, dims = variable.data, list(variable.dims)
+    for axis, written in named:
+        number, size = int(written), array.shape[dims.index(axis)] if axis in dims[1:] else 0
+        if not 1 <= number <= size:
+            allowed = ", ".join(
+                f"{d} = 1 to {n}" for d, n in zip(dims[1:], array.shape[1:], strict=True)
+            )
+            raise StudyError(f"{name}[{axis}={written}]: allowed {allowed or 'no index'}")
+        array = np.take(array, number - 1, axis=dims.index(axis))
+        dims.remove(axis)
+    return _worst(data, array, tuple(dims))
+
+
+def _worst(data: SweepData, array: np.ndarray, dims: tuple[str, ...]) -> np.ndarray:
+    """Largest number of each case, of the links that count, (n,)."""
+    if array.ndim == 1:
+        return array
+    if array.dtype.kind == "f" and "link" in dims:
+        shape = [3 if d == "link" else 1 for d in dims]
+        array = np.where(np.reshape(counted_links(data), shape), array, np.nan)
+    flat = array.reshape(len(array), -1)
+    if flat.dtype.kind != "f":
+        return flat.max(axis=1)
+    is_empty = np.all(np.isnan(flat), axis=1)
+    return np.where(is_empty, np.nan, np.nanmax(np.where(np.isnan(flat), -np.inf, flat), axis=1))
+
+
+def counted_links(data: SweepData) -> np.ndarray:
+    """Links that a metric counts: those that some case controls, all where none does, (3,).
+
+    The same for all cases, or fewer links under control would look like less vibration.
+    """
+    fields = Fields(data.spec.study, build_table(data.spec).fields)
+    is_closed = fields.raw("control.feedback") != "none"
+    links = (fields.numbers("control.links") != 0) & is_closed[:, None]
+    found = links.any(axis=0)
+    return found if found.any() else np.ones(3, bool)
+
+
 def _turned(name: str, known: list[str]) -> str:
     """A name of the same words in another order."""
     words = sorted(name.split("_"))
     return next((other for other in known if sorted(other.split("_")) == words), "")
 
 
-def _entry(variable: Variable, name: str, indices: tuple[int, ...], candidate: str) -> np.ndarray:
-    array = variable.data
+def _entry(data: SweepData, name: str, indices: tuple[int, ...], candidate: str) -> np.ndarray:
+    variable = data.variables[candidate]
+    array, dims = variable.data, variable.dims
     if variable_name(name) != candidate or "[" not in name:
         used = indices
     else:
@@ -389,16 +461,10 @@ def _entry(variable: Variable, name: str, indices: tuple[int, ...], candidate: s
                 for axis, size in zip(variable.dims[1:], variable.data.shape[1:], strict=True)
             )
             raise StudyError(f"{name!r}: no such entry; indices allowed: {sizes or 'none'}")
-        array = array[:, index]
-    if array.ndim == 1:
-        return array
-    if candidate not in (*metric_names(), *_PER_CASE):
+        array, dims = array[:, index], (dims[0], *dims[2:])
+    if array.ndim > 1 and candidate not in (*metric_names(), *_PER_CASE):
         raise StudyError(f"{name!r}: a list; name one entry of it, such as {name}[0]")
-    flat = array.reshape(len(array), -1)
-    if flat.dtype.kind != "f":
-        return flat.max(axis=1)
-    is_empty = np.all(np.isnan(flat), axis=1)
-    return np.where(is_empty, np.nan, np.nanmax(np.where(np.isnan(flat), -np.inf, flat), axis=1))
+    return _worst(data, array, dims)
 
 
 def manifest_attributes(manifest: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table as RichTable
 
 from jaxmodel import status
@@ -29,6 +30,8 @@ from studies.sweeps.table import Table, case_study
 
 #: What `show` ranks cases by unless told otherwise.
 DEFAULT_METRIC = "residual_rms"
+#: Stands beside every metric of a case that has it, and what is said of cases below so much.
+MARGIN, ENOUGH = "gain_margin", 2.0
 #: Digits of a case's id that tables show.
 ID_DIGITS = 8
 #: Rows of a table of failed cases.
@@ -103,7 +106,7 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
     console.print(f"{data.spec.study.title}: {data.n_cases} cases, {', '.join(swept_names(data))}")
     _print(status_rows(data), console)
     if DEFAULT_METRIC in data.variables and (codes == status.OK).any():
-        console.print(f"best cases by {DEFAULT_METRIC}, worst link and station:")
+        console.print(f"best cases by {DEFAULT_METRIC}, worst controlled link and station:")
         print_cases(data, best_cases(data, DEFAULT_METRIC), [DEFAULT_METRIC], console)
 
 
@@ -134,13 +137,31 @@ def _print_failed(data: SweepData, codes: np.ndarray, console: Console) -> None:
 
 
 def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console: Console) -> None:
-    """Print `case_rows`."""
+    """Print `case_rows`, and what must be said of them."""
     _print(case_rows(data, cases, metrics), console)
+    warning = margin_warning(data, cases)
+    if warning:
+        console.print(f"[bold red]{escape(warning)}[/]", soft_wrap=True, markup=True)
+
+
+def margin_warning(data: SweepData, cases: np.ndarray) -> str:
+    """What is said where cases have a gain margin below `ENOUGH`, "" where none has."""
+    margin = data[MARGIN][cases] if MARGIN in data.variables else np.full(len(cases), np.nan)
+    low = int(np.sum(margin < ENOUGH))
+    if not low:
+        return ""
+    which = "this case has" if len(cases) == 1 else f"{low} of these {len(cases)} cases have"
+    return (
+        f"CAUTION: {which} a gain margin below {ENOUGH:g} (smallest {np.nanmin(margin):.3g}); such "
+        f"loops may go unstable on the machine. Ask for --subject-to '{MARGIN} > {ENOUGH:g}'."
+    )
 
 
 def case_rows(data: SweepData, cases: np.ndarray, metrics: list[str]) -> Rows:
-    """Cases with what varies and some metrics."""
+    """Cases with what varies, some metrics, and their gain margins."""
     names = swept_names(data)
+    if MARGIN not in metrics and MARGIN in data.variables and np.isfinite(data[MARGIN]).any():
+        metrics = [*metrics, MARGIN]
     columns = [metric_values(data, name) for name in metrics]
     rows = []
     for k in cases:

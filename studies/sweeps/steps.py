@@ -55,7 +55,7 @@ class Steps(NamedTuple):
 
 #: One at a time: of two runs of a program with an eigenvalue problem in it (basis loaded) XLA's
 #: CPU client now and then never ends one (jax 0.10).
-_PREPARING = Lock()
+PREPARING = Lock()
 _STEPS: dict[tuple, Steps] = {}
 #: Kernels kept in memory.
 KEPT_KERNELS = 8
@@ -148,7 +148,7 @@ def start_block(
         varying, shared: leaves of the block's cases.
     """
     lanes, parts = program.layout.lanes, steps.parts
-    with _PREPARING:
+    with PREPARING:
         own = [np.asarray(x, order="C") for x in prepare(program, parts, varying, shared)]
     start: Start = joined(parts.tree, parts.is_varying, own, steps.shared)
     varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)

@@ -1,0 +1,181 @@
+"""The eigenvalues of L along the frequency axis, and where they make the loop unstable.
+
+The loop with all gains times k has a pole on the imaginary axis where an eigenvalue of L(j omega)
+is 1/k. So the gain margin is the inverse of the rightmost point at which one of the eigenvalues'
+curves crosses the positive real axis (characteristic loci; MacFarlane and Postlethwaite 1977).
+The curves turn as fast as modes without control are damped, never faster: the frequencies to look
+at are known beforehand. `walk` is an elementwise step for the same executors as the loop over
+samples; eigenvalues are carried from frequency to frequency by the iteration of Durand and Kerner.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxmodel.pairs import Pair
+from jaxmodel.parameters import Array
+from jaxmodel.return_difference import (
+    LoopResponse,
+    Turn,
+    go_round,
+    spectrum_polynomial,
+)
+
+#: Iterations at each frequency.
+ITERATIONS = 4
+
+
+class Loci(NamedTuple):
+    """State of the walk: n = 3 C eigenvalues."""
+
+    value: Pair  # [1], (n,)
+    last: Pair  # at the last frequency where crossings were looked for [1], (n,)
+    omega: Array  # which that is [rad/s], ()
+    # of the rightmost crossing of each curve: where it meets the axis [1], and the frequencies on
+    # either side [rad/s], (n,) each; 0: none
+    crossing: Array
+    place: Array  # by linear interpolation
+    left: Array
+    right: Array
+
+
+class Station(NamedTuple):
+    """A frequency of the walk."""
+
+    omega: Array  # [rad/s], rising, never 0, ()
+    cosine: Array  # of omega T, ()
+    sine: Array
+    # 0: only iterate there; 1: begin to look for crossings there; 2: look for them between the last
+    # frequency of that kind and this one, ()
+    kind: Array
+
+
+def start_walk(value: Pair) -> Loci:
+    """State before the first station, with first guesses, (n, ...)."""
+    zero = 0 * value.re
+    return Loci(value, value, zero[0], zero, zero, zero, zero)
+
+
+def walk(response: LoopResponse, spread: Array, loci: Loci, station: Station) -> Loci:
+    """Carry the eigenvalues to the next frequency.
+
+    Args:
+        response: of the loop.
+        spread: see `go_round`, (3, C).
+        loci: so far.
+        station: the next frequency.
+    """
+    zero = jnp.zeros_like(station.omega)
+    turn = go_round(
+        response, Pair(zero, station.omega), Pair(station.cosine, -station.sine), spread
+    )
+    value, last = _iterated(turn, loci.value), loci.last
+    # where the straight line between two values meets the real axis
+    rise = value.im - last.im
+    was_above, is_above = last.im > 0, value.im > 0
+    is_through = (was_above & ~is_above) | (is_above & ~was_above)
+    share = jnp.where(is_through, -last.im / jnp.where(is_through, rise, 1.0), 0.0)
+    meets = last.re + share * (value.re - last.re)
+    is_more = is_through & (station.kind > 1) & (meets > loci.crossing)
+    is_kept = station.kind > 0
+    return Loci(
+        value,
+        Pair(jnp.where(is_kept, value.re, last.re), jnp.where(is_kept, value.im, last.im)),
+        jnp.where(is_kept, station.omega, loci.omega),
+        jnp.where(is_more, meets, loci.crossing),
+        jnp.where(is_more, loci.omega + share * (station.omega - loci.omega), loci.place),
+        jnp.where(is_more, loci.omega, loci.left),
+        jnp.where(is_more, station.omega, loci.right),
+    )
+
+
+def _iterated(turn: Turn, values: Pair) -> Pair:
+    """Eigenvalues made better one after the other, the newest at once in use (Durand, Kerner)."""
+
+    def improve(values: Pair, _: None) -> tuple[Pair, None]:
+        x = values[0]
+        apart = x - values[1]
+        for k in range(2, values.re.shape[0]):
+            apart = apart * (x - values[k])
+        x = x - spectrum_polynomial(turn, x) * apart.inverse()
+        join = jnp.concatenate
+        return Pair(join([values.re[1:], x.re[None]]), join([values.im[1:], x.im[None]])), None
+
+    return jax.lax.scan(improve, values, None, length=ITERATIONS * values.re.shape[0])[0]
+
+
+class Meeting(NamedTuple):
+    """A guess at where an eigenvalue is real and positive, to be made better."""
+
+    omega: Array  # [rad/s], ()
+    value: Array  # the eigenvalue, 1/k [1], ()
+    cosine: Array  # of omega T, ()
+    sine: Array
+    step: Array  # the last one as a share of the largest allowed, ()
+    by_omega: Pair  # derivatives of det(x - L) by frequency and eigenvalue, ()
+    by_value: Pair
+
+
+class Known(NamedTuple):
+    """A meeting point that has been found and is not wanted again."""
+
+    is_there: Array  # 1 or 0, ()
+    omega: Array  # [rad/s], ()
+    value: Array  # [1], ()
+    by_omega: Pair
+    by_value: Pair
+
+
+#: Largest steps of `approach`, as shares of frequency and eigenvalue.
+STRIDE = (0.01, 0.2)
+_TERMS = 8
+
+
+def start_approach(omega: Array, value: Array, cosine: Array, sine: Array) -> Meeting:
+    """State before the first step from a guess, see `Meeting`, (...)."""
+    zero = 0 * omega
+    none = Pair(zero, zero)
+    return Meeting(omega, value, cosine, sine, zero, none, none)
+
+
+def approach(response: LoopResponse, known: Known, meeting: Meeting) -> Meeting:
+    """A step of Newton's iteration on det(x - L(j omega)) = 0 for real omega and x.
+
+    Args:
+        response: of the loop.
+        known: what is divided out.
+        meeting: so far.
+    """
+    omega, value, zero = meeting.omega, meeting.value, jnp.zeros_like(meeting.omega)
+    one = jnp.ones_like(zero)
+    shift = Pair(meeting.cosine, -meeting.sine)
+    none = Pair(zero, zero)
+
+    def wanted(s: Pair, shift: Pair, x: Array) -> Pair:
+        found = spectrum_polynomial(go_round(response, s, shift), Pair(x, jnp.zeros_like(x)))
+        away = known.by_omega * (s.im - known.omega) + known.by_value * (x - known.value)
+        return found * (away * known.is_there + (1 - known.is_there)).inverse()
+
+    at = (Pair(zero, omega), shift, value)
+    turning = shift * Pair(zero, -response.period * one)  # d/d omega of exp(-j omega T)
+    found, by_omega = jax.jvp(wanted, at, (Pair(zero, one), turning, zero))
+    _, by_value = jax.jvp(wanted, at, (none, none, one))
+    area = by_omega.re * by_value.im - by_omega.im * by_value.re
+    over = 1 / jnp.where(area == 0, one, area)
+    d_omega = (found.im * by_value.re - found.re * by_value.im) * over
+    d_value = (found.re * by_omega.im - found.im * by_omega.re) * over
+    step = jnp.maximum(
+        jnp.abs(d_omega) / (STRIDE[0] * jnp.abs(omega)),
+        jnp.abs(d_value) / (STRIDE[1] * jnp.abs(value)),
+    )
+    share = 1 / jnp.maximum(step, 1.0)
+    d_omega, d_value = share * d_omega, share * d_value
+    angle = Pair(zero, -response.period * d_omega)
+    turn = angle * (1 / _TERMS) + 1.0
+    for n in range(_TERMS - 1, 0, -1):
+        turn = turn * angle * (1 / n) + 1.0
+    after = shift * turn
+    return Meeting(omega + d_omega, value + d_value, after.re, -after.im, step, by_omega, by_value)

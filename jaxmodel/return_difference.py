@@ -1,0 +1,305 @@
+"""The sampled loop by its return difference: det(I - k L(s)) without one large matrix.
+
+L(s) takes the forces of the controller's channels once round the loop: hold, amplifier, links and
+pose, patches, filters, controller. What a sampler sees is the sum of the plant's responses at
+s + 2 pi j n/T. Links meet in the pose alone, so each response is a sum over the modes of each link
+and a system of three equations for the pose, and det(x - L) is found link by link and then from
+3x3 matrices. docs/theory.md, "Gain margins of a batch". Shapes: structure first, lanes last.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.axial import axial_force
+from jaxmodel.case import Case, Structure
+from jaxmodel.estimator import Estimator
+from jaxmodel.kinematics import close_chain
+from jaxmodel.loop import Loop
+from jaxmodel.pairs import Pair, determinant, product
+from jaxmodel.parameters import Array
+
+#: Images n of the spectrum that are summed; those left out change the sum by 1e-4.
+IMAGES = (0, -1, 1, -2)
+
+
+class LoopResponse(NamedTuple):
+    """One loop about rest, in normal coordinates of each link (modal masses 1)."""
+
+    mass: Array  # of the pose with straight links, (3, 3)
+    damping: Array  # of the drive in the pose, (3, 3)
+    stiffness: Array  # (3, 3)
+    square: Array  # omega^2 of the modes of a link whose ends are held [1/s2], (3, R)
+    decay: Array  # 2 zeta omega [1/s], (3, R)
+    lightness: Array  # inertia left to a mode that drags nothing but the pose's mass [1], (3, R)
+    enter: Array  # generalised force on the pose per modal acceleration, (3, 3, R)
+    leave: Array  # inertia force on a mode per pose acceleration, (3, 3, R)
+    observe: Array  # channels per modal coordinate, (3, C, R)
+    act: Array  # on the modes per channel force, (3, C, R)
+    feedthrough: Array  # compensated, channels per channel force, (3, C, C)
+    estimator: Estimator
+    velocity_gain: Array  # (3, C)
+    position_gain: Array | None
+    period: Array  # T [s], ()
+    antialias: Array  # [rad/s], ()
+    highpass: Array | None  # of the patches [rad/s], None where there is none, ()
+    lag: Array | None  # of the amplifiers [s], None where there are none, ()
+
+
+def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> LoopResponse:
+    """What the return difference reads, for bases whose links end on their chord.
+
+    Args:
+        structure: static choices with feedback "sampled".
+        case: the numbers.
+        loop: of the case, from `prepare`.
+        pose: where to linearise, at rest under the steady load [m, m, rad], (3,).
+
+    Returns:
+        LoopResponse.
+    """
+    plant, law, drive, electronics = loop.plant, loop.controller, loop.drive, case.electronics
+    pose = jnp.asarray(pose, loop.omega.dtype)
+    still = jnp.zeros_like(pose)
+
+    def rates(pose_rate: Array) -> tuple[Array, Array]:
+        chain = close_chain(plant, pose, pose_rate)
+        return chain.rho_rate, chain.gamma_rate
+
+    to_rho, to_gamma = jax.jacfwd(rates)(still)  # (3 links, 3)
+    chain = close_chain(plant, pose, still)
+    platform = jnp.diag(
+        jnp.stack([plant.platform_mass, plant.platform_mass, plant.platform_inertia])
+    )
+    swing = -plant.tip_mass * chain.chord * chain.sine
+    mass = platform + sum(
+        jnp.einsum("i,ip,iq->pq", *terms)
+        for terms in (
+            (plant.slider_link_mass, to_rho, to_rho),
+            (plant.inertia, to_gamma, to_gamma),
+            (swing, to_rho, to_gamma),
+            (swing, to_gamma, to_rho),
+        )
+    )
+    leave = to_gamma[:, :, None] * plant.c[:, None] - (
+        (chain.sine[:, None] * to_rho)[:, :, None] * plant.b[:, None]
+    )
+    slope = drive.kd + drive.viscous_friction
+    if structure.has_friction:
+        slope = slope + drive.coulomb_friction / drive.friction_speed
+    stiffness = jnp.einsum("i,ip,iq->pq", drive.kp, to_rho, to_rho)
+    modal_mass = plant.modal_mass[:, None]
+    springs, turn = plant.stiffness / modal_mass, None
+    if structure.has_wrench:
+        held = jnp.linalg.solve(to_rho.T, -case.load.wrench)
+        curved = jax.hessian(lambda x: jnp.sum(held * close_chain(plant, x, still).rho))(pose)
+        stiffness = stiffness - curved
+        if plant.shortening is not None:
+            axial = axial_force(plant, pose, still, still, case.load.wrench)[:, None]
+            springs = springs + axial * plant.shortening / modal_mass
+            if plant.mixed_shortening is not None:
+                mixed = axial[:, :, None] * plant.mixed_shortening / modal_mass[:, :, None]
+                eye = jnp.eye(springs.shape[1])
+                springs, turn = jnp.linalg.eigh(springs[:, :, None] * eye + mixed)
+    leave = leave / modal_mass[:, None]
+    decay = plant.damping / modal_mass
+    observe = jnp.einsum("ick,ikr->icr", law.filter, loop.sensor)
+    act = jnp.einsum("irk,ikc->icr", loop.actuator, law.synthesizer)
+    if turn is not None:
+        leave, observe, act = (jnp.einsum("ipr,irs->ips", x, turn) for x in (leave, observe, act))
+        decay = jnp.einsum("irs,ir,irs->is", turn, decay, turn)
+    enter = leave * modal_mass[:, None]
+    drag = jnp.einsum("ipr,pq,iqr->ir", enter, jnp.linalg.inv(mass), leave)
+    if not structure.is_coupled:
+        enter, drag = jnp.zeros_like(enter), jnp.zeros_like(drag)
+    return LoopResponse(
+        mass=mass,
+        damping=jnp.einsum("i,ip,iq->pq", slope, to_rho, to_rho),
+        stiffness=stiffness,
+        square=springs,
+        decay=decay,
+        lightness=1 - drag,
+        enter=enter,
+        leave=leave,
+        observe=observe,
+        act=act,
+        feedthrough=jnp.einsum("ick,ikl,ild->icd", law.filter, law.feedthrough, law.synthesizer),
+        estimator=law.estimator,
+        velocity_gain=law.velocity_gain,
+        position_gain=law.position_gain,
+        period=jnp.asarray(electronics.period),
+        antialias=jnp.asarray(electronics.antialias),
+        highpass=electronics.sensor_highpass if structure.has_sensor_highpass else None,
+        lag=electronics.amplifier_lag if structure.has_amplifier else None,
+    )
+
+
+class AssembledModes(NamedTuple):
+    """Modes of the machine without control, m = 3 + 3 R; damping to first order."""
+
+    omega: Array  # ascending [rad/s], (m,)
+    decay: Array  # zeta omega [1/s], (m,)
+    share: Array  # of kinetic energy in the pose, then in the links' modes by order, (1 + R, m)
+
+
+def assembled_modes(response: LoopResponse) -> AssembledModes:
+    """Natural modes of pose and links: one symmetric eigenvalue problem.
+
+    With modal masses 1 the mass matrix is (1 G'; G M) and its Cholesky factor (1 0; G C),
+    C C' = M - G G', so that K reduces to (K_q, -K_q G'C'^-1; ., C^-1 (K_p + G K_q G') C'^-1).
+    """
+
+    def side_by_side(x: Array) -> Array:
+        return jnp.concatenate([x[0], x[1], x[2]], axis=1)
+
+    enter, leave = side_by_side(response.enter), side_by_side(response.leave)
+    # entries of both have one sign; without coupling the pose does not feel the links at all
+    drag = jnp.sign(leave) * jnp.sqrt(jnp.maximum(enter * leave, 0.0))
+    factor = jnp.linalg.inv(jnp.linalg.cholesky(response.mass - drag @ drag.T))
+
+    def reduced(pose: Array, links: Array) -> Array:
+        side = -(factor @ drag) * links
+        pose = factor @ (pose + (drag * links) @ drag.T) @ factor.T
+        return jnp.block([[pose, side], [side.T, jnp.diag(links)]])
+
+    stiffness = reduced(response.stiffness, jnp.ravel(response.square))
+    damping = reduced(response.damping, jnp.ravel(response.decay))
+    square, shape = jnp.linalg.eigh(stiffness)
+    n_modes = response.square.shape[1]
+    energy = shape * shape
+    links = jnp.sum(jnp.reshape(energy[3:], (3, n_modes, -1)), axis=0)
+    return AssembledModes(
+        jnp.sqrt(jnp.maximum(square, 0.0)),
+        jnp.sum(shape * (damping @ shape), axis=0) / 2,
+        jnp.concatenate([jnp.sum(energy[:3], axis=0)[None], links]),
+    )
+
+
+class Turn(NamedTuple):
+    """L at one s, as far as it is needed for its determinants; `spectrum_polynomial` reads it."""
+
+    own: list[Pair]  # coefficients of det(x - L_i) of each link, highest power first, (3,) each
+    joint: list[Pair]  # of entering adj(x - L_i) leaving, the same way, (3, 3, 3)
+    pose: Pair  # dynamic stiffness of the pose, its links on it, (3, 3)
+    pose_inverse: Pair  # 1/det of that, ()
+
+
+def go_round(response: LoopResponse, s: Pair, shift: Pair, spread: Array | None = None) -> Turn:
+    """L at s.
+
+    Args:
+        response: of the loop.
+        s: [1/s], ().
+        shift: exp(-s T), ().
+        spread: what is taken from the diagonal of L, so that channels without gains have
+            eigenvalues of their own [1], (3, C); None: nothing.
+    """
+    observe, act = response.observe, response.act
+    turn = 2 * np.pi / response.period
+    held = -shift + 1.0
+    seen = None
+    for image in IMAGES:
+        at = Pair(s.re, s.im + image * turn)
+        at2 = at * at
+        chain = _electronics(response, at, at2, held)
+        inertia = 1.0 if image == 0 else response.lightness
+        inverse = (at2 * inertia + at * response.decay + response.square).inverse()
+        part = _through(observe, act, inverse) * chain
+        seen = part if seen is None else seen + part
+        if image == 0:
+            leaving = _through(observe, response.leave, inverse) * (at2 * chain)
+            entering = _through(response.enter, act, inverse) * at2
+            links = _through(response.enter, response.leave, inverse).sum(0)
+            pose = (
+                at2 * response.mass + at * response.damping + response.stiffness
+                - links * (at2 * at2)
+            )  # fmt: skip
+    channel = _channel(response, shift)[:, :, None]
+    loop, leaving = (seen - response.feedthrough) * channel, leaving * channel
+    if spread is not None:
+        loop = _plus_diagonal(loop, Pair(-spread, jnp.zeros_like(spread)))
+    own, joint = _by_link(loop, leaving, entering)
+    return Turn(own, joint, pose, determinant(pose).inverse())
+
+
+def _through(one: Array, other: Array, inverse: Pair) -> Pair:
+    """sum over the modes of one_a other_b/own, (3, A, B)."""
+    weighed = Pair(other * inverse.re[:, None], other * inverse.im[:, None])
+    return Pair(
+        jnp.sum(one[:, :, None] * weighed.re[:, None], axis=3),
+        jnp.sum(one[:, :, None] * weighed.im[:, None], axis=3),
+    )
+
+
+def _electronics(response: LoopResponse, s: Pair, s2: Pair, held: Pair) -> Pair:
+    """Hold, amplifier, high-pass of the patches and anti-alias filter at s, ()."""
+    corner = response.antialias
+    below = (s2 + s * (np.sqrt(2.0) * corner) + corner * corner) * (s * response.period)
+    above = held * (corner * corner)
+    if response.highpass is not None:
+        below, above = below * (s + response.highpass), above * s
+    if response.lag is not None:
+        below = below * (s * response.lag + 1.0)
+    return above * below.inverse()
+
+
+def _channel(response: LoopResponse, shift: Pair) -> Pair:
+    """Force of each channel per channel signal, a sample later, (3, C)."""
+    estimator, shift2 = response.estimator, shift * shift
+
+    def section(c0: Array, c1: Array, c2: Array) -> Pair:
+        return Pair(c0 + c1 * shift.re + c2 * shift2.re, c1 * shift.im + c2 * shift2.im)
+
+    b0, b1, a1 = estimator.first
+    zero = jnp.zeros_like(b0)
+    above = section(*(response.velocity_gain * c for c in estimator.velocity))
+    if response.position_gain is not None:
+        above = above + section(*(response.position_gain * c for c in estimator.position))
+    below = section(1 + zero, *estimator.denominator) * section(1 + zero, a1, zero)
+    force = above * section(b0, b1, zero) * below.inverse()
+    if response.position_gain is not None:
+        force = force + response.position_gain * estimator.direct
+    return -(force * shift)
+
+
+def _by_link(loop: Pair, leaving: Pair, entering: Pair) -> tuple[list[Pair], list[Pair]]:
+    """det(x - L_i) and entering adj(x - L_i) leaving as polynomials in x (Faddeev, LeVerrier).
+
+    With M_1 = I, c_0 = 1: c_j = -tr(L M_j)/j, M_(j+1) = L M_j + c_j I, det = sum c_j x^(n-j) and
+    adj = sum M_(j+1) x^(n-1-j).
+    """
+    n = loop.re.shape[1]
+    trace = sum((loop[:, i, i] for i in range(1, n)), start=loop[:, 0, 0])
+    own, joint, power = [-trace], [product(entering, leaving)], loop
+    for j in range(1, n):
+        power = _plus_diagonal(power, own[-1][:, None])
+        joint.append(product(entering, product(power, leaving)))
+        power = product(loop, power)
+        trace = sum((power[:, i, i] for i in range(1, n)), start=power[:, 0, 0])
+        own.append(trace * (-1 / (j + 1)))
+    return own, joint
+
+
+def _plus_diagonal(matrix: Pair, value: Pair) -> Pair:
+    """Add to the diagonals of (3, n, n); value (3, n), or (3, 1)."""
+    n = matrix.re.shape[1]
+    eye = np.eye(n).reshape(1, n, n, *(1,) * (matrix.re.ndim - 3))
+    return Pair(matrix.re + eye * value.re[:, None], matrix.im + eye * value.im[:, None])
+
+
+def spectrum_polynomial(turn: Turn, x: Pair) -> Pair:
+    """det(x - L), whose zeros are the eigenvalues of L, (); the highest power has factor 1.
+
+    Args:
+        turn: L at some s.
+        x: [1], ().
+    """
+    own, joint = x + turn.own[0], turn.joint[0]
+    for constant, matrix in zip(turn.own[1:], turn.joint[1:], strict=True):
+        own, joint = own * x + constant, joint * x + matrix
+    pose = turn.pose - (joint * own.inverse()[:, None, None]).sum(0)
+    return determinant(pose) * turn.pose_inverse * own[0] * own[1] * own[2]

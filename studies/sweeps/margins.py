@@ -1,0 +1,420 @@
+"""Stability of every case of a chunk: gain margin, and what breaks beyond it.
+
+`jaxmodel.loci` says how. The steps run as traced kernels where there are any, else in XLA's scan:
+along the axis first; then between the two frequencies of each crossing, with more iterations; then
+by Newton's iteration, once more with what was found divided out, since links that are alike have
+crossings side by side. Rests on `MARGIN_MODES` plant modes, at rest at the first way-point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache, partial
+from threading import Lock
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.loci import (
+    Known,
+    Loci,
+    Meeting,
+    Station,
+    approach,
+    start_approach,
+    start_walk,
+    walk,
+)
+from jaxmodel.pairs import Pair
+from jaxmodel.prepare import prepare
+from jaxmodel.return_difference import (
+    AssembledModes,
+    LoopResponse,
+    assembled_modes,
+    loop_response,
+)
+from studies.config import processor
+from studies.kernels import cpu
+from studies.kernels.llvm import is_available
+from studies.kernels.traced import Leaf, TracedLoop, trace_loop
+from studies.stability import HIGHEST, with_margin_modes
+from studies.sweeps.plan import lane_unit
+from studies.sweeps.steps import PREPARING
+
+#: Cases that are looked at together.
+BLOCK = 64
+
+
+class Walk(NamedTuple):
+    """Frequencies of a walk along the axis."""
+
+    background: int  # between `LOWEST_HZ` and half the sample rate
+    beside: tuple[float, ...]  # beside each mode of the machine, multiples of its zeta omega
+    repeats: int  # iterations' turns at each
+
+
+#: The walk, and the one of cases in which it saw what is not there.
+WALKS = (
+    Walk(160, (-9.0, -4.5, -2.2, -1.0, -0.3, 0.3, 1.0, 2.2, 4.5, 9.0), 1),
+    Walk(400, tuple(np.tan(np.linspace(-1.5, 1.5, 24)).tolist()), 3),
+)
+LOWEST_HZ = 5.0
+#: Modes are taken to be at least as wide as this share of their frequency [1].
+NARROWEST = 2e-4
+#: What keeps eigenvalues of idle channels apart, on the way and in the second look.
+SPREAD, FINE_SPREAD = 1e-3, 1e-6
+#: Crossings looked at again per case.
+CHOSEN = 4
+#: Steps of Newton's iteration, and the last one that counts as none.
+NEWTON, CONVERGED = 10, 1e-3
+#: A crossing seen from afar is looked at once more if nothing is found within this factor of it.
+NEAR = 1.2
+
+
+class Look(NamedTuple):
+    """How the neighbourhood of a crossing is looked at."""
+
+    wider: float  # beyond the two frequencies on either side of it, as a share of their distance
+    frequencies: int
+    repeats: int  # at each of them
+    starts: int  # before the first
+
+
+LOOK = Look(0.3, 10, 3, 24)
+
+
+class LoopFigures(NamedTuple):
+    """Of each case, (n,); NaN where there is no sampled loop or its basis is not known here."""
+
+    gain_margin: np.ndarray  # largest factor on all gains with every smaller one stable [1]
+    breaking_frequency: np.ndarray  # of what goes unstable there [Hz], NaN where nothing does
+    breaking_mode: np.ndarray  # order of the nearest link mode, 0: the drive, NaN as before
+
+
+#: What `pinned_free` lacks: links that end on their chord.
+KNOWN_BASES = ("pinned_pinned", "loaded")
+
+
+def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
+    """Judge the sampled loops of cases.
+
+    Args:
+        structure: of their runs.
+        cases: leaves with a leading axis, all cases or 1.
+    """
+    count = max(len(leaf) for leaf in jax.tree.leaves(cases))
+    if structure.feedback != "sampled" or structure.basis not in KNOWN_BASES:
+        return LoopFigures(*(np.full(count, np.nan) for _ in LoopFigures._fields))
+    structure, cases = with_margin_modes(structure, cases)
+    whole = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
+    with ThreadPoolExecutor(len(jax.local_devices())) as pool:
+
+        def judged(rows: np.ndarray, way: Walk) -> tuple[LoopFigures, np.ndarray]:
+            share = min(BLOCK, -(-len(rows) // len(jax.local_devices())))
+            parts = [rows[k : k + share] for k in range(0, len(rows), share)]
+            found = pool.map(partial(_judge_block, structure, way, whole), parts)
+            return jax.tree.map(lambda *x: np.concatenate(x), *found)
+
+        figures, is_doubtful = judged(np.arange(count), WALKS[0])
+        again = np.flatnonzero(is_doubtful)
+        if len(again):
+            better, _ = judged(again, WALKS[1])
+            for old, new in zip(figures, better, strict=True):
+                old[again] = new
+    return figures
+
+
+class Crossings(NamedTuple):
+    """Where eigenvalues may be real and positive, (k,) each."""
+
+    case: np.ndarray  # number in the block
+    value: np.ndarray  # eigenvalue [1]
+    omega: np.ndarray  # [rad/s]
+
+
+def _judge_block(
+    structure: Structure, way: Walk, cases: Case, rows: np.ndarray
+) -> tuple[LoopFigures, np.ndarray]:
+    """Figures of some cases, at most a block, and of which the walk saw what is not there."""
+    filled = rows[np.minimum(np.arange(BLOCK), len(rows) - 1)]  # one size, one compilation
+    block = jax.tree.map(lambda x: x[filled], cases)
+    with PREPARING:
+        found = jax.tree.map(np.asarray, _respond(structure, block))
+    response, modes = jax.tree.map(lambda x: x[..., : len(rows)], found)
+    with np.errstate(all="ignore"):  # what is not finite finds no crossing
+        return _judged(response, modes, way)
+
+
+@partial(jax.jit, static_argnums=0)
+def _respond(structure: Structure, cases: Case) -> tuple[LoopResponse, AssembledModes]:
+    """Lanes last."""
+
+    def one(case: Case) -> tuple[LoopResponse, AssembledModes]:
+        loop = prepare(structure, case).loop
+        response = loop_response(structure, case, loop, case.path.waypoints[0])
+        return response, assembled_modes(response)
+
+    return jax.vmap(one, out_axes=-1)(cases)
+
+
+def _judged(
+    response: LoopResponse, modes: AssembledModes, way: Walk
+) -> tuple[LoopFigures, np.ndarray]:
+    count, top = len(response.period), np.pi / response.period
+    seen, left, right = _walk_along(response, modes, way)
+    start = _look_closer(response, seen, left, right)
+    known = np.zeros(count)
+    np.maximum.at(known, start.case, start.value)
+    is_strange = ~_is_confirmed(seen, start) & (seen.value > known[seen.case])
+    is_doubtful = np.isin(np.arange(count), seen.case[is_strange])
+    value, omega = np.zeros(count), np.full(count, np.nan)
+    met, is_met = _meet(response, start, _known(count, None))
+    best = _rightmost(met.value, is_met, start.case, count)
+    found = np.flatnonzero(best >= 0)
+    if len(found):
+        met = jax.tree.map(lambda x: x[best[found]], met)
+        # the same once more without what was found
+        again = Crossings(np.arange(len(found)), met.value * 1.02, met.omega)
+        here = jax.tree.map(lambda x: x[..., found], response)
+        other, is_other = _meet(here, again, _known(len(found), met))
+        is_more = is_other & (other.value > met.value)
+        value[found] = np.where(is_more, other.value, met.value)
+        omega[found] = np.where(is_more, other.omega, met.omega)
+    breaks = value > 1 / HIGHEST
+    margin = np.where(breaks, 1 / np.where(breaks, value, 1.0), HIGHEST)
+    omega = np.where(breaks, omega, np.nan)
+    apart = np.abs(_folded(modes.omega, top) - np.abs(omega))
+    order = np.take_along_axis(
+        np.argmax(modes.share, axis=0), np.argmin(apart, axis=0)[None], axis=0
+    )[0]
+    leaves = jax.tree.leaves(response)
+    is_finite = np.all([np.isfinite(x).reshape(-1, count).all(axis=0) for x in leaves], axis=0)
+    figures = LoopFigures(
+        np.where(is_finite, margin, np.nan),
+        np.where(is_finite, np.abs(omega) / (2 * np.pi), np.nan),
+        np.where(is_finite & breaks, order, np.nan),
+    )
+    return figures, is_doubtful & is_finite
+
+
+def _folded(omega: np.ndarray, top: np.ndarray) -> np.ndarray:
+    """Where sampling shows frequencies, 0 to pi/T."""
+    return np.abs((omega + top) % (2 * top) - top)
+
+
+def stations(modes: AssembledModes, period: np.ndarray, way: Walk) -> np.ndarray:
+    """Frequencies to walk along, rising [rad/s], (F, lanes)."""
+    top = np.pi / period
+    lowest = 2 * np.pi * LOWEST_HZ
+    background = lowest * (top / lowest) ** np.linspace(0, 1, way.background)[:, None]
+    width = np.maximum(modes.decay, NARROWEST * modes.omega)
+    beside = [np.abs(_folded(modes.omega, top) + x * width) for x in way.beside]
+    omega = np.concatenate([background, *beside])
+    omega = np.where(omega > top, 2 * top - omega, omega)
+    return np.sort(np.clip(omega, 1.0, top * (1 - 1e-6)), axis=0)
+
+
+def _walk_along(
+    response: LoopResponse, modes: AssembledModes, way: Walk
+) -> tuple[Crossings, np.ndarray, np.ndarray]:
+    """The rightmost crossings of each case and the frequencies [rad/s] on either side."""
+    omega = np.repeat(stations(modes, response.period, way), way.repeats, axis=0)
+    turn = np.arange(len(omega)) + 1
+    kind = np.where(turn % way.repeats > 0, 0.0, np.where(turn == way.repeats, 1.0, 2.0))
+    shape = response.velocity_gain.shape
+    spread = np.broadcast_to(_spread(shape[:2], SPREAD)[..., None], shape)
+    first = -spread.reshape(-1, shape[2])
+    loci = _walked(response, spread, Pair(first, 0 * first), omega, kind)
+    order = np.argsort(-loci.crossing, axis=0)[:CHOSEN]
+    value, place, left, right = (
+        np.take_along_axis(x, order, axis=0)
+        for x in (loci.crossing, loci.place, loci.left, loci.right)
+    )
+    row, case = np.nonzero(value > 0.8 / HIGHEST)
+    seen = Crossings(case, value[row, case], place[row, case])
+    return seen, left[row, case], right[row, case]
+
+
+def _is_confirmed(seen: Crossings, found: Crossings) -> np.ndarray:
+    """Whether something near each crossing has been found, (k,)."""
+    order = np.argsort(found.case, kind="stable")
+    begin, end = (np.searchsorted(found.case[order], seen.case, side) for side in ("left", "right"))
+    width = int(np.max(end - begin, initial=0))
+    place = begin[:, None] + np.arange(width)
+    value = (
+        found.value[order[np.minimum(place, len(order) - 1)]] if width else np.ones((len(end), 0))
+    )
+    near = np.abs(np.log(value / seen.value[:, None])) < np.log(NEAR)
+    return np.any(near & (place < end[:, None]), axis=1)
+
+
+def _look_closer(
+    response: LoopResponse, seen: Crossings, left: np.ndarray, right: np.ndarray, look: Look = LOOK
+) -> Crossings:
+    """The two rightmost crossings of each interval."""
+    more = look.wider * (right - left)
+    share = (np.arange(look.frequencies)[:, None] + 0.382) / (look.frequencies - 0.5)
+    omega = left - more + (right - left + 2 * more) * share
+    first, others = np.repeat(omega[:1], look.starts, 0), np.repeat(omega[1:], look.repeats, 0)
+    omega = np.concatenate([first, others])
+    kind = [0.0] * (look.starts - 1) + [1.0]
+    kind += ([0.0] * (look.repeats - 1) + [2.0]) * (look.frequencies - 1)
+    shape = response.velocity_gain.shape
+    n = shape[0] * shape[1]
+    k = np.arange(n)[:, None]
+    ring = np.exp(2j * np.pi * (k + 0.3) / n) * (0.2 + 0.8 * ((4 * k) % n) / n) * seen.value
+    spread = np.broadcast_to(
+        _spread(shape[:2], FINE_SPREAD)[..., None], (*shape[:2], len(seen.case))
+    )
+    here = jax.tree.map(lambda x: x[..., seen.case], response)
+    loci = _walked(here, spread, Pair(ring.real, ring.imag), omega, np.array(kind))
+    order = np.argsort(-loci.crossing, axis=0)[:2]
+    value, place = (np.take_along_axis(x, order, axis=0) for x in (loci.crossing, loci.place))
+    row, column = np.nonzero(value > 0.8 / HIGHEST)
+    return Crossings(seen.case[column], value[row, column], place[row, column])
+
+
+def _spread(shape: tuple[int, ...], size: float) -> np.ndarray:
+    n = int(np.prod(shape))
+    return size * (1 + np.arange(n).reshape(shape)) / n
+
+
+def _known(count: int, found: Meeting | None) -> Known:
+    if found is None:
+        zero = np.zeros(count)
+        return Known(zero, zero, zero, Pair(zero, zero), Pair(zero, zero))
+    return Known(np.ones(count), found.omega, found.value, found.by_omega, found.by_value)
+
+
+def _meet(response: LoopResponse, start: Crossings, known: Known) -> tuple[Meeting, np.ndarray]:
+    """Newton's iteration from each crossing; where it ended, and whether it came to rest."""
+    here = jax.tree.map(lambda x: x[..., start.case], response)
+    known = jax.tree.map(lambda x: x[start.case], known)
+    angle = start.omega * here.period
+    guess = start_approach(start.omega, start.value, np.cos(angle), np.sin(angle))
+    found = _approached(here, known, guess)
+    is_met = (found.step < CONVERGED) & (found.value > 0) & np.isfinite(found.value)
+    return found, is_met
+
+
+def _rightmost(value: np.ndarray, is_met: np.ndarray, case: np.ndarray, count: int) -> np.ndarray:
+    """Number of the largest value of each case, -1 where it has none, (count,)."""
+    best = np.full(count, -1)
+    for k in np.argsort(np.where(is_met, value, -np.inf)):
+        if is_met[k]:
+            best[case[k]] = k
+    return best
+
+
+# --- the steps on this machine --------------------------------------------------------------------
+
+
+def _walked(
+    response: LoopResponse, spread: np.ndarray, first: Pair, omega: np.ndarray, kind: np.ndarray
+) -> Loci:
+    angle = omega * response.period
+    inputs = Station(omega, np.cos(angle), np.sin(angle), kind)
+    return _run(_walk, (response, spread), inputs, start_walk(first), len(omega))
+
+
+def _walk(constants: tuple[LoopResponse, Any], station: Station, loci: Loci) -> Loci:
+    response, spread = constants
+    return walk(response, spread, loci, station)
+
+
+def _approached(response: LoopResponse, known: Known, guess: Meeting) -> Meeting:
+    return _run(_approach, (response, known), (), guess, NEWTON)
+
+
+def _approach(constants: tuple[LoopResponse, Known], _: tuple, meeting: Meeting) -> Meeting:
+    response, known = constants
+    return approach(response, known, meeting)
+
+
+def _run(step: Callable[..., Any], constants: Any, inputs: Any, state: Any, n_steps: int) -> Any:
+    """Take all steps; arrays lanes last, those of inputs with the steps first."""
+    lanes = jax.tree.leaves(state)[0].shape[-1]
+    if lanes == 0:
+        return state
+    parts = [jax.tree.flatten(part) for part in (constants, inputs, state)]
+    varies = tuple(leaf.ndim > 1 for leaf in parts[1][0])
+    with _TRACING:
+        run = _runner(
+            step,
+            tuple(tree for _, tree in parts),
+            tuple(leaf.shape[:-1] for leaf in parts[0][0]),
+            varies,
+            tuple(leaf.shape[:-1] for leaf in parts[2][0]),
+        )
+    # whole vectors; whole blocks for XLA, which compiles for each size
+    more = -lanes % (lane_unit() if _has_kernels() else BLOCK)
+
+    def filled(x: Any, is_wide: bool = True) -> np.ndarray:
+        x = np.asarray(x)
+        if is_wide and more:
+            x = np.concatenate([x, np.repeat(x[..., -1:], more, axis=-1)], axis=-1)
+        return np.array(x, order="C", copy=True)
+
+    leaves = [
+        *map(filled, parts[0][0]),
+        *(filled(x, is_wide) for x, is_wide in zip(parts[1][0], varies, strict=True)),
+        *map(filled, parts[2][0]),
+    ]
+    last = run(leaves, n_steps, lanes + more)
+    return jax.tree.unflatten(parts[2][1], [x[..., :lanes] for x in last])
+
+
+#: One thread makes a kernel, others wait for it.
+_TRACING = Lock()
+
+
+def _has_kernels() -> bool:
+    return processor() == "cpu" and is_available()
+
+
+@lru_cache(maxsize=32)
+def _runner(
+    step: Callable[..., Any], trees: tuple, constants: tuple, varies: tuple, state: tuple
+) -> Callable[[list, int, int], list]:
+    """Runs the step on leaves of constants, inputs and state."""
+    sizes = len(constants), len(varies), len(state)
+
+    def flat(*parts: list) -> list:
+        return jax.tree.leaves(step(*map(jax.tree.unflatten, trees, parts)))
+
+    if _has_kernels():
+        real = jax.dtypes.canonicalize_dtype(np.float64)
+
+        def make() -> TracedLoop:
+            return trace_loop(
+                flat,
+                [Leaf(shape, True) for shape in constants],
+                [Leaf((), is_wide) for is_wide in varies],
+                [Leaf(shape, True) for shape in state],
+                real,
+            )
+
+        name = f"{step.__name__} {real} {trees[0]} {constants} {varies} {state}"
+        kernel = cpu.kept_kernel(name, make)
+
+        def run(leaves: list, n_steps: int, lanes: int) -> list:
+            kernel.run(leaves, n_steps, lanes)
+            return leaves[sizes[0] + sizes[1] :]
+
+        return run
+
+    @partial(jax.jit, static_argnums=3)
+    def scanned(constants: list, inputs: list, state: list, n_steps: int) -> list:
+        def body(at: list, row: list | None) -> tuple[list, None]:
+            return flat(constants, row or [], at), None
+
+        return jax.lax.scan(body, state, inputs or None, length=n_steps)[0]
+
+    def run_scan(leaves: list, n_steps: int, lanes: int) -> list:
+        given, inputs = leaves[: sizes[0]], leaves[sizes[0] : sizes[0] + sizes[1]]
+        return list(map(np.asarray, scanned(given, inputs, leaves[-sizes[2] :], n_steps)))
+
+    return run_scan

@@ -1,0 +1,123 @@
+"""Gain margins of batches: return difference and loci against the eigenvalues of the loop."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmodel.pairs import Pair
+from jaxmodel.prepare import prepare
+from jaxmodel.return_difference import go_round, loop_response, spectrum_polynomial
+from jaxmodel.sampled_loop import closed_loop
+from studies.cases import as_arrays, build_case, build_structure
+from studies.spec import paper_study
+from studies.stability import HIGHEST, loop_report, with_margin_modes
+from studies.sweeps.margins import judge_loops
+from tests.loops import exact_margins, random_loops
+
+STUDY = paper_study()
+HOME = np.array(STUDY.motion.waypoints[0])
+#: Poses off home, where nothing is symmetric.
+POSE = np.array([0.005, -0.003, 0.5])
+PLANTS = {
+    "plain": {},
+    "under load": {"load__wrench": (3.0, -2.0, 0.1)},
+    "loaded basis under load": {"load__wrench": (3.0, -2.0, 0.1), "link__basis": "loaded"},
+    "no reaction of bending": {"run__model": "ked"},
+    "locked": {"drive__locked": True},
+    "electronics": {"electronics__sensor_highpass_hz": 2.0, "electronics__amplifier_hz": 3000.0},
+    "strain rate feedback": {"control__law": "srf", "control__gain_factor": 1e-3},
+    "friction": {"drive__coulomb_friction": 0.5},
+    "one mode": {"control__modes": 1},
+}
+
+
+def looked_at(study):
+    structure, case = with_margin_modes(build_structure(study), as_arrays(build_case(study)))
+    return structure, jax.tree.map(jnp.asarray, case)
+
+
+@partial(jax.jit, static_argnums=0)
+def determinant(structure, case, omega, factor):
+    """det(I - k L(j omega)) from det(x - L), x = 1/k."""
+    response = loop_response(structure, case, prepare(structure, case).loop, POSE)
+    angle = omega * response.period
+    turn = go_round(response, Pair(0 * omega, omega), Pair(jnp.cos(angle), -jnp.sin(angle)))
+    found = spectrum_polynomial(turn, Pair(1 / factor, 0 * factor))
+    n = 3 * structure.n_channels
+    return (found.re + 1j * found.im) * factor**n
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_return_difference_is_that_of_the_matrices(name):
+    structure, case = looked_at(STUDY.change(**PLANTS[name]))
+    loop = jax.tree.map(np.asarray, jax.jit(closed_loop, static_argnums=0)(structure, case, POSE))
+    eye, period = np.eye(len(loop.open)), float(case.electronics.period)
+    for hertz, factor in ((3.0, 1.0), (114.4, 1.0), (500.0, 2.0), (722.0, 1.0), (4400.0, 0.5)):
+        z = np.exp(2j * np.pi * hertz * period)
+        closed = np.linalg.slogdet(eye * z - loop.open - factor * loop.feedback)
+        opened = np.linalg.slogdet(eye * z - loop.open)
+        wanted = closed[0] / opened[0] * np.exp(closed[1] - opened[1])
+        found = determinant(structure, case, 2 * np.pi * hertz, factor)
+        # images of the spectrum that are left out
+        np.testing.assert_allclose(complex(found), wanted, rtol=3e-4)
+
+
+def assert_margins(found, wanted):
+    """No verdict wrong; margins within 2 %. Below 0.01 nobody looks."""
+    np.testing.assert_array_equal(found > 1, wanted > 1)
+    is_tiny = wanted < 0.011
+    assert np.all(found[is_tiny] < 0.0115)
+    np.testing.assert_allclose(found[~is_tiny], wanted[~is_tiny], rtol=0.02)
+
+
+def test_margins_of_random_loops():
+    loops = random_loops(40, 5)
+    wanted = exact_margins(loops)
+    assert_margins(judge_loops(*loops).gain_margin, wanted)
+    # neither all stable nor all unstable
+    assert 5 < np.sum(wanted > 1) < 35
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(4))
+def test_margins_of_a_thousand_random_loops(seed):
+    loops = random_loops(250, 100 + seed)
+    assert_margins(judge_loops(*loops).gain_margin, exact_margins(loops))
+
+
+def single(study):
+    structure, case = build_structure(study), build_case(study)
+    found = judge_loops(structure, jax.tree.map(lambda x: np.asarray(x)[None], case))
+    return jax.tree.map(lambda x: float(x[0]), found)
+
+
+def test_margins_are_those_of_single_runs():
+    structure, case = build_structure(STUDY), as_arrays(build_case(STUDY))
+    found = single(STUDY)
+    np.testing.assert_allclose(
+        found.gain_margin, loop_report(structure, case, HOME).gain_margin, rtol=1e-3
+    )
+
+
+def test_what_breaks_is_named():
+    """The paper's gains on mode 1 alone break the mode that three patches show as mode 1."""
+    found = single(STUDY)
+    matrices = closed_loop(*looked_at(STUDY), HOME)
+    poles = np.linalg.eigvals(matrices.open + 1.001 * found.gain_margin * matrices.feedback)
+    worst = poles[np.argmax(np.abs(poles))]
+    hertz = abs(np.angle(worst)) * STUDY.electronics.sample_rate_hz / (2 * np.pi)
+    np.testing.assert_allclose(found.breaking_frequency, hertz, rtol=1e-3)
+    assert found.breaking_mode in range(1, 13)
+
+
+def test_loops_without_feedback_have_no_limit():
+    none = single(STUDY.change(control__links=(False, False, False)))
+    assert none.gain_margin == HIGHEST
+    assert np.isnan(none.breaking_frequency) and np.isnan(none.breaking_mode)
+    assert np.isnan(single(STUDY.change(control__feedback="none")).gain_margin)
+    assert np.isnan(single(STUDY.change(control__feedback="ideal")).gain_margin)
