@@ -70,6 +70,8 @@ SPREAD, FINE_SPREAD = 1e-3, 1e-6
 CHOSEN = 4
 #: Steps of Newton's iteration, and the last one that counts as none.
 NEWTON, CONVERGED = 10, 1e-3
+#: Where to start for crossings beside the rightmost that was found, as multiples of it.
+AGAIN = (1.02, 1.1, 1.005)
 #: A crossing seen from afar is looked at once more if nothing is found within this factor of it.
 NEAR = 1.2
 
@@ -174,15 +176,15 @@ def _judged(
     met, is_met = _meet(response, start, _known(count, None))
     best = _rightmost(met.value, is_met, start.case, count)
     found = np.flatnonzero(best >= 0)
-    if len(found):
-        met = jax.tree.map(lambda x: x[best[found]], met)
-        # the same once more without what was found
-        again = Crossings(np.arange(len(found)), met.value * 1.02, met.omega)
-        here = jax.tree.map(lambda x: x[..., found], response)
+    met = jax.tree.map(lambda x: x[best[found]], met)
+    here = jax.tree.map(lambda x: x[..., found], response)
+    for start_at in AGAIN if len(found) else ():
+        # once more, a little to the right, without what was found
+        again = Crossings(np.arange(len(found)), met.value * start_at, met.omega)
         other, is_other = _meet(here, again, _known(len(found), met))
         is_more = is_other & (other.value > met.value)
-        value[found] = np.where(is_more, other.value, met.value)
-        omega[found] = np.where(is_more, other.omega, met.omega)
+        met = jax.tree.map(lambda a, b, more=is_more: np.where(more, b, a), met, other)
+    value[found], omega[found] = met.value, met.omega
     breaks = value > 1 / HIGHEST
     margin = np.where(breaks, 1 / np.where(breaks, value, 1.0), HIGHEST)
     omega = np.where(breaks, omega, np.nan)
