@@ -10,13 +10,13 @@ from rich.console import Console
 
 from studies import cli
 from studies import spec as spec_module
-from studies.design import load_design
 from studies.errors import StudyError
 from studies.runs import run_study
 from studies.spec import load_study, paper_study, read_toml
 from studies.store import read_store
 from studies.sweeps.results import load
 from studies.sweeps.run import run_sweep
+from studies.sweeps.show import best_cases
 from studies.sweeps.spec import parse_sweep
 from studies.tuning import audit as audit_module
 from studies.tuning.evaluate import Evaluation, Evaluator
@@ -116,31 +116,27 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
 
 @pytest.mark.long
 def test_placement_by_gradient_is_as_good_as_the_sweep(tmp_path):
-    """The ready sweep of 4,096 placements and `tune_placement`, both as they are run."""
+    """The ready sweep of 4,096 placements and gains, and `tune_placement`, as they are run."""
     specs = Path(spec_module.__file__).parent / "specs"
     spec = load_tuning(specs / "tune_placement.toml")
     asked = read_toml(specs / "placement.toml")
-    for section in ("run", "link", "motion", "shaper", "metrics"):
+    for section in ("run", "link", "motion", "shaper", "drive", "metrics"):
         assert spec.data[section] == asked[section]
     swept = run_sweep(parse_sweep(asked), tmp_path / "sweep", is_quiet=True)
     data = load(tmp_path / "sweep")
+    best = best_cases(data, "residual_rms", "gain_margin >= 2", 15)
     residual = np.sqrt(np.mean(data["residual_rms"] ** 2, axis=(1, 2)))
-    best = int(np.argmin(np.where(data["status"] == 0, residual, np.inf)))
+    # the question discriminates, also against the middle of what is allowed
+    assert residual[best].max() > 1.2 * residual[best].min()
     found = run_tuning(spec, tmp_path / "tune", False, Console(quiet=True), True)
-    tuned = load_study(tmp_path / "tune" / "tuned.toml")
-
-    def left(study, **changes):
-        result = run_study(study.change(**changes), has_record=False, has_loop=False).result
-        assert result.status == 0
-        return np.sqrt(np.mean(result.metrics.residual_rms**2))
-
-    # a tuning has no rounding; by chance rounding favours one of 4,096 placements by 2e-4
-    fine = {"electronics__adc_bits": 32}
-    assert left(tuned, **fine) <= left(load_design(tmp_path / "sweep", best).study, **fine)
-    assert left(tuned) <= residual[best] * (1 + 1e-3)
+    tuned = run_study(load_study(tmp_path / "tune" / "tuned.toml"), has_record=False)
+    assert tuned.status == 0 and tuned.loop.gain_margin >= 2 * (1 - 1e-3)
+    # one of 4,096 may be a little better than where 16 descents end
+    left = np.sqrt(np.mean(tuned.result.metrics.residual_rms**2))
+    assert left <= 1.03 * residual[best].min()
     differentiated = int(found.at.iteration) * (1 + spec.tune.starts)
     # what each costs is measured where compilers do their best: docs/tuning.md
-    assert swept.n_run == len(residual) == 4096 and differentiated <= 4096 // 50
+    assert swept.n_run == 4096 and differentiated <= 4096 // 10
 
 
 # --- the folder -----------------------------------------------------------------------------------
