@@ -80,7 +80,7 @@ def simulate(
     from studies.run_report import check_results, settling_text, write_results
     from studies.runs import describe, run_study
     from studies.spec import load_study
-    from studies.stability import margin_text
+    from studies.stability import caution, margin_text
     from studies.sweeps.spec import ready_spec
 
     spec = load_study(ready_spec(study))
@@ -99,6 +99,9 @@ def simulate(
     if run.loop is not None:
         margin = margin_text(run.loop.gain_margin)
         console.print(f"gain margin of the linearised sampled loop: {margin}")
+        warning = caution(run.loop.gain_margin)
+        if warning:
+            console.print(f"[bold red]{warning}[/]", soft_wrap=True, markup=True)
     console.print(written, soft_wrap=True)
 
 

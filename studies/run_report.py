@@ -6,14 +6,23 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jaxmodel import status
 from jaxmodel.axial import euler_force
 from studies import figures
 from studies.errors import StudyError
 from studies.pages import literal, picture, table, write_report
-from studies.runs import Run, chord_deflection, describe, run_attributes, run_variables
-from studies.stability import margin_text
+from studies.runs import (
+    Run,
+    chord_deflection,
+    describe,
+    run_attributes,
+    run_variables,
+    uncontrolled_twin,
+)
+from studies.stability import caution, margin_text
 from studies.store import check_target, write_store
 
 #: Captions of what is drawn, by the end of the file's name.
@@ -22,6 +31,7 @@ FIGURES = {
     "error": "Platform: pose minus shaped command",
     "voltage": "Voltages of the actuators, numbered from the slider on",
 }
+_FREE = "without control"
 _POSE = ("x [µm]", "y [µm]", "φ [µrad]")
 
 
@@ -61,10 +71,11 @@ def write_results(out: Path, run: Run, has_report: bool, notes: Sequence[str] = 
     write_store(out, run_variables(run), run_attributes(run.study))
     if not has_report:
         return f"written: {out}"
+    twin = uncontrolled_twin(run)
     with figures.styled():
-        for name, figure in draw(run).items():
+        for name, figure in draw(run, twin).items():
             figures.write_figure(figure, out.with_name(_figure(out, name)))
-    write_report(out.parent, report(out, run, notes), run.study, out.stem)
+    write_report(out.parent, report(out, run, twin, notes), run.study, out.stem)
     return f"written: {out}\nreport: {out.with_name(out.stem)}.html"
 
 
@@ -73,13 +84,15 @@ def _figure(out: Path, name: str) -> str:
     return f"{out.stem}-{name}.png"
 
 
-def report(out: Path, run: Run, notes: Sequence[str]) -> str:
-    """Markdown text; arguments of `write_results`."""
+def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str]) -> str:
+    """Markdown text; arguments of `write_results`, and the same run without control."""
+    warning = caution(run.loop.gain_margin) if run.loop is not None else ""
     lines = [
         f"# {literal(run.study.title) or 'study'}: one run", "",
         _status(run, notes), "",
+        *([f"**{literal(warning)}**", ""] if warning else []),
         "## Links", "",
-        *_links(run), "",
+        *_links(run, twin), "",
         "## Platform", "",
         *_platform(run), "",
         "## Control loop", "",
@@ -98,7 +111,7 @@ def _status(run: Run, notes: Sequence[str]) -> str:
     return " ".join([f"Status: **{describe(run.status)}**{since}.", *map(literal, notes)])
 
 
-def _links(run: Run) -> list[str]:
+def _links(run: Run, twin: Run | None) -> list[str]:
     metrics, own = run.result.metrics, run.study.metrics
     rows = [
         [
@@ -110,16 +123,24 @@ def _links(run: Run) -> list[str]:
         ]
         for i in range(3)
     ]  # fmt: skip
+    more: tuple[str, ...] = ()
+    told = ""
+    if twin is not None:
+        more = ("residual rms without control [µm]",)
+        for row, rms in zip(rows, twin.result.metrics.residual_rms, strict=True):
+            row.insert(2, f"{1e6 * rms.max():.4g}")
+        if twin.status not in (status.OK, *status.FINISHED):
+            told = f" Without control the run ends early: {describe(twin.status)}."
     stations = ", ".join(f"{1e3 * x:g}" for x in own.stations)
     heads = (
-        "link", "residual rms [µm]", "residual peak [µm]", "peak while moving [µm]",
+        "link", "residual rms [µm]", *more, "residual peak [µm]", "peak while moving [µm]",
         "settling time [ms]", "peak voltage [V]", "peak motor force [N]",
     )  # fmt: skip
     return [
         f"Deflections: the largest of the stations at {stations} mm. Residual window: "
         f"{own.residual_length:g} s, from {own.residual_delay:g} s after the shaped command. "
         f"Settled: within {1e6 * own.settling_band:g} µm from then to the end of the run, "
-        f"{1e3 * _watched(run):.4g} ms after the shaped command.", "",
+        f"{1e3 * _watched(run):.4g} ms after the shaped command.{told}", "",
         *table(heads, rows),
     ]  # fmt: skip
 
@@ -192,8 +213,8 @@ def _motion(run: Run) -> str:
     return told
 
 
-def draw(run: Run) -> dict[str, Figure]:
-    """FIGURES of a run, three panels each, in the style of the caller."""
+def draw(run: Run, twin: Run | None = None) -> dict[str, Figure]:
+    """FIGURES of a run, three panels each, in the style of the caller; twin: without control."""
     record, end = run.result.record, float(run.result.command_end)
     assert record is not None
     pairs = [f"pair {k + 1}" for k in range(record.actuator_voltage.shape[2])]
@@ -206,11 +227,18 @@ def draw(run: Run) -> dict[str, Figure]:
     drawn = {}
     for name, rows in panels.items():
         figure, axes = figures.new_figure(3, 1, 1.3)
+        done: list[Axes] = []
         for ax, (values, names, label) in zip(axes[:, 0], rows, strict=True):
-            figures.traces(record.time, values, names, label, ax)
+            if name == "deflection" and twin is not None:
+                figures.traces(record.time, values, ["with control"], label, ax)
+                without = 1e6 * chord_deflection(twin)[:, len(done)]
+                ax.plot(record.time, without, color="#999999", linewidth=0.7, zorder=1, label=_FREE)
+            else:
+                figures.traces(record.time, values, names, label, ax)
+            done.append(ax)
             ax.axvline(end, color="#888888", linewidth=0.8, linestyle=":")
         axes[-1, 0].set_xlabel("time [s]")
-        if name == "voltage":
+        if name == "voltage" or (name == "deflection" and twin is not None):
             figures.legend_above(figure, axes[0, 0])
         drawn[name] = figure
     return drawn

@@ -117,6 +117,15 @@ def uncontrolled(case: Case) -> Case:
     return case._replace(control=case.control._replace(link_mask=off))
 
 
+def uncontrolled_twin(run: Run) -> Run | None:
+    """The same run with no link controlled, trajectories included; None where none is anyway."""
+    if run.structure.feedback == "none" or not np.any(run.study.control.links):
+        return None
+    case = uncontrolled(run.case)
+    result = jax.tree.map(np.asarray, _simulate(run.structure, case, True))
+    return Run(run.study, run.structure, case, result, None, None, int(result.status))
+
+
 def with_ratio(case: Case, ratio: Any) -> Case:
     """The same case, or cases, with other EMC ratios, (..., 3, C)."""
     ratio = jnp.asarray(ratio, jnp.result_type(float))

@@ -26,6 +26,8 @@ from jaxmodel.sampled_loop import RADIUS_TOLERANCE, closed_loop
 
 #: Plant modes that a margin rests on at least: modes that nobody controls limit the gains [1].
 MARGIN_MODES = 12
+#: Margins below this are pointed out [1].
+ENOUGH = 2.0
 #: Margins beyond this are given as it, and those below the other as 0 [1].
 HIGHEST, LOWEST = 64.0, 0.01
 #: Gain factors that are looked at are no further apart than this [1].
@@ -48,6 +50,21 @@ def with_margin_modes(
         is_smooth=True, feedback="sampled", has_position_gain=True,
     )  # fmt: skip
     return structure, case
+
+
+def caution(margin: float) -> str:
+    """What must be said of a gain margin, "" where it is `ENOUGH`, or there is none."""
+    if margin < 1:
+        return (
+            "UNSTABLE LOOP: the linearised sampled loop grows by itself; saturation and the end of "
+            "the run bound what is seen here. Lower the gains below "
+            f"{margin:.3g} of these."
+        )
+    if margin < ENOUGH:
+        return (
+            f"CAUTION: a gain margin of {margin:.3g}; below {ENOUGH:g} a machine may go unstable."
+        )
+    return ""
 
 
 def margin_text(value: float, digits: int = 4) -> str:

@@ -134,7 +134,7 @@ def test_the_report_of_a_run_is_whole(short_folder, short_run):
     found = parsed((short_folder / "my run.html").read_text(encoding="utf-8"))
     assert found.title == f"{TITLE}: one run" and TITLE in found.text
     # links, platform, two tracked modes, versions
-    assert len(found.images) == 3 and found.rows == [[7] * 4, [4] * 4, [3] * 3, [2] * 8]
+    assert len(found.images) == 3 and found.rows == [[8] * 4, [4] * 4, [3] * 3, [2] * 8]
     rms = f"{1e6 * float(short_run.residual_rms[1].max()):.4g}"
     margin = f"gain margin {float(short_run.gain_margin):.4g}, spectral radius"
     watched = f"to the end of the run, {50 - 1e3 * float(short_run.command_end):.4g} ms after"
@@ -326,3 +326,24 @@ def test_info_names_versions_devices_and_precision(capsys):
     assert code == 0
     for word in ("flexlink-studies", "jax", "devices", "float64", "cache"):
         assert word in out
+
+
+def test_an_unstable_loop_is_said_loudly_and_beside_no_control(capsys, tmp_path):
+    loud = SHORT.replace("modes = 2\n[motion]", "modes = 2\ngain_factor = 20.0\n[motion]")
+    (tmp_path / "loud.toml").write_text(loud)
+    out = tmp_path / "run.h5"
+    code, text, _ = run(capsys, "simulate", tmp_path / "loud.toml", "--out", out, "--report")
+    assert code == 0 and "UNSTABLE LOOP" in text
+    report = (tmp_path / "run.md").read_text()
+    assert "**UNSTABLE LOOP" in report
+    # the column beside is what the same study leaves without control
+    open_study = loud.replace("gain_factor = 20.0", "links = [false, false, false]")
+    (tmp_path / "open.toml").write_text(open_study)
+    alone = tmp_path / "open.h5"
+    run(capsys, "simulate", tmp_path / "open.toml", "--out", alone)
+    with xarray.open_dataset(alone) as data:
+        wanted = 1e6 * data["residual_rms"].values.max(axis=1)
+    table = [row.split("|") for row in report.splitlines() if row.startswith("| ")]
+    column = [cell.strip() for cell in table[0]].index("residual rms without control [µm]")
+    found = [float(row[column]) for row in table[2:5]]
+    np.testing.assert_allclose(found, wanted, rtol=1e-3)

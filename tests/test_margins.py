@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from functools import partial
 
 import jax
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmodel import status
 from jaxmodel.pairs import Pair
 from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import go_round, loop_response, spectrum_polynomial
@@ -17,7 +19,13 @@ from studies.cases import as_arrays, build_case, build_structure
 from studies.spec import paper_study
 from studies.stability import HIGHEST, loop_report, with_margin_modes
 from studies.sweeps.margins import judge_loops
-from tests.loops import exact_margins, random_loops
+from studies.sweeps.plan import chunk_cases, local_layout, plan_groups
+from studies.sweeps.results import load
+from studies.sweeps.run import run_sweep
+from studies.sweeps.show import best_cases
+from studies.sweeps.spec import parse_sweep
+from studies.sweeps.table import build_table
+from tests.loops import Loops, exact_margins, random_loops
 
 STUDY = paper_study()
 HOME = np.array(STUDY.motion.waypoints[0])
@@ -125,3 +133,44 @@ def test_loops_without_feedback_have_no_limit():
     assert np.isnan(none.breaking_frequency) and np.isnan(none.breaking_mode)
     assert np.isnan(single(STUDY.change(control__feedback="none")).gain_margin)
     assert np.isnan(single(STUDY.change(control__feedback="ideal")).gain_margin)
+
+
+TWO_LINKS = """
+[run]
+duration = 0.15
+[control]
+links = [true, true, false]
+[motion]
+waypoints = [[0.0, 0.0, 0.5236], [0.0, 0.01, 0.5236]]
+move_time = 0.03
+[shaper]
+kind = "none"
+[metrics]
+residual_delay = 0.02
+residual_length = 0.09
+[sweep]
+method = "sobol"
+count = 1024
+[sweep.axes]
+placement = { kind = "same" }
+"""
+
+
+@pytest.mark.long
+def test_cases_that_are_ok_have_stable_loops(tmp_path):
+    """200 of them by eigenvalues, and 50 of those called unstable; none was saturated instead."""
+    spec = parse_sweep(tomllib.loads(TWO_LINKS))
+    run_sweep(spec, tmp_path / "sweep", is_quiet=True)
+    data, table = load(tmp_path / "sweep"), build_table(spec)
+    rng = np.random.default_rng(0)
+    group = plan_groups(table, np.arange(len(table)), local_layout)[0]
+    assert set(np.unique(data["status"])) <= {status.OK, status.UNSTABLE}
+    for code, count in ((status.OK, 200), (status.UNSTABLE, 50)):
+        rows = rng.choice(np.flatnonzero(data["status"] == code), count, replace=False)
+        cases = chunk_cases(table, np.sort(rows), group.structure, count)
+        cases = jax.tree.map(lambda x, n=count: np.broadcast_to(x, (n, *x.shape[1:])), cases)
+        wanted = exact_margins(Loops(group.structure, cases))
+        assert np.all((wanted > 1) == (code == status.OK))
+        np.testing.assert_allclose(data["gain_margin"][np.sort(rows)], wanted, rtol=0.02, atol=1e-2)
+    best = best_cases(data, "residual_rms", "gain_margin >= 2", 10)
+    assert np.all(data["gain_margin"][best] >= 2)

@@ -16,8 +16,9 @@ from matplotlib.figure import Figure
 from jaxmodel import status
 from studies import figures
 from studies.errors import StudyError
+from studies.stability import ENOUGH
 from studies.sweeps.results import SweepData, metric_values, swept_names
-from studies.sweeps.show import ENOUGH, MARGIN, best_cases, label, shown_value
+from studies.sweeps.show import MARGIN, best_cases, label, shown_value
 
 #: More distinct values than this are no grid.
 FEW = 60

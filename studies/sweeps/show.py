@@ -14,6 +14,7 @@ from jaxmodel import status
 from studies.errors import StudyError
 from studies.fields import parse_entry
 from studies.runs import check_run
+from studies.stability import ENOUGH
 from studies.sweeps.condition import evaluate
 from studies.sweeps.plan import peak_memory
 from studies.sweeps.results import (
@@ -30,8 +31,8 @@ from studies.sweeps.table import Table, case_study
 
 #: What `show` ranks cases by unless told otherwise.
 DEFAULT_METRIC = "residual_rms"
-#: Stands beside every metric of a case that has it, and what is said of cases below so much.
-MARGIN, ENOUGH = "gain_margin", 2.0
+#: Stands beside every metric of a case that has it.
+MARGIN = "gain_margin"
 #: Digits of a case's id that tables show.
 ID_DIGITS = 8
 #: Rows of a table of failed cases.
