@@ -43,8 +43,9 @@ class Pair:
         return Pair(self.re[place], self.im[place])
 
     def inverse(self) -> Pair:
-        """1/x."""
-        size = 1 / (self.re * self.re + self.im * self.im)
+        """1/x, and 0 of 0."""
+        least = float(jnp.finfo(self.re.dtype).tiny)
+        size = 1 / (self.re * self.re + self.im * self.im + least)
         return Pair(self.re * size, -self.im * size)
 
     def conjugate(self) -> Pair:

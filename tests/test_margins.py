@@ -18,6 +18,7 @@ from jaxmodel.sampled_loop import closed_loop
 from studies.cases import as_arrays, build_case, build_structure
 from studies.spec import paper_study
 from studies.stability import HIGHEST, loop_report, with_margin_modes
+from studies.sweeps import margins
 from studies.sweeps.margins import judge_loops
 from studies.sweeps.plan import chunk_cases, local_layout, plan_groups
 from studies.sweeps.results import load
@@ -100,6 +101,17 @@ def test_margins_of_a_thousand_random_loops(seed):
     np.testing.assert_array_equal(found > 1, wanted > 1)
     error = np.abs(found / wanted - 1)[wanted > 0.0115]
     assert np.sum(error > 0.02) <= 1 and error.max() < 0.1
+
+
+def test_scan_gives_the_same_as_kernels(monkeypatch):
+    loops = random_loops(8, 5)
+    kernels = judge_loops(*loops)
+    monkeypatch.setattr(margins, "_has_kernels", lambda: False)
+    margins._runner.cache_clear()
+    scanned = judge_loops(*loops)
+    margins._runner.cache_clear()
+    for one, other in zip(kernels, scanned, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
 def single(study):

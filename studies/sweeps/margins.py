@@ -150,7 +150,8 @@ def _judge_block(
         return _judged(response, modes, way)
 
 
-@partial(jax.jit, static_argnums=0)
+# compiled in haste: it takes a fiftieth of the time
+@partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
 def _respond(structure: Structure, cases: Case) -> tuple[LoopResponse, AssembledModes]:
     """Lanes last."""
 
