@@ -17,6 +17,8 @@ from studies.spec import Study
 
 Columns = Mapping[str, np.ndarray]
 
+#: An index that names its axis and counts from 1, as the files do: `residual_rms[link=1]`.
+NAMED_INDEX = re.compile(r"\[(\w+)=(\d{1,6})\]")
 _ENTRY = re.compile(r"(?P<field>[^\s\[\]]+)(?P<indices>(\[\d{1,6}\])*)")
 
 

@@ -129,7 +129,7 @@ def _links(run: Run, twin: Run | None) -> list[str]:
         more = ("residual rms without control [µm]",)
         for row, rms in zip(rows, twin.result.metrics.residual_rms, strict=True):
             row.insert(2, f"{1e6 * rms.max():.4g}")
-        if twin.status not in (status.OK, *status.FINISHED):
+        if twin.status not in status.FINISHED:
             told = f" Without control the run ends early: {describe(twin.status)}."
     stations = ", ".join(f"{1e3 * x:g}" for x in own.stations)
     heads = (

@@ -35,3 +35,13 @@ def small(sweep=MIXED, **sections):
 
 def small_spec(sweep=MIXED, **sections):
     return parse_sweep(small(sweep, **sections))
+
+
+#: Sections of a fast move without a shaper.
+FAST_MOVE = """
+[motion]
+waypoints = [[0.0, 0.0, 0.5236], [0.0, 0.01, 0.5236]]
+move_time = 0.03
+[shaper]
+kind = "none"
+"""

@@ -27,6 +27,7 @@ from studies.sweeps.show import best_cases
 from studies.sweeps.spec import parse_sweep
 from studies.sweeps.table import build_table
 from tests.loops import Loops, exact_margins, random_loops
+from tests.sweeps import FAST_MOVE
 
 STUDY = paper_study()
 HOME = np.array(STUDY.motion.waypoints[0])
@@ -147,17 +148,15 @@ def test_loops_without_feedback_have_no_limit():
     assert np.isnan(single(STUDY.change(control__feedback="ideal")).gain_margin)
 
 
-TWO_LINKS = """
+TWO_LINKS = (
+    """
 [run]
 duration = 0.15
 [control]
 links = [true, true, false]
-[motion]
-waypoints = [[0.0, 0.0, 0.5236], [0.0, 0.01, 0.5236]]
-move_time = 0.03
-[shaper]
-kind = "none"
-[metrics]
+"""
+    + FAST_MOVE
+    + """[metrics]
 residual_delay = 0.02
 residual_length = 0.09
 [sweep]
@@ -166,6 +165,7 @@ count = 1024
 [sweep.axes]
 placement = { kind = "same" }
 """
+)
 
 
 @pytest.mark.long

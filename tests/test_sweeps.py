@@ -30,7 +30,7 @@ from studies.sweeps.program import TRACES
 from studies.sweeps.results import load, metric_values
 from studies.sweeps.run import make_plan, run_sweep
 from studies.sweeps.show import best_cases, case_rows, margin_warning
-from tests.sweeps import MIXED, small, small_spec
+from tests.sweeps import FAST_MOVE, MIXED, small, small_spec
 
 SILENT = Console(file=open(os.devnull, "w"))  # noqa: SIM115
 
@@ -522,25 +522,24 @@ def test_background_threads_may_run_sweeps(tmp_path):
     assert found[0].n_done == 72
 
 
-LOADED = """
+LOADED = (
+    """
 [run]
 duration = 0.05
 [link]
 basis = "loaded"
 [control]
 basis = "loaded"
-[motion]
-waypoints = [[0.0, 0.0, 0.5236], [0.0, 0.01, 0.5236]]
-move_time = 0.03
-[shaper]
-kind = "none"
-[metrics]
+"""
+    + FAST_MOVE
+    + """[metrics]
 residual_length = 0.01
 [[sweep.blocks]]
 method = "random"
 count = 256
 axes = { gain = { from = 0.01, to = 0.1 }, "link.joint_inertia_c" = { from = 1e-6, to = 1e-5 } }
 """
+)
 
 
 @pytest.mark.long

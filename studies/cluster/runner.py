@@ -107,7 +107,7 @@ class ClusterRunner:
                         if answer.compile_time and structure not in compiled:
                             compiled.add(structure)
                             reporter.compiled(answer.executor, answer.compile_time)
-                        yield Done(flight.chunk, structure.substeps, answer.outcome)
+                        yield Done(flight.chunk, structure.substeps, answer.judged)
                     elif flight.is_alone:
                         yield Lost(flight.chunk, answer)
                     else:

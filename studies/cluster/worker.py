@@ -20,7 +20,7 @@ from distributed import Worker, get_worker
 from jaxmodel.case import Structure
 from studies import config
 from studies.errors import StudyError
-from studies.sweeps.chunks import Outcome, start_chunk
+from studies.sweeps.chunks import Judged, start_chunk
 from studies.sweeps.executor import make_executor
 from studies.sweeps.folder import code_digest
 from studies.sweeps.plan import chunk_cases, even_layout, local_layout
@@ -47,7 +47,7 @@ class Job(NamedTuple):
 class Answer(NamedTuple):
     """What a worker has made of a job."""
 
-    outcome: Outcome  # padded, NumPy arrays
+    judged: Judged  # padded, NumPy arrays
     executor: str
     compile_time: float  # [s], 0 where the program was there already
     worker: str  # address
@@ -109,9 +109,9 @@ def run_chunk(job: Job) -> Answer:
         is_first = executor.compile_time == 0
         size = even_layout(job.size).size
         cases = chunk_cases(table, job.rows, job.structure, size)
-        outcome = start_chunk(executor, table, job.rows, cases, job.has_own_ratio).wait()
+        judged = start_chunk(executor, table, job.rows, cases, job.has_own_ratio).wait()
         compile_time = executor.compile_time if is_first else 0.0
-        return Answer(outcome, executor.name, compile_time, worker.address)
+        return Answer(judged, executor.name, compile_time, worker.address)
 
 
 @lru_cache(maxsize=1)

@@ -15,7 +15,7 @@ from studies.cases import powered
 from studies.compilation import compiler_time
 from studies.runs import with_ratio
 from studies.sweeps.executor import make_executor, own_ratios
-from studies.sweeps.margins import LoopFigures, judge_loops
+from studies.sweeps.margins import LoopMargins, judge_loops
 from studies.sweeps.plan import Chunk, Group, Layout, chunk_cases, local_layout
 from studies.sweeps.program import Executor
 from studies.sweeps.progress import Reporter
@@ -27,20 +27,20 @@ class Done(NamedTuple):
 
     chunk: Chunk
     substeps: int  # plant steps per sample of its program
-    outcome: Outcome  # padded
+    judged: Judged  # padded
 
 
-class Outcome(NamedTuple):
-    """What is known of a chunk's cases after it."""
+class Judged(NamedTuple):
+    """Runs of a chunk, and its loops judged."""
 
     result: Result
-    loop: LoopFigures
+    margins: LoopMargins
 
 
 class Started(NamedTuple):
     """A chunk on its way; as `Running`, with the judgement of its loops."""
 
-    wait: Callable[[], Outcome]
+    wait: Callable[[], Judged]
     cancel: Callable[[], None]
 
 
@@ -138,9 +138,9 @@ def start_chunk(
         own = powered(own_ratios(executor, cases), exponent)
         cases = with_ratio(cases, np.where(is_own[:, None, None], own, cases.control.ratio))
     before = compiler_time()
-    loop = judge_loops(executor.structure, cases)
+    margins = judge_loops(executor.structure, cases)
     spent = compiler_time() - before
     running = executor.start(cases)
     if is_first:
         executor.compile_time += spent
-    return Started(lambda: Outcome(running.wait(), loop), running.cancel)
+    return Started(lambda: Judged(running.wait(), margins), running.cancel)

@@ -8,7 +8,6 @@ Everything is evaluated for all cases at once; nothing else can be written, so n
 from __future__ import annotations
 
 import ast
-import re
 from collections.abc import Callable
 from functools import reduce
 from typing import Any
@@ -16,12 +15,10 @@ from typing import Any
 import numpy as np
 
 from studies.errors import StudyError, shown
+from studies.fields import NAMED_INDEX
 
 #: A longer condition is refused [characters].
 LONGEST = 1000
-
-#: `[link=1]`, which is no Python.
-_NAMED_INDEX = re.compile(r"\[(\w+)=(\d+)\]")
 
 Lookup = Callable[[str], np.ndarray]
 
@@ -70,7 +67,7 @@ def evaluate(text: str, lookup: Lookup, field: str) -> np.ndarray:
         raise StudyError(f"{field}: {len(text)} characters; allowed up to {LONGEST}")
     said = shown(text)
     try:
-        tree = ast.parse(_NAMED_INDEX.sub(r'["\1=\2"]', text.strip()), mode="eval").body
+        tree = ast.parse(NAMED_INDEX.sub(r'["\1=\2"]', text.strip()), mode="eval").body
         with np.errstate(all="ignore"):
             value = np.asarray(_value(tree, lookup))
     except StudyError as error:

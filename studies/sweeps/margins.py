@@ -66,8 +66,8 @@ LOWEST_HZ = 5.0
 NARROWEST = 2e-4
 #: What keeps eigenvalues of idle channels apart, on the way and in the second look.
 SPREAD, FINE_SPREAD = 1e-3, 1e-6
-#: Crossings looked at again per case.
-CHOSEN = 4
+#: Crossings looked at again per case, and kept of each place looked at.
+CHOSEN, KEPT = 4, 2
 #: Steps of Newton's iteration, and the last one that counts as none.
 NEWTON, CONVERGED = 10, 1e-3
 #: Where to start for crossings beside the rightmost that was found, as multiples of it.
@@ -88,7 +88,7 @@ class Look(NamedTuple):
 LOOK = Look(0.3, 10, 3, 24)
 
 
-class LoopFigures(NamedTuple):
+class LoopMargins(NamedTuple):
     """Of each case, (n,); NaN where there is no sampled loop or its basis is not known here."""
 
     gain_margin: np.ndarray  # largest factor on all gains with every smaller one stable [1]
@@ -100,7 +100,7 @@ class LoopFigures(NamedTuple):
 KNOWN_BASES = ("pinned_pinned", "loaded")
 
 
-def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
+def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
     """Judge the sampled loops of cases.
 
     Args:
@@ -109,12 +109,12 @@ def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
     """
     count = max(len(leaf) for leaf in jax.tree.leaves(cases))
     if structure.feedback != "sampled" or structure.basis not in KNOWN_BASES:
-        return LoopFigures(*(np.full(count, np.nan) for _ in LoopFigures._fields))
+        return LoopMargins(*(np.full(count, np.nan) for _ in LoopMargins._fields))
     structure, cases = with_margin_modes(structure, cases)
     whole = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
     with ThreadPoolExecutor(len(jax.local_devices())) as pool:
 
-        def judged(rows: np.ndarray, way: Walk) -> tuple[LoopFigures, np.ndarray]:
+        def judged(rows: np.ndarray, way: Walk) -> tuple[LoopMargins, np.ndarray]:
             share = min(BLOCK, -(-len(rows) // len(jax.local_devices())))
             parts = [rows[k : k + share] for k in range(0, len(rows), share)]
             found = pool.map(partial(_judge_block, structure, way, whole), parts)
@@ -139,7 +139,7 @@ class Crossings(NamedTuple):
 
 def _judge_block(
     structure: Structure, way: Walk, cases: Case, rows: np.ndarray
-) -> tuple[LoopFigures, np.ndarray]:
+) -> tuple[LoopMargins, np.ndarray]:
     """Figures of some cases, at most a block, and of which the walk saw what is not there."""
     filled = rows[np.minimum(np.arange(BLOCK), len(rows) - 1)]  # one size, one compilation
     block = jax.tree.map(lambda x: x[filled], cases)
@@ -165,7 +165,7 @@ def _respond(structure: Structure, cases: Case) -> tuple[LoopResponse, Assembled
 
 def _judged(
     response: LoopResponse, modes: AssembledModes, way: Walk
-) -> tuple[LoopFigures, np.ndarray]:
+) -> tuple[LoopMargins, np.ndarray]:
     count, top = len(response.period), np.pi / response.period
     seen, left, right = _walk_along(response, modes, way)
     start = _look_closer(response, seen, left, right)
@@ -195,7 +195,7 @@ def _judged(
     )[0]
     leaves = jax.tree.leaves(response)
     is_finite = np.all([np.isfinite(x).reshape(-1, count).all(axis=0) for x in leaves], axis=0)
-    figures = LoopFigures(
+    figures = LoopMargins(
         np.where(is_finite, margin, np.nan),
         np.where(is_finite, np.abs(omega) / (2 * np.pi), np.nan),
         np.where(is_finite & breaks, order, np.nan),
@@ -227,18 +227,27 @@ def _walk_along(
     omega = np.repeat(stations(modes, response.period, way), way.repeats, axis=0)
     turn = np.arange(len(omega)) + 1
     kind = np.where(turn % way.repeats > 0, 0.0, np.where(turn == way.repeats, 1.0, 2.0))
-    shape = response.velocity_gain.shape
-    spread = np.broadcast_to(_spread(shape[:2], SPREAD)[..., None], shape)
-    first = -spread.reshape(-1, shape[2])
+    spread = _spread(response, SPREAD)
+    first = -spread.reshape(-1, spread.shape[2])
     loci = _walked(response, spread, Pair(first, 0 * first), omega, kind)
-    order = np.argsort(-loci.crossing, axis=0)[:CHOSEN]
+    return _crossings(loci, np.arange(spread.shape[2]), CHOSEN)
+
+
+def _crossings(loci: Loci, case: np.ndarray, most: int) -> tuple[Crossings, np.ndarray, np.ndarray]:
+    """The rightmost crossings of each lane, and the frequencies [rad/s] on either side.
+
+    Args:
+        loci: after a walk.
+        case: of each lane.
+        most: crossings of a lane.
+    """
+    order = np.argsort(-loci.crossing, axis=0)[:most]
     value, place, left, right = (
         np.take_along_axis(x, order, axis=0)
         for x in (loci.crossing, loci.place, loci.left, loci.right)
     )
-    row, case = np.nonzero(value > 0.8 / HIGHEST)
-    seen = Crossings(case, value[row, case], place[row, case])
-    return seen, left[row, case], right[row, case]
+    at = np.nonzero(value > 0.8 / HIGHEST)
+    return Crossings(case[at[1]], value[at], place[at]), left[at], right[at]
 
 
 def _is_confirmed(seen: Crossings, found: Crossings) -> np.ndarray:
@@ -255,34 +264,30 @@ def _is_confirmed(seen: Crossings, found: Crossings) -> np.ndarray:
 
 
 def _look_closer(
-    response: LoopResponse, seen: Crossings, left: np.ndarray, right: np.ndarray, look: Look = LOOK
+    response: LoopResponse, seen: Crossings, left: np.ndarray, right: np.ndarray
 ) -> Crossings:
-    """The two rightmost crossings of each interval."""
-    more = look.wider * (right - left)
-    share = (np.arange(look.frequencies)[:, None] + 0.382) / (look.frequencies - 0.5)
+    """The rightmost crossings of each interval."""
+    more = LOOK.wider * (right - left)
+    share = (np.arange(LOOK.frequencies)[:, None] + 0.382) / (LOOK.frequencies - 0.5)
     omega = left - more + (right - left + 2 * more) * share
-    first, others = np.repeat(omega[:1], look.starts, 0), np.repeat(omega[1:], look.repeats, 0)
+    first, others = np.repeat(omega[:1], LOOK.starts, 0), np.repeat(omega[1:], LOOK.repeats, 0)
     omega = np.concatenate([first, others])
-    kind = [0.0] * (look.starts - 1) + [1.0]
-    kind += ([0.0] * (look.repeats - 1) + [2.0]) * (look.frequencies - 1)
-    shape = response.velocity_gain.shape
-    n = shape[0] * shape[1]
+    kind = [0.0] * (LOOK.starts - 1) + [1.0]
+    kind += ([0.0] * (LOOK.repeats - 1) + [2.0]) * (LOOK.frequencies - 1)
+    here = jax.tree.map(lambda x: x[..., seen.case], response)
+    spread = _spread(here, FINE_SPREAD)
+    n = spread.shape[0] * spread.shape[1]
     k = np.arange(n)[:, None]
     ring = np.exp(2j * np.pi * (k + 0.3) / n) * (0.2 + 0.8 * ((4 * k) % n) / n) * seen.value
-    spread = np.broadcast_to(
-        _spread(shape[:2], FINE_SPREAD)[..., None], (*shape[:2], len(seen.case))
-    )
-    here = jax.tree.map(lambda x: x[..., seen.case], response)
     loci = _walked(here, spread, Pair(ring.real, ring.imag), omega, np.array(kind))
-    order = np.argsort(-loci.crossing, axis=0)[:2]
-    value, place = (np.take_along_axis(x, order, axis=0) for x in (loci.crossing, loci.place))
-    row, column = np.nonzero(value > 0.8 / HIGHEST)
-    return Crossings(seen.case[column], value[row, column], place[row, column])
+    return _crossings(loci, seen.case, KEPT)[0]
 
 
-def _spread(shape: tuple[int, ...], size: float) -> np.ndarray:
-    n = int(np.prod(shape))
-    return size * (1 + np.arange(n).reshape(shape)) / n
+def _spread(response: LoopResponse, size: float) -> np.ndarray:
+    """See `go_round`: up to `size`, another for each channel, (3, C, lanes)."""
+    shape = response.velocity_gain.shape
+    n = shape[0] * shape[1]
+    return np.broadcast_to(size * (1 + np.arange(n).reshape(*shape[:2], 1)) / n, shape)
 
 
 def _known(count: int, found: Meeting | None) -> Known:

@@ -18,13 +18,13 @@ from jaxmodel import status
 from jaxmodel.prepare import SPECTRUM_SPAN
 from studies.errors import StudyError, field_error, nearest
 from studies.explain import unit_of
-from studies.fields import Fields, field_value, parse_entry
+from studies.fields import NAMED_INDEX, Fields, field_value, parse_entry
 from studies.runs import METRIC_LABELS, STATUS_LABEL
 from studies.spec import Study
 from studies.stability import HIGHEST, MARGIN_MODES
 from studies.store import Streamed, Variable, read_store, variable_labels, write_store
 from studies.sweeps.axes import LABELS, SHOWN_AS, known_field
-from studies.sweeps.chunks import Outcome
+from studies.sweeps.chunks import Judged
 from studies.sweeps.folder import (
     CHUNKS,
     JOINED,
@@ -34,7 +34,6 @@ from studies.sweeps.folder import (
     finished_cases,
     read_manifest,
 )
-from studies.sweeps.margins import LoopFigures
 from studies.sweeps.spec import SweepSpec, parse_sweep
 from studies.sweeps.table import Table, as_numbers, build_table
 
@@ -74,8 +73,6 @@ _PER_CASE: dict[str, tuple] = {
         (), "1", "order of the link mode nearest to that frequency, 0: the drive, NaN: nothing"
     ),
 }  # fmt: skip
-#: Those of them that come from the linearised loop.
-OF_LOOP = LoopFigures._fields
 
 
 #: Metrics that single precision has within 1 %: `studies bench --work W1 --precision float32`
@@ -119,7 +116,7 @@ def kept_metrics(spec: SweepSpec) -> list[str]:
 def chunk_variables(
     table: Table,
     rows: np.ndarray,
-    outcome: Outcome,
+    judged: Judged,
     is_too_stiff: np.ndarray,
     substeps: int,
     kept: list[str],
@@ -129,7 +126,7 @@ def chunk_variables(
     Args:
         table: all cases.
         rows: those of the chunk.
-        outcome: of the chunk, padded.
+        judged: of the chunk, padded.
         is_too_stiff: per case of the chunk.
         substeps: plant steps per sample of its program.
         kept: metrics to keep.
@@ -137,23 +134,19 @@ def chunk_variables(
     Returns:
         Variables; metrics of a case that did not finish, and of modes that it does not have, NaN.
     """
-    count, (result, loop) = len(rows), outcome
-    margin = np.asarray(loop.gain_margin)[:count]
+    count, result = len(rows), judged.result
+    margins = {name: data[:count] for name, data in judged.margins._asdict().items()}
     code = np.asarray(result.status)[:count].copy()
     code[is_too_stiff] = status.TOO_STIFF
-    code[np.isin(code, status.FINISHED) & (margin < 1)] = status.UNSTABLE
+    code[np.isin(code, status.FINISHED) & (margins["gain_margin"] < 1)] = status.UNSTABLE
     is_finished = np.isin(code, status.FINISHED)
     modes, controlled = (table.values(name)[rows] for name in ("link.modes", "control.modes"))
     variables = {
         "case_id": Variable(table.case_id[rows].astype(str), ("case",), "1", "hash of the case")
     }
-    known = {"status": code, "substeps": np.full(count, substeps)}
+    known = {"status": code, "substeps": np.full(count, substeps), **margins}
     for name, (dims, *about) in _PER_CASE.items():
-        if name in known:
-            data = known[name]
-        else:
-            source: Any = loop if name in OF_LOOP else result
-            data = np.asarray(getattr(source, name))[:count]
+        data = known[name] if name in known else np.asarray(getattr(result, name))[:count]
         variables[name] = Variable(data, ("case", *dims), *about)
     for name in kept:
         source = result if name == "energy_ratio" else result.metrics
@@ -358,10 +351,6 @@ def gather(table: Table, finished: Finished) -> dict[str, Variable]:
     return variables
 
 
-#: An index that names its axis and counts from 1, as the files do: `residual_rms[link=1]`.
-_NAMED_INDEX = re.compile(r"\[(\w+)=(\d{1,6})\]")
-
-
 def metric_values(data: SweepData, name: str) -> np.ndarray:
     """One number per case: a metric, an entry of it, or a field, (n,).
 
@@ -373,9 +362,9 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
     Raises:
         StudyError: unknown name or entry.
     """
-    named = _NAMED_INDEX.findall(name)
+    named = NAMED_INDEX.findall(name)
     if named:
-        return _of_axes(data, _NAMED_INDEX.sub("", name), named)
+        return _of_axes(data, NAMED_INDEX.sub("", name), named)
     entry = parse_entry(name)
     if entry is not None and entry.field in SHOWN_AS:
         name = SHOWN_AS[entry.field] + name[len(entry.field) :]

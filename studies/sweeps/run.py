@@ -182,7 +182,7 @@ def _run_chunks(
             continue
         chunk = one.chunk
         variables = chunk_variables(
-            table, chunk.rows, one.outcome, chunk.is_too_stiff, one.substeps, kept
+            table, chunk.rows, one.judged, chunk.is_too_stiff, one.substeps, kept
         )
         folder.write_chunk(variables)
         reporter.chunk(variables["status"].data)

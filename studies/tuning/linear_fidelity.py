@@ -24,15 +24,13 @@ from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spillover
 from studies.cases import as_arrays, build_case, build_structure
 from studies.spec import Study
-from studies.stability import gain_margin
+from studies.stability import MARGIN_MODES, gain_margin
 from studies.tuning.scenarios import nominal
 from studies.tuning.spec import OWN, Family, TuneSpec
 
 #: Decay rate that violations of `gain_margin` are measured in, and which counts as stable where
 #: no limit of the loop is set [1/s].
 STABLE = 10.0
-#: Plant modes at least.
-MARGIN_MODES = 12
 #: Points of each straight move at which its distance from singularities is looked at.
 PATH_POINTS = 17
 #: Designs that are looked at in one call; each core takes one call after the other.

@@ -8,11 +8,11 @@ import numpy as np
 
 from jaxmodel import status
 from studies.pages import literal, picture
+from studies.stability import MARGIN_MODES
 from studies.sweeps.results import metric_label
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
 from studies.tuning.check import Judged, Searched, patch_centers
 from studies.tuning.free import PLACEMENT
-from studies.tuning.linear_fidelity import MARGIN_MODES
 from studies.tuning.optimise import KEPT, Progress, excess
 from studies.tuning.scenarios import move_label
 from studies.tuning.spec import LOOP_LIMITS, OWN, Family, TuneSpec
