@@ -35,7 +35,9 @@ def find_bases(structure: Structure, case: Case) -> Bases:
     beam, patches, n = case.machine.beam, case.machine.patches, structure.n_controlled
     belief = beam._replace(stiffness_factor=1.0)
     size = max(structure.n_modes, n)
-    stations = jnp.append(jnp.asarray(case.windows.stations), case.initial.load_station)
+    stations = jnp.asarray(case.windows.stations)
+    load = jnp.broadcast_to(case.initial.load_station, (*stations.shape[:-1], 1))
+    stations = jnp.concatenate([stations, load], axis=-1)
     both = structure.basis, structure.controller_basis
     if both == ("loaded", "loaded"):
         plant, model = _side_by_side(beam, belief, patches, size, stations)
@@ -64,8 +66,9 @@ def _side_by_side(
     """
     pairs = zip(one, other, strict=True)
     beam = Beam(*(jnp.concatenate([jnp.broadcast_to(x, (3,)) for x in pair]) for pair in pairs))
-    centers = jnp.concatenate([jnp.asarray(patches.center)] * 2)
-    six = build_basis("loaded", beam, patches._replace(center=centers), size, stations)
+    twice = (jnp.asarray(x) for x in patches)
+    both = Patches(*(jnp.concatenate([x, x]) if x.ndim else x for x in twice))
+    six = build_basis("loaded", beam, both, size, jnp.tile(stations, (stations.ndim, 1)))
     return jax.tree.map(lambda x: x[:3], six), jax.tree.map(lambda x: x[3:], six)
 
 

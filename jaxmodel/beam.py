@@ -11,7 +11,7 @@ amplitude for `pinned_pinned` (m_j = m_b/2), modal mass half the link's for `loa
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,8 @@ from jaxmodel.parameters import Array, Beam, Patches
 from jaxmodel.piezo import bare_stiffness, one_sided_section, patch_ends, two_sided_section
 
 BASES = ("pinned_pinned", "pinned_free", "loaded")
+
+_Parts = TypeVar("_Parts", Beam, Patches)
 
 
 class ModalBasis(NamedTuple):
@@ -51,9 +53,10 @@ def build_basis(
     Args:
         kind: one of `BASES` (static).
         beam: link data, () or (3,) fields.
-        patches: patch data; one row of centres per link.
+        patches: patch data, () or (3,) fields; one row of centres per link.
         n_modes: R, modes per link (static).
-        stations: positions where the chord deflection is wanted [m], (S,).
+        stations: positions where the chord deflection is wanted [m], (S,), or (3, S) for links with
+            positions of their own.
         mode_mask: 1 for modes that exist, 0 for modes switched off, () or (R,). A mode that is off
             keeps its oscillator but couples to nothing, so it stays at rest.
 
@@ -69,18 +72,20 @@ def build_basis(
         raise ValueError(f"n_modes = {n_modes}: allowed 1 or more [1]")
     link = {"pinned_pinned": _pinned_pinned, "pinned_free": _pinned_free, "loaded": _loaded}[kind]
     centers = jnp.asarray(patches.center)
-    beam = _each_link(beam, len(centers))
+    n_links = len(centers)
     stations = jnp.asarray(stations)
-    shared = patches._replace(center=None)
+    stations = jnp.broadcast_to(stations, (n_links, stations.shape[-1]))
+    own = _each_link(patches._replace(center=0.0), n_links)._replace(center=centers)
 
-    def one_link(beam_i: Beam, center_i: Array) -> ModalBasis:
-        return link(beam_i, shared._replace(center=center_i), n_modes, stations)
+    def one_link(beam_i: Beam, patches_i: Patches, stations_i: Array) -> ModalBasis:
+        return link(beam_i, patches_i, n_modes, stations_i)
 
-    return mask_modes(jax.vmap(one_link)(beam, centers), mode_mask)
+    return mask_modes(jax.vmap(one_link)(_each_link(beam, n_links), own, stations), mode_mask)
 
 
-def _each_link(beam: Beam, n_links: int) -> Beam:
-    return Beam(*(jnp.broadcast_to(jnp.asarray(field), (n_links,)) for field in beam))
+def _each_link(parts: _Parts, n_links: int) -> _Parts:
+    """Data of links, one value of each for every link."""
+    return type(parts)(*(jnp.broadcast_to(jnp.asarray(field), (n_links,)) for field in parts))
 
 
 def mask_modes(basis: ModalBasis, mode_mask: Array) -> ModalBasis:

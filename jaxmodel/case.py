@@ -24,6 +24,7 @@ class Structure(NamedTuple):
     has_shortening: bool = True  # bent links have shorter chords (none in basis pinned_free)
     is_coupled: bool = True  # False: kineto-elastodynamics, bending does not act back
     has_wrench: bool = False  # force and moment on the platform
+    has_payload_offset: bool = False  # the payload's centre of mass is off the reference point
     controller_basis: str = "pinned_pinned"
     feedback: str = "sampled"  # "sampled", "ideal" or "none"
     law: str = "imsc"  # "imsc" or "srf"
@@ -132,7 +133,7 @@ class Windows(NamedTuple):
     arrival_tolerance: Array  # tolerated rms error of a joint's place in the window [m], ()
     singularity_margin: Array  # tolerated distance of link angles from 0 and 90 deg [rad], ()
     condition_limit: Array  # tolerated condition number [1], ()
-    stations: Array  # where chord deflection is taken [m], (S,)
+    stations: Array  # where chord deflection is taken [m], (S,), or (3, S) for each link
 
 
 class Case(NamedTuple):

@@ -119,7 +119,7 @@ def accelerations(
         joint = _joint(chain, _rigid_link(plant, chain, swing, slider_force))
     phi2 = pose_rate[2] * pose_rate[2]
     rates = swing.f - phi2 * chain.frame.c_f, swing.g - phi2 * chain.frame.c_g
-    pose_acc = _pose_acceleration(plant, chain, joint, rates, wrench)
+    pose_acc = _pose_acceleration(plant, chain, joint, rates, phi2, wrench)
 
     acc_f, acc_g = (a + b for a, b in zip(rates, chain.frame.joint_motion(pose_acc), strict=True))
     force_f = joint.ff * acc_f + joint.fg * acc_g + joint.load_f
@@ -268,23 +268,51 @@ def _release_end(
     return _End(row, motion, force), joint
 
 
+class Platform(NamedTuple):
+    """Platform and payload as the pose feels them: M_p X'' - phi'^2 moment = forces on it."""
+
+    matrix: tuple[Array | None, ...]  # M_p, upper triangle [kg, kg m, kg m2], () each; None: zero
+    moment: tuple[Array, Array] | None  # mass times its centre from X [kg m]; None: centre at X
+
+
+def platform_mass(plant: Plant, turn: tuple[Array, Array]) -> Platform:
+    """M_p = (m 0 -s_y; 0 m s_x; -s_y s_x I), (s_x, s_y) the first moment turned by phi.
+
+    Args:
+        plant: the machine.
+        turn: sin and cos of phi [1].
+    """
+    mass, inertia = plant.platform_mass, plant.platform_inertia
+    if plant.platform_moment is None:
+        return Platform((mass, None, None, mass, None, inertia), None)
+    (sine, cosine), own = turn, plant.platform_moment
+    x, y = cosine * own[0] - sine * own[1], sine * own[0] + cosine * own[1]
+    return Platform((mass, None, -y, mass, x, inertia), (x, y))
+
+
 def _pose_acceleration(
-    plant: Plant, chain: Chain, joint: _Joint, rates: tuple[Array, Array], wrench: Array | None
+    plant: Plant,
+    chain: Chain,
+    joint: _Joint,
+    rates: tuple[Array, Array],
+    phi2: Array,
+    wrench: Array | None,
 ) -> Array:
-    """Solve M_p X'' + sum J^t (W (J X'' + rates) + load) = wrench over the links, J X'' = C''."""
+    """Solve M_p X'' - phi'^2 moment + sum J^t (W (J X'' + rates) + load) = wrench over the links.
+
+    J X'' = C''.
+    """
+    platform = platform_mass(plant, chain.turn)
     x, y, cx, cy = chain.frame.x, chain.frame.y, chain.cx, chain.cy
     # W in the plane's axes
     f_x, g_x = x * joint.ff - y * joint.fg, x * joint.fg - y * joint.gg
     w_xx, w_xy = x * f_x - y * g_x, y * f_x + x * g_x
     w_yy = joint.ff + joint.gg - w_xx
     turn_x, turn_y = cx * w_xy - cy * w_xx, cx * w_yy - cy * w_xy  # how phi'' meets x'' and y''
-    matrix = (
-        plant.platform_mass + jnp.sum(w_xx, axis=0),
-        jnp.sum(w_xy, axis=0),
-        jnp.sum(turn_x, axis=0),
-        plant.platform_mass + jnp.sum(w_yy, axis=0),
-        jnp.sum(turn_y, axis=0),
-        plant.platform_inertia + jnp.sum(cx * turn_y - cy * turn_x, axis=0),
+    links = (w_xx, w_xy, turn_x, w_yy, turn_y, cx * turn_y - cy * turn_x)
+    matrix = tuple(
+        jnp.sum(part, axis=0) if own is None else own + jnp.sum(part, axis=0)
+        for own, part in zip(platform.matrix, links, strict=True)
     )
     force_f = joint.ff * rates[0] + joint.fg * rates[1] + joint.load_f
     force_g = joint.fg * rates[0] + joint.gg * rates[1] + joint.load_g
@@ -294,6 +322,9 @@ def _pose_acceleration(
         jnp.sum(force_y, axis=0),
         jnp.sum(cx * force_y - cy * force_x, axis=0),
     )
+    if platform.moment is not None:
+        outward = (phi2 * platform.moment[0], phi2 * platform.moment[1])
+        load = (load[0] + outward[0], load[1] + outward[1], load[2])
     if wrench is not None:
         load = tuple(own + wrench[k] for k, own in enumerate(load))
     return solve_symmetric_3(matrix, load)
@@ -320,6 +351,13 @@ def solve_symmetric_3(matrix: tuple[Array, ...], right: tuple[Array, ...]) -> Ar
     x2 = y2 / d2
     x1 = y1 / d1 - l21 * x2
     return jnp.stack([right[0] / m00 - l10 * x1 - l20 * x2, x1, x2])
+
+
+def mass_matrix(platform: Platform) -> Array:
+    """M_p as a matrix [kg, kg m, kg m2], (3, 3)."""
+    real = jnp.result_type(float)
+    m = [jnp.asarray(0.0 if entry is None else entry, real) for entry in platform.matrix]
+    return jnp.stack([jnp.stack([m[j] for j in row]) for row in ((0, 1, 2), (1, 3, 4), (2, 4, 5))])
 
 
 def inverse_dynamics(
@@ -352,8 +390,10 @@ def inverse_dynamics(
     force_f, force_g = frame.joint_force(on_rho, on_gamma)
     to_f = jnp.stack([frame.x, frame.y, -frame.c_g])
     to_g = jnp.stack([-frame.y, frame.x, frame.c_f])
-    platform = jnp.stack([plant.platform_mass, plant.platform_mass, plant.platform_inertia])
-    load = platform * pose_acc + jnp.sum(to_f * force_f + to_g * force_g, axis=1)
+    platform = platform_mass(plant, chain.turn)
+    load = jnp.sum(to_f * force_f + to_g * force_g, axis=1) + mass_matrix(platform) @ pose_acc
+    if platform.moment is not None:
+        load = load - phi2 * jnp.stack([*platform.moment, jnp.zeros_like(phi2)])
     load = load if wrench is None else load - wrench
     return jnp.linalg.solve(frame.rho_f * to_f, load)
 
@@ -386,6 +426,10 @@ def kinetic_energy(plant: Plant, chain: Chain, pose_rate: Array, q: Array, q_rat
         plant.platform_mass * (pose_rate[0] ** 2 + pose_rate[1] ** 2)
         + plant.platform_inertia * pose_rate[2] ** 2
     ) / 2
+    moment = platform_mass(plant, chain.turn).moment
+    if moment is not None:
+        across = moment[0] * pose_rate[1] - moment[1] * pose_rate[0]
+        platform = platform + across * pose_rate[2]
     return jnp.sum(links, axis=0) + platform
 
 

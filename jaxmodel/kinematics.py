@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxmodel import status
 from jaxmodel.parameters import Array
@@ -21,6 +22,8 @@ from jaxmodel.trigonometry import sine_cosine
 
 #: sin and cos of gamma must exceed this: parallel or perpendicular to the guide is singular [1].
 SINGULAR_MARGIN = 1e-3
+#: Keeps the root of a joint's distance from the platform's centre away from 0 [m2].
+TINY_AREA = 1e-20
 
 
 class Bend(NamedTuple):
@@ -77,6 +80,7 @@ class Chain(NamedTuple):
 
     bend: Bend
     frame: Frame
+    turn: tuple[Array, Array]  # sin and cos of phi [1], () each
     cx: Array  # C - X in the plane [m]
     cy: Array
     s: Array  # u.(C - A) [m]
@@ -141,6 +145,7 @@ def close_chain(plant: Plant, pose: Array, pose_rate: Array, bend: Bend | None =
     return Chain(
         bend=bend,
         frame=frame,
+        turn=(sine, cosine),
         cx=cx,
         cy=cy,
         s=s,
@@ -176,15 +181,41 @@ def link_angle(chain: Chain) -> Array:
 
 
 def singularity_distance(plant: Plant, pose: Array) -> Array:
-    """Smallest distance of any link angle gamma from 0 and 90 deg [rad], ().
+    """Distance of a path from poses that sliders cannot reach through or cannot hold [rad], ().
+
+    The smaller of two: of any link angle gamma from 0 and 90 deg, and `hold`.
 
     Args:
         plant: the machine.
         pose: of the undeformed machine, (N, 3) [m, m, rad].
     """
     lanes = plant._replace(**{name: getattr(plant, name)[:, None] for name in _LINK_FIELDS})
-    gamma = link_angle(close_chain(lanes, pose.T, jnp.zeros_like(pose.T)))
-    return jnp.min(jnp.minimum(gamma, jnp.pi / 2 - gamma))
+    chain = close_chain(lanes, pose.T, jnp.zeros_like(pose.T))
+    gamma = link_angle(chain)
+    nearest = jnp.min(jnp.minimum(gamma, jnp.pi / 2 - gamma))
+    return jnp.minimum(nearest, jnp.min(hold(lanes, chain)))
+
+
+def hold(plant: Plant, chain: Chain) -> Array:
+    """How firmly links of given length hold the platform [1], (): 1 best, 0 not at all.
+
+    Three links whose lines meet in one point, or are parallel, let the platform turn about that
+    point. |det| of their directions and moments about the centre of the joints, over its largest
+    value; near 0 it is the angle [rad] by which the lines miss.
+
+    Args:
+        plant: the machine.
+        chain: of straight links.
+    """
+    frame = chain.frame
+    x, y = frame.x, frame.y
+    from_x, from_y = (c - jnp.mean(c, axis=0) for c in (chain.cx, chain.cy))
+    arm = x * from_y - y * from_x
+    size = jnp.mean(jnp.sqrt(jnp.maximum(from_x**2 + from_y**2, TINY_AREA)), axis=0)
+    determinant = sum(
+        arm[i] * (x[j] * y[k] - y[j] * x[k]) for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+    )
+    return jnp.abs(determinant) / (size * np.sqrt(6.75))
 
 
 def inverse_kinematics(plant: Plant, pose: Array, pose_rate: Array) -> tuple[Array, Array]:
@@ -215,6 +246,8 @@ _LINK_FIELDS = ("ux", "uy", "joint_cos", "joint_sin", "s0", "h0", "length")
 def path_status(plant: Plant, pose: Array) -> Array:
     """First bad status along poses of the undeformed machine, with its index.
 
+    Beside that of the links, SINGULAR where they do not `hold` the platform.
+
     Args:
         plant: the machine.
         pose: (N, 3) [m, m, rad].
@@ -223,9 +256,24 @@ def path_status(plant: Plant, pose: Array) -> Array:
         (code (), index ()): code OK and index 0 where the whole path is sound.
     """
     lanes = plant._replace(**{name: getattr(plant, name)[:, None] for name in _LINK_FIELDS})
-    codes = chain_status(lanes, close_chain(lanes, pose.T, jnp.zeros_like(pose.T)))
+    chain = close_chain(lanes, pose.T, jnp.zeros_like(pose.T))
+    codes = chain_status(lanes, chain)
+    is_loose = (codes == status.OK) & (hold(lanes, chain) < SINGULAR_MARGIN)
+    codes = jnp.where(is_loose, float(status.SINGULAR), codes)
     index = jnp.argmax(codes != status.OK)
     return codes[index], index
+
+
+def lift(plant: Plant, pose: Array) -> Array:
+    """Distance of the joints C from their guides over the lengths of the links [1], (3,).
+
+    The sine of gamma: a joint beyond 1 is out of reach, one below 0 on the wrong side.
+
+    Args:
+        plant: the machine.
+        pose: of the undeformed machine, (3,) [m, m, rad].
+    """
+    return close_chain(plant, pose, jnp.zeros_like(pose)).h / plant.length
 
 
 def closure_residual(chain: Chain, gamma: Array) -> Array:

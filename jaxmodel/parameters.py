@@ -23,12 +23,13 @@ HOME = (0.0, 0.0, np.pi / 6)
 
 
 class Geometry(NamedTuple):
-    """Guides and platform joints. The guides are the sides of an equilateral triangle round O."""
+    """Guides and platform joints. The paper's guides are the sides of a triangle round O."""
 
     guide_side: Array  # a [m], ()
     guide_angle: Array  # alpha [rad], (3,)
     joint_radius: Array  # distance platform centre - C_i [m], () or (3,)
     joint_angle: Array  # psi, body angle of C_i [rad], (3,)
+    guide_offset: Array = 0.0  # by which a guide lies further from O than the side [m], () or (3,)
 
 
 class Masses(NamedTuple):
@@ -37,6 +38,9 @@ class Masses(NamedTuple):
     platform_mass: Array  # m_p [kg], ()
     platform_inertia: Array  # I_p [kg m2], ()
     slider_mass: Array  # m_s [kg], () or (3,)
+    payload_mass: Array = 0.0  # [kg], ()
+    payload_inertia: Array = 0.0  # about its own centre of mass [kg m2], ()
+    payload_offset: Array | None = None  # its centre of mass in the platform's axes [m], (2,)
 
 
 class Beam(NamedTuple):
@@ -53,17 +57,20 @@ class Beam(NamedTuple):
 
 
 class Patches(NamedTuple):
-    """Piezo pairs: sensor and actuator of pair k share a centre, on opposite faces of the link."""
+    """Piezo pairs: sensor and actuator of pair k share a centre, on opposite faces of the link.
+
+    () or (3,) each, but for the centres.
+    """
 
     center: Array  # [m], (3, n_patches)
-    sensor_length: Array  # [m], ()
-    actuator_length: Array  # [m], ()
-    width: Array  # [m], ()
-    thickness: Array  # t_p [m], ()
-    youngs_modulus: Array  # E_p [Pa], ()
-    d31: Array  # [C/N], ()
-    relative_permittivity: Array  # eps33T/eps0 [1], ()
-    density: Array  # [kg/m3], ()
+    sensor_length: Array  # [m]
+    actuator_length: Array  # [m]
+    width: Array  # [m]
+    thickness: Array  # t_p [m]
+    youngs_modulus: Array  # E_p [Pa]
+    d31: Array  # [C/N]
+    relative_permittivity: Array  # eps33T/eps0 [1]
+    density: Array  # [kg/m3]
 
 
 class Damping(NamedTuple):

@@ -92,13 +92,14 @@ def placement_faults(patches: Patches, length: Array) -> tuple[Array, Array]:
     """Whether any patch leaves its link, and whether any two pairs of a link overlap.
 
     Args:
-        patches: patch data; the longer of sensor and actuator decides.
+        patches: patch data, () or (3,) fields; the longer of sensor and actuator decides.
         length: link length [m], () or (3,).
 
     Returns:
         (is_off_link, is_overlapping), boolean scalars.
     """
-    half = jnp.maximum(patches.sensor_length, patches.actuator_length) / 2
+    longer = jnp.maximum(patches.sensor_length, patches.actuator_length)
+    half = jnp.broadcast_to(longer / 2, (3,))[:, None]
     center = jnp.sort(jnp.asarray(patches.center), axis=-1)
     tolerance = 1e-12  # [m], so that patches that just touch are allowed in spite of rounding
     end = jnp.broadcast_to(jnp.asarray(length), (3,))[:, None]

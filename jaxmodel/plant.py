@@ -31,8 +31,10 @@ class Plant(NamedTuple):
     slider_link_mass: Array  # m_b + m_s [kg], (3,)
     tip_mass: Array  # e/L: share of the link's mass that moves with C [kg], (3,)
     inertia: Array  # J0 [kg m2], (3,)
+    # platform and payload
     platform_mass: Array  # [kg], ()
-    platform_inertia: Array  # [kg m2], ()
+    platform_inertia: Array  # about the reference point [kg m2], ()
+    platform_moment: Array | None  # mass times its centre in the platform's axes [kg m], (2,)
     # modes
     modal_mass: Array  # m, the same for all modes of a link [kg], (3,)
     stiffness: Array  # k_j [N/m], (3, R)
@@ -62,8 +64,9 @@ def build_plant(
 ) -> Plant:
     """Collect machine and basis into a `Plant`.
 
-    Guide i starts at A_i = -r_in n_i - (a/2) u_i, r_in = a/(2 sqrt 3), u_i = (cos, sin) alpha_i,
-    and n_i, the inward normal, is u_i turned by +90 deg.
+    Guide i starts at A_i = -r_i n_i - (a/2) u_i, r_i = a/(2 sqrt 3) + its offset,
+    u_i = (cos, sin) alpha_i, and n_i, the inward normal, is u_i turned by +90 deg. The payload
+    adds its mass, inertia and first moment to the platform's.
 
     Args:
         machine: physical description.
@@ -81,21 +84,27 @@ def build_plant(
     def link(x: Array) -> Array:
         return jnp.broadcast_to(jnp.asarray(x), (3,))
 
+    payload, offset = jnp.asarray(masses.payload_mass), masses.payload_offset
+    mass = masses.platform_mass + payload
+    inertia = masses.platform_inertia + jnp.asarray(masses.payload_inertia)
+    if offset is not None:
+        inertia = inertia + payload * jnp.sum(jnp.asarray(offset) ** 2)
     return Plant(
         ux=jnp.cos(angle),
         uy=jnp.sin(angle),
         joint_cos=link(geometry.joint_radius) * jnp.cos(psi),
         joint_sin=link(geometry.joint_radius) * jnp.sin(psi),
         s0=link(geometry.guide_side / 2),
-        h0=link(geometry.guide_side / jnp.sqrt(12.0)),
+        h0=link(geometry.guide_side / jnp.sqrt(12.0) + geometry.guide_offset),
         length=link(beam.length),
         slider_link_mass=link(masses.slider_mass)
         + basis.link_mass
         + LOCK_MASS * jnp.asarray(is_locked, basis.mass.dtype),
         tip_mass=basis.first_moment / link(beam.length),
         inertia=basis.inertia,
-        platform_mass=jnp.asarray(masses.platform_mass),
-        platform_inertia=jnp.asarray(masses.platform_inertia),
+        platform_mass=mass,
+        platform_inertia=inertia,
+        platform_moment=None if offset is None else payload * jnp.asarray(offset),
         modal_mass=basis.mass[:, 0],
         stiffness=basis.stiffness,
         damping=2

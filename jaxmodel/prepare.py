@@ -263,7 +263,7 @@ def _static_status(
     is_used = jnp.arange(structure.n_modes) < case.n_modes
     mode_step, zeta = (jnp.where(is_used, x, 0.0) for x in (mode_step, zeta))
     patches, windows, control = case.machine.patches, case.windows, case.control
-    length = case.machine.beam.length
+    length = jnp.broadcast_to(case.machine.beam.length, (3,))
     is_off, is_overlapping = placement_faults(patches, length)
     is_modal = structure.law == "imsc"
     checks = (
@@ -280,7 +280,10 @@ def _static_status(
             status.TOO_STIFF,
         ),
         (jnp.any(zeta >= 1), status.OVERDAMPED),
-        (~jnp.all((windows.stations > 0) & (windows.stations < length)), status.STATION_OFF_LINK),
+        (
+            ~jnp.all((windows.stations > 0) & (windows.stations < length[:, None])),
+            status.STATION_OFF_LINK,
+        ),
         (~_is_finite(case), status.NON_FINITE),
     )
     code = jnp.zeros(())

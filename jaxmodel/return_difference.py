@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxmodel.axial import axial_force
 from jaxmodel.case import Case, Structure
+from jaxmodel.dynamics import mass_matrix, platform_mass
 from jaxmodel.estimator import Estimator
 from jaxmodel.kinematics import close_chain
 from jaxmodel.loop import Loop
@@ -72,9 +73,7 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
 
     to_rho, to_gamma = jax.jacfwd(rates)(still)  # (3 links, 3)
     chain = close_chain(plant, pose, still)
-    platform = jnp.diag(
-        jnp.stack([plant.platform_mass, plant.platform_mass, plant.platform_inertia])
-    )
+    platform = mass_matrix(platform_mass(plant, chain.turn))
     swing = -plant.tip_mass * chain.chord * chain.sine
     mass = platform + sum(
         jnp.einsum("i,ip,iq->pq", *terms)

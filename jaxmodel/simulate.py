@@ -33,7 +33,7 @@ class Result(NamedTuple):
     command_end: Array  # end of the shaped command [s], ()
     sensor_condition: Array  # condition number of the modal filter per link [1], (3,)
     actuator_condition: Array  # of the synthesizer [1], (3,)
-    singularity_distance: Array  # of link angles from 0 and 90 deg on the path [rad], ()
+    singularity_distance: Array  # of the path from poses no slider reaches or holds [rad], ()
     energy_ratio: Array  # EMC ratios (24) that this run's modal energies give [1], (3, C)
     record: Record | None  # trajectories, leading axis (n_steps,), if asked for
 
@@ -46,7 +46,7 @@ class Command(NamedTuple):
     end: Array  # end of the shaped command [s], ()
     status: Array  # reach, singularity or length fault of the command, as a float, ()
     bad_time: Array  # when it appears [s], ()
-    singularity_distance: Array  # of the link angles from 0 and 90 deg on the path [rad], ()
+    singularity_distance: Array  # of the path from poses no slider reaches or holds [rad], ()
 
 
 def command(structure: Structure, case: Case, prepared: Prepared) -> Command:

@@ -36,7 +36,8 @@ FINISHED = (
 REASONS = {
     OK: "ok",
     OUT_OF_REACH: "pose out of reach",
-    SINGULAR: "singular pose: a link parallel or perpendicular to its guide",
+    SINGULAR: "singular pose: a link parallel or perpendicular to its guide, or the links' lines "
+    "through one point",
     DIVERGED: "diverged: bending beyond a tenth of the link",
     NON_FINITE: "non-finite number",
     SATURATED: "actuators saturated too often",

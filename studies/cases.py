@@ -54,6 +54,7 @@ def build_structure(study: Study, substeps: int | None = None) -> Structure:
         has_shortening=study.link.shortening,
         is_coupled=study.run.model == "coupled",
         has_wrench=any(x != 0 for x in (*study.load.wrench, *study.load.pulse)),
+        has_payload_offset=any(x != 0 for x in study.load.offset),
         controller_basis=study.control.basis,
         feedback=study.control.feedback,
         law=study.control.law,
@@ -86,7 +87,7 @@ def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
     fields = Fields(study, columns)
     number = fields.numbers
     return Case(
-        machine=_machine(fields),
+        machine=_machine(fields, structure),
         n_modes=number("link.modes").astype(int),
         path=_path(fields),
         shaping=_shaping(fields),
@@ -134,30 +135,39 @@ def as_arrays(case: Case) -> Case:
     return jax.tree.map(leaf, case)
 
 
-def _machine(fields: Fields) -> Machine:
-    def number(section: str, name: str) -> np.ndarray:
-        return fields.numbers(f"{section}.{name}")
-
-    outward = fields.choices("machine.assembly", tuple(ASSEMBLIES))
+def _machine(fields: Fields, structure: Structure) -> Machine:
+    number, each = fields.numbers, fields.each_link
     return Machine(
         Geometry(
-            number("machine", "guide_side"),
-            np.array([[2 * np.pi / 3, 4 * np.pi / 3, 0.0]]),
-            number("machine", "joint_radius"),
-            np.array(list(ASSEMBLIES.values()))[outward],
+            number("machine.guide_side"),
+            np.radians(number("machine.guide_angles_deg")),
+            each("machine.joint_radius"),
+            _joint_angle(fields),
+            each("machine.guide_offsets"),
         ),
         Masses(
-            number("machine", "platform_mass") + number("load", "mass"),
-            number("machine", "platform_inertia") + number("load", "inertia"),
-            number("machine", "slider_mass"),
+            number("machine.platform_mass"),
+            number("machine.platform_inertia"),
+            each("machine.slider_mass"),
+            number("load.mass"),
+            number("load.inertia"),
+            number("load.offset") if structure.has_payload_offset else None,
         ),
-        Beam(*(number("link", name) for name in Beam._fields)),
+        Beam(*(each(f"link.{name}") for name in Beam._fields)),
         Patches(
-            center=_per_link(number("patches", "centers")),
-            **{name: number("patches", name) for name in Patches._fields if name != "center"},
+            center=_per_link(number("patches.centers")),
+            **{name: each(f"patches.{name}") for name in Patches._fields if name != "center"},
         ),
         _damping(fields),
     )
+
+
+def _joint_angle(fields: Fields) -> np.ndarray:
+    """psi [rad], (m, 3): as given, else those of the assembly."""
+    outward = fields.choices("machine.assembly", tuple(ASSEMBLIES))
+    known = np.array(list(ASSEMBLIES.values()))[outward]
+    given = np.radians(fields.numbers("machine.joint_angles_deg"))
+    return np.where(np.isnan(given), known, given) if given.shape[1] else known
 
 
 def _damping(fields: Fields) -> Damping:

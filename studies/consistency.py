@@ -18,6 +18,17 @@ SAMPLE_LIMIT = 2_000_000
 SLOWEST_AMPLIFIER = 1.0
 
 
+def each_link(value: Any) -> np.ndarray:
+    """One number for all links, or three of them, as (3,)."""
+    return np.broadcast_to(np.asarray(value, float), (3,))
+
+
+def patch_pitch(study: Study) -> np.ndarray:
+    """Room along each link that one patch pair takes, the longer of both [m], (3,)."""
+    patches = study.patches
+    return np.maximum(each_link(patches.sensor_length), each_link(patches.actuator_length))
+
+
 def patch_centers(study: Study) -> np.ndarray:
     """Patch centres of every link [m], (3, K)."""
     centers = study.patches.centers
@@ -36,35 +47,9 @@ def check_consistency(study: Study) -> None:
     Raises:
         StudyError: the first fault.
     """
-    link, patches, control = study.link, study.patches, study.control
-    centers = patch_centers(study)
-    half = max(patches.sensor_length, patches.actuator_length) / 2
-    if 2 * half > link.length:
-        name = "sensor" if patches.sensor_length > patches.actuator_length else "actuator"
-        raise field_error(
-            f"patches.{name}_length", 2 * half, f"at most link.length = {link.length:g}", "m"
-        )
-    for row in centers:
-        ordered, given = np.sort(row), [float(f"{x:.9g}") for x in row]
-        if ordered[0] < half - 1e-12 or ordered[-1] > link.length - half + 1e-12:
-            raise field_error(
-                "patches.centers",
-                given,
-                f"{half:g} to {link.length - half:g}, so that no patch leaves the link",
-                "m",
-            )
-        if np.any(np.diff(ordered) < 2 * half - 1e-12):
-            raise field_error(
-                "patches.centers",
-                given,
-                f"centres at least {2 * half:g} apart, so that no patches overlap",
-                "m",
-            )
-    if patches.width > link.width * (1 + 1e-9):
-        raise field_error(
-            "patches.width", patches.width, f"at most link.width = {link.width:g}", "m"
-        )
-    n_patches = centers.shape[1]
+    link, control = study.link, study.control
+    _check_patches(study)
+    n_patches = patch_centers(study).shape[1]
     if control.law == "imsc" and control.modes > n_patches:
         raise field_error(
             "control.modes",
@@ -73,7 +58,7 @@ def check_consistency(study: Study) -> None:
             "1",
         )
     _check_lists(study)
-    if link.basis != "loaded" and (link.joint_inertia_b or link.joint_inertia_c):
+    if link.basis != "loaded" and np.any([link.joint_inertia_b, link.joint_inertia_c]):
         raise field_error("link.basis", link.basis, "loaded, where a joint has rotary inertia")
     if study.drive.locked and link.basis == "pinned_free":
         raise field_error(
@@ -85,15 +70,53 @@ def check_consistency(study: Study) -> None:
             "pinned_pinned or loaded, where run.model is ked: rigid motion prescribes both ends",
         )  # fmt: skip
     stations = ("metrics.stations", study.metrics.stations)
+    shortest = each_link(link.length).min()
     for name, values in (stations, ("initial.load_station", (study.initial.load_station,))):
         for value in values:
-            if not 0 < value < link.length:
+            if not 0 < value < shortest:
                 raise field_error(
-                    name, value, f"between 0 and link.length = {link.length:g}, exclusive", "m"
+                    name, value, f"between 0 and link.length = {shortest:g}, exclusive", "m"
                 )
     _check_sampling(study)
     _check_pulses(study)
     _check_coupling(study)
+
+
+def _check_patches(study: Study) -> None:
+    """Patches that leave their link, or overlap."""
+    patches, link = study.patches, study.link
+    pitches, lengths, is_own = patch_pitch(study), each_link(link.length), _differs(link.length)
+    sensor = each_link(patches.sensor_length)
+    for i, (row, pitch, length) in enumerate(
+        zip(patch_centers(study), pitches, lengths, strict=True)
+    ):
+        of_link = f" (link {i + 1})" if is_own or _differs(list(pitches)) else ""
+        if pitch > length:
+            name = "sensor" if sensor[i] == pitch else "actuator"
+            raise field_error(
+                f"patches.{name}_length", pitch, f"at most link.length = {length:g}{of_link}", "m"
+            )
+        ordered, given = np.sort(row), [float(f"{x:.9g}") for x in row]
+        if ordered[0] < pitch / 2 - 1e-12 or ordered[-1] > length - pitch / 2 + 1e-12:
+            raise field_error(
+                "patches.centers", given,
+                f"{pitch / 2:g} to {length - pitch / 2:g}, so that no patch leaves the "
+                f"link{of_link}", "m",
+            )  # fmt: skip
+        if np.any(np.diff(ordered) < pitch - 1e-12):
+            raise field_error(
+                "patches.centers", given,
+                f"centres at least {pitch:g} apart, so that no patches overlap{of_link}", "m",
+            )  # fmt: skip
+    widths = each_link(patches.width)
+    for i in np.flatnonzero(widths > each_link(link.width) * (1 + 1e-9))[:1]:
+        raise field_error(
+            "patches.width", widths[i], f"at most link.width = {each_link(link.width)[i]:g}", "m"
+        )
+
+
+def _differs(value: Any) -> bool:
+    return bool(np.ptp(each_link(value)) > 0)
 
 
 def check_locked(study: Study) -> None:
@@ -112,13 +135,14 @@ def check_locked(study: Study) -> None:
 def _check_coupling(study: Study) -> None:
     """The ceramic must couple, and less than completely: k31^2 = d31^2 E_p/eps33T in (0, 1)."""
     patches = study.patches
-    stiffness = patches.youngs_modulus / (patches.relative_permittivity * VACUUM_PERMITTIVITY)
-    highest = 1 / stiffness**0.5
-    if not 1e-6 * highest < abs(patches.d31) < highest:
+    permittivity = each_link(patches.relative_permittivity) * VACUUM_PERMITTIVITY
+    highest = np.sqrt(permittivity / each_link(patches.youngs_modulus))
+    size = np.abs(each_link(patches.d31))
+    for i in np.flatnonzero((size <= 1e-6 * highest) | (size >= highest))[:1]:
         raise field_error(
             "patches.d31", patches.d31,
-            f"{1e-6 * highest:.3g} to {highest:.3g} in size, for a coupling k31^2 below 1 with "
-            "patches.youngs_modulus and patches.relative_permittivity", "C/N",
+            f"{1e-6 * highest[i]:.3g} to {highest[i]:.3g} in size, for a coupling k31^2 below 1 "
+            "with patches.youngs_modulus and patches.relative_permittivity", "C/N",
         )  # fmt: skip
 
 

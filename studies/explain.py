@@ -35,6 +35,10 @@ def allowed_values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
     if hasattr(annotation, "__metadata__"):
         return allowed_values(arguments[0], _limits(annotation))
     if origin in (Union, UnionType):
+        several = get_args(arguments[-1])
+        if several == arguments[:1] * len(several):  # one number, or some of the same kind
+            inner, limits = get_args(arguments[0])[0], _range(_limits(arguments[0]))
+            return f"{_WORDS[inner]}, or a list of {len(several)}, each {limits}"
         return ", or ".join(allowed_values(each, metadata) for each in arguments)
     if origin is Literal:
         names = [repr(name) for name in arguments]
@@ -50,6 +54,8 @@ def allowed_values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
 
 def _entries(arguments: tuple[Any, ...], metadata: Iterable[Any]) -> str:
     """A list: how many entries, and of what."""
+    if not arguments:
+        return "an empty list"
     entry = arguments[0]
     inner = get_args(entry)[0] if hasattr(entry, "__metadata__") else entry
     inner = dict if get_origin(inner) is dict else inner

@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from studies.spec import Study
+from studies.spec import EACH_LINK, Study
 
 Columns = Mapping[str, np.ndarray]
 
 #: An index that names its axis and counts from 1, as the files do: `residual_rms[link=1]`.
 NAMED_INDEX = re.compile(r"\[(\w+)=(\d{1,6})\]")
+LINKS = 3
 _ENTRY = re.compile(r"(?P<field>[^\s\[\]]+)(?P<indices>(\[\d{1,6}\])*)")
 
 
@@ -42,6 +43,11 @@ def field_value(study: Study, field: str) -> Any:
     section, _, leaf = field.partition(".")
     value = getattr(study, section)
     return getattr(value, leaf) if leaf else value
+
+
+def as_list(field: str, value: Any) -> Any:
+    """A field's value where its entries are asked for: three, where one stands for all links."""
+    return (value,) * LINKS if field in EACH_LINK and not isinstance(value, tuple) else value
 
 
 def padded(values: list[Any]) -> np.ndarray:
@@ -103,14 +109,25 @@ class Fields:
     def numbers(self, field: str) -> np.ndarray:
         """As floats, entries of lists put in; what ragged lists lack is NaN."""
         raw = self.raw(field)
-        array = padded(list(raw)) if raw.dtype == object else raw.astype(float)
+        if raw.dtype == object:
+            is_mixed = field in EACH_LINK and any(isinstance(value, tuple) for value in raw)
+            array = padded([as_list(field, x) for x in raw] if is_mixed else list(raw))
+        else:
+            array = raw.astype(float)
         for name, column in self.columns.items():
             entry = parse_entry(name)
             if entry is not None and entry.field == field and entry.indices:
+                if array.ndim == 1:
+                    array = np.repeat(array[:, None], LINKS, axis=1)
                 if len(array) != len(column):
                     array = np.repeat(array, len(column), axis=0)
                 np.moveaxis(array, 0, -1)[entry.indices] = np.moveaxis(column, 0, -1)
         return array
+
+    def each_link(self, field: str) -> np.ndarray:
+        """As floats, one for each link where one stands for all, (m, 3)."""
+        array = self.numbers(field)
+        return np.repeat(array[:, None], LINKS, axis=1) if array.ndim == 1 else array
 
     def choices(self, field: str, names: tuple[str, ...]) -> np.ndarray:
         """Position of each text value in `names`, (m,)."""

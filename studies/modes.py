@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.kinematics import path_status
+from jaxmodel.kinematics import lift, path_status
 from jaxmodel.linear import NaturalModes, linearise, natural_modes, resting
 from jaxmodel.prepare import prepare
 from studies.cases import as_arrays, build_case, build_structure
@@ -57,8 +57,8 @@ def machine_modes(study: Study | None = None, **changes: Any) -> NaturalModes:
     study = modes_study(study, **changes)
     structure, case = build_structure(study), as_arrays(build_case(study))
     where = study.motion.waypoints[0]
-    code, plant = _at_pose(structure, case, np.array(where))
-    check_pose("pose", where, int(code))
+    code, lifts, plant = _at_pose(structure, case, np.array(where))
+    check_pose("pose", where, int(code), np.asarray(lifts))
     found = natural_modes(plant)
     if study.drive.locked:  # the three coordinates that the sliders hold are no modes
         found = NaturalModes(found.frequency[3:], found.damping_ratio[3:], found.shape[:, 3:])
@@ -69,4 +69,4 @@ def machine_modes(study: Study | None = None, **changes: Any) -> NaturalModes:
 def _at_pose(structure: Structure, case: Case, pose: np.ndarray):
     loop = prepare(structure, case).loop
     code, _ = path_status(loop.plant, pose[None])
-    return code, linearise(structure, loop, pose, resting(structure, case))
+    return code, lift(loop.plant, pose), linearise(structure, loop, pose, resting(structure, case))

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 
 from jaxmodel import shaper
 from studies import figures
+from studies.consistency import each_link
 from studies.paper_cases import ALL, OFF, ONE, TWO, PaperRuns
 from studies.paper_measures import Measures
 
@@ -107,7 +108,7 @@ def _deflection(runs: PaperRuns, measures: Measures, links: tuple[bool, ...]) ->
 def _station(runs: PaperRuns) -> int:
     """The station at three quarters of the link, or the one nearest to it."""
     stations = np.array(runs.study.metrics.stations)
-    return int(np.argmin(np.abs(stations - 0.75 * runs.study.link.length)))
+    return int(np.argmin(np.abs(stations - 0.75 * each_link(runs.study.link.length).mean())))
 
 
 def _modes(runs: PaperRuns, measures: Measures) -> Figure:

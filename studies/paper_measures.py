@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import periodogram
 
+from studies.consistency import each_link
 from studies.paper_cases import PaperRuns
 
 #: The peak of a mode is looked for within this fraction of its frequency [1].
@@ -35,7 +36,7 @@ class Measures(NamedTuple):
 def middle_station(runs: PaperRuns) -> int:
     """Index of the station nearest to mid-span."""
     stations = np.array(runs.study.metrics.stations)
-    return int(np.argmin(np.abs(stations - runs.study.link.length / 2)))
+    return int(np.argmin(np.abs(stations - each_link(runs.study.link.length).mean() / 2)))
 
 
 def measure(runs: PaperRuns) -> Measures:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from studies.consistency import each_link
 from studies.pages import picture, table
 from studies.paper_cases import ALL, MOVES, OFF, PAPER_RATIOS, PaperRuns
 from studies.paper_figures import PAPER_FIGURES
@@ -58,8 +59,9 @@ def _head(context: Context) -> list[str]:
         f"only). {note}",
         "",
         f"Plant: {study.link.modes} modes per link ({study.link.basis}), structural damping "
-        f"{study.link.first_damping:g}, E = {study.link.youngs_modulus / 1e9:g} GPa, slider drive "
-        f"Kp = {study.drive.kp:g} N/m, Kd = {study.drive.kd:g} N s/m. Control: sampled at "
+        f"{study.link.first_damping:g}, E = {span(each_link(study.link.youngs_modulus) / 1e9)} "
+        f"GPa, slider drive Kp = {study.drive.kp:g} N/m, Kd = {study.drive.kd:g} N s/m. Control: "
+        "sampled at "
         f"{loop.sample_rate_hz / 1e3:g} kHz, {loop.adc_bits} bit, one sample of delay, velocity by "
         f"{loop.estimator}, gains {', '.join(f'{k:g}' for k in control.velocity_gain)} N s/m of "
         f"the paper times {control.gain_factor:g}. One ADC step is "

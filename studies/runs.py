@@ -19,7 +19,7 @@ from jaxmodel.bases import find_bases
 from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
-from jaxmodel.kinematics import path_status
+from jaxmodel.kinematics import SINGULAR_MARGIN, lift, path_status
 from jaxmodel.linear import linearise, mechanical, resting
 from jaxmodel.motion import end_of_path, sample_path
 from jaxmodel.plant import damping_ratio
@@ -35,7 +35,7 @@ from jaxmodel.shaper import Taps, last_sample
 from jaxmodel.simulate import Result, simulate, steady_load
 from studies import config
 from studies.cases import as_arrays, build_case, build_structure, powered
-from studies.consistency import check_locked
+from studies.consistency import check_locked, each_link
 from studies.errors import field_error
 from studies.spec import Study
 from studies.stability import (
@@ -47,6 +47,8 @@ from studies.stability import (
 )
 from studies.store import Variable
 
+#: What `singularity_distance` means.
+DISTANCE_TEXT = "of link angles from 0 and 90 deg, and of the links from lines through one point"
 #: More plant steps per sample than this are refused.
 SUBSTEP_LIMIT = 200
 
@@ -145,6 +147,7 @@ class Preflight(NamedTuple):
     """What is known of a case before it runs."""
 
     pose_status: Any  # of every way-point, (n,)
+    lift: Any  # of the links there, see `jaxmodel.kinematics.lift` [1], (n, 3)
     path_status: Any  # first fault along the unshaped path, ()
     path_time: Any  # when [s], ()
     path_pose: Any  # where, (3,)
@@ -170,7 +173,8 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
     prepared = prepare(structure, case)
     plant = prepared.loop.plant
     shaper_length = last_sample(prepared.taps) * case.electronics.period
-    each = jax.vmap(lambda pose: path_status(plant, pose[None])[0])(case.path.waypoints)
+    points = jnp.asarray(case.path.waypoints)
+    each = jax.vmap(lambda pose: (path_status(plant, pose[None])[0], lift(plant, pose)))(points)
     end = end_of_path(case.path)
     time = jnp.linspace(0.0, 1.0, 2001) * end
     poses = sample_path(case.path, time).position
@@ -179,7 +183,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
     corner = lowpass_corner(structure, case, prepared.bases)
     damping = jnp.max(damping_ratio(case.machine.damping, prepared.loop.omega))
     return Preflight(
-        each, code, time[index], poses[index], end, shaper_length, worst,
+        *each, code, time[index], poses[index], end, shaper_length, worst,
         jnp.max(prepared.loop.omega), damping, corner, steady_load(structure, case, plant),
         critical_force(plant), prepared.loop.controller, prepared.taps,
     )  # fmt: skip
@@ -207,7 +211,7 @@ def check_run(study: Study) -> tuple[Structure, Case]:
     structure = structure._replace(substeps=_drive_substeps(study, structure, case))
     known = preflight(structure, case)
     for k, pose in enumerate(study.motion.waypoints):
-        check_pose(f"motion.waypoints.{k}", pose, int(known.pose_status[k]))
+        check_pose(f"motion.waypoints.{k}", pose, int(known.pose_status[k]), known.lift[k])
     if int(known.path_status) != status.OK:
         x, y, phi = known.path_pose
         raise field_error(
@@ -232,23 +236,32 @@ def check_run(study: Study) -> tuple[Structure, Case]:
     return structure, case
 
 
-def check_pose(field: str, pose: tuple[float, float, float], code: int) -> None:
+def check_pose(field: str, pose: tuple[float, float, float], code: int, lifts: np.ndarray) -> None:
     """Refuse a pose that no link can reach, or where a link is parallel or square to its guide.
 
     Args:
         field: name for the message.
         pose: (x, y, phi) [m, m, rad].
         code: its status.
+        lifts: of the links there, (3,).
 
     Raises:
         StudyError: out of reach or singular.
     """
-    if code != status.OK:
-        raise field_error(
-            field, pose,
-            "a pose where every link angle gamma is inside (0, 90) deg "
-            f"(here: {status.REASONS[code]})", "m, m, rad",
-        )  # fmt: skip
+    if code == status.OK:
+        return
+    margin = SINGULAR_MARGIN
+    wrong = [
+        f"the joint of link {i + 1} is {x:.3g} link lengths inside its guide"
+        for i, x in enumerate(lifts)
+        if not margin <= x < np.sqrt(1 - margin**2)
+    ]
+    allowed = "every link angle gamma is inside (0, 90) deg"
+    raise field_error(
+        field, pose,
+        f"a pose where {allowed if wrong else 'the lines of the links do not meet in one point'} "
+        f"(here: {': '.join([status.REASONS[code], *wrong[:1]])})", "m, m, rad",
+    )  # fmt: skip
 
 
 def _check_load(study: Study, known: Preflight) -> None:
@@ -483,7 +496,10 @@ def run_variables(run: Run) -> dict[str, Variable]:
             run.result.actuator_condition, ("link",), "1", "condition number of the synthesizer"
         ),
         "singularity_distance": Variable(
-            run.result.singularity_distance, (), "rad", "of link angles from 0 and 90 deg"
+            run.result.singularity_distance,
+            (),
+            "rad",
+            DISTANCE_TEXT,
         ),
         "energy_ratio": Variable(
             run.result.energy_ratio,
@@ -544,7 +560,7 @@ def run_variables(run: Run) -> dict[str, Variable]:
 def chord_deflection(run: Run) -> np.ndarray:
     """Mid-span deflection relative to the chord B-C [m], (n_steps, 3), from the plant's modes."""
     machine, structure = run.case.machine, run.structure
-    middle = jnp.asarray([run.study.link.length / 2])
+    middle = each_link(run.study.link.length)[:, None] / 2
     shape = build_basis(structure.basis, machine.beam, machine.patches, structure.n_modes, middle)
     at = np.asarray(shape.deflection_at)[:, 0]
     return np.einsum("tir,ir->ti", run.result.record.modal_coordinate, at)  # type: ignore[union-attr]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -31,7 +31,12 @@ Hertz = Annotated[float, Field(ge=0.1, le=1e5)]
 Zeta = Annotated[float, Field(ge=0, lt=1)]
 Time = Annotated[float, Field(ge=1e-4, le=100)]
 Pause = Annotated[float, Field(ge=0, le=100)]
+Degrees = Annotated[float, Field(ge=-360, le=360)]
+Offset = Annotated[float, Field(ge=-1, le=1)]
 Flags = tuple[bool, bool, bool]
+Number = TypeVar("Number")
+#: One number for all links, or one for each.
+EachLink: TypeAlias = Number | tuple[Number, Number, Number]
 
 
 def described(default: Any, unit: str, text: str, **bounds: Any) -> Any:
@@ -59,18 +64,33 @@ class Run(Section):
 class Machine(Section):
     """Guides, platform, sliders."""
 
-    assembly: Literal["inward", "outward"] = described("inward", "-", "which of the two assemblies")
     guide_side: float = described(0.6, "m", "side of the guide triangle", ge=0.01, le=10)
-    joint_radius: float = described(
-        round(0.12 / 3**0.5, 12), "m", "platform centre to joint", ge=1e-4, le=5
+    guide_angles_deg: tuple[Degrees, Degrees, Degrees] = described(
+        (120.0, 240.0, 0.0), "deg", "direction alpha of each guide; the platform is on its left"
+    )
+    guide_offsets: EachLink[Annotated[float, Field(ge=-10, le=10)]] = described(
+        0.0, "m", "by which a guide lies outside its side of the triangle"
+    )
+    assembly: Literal["inward", "outward"] = described(
+        "inward", "-", "which of the paper's two assemblies: joints at 90, 210, 330 deg or opposite"
+    )
+    joint_angles_deg: tuple[()] | tuple[Degrees, Degrees, Degrees] = described(
+        (), "deg", "of the platform's joints in its own axes; empty: as assembly says"
+    )
+    joint_radius: EachLink[Annotated[float, Field(ge=1e-4, le=5)]] = described(
+        round(0.12 / 3**0.5, 12), "m", "reference point of the platform to its joints"
     )
     platform_mass: float = described(0.25, "kg", "m_p", ge=1e-3, le=1e3)
-    platform_inertia: float = described(3.0e-4, "kg m2", "I_p", ge=1e-7, le=1e2)
-    slider_mass: float = described(0.15, "kg", "m_s of each slider", ge=1e-3, le=1e3)
+    platform_inertia: float = described(
+        3.0e-4, "kg m2", "I_p about the reference point", ge=1e-7, le=1e2
+    )
+    slider_mass: EachLink[Annotated[float, Field(ge=1e-3, le=1e3)]] = described(
+        0.15, "kg", "m_s of each slider"
+    )
 
 
 class Link(Section):
-    """The three flexible links."""
+    """The three flexible links; dimensions and material: one number for all, or three."""
 
     basis: Basis = described("pinned_pinned", "-", "modal basis of the plant")
     modes: int = described(8, "1", "plant modes per link", ge=1, le=16)
@@ -79,17 +99,13 @@ class Link(Section):
         "-",
         "a bent link's chord is shorter: axial force acts on bending (not in pinned_free)",
     )
-    length: float = described(0.2, "m", "L", ge=1e-3, le=10)
-    thickness: float = described(2e-3, "m", "t_b", ge=1e-5, le=0.1)
-    width: float = described(10e-3, "m", "width", ge=1e-4, le=1)
-    density: float = described(2750.0, "kg/m3", "density", ge=1, le=3e4)
-    youngs_modulus: float = described(70e9, "Pa", "E", ge=1e3, le=2e12)
-    stiffness_factor: float = described(
-        1.0,
-        "1",
-        "true bending stiffness over the one controller and shaper believe",
-        ge=1e-3,
-        le=10,
+    length: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(0.2, "m", "L")
+    thickness: EachLink[Annotated[float, Field(ge=1e-5, le=0.1)]] = described(2e-3, "m", "t_b")
+    width: EachLink[Annotated[float, Field(ge=1e-4, le=1)]] = described(10e-3, "m", "width")
+    density: EachLink[Annotated[float, Field(ge=1, le=3e4)]] = described(2750.0, "kg/m3", "density")
+    youngs_modulus: EachLink[Annotated[float, Field(ge=1e3, le=2e12)]] = described(70e9, "Pa", "E")
+    stiffness_factor: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(
+        1.0, "1", "true bending stiffness over the one controller and shaper believe"
     )
     damping_ratio: Zeta | tuple[Zeta, ...] | tuple[tuple[Zeta, ...], ...] = described(
         0.01, "1", "of mode 1; or by mode as measured, one list for all links, or three"
@@ -97,11 +113,11 @@ class Link(Section):
     damping_law: Literal["constant", "mass", "stiffness"] = described(
         "constant", "-", "of the modes beyond: same ratio, falling with frequency, or rising"
     )
-    joint_inertia_b: float = described(
-        0.0, "kg m2", "at the slider joint (basis loaded)", ge=0, le=1
+    joint_inertia_b: EachLink[Annotated[float, Field(ge=0, le=1)]] = described(
+        0.0, "kg m2", "at the slider joint (basis loaded)"
     )
-    joint_inertia_c: float = described(
-        0.0, "kg m2", "at the platform joint (basis loaded)", ge=0, le=1
+    joint_inertia_c: EachLink[Annotated[float, Field(ge=0, le=1)]] = described(
+        0.0, "kg m2", "at the platform joint (basis loaded)"
     )
 
     @property
@@ -114,21 +130,31 @@ class Link(Section):
 
 
 class Patches(Section):
-    """Piezo pairs: a sensor and an actuator on opposite faces share a centre."""
+    """Piezo pairs: sensor and actuator on opposite faces share a centre; one number, or three."""
 
     centers: tuple[float, ...] | tuple[tuple[float, ...], ...] = described(
         (0.05, 0.10, 0.15), "m", "centres along the link; one list for all links, or three lists"
     )
-    sensor_length: float = described(0.010, "m", "sensor length", ge=1e-5, le=1)
-    actuator_length: float = described(0.030, "m", "actuator length", ge=1e-5, le=1)
-    width: float = described(0.010, "m", "patch width", ge=1e-5, le=1)
-    thickness: float = described(0.2e-3, "m", "t_p", ge=1e-6, le=0.01)
-    youngs_modulus: float = described(66e9, "Pa", "E_p", ge=1e3, le=2e12)
-    d31: float = described(
-        -180e-12, "C/N", "piezoelectric constant (its sign has no effect)", ge=-1e-9, le=1e-9
+    sensor_length: EachLink[Annotated[float, Field(ge=1e-5, le=1)]] = described(
+        0.010, "m", "sensor length"
     )
-    relative_permittivity: float = described(1750.0, "1", "eps33T/eps0", ge=1, le=1e5)
-    density: float = described(7800.0, "kg/m3", "density of the ceramic", ge=0, le=3e4)
+    actuator_length: EachLink[Annotated[float, Field(ge=1e-5, le=1)]] = described(
+        0.030, "m", "actuator length"
+    )
+    width: EachLink[Annotated[float, Field(ge=1e-5, le=1)]] = described(0.010, "m", "patch width")
+    thickness: EachLink[Annotated[float, Field(ge=1e-6, le=0.01)]] = described(0.2e-3, "m", "t_p")
+    youngs_modulus: EachLink[Annotated[float, Field(ge=1e3, le=2e12)]] = described(
+        66e9, "Pa", "E_p"
+    )
+    d31: EachLink[Annotated[float, Field(ge=-1e-9, le=1e-9)]] = described(
+        -180e-12, "C/N", "piezoelectric constant (its sign has no effect)"
+    )
+    relative_permittivity: EachLink[Annotated[float, Field(ge=1, le=1e5)]] = described(
+        1750.0, "1", "eps33T/eps0"
+    )
+    density: EachLink[Annotated[float, Field(ge=0, le=3e4)]] = described(
+        7800.0, "kg/m3", "density of the ceramic"
+    )
 
 
 class Motion(Section):
@@ -271,7 +297,12 @@ class Load(Section):
     """What the platform carries and what acts on it, at its reference point (the pose)."""
 
     mass: float = described(0.0, "kg", "payload, added to m_p", ge=0, le=1e3)
-    inertia: float = described(0.0, "kg m2", "payload, added to I_p", ge=0, le=1e2)
+    inertia: float = described(
+        0.0, "kg m2", "payload about its own centre of mass, added to I_p", ge=0, le=1e2
+    )
+    offset: tuple[Offset, Offset] = described(
+        (0.0, 0.0), "m", "payload's centre of mass in the platform's axes"
+    )
     wrench: Wrench = described(
         (0.0, 0.0, 0.0), "N, N, N m", "steady force and moment; the run starts in equilibrium"
     )
@@ -357,6 +388,20 @@ class Study(Section):
                     raise StudyError(f"{field}: {section} is no section of a study")
             target[leaf] = value
         return parse_study(data)
+
+
+def _each_link_fields() -> frozenset[str]:
+    """Fields that take one number for all links, or one for each."""
+    found = set()
+    for section, outer in Study.model_fields.items():
+        for leaf, info in getattr(outer.annotation, "model_fields", {}).items():
+            one, *others = get_args(info.annotation) or (None,)
+            if [get_args(other) for other in others] == [(one,) * 3]:
+                found.add(f"{section}.{leaf}")
+    return frozenset(found)
+
+
+EACH_LINK = _each_link_fields()
 
 
 def parse_study(data: dict[str, Any]) -> Study:

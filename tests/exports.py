@@ -39,7 +39,10 @@ TUNED = {
 SINGLE = {
     **_SHORT,
     "electronics": {"adc_bits": 16},
-    "title": "two modes, one link",
+    "link": {"modes": 4, "length": [0.2, 0.21, 0.2], "thickness": [2.0e-3, 2.1e-3, 1.9e-3]},
+    "machine": {"guide_offsets": [0.0, 0.005, 0.0]},
+    "load": {"mass": 0.05, "offset": [0.01, -0.005]},
+    "title": "two modes, one link of three different ones",
     "control": {"modes": 2, "links": [False, True, False], "feedthrough_factor": 0.7},
 }
 DESIGNS = {"paper": PAPER, "tuned": TUNED, "single": SINGLE}

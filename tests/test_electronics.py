@@ -27,7 +27,7 @@ def electronics(**changes):
 
 
 def test_patch_into_one_megohm_is_a_high_pass_of_24_hz():
-    capacitance = float(sensor_capacitance(build_case(STUDY).machine.patches))
+    capacitance = float(sensor_capacitance(build_case(STUDY).machine.patches)[0])
     assert capacitance == pytest.approx(6.68e-9, rel=1e-3)
     corner = 1 / (1e6 * capacitance) / HERTZ
     assert corner == pytest.approx(23.8, abs=0.1)

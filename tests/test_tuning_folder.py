@@ -30,7 +30,9 @@ from tests.tunings import GAIN, SMALL, tuning
 
 FILE = """
 run = { duration = 0.06 }
-link = { modes = 2 }
+link = { modes = 2, length = [0.2, 0.21, 0.2], thickness = [2.0e-3, 2.1e-3, 1.95e-3] }
+machine = { slider_mass = [0.15, 0.16, 0.15], guide_offsets = [0.0, 0.005, 0.0] }
+load = { mass = 0.05, offset = [0.01, -0.005] }
 control = { modes = 2, ratios = [[1.0, 0.3], [1.0, 0.3], [1.0, 0.3]] }
 shaper = { kind = "none" }
 metrics = { residual_delay = 0.002, residual_length = 0.02 }

@@ -18,6 +18,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.dynamics import modal_chain
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
+from studies.consistency import each_link
 from studies.figures import SERIES, axes_or_new, styled
 from studies.runs import check_run
 from studies.spec import Study
@@ -53,10 +54,11 @@ def skeleton(study: Study, pose: np.ndarray, q: np.ndarray, exaggeration: float)
         np.asarray(part)
         for part in _positions(structure._replace(n_steps=1), case, pose, q, exaggeration)
     )
-    side = study.machine.guide_side
-    direction = np.array([[np.cos(a), np.sin(a)] for a in case.machine.geometry.guide_angle])
+    side, angle = study.machine.guide_side, np.asarray(case.machine.geometry.guide_angle)
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     inward = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
-    start = -side / np.sqrt(12.0) * inward - side / 2 * direction
+    away = side / np.sqrt(12.0) + each_link(study.machine.guide_offsets)
+    start = -away[:, None] * inward - side / 2 * direction
     return Skeleton(np.stack([start, start + side * direction], axis=1), slider, joint, link)
 
 
@@ -69,7 +71,7 @@ def _positions(
     along = jnp.linspace(0.0, 1.0, _POINTS)
     shape = build_basis(
         structure.basis, machine.beam, machine.patches, structure.n_modes,
-        along * machine.beam.length,
+        plant.length[:, None] * along,
     ).deflection_at  # fmt: skip
     u = jnp.stack([plant.ux, plant.uy], axis=1)
     n = jnp.stack([-plant.uy, plant.ux], axis=1)
@@ -133,8 +135,8 @@ def mode_skeleton(study: Study, pose: np.ndarray, shape: np.ndarray) -> Skeleton
         pose: at rest [m, m, rad], (3,).
         shape: of the mode over (X, q), (3 + 3R,).
     """
-    length, q = study.link.length, shape[3:].reshape(3, -1)
-    size = np.abs(shape[:3]) * [1, 1, study.machine.joint_radius]
+    length, q = each_link(study.link.length).min(), shape[3:].reshape(3, -1)
+    size = np.abs(shape[:3]) * [1, 1, each_link(study.machine.joint_radius).mean()]
     factor = min(
         DRAWN * length / max(np.abs(q).max(), 1e-300), DRAWN_POSE * length / max(size.max(), 1e-300)
     )

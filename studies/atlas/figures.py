@@ -15,6 +15,7 @@ from studies.atlas.drawing import Clip, animate, draw_mode, mode_skeleton, skele
 from studies.atlas.findings import Findings
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.subsets import TARGETS, link_label, player_labels, setting_label
+from studies.consistency import each_link
 from studies.figures import SERIES, comparison, legend_above, new_figure
 
 #: Place of the late window.
@@ -308,7 +309,7 @@ def write_animation(found: Findings, folder: Path) -> None:
     index = index[index < len(runs.time)]
     q = runs.modal[which, :, index]
     peak = np.abs(runs.modal[which, 0, runs.time >= end, :, 0]).max(initial=1e-9)
-    factor = float(f"{CLIP_SIZE * found.study.link.length / peak:.1g}")
+    factor = float(f"{CLIP_SIZE * each_link(found.study.link.length).min() / peak:.1g}")
     off, on = (skeleton(found.study, runs.pose[which, k, index], q[:, k], factor) for k in (0, -1))
     titles = ("without control", "three links controlled")
     animate(Clip(runs.time[index] - end, (off, on), titles, factor), folder / ANIMATION)

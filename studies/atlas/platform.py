@@ -21,6 +21,7 @@ from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
 from studies.atlas.subsets import WINDOWS, link_label, long_enough, residual_window
 from studies.batches import run_batches
 from studies.cases import powered
+from studies.consistency import each_link
 from studies.runs import check_run, resolved_study, with_ratio
 from studies.spec import Study
 
@@ -136,8 +137,10 @@ def responses(study: Study, frequency: np.ndarray) -> Responses:
     Raises:
         StudyError: as `check_run`.
     """
-    study = resolved_study(study).change(metrics__stations=(study.link.length / 2,))
+    middle = each_link(study.link.length)[:, None] / 2
+    study = resolved_study(study).change(metrics__stations=(float(middle.min()),))
     structure, case = check_run(study)
+    case = case._replace(windows=case.windows._replace(stations=jnp.asarray(middle)))
     structure = structure._replace(n_steps=1, substeps=1, n_frequencies=1, has_noise=False)
     pose = jnp.asarray(study.motion.waypoints[0], case.electronics.period.dtype)
     value, radius = [], []

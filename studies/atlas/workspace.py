@@ -17,7 +17,7 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.case import Case, Structure
 from jaxmodel.dynamics import kinetic_energy, modal_chain
-from jaxmodel.kinematics import chain_status, close_chain, link_angle
+from jaxmodel.kinematics import close_chain, lift, link_angle, path_status
 from jaxmodel.linear import linearise, mechanical, resting
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
@@ -85,9 +85,9 @@ def natural_modes_at(study: Study, poses: Any) -> PoseModes:
     """
     structure, case = _machine(study)
     poses = np.asarray(poses, float)
-    codes, _ = _stand(structure, case, poses)
-    for pose, code in zip(poses, np.asarray(codes), strict=True):
-        check_pose("pose", tuple(pose.tolist()), int(code))
+    codes, _, lifts = map(np.asarray, _stand(structure, case, poses))
+    for pose, code, heights in zip(poses, codes, lifts, strict=True):
+        check_pose("pose", tuple(pose.tolist()), int(code), heights)
     return _solve(structure, case, poses)
 
 
@@ -107,7 +107,7 @@ def map_workspace(study: Study, count: int = GRID, turns: tuple[float, ...] = TU
     x, y = _extent(structure, case, study, phi, count)
     grid = np.stack(np.meshgrid(phi, y, x, indexing="ij")[::-1], axis=-1)
     poses = grid.reshape(-1, 3)
-    codes, gamma = (np.asarray(part) for part in _stand(structure, case, poses))
+    codes, gamma, _ = (np.asarray(part) for part in _stand(structure, case, poses))
     good = codes == status.OK
     found = _solve(structure, case, poses[good])
     chosen = np.sort(np.argsort(-found.order_share[..., 0], axis=1)[:, :3], axis=1)
@@ -144,7 +144,7 @@ def _extent(
     """Grid lines that hold all poses where the machine can stand."""
     look = np.linspace(-0.6, 0.6, 121) * study.machine.guide_side
     grid = np.stack(np.meshgrid(phi, look, look, indexing="ij")[::-1], axis=-1)
-    codes, _ = _stand(structure, case, grid.reshape(-1, 3))
+    codes, _, _ = _stand(structure, case, grid.reshape(-1, 3))
     good = (np.asarray(codes) == status.OK).reshape(grid.shape[:-1]).any(axis=0)
     step = look[1] - look[0]
     rows, columns = (look[np.flatnonzero(good.any(axis=k))] for k in (1, 0))
@@ -154,13 +154,13 @@ def _extent(
 
 
 @partial(jax.jit, static_argnums=0)
-def _stand(structure: Structure, case: Case, poses: Array) -> tuple[Array, Array]:
-    """Status and link angles [rad] of poses, (n,) and (n, 3)."""
+def _stand(structure: Structure, case: Case, poses: Array) -> tuple[Array, Array, Array]:
+    """Status, link angles [rad] and `lift` of poses, (n,), (n, 3) and (n, 3)."""
     plant = prepare(structure, case).loop.plant
 
-    def one(pose: Array) -> tuple[Array, Array]:
+    def one(pose: Array) -> tuple[Array, Array, Array]:
         chain = close_chain(plant, pose, jnp.zeros_like(pose))
-        return chain_status(plant, chain), link_angle(chain)
+        return path_status(plant, pose[None])[0], link_angle(chain), lift(plant, pose)
 
     return jax.vmap(one)(poses)
 

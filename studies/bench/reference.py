@@ -35,14 +35,28 @@ def guides(geometry):
     angle = geometry.guide_angle
     u = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
     n = jnp.stack([-jnp.sin(angle), jnp.cos(angle)], axis=1)
-    inradius = geometry.guide_side / (2 * np.sqrt(3.0))
-    return -inradius * n - geometry.guide_side / 2 * u, u, n
+    away = geometry.guide_side / (2 * np.sqrt(3.0)) + jnp.broadcast_to(geometry.guide_offset, (3,))
+    return -away[:, None] * n - geometry.guide_side / 2 * u, u, n
 
 
 def platform_joints(geometry, pose):
     """Joints C_i [m] of the platform, (3, 2)."""
     angle = geometry.joint_angle + pose[2]
-    return pose[:2] + geometry.joint_radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+    radius = jnp.broadcast_to(geometry.joint_radius, (3,))
+    return pose[:2] + radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+
+
+def payload_energy(masses, pose, pose_rate):
+    """T [J] of the payload from the velocity of its centre of mass."""
+    offset = jnp.zeros(2) if masses.payload_offset is None else jnp.asarray(masses.payload_offset)
+
+    def center(pose):
+        cosine, sine = jnp.cos(pose[2]), jnp.sin(pose[2])
+        return pose[:2] + jnp.array([[cosine, -sine], [sine, cosine]]) @ offset
+
+    velocity = jax.jvp(center, (pose,), (pose_rate,))[1]
+    turning = masses.payload_inertia * pose_rate[2] ** 2
+    return (masses.payload_mass * jnp.sum(velocity**2) + turning) / 2
 
 
 def tip_deflection(basis, q):
@@ -82,7 +96,7 @@ def close(machine, basis, pose, q):
     return rho, slant - jnp.arctan2(tip, length)
 
 
-def kinetic_energy(machine, basis, gamma, q, rho_rate, gamma_rate, pose_rate, q_rate):
+def kinetic_energy(machine, basis, gamma, pose, q, rho_rate, gamma_rate, pose_rate, q_rate):
     """T [J] from the velocity a + x b + sum_j Y_j(x) c_j of the points of a link.
 
     The centre of mass moves in along the chord with half of what the chord shortens by; squares of
@@ -108,7 +122,8 @@ def kinetic_energy(machine, basis, gamma, q, rho_rate, gamma_rate, pose_rate, q_
     )
     masses = machine.masses
     platform = masses.platform_mass * jnp.sum(pose_rate[:2] ** 2)
-    return (jnp.sum(links) + platform + masses.platform_inertia * pose_rate[2] ** 2) / 2
+    platform = platform + masses.platform_inertia * pose_rate[2] ** 2
+    return (jnp.sum(links) + platform) / 2 + payload_energy(masses, pose, pose_rate)
 
 
 def modal_load(machine, basis, q, q_rate, force):
@@ -137,7 +152,7 @@ def by_lagrangian(machine, basis, motion: Motion, loads: Loads):
     def energy(z, z_rate):
         (_, gamma), (rho_rate, gamma_rate) = jax.jvp(joint_coordinates, (z,), (z_rate,))
         rates = (rho_rate, gamma_rate, *split(z_rate))
-        return kinetic_energy(machine, basis, gamma, split(z)[1], *rates)
+        return kinetic_energy(machine, basis, gamma, *split(z), *rates)
 
     z = jnp.concatenate([motion.pose, motion.q.ravel()])
     z_rate = jnp.concatenate([motion.pose_rate, motion.q_rate.ravel()])
@@ -161,8 +176,8 @@ def by_multipliers(machine, basis, motion: Motion, loads: Loads):
         return (tips - platform_joints(machine.geometry, pose)).ravel()
 
     def energy(y, y_rate):
-        _, gamma, _, q = split(y)
-        return kinetic_energy(machine, basis, gamma, q, *split(y_rate))
+        _, gamma, pose, q = split(y)
+        return kinetic_energy(machine, basis, gamma, pose, q, *split(y_rate))
 
     def all_coordinates(z):
         pose, q = z

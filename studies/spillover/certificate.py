@@ -9,6 +9,7 @@ from threadpoolctl import threadpool_limits
 
 from jaxmodel.beam import BASES
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
+from studies.consistency import each_link
 from studies.errors import StudyError, field_error
 from studies.export.controller import FixedController, fixed_controller
 from studies.spec import Study
@@ -102,8 +103,10 @@ def certify(
     if not 1 < margin <= 32:
         raise field_error("--margin", margin, "more than 1, up to 32", "1")
     found = fixed_controller(study)
-    believed = found.study.link.joint_inertia_c
-    departures = tuple(d for d in departures if d.joint_inertia != believed)
+    believed = each_link(found.study.link.joint_inertia_c)
+    departures = tuple(
+        d for d in departures if d.joint_inertia is None or np.any(d.joint_inertia != believed)
+    )
     plants = all_plants(bases, departures, plant_sizes(found, sizes))
     maker = LoopMaker(found)
     faults = np.vectorize(maker.fault, otypes=[object])(plants)

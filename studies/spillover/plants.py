@@ -121,14 +121,15 @@ class LoopMaker:
     def fault(self, plant: Plant) -> str:
         """Why there is no such plant, "" where there is one."""
         study, machine = self._found.study, self._placed(plant).machine
-        is_off, is_overlapping = placement_faults(machine.patches, study.link.length)
+        is_off, is_overlapping = placement_faults(machine.patches, machine.beam.length)
         if is_off or is_overlapping:
             what = "patches leave the link" if is_off else "patches overlap"
             return f"{plant.departure}: {what}"
         if plant.basis == "pinned_free" and study.drive.locked:
             return f"{plant.basis}: its sliders cannot be locked"
         link, joint = study.link, plant.departure.joint_inertia
-        if plant.basis != WITH_JOINTS and (link.joint_inertia_b or link.joint_inertia_c or joint):
+        inertia = (link.joint_inertia_b, link.joint_inertia_c, joint or 0.0)
+        if plant.basis != WITH_JOINTS and any(np.any(part) for part in inertia):
             size = f" of {joint:g} kg m2" if joint else ""
             return f"{plant.basis}: it has no rotary inertia{size} at the joints"
         return ""

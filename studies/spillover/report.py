@@ -258,8 +258,8 @@ def _plant(found: Certificate, at: tuple[int, ...]) -> dict[str, Any]:
     }
 
 
-def _joint(found: Certificate, plant: Plant) -> float:
-    """True J_C [kg m2]."""
+def _joint(found: Certificate, plant: Plant) -> Any:
+    """True J_C [kg m2], one for all links or three."""
     known = plant.departure.joint_inertia
     return found.study.link.joint_inertia_c if known is None else known
 

@@ -14,10 +14,10 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from studies.consistency import check_consistency
+from studies.consistency import check_consistency, each_link, patch_centers, patch_pitch
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.explain import explain
-from studies.fields import Columns, field_value, parse_entry
+from studies.fields import Columns, as_list, field_value, parse_entry
 from studies.spec import Study
 
 #: Axes under a name of their own: what each varies, and how it is written.
@@ -140,6 +140,7 @@ def known_field(name: str, study: Study, path: str = "") -> Any:
         hint = f"did you mean {close!r}?" if close else "see studies init for all fields"
         raise StudyError(f"{where}{shown(name)}: unknown field; {hint}")
     value = field_value(study, entry.field)
+    value = as_list(entry.field, value) if entry.indices else value
     for index in entry.indices:
         if not isinstance(value, tuple) or index >= len(value):
             size = f"0 to {len(value) - 1}" if isinstance(value, tuple) and value else "none"
@@ -171,7 +172,9 @@ def set_value(study: Study, name: str, value: Any) -> dict[str, Any]:
     assert entry is not None
     data = study.model_dump()
     section, _, leaf = entry.field.partition(".")
-    data[section][leaf] = replaced(data[section][leaf], entry.indices, value)
+    whole = data[section][leaf]
+    whole = as_list(entry.field, whole) if entry.indices else whole
+    data[section][leaf] = replaced(whole, entry.indices, value)
     return data
 
 
@@ -402,18 +405,23 @@ def _placement(written: Any, study: Study, path: str) -> Axis:
         raise field_error(f"{path}.kind", kind, ", ".join(map(repr, PLACEMENTS)), hint=hint)
     if isinstance(candidates, bool) or not isinstance(candidates, int) or not 0 <= candidates <= 60:
         raise field_error(f"{path}.candidates", candidates, "a whole number from 1 to 60", "1")
-    centers = study.patches.centers
-    count = len(centers[0]) if isinstance(centers[0], tuple) else len(centers)
-    room = _Room(study, count, kind == "mirrored", path)
+    count = patch_centers(study).shape[1]
+    lengths, pitches = each_link(study.link.length), patch_pitch(study)
     if kind == "per_link":
         if candidates:
             raise field_error(f"{path}.candidates", candidates, "0 with kind per_link")
+        rooms = [_Room(*room, count, False, path) for room in zip(lengths, pitches, strict=True)]
 
         def sample(u: np.ndarray) -> Columns:
-            rows = [room.place(u[:, i * count : (i + 1) * count]) for i in range(3)]
+            rows = [rooms[i].place(u[:, i * count : (i + 1) * count]) for i in range(3)]
             return {"patches.centers": np.stack(rows, axis=1)}
 
         return Axis(3 * count, sample, None)
+    if kind == "mirrored" and np.ptp(lengths) > 0:
+        raise field_error(
+            f"{path}.kind", kind, f"'same' or 'per_link' with link.length = {list(lengths)}"
+        )
+    room = _Room(lengths.min(), pitches.max(), count, kind == "mirrored", path)
     grid = {"patches.centers": room.grid(candidates)} if candidates else None
     if grid is not None and len(grid["patches.centers"]) == 0:
         raise field_error(
@@ -425,10 +433,10 @@ def _placement(written: Any, study: Study, path: str) -> Axis:
 class _Room:
     """Where sorted patches fit: free play beyond the patches' own length, shared out in order."""
 
-    def __init__(self, study: Study, count: int, is_mirrored: bool, path: str) -> None:
-        patches = study.patches
-        self.length, self.count, self.is_mirrored = study.link.length, count, is_mirrored
-        self.size = max(patches.sensor_length, patches.actuator_length)
+    def __init__(
+        self, length: float, size: float, count: int, is_mirrored: bool, path: str
+    ) -> None:
+        self.length, self.size, self.count, self.is_mirrored = length, size, count, is_mirrored
         self.free = count // 2 if is_mirrored else count
         taken = self.free * self.size
         end = self.length

@@ -159,6 +159,7 @@ def _structure(table: Table, members: np.ndarray) -> Structure:
         has_friction=bool((column("drive.coulomb_friction") > 0).any()),
         has_position_gain=bool(np.any(fields.numbers(_POSITION) != 0)),
         has_wrench=any(np.any(fields.numbers(name) != 0) for name in _WRENCH),
+        has_payload_offset=bool(np.any(fields.numbers("load.offset") != 0)),
     )
 
 

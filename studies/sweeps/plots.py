@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from jaxmodel import status
 from studies import figures
+from studies.consistency import each_link
 from studies.errors import StudyError
 from studies.stability import ENOUGH
 from studies.sweeps.results import SweepData, metric_values, swept_names
@@ -264,7 +265,7 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
 def _placements(data: SweepData, y: str) -> Figure:
     """The best placements on the link, one below the other, over all cases by each patch."""
     centers, value = data["patches_centers"], metric_values(data, y)
-    patches, link = data.spec.study.patches, data.spec.study.link
+    patches, length = data.spec.study.patches, each_link(data.spec.study.link.length).max()
     chosen = best_cases(data, y, count=N_PLACEMENTS)
     is_ok = (data["status"] == status.OK) & np.isfinite(value)
     others = [name for name in swept_names(data) if name != "patches_centers"]
@@ -274,18 +275,18 @@ def _placements(data: SweepData, y: str) -> Figure:
         top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.2, 1))
         texts = []
         for row, case in enumerate(chosen):
-            top.plot([0, link.length * unit], [row, row], color="#AAAAAA", linewidth=1)
+            top.plot([0, length * unit], [row, row], color="#AAAAAA", linewidth=1)
             for center in centers[case]:
-                for length, color, height in (
-                    (patches.actuator_length, figures.SERIES[0], 0.6),
-                    (patches.sensor_length, figures.SERIES[1], 0.3),
+                for size, color, height in (
+                    (each_link(patches.actuator_length).max(), figures.SERIES[0], 0.6),
+                    (each_link(patches.sensor_length).max(), figures.SERIES[1], 0.3),
                 ):
-                    left = (center - length / 2) * unit
-                    top.barh(row, length * unit, height, left, color=color, linewidth=0)
+                    left = (center - size / 2) * unit
+                    top.barh(row, size * unit, height, left, color=color, linewidth=0)
             also = "".join(f", {name} = {shown_value(data, name, case)}" for name in others)
             texts.append(f"case {case}: {value[case]:.4g}{also}")
         top.set_ylim(len(chosen) - 0.4, -0.6)
-        top.set_xlim(0, link.length * unit)
+        top.set_xlim(0, length * unit)
         top.set_ylabel("best placements")
         top.yaxis.tick_right()
         top.set_yticks(range(len(chosen)), texts, fontsize=7)

@@ -19,7 +19,7 @@ from jaxmodel.prepare import SPECTRUM_SPAN
 from studies.errors import StudyError, field_error, nearest
 from studies.explain import unit_of
 from studies.fields import NAMED_INDEX, Fields, field_value, parse_entry
-from studies.runs import METRIC_LABELS, STATUS_LABEL
+from studies.runs import DISTANCE_TEXT, METRIC_LABELS, STATUS_LABEL
 from studies.spec import Study
 from studies.stability import HIGHEST, MARGIN_MODES
 from studies.store import Streamed, Variable, read_store, variable_labels, write_store
@@ -63,7 +63,7 @@ _PER_CASE: dict[str, tuple] = {
     "substeps": ((), "1", "plant steps per sample"),
     "sensor_condition": (("link",), "1", "condition number of the modal filter"),
     "actuator_condition": (("link",), "1", "condition number of the synthesizer"),
-    "singularity_distance": ((), "rad", "of link angles from 0 and 90 deg on the path"),
+    "singularity_distance": ((), "rad", DISTANCE_TEXT),
     "gain_margin": (
         (), "1", "largest factor on all gains with every smaller one stable, at the first "
         f"way-point with {MARGIN_MODES} plant modes or more; {HIGHEST:g}: that or more",

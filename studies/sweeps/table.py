@@ -15,8 +15,8 @@ import numpy as np
 
 from studies.consistency import SAMPLE_LIMIT
 from studies.errors import StudyError, field_error
-from studies.fields import Columns, Fields, padded, parse_entry
-from studies.spec import Study, parse_study
+from studies.fields import Columns, Fields, as_list, padded, parse_entry
+from studies.spec import EACH_LINK, Study, parse_study
 from studies.sweeps.axes import ALIASES, LIMIT, known_field, replaced, set_value
 from studies.sweeps.condition import evaluate
 from studies.sweeps.designs import length, spread
@@ -112,6 +112,10 @@ def values(study: Study, columns: Columns, name: str) -> np.ndarray:
     assert entry is not None
     if isinstance(value, tuple):
         raise StudyError(f"{name}: a list; name one entry of it, such as {name}[0]")
+    if name in EACH_LINK and any(column.startswith(f"{name}[") for column in columns):
+        raise StudyError(f"{name}: differs between links here; name one, such as {name}[0]")
+    if not entry.indices and name in columns:
+        raise StudyError(f"{name}: a list in this sweep; name one entry of it, such as {name}[0]")
     if not entry.indices or isinstance(value, str):
         return np.array([value])
     array = Fields(study, columns).numbers(entry.field)
@@ -241,6 +245,7 @@ def _varying_text(study: Study, columns: Columns) -> dict[str, list[str]]:
         if entry is None or not entry.indices:
             continue
         base = whole.get(entry.field) or [known_field(entry.field, study)] * len(column)
+        base = [as_list(entry.field, value) for value in base]
         whole[entry.field] = [
             replaced(value, entry.indices, new)
             for value, new in zip(base, column.tolist(), strict=True)

@@ -22,7 +22,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.control import pole_placement
 from jaxmodel.parameters import Array
 from studies.cases import build_structure
-from studies.consistency import patch_centers
+from studies.consistency import each_link, patch_centers, patch_pitch
 from studies.errors import StudyError, field_error, nearest, shown_name
 from studies.fields import parse_entry
 from studies.spec import Study
@@ -62,6 +62,8 @@ LEAVES: dict[str, Leaf] = {
     **_same(
         "machine", "machine.masses", "platform_mass", "platform_inertia", "slider_mass"
     ),
+    "load.mass": Leaf("machine.masses.payload_mass"),
+    "load.inertia": Leaf("machine.masses.payload_inertia"),
 }  # fmt: skip
 #: Free names that stand for several numbers of a Case.
 POLES = ("poles.decay", "poles.frequency_hz")
@@ -311,21 +313,22 @@ def _place_poles(structure: Structure, case: Case, values: Array) -> Case:
 def _placement(bounds: Any, study: Study, path: str) -> tuple[list[Free], Callable]:
     if not isinstance(bounds, dict) or set(bounds) != {"kind"} or bounds["kind"] not in PLACEMENTS:
         raise field_error(path, bounds, "{kind = 'same'} or {kind = 'per_link'}")
-    patches, centers = study.patches, patch_centers(study)
-    pitch = max(patches.sensor_length, patches.actuator_length)
+    centers, pitch, length = patch_centers(study), patch_pitch(study), each_link(study.link.length)
     links, count = (1 if bounds["kind"] == "same" else 3), centers.shape[1]
-    free = study.link.length - count * pitch
-    if free <= 0:
+    if links == 1:  # where all links have room
+        pitch, length = pitch.max(keepdims=True), length.min(keepdims=True)
+    free = length - count * pitch
+    if np.any(free <= 0):
         raise field_error(path, bounds, f"a link longer than its {count} patches")
     numbers = []
     for i in range(links):
-        gaps = np.diff([0.0, *(np.sort(centers[i]) - pitch * (np.arange(count) + 0.5))])
-        starts = _shares(gaps / free)
+        gaps = np.diff([0.0, *(np.sort(centers[i]) - pitch[i] * (np.arange(count) + 0.5))])
+        starts = _shares(gaps / free[i])
         numbers += [
             Free(f"placement[{i}][{k}]", Range(0.0, 1.0, 0, False), float(starts[k]), PLACEMENT)
             for k in range(count)
         ]
-    return numbers, partial(_place_patches, links, pitch)
+    return numbers, partial(_place_patches, links, tuple(pitch))
 
 
 def _shares(gaps: np.ndarray) -> np.ndarray:
@@ -338,15 +341,16 @@ def _shares(gaps: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
-def _place_patches(links: int, pitch: float, case: Case, values: Array) -> Case:
+def _place_patches(links: int, pitches: tuple[float, ...], case: Case, values: Array) -> Case:
     """Patches one after the other, each after a gap that is its share of what is still free.
 
     Of k gaps to come, a number v takes 1 - (1 - v)^(1/k): equal numbers are drawn evenly from all
     placements.
     """
-    patches = case.machine.patches
+    patches, pitch = case.machine.patches, jnp.asarray(pitches)
     count = values.shape[0] // links
-    left = case.machine.beam.length - count * pitch
+    length = jnp.broadcast_to(case.machine.beam.length, (3,))
+    left = (jnp.min(length) if links == 1 else length) - count * pitch
     begin, centers = jnp.zeros((links,), values.dtype), []
     is_kept, shares = jnp.isnan(jnp.sum(values)), jnp.reshape(_safe(values), (links, count))
     for k in range(count):

@@ -35,7 +35,8 @@ def scenario_columns(
         shift = 2 * qmc.LatinHypercube(len(spread), rng=seed).random(count) - 1
         shift[is_own] = 0.0
         for k, (name, percent) in enumerate(spread.items()):
-            machines[name] = known_field(name, spec.study) * (1 + percent / 100 * shift[:, k])
+            share = 1 + percent / 100 * shift[:, k]
+            machines[name] = np.multiply.outer(share, known_field(name, spec.study))
     columns = {name: np.tile(column, moves) for name, column in machines.items()}
     for name in spec.tune.scenarios.each:
         columns[name] = np.repeat(column_of([move[name] for move in spec.moves]), count, axis=0)

@@ -26,7 +26,7 @@ from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.explain import explain
 from studies.fields import parse_entry
 from studies.runs import METRIC_LABELS, check_run
-from studies.spec import Section, Study, described, parse_study, read_toml
+from studies.spec import EACH_LINK, Section, Study, described, parse_study, read_toml
 from studies.sweeps.axes import checked_value, known_field, set_value
 from studies.sweeps.results import metric_label
 from studies.tuning.free import FreeNumbers, free_numbers, writes
@@ -191,15 +191,16 @@ def _check_spread(tune: Tune, study: Study) -> None:
     for name, percent in tune.scenarios.spread.items():
         path = f"tune.scenarios.spread.{shown_name(name)}"
         value = known_field(name, study, "tune.scenarios.spread")
-        if isinstance(value, bool) or not isinstance(value, float):
+        numbers = value if name in EACH_LINK and isinstance(value, tuple) else (value,)
+        if not all(isinstance(number, float) for number in numbers):
             raise field_error(path, percent, f"for a number; {name} is {shown(value)}")
         _check_positive(percent, 99.0, path, "%")
-        if value == 0:
+        if not any(numbers):
             raise field_error(name, value, f"not 0 where {path} is a share of it")
         if name.partition(".")[0] in ("run", "metrics", "motion"):
             raise field_error(path, percent, "for the machine and its control; each takes others")
         for share in (1 - percent / 100, 1 + percent / 100):
-            checked_value(study, name, value * share, path)
+            checked_value(study, name, (np.array(value) * share).tolist(), path)
 
 
 def _check_feedback(tune: Tune, study: Study) -> None:

@@ -1,0 +1,251 @@
+"""Own machines: three different links, guides, joints, a payload off the centre."""
+
+import tomllib
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmodel import dynamics, kinematics, status
+from jaxmodel.beam import build_basis
+from jaxmodel.parameters import HOME
+from jaxmodel.plant import build_plant
+from studies import cli
+from studies.bench import reference
+from studies.cases import as_arrays, build_case
+from studies.errors import StudyError
+from studies.fields import field_value
+from studies.runs import check_run, run_study
+from studies.spec import EACH_LINK, load_study, parse_study
+from studies.sweeps.results import load
+from studies.sweeps.run import run_sweep
+from studies.sweeps.spec import parse_sweep
+from studies.template import study_template
+from studies.tuning.run import run_tuning
+from studies.tuning.spec import parse_tuning
+from tests.machines import random_machine
+
+SEEDS = range(10)
+R = 3
+
+
+@pytest.fixture(scope="module")
+def machines():
+    """Ten machines, stacked."""
+    cases = [as_arrays(build_case(random_machine(seed))) for seed in SEEDS]
+    return jax.tree.map(lambda *x: jnp.stack(x), *(case.machine for case in cases))
+
+
+def states(count):
+    """Random states far from rest, and loads."""
+    rng = np.random.default_rng(11)
+    motion = reference.Motion(
+        pose=np.array(HOME) + [0.012, 0.012, 0.06] * rng.uniform(-1, 1, (count, 3)),
+        pose_rate=rng.normal(size=(count, 3)) * [0.3, 0.3, 1.0],
+        q=3e-3 * rng.uniform(-1, 1, (count, 3, R)) / np.arange(1, R + 1),
+        q_rate=0.5 * rng.normal(size=(count, 3, R)),
+    )
+    return motion, reference.Loads(
+        10 * rng.normal(size=(count, 3)), 3 * rng.normal(size=(count, 3, R))
+    )
+
+
+@partial(jax.jit, static_argnums=0)
+@partial(jax.vmap, in_axes=(None, 0, 0, 0))
+def both_ways(kind, machine, motion, loads):
+    basis = build_basis(kind, machine.beam, machine.patches, R, jnp.array([0.1]))
+    plant = build_plant(machine, basis, False, kind != "pinned_free")
+    chain = dynamics.modal_chain(plant, *motion)
+    found = dynamics.accelerations(
+        plant, chain, motion.pose_rate, motion.q, motion.q_rate,
+        loads.slider, loads.modal / plant.modal_mass[:, None],
+    )  # fmt: skip
+    own = basis._replace(shortening=plant.shortening, mixed_shortening=plant.mixed_shortening)
+    return (found.pose, found.modal), reference.by_lagrangian(machine, own, motion, loads)
+
+
+@pytest.mark.parametrize("kind", ["pinned_pinned", "pinned_free", "loaded"])
+def test_ten_machines_accelerate_as_their_lagrangians_say(kind, machines):
+    found, wanted = both_ways(kind, machines, *states(len(SEEDS)))
+    for mine, theirs in zip(found, wanted, strict=True):
+        axes = tuple(range(1, theirs.ndim))
+        error = np.abs(mine - theirs).max(axis=axes) / np.abs(theirs).max(axis=axes)
+        assert error.max() < 1e-10
+
+
+def test_a_payload_off_the_centre_matters_to_the_lagrangian(machines):
+    """So that the comparison above would notice a payload that one of both leaves out."""
+    masses = machines.masses._replace(payload_offset=0 * machines.masses.payload_offset)
+    at_centre = machines._replace(masses=masses)
+    motion, loads = states(len(SEEDS))
+    (one, _), _ = both_ways("pinned_pinned", machines, motion, loads)
+    (other, _), _ = both_ways("pinned_pinned", at_centre, motion, loads)
+    assert np.abs(one - other).max(axis=1).min() > 1e-3 * np.abs(one).max()
+
+
+SHORT = {
+    "run": {"duration": 0.08},
+    "link": {"modes": 4},
+    "motion": {"waypoints": [HOME, (0.0, 0.01, HOME[2])], "move_time": 0.05},
+    "shaper": {"kind": "none"},
+    "control": {"gain_factor": 0.2},
+    "metrics": {"residual_length": 0.02},
+}
+
+
+def sections(study):
+    """A study as the dictionary of its file."""
+    return tomllib.loads(study_template(study))
+
+
+def test_a_sweep_over_machines_is_their_single_runs(tmp_path):
+    """All ten in one batch: links, patches, guides, joints, payload as columns."""
+    studies = [random_machine(seed, **SHORT) for seed in SEEDS]
+    names = [*EACH_LINK, "machine.guide_angles_deg", "machine.joint_angles_deg", "load.offset",
+             "load.mass", "load.inertia", "link.damping_ratio", "patches.centers"]  # fmt: skip
+    axes = {name: [field_value(study, name) for study in studies] for name in names}
+    axes = {name: values for name, values in axes.items() if len(set(values)) > 1}
+    assert len(axes) == 20
+    spec = parse_sweep(sections(studies[0]) | {"sweep": {"method": "zip", "axes": axes}})
+    run_sweep(spec, tmp_path, is_quiet=True)
+    swept = load(tmp_path)
+    assert set(swept["status"]) == {status.OK}
+    for case in (0, 7):
+        run = run_study(studies[case], has_record=False)
+        for name in ("residual_rms", "peak_voltage", "pose_error_rms"):
+            wanted = getattr(run.result.metrics, name)
+            np.testing.assert_allclose(swept[name][case], wanted, rtol=1e-8, err_msg=name)
+        np.testing.assert_allclose(swept["gain_margin"][case], run.loop.gain_margin, rtol=0.02)
+
+
+def test_entries_of_one_number_for_all_links_are_swept(tmp_path):
+    """`link.thickness[1]` of a study that gives one thickness."""
+    study = parse_study(SHORT)
+    data = sections(study) | {
+        "sweep": {
+            "axes": {"link.thickness[1]": [2.0e-3, 2.2e-3], "link.thickness[0]": [2e-3, 2.1e-3]}
+        }
+    }
+    run_sweep(parse_sweep(data), tmp_path, is_quiet=True)
+    swept = load(tmp_path)
+    same = run_study(study.change(link__thickness=(2.1e-3, 2.2e-3, 2e-3)), has_record=False)
+    np.testing.assert_allclose(
+        swept["residual_rms"][3], same.result.metrics.residual_rms, rtol=1e-8
+    )
+
+
+def tune(study, folder):
+    """A few iterations of gain and placement."""
+    free = {
+        "control.gain_factor": {"from": 0.02, "to": 1.0, "scale": "log"},
+        "placement": {"kind": "per_link"},
+    }
+    tuning = {
+        "free": free, "starts": 2, "iterations": 3, "limits": {"gain_margin": 1.5},
+        "scenarios": {"count": 1, "check": 2, "spread": {"link.youngs_modulus": 2.0}},
+    }  # fmt: skip
+    run_tuning(parse_tuning(sections(study) | {"tune": tuning}), folder, is_quiet=True)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", SEEDS)
+def test_ten_machines_are_tuned_and_exported(seed, tmp_path):
+    """In short: the machines of tests.tunings and tests.exports have three different links too."""
+    study = random_machine(seed, **SHORT)
+    tune(study, tmp_path / "tuned")
+    found = tmp_path / "tuned" / "tuned.toml"
+    tuned = load_study(found)
+    assert tuned.link == study.link and tuned.machine == study.machine
+    assert tuned.patches.centers != study.patches.centers
+    for target in ("c", "json"):
+        cli.main(["export", str(found), "--target", target, "--out", str(tmp_path / target)])
+    file = tmp_path / "json" / "flexlink.json"
+    cli.main(["import-gains", str(file), "--out", str(tmp_path / "again.toml")])
+    assert load_study(tmp_path / "again.toml") == tuned
+
+
+def test_computed_torque_moves_a_payload_as_wanted(machines):
+    """Forces from the inverse dynamics give the rigid machine the acceleration asked for."""
+    motion, _ = states(len(SEEDS))
+    wanted = np.random.default_rng(5).normal(size=(len(SEEDS), 3)) * [3, 3, 30]
+
+    @jax.jit
+    @jax.vmap
+    def found(machine, pose, pose_rate, acceleration):
+        basis = build_basis("pinned_pinned", machine.beam, machine.patches, R, jnp.array([0.1]))
+        plant = build_plant(machine, basis, False, False)
+        force = dynamics.inverse_dynamics(plant, pose, pose_rate, acceleration)
+        still = jnp.zeros((3, R))
+        chain = dynamics.modal_chain(plant, pose, pose_rate, still, still)
+        return dynamics.accelerations(
+            plant, chain, pose_rate, still, still, force, still, is_coupled=False
+        ).pose
+
+    np.testing.assert_allclose(
+        found(machines, motion.pose, motion.pose_rate, wanted), wanted, atol=1e-9
+    )
+
+
+def test_a_turned_machine_is_the_same_machine():
+    """Guides and path turned by 40 deg: same bending, and links keep their numbers."""
+    angle, one = 40.0, random_machine(2, **SHORT)
+    turn = np.radians(angle)
+    alpha = tuple(a + angle for a in one.machine.guide_angles_deg)
+    points = [
+        (
+            np.cos(turn) * x - np.sin(turn) * y,
+            np.sin(turn) * x + np.cos(turn) * y,
+            phi + turn,
+        )
+        for x, y, phi in one.motion.waypoints
+    ]
+    other = one.change(machine__guide_angles_deg=alpha, motion__waypoints=points)
+    first, second = (run_study(study, has_record=False) for study in (one, other))
+    np.testing.assert_allclose(
+        second.result.metrics.residual_rms, first.result.metrics.residual_rms, rtol=1e-6
+    )
+    np.testing.assert_allclose(second.loop.gain_margin, first.loop.gain_margin, rtol=1e-6)
+
+
+#: Link length that makes all links point at the centre of the platform where its joints do [m].
+IN_LINE = (0.6 / np.sqrt(12) + 0.06) / np.sin(np.pi / 3)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"machine__guide_offsets": (0.0, 0.05, 0.0)}, "the joint of link 2 is 1.12 link lengths"),
+        ({"machine__guide_offsets": (0.0, 0.0, -0.2)}, "the joint of link 3 is -0.134 link"),
+        (
+            {"machine__joint_angles_deg": (150.0, 270.0, 30.0), "link__length": IN_LINE},
+            "do not meet in one point",
+        ),
+        ({"link__length": (0.2, 0.2, 0.16)}, "so that no patch leaves the link (link 3)"),
+        ({"patches__actuator_length": (0.03, 0.06, 0.03)}, "so that no patches overlap (link 2)"),
+        ({"patches__width": (0.01, 0.01, 0.02)}, "patches.width = 0.02: allowed at most"),
+        ({"link__length": (0.2, 0.2)}, "allowed a finite number, or a list of 3, each >= 0.001"),
+        ({"machine__joint_angles_deg": (0.0,)}, "allowed an empty list, or 3 finite numbers"),
+    ],
+)  # fmt: skip
+def test_a_machine_that_cannot_be_built_is_refused(change, words):
+    with pytest.raises(StudyError) as error:
+        check_run(parse_study({}).change(**change))
+    assert words in str(error.value)
+
+
+def test_links_in_line_with_one_point_hold_nothing():
+    """`hold` is 1 where forces pull at right angles, and 0 where all links point at the centre."""
+    plant = build_plant_of(parse_study({}))
+    chain = kinematics.close_chain(plant, jnp.array(HOME), jnp.zeros(3))
+    assert 0.5 < float(kinematics.hold(plant, chain)) <= 1
+    cx, cy = plant.length * chain.frame.x, plant.length * chain.frame.y
+    assert float(kinematics.hold(plant, chain._replace(cx=cx, cy=cy))) < 1e-12
+
+
+def build_plant_of(study):
+    """Plant of a study's machine."""
+    machine = as_arrays(build_case(study)).machine
+    basis = build_basis("pinned_pinned", machine.beam, machine.patches, R, jnp.array([0.1]))
+    return build_plant(machine, basis)
