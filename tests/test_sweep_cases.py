@@ -215,7 +215,7 @@ def test_designs_for_sensitivity():
     ("name", "count"),
     [
         ("placement", 4096), ("gains", 216), ("links", 48), ("spillover", 120),
-        ("robustness", 400), ("models", 90),
+        ("robustness", 400), ("mistuning", 507), ("models", 90),
     ],
 )  # fmt: skip
 def test_ready_sweeps_are_valid(name, count):
