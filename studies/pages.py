@@ -32,6 +32,9 @@ _MARKS = re.compile(
 #: What it takes for one at the begin of a line.
 _FIRST_MARKS = re.compile(r"^(\d*)([-+.)](?=\s|$)|[>=~]|--)")
 
+#: What sections begin with.
+HEADING = ("heading_open", "h2")
+
 STYLE = """
 :root { color-scheme: light; }
 body {
@@ -43,6 +46,8 @@ h1 { font-size: 1.75rem; margin-top: 0; }
 h2 { font-size: 1.3rem; padding-bottom: 0.2rem; border-bottom: 1px solid #ccc; }
 h3 { font-size: 1.1rem; }
 p, ul, ol { max-width: 48rem; overflow-wrap: break-word; }
+.contents { padding: 0.5rem 0; border-top: 1px solid #ccc; font-size: 0.9rem; line-height: 1.9; }
+.contents a { white-space: nowrap; }
 a { color: #0b3c6f; }
 .table { overflow-x: auto; margin: 1rem 0; }
 table { border-collapse: collapse; font-size: 0.875rem; font-variant-numeric: tabular-nums; }
@@ -64,6 +69,7 @@ pre code { font-size: inherit; }
   p, ul, ol, figure { max-width: none; }
   p, li { orphans: 3; widows: 3; }
   a { color: inherit; text-decoration: none; }
+  .contents { display: none; }
   .table { overflow: visible; }
   table { font-size: 7.5pt; }
   th, td { padding: 0.15rem 0.3rem; overflow-wrap: break-word; }
@@ -95,6 +101,12 @@ def _row(cells: Iterable[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
+def opening(asked: str, found: str, following: str) -> list[str]:
+    """First lines of a report: what was asked, what came out, what to do next; Markdown."""
+    parts = (("Asked", asked), ("Came out", found), ("Next", following))
+    return [line for head, text in parts for line in (f"**{head}:** {text}", "")]
+
+
 def picture(name: str, caption: str) -> str:
     """Line of a figure, to stand alone.
 
@@ -123,23 +135,44 @@ def page(
         ValueError: a figure without its image.
     """
     tokens = _arranged(_PARSER.parse(text), images)
+    tokens = _with_contents(tokens, ["Versions", *files])
     body = _PARSER.renderer.render(tokens, _PARSER.options, {})
     rows = "".join(
         f'<tr><th scope="row">{escape(name)}</th><td>{escape(str(value))}</td></tr>\n'
         for name, value in facts.items()
     )
     appended = "".join(
-        f"<h2>{escape(title)}</h2>\n<pre><code>{escape(content)}</code></pre>\n"
+        f'<h2 id="{_anchor(title)}">{escape(title)}</h2>\n'
+        f"<pre><code>{escape(content)}</code></pre>\n"
         for title, content in files.items()
     )
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(_title(tokens))}</title>\n<style>{STYLE}</style>\n</head>\n"
-        f"<body>\n<main>\n{body}<h2>Versions</h2>\n"
+        f'<body>\n<main>\n{body}<h2 id="versions">Versions</h2>\n'
         f'<div class="table">\n<table>\n<tbody>\n{rows}</tbody>\n</table>\n</div>\n{appended}'
         "</main>\n</body>\n</html>\n"
     )
+
+
+def _with_contents(tokens: list[Token], more: list[str]) -> list[Token]:
+    """The same with anchors at the headings of sections, and links to them before the first."""
+    starts = [k for k, token in enumerate(tokens) if (token.type, token.tag) == HEADING]
+    if not starts:
+        return tokens
+    titles = [_plain(tokens[k + 1].children) for k in starts]
+    for k, title in zip(starts, titles, strict=True):
+        tokens[k].attrSet("id", _anchor(title))
+    links = " · ".join(f"[{literal(title)}](#{_anchor(title)})" for title in [*titles, *more])
+    contents = _PARSER.parse(f"{links}")
+    contents[0].attrSet("class", "contents")
+    return [*tokens[: starts[0]], *contents, *tokens[starts[0] :]]
+
+
+def _anchor(title: str) -> str:
+    """Name of a section in links to it."""
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
 def _arranged(tokens: list[Token], images: Mapping[str, bytes]) -> list[Token]:

@@ -26,12 +26,14 @@ ALLOWED = 1e-4
 #: Smaller derivatives than this share of the largest one count as if they had its size: what a
 #: difference can resolve.
 SMALLEST = 1e-3
-#: Smaller ones than this share of the figure itself are rounding.
-NOTHING = 1e-7
+#: And where even that is smaller, they count as if they changed a figure, which is a share of the
+#: study's own, by this much from bound to bound: derivatives near zero are judged absolutely.
+NEAR_ZERO = 1e-3
 #: What a disagreement is, for a reader.
 MEANING = (
     "Derivatives along the way from bound to bound. A disagreement is a share of the larger of the "
-    f"two, or of {SMALLEST:g} of the figure's largest derivative where both are smaller."
+    f"two, or of {SMALLEST:g} of the figure's largest derivative where both are smaller, and of "
+    f"{NEAR_ZERO:g} at least: figures are shares of the study's own."
 )
 
 
@@ -67,7 +69,7 @@ def audit(spec: TuneSpec, places: np.ndarray) -> list[Disagreement]:
             exact.append(differences)
         a, b = np.array(own), np.array(exact)  # (places, figures, numbers)
         typical = SMALLEST * np.abs(b).max(axis=(0, 2), keepdims=True)
-        size = np.maximum(np.maximum(np.abs(a), np.abs(b)), np.maximum(typical, NOTHING))
+        size = np.maximum(np.maximum(np.abs(a), np.abs(b)), np.maximum(typical, NEAR_ZERO))
         share = np.where(np.isfinite(a - b), np.abs(a - b) / size, np.inf)
         for k, number in enumerate(numbers):
             n, m = np.unravel_index(np.argmax(share[..., k]), share.shape[:2])

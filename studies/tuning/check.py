@@ -14,7 +14,9 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import Result
 from studies.cases import as_arrays, build_case, build_cases, in_working_precision
-from studies.fields import parse_entry
+from studies.errors import StudyError
+from studies.fields import as_list, parse_entry
+from studies.runs import run_study
 from studies.spec import Study, parse_study
 from studies.sweeps.axes import replaced
 from studies.sweeps.executor import make_executor
@@ -23,13 +25,13 @@ from studies.tuning.evaluate import first_residual, tuned_structure
 from studies.tuning.free import PLACEMENT, POLES
 from studies.tuning.linear_fidelity import LoopFigures, loop_figures
 from studies.tuning.merit import (
+    Merit,
     all_judged,
     allowed_limits,
     largest,
     merit_of,
     objectives,
     own_limits,
-    size,
 )
 from studies.tuning.optimise import excess
 from studies.tuning.scenarios import lane_columns, scenario_columns
@@ -40,12 +42,23 @@ CHUNK = 256
 
 
 class Judged(NamedTuple):
-    """One design on fresh scenarios, machine by machine within each move."""
+    """One design: on fresh scenarios, machine by machine within each move, and as its file says."""
 
     objective: np.ndarray  # nan where a run did not finish, (S,)
-    metrics: dict[str, np.ndarray]  # size of those of the objective, largest entry of others, (S,)
+    metrics: dict[str, np.ndarray]  # largest entry of the links that count, (S,)
     status: np.ndarray  # (S,)
+    watched: np.ndarray  # from the end of the command to that of the run [s], (S,)
     loop: LoopFigures | None  # None with other feedback than sampled
+    own: OwnRun
+
+
+class OwnRun(NamedTuple):
+    """A design on the machine and move of its own file: what `studies simulate` gives."""
+
+    objective: float
+    metrics: dict[str, float]
+    status: int
+    watched: float  # [s]
 
 
 class Searched(NamedTuple):
@@ -88,7 +101,9 @@ def tuned_study(spec: TuneSpec, family: Family, values: np.ndarray) -> Study:
         assert entry is not None
         section, _, leaf = entry.field.partition(".")
         new = np.asarray(value).tolist()
-        data[section][leaf] = replaced(data[section][leaf], entry.indices, new)
+        old = data[section][leaf]
+        old = as_list(entry.field, old) if entry.indices else old
+        data[section][leaf] = replaced(old, entry.indices, new)
     return parse_study(data)
 
 
@@ -117,14 +132,14 @@ def fresh_columns(spec: TuneSpec) -> dict[str, np.ndarray]:
 
 
 def judge(spec: TuneSpec, designs: list[Study]) -> list[Judged]:
-    """Run designs on scenarios that the tuning has not seen.
+    """Run designs on scenarios that the tuning has not seen, and as their own files say.
 
     Args:
         spec: of the tuning.
         designs: studies that differ from the tuning's own in numbers only; its own comes first.
     """
     columns = fresh_columns(spec)
-    count, merit, structure = len(columns["run.seed"]), merit_of(spec), tuned_structure(spec)
+    count, merit, structure = len(columns["run.seed"]), merit_of(spec), shown_structure(spec)
     parts = [build_cases(study, columns, structure) for study in designs]
 
     def joined(*leaves: np.ndarray) -> np.ndarray:
@@ -132,16 +147,51 @@ def judge(spec: TuneSpec, designs: list[Study]) -> list[Judged]:
 
     result = _run(structure, jax.tree.map(joined, *parts), count * len(designs))
     each = [_rows(result.metrics, k * count, count) for k in range(len(designs))]
-    found = []
+    duration = structure.n_steps / spec.study.electronics.sample_rate_hz
+    own, found = [_own_run(study) for study in designs], []
     for k, (study, metrics) in enumerate(zip(designs, each, strict=True)):
-        codes = result.status[k * count : (k + 1) * count]
+        rows = slice(k * count, (k + 1) * count)
+        codes = result.status[rows]
         objective = np.asarray(objectives(merit, metrics, each[0]))
-        figures = {name: np.asarray(size(metrics, name)) for name, _ in merit.objective}
-        figures |= {name: np.asarray(largest(metrics, name)) for name in merit.limits}
         objective = np.where(np.isin(codes, status.FINISHED), objective, np.nan)
-        loop = loop_figures(study) if study.control.feedback == "sampled" else None
-        found.append(Judged(objective, figures, codes, loop))
+        found.append(
+            Judged(
+                objective,
+                {name: np.asarray(largest(merit, metrics, name)) for name in merit.shown},
+                codes,
+                duration - result.command_end[rows],
+                loop_figures(study) if study.control.feedback == "sampled" else None,
+                _seen(merit, own[k], own[0], duration),
+            )
+        )
     return found
+
+
+def _own_run(study: Study) -> Result | None:
+    """The run of a design's own file; None where that refuses to run."""
+    try:
+        return run_study(study, has_record=False, has_loop=False).result
+    except StudyError:
+        return None
+
+
+def _seen(merit: Merit, run: Result | None, first: Result | None, duration: float) -> OwnRun:
+    """What a run shows, beside that of the study itself."""
+    if run is None or first is None:
+        nothing = dict.fromkeys(merit.shown, float("nan"))
+        return OwnRun(float("nan"), nothing, status.NON_FINITE, float("nan"))
+    metrics, own = (jax.tree.map(lambda x: np.asarray(x)[None], x.metrics) for x in (run, first))
+    return OwnRun(
+        float(objectives(merit, metrics, own)[0]),
+        {name: float(largest(merit, metrics, name)[0]) for name in merit.shown},
+        int(run.status),
+        duration - float(run.command_end),
+    )
+
+
+def shown_structure(spec: TuneSpec) -> Structure:
+    """Program of the runs that a report shows."""
+    return tuned_structure(spec)._replace(metrics=merit_of(spec).shown_metrics)
 
 
 def _rows(metrics: Metrics, first: int, count: int) -> Metrics:
@@ -171,7 +221,7 @@ def search(spec: TuneSpec, screen: Any) -> Searched:
     points = np.where(family.is_free, points[:n], own_place)
     values = np.where(family.is_free, spec.free.values(points), np.nan)
     columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)
-    count, structure = len(columns["run.seed"]), tuned_structure(spec)
+    count, structure = len(columns["run.seed"]), shown_structure(spec)
     lanes = lane_columns(spec, columns, [None, *[family] * CHUNK])
     cases = build_cases(spec.study, lanes, structure)
     layout = even_layout(count * (1 + CHUNK))
@@ -196,7 +246,7 @@ def search(spec: TuneSpec, screen: Any) -> Searched:
         own, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
         allowed = allowed_limits(merit, family, own_limits(merit, own))
         judgement = all_judged(merit, others, own, allowed)
-        found.append((*map(np.asarray, judgement), first_residual(metrics)[1:]))
+        found.append((*map(np.asarray, judgement), first_residual(merit, metrics)[1:]))
     objective, limits, peaks, residual = (np.concatenate(x)[:n] for x in zip(*found, strict=True))
     spent -= executor.compile_time
     beyond, linear = np.full(n, np.inf), np.full(n, np.nan)

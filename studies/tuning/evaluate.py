@@ -22,7 +22,15 @@ from studies.runs import check_run
 from studies.sweeps.gradients import make_gradients
 from studies.sweeps.plan import Layout, even_layout, lane_unit
 from studies.tuning.linear_fidelity import LinearFidelity
-from studies.tuning.merit import allowed_limits, judged_slopes, largest, merit_of, own_limits, size
+from studies.tuning.merit import (
+    Merit,
+    allowed_limits,
+    judged_slopes,
+    largest,
+    merit_of,
+    own_limits,
+    size,
+)
 from studies.tuning.scenarios import lane_columns, nominal, scenario_columns
 from studies.tuning.spec import OWN, Family, TuneSpec
 
@@ -36,7 +44,7 @@ class Evaluation(NamedTuple):
     limit_slope: np.ndarray  # (designs, m, p)
     peaks: np.ndarray  # largest values of the limited metrics, nan for the loop's, (designs, m)
     status: np.ndarray  # of each run, (designs, scenarios)
-    residual: np.ndarray  # rms of all stations, first scenario, nan if not there [m], (designs,)
+    residual: np.ndarray  # residual rms of the links that count, first scenario [m], (designs,)
 
 
 class Evaluator:
@@ -112,7 +120,7 @@ class Evaluator:
             np.where(self.is_free[:, None], limit_slope, 0.0),
             np.concatenate([found.peaks, np.full(beyond.shape, np.nan)], axis=1),
             codes[1:],
-            first_residual(metrics)[1:],
+            first_residual(self.merit, metrics)[1:],
         )
 
     def _check_own(self, codes: np.ndarray, metrics: Any) -> None:
@@ -124,14 +132,14 @@ class Evaluator:
                 f"{status.REASONS[int(codes[k])]}; everything is measured against it"
             )
         for name, _ in self.merit.objective:
-            if (np.asarray(size(metrics, name)) == 0).any():
+            if (np.asarray(size(self.merit, metrics, name)) == 0).any():
                 raise StudyError(
                     f"tune.objective: {name} is 0 in a run of the study itself, so nothing can be "
                     "measured against it; limit it instead"
                 )
         wanted = {name for one in self.families for name, x in one.limits.items() if x == OWN}
         for name in wanted & set(self.merit.limits):
-            if (np.asarray(largest(metrics, name)) <= 0).any():
+            if (np.asarray(largest(self.merit, metrics, name)) <= 0).any():
                 raise StudyError(
                     f"tune.limits.{name} = 'own': the study itself has 0 in a run, of which "
                     "nothing is a share; give a number"
@@ -147,12 +155,14 @@ def _layout(lanes: int) -> Layout:
     return Layout(whole.devices, -(-lanes // (whole.devices * block)), block)
 
 
-def first_residual(metrics: Any) -> np.ndarray:
-    """Residual rms of all stations in the first scenario [m], (designs,); nan if not there."""
-    rms = metrics.residual_rms
-    if rms is None:
+def first_residual(merit: Merit, metrics: Any) -> np.ndarray:
+    """Residual rms of the first scenario [m], (designs,); nan if not there.
+
+    Root of the mean square of all stations of the links that count.
+    """
+    if metrics.residual_rms is None:
         return np.full(len(metrics.saturated_fraction), np.nan)
-    return np.sqrt(np.mean(rms[:, 0] ** 2, axis=(1, 2)))
+    return np.sqrt(np.mean(metrics.residual_rms[:, 0, list(merit.links)] ** 2, axis=(1, 2)))
 
 
 def tuned_structure(spec: TuneSpec) -> Structure:

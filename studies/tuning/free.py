@@ -26,7 +26,14 @@ from studies.consistency import each_link, patch_centers, patch_pitch
 from studies.errors import StudyError, field_error, nearest, shown_name
 from studies.fields import parse_entry
 from studies.spec import Study
-from studies.sweeps.axes import Range, checked_value, known_field, parse_range
+from studies.sweeps.axes import (
+    ALIASES,
+    READY_MADE,
+    Range,
+    checked_value,
+    known_field,
+    parse_range,
+)
 
 TWO_PI = 2 * np.pi
 
@@ -196,6 +203,9 @@ def _plain(name: str, bounds: Any, study: Study, path: str) -> tuple[list[Free],
     entry, ready = parse_entry(name), nearest(name, DECIDED)
     if ready and name.partition(".")[0] not in Study.model_fields:
         raise StudyError(f"{path}: cannot be free; did you mean {ready!r}?")
+    if name in READY_MADE:
+        hint = f"did you mean {ALIASES[name]!r}?" if name in ALIASES else "an axis of sweeps alone"
+        raise StudyError(f"{path}: cannot be free; {hint}")
     value = known_field(name, study, path)  # names the nearest field if there is none
     assert entry is not None
     leaf = LEAVES.get(entry.field)

@@ -44,7 +44,6 @@ class LoopFigures(NamedTuple):
     slowest_decay: float  # [1/s]
     spillover: float  # see `jaxmodel.sampled_loop.spillover` [1]
     singularity_distance: float  # [rad]
-    residual: float  # linear residual vibration, root of the mean square of all stations [m]
 
 
 def with_margin_modes(study: Study) -> Study:
@@ -61,7 +60,7 @@ class LinearFidelity:
             spec: of the tuning.
             families: of each design, in the order that they are given in.
         """
-        self._spec, self.names = spec, spec.loop_limits
+        self._spec, self.names, self._links = spec, spec.loop_limits, spec.counted_links
         own = nominal(spec, None)
         larger = with_margin_modes(own)
         self._structure = build_structure(larger)._replace(
@@ -121,7 +120,7 @@ class LinearFidelity:
         limits = self._limits[position] if self.names else np.array([STABLE])
         look = partial(
             _look, self._structure, names, self._spec.free.place, self._cases[position],
-            self._pose, limits,
+            self._pose, limits, self._links,
         )  # fmt: skip
         count = len(values)
         rows = np.minimum(np.arange(-(-count // BATCH) * BATCH), count - 1)
@@ -187,17 +186,17 @@ def _limit_slopes(
     return jax.lax.map(one, (values, cases, limits))
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@partial(jax.jit, static_argnums=(0, 1, 2, 6))
 def _look(
     structure: Structure, names: tuple, place: Any, case: Case, pose: Array, limits: Array,
-    values: Array,
+    links: tuple[int, ...], values: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
     def one(x: Array) -> tuple[Array, Array]:
         placed = place(case, x)
         matrices = closed_loop(structure, placed, pose)
         rms = linear_residual(structure, placed, matrices)
         excess = _excess(structure, names, placed, matrices, limits)
-        return excess, jnp.sqrt(jnp.mean(rms**2))
+        return excess, jnp.sqrt(jnp.mean(rms[np.array(links)] ** 2))
 
     return jax.lax.map(one, values)
 
@@ -205,7 +204,6 @@ def _look(
 _closed_loop = jax.jit(closed_loop, static_argnums=0)
 _spillover = jax.jit(spillover, static_argnums=0)
 _distance = jax.jit(_singularity_distance, static_argnums=0)
-_residual = jax.jit(linear_residual, static_argnums=0)
 
 
 def loop_figures(study: Study) -> LoopFigures:
@@ -225,11 +223,9 @@ def loop_figures(study: Study) -> LoopFigures:
     def poles(factor: float) -> np.ndarray:
         return np.linalg.eigvals(opened + factor * feedback)
 
-    rms = np.asarray(_residual(structure, case, matrices))
     return LoopFigures(
         gain_margin(poles),
         float(-np.log(np.abs(poles(1.0)).max()) / period),
         float(_spillover(plain, case, matrices)),
         float(_distance(plain, case)),
-        float(np.sqrt(np.mean(rms**2))),
     )

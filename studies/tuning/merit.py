@@ -11,8 +11,11 @@ import numpy as np
 
 from jaxmodel.metrics import Metrics
 from jaxmodel.parameters import Array
-from studies.fields import parse_entry
+from studies.entries import parse_entries
 from studies.tuning.spec import OWN, Family, TuneSpec
+
+#: What a report shows of every design, whatever it is tuned for.
+SHOWN = ("residual_rms", "settling_time", "peak_voltage")
 
 
 class Merit(NamedTuple):
@@ -21,39 +24,52 @@ class Merit(NamedTuple):
     objective: tuple[tuple[str, float], ...]  # metric and weight, 1 in all
     limits: tuple[str, ...]  # metrics with a limit
     tail: float  # share of worst scenarios that count
+    links: tuple[int, ...]  # those that count where a name says no link, from 0
 
     @property
     def metrics(self) -> tuple[str, ...]:
         """Fields of `Metrics` that this takes."""
-        names = [parse_entry(name) for name in (*dict(self.objective), *self.limits)]
-        return tuple(sorted({entry.field for entry in names if entry}))
+        return _fields((*dict(self.objective), *self.limits))
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Names of what reports show: what is asked for, and `SHOWN`."""
+        return tuple(dict.fromkeys((*dict(self.objective), *self.limits, *SHOWN)))
+
+    @property
+    def shown_metrics(self) -> tuple[str, ...]:
+        """Fields of `Metrics` that those take."""
+        return _fields(self.shown)
+
+
+def _fields(names: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(sorted({parse_entries(name).metric for name in names}))
 
 
 def merit_of(spec: TuneSpec) -> Merit:
     """Of a tuning."""
     total = sum(map(float, spec.tune.objective.values()))
     weights = tuple((name, float(weight) / total) for name, weight in spec.tune.objective.items())
-    return Merit(weights, spec.metric_limits, float(spec.tune.scenarios.tail))
+    tail = float(spec.tune.scenarios.tail)
+    return Merit(weights, spec.metric_limits, tail, spec.counted_links)
 
 
-def entries(metrics: Metrics, name: str) -> Array:
-    """Entries of a metric, (S, n)."""
-    entry = parse_entry(name)
-    assert entry is not None
-    data = getattr(metrics, entry.field)
-    return jnp.reshape(data[(slice(None), *entry.indices)], (data.shape[0], -1))
+def entries(merit: Merit, metrics: Metrics, name: str) -> Array:
+    """Entries of a metric, of the links that count, (S, n)."""
+    chosen = parse_entries(name)
+    return chosen.take(getattr(metrics, chosen.metric), merit.links)
 
 
-def size(metrics: Metrics, name: str) -> Array:
+def size(merit: Merit, metrics: Metrics, name: str) -> Array:
     """Root of the mean square of the entries, (S,)."""
-    square = jnp.mean(entries(metrics, name) ** 2, axis=1)
+    square = jnp.mean(entries(merit, metrics, name) ** 2, axis=1)
     # the root has no slope at 0; what is no number stays none
     return jnp.where(square == 0, 0.0, jnp.sqrt(jnp.where(square == 0, 1.0, square)))
 
 
-def largest(metrics: Metrics, name: str) -> Array:
+def largest(merit: Merit, metrics: Metrics, name: str) -> Array:
     """Largest entry, (S,)."""
-    return jnp.max(entries(metrics, name), axis=1)
+    return jnp.max(entries(merit, metrics, name), axis=1)
 
 
 def tail_weights(count: int, tail: float) -> np.ndarray:
@@ -70,7 +86,9 @@ def objectives(merit: Merit, metrics: Metrics, own: Metrics) -> Array:
         metrics: of the design, (S, ...).
         own: of the study itself in the same scenarios, (S, ...).
     """
-    shares = [weight * size(metrics, x) / size(own, x) for x, weight in merit.objective]
+    shares = [
+        weight * size(merit, metrics, x) / size(merit, own, x) for x, weight in merit.objective
+    ]
     return jnp.sum(jnp.stack(shares), axis=0)
 
 
@@ -90,7 +108,7 @@ def judged(
     """
     each = objectives(merit, metrics, own)
     weights = tail_weights(each.shape[0], merit.tail)
-    values = [largest(metrics, name) for name in merit.limits]
+    values = [largest(merit, metrics, name) for name in merit.limits]
     peaks = jnp.stack(values, axis=1) if values else jnp.zeros((each.shape[0], 0))
     excess = jnp.max(peaks / allowed - 1, axis=0)
     return jnp.sum(-jnp.sort(-each) * weights), excess, jnp.max(peaks, axis=0)
@@ -143,7 +161,7 @@ def judged_slopes(
 
 def own_limits(merit: Merit, own: Metrics) -> np.ndarray:
     """What the study itself reaches, (S, m)."""
-    columns = [np.asarray(largest(own, name)) for name in merit.limits]
+    columns = [np.asarray(largest(merit, own, name)) for name in merit.limits]
     count = len(jax.tree.leaves(own)[0])
     return np.stack(columns, axis=1) if columns else np.zeros((count, 0))
 

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxmodel import status
-from studies.pages import literal, picture
-from studies.stability import MARGIN_MODES
-from studies.sweeps.results import metric_label
+from studies.entries import links_text, parse_entries
+from studies.pages import literal, opening, picture, table
+from studies.runs import METRIC_LABELS
+from studies.stability import MARGIN_MODES, caution, margin_text
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
 from studies.tuning.check import Judged, Searched, patch_centers
 from studies.tuning.free import PLACEMENT
-from studies.tuning.optimise import KEPT, Progress, excess
+from studies.tuning.merit import SHOWN
+from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
 from studies.tuning.scenarios import move_label
-from studies.tuning.spec import LOOP_LIMITS, OWN, Family, TuneSpec
+from studies.tuning.spec import LOOP_LIMITS, OWN, Family, TuneSpec, label
+from studies.units import headed, number, readable
 
+#: Limits that hold from below.
+LOWER = ("gain_margin", "slowest_decay", "singularity_distance")
+#: Settling times this near to the end of the run have not settled [s].
+NEARLY = 2e-4
 #: A limit nearer than this share counts as active.
 NEAR = 0.02
 #: Starts that end within this share of the best one count as equally good.
@@ -46,16 +54,12 @@ def report(spec: TuneSpec, found: Findings) -> str:
         spec: of the tuning.
         found: what it found.
     """
-    at = found.at
     lines = [f"# {literal(spec.study.title) or 'study'}: tuning", ""]
     lines += [
-        f"{_count(len(at.family), 'start')} of {_count(len(spec.moving), 'family')}, "
-        f"{_count(int(at.iteration), 'iteration')} ({spec.tune.method}), "
-        f"{_count(spec.tune.scenarios.count, 'machine')} on {_count(len(spec.moves), 'move')}"
-        + (f"; {at.is_frozen.sum()} starts were frozen." if at.is_frozen.any() else "."), "",
-        *_summary(spec, found), *_by_move(spec, found), *_limits(spec, found),
-        *_numbers(spec, found), *_search(spec, found), *_fidelity(spec, found),
-        "## Derivatives", "",
+        *opening(_asked(spec, found), _came_out(spec, found), _next(spec, found)),
+        *_own_machine(spec, found), *_fresh(spec, found), *_by_move(spec, found),
+        *_limits(spec, found), *_numbers(spec, found), *_search(spec, found),
+        *_fidelity(spec, found), "## Derivatives", "",
     ]  # fmt: skip
     worst = max(found.audited, key=lambda entry: entry.share)
     place = ("half way to the best design", "at the best design")[worst.place]
@@ -66,6 +70,88 @@ def report(spec: TuneSpec, found: Findings) -> str:
         + ("below" if worst.share <= ALLOWED else "**above**") + f" {ALLOWED:g}. {MEANING}"
     )  # fmt: skip
     return "\n".join(lines) + "\n"
+
+
+def _asked(spec: TuneSpec, found: Findings) -> str:
+    goals = ", ".join(
+        name if len(spec.tune.objective) == 1 else f"{name} (weight {weight:g})"
+        for name, weight in spec.tune.objective.items()
+    )
+    limits = [
+        f"{name} {'at least' if name in LOWER else 'at most'} "
+        + ("the study's own" if limit == OWN else f"{limit:g}")
+        for name, limit in spec.tune.limits.items()
+    ]
+    at, scenarios = found.at, spec.tune.scenarios
+    return (
+        f"the least {goals} of {links_text(spec.counted_links)}"
+        + (f" with {', '.join(limits)}" if limits else "")
+        + f"; {_count(len(spec.free.numbers), 'free number')} in "
+        f"{_count(len(spec.moving), 'family')}, {_count(len(at.family), 'start')}, "
+        f"{_count(scenarios.count, 'machine')} on {_count(len(spec.moves), 'move')}. "
+        f"{ended(spec, at)}"
+        + (f" {at.is_frozen.sum()} starts were frozen." if at.is_frozen.any() else "")
+    )
+
+
+def ended(spec: TuneSpec, at: Progress) -> str:
+    """Why a tuning ended, in a sentence."""
+    done, asked = int(at.iteration), spec.tune.iterations
+    if done < asked:
+        return (
+            f"Ended after {done} of {asked} iterations: for {PATIENCE} no family had gained "
+            f"{100 * GAIN:g} %."
+        )
+    return f"Ended after all {asked} iterations ({spec.tune.method})."
+
+
+def _came_out(spec: TuneSpec, found: Findings) -> str:
+    """The best family in numbers, before and after."""
+    k = best_family(spec, found)
+    one, own, name = found.judged[k], found.own, spec.families[k].name
+    told = []
+    for metric in (*spec.tune.objective, *(x for x in SHOWN if x not in spec.tune.objective)):
+        before, after = (_value(metric, x.own.metrics, x.own.watched) for x in (own, one))
+        told.append(f"{metric} {after} instead of {before} {_unit(metric)}".strip())
+    if one.loop is not None and own.loop is not None:
+        told.append(f"gain margin {one.loop.gain_margin:.3g} instead of {own.loop.gain_margin:.3g}")
+    machines = _count(spec.tune.scenarios.check, "fresh machine")
+    text = (
+        f"{name}: {', '.join(told)} on the study's own machine; on {machines} "
+        f"{one.objective.mean():.3g} of the objective, {one.objective.max():.3g} on the worst."
+    )
+    warnings = [caution(one.loop.gain_margin)] if one.loop is not None else []
+    if found.at.beyond(found.at.winner(k)) > 0:
+        warnings.append("A limit is violated.")
+    return " ".join([text, *(f"**{warning}**" for warning in warnings if warning)])
+
+
+def best_family(spec: TuneSpec, found: Findings) -> int:
+    """Position of the family to recommend: limits kept first, then the least objective."""
+
+    def rank(k: int) -> tuple:
+        is_moving = k < len(spec.moving)
+        beyond = found.at.beyond(found.at.winner(k)) if is_moving else 0.0
+        value = found.judged[k].objective.mean()
+        return beyond > 0, not np.isfinite(value), value
+
+    return min(range(len(spec.moving)), key=rank)
+
+
+def _next(spec: TuneSpec, found: Findings) -> str:
+    file = file_name(spec, spec.families[best_family(spec, found)])
+    return (
+        f"`studies simulate {file} --out run.h5 --report` for its trajectories, `studies spillover "
+        f"{file} --out certificate` before it meets a machine, `studies export {file} --target c "
+        "--out dsp` to take it there."
+    )
+
+
+def file_name(spec: TuneSpec, family: Family) -> str:
+    """Of the study that a family gives."""
+    if len(spec.moving) == 1:
+        return "tuned.toml"
+    return f"tuned_{label(family.name)}.toml"
 
 
 def _count(n: int, what: str) -> str:
@@ -93,43 +179,100 @@ def _rows(spec: TuneSpec, found: Findings) -> list[tuple[str, Judged]]:
     return [("the study itself", found.own), *((family.name, one) for family, one in pairs)]
 
 
-def _summary(spec: TuneSpec, found: Findings) -> list[str]:
+def _unit(metric: str) -> str:
+    unit = readable(METRIC_LABELS[parse_entries(metric).metric][1])[1]
+    return "" if unit == "1" else unit
+
+
+def _value(metric: str, values: Mapping[str, Any], watched: float) -> str:
+    """A figure of one run as a report shows it."""
+    value = float(values[metric])
+    unit = METRIC_LABELS[parse_entries(metric).metric][1]
+    if metric.startswith("settling_time") and value >= watched - NEARLY > 0:
+        return f"not within {number(watched, unit)}"
+    return number(value, unit)
+
+
+def _columns(spec: TuneSpec, found: Findings) -> tuple[list[str], list[str]]:
+    """Metrics that tables show, and their heads."""
     names = list(found.own.metrics)
+    return names, [headed(x, METRIC_LABELS[parse_entries(x).metric][1]) for x in names]
+
+
+def _own_machine(spec: TuneSpec, found: Findings) -> list[str]:
+    names, heads = _columns(spec, found)
     modes = max(MARGIN_MODES, spec.study.link.modes)
-    heads = [f"{name} [{metric_label(name.partition('[')[0])[1]}]" for name in names]
-    lines = [
-        f"On {_count(spec.tune.scenarios.check, 'machine')} for each move that the tuning has not "
-        "seen, with the real converters and limits. Objective: 1 is the study itself, mean and "
-        "worst of all scenarios. Metrics: the worst of all scenarios, of those in the objective "
-        "the root of the mean square of all entries (links, stations), of limits the largest "
-        f"entry. Figures of the loop: on {modes} plant modes (`studies simulate` takes those of "
-        "the study).", "",
-        "| design | objective | worst | " + " | ".join(heads) + " | gain margin | slowest decay "
-        "[1/s] | spillover | statuses |", "|---" * (len(names) + 7) + "|",
-    ]  # fmt: skip
-    for name, one in _rows(spec, found):
-        loop = "- | - | -"
+    rows = []
+    files = ["study.toml", *(file_name(spec, x) for x in spec.moving)]
+    for k, (name, one) in enumerate(_rows(spec, found)):
+        cells = [_value(metric, one.own.metrics, one.own.watched) for metric in names]
+        loop = ["-"] * 3
         if one.loop is not None:
-            loop = (
-                f"{one.loop.gain_margin:.4g} | {one.loop.slowest_decay:.4g} | "
-                f"{one.loop.spillover:.4g}"
-            )
-        metrics = " | ".join(f"{one.metrics[metric].max():.4g}" for metric in names)
-        lines.append(
-            f"| {name} | {one.objective.mean():.4f} | {one.objective.max():.4f} | {metrics} | "
-            f"{loop} | {_codes(one)} |"
+            loop = [
+                margin_text(one.loop.gain_margin), f"{one.loop.slowest_decay:.4g}",
+                f"{one.loop.spillover:.4g}",
+            ]  # fmt: skip
+        file = f"`{files[k]}`" if k < len(files) else "-"
+        rows.append(
+            [name, file, f"{one.own.objective:.4f}", *cells, *loop, status.REASONS[one.own.status]]
         )
-    caption = (
-        "Best objective that keeps the limits, over iterations, on the machines of the tuning; "
-        "thin: every start"
+    return [
+        "## On the study's own machine", "",
+        "What `studies simulate` gives for the file of each design, with the real converters and "
+        f"limits. Of {links_text(spec.counted_links)}"
+        + (", those under control, " if len(spec.counted_links) < 3 else " ")
+        + "the largest value counts: peaks are the highest peak, an rms that of the worst link and "
+        f"station, a time that of the slowest link. {_weighing(spec)} Gain margin, slowest decay "
+        f"and spillover are those of the linearised loop with {modes} plant modes.", "",
+        *table(
+            ("design", "file", "objective", *heads, "gain margin", "slowest decay [1/s]",
+             "spillover", "status"), rows,
+        ), "",
+        picture(
+            "descent.png", "Best objective that keeps the limits, over iterations, on the machines "
+            "of the tuning; thin: every start",
+        ), "",
+    ]  # fmt: skip
+
+
+def _weighing(spec: TuneSpec) -> str:
+    count = len(spec.tune.objective)
+    whole = "the weighted mean of these shares; " if count > 1 else ""
+    return (
+        "Objective: " + whole + f"the root of the mean square of all entries of "
+        f"{' or '.join(spec.tune.objective)} (links, stations) over that of the study itself, so "
+        "1 is the study."
     )
-    return [*lines, "", picture("descent.png", caption), ""]
+
+
+def _fresh(spec: TuneSpec, found: Findings) -> list[str]:
+    names, heads = _columns(spec, found)
+    rows = []
+    for name, one in _rows(spec, found):
+        worst = [int(np.argmax(np.nan_to_num(one.metrics[x], nan=-np.inf))) for x in names]
+        cells = [
+            _value(x, {x: one.metrics[x][k]}, one.watched[k])
+            for x, k in zip(names, worst, strict=True)
+        ]
+        rows.append(
+            [name, f"{one.objective.mean():.4f}", f"{one.objective.max():.4f}", *cells, _codes(one)]
+        )
+    return [
+        "## On fresh machines", "",
+        f"{_count(spec.tune.scenarios.check, 'machine')} for each move, none of which the tuning "
+        "has seen (`scenario_...` in `tune.h5`), with the real converters and limits. Metrics: the "
+        "largest value as above, on the worst of all machines and moves.", "",
+        *table(("design", "objective, mean", "objective, worst", *heads, "statuses"), rows), "",
+    ]  # fmt: skip
 
 
 def _by_move(spec: TuneSpec, found: Findings) -> list[str]:
     """Change of every figure on each move, mean of the fresh machines."""
     count = spec.tune.scenarios.check
-    lines = ["## Change against the study itself", "", "Means of the fresh machines.", ""]
+    lines = [
+        "## Change against the study itself", "",
+        "Of the mean over the fresh machines.", "",
+    ]  # fmt: skip
     names = list(found.own.metrics)
     lines += ["| design | move | objective | " + " | ".join(names) + " |"]
     lines += ["|---" * (len(names) + 3) + "|"]

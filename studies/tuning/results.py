@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from studies.entries import links_text, parse_entries
 from studies.fields import parse_entry
 from studies.runs import STATUS_LABEL
 from studies.store import Variable
@@ -12,7 +13,7 @@ from studies.sweeps.table import as_numbers
 from studies.tuning.check import Judged, fresh_columns, patch_centers
 from studies.tuning.free import POLES
 from studies.tuning.report import Findings
-from studies.tuning.spec import Family, TuneSpec, label
+from studies.tuning.spec import TuneSpec
 
 #: Figures of the linearised loop, and their units.
 LOOP_UNITS = {"gain_margin": "1", "slowest_decay": "s-1", "spillover": "1"}
@@ -24,13 +25,6 @@ def free_unit(key: str) -> str:
         return ("s-1", "Hz")[POLES.index(key)]
     entry = parse_entry(key)
     return field_unit(entry.field) if entry and "." in entry.field else "1"
-
-
-def file_name(spec: TuneSpec, family: Family) -> str:
-    """Of the study that a family gives."""
-    if len(spec.moving) == 1:
-        return "tuned.toml"
-    return f"tuned_{label(family.name)}.toml"
 
 
 def variables(spec: TuneSpec, found: Findings) -> dict[str, Variable]:
@@ -121,11 +115,19 @@ def _fresh(spec: TuneSpec, found: Findings) -> dict[str, Variable]:
     fresh["fresh_objective"] = Variable(each("objective"), both, "1", "objective, fresh machines")
     fresh["fresh_status"] = Variable(each("status"), both, *STATUS_LABEL)
     fresh["own_status"] = Variable(found.own.status, axis, *STATUS_LABEL)
+    links = links_text(spec.counted_links)
     for name, own in found.own.metrics.items():
         label, unit = variable_name(name), metric_label(name.partition("[")[0])[1]
         values = np.stack([one.metrics[name] for one in found.judged])
-        fresh[f"fresh_{label}"] = Variable(values, both, unit, f"{name}, fresh machines")
-        fresh[f"own_{label}"] = Variable(own, axis, unit, f"{name} of the study itself")
+        text = name if parse_entries(name).names_a_link else f"{name}, largest of {links}"
+        fresh[f"fresh_{label}"] = Variable(values, both, unit, f"{text}, fresh machines")
+        fresh[f"own_{label}"] = Variable(
+            own, axis, unit, f"{text}, fresh machines, the study itself"
+        )
+        values = np.array([one.own.metrics[name] for one in found.judged])
+        fresh[f"file_{label}"] = Variable(values, ("family",), unit, f"{text}, as the file runs")
+        before = np.array(found.own.own.metrics[name])
+        fresh[f"file_own_{label}"] = Variable(before, (), unit, f"{text}, the study as it runs")
     if found.own.loop is not None:
         for name, unit in LOOP_UNITS.items():
             what = f"{name.replace('_', ' ')} of the linearised loop"

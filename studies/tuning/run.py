@@ -7,6 +7,7 @@ figures.
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +27,10 @@ from studies.tuning.check import judge, search, tuned_study
 from studies.tuning.evaluate import Evaluator
 from studies.tuning.folder import PROGRESS, RESULTS, open_tuning, save_progress
 from studies.tuning.optimise import Progress, fits, optimise, start_families
-from studies.tuning.report import Findings, report, summary, unkept
-from studies.tuning.results import file_name, variables
+from studies.tuning.report import Findings, ended, file_name, report, summary, unkept
+from studies.tuning.results import variables
 from studies.tuning.spec import TuneSpec
+from studies.units import duration_text
 
 REPORT = "report.html"
 
@@ -79,9 +81,11 @@ def run_tuning(
         say("compiling, and looking for starts by the linear loop")
         evaluator = evaluator or make_evaluator(spec)
 
+        clock = _Clock()
+
         def keep(at: Progress) -> None:
             save_progress(out / PROGRESS, at)
-            say(_told(spec, at))
+            say(f"{_told(spec, at)}{clock.left(spec, at)}")
 
         at = optimise(spec, evaluator, before, keep)
         lost = [f.name for k, f in enumerate(spec.moving) if not _has_finished(at, k)]
@@ -90,6 +94,7 @@ def run_tuning(
                 f"tune.starts: no start of {', '.join(lost)} finished a run; the study with what "
                 "the family sets should be one that does (try studies simulate)"
             )
+        say(ended(spec, at))
         say("comparing derivatives with differences, running the results on fresh machines")
         found = find(spec, evaluator, at)
         _write(spec, found, out)
@@ -99,6 +104,22 @@ def run_tuning(
     if faults:
         raise StudyError("tune.limits: not kept together; " + "; ".join(faults))
     return found
+
+
+class _Clock:
+    """Time that the iterations of this session take; the first one compiles."""
+
+    def __init__(self) -> None:
+        self._seen: list[float] = []
+
+    def left(self, spec: TuneSpec, at: Progress) -> str:
+        """How much is left after an iteration, "" after the first or last one."""
+        self._seen.append(time.monotonic())
+        count = spec.tune.iterations - int(at.iteration)
+        if len(self._seen) < 2 or count <= 0:
+            return ""
+        each = (self._seen[-1] - self._seen[0]) / (len(self._seen) - 1)
+        return f"; {duration_text(count * each)} left at most"
 
 
 def _has_finished(at: Progress, family: int) -> bool:

@@ -22,13 +22,12 @@ from pydantic import ValidationError
 
 from jaxmodel.case import Structure
 from studies.cases import build_structure
+from studies.entries import controlled_links, parse_entries
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.explain import explain
-from studies.fields import parse_entry
 from studies.runs import METRIC_LABELS, check_run
 from studies.spec import EACH_LINK, Section, Study, described, parse_study, read_toml
 from studies.sweeps.axes import checked_value, known_field, set_value
-from studies.sweeps.results import metric_label
 from studies.tuning.free import FreeNumbers, free_numbers, writes
 
 #: Limits that no run is needed for; all but `spillover` are lower ones. Those of the loop:
@@ -117,6 +116,11 @@ class TuneSpec(NamedTuple):
         return bool(np.any([self.study.control.position_gain, *gains]))
 
     @property
+    def counted_links(self) -> tuple[int, ...]:
+        """Links that metrics are taken over where none is named, from 0: those under control."""
+        return controlled_links([self.study, *(one.study(self.study) for one in self.families)])
+
+    @property
     def metric_limits(self) -> tuple[str, ...]:
         """Limits that runs are judged by."""
         return tuple(name for name in self.tune.limits if name not in LOOP_LIMITS)
@@ -176,15 +180,14 @@ def _check_figures(tune: Tune, study: Study) -> None:
         _check_metric(name, "tune.limits", True, study)
         if limit != OWN:
             _check_positive(limit, 1e30, f"tune.limits.{shown_name(name)}", more=" or 'own'")
-    for name in tune.limits:
-        entry = parse_entry(name)
-        if entry is not None and entry.indices and entry.field in tune.limits:
-            whole, part = tune.limits[entry.field], tune.limits[name]
-            if OWN not in (whole, part) and part > whole:
-                raise StudyError(
-                    f"tune.limits: {name} = {part:g} allows more than {entry.field} = {whole:g}, "
-                    "which holds for all its entries; leave one out"
-                )
+    for name, part in tune.limits.items():
+        metric = _field(name)
+        whole = tune.limits.get(metric, OWN)
+        if name != metric and OWN not in (whole, part) and part > whole:
+            raise StudyError(
+                f"tune.limits: {name} = {part:g} allows more than {metric} = {whole:g}, "
+                "which holds for all its entries; leave one out"
+            )
 
 
 def _check_spread(tune: Tune, study: Study) -> None:
@@ -221,30 +224,27 @@ def _check_positive(number: Any, most: float, path: str, unit: str = "", more: s
 
 
 def _check_metric(name: str, path: str, has_loop: bool, study: Study) -> None:
-    entry = parse_entry(name)
+    if has_loop and name in LOOP_LIMITS:
+        return
+    if has_loop and _field(name) in LOOP_LIMITS:
+        raise StudyError(f"{path}: {name!r} has no such entry; allowed {_field(name)}")
     known = [*METRIC_LABELS, *(LOOP_LIMITS if has_loop else ())]
-    if entry is None or entry.field not in known:
+    if _field(name) not in known:
         hint = nearest(name, known)
         raise StudyError(
             f"{path}: {name!r} is no metric; "
             + (f"did you mean {hint!r}?" if hint else f"allowed {', '.join(known)}")
         )
-    if not has_loop and entry.field in STEPPED:
+    if not has_loop and _field(name) in STEPPED:
         raise StudyError(
-            f"{path}: {entry.field} moves in steps and has no derivative"
-            + ("; take ringing_time" if entry.field == "settling_time" else "; limit it instead")
+            f"{path}: {_field(name)} moves in steps and has no derivative"
+            + ("; take ringing_time" if _field(name) == "settling_time" else "; limit it instead")
         )
-    axes = () if entry.field in LOOP_LIMITS else metric_label(entry.field)[0]
-    most = {
+    sizes = {
         "station": len(study.metrics.stations), "mode": study.link.modes,
         "controlled_mode": study.control.modes, "spectrum_point": Structure().n_frequencies,
     }  # fmt: skip
-    sizes = [most.get(axis, 3) for axis in axes]
-    if len(entry.indices) > len(sizes) or any(
-        k >= size for k, size in zip(entry.indices, sizes, strict=False)
-    ):
-        shape = "".join(f"[0 to {size - 1}]" for size in sizes)
-        raise StudyError(f"{path}: {name!r} has no such entry; allowed {entry.field}{shape}")
+    parse_entries(name, path, sizes)
 
 
 def _moves(tune: Tune, study: Study) -> tuple[dict[str, Any], ...]:
