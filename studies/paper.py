@@ -16,6 +16,7 @@ from rich.table import Column, Table
 
 from studies.batches import Tell
 from studies.errors import StudyError
+from studies.figures import styled, write_figure
 from studies.pages import write_report
 from studies.paper_cases import (
     EXECUTOR,
@@ -30,6 +31,7 @@ from studies.paper_figures import PAPER_FIGURES, draw_figure
 from studies.paper_measures import Measures, measure, middle_station
 from studies.report import report
 from studies.runs import STATUS_LABEL, describe, metric_variables, run_attributes
+from studies.sketch import sketch
 from studies.spec import Study, paper_study
 from studies.store import Variable, check_target, staged, write_store
 
@@ -90,6 +92,8 @@ def _write(out: Path, runs: PaperRuns, measures: Measures, tell: Tell) -> None:
         for name in PAPER_FIGURES:
             tell(f"drawing {name}", 0.25)
             draw_figure(name, runs, measures, staging)
+        with styled():
+            write_figure(sketch(runs.study), staging / "machine.png")
         write_report(staging, report(runs, measures), runs.study)
 
 

@@ -13,7 +13,7 @@ from jaxmodel import status
 from jaxmodel.axial import euler_force
 from studies import figures
 from studies.errors import StudyError
-from studies.pages import literal, picture, table, write_report
+from studies.pages import literal, opening, picture, table, write_report
 from studies.runs import (
     Run,
     chord_deflection,
@@ -22,7 +22,9 @@ from studies.runs import (
     run_variables,
     uncontrolled_twin,
 )
-from studies.stability import caution, margin_text
+from studies.sketch import CAPTION, sketch
+from studies.spec import Study
+from studies.stability import ENOUGH, caution, margin_text
 from studies.store import check_target, write_store
 
 #: Captions of what is drawn, by the end of the file's name.
@@ -30,6 +32,7 @@ FIGURES = {
     "deflection": "Deflection of the links' middle from the chord between their ends",
     "error": "Platform: pose minus shaped command",
     "voltage": "Voltages of the actuators, numbered from the slider on",
+    "machine": CAPTION,
 }
 _FREE = "without control"
 _POSE = ("x [µm]", "y [µm]", "φ [µrad]")
@@ -73,7 +76,7 @@ def write_results(out: Path, run: Run, has_report: bool, notes: Sequence[str] = 
         return f"written: {out}"
     twin = uncontrolled_twin(run)
     with figures.styled():
-        for name, figure in draw(run, twin).items():
+        for name, figure in {**draw(run, twin), "machine": sketch(run.study)}.items():
             figures.write_figure(figure, out.with_name(_figure(out, name)))
     write_report(out.parent, report(out, run, twin, notes), run.study, out.stem)
     return f"written: {out}\nreport: {out.with_name(out.stem)}.html"
@@ -86,23 +89,112 @@ def _figure(out: Path, name: str) -> str:
 
 def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str]) -> str:
     """Markdown text; arguments of `write_results`, and the same run without control."""
-    warning = caution(run.loop.gain_margin) if run.loop is not None else ""
+
+    def shown(name: str) -> list[str]:
+        return [picture(_figure(out, name), FIGURES[name]), ""]
+
     lines = [
         f"# {literal(run.study.title) or 'study'}: one run", "",
-        _status(run, notes), "",
-        *([f"**{literal(warning)}**", ""] if warning else []),
+        *opening(_asked(run), _came_out(run, twin, notes), _next(run)),
+        *shown("machine"),
         "## Links", "",
         *_links(run, twin), "",
+        f"Over time; dotted: the end of the shaped command at {run.result.command_end:.4g} s.", "",
+        *shown("deflection"),
         "## Platform", "",
         *_platform(run), "",
+        *shown("error"),
         "## Control loop", "",
         *_loop(run), "",
-        "## Over time", "",
-        f"Dotted: the end of the shaped command at {run.result.command_end:.4g} s.",
+        *shown("voltage"),
     ]  # fmt: skip
-    for name, caption in FIGURES.items():
-        lines += ["", picture(_figure(out, name), caption)]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)
+
+
+def _asked(run: Run) -> str:
+    return f"{motion_text(run.study)}; {control_text(run.study)}."
+
+
+def motion_text(study: Study) -> str:
+    """What moves the machine, in words."""
+    motion, load, drive = study.motion, study.load, study.drive
+    points = np.array(motion.waypoints, float)[:, :2]
+    count = len(points) - 1
+    told = "the platform at rest"
+    if count:
+        longest = 1e3 * np.linalg.norm(np.diff(points, axis=0), axis=1).max()
+        times = np.atleast_1d(motion.move_time)
+        span = f"{1e3 * times.min():.4g}" + (
+            f" to {1e3 * times.max():.4g}" if np.ptp(times) else ""
+        )
+        shaper = "no shaper" if study.shaper.kind == "none" else f"shaper {study.shaper.kind}"
+        moves = f"{count} move{'s' if count > 1 else ''} of {'up to ' if count > 1 else ''}"
+        told = f"{moves}{longest:.4g} mm in {span} ms{' each' if count > 1 else ''}, {shaper}"
+    blows = [
+        f"a pulse of {max(map(abs, force)):.4g} {unit} on the {where}"
+        for force, unit, where in (
+            (drive.pulse_force, "N", "sliders"), (load.pulse, "N or N m", "platform"),
+        )
+        if any(force)
+    ]  # fmt: skip
+    if drive.ripple:
+        blows.append(f"force ripple of {drive.ripple:g} N rms")
+    if any(study.initial.load_deflection) or any(map(any, study.initial.modal)):
+        blows.append("links bent at the start")
+    return ", ".join([told, *blows])
+
+
+def control_text(study: Study) -> str:
+    """Who is controlled and how, in words."""
+    control = study.control
+    links = [str(i + 1) for i in range(3) if control.links[i]]
+    if control.feedback == "none" or not links:
+        return "no link controlled"
+    law = {"imsc": f"modal control of {control.modes} modes", "srf": "strain rate feedback"}
+    return (
+        f"{law[control.law]} on link{'s' if len(links) > 1 else ''} {', '.join(links)}, "
+        f"{control.feedback} feedback, gain factor {control.gain_factor:g}"
+    )
+
+
+def _came_out(run: Run, twin: Run | None, notes: Sequence[str]) -> str:
+    metrics, worst = run.result.metrics, _worst_link(run)
+    told = [_status(run, notes)]
+    if run.status in status.FINISHED:
+        rms = 1e6 * metrics.residual_rms[worst].max()
+        without = ""
+        if twin is not None and twin.status in status.FINISHED:
+            without = (
+                f" ({1e6 * twin.result.metrics.residual_rms[worst].max():.4g} without control)"
+            )
+        told.append(
+            f"Link {worst + 1} vibrates most: {rms:.4g} µm rms{without}, settled after "
+            f"{settling_text(run, worst)} ms; peak voltage {metrics.peak_voltage.max():.4g} of "
+            f"{run.study.electronics.voltage_limit:g} V."
+        )
+    if run.loop is not None:
+        told.append(f"Gain margin {margin_text(run.loop.gain_margin)}.")
+        warning = caution(run.loop.gain_margin)
+        told += [f"**{literal(warning)}**"] if warning else []
+    return " ".join(told)
+
+
+def _worst_link(run: Run) -> int:
+    return int(np.argmax(np.nan_to_num(run.result.metrics.residual_rms.max(axis=1), nan=-1.0)))
+
+
+def _next(run: Run) -> str:
+    if run.loop is not None and run.loop.gain_margin < ENOUGH:
+        return (
+            "lower `control.gain_factor`, or move the patches: a sweep over `gain` and `placement` "
+            "(`studies sweep placement`) shows where margins are."
+        )
+    if run.study.control.feedback == "none" or not any(run.study.control.links):
+        return "control the links (`[control]`) and compare."
+    return (
+        "`studies spillover STUDY --out certificate` for how far the design may be trusted, "
+        "`studies tune SPEC` for better numbers, `studies export STUDY` for the controller."
+    )
 
 
 def _status(run: Run, notes: Sequence[str]) -> str:

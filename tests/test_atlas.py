@@ -137,7 +137,7 @@ def test_atlas_writes_what_its_report_shows(atlas):
         assert f"({name}.png)" in text
     assert "nan" not in text.lower()
     page = Page((folder / "report.html").read_text(encoding="utf-8"))
-    assert len(page.images) == len(figures.FIGURES) + 1
+    assert len(page.images) == len(figures.FIGURES) + 2
     assert page.title == "Coupling atlas"
     with Image.open(folder / figures.ANIMATION) as film:
         assert film.n_frames == 4

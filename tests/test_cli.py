@@ -129,12 +129,12 @@ def test_the_metrics_agree_with_the_trajectories(short_run):
 
 def test_the_report_of_a_run_is_whole(short_folder, short_run):
     names = {f"my run{end}" for end in (".h5", ".md", ".html")}
-    figures = {f"my run-{name}.png" for name in ("deflection", "error", "voltage")}
+    figures = {f"my run-{name}.png" for name in ("deflection", "error", "voltage", "machine")}
     assert {path.name for path in short_folder.iterdir()} == names | figures | {"short.toml"}
     found = parsed((short_folder / "my run.html").read_text(encoding="utf-8"))
     assert found.title == f"{TITLE}: one run" and TITLE in found.text
     # links, platform, two tracked modes, versions
-    assert len(found.images) == 3 and found.rows == [[8] * 4, [4] * 4, [3] * 3, [2] * 8]
+    assert len(found.images) == 4 and found.rows == [[8] * 4, [4] * 4, [3] * 3, [2] * 8]
     rms = f"{1e6 * float(short_run.residual_rms[1].max()):.4g}"
     margin = f"gain margin {float(short_run.gain_margin):.4g}, spectral radius"
     watched = f"to the end of the run, {50 - 1e3 * float(short_run.command_end):.4g} ms after"

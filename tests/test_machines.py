@@ -17,7 +17,9 @@ from studies.bench import reference
 from studies.cases import as_arrays, build_case
 from studies.errors import StudyError
 from studies.fields import field_value
+from studies.figures import styled
 from studies.runs import check_run, run_study
+from studies.sketch import sketch, standing
 from studies.spec import EACH_LINK, load_study, parse_study
 from studies.sweeps.results import load
 from studies.sweeps.run import run_sweep
@@ -249,3 +251,19 @@ def build_plant_of(study):
     machine = as_arrays(build_case(study)).machine
     basis = build_basis("pinned_pinned", machine.beam, machine.patches, R, jnp.array([0.1]))
     return build_plant(machine, basis)
+
+
+def test_a_sketch_stands_where_the_machine_does():
+    study = random_machine(4)
+    case, pose = build_case(study), np.array(study.motion.waypoints[0])
+    slider, joint = standing(case, pose)
+    plant = build_plant_of(study)
+    chain = kinematics.close_chain(plant, jnp.array(pose), jnp.zeros(3))
+    u = np.stack([plant.ux, plant.uy], axis=1)
+    n = np.stack([-u[:, 1], u[:, 0]], axis=1)
+    corner = -np.asarray(plant.s0)[:, None] * u - np.asarray(plant.h0)[:, None] * n
+    np.testing.assert_allclose(slider, corner + np.asarray(chain.rho)[:, None] * u, atol=1e-12)
+    centre = joint - pose[:2]
+    np.testing.assert_allclose(centre, np.stack([chain.cx, chain.cy], axis=1), atol=1e-12)
+    with styled():
+        assert len(sketch(study).axes) == 1

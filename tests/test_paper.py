@@ -1,6 +1,7 @@
 """The paper's study end to end on a short run, and the tables and numbers it reports."""
 
 import io
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -69,7 +70,7 @@ def short(tmp_path_factory):
 def test_folder_holds_whole_files_and_nothing_else(short):
     names = sorted(file.name for file in short.folder.iterdir())
     figures = [f"{name}.{kind}" for name in FIGURES for kind in ("pdf", "png")]
-    assert names == sorted([*figures, "paper.h5", "report.html", "report.md"])
+    assert names == sorted([*figures, "machine.png", "paper.h5", "report.html", "report.md"])
     assert (short.folder / "fig03.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert (short.folder / "fig03.pdf").read_bytes()[:5] == b"%PDF-"
 
@@ -206,6 +207,11 @@ def test_report_holds_the_papers_numbers_and_those_of_the_run(short):
         assert f"({name}.png)" in text
     rows = [line for line in text.splitlines() if line.startswith("|")]
     assert len(rows) > 60
+
+
+def test_every_figure_stands_beside_its_table():
+    text = "".join(Path(report.__file__).read_text().split())
+    assert all(f'"{name}"' in text for name in paper_figures.PAPER_FIGURES)
 
 
 def test_table_1_percentages_are_the_papers():

@@ -442,13 +442,13 @@ def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_
     figures = [f"{name}.{kind}" for name in ("margins", "damping", "leakage", "laws")
                for kind in ("png", "pdf")]  # fmt: skip
     files = {"report.md", "report.html", "certificate.json", "spillover.h5", *figures}
-    assert {path.name for path in out.iterdir()} == files
+    assert {path.name for path in out.iterdir()} == files | {"machine.png"}
     report = (out / "report.md").read_text()
     assert report.startswith("# Spillover certificate passed: gain margin 2.5, 2 required")
     assert all(f"({name}.png)" in report for name in ("margins", "damping", "leakage", "laws"))
     assert "| modified IMSC |" in report and "Not covered" in report
     page = parsed((out / "report.html").read_text())
-    assert len(page.images) == 4 and page.title.startswith("Spillover certificate passed")
+    assert len(page.images) == 5 and page.title.startswith("Spillover certificate passed")
     data = json.loads((out / "certificate.json").read_text())
     assert data["is_passed"] and len(data["plants"]) == 8 and len(data["laws"]) == 7
     assert all(plant["passes"] for plant in data["plants"])

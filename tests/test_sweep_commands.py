@@ -62,7 +62,7 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     check_report(out)
     code, text, _ = run(capsys, "show", out)
     assert code == 0 and "ok" in text and "best cases by residual_rms" in text
-    assert "residual_rms [m]" in text
+    assert "residual_rms [µm]" in text
     assert run(capsys, "show", out, "--failed")[0] == 0
     code, text, _ = run(
         capsys, "best", out, "--by", "control_energy", "--subject-to",
@@ -77,7 +77,7 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     assert code == 0 and "largest difference of a metric" in text
     assert (tmp_path / "run.h5").stat().st_size > 10_000
     page = parsed((tmp_path / "run.html").read_text(encoding="utf-8"))
-    assert len(page.images) == 3 and "sweep: ok; largest difference of a metric" in page.text
+    assert len(page.images) == 4 and "sweep: ok; largest difference of a metric" in page.text
     _, text, _ = run(capsys, "best", out, "--by", "residual_rms", "--count", "1")
     number, name = re.search(r"(\d+) +│ ([0-9a-f]{8}) ", text).groups()
     assert load_design(out, f"id:{name}").study == load_design(out, int(number)).study
@@ -105,24 +105,32 @@ def check_report(folder):
     for part in ("- 8 base points of a Saltelli design of", "0.05 to 1, log scale", "40 cases.",
                  "| drive.kp | N/m |", f"| ok | {count} | {count / 0.4:.1f} |"):  # fmt: skip
         assert part in text
-    assert page.title == "small: sweep" and len(page.images) == 1 and "[sweep.axes]" in page.text
-    value = np.where(code == 0, np.nanmax(data["residual_rms"], axis=(1, 2)), np.inf)
+    assert page.title == "small: sweep" and len(page.images) == 3 and "[sweep.axes]" in page.text
+    safe = (code == 0) & (data["gain_margin"] >= 2)
+    count = int(safe.sum())
+    assert 10 < count < 40
+    value = np.where(safe, np.nanmax(data["residual_rms"], axis=(1, 2)), np.inf)
+    first = f"Best: case {np.argmin(value)} with {1e6 * value.min():.4g} µm"
+    head = text.partition("## ")[0]
+    assert first in head and "40 cases of control_gain_factor, drive_kp, patches_cent" in head
     best = text.partition("## Best cases by residual_rms")[2].partition("\n## ")[0]
     rows = [int(k) for k in re.findall(r"(?m)^\| (\d+) ", best)]
     assert rows == np.argsort(value, kind="stable")[: min(count, 10)].tolist()
 
-    def told(code, has_figure):
+    def told(code, drawn):
         changed = {**data.variables, "status": data.variables["status"]._replace(data=code)}
-        return report(dataclasses.replace(data, variables=changed), "residual_rms", has_figure)
+        return report(dataclasses.replace(data, variables=changed), "residual_rms", drawn)
 
     loud = int(np.sum(gain > 0.5))
-    text = told(np.where(gain > 0.5, 4, 0), True)
+    text = told(np.where(gain > 0.5, 4, 0), ["cases.png"])
     assert 0 < loud < 40 and f"| non-finite number | {loud} | {loud / 0.4:.1f} |" in text
     first = text.partition("## What the failures depend on")[2].split("\n| ")[3]
     assert first.startswith("control_gain_factor | 1.00 |") and "| 0 % (<=" in first
-    text = told(np.full(40, 4), False)
+    text = told(np.full(40, 4), [])
     assert "No case of status ok has it." in text and "![" not in text
-    assert "depend on" not in text  # where nothing is ok there is nothing to compare
+    assert (
+        "## What the failures depend on" not in text
+    )  # where nothing is ok there is nothing to compare
 
 
 def test_a_dry_run_says_why_its_sample_cannot_run(capsys, tmp_path):

@@ -13,8 +13,9 @@ from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.plots import length_text
 from studies.atlas.subsets import TARGETS, WINDOWS, link_label, setting_label
 from studies.atlas.workspace import MAP_MODES, Map
-from studies.pages import literal, picture, table
+from studies.pages import literal, opening, picture, table
 from studies.report_context import span
+from studies.sketch import CAPTION
 
 LATE = WINDOWS.index("late")
 
@@ -26,9 +27,10 @@ def report(found: Findings, dropped: list[str]) -> str:
         found: everything.
         dropped: settings that are left out, and why.
     """
-    sections = (_head, _claims, _subsets, _shares, _workspace, _platform, _motion)
+    sections = (_head, _subsets, _shares, _claims, _workspace, _platform, _motion)
     lines = [line for section in sections for line in (*section(found), "")]
-    lines[2:2] = [line for text in dropped for line in (f"**Left out:** {text}", "")]
+    first = lines.index("## How to read it")
+    lines[first:first] = [line for text in dropped for line in (f"**Left out:** {text}", "")]
     return "\n".join(lines)
 
 
@@ -47,7 +49,19 @@ def _head(found: Findings) -> list[str]:
     delay, length = study.metrics.residual_delay, study.metrics.residual_length
     return [
         "# Coupling atlas", "",
-        f"{literal(study.title)}: {count} subsets of controlled links and modes "
+        *opening(
+            f"{literal(study.title)}: which of the three links and {subsets.modes} modes a link "
+            "are worth controlling, who "
+            f"helps or hurts whom, and whether the paper's statements hold: {count} subsets in "
+            f"{settings} setting{'s' if settings > 1 else ''}.",
+            _came_out(found),
+            "control the links that carry the largest shares below; `studies sweep links` looks at "
+            "fewer subsets in more settings, `studies spillover DESIGN --out DIR` says how far the "
+            "design may be trusted.",
+        ),
+        picture("machine.png", CAPTION), "",
+        "## How to read it", "",
+        f"{count} subsets of controlled links and modes "
         f"({subsets.modes} a link), "
         f"{settings} setting{'s' if settings > 1 else ''} of move time and shaper, "
         f"{subsets.status.size} runs; "
@@ -64,6 +78,30 @@ def _head(found: Findings) -> list[str]:
         "and percentages of it say little.", "",
         *_stability(found),
     ]  # fmt: skip
+
+
+def _came_out(found: Findings) -> str:
+    """The answer in the setting that leaves most vibration, late window."""
+    subsets = found.subsets
+    link = subsets.link[:, LATE][:, subsets.link_subsets]  # (settings, 8, 3)
+    rms = np.sqrt(np.mean(link**2, axis=-1))
+    k = int(np.argmax(rms[:, 0]))
+    alone = [1, 2, 4]
+    best = min(alone, key=lambda subset: rms[k, subset])
+    others = [
+        100 * (link[k, 1 << i, j] / link[k, 0, j] - 1) for i in range(3) for j in range(3) if i != j
+    ]
+    worse = int(np.sum(one_more_link(subsets).change[k, LATE, TARGETS.index("all links")] > 1e-3))
+    told = (
+        f"Where most vibration is left ({found.setting(k)}), control of all links takes the "
+        f"residual of the three from {length_text(rms[k, 0])} to {length_text(rms[k, 7])} rms; of "
+        f"single links, link {link_label(best)} gives most ({length_text(rms[k, best])}). One "
+        f"link under control changes its neighbours by {min(others):+.0f} to {max(others):+.0f} %; "
+        f"of the 12 steps to one more link {worse or 'none'} make it worse."
+    )
+    if not found.responses.is_stable.all():
+        told += " **The linearised loop is unstable, see below: these are limit cycles.**"
+    return told
 
 
 def _stability(found: Findings) -> list[str]:
@@ -226,7 +264,7 @@ def _shares(found: Findings) -> list[str]:
         beyond = one.reshape(3, -1)[:, 1:]
         rows.append([
             found.setting(k), *(f"{100 * x:.2f}" for x in by_link),
-            f"{100 * np.abs(beyond).sum():.2f}", f"{100 * one.sum():.6f}", f"{100 * total:.6f}",
+            f"{100 * np.abs(beyond).sum():.2f}", f"{100 * total:.4g}",
         ])  # fmt: skip
     return [
         "## Who contributes what", "",
@@ -234,7 +272,7 @@ def _shares(found: Findings) -> list[str]:
         "away from all links (late window), in percent of what is there without control. Mean "
         "squares of motions that do not touch add up, so interactions are coupling.", "",
         *table(("setting", "link 1", "link 2", "link 3", "modes 2 and up, sizes added",
-                "sum of shares", "removed by all"), rows), "",
+                "removed by all"), rows), "",
         *_figure("shares"), *_figure("interactions"),
     ]  # fmt: skip
 

@@ -30,9 +30,10 @@ from studies.atlas.subsets import (
 from studies.atlas.workspace import PAIRS
 from studies.batches import Tell
 from studies.errors import StudyError
-from studies.figures import save, styled
+from studies.figures import save, styled, write_figure
 from studies.pages import write_report
 from studies.runs import run_attributes
+from studies.sketch import sketch
 from studies.spec import Study
 from studies.store import Variable, staged, write_store
 from studies.sweeps.folder import locked_folder, refuse_others
@@ -96,6 +97,7 @@ def _finish(study: Study, out: Path, tell: Tell) -> None:
             with styled():
                 for name, figure in FIGURES.items():
                     save(figure.draw(found), staging, name)
+                write_figure(sketch(study), staging / "machine.png")
             write_animation(found, staging)
             write_report(staging, report(found, dropped), study)
     except OSError as error:

@@ -9,8 +9,8 @@ from studies.export.controller import FixedController
 from studies.export.cost import Cost
 from studies.export.fixed import MARGIN, FixedPoint
 from studies.export.verify import AIM, Verification
-from studies.pages import literal
-from studies.stability import LoopReport
+from studies.pages import literal, opening
+from studies.stability import LoopReport, caution, margin_text
 
 
 def report(
@@ -31,7 +31,22 @@ def report(
         fixed, cost: formats and cost in fixed point.
     """
     verdict = "passed" if verified.is_passed else "FAILED, no code was written"
-    lines = [f"# Verification: {verdict}", "", *(f"- {literal(line)}" for line in origin), ""]
+    count = len(verified.checks)
+    kept = sum(check.is_met for check in verified.checks)
+    warning = caution(loop.gain_margin)
+    lines = [
+        f"# Verification: {verdict}", "",
+        *opening(
+            "does what was exported do what the simulated controller does, sample by sample, over "
+            "the case's motion and against extreme inputs?",
+            f"**{verdict}**; {kept} of {count} comparisons agree; gain margin "
+            f"{margin_text(loop.gain_margin)}." + (f" **{literal(warning)}**" if warning else ""),
+            "wiring, timing, start-up and sensor faults: `docs/export.md`. The amplifiers stay off "
+            "until the channels have been checked one by one.",
+        ),
+        "## What was exported", "",
+        *(f"- {literal(line)}" for line in origin), "",
+    ]  # fmt: skip
     lines += [
         f"Linearised sampled loop with the exported coefficients: spectral radius "
         f"{loop.spectral_radius:.6f}, gain margin {loop.gain_margin:.3f} "

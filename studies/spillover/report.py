@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
-from studies.pages import literal, picture, table
+from studies.pages import literal, opening, picture, table
 from studies.runs import describe
+from studies.sketch import CAPTION
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import FAST, GIVEN, SETTLING, WINDOW, WITHOUT, Comparison
 from studies.spillover.plants import Plant
@@ -85,12 +86,34 @@ def _head(found: Certificate) -> list[str]:
         told += f" With fewer than {found.fails_from} plant modes a link all of them pass."
     return [
         f"# Spillover certificate {verdict(found)}", "",
+        *opening(
+            f"is the controller of {literal(study.title) or 'the study'} safe on plants that it "
+            f"does not know: {total} of them, a gain margin of {found.required:g} on each.",
+            f"**{verdict(found)[0].upper()}{verdict(found)[1:]}.** {good} of {total} plants pass.",
+            _next(found),
+        ),
+        picture("machine.png", CAPTION), "",
+        "## The design", "",
         f"{literal(study.title) or 'study'}: law {control.law}, basis {control.basis}, "
         f"{found.n_controlled} controlled modes on links {links}, gain factor "
         f"{control.gain_factor:g}; {electronics.sample_rate_hz:g} Hz, anti-alias filter "
         f"{electronics.antialias_hz:g} Hz, "
         f"one sample of delay, velocity estimate {electronics.estimator}.", "", told,
     ]  # fmt: skip
+
+
+def _next(found: Certificate) -> str:
+    margin = float(found.margin[found.worst])
+    if found.is_passed:
+        return "`studies export DESIGN --target c --out dsp` takes it to a controller."
+    if margin > 0:
+        share = margin / found.required
+        return (
+            f"gains times {share:.2g} would pass on these plants (`control.gain_factor = "
+            f"{share * found.study.control.gain_factor:.3g}`), at less damping; or move the "
+            "patches and filters (`studies tune tune_placement`)."
+        )
+    return "another law, basis or estimate of the velocity (see the laws below): no gain passes."
 
 
 def _margins(found: Certificate) -> list[str]:

@@ -15,6 +15,7 @@ from studies.design import Design
 from studies.errors import StudyError
 from studies.pages import write_report
 from studies.runs import STATUS_LABEL, resolved_study, run_attributes
+from studies.sketch import sketch
 from studies.spec import Study
 from studies.spillover import plots
 from studies.spillover.certificate import Certificate, certify
@@ -100,6 +101,7 @@ def _draw(folder: Path, found: Certificate, laws: Comparison | None) -> None:
             figures.save(figure, folder, name)
         if found.study.control.law == "imsc":
             figures.save(plots.leakage(found), folder, "leakage")
+        figures.write_figure(sketch(found.study), folder / "machine.png")
 
 
 def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable]:

@@ -18,14 +18,21 @@ from studies import figures
 from studies.consistency import each_link
 from studies.errors import StudyError
 from studies.stability import ENOUGH
-from studies.sweeps.results import SweepData, metric_values, swept_names
-from studies.sweeps.show import MARGIN, best_cases, label, shown_value
+from studies.sweeps.axes import SHOWN_AS
+from studies.sweeps.results import SweepData, metric_values, swept_names, variable_name
+from studies.sweeps.show import MARGIN, label, recommended, shown_metric, shown_value
+from studies.sweeps.spec import Node
 
 #: More distinct values than this are no grid.
 FEW = 60
 #: Placements drawn one below the other.
 N_PLACEMENTS = 15
 MAP = "viridis"
+#: The best cases among others.
+BEST = "#D00000"
+#: From so many values on, the largest 2 % do not set the limits of an axis.
+MANY = 50
+VOLTAGE = "peak_voltage"
 #: Of lines, where the colours begin anew.
 MARKERS = ("o", "^", "s")
 #: More groups than this have no bands, which would cover one another.
@@ -56,23 +63,108 @@ def plot(data: SweepData, x: str | None, y: str, hue: str | None) -> Figure:
         if "patches_centers" in data.variables and data["patches_centers"].ndim == 2:
             return _placements(data, y)
         return _parallel(data, y, chosen)
-    across = metric_values(data, x)[chosen]
-    group = None if hue is None else metric_values(data, hue)[chosen]
+    across = shown_metric(data, x)[chosen]
+    group = None if hue is None else shown_metric(data, hue)[chosen]
+    shown = shown_metric(data, y)[chosen]
     with figures.styled():
         figure = Figure(figsize=(5.2, 3.6), layout="constrained")
         ax = figure.subplots()
         _say_left_out(figure, data, chosen)
         ax.set_xlabel(label(data, x))
         if group is not None and _is_grid(across, group):
-            _heat_map(figure, ax, across, group, value[chosen], label(data, y))
+            _heat_map(figure, ax, across, group, shown, label(data, y))
             ax.set_ylabel(label(data, str(hue)))
             return figure
         ax.set_ylabel(label(data, y))
         if len(np.unique(across)) <= min(FEW, max(len(across) // 2, 12)):
-            _lines(ax, across, value[chosen], group, hue)
+            _lines(ax, across, shown, group, hue)
         else:
-            _points(figure, ax, across, value[chosen], group, "" if hue is None else hue)
+            best = np.isin(np.flatnonzero(chosen), recommended(data, y))
+            hue_label = "" if hue is None else label(data, hue)
+            _points(figure, ax, across, shown, group, hue_label, best)
+            ax.set_xscale("log" if is_log(data, x) or _is_wide(across) else "linear")
+            if x == MARGIN:
+                ax.axvline(ENOUGH, color="black", linewidth=0.8, linestyle=":")
     return figure
+
+
+def front(data: SweepData, y: str) -> Figure:
+    """A metric over the gain margin, coloured by peak voltage; black: nothing better in both.
+
+    Args:
+        data: with cases of status ok that have a gain margin.
+        y: the metric.
+    """
+    chosen = np.flatnonzero((data["status"] == status.OK) & np.isfinite(metric_values(data, y)))
+    margin, value = data[MARGIN][chosen], shown_metric(data, y)[chosen]
+    with figures.styled():
+        figure = Figure(figsize=(6.2, 3.8), layout="constrained")
+        ax = figure.subplots()
+        color: Any = figures.SERIES[0]
+        if VOLTAGE in data.variables:
+            color = metric_values(data, VOLTAGE)[chosen]
+        dots = ax.scatter(
+            margin, value, s=5, c=color, cmap=MAP, linewidths=0, rasterized=True,
+            norm="log" if VOLTAGE in data.variables and _is_wide(color) else None,
+        )  # fmt: skip
+        if VOLTAGE in data.variables:
+            figure.colorbar(dots, ax=ax, label=label(data, VOLTAGE))
+        best = np.array(sorted(not_beaten(margin, value), key=lambda k: margin[k]), int)
+        ax.plot(margin[best], value[best], "-", color="black", linewidth=0.8, zorder=3)
+        ax.plot(
+            margin[best], value[best], "o", color="black", markerfacecolor="none", markersize=4,
+            zorder=3,
+        )  # fmt: skip
+        ax.axvline(ENOUGH, color="black", linewidth=0.8, linestyle=":")
+        ax.set(xlabel="gain margin", ylabel=label(data, y))
+        _scale_ordinate(ax, value)
+    return figure
+
+
+def not_beaten(margin: np.ndarray, value: np.ndarray) -> list[int]:
+    """Cases that no other has at least the margin of with a smaller value."""
+    found: list[int] = []
+    lowest = np.inf
+    for k in np.lexsort((value, -margin)):
+        if value[k] < lowest:
+            found.append(int(k))
+            lowest = value[k]
+    return found
+
+
+def is_log(data: SweepData, name: str) -> bool:
+    """Whether an axis was sampled on a logarithmic scale."""
+
+    def scales(node: Node) -> dict[str, Any]:
+        own = {
+            SHOWN_AS.get(axis, axis): written.get("scale")
+            for axis, written in node.block.axes.items()
+            if isinstance(written, dict)
+        }
+        for child in node.children:
+            own |= scales(child)
+        return own
+
+    found = {variable_name(axis): scale for axis, scale in scales(data.spec.root).items()}
+    return found.get(variable_name(SHOWN_AS.get(name, name))) == "log"
+
+
+def _scale_ordinate(ax: Axes, value: np.ndarray) -> None:
+    """Logarithmic for wide values; limits that a few outliers do not set."""
+    is_wide = _is_wide(value)
+    ax.set_yscale("log" if is_wide else "linear")
+    if len(value) < MANY:
+        return
+    shape = np.log(value) if is_wide else value
+    low, high = np.percentile(shape, [0.0, 98.0])
+    room = 0.08 * (high - low)
+    if np.max(shape) <= high + 4 * room or high <= low:
+        return
+    bottom, top = (np.exp(x) if is_wide else x for x in (low - room, high + 4 * room))
+    ax.set_ylim(bottom, top)
+    beyond = int(np.sum(value > top))
+    if beyond:
+        ax.set_title(f"{beyond} above {top:.3g} not shown", fontsize=7.5, loc="right")
 
 
 def _say_left_out(figure: Figure, data: SweepData, chosen: np.ndarray) -> None:
@@ -204,7 +296,7 @@ def _short(value: object) -> str:
 
 def _points(
     figure: Figure, ax: Axes, across: np.ndarray, value: np.ndarray, group: np.ndarray | None,
-    hue: str,
+    hue: str, best: np.ndarray,
 ) -> None:  # fmt: skip
     size = 9 if len(value) < 2000 else 4
     if group is None:
@@ -220,15 +312,26 @@ def _points(
                 across[part], value[part], s=size, color=color, linewidths=0, label=str(name)
             )
         ax.legend(fontsize=7, title=hue)
-    ax.set_yscale("log" if _is_wide(value) else "linear")
+    ax.plot(
+        across[best], value[best], "o", color="black", markerfacecolor="none", markersize=5,
+        markeredgewidth=0.9, zorder=3,
+    )  # fmt: skip
+    _scale_ordinate(ax, value)
+
+
+def _best_text(data: SweepData, count: int) -> str:
+    """Which cases `recommended` gives, in words."""
+    has_margin = MARGIN in data.variables and bool(np.any(data[MARGIN] >= ENOUGH))
+    return f"{count} smallest" + (f" with a gain margin of {ENOUGH:g} or more" * has_margin)
 
 
 def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
-    """Every axis a vertical line, every case a polyline, coloured by rank; best ones on top."""
+    """Every axis a vertical line, every case a polyline, coloured by rank; the best stand out."""
     names = [name for name in swept_names(data) if data[name].ndim == 1]
     if not names:
         raise StudyError("--x: needed here, no axis of this sweep is a single number or text")
-    value = metric_values(data, y)[chosen]
+    value = shown_metric(data, y)[chosen]
+    best = np.flatnonzero(np.isin(np.flatnonzero(chosen), recommended(data, y)))
     order = np.argsort(-value)
     rank = np.argsort(np.argsort(value)) / max(len(value) - 1, 1)
     lines = []
@@ -245,7 +348,7 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
                 column = column.astype(float)
                 low, high = float(column.min()), float(column.max())
                 texts = [f"{v:.3g}" for v in (low, high)]
-                if low > 0 and high > 30 * low:
+                if low > 0 and (high > 30 * low or (k < len(names) and is_log(data, name))):
                     column, low, high = np.log(column), np.log(low), np.log(high)
             lines.append((column - low) / max(high - low, 1e-300))
             places = np.linspace(0, 1, len(texts)) if len(texts) > 1 else [0.0]
@@ -254,19 +357,24 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
         matrix = np.array(lines)
         for case in order[-3000:]:
             color = figures.matplotlib.colormaps[MAP](rank[case])
-            ax.plot(matrix[:, case], color=color, linewidth=0.5, alpha=0.6)
+            ax.plot(matrix[:, case], color=color, linewidth=0.5, alpha=0.4)
+        for case in best:
+            ax.plot(matrix[:, case], color=BEST, linewidth=1.3)
         ax.set_xticks(range(len(names) + 1), [*names, label(data, y)], rotation=15, ha="right")
         ax.set_yticks([])
-        ax.set_title("dark: smallest", fontsize=7.5, loc="right")
+        ax.set_title(
+            f"red: the {_best_text(data, len(best))}; else dark: smallest", fontsize=7.5,
+            loc="right",
+        )  # fmt: skip
         _say_left_out(figure, data, chosen)
     return figure
 
 
 def _placements(data: SweepData, y: str) -> Figure:
     """The best placements on the link, one below the other, over all cases by each patch."""
-    centers, value = data["patches_centers"], metric_values(data, y)
+    centers, value = data["patches_centers"], shown_metric(data, y)
     patches, length = data.spec.study.patches, each_link(data.spec.study.link.length).max()
-    chosen = best_cases(data, y, count=N_PLACEMENTS)
+    chosen = recommended(data, y, N_PLACEMENTS)
     is_ok = (data["status"] == status.OK) & np.isfinite(value)
     others = [name for name in swept_names(data) if name != "patches_centers"]
     unit = 1e3
@@ -293,17 +401,23 @@ def _placements(data: SweepData, y: str) -> Figure:
         top.tick_params(axis="y", length=0)
         top.grid(False)
         top.set_title(
-            f"smallest {label(data, y)}; blue: actuator, orange: sensor", fontsize=8.5, loc="left"
-        )
+            f"{label(data, y)}, the {_best_text(data, len(chosen))}; blue: actuator, orange: "
+            "sensor", fontsize=8.5, loc="left",
+        )  # fmt: skip
         for k in range(centers.shape[1]):
             color = figures.SERIES[k % len(figures.SERIES)]
             bottom.scatter(
                 centers[is_ok, k] * unit, value[is_ok], s=3, color=color, linewidths=0,
                 label=f"pair {k + 1}", alpha=0.5, rasterized=True,
             )  # fmt: skip
-        bottom.set_yscale("log" if _is_wide(value[is_ok]) else "linear")
+            bottom.plot(
+                centers[chosen, k] * unit, value[chosen], "o", color="black", markersize=4,
+                markerfacecolor="none", markeredgewidth=0.8, zorder=3,
+            )  # fmt: skip
+        _scale_ordinate(bottom, value[is_ok])
         bottom.set_xlabel("centre of the patch pair along the link [mm]")
         bottom.set_ylabel(label(data, y))
-        bottom.legend(fontsize=7, markerscale=3)
+        bottom.set_title("rings: those above", fontsize=7.5, loc="left")
+        bottom.legend(fontsize=7, markerscale=3, loc="upper right")
         _say_left_out(figure, data, is_ok)
     return figure

@@ -6,30 +6,49 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from jaxmodel import status
 from studies.errors import StudyError, shown
-from studies.pages import literal, picture, table, write_report
+from studies.figures import styled
+from studies.pages import literal, opening, picture, table, write_report
+from studies.sketch import CAPTION, sketch
+from studies.spec import Study
+from studies.stability import ENOUGH, margin_text
 from studies.sweeps.axes import SHOWN_AS
-from studies.sweeps.plots import plot, save_plot
-from studies.sweeps.results import SweepData, kept_metrics, load, metric_values
+from studies.sweeps.plots import front, plot, save_plot
+from studies.sweeps.results import (
+    SweepData,
+    load,
+    metric_values,
+    swept_names,
+)
 from studies.sweeps.show import (
-    DEFAULT_METRIC,
+    MARGIN,
     SHARES,
     Rows,
     axis_rows,
     best_cases,
     case_rows,
     cause_rows,
+    counted_text,
     label,
     margin_warning,
+    ranking,
+    recommended,
+    shown_metric,
+    shown_value,
     status_rows,
+    unit_of_metric,
 )
 from studies.sweeps.spec import Node
-from studies.sweeps.table import Table, build_table
+from studies.sweeps.table import Table, build_table, case_study
 from studies.template import study_template, toml_text, toml_value
+from studies.units import readable
 
-REPORT, FIGURE = "report.html", "cases.png"
+REPORT, FIGURE, FRONT, MACHINE = "report.html", "cases.png", "front.png", "machine.png"
+#: The best cases are as good as one where they differ by less than this share.
+ALIKE = 0.02
 #: More listed values of an axis are not spelt out.
 MOST_VALUES = 12
 #: What a block makes of its axes.
@@ -46,7 +65,7 @@ _METHODS = {
 
 
 def write_sweep_report(folder: Path) -> None:
-    """Write `report.md` and `report.html` of a sweep, with its figure, into its folder.
+    """Write `report.md` and `report.html` of a sweep, with its figures, into its folder.
 
     Args:
         folder: of a finished sweep.
@@ -56,40 +75,68 @@ def write_sweep_report(folder: Path) -> None:
     """
     data = load(folder)
     spec = data.spec
-    metric = DEFAULT_METRIC if DEFAULT_METRIC in data.variables else kept_metrics(spec)[0]
-    try:
-        figure = plot(data, None, metric, None)
-    except StudyError:  # no case is ok, or no axis is a single number or text
-        has_figure = False
-    else:
-        save_plot(figure, folder / FIGURE)
-        has_figure = True
+    metric = ranking(data)
+    drawn = []
+    for name, draw in ((FIGURE, _all_axes), (FRONT, _front)):
+        try:
+            figure = draw(data, metric)
+        except StudyError:  # no case is ok, or nothing to draw over
+            continue
+        save_plot(figure, folder / name)
+        drawn.append(name)
+    with styled():
+        save_plot(sketch(_best_study(data, metric)), folder / MACHINE)
     files = {"Sweep file": toml_text(spec.data), "Study of all cases": study_template(spec.study)}
-    write_report(folder, report(data, metric, has_figure), files)
+    write_report(folder, report(data, metric, [*drawn, MACHINE]), files)
 
 
-def report(data: SweepData, metric: str, has_figure: bool) -> str:
+def _all_axes(data: SweepData, metric: str) -> Figure:
+    return plot(data, None, metric, None)
+
+
+def _front(data: SweepData, metric: str) -> Figure:
+    known = data[MARGIN] if MARGIN in data.variables else np.full(data.n_cases, np.nan)
+    fine = known[(data["status"] == status.OK) & np.isfinite(metric_values(data, metric))]
+    if len(fine) < 3 or not np.isfinite(fine).all() or np.ptp(fine) <= 0:
+        raise StudyError("too few gain margins to draw over")
+    return front(data, metric)
+
+
+def _best_study(data: SweepData, metric: str) -> Study:
+    """Of the best case; of the sweep itself where no case is ok."""
+    try:
+        return case_study(build_table(data.spec), int(recommended(data, metric, 1)[0]))
+    except StudyError:
+        return data.spec.study
+
+
+def report(data: SweepData, metric: str, drawn: list[str]) -> str:
     """Markdown text.
 
     Args:
         data: the sweep.
         metric: what the best cases are ranked by.
-        has_figure: whether there is a figure of it, `FIGURE`.
+        drawn: figures that there are, of `FIGURE`, `FRONT` and `MACHINE`.
     """
     cases = build_table(data.spec)
     lines = [
         f"# {literal(data.spec.study.title)}: sweep", "",
+        *opening(_asked(data, cases, metric), *_answer(data, metric)),
+        *_figure(MACHINE, f"{CAPTION}. Of the best case, where cases differ", drawn),
+        f"## Best cases by {metric}", "",
+        *_best(data, metric), "",
+    ]  # fmt: skip
+    told = f"{metric} over the gain margin; the line: cases that no other beats in both"
+    lines += [
+        *_figure(FIGURE, f"Cases of status ok and their {metric}", drawn),
+        *_figure(FRONT, told, drawn),
+        "## How the cases ended", "",
+        *_table(status_rows(data)), "",
         "## What varied", "",
         *_blocks(data.spec.root), "",
         *_counts(data, cases), "",
         *_table(axis_rows(cases)), "",
-        "## How the cases ended", "",
-        *_table(status_rows(data)), "",
-        f"## Best cases by {metric}", "",
-        *_best(data, metric), "",
     ]  # fmt: skip
-    if has_figure:
-        lines += [picture(FIGURE, f"Cases of status ok and their {metric}"), ""]
     causes = cause_rows(data)
     if causes.rows:
         lines += [
@@ -99,6 +146,59 @@ def report(data: SweepData, metric: str, has_figure: bool) -> str:
             *_table(causes), "",
         ]  # fmt: skip
     return "\n".join(lines)
+
+
+def _figure(name: str, caption: str, drawn: list[str]) -> list[str]:
+    return [picture(name, caption), ""] if name in drawn else []
+
+
+def _asked(data: SweepData, cases: Table, metric: str) -> str:
+    axes = literal(", ".join(swept_names(data)))
+    return (
+        f"{_count(len(cases), 'case')} of {axes or 'a list'}, ranked by {metric} "
+        f"(smallest first; {counted_text(data, metric)})."
+    )
+
+
+def _answer(data: SweepData, metric: str) -> tuple[str, str]:
+    """What came out, and what to do next."""
+    codes = data["status"]
+    n_ok = int(np.sum(codes == status.OK))
+    ended = f"{n_ok} of {_count(data.n_cases, 'case')} ended ok"
+    others = [f"{count} {name}" for name, count, _ in status_rows(data).rows if name != "ok"][:3]
+    told = f"{ended}{' (' + ', '.join(others) + ')' if others else ''}."
+    value = metric_values(data, metric)
+    if not np.isfinite(value[codes == status.OK]).any():
+        return told, "look at what the failures depend on, below, and at `studies show --failed`."
+    best = recommended(data, metric)
+    first, shown = int(best[0]), shown_metric(data, metric)
+    unit = readable(unit_of_metric(data, metric))[1]
+    names = ", ".join(f"{name} = {shown_value(data, name, first)}" for name in swept_names(data))
+    told += f" Best: case {first} with {shown[first]:.4g} {unit} ({literal(names)})"
+    safe = MARGIN in data.variables and np.isfinite(data[MARGIN][first])
+    if safe:
+        told += f", gain margin {margin_text(data[MARGIN][first])}"
+    others_ok = shown[(codes == status.OK) & np.isfinite(shown)]
+    told += f"; half of all cases have {np.median(others_ok):.4g} {unit} or more."
+    spread = float(np.ptp(shown[best]) / max(abs(shown[first]), 1e-300))
+    if len(best) > 3 and spread < ALIKE:
+        told += (
+            f" **The {len(best)} best differ by {100 * spread:.2g} % only: {metric} does not tell "
+            "them apart, ask another metric.**"
+        )
+    warning = margin_warning(data, best) if safe else ""
+    if warning:
+        told += f" **{literal(warning)}**"
+    condition = f' --subject-to "{MARGIN} > {ENOUGH:g}"' if safe else ""
+    return told, (
+        f"`studies best DIR --by {metric}{condition}` for more of them, `studies replay DIR --case "
+        f"{first} --out run.h5 --report` for the trajectories of the best; before acting on it, "
+        "see whether another metric ranks alike (`--by settling_time`, `--by peak_voltage`)."
+    )
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}{'' if n == 1 else 's'}"
 
 
 def _blocks(node: Node, depth: int = 0) -> list[str]:
@@ -141,13 +241,23 @@ def _counts(data: SweepData, cases: Table) -> list[str]:
 
 
 def _best(data: SweepData, metric: str) -> list[str]:
-    if not np.isfinite(metric_values(data, metric)[data["status"] == status.OK]).any():
+    value = metric_values(data, metric)
+    if not np.isfinite(value[data["status"] == status.OK]).any():
         return ["No case of status ok has it."]
-    best = best_cases(data, metric)
+    best = recommended(data, metric)
     warning = margin_warning(data, best)
+    told = f"Cases of status ok, smallest {label(data, metric)} first."
+    if not warning and MARGIN in data.variables and np.isfinite(data[MARGIN][best]).any():
+        told = f"Cases with a gain margin of {ENOUGH:g} or more, smallest {metric} first."
+        free = best_cases(data, metric, count=1)
+        if value[free[0]] < value[best[0]]:
+            told += (
+                f" Without regard to the margin case {free[0]} is first with "
+                f"{shown_metric(data, metric)[free[0]]:.4g} at a margin of "
+                f"{data[MARGIN][free[0]]:.3g}."
+            )
     return [
-        f"Cases of status ok, smallest {label(data, metric)} first; a metric of several links or "
-        "stations counts with the largest of the controlled links.", "",
+        told, "",
         *([f"**{literal(warning)}**", ""] if warning else []),
         *_table(case_rows(data, best, [metric])),
     ]  # fmt: skip

@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from jaxmodel import status
+from studies.entries import links_text
 from studies.errors import StudyError
 from studies.fields import parse_entry
 from studies.runs import check_run
@@ -20,7 +21,11 @@ from studies.sweeps.plan import peak_memory
 from studies.sweeps.results import (
     NOT_RUN,
     SweepData,
+    counted_links,
     field_unit,
+    kept_metrics,
+    metric_label,
+    metric_names,
     metric_values,
     swept_names,
     variable_name,
@@ -28,9 +33,8 @@ from studies.sweeps.results import (
 from studies.sweeps.run import Plan, calibrate
 from studies.sweeps.sensitivity import failure_causes
 from studies.sweeps.table import Table, case_study
+from studies.units import headed, readable
 
-#: What `show` ranks cases by unless told otherwise.
-DEFAULT_METRIC = "residual_rms"
 #: Stands beside every metric of a case that has it.
 MARGIN = "gain_margin"
 #: Digits of a case's id that tables show.
@@ -106,9 +110,10 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
         return
     console.print(f"{data.spec.study.title}: {data.n_cases} cases, {', '.join(swept_names(data))}")
     _print(status_rows(data), console)
-    if DEFAULT_METRIC in data.variables and (codes == status.OK).any():
-        console.print(f"best cases by {DEFAULT_METRIC}, worst controlled link and station:")
-        print_cases(data, best_cases(data, DEFAULT_METRIC), [DEFAULT_METRIC], console)
+    by = ranking(data)
+    if np.isfinite(metric_values(data, by)[codes == status.OK]).any():
+        console.print(f"best cases by {by}, {counted_text(data, by)}:")
+        print_cases(data, best_cases(data, by), [by], console)
 
 
 def status_rows(data: SweepData) -> Rows:
@@ -163,7 +168,7 @@ def case_rows(data: SweepData, cases: np.ndarray, metrics: list[str]) -> Rows:
     names = swept_names(data)
     if MARGIN not in metrics and MARGIN in data.variables and np.isfinite(data[MARGIN]).any():
         metrics = [*metrics, MARGIN]
-    columns = [metric_values(data, name) for name in metrics]
+    columns = [shown_metric(data, name) for name in metrics]
     rows = []
     for k in cases:
         cells = [shown_value(data, name, k) for name in names]
@@ -187,9 +192,54 @@ def tell_left_out(data: SweepData, console: Console) -> None:
 
 
 def label(data: SweepData, name: str) -> str:
-    """A name with its unit; a metric of several links or stations counts with its largest."""
+    """A name with the unit that it is shown in, a metric's in µm or ms, an axis' as written."""
     unit = unit_of_metric(data, name)
+    if is_metric(name):
+        return headed(name, unit)
     return f"{name} [{unit}]" if unit else name
+
+
+def ranking(data: SweepData) -> str:
+    """What cases are ranked by: as the sweep says, or the first metric that it keeps."""
+    by = data.spec.sweep.by
+    return by if by.partition("[")[0] in data.variables else kept_metrics(data.spec)[0]
+
+
+def counted_text(data: SweepData, by: str) -> str:
+    """Over what a metric's largest value is taken, in words."""
+    metric = by.partition("[")[0]
+    axes = list(metric_label(metric)[0])
+    told = []
+    if "link" in axes and "link=" not in by:
+        told.append(links_text(tuple(np.flatnonzero(counted_links(data)).tolist())))
+    told += [f"all {axis}s" for axis in axes if axis != "link" and f"{axis}=" not in by]
+    return f"largest of {' and '.join(told)}" if told else "one number"
+
+
+def is_metric(name: str) -> bool:
+    """Whether a name is a metric or an entry of one, and not an axis."""
+    return name.partition("[")[0] in metric_names()
+
+
+def shown_metric(data: SweepData, name: str) -> np.ndarray:
+    """Values of a metric in the unit it is shown in, or of an axis as written, (n,)."""
+    values = metric_values(data, name)
+    if values.dtype.kind != "f" or not is_metric(name):
+        return values
+    return readable(unit_of_metric(data, name))[0] * values
+
+
+def recommended(data: SweepData, by: str, count: int = 10) -> np.ndarray:
+    """The best cases with a gain margin of `ENOUGH`, or of any margin where none has that.
+
+    Arguments and errors as `best_cases`.
+    """
+    if MARGIN in data.variables and np.isfinite(data[MARGIN]).any():
+        try:
+            return best_cases(data, by, f"{MARGIN} >= {ENOUGH:g}", count)
+        except StudyError:
+            pass
+    return best_cases(data, by, count=count)
 
 
 def shown_value(data: SweepData, name: str, case: int) -> str:

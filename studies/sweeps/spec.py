@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import ValidationError
 
+from studies.entries import parse_entries
 from studies.errors import StudyError, field_error, nearest
 from studies.explain import explain
 from studies.spec import Section, Study, described, parse_study, read_toml
@@ -47,6 +48,7 @@ class Sweep(Block):
     repeats: int = described(1, "1", "runs of each case, with seeds of their own", ge=1, le=10**6)
     seed: int = described(0, "1", "of the sampling methods", ge=0, le=10**9)
     metrics: tuple[str, ...] = described((), "-", "metrics to keep; empty: all")
+    by: str = described("residual_rms", "-", "metric, or entry of one, that cases are ranked by")
 
 
 class Node(NamedTuple):
@@ -103,6 +105,9 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
     study = parse_study({name: value for name, value in data.items() if name != "sweep"})
     sweep = _parse_block(Sweep, data["sweep"], "sweep")
     assert isinstance(sweep, Sweep)
+    ranking = parse_entries(sweep.by, "sweep.by").metric
+    if "by" in data["sweep"] and sweep.metrics and ranking not in sweep.metrics:
+        raise field_error("sweep.by", sweep.by, f"one of sweep.metrics = {list(sweep.metrics)}")
     return SweepSpec(study, sweep, _node(sweep, "sweep"), data)
 
 

@@ -15,9 +15,10 @@ from rich.console import Console
 
 from studies import config
 from studies.errors import StudyError
-from studies.figures import save
+from studies.figures import save, styled, write_figure
 from studies.pages import write_report
 from studies.runs import run_attributes
+from studies.sketch import sketch
 from studies.store import replacing, write_store
 from studies.sweeps.folder import make_manifest
 from studies.template import study_template, toml_text
@@ -27,7 +28,15 @@ from studies.tuning.check import judge, search, tuned_study
 from studies.tuning.evaluate import Evaluator
 from studies.tuning.folder import PROGRESS, RESULTS, open_tuning, save_progress
 from studies.tuning.optimise import Progress, fits, optimise, start_families
-from studies.tuning.report import Findings, ended, file_name, report, summary, unkept
+from studies.tuning.report import (
+    Findings,
+    best_family,
+    ended,
+    file_name,
+    report,
+    summary,
+    unkept,
+)
 from studies.tuning.results import variables
 from studies.tuning.spec import TuneSpec
 from studies.units import duration_text
@@ -191,6 +200,9 @@ def _write(spec: TuneSpec, found: Findings, out: Path) -> None:
             temporary.write_text(study_template(study), encoding="utf-8")
     attributes = run_attributes(spec.study) | {"tuning": json.dumps(spec.data)}
     write_store(out / RESULTS, variables(spec, found), attributes)
+    best = spec.moving[best_family(spec, found)]
+    with styled():
+        write_figure(sketch(studies[file_name(spec, best)]), out / "machine.png")
     save(plots.descent(spec, found), out, "descent")
     save(plots.gains(spec, found), out, "gains")
     for limit in spec.metric_limits[:1]:
