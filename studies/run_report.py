@@ -90,16 +90,18 @@ def _figure(out: Path, name: str) -> str:
 def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str]) -> str:
     """Markdown text; arguments of `write_results`, and the same run without control."""
 
+    end = float(run.result.command_end)
+
     def shown(name: str) -> list[str]:
         return [picture(_figure(out, name), FIGURES[name]), ""]
 
     lines = [
         f"# {literal(run.study.title) or 'study'}: one run", "",
-        *opening(_asked(run), _came_out(run, twin, notes), _next(run)),
+        *opening(_asked(run), _came_out(run, twin, notes), _next(run, twin)),
         *shown("machine"),
         "## Links", "",
         *_links(run, twin), "",
-        f"Over time; dotted: the end of the shaped command at {run.result.command_end:.4g} s.", "",
+        f"Over time; dotted: the end of the shaped command at {round(end, 9):.4g} s.", "",
         *shown("deflection"),
         "## Platform", "",
         *_platform(run), "",
@@ -183,7 +185,7 @@ def _worst_link(run: Run) -> int:
     return int(np.argmax(np.nan_to_num(run.result.metrics.residual_rms.max(axis=1), nan=-1.0)))
 
 
-def _next(run: Run) -> str:
+def _next(run: Run, twin: Run | None) -> str:
     if run.loop is not None and run.loop.gain_margin < ENOUGH:
         return (
             "lower `control.gain_factor`, or move the patches: a sweep over `gain` and `placement` "
@@ -191,6 +193,13 @@ def _next(run: Run) -> str:
         )
     if run.study.control.feedback == "none" or not any(run.study.control.links):
         return "control the links (`[control]`) and compare."
+    band = run.study.metrics.settling_band
+    if twin is not None and twin.result.metrics.residual_rms.max() < band:
+        return (
+            f"there is hardly anything to suppress, without control less than {1e6 * band:g} µm "
+            "is left: a faster move, or a disturbance (`studies simulate disturbance`), shows what "
+            "control does."
+        )
     return (
         "`studies spillover STUDY --out certificate` for how far the design may be trusted, "
         "`studies tune SPEC` for better numbers, `studies export STUDY` for the controller."

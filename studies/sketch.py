@@ -26,7 +26,7 @@ def sketch(study: Study) -> Figure:
     """Guides, sliders, links with their patches, platform and path."""
     case, pose = build_case(study), np.array(study.motion.waypoints[0], float)
     slider, joint = standing(case, pose)
-    figure = Figure(figsize=(4.2, 3.7), layout="constrained")
+    figure = Figure(figsize=(3.4, 3.0), layout="constrained")
     ax: Axes = figure.subplots()
     _guides(ax, study, case)
     ax.fill(*(1e3 * joint.T), color="#DDDDDD", zorder=1)

@@ -147,7 +147,7 @@ def test_the_report_of_a_run_is_whole(short_folder, short_run):
 @pytest.mark.parametrize("width", [1280, 600])
 def test_a_browser_shows_all_of_a_report(short_folder, tmp_path, width):
     html = (short_folder / "my run.html").read_text(encoding="utf-8")
-    assert rendered(html, tmp_path, width) == (3, 0, 0)
+    assert rendered(html, tmp_path, width) == (4, 0, 0)
 
 
 def test_reports_that_cannot_be_are_refused_before_the_run(capsys, tmp_path):

@@ -18,7 +18,7 @@ from jaxmodel.sampled_loop import closed_loop
 from studies.cases import as_arrays, build_case, build_structure
 from studies.spec import paper_study
 from studies.stability import HIGHEST, loop_report, with_margin_modes
-from studies.sweeps import margins
+from studies.sweeps import lanes
 from studies.sweeps.margins import judge_loops
 from studies.sweeps.plan import chunk_cases, local_layout, plan_groups
 from studies.sweeps.results import load
@@ -26,7 +26,7 @@ from studies.sweeps.run import run_sweep
 from studies.sweeps.show import best_cases
 from studies.sweeps.spec import parse_sweep
 from studies.sweeps.table import build_table
-from tests.loops import Loops, exact_margins, random_loops
+from tests.loops import Loops, _matrices, exact_margins, random_loops
 from tests.sweeps import FAST_MOVE
 
 STUDY = paper_study()
@@ -104,13 +104,66 @@ def test_margins_of_a_thousand_random_loops(seed):
     assert np.sum(error > 0.02) <= 1 and error.max() < 0.1
 
 
+def exact_poles(loops):
+    """All poles of each loop [1/s], by eigenvalues."""
+    wide = with_margin_modes(*loops)
+    opened, feedback = map(np.asarray, _matrices(*wide))
+    period = np.broadcast_to(np.asarray(wide[1].electronics.period), (len(opened),))
+    with np.errstate(all="ignore"):
+        return [
+            np.log(np.linalg.eigvals(a + b).astype(complex)) / t
+            for a, b, t in zip(opened, feedback, period, strict=True)
+        ]
+
+
+def check_damping(loops):
+    """Ratios are those of poles that the loops have, wherever they were found; share of those."""
+    found, poles = judge_loops(*loops), exact_poles(loops)
+    orders = np.broadcast_to(np.asarray(loops.cases.control.n_active), (len(poles),))
+    looked, missing = 0, 0
+    for k in np.flatnonzero(found.gain_margin > 1):
+        is_pole = np.isfinite(poles[k]) & (np.abs(poles[k]) > 0)
+        ratio = -poles[k][is_pole].real / np.abs(poles[k][is_pole])
+        for order in range(int(orders[k])):
+            mine = found.damping_ratio[k, order]
+            looked, missing = looked + 1, missing + int(np.isnan(mine))
+            assert np.isnan(mine) or np.abs(ratio - mine).min() < 1e-3 * mine
+    return 1 - missing / looked
+
+
+def test_damping_ratios_are_those_of_the_loops_poles():
+    assert check_damping(random_loops(40, 3)) > 0.98
+
+
+@pytest.mark.long
+def test_damping_ratios_of_five_hundred_random_loops():
+    assert check_damping(random_loops(500, 900)) > 0.99
+
+
+def test_damping_ratio_follows_the_modes():
+    """As the report of one run has it: the same modes, followed by eigenvalues."""
+    structure, case = build_structure(STUDY), as_arrays(build_case(STUDY))
+    wanted = loop_report(structure, case, HOME).damping_ratio[:3]
+    found = single_damping(STUDY)
+    np.testing.assert_allclose(found, wanted.min(axis=1), rtol=2e-3)
+    one = single_damping(STUDY.change(control__links=(False, True, False)))
+    assert np.all(np.abs(one / found - 1) < 0.3)  # of the link under control, not of the others
+    assert np.isnan(single_damping(STUDY.change(control__links=(False, False, False)))).all()
+
+
+def single_damping(study):
+    structure, case = build_structure(study), build_case(study)
+    found = judge_loops(structure, jax.tree.map(lambda x: np.asarray(x)[None], case))
+    return found.damping_ratio[0]
+
+
 def test_scan_gives_the_same_as_kernels(monkeypatch):
     loops = random_loops(8, 5)
     kernels = judge_loops(*loops)
-    monkeypatch.setattr(margins, "_has_kernels", lambda: False)
-    margins._runner.cache_clear()
+    monkeypatch.setattr(lanes, "_has_kernels", lambda: False)
+    lanes._runner.cache_clear()
     scanned = judge_loops(*loops)
-    margins._runner.cache_clear()
+    lanes._runner.cache_clear()
     for one, other in zip(kernels, scanned, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6)
 
@@ -118,7 +171,7 @@ def test_scan_gives_the_same_as_kernels(monkeypatch):
 def single(study):
     structure, case = build_structure(study), build_case(study)
     found = judge_loops(structure, jax.tree.map(lambda x: np.asarray(x)[None], case))
-    return jax.tree.map(lambda x: float(x[0]), found)
+    return jax.tree.map(lambda x: float(x[0]), found._replace(damping_ratio=None))
 
 
 def test_margins_are_those_of_single_runs():

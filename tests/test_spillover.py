@@ -494,7 +494,9 @@ def test_command_fails_a_design(capsys, monkeypatch, tmp_path):
     assert code == 1 and "failed by mode" in text and "unstable" in text
     assert "laws are not compared: not today" in text
     report = (out / "report.md").read_text()
-    assert report.startswith("# Spillover certificate failed by mode") and "## Laws" not in report
+    assert (
+        report.startswith("# Spillover certificate failed: gain margin") and "## Laws" not in report
+    )
     assert "| **no** |" in report and "- laws are not compared: not today" in report
     assert not json.loads((out / "certificate.json").read_text())["is_passed"]
 

@@ -85,7 +85,8 @@ def _head(found: Certificate) -> list[str]:
     elif found.fails_from:
         told += f" With fewer than {found.fails_from} plant modes a link all of them pass."
     return [
-        f"# Spillover certificate {verdict(found)}", "",
+        f"# Spillover certificate {'passed' if found.is_passed else 'failed'}: gain margin "
+        f"{margin_text(found.margin[at], 3)}, {found.required:g} required", "",
         *opening(
             f"is the controller of {literal(study.title) or 'the study'} safe on plants that it "
             f"does not know: {total} of them, a gain margin of {found.required:g} on each.",

@@ -332,9 +332,9 @@ def code_digest(more: Iterable[Path] = ()) -> str:
     names = (
         "cases.py", "fields.py", "spec.py", "stability.py", "kernels/cpu.py", "kernels/fusion.py",
         "kernels/gpu.py", "kernels/graph.py", "kernels/llvm.py", "kernels/traced.py",
-        "sweeps/chunks.py", "sweeps/executor.py", "sweeps/kernels.py", "sweeps/margins.py",
-        "sweeps/plan.py", "sweeps/program.py", "sweeps/scan.py", "sweeps/steps.py",
-        "sweeps/table.py",
+        "sweeps/chunks.py", "sweeps/damping.py", "sweeps/executor.py", "sweeps/kernels.py",
+        "sweeps/lanes.py", "sweeps/margins.py", "sweeps/plan.py", "sweeps/program.py",
+        "sweeps/scan.py", "sweeps/steps.py", "sweeps/table.py",
     )  # fmt: skip
     sources = sorted((_SOURCES / "jaxmodel").glob("*.py"))
     for path in (*sources, *(_SOURCES / "studies" / name for name in names), *more):

@@ -1,4 +1,4 @@
-"""Stability of every case of a chunk: gain margin, and what breaks beyond it.
+"""Stability of every case of a chunk: gain margin, what breaks beyond it, and damping.
 
 `jaxmodel.loci` says how. The steps run as traced kernels where there are any, else in XLA's scan:
 along the axis first; then between the two frequencies of each crossing, with more iterations; then
@@ -8,10 +8,8 @@ crossings side by side. Rests on `MARGIN_MODES` plant modes, at rest at the firs
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache, partial
-from threading import Lock
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -36,16 +34,10 @@ from jaxmodel.return_difference import (
     assembled_modes,
     loop_response,
 )
-from studies.config import processor
-from studies.kernels import cpu
-from studies.kernels.llvm import is_available
-from studies.kernels.traced import Leaf, TracedLoop, trace_loop
 from studies.stability import HIGHEST, with_margin_modes
-from studies.sweeps.plan import lane_unit
+from studies.sweeps.damping import damping_ratios
+from studies.sweeps.lanes import BLOCK, run_steps
 from studies.sweeps.steps import PREPARING
-
-#: Cases that are looked at together.
-BLOCK = 64
 
 
 class Walk(NamedTuple):
@@ -94,6 +86,7 @@ class LoopMargins(NamedTuple):
     gain_margin: np.ndarray  # largest factor on all gains with every smaller one stable [1]
     breaking_frequency: np.ndarray  # of what goes unstable there [Hz], NaN where nothing does
     breaking_mode: np.ndarray  # order of the nearest link mode, 0: the drive, NaN as before
+    damping_ratio: np.ndarray  # of the modes of each order under control, the least [1], (n, C)
 
 
 #: What `pinned_free` lacks: links that end on their chord.
@@ -109,7 +102,9 @@ def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
     """
     count = max(len(leaf) for leaf in jax.tree.leaves(cases))
     if structure.feedback != "sampled" or structure.basis not in KNOWN_BASES:
-        return LoopMargins(*(np.full(count, np.nan) for _ in LoopMargins._fields))
+        nothing = np.full(count, np.nan)
+        each = np.full((count, structure.n_controlled), np.nan)
+        return LoopMargins(nothing, nothing.copy(), nothing.copy(), each)
     structure, cases = with_margin_modes(structure, cases)
     whole = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
     with ThreadPoolExecutor(len(jax.local_devices())) as pool:
@@ -141,13 +136,16 @@ def _judge_block(
     structure: Structure, way: Walk, cases: Case, rows: np.ndarray
 ) -> tuple[LoopMargins, np.ndarray]:
     """Figures of some cases, at most a block, and of which the walk saw what is not there."""
+    n_links = np.sum(cases.control.link_mask[rows] > 0, axis=1)
     filled = rows[np.minimum(np.arange(BLOCK), len(rows) - 1)]  # one size, one compilation
     block = jax.tree.map(lambda x: x[filled], cases)
     with PREPARING:
         found = jax.tree.map(np.asarray, _respond(structure, block))
     response, modes = jax.tree.map(lambda x: x[..., : len(rows)], found)
     with np.errstate(all="ignore"):  # what is not finite finds no crossing
-        return _judged(response, modes, way)
+        margins, is_doubtful = _judged(response, modes, way)
+        ratio = damping_ratios(response, modes, n_links, structure.n_controlled)
+    return margins._replace(damping_ratio=ratio), is_doubtful
 
 
 # compiled in haste: it takes a fiftieth of the time
@@ -199,6 +197,7 @@ def _judged(
         np.where(is_finite, margin, np.nan),
         np.where(is_finite, np.abs(omega) / (2 * np.pi), np.nan),
         np.where(is_finite & breaks, order, np.nan),
+        np.empty(0),
     )
     return figures, is_doubtful & is_finite
 
@@ -325,7 +324,7 @@ def _walked(
 ) -> Loci:
     angle = omega * response.period
     inputs = Station(omega, np.cos(angle), np.sin(angle), kind)
-    return _run(_walk, (response, spread), inputs, start_walk(first), len(omega))
+    return run_steps(_walk, (response, spread), inputs, start_walk(first), len(omega))
 
 
 def _walk(constants: tuple[LoopResponse, Any], station: Station, loci: Loci) -> Loci:
@@ -334,95 +333,9 @@ def _walk(constants: tuple[LoopResponse, Any], station: Station, loci: Loci) -> 
 
 
 def _approached(response: LoopResponse, known: Known, guess: Meeting) -> Meeting:
-    return _run(_approach, (response, known), (), guess, NEWTON)
+    return run_steps(_approach, (response, known), (), guess, NEWTON)
 
 
 def _approach(constants: tuple[LoopResponse, Known], _: tuple, meeting: Meeting) -> Meeting:
     response, known = constants
     return approach(response, known, meeting)
-
-
-def _run(step: Callable[..., Any], constants: Any, inputs: Any, state: Any, n_steps: int) -> Any:
-    """Take all steps; arrays lanes last, those of inputs with the steps first."""
-    lanes = jax.tree.leaves(state)[0].shape[-1]
-    if lanes == 0:
-        return state
-    parts = [jax.tree.flatten(part) for part in (constants, inputs, state)]
-    varies = tuple(leaf.ndim > 1 for leaf in parts[1][0])
-    with _TRACING:
-        run = _runner(
-            step,
-            tuple(tree for _, tree in parts),
-            tuple(leaf.shape[:-1] for leaf in parts[0][0]),
-            varies,
-            tuple(leaf.shape[:-1] for leaf in parts[2][0]),
-        )
-    # whole vectors; whole blocks for XLA, which compiles for each size
-    more = -lanes % (lane_unit() if _has_kernels() else BLOCK)
-
-    def filled(x: Any, is_wide: bool = True) -> np.ndarray:
-        x = np.asarray(x)
-        if is_wide and more:
-            x = np.concatenate([x, np.repeat(x[..., -1:], more, axis=-1)], axis=-1)
-        return np.array(x, order="C", copy=True)
-
-    leaves = [
-        *map(filled, parts[0][0]),
-        *(filled(x, is_wide) for x, is_wide in zip(parts[1][0], varies, strict=True)),
-        *map(filled, parts[2][0]),
-    ]
-    last = run(leaves, n_steps, lanes + more)
-    return jax.tree.unflatten(parts[2][1], [x[..., :lanes] for x in last])
-
-
-#: One thread makes a kernel, others wait for it.
-_TRACING = Lock()
-
-
-def _has_kernels() -> bool:
-    return processor() == "cpu" and is_available()
-
-
-@lru_cache(maxsize=32)
-def _runner(
-    step: Callable[..., Any], trees: tuple, constants: tuple, varies: tuple, state: tuple
-) -> Callable[[list, int, int], list]:
-    """Runs the step on leaves of constants, inputs and state."""
-    sizes = len(constants), len(varies), len(state)
-
-    def flat(*parts: list) -> list:
-        return jax.tree.leaves(step(*map(jax.tree.unflatten, trees, parts)))
-
-    if _has_kernels():
-        real = jax.dtypes.canonicalize_dtype(np.float64)
-
-        def make() -> TracedLoop:
-            return trace_loop(
-                flat,
-                [Leaf(shape, True) for shape in constants],
-                [Leaf((), is_wide) for is_wide in varies],
-                [Leaf(shape, True) for shape in state],
-                real,
-            )
-
-        name = f"{step.__name__} {real} {trees[0]} {constants} {varies} {state}"
-        kernel = cpu.kept_kernel(name, make)
-
-        def run(leaves: list, n_steps: int, lanes: int) -> list:
-            kernel.run(leaves, n_steps, lanes)
-            return leaves[sizes[0] + sizes[1] :]
-
-        return run
-
-    @partial(jax.jit, static_argnums=3)
-    def scanned(constants: list, inputs: list, state: list, n_steps: int) -> list:
-        def body(at: list, row: list | None) -> tuple[list, None]:
-            return flat(constants, row or [], at), None
-
-        return jax.lax.scan(body, state, inputs or None, length=n_steps)[0]
-
-    def run_scan(leaves: list, n_steps: int, lanes: int) -> list:
-        given, inputs = leaves[: sizes[0]], leaves[sizes[0] : sizes[0] + sizes[1]]
-        return list(map(np.asarray, scanned(given, inputs, leaves[-sizes[2] :], n_steps)))
-
-    return run_scan

@@ -165,8 +165,8 @@ def _answer(data: SweepData, metric: str) -> tuple[str, str]:
     codes = data["status"]
     n_ok = int(np.sum(codes == status.OK))
     ended = f"{n_ok} of {_count(data.n_cases, 'case')} ended ok"
-    others = [f"{count} {name}" for name, count, _ in status_rows(data).rows if name != "ok"][:3]
-    told = f"{ended}{' (' + ', '.join(others) + ')' if others else ''}."
+    others = [f"{count}: {name}" for name, count, _ in status_rows(data).rows if name != "ok"][:3]
+    told = f"{ended}{' (' + '; '.join(others) + ')' if others else ''}."
     value = metric_values(data, metric)
     if not np.isfinite(value[codes == status.OK]).any():
         return told, "look at what the failures depend on, below, and at `studies show --failed`."

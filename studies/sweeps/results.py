@@ -72,8 +72,14 @@ _PER_CASE: dict[str, tuple] = {
     "breaking_mode": (
         (), "1", "order of the link mode nearest to that frequency, 0: the drive, NaN: nothing"
     ),
+    "damping_ratio": (
+        ("controlled_mode",), "1", "least of the modes of each order, of as many as links are "
+        "controlled, the most damped ones",
+    ),
 }  # fmt: skip
 
+#: Of these the smallest entry is the worst.
+LEAST = ("damping_ratio",)
 
 #: Metrics that single precision has within 1 %: `studies bench --work W1 --precision float32`
 #: prints the errors. Small vibration after a move is lost in the rounding of the pose.
@@ -147,6 +153,9 @@ def chunk_variables(
     known = {"status": code, "substeps": np.full(count, substeps), **margins}
     for name, (dims, *about) in _PER_CASE.items():
         data = known[name] if name in known else np.asarray(getattr(result, name))[:count]
+        if name in LEAST:
+            data = data.copy()
+            _forget(data, dims.index("controlled_mode"), controlled)
         variables[name] = Variable(data, ("case", *dims), *about)
     for name in kept:
         source = result if name == "energy_ratio" else result.metrics
@@ -401,11 +410,13 @@ def _of_axes(data: SweepData, name: str, named: list[tuple[str, str]]) -> np.nda
             raise StudyError(f"{name}[{axis}={written}]: allowed {allowed or 'no index'}")
         array = np.take(array, number - 1, axis=dims.index(axis))
         dims.remove(axis)
-    return _worst(data, array, tuple(dims))
+    return _worst(data, array, tuple(dims), name in LEAST)
 
 
-def _worst(data: SweepData, array: np.ndarray, dims: tuple[str, ...]) -> np.ndarray:
-    """Largest number of each case, of the links that count, (n,)."""
+def _worst(
+    data: SweepData, array: np.ndarray, dims: tuple[str, ...], is_least: bool = False
+) -> np.ndarray:
+    """Largest number of each case, or least, of the links that count, (n,)."""
     if array.ndim == 1:
         return array
     if array.dtype.kind == "f" and "link" in dims:
@@ -414,6 +425,8 @@ def _worst(data: SweepData, array: np.ndarray, dims: tuple[str, ...]) -> np.ndar
     flat = array.reshape(len(array), -1)
     if flat.dtype.kind != "f":
         return flat.max(axis=1)
+    if is_least:
+        return -_worst(data, -flat, ("case", "entry"))
     is_empty = np.all(np.isnan(flat), axis=1)
     return np.where(is_empty, np.nan, np.nanmax(np.where(np.isnan(flat), -np.inf, flat), axis=1))
 
@@ -453,7 +466,7 @@ def _entry(data: SweepData, name: str, indices: tuple[int, ...], candidate: str)
         array, dims = array[:, index], (dims[0], *dims[2:])
     if array.ndim > 1 and candidate not in (*metric_names(), *_PER_CASE):
         raise StudyError(f"{name!r}: a list; name one entry of it, such as {name}[0]")
-    return _worst(data, array, dims)
+    return _worst(data, array, dims, candidate in LEAST)
 
 
 def manifest_attributes(manifest: Mapping[str, Any]) -> dict[str, Any]:
