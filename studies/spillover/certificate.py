@@ -93,7 +93,7 @@ def certify(
         study: with sampled feedback.
         margin: gain margin that every plant must leave [1], above 1.
         bases: modal bases of the plant.
-        sizes: plant modes per link; empty: from the controlled ones to 10.
+        sizes: plant modes per link; empty: from the controlled ones to 12.
         departures: from what the controller believes; joints in basis "loaded" only.
 
     Raises:

@@ -59,7 +59,7 @@ def compare_laws(study: Study, margin: float = 2.0, sizes: tuple[int, ...] = ())
     Args:
         study: the design, with sampled feedback.
         margin: gain margin that the factors leave [1].
-        sizes: plant modes per link; empty: from the controlled ones to 10.
+        sizes: plant modes per link; empty: from the controlled ones to 12.
 
     Raises:
         StudyError: as `certify`, or a design that does not damp mode 1.

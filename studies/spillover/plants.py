@@ -22,10 +22,10 @@ from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
 from studies.errors import field_error
 from studies.export.controller import FixedController
-from studies.stability import link_poles
+from studies.stability import MARGIN_MODES, link_poles
 
 #: Plant modes per link at most.
-LARGEST = 10
+LARGEST = MARGIN_MODES
 #: The only basis with rotary inertia at the joints.
 WITH_JOINTS = "loaded"
 
