@@ -58,7 +58,7 @@ def check_consistency(study: Study) -> None:
             "1",
         )
     _check_lists(study)
-    if link.basis != "loaded" and np.any([link.joint_inertia_b, link.joint_inertia_c]):
+    if link.basis != "loaded" and any(map(np.any, (link.joint_inertia_b, link.joint_inertia_c))):
         raise field_error("link.basis", link.basis, "loaded, where a joint has rotary inertia")
     if study.drive.locked and link.basis == "pinned_free":
         raise field_error(

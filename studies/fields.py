@@ -20,7 +20,7 @@ Columns = Mapping[str, np.ndarray]
 #: An index that names its axis and counts from 1, as the files do: `residual_rms[link=1]`.
 NAMED_INDEX = re.compile(r"\[(\w+)=(\d{1,6})\]")
 LINKS = 3
-_ENTRY = re.compile(r"(?P<field>[^\s\[\]]+)(?P<indices>(\[\d{1,6}\])*)")
+_ENTRY = re.compile(r"(?P<field>[^\s\[\]]+)(?P<indices>(\[(0|[1-9]\d{0,5})\])*)")
 
 
 class Entry(NamedTuple):

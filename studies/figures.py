@@ -14,6 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from studies.store import replacing
 
@@ -74,6 +75,20 @@ def write_figure(figure: Figure, path: Path) -> None:
     """Write the figure in the format of its file's ending; errors as `save`."""
     with replacing(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:])
+
+
+def log_scale(ax: Axes, which: str) -> None:
+    """Make an axis, "x" or "y", logarithmic, with plain numbers, few enough to read."""
+    ax.set(**{f"{which}scale": "log"})
+    axis = ax.xaxis if which == "x" else ax.yaxis
+    low, high = sorted(axis.get_view_interval())
+    decades = np.log10(high / low)
+    if decades < 0.6:
+        axis.set_major_locator(MaxNLocator(6))
+    elif decades < 4:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < 2.5 else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.3g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def axes_or_new(ax: Axes | None) -> Axes:

@@ -58,7 +58,7 @@ def machine_modes(study: Study | None = None, **changes: Any) -> NaturalModes:
     structure, case = build_structure(study), as_arrays(build_case(study))
     where = study.motion.waypoints[0]
     code, lifts, plant = _at_pose(structure, case, np.array(where))
-    check_pose("pose", where, int(code), np.asarray(lifts))
+    check_pose(study, "pose", where, int(code), np.asarray(lifts))
     found = natural_modes(plant)
     if study.drive.locked:  # the three coordinates that the sliders hold are no modes
         found = NaturalModes(found.frequency[3:], found.damping_ratio[3:], found.shape[:, 3:])

@@ -211,7 +211,7 @@ def check_run(study: Study) -> tuple[Structure, Case]:
     structure = structure._replace(substeps=_drive_substeps(study, structure, case))
     known = preflight(structure, case)
     for k, pose in enumerate(study.motion.waypoints):
-        check_pose(f"motion.waypoints.{k}", pose, int(known.pose_status[k]), known.lift[k])
+        check_pose(study, f"motion.waypoints.{k}", pose, int(known.pose_status[k]), known.lift[k])
     if int(known.path_status) != status.OK:
         x, y, phi = known.path_pose
         raise field_error(
@@ -226,9 +226,9 @@ def check_run(study: Study) -> tuple[Structure, Case]:
     if is_modal and known.condition > study.metrics.condition_limit:
         raise field_error(
             "patches.centers", study.patches.centers,
-            f"a placement whose modal filter for control.modes = {study.control.modes} has a "
-            f"condition number up to metrics.condition_limit = {study.metrics.condition_limit:g}; "
-            f"it is {known.condition:.3g}", "m",
+            f"a placement whose modal filter for control.modes = {study.control.modes} has on each "
+            f"link a condition number up to metrics.condition_limit = "
+            f"{study.metrics.condition_limit:g}; the largest is {known.condition:.3g}", "1",
         )  # fmt: skip
     _check_rates(study, structure, known)
     if structure.feedback == "ideal":
@@ -236,10 +236,13 @@ def check_run(study: Study) -> tuple[Structure, Case]:
     return structure, case
 
 
-def check_pose(field: str, pose: tuple[float, float, float], code: int, lifts: np.ndarray) -> None:
+def check_pose(
+    study: Study, field: str, pose: tuple[float, float, float], code: int, lifts: np.ndarray
+) -> None:
     """Refuse a pose that no link can reach, or where a link is parallel or square to its guide.
 
     Args:
+        study: whose machine it is.
         field: name for the message.
         pose: (x, y, phi) [m, m, rad].
         code: its status.
@@ -250,17 +253,23 @@ def check_pose(field: str, pose: tuple[float, float, float], code: int, lifts: n
     """
     if code == status.OK:
         return
-    margin = SINGULAR_MARGIN
+    lengths = each_link(study.link.length)
     wrong = [
-        f"the joint of link {i + 1} is {x:.3g} link lengths inside its guide"
-        for i, x in enumerate(lifts)
-        if not margin <= x < np.sqrt(1 - margin**2)
+        f"link {i + 1} is {length:.4g} m long, its joint lies {x * length:.4g} m inside its guide"
+        for i, (x, length) in enumerate(zip(lifts, lengths, strict=True))
+        if not SINGULAR_MARGIN <= x < np.sqrt(1 - SINGULAR_MARGIN**2)
     ]
-    allowed = "every link angle gamma is inside (0, 90) deg"
+    if not wrong:
+        raise field_error(
+            field, pose,
+            "a pose where the lines of the links do not meet in one point "
+            f"(here: {status.REASONS[code]})", "m, m, rad",
+        )  # fmt: skip
     raise field_error(
         field, pose,
-        f"a pose where {allowed if wrong else 'the lines of the links do not meet in one point'} "
-        f"(here: {': '.join([status.REASONS[code], *wrong[:1]])})", "m, m, rad",
+        "a pose where the joint of each link lies inside its guide by more than 0 and less than "
+        f"link.length, so that gamma is inside (0, 90) deg (here: {status.REASONS[code]}; "
+        f"{wrong[0]}; machine.guide_offsets moves it)", "m, m, rad",
     )  # fmt: skip
 
 

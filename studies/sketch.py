@@ -16,7 +16,8 @@ from studies.spec import Study
 ON, OFF, PATCH = figures.SERIES[0], "#888888", figures.SERIES[1]
 CAPTION = (
     "The machine at its first way-point; blue: links under control, grey: the others, orange: "
-    "patches, red: the path of the platform's reference point, enlarged where it is short"
+    "patches, red: the path of the platform's reference point, enlarged where it is short, black "
+    "cross: a payload's centre of mass"
 )
 #: The path is drawn at least this long, as a share of the guides' side.
 SHORTEST_PATH = 0.08

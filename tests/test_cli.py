@@ -214,7 +214,7 @@ def test_modes_of_a_study_are_those_of_its_own_machine(capsys, tmp_path):
         (("--pose", "nan", 0, 0.5), "= nan: allowed a finite number"),
         (
             ("--modes", 2, "--pose", 0.5, 0, 0.5),
-            "inside (0, 90) deg (here: pose out of reach: the joint of link",
+            "inside (0, 90) deg (here: pose out of reach; link 1 is 0.2 m long",
         ),
         (("--modes", 2, "--pose", 0.09526, 0.055, -1.047), "(here: singular pose: a link parallel"),
         (("--poze", 1, 2, 3), "No such option: --poze (Possible options:"),

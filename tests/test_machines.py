@@ -14,16 +14,19 @@ from jaxmodel.parameters import HOME
 from jaxmodel.plant import build_plant
 from studies import cli
 from studies.bench import reference
-from studies.cases import as_arrays, build_case
+from studies.cases import as_arrays, build_case, build_cases, build_structure
 from studies.errors import StudyError
 from studies.fields import field_value
 from studies.figures import styled
 from studies.runs import check_run, run_study
 from studies.sketch import sketch, standing
 from studies.spec import EACH_LINK, load_study, parse_study
-from studies.sweeps.results import load
+from studies.sweeps.plots import plot
+from studies.sweeps.results import load, metric_values
 from studies.sweeps.run import run_sweep
+from studies.sweeps.show import axis_rows, select, written_name
 from studies.sweeps.spec import parse_sweep
+from studies.sweeps.table import build_table
 from studies.template import study_template
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import parse_tuning
@@ -138,6 +141,43 @@ def test_entries_of_one_number_for_all_links_are_swept(tmp_path):
     )
 
 
+def test_what_differs_between_links_has_no_value_as_a_whole(tmp_path):
+    """Nor does a condition or an axis of that name mean anything."""
+    axes = {"link.thickness[1]": [2.0e-3, 2.2e-3], "control.gain_factor": [0.1, 0.2]}
+    spec = parse_sweep(sections(parse_study(SHORT)) | {"sweep": {"axes": axes}})
+    run_sweep(spec, tmp_path, is_quiet=True)
+    data = load(tmp_path)
+    for ask in (
+        lambda: metric_values(data, "link.thickness"),
+        lambda: select(data, "link.thickness > 0.0021"),
+        lambda: plot(data, "link.thickness", "residual_rms", None),
+    ):
+        with pytest.raises(StudyError, match=r"differs between links here; name one, such as"):
+            ask()
+    assert metric_values(data, "link.thickness[1]").tolist() == [2.0e-3] * 2 + [2.2e-3] * 2
+    assert metric_values(data, "link.thickness[0]").tolist() == [2.0e-3] * 4
+    assert written_name(data, "link_thickness_1") == "link.thickness[1]"
+
+
+@pytest.mark.parametrize(
+    "change", [{"link__joint_inertia_b": (0.0, 0.0, 0.0)}, {"link__joint_inertia_c": 0.0}]
+)
+def test_joints_without_inertia_need_no_basis_of_their_own(change):
+    parse_study({}).change(**change)
+    with pytest.raises(StudyError, match="allowed loaded, where a joint has rotary inertia"):
+        parse_study({}).change(link__joint_inertia_b=(0.0, 1e-4, 0.0))
+
+
+def test_angles_of_joints_may_be_swept_with_the_assemblys_own():
+    study = parse_study(SHORT)
+    axes = {"machine.joint_angles_deg": [[], [90.0, 210.0, 330.0], [92.0, 210.0, 330.0]]}
+    table = build_table(parse_sweep(sections(study) | {"sweep": {"axes": axes}}))
+    assert [row[2] for row in axis_rows(table).rows] == ["3"]
+    angle = build_cases(study, table.fields, build_structure(study)).machine.geometry.joint_angle
+    np.testing.assert_allclose(angle[0], angle[1], atol=1e-12)
+    assert angle[2, 0] > angle[1, 0]
+
+
 def tune(study, folder):
     """A few iterations of gain and placement."""
     free = {
@@ -218,8 +258,8 @@ IN_LINE = (0.6 / np.sqrt(12) + 0.06) / np.sin(np.pi / 3)
 @pytest.mark.parametrize(
     "change, words",
     [
-        ({"machine__guide_offsets": (0.0, 0.05, 0.0)}, "the joint of link 2 is 1.12 link lengths"),
-        ({"machine__guide_offsets": (0.0, 0.0, -0.2)}, "the joint of link 3 is -0.134 link"),
+        ({"machine__guide_offsets": (0.0, 0.05, 0.0)}, "its joint lies 0.2232 m inside"),
+        ({"machine__guide_offsets": (0.0, 0.0, -0.2)}, "its joint lies -0.0"),
         (
             {"machine__joint_angles_deg": (150.0, 270.0, 30.0), "link__length": IN_LINE},
             "do not meet in one point",

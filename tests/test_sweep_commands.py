@@ -112,7 +112,7 @@ def check_report(folder):
     value = np.where(safe, np.nanmax(data["residual_rms"], axis=(1, 2)), np.inf)
     first = f"Best: case {np.argmin(value)} with {1e6 * value.min():.4g} µm"
     head = text.partition("## ")[0]
-    assert first in head and "40 cases of control_gain_factor, drive_kp, patches_cent" in head
+    assert first in head and "40 cases of control.gain_factor, drive.kp, patches.cent" in head
     best = text.partition("## Best cases by residual_rms")[2].partition("\n## ")[0]
     rows = [int(k) for k in re.findall(r"(?m)^\| (\d+) ", best)]
     assert rows == np.argsort(value, kind="stable")[: min(count, 10)].tolist()

@@ -115,6 +115,8 @@ def deep(n):
         ({"free": {"poles.decay": {"from": 1.0, "to": 2.0}}}, "needs poles.frequency_hz beside it"),
         ({"free": {**GAIN, "control.velocity_gain": {"from": 1.0, "to": 100.0},
                    "control.velocity_gain[0]": {"from": 1.0, "to": 100.0}}}, "free twice"),
+        ({"free": {"link.thickness": {"from": 1e-3, "to": 3e-3},
+                   "link.thickness[0]": {"from": 1e-3, "to": 3e-3}}}, "free twice"),
         ({"free": {"placement": {"from": 0, "to": 1}}}, "allowed {kind = 'same'}"),
         ({"free": GAIN, "objective": {"residual": 1.0}}, "did you mean 'residual_rms'"),
         ({"free": GAIN, "objective": {"residual_rms": -1.0}}, "allowed a number > 0"),
@@ -198,6 +200,17 @@ def test_what_all_runs_share_is_no_column():
     assert list(lane_columns(spec, scenario_columns(spec, 2, 0), designs)) == ["run.seed"]
     fresh = lane_columns(spec, scenario_columns(spec, 1, 0, is_fresh=True), designs)
     assert (fresh["run.seed"] != spec.study.run.seed).all()
+
+
+def test_moves_may_have_unequal_paths():
+    home = SMALL["motion"]["waypoints"][0]
+    paths = [[home, [0.0, 0.005, home[2]]], [home, [0.002, 0.0, home[2]], home]]
+    data = {**SMALL, "run": {"duration": 0.1}}
+    spec = parse_tuning(
+        {**data, "tune": {"free": GAIN, "scenarios": {"each": {"motion.waypoints": paths}}}}
+    )
+    lanes = lane_columns(spec, scenario_columns(spec, 1, 0), [None, spec.families[0]])
+    assert [len(path) for path in lanes["motion.waypoints"]] == [2, 3, 2, 3]
 
 
 def test_ready_tunings_are_valid():

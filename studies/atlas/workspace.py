@@ -87,7 +87,7 @@ def natural_modes_at(study: Study, poses: Any) -> PoseModes:
     poses = np.asarray(poses, float)
     codes, _, lifts = map(np.asarray, _stand(structure, case, poses))
     for pose, code, heights in zip(poses, codes, lifts, strict=True):
-        check_pose("pose", tuple(pose.tolist()), int(code), heights)
+        check_pose(study, "pose", tuple(pose.tolist()), int(code), heights)
     return _solve(structure, case, poses)
 
 

@@ -110,7 +110,7 @@ def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
     motion it is at all, a link's, the drive's or a filter's, participation factors tell,
     products of entries of left and right eigenvector (Perez-Arriaga, Verghese and Schweppe 1982):
     what leaves the unit circle can be a filter's pole, fed through by a mode that is far stiffer
-    and merely follows. The frequency of a mode is that without control.
+    and merely follows. The frequency is that of these modes of these links, their ends held.
 
     Args:
         loop: the loop.
@@ -127,10 +127,9 @@ def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
         return f"drive of the sliders ({hertz:.0f} Hz)"
     q, q_rate = np.abs(right[6:last].reshape(2, 3, r))
     energy = (loop.omega * q) ** 2 + q_rate**2
-    modes = _leading(energy.sum(axis=0))
-    known = [*loop.mode_poles, *loop.omega.T[len(loop.mode_poles) :]]
-    own = ", ".join(f"{np.abs(known[j]).mean() / (2 * np.pi):.0f}" for j in modes)
-    text = f"{_listed('mode', modes)} of {_listed('link', _leading(energy.sum(axis=1)))} ({own} Hz)"
+    modes, moving = _leading(energy.sum(axis=0)), _leading(energy.sum(axis=1))
+    own = ", ".join(f"{loop.omega[moving, j].mean() / (2 * np.pi):.0f}" for j in modes)
+    text = f"{_listed('mode', modes)} of {_listed('link', moving)} ({own} Hz)"
     if links > filters:
         return text
     return f"{text}, " + (f"through a filter at {hertz:.0f} Hz" if hertz >= 1 else "statically")

@@ -126,7 +126,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     @app.command()
     def plot(
         folder: Folder,
-        y: Annotated[str, typer.Option(help="metric or axis")] = "residual_rms",
+        y: Annotated[
+            str | None, typer.Option(help="metric or axis; none: what the sweep ranks by")
+        ] = None,
         x: Annotated[str | None, typer.Option(help="axis or metric; none: all axes")] = None,
         hue: Annotated[str | None, typer.Option(help="axis or metric for the colour")] = None,
         out: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG; default: folder")] = None,
@@ -136,11 +138,12 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.sweeps.plots import plot as draw
         from studies.sweeps.plots import save_plot
         from studies.sweeps.results import load, variable_name
-        from studies.sweeps.show import tell_left_out
+        from studies.sweeps.show import ranking, tell_left_out
 
+        data = load(folder)
+        y = y or ranking(data)
         names = [variable_name(name) for name in (y, x, hue) if name]
         path = out or folder / f"{'-over-'.join(names[:2])}{'-by-' + names[2] if hue else ''}.png"
-        data = load(folder)
         save_plot(draw(data, x, y, hue), path)
         tell_left_out(data, console)
         console.print(f"written: {path}", soft_wrap=True)

@@ -63,6 +63,12 @@ def plot(data: SweepData, x: str | None, y: str, hue: str | None) -> Figure:
         if "patches_centers" in data.variables and data["patches_centers"].ndim == 2:
             return _placements(data, y)
         return _parallel(data, y, chosen)
+    for option, name in (("--x", x), ("--hue", hue)):
+        there = metric_values(data, name) if name is not None else value
+        if there.dtype.kind == "f":
+            chosen = chosen & np.isfinite(there)
+        if not chosen.any():
+            raise StudyError(f"{option} {name}: no case of status ok has it")
     across = shown_metric(data, x)[chosen]
     group = None if hue is None else shown_metric(data, hue)[chosen]
     shown = shown_metric(data, y)[chosen]
@@ -82,7 +88,8 @@ def plot(data: SweepData, x: str | None, y: str, hue: str | None) -> Figure:
             best = np.isin(np.flatnonzero(chosen), recommended(data, y))
             hue_label = "" if hue is None else label(data, hue)
             _points(figure, ax, across, shown, group, hue_label, best)
-            ax.set_xscale("log" if is_log(data, x) or _is_wide(across) else "linear")
+            if is_log(data, x) or _is_wide(across):
+                figures.log_scale(ax, "x")
             if x == MARGIN:
                 ax.axvline(ENOUGH, color="black", linewidth=0.8, linestyle=":")
     return figure
@@ -152,7 +159,8 @@ def is_log(data: SweepData, name: str) -> bool:
 def _scale_ordinate(ax: Axes, value: np.ndarray) -> None:
     """Logarithmic for wide values; limits that a few outliers do not set."""
     is_wide = _is_wide(value)
-    ax.set_yscale("log" if is_wide else "linear")
+    if is_wide:
+        figures.log_scale(ax, "y")
     if len(value) < MANY:
         return
     shape = np.log(value) if is_wide else value
@@ -217,8 +225,9 @@ def _heat_map(
     )
     several = "median of " if len(value) > len(numbers) else ""
     figure.colorbar(mesh, ax=ax, label=several + text)
-    ax.set_xscale("log" if _is_geometric(columns) else "linear")
-    ax.set_yscale("log" if _is_geometric(rows) else "linear")
+    for which, middles in (("x", columns), ("y", rows)):
+        if _is_geometric(middles):
+            figures.log_scale(ax, which)
     ax.grid(False)
 
 
@@ -279,9 +288,10 @@ def _lines(
             ax.set_xticks(range(len(wanted)), [str(v) for v in wanted], rotation=30, ha="right")
     if group is not None:
         ax.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    ax.set_yscale("log" if _is_wide(value) else "linear")
+    if _is_wide(value):
+        figures.log_scale(ax, "y")
     if _is_geometric(np.unique(across)):
-        ax.set_xscale("log")
+        figures.log_scale(ax, "x")
 
 
 def _distinct(values: np.ndarray) -> list[Any]:

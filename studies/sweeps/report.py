@@ -40,6 +40,7 @@ from studies.sweeps.show import (
     shown_value,
     status_rows,
     unit_of_metric,
+    written_name,
 )
 from studies.sweeps.spec import Node
 from studies.sweeps.table import Table, build_table, case_study
@@ -47,6 +48,8 @@ from studies.template import study_template, toml_text, toml_value
 from studies.units import readable
 
 REPORT, FIGURE, FRONT, MACHINE = "report.html", "cases.png", "front.png", "machine.png"
+#: Metrics to ask as well.
+OTHERS = ("settling_time", "peak_voltage")
 #: The best cases are as good as one where they differ by less than this share.
 ALIKE = 0.02
 #: More listed values of an axis are not spelt out.
@@ -153,7 +156,7 @@ def _figure(name: str, caption: str, drawn: list[str]) -> list[str]:
 
 
 def _asked(data: SweepData, cases: Table, metric: str) -> str:
-    axes = literal(", ".join(swept_names(data)))
+    axes = literal(", ".join(written_name(data, name) for name in swept_names(data)))
     return (
         f"{_count(len(cases), 'case')} of {axes or 'a list'}, ranked by {metric} "
         f"(smallest first; {counted_text(data, metric)})."
@@ -173,13 +176,16 @@ def _answer(data: SweepData, metric: str) -> tuple[str, str]:
     best = recommended(data, metric)
     first, shown = int(best[0]), shown_metric(data, metric)
     unit = readable(unit_of_metric(data, metric))[1]
-    names = ", ".join(f"{name} = {shown_value(data, name, first)}" for name in swept_names(data))
+    names = ", ".join(
+        f"{written_name(data, name)} = {shown_value(data, name, first)}"
+        for name in swept_names(data)
+    )
     told += f" Best: case {first} with {shown[first]:.4g} {unit} ({literal(names)})"
     safe = MARGIN in data.variables and np.isfinite(data[MARGIN][first])
     if safe:
         told += f", gain margin {margin_text(data[MARGIN][first])}"
     others_ok = shown[(codes == status.OK) & np.isfinite(shown)]
-    told += f"; half of all cases have {np.median(others_ok):.4g} {unit} or more."
+    told += f"; half of the ok cases have {np.median(others_ok):.4g} {unit} or more."
     spread = float(np.ptp(shown[best]) / max(abs(shown[first]), 1e-300))
     if len(best) > 3 and spread < ALIKE:
         told += (
@@ -189,11 +195,16 @@ def _answer(data: SweepData, metric: str) -> tuple[str, str]:
     warning = margin_warning(data, best) if safe else ""
     if warning:
         told += f" **{literal(warning)}**"
-    condition = f' --subject-to "{MARGIN} > {ENOUGH:g}"' if safe else ""
+    condition = ""
+    if safe and data[MARGIN][first] >= ENOUGH:
+        condition = f' --subject-to "{MARGIN} >= {ENOUGH:g}"'
+    others = [x for x in OTHERS if x in data.variables and x != metric.partition("[")[0]]
+    rivals = " or ".join(f"`--by {name}`" for name in others)
+    rank = f"; before acting on it, see whether another metric ranks alike ({rivals})"
     return told, (
-        f"`studies best DIR --by {metric}{condition}` for more of them, `studies replay DIR --case "
-        f"{first} --out run.h5 --report` for the trajectories of the best; before acting on it, "
-        "see whether another metric ranks alike (`--by settling_time`, `--by peak_voltage`)."
+        f'`studies best DIR --by "{metric}"{condition}` for more of them, `studies replay DIR '
+        f"--case {first} --out run.h5 --report` for the trajectories of the best"
+        f"{rank if others else ''}."
     )
 
 

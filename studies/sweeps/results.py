@@ -384,6 +384,9 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
         if candidate in variables and variables[candidate].dims[:1] == ("case",):
             return _entry(data, name, entry.indices if entry else (), candidate)
     if "." in key:
+        swept = build_table(data.spec).columns
+        if name == key and any(column.startswith(f"{key}[") for column in swept):
+            raise StudyError(f"{key}: differs between links here; name one, such as {key}[0]")
         value = known_field(name, data.spec.study)
         if isinstance(value, tuple):
             raise StudyError(f"{name}: a list; name one entry of it, such as {name}[0]")

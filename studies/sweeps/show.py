@@ -15,7 +15,7 @@ from studies.entries import links_text
 from studies.errors import StudyError
 from studies.fields import parse_entry
 from studies.runs import check_run
-from studies.stability import ENOUGH
+from studies.stability import ENOUGH, margin_text
 from studies.sweeps.condition import evaluate
 from studies.sweeps.plan import peak_memory
 from studies.sweeps.results import (
@@ -32,7 +32,7 @@ from studies.sweeps.results import (
 )
 from studies.sweeps.run import Plan, calibrate
 from studies.sweeps.sensitivity import failure_causes
-from studies.sweeps.table import Table, case_study
+from studies.sweeps.table import Table, build_table, case_study
 from studies.units import headed, readable
 
 #: Stands beside every metric of a case that has it.
@@ -112,8 +112,11 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
     _print(status_rows(data), console)
     by = ranking(data)
     if np.isfinite(metric_values(data, by)[codes == status.OK]).any():
-        console.print(f"best cases by {by}, {counted_text(data, by)}:")
-        print_cases(data, best_cases(data, by), [by], console)
+        best = recommended(data, by)
+        is_safe = not margin_warning(data, best) and MARGIN in data.variables
+        safe = f", gain margin {ENOUGH:g} or more" if is_safe else ""
+        console.print(f"best cases by {by}, {counted_text(data, by)}{safe}:")
+        print_cases(data, best, [by], console)
 
 
 def status_rows(data: SweepData) -> Rows:
@@ -172,9 +175,19 @@ def case_rows(data: SweepData, cases: np.ndarray, metrics: list[str]) -> Rows:
     rows = []
     for k in cases:
         cells = [shown_value(data, name, k) for name in names]
-        numbers = (f"{column[k]:.4g}" for column in columns)
+        numbers = (
+            margin_text(column[k]) if name == MARGIN else f"{column[k]:.4g}"
+            for name, column in zip(metrics, columns, strict=True)
+        )
         rows.append([str(k), short_id(data, k), *cells, *numbers])
-    return Rows(["case", "id", *names, *(label(data, name) for name in metrics)], rows)
+    heads = [*(written_name(data, name) for name in names), *(label(data, x) for x in metrics)]
+    return Rows(["case", "id", *heads], rows)
+
+
+def written_name(data: SweepData, name: str) -> str:
+    """An axis as the sweep's file writes it: `link.thickness[1]`, not `link_thickness_1`."""
+    columns = build_table(data.spec).columns
+    return next((column for column in columns if variable_name(column) == name), name)
 
 
 def short_id(data: SweepData, case: int) -> str:
@@ -305,7 +318,7 @@ def axis_rows(table: Table) -> Rows:
         unit = field_unit(entry.field if entry else name)
         is_numeric = column.dtype.kind in "fi"
         ends = [f"{column.min():.4g}", f"{column.max():.4g}"] if is_numeric else ["", ""]
-        rows.append([name, unit, str(len(np.unique(column.astype(str), axis=0))), *ends])
+        rows.append([name, unit, str(len({str(value) for value in column.tolist()})), *ends])
     return Rows(["axis", "unit", "values", "smallest", "largest"], rows)
 
 

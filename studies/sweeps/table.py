@@ -173,6 +173,8 @@ def case_study(table: Table, index: int) -> Study:
     """
     data = loose_study(table, index).model_dump()
     data["run"]["seed"] = int(table.seed[index])
+    modes = data["control"]["modes"]  # a mask of all cases may name more than this one has
+    data["control"]["mode_mask"] = tuple(row[:modes] for row in data["control"]["mode_mask"])
     data["title"] = f"{table.study.title}: case {table.case_id[index].decode()}"[:200]
     return parse_study(data)
 

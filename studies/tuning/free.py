@@ -179,7 +179,9 @@ def _check_twice(numbers: list[Free]) -> None:
     names = [number.name for number in numbers]
     ready = [key for key in DECIDED if any(number.key == key for number in numbers)]
     for k, (name, _, _, own_key) in enumerate(numbers):
-        if name in names[:k]:
+        if name in names[:k] or any(
+            name.startswith(f"{other}[") or other.startswith(f"{name}[") for other in names[:k]
+        ):
             raise StudyError(f"tune.free.{name}: free twice")
         for key in ready:
             if own_key not in DECIDED and own_key.startswith(DECIDED[key]):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from studies import figures
 from studies.sweeps.results import metric_label
@@ -36,7 +36,7 @@ def descent(spec: TuneSpec, found: Findings) -> Figure:
                 iteration, lowest, color=color, linestyle=dash, linewidth=1.6, label=family.name
             )
         ax.set(xlabel="iteration", ylabel=OBJECTIVE, xlim=(0.5, len(best) + 0.5))
-        _ratio_scale(ax, "y")
+        figures.log_scale(ax, "y")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         figure.legend(loc="outside right upper")
     return figure
@@ -62,7 +62,7 @@ def gains(spec: TuneSpec, found: Findings) -> Figure:
                 )  # fmt: skip
             ax.axvline(1.0, color="black", linewidth=0.8)
             ax.set(xlabel=OBJECTIVE, title=move_label(move), ylim=(rows - 0.4, -0.6))
-            _ratio_scale(ax, "x")
+            figures.log_scale(ax, "x")
         axes[0].set_yticks(range(rows), [family.name for family in spec.families])
         figures.legend_above(figure, axes[0])
     return figure
@@ -123,20 +123,9 @@ def front(spec: TuneSpec, found: Findings, limit: str) -> Figure:
         for value in sorted(x for x in limits if isinstance(x, float)):
             ax.axvline(value, color="black", linewidth=0.8, linestyle=":", label="limit")
         ax.set(xlabel=_label(limit), ylabel=OBJECTIVE)
-        _ratio_scale(ax, "y")
+        figures.log_scale(ax, "y")
         figure.legend(loc="outside right upper")
     return figure
-
-
-def _ratio_scale(ax: Axes, which: str) -> None:
-    """Logarithmic, with plain numbers, few enough to read."""
-    ax.set(**{f"{which}scale": "log"})
-    axis = ax.xaxis if which == "x" else ax.yaxis
-    low, high = sorted(axis.get_view_interval())
-    is_wide = high / low > 4
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)) if is_wide else MaxNLocator(6))
-    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.3g}"))
-    axis.set_minor_formatter(NullFormatter())
 
 
 def _label(metric: str) -> str:

@@ -86,7 +86,7 @@ def _asked(spec: TuneSpec, found: Findings) -> str:
     ]
     at, scenarios = found.at, spec.tune.scenarios
     return (
-        f"the least {goals} of {links_text(spec.counted_links)}"
+        f"the least {goals}{_of_links(spec)}"
         + (f" with {', '.join(limits)}" if limits else "")
         + f"; {_count(len(spec.free.numbers), 'free number')} in "
         f"{_count(len(spec.moving), 'family')}, {_count(len(at.family), 'start')}, "
@@ -94,6 +94,12 @@ def _asked(spec: TuneSpec, found: Findings) -> str:
         f"{ended(spec, at)}"
         + (f" {at.is_frozen.sum()} starts were frozen." if at.is_frozen.any() else "")
     )
+
+
+def _of_links(spec: TuneSpec) -> str:
+    if all(parse_entries(name).names_a_link for name in spec.tune.objective):
+        return ""
+    return f" of {links_text(spec.counted_links)}"
 
 
 def ended(spec: TuneSpec, at: Progress) -> str:
@@ -247,6 +253,19 @@ def _weighing(spec: TuneSpec) -> str:
     )
 
 
+def _machines(spec: TuneSpec) -> str:
+    count = _count(spec.tune.scenarios.check, "machine")
+    if not spec.tune.scenarios.spread:
+        return (
+            f"{count} for each move with noise of their own, the real converters and limits; "
+            "`tune.scenarios.spread` is empty, so all are the study's own machine."
+        )
+    return (
+        f"{count} for each move, none of which the tuning has seen (`scenario_...` in `tune.h5`), "
+        "with the real converters and limits."
+    )
+
+
 def _fresh(spec: TuneSpec, found: Findings) -> list[str]:
     names, heads = _columns(spec, found)
     rows = []
@@ -261,9 +280,8 @@ def _fresh(spec: TuneSpec, found: Findings) -> list[str]:
         )
     return [
         "## On fresh machines", "",
-        f"{_count(spec.tune.scenarios.check, 'machine')} for each move, none of which the tuning "
-        "has seen (`scenario_...` in `tune.h5`), with the real converters and limits. Metrics: the "
-        "largest value as above, on the worst of all machines and moves.", "",
+        f"{_machines(spec)} Metrics: the largest value as above, on the worst of all machines and "
+        "moves.", "",
         *table(("design", "objective, mean", "objective, worst", *heads, "statuses"), rows), "",
     ]  # fmt: skip
 
@@ -366,16 +384,17 @@ def _numbers(spec: TuneSpec, found: Findings) -> list[str]:
 
 def _centers(spec: TuneSpec, places: list[np.ndarray]) -> list[str]:
     """Where the patches are, which shares of the room that is left do not tell."""
-    lines = ["| design | centres of the patches [mm] |", "|---|---|"]
+    lines = []
     own = spec.moving[0]._replace(columns={}), np.full(len(spec.free.numbers), np.nan)
     designs = [("the study itself", *own)]
     for family, place in zip(spec.moving, places, strict=True):
         designs.append((family.name, family, spec.free.values(place)))
     for name, family, values in designs:
-        rows = np.unique(1e3 * patch_centers(spec, family, values), axis=0)
-        text = "; ".join(", ".join(f"{x:.1f}" for x in row) for row in rows)
-        lines.append(f"| {name} | {text} |")
-    return [*lines, ""]
+        centers = 1e3 * patch_centers(spec, family, values)
+        cells = [", ".join(f"{x:.1f}" for x in row) for row in centers]
+        lines.append([name, *cells])
+    heads = [f"centres on link {i + 1} [mm]" for i in range(3)]
+    return [*table(("design", *heads), lines), ""]
 
 
 def _alike(at: Progress, family: int) -> np.ndarray:
@@ -427,8 +446,10 @@ def _fidelity(spec: TuneSpec, found: Findings) -> list[str]:
     ratio = np.percentile(a / b, [5, 50, 95])
     spread = b.max() / b.min() - 1
     rank = f"rank correlation {rank_correlation(a, b):.3f}"
-    if len(b) < FEW or spread < NARROW:
-        rank = f"too few, or too much alike ({100 * spread:.1f} %), to compare their order"
+    if len(b) < FEW:
+        rank = "too few to compare their order"
+    elif spread < NARROW:
+        rank = f"too much alike ({100 * spread:.1f} %) to compare their order"
     return [
         "## Linear fidelity", "",
         f"Residual vibration of the linearised loop (H2 norm) over that of the run, {len(a)} "

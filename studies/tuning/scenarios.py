@@ -72,8 +72,16 @@ def lane_columns(
     return {
         name: column
         for name, column in lanes.items()
-        if not np.array_equal(column, np.broadcast_to(known_field(name, spec.study), column.shape))
+        if not _is_everywhere(column, known_field(name, spec.study))
     }
+
+
+def _is_everywhere(column: np.ndarray, value: Any) -> bool:
+    """Whether a column has this value in all rows."""
+    if column.dtype == object:  # lists of unequal length
+        return all(row == value for row in column)
+    same = np.asarray(value)
+    return column.shape[1:] == same.shape and bool(np.all(column == same))
 
 
 def nominal(spec: TuneSpec, family: Family | None) -> Study:
