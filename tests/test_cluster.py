@@ -83,7 +83,7 @@ def test_numbers_are_those_of_the_local_run(cluster, local, tmp_path):
 
 def test_workers_do_not_mix_up_sweeps(cluster, tmp_path):
     """Same shapes, another number that all cases share: it is written into the program."""
-    for kp in (1e4, 4e4):
+    for kp in (2e4, 4e4):  # the first is that of the other tests: compiled already
         spec = small_spec(drive={"kp": kp})
         here, there = tmp_path / f"here{kp:g}", tmp_path / f"there{kp:g}"
         run_sweep(spec, here, is_quiet=True)
