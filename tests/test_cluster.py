@@ -147,6 +147,7 @@ def test_other_versions_are_refused(cluster, tmp_path):
         told(cluster, tmp_path / "late")  # a worker that came after the others were compared
 
 
+@pytest.mark.long
 def test_a_tuning_has_the_same_slopes(cluster):
     spec = tuning(GAIN, starts=3)
     here = make_evaluator(spec)

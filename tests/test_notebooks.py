@@ -10,9 +10,9 @@ from nbformat.v4 import new_code_cell, new_notebook
 NOTEBOOKS = {
     path.stem: path for path in sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 }
-#: Minutes of compiling; in short: the same functions in test_tuning and test_tuning_folder.
-LONG = "4_gradient_tuning"
-QUICK = [name for name in NOTEBOOKS if name != LONG]
+#: Much to compile; in short: the same functions in test_tuning, test_atlas and test_spillover.
+LONG = ("2_coupling", "4_gradient_tuning", "5_spillover")
+QUICK = [name for name in NOTEBOOKS if name not in LONG]
 
 
 def test_there_are_notebooks():
@@ -31,7 +31,7 @@ def test_notebook_is_stripped(name):
 
 @pytest.fixture(scope="module")
 def executed():
-    """All but the long one, in one process that forgets its names in between."""
+    """All but the long ones, in one process that forgets its names in between."""
     books = {name: read(name) for name in QUICK}
     cells = []
     for name, book in books.items():
@@ -48,8 +48,9 @@ def test_notebook_runs(executed, name):
 
 
 @pytest.mark.long
-def test_long_notebook_runs():
-    book = read(LONG)
+@pytest.mark.parametrize("name", LONG)
+def test_long_notebook_runs(name):
+    book = read(name)
     execute(book)
     check_outputs(book)
 
