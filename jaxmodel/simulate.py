@@ -296,9 +296,7 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
         final = jnp.where((final == status.OK) & is_wrong, float(bad), final)
     # zeros of a run that stopped would look like a perfect one
     is_finished = reduce(jnp.logical_or, (final == code for code in status.FINISHED))
-    # (a product: their derivatives must be NaN as well)
-    known = jnp.where(is_finished, 1.0, jnp.nan)
-    result = jax.tree.map(lambda x: known * x, result)
+    result = jax.tree.map(lambda x: jnp.where(is_finished, x, jnp.nan), result)
     return Result(
         metrics=result,
         status=final.astype(jnp.int32),

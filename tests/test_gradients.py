@@ -12,7 +12,6 @@ from jaxmodel.bases import find_bases
 from jaxmodel.control import pole_placement
 from jaxmodel.simulate import simulate
 from studies.cases import as_arrays, build_case, build_structure
-from studies.spec import paper_study
 from tests.test_batch import short_study
 
 
@@ -120,16 +119,3 @@ def test_rounded_loops_have_the_slope_of_the_smooth_loop():
     assert slope == pytest.approx(fourth_order(smooth, 0.5, 1e-3), rel=1e-6)
     # rounding shows in the value: these are not the same loop
     assert abs(float(smooth(0.5)) / value - 1) > 1e-6
-
-
-def test_a_run_that_is_not_there_has_no_slope():
-    """A window longer than the run: NaN, and not the slope 0 of a constant."""
-    study = paper_study().change(link__modes=2, control__modes=2, run__duration=0.01)
-    structure, case = build_structure(study), as_arrays(build_case(study))
-
-    def residual(factor):
-        control = case.control._replace(gain_factor=factor)
-        return simulate(structure, case._replace(control=control)).metrics.residual_rms.max()
-
-    value, slope = jax.jit(jax.value_and_grad(residual))(0.5)
-    assert np.isnan(value) and np.isnan(slope)
