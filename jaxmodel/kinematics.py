@@ -193,10 +193,10 @@ def singularity_distance(plant: Plant, pose: Array) -> Array:
     chain = close_chain(lanes, pose.T, jnp.zeros_like(pose.T))
     gamma = link_angle(chain)
     nearest = jnp.min(jnp.minimum(gamma, jnp.pi / 2 - gamma))
-    return jnp.minimum(nearest, jnp.min(hold(lanes, chain)))
+    return jnp.minimum(nearest, jnp.min(hold(chain)))
 
 
-def hold(plant: Plant, chain: Chain) -> Array:
+def hold(chain: Chain) -> Array:
     """How firmly links of given length hold the platform [1], (): 1 best, 0 not at all.
 
     Three links whose lines meet in one point, or are parallel, let the platform turn about that
@@ -204,7 +204,6 @@ def hold(plant: Plant, chain: Chain) -> Array:
     value; near 0 it is the angle [rad] by which the lines miss.
 
     Args:
-        plant: the machine.
         chain: of straight links.
     """
     frame = chain.frame
@@ -258,7 +257,7 @@ def path_status(plant: Plant, pose: Array) -> Array:
     lanes = plant._replace(**{name: getattr(plant, name)[:, None] for name in _LINK_FIELDS})
     chain = close_chain(lanes, pose.T, jnp.zeros_like(pose.T))
     codes = chain_status(lanes, chain)
-    is_loose = (codes == status.OK) & (hold(lanes, chain) < SINGULAR_MARGIN)
+    is_loose = (codes == status.OK) & (hold(chain) < SINGULAR_MARGIN)
     codes = jnp.where(is_loose, float(status.SINGULAR), codes)
     index = jnp.argmax(codes != status.OK)
     return codes[index], index

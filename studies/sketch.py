@@ -54,7 +54,7 @@ def sketch(study: Study) -> Figure:
 
 def standing(case: Case, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sliders B and joints C [m] of straight links at a pose, (3, 2) each; NaN out of reach."""
-    u, n, corner = _axes(case)
+    u, n, corner = guides(case)
     angle = case.machine.geometry.joint_angle + pose[2]
     radius = np.asarray(case.machine.geometry.joint_radius)[..., None]
     joint = pose[:2] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -65,7 +65,7 @@ def standing(case: Case, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return corner + rho[:, None] * u, joint
 
 
-def _axes(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def guides(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Directions and inward normals of the guides, and where they start [m], (3, 2) each."""
     geometry = case.machine.geometry
     angle, side = np.asarray(geometry.guide_angle), float(geometry.guide_side)
@@ -76,7 +76,7 @@ def _axes(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _guides(ax: Axes, study: Study, case: Case) -> None:
-    u, _, corner = _axes(case)
+    u, _, corner = guides(case)
     for start, end in zip(corner, corner + study.machine.guide_side * u, strict=True):
         ax.plot(*(1e3 * np.stack([start, end], axis=1)), color="#BBBBBB", linewidth=3, zorder=0)
 

@@ -27,6 +27,12 @@ def number(value: float, unit: str) -> str:
     return f"{readable(unit)[0] * value:.4g}"
 
 
+def count_text(n: int, what: str) -> str:
+    """A number of things: "1 family", "2 families", "3 cases"."""
+    many = f"{what.removesuffix('y')}ies" if what.endswith("y") else f"{what}s"
+    return f"{n} {what if n == 1 else many}"
+
+
 def duration_text(seconds: float) -> str:
     """A time to wait in words: "40 s", "3 min", "2 h 10 min"."""
     if seconds < 100:

@@ -268,9 +268,9 @@ def test_links_in_line_with_one_point_hold_nothing():
     """`hold` is 1 where forces pull at right angles, and 0 where all links point at the centre."""
     plant = build_plant_of(parse_study({}))
     chain = kinematics.close_chain(plant, jnp.array(HOME), jnp.zeros(3))
-    assert 0.5 < float(kinematics.hold(plant, chain)) <= 1
+    assert 0.5 < float(kinematics.hold(chain)) <= 1
     cx, cy = plant.length * chain.frame.x, plant.length * chain.frame.y
-    assert float(kinematics.hold(plant, chain._replace(cx=cx, cy=cy))) < 1e-12
+    assert float(kinematics.hold(chain._replace(cx=cx, cy=cy))) < 1e-12
 
 
 def build_plant_of(study):

@@ -202,6 +202,23 @@ def test_what_all_runs_share_is_no_column():
     assert (fresh["run.seed"] != spec.study.run.seed).all()
 
 
+def test_three_values_are_spread_together_on_every_move():
+    own = [2.0e-3, 2.1e-3, 1.9e-3]
+    spec = parse_tuning(
+        {**SMALL, "link": {"modes": 2, "thickness": own},
+         "tune": {"free": GAIN, "scenarios": {
+             "count": 3, "spread": {"link.thickness": 5.0},
+             "each": {"motion.move_time": [0.03, 0.035]}}}}
+    )  # fmt: skip
+    column = scenario_columns(spec, 3, 0)["link.thickness"]
+    assert column.shape == (6, 3)
+    np.testing.assert_array_equal(column[:3], column[3:])
+    np.testing.assert_allclose(column[0], own)
+    share = column / own
+    np.testing.assert_allclose(share, share[:, :1] * np.ones(3))
+    assert 0 < np.abs(share - 1).max() <= 0.05
+
+
 def test_moves_may_have_unequal_paths():
     home = SMALL["motion"]["waypoints"][0]
     paths = [[home, [0.0, 0.005, home[2]]], [home, [0.002, 0.0, home[2]], home]]

@@ -21,6 +21,7 @@ from jaxmodel.prepare import prepare
 from studies.consistency import each_link
 from studies.figures import SERIES, axes_or_new, styled
 from studies.runs import check_run
+from studies.sketch import guides
 from studies.spec import Study
 
 #: Points along a link.
@@ -54,12 +55,9 @@ def skeleton(study: Study, pose: np.ndarray, q: np.ndarray, exaggeration: float)
         np.asarray(part)
         for part in _positions(structure._replace(n_steps=1), case, pose, q, exaggeration)
     )
-    side, angle = study.machine.guide_side, np.asarray(case.machine.geometry.guide_angle)
-    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    inward = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
-    away = side / np.sqrt(12.0) + each_link(study.machine.guide_offsets)
-    start = -away[:, None] * inward - side / 2 * direction
-    return Skeleton(np.stack([start, start + side * direction], axis=1), slider, joint, link)
+    direction, _, start = guides(case)
+    end = start + study.machine.guide_side * direction
+    return Skeleton(np.stack([start, end], axis=1), slider, joint, link)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -143,9 +143,8 @@ def _judge_block(
         found = jax.tree.map(np.asarray, _respond(structure, block))
     response, modes = jax.tree.map(lambda x: x[..., : len(rows)], found)
     with np.errstate(all="ignore"):  # what is not finite finds no crossing
-        margins, is_doubtful = _judged(response, modes, way)
         ratio = damping_ratios(response, modes, n_links, structure.n_controlled)
-    return margins._replace(damping_ratio=ratio), is_doubtful
+        return _judged(response, modes, way, ratio)
 
 
 # compiled in haste: it takes a fiftieth of the time
@@ -162,7 +161,7 @@ def _respond(structure: Structure, cases: Case) -> tuple[LoopResponse, Assembled
 
 
 def _judged(
-    response: LoopResponse, modes: AssembledModes, way: Walk
+    response: LoopResponse, modes: AssembledModes, way: Walk, ratio: np.ndarray
 ) -> tuple[LoopMargins, np.ndarray]:
     count, top = len(response.period), np.pi / response.period
     seen, left, right = _walk_along(response, modes, way)
@@ -197,7 +196,7 @@ def _judged(
         np.where(is_finite, margin, np.nan),
         np.where(is_finite, np.abs(omega) / (2 * np.pi), np.nan),
         np.where(is_finite & breaks, order, np.nan),
-        np.empty(0),
+        ratio,
     )
     return figures, is_doubtful & is_finite
 

@@ -43,9 +43,9 @@ from studies.sweeps.show import (
     written_name,
 )
 from studies.sweeps.spec import Node
-from studies.sweeps.table import Table, build_table, case_study
+from studies.sweeps.table import Table, case_study
 from studies.template import study_template, toml_text, toml_value
-from studies.units import readable
+from studies.units import count_text, readable
 
 REPORT, FIGURE, FRONT, MACHINE = "report.html", "cases.png", "front.png", "machine.png"
 #: Metrics to ask as well.
@@ -108,7 +108,7 @@ def _front(data: SweepData, metric: str) -> Figure:
 def _best_study(data: SweepData, metric: str) -> Study:
     """Of the best case; of the sweep itself where no case is ok."""
     try:
-        return case_study(build_table(data.spec), int(recommended(data, metric, 1)[0]))
+        return case_study(data.table, int(recommended(data, metric, 1)[0]))
     except StudyError:
         return data.spec.study
 
@@ -121,7 +121,7 @@ def report(data: SweepData, metric: str, drawn: list[str]) -> str:
         metric: what the best cases are ranked by.
         drawn: figures that there are, of `FIGURE`, `FRONT` and `MACHINE`.
     """
-    cases = build_table(data.spec)
+    cases = data.table
     lines = [
         f"# {literal(data.spec.study.title)}: sweep", "",
         *opening(_asked(data, cases, metric), *_answer(data, metric)),
@@ -158,7 +158,7 @@ def _figure(name: str, caption: str, drawn: list[str]) -> list[str]:
 def _asked(data: SweepData, cases: Table, metric: str) -> str:
     axes = literal(", ".join(written_name(data, name) for name in swept_names(data)))
     return (
-        f"{_count(len(cases), 'case')} of {axes or 'a list'}, ranked by {metric} "
+        f"{count_text(len(cases), 'case')} of {axes or 'a list'}, ranked by {metric} "
         f"(smallest first; {counted_text(data, metric)})."
     )
 
@@ -167,7 +167,7 @@ def _answer(data: SweepData, metric: str) -> tuple[str, str]:
     """What came out, and what to do next."""
     codes = data["status"]
     n_ok = int(np.sum(codes == status.OK))
-    ended = f"{n_ok} of {_count(data.n_cases, 'case')} ended ok"
+    ended = f"{n_ok} of {count_text(data.n_cases, 'case')} ended ok"
     others = [f"{count}: {name}" for name, count, _ in status_rows(data).rows if name != "ok"][:3]
     told = f"{ended}{' (' + '; '.join(others) + ')' if others else ''}."
     value = metric_values(data, metric)
@@ -206,10 +206,6 @@ def _answer(data: SweepData, metric: str) -> tuple[str, str]:
         f"--case {first} --out run.h5 --report` for the trajectories of the best"
         f"{rank if others else ''}."
     )
-
-
-def _count(n: int, what: str) -> str:
-    return f"{n} {what}{'' if n == 1 else 's'}"
 
 
 def _blocks(node: Node, depth: int = 0) -> list[str]:

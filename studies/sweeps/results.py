@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -249,6 +249,11 @@ class SweepData:
     def __getitem__(self, name: str) -> np.ndarray:
         return self.variables[name].data
 
+    @cached_property
+    def table(self) -> Table:
+        """Its cases, spread once."""
+        return build_table(self.spec)
+
     @property
     def n_cases(self) -> int:
         return len(self.variables["case"].data)
@@ -283,7 +288,7 @@ class SweepData:
 
 def swept_names(data: SweepData) -> list[str]:
     """What varies, as variables of the file, in the order of the sweep; labels stand for fields."""
-    columns = build_table(data.spec).columns
+    columns = data.table.columns
     labelled = {LABELS[name] for name in columns if name in LABELS}
     return [variable_name(name) for name in columns if name not in labelled]
 
@@ -384,7 +389,7 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
         if candidate in variables and variables[candidate].dims[:1] == ("case",):
             return _entry(data, name, entry.indices if entry else (), candidate)
     if "." in key:
-        swept = build_table(data.spec).columns
+        swept = data.table.columns
         if name == key and any(column.startswith(f"{key}[") for column in swept):
             raise StudyError(f"{key}: differs between links here; name one, such as {key}[0]")
         value = known_field(name, data.spec.study)
@@ -439,7 +444,7 @@ def counted_links(data: SweepData) -> np.ndarray:
 
     The same for all cases, or fewer links under control would look like less vibration.
     """
-    fields = Fields(data.spec.study, build_table(data.spec).fields)
+    fields = Fields(data.spec.study, data.table.fields)
     is_closed = fields.raw("control.feedback") != "none"
     links = (fields.numbers("control.links") != 0) & is_closed[:, None]
     found = links.any(axis=0)

@@ -15,7 +15,6 @@ from jaxmodel import status
 from studies.errors import StudyError
 from studies.sweeps.axes import build_axis
 from studies.sweeps.results import NOT_RUN, SweepData, metric_values, swept_names
-from studies.sweeps.table import build_table
 
 #: Refuse where less than this share of the design is left [1].
 LEAST_LEFT = 0.5
@@ -235,4 +234,4 @@ def design_values(data: SweepData, metric: str) -> np.ndarray:
     """
     is_ok = data["status"] == status.OK
     value = np.where(is_ok, metric_values(data, metric).astype(float), np.nan)
-    return value[build_table(data.spec).origin]
+    return value[data.table.origin]

@@ -32,7 +32,7 @@ from studies.sweeps.results import (
 )
 from studies.sweeps.run import Plan, calibrate
 from studies.sweeps.sensitivity import failure_causes
-from studies.sweeps.table import Table, build_table, case_study
+from studies.sweeps.table import Table, case_study
 from studies.units import headed, readable
 
 #: Stands beside every metric of a case that has it.
@@ -186,7 +186,7 @@ def case_rows(data: SweepData, cases: np.ndarray, metrics: list[str]) -> Rows:
 
 def written_name(data: SweepData, name: str) -> str:
     """An axis as the sweep's file writes it: `link.thickness[1]`, not `link_thickness_1`."""
-    columns = build_table(data.spec).columns
+    columns = data.table.columns
     return next((column for column in columns if variable_name(column) == name), name)
 
 

@@ -20,7 +20,7 @@ from studies.tuning.merit import SHOWN
 from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
 from studies.tuning.scenarios import move_label
 from studies.tuning.spec import LOOP_LIMITS, OWN, Family, TuneSpec, label
-from studies.units import headed, number, readable
+from studies.units import count_text, headed, number, readable
 
 #: Limits that hold from below.
 LOWER = ("gain_margin", "slowest_decay", "singularity_distance")
@@ -88,9 +88,9 @@ def _asked(spec: TuneSpec, found: Findings) -> str:
     return (
         f"the least {goals}{_of_links(spec)}"
         + (f" with {', '.join(limits)}" if limits else "")
-        + f"; {_count(len(spec.free.numbers), 'free number')} in "
-        f"{_count(len(spec.moving), 'family')}, {_count(len(at.family), 'start')}, "
-        f"{_count(scenarios.count, 'machine')} on {_count(len(spec.moves), 'move')}. "
+        + f"; {count_text(len(spec.free.numbers), 'free number')} in "
+        f"{count_text(len(spec.moving), 'family')}, {count_text(len(at.family), 'start')}, "
+        f"{count_text(scenarios.count, 'machine')} on {count_text(len(spec.moves), 'move')}. "
         f"{ended(spec, at)}"
         + (f" {at.is_frozen.sum()} starts were frozen." if at.is_frozen.any() else "")
     )
@@ -123,7 +123,7 @@ def _came_out(spec: TuneSpec, found: Findings) -> str:
         told.append(f"{metric} {after} instead of {before} {_unit(metric)}".strip())
     if one.loop is not None and own.loop is not None:
         told.append(f"gain margin {one.loop.gain_margin:.3g} instead of {own.loop.gain_margin:.3g}")
-    machines = _count(spec.tune.scenarios.check, "fresh machine")
+    machines = count_text(spec.tune.scenarios.check, "fresh machine")
     text = (
         f"{name}: {', '.join(told)} on the study's own machine; on {machines} "
         f"{one.objective.mean():.3g} of the objective, {one.objective.max():.3g} on the worst."
@@ -162,14 +162,9 @@ def file_name(spec: TuneSpec, family: Family) -> str:
     return f"tuned_{label(family.name)}.toml"
 
 
-def _count(n: int, what: str) -> str:
-    many = f"{what.removesuffix('y')}ies" if what.endswith("y") else f"{what}s"
-    return f"{n} {what if n == 1 else many}"
-
-
 def summary(spec: TuneSpec, found: Findings) -> list[str]:
     """What was gained, a line for each family."""
-    machines = _count(spec.tune.scenarios.check, "fresh machine")
+    machines = count_text(spec.tune.scenarios.check, "fresh machine")
     lines = []
     for k, (family, one) in enumerate(zip(spec.families, found.judged, strict=True)):
         is_moving = k < len(spec.moving)
@@ -254,7 +249,7 @@ def _weighing(spec: TuneSpec) -> str:
 
 
 def _machines(spec: TuneSpec) -> str:
-    count = _count(spec.tune.scenarios.check, "machine")
+    count = count_text(spec.tune.scenarios.check, "machine")
     if not spec.tune.scenarios.spread:
         return (
             f"{count} for each move with noise of their own, the real converters and limits; "

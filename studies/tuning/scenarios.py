@@ -37,7 +37,7 @@ def scenario_columns(
         for k, (name, percent) in enumerate(spread.items()):
             share = 1 + percent / 100 * shift[:, k]
             machines[name] = np.multiply.outer(share, known_field(name, spec.study))
-    columns = {name: np.tile(column, moves) for name, column in machines.items()}
+    columns = {name: _repeated(column, moves) for name, column in machines.items()}
     for name in spec.tune.scenarios.each:
         columns[name] = np.repeat(column_of([move[name] for move in spec.moves]), count, axis=0)
     return columns
@@ -61,10 +61,7 @@ def lane_columns(
         families: of each design; None is the study itself.
     """
     count = len(next(iter(columns.values())))
-    lanes = {
-        name: np.tile(column, (len(families),) + (1,) * (column.ndim - 1))
-        for name, column in columns.items()
-    }
+    lanes = {name: _repeated(column, len(families)) for name, column in columns.items()}
     for name in sorted({name for family in families if family for name in family.columns}):
         own = known_field(name, spec.study)
         values = [family.columns.get(name, own) if family else own for family in families]
@@ -74,6 +71,11 @@ def lane_columns(
         for name, column in lanes.items()
         if not _is_everywhere(column, known_field(name, spec.study))
     }
+
+
+def _repeated(column: np.ndarray, times: int) -> np.ndarray:
+    """All rows of a column, several times over."""
+    return np.concatenate([column] * times)
 
 
 def _is_everywhere(column: np.ndarray, value: Any) -> bool:
