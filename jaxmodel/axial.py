@@ -30,7 +30,7 @@ def critical_force(plant: Plant) -> Array:
     if plant.mixed_shortening is None:
         return jnp.min(plant.stiffness / plant.shortening, axis=1)
     scale = 1 / jnp.sqrt(plant.stiffness)
-    softness = scale[:, :, None] * _slopes(plant) * scale[:, None, :]
+    softness = scale[:, :, None] * chord_slopes(plant) * scale[:, None, :]
 
     def square(power: Array, _: None) -> tuple[Array, None]:
         power = power @ power
@@ -59,15 +59,22 @@ def loaded_frequency(plant: Plant, axial: Array) -> Array:
     """
     stiffness = plant.stiffness[:, :, None] * jnp.eye(plant.stiffness.shape[1])
     if plant.shortening is not None:
-        stiffness = stiffness + jnp.asarray(axial)[:, None, None] * _slopes(plant)
+        stiffness = stiffness + jnp.asarray(axial)[:, None, None] * chord_slopes(plant)
     squared = jnp.linalg.eigvalsh(stiffness / plant.modal_mass[:, None, None])
     is_stable = squared > 0
     return jnp.where(is_stable, jnp.sqrt(jnp.where(is_stable, squared, 1.0)), 0.0)
 
 
-def _slopes(plant: Plant) -> Array:
-    """S as a matrix [1/m], (3, R, R)."""
-    assert plant.shortening is not None
+def chord_slopes(plant: Plant) -> Array:
+    """S as a matrix [1/m], (3, R, R): what an axial force of 1 N adds to the stiffness.
+
+    Zero where the chord keeps its length; -tau tau^t/L where modes move their ends by tau along the
+    normal of their frame, which makes the chord longer.
+    """
+    if plant.tip is not None:
+        return -plant.tip[:, :, None] * plant.tip[:, None] / plant.length[:, None, None]
+    if plant.shortening is None:
+        return jnp.zeros((*plant.stiffness.shape, plant.stiffness.shape[1]))
     slopes = plant.shortening[:, :, None] * jnp.eye(plant.shortening.shape[1])
     return slopes if plant.mixed_shortening is None else slopes + plant.mixed_shortening
 

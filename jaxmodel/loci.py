@@ -29,7 +29,7 @@ ITERATIONS = 4
 
 
 class Loci(NamedTuple):
-    """State of the walk: n = 3 C eigenvalues."""
+    """State of the walk: n eigenvalues, one for each channel."""
 
     value: Pair  # [1], (n,)
     last: Pair  # at the last frequency where crossings were looked for [1], (n,)
@@ -64,7 +64,7 @@ def walk(response: LoopResponse, spread: Array, loci: Loci, station: Station) ->
 
     Args:
         response: of the loop.
-        spread: see `go_round`, (3, C).
+        spread: see `go_round`, one for each channel.
         loci: so far.
         station: the next frequency.
     """

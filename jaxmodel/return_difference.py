@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.axial import axial_force
+from jaxmodel.axial import axial_force, chord_slopes
 from jaxmodel.case import Case, Structure
 from jaxmodel.dynamics import mass_matrix, platform_mass
 from jaxmodel.estimator import Estimator
@@ -23,13 +23,17 @@ from jaxmodel.kinematics import close_chain
 from jaxmodel.loop import Loop
 from jaxmodel.pairs import Pair, determinant, product
 from jaxmodel.parameters import Array
+from jaxmodel.plant import Plant
 
 #: Images n of the spectrum that are summed; those left out change the sum by 1e-4.
 IMAGES = (0, -1, 1, -2)
 
 
 class LoopResponse(NamedTuple):
-    """One loop about rest, in normal coordinates of each link (modal masses 1)."""
+    """One loop about rest, in normal coordinates of each link (modal masses 1).
+
+    The first n links have channels: all three, or those under control, see `controlled_first`.
+    """
 
     mass: Array  # of the pose with straight links, (3, 3)
     damping: Array  # of the drive in the pose, (3, 3)
@@ -39,11 +43,11 @@ class LoopResponse(NamedTuple):
     lightness: Array  # inertia left to a mode that drags nothing but the pose's mass [1], (3, R)
     enter: Array  # generalised force on the pose per modal acceleration, (3, 3, R)
     leave: Array  # inertia force on a mode per pose acceleration, (3, 3, R)
-    observe: Array  # channels per modal coordinate, (3, C, R)
-    act: Array  # on the modes per channel force, (3, C, R)
-    feedthrough: Array  # compensated, channels per channel force, (3, C, C)
+    observe: Array  # channels per modal coordinate, (n, C, R)
+    act: Array  # on the modes per channel force, (n, C, R)
+    feedthrough: Array  # compensated, channels per channel force, (n, C, C)
     estimator: Estimator
-    velocity_gain: Array  # (3, C)
+    velocity_gain: Array  # (n, C)
     position_gain: Array | None
     period: Array  # T [s], ()
     antialias: Array  # [rad/s], ()
@@ -52,7 +56,7 @@ class LoopResponse(NamedTuple):
 
 
 def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> LoopResponse:
-    """What the return difference reads, for bases whose links end on their chord.
+    """What the return difference reads.
 
     Args:
         structure: static choices with feedback "sampled".
@@ -84,33 +88,32 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
             (swing, to_gamma, to_rho),
         )
     )
-    leave = to_gamma[:, :, None] * plant.c[:, None] - (
-        (chain.sine[:, None] * to_rho)[:, :, None] * plant.b[:, None]
+    at_c, at_b, inertia = _from_chord(plant)
+    leave = to_gamma[:, :, None] * at_c[:, None] - (
+        (chain.sine[:, None] * to_rho)[:, :, None] * at_b[:, None]
     )
     slope = drive.kd + drive.viscous_friction
     if structure.has_friction:
         slope = slope + drive.coulomb_friction / drive.friction_speed
     stiffness = jnp.einsum("i,ip,iq->pq", drive.kp, to_rho, to_rho)
     modal_mass = plant.modal_mass[:, None]
-    springs, turn = plant.stiffness / modal_mass, None
+    springs = None
     if structure.has_wrench:
         held = jnp.linalg.solve(to_rho.T, -case.load.wrench)
         curved = jax.hessian(lambda x: jnp.sum(held * close_chain(plant, x, still).rho))(pose)
         stiffness = stiffness - curved
-        if plant.shortening is not None:
-            axial = axial_force(plant, pose, still, still, case.load.wrench)[:, None]
-            springs = springs + axial * plant.shortening / modal_mass
-            if plant.mixed_shortening is not None:
-                mixed = axial[:, :, None] * plant.mixed_shortening / modal_mass[:, :, None]
-                eye = jnp.eye(springs.shape[1])
-                springs, turn = jnp.linalg.eigh(springs[:, :, None] * eye + mixed)
+        axial = axial_force(plant, pose, still, still, case.load.wrench)
+        springs = axial[:, None, None] * chord_slopes(plant)
+    modes = _normal_modes(plant, inertia, springs)
     leave = leave / modal_mass[:, None]
     decay = plant.damping / modal_mass
     observe = jnp.einsum("ick,ikr->icr", law.filter, loop.sensor)
     act = jnp.einsum("irk,ikc->icr", loop.actuator, law.synthesizer)
-    if turn is not None:
-        leave, observe, act = (jnp.einsum("ipr,irs->ips", x, turn) for x in (leave, observe, act))
-        decay = jnp.einsum("irs,ir,irs->is", turn, decay, turn)
+    if modes.shape is not None:
+        leave, observe, act = (
+            jnp.einsum("ipr,irs->ips", x, modes.shape) for x in (leave, observe, act)
+        )
+        decay = jnp.einsum("irs,ir,irs->is", modes.shape, decay, modes.shape)
     enter = leave * modal_mass[:, None]
     drag = jnp.einsum("ipr,pq,iqr->ir", enter, jnp.linalg.inv(mass), leave)
     if not structure.is_coupled:
@@ -119,7 +122,7 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
         mass=mass,
         damping=jnp.einsum("i,ip,iq->pq", slope, to_rho, to_rho),
         stiffness=stiffness,
-        square=springs,
+        square=modes.square,
         decay=decay,
         lightness=1 - drag,
         enter=enter,
@@ -135,6 +138,79 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
         highpass=electronics.sensor_highpass if structure.has_sensor_highpass else None,
         lag=electronics.amplifier_lag if structure.has_amplifier else None,
     )
+
+
+def _from_chord(plant: Plant) -> tuple[Array, Array, Array | None]:
+    """c, b and the modal inertia matrix of deflections from the chord.
+
+    The platform holds the far ends, so sliders and chords follow the pose alone. Where a mode moves
+    its end by tau_j, the frame is turned by -tau_j q_j/L against the chord:
+    c - tau J0/L, b - tau e/L and m I + tau tau^t J0/L^2 - (tau c^t + c tau^t)/L.
+
+    Returns:
+        c [kg m], (3, R); b [kg], (3, R); inertia [kg], (3, R, R), None: m I.
+    """
+    if plant.tip is None:
+        return plant.c, plant.b, None
+    turn = plant.tip / plant.length[:, None]
+    c = plant.c - plant.inertia[:, None] * turn
+    b = plant.b - plant.tip_mass[:, None] * plant.tip
+    mixed = turn[:, :, None] * (c + plant.c)[:, None]
+    eye = plant.modal_mass[:, None, None] * jnp.eye(turn.shape[1])
+    return c, b, eye - (mixed + jnp.swapaxes(mixed, 1, 2)) / 2
+
+
+class _NormalModes(NamedTuple):
+    """Of each link between held ends."""
+
+    square: Array  # omega^2 [1/s2], (3, R)
+    shape: Array | None  # in modal coordinates, of modal mass m, (3, R, R); None: themselves
+
+
+def _normal_modes(plant: Plant, inertia: Array | None, springs: Array | None) -> _NormalModes:
+    """Modes of (modal inertia, stiffness with `springs` of axial forces [N/m], (3, R, R))."""
+    mass = plant.modal_mass[:, None]
+    if inertia is None and (springs is None or plant.mixed_shortening is None):
+        diagonal = 0.0 if springs is None else jnp.einsum("irr->ir", springs)
+        return _NormalModes((plant.stiffness + diagonal) / mass, None)
+    eye = jnp.eye(plant.stiffness.shape[1])
+    stiffness = plant.stiffness[:, :, None] * eye + (0.0 if springs is None else springs)
+    if inertia is None:
+        return _NormalModes(*jnp.linalg.eigh(stiffness / mass[:, None]))
+    half = jnp.linalg.inv(jnp.linalg.cholesky(inertia / mass[:, None]))
+    square, shape = jnp.linalg.eigh(
+        jnp.einsum("ijr,irs,iks->ijk", half, stiffness / mass[:, None], half)
+    )
+    return _NormalModes(square, jnp.einsum("ikr,iks->irs", half, shape))
+
+
+#: Fields of links, and those that only links with channels need.
+_LINK_FIELDS = ("square", "decay", "lightness", "enter", "leave")
+_CHANNEL_FIELDS = (
+    "observe", "act", "feedthrough", "estimator", "velocity_gain", "position_gain"
+)  # fmt: skip
+
+
+def controlled_first(response: LoopResponse, link_mask: np.ndarray, count: int) -> LoopResponse:
+    """The same loops with links under control first and no channels on the others; on the host.
+
+    Args:
+        response: with channels on all links, lanes last.
+        link_mask: above 0 for links under control, (3, lanes).
+        count: how many these are in every lane (static).
+    """
+    order = np.argsort(link_mask <= 0, axis=0, kind="stable")
+
+    def moved(x: Array, most: int) -> Array:
+        rows = order[:most].reshape(most, *(1,) * (x.ndim - 2), order.shape[1])
+        return np.take_along_axis(x, rows, axis=0)
+
+    links = {name: moved(getattr(response, name), 3) for name in _LINK_FIELDS}
+    channels = {
+        name: jax.tree.map(lambda x: moved(x, count), getattr(response, name))
+        for name in _CHANNEL_FIELDS
+    }
+    return response._replace(**links, **channels)
 
 
 class AssembledModes(NamedTuple):
@@ -181,8 +257,8 @@ def assembled_modes(response: LoopResponse) -> AssembledModes:
 class Turn(NamedTuple):
     """L at one s, as far as it is needed for its determinants; `spectrum_polynomial` reads it."""
 
-    own: list[Pair]  # coefficients of det(x - L_i) of each link, highest power first, (3,) each
-    joint: list[Pair]  # of entering adj(x - L_i) leaving, the same way, (3, 3, 3)
+    own: list[Pair]  # coefficients of det(x - L_i) of each link, highest power first, (n,) each
+    joint: list[Pair]  # of entering adj(x - L_i) leaving, the same way, (n, 3, 3)
     pose: Pair  # dynamic stiffness of the pose, its links on it, (3, 3)
     pose_inverse: Pair  # 1/det of that, ()
 
@@ -195,9 +271,10 @@ def go_round(response: LoopResponse, s: Pair, shift: Pair, spread: Array | None 
         s: [1/s], ().
         shift: exp(-s T), ().
         spread: what is taken from the diagonal of L, so that channels without gains have
-            eigenvalues of their own [1], (3, C); None: nothing.
+            eigenvalues of their own [1], (n, C); None: nothing.
     """
     observe, act = response.observe, response.act
+    n = observe.shape[0]
     turn = 2 * np.pi / response.period
     held = -shift + 1.0
     seen = None
@@ -207,11 +284,12 @@ def go_round(response: LoopResponse, s: Pair, shift: Pair, spread: Array | None 
         chain = _electronics(response, at, at2, held)
         inertia = 1.0 if image == 0 else response.lightness
         inverse = (at2 * inertia + at * response.decay + response.square).inverse()
-        part = _through(observe, act, inverse) * chain
+        own = inverse[:n]
+        part = _through(observe, act, own) * chain
         seen = part if seen is None else seen + part
         if image == 0:
-            leaving = _through(observe, response.leave, inverse) * (at2 * chain)
-            entering = _through(response.enter, act, inverse) * at2
+            leaving = _through(observe, response.leave[:n], own) * (at2 * chain)
+            entering = _through(response.enter[:n], act, own) * at2
             links = _through(response.enter, response.leave, inverse).sum(0)
             pose = (
                 at2 * response.mass + at * response.damping + response.stiffness
@@ -226,7 +304,7 @@ def go_round(response: LoopResponse, s: Pair, shift: Pair, spread: Array | None 
 
 
 def _through(one: Array, other: Array, inverse: Pair) -> Pair:
-    """sum over the modes of one_a other_b/own, (3, A, B)."""
+    """sum over the modes of one_a other_b/own, (n, A, B)."""
     weighed = Pair(other * inverse.re[:, None], other * inverse.im[:, None])
     return Pair(
         jnp.sum(one[:, :, None] * weighed.re[:, None], axis=3),
@@ -247,7 +325,7 @@ def _electronics(response: LoopResponse, s: Pair, s2: Pair, held: Pair) -> Pair:
 
 
 def _channel(response: LoopResponse, shift: Pair) -> Pair:
-    """Force of each channel per channel signal, a sample later, (3, C)."""
+    """Force of each channel per channel signal, a sample later, (n, C)."""
     estimator, shift2 = response.estimator, shift * shift
 
     def section(c0: Array, c1: Array, c2: Array) -> Pair:
@@ -284,7 +362,7 @@ def _by_link(loop: Pair, leaving: Pair, entering: Pair) -> tuple[list[Pair], lis
 
 
 def _plus_diagonal(matrix: Pair, value: Pair) -> Pair:
-    """Add to the diagonals of (3, n, n); value (3, n), or (3, 1)."""
+    """Add to the diagonals of (i, n, n); value (i, n), or (i, 1)."""
     n = matrix.re.shape[1]
     eye = np.eye(n).reshape(1, n, n, *(1,) * (matrix.re.ndim - 3))
     return Pair(matrix.re + eye * value.re[:, None], matrix.im + eye * value.im[:, None])
@@ -301,4 +379,7 @@ def spectrum_polynomial(turn: Turn, x: Pair) -> Pair:
     for constant, matrix in zip(turn.own[1:], turn.joint[1:], strict=True):
         own, joint = own * x + constant, joint * x + matrix
     pose = turn.pose - (joint * own.inverse()[:, None, None]).sum(0)
-    return determinant(pose) * turn.pose_inverse * own[0] * own[1] * own[2]
+    found = determinant(pose) * turn.pose_inverse
+    for link in range(own.re.shape[0]):
+        found = found * own[link]
+    return found

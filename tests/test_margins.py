@@ -13,7 +13,12 @@ import pytest
 from jaxmodel import status
 from jaxmodel.pairs import Pair
 from jaxmodel.prepare import prepare
-from jaxmodel.return_difference import go_round, loop_response, spectrum_polynomial
+from jaxmodel.return_difference import (
+    controlled_first,
+    go_round,
+    loop_response,
+    spectrum_polynomial,
+)
 from jaxmodel.sampled_loop import closed_loop
 from studies.cases import as_arrays, build_case, build_structure
 from studies.spec import paper_study
@@ -37,6 +42,13 @@ PLANTS = {
     "plain": {},
     "under load": {"load__wrench": (3.0, -2.0, 0.1)},
     "loaded basis under load": {"load__wrench": (3.0, -2.0, 0.1), "link__basis": "loaded"},
+    # modes between held ends are others than the basis: its damping ties them, which is left out
+    "free ends": {"link__basis": "pinned_free", "link__damping_ratio": (1e-4,)},
+    "free ends under load": {
+        "load__wrench": (3.0, -2.0, 0.1),
+        "link__basis": "pinned_free",
+        "link__damping_ratio": (1e-4,),
+    },
     "no reaction of bending": {"run__model": "ked"},
     "locked": {"drive__locked": True},
     "electronics": {"electronics__sensor_highpass_hz": 2.0, "electronics__amplifier_hz": 3000.0},
@@ -157,8 +169,35 @@ def single_damping(study):
     return found.damping_ratio[0]
 
 
+def test_idle_links_cost_nothing_and_change_nothing():
+    """Loops whose idle links have no channels, beside the same ones with channels of gain 0."""
+    study = STUDY.change(control__links=(False, True, True))
+    structure, case = looked_at(study)
+
+    @jax.jit
+    def respond(case):
+        return loop_response(structure, case, prepare(structure, case).loop, POSE)
+
+    whole = jax.tree.map(lambda x: np.asarray(x)[..., None], respond(case))
+    mask = np.array([[0.0], [1.0], [1.0]])
+    fewer = controlled_first(whole, mask, 2)
+    assert fewer.velocity_gain.shape[0] == 2 and np.all(fewer.velocity_gain != 0)
+    angle = 700.0 * whole.period
+    at = Pair(0 * angle, 700.0 + 0 * angle), Pair(np.cos(angle), -np.sin(angle))
+    x = Pair(0.3 + 0 * angle, 0.1 + 0 * angle)
+    polynomial = jax.jit(lambda one: spectrum_polynomial(go_round(one, *at), x))
+    found, wanted = polynomial(fewer), polynomial(whole)
+    idle = (0.3 + 0.1j) ** structure.n_channels  # eigenvalues 0
+    np.testing.assert_allclose(
+        (found.re + 1j * found.im) * idle, wanted.re + 1j * wanted.im, rtol=1e-9
+    )
+
+
 def test_scan_gives_the_same_as_kernels(monkeypatch):
-    loops = random_loops(8, 5)
+    loops = random_loops(20, 5)
+    is_pair = np.sum(loops.cases.control.link_mask, axis=1) == 2  # one number, one compilation
+    assert np.sum(is_pair) > 4
+    loops = loops._replace(cases=jax.tree.map(lambda x: x[is_pair], loops.cases))
     kernels = judge_loops(*loops)
     monkeypatch.setattr(lanes, "_has_kernels", lambda: False)
     lanes._runner.cache_clear()
@@ -174,12 +213,11 @@ def single(study):
     return jax.tree.map(lambda x: float(x[0]), found._replace(damping_ratio=None))
 
 
-def test_margins_are_those_of_single_runs():
-    structure, case = build_structure(STUDY), as_arrays(build_case(STUDY))
-    found = single(STUDY)
-    np.testing.assert_allclose(
-        found.gain_margin, loop_report(structure, case, HOME).gain_margin, rtol=1e-3
-    )
+@pytest.mark.parametrize("basis", ["pinned_pinned", "pinned_free"])
+def test_margins_are_those_of_single_runs(basis):
+    study = STUDY.change(link__basis=basis)
+    wanted = loop_report(build_structure(study), as_arrays(build_case(study)), HOME)
+    np.testing.assert_allclose(single(study).gain_margin, wanted.gain_margin, rtol=1e-3)
 
 
 def test_what_breaks_is_named():

@@ -32,6 +32,7 @@ from jaxmodel.return_difference import (
     AssembledModes,
     LoopResponse,
     assembled_modes,
+    controlled_first,
     loop_response,
 )
 from studies.stability import HIGHEST, with_margin_modes
@@ -81,16 +82,12 @@ LOOK = Look(0.3, 10, 3, 24)
 
 
 class LoopMargins(NamedTuple):
-    """Of each case, (n,); NaN where there is no sampled loop or its basis is not known here."""
+    """Of each case, (n,); NaN where there is no sampled loop."""
 
     gain_margin: np.ndarray  # largest factor on all gains with every smaller one stable [1]
     breaking_frequency: np.ndarray  # of what goes unstable there [Hz], NaN where nothing does
     breaking_mode: np.ndarray  # order of the nearest link mode, 0: the drive, NaN as before
     damping_ratio: np.ndarray  # of the modes of each order under control, the least [1], (n, C)
-
-
-#: What `pinned_free` lacks: links that end on their chord.
-KNOWN_BASES = ("pinned_pinned", "loaded")
 
 
 def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
@@ -101,27 +98,45 @@ def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
         cases: leaves with a leading axis, all cases or 1.
     """
     count = max(len(leaf) for leaf in jax.tree.leaves(cases))
-    if structure.feedback != "sampled" or structure.basis not in KNOWN_BASES:
-        nothing = np.full(count, np.nan)
-        each = np.full((count, structure.n_controlled), np.nan)
-        return LoopMargins(nothing, nothing.copy(), nothing.copy(), each)
+    if structure.feedback != "sampled":
+        return _nothing(count, structure)
     structure, cases = with_margin_modes(structure, cases)
     whole = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
-    with ThreadPoolExecutor(len(jax.local_devices())) as pool:
+    n_links = np.sum(whole.control.link_mask > 0, axis=1)
+    threads = len(jax.local_devices())
+    figures = _nothing(count, structure)
+    with ThreadPoolExecutor(threads) as pool:
 
-        def judged(rows: np.ndarray, way: Walk) -> tuple[LoopMargins, np.ndarray]:
-            share = min(BLOCK, -(-len(rows) // len(jax.local_devices())))
-            parts = [rows[k : k + share] for k in range(0, len(rows), share)]
-            found = pool.map(partial(_judge_block, structure, way, whole), parts)
-            return jax.tree.map(lambda *x: np.concatenate(x), *found)
+        def judge(rows: np.ndarray, way: Walk) -> np.ndarray:
+            """Write the figures of these cases; which of them are doubtful."""
+            parts = _alike(rows, n_links, threads)
+            found = list(pool.map(partial(_judge_block, structure, way, whole), parts))
+            doubtful = []
+            for part, (those, is_doubtful) in zip(parts, found, strict=True):
+                for old, new in zip(figures, those, strict=True):
+                    old[part] = new
+                doubtful.append(part[is_doubtful])
+            return np.concatenate(doubtful)
 
-        figures, is_doubtful = judged(np.arange(count), WALKS[0])
-        again = np.flatnonzero(is_doubtful)
+        again = judge(np.arange(count), WALKS[0])
         if len(again):
-            better, _ = judged(again, WALKS[1])
-            for old, new in zip(figures, better, strict=True):
-                old[again] = new
+            judge(again, WALKS[1])
     return figures
+
+
+def _nothing(count: int, structure: Structure) -> LoopMargins:
+    one, two, three = np.full((3, count), np.nan)
+    return LoopMargins(one, two, three, np.full((count, structure.n_controlled), np.nan))
+
+
+def _alike(rows: np.ndarray, n_links: np.ndarray, threads: int) -> list[np.ndarray]:
+    """Blocks of cases with as many links under control: idle ones take no time."""
+    parts = []
+    for count in np.unique(n_links[rows]):
+        mine = rows[n_links[rows] == count]
+        share = min(BLOCK, -(-len(mine) // threads))
+        parts += [mine[k : k + share] for k in range(0, len(mine), share)]
+    return parts
 
 
 class Crossings(NamedTuple):
@@ -136,12 +151,14 @@ def _judge_block(
     structure: Structure, way: Walk, cases: Case, rows: np.ndarray
 ) -> tuple[LoopMargins, np.ndarray]:
     """Figures of some cases, at most a block, and of which the walk saw what is not there."""
-    n_links = np.sum(cases.control.link_mask[rows] > 0, axis=1)
+    mask = cases.control.link_mask[rows].T
+    n_links = np.sum(mask > 0, axis=0)
     filled = rows[np.minimum(np.arange(BLOCK), len(rows) - 1)]  # one size, one compilation
     block = jax.tree.map(lambda x: x[filled], cases)
     with PREPARING:
         found = jax.tree.map(np.asarray, _respond(structure, block))
     response, modes = jax.tree.map(lambda x: x[..., : len(rows)], found)
+    response = controlled_first(response, mask, max(1, n_links[0]))
     with np.errstate(all="ignore"):  # what is not finite finds no crossing
         ratio = damping_ratios(response, modes, n_links, structure.n_controlled)
         return _judged(response, modes, way, ratio)
@@ -282,7 +299,7 @@ def _look_closer(
 
 
 def _spread(response: LoopResponse, size: float) -> np.ndarray:
-    """See `go_round`: up to `size`, another for each channel, (3, C, lanes)."""
+    """See `go_round`: up to `size`, another for each channel, (n, C, lanes)."""
     shape = response.velocity_gain.shape
     n = shape[0] * shape[1]
     return np.broadcast_to(size * (1 + np.arange(n).reshape(*shape[:2], 1)) / n, shape)
