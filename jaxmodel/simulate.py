@@ -27,7 +27,9 @@ from jaxmodel.shaper import last_sample
 class Result(NamedTuple):
     """Outcome of a run."""
 
-    metrics: metrics.Metrics  # NaN where the run did not finish
+    # NaN where the run did not finish; their slopes are 0 there, so that a sum over the cases of a
+    # batch which masks those by `status` has the right slope
+    metrics: metrics.Metrics
     status: Array  # code of `jaxmodel.status`, integer, ()
     bad_time: Array  # when it appeared [s], 0 where fine or wrong from the start, ()
     command_end: Array  # end of the shaped command [s], ()

@@ -94,7 +94,8 @@ def test_bad_case_leaves_gradients_of_others_alone(reverse, point):
     broken[12:] = 40.0  # patches pushed off the link
     after = np.asarray(reverse(np.stack([point, broken])))
     np.testing.assert_allclose(after[0], good, rtol=1e-12)
-    assert np.all(np.isfinite(after[1]))
+    # a sum over a batch that leaves it out by its status keeps the right slope
+    np.testing.assert_array_equal(after[1], 0.0)
 
 
 def fourth_order(f, x, step):

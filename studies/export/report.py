@@ -96,7 +96,7 @@ def _in_the_loop(found: FixedController, verified: Verification) -> list[str]:
     return [
         *lines, "",
         f"Against JAX: rms over the three links. One ADC code stands for {1e3 * code:.3g} mV at "
-        f"a sensor, up to {1e6 * deflection:.2g} um in the first controlled channel: residuals far "
+        f"a sensor, up to {1e6 * deflection:.2g} µm in the first controlled channel: residuals far "
         "below are decided by which code the noise falls on, and differ from run to run.",
     ]  # fmt: skip
 

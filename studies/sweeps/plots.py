@@ -17,7 +17,7 @@ from jaxmodel import status
 from studies import figures
 from studies.consistency import each_link
 from studies.errors import StudyError
-from studies.stability import ENOUGH
+from studies.stability import ENOUGH, HIGHEST
 from studies.sweeps.axes import SHOWN_AS
 from studies.sweeps.results import SweepData, metric_values, swept_names, variable_name
 from studies.sweeps.show import MARGIN, label, recommended, shown_metric, shown_value
@@ -123,7 +123,8 @@ def front(data: SweepData, y: str) -> Figure:
             zorder=3,
         )  # fmt: skip
         ax.axvline(ENOUGH, color="black", linewidth=0.8, linestyle=":")
-        ax.set(xlabel="gain margin", ylabel=label(data, y))
+        ends = f" ({HIGHEST:g}: that or more)" if margin.max(initial=0.0) >= HIGHEST else ""
+        ax.set(xlabel=f"gain margin{ends}", ylabel=label(data, y))
         _scale_ordinate(ax, value)
     return figure
 
