@@ -27,7 +27,7 @@ class Structure(NamedTuple):
     has_payload_offset: bool = False  # the payload's centre of mass is off the reference point
     controller_basis: str = "pinned_pinned"
     feedback: str = "sampled"  # "sampled", "ideal" or "none"
-    law: str = "imsc"  # "imsc" or "srf"
+    law: str = "imsc"  # name in `jaxmodel.laws.LAWS`
     has_feedforward: bool = False  # computed torque on top of PD
     has_sensor_highpass: bool = False  # patches drained by their amplifiers' inputs
     has_amplifier: bool = False  # actuators behind amplifiers of finite bandwidth
@@ -38,11 +38,6 @@ class Structure(NamedTuple):
     is_smooth: bool = (
         False  # rounding replaced by equal noise, limits with round corners: for gradients
     )
-
-    @property
-    def n_channels(self) -> int:
-        """Signals the estimator works on, per link."""
-        return self.n_patches if self.law == "srf" else self.n_controlled
 
 
 class Control(NamedTuple):
@@ -58,6 +53,7 @@ class Control(NamedTuple):
     gain_factor: Array  # common factor on all gains [1], ()
     is_per_mass: Array  # 1: gains in 1/s and 1/s2, 0: in N s/m and N/m, ()
     feedthrough_factor: Array  # share of the residual modes' feed-through compensated [1], ()
+    parameters: dict[str, Array]  # the law's own, by name, (3,) each
 
 
 class Electronics(NamedTuple):

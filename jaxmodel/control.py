@@ -1,4 +1,4 @@
-"""Modal control laws: modal filter, synthesizer, pole placement (22)-(23), EMC (24), SRF (16)-(18).
+"""What modal laws are made of: modal filter, synthesizer, pole placement (22)-(23), EMC (24).
 
 Matrices act per link. A controller is data: channel signals y = `filter` V_s, rates of them from
 the estimator, channel forces, and V_a = `synthesizer` f. IMSC has one channel per controlled mode,
@@ -36,25 +36,6 @@ def pole_placement(decay: Array, damped_frequency: Array, omega: Array) -> PoleG
         PoleGains per unit modal mass; times m_j they are in N/m and N s/m.
     """
     return PoleGains(decay**2 + damped_frequency**2 - omega**2, 2 * decay)
-
-
-def optimal_gains(omega: Array, control_weight: Array) -> PoleGains:
-    """Gains that minimise int omega^2 q^2 + q'^2 + R u^2 dt of q'' + omega^2 q = u (IMSC-LQR).
-
-    k_p = omega sqrt(omega^2 + 1/R) - omega^2 and k_d = sqrt(2 k_p + 1/R): the closed-form solution
-    of the mode's Riccati equation (Meirovitch 1990, Dynamics and Control of Structures).
-
-    Args:
-        omega: natural frequency of the mode [rad/s].
-        control_weight: R, weight of the squared control per unit modal mass [s2].
-
-    Returns:
-        PoleGains per unit modal mass.
-    """
-    share = 1 / control_weight
-    # without the difference of two large numbers where control is expensive
-    position = omega * share / (jnp.sqrt(omega**2 + share) + omega)
-    return PoleGains(position, jnp.sqrt(2 * position + share))
 
 
 def efficient_modal_control(energy: Array, omega: Array) -> Array:

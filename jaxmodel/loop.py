@@ -28,6 +28,7 @@ from jaxmodel.dynamics import Accelerations, accelerations, modal_chain
 from jaxmodel.electronics import Amplifier
 from jaxmodel.integrator import Exponential
 from jaxmodel.kinematics import Chain, chain_status, close_chain
+from jaxmodel.laws import n_channels
 from jaxmodel.parameters import Array
 from jaxmodel.plant import Plant
 
@@ -316,10 +317,8 @@ def advance(
         loop.drive, reference, rates.chain.rho, rates.chain.rho_rate, structure.is_smooth
     )
     sample = _sample(loop, plant, inputs, voltage, clipped, motors, rates)
-    totals = metrics.accumulate(
-        state.totals, sample, inputs.window, loop.omega, loop.modal_omega, loop.rotation,
-        loop.settling_band,
-    )  # fmt: skip
+    fixed = metrics.Fixed(loop.omega, loop.modal_omega, loop.rotation, loop.settling_band)
+    totals = metrics.accumulate(state.totals, metrics.Instant(sample, inputs.window, fixed))
     seen = plant.q if plant.s is None else plant.q - plant.s
     record = Record(
         time=inputs.window.time,
@@ -450,12 +449,12 @@ def initial_state(
     is_sampled = structure.feedback == "sampled"
     is_drained = is_sampled and structure.has_sensor_highpass
     drained = jnp.where(highpass > 0, q, zero)
-    controller = rest_controller(structure.n_channels, structure.n_patches, q.dtype)
+    controller = rest_controller(n_channels(structure), structure.n_patches, q.dtype)
     n_stations = loop.deflection_at.shape[1]
-    totals = metrics.zero_totals(
-        n_stations, structure.n_modes, structure.n_controlled, structure.n_frequencies, q.dtype,
-        structure.metrics,
-    )  # fmt: skip
+    sizes = metrics.Sizes(
+        n_stations, structure.n_modes, structure.n_controlled, structure.n_frequencies
+    )
+    totals = metrics.zero_totals(sizes, q.dtype, structure.metrics)
     return State(
         PlantState(
             pose,

@@ -1,5 +1,8 @@
 """Numbers that judge a run, accumulated inside the loop so that no trajectory has to be kept.
 
+A `Metric` says what it is, which `Total`s it adds up sample by sample, and what it makes of them in
+the end; `METRICS` is the only list of them, and `METRICS.add` puts in one of your own.
+
 Windows: *moving* is from t = 0 to the end of the shaped command, *residual* starts
 `residual_delay` after it and lasts `residual_length`. Deflections are chord deflections (relative
 to the line B-C) at the stations, so they do not depend on the basis. Modal coordinates of the
@@ -8,11 +11,15 @@ controller's modes are what a noise-free modal filter makes of the plant's defle
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 
+from jaxmodel.control import efficient_modal_control
 from jaxmodel.parameters import Array
+from jaxmodel.table import Table
 
 
 class Sample(NamedTuple):
@@ -43,209 +50,184 @@ class Window(NamedTuple):
     taper: Array  # Hann window of the spectra [1]
 
 
-class Totals(NamedTuple):
-    """Running sums and maxima."""
+class Fixed(NamedTuple):
+    """What the metrics read of the case at every sample."""
 
-    count: Array  # samples so far, ()
-    moving_count: Array
-    residual_count: Array
-    moving_square: Array  # deflection, (3, S)
-    moving_peak: Array
-    residual_square: Array
-    residual_peak: Array
-    moving_modal_square: Array  # plant modes, (3, R)
-    residual_modal_square: Array
-    residual_modal_peak: Array
-    settled_at: Array  # last time outside the band after the command [s], (3,)
-    ringing: Array  # sum of share outside the band after the command, (3,)
-    moving_error_peak: Array  # pose, (3,)
-    residual_error_square: Array
-    peak_voltage: Array  # (3,)
-    voltage_square: Array  # ()
-    saturated: Array  # ()
-    clipped: Array  # ()
-    peak_force: Array  # (3,)
-    motor_saturated: Array  # ()
-    peak_tension: Array  # (3,)
-    peak_compression: Array  # (3,)
-    stretch_peak: Array  # (3,)
-    plant_energy: Array  # sum while moving, (3, R)
-    modal_energy: Array  # the same in the controller's modes, (3, C)
-    taper_square: Array  # ()
-    phasor: tuple[Array, Array]  # cos and sin of omega t, (3, C, n_frequencies)
-    spectrum: tuple[Array, Array]  # sum of taper q cos, q sin, (3, C, n_frequencies)
+    omega: Array  # plant modes [rad/s], (3, R)
+    modal_omega: Array  # controller's modes [rad/s], (3, C)
+    rotation: tuple[Array, Array]  # cos and sin of (frequency x period), (3, C, n_frequencies)
+    band: Array  # settling band [m], ()
 
 
-class Metrics(NamedTuple):
-    """Judgement of a run."""
+class Instant(NamedTuple):
+    """Everything that a total may read at a sample."""
 
-    residual_rms: Array  # chord deflection in the residual window [m], (3, S)
-    residual_peak: Array  # [m], (3, S)
-    structural_rms: Array  # while moving [m], (3, S)
-    structural_peak: Array  # [m], (3, S)
-    residual_modal_rms: Array  # plant modes in the residual window [m], (3, R)
-    residual_modal_peak: Array  # [m], (3, R)
-    structural_modal_rms: Array  # plant modes while moving [m], (3, R)
-    settling_time: Array  # from the command's end until it stays in the band [s], (3,)
-    ringing_time: Array  # smooth: integral of d^2/(d^2 + band^2) after the command [s], (3,)
-    pose_error_peak: Array  # while moving [m, m, rad], (3,)
-    pose_error_rms: Array  # in the residual window [m, m, rad], (3,)
-    peak_voltage: Array  # [V], (3,)
-    saturated_fraction: Array  # samples with any actuator at its limit [1], ()
-    clipped_fraction: Array  # samples with any ADC channel at its end [1], ()
-    control_energy: Array  # integral of sum V_a^2 over the run [V2 s], ()
-    peak_force: Array  # of the motors [N], (3,)
-    motor_saturated_fraction: Array  # samples with any motor at its limit [1], ()
-    peak_tension: Array  # in the links [N], (3,)
-    peak_compression: Array  # [N], (3,)
-    stretch_error_peak: Array  # of the platform if links stretched [m, m, rad], (3,)
-    plant_energy: Array  # mean of omega^2 q^2 + q'^2 while moving, plant modes [m2/s2], (3, R)
-    modal_energy: Array  # the same, controller's modes, for EMC (24) [m2/s2], (3, C)
-    spectral_density: Array  # one-sided PSD of the controller's modes [m2/Hz], (3, C, n)
+    sample: Sample
+    window: Window
+    fixed: Fixed
 
 
-#: Totals that each metric needs.
-NEEDS = {
-    "residual_rms": ("residual_count", "residual_square"),
-    "residual_peak": ("residual_peak",),
-    "structural_rms": ("moving_count", "moving_square"),
-    "structural_peak": ("moving_peak",),
-    "residual_modal_rms": ("residual_count", "residual_modal_square"),
-    "residual_modal_peak": ("residual_modal_peak",),
-    "structural_modal_rms": ("moving_count", "moving_modal_square"),
-    "settling_time": ("settled_at",),
-    "ringing_time": ("ringing",),
-    "pose_error_peak": ("moving_error_peak",),
-    "pose_error_rms": ("residual_count", "residual_error_square"),
-    "peak_voltage": ("peak_voltage",),
-    "saturated_fraction": ("count", "saturated"),
-    "clipped_fraction": ("count", "clipped"),
-    "control_energy": ("voltage_square",),
-    "peak_force": ("peak_force",),
-    "motor_saturated_fraction": ("count", "motor_saturated"),
-    "peak_tension": ("peak_tension",),
-    "peak_compression": ("peak_compression",),
-    "stretch_error_peak": ("stretch_peak",),
-    "plant_energy": ("moving_count", "plant_energy"),
-    "modal_energy": ("moving_count", "modal_energy"),
-    "spectral_density": ("taper_square", "phasor", "spectrum"),
-}
-#: Metrics that the status of a run depends on.
-ALWAYS = (
-    "saturated_fraction", "clipped_fraction", "motor_saturated_fraction", "pose_error_rms",
-    "peak_compression",
-)  # fmt: skip
+class Ending(NamedTuple):
+    """What the metrics read of the case at the end."""
+
+    period: Array  # between samples [s], ()
+    modal_omega: Array  # controller's modes [rad/s], (3, C)
 
 
-def zero_totals(
-    n_stations: int, n_modes: int, n_controlled: int, n_frequencies: int, dtype,
-    wanted: tuple[str, ...] = (),
-) -> Totals:  # fmt: skip
+#: Arrays by the name of their `Total`.
+Totals = dict[str, Any]
+
+
+class Total(NamedTuple):
+    """A running sum or maximum."""
+
+    name: str
+    dims: tuple[str, ...]  # see `Metric`
+    update: Callable[[Totals, Instant], Any]  # from all totals so far to this one's next value
+    start: Any = 0.0  # value before the first sample; a tuple: an array for each entry
+
+
+class Metric(NamedTuple):
+    """One number, or array of numbers, of a run."""
+
+    name: str
+    dims: tuple[str, ...]  # axes: keys of `Sizes.axes`
+    unit: str  # SI; of each entry where they differ: "m; m; rad"
+    text: str  # what it is
+    totals: tuple[Total, ...]  # what it is made of; totals of one name are added up once
+    finish: Callable[[Totals, Ending], Array]
+    has_slope: bool = True  # may be an objective; else it only tells designs apart
+    is_single: bool = True  # float32 has it within 1 % (`studies bench --precision float32`)
+
+
+class Sizes(NamedTuple):
+    """Lengths of the axes that differ from run to run."""
+
+    n_stations: int
+    n_modes: int
+    n_controlled: int
+    n_frequencies: int
+
+    @property
+    def axes(self) -> dict[str, int]:
+        """Length of every axis by name."""
+        return {
+            "link": 3,
+            "pose_axis": 3,
+            "slider_axis": 3,
+            "station": self.n_stations,
+            "mode": self.n_modes,
+            "controlled_mode": self.n_controlled,
+            "spectrum_point": self.n_frequencies,
+        }
+
+
+@jax.tree_util.register_pytree_node_class
+class Metrics(dict[str, Any]):
+    """Judgement of a run: arrays by name, also as attributes; None where not accumulated."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in METRICS:
+            raise AttributeError(name)
+        return self.get(name)
+
+    def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[str, ...]]:
+        return tuple(self.values()), tuple(self)
+
+    @classmethod
+    def tree_unflatten(cls, names: tuple[str, ...], values: Any) -> Metrics:
+        return cls(zip(names, values, strict=True))
+
+
+def zero_totals(sizes: Sizes, dtype: Any, wanted: tuple[str, ...] = ()) -> Totals:
     """Totals before the first sample.
 
     Args:
-        n_stations, n_modes, n_controlled, n_frequencies: sizes.
+        sizes: of the axes.
         dtype: of all of them.
-        wanted: metrics to accumulate, () for all; what only others need is None.
+        wanted: metrics to accumulate, () for all.
     """
-    zero, link = jnp.zeros((), dtype), jnp.zeros((3,), dtype)
-    stations, modes = jnp.zeros((3, n_stations), dtype), jnp.zeros((3, n_modes), dtype)
-    controlled = jnp.zeros((3, n_controlled), dtype)
-    lines = jnp.zeros((3, n_controlled, n_frequencies), dtype)
-    whole = Totals(
-        zero, zero, zero, stations, stations, stations, stations, modes, modes, modes, link, link,
-        link, link, link, zero, zero, zero, link, zero, link, link, link, modes, controlled, zero,
-        (1 + lines, lines), (lines, lines),
-    )  # fmt: skip
-    names = {*wanted, *ALWAYS} if wanted else NEEDS
-    needed = {total for name in names for total in NEEDS[name]}
-    kept = (x if f in needed else None for f, x in zip(Totals._fields, whole, strict=True))
-    return Totals._make(kept)
+
+    def begin(total: Total) -> Any:
+        shape = tuple(sizes.axes[name] for name in total.dims)
+        return jax.tree.map(lambda start: jnp.full(shape, start, dtype), total.start)
+
+    names = {*wanted, *ALWAYS} if wanted else METRICS
+    return {x.name: begin(x) for name in METRICS if name in names for x in METRICS[name].totals}
 
 
-def _filled(totals: Totals) -> Totals:
-    """Zeros for what is not accumulated, so that one arithmetic serves all choices."""
-    pairs = ("phasor", "spectrum")
-    return Totals._make(
-        x if x is not None else (0.0, 0.0) if f in pairs else 0.0
-        for f, x in zip(Totals._fields, totals, strict=True)
-    )
-
-
-def accumulate(
-    totals: Totals,
-    sample: Sample,
-    window: Window,
-    omega: Array,
-    modal_omega: Array,
-    rotation: tuple[Array, Array],
-    band: Array,
-) -> Totals:
+def accumulate(totals: Totals, instant: Instant) -> Totals:
     """Add one sample.
 
     Args:
         totals: so far.
-        sample: the instant's signals.
-        window: the instant's weights.
-        omega: plant modes [rad/s], (3, R).
-        modal_omega: controller's modes [rad/s], (3, C).
-        rotation: cos and sin of (frequency x period), (3, C, n_frequencies).
-        band: settling band [m], ().
-
-    Returns:
-        Totals.
+        instant: the instant's signals and weights.
     """
-    given, totals = totals, _filled(totals)
-    moving, residual = window.is_moving, window.is_residual
-    size = jnp.abs(sample.deflection)
-    square = sample.deflection * sample.deflection
-    modal_square = sample.q * sample.q
-    highest = jnp.max(size, axis=1)
-    is_outside = highest > band
-    is_after = jnp.where(window.after_command > 0, 1.0, 0.0).astype(highest.dtype)
-    cosine, sine = (jnp.asarray(x) for x in totals.phasor)
-    turn_c, turn_s = rotation
-    weighted = (window.taper * sample.modal)[:, :, None]
-    plant_energy = omega * omega * modal_square + sample.q_rate * sample.q_rate
-    modal_energy = (modal_omega * sample.modal) ** 2 + sample.modal_rate * sample.modal_rate
-    new = Totals(
-        count=totals.count + 1,
-        moving_count=totals.moving_count + moving,
-        residual_count=totals.residual_count + residual,
-        moving_square=totals.moving_square + moving * square,
-        moving_peak=jnp.maximum(totals.moving_peak, moving * size),
-        residual_square=totals.residual_square + residual * square,
-        residual_peak=jnp.maximum(totals.residual_peak, residual * size),
-        moving_modal_square=totals.moving_modal_square + moving * modal_square,
-        residual_modal_square=totals.residual_modal_square + residual * modal_square,
-        residual_modal_peak=jnp.maximum(totals.residual_modal_peak, residual * jnp.abs(sample.q)),
-        settled_at=jnp.where(is_outside, window.after_command, totals.settled_at),
-        ringing=totals.ringing + is_after * highest * highest / (highest * highest + band * band),
-        moving_error_peak=jnp.maximum(
-            totals.moving_error_peak, moving * jnp.abs(sample.pose_error)
-        ),
-        residual_error_square=totals.residual_error_square
-        + residual * sample.pose_error * sample.pose_error,
-        peak_voltage=jnp.maximum(totals.peak_voltage, jnp.max(jnp.abs(sample.voltage), axis=1)),
-        voltage_square=totals.voltage_square
-        + jnp.sum(jnp.sum(sample.voltage * sample.voltage, axis=1), axis=0),
-        saturated=totals.saturated + sample.is_saturated,
-        clipped=totals.clipped + sample.is_clipped,
-        peak_force=jnp.maximum(totals.peak_force, jnp.abs(sample.motor_force)),
-        motor_saturated=totals.motor_saturated + sample.is_motor_saturated,
-        peak_tension=jnp.maximum(totals.peak_tension, sample.axial_force),
-        peak_compression=jnp.maximum(totals.peak_compression, -sample.axial_force),
-        stretch_peak=jnp.maximum(totals.stretch_peak, jnp.abs(sample.stretch_error)),
-        plant_energy=totals.plant_energy + moving * plant_energy,
-        modal_energy=totals.modal_energy + moving * modal_energy,
-        taper_square=totals.taper_square + window.taper * window.taper,
-        phasor=(cosine * turn_c - sine * turn_s, sine * turn_c + cosine * turn_s),
-        spectrum=(
-            totals.spectrum[0] + weighted * cosine,
-            totals.spectrum[1] + weighted * sine,
-        ),
+    known = {total.name: total for metric in METRICS.values() for total in metric.totals}
+    return {name: known[name].update(totals, instant) for name in totals}
+
+
+def finish(totals: Totals, ending: Ending) -> Metrics:
+    """All metrics that the totals of a run allow."""
+    return Metrics(
+        (name, metric.finish(totals, ending))
+        for name, metric in METRICS.items()
+        if all(total.name in totals for total in metric.totals)
     )
-    return Totals._make(None if a is None else b for a, b in zip(given, new, strict=True))
+
+
+# --- totals ---------------------------------------------------------------------------------------
+
+
+def _counted(name: str, weight: Callable[[Instant], Array | float]) -> Total:
+    return Total(name, (), lambda totals, at: totals[name] + weight(at))
+
+
+def _summed(name: str, dims: tuple[str, ...], term: Callable[[Instant], Array]) -> Total:
+    return Total(name, dims, lambda totals, at: totals[name] + term(at))
+
+
+def _highest(name: str, dims: tuple[str, ...], value: Callable[[Instant], Array]) -> Total:
+    return Total(name, dims, lambda totals, at: jnp.maximum(totals[name], value(at)))
+
+
+def _last_outside(totals: Totals, at: Instant) -> Array:
+    highest = jnp.max(jnp.abs(at.sample.deflection), axis=1)
+    return jnp.where(highest > at.fixed.band, at.window.after_command, totals["settled_at"])
+
+
+def _share_outside(at: Instant) -> Array:
+    highest = jnp.max(jnp.abs(at.sample.deflection), axis=1)
+    is_after = jnp.where(at.window.after_command > 0, 1.0, 0.0).astype(highest.dtype)
+    band = at.fixed.band
+    return is_after * highest * highest / (highest * highest + band * band)
+
+
+def _turned(totals: Totals, at: Instant) -> tuple[Array, Array]:
+    cosine, sine = totals["phasor"]
+    turn_c, turn_s = at.fixed.rotation
+    return cosine * turn_c - sine * turn_s, sine * turn_c + cosine * turn_s
+
+
+def _transformed(totals: Totals, at: Instant) -> tuple[Array, Array]:
+    (cosine, sine), spectrum = totals["phasor"], totals["spectrum"]
+    weighted = (at.window.taper * at.sample.modal)[:, :, None]
+    return spectrum[0] + weighted * cosine, spectrum[1] + weighted * sine
+
+
+_STATIONS, _MODES = ("link", "station"), ("link", "mode")
+_CONTROLLED = ("link", "controlled_mode")
+_LINES = (*_CONTROLLED, "spectrum_point")
+
+_COUNT = _counted("count", lambda at: 1)
+_MOVING = _counted("moving_count", lambda at: at.window.is_moving)
+_RESIDUAL = _counted("residual_count", lambda at: at.window.is_residual)
+_TAPER = _counted("taper_square", lambda at: at.window.taper * at.window.taper)
+_PHASOR = Total("phasor", _LINES, _turned, (1.0, 0.0))
+_SPECTRUM = Total("spectrum", _LINES, _transformed, (0.0, 0.0))
+
+
+# --- metrics --------------------------------------------------------------------------------------
 
 
 def _root(x: Array) -> Array:
@@ -253,47 +235,298 @@ def _root(x: Array) -> Array:
     return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0)
 
 
-def finish(totals: Totals, period: Array) -> Metrics:
-    """Metrics from the totals of a run sampled every `period` [s].
+def _rms(
+    name: str,
+    dims: tuple[str, ...],
+    unit: str,
+    text: str,
+    count: Total,
+    square: Callable[[Instant], Array],
+    **about: bool,
+) -> Metric:
+    """Root of the mean over a window."""
+    total = _summed(f"{name}_square", dims, square)
 
-    The spectral density is the Hann-windowed periodogram 2 T |sum w x e^(-j omega t)|^2/sum w^2 at
-    given frequencies, one-sided. Metrics that have not been accumulated are None.
-    """
-    is_there = {f: x is not None for f, x in zip(Totals._fields, totals, strict=True)}
-    totals = _filled(totals)
-    moving = jnp.maximum(totals.moving_count, 1)
-    residual = jnp.maximum(totals.residual_count, 1)
-    count = jnp.maximum(totals.count, 1)
-    power = totals.spectrum[0] ** 2 + totals.spectrum[1] ** 2
-    taper = jnp.where(totals.taper_square > 0, totals.taper_square, 1.0)
-    whole = Metrics(
-        residual_rms=_root(totals.residual_square / residual),
-        residual_peak=totals.residual_peak,
-        structural_rms=_root(totals.moving_square / moving),
-        structural_peak=totals.moving_peak,
-        residual_modal_rms=_root(totals.residual_modal_square / residual),
-        residual_modal_peak=totals.residual_modal_peak,
-        structural_modal_rms=_root(totals.moving_modal_square / moving),
-        settling_time=totals.settled_at,
-        ringing_time=totals.ringing * period,
-        pose_error_peak=totals.moving_error_peak,
-        pose_error_rms=_root(totals.residual_error_square / residual),
-        peak_voltage=totals.peak_voltage,
-        saturated_fraction=totals.saturated / count,
-        clipped_fraction=totals.clipped / count,
-        control_energy=totals.voltage_square * period,
-        peak_force=totals.peak_force,
-        motor_saturated_fraction=totals.motor_saturated / count,
-        peak_tension=totals.peak_tension,
-        peak_compression=totals.peak_compression,
-        stretch_error_peak=totals.stretch_peak,
-        plant_energy=totals.plant_energy / moving,
-        modal_energy=totals.modal_energy / moving,
-        spectral_density=2 * period * power / taper,
-    )
-    return Metrics(
-        *(
-            x if all(is_there[total] for total in NEEDS[name]) else None
-            for name, x in zip(Metrics._fields, whole, strict=True)
-        )
-    )
+    def finished(totals: Totals, ending: Ending) -> Array:
+        return _root(totals[total.name] / jnp.maximum(totals[count.name], 1))
+
+    return Metric(name, dims, unit, text, (count, total), finished, **about)
+
+
+def _mean(
+    name: str,
+    dims: tuple[str, ...],
+    unit: str,
+    text: str,
+    count: Total,
+    term: Callable[[Instant], Array],
+    **about: bool,
+) -> Metric:
+    total = _summed(f"{name}_sum", dims, term)
+
+    def finished(totals: Totals, ending: Ending) -> Array:
+        return totals[total.name] / jnp.maximum(totals[count.name], 1)
+
+    return Metric(name, dims, unit, text, (count, total), finished, **about)
+
+
+def _peak(
+    name: str,
+    dims: tuple[str, ...],
+    unit: str,
+    text: str,
+    value: Callable[[Instant], Array],
+    **about: bool,
+) -> Metric:
+    total = _highest(name, dims, value)
+    return Metric(name, dims, unit, text, (total,), lambda totals, _: totals[name], **about)
+
+
+def _square(x: Array) -> Array:
+    return x * x
+
+
+def _sum_of_squares(voltage: Array) -> Array:
+    return jnp.sum(jnp.sum(voltage * voltage, axis=1), axis=0)
+
+
+def _plant_energy(at: Instant) -> Array:
+    omega, q, q_rate = at.fixed.omega, at.sample.q, at.sample.q_rate
+    return omega * omega * (q * q) + q_rate * q_rate
+
+
+def _modal_energy(at: Instant) -> Array:
+    modal, rate = at.sample.modal, at.sample.modal_rate
+    return (at.fixed.modal_omega * modal) ** 2 + rate * rate
+
+
+def _density(totals: Totals, ending: Ending) -> Array:
+    """2 T |sum w x e^(-j omega t)|^2/sum w^2."""
+    power = totals["spectrum"][0] ** 2 + totals["spectrum"][1] ** 2
+    taper = totals["taper_square"]
+    return 2 * ending.period * power / jnp.where(taper > 0, taper, 1.0)
+
+
+_MODAL_ENERGY = _summed(
+    "modal_energy_sum", _CONTROLLED, lambda at: at.window.is_moving * _modal_energy(at)
+)
+
+
+def _over_moving(totals: Totals, name: str) -> Array:
+    return totals[name] / jnp.maximum(totals["moving_count"], 1)
+
+
+#: All metrics by name, in the order of the files.
+METRICS: Table[Metric] = Table(
+    "metric",
+    [
+        _rms(
+            "residual_rms",
+            _STATIONS,
+            "m",
+            "rms chord deflection in the residual window",
+            _RESIDUAL,
+            lambda at: at.window.is_residual * _square(at.sample.deflection),
+            is_single=False,
+        ),
+        _peak(
+            "residual_peak",
+            _STATIONS,
+            "m",
+            "peak chord deflection in the residual window",
+            lambda at: at.window.is_residual * jnp.abs(at.sample.deflection),
+            is_single=False,
+        ),
+        _rms(
+            "structural_rms",
+            _STATIONS,
+            "m",
+            "rms chord deflection while moving",
+            _MOVING,
+            lambda at: at.window.is_moving * _square(at.sample.deflection),
+        ),
+        _peak(
+            "structural_peak",
+            _STATIONS,
+            "m",
+            "peak chord deflection while moving",
+            lambda at: at.window.is_moving * jnp.abs(at.sample.deflection),
+        ),
+        _rms(
+            "residual_modal_rms",
+            _MODES,
+            "m",
+            "rms of plant modes in the residual window",
+            _RESIDUAL,
+            lambda at: at.window.is_residual * _square(at.sample.q),
+            is_single=False,
+        ),
+        _peak(
+            "residual_modal_peak",
+            _MODES,
+            "m",
+            "peak of plant modes in the residual window",
+            lambda at: at.window.is_residual * jnp.abs(at.sample.q),
+            is_single=False,
+        ),
+        _rms(
+            "structural_modal_rms",
+            _MODES,
+            "m",
+            "rms of plant modes while moving",
+            _MOVING,
+            lambda at: at.window.is_moving * _square(at.sample.q),
+        ),
+        Metric(
+            "settling_time",
+            ("link",),
+            "s",
+            "from the command's end until all stations stay in the band",
+            (Total("settled_at", ("link",), _last_outside),),
+            lambda totals, _: totals["settled_at"],
+            has_slope=False,
+            is_single=False,
+        ),
+        Metric(
+            "ringing_time",
+            ("link",),
+            "s",
+            "time outside the band after the command, smooth",
+            (_summed("ringing", ("link",), _share_outside),),
+            lambda totals, ending: totals["ringing"] * ending.period,
+            is_single=False,
+        ),
+        _peak(
+            "pose_error_peak",
+            ("pose_axis",),
+            "m; m; rad",
+            "peak error from the shaped command while moving",
+            lambda at: at.window.is_moving * jnp.abs(at.sample.pose_error),
+        ),
+        _rms(
+            "pose_error_rms",
+            ("pose_axis",),
+            "m; m; rad",
+            "rms error in the residual window",
+            _RESIDUAL,
+            lambda at: at.window.is_residual * _square(at.sample.pose_error),
+            is_single=False,
+        ),
+        _peak(
+            "peak_voltage",
+            ("link",),
+            "V",
+            "peak actuator voltage",
+            lambda at: jnp.max(jnp.abs(at.sample.voltage), axis=1),
+            is_single=False,
+        ),
+        _mean(
+            "saturated_fraction",
+            (),
+            "1",
+            "samples with an actuator at its limit",
+            _COUNT,
+            lambda at: at.sample.is_saturated,
+            has_slope=False,
+        ),
+        _mean(
+            "clipped_fraction",
+            (),
+            "1",
+            "samples with an ADC channel at its end",
+            _COUNT,
+            lambda at: at.sample.is_clipped,
+            has_slope=False,
+        ),
+        Metric(
+            "control_energy",
+            (),
+            "V2 s",
+            "integral of the summed squared actuator voltages",
+            (_summed("voltage_square", (), lambda at: _sum_of_squares(at.sample.voltage)),),
+            lambda totals, ending: totals["voltage_square"] * ending.period,
+        ),
+        _peak(
+            "peak_force",
+            ("slider_axis",),
+            "N",
+            "peak motor force",
+            lambda at: jnp.abs(at.sample.motor_force),
+        ),
+        _mean(
+            "motor_saturated_fraction",
+            (),
+            "1",
+            "samples with a motor at its limit",
+            _COUNT,
+            lambda at: at.sample.is_motor_saturated,
+            has_slope=False,
+        ),
+        _peak(
+            "peak_tension",
+            ("link",),
+            "N",
+            "largest tension in a link",
+            lambda at: at.sample.axial_force,
+        ),
+        _peak(
+            "peak_compression",
+            ("link",),
+            "N",
+            "largest compression of a link",
+            lambda at: -at.sample.axial_force,
+        ),
+        _peak(
+            "stretch_error_peak",
+            ("pose_axis",),
+            "m; m; rad",
+            "peak pose error that stretching links would add, N L/(E A)",
+            lambda at: jnp.abs(at.sample.stretch_error),
+        ),
+        _mean(
+            "plant_energy",
+            _MODES,
+            "m2/s2",
+            "mean of omega^2 q^2 + q'^2 while moving",
+            _MOVING,
+            lambda at: at.window.is_moving * _plant_energy(at),
+        ),
+        Metric(
+            "modal_energy",
+            _CONTROLLED,
+            "m2/s2",
+            "the same in the controller's modes",
+            (_MOVING, _MODAL_ENERGY),
+            lambda totals, _: _over_moving(totals, "modal_energy_sum"),
+        ),
+        Metric(
+            "spectral_density",
+            _LINES,
+            "m2/Hz",
+            "one-sided power spectral density of the controller's modes, Hann periodogram of the "
+            "run",
+            (_TAPER, _PHASOR, _SPECTRUM),
+            _density,
+            is_single=False,
+        ),
+        Metric(
+            "energy_ratio",
+            _CONTROLLED,
+            "1",
+            "EMC ratios (24) that the run's modal energies give",
+            (_MOVING, _MODAL_ENERGY),
+            lambda totals, ending: efficient_modal_control(
+                _over_moving(totals, "modal_energy_sum"), ending.modal_omega
+            ),
+        ),
+    ],
+)
+
+#: Metrics that the status of a run depends on.
+ALWAYS = (
+    "saturated_fraction",
+    "clipped_fraction",
+    "motor_saturated_fraction",
+    "pose_error_rms",
+    "peak_compression",
+)

@@ -12,11 +12,13 @@ from jaxmodel import shaper, status
 from jaxmodel.axial import axial_compliance
 from jaxmodel.bases import Bases, find_bases
 from jaxmodel.case import Case, Structure
-from jaxmodel.control import active_modes, condition_number, force_gains, left_inverse
+from jaxmodel.control import active_modes, condition_number, left_inverse
 from jaxmodel.controller import Controller
 from jaxmodel.electronics import design_amplifier
-from jaxmodel.estimator import KINDS, design_estimator
+from jaxmodel.estimator import KINDS
 from jaxmodel.integrator import exponential_step
+from jaxmodel.laws import LAWS, is_modal
+from jaxmodel.laws.contract import Known
 from jaxmodel.loop import Loop
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import actuator_constant, placement_faults, sensor_constant
@@ -46,9 +48,8 @@ class ControllerDesign(NamedTuple):
     """Controller and what its design knows, before gains are chosen or judged."""
 
     controller: Controller
-    observer: Array  # (3, C, K): modal filter of the controlled modes [m/V]
+    known: Known
     modal_omega: Array  # frequencies of the controller's own modes [rad/s], (3, C)
-    assembled_omega: Array  # frequencies the estimator is exact at [rad/s], (3, C)
     sensor_condition: Array  # (3,)
     actuator_condition: Array  # (3,)
 
@@ -93,7 +94,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         deflection_at=basis.deflection_at,
         controller=design.controller,
         ideal=_ideal(design.controller, sensor) if structure.feedback == "ideal" else None,
-        observer=jnp.einsum("ick,ikr->icr", design.observer, sensor),
+        observer=jnp.einsum("ick,ikr->icr", design.known.observer, sensor),
         modal_omega=design.modal_omega,
         rotation=(jnp.cos(angle), jnp.sin(angle)),
         drive=case.drive._replace(
@@ -148,8 +149,8 @@ def _constants(case: Case) -> tuple[Array, Array]:
 def design_controller(structure: Structure, case: Case, bases: Bases) -> ControllerDesign:
     """Controller of a case from what it believes, `Bases.model`.
 
-    IMSC: modal filter pinv(lambda_s Phi_s^t), synthesizer pinv(lambda_a Phi_a), gains (20) with
-    ratios (24). SRF (16): every patch feeds back the rate of its own voltage.
+    Modal filter pinv(lambda_s Phi_s^t) and synthesizer pinv(lambda_a Phi_a), then what the law
+    makes of them (`jaxmodel.laws`).
 
     Args:
         structure: static choices; `law` and sizes are read.
@@ -161,44 +162,26 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
     """
     control, electronics = case.control, case.electronics
     model, assembled, n = bases.model, bases.believed_omega, structure.n_controlled
-    known = model.mass.shape[1]
+    size = model.mass.shape[1]
     lambda_s, lambda_a = _constants(case)
-    sensor = lambda_s[:, None, None] * jnp.swapaxes(model.sensor_slope, 1, 2)  # (3, K, known)
-    actuator = lambda_a[:, None, None] * model.actuator_slope  # (3, known, K)
+    sensor = lambda_s[:, None, None] * jnp.swapaxes(model.sensor_slope, 1, 2)  # (3, K, size)
+    actuator = lambda_a[:, None, None] * model.actuator_slope  # (3, size, K)
     mask = active_modes(control.n_active, n, structure.n_patches)
     seen, driven = sensor[:, :, :n], jnp.swapaxes(actuator[:, :n], 1, 2)
     # in one call: XLA's CPU compiler aborts on two of them side by side where C = 1 (jax 0.10)
     inverse = jax.vmap(left_inverse, (0, None))(jnp.concatenate([seen, driven]), mask)
     observer, synthesizer = inverse[:3], jnp.swapaxes(inverse[3:], 1, 2)
 
-    on = jnp.asarray(control.link_mask)[:, None] * control.gain_factor
-    if structure.law == "srf":
-        eye = jnp.broadcast_to(jnp.eye(structure.n_patches), (3,) + (structure.n_patches,) * 2)
-        channel_filter, synthesizer = eye, eye
-        velocity = on * jnp.broadcast_to(control.velocity_gain[:, None], (3, structure.n_patches))
-        position = on * jnp.broadcast_to(control.position_gain[:, None], (3, structure.n_patches))
-        channel_omega = jnp.broadcast_to(assembled[:, :1], (3, structure.n_patches))
-        ratio, zeta = electronics.lowpass_ratio[0], electronics.lowpass_zeta[0]
-    else:
-        channel_filter = observer
-        on = on * jnp.asarray(control.mode_mask) * mask
-        modal_mass = model.mass[:, :n]
-        velocity = on * force_gains(
-            control.velocity_gain, control.ratio, modal_mass, control.is_per_mass
-        )
-        position = on * force_gains(
-            control.position_gain, control.ratio, modal_mass, control.is_per_mass
-        )
-        channel_omega = assembled
-        ratio, zeta = electronics.lowpass_ratio, electronics.lowpass_zeta
-    residual = (1.0 - jnp.pad(mask, (0, known - n))) / model.stiffness
+    known = Known(observer, synthesizer, assembled, model.mass[:, :n], mask)
+    feedback = LAWS[structure.law].design(structure, case, known)
+    residual = (1.0 - jnp.pad(mask, (0, size - n))) / model.stiffness
     feedthrough = jnp.einsum("ikr,ir,irl->ikl", sensor, residual, actuator)
     controller = Controller(
-        filter=channel_filter,
-        estimator=design_estimator(channel_omega, electronics, ratio, zeta),
-        velocity_gain=velocity,
-        position_gain=position if structure.has_position_gain else None,
-        synthesizer=synthesizer,
+        filter=feedback.filter,
+        estimator=feedback.estimator,
+        velocity_gain=feedback.velocity_gain,
+        position_gain=feedback.position_gain if structure.has_position_gain else None,
+        synthesizer=feedback.synthesizer,
         feedthrough=control.feedthrough_factor * feedthrough,
         voltage_limit=jnp.asarray(electronics.voltage_limit),
         adc_gain=jnp.asarray(electronics.conditioner_gain),
@@ -206,14 +189,14 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         adc_step=jnp.asarray(electronics.adc_range / electronics.adc_levels),
         adc_top=jnp.asarray(electronics.adc_levels - 1.0),
         adc_noise=jnp.asarray(electronics.adc_noise),
+        rival_omega=feedback.rival_omega,
     )  # fmt: skip
     return ControllerDesign(
-        controller,
-        observer,
-        jnp.sqrt(model.stiffness / model.mass)[:, :n],
-        assembled,
-        condition_number(seen, mask),
-        condition_number(driven, mask),
+        controller=controller,
+        known=known,
+        modal_omega=jnp.sqrt(model.stiffness / model.mass)[:, :n],
+        sensor_condition=condition_number(seen, mask),
+        actuator_condition=condition_number(driven, mask),
     )
 
 
@@ -265,10 +248,9 @@ def _static_status(
     patches, windows, control = case.machine.patches, case.windows, case.control
     length = jnp.broadcast_to(case.machine.beam.length, (3,))
     is_off, is_overlapping = placement_faults(patches, length)
-    is_modal = structure.law == "imsc"
     checks = (
         (_is_ill_conditioned(structure, case, design), status.ILL_CONDITIONED),
-        ((control.n_active > structure.n_patches) & is_modal, status.TOO_MANY_MODES),
+        ((control.n_active > structure.n_patches) & is_modal(structure), status.TOO_MANY_MODES),
         (is_overlapping, status.PATCHES_OVERLAP),
         (is_off, status.PATCH_OFF_LINK),
         (
@@ -311,7 +293,7 @@ def drive_rate(case: Case) -> Array:
 
 
 def _is_ill_conditioned(structure: Structure, case: Case, design: ControllerDesign) -> Array:
-    uses_filter = structure.law == "imsc" and structure.feedback != "none"
+    uses_filter = is_modal(structure) and structure.feedback != "none"
     worst = jnp.maximum(jnp.max(design.sensor_condition), jnp.max(design.actuator_condition))
     return (worst > case.windows.condition_limit) & uses_filter
 

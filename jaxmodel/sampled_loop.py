@@ -16,6 +16,7 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, ControllerState, controller_step
 from jaxmodel.electronics import FASTEST
+from jaxmodel.laws import n_channels
 from jaxmodel.linear import LinearPlant, Moment, linearise, resting
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
@@ -69,7 +70,7 @@ def closed_loop(
     scale = jnp.concatenate([analogue.size, jnp.full((n_inputs,), 1e6)])
     exact = jax.scipy.linalg.expm(held / scale[:, None] * scale * case.electronics.period)
     exact = (exact * scale[:, None] / scale)[:n]
-    channels, patches = structure.n_channels, structure.n_patches
+    channels, patches = n_channels(structure), structure.n_patches
     n_sensors = 3 * patches
 
     def advance(x: Array, factor: Array) -> Array:

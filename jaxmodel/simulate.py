@@ -12,7 +12,6 @@ import numpy as np
 from jaxmodel import metrics, status
 from jaxmodel.axial import axial_force, critical_force, euler_force
 from jaxmodel.case import Case, Load, Structure
-from jaxmodel.control import efficient_modal_control
 from jaxmodel.controller import Controller
 from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.kinematics import inverse_kinematics, path_status, singularity_distance
@@ -36,7 +35,6 @@ class Result(NamedTuple):
     sensor_condition: Array  # condition number of the modal filter per link [1], (3,)
     actuator_condition: Array  # of the synthesizer [1], (3,)
     singularity_distance: Array  # of the path from poses no slider reaches or holds [rad], ()
-    energy_ratio: Array  # EMC ratios (24) that this run's modal energies give [1], (3, C)
     record: Record | None  # trajectories, leading axis (n_steps,), if asked for
 
 
@@ -199,8 +197,7 @@ class Outline(NamedTuple):
     command_end: Array  # [s], ()
     sensor_condition: Array  # (3,)
     actuator_condition: Array  # (3,)
-    modal_omega: Array  # of the controller's modes [rad/s], (3, C)
-    period: Array  # [s], ()
+    ending: metrics.Ending
     saturation_limit: Array  # [1], ()
     arrival_tolerance: Array  # [m], ()
     critical_force: Array  # N_cr of the links [N], (3,)
@@ -247,18 +244,17 @@ def begin(structure: Structure, case: Case, law: Controller | None = None) -> St
             case.electronics.sensor_highpass,
         ),
         Outline(
-            jnp.where(prepared.status == status.OK, outside.bad_time, 0.0),
-            outside.end,
-            prepared.sensor_condition,
-            prepared.actuator_condition,
-            loop.modal_omega,
-            jnp.asarray(case.electronics.period),
-            jnp.asarray(case.windows.saturation_limit),
-            jnp.asarray(case.windows.arrival_tolerance),
-            _allowed_compression(case, loop.plant),
-            jnp.max(jnp.asarray(case.machine.geometry.joint_radius)),
-            outside.singularity_distance,
-            jnp.asarray(case.windows.singularity_margin),
+            early_time=jnp.where(prepared.status == status.OK, outside.bad_time, 0.0),
+            command_end=outside.end,
+            sensor_condition=prepared.sensor_condition,
+            actuator_condition=prepared.actuator_condition,
+            ending=metrics.Ending(jnp.asarray(case.electronics.period), loop.modal_omega),
+            saturation_limit=jnp.asarray(case.windows.saturation_limit),
+            arrival_tolerance=jnp.asarray(case.windows.arrival_tolerance),
+            critical_force=_allowed_compression(case, loop.plant),
+            joint_radius=jnp.max(jnp.asarray(case.machine.geometry.joint_radius)),
+            singularity_distance=outside.singularity_distance,
+            singularity_margin=jnp.asarray(case.windows.singularity_margin),
         ),
     )
 
@@ -282,7 +278,7 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
     Returns:
         Result.
     """
-    result = metrics.finish(last.totals, outline.period)
+    result = metrics.finish(last.totals, outline.ending)
     final = last.status
     limit, error = outline.saturation_limit, result.pose_error_rms
     miss = jnp.sqrt(error[0] ** 2 + error[1] ** 2) + outline.joint_radius * error[2]
@@ -307,9 +303,6 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
         sensor_condition=outline.sensor_condition,
         actuator_condition=outline.actuator_condition,
         singularity_distance=outline.singularity_distance,
-        energy_ratio=None
-        if result.modal_energy is None
-        else efficient_modal_control(result.modal_energy, outline.modal_omega),
         record=record,
     )
 

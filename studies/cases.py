@@ -24,10 +24,12 @@ from jaxmodel.case import (
     Structure,
     Windows,
 )  # fmt: skip
+from jaxmodel.laws import LAWS
+from jaxmodel.laws.contract import Law
 from jaxmodel.parameters import ASSEMBLIES, Beam, Damping, Geometry, Machine, Masses, Patches
 from studies.consistency import patch_centers
 from studies.fields import Columns, Fields
-from studies.spec import Study
+from studies.spec import OWN_FIELDS, Study
 
 TWO_PI = 2 * np.pi
 #: Duration of a move that only fills up a path of fewer moves [s].
@@ -63,7 +65,8 @@ def build_structure(study: Study, substeps: int | None = None) -> Structure:
         has_amplifier=study.electronics.amplifier_hz > 0,
         has_noise=noisy,
         has_friction=study.drive.coulomb_friction > 0,
-        has_position_gain=any(gain != 0 for gain in study.control.position_gain),
+        has_position_gain=LAWS[study.control.law].has_position
+        or any(gain != 0 for gain in study.control.position_gain),
         is_smooth=study.run.smooth,
     )
 
@@ -235,7 +238,18 @@ def _control(fields: Fields, structure: Structure) -> Control:
         gain_factor=number("control.gain_factor"),
         is_per_mass=fields.choices("control.gain_unit", ("N s/m", "1/s")).astype(float),
         feedthrough_factor=number("control.feedthrough_factor"),
+        parameters=_parameters(fields, LAWS[structure.law]),
     )
+
+
+def _parameters(fields: Fields, law: Law) -> dict[str, np.ndarray]:
+    names = {x.name: f"{OWN_FIELDS}.{law.name}.{x.name}" for x in law.parameters}
+    return {name: fields.each_link(field) for name, field in names.items()}
+
+
+def law_parameters(study: Study, law: Law) -> dict[str, np.ndarray]:
+    """Fields of a law's own as a study has them, whichever law it chooses, (3,) each."""
+    return {name: x[0] for name, x in _parameters(Fields(study), law).items()}
 
 
 def powered(ratio: Any, exponent: Any) -> np.ndarray:

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxmodel.laws import LAWS
 from jaxmodel.piezo import VACUUM_PERMITTIVITY
-from studies.errors import field_error
+from studies.errors import field_error, nearest
 
 if TYPE_CHECKING:
     from studies.spec import Study
@@ -50,7 +51,7 @@ def check_consistency(study: Study) -> None:
     link, control = study.link, study.control
     _check_patches(study)
     n_patches = patch_centers(study).shape[1]
-    if control.law == "imsc" and control.modes > n_patches:
+    if LAWS[control.law].channel == "mode" and control.modes > n_patches:
         raise field_error(
             "control.modes",
             control.modes,
@@ -58,6 +59,7 @@ def check_consistency(study: Study) -> None:
             "1",
         )
     _check_lists(study)
+    _check_own_fields(study)
     if link.basis != "loaded" and any(map(np.any, (link.joint_inertia_b, link.joint_inertia_c))):
         raise field_error("link.basis", link.basis, "loaded, where a joint has rotary inertia")
     if study.drive.locked and link.basis == "pinned_free":
@@ -80,6 +82,22 @@ def check_consistency(study: Study) -> None:
     _check_sampling(study)
     _check_pulses(study)
     _check_coupling(study)
+
+
+def _check_own_fields(study: Study) -> None:
+    """Fields of laws' own; those of a law that is not chosen may stand there for a sweep."""
+    for name, fields in study.control.laws.items():
+        path = f"control.laws.{name}"
+        if name not in LAWS:
+            raise field_error(path, fields, ", ".join(LAWS), hint=nearest(name, LAWS))
+        known = {parameter.name: parameter for parameter in LAWS[name].parameters}
+        for leaf, value in fields.items():
+            if leaf not in known:
+                allowed = ", ".join(known) or "no field of its own"
+                raise field_error(f"{path}.{leaf}", value, allowed, hint=nearest(leaf, known))
+            low, high, unit = known[leaf].low, known[leaf].high, known[leaf].unit
+            if not np.all((each_link(value) >= low) & (each_link(value) <= high)):
+                raise field_error(f"{path}.{leaf}", value, f"{low:g} to {high:g}", unit)
 
 
 def _check_patches(study: Study) -> None:

@@ -8,11 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel import status
+from jaxmodel.metrics import METRICS
 from studies.errors import StudyError, field_error, nearest
 from studies.runs import Run, metric_variables
 from studies.spec import Study, load_study
 from studies.sweeps.folder import MANIFEST, TUNING, read_manifest
-from studies.sweeps.results import NOT_RUN, SweepData, load, metric_names
+from studies.sweeps.results import NOT_RUN, SweepData, load
 from studies.sweeps.spec import parse_sweep, ready_spec
 from studies.sweeps.table import build_table, case_study
 
@@ -62,7 +63,7 @@ def load_design(path: Path, case: int | str | None = None) -> Design:
     case_id = str(data["case_id"][number])
     if code == NOT_RUN:
         return Design(study, {}, case_id)
-    names = ["status", *(name for name in metric_names() if name in data.variables)]
+    names = ["status", *(name for name in METRICS if name in data.variables)]
     return Design(study, {name: data[name][number] for name in names}, case_id)
 
 
@@ -112,7 +113,6 @@ def deviation(run: Run, stored: dict[str, np.ndarray]) -> tuple[float, str]:
         (difference [1], name of the metric); (0, "") where there is nothing to compare.
     """
     found = {name: variable.data for name, variable in metric_variables(run.result).items()}
-    found["energy_ratio"] = run.result.energy_ratio
     worst = (0.0, "")
     for name, wanted in stored.items():
         if name == "status":

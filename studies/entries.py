@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxmodel.metrics import METRICS
 from studies.errors import StudyError, nearest
-from studies.fields import LINKS, NAMED_INDEX, parse_entry
-from studies.runs import METRIC_LABELS
+from studies.paths import LINKS, NAMED_INDEX, parse_entry
 from studies.spec import Study
 
 
@@ -42,7 +42,7 @@ class Entries(NamedTuple):
     @property
     def axes(self) -> tuple[str, ...]:
         """Names of the metric's axes after the runs'."""
-        return METRIC_LABELS[self.metric][0]
+        return METRICS[self.metric].dims
 
     @property
     def names_a_link(self) -> bool:
@@ -66,11 +66,11 @@ def parse_entries(name: str, path: str = "", sizes: Mapping[str, int] | None = N
     """
     where = f"{path}: " if path else ""
     plain = parse_entry(NAMED_INDEX.sub("", name))
-    if plain is None or plain.field not in METRIC_LABELS:
-        hint = nearest(name.partition("[")[0], METRIC_LABELS)
-        told = f"did you mean {hint!r}?" if hint else f"allowed {', '.join(METRIC_LABELS)}"
+    if plain is None or plain.field not in METRICS:
+        hint = nearest(name.partition("[")[0], METRICS)
+        told = f"did you mean {hint!r}?" if hint else f"allowed {', '.join(METRICS)}"
         raise StudyError(f"{where}{name!r} is no metric; {told}")
-    axes = METRIC_LABELS[plain.field][0]
+    axes = METRICS[plain.field].dims
     size = {axis: (sizes or {}).get(axis, 3) for axis in axes}
     at: dict[str, int] = {}
     for axis, written in NAMED_INDEX.findall(name):

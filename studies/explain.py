@@ -9,6 +9,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from studies.choices import OneOf
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
 
 _SIGNS = (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
@@ -26,11 +27,24 @@ def unit_of(info: FieldInfo) -> str:
     return "" if unit == "-" else unit
 
 
+def choices_of(annotation: Any, metadata: Iterable[Any] = ()) -> tuple[Any, ...]:
+    """What a field that is a choice may be; () for others."""
+    tables = [item.names for item in metadata if isinstance(item, OneOf)]
+    literal = get_args(annotation) if get_origin(annotation) is Literal else ()
+    return tables[0] if tables else literal
+
+
 def allowed_values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
     """What a type with its limits allows: "a number > 0 and <= 100", "'a' or 'b'", "3 numbers".
 
     annotation: the type of a field or of an entry. metadata: its limits, as pydantic keeps them.
     """
+    names = choices_of(annotation, metadata)
+    if names:
+        return " or ".join(filter(None, (", ".join(map(repr, names[:-1])), repr(names[-1]))))
+    for item in metadata:
+        if hasattr(item, "allowed"):  # says it itself
+            return str(item.allowed)
     origin, arguments = get_origin(annotation), get_args(annotation)
     if hasattr(annotation, "__metadata__"):
         return allowed_values(arguments[0], _limits(annotation))
@@ -40,9 +54,6 @@ def allowed_values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
             inner, limits = get_args(arguments[0])[0], _range(_limits(arguments[0]))
             return f"{_WORDS[inner]}, or a list of {len(several)}, each {limits}"
         return ", or ".join(allowed_values(each, metadata) for each in arguments)
-    if origin is Literal:
-        names = [repr(name) for name in arguments]
-        return " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
     if origin is dict:
         return "a table"
     if origin is tuple:
@@ -162,7 +173,7 @@ def _bad_value(
         annotation = arguments[0] if arguments[-1] is Ellipsis else arguments[part]
         metadata, value = [], value[part]
         name = [*name, part]
-    choices = get_args(annotation) if get_origin(annotation) is Literal else ()
+    choices = choices_of(annotation, metadata)
     hint = nearest(value, choices) if isinstance(value, str) else ""
     field = ".".join(str(part) for part in [inside, *name] if part != "")
     return field_error(field, value, allowed_values(annotation, metadata), unit_of(info), hint)

@@ -7,47 +7,15 @@ also be named after an entry of a list, `control.velocity_gain[0]`.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from studies.spec import EACH_LINK, Study
+from studies.paths import LINKS, as_list, field_value, is_each_link, parse_entry
+from studies.spec import Study
 
 Columns = Mapping[str, np.ndarray]
-
-#: An index that names its axis and counts from 1, as the files do: `residual_rms[link=1]`.
-NAMED_INDEX = re.compile(r"\[(\w+)=(\d{1,6})\]")
-LINKS = 3
-_ENTRY = re.compile(r"(?P<field>[^\s\[\]]+)(?P<indices>(\[(0|[1-9]\d{0,5})\])*)")
-
-
-class Entry(NamedTuple):
-    """A field, or an entry of a list: `control.ratios[0][1]` is ("control.ratios", (0, 1))."""
-
-    field: str
-    indices: tuple[int, ...]
-
-
-def parse_entry(name: str) -> Entry | None:
-    """Split a name into field and indices; None where it is no such name."""
-    match = _ENTRY.fullmatch(name)
-    if match is None:
-        return None
-    return Entry(match["field"], tuple(map(int, re.findall(r"\d+", match["indices"]))))
-
-
-def field_value(study: Study, field: str) -> Any:
-    """Value of `section.field` of a study."""
-    section, _, leaf = field.partition(".")
-    value = getattr(study, section)
-    return getattr(value, leaf) if leaf else value
-
-
-def as_list(field: str, value: Any) -> Any:
-    """A field's value where its entries are asked for: three, where one stands for all links."""
-    return (value,) * LINKS if field in EACH_LINK and not isinstance(value, tuple) else value
 
 
 def padded(values: list[Any]) -> np.ndarray:
@@ -110,7 +78,7 @@ class Fields:
         """As floats, entries of lists put in; what ragged lists lack is NaN."""
         raw = self.raw(field)
         if raw.dtype == object:
-            is_mixed = field in EACH_LINK and any(isinstance(value, tuple) for value in raw)
+            is_mixed = is_each_link(field) and any(isinstance(value, tuple) for value in raw)
             array = padded([as_list(field, x) for x in raw] if is_mixed else list(raw))
         else:
             array = raw.astype(float)

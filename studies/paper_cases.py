@@ -202,7 +202,7 @@ def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:
         structure = built[0][0]
         frame = frame_of(structure, built[0][1])
         results = [run_batches(structure, [arrays for _, arrays in built], tell)]
-        energy_ratio = results[0].energy_ratio
+        energy_ratio = results[0].metrics.energy_ratio
         by_counterpart = {case.counterpart: energy_ratio[k] for k, case in enumerate(off)}
         ratios = [_ratio(case, by_counterpart) for case in on]
         arrays = [build_paper_case(base, case, r)[1] for case, r in zip(on, ratios, strict=True)]
@@ -257,7 +257,9 @@ def _pinned_free_ratios(base: Study, off: list[PaperCase], tell: Tell) -> list[E
     for case in _unshaped(off):
         tell("modal energies in pinned-free coordinates", 0.0)
         run = run_study(case_study(study, case), has_record=False, has_loop=False)
-        rows.append(EnergyRatio(case.move, case.shaper, "pinned_free", run.result.energy_ratio))
+        rows.append(
+            EnergyRatio(case.move, case.shaper, "pinned_free", run.result.metrics.energy_ratio)
+        )
         tell("modal energies in pinned-free coordinates", 1.0)
     return rows
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from jaxmodel import status
 from jaxmodel.axial import euler_force
+from jaxmodel.laws import LAWS
 from studies import figures
 from studies.errors import StudyError
 from studies.pages import literal, opening, picture, table, write_report
@@ -154,9 +155,10 @@ def control_text(study: Study) -> str:
     links = [str(i + 1) for i in range(3) if control.links[i]]
     if control.feedback == "none" or not links:
         return "no link controlled"
-    law = {"imsc": f"modal control of {control.modes} modes", "srf": "strain rate feedback"}
+    law = LAWS[control.law]
+    what = f"{law.text} of {control.modes} modes" if law.channel == "mode" else law.text
     return (
-        f"{law[control.law]} on link{'s' if len(links) > 1 else ''} {', '.join(links)}, "
+        f"{what} on link{'s' if len(links) > 1 else ''} {', '.join(links)}, "
         f"{control.feedback} feedback, gain factor {control.gain_factor:g}"
     )
 

@@ -20,7 +20,9 @@ from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
 from jaxmodel.kinematics import SINGULAR_MARGIN, lift, path_status
+from jaxmodel.laws import is_modal, n_channels
 from jaxmodel.linear import linearise, mechanical, resting
+from jaxmodel.metrics import METRICS
 from jaxmodel.motion import end_of_path, sample_path
 from jaxmodel.plant import damping_ratio
 from jaxmodel.prepare import (
@@ -95,7 +97,7 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
 
 def _own_ratio(study: Study, structure: Structure, case: Case, has_record: bool) -> np.ndarray:
     """Ratios (24) of the same case's uncontrolled run, (3, C); has_record: as the run after it."""
-    ratio = _simulate(structure, uncontrolled(case), has_record).energy_ratio
+    ratio = _simulate(structure, uncontrolled(case), has_record).metrics.energy_ratio
     return powered(ratio, study.control.ratio_exponent)
 
 
@@ -222,8 +224,8 @@ def check_run(study: Study) -> tuple[Structure, Case]:
         )  # fmt: skip
     _check_load(study, known)
     _check_duration(study, structure, known)
-    is_modal = structure.law == "imsc" and structure.feedback != "none"
-    if is_modal and known.condition > study.metrics.condition_limit:
+    is_filtered = is_modal(structure) and structure.feedback != "none"
+    if is_filtered and known.condition > study.metrics.condition_limit:
         raise field_error(
             "patches.centers", study.patches.centers,
             f"a placement whose modal filter for control.modes = {study.control.modes} has on each "
@@ -334,7 +336,7 @@ def _check_rates(study: Study, structure: Structure, known: Preflight) -> None:
         raise field_error(
             "electronics.lowpass_ratio", study.electronics.lowpass_ratio,
             f"low-pass corners below half the sample rate, {rate / 2:g} Hz; the highest of the "
-            f"{structure.n_channels} is at {corner:.5g} Hz (lower it, control.modes or raise "
+            f"{n_channels(structure)} is at {corner:.5g} Hz (lower it, control.modes or raise "
             "electronics.sample_rate_hz)", "1",
         )  # fmt: skip
 
@@ -417,45 +419,12 @@ def _ideal_substeps(study: Study, structure: Structure, case: Case) -> int:
 #: Unit, long name and flags of a status in a file.
 STATUS_LABEL = ("1", "how the run ended", status.REASONS)
 
-METRIC_LABELS = {
-    "residual_rms": (("link", "station"), "m", "rms chord deflection in the residual window"),
-    "residual_peak": (("link", "station"), "m", "peak chord deflection in the residual window"),
-    "structural_rms": (("link", "station"), "m", "rms chord deflection while moving"),
-    "structural_peak": (("link", "station"), "m", "peak chord deflection while moving"),
-    "residual_modal_rms": (("link", "mode"), "m", "rms of plant modes in the residual window"),
-    "residual_modal_peak": (("link", "mode"), "m", "peak of plant modes in the residual window"),
-    "structural_modal_rms": (("link", "mode"), "m", "rms of plant modes while moving"),
-    "settling_time": (("link",), "s", "from the command's end until all stations stay in the band"),
-    "ringing_time": (("link",), "s", "time outside the band after the command, smooth"),
-    "pose_error_peak": (
-        ("pose_axis",), "m; m; rad", "peak error from the shaped command while moving"
-    ),
-    "pose_error_rms": (("pose_axis",), "m; m; rad", "rms error in the residual window"),
-    "peak_voltage": (("link",), "V", "peak actuator voltage"),
-    "saturated_fraction": ((), "1", "samples with an actuator at its limit"),
-    "clipped_fraction": ((), "1", "samples with an ADC channel at its end"),
-    "control_energy": ((), "V2 s", "integral of the summed squared actuator voltages"),
-    "peak_force": (("slider_axis",), "N", "peak motor force"),
-    "motor_saturated_fraction": ((), "1", "samples with a motor at its limit"),
-    "peak_tension": (("link",), "N", "largest tension in a link"),
-    "peak_compression": (("link",), "N", "largest compression of a link"),
-    "stretch_error_peak": (
-        ("pose_axis",), "m; m; rad", "peak pose error that stretching links would add, N L/(E A)"
-    ),
-    "plant_energy": (("link", "mode"), "m2/s2", "mean of omega^2 q^2 + q'^2 while moving"),
-    "modal_energy": (("link", "controlled_mode"), "m2/s2", "the same in the controller's modes"),
-    "spectral_density": (
-        ("link", "controlled_mode", "spectrum_point"), "m2/Hz",
-        "one-sided power spectral density of the controller's modes, Hann periodogram of the run",
-    ),
-}  # fmt: skip
-
 
 def metric_variables(result: Result) -> dict[str, Variable]:
     """Labelled metrics of a run."""
     return {
-        name: Variable(np.asarray(getattr(result.metrics, name)), dims, unit, text)
-        for name, (dims, unit, text) in METRIC_LABELS.items()
+        name: Variable(np.asarray(data), METRICS[name].dims, METRICS[name].unit, METRICS[name].text)
+        for name, data in result.metrics.items()
     }
 
 
@@ -509,12 +478,6 @@ def run_variables(run: Run) -> dict[str, Variable]:
             (),
             "rad",
             DISTANCE_TEXT,
-        ),
-        "energy_ratio": Variable(
-            run.result.energy_ratio,
-            ("link", "controlled_mode"),
-            "1",
-            "EMC ratios (24) that this run's modal energies give",
         ),
         **metric_variables(run.result),
     }

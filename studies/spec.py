@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from jaxmodel.laws import LAWS
 from jaxmodel.parameters import HOME
+from studies.choices import OneOf
 from studies.consistency import check_consistency
 from studies.errors import StudyError, field_error
 from studies.explain import explain
 
+#: Where fields of laws' own are.
+OWN_FIELDS = "control.laws"
 Basis = Literal["pinned_pinned", "pinned_free", "loaded"]
 
 
@@ -37,6 +41,19 @@ Flags = tuple[bool, bool, bool]
 Number = TypeVar("Number")
 #: One number for all links, or one for each.
 EachLink: TypeAlias = Number | tuple[Number, Number, Number]
+
+
+class OwnFields:
+    """Annotation of `control.laws`: says what it may hold."""
+
+    @property
+    def allowed(self) -> str:
+        known = [
+            f"{law.name}.{x.name} ({x.text} [{x.unit}], {x.low:g} to {x.high:g}; {x.default:g})"
+            for law in LAWS.values()
+            for x in law.parameters
+        ]
+        return f"tables by law; {', '.join(known)}"
 
 
 def described(default: Any, unit: str, text: str, **bounds: Any) -> Any:
@@ -195,8 +212,9 @@ class Control(Section):
     feedback: Literal["sampled", "ideal", "none"] = described(
         "sampled", "-", "digital loop, the paper's continuous state feedback, or none"
     )
-    law: Literal["imsc", "srf"] = described(
-        "imsc", "-", "modal control, or strain rate feedback (16)"
+    law: Annotated[str, OneOf(lambda: LAWS)] = described("imsc", "-", "control law")
+    laws: Annotated[dict[str, dict[str, EachLink[float]]], OwnFields()] = described(
+        {}, "-", "fields of laws' own, by law"
     )
     basis: Basis = described("pinned_pinned", "-", "modal basis the controller believes in")
     modes: int = described(3, "1", "controlled modes per link", ge=1, le=12)
@@ -388,20 +406,6 @@ class Study(Section):
                     raise StudyError(f"{field}: {section} is no section of a study")
             target[leaf] = value
         return parse_study(data)
-
-
-def _each_link_fields() -> frozenset[str]:
-    """Fields that take one number for all links, or one for each."""
-    found = set()
-    for section, outer in Study.model_fields.items():
-        for leaf, info in getattr(outer.annotation, "model_fields", {}).items():
-            one, *others = get_args(info.annotation) or (None,)
-            if [get_args(other) for other in others] == [(one,) * 3]:
-                found.add(f"{section}.{leaf}")
-    return frozenset(found)
-
-
-EACH_LINK = _each_link_fields()
 
 
 def parse_study(data: dict[str, Any]) -> Study:

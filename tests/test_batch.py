@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from jaxmodel import status
+from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import simulate
 from studies.cases import as_arrays, build_case, build_structure
 from studies.spec import paper_study
@@ -181,6 +182,6 @@ def test_comparator_can_fail(structure, cases, batch):
     result = batch(stack(cases))
     single = jax.tree.map(lambda x: np.asarray(x)[0], result)
     metrics = single.metrics
-    off = metrics._replace(residual_rms=metrics.residual_rms * (1 + 1e-8))
+    off = Metrics(metrics | {"residual_rms": metrics.residual_rms * (1 + 1e-8)})
     with pytest.raises(AssertionError):
         compare(result, 0, single._replace(metrics=off))

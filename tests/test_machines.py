@@ -16,11 +16,11 @@ from studies import cli
 from studies.bench import reference
 from studies.cases import as_arrays, build_case, build_cases, build_structure
 from studies.errors import StudyError
-from studies.fields import field_value
 from studies.figures import styled
+from studies.paths import EACH_LINK, field_value
 from studies.runs import check_run, run_study
 from studies.sketch import sketch, standing
-from studies.spec import EACH_LINK, load_study, parse_study
+from studies.spec import load_study, parse_study
 from studies.sweeps.plots import plot
 from studies.sweeps.results import load, metric_values
 from studies.sweeps.run import run_sweep

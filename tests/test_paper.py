@@ -10,6 +10,7 @@ import xarray
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from jaxmodel.metrics import Metrics
 from studies import load, paper, paper_cases, paper_figures, report, report_context
 from studies.atlas import atlas_sweep, read_subsets
 from studies.cli import main
@@ -184,7 +185,8 @@ def test_late_window_and_settling_of_a_known_decay(short):
     tau, peak = 0.03, 1e-6
     shape = record.chord_deflection_stations.shape
     decay = np.broadcast_to((peak * np.exp(-after / tau))[..., None, None], shape)
-    metrics = runs.result.metrics._replace(residual_peak=np.full(shape[:1] + shape[2:], peak))
+    peaks = {"residual_peak": np.full(shape[:1] + shape[2:], peak)}
+    metrics = Metrics(runs.result.metrics | peaks)
     changed = runs.result._replace(
         record=record._replace(chord_deflection_stations=decay), metrics=metrics
     )

@@ -66,7 +66,7 @@ def test_ratios_of_the_own_run():
     """Two passes in one: uncontrolled for the ratios (24), then controlled with them."""
     found = judged(control__ratio_source="own_run", control__ratio_exponent=0.5)
     off = judged(control__links=(False, False, False))
-    ratio = off.result.energy_ratio
+    ratio = off.result.metrics.energy_ratio
     np.testing.assert_allclose(ratio[:, 0], 1)
     assert np.all((ratio[:, 1] > 0) & (ratio[:, 1] < 1))
     rows = tuple(map(tuple, np.sqrt(ratio).tolist()))

@@ -22,7 +22,10 @@ REFUSED = [
     ("gain_factor = 1", "gain_factor = 1: unknown field; did you mean 'control.gain_factor'?"),
     ("[drive]\nzzzz = 1", "drive.zzzz = 1: unknown field; allowed in [drive]: kind, kp, kd, force"),
     ('"" = 1', " = 1: unknown field; allowed at the top: title, run, machine"),
-    ('[control]\nlaw = "imcs"', "control.law = 'imcs': allowed 'imsc' or 'srf'; did you mean 'ims"),
+    (
+        '[control]\nlaw = "imcs"',
+        "'imsc', 'srf', 'lqr', 'modified_imsc' or 'ppf'; did you mean 'imsc'?",
+    ),
     ('[shaper]\nkind = "EI"', "'ei2' or 'ei3'; did you mean 'ei'?"),
     # wrong type
     ('[run]\nduration = "0.8"', "run.duration = '0.8': allowed a finite number > 0 and <= 100 [s]"),

@@ -9,10 +9,10 @@ import pytest
 import scipy.linalg
 import xarray
 
-from jaxmodel.control import optimal_gains
 from jaxmodel.controller import ControllerState, controller_step, rest_controller, strongest
 from jaxmodel.electronics import measurement_chain
-from jaxmodel.ppf import HIGHEST_RATIO, design_position_filter
+from jaxmodel.laws.lqr import optimal_gains
+from jaxmodel.laws.ppf import HIGHEST_RATIO, design_position_filter
 from studies.cases import as_arrays, build_case, build_structure
 from studies.errors import StudyError
 from studies.export.controller import fixed_controller
@@ -244,7 +244,7 @@ def laws():
     """All laws of the default design, by name."""
     found = fixed_controller(STUDY)
     plant = Plant("pinned_pinned", 8)
-    return {law.name: law for law in all_laws(found, LoopMaker(found), plant)}
+    return {law.law.text: law for law in all_laws(found, LoopMaker(found), plant)}
 
 
 def test_laws_are_equally_strong_on_mode_1(laws):

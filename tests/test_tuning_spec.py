@@ -9,8 +9,8 @@ import pytest
 from studies import spec as spec_module
 from studies.cases import as_arrays, build_case
 from studies.errors import StudyError
+from studies.paths import set_value
 from studies.spec import parse_study
-from studies.sweeps.axes import set_value
 from studies.tuning.merit import tail_weights
 from studies.tuning.scenarios import lane_columns, scenario_columns
 from studies.tuning.spec import load_tuning, parse_tuning

@@ -77,7 +77,7 @@ def platform_error(study: Study, tell: Any = None) -> PlatformError:
     cases = []
     for k, (_, case) in enumerate(built):
         if study.control.ratio_source == "own_run":
-            own = powered(quiet.energy_ratio[2 * k], study.control.ratio_exponent)
+            own = powered(quiet.metrics.energy_ratio[2 * k], study.control.ratio_exponent)
             case = with_ratio(case, own)
         cases += [_with_links(case, links) for links in LINK_SETS[1:]]
     active = run_batches(structure, cases, tell)

@@ -46,14 +46,14 @@ class Channels(NamedTuple):
         return bool(np.any(self.direct))
 
 
-def fold(controller: Controller, law: str) -> Channels:
+def fold(controller: Controller, kind: str) -> Channels:
     """Channels of a controller.
 
     u = -k_d v - k_p x with v and x two outputs of one filter, so one numerator -k_d n_v - k_p n_x.
 
     Args:
         controller: NumPy arrays; a channel without gains is left out.
-        law: "imsc" or "srf".
+        kind: what a channel is, "mode" or "patch".
     """
     estimator, velocity = controller.estimator, controller.velocity_gain
     position = controller.position_gain
@@ -68,7 +68,7 @@ def fold(controller: Controller, law: str) -> Channels:
     force = -velocity[at][:, None] * gathered(estimator.velocity)
     force = force - position[at][:, None] * gathered(estimator.position)
     return Channels(
-        kind="patch" if law == "srf" else "mode",
+        kind=kind,
         link=link,
         number=number,
         filter=controller.filter[at],

@@ -10,6 +10,7 @@ import numpy as np
 from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
+from jaxmodel.laws import LAWS, is_modal
 from jaxmodel.shaper import Taps
 from studies.errors import StudyError, field_error
 from studies.export.channels import Channels, fold
@@ -35,7 +36,7 @@ class FixedController(NamedTuple):
     @property
     def is_modal(self) -> bool:
         """Whether channels are modes, in metres and newtons; volts otherwise."""
-        return self.study.control.law == "imsc"
+        return is_modal(self.structure)
 
 
 def fixed_controller(study: Study) -> FixedController:
@@ -60,8 +61,8 @@ def fixed_controller(study: Study) -> FixedController:
         )  # fmt: skip
     _check_finite(controller, taps)
     return FixedController(
-        study, structure, case, controller, fold(controller, study.control.law), _merged(taps),
-        _frequencies(structure, case),
+        study, structure, case, controller, fold(controller, LAWS[study.control.law].channel),
+        _merged(taps), _frequencies(structure, case),
     )  # fmt: skip
 
 
@@ -89,8 +90,7 @@ def _any(gain: np.ndarray | None) -> bool:
 def _frequencies(structure: Structure, case: Case) -> np.ndarray:
     """Where the velocity estimate of each channel is exact [Hz], (3, C)."""
     hertz = np.asarray(find_bases(structure, case).believed_omega) / (2 * np.pi)
-    is_modal = structure.law == "imsc"
-    return hertz if is_modal else np.repeat(hertz[:, :1], structure.n_patches, axis=1)
+    return hertz if is_modal(structure) else np.repeat(hertz[:, :1], structure.n_patches, axis=1)
 
 
 def _merged(taps: Taps) -> Taps:

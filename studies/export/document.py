@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jaxmodel.controller import Controller
 from jaxmodel.estimator import Estimator
+from jaxmodel.laws import LAWS
 from jaxmodel.shaper import Taps
 from studies import config
+from studies.choices import OneOf
 from studies.errors import StudyError, shown
 from studies.export.controller import FixedController, fixed_controller
 from studies.spec import Study, parse_study
@@ -55,7 +57,7 @@ class Document(Part):
     case_id: str = Field(description="id of the case in its sweep; empty where there is none")
     study_hash: str = Field(description="SHA-256 of the study below as compact sorted JSON")
     versions: dict[str, str]
-    law: Literal["imsc", "srf"]
+    law: Annotated[str, OneOf(lambda: LAWS)]
     estimator: Literal["modal_phase", "difference"]
     order: str = Field(description="how wires of sensors and actuators are numbered")
     steps: list[str] = Field(description="the arithmetic of one sample, in words")

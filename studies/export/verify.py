@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmodel.laws import LAWS, n_channels
 from jaxmodel.motion import sample_path, shape_path
 from jaxmodel.shaper import Taps
 from studies.export.c_text import Source
@@ -85,14 +86,14 @@ def vibration(run: LoopRun) -> float:
 
 def reference_run(found: FixedController) -> LoopRun:
     """The case's motion with the JAX controller."""
-    law = jax_law(found.controller, found.structure.n_channels)
+    law = jax_law(found.controller, n_channels(found.structure))
     return run_in_the_loop(found.structure, found.case, law)
 
 
 def verify_document(found: FixedController, reference: LoopRun, document: Document) -> Verification:
     """A controller built from nothing but its document, against the JAX controller."""
     controller, taps = controller_of(document)
-    channels = fold(controller, document.law)
+    channels = fold(controller, LAWS[document.law].channel)
     checks = [
         _compare(
             f"open loop, {name}", respond_floating(channels, controller, codes).command,
@@ -145,7 +146,7 @@ def verify_fixed(
     """C in fixed point against its integer model, bit by bit, and against the JAX controller."""
     rail = rail_samples(found.study.electronics.sample_rate_hz)
     checks, runs = [], {"JAX": reference}
-    behind_dac = jax_law(found.controller, found.structure.n_channels, fixed.dac_step)
+    behind_dac = jax_law(found.controller, n_channels(found.structure), fixed.dac_step)
     runs["JAX behind the DAC"] = run_in_the_loop(found.structure, found.case, behind_dac)
     shape = reference.codes.shape[1:]
     with _loaded(found, source, name, compiler, np.uint16, np.int32) as code:
@@ -215,7 +216,7 @@ def _hard(found: FixedController, reference: LoopRun) -> dict[str, np.ndarray]:
 
 
 def _replayed(found: FixedController, codes: np.ndarray) -> np.ndarray:
-    return np.asarray(replay(found.controller, found.structure.n_channels, codes))
+    return np.asarray(replay(found.controller, n_channels(found.structure), codes))
 
 
 def _compare(what: str, found: np.ndarray, wanted: np.ndarray, allowed: float) -> Check:

@@ -16,7 +16,7 @@ from studies.export.controller import FixedController, fixed_controller
 from studies.runs import check_run
 from studies.spec import Study
 from studies.spillover.judgement import STEPS, breaking_motion, damping, follow
-from studies.spillover.laws import Law, all_laws
+from studies.spillover.laws import Candidate, all_laws
 from studies.spillover.plants import LoopMaker, Plant, plant_sizes
 from studies.stability import HIGHEST, LOWEST, gain_margin
 
@@ -71,10 +71,10 @@ def compare_laws(study: Study, margin: float = 2.0, sizes: tuple[int, ...] = ())
     laws = all_laws(found, LoopMaker(found), plant)
     with threadpool_limits(1, "blas"):
         views = [_View(found, law, plant, sizes) for law in laws]
-        given = views[0 if found.is_modal else 1]
+        given = next(view for view in views if view.law.law.name == study.control.law)
         target = given.damping(1.0)[0]
         rows = [(WITHOUT, given, 0.0), (GIVEN, given, 1.0)]
-        rows += [(view.law.name, view, view.fair(margin, target)) for view in views]
+        rows += [(view.law.law.text, view, view.fair(margin, target)) for view in views]
         zeta = np.array([view.damping(factor) for _, view, factor in rows])
     moved, result = _run(found, [view.law.at(factor) for _, view, factor in rows])
     metrics = result.metrics
@@ -98,7 +98,7 @@ class _View:
     """A law on the design's own plants."""
 
     def __init__(
-        self, found: FixedController, law: Law, plant: Plant, sizes: tuple[int, ...]
+        self, found: FixedController, law: Candidate, plant: Plant, sizes: tuple[int, ...]
     ) -> None:
         self.law, maker = law, LoopMaker(found)
         self.limit, self.breaking = HIGHEST, ""

@@ -14,24 +14,24 @@ import numpy as np
 
 from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
-from jaxmodel.control import optimal_gains
 from jaxmodel.controller import Controller
-from jaxmodel.ppf import design_position_filter
+from jaxmodel.laws import IMSC, LAWS
+from jaxmodel.laws.contract import Law, as_modal
+from jaxmodel.parameters import Array
 from jaxmodel.prepare import design_controller
+from studies.cases import law_parameters
 from studies.errors import field_error
 from studies.export.controller import FixedController
 from studies.spillover.plants import LoopMaker, Plant, widened
 
-#: Damping of the filters of positive position feedback [1].
-FILTER_ZETA = 0.5
 #: Damping of mode 1 below this share of that of other modes is rounding [1].
 ROUNDING = 1e-9
 
 
-class Law(NamedTuple):
+class Candidate(NamedTuple):
     """A control law with a channel for each patch, see `widened`."""
 
-    name: str
+    law: Law
     controller: Controller  # at factor 1
 
     def at(self, factor: float) -> Controller:
@@ -61,8 +61,8 @@ class Law(NamedTuple):
         return parts or [(slice(None), law)]
 
 
-def all_laws(found: FixedController, maker: LoopMaker, plant: Plant) -> list[Law]:
-    """The laws to compare; the one that the design is of with the design's own numbers.
+def all_laws(found: FixedController, maker: LoopMaker, plant: Plant) -> list[Candidate]:
+    """Every law there is; the one that the design is of with the design's own numbers.
 
     Args:
         found: the design.
@@ -72,9 +72,7 @@ def all_laws(found: FixedController, maker: LoopMaker, plant: Plant) -> list[Law
     Raises:
         StudyError: velocity gains that do not damp mode 1, so nothing to compare strength by.
     """
-    given, has_modes = found.controller, found.is_modal
-    imsc = given if has_modes else _designed(found, "imsc")
-    srf = _designed(found, "srf") if has_modes else given
+    control, given = found.study.control, found.controller
 
     def strength(law: Controller) -> np.ndarray:
         """Damping constant that a law gives mode 1 of each link [N s/m], (3,)."""
@@ -83,39 +81,35 @@ def all_laws(found: FixedController, maker: LoopMaker, plant: Plant) -> list[Law
         every = np.einsum("irc,ic,icr->ir", driven, gain, seen)
         return np.where(np.abs(every[:, 0]) > ROUNDING * np.abs(every).max(), every[:, 0], 0.0)
 
-    control, wanted = found.study.control, strength(given)
+    modal = given if control.law == IMSC.name else _designed(found, IMSC)
+    # a law that feeds back no velocities is as strong as modal control with the same settings
+    wanted = strength(given if np.any(given.velocity_gain) else modal)
     if not np.any(wanted > 0) or np.any(wanted < 0):
         raise field_error(
             "control.velocity_gain", control.velocity_gain,
             "with control.ratios and control.mode_mask, gains that damp mode 1, to compare laws of "
             "equal strength",
         )  # fmt: skip
-    if has_modes:
-        srf = _scaled(srf, wanted, strength(srf))
-    else:
-        has = strength(imsc)
+    if modal is not given:
+        has = strength(modal)
         if np.any((wanted > 0) & (has == 0)):
             raise field_error(
                 "control.ratios", control.ratios,
                 "with control.mode_mask, mode 1 on, to compare with IMSC of equal strength",
             )  # fmt: skip
-        imsc = _scaled(imsc, wanted, has)
-    omega, is_on = _assembled_omega(found), imsc.velocity_gain != 0
-    if imsc.position_gain is not None:
-        is_on = is_on | (imsc.position_gain != 0)
-    laws = {
-        "IMSC": imsc,
-        "strain rate feedback": srf,
-        "IMSC-LQR": _optimal(imsc, _modal_mass(found), omega),
-        "modified IMSC": imsc._replace(rival_omega=np.where(is_on, omega, 0.0)),
-        "positive position feedback": _position_feedback(found, imsc, omega),
-    }
-    return [Law(name, _even(law, found.n_patches)) for name, law in laws.items()]
+        modal = _scaled(modal, wanted, has)
 
+    def as_strong(law: Law) -> Controller:
+        if law.as_strong is not None:
+            return _designed(found, law, modal)
+        own = _designed(found, law)
+        return _scaled(own, wanted, strength(own))
 
-def _assembled_omega(found: FixedController) -> np.ndarray:
-    """Frequencies of the controlled modes as the controller believes [rad/s], (3, C)."""
-    return np.asarray(find_bases(found.structure, found.case).believed_omega)
+    own = {control.law: given, IMSC.name: modal}
+    return [
+        Candidate(law, _even(own[name] if name in own else as_strong(law), found.n_patches))
+        for name, law in LAWS.items()
+    ]
 
 
 def _even(law: Controller, n_channels: int) -> Controller:
@@ -133,51 +127,34 @@ def _scaled(law: Controller, wanted: np.ndarray, has: np.ndarray) -> Controller:
 
 
 @partial(jax.jit, static_argnums=0)
-def _design(structure: Structure, case: Case) -> Controller:
-    return design_controller(structure, case, find_bases(structure, case)).controller
+def _design(structure: Structure, case: Case, gains: tuple[Array, Array] | None) -> Controller:
+    """By the law of the structure; gains: of modal control that it is to be as strong as."""
+    bases, law = find_bases(structure, case), LAWS[structure.law]
+    if gains is not None:
+        assert law.as_strong is not None
+        case = case._replace(control=as_modal(case.control, *gains))
+        known = design_controller(structure, case, bases).known
+        case = case._replace(control=law.as_strong(case, known))
+    return design_controller(structure, case, bases).controller
 
 
-_filters = jax.jit(design_position_filter)
+def _designed(found: FixedController, law: Law, modal: Controller | None = None) -> Controller:
+    """The study's controller by another law, NumPy arrays.
 
-
-def _designed(found: FixedController, law: str) -> Controller:
-    """The study's controller by another law, NumPy arrays."""
-    structure = found.structure._replace(law=law, n_steps=1)
-    return jax.tree.map(np.asarray, _design(structure, found.case))
-
-
-def _modal_mass(found: FixedController) -> np.ndarray:
-    """Modal masses of the controller's basis [kg], (3, C)."""
-    control = found.case.control
-    ones = np.ones_like(control.ratio)
-    unit = control._replace(
-        velocity_gain=ones[:, 0], ratio=ones, mode_mask=ones, link_mask=ones[:, 0],
-        gain_factor=np.ones(()), is_per_mass=np.ones(()),
-    )  # fmt: skip
-    # a gain of 1 per modal mass
-    return _designed(found._replace(case=found.case._replace(control=unit)), "imsc").velocity_gain
-
-
-def _optimal(imsc: Controller, mass: np.ndarray, omega: np.ndarray) -> Controller:
-    """Optimal gains of every mode with one weight, which gives the first mode its own k_d.
-
-    From k_d^2 = 2 k_p + 1/R: 1/R = h (h - 2 omega) with h^2 = k_d^2 + 4 omega^2.
+    Args:
+        found: the design.
+        law: which one.
+        modal: modal control that it is to be as strong as; None: with the study's own settings.
     """
-    is_on = imsc.velocity_gain != 0
-    first = int(np.flatnonzero(is_on.any(axis=0))[0])
-    gain = (imsc.velocity_gain / mass)[is_on[:, first], first].mean()
-    at = omega[is_on[:, first], first].mean()
-    size = np.hypot(gain, 2 * at)
-    weight = (1 + 2 * at / size) / gain**2
-    gains = jax.tree.map(np.asarray, optimal_gains(omega, weight))
-    return imsc._replace(
-        velocity_gain=is_on * mass * gains.velocity, position_gain=is_on * mass * gains.position
-    )
-
-
-def _position_feedback(found: FixedController, imsc: Controller, omega: np.ndarray) -> Controller:
-    """Positive position feedback that damps each assembled mode as much as IMSC."""
-    filters = jax.tree.map(np.asarray, _filters(omega, FILTER_ZETA, found.case.electronics))
-    is_fit = filters.damping > 0
-    gain = np.where(is_fit, imsc.velocity_gain / np.where(is_fit, filters.damping, 1.0), 0.0)
-    return imsc._replace(estimator=filters.estimator, velocity_gain=0 * gain, position_gain=-gain)
+    structure = found.structure._replace(
+        law=law.name, n_steps=1,
+        has_position_gain=law.has_position or found.structure.has_position_gain,
+    )  # fmt: skip
+    control = found.case.control._replace(parameters=law_parameters(found.study, law))
+    gains = None
+    if modal is not None:
+        position = modal.position_gain
+        velocity = modal.velocity_gain
+        gains = velocity, np.zeros_like(velocity) if position is None else position
+    case = found.case._replace(control=control)
+    return jax.tree.map(np.asarray, _design(structure, case, gains))

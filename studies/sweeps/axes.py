@@ -9,15 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import combinations, product
-from typing import Any, Literal, NamedTuple, get_args, get_origin
+from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ValidationError
 
-from studies.consistency import check_consistency, each_link, patch_centers, patch_pitch
-from studies.errors import StudyError, field_error, nearest, shown, shown_name
-from studies.explain import explain
-from studies.fields import Columns, as_list, field_value, parse_entry
+from studies.consistency import each_link, patch_centers, patch_pitch
+from studies.errors import field_error, nearest, shown_name
+from studies.fields import Columns
+from studies.paths import checked_value, field_choices, known_field
 from studies.spec import Study
 
 #: Axes under a name of their own: what each varies, and how it is written.
@@ -58,11 +57,6 @@ SHOWN_AS = ALIASES | {
     "shaper_frequency": "shaper.frequencies_hz",
 }
 PLACEMENTS = ("same", "mirrored", "per_link")
-#: Faults in these fields are a status of the case, so that a sweep may run into them.
-JUDGED_BY_STATUS = (
-    "patches.", "motion.", "machine.", "link.length", "link.modes", "control.modes",
-    "electronics.", "shaper.frequencies_hz", "run.duration", "metrics.",
-)  # fmt: skip
 #: Numbers beyond this are refused.
 LARGEST = 1e150
 #: More values than this from one axis or block are refused.
@@ -125,89 +119,6 @@ def build_axis(name: str, written: Any, study: Study, path: str) -> Axis:
     return _field_axis(name, written, study, full)
 
 
-def known_field(name: str, study: Study, path: str = "") -> Any:
-    """Value of a field or an entry of it in a study.
-
-    Raises:
-        StudyError: no such field or entry, with the nearest name.
-    """
-    entry = parse_entry(name)
-    names = _all_fields()
-    where = f"{path}: " if path else ""
-    if entry is None or entry.field not in names:
-        wanted = entry.field if entry else name
-        close = nearest(wanted, [*names, *READY_MADE]) or _by_leaf(wanted, names)
-        hint = f"did you mean {close!r}?" if close else "see studies init for all fields"
-        raise StudyError(f"{where}{shown(name)}: unknown field; {hint}")
-    value = field_value(study, entry.field)
-    value = as_list(entry.field, value) if entry.indices else value
-    for index in entry.indices:
-        if not isinstance(value, tuple) or index >= len(value):
-            size = f"0 to {len(value) - 1}" if isinstance(value, tuple) and value else "none"
-            raise StudyError(
-                f"{where}{name!r}: no such entry; {entry.field} = "
-                f"{field_value(study, entry.field)}, allowed index here {size}"
-            )
-        value = value[index]
-    return value
-
-
-def _by_leaf(wanted: str, names: list[str]) -> str:
-    leaf = wanted.rsplit(".", 1)[-1]
-    return next((name for name in names if name.endswith(f".{leaf}")), "")
-
-
-def _all_fields() -> list[str]:
-    names = []
-    for section, info in Study.model_fields.items():
-        inner = info.annotation
-        if isinstance(inner, type) and issubclass(inner, BaseModel):
-            names += [f"{section}.{leaf}" for leaf in inner.model_fields]
-    return names
-
-
-def set_value(study: Study, name: str, value: Any) -> dict[str, Any]:
-    """The study as a dictionary, with a field or an entry of it replaced."""
-    entry = parse_entry(name)
-    assert entry is not None
-    data = study.model_dump()
-    section, _, leaf = entry.field.partition(".")
-    whole = data[section][leaf]
-    whole = as_list(entry.field, whole) if entry.indices else whole
-    data[section][leaf] = replaced(whole, entry.indices, value)
-    return data
-
-
-def replaced(whole: Any, indices: tuple[int, ...], value: Any) -> Any:
-    """A nested tuple with one entry replaced."""
-    if not indices:
-        return value
-    first, *rest = indices
-    return (*whole[:first], replaced(whole[first], tuple(rest), value), *whole[first + 1 :])
-
-
-def checked_value(study: Study, name: str, value: Any, path: str) -> Any:
-    """A value as the field takes it (numbers as floats where it holds floats).
-
-    Raises:
-        StudyError: not allowed there, alone or with the other fields of the study.
-    """
-    data = set_value(study, name, _plain(value))
-    try:
-        changed = Study.model_validate(data)
-        if not name.startswith(JUDGED_BY_STATUS):
-            check_consistency(changed)
-    except ValidationError as error:
-        raise StudyError(f"{path}: {explain(error, Study, data)}") from None
-    except StudyError as error:
-        raise StudyError(f"{path}: {error}") from None
-    return known_field(name, changed)
-
-
-def _plain(value: Any) -> Any:
-    return tuple(map(_plain, value)) if isinstance(value, (list, tuple)) else value
-
-
 def column_of(values: list[Any]) -> np.ndarray:
     """Values of one field as a column: an array where they have one shape, else of objects."""
     if isinstance(values[0], (tuple, list)) or any(isinstance(v, tuple) for v in values):
@@ -224,7 +135,7 @@ def column_of(values: list[Any]) -> np.ndarray:
 
 
 def _field_axis(name: str, written: Any, study: Study, path: str) -> Axis:
-    base = known_field(name, study, path)
+    base = known_field(name, study, path, READY_MADE)
     if written == "all":
         written = _every_choice(name, base, path)
     if isinstance(written, dict):
@@ -242,13 +153,9 @@ _WRITTEN = "a list of values, a range {from = ..., to = ..., count = ..., scale 
 
 def _every_choice(name: str, base: Any, path: str) -> list[Any]:
     """All values of a choice or a switch."""
-    entry = parse_entry(name)
-    assert entry is not None
-    section, _, leaf = entry.field.partition(".")
-    model: Any = Study.model_fields[section].annotation
-    annotation = model.model_fields[leaf].annotation
-    if get_origin(annotation) is Literal:
-        return list(get_args(annotation))
+    choices = field_choices(name)
+    if choices:
+        return list(choices)
     if isinstance(base, bool):
         return [False, True]
     raise field_error(path, "all", "'all' for a choice or a switch only; " + _WRITTEN)

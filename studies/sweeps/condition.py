@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from studies.errors import StudyError, shown
-from studies.fields import NAMED_INDEX
+from studies.paths import NAMED_INDEX
 
 #: A longer condition is refused [characters].
 LONGEST = 1000

@@ -9,16 +9,9 @@ from scipy.stats import qmc
 
 from studies.errors import StudyError, field_error
 from studies.fields import Columns
+from studies.paths import checked_value, known_field
 from studies.spec import Study
-from studies.sweeps.axes import (
-    LIMIT,
-    READY_MADE,
-    Axis,
-    build_axis,
-    checked_value,
-    column_of,
-    known_field,
-)
+from studies.sweeps.axes import LIMIT, READY_MADE, Axis, build_axis, column_of
 from studies.sweeps.spec import SAMPLED, Node
 
 
@@ -114,7 +107,7 @@ def _listed(node: Node, study: Study) -> Columns:
         for name in case:
             if name in READY_MADE:
                 raise StudyError(f"{path}.{k}: {name} is no field; write the field it stands for")
-            known_field(name, study, f"{path}.{k}")
+            known_field(name, study, f"{path}.{k}", READY_MADE)
     names = list(dict.fromkeys(name for case in node.block.cases for name in case))
     columns: dict[str, np.ndarray] = {}
     for name in names:

@@ -36,4 +36,4 @@ def make_executor(structure: Structure, layout: Layout, has_own_ratio: bool) -> 
 
 def own_ratios(executor: Executor, cases: Case) -> np.ndarray:
     """EMC ratios of the cases' own uncontrolled runs, (size, 3, C)."""
-    return np.asarray(executor.start(uncontrolled(cases)).wait().energy_ratio)
+    return np.asarray(executor.start(uncontrolled(cases)).wait().metrics.energy_ratio)

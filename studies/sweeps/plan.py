@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.laws import LAWS
 from jaxmodel.prepare import STIFFNESS_LIMIT, drive_rate
 from studies.cases import build_cases, build_structure, in_working_precision
 from studies.config import processor
@@ -137,8 +138,7 @@ def _accumulated(table: Table, kept: tuple[str, ...]) -> tuple[str, ...]:
     if not kept:
         return ()
     has_own = (table.values("control.ratio_source") == "own_run").any()
-    names = {"modal_energy" if name == "energy_ratio" else name for name in kept}
-    return tuple(sorted(names | ({"modal_energy"} if has_own else set())))
+    return tuple(sorted({*kept} | ({"energy_ratio"} if has_own else set())))
 
 
 def _structure(table: Table, members: np.ndarray) -> Structure:
@@ -157,7 +157,8 @@ def _structure(table: Table, members: np.ndarray) -> Structure:
         has_amplifier=bool((column("electronics.amplifier_hz") > 0).any()),
         has_noise=bool(noisy) or one.is_smooth,
         has_friction=bool((column("drive.coulomb_friction") > 0).any()),
-        has_position_gain=bool(np.any(fields.numbers(_POSITION) != 0)),
+        has_position_gain=LAWS[one.law].has_position
+        or bool(np.any(fields.numbers(_POSITION) != 0)),
         has_wrench=any(np.any(fields.numbers(name) != 0) for name in _WRENCH),
         has_payload_offset=bool(np.any(fields.numbers("load.offset") != 0)),
     )

@@ -17,12 +17,7 @@ from studies.spec import Study
 from studies.stability import ENOUGH, margin_text
 from studies.sweeps.axes import SHOWN_AS
 from studies.sweeps.plots import front, plot, save_plot
-from studies.sweeps.results import (
-    SweepData,
-    load,
-    metric_values,
-    swept_names,
-)
+from studies.sweeps.results import SweepData, load, metric_values, swept_names
 from studies.sweeps.show import (
     MARGIN,
     SHARES,

@@ -15,15 +15,15 @@ import jax
 import numpy as np
 
 from jaxmodel import status
+from jaxmodel.metrics import METRICS
 from jaxmodel.prepare import SPECTRUM_SPAN
 from studies.errors import StudyError, field_error, nearest
-from studies.explain import unit_of
-from studies.fields import NAMED_INDEX, Fields, field_value, parse_entry
-from studies.runs import DISTANCE_TEXT, METRIC_LABELS, STATUS_LABEL
-from studies.spec import Study
+from studies.fields import Fields
+from studies.paths import NAMED_INDEX, field_unit, field_value, known_field, parse_entry
+from studies.runs import DISTANCE_TEXT, STATUS_LABEL
 from studies.stability import HIGHEST, MARGIN_MODES
 from studies.store import Streamed, Variable, read_store, variable_labels, write_store
-from studies.sweeps.axes import LABELS, SHOWN_AS, known_field
+from studies.sweeps.axes import LABELS, SHOWN_AS
 from studies.sweeps.chunks import Judged
 from studies.sweeps.folder import (
     CHUNKS,
@@ -81,20 +81,6 @@ _PER_CASE: dict[str, tuple] = {
 #: Of these the smallest entry is the worst.
 LEAST = ("damping_ratio",)
 
-#: Metrics that single precision has within 1 %: `studies bench --work W1 --precision float32`
-#: prints the errors. Small vibration after a move is lost in the rounding of the pose.
-SINGLE_PRECISION = (
-    "structural_rms", "structural_peak", "structural_modal_rms", "pose_error_peak",
-    "saturated_fraction", "clipped_fraction", "motor_saturated_fraction", "control_energy",
-    "peak_force", "peak_tension", "peak_compression", "stretch_error_peak", "plant_energy",
-    "modal_energy", "energy_ratio",
-)  # fmt: skip
-
-
-def metric_names() -> list[str]:
-    """Metrics that a sweep can keep."""
-    return [*METRIC_LABELS, "energy_ratio"]
-
 
 def kept_metrics(spec: SweepSpec) -> list[str]:
     """Metrics that a sweep keeps.
@@ -102,18 +88,18 @@ def kept_metrics(spec: SweepSpec) -> list[str]:
     Raises:
         StudyError: unknown metric, or one that the working precision does not hold.
     """
-    names = metric_names()
     for name in spec.sweep.metrics:
-        if name not in names:
-            hint = nearest(name, names)
-            raise field_error("sweep.metrics", name, ", ".join(names), hint=hint)
-    kept = list(spec.sweep.metrics) or names
-    lost = [name for name in kept if name not in SINGLE_PRECISION]
+        if name not in METRICS:
+            hint = nearest(name, METRICS)
+            raise field_error("sweep.metrics", name, ", ".join(METRICS), hint=hint)
+    kept = list(spec.sweep.metrics or METRICS)
+    single = [name for name, metric in METRICS.items() if metric.is_single]
+    lost = [name for name in kept if name not in single]
     if lost and jax.dtypes.canonicalize_dtype(np.float64) == np.float32:
         written = lost if spec.sweep.metrics else []
         raise field_error(
             "sweep.metrics", written,
-            f"with float32 a list of {', '.join(SINGLE_PRECISION)}, which it has within 1 %; "
+            f"with float32 a list of {', '.join(single)}, which it has within 1 %; "
             "leave --precision out for the others",
         )  # fmt: skip
     return kept
@@ -158,9 +144,8 @@ def chunk_variables(
             _forget(data, dims.index("controlled_mode"), controlled)
         variables[name] = Variable(data, ("case", *dims), *about)
     for name in kept:
-        source = result if name == "energy_ratio" else result.metrics
-        data = np.array(getattr(source, name), copy=True)[:count]
-        dims, unit, text = metric_label(name)
+        data = np.array(result.metrics[name], copy=True)[:count]
+        dims, unit, text = _label(name)
         if "mode" in dims:
             _forget(data, dims.index("mode"), modes)
         if "controlled_mode" in dims:
@@ -168,14 +153,6 @@ def chunk_variables(
         data[~is_finished] = np.nan
         variables[name] = Variable(data, ("case", *dims), unit, text)
     return variables
-
-
-def metric_label(name: str) -> tuple[tuple[str, ...], str, str]:
-    """Axes after `case`, unit and long name of a metric."""
-    if name == "energy_ratio":
-        text = "EMC ratios (24) that the run's modal energies give"
-        return ("link", "controlled_mode"), "1", text
-    return METRIC_LABELS[name]
 
 
 def _forget(data: np.ndarray, axis: int, count: np.ndarray) -> None:
@@ -210,15 +187,6 @@ def case_variables(table: Table) -> dict[str, Variable]:
             dims = tuple(f"{variable_name(name)}_{k}" for k in range(1, array.ndim))
         variables[variable_name(name)] = Variable(array, (*axis, *dims), field_unit(field), name)
     return variables
-
-
-def field_unit(field: str) -> str:
-    """Unit of a field of a study, "1" for none."""
-    section, _, leaf = field.partition(".")
-    if not leaf:
-        return "1"
-    model: Any = Study.model_fields[section].annotation
-    return unit_of(model.model_fields[leaf]) or "1"
 
 
 def axis_variables(table: Table, sizes: Mapping[str, int]) -> dict[str, Variable]:
@@ -348,7 +316,7 @@ def gather(table: Table, finished: Finished) -> dict[str, Variable]:
             continue
         with h5py.File(file, "r") as store:
             for name, dataset in store.items():
-                if name not in _PER_CASE and name not in metric_names():
+                if name not in _PER_CASE and name not in METRICS:
                     continue
                 data = dataset[()]
                 if name not in variables:
@@ -404,7 +372,7 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
 
 def _of_axes(data: SweepData, name: str, named: list[tuple[str, str]]) -> np.ndarray:
     """Values of a metric at numbers of some of its axes, counted from 1."""
-    if name not in data.variables or name not in (*metric_names(), *_PER_CASE):
+    if name not in data.variables or name not in (*METRICS, *_PER_CASE):
         metric_values(data, name)  # says what is wrong with it
         raise StudyError(f"{name!r}: indices that name an axis are for metrics")
     variable = data.variables[name]
@@ -472,7 +440,7 @@ def _entry(data: SweepData, name: str, indices: tuple[int, ...], candidate: str)
             )
             raise StudyError(f"{name!r}: no such entry; indices allowed: {sizes or 'none'}")
         array, dims = array[:, index], (dims[0], *dims[2:])
-    if array.ndim > 1 and candidate not in (*metric_names(), *_PER_CASE):
+    if array.ndim > 1 and candidate not in (*METRICS, *_PER_CASE):
         raise StudyError(f"{name!r}: a list; name one entry of it, such as {name}[0]")
     return _worst(data, array, dims, candidate in LEAST)
 
@@ -539,7 +507,7 @@ def _largest(files: list[Path]) -> dict[str, tuple[int, ...]]:
     for file in files:
         with h5py.File(file, "r") as store:
             for name, dataset in store.items():
-                if name in _PER_CASE or name in metric_names():
+                if name in _PER_CASE or name in METRICS:
                     old = largest.get(name, dataset.shape)
                     largest[name] = tuple(map(max, old, dataset.shape))
     return largest
@@ -556,4 +524,7 @@ def _fitted(data: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 def _label(name: str) -> tuple:
     """Axes after `case`, unit, long name and any flags of what a chunk holds."""
-    return _PER_CASE[name] if name in _PER_CASE else metric_label(name)
+    if name in _PER_CASE:
+        return _PER_CASE[name]
+    metric = METRICS[name]
+    return metric.dims, metric.unit, metric.text

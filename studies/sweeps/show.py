@@ -11,9 +11,10 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from jaxmodel import status
+from jaxmodel.metrics import METRICS
 from studies.entries import links_text
 from studies.errors import StudyError
-from studies.fields import parse_entry
+from studies.paths import field_unit, parse_entry
 from studies.runs import check_run
 from studies.stability import ENOUGH, margin_text
 from studies.sweeps.condition import evaluate
@@ -22,10 +23,7 @@ from studies.sweeps.results import (
     NOT_RUN,
     SweepData,
     counted_links,
-    field_unit,
     kept_metrics,
-    metric_label,
-    metric_names,
     metric_values,
     swept_names,
     variable_name,
@@ -221,7 +219,7 @@ def ranking(data: SweepData) -> str:
 def counted_text(data: SweepData, by: str) -> str:
     """Over what a metric's largest value is taken, in words."""
     metric = by.partition("[")[0]
-    axes = list(metric_label(metric)[0])
+    axes = list(data.variables[metric].dims[1:])
     told = []
     if "link" in axes and "link=" not in by:
         told.append(links_text(tuple(np.flatnonzero(counted_links(data)).tolist())))
@@ -231,7 +229,7 @@ def counted_text(data: SweepData, by: str) -> str:
 
 def is_metric(name: str) -> bool:
     """Whether a name is a metric or an entry of one, and not an axis."""
-    return name.partition("[")[0] in metric_names()
+    return name.partition("[")[0] in METRICS
 
 
 def shown_metric(data: SweepData, name: str) -> np.ndarray:

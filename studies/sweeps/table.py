@@ -15,9 +15,17 @@ import numpy as np
 
 from studies.consistency import SAMPLE_LIMIT
 from studies.errors import StudyError, field_error
-from studies.fields import Columns, Fields, as_list, padded, parse_entry
-from studies.spec import EACH_LINK, Study, parse_study
-from studies.sweeps.axes import ALIASES, LIMIT, known_field, replaced, set_value
+from studies.fields import Columns, Fields, padded
+from studies.paths import (
+    as_list,
+    is_each_link,
+    known_field,
+    parse_entry,
+    replaced,
+    set_value,
+)
+from studies.spec import Study, parse_study
+from studies.sweeps.axes import ALIASES, LIMIT, READY_MADE
 from studies.sweeps.condition import evaluate
 from studies.sweeps.designs import length, spread
 from studies.sweeps.spec import SweepSpec
@@ -107,12 +115,12 @@ def values(study: Study, columns: Columns, name: str) -> np.ndarray:
     name = ALIASES.get(name, name)
     if name in columns and columns[name].ndim == 1 and columns[name].dtype != object:
         return columns[name]
-    value = known_field(name, study)
+    value = known_field(name, study, others=READY_MADE)
     entry = parse_entry(name)
     assert entry is not None
     if isinstance(value, tuple):
         raise StudyError(f"{name}: a list; name one entry of it, such as {name}[0]")
-    if name in EACH_LINK and any(column.startswith(f"{name}[") for column in columns):
+    if is_each_link(name) and any(column.startswith(f"{name}[") for column in columns):
         raise StudyError(f"{name}: differs between links here; name one, such as {name}[0]")
     if not entry.indices and name in columns:
         raise StudyError(f"{name}: a list in this sweep; name one entry of it, such as {name}[0]")
@@ -212,6 +220,7 @@ def case_ids(study: Study, columns: Columns, repeat: np.ndarray) -> np.ndarray:
         for section, fields in data.items()
         if isinstance(fields, dict)  # the title is no parameter
         for leaf, value in fields.items()
+        if value != {}
     }
     names = sorted(fixed.keys() | varying.keys())
     # fixed lines that follow one another are joined once

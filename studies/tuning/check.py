@@ -15,10 +15,9 @@ from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import Result
 from studies.cases import as_arrays, build_case, build_cases, in_working_precision
 from studies.errors import StudyError
-from studies.fields import as_list, parse_entry
+from studies.paths import as_list, parse_entry, replaced
 from studies.runs import run_study
 from studies.spec import Study, parse_study
-from studies.sweeps.axes import replaced
 from studies.sweeps.executor import make_executor
 from studies.sweeps.plan import even_layout
 from studies.tuning.evaluate import first_residual, tuned_structure

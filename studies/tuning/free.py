@@ -24,16 +24,9 @@ from jaxmodel.parameters import Array
 from studies.cases import build_structure
 from studies.consistency import each_link, patch_centers, patch_pitch
 from studies.errors import StudyError, field_error, nearest, shown_name
-from studies.fields import parse_entry
+from studies.paths import checked_value, known_field, parse_entry
 from studies.spec import Study
-from studies.sweeps.axes import (
-    ALIASES,
-    READY_MADE,
-    Range,
-    checked_value,
-    known_field,
-    parse_range,
-)
+from studies.sweeps.axes import ALIASES, READY_MADE, Range, parse_range
 
 TWO_PI = 2 * np.pi
 

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from jaxmodel.metrics import METRICS
 from studies import figures
-from studies.sweeps.results import metric_label
 from studies.tuning.optimise import KEPT, excess
 from studies.tuning.report import Findings, is_kept
 from studies.tuning.scenarios import move_label
@@ -129,5 +129,5 @@ def front(spec: TuneSpec, found: Findings, limit: str) -> Figure:
 
 
 def _label(metric: str) -> str:
-    _, unit, text = metric_label(metric.partition("[")[0])
-    return f"{text} [{unit}]"
+    found = METRICS[metric.partition("[")[0]]
+    return f"{found.text} [{found.unit}]"

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxmodel import status
+from jaxmodel.metrics import METRICS
 from studies.entries import links_text, parse_entries
 from studies.pages import literal, opening, picture, table
-from studies.runs import METRIC_LABELS
 from studies.sketch import CAPTION
 from studies.stability import MARGIN_MODES, caution, margin_text
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
@@ -183,14 +183,14 @@ def _rows(spec: TuneSpec, found: Findings) -> list[tuple[str, Judged]]:
 
 
 def _unit(metric: str) -> str:
-    unit = readable(METRIC_LABELS[parse_entries(metric).metric][1])[1]
+    unit = readable(METRICS[parse_entries(metric).metric].unit)[1]
     return "" if unit == "1" else unit
 
 
 def _value(metric: str, values: Mapping[str, Any], watched: float) -> str:
     """A figure of one run as a report shows it."""
     value = float(values[metric])
-    unit = METRIC_LABELS[parse_entries(metric).metric][1]
+    unit = METRICS[parse_entries(metric).metric].unit
     if metric.startswith("settling_time") and value >= watched - NEARLY > 0:
         return f"not within {number(watched, unit)}"
     return number(value, unit)
@@ -199,7 +199,7 @@ def _value(metric: str, values: Mapping[str, Any], watched: float) -> str:
 def _columns(spec: TuneSpec, found: Findings) -> tuple[list[str], list[str]]:
     """Metrics that tables show, and their heads."""
     names = list(found.own.metrics)
-    return names, [headed(x, METRIC_LABELS[parse_entries(x).metric][1]) for x in names]
+    return names, [headed(x, METRICS[parse_entries(x).metric].unit) for x in names]
 
 
 def _own_machine(spec: TuneSpec, found: Findings) -> list[str]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaxmodel.metrics import METRICS
 from studies.entries import links_text, parse_entries
-from studies.fields import parse_entry
+from studies.paths import field_unit, parse_entry
 from studies.runs import STATUS_LABEL
 from studies.store import Variable
-from studies.sweeps.results import field_unit, metric_label, variable_name
+from studies.sweeps.results import variable_name
 from studies.sweeps.table import as_numbers
 from studies.tuning.check import Judged, fresh_columns, patch_centers
 from studies.tuning.free import POLES
@@ -117,7 +118,7 @@ def _fresh(spec: TuneSpec, found: Findings) -> dict[str, Variable]:
     fresh["own_status"] = Variable(found.own.status, axis, *STATUS_LABEL)
     links = links_text(spec.counted_links)
     for name, own in found.own.metrics.items():
-        label, unit = variable_name(name), metric_label(name.partition("[")[0])[1]
+        label, unit = variable_name(name), METRICS[name.partition("[")[0]].unit
         values = np.stack([one.metrics[name] for one in found.judged])
         text = name if parse_entries(name).names_a_link else f"{name}, largest of {links}"
         fresh[f"fresh_{label}"] = Variable(values, both, unit, f"{text}, fresh machines")

@@ -8,8 +8,9 @@ import numpy as np
 from scipy.stats import qmc
 
 from studies.fields import Columns
+from studies.paths import known_field, set_value
 from studies.spec import Study, parse_study
-from studies.sweeps.axes import column_of, known_field, set_value
+from studies.sweeps.axes import column_of
 from studies.tuning.spec import Family, TuneSpec
 
 

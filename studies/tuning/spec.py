@@ -21,21 +21,21 @@ import numpy as np
 from pydantic import ValidationError
 
 from jaxmodel.case import Structure
+from jaxmodel.laws import LAWS
+from jaxmodel.metrics import METRICS
 from studies.cases import build_structure
 from studies.entries import controlled_links, parse_entries
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.explain import explain
-from studies.runs import METRIC_LABELS, check_run
-from studies.spec import EACH_LINK, Section, Study, described, parse_study, read_toml
-from studies.sweeps.axes import checked_value, known_field, set_value
+from studies.paths import checked_value, is_each_link, known_field, set_value
+from studies.runs import check_run
+from studies.spec import Section, Study, described, parse_study, read_toml
 from studies.tuning.free import FreeNumbers, free_numbers, writes
 
 #: Limits that no run is needed for; all but `spillover` are lower ones. Those of the loop:
 OF_LOOP = ("gain_margin", "slowest_decay", "spillover")
 #: and with that of the mechanism.
 LOOP_LIMITS = (*OF_LOOP, "singularity_distance")
-#: Metrics without a derivative: as limits they only choose between designs.
-STEPPED = ("settling_time", "saturated_fraction", "clipped_fraction")
 #: Runs in one batch.
 MOST_RUNS = 50_000
 #: Limit that stands for what the study itself reaches.
@@ -110,6 +110,8 @@ class TuneSpec(NamedTuple):
     @property
     def has_position_gain(self) -> bool:
         """Whether any design feeds back positions."""
+        if LAWS[self.study.control.law].has_position:
+            return True
         if any("position_gain" in x for number in self.free.numbers for x in writes(number)):
             return True
         gains = [family.study(self.study).control.position_gain for family in self.families]
@@ -194,7 +196,7 @@ def _check_spread(tune: Tune, study: Study) -> None:
     for name, percent in tune.scenarios.spread.items():
         path = f"tune.scenarios.spread.{shown_name(name)}"
         value = known_field(name, study, "tune.scenarios.spread")
-        numbers = value if name in EACH_LINK and isinstance(value, tuple) else (value,)
+        numbers = value if is_each_link(name) and isinstance(value, tuple) else (value,)
         if not all(isinstance(number, float) for number in numbers):
             raise field_error(path, percent, f"for a number; {name} is {shown(value)}")
         _check_positive(percent, 99.0, path, "%")
@@ -228,14 +230,14 @@ def _check_metric(name: str, path: str, has_loop: bool, study: Study) -> None:
         return
     if has_loop and _field(name) in LOOP_LIMITS:
         raise StudyError(f"{path}: {name!r} has no such entry; allowed {_field(name)}")
-    known = [*METRIC_LABELS, *(LOOP_LIMITS if has_loop else ())]
+    known = [*METRICS, *(LOOP_LIMITS if has_loop else ())]
     if _field(name) not in known:
         hint = nearest(name, known)
         raise StudyError(
             f"{path}: {name!r} is no metric; "
             + (f"did you mean {hint!r}?" if hint else f"allowed {', '.join(known)}")
         )
-    if not has_loop and _field(name) in STEPPED:
+    if not has_loop and not METRICS[_field(name)].has_slope:
         raise StudyError(
             f"{path}: {_field(name)} moves in steps and has no derivative"
             + ("; take ringing_time" if _field(name) == "settling_time" else "; limit it instead")

@@ -1,6 +1,6 @@
 """Positive position feedback (Goh and Caughey 1985; Fanson and Caughey 1990).
 
-A second-order filter per channel pushes along with its output, f = +g eta with
+A second-order filter per mode pushes along with its output, f = +g eta with
 eta'' + 2 zeta_f omega_f eta' + omega_f^2 eta = omega_f^2 q. Where the filter lags by 90 degrees
 that is a force against q'. In a sampled loop anti-alias filter, delay and hold lag as well, so the
 filter is tuned for all of them together.
@@ -12,9 +12,11 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from jaxmodel.case import Electronics
+from jaxmodel.case import Case, Electronics, Structure
 from jaxmodel.electronics import measurement_chain
 from jaxmodel.estimator import Estimator, second_order
+from jaxmodel.laws.contract import Feedback, Known, Law, Parameter, modal_feedback, modal_gains
+from jaxmodel.laws.imsc import same
 from jaxmodel.parameters import Array
 
 #: Highest corner over the assembled frequency, for where the chain lags by 90 degrees itself [1].
@@ -60,3 +62,29 @@ def design_position_filter(omega: Array, zeta: Array, electronics: Electronics) 
     response = low * (1 + z) ** 2 / (1 + a1 * z + a2 * z * z)
     whole = measurement_chain(omega, electronics) * response
     return PositionFilter(estimator, corner, -jnp.imag(whole) / omega)
+
+
+def design(structure: Structure, case: Case, known: Known) -> Feedback:
+    """Damp each assembled mode as much as the study's velocity gains are meant to: g = k_d/damping.
+
+    Modes at which the measurement chain lags too much get no gain.
+    """
+    velocity, _ = modal_gains(case, known)
+    zeta = jnp.asarray(case.control.parameters["filter_damping"])[:, None]
+    filters = design_position_filter(known.omega, zeta, case.electronics)
+    is_fit = filters.damping > 0
+    gain = jnp.where(is_fit, velocity / jnp.where(is_fit, filters.damping, 1.0), 0.0)
+    return modal_feedback(case, known, 0 * gain, -gain, filters.estimator)
+
+
+PPF = Law(
+    "ppf",
+    "positive position feedback",
+    "mode",
+    design,
+    parameters=(
+        Parameter("filter_damping", 0.5, "1", "zeta_f, damping ratio of the filters", 0.01, 2.0),
+    ),
+    has_position=True,
+    as_strong=same,
+)

@@ -1,0 +1,30 @@
+"""Control laws, a file each; `contract` says what a law is.
+
+In: a `Case` and what the controller believes of the machine. Out: coefficients of the sampled
+controller. A law that stands in `LAWS` can be chosen by `control.law` in a study file, swept,
+tuned, certified and exported. To add one, write a file like `imsc` and put its `Law` into the list
+below; `LAWS.add` puts one in from outside.
+"""
+
+from __future__ import annotations
+
+from jaxmodel.case import Structure
+from jaxmodel.laws.contract import Law
+from jaxmodel.laws.imsc import IMSC
+from jaxmodel.laws.lqr import LQR
+from jaxmodel.laws.modified_imsc import MODIFIED_IMSC
+from jaxmodel.laws.ppf import PPF
+from jaxmodel.laws.srf import SRF
+from jaxmodel.table import Table
+
+LAWS: Table[Law] = Table("law", [IMSC, SRF, LQR, MODIFIED_IMSC, PPF])
+
+
+def is_modal(structure: Structure) -> bool:
+    """Whether channels are modes; patches otherwise."""
+    return LAWS[structure.law].channel == "mode"
+
+
+def n_channels(structure: Structure) -> int:
+    """Signals that the estimator works on, per link."""
+    return structure.n_controlled if is_modal(structure) else structure.n_patches

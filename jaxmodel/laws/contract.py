@@ -1,0 +1,128 @@
+"""What a control law is: how its channels are made and fed back, and what a study may set in it.
+
+A law turns the numbers of a case into coefficients of the one sampled controller
+(`jaxmodel.controller`): channel signals y = `filter` V_s, estimates of their rates and values,
+channel forces, V_a = `synthesizer` f. Per link; shapes (3, C, ...) with C channels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+
+from jaxmodel.case import Case, Control, Structure
+from jaxmodel.control import force_gains
+from jaxmodel.estimator import Estimator, design_estimator
+from jaxmodel.parameters import Array
+
+
+class Parameter(NamedTuple):
+    """A field of a law's own in the study file, `[control.laws.NAME]`; one number, or three."""
+
+    name: str
+    default: float
+    unit: str
+    text: str
+    low: float  # smallest value allowed
+    high: float
+
+
+class Known(NamedTuple):
+    """What a law may build on: the controller's belief of the machine."""
+
+    observer: Array  # modal filter pinv(lambda_s Phi_s^t) of the controlled modes [m/V], (3, C, K)
+    synthesizer: Array  # pinv(lambda_a Phi_a), voltages from modal forces [V/N], (3, K, C)
+    omega: Array  # frequencies of the assembled links [rad/s], (3, C)
+    modal_mass: Array  # [kg], (3, C)
+    mask: Array  # 1 for controlled modes, as many as patches can tell apart, (C,)
+
+
+class Feedback(NamedTuple):
+    """What a law makes; see `jaxmodel.controller.Controller`."""
+
+    filter: Array  # (3, C, K)
+    synthesizer: Array  # (3, K, C)
+    estimator: Estimator
+    velocity_gain: Array  # (3, C)
+    position_gain: Array  # (3, C)
+    rival_omega: Array | None = None  # (3, C)
+
+
+class Law(NamedTuple):
+    """A control law."""
+
+    name: str  # in study files
+    text: str  # in reports
+    channel: Literal["mode", "patch"]  # what a channel is: a controlled mode, or a patch pair
+    design: Callable[[Structure, Case, Known], Feedback]
+    parameters: tuple[Parameter, ...] = ()
+    # positions are always fed back; else where `control.position_gain` is not zero
+    has_position: bool = False
+    # the channels of a link act one at a time, so each is judged by itself
+    is_switching: bool = False
+    # settings with which it damps mode 1 as much as modal control does with those of the case;
+    # None: its velocity gains are scaled to that
+    as_strong: Callable[[Case, Known], Control] | None = None
+
+
+def on_and_off(case: Case, known: Known) -> Array:
+    """Gain factor of channels that act, 0 for the others [1], (3, C)."""
+    control = case.control
+    links = jnp.asarray(control.link_mask)[:, None] * control.gain_factor
+    return links * jnp.asarray(control.mode_mask) * known.mask
+
+
+def modal_gains(case: Case, known: Known) -> tuple[Array, Array]:
+    """Velocity [N s/m] and position gains [N/m] of the study by mode, ratios (24), (3, C) each."""
+    control, on = case.control, on_and_off(case, known)
+    velocity, position = (
+        on * force_gains(first, control.ratio, known.modal_mass, control.is_per_mass)
+        for first in (control.velocity_gain, control.position_gain)
+    )
+    return velocity, position
+
+
+def as_modal(control: Control, velocity: Array, position: Array) -> Control:
+    """Settings of modal control that make these gains, (3, C) each [N s/m], [N/m].
+
+    Positions must be the same multiple of velocities for all modes of a link.
+    """
+    is_on = velocity != 0
+    share = jnp.where(is_on, position / jnp.where(is_on, velocity, 1.0), 0.0)
+    largest = jnp.argmax(jnp.abs(share), axis=1)
+    return control._replace(
+        velocity_gain=jnp.ones((3,)),
+        position_gain=jnp.take_along_axis(share, largest[:, None], axis=1)[:, 0],
+        ratio=velocity,
+        gain_factor=jnp.ones(()),
+        is_per_mass=jnp.zeros(()),
+        mode_mask=is_on.astype(velocity.dtype),
+    )
+
+
+def modal_feedback(
+    case: Case,
+    known: Known,
+    velocity: Array,
+    position: Array,
+    estimator: Estimator | None = None,
+    rival_omega: Array | None = None,
+) -> Feedback:
+    """Feedback of modes: modal filter and synthesizer around the gains of each mode.
+
+    Args:
+        case: the numbers.
+        known: what the controller knows.
+        velocity: gains [N s/m], (3, C).
+        position: gains [N/m], (3, C).
+        estimator: of modal velocities and positions; None: that of the study.
+        rival_omega: see `Controller`.
+    """
+    electronics = case.electronics
+    if estimator is None:
+        estimator = design_estimator(
+            known.omega, electronics, electronics.lowpass_ratio, electronics.lowpass_zeta
+        )
+    return Feedback(known.observer, known.synthesizer, estimator, velocity, position, rival_omega)

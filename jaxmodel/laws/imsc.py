@@ -1,0 +1,19 @@
+"""Independent modal space control, (20)-(24): every mode has its own gains."""
+
+from __future__ import annotations
+
+from jaxmodel.case import Case, Control, Structure
+from jaxmodel.laws.contract import Feedback, Known, Law, modal_feedback, modal_gains
+
+
+def design(structure: Structure, case: Case, known: Known) -> Feedback:
+    """Gains of mode 1 and ratios (24), by modal filter and synthesizer."""
+    return modal_feedback(case, known, *modal_gains(case, known))
+
+
+def same(case: Case, known: Known) -> Control:
+    """Settings of modal control itself."""
+    return case.control
+
+
+IMSC = Law("imsc", "IMSC", "mode", design, as_strong=same)

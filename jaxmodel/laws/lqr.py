@@ -1,0 +1,85 @@
+"""IMSC with optimal gains (IMSC-LQR; Meirovitch 1990, Dynamics and Control of Structures)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from jaxmodel.case import Case, Control, Structure
+from jaxmodel.control import PoleGains
+from jaxmodel.laws.contract import (
+    Feedback,
+    Known,
+    Law,
+    Parameter,
+    modal_feedback,
+    modal_gains,
+    on_and_off,
+)
+from jaxmodel.parameters import Array
+
+
+def optimal_gains(omega: Array, control_weight: Array) -> PoleGains:
+    """Gains that minimise int omega^2 q^2 + q'^2 + R u^2 dt of q'' + omega^2 q = u.
+
+    k_p = omega sqrt(omega^2 + 1/R) - omega^2 and k_d = sqrt(2 k_p + 1/R): the closed-form solution
+    of the mode's Riccati equation.
+
+    Args:
+        omega: natural frequency of the mode [rad/s].
+        control_weight: R, weight of the squared control per unit modal mass [s2].
+
+    Returns:
+        PoleGains per unit modal mass.
+    """
+    share = 1 / control_weight
+    # without the difference of two large numbers where control is expensive
+    position = omega * share / (jnp.sqrt(omega**2 + share) + omega)
+    return PoleGains(position, jnp.sqrt(2 * position + share))
+
+
+def design(structure: Structure, case: Case, known: Known) -> Feedback:
+    """Optimal gains of every controlled mode, one weight for each link."""
+    weight = jnp.asarray(case.control.parameters["control_weight"])[:, None]
+    gains = optimal_gains(known.omega, weight)
+    scale = on_and_off(case, known) * known.modal_mass
+    return modal_feedback(case, known, scale * gains.velocity, scale * gains.position)
+
+
+def as_strong(case: Case, known: Known) -> Control:
+    """One weight for all links, which gives the first mode k_d of modal control, and its modes.
+
+    From k_d^2 = 2 k_p + 1/R: 1/R = h (h - 2 omega) with h^2 = k_d^2 + 4 omega^2.
+    """
+    velocity, _ = modal_gains(case, known)
+    is_on = velocity != 0
+    first = jnp.argmax(jnp.any(is_on, axis=0))
+    chosen = is_on[:, first]
+    count = jnp.maximum(jnp.sum(chosen), 1)
+    gain = jnp.sum(jnp.where(chosen, (velocity / known.modal_mass)[:, first], 0.0)) / count
+    at = jnp.sum(jnp.where(chosen, known.omega[:, first], 0.0)) / count
+    weight = (1 + 2 * at / jnp.hypot(gain, 2 * at)) / gain**2
+    return case.control._replace(
+        parameters={"control_weight": jnp.full((3,), weight)},
+        mode_mask=is_on.astype(known.omega.dtype),
+        gain_factor=jnp.ones(()),
+    )
+
+
+LQR = Law(
+    "lqr",
+    "IMSC-LQR",
+    "mode",
+    design,
+    parameters=(
+        Parameter(
+            "control_weight",
+            2e-5,
+            "s2",
+            "R of the optimal gains, weight of the squared control per modal mass",
+            1e-9,
+            1e3,
+        ),
+    ),
+    has_position=True,
+    as_strong=as_strong,
+)

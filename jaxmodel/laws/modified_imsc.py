@@ -1,0 +1,26 @@
+"""Modified IMSC (Baz and Poh 1988): the actuators of a link serve one mode at a time.
+
+The mode of highest modal energy (omega q)^2 + q'^2 is served; which one that is may change at every
+sample (`jaxmodel.controller.strongest`).
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.laws.contract import Feedback, Known, Law, modal_feedback, modal_gains
+from jaxmodel.laws.imsc import same
+
+
+def design(structure: Structure, case: Case, known: Known) -> Feedback:
+    """As IMSC; modes with gains are rivals."""
+    velocity, position = modal_gains(case, known)
+    is_on = (velocity != 0) | (position != 0)
+    rival_omega = jnp.where(is_on, known.omega, 0.0)
+    return modal_feedback(case, known, velocity, position, rival_omega=rival_omega)
+
+
+MODIFIED_IMSC = Law(
+    "modified_imsc", "modified IMSC", "mode", design, is_switching=True, as_strong=same
+)

@@ -1,0 +1,31 @@
+"""Strain rate feedback (16)-(18): every patch pair feeds back the rate of its own voltage."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.estimator import design_estimator
+from jaxmodel.laws.contract import Feedback, Known, Law
+
+
+def design(structure: Structure, case: Case, known: Known) -> Feedback:
+    """Gains of the link [s] and [1]; the estimator is exact at mode 1."""
+    control, electronics, n = case.control, case.electronics, structure.n_patches
+    on = jnp.asarray(control.link_mask)[:, None] * control.gain_factor
+    eye = jnp.broadcast_to(jnp.eye(n), (3, n, n))
+    return Feedback(
+        filter=eye,
+        synthesizer=eye,
+        estimator=design_estimator(
+            jnp.broadcast_to(known.omega[:, :1], (3, n)),
+            electronics,
+            electronics.lowpass_ratio[0],
+            electronics.lowpass_zeta[0],
+        ),
+        velocity_gain=on * jnp.broadcast_to(control.velocity_gain[:, None], (3, n)),
+        position_gain=on * jnp.broadcast_to(control.position_gain[:, None], (3, n)),
+    )
+
+
+SRF = Law("srf", "strain rate feedback", "patch", design)

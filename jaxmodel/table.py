@@ -1,0 +1,50 @@
+"""Things of one kind by name, to which users may add their own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Generic, Protocol, TypeVar
+
+
+class Named(Protocol):
+    """What a table holds."""
+
+    @property
+    def name(self) -> str: ...
+
+
+_Entry = TypeVar("_Entry", bound=Named)
+
+
+class Table(Mapping[str, _Entry], Generic[_Entry]):
+    """Entries by name, in the order in which they came."""
+
+    def __init__(self, kind: str, entries: Iterable[_Entry] = ()) -> None:
+        """
+        Args:
+            kind: what an entry is called.
+            entries: the first ones.
+        """
+        self.kind = kind
+        self._entries = {entry.name: entry for entry in entries}
+
+    def __getitem__(self, name: str) -> _Entry:
+        return self._entries[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def add(self, entry: _Entry) -> None:
+        """Put in another one.
+
+        Raises:
+            ValueError: the name is taken by another entry, or is no name.
+        """
+        name = entry.name
+        if not name.isidentifier() or name.startswith("_") or hasattr(dict, name):
+            raise ValueError(f"{self.kind} {name!r}: letters, digits and _ are allowed in a name")
+        if self._entries.setdefault(name, entry) is not entry:
+            raise ValueError(f"{self.kind} {name!r}: there is one of that name; choose another")
