@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxmodel.estimator import Estimator
 from jaxmodel.parameters import Array
@@ -137,6 +138,30 @@ def strongest(omega: Array, value: Array, rate: Array) -> Array:
     energy = jnp.where(is_rival, (omega * value) ** 2 + rate**2, 0.0)
     is_first = energy >= jnp.max(energy, axis=1, keepdims=True)
     return jnp.where(is_rival & ~is_first, 0.0, 1.0).astype(energy.dtype)
+
+
+def linear_parts(controller: Controller) -> list[tuple[slice, Controller]]:
+    """What a linear analysis can judge: the controller, or each rival channel by itself.
+
+    Each with the channels whose modes it tells about. That every part is stable proves nothing
+    about switching between them.
+
+    Args:
+        controller: NumPy arrays.
+    """
+    if controller.rival_omega is None:
+        return [(slice(None), controller)]
+    parts = []
+    for j in np.flatnonzero(np.any(controller.rival_omega, axis=0)):
+        alone = np.arange(controller.rival_omega.shape[1]) == j
+        position = controller.position_gain
+        part = controller._replace(
+            velocity_gain=alone * controller.velocity_gain,
+            position_gain=None if position is None else alone * position,
+            rival_omega=np.zeros_like(controller.rival_omega),
+        )
+        parts.append((slice(j, j + 1), part))
+    return parts or [(slice(None), controller)]
 
 
 def controller_step(

@@ -17,12 +17,13 @@ from threadpoolctl import threadpool_limits
 
 from jaxmodel.axial import axial_force
 from jaxmodel.case import Case, Structure
-from jaxmodel.controller import Controller
+from jaxmodel.controller import Controller, linear_parts
+from jaxmodel.laws import LAWS
 from jaxmodel.linear import Moment
 from jaxmodel.motion import PathSample, end_of_path, sample_path
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import RADIUS_TOLERANCE, closed_loop
+from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
 
 #: Plant modes that a margin rests on at least: modes that nobody controls limit the gains [1].
 MARGIN_MODES = 12
@@ -99,6 +100,26 @@ _closed_loop = jax.jit(closed_loop, static_argnums=0)
 INSTANTS = 401
 
 
+def _poles(still: np.ndarray, moved: np.ndarray, factor: float) -> np.ndarray:
+    """Discrete poles with all gains times a factor."""
+    return np.linalg.eigvals(still + factor * moved)
+
+
+@partial(jax.jit, static_argnums=0)
+def _controller(structure: Structure, case: Case) -> Controller:
+    return prepare(structure, case).loop.controller
+
+
+def _parts(
+    structure: Structure, case: Case, law: Controller | None = None
+) -> list[tuple[slice, Controller | None]]:
+    """Controllers to judge, and the modes that each tells about; None: the case's own."""
+    if law is None and not LAWS[structure.law].is_switching:
+        return [(slice(None), None)]
+    law = _controller(structure, case) if law is None else law
+    return [*linear_parts(jax.tree.map(np.asarray, law))]
+
+
 @partial(jax.jit, static_argnums=0)
 def _forces(structure: Structure, case: Case) -> tuple[Array, PathSample, Array]:
     """Instants of the unshaped motion, and the tension in the links [N], (n, 3)."""
@@ -127,11 +148,16 @@ def motion_report(structure: Structure, case: Case) -> MotionReport:
     chosen = np.unique([0, *force.argmin(axis=0), *force.argmax(axis=0)])
     wrench = np.asarray(case.load.wrench, force.dtype)
 
+    parts = _parts(plain, case)
+
     def margin(k: int) -> float:
         moment = Moment(sample.velocity[k], sample.acceleration[k], wrench)
-        matrices = _closed_loop(plain, case, sample.position[k], None, moment)
-        still, moved = np.asarray(matrices.open), np.asarray(matrices.feedback)
-        return gain_margin(cache(lambda factor: np.linalg.eigvals(still + factor * moved)))
+        margins = []
+        for _, part in parts:
+            matrices = _closed_loop(plain, case, sample.position[k], part, moment)
+            poles = partial(_poles, np.asarray(matrices.open), np.asarray(matrices.feedback))
+            margins.append(gain_margin(cache(poles)))
+        return min(margins)
 
     with threadpool_limits(1, "blas"):
         margins = [margin(k) for k in chosen]
@@ -149,6 +175,7 @@ def loop_report(
     """Spectral radius, gain margin and damping of the lowest link modes.
 
     Modes are followed from zero gain to full gain, so that filter poles are not mistaken for them.
+    Where channels act one at a time the report is the worst of them, each by itself.
 
     Args:
         structure: static choices.
@@ -162,24 +189,36 @@ def loop_report(
         LinAlgError: an entry of the loop's matrices is not finite.
     """
     plain, case = with_margin_modes(structure, case, n_modes)
-    matrices = jax.tree.map(np.asarray, _closed_loop(plain, case, pose, law))
+    parts = _parts(plain, case, law)
     period = float(case.electronics.period)
-
-    @cache
-    def poles(factor: float) -> np.ndarray:
-        return np.linalg.eigvals(matrices.open + factor * matrices.feedback)
-
     with threadpool_limits(1, "blas"):  # many small matrices: more threads only get in the way
-        start = np.exp(link_poles(matrices.plant, n_tracked).ravel() * period)
-        tracked = follow_poles(start, map(poles, map(float, STEPS)))[-1].reshape(-1, 3)
-        decay = np.log(tracked) / period
-        missing = ((0, n_tracked - len(tracked)), (0, 0))
-        frequency, zeta = (
-            np.pad(x, missing, constant_values=np.nan)
-            for x in (np.abs(decay) / (2 * np.pi), -decay.real / np.abs(decay))
-        )
-        radius = float(np.abs(poles(1.0)).max())
-        return LoopReport(radius, gain_margin(poles, STEPS), frequency, zeta)
+        reports = [
+            _judged(_closed_loop(plain, case, pose, part), period, n_tracked) for _, part in parts
+        ]
+    frequency, zeta = np.array(reports[0].frequency_hz), np.array(reports[0].damping_ratio)
+    for (modes, _), one in zip(parts, reports, strict=True):
+        frequency[modes], zeta[modes] = one.frequency_hz[modes], one.damping_ratio[modes]
+    return LoopReport(
+        max(one.spectral_radius for one in reports),
+        min(one.gain_margin for one in reports),
+        frequency,
+        zeta,
+    )
+
+
+def _judged(matrices: LoopMatrices, period: float, n_tracked: int) -> LoopReport:
+    matrices = jax.tree.map(np.asarray, matrices)
+    poles = cache(partial(_poles, matrices.open, matrices.feedback))
+    start = np.exp(link_poles(matrices.plant, n_tracked).ravel() * period)
+    tracked = follow_poles(start, map(poles, map(float, STEPS)))[-1].reshape(-1, 3)
+    decay = np.log(tracked) / period
+    missing = ((0, n_tracked - len(tracked)), (0, 0))
+    frequency, zeta = (
+        np.pad(x, missing, constant_values=np.nan)
+        for x in (np.abs(decay) / (2 * np.pi), -decay.real / np.abs(decay))
+    )
+    radius = float(np.abs(poles(1.0)).max())
+    return LoopReport(radius, gain_margin(poles, STEPS), frequency, zeta)
 
 
 def gain_margin(

@@ -9,7 +9,13 @@ import pytest
 import scipy.linalg
 import xarray
 
-from jaxmodel.controller import ControllerState, controller_step, rest_controller, strongest
+from jaxmodel.controller import (
+    ControllerState,
+    controller_step,
+    linear_parts,
+    rest_controller,
+    strongest,
+)
 from jaxmodel.electronics import measurement_chain
 from jaxmodel.laws.lqr import optimal_gains
 from jaxmodel.laws.ppf import HIGHEST_RATIO, design_position_filter
@@ -308,11 +314,11 @@ def test_the_strongest_is_that_of_highest_energy_and_others_are_no_rivals():
 
 
 def test_parts_of_the_modified_law_are_its_channels(laws):
-    parts = laws["modified IMSC"].linear_parts
+    parts = linear_parts(laws["modified IMSC"].controller)
     whole = laws["modified IMSC"].controller.velocity_gain
     np.testing.assert_allclose(sum(part.velocity_gain for _, part in parts), whole)
     assert [modes.start for modes, _ in parts] == [0, 1, 2]
-    assert len(laws["IMSC"].linear_parts) == 1
+    assert len(linear_parts(laws["IMSC"].controller)) == 1
 
 
 def test_idle_channels_change_nothing():

@@ -8,12 +8,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from jaxmodel.beam import BASES
+from jaxmodel.controller import linear_parts
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.consistency import each_link
 from studies.errors import StudyError, field_error
 from studies.export.controller import FixedController, fixed_controller
 from studies.spec import Study
-from studies.spillover.judgement import Judgement, judge
+from studies.spillover.judgement import Judgement, judge, worst_of
 from studies.spillover.plants import (
     DEPARTURES,
     Departure,
@@ -123,12 +124,17 @@ def _judged(
     found: FixedController, maker: LoopMaker, plants: list[Plant]
 ) -> dict[Plant, Judgement]:
     """Judgement of every plant that stands by itself."""
-    law = widened(found.controller, found.n_patches)
+    parts = [
+        (modes, widened(part, found.n_patches)) for modes, part in linear_parts(found.controller)
+    ]
+    judgements = {}
     try:
         with threadpool_limits(1, "blas"):
-            return {
-                plant: judge(loop) for plant in plants if (loop := maker.loop(plant, law)).stands
-            }
+            for plant in plants:
+                loops = [(modes, maker.loop(plant, part)) for modes, part in parts]
+                if loops[0][1].stands:
+                    judgements[plant] = worst_of([(modes, judge(loop)) for modes, loop in loops])
+        return judgements
     except np.linalg.LinAlgError:
         raise StudyError("a linearised loop is not finite: nothing to judge") from None
 

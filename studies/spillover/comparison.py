@@ -10,7 +10,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.controller import Controller
+from jaxmodel.controller import Controller, linear_parts
 from jaxmodel.simulate import Result, simulate
 from studies.export.controller import FixedController, fixed_controller
 from studies.runs import check_run
@@ -103,7 +103,7 @@ class _View:
         self.law, maker = law, LoopMaker(found)
         self.limit, self.breaking = HIGHEST, ""
         self._n_links = _controlled_links(found.controller)
-        parts = law.linear_parts
+        parts = linear_parts(law.controller)
         self._parts = [(modes, maker.loop(plant, part)) for modes, part in parts]
         for _, part in parts:
             for n in sorted(sizes, reverse=True):  # where the limit is lowest, as a rule

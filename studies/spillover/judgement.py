@@ -53,6 +53,18 @@ def judge(loop: SampledLoop) -> Judgement:
     )  # fmt: skip
 
 
+def worst_of(parts: list[tuple[slice, Judgement]]) -> Judgement:
+    """Of a law whose channels act one at a time, each with the modes it tells about."""
+    each = [judgement for _, judgement in parts]
+    frequency, zeta = np.array(each[0].frequency_hz), np.array(each[0].damping_ratio)
+    for modes, one in parts:
+        frequency[modes], zeta[modes] = one.frequency_hz[modes], one.damping_ratio[modes]
+    lowest = min(each, key=lambda one: one.margin)
+    return lowest._replace(
+        radius=max(one.radius for one in each), frequency_hz=frequency, damping_ratio=zeta
+    )
+
+
 def follow(
     loop: SampledLoop, factors: np.ndarray, poles: Callable[[float], np.ndarray]
 ) -> np.ndarray:

@@ -42,24 +42,6 @@ class Candidate(NamedTuple):
             velocity_gain=factor * law.velocity_gain, position_gain=factor * law.position_gain
         )
 
-    @property
-    def linear_parts(self) -> list[tuple[slice, Controller]]:
-        """What a linear analysis can judge: the law, or each rival channel by itself.
-
-        Each with the modes whose damping it tells.
-        """
-        law = self.controller
-        assert law.position_gain is not None and law.rival_omega is not None
-        parts = []
-        for j in np.flatnonzero(law.rival_omega.any(axis=0)):
-            alone = np.arange(law.rival_omega.shape[1]) == j
-            part = law._replace(
-                velocity_gain=alone * law.velocity_gain, position_gain=alone * law.position_gain,
-                rival_omega=np.zeros_like(law.rival_omega),
-            )  # fmt: skip
-            parts.append((slice(j, j + 1), part))
-        return parts or [(slice(None), law)]
-
 
 def all_laws(found: FixedController, maker: LoopMaker, plant: Plant) -> list[Candidate]:
     """Every law there is; the one that the design is of with the design's own numbers.

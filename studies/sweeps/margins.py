@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.laws import IMSC, LAWS
 from jaxmodel.loci import (
     Known,
     Loci,
@@ -100,6 +101,8 @@ def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
     count = max(len(leaf) for leaf in jax.tree.leaves(cases))
     if structure.feedback != "sampled":
         return _nothing(count, structure)
+    if LAWS[structure.law].is_switching:
+        return _judge_one_by_one(structure, cases)
     structure, cases = with_margin_modes(structure, cases)
     whole = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
     n_links = np.sum(whole.control.link_mask > 0, axis=1)
@@ -122,6 +125,29 @@ def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
         if len(again):
             judge(again, WALKS[1])
     return figures
+
+
+def _judge_one_by_one(structure: Structure, cases: Case) -> LoopMargins:
+    """Worst figures of loops whose controlled modes act one at a time, each by itself."""
+    alone = structure._replace(law=IMSC.name)
+    parts = []
+    for j in range(structure.n_controlled):
+        mask = cases.control.mode_mask * (np.arange(structure.n_controlled) == j)
+        control = cases.control._replace(mode_mask=mask)
+        parts.append(judge_loops(alone, cases._replace(control=control)))
+    margins = np.stack([part.gain_margin for part in parts])
+    worst = np.argmin(np.where(np.isnan(margins), -np.inf, margins), axis=0)[None]
+
+    def of_worst(name: str) -> np.ndarray:
+        values = np.stack([getattr(part, name) for part in parts])
+        return np.take_along_axis(values, worst, axis=0)[0]
+
+    return LoopMargins(
+        gain_margin=of_worst("gain_margin"),
+        breaking_frequency=of_worst("breaking_frequency"),
+        breaking_mode=of_worst("breaking_mode"),
+        damping_ratio=np.stack([part.damping_ratio[:, j] for j, part in enumerate(parts)], axis=1),
+    )
 
 
 def _nothing(count: int, structure: Structure) -> LoopMargins:
