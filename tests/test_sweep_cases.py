@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from studies.cases import as_arrays, build_case, build_cases, build_structure
 from studies.errors import StudyError
 from studies.fields import Fields, padded
-from studies.sweeps.designs import morris_points, saltelli_points
+from studies.sweeps.methods import morris_points, saltelli_points
 from studies.sweeps.spec import load_sweep, parse_sweep, ready_spec
 from studies.sweeps.table import build_table, case_study
 from tests.sweeps import BASE, MIXED, small, small_spec

@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
@@ -153,47 +152,21 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         folder: Folder,
         by: Annotated[str, typer.Option(help="metric")] = "residual_rms",
     ) -> None:
-        """Which parameters matter: from a sweep with method morris or saltelli."""
+        """Which parameters matter: from a sweep with a method made for it (morris, saltelli)."""
         start()
-        from studies.sweeps.designs import unit_points
         from studies.sweeps.results import load
-        from studies.sweeps.sensitivity import (
-            design_values,
-            elementary_effects,
-            factor_names,
-            sobol_indices,
-        )
+        from studies.sweeps.sensitivity import analyse
         from studies.sweeps.show import label
 
         data = load(folder)
-        names = factor_names(data)
-        value = design_values(data, by)
-        console.print(f"{label(data, by)}, {len(value)} rows of a {data.spec.sweep.method} design")
-        if data.spec.sweep.method == "morris":
-            points = unit_points(data.spec.root, len(names), data.spec.sweep.seed)
-            effects = elementary_effects(points, value)
-            table = Table("factor", "mean |effect|", "mean effect", "deviation", "effects used")
-            columns = zip(
-                names, effects.mean_size, effects.mean, effects.deviation, effects.n_used,
-                strict=True,
-            )  # fmt: skip
-            for name, *numbers, used in sorted(columns, key=lambda row: -row[1]):
-                table.add_row(name, *(f"{x:.4g}" for x in numbers), str(used))
-            left_out, what = effects.n_left_out, "effects"
-        else:
-            found = sobol_indices(value, len(names))
-            table = Table("factor", "first", "95 %", "total", "95 %")
-            for k in np.argsort(-found.total):
-                a, b = found.first_interval[k], found.total_interval[k]
-                table.add_row(
-                    names[k], f"{found.first[k]:.3f}", f"{a[0]:.3f} to {a[1]:.3f}",
-                    f"{found.total[k]:.3f}", f"{b[0]:.3f} to {b[1]:.3f}",
-                )  # fmt: skip
-            left_out, what = found.n_left_out, "base points"
-            if np.any(found.first > found.total_interval[:, 1]):
-                console.print(
-                    "a first index beyond the total one: not settled yet, take more base points"
-                )
+        found = analyse(data, by)
+        design = f"a {data.spec.sweep.method} design"
+        console.print(f"{label(data, by)}, {len(data.table.origin)} rows of {design}")
+        table = Table(*found.heads)
+        for row in found.rows:
+            table.add_row(*row)
+        for note in found.notes:
+            console.print(note)
         console.print(table)
-        if left_out:
-            console.print(f"left out because of failed cases: {left_out} {what}")
+        if found.n_left_out:
+            console.print(f"left out because of failed cases: {found.n_left_out} {found.what}")

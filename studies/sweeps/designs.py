@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
-from studies.errors import StudyError, field_error
+from studies.errors import StudyError
 from studies.fields import Columns
 from studies.paths import checked_value, known_field
 from studies.spec import Study
 from studies.sweeps.axes import LIMIT, READY_MADE, Axis, build_axis, column_of
-from studies.sweeps.spec import SAMPLED, Node
+from studies.sweeps.methods import METHODS, Asked
+from studies.sweeps.spec import Node
 
 
 def spread(node: Node, study: Study, seed: int) -> Columns:
@@ -26,17 +26,15 @@ def spread(node: Node, study: Study, seed: int) -> Columns:
     Raises:
         StudyError: a bad axis, a name used twice, too many cases.
     """
-    block = node.block
-    if block.method == "list":
+    method, own = METHODS[node.block.method], None
+    if node.block.cases:
         own = _listed(node, study)
-    elif block.method in SAMPLED:
+    elif method.points is not None:
         own = _sampled(node, study, seed)
-    else:
-        own = None
     parts = [own] if own is not None else [_grid_of(a, n) for n, a in _axes(node, study).items()]
     parts += [spread(child, study, seed + 1000 * (k + 1)) for k, child in enumerate(node.children)]
     _check_names(parts, node.path)
-    if block.method == "zip":
+    if method.combine == "side by side":
         return _paired(parts, node.path)
     return _product(parts, node.path)
 
@@ -81,7 +79,7 @@ def _paired(parts: list[Columns], path: str) -> Columns:
         named = ", ".join(
             f"{'/'.join(columns)}: {size}" for columns, size in zip(parts, sizes, strict=True)
         )
-        raise StudyError(f"{path}.method = 'zip': axes of one length; here {named}")
+        raise StudyError(f"{path}: axes of one length side by side; here {named}")
     return {name: column for columns in parts for name, column in columns.items()}
 
 
@@ -137,64 +135,7 @@ def _sampled(node: Node, study: Study, seed: int) -> Columns:
 
 
 def unit_points(node: Node, dimensions: int, seed: int) -> np.ndarray:
-    """Points of the unit cube for a sampling method, (n, dimensions).
-
-    The first rows stay the same when more are asked for, so that a study can grow.
-    """
-    block = node.block
-    if block.method == "random":
-        return np.random.default_rng(seed).random((block.count, dimensions))
-    if block.method == "latin_hypercube":
-        size = block.size or block.count
-        parts = [
-            qmc.LatinHypercube(dimensions, rng=np.random.default_rng([seed, k])).random(size)
-            for k in range(block.count // size)
-        ]
-        return np.concatenate(parts)
-    if block.method == "sobol":
-        return _sobol(block.count, dimensions, seed, node.path)
-    if block.method == "saltelli":
-        return saltelli_points(_sobol(block.count, 2 * dimensions, seed, node.path))
-    return morris_points(block.count, dimensions, block.levels, seed)
-
-
-def _sobol(count: int, dimensions: int, seed: int, path: str) -> np.ndarray:
-    if dimensions > 21201:
-        raise field_error(f"{path}.axes", dimensions, "up to 21201 dimensions for Sobol points")
-    # the next power of two, cut: a balanced sequence, and no warning about its length
-    exponent = int(np.ceil(np.log2(max(count, 1))))
-    engine = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
-    return engine.random_base2(exponent)[:count]
-
-
-def saltelli_points(points: np.ndarray) -> np.ndarray:
-    """Design for Sobol indices from (n, 2 d) points: rows A, B, A with column i of B; (n (d+2), d).
-
-    The d + 2 rows of each base point follow one another. Saltelli et al. 2010.
-    """
-    n, d = len(points), points.shape[1] // 2
-    a, b = points[:, :d], points[:, d:]
-    mixed = np.repeat(a[:, None], d, axis=1)
-    mixed[:, np.arange(d), np.arange(d)] = b
-    return np.concatenate([a[:, None], b[:, None], mixed], axis=1).reshape(n * (d + 2), d)
-
-
-def morris_points(count: int, dimensions: int, levels: int, seed: int) -> np.ndarray:
-    """Trajectories for elementary effects, (count (d + 1), d); Morris 1991.
-
-    Each starts on a random point of the grid and changes one coordinate after the other, in random
-    order, by +-levels/(2 (levels - 1)). The ends of the cube are part of the grid.
-    """
-    step = (levels // 2) / (levels - 1)
-    rows = []
-    for k in range(count):
-        rng = np.random.default_rng([seed, k])
-        start = rng.integers(0, levels, dimensions) / (levels - 1)
-        sign = np.where(start + step > 1 + 1e-12, -1.0, 1.0)
-        is_free = (start + step <= 1 + 1e-12) & (start - step >= -1e-12)
-        sign = np.where(is_free & (rng.random(dimensions) < 0.5), -1.0, sign)
-        moved = np.zeros((dimensions + 1, dimensions))
-        for position, axis in enumerate(rng.permutation(dimensions)):
-            moved[position + 1 :, axis] = sign[axis] * step
-        rows.append(start + moved)
-    return np.concatenate(rows).clip(0.0, 1.0)
+    """Points of the unit cube for a sampling method, (n, dimensions)."""
+    points = METHODS[node.block.method].points
+    assert points is not None
+    return points(Asked(node.block, dimensions, seed, node.path))

@@ -16,6 +16,7 @@ from studies.sketch import CAPTION, sketch
 from studies.spec import Study
 from studies.stability import ENOUGH, margin_text
 from studies.sweeps.axes import SHOWN_AS
+from studies.sweeps.methods import METHODS
 from studies.sweeps.plots import front, plot, save_plot
 from studies.sweeps.results import SweepData, load, metric_values, swept_names
 from studies.sweeps.show import (
@@ -49,19 +50,9 @@ OTHERS = ("settling_time", "peak_voltage")
 ALIKE = 0.02
 #: More listed values of an axis are not spelt out.
 MOST_VALUES = 12
+
+
 #: What a block makes of its axes.
-_METHODS = {
-    "grid": "every combination of",
-    "zip": "side by side",
-    "list": "{} cases, spelt out in the file",
-    "random": "{} random points of",
-    "latin_hypercube": "{} points of Latin hypercubes of",
-    "sobol": "{} Sobol points of",
-    "morris": "{} trajectories of a Morris design of",
-    "saltelli": "{} base points of a Saltelli design of",
-}
-
-
 def write_sweep_report(folder: Path) -> None:
     """Write `report.md` and `report.html` of a sweep, with its figures, into its folder.
 
@@ -206,7 +197,7 @@ def _answer(data: SweepData, metric: str) -> tuple[str, str]:
 def _blocks(node: Node, depth: int = 0) -> list[str]:
     """A block with its axes and further blocks, as a nested list."""
     block, indent = node.block, "  " * depth
-    lines = [f"{indent}- " + _METHODS[block.method].format(block.count or len(block.cases))]
+    lines = [f"{indent}- " + METHODS[block.method].text.format(block.count or len(block.cases))]
     for name, written in block.axes.items():
         field = f" (`{SHOWN_AS[name]}`)" if name in SHOWN_AS else ""
         lines.append(f"{indent}  - `{name}`{field}: {literal(_values(written))}")

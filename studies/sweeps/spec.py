@@ -12,25 +12,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from pydantic import ValidationError
 
+from studies.choices import OneOf
 from studies.entries import parse_entries
 from studies.errors import StudyError, field_error, nearest
 from studies.explain import explain
 from studies.spec import Section, Study, described, parse_study, read_toml
-
-Method = Literal[
-    "grid", "zip", "list", "random", "latin_hypercube", "sobol", "morris", "saltelli"
-]  # fmt: skip
-SAMPLED = ("random", "latin_hypercube", "sobol", "morris", "saltelli")
+from studies.sweeps.methods import METHODS
 
 
 class Block(Section):
     """Axes and how they combine."""
 
-    method: Method = described("grid", "-", "how axes and blocks combine")
+    method: Annotated[str, OneOf(lambda: METHODS)] = described(
+        "grid", "-", "how axes and blocks combine"
+    )
     axes: dict[str, Any] = described({}, "-", "field or ready-made axis = values")
     blocks: tuple[dict[str, Any], ...] = described((), "-", "further blocks")
     cases: tuple[dict[str, Any], ...] = described(
@@ -153,28 +152,31 @@ def _node(block: Block, path: str, depth: int = 0) -> Node:
 
 def _check_block(block: Block, path: str) -> None:
     """What a method needs, and nothing that it would ignore."""
-    is_sampled = block.method in SAMPLED
-    if is_sampled and block.count < 1:
-        raise field_error(f"{path}.count", block.count, f"1 or more, for method {block.method}")
-    if not is_sampled and block.count:
-        raise field_error(f"{path}.count", block.count, f"0, method {block.method} has no count")
-    if block.size and block.method != "latin_hypercube":
-        raise field_error(f"{path}.size", block.size, "0, but for method latin_hypercube")
+    name, method = block.method, METHODS[block.method]
+    if "count" in method.fields and block.count < 1:
+        raise field_error(f"{path}.count", block.count, f"1 or more, for method {name}")
+    for field in ("count", "size", "levels"):
+        value, default = getattr(block, field), Block.model_fields[field].default
+        if field not in method.fields and value != default:
+            readers = ", ".join(other.name for other in METHODS.values() if field in other.fields)
+            raise field_error(
+                f"{path}.{field}", value, f"{default}, method {name} has no {field} ({readers})"
+            )
     if block.size and block.count % block.size:
         raise field_error(
             f"{path}.count", block.count, f"a multiple of {path}.size = {block.size}", "1"
         )
-    if (block.method == "list") != bool(block.cases):
+    if ("cases" in method.fields) != bool(block.cases):
         raise field_error(f"{path}.cases", block.cases, "one or more, with method list only")
-    if block.method == "list" and block.axes:
+    if block.cases and block.axes:
         raise field_error(f"{path}.axes", list(block.axes), "none with method list")
-    if is_sampled and not block.axes:
+    if method.points is not None and not block.axes:
         raise field_error(f"{path}.axes", {}, "one axis or more")
     if not (block.axes or block.blocks or block.cases) and path != "sweep":
         raise field_error(path, {}, "a block with axes, blocks or cases")
-    if path != "sweep" and block.method in ("morris", "saltelli"):
+    if path != "sweep" and method.analysis is not None:
         raise field_error(
-            f"{path}.method", block.method, "any other inside a block; these stand alone in [sweep]"
+            f"{path}.method", name, "any other inside a block; these stand alone in [sweep]"
         )
-    if block.method in ("morris", "saltelli") and block.blocks:
-        raise field_error(f"{path}.blocks", len(block.blocks), "none with method " + block.method)
+    if method.analysis is not None and block.blocks:
+        raise field_error(f"{path}.blocks", len(block.blocks), "none with method " + name)
