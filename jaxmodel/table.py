@@ -44,7 +44,10 @@ class Table(Mapping[str, _Entry], Generic[_Entry]):
             ValueError: the name is taken by another entry, or is no name.
         """
         name = entry.name
-        if not name.isidentifier() or name.startswith("_") or hasattr(dict, name):
-            raise ValueError(f"{self.kind} {name!r}: letters, digits and _ are allowed in a name")
+        plain = name.replace("-", "_")
+        if not plain.isidentifier() or name.startswith("_") or hasattr(dict, name):
+            raise ValueError(
+                f"{self.kind} {name!r}: letters, digits, - and _ are allowed in a name"
+            )
         if self._entries.setdefault(name, entry) is not entry:
             raise ValueError(f"{self.kind} {name!r}: there is one of that name; choose another")

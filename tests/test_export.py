@@ -11,7 +11,7 @@ import pytest
 
 import studies
 from studies.export import run as export_run
-from studies.export import sequences
+from studies.export import sequences, targets
 from studies.export.compiler import STRICT
 from studies.export.controller import fixed_controller
 from studies.export.document import document, import_study, study_hash
@@ -191,13 +191,13 @@ def test_fuzzing_notices_a_fault(capsys, designs, folders, tmp_path):
 
 def test_wrong_code_is_not_written(capsys, designs, tmp_path, monkeypatch):
     needs_compiler()
-    right = export_run.floating_source
+    right = targets.floating_source
 
     def wrong(*arguments):
         source = right(*arguments)
         return source._replace(code=re.sub(r"R\((-?\d\.\d{8})\d+", r"R(\1", source.code))
 
-    monkeypatch.setattr(export_run, "floating_source", wrong)
+    monkeypatch.setattr(targets, "floating_source", wrong)
     out = tmp_path / "wrong"
     code, text, _ = run(capsys, "export", designs["paper"], "--target", "c", "--out", out)
     assert code == 1 and "FAILED: open loop, recorded codes" in text

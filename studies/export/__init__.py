@@ -7,5 +7,6 @@
   of them, which `c_text` puts into the templates.
 - Proof: `compiler` makes the code callable, `in_the_loop` runs it with the plant, `sequences` are
   inputs that no plant would make, `verify` compares, `report` tells.
-- `run` leads from the design to the files.
+- `targets` is the table of what can be written, each of a `job`; `run` leads from the design to the
+  files.
 """

@@ -1,0 +1,103 @@
+"""One export: what is asked for, the checks that every target makes, and what comes out."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from jaxmodel import status
+from studies.errors import StudyError, field_error
+from studies.export.channels import Channels, unfold
+from studies.export.controller import FixedController
+from studies.export.cost import Cost
+from studies.export.fixed import FixedPoint, rail_samples
+from studies.export.in_the_loop import LoopRun
+from studies.export.verify import Verification, reference_run
+from studies.runs import describe
+from studies.stability import LoopReport, loop_report
+
+
+class Job(NamedTuple):
+    """What is to be exported, and how."""
+
+    found: FixedController
+    name: str
+    origin: list[str]
+    case_id: str
+    compiler: list[str]
+    is_verified: bool
+    dac_bits: int
+    console: Console
+
+
+class Made(NamedTuple):
+    """What came out."""
+
+    files: dict[str, str]
+    loop: LoopReport  # with the exported coefficients
+    verified: Verification | None
+    fixed: FixedPoint | None = None
+    cost: Cost | None = None
+
+
+def judged(found: FixedController, channels: Channels, note: str) -> LoopReport:
+    """Linearised sampled loop with given coefficients; refused where it is unstable."""
+    home = np.array(found.study.motion.waypoints[0], float)
+    law = unfold(channels, found.controller)
+    law = jax.tree.map(jnp.asarray, law)
+    try:
+        # not the case's own controller: its kind must not cost another compilation
+        structure = found.structure._replace(has_position_gain=False)
+        loop = loop_report(structure, found.case, home, 1, law=law)
+    except np.linalg.LinAlgError:
+        raise StudyError("the linearised loop is not finite: no controller to export") from None
+    if not loop.is_stable:
+        factor = found.study.control.gain_factor
+        way = f"at most {0.5 * factor * loop.gain_margin:.3g}, half of what is stable"
+        if loop.gain_margin == 0:
+            way = "smaller ones do not help either: see studies simulate and docs/theory.md"
+        raise field_error(
+            "control.gain_factor", factor,
+            f"gains whose sampled loop is stable{note}: its spectral radius is "
+            f"{loop.spectral_radius:.6f}, its gain margin {loop.gain_margin:.3g} ({way})", "1",
+        )  # fmt: skip
+    return loop
+
+
+def reference_motion(job: Job) -> LoopRun:
+    """The case's motion with the JAX controller, which must run to its end."""
+    found = job.found
+    job.console.print(f"in the loop: {found.structure.n_steps} samples for each controller")
+    run = reference_run(found)
+    code = int(run.result.status)
+    if code not in status.FINISHED:
+        raise StudyError(
+            f"{found.study.title}: {describe(code)} at {run.result.bad_time:.4g} s; allowed: a "
+            "study that runs to its end (see studies simulate)"
+        )
+    _check_clipping(found, run)
+    return run
+
+
+def _check_clipping(found: FixedController, run: LoopRun) -> None:
+    """Refuse a motion that the exported code would take for a broken sensor."""
+    electronics = found.study.electronics
+    rail = rail_samples(electronics.sample_rate_hz)
+    used = np.isin(np.arange(3), found.channels.link)[:, None]
+    for end in (0.0, float(found.controller.adc_top)):
+        length = np.zeros(run.codes.shape[1:])
+        for k, code in enumerate(run.codes):
+            length = np.where((code == end) & used, length + 1, 0)
+            if length.max() >= rail:
+                link, patch = np.unravel_index(np.argmax(length), length.shape)
+                raise field_error(
+                    "electronics.conditioner_gain", electronics.conditioner_gain,
+                    f"so small that the motion does not hold sensor {patch + 1} of link {link + 1} "
+                    f"at an end of the ADC's range for {1e3 * rail / electronics.sample_rate_hz:g} "
+                    f"ms, as until t = {k / electronics.sample_rate_hz:.4g} s: that is taken for a "
+                    "broken sensor (see electronics.conditioner_bias, too)", "1",
+                )  # fmt: skip
