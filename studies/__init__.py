@@ -2,6 +2,7 @@
 
 from studies.config import configure, info
 from studies.errors import StudyError
+from studies.extensions import extend
 from studies.runs import Run, chord_deflection, run_study
 from studies.spec import Study, load_study, paper_study, parse_study
 from studies.sweeps.results import load
@@ -14,6 +15,7 @@ __all__ = [
     "StudyError",
     "chord_deflection",
     "configure",
+    "extend",
     "info",
     "load",
     "load_study",

@@ -14,7 +14,7 @@ from rich.table import Table
 from typer.exceptions import Abort, TyperException
 
 from studies.atlas.commands import add_commands as add_atlas
-from studies.config import start
+from studies.config import configure, start
 from studies.errors import StudyError, field_error
 from studies.export.commands import add_commands as add_export
 from studies.spillover.commands import add_commands as add_spillover
@@ -22,8 +22,7 @@ from studies.sweeps.commands import add_commands
 from studies.tuning.commands import add_commands as add_tuning
 
 app = typer.Typer(
-    help="Parameter studies of a planar 3-PRR manipulator with flexible links.",
-    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+        no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
 )  # fmt: skip
 #: Columns of tables where nobody watches; a terminal's own width otherwise.
 FILE_WIDTH = 240
@@ -54,6 +53,26 @@ def main(arguments: list[str] | None = None) -> None:
     except (KeyboardInterrupt, Abort):
         print("studies: interrupted", file=sys.stderr)
         sys.exit(INTERRUPTED)
+
+
+@app.callback()
+def prepare(
+    own: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--with",
+            help="Python file or module with laws, metrics, sweep methods or export targets of "
+            "your own",
+        ),
+    ] = None,
+) -> None:
+    """Parameter studies of a planar 3-PRR manipulator with flexible links."""
+    if own:
+        configure()  # before any JAX operation of these files
+        from studies.extensions import extend
+
+        for module in own:
+            extend(module)
 
 
 @app.command()

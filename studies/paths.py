@@ -8,7 +8,7 @@ the law's default.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, get_args
 
 from pydantic import BaseModel, ValidationError
@@ -157,17 +157,23 @@ def _by_leaf(wanted: str, names: list[str]) -> str:
 
 def set_value(study: Study, name: str, value: Any) -> dict[str, Any]:
     """The study as a dictionary, with a field or an entry of it replaced."""
-    entry = parse_entry(name)
-    assert entry is not None
+    return set_values(study, {name: value})
+
+
+def set_values(study: Study, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The study as a dictionary, with fields or entries of fields replaced, one after the other."""
     data = study.model_dump()
-    *sections, leaf = entry.field.split(".")
-    target = data
-    for section in sections:
-        target = target.setdefault(section, {})
-    if entry.indices:
-        whole = as_list(entry.field, field_value(study, entry.field))
-        value = replaced(whole, entry.indices, value)
-    target[leaf] = value
+    for name, value in values.items():
+        entry = parse_entry(name)
+        assert entry is not None
+        *sections, leaf = entry.field.split(".")
+        target = data
+        for section in sections:
+            target = target.setdefault(section, {})
+        if entry.indices:
+            whole = target[leaf] if leaf in target else field_value(study, entry.field)
+            value = replaced(as_list(entry.field, whole), entry.indices, value)
+        target[leaf] = value
     return data
 
 

@@ -10,7 +10,6 @@ import json
 import platform
 from functools import cache, lru_cache
 from importlib.metadata import version
-from pathlib import Path
 from threading import RLock
 from typing import NamedTuple
 
@@ -18,11 +17,11 @@ import numpy as np
 from distributed import Worker, get_worker
 
 from jaxmodel.case import Structure
-from studies import config
+from studies import config, sources
 from studies.errors import StudyError
+from studies.extensions import extend_as_told
 from studies.sweeps.chunks import Judged, start_chunk
 from studies.sweeps.executor import make_executor
-from studies.sweeps.folder import code_digest
 from studies.sweeps.plan import chunk_cases, even_layout, local_layout
 from studies.sweeps.program import Executor
 from studies.sweeps.spec import parse_sweep
@@ -56,9 +55,9 @@ class Answer(NamedTuple):
 @cache
 def identity() -> dict[str, str]:
     """What must be the same on client and workers."""
-    parts = Path(__file__).parent, Path(__file__).parents[1] / "tuning"
+    extend_as_told()
     return {
-        "code": code_digest(sorted(path for part in parts for path in part.glob("*.py"))),
+        "code": sources.digest("studies.cluster.worker", "studies.cluster.designs"),
         "python": ".".join(platform.python_version_tuple()[:2]),
         **{name: version(name) for name in ("jax", "jaxlib", "numpy")},
     }

@@ -7,17 +7,16 @@ optional (extra `fast`); without it XLA runs the same step.
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from studies import sources
 from studies.compilation import ObjectCache, compiling
 from studies.kernels.graph import is_known
 from studies.kernels.llvm import Frame, Writer, binding, ir
@@ -87,7 +86,9 @@ def kept_kernel(name: str, make: Callable[[], TracedLoop]) -> Kernel:
         name: of the loop, with all sizes.
         make: traces it.
     """
-    kept = ObjectCache("loop", name, _source_digest(), jax.__version__, *_target())
+    kept = ObjectCache(
+        "loop", name, sources.digest(__name__, "jaxmodel"), jax.__version__, *_target()
+    )
     found = kept.take(None)
     if found is None:
         kernel, code = _build(make())
@@ -102,15 +103,6 @@ def kept_kernel(name: str, make: Callable[[], TracedLoop]) -> Kernel:
     engine.finalize_object()
     dtype = np.dtype(f"f{VECTOR_BYTES // width}")
     return Kernel(engine, width, np.array(numbers, dtype), Counter(operations))
-
-
-@cache
-def _source_digest() -> str:
-    """Of the code that a traced loop comes from."""
-    top = Path(__file__).parents[2]
-    files = [*(top / "jaxmodel").glob("*.py"), *Path(__file__).parent.glob("*.py")]
-    texts = [path.read_bytes() for path in sorted(files)]
-    return hashlib.sha256(b"\0".join(texts)).hexdigest()
 
 
 class _VectorWriter(Writer):

@@ -15,14 +15,14 @@ import re
 import subprocess
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from hashlib import file_digest, sha256
+from hashlib import file_digest
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 
-from studies import config
+from studies import config, sources
 from studies.errors import StudyError
 from studies.store import Variable, replacing, write_store
 
@@ -171,16 +171,20 @@ def locked_folder(path: Path, what: str) -> Iterator[None]:
         yield
 
 
-def make_manifest(data: dict[str, Any], more: Iterable[Path] = ()) -> dict[str, Any]:
+#: Modules that decide the numbers of a sweep, with all that they import.
+DECISIVE = ("studies.sweeps.chunks", "studies.sweeps.table")
+
+
+def make_manifest(data: dict[str, Any], modules: Iterable[str] = DECISIVE) -> dict[str, Any]:
     """What decides a sweep's numbers, and what ran it.
 
     Args:
         data: the sweep file as read.
-        more: sources that decide them too.
+        modules: what decides them, with all that they import.
     """
     return {
         "spec": data,
-        "code": code_digest(more),
+        "code": sources.digest(*modules),
         "git": git_state(),
         **config.origin(),
     }
@@ -324,22 +328,6 @@ def _sync(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def code_digest(more: Iterable[Path] = ()) -> str:
-    """Hash of the sources that decide a case's numbers, and of more of them."""
-    digest = sha256()
-    names = (
-        "cases.py", "fields.py", "spec.py", "stability.py", "kernels/cpu.py", "kernels/fusion.py",
-        "kernels/gpu.py", "kernels/graph.py", "kernels/llvm.py", "kernels/traced.py",
-        "sweeps/chunks.py", "sweeps/damping.py", "sweeps/executor.py", "sweeps/kernels.py",
-        "sweeps/lanes.py", "sweeps/margins.py", "sweeps/plan.py", "sweeps/program.py",
-        "sweeps/scan.py", "sweeps/steps.py", "sweeps/table.py",
-    )  # fmt: skip
-    sources = sorted((_SOURCES / "jaxmodel").glob("*.py"))
-    for path in (*sources, *(_SOURCES / "studies" / name for name in names), *more):
-        digest.update(path.name.encode() + path.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 def git_state() -> str:

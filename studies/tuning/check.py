@@ -15,7 +15,7 @@ from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import Result
 from studies.cases import as_arrays, build_case, build_cases, in_working_precision
 from studies.errors import StudyError
-from studies.paths import as_list, parse_entry, replaced
+from studies.paths import set_values
 from studies.runs import run_study
 from studies.spec import Study, parse_study
 from studies.sweeps.executor import make_executor
@@ -94,16 +94,7 @@ def tuned_study(spec: TuneSpec, family: Family, values: np.ndarray) -> Study:
     for name, value in zip(spec.free.names, values, strict=True):
         if name in names and not name.startswith((PLACEMENT, *POLES)):
             whole[name] = value
-    data = study.model_dump()
-    for name, value in whole.items():
-        entry = parse_entry(name)
-        assert entry is not None
-        section, _, leaf = entry.field.partition(".")
-        new = np.asarray(value).tolist()
-        old = data[section][leaf]
-        old = as_list(entry.field, old) if entry.indices else old
-        data[section][leaf] = replaced(old, entry.indices, new)
-    return parse_study(data)
+    return parse_study(set_values(study, {k: np.asarray(x).tolist() for k, x in whole.items()}))
 
 
 def patch_centers(spec: TuneSpec, family: Family, values: np.ndarray) -> np.ndarray:

@@ -20,12 +20,13 @@ import numpy as np
 from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.control import pole_placement
+from jaxmodel.laws import LAWS
 from jaxmodel.parameters import Array
 from studies.cases import build_structure
 from studies.consistency import each_link, patch_centers, patch_pitch
 from studies.errors import StudyError, field_error, nearest, shown_name
 from studies.paths import checked_value, known_field, parse_entry
-from studies.spec import Study
+from studies.spec import OWN_FIELDS, Study
 from studies.sweeps.axes import ALIASES, READY_MADE, Range, parse_range
 
 TWO_PI = 2 * np.pi
@@ -203,11 +204,12 @@ def _plain(name: str, bounds: Any, study: Study, path: str) -> tuple[list[Free],
         raise StudyError(f"{path}: cannot be free; {hint}")
     value = known_field(name, study, path)  # names the nearest field if there is none
     assert entry is not None
-    leaf = LEAVES.get(entry.field)
+    leaves = LEAVES | _own_leaves(study)
+    leaf = leaves.get(entry.field)
     if leaf is None:
-        hint = nearest(entry.field, LEAVES)
+        hint = nearest(entry.field, leaves)
         raise StudyError(
-            f"{path}: cannot be free; fields that can are {', '.join(LEAVES)}, {', '.join(POLES)} "
+            f"{path}: cannot be free; fields that can are {', '.join(leaves)}, {', '.join(POLES)} "
             f"and {PLACEMENT}" + (f"; did you mean {hint!r}?" if hint else "")
         )
     _check_field(entry.field, study, path)
@@ -226,6 +228,15 @@ def _plain(name: str, bounds: Any, study: Study, path: str) -> tuple[list[Free],
     if not numbers:
         raise field_error(name, value, f"one number or more, where {path} is to be free")
     return numbers, partial(_set, tuple(setters))
+
+
+def _own_leaves(study: Study) -> dict[str, Leaf]:
+    """Fields of the study's law's own."""
+    law = LAWS[study.control.law]
+    return {
+        f"{OWN_FIELDS}.{law.name}.{x.name}": Leaf(f"control.parameters.{x.name}")
+        for x in law.parameters
+    }
 
 
 def _check_field(field: str, study: Study, path: str) -> None:
@@ -261,12 +272,17 @@ def _set(setters: tuple[Setter, ...], case: Case, values: Array) -> Case:
 
 
 def _replaced(tree: Any, path: list[str], indices: tuple[int, ...], value: Array) -> Any:
-    """A tree of named tuples with one number replaced; too few indices mean all that follow."""
+    """A tree of named tuples and dictionaries with one number replaced.
+
+    Too few indices mean all that follow.
+    """
     if not path:
         whole = jnp.asarray(tree, value.dtype)
         at = _widened(indices, whole.ndim)
         return whole.at[at].set(jnp.where(jnp.isnan(value), whole[at], _safe(value)))
     first, *rest = path
+    if isinstance(tree, dict):
+        return tree | {first: _replaced(tree[first], rest, indices, value)}
     return tree._replace(**{first: _replaced(getattr(tree, first), rest, indices, value)})
 
 

@@ -43,6 +43,9 @@ from studies.units import duration_text
 
 REPORT = "report.html"
 
+#: Modules that decide the numbers of a tuning, with all that they import.
+DECISIVE = ("studies.tuning.check", "studies.tuning.evaluate", "studies.tuning.optimise")
+
 
 def make_evaluator(spec: TuneSpec) -> Evaluator:
     """Evaluator of all starts."""
@@ -76,7 +79,7 @@ def run_tuning(
     """
     config.require_configured()
     console = console or Console(highlight=False, markup=False)
-    manifest = make_manifest(spec.data, sorted(Path(__file__).parent.glob("*.py")))
+    manifest = make_manifest(spec.data, DECISIVE)
 
     def say(text: str) -> None:
         if not is_quiet:

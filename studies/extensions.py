@@ -1,0 +1,115 @@
+"""Laws, metrics, sweep methods and export targets of your own, from one Python file.
+
+    laws = [Law("mine", ...)]
+    metrics = [Metric("pose_speed", ...)]
+
+`studies --with mine.py sweep ...` takes it in, and so does `studies.extend("mine.py")`; a study
+file alone never runs code. Workers take in what the environment variable FLEXLINK_WITH names.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from jaxmodel.laws import LAWS
+from jaxmodel.laws.contract import Law
+from jaxmodel.metrics import METRICS, Metric
+from jaxmodel.table import Table
+from studies import sources
+from studies.errors import StudyError
+from studies.sweeps.methods import METHODS, Method
+
+#: Where processes started from here find what was taken in, as paths or module names.
+VARIABLE = "FLEXLINK_WITH"
+
+
+def extend(
+    module: str | Path = "",
+    laws: Iterable[Law] = (),
+    metrics: Iterable[Metric] = (),
+    methods: Iterable[Method] = (),
+    targets: Iterable[Any] = (),
+) -> None:
+    """Take in laws, metrics, sweep methods and export targets; the same ones again change nothing.
+
+    Args:
+        module: Python file (`*.py`) or importable module with lists `laws`, `metrics`, `methods`,
+            `targets`; "" for none.
+        laws, metrics, methods, targets: more of them.
+
+    Raises:
+        StudyError: no such module, one that fails or has nothing, or a name that is taken.
+    """
+    found = _imported(str(module)) if str(module) else None
+    for kind, given in (
+        ("laws", laws),
+        ("metrics", metrics),
+        ("methods", methods),
+        ("targets", targets),
+    ):
+        entries = [*getattr(found, kind, ()), *given]
+        for entry in entries:
+            try:
+                _table(kind).add(entry)
+            except (ValueError, AttributeError) as error:
+                raise StudyError(f"{module or 'extend'}: {kind}: {error}") from None
+    if found is None:
+        return
+    if not any(hasattr(found, kind) for kind in ("laws", "metrics", "methods", "targets")):
+        raise StudyError(f"{module}: has none of the lists laws, metrics, methods, targets")
+    file = Path(str(found.__file__)).resolve()
+    if file not in sources.OUTSIDE:
+        sources.OUTSIDE.append(file)
+        before = os.environ.get(VARIABLE, "")
+        os.environ[VARIABLE] = os.pathsep.join(filter(None, (before, str(file))))
+
+
+def extend_as_told() -> None:
+    """Take in what the environment names, as a process started by another one does."""
+    for module in filter(None, os.environ.get(VARIABLE, "").split(os.pathsep)):
+        if Path(module).resolve() not in sources.OUTSIDE:
+            sources.OUTSIDE.append(Path(module).resolve())
+            extend(module)
+
+
+def _table(kind: str) -> Table[Any]:
+    if kind == "targets":  # compilers and templates are needed for exports alone
+        from studies.export.targets import TARGETS
+
+        return TARGETS
+    tables: dict[str, Table[Any]] = {"laws": LAWS, "metrics": METRICS, "methods": METHODS}
+    return tables[kind]
+
+
+def _imported(module: str) -> ModuleType:
+    """A module by its file or name."""
+    path = Path(module)
+    name = path.stem if path.suffix == ".py" else module
+    if path.suffix == ".py" and not path.is_file():
+        raise StudyError(f"{module}: no such file")
+    known = sys.modules.get(name)
+    if path.suffix == ".py" and known is not None:
+        if Path(str(known.__file__)).resolve() == path.resolve():
+            return known
+        raise StudyError(f"{module}: a module {name} is loaded already; choose another file name")
+    try:
+        if path.suffix != ".py":
+            return importlib.import_module(module)
+        spec = importlib.util.spec_from_file_location(name, path)
+        assert spec is not None and spec.loader is not None
+        found = importlib.util.module_from_spec(spec)
+        sys.modules[name] = found
+        spec.loader.exec_module(found)
+    except Exception as error:  # whatever the file does
+        sys.modules.pop(name, None)
+        raise StudyError(
+            f"{module}: cannot be imported ({type(error).__name__}: {error})"
+        ) from None
+    return found

@@ -1,0 +1,75 @@
+"""Which source files decide a number: the closure of what modules import, and its digest."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterable, Iterator
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+
+TOP = Path(__file__).parents[1]
+PACKAGES = ("jaxmodel", "studies")
+
+#: Files of laws, metrics, methods and targets that came from outside.
+OUTSIDE: list[Path] = []
+
+
+def digest(*modules: str, top: Path = TOP) -> str:
+    """Hash of the sources of modules and all that they import, 16 hexadecimal digits.
+
+    Args:
+        modules: dotted names; that of a package stands for all its modules.
+        top: folder of the packages.
+    """
+    found = sha256()
+    for path in closure(modules, top):
+        found.update(str(path.relative_to(top)).encode() + b"\0" + path.read_bytes())
+    for path in OUTSIDE:
+        found.update(path.read_bytes())
+    return found.hexdigest()[:16]
+
+
+def closure(modules: Iterable[str], top: Path = TOP) -> list[Path]:
+    """Source files of modules and of all modules of these packages that they import, sorted."""
+    found: set[Path] = set()
+    waiting = [path for name in modules for path in _files(name, top, is_whole=True)]
+    while waiting:
+        path = waiting.pop()
+        if path not in found:
+            found.add(path)
+            waiting += [file for name in _imports(path) for file in _files(name, top)]
+    return sorted(found)
+
+
+def _files(name: str, top: Path, is_whole: bool = False) -> list[Path]:
+    """File of a module, or of the module that a name is in; what packages collect is left out."""
+    parts = name.split(".")
+    if parts[0] not in PACKAGES:
+        return []
+    folder = top.joinpath(*parts)
+    if is_whole and folder.is_dir():
+        return sorted(folder.rglob("*.py"))
+    for k in range(len(parts), 0, -1):
+        at = top.joinpath(*parts[:k])
+        for file in (at.with_suffix(".py"), at / "__init__.py"):
+            if file.is_file():
+                return [file]
+    return []
+
+
+@cache
+def _imports(path: Path) -> tuple[str, ...]:
+    """Names that a file imports when it runs; those of other packages too."""
+    return tuple(_imported(ast.parse(path.read_bytes())))
+
+
+def _imported(node: ast.AST) -> Iterator[str]:
+    if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+        return
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+    elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+        yield from (f"{node.module}.{alias.name}" for alias in node.names)
+    for inner in ast.iter_child_nodes(node):
+        yield from _imported(inner)

@@ -1,0 +1,209 @@
+"""Contracts: what is in the tables works everywhere, and so does what users add to them."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tomllib
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from jaxmodel.laws import LAWS
+from jaxmodel.metrics import METRICS, Metric
+from jaxmodel.table import Table
+from studies import sources
+from studies.bench.works import EXECUTORS
+from studies.cli import main
+from studies.errors import StudyError
+from studies.export.targets import TARGETS
+from studies.extensions import VARIABLE, extend
+from studies.runs import run_study
+from studies.spec import parse_study
+from studies.store import read_store
+from studies.sweeps.methods import METHODS
+from studies.sweeps.plan import chunk_cases, local_layout, plan_groups
+from studies.sweeps.results import load
+from studies.sweeps.spec import parse_sweep
+from studies.sweeps.table import build_table
+
+DOCS = Path(__file__).parents[1] / "docs" / "own-parts.md"
+#: One fast move of a small model.
+SMALL = """
+[run]
+duration = 0.06
+[link]
+modes = 3
+[motion]
+waypoints = [[0, 0, 0.5236], [0, 0.01, 0.5236]]
+move_time = 0.03
+[shaper]
+kind = "none"
+[metrics]
+residual_length = 0.02
+"""
+OWN = SMALL + '[control]\nlaw = "even_damping"\nmodes = 2\n'
+SWEEP = (
+    OWN
+    + """
+[sweep]
+method = "diagonal"
+count = 6
+metrics = ["turning", "residual_rms"]
+[sweep.axes]
+"control.laws.even_damping.constant" = { from = 0.2, to = 2.0 }
+move_time = { from = 0.025, to = 0.03 }
+"""
+)
+TUNE = (
+    OWN
+    + """
+[tune]
+objective = { residual_rms = 1.0, turning = 0.1 }
+iterations = 4
+starts = 2
+free = { "control.laws.even_damping.constant" = { from = 0.2, to = 4.0 } }
+"""
+)
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory):
+    """The tables with the parts of the docs in them, and as they were afterwards."""
+    file = tmp_path_factory.mktemp("own") / "own_parts.py"
+    file.write_text("\n".join(re.findall("```python\n(.*?)```", DOCS.read_text(), re.S)))
+    tables = (LAWS, METRICS, METHODS, TARGETS)
+    before = [dict(table._entries) for table in tables]
+    extend(file)
+    extend(file)  # again: nothing happens
+    yield file
+    for table, entries in zip(tables, before, strict=True):
+        table._entries = entries
+    sources.OUTSIDE.remove(file)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv(VARIABLE)
+    jax.clear_caches()
+
+
+def written(tmp_path, text):
+    path = tmp_path / "file.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def run(capsys, own, *arguments):
+    main(["--with", str(own), *map(str, arguments)])
+    return capsys.readouterr().out
+
+
+def test_own_law_and_metric_in_a_single_run(own):
+    study = parse_study(tomllib.loads(OWN))
+    weak = run_study(study, has_record=False)
+    strong = run_study(
+        study.change(control__laws={"even_damping": {"constant": (3.0, 3.0, 3.0)}}),
+        has_record=False,
+    )
+    assert weak.loop.damping_ratio[0].max() < strong.loop.damping_ratio[0].max()
+    assert 0 < float(weak.result.metrics.turning) != float(strong.result.metrics.turning)
+
+
+def test_own_parts_in_a_sweep(own, tmp_path, capsys):
+    run(capsys, own, "sweep", written(tmp_path, SWEEP), "--out", tmp_path / "sweep", "--quiet")
+    data = load(tmp_path / "sweep")
+    constant = data["control_laws_even_damping_constant"]
+    share = (np.arange(6) + 0.5) / 6
+    np.testing.assert_allclose(constant, 0.2 + 1.8 * share)
+    np.testing.assert_allclose(data["motion_move_time"], 0.025 + 0.005 * share)
+    assert np.all(data["turning"] > 0) and data.variables["turning"].units == "rad s"
+    assert np.all(np.diff(data["damping_ratio"][:, 0]) > 0)
+    assert "even_damping" in run(capsys, own, "show", tmp_path / "sweep")
+    text = run(capsys, own, "best", tmp_path / "sweep", "--by", "turning")
+    assert "turning [rad s]" in text
+
+
+def test_own_parts_on_kernel_and_scan(own):
+    """Equal within 1e-9."""
+    table = build_table(parse_sweep(tomllib.loads(SWEEP)))
+    group = plan_groups(table, np.arange(len(table)), local_layout)[0]
+    structure = group.structure._replace(metrics=("turning", "residual_rms"))
+    cases = chunk_cases(table, group.rows, structure, group.layout.size)
+    found = {
+        name: make(structure, group.layout, False).start(cases).wait().metrics
+        for name, make in EXECUTORS.items()
+        if name != "gpu"
+    }
+    one, *others = found.values()
+    for other in others:
+        for name in ("turning", "residual_rms"):
+            np.testing.assert_allclose(other[name], one[name], rtol=1e-9)
+
+
+def test_own_law_is_tuned_by_gradient(own, tmp_path, capsys):
+    run(capsys, own, "tune", written(tmp_path, TUNE), "--out", tmp_path / "tuned", "--quiet")
+    arrays, _ = read_store(tmp_path / "tuned" / "tune.h5")
+    objective = arrays["fresh_objective"].data
+    assert np.all(np.isfinite(objective))
+    study = tomllib.loads((tmp_path / "tuned" / "tuned.toml").read_text())
+    assert study["control"]["laws"]["even_damping"]["constant"] != 1.0
+
+
+def test_own_target_is_written(own, tmp_path, capsys):
+    run(capsys, own, "export", written(tmp_path, OWN), "--target", "csv", "--out", tmp_path / "out")
+    rows = (tmp_path / "out" / "flexlink.csv").read_text().splitlines()
+    assert len(rows) == 6 and rows[0].startswith("link 1, mode 1,")
+
+
+def test_own_law_becomes_c(own, tmp_path, capsys):
+    text = run(
+        capsys, own, "export", written(tmp_path, OWN), "--target", "c", "--out", tmp_path / "c"
+    )
+    assert "verified" in text or shutil.which("cc") is None
+
+
+def test_what_is_taken_or_empty_is_refused(tmp_path):
+    with pytest.raises(StudyError, match="metrics: metric 'residual_rms': there is one"):
+        extend(metrics=[METRICS["residual_rms"]._replace(text="another")])
+    for text, message in (("", "none of the lists laws"), ("1/0", "ZeroDivisionError")):
+        path = tmp_path / f"part{len(text)}.py"
+        path.write_text(text)
+        with pytest.raises(StudyError, match=message):
+            extend(path)
+    with pytest.raises(StudyError, match="no such file"):
+        extend(tmp_path / "none.py")
+
+
+@pytest.mark.parametrize("name", ["a b", "items", "_a", ""])
+def test_names_that_are_none_are_refused(name):
+    table: Table[Metric] = Table("metric")
+    with pytest.raises(ValueError, match="letters, digits"):
+        table.add(METRICS["residual_rms"]._replace(name=name))
+
+
+def test_every_source_of_a_number_is_in_the_digest(tmp_path):
+    """A copy with one file changed has another digest; a report's text does not matter."""
+    for package in sources.PACKAGES:
+        shutil.copytree(
+            sources.TOP / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__")
+        )
+    sweeps = ("studies.sweeps.chunks", "studies.sweeps.table")
+    workers = ("studies.cluster.worker", "studies.cluster.designs")
+    before = {roots: sources.digest(*roots, top=tmp_path) for roots in (sweeps, workers)}
+    for name, roots in (
+        ("jaxmodel/laws/ppf.py", sweeps),
+        ("jaxmodel/laws/__init__.py", sweeps),
+        ("studies/runs.py", sweeps),
+        ("studies/consistency.py", sweeps),
+        ("studies/kernels/tangents.py", sweeps),
+        ("studies/sweeps/gradients.py", workers),
+        ("studies/tuning/merit.py", workers),
+    ):
+        path = tmp_path / name
+        text = path.read_bytes()
+        path.write_bytes(text + b"\n# changed\n")
+        assert sources.digest(*roots, top=tmp_path) != before[roots], name
+        path.write_bytes(text)
+    report = tmp_path / "studies" / "sweeps" / "report.py"
+    report.write_bytes(report.read_bytes() + b"\n")
+    assert all(sources.digest(*roots, top=tmp_path) == x for roots, x in before.items())
