@@ -7,11 +7,9 @@ links do not stretch there; `stretch_error` says by how much that would move the
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
-
 from jaxmodel.dynamics import accelerations, inverse_dynamics
 from jaxmodel.kinematics import Chain, close_chain
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array, Beam
 from jaxmodel.piezo import bare_stiffness
 from jaxmodel.plant import Plant

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-
 from jaxmodel.beam import ModalBasis, build_basis, held_frequency, mask_modes
 from jaxmodel.case import Case, Structure
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array, Beam, Patches
 
 

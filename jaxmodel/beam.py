@@ -13,10 +13,9 @@ from __future__ import annotations
 
 from typing import NamedTuple, TypeVar
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array, Beam, Patches
 from jaxmodel.piezo import bare_stiffness, one_sided_section, patch_ends, two_sided_section
 

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 
 

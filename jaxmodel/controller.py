@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.estimator import Estimator
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
-
 from jaxmodel.case import Drive
 from jaxmodel.controller import soft_limit
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 
 

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
-
 from jaxmodel.kinematics import Bend, Chain, close_chain
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 from jaxmodel.plant import Plant
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Electronics
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 
 #: Samples over the lag from which on the linearised loop takes an amplifier for infinitely fast.

@@ -14,10 +14,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
-
 from jaxmodel.case import Electronics
 from jaxmodel.electronics import measurement_chain
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 
 KINDS = ("modal_phase", "difference")

@@ -14,9 +14,9 @@ from __future__ import annotations
 from math import factorial
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 
 _DOUBLINGS = 8  # |omega h| up to 20 becomes below 0.1, where the series below is exact

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel import status
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 from jaxmodel.plant import Plant
 from jaxmodel.trigonometry import sine_cosine

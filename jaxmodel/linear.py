@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.drive import Reference, slider_force
 from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.kinematics import close_chain
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Loop, PlantState, plant_rates
 from jaxmodel.parameters import Array
 

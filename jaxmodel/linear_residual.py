@@ -9,11 +9,9 @@ from __future__ import annotations
 
 from functools import partial
 
-import jax
-import jax.numpy as jnp
-
 from jaxmodel.case import Case, Structure
 from jaxmodel.dynamics import inverse_dynamics
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.sampled_loop import LoopMatrices, summed_squares
 from jaxmodel.simulate import begin

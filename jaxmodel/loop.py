@@ -10,9 +10,6 @@ from __future__ import annotations
 from functools import partial
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-
 from jaxmodel import metrics, status
 from jaxmodel.axial import stretch_error
 from jaxmodel.case import Drive, Structure
@@ -29,6 +26,7 @@ from jaxmodel.electronics import Amplifier
 from jaxmodel.integrator import Exponential
 from jaxmodel.kinematics import Chain, chain_status, close_chain
 from jaxmodel.laws import n_channels
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.plant import Plant
 

@@ -12,12 +12,11 @@ controller's modes are what a noise-free modal filter makes of the plant's defle
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
-
 from jaxmodel.control import efficient_modal_control
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.table import Table
 
@@ -122,9 +121,12 @@ class Sizes(NamedTuple):
         }
 
 
-@jax.tree_util.register_pytree_node_class
 class Metrics(dict[str, Any]):
     """Judgement of a run: arrays by name, also as attributes; None where not accumulated."""
+
+    def __new__(cls, *_: Any) -> Metrics:
+        _make_known()  # before there is one
+        return super().__new__(cls)
 
     def __getattr__(self, name: str) -> Any:
         if name not in METRICS:
@@ -137,6 +139,11 @@ class Metrics(dict[str, Any]):
     @classmethod
     def tree_unflatten(cls, names: tuple[str, ...], values: Any) -> Metrics:
         return cls(zip(names, values, strict=True))
+
+
+@cache
+def _make_known() -> None:
+    jax.tree_util.register_pytree_node_class(Metrics)
 
 
 def zero_totals(sizes: Sizes, dtype: Any, wanted: tuple[str, ...] = ()) -> Totals:

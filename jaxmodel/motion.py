@@ -2,12 +2,9 @@
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jax.typing import ArrayLike
 
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.shaper import Taps
 
@@ -41,10 +38,10 @@ class PathSample(NamedTuple):
 
 
 def square_path(
-    side: ArrayLike = 0.01,
-    move_time: ArrayLike = 0.1,
-    dwell: ArrayLike = 0.0,
-    phi: ArrayLike = np.pi / 6,
+    side: Array = 0.01,
+    move_time: Array = 0.1,
+    dwell: Array = 0.0,
+    phi: Array = np.pi / 6,
 ) -> Path:
     """Return the paper's square (0,0), (0,s), (s,s), (s,0), (0,0) with the cycloid (25).
 
@@ -92,7 +89,7 @@ def quintic(u: Array) -> tuple[Array, Array, Array]:
     )
 
 
-def sample_path(path: Path, time: ArrayLike) -> PathSample:
+def sample_path(path: Path, time: Array) -> PathSample:
     """Return the pose and its rates at the given times.
 
     X(t) = w_0 + sum_k (w_{k+1} - w_k) s(clip((t - t_k)/tf_k, 0, 1)): at rest in the first waypoint
@@ -128,9 +125,7 @@ def sample_path(path: Path, time: ArrayLike) -> PathSample:
     return PathSample(*jnp.vectorize(at, signature="()->(d),(d),(d)")(time))
 
 
-def shape_path(
-    path: Path, taps: Taps, n_times: int, per_sample: int, step: ArrayLike
-) -> PathSample:
+def shape_path(path: Path, taps: Taps, n_times: int, per_sample: int, step: Array) -> PathSample:
     """Return the path convolved with a sampled input shaper, on the grid t_j = j h.
 
     X_ref(t) = sum_i W_i X(t - n_i T) with T = per_sample h. The path is evaluated once on the grid
@@ -155,11 +150,13 @@ def shape_path(
         weight, shift = tap
 
         def accumulate(sum_so_far: Array, rows: Array) -> Array:
-            return sum_so_far + weight * lax.dynamic_slice_in_dim(rows, n_times - shift, n_times)
+            return sum_so_far + weight * jax.lax.dynamic_slice_in_dim(
+                rows, n_times - shift, n_times
+            )
 
         return jax.tree.map(accumulate, total, padded), None
 
     # Ten taps a pass: on a CPU twice as fast as one, where the running sums dominate.
     at_zero = jax.tree.map(jnp.zeros_like, sampled)
-    total, _ = lax.scan(add, at_zero, (taps.weight, shifts), unroll=10)
+    total, _ = jax.lax.scan(add, at_zero, (taps.weight, shifts), unroll=10)
     return total

@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 
 

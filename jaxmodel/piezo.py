@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
-
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array, Beam, Patches
 
 VACUUM_PERMITTIVITY = 8.8541878128e-12  # [F/m]

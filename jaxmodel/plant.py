@@ -10,9 +10,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
-
 from jaxmodel.beam import ModalBasis
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array, Damping, Machine
 
 

@@ -12,9 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.pairs import Pair
 from jaxmodel.parameters import Array
 from jaxmodel.return_difference import LoopResponse, go_round, spectrum_polynomial

@@ -5,9 +5,6 @@ from __future__ import annotations
 from functools import reduce
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-
 from jaxmodel import shaper, status
 from jaxmodel.axial import axial_compliance
 from jaxmodel.bases import Bases, find_bases
@@ -19,6 +16,7 @@ from jaxmodel.estimator import KINDS
 from jaxmodel.integrator import exponential_step
 from jaxmodel.laws import LAWS, is_modal
 from jaxmodel.laws.contract import Known
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Loop
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import actuator_constant, placement_faults, sensor_constant

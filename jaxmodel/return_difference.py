@@ -11,8 +11,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.axial import axial_force, chord_slopes
@@ -20,6 +18,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.dynamics import mass_matrix, platform_mass
 from jaxmodel.estimator import Estimator
 from jaxmodel.kinematics import close_chain
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Loop
 from jaxmodel.pairs import Pair, determinant, product
 from jaxmodel.parameters import Array

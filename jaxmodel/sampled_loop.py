@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, ControllerState, controller_step
 from jaxmodel.electronics import FASTEST
 from jaxmodel.laws import n_channels
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.linear import LinearPlant, Moment, linearise, resting
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare

@@ -8,10 +8,9 @@ humps); the paper, section 3.1.
 from math import comb
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 
 KINDS = ("none", "zv", "zvd", "zvdd", "ei", "ei_damped", "ei2", "ei3")
@@ -35,23 +34,23 @@ class Taps(NamedTuple):
     sample: Array
 
 
-def _root(x: ArrayLike) -> Array:
+def _root(x: Array) -> Array:
     """Return sqrt(max(x, 0)), with gradient zero where x <= 0."""
     x = jnp.asarray(x)
     return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1)), 0)
 
 
-def damped_frequency(omega: ArrayLike, zeta: ArrayLike) -> Array:
+def damped_frequency(omega: Array, zeta: Array) -> Array:
     """Return w_d = w sqrt(1 - z^2) [rad/s] of a mode omega [rad/s], zeta in [0, 1) [1]."""
     return jnp.sqrt(1 - jnp.square(zeta)) * omega
 
 
-def _half_periods(n: int, omega: ArrayLike, zeta: ArrayLike) -> Array:
+def _half_periods(n: int, omega: Array, zeta: Array) -> Array:
     """Return the times k T_d/2 = k pi/w_d, k = 0..n-1 [s], shape (n,)."""
     return jnp.arange(n) * (np.pi / damped_frequency(omega, zeta))
 
 
-def _zero_vibration(order: int, omega: ArrayLike, zeta: ArrayLike) -> Impulses:
+def _zero_vibration(order: int, omega: Array, zeta: Array) -> Impulses:
     zeta = jnp.asarray(zeta)
     decay = jnp.pi * zeta / jnp.sqrt(1 - jnp.square(zeta))
     binomial = jnp.array([comb(order, k) for k in range(order + 1)])
@@ -64,7 +63,7 @@ def none() -> Impulses:
     return Impulses(jnp.ones(1), jnp.zeros(1))
 
 
-def zv(omega: ArrayLike, zeta: ArrayLike) -> Impulses:
+def zv(omega: Array, zeta: Array) -> Impulses:
     """Return the zero-vibration shaper, shape (2,).
 
     A_k = K^k/(1 + K) at k T_d/2, K = exp(-z pi/sqrt(1 - z^2)). Singer and Seering 1990.
@@ -76,7 +75,7 @@ def zv(omega: ArrayLike, zeta: ArrayLike) -> Impulses:
     return _zero_vibration(1, omega, zeta)
 
 
-def zvd(omega: ArrayLike, zeta: ArrayLike) -> Impulses:
+def zvd(omega: Array, zeta: Array) -> Impulses:
     """Return the shaper with zero vibration and zero slope, shape (3,).
 
     A_k = C(2, k) K^k/(1 + K)^2 at k T_d/2. Arguments as in `zv`.
@@ -84,7 +83,7 @@ def zvd(omega: ArrayLike, zeta: ArrayLike) -> Impulses:
     return _zero_vibration(2, omega, zeta)
 
 
-def zvdd(omega: ArrayLike, zeta: ArrayLike) -> Impulses:
+def zvdd(omega: Array, zeta: Array) -> Impulses:
     """Return the shaper with zero vibration and two zero derivatives, shape (4,).
 
     A_k = C(3, k) K^k/(1 + K)^3 at k T_d/2. Arguments as in `zv`.
@@ -92,7 +91,7 @@ def zvdd(omega: ArrayLike, zeta: ArrayLike) -> Impulses:
     return _zero_vibration(3, omega, zeta)
 
 
-def ei(omega: ArrayLike, zeta: ArrayLike, tolerance: ArrayLike) -> Impulses:
+def ei(omega: Array, zeta: Array, tolerance: Array) -> Impulses:
     """Return the paper's extra-insensitive shaper (13), shape (3,).
 
     A = [(1 + V)/4, (1 - V)/2, (1 + V)/4] at [0, T_d/2, T_d]: amplitudes of the undamped mode, times
@@ -108,7 +107,7 @@ def ei(omega: ArrayLike, zeta: ArrayLike, tolerance: ArrayLike) -> Impulses:
     return Impulses(jnp.stack([outer, (1 - tolerance) / 2, outer]), _half_periods(3, omega, zeta))
 
 
-def ei_damped(omega: ArrayLike, zeta: ArrayLike, tolerance: ArrayLike) -> Impulses:
+def ei_damped(omega: Array, zeta: Array, tolerance: Array) -> Impulses:
     """Return the extra-insensitive shaper of a damped mode, shape (3,).
 
     A_1, A_3 and t_2/T_d are polynomials in V and z that Singhose fitted to the exact solution,
@@ -135,7 +134,7 @@ def ei_damped(omega: ArrayLike, zeta: ArrayLike, tolerance: ArrayLike) -> Impuls
     )
 
 
-def ei2(omega: ArrayLike, zeta: ArrayLike, tolerance: ArrayLike) -> Impulses:
+def ei2(omega: Array, zeta: Array, tolerance: Array) -> Impulses:
     """Return the two-hump extra-insensitive shaper, shape (4,).
 
     A_1 = A_4 = (3 X^2 + 2 X + 3 V^2)/(16 X), A_2 = A_3 = 1/2 - A_1 at k T_d/2, with
@@ -151,7 +150,7 @@ def ei2(omega: ArrayLike, zeta: ArrayLike, tolerance: ArrayLike) -> Impulses:
     return Impulses(jnp.stack([outer, inner, inner, outer]), _half_periods(4, omega, zeta))
 
 
-def ei3(omega: ArrayLike, zeta: ArrayLike, tolerance: ArrayLike) -> Impulses:
+def ei3(omega: Array, zeta: Array, tolerance: Array) -> Impulses:
     """Return the three-hump extra-insensitive shaper, shape (5,).
 
     A_1 = A_5 = [1 + 3 V + 2 sqrt(2 (V^2 + V))]/16, A_2 = A_4 = (1 - V)/4, A_3 = 1 - 2 (A_1 + A_2)
@@ -164,9 +163,7 @@ def ei3(omega: ArrayLike, zeta: ArrayLike, tolerance: ArrayLike) -> Impulses:
     return Impulses(jnp.stack([outer, inner, middle, inner, outer]), _half_periods(5, omega, zeta))
 
 
-def design_shaper(
-    kind: ArrayLike, omega: ArrayLike, zeta: ArrayLike, tolerance: ArrayLike
-) -> Impulses:
+def design_shaper(kind: Array, omega: Array, zeta: Array, tolerance: Array) -> Impulses:
     """Return the shaper of the given kind, padded with zero amplitudes to shape (5,).
 
     Args:
@@ -213,7 +210,7 @@ def shaper_duration(impulses: Impulses) -> Array:
     return jnp.max(jnp.where(impulses.amplitude != 0, impulses.time, 0))
 
 
-def _neighbours(impulses: Impulses, period: ArrayLike) -> tuple[Array, Array, Array]:
+def _neighbours(impulses: Impulses, period: Array) -> tuple[Array, Array, Array]:
     """Return the samples (2n,) around each impulse and the time from and to them [s], (n,) each."""
     earlier = jnp.floor(impulses.time / period)
     since = impulses.time - earlier * period
@@ -221,7 +218,7 @@ def _neighbours(impulses: Impulses, period: ArrayLike) -> tuple[Array, Array, Ar
     return samples, since, jnp.asarray(period) - since
 
 
-def split_linear(impulses: Impulses, period: ArrayLike) -> Taps:
+def split_linear(impulses: Impulses, period: Array) -> Taps:
     """Return the shaper on a sample grid, each impulse shared linearly by its two neighbours.
 
     A (1 - f) at sample k and A f at k + 1, f = t/T - k. Keeps the mean delay, not the zeros.
@@ -238,7 +235,7 @@ def split_linear(impulses: Impulses, period: ArrayLike) -> Taps:
     return Taps(shares * jnp.tile(impulses.amplitude, 2), samples)
 
 
-def split_exact(impulses: Impulses, period: ArrayLike, omega: ArrayLike, zeta: ArrayLike) -> Taps:
+def split_exact(impulses: Impulses, period: Array, omega: Array, zeta: Array) -> Taps:
     """Return the shaper on a sample grid, each impulse shared so that one mode sees no difference.
 
     A e^{z w (t - t_k)} sin(w_d (t_{k+1} - t))/sin(w_d T) at sample k and
@@ -279,7 +276,7 @@ def in_series(first: Taps, second: Taps) -> Taps:
     )
 
 
-def residual_vibration(impulses: Impulses, omega: ArrayLike, zeta: ArrayLike) -> Array:
+def residual_vibration(impulses: Impulses, omega: Array, zeta: Array) -> Array:
     """Return the vibration left by the shaper, relative to that of a unit impulse [1].
 
     V = e^{-z w t_n} sqrt(C^2 + S^2), C = sum A_i e^{z w t_i} cos(w_d t_i), S the same with sin:
@@ -303,9 +300,7 @@ def residual_vibration(impulses: Impulses, omega: ArrayLike, zeta: ArrayLike) ->
     return jnp.vectorize(at)(omega, zeta)
 
 
-def sensitivity_curve(
-    impulses: Impulses, ratio: ArrayLike, omega: ArrayLike, zeta: ArrayLike
-) -> Array:
+def sensitivity_curve(impulses: Impulses, ratio: Array, omega: Array, zeta: Array) -> Array:
     """Return (10) at the frequencies ratio * omega [1], in the shape of ratio.
 
     Args:
@@ -317,9 +312,7 @@ def sensitivity_curve(
     return residual_vibration(impulses, omega * jnp.asarray(ratio), zeta)
 
 
-def insensitivity(
-    impulses: Impulses, omega: ArrayLike, zeta: ArrayLike, level: ArrayLike = 0.05
-) -> Array:
+def insensitivity(impulses: Impulses, omega: Array, zeta: Array, level: Array = 0.05) -> Array:
     """Return the width of the band of frequencies with V below a level, in units of omega [1].
 
     Summed over the ratios from 0 to 2, so that a hump a little above the level, as (13) has on a

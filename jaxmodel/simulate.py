@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from functools import partial, reduce
+from collections.abc import Callable
+from functools import cache, partial, reduce
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel import metrics, status
@@ -15,6 +14,7 @@ from jaxmodel.case import Case, Load, Structure
 from jaxmodel.controller import Controller
 from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.kinematics import inverse_kinematics, path_status, singularity_distance
+from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Inputs, Loop, Record, State, initial_state, step
 from jaxmodel.motion import end_of_path, shape_path
 from jaxmodel.parameters import Array
@@ -323,16 +323,18 @@ def simulate(
         of the smooth loop: converters without rounding, limits with round corners.
     """
     has_converters = structure.feedback == "sampled" and not structure.is_smooth
-    run = _rounded if has_converters else _run
+    run = _rounded() if has_converters else _run
     return run(structure, has_record, case, law)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _rounded(structure: Structure, has_record: bool, case: Case, law: Controller | None) -> Result:
-    return _run(structure, has_record, case, law)
+@cache
+def _rounded() -> Callable[..., Result]:
+    """`_run` with the derivatives of the smooth loop."""
+    run = jax.custom_jvp(_run, nondiff_argnums=(0, 1))
+    run.defjvp(_smooth_tangent)
+    return run
 
 
-@_rounded.defjvp
 def _smooth_tangent(
     structure: Structure, has_record: bool, primals: tuple, tangents: tuple
 ) -> tuple[Result, Result]:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from math import factorial
 
-import jax.numpy as jnp
 import numpy as np
 
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 
 #: pi/2 in three parts; the first has 33 bits, so that its small multiples are exact.

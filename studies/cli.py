@@ -96,10 +96,11 @@ def simulate(
 ) -> None:
     """Run one study with full trajectories."""
     start(precision)
+    from studies.labels import describe
+    from studies.margin import caution, margin_text
     from studies.run_report import check_results, settling_text, write_results
-    from studies.runs import describe, run_study
+    from studies.runs import run_study
     from studies.spec import load_study
-    from studies.stability import caution, margin_text
     from studies.sweeps.spec import ready_spec
 
     spec = load_study(ready_spec(study))
@@ -134,8 +135,9 @@ def replay(
     """Run one case of a sweep again with full trajectories, and compare with what it found."""
     start()
     from studies.design import deviation, load_design
+    from studies.labels import describe
     from studies.run_report import check_results, write_results
-    from studies.runs import describe, run_study
+    from studies.runs import run_study
 
     if report and out is None:
         raise StudyError("--report: is written beside the trajectories; name their file by --out")

@@ -12,12 +12,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-import jax
-
 from studies.errors import StudyError, field_error, nearest
-
-# Its attributes are made at run time, where type checkers do not see them.
-settings: Any = jax.config
 
 PACKAGE = "flexlink-studies"
 PRECISIONS = ("float64", "float32")
@@ -44,6 +39,13 @@ COMPILER_FLAGS = {
 }
 # XLA runs a program on one core of a device, so a device per core is how a batch uses them all.
 DEVICE_FLAG = "--xla_force_host_platform_device_count"
+
+
+def _settings() -> Any:
+    """JAX's settings; type checkers do not see its attributes, which are made at run time."""
+    import jax
+
+    return jax.config
 
 
 def configure(
@@ -74,7 +76,7 @@ def configure(
         os.environ["XLA_FLAGS"] = new_flags
     else:
         _require_in_force(old_flags, devices, flags)
-    settings.update("jax_enable_x64", precision == "float64")
+    _settings().update("jax_enable_x64", precision == "float64")
     global _is_configured
     _is_configured = True
     _set_cache(cache)
@@ -87,9 +89,11 @@ def start(precision: str = "float64", cpu_only: bool = False) -> None:
 
     Raises StudyError as `configure`, and where JAX cannot start.
     """
+    import jax
+
     configure(precision)
     if cpu_only:
-        settings.update("jax_platforms", "cpu")
+        _settings().update("jax_platforms", "cpu")
     try:
         jax.local_devices()
     except (RuntimeError, AssertionError) as error:
@@ -101,6 +105,8 @@ def start(precision: str = "float64", cpu_only: bool = False) -> None:
 
 def info() -> dict[str, Any]:
     """Versions and settings in force, as plain values for `studies info`; starts JAX."""
+    import jax
+
     kinds = [device.device_kind for device in jax.devices()]
     folder = cache_folder()
     return {
@@ -108,7 +114,7 @@ def info() -> dict[str, Any]:
         "python": platform.python_version(),
         **{name: _version(name) for name in ("jax", "jaxlib", "numpy", "h5py")},
         "devices": ", ".join(f"{kinds.count(kind)} x {kind}" for kind in sorted(set(kinds))),
-        "precision": "float64" if settings.jax_enable_x64 else "float32",
+        "precision": "float64" if _settings().jax_enable_x64 else "float32",
         "cache": folder or "none",
         "cache_mib": round(_folder_bytes(folder) / 2**20, 1) if folder else 0.0,
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
@@ -124,8 +130,8 @@ def origin() -> dict[str, str]:
 
 def cache_folder() -> str:
     """Where compiled programs are kept; "" for nowhere."""
-    is_kept = settings.jax_enable_compilation_cache
-    return (is_kept and settings.jax_compilation_cache_dir) or ""
+    is_kept = _settings().jax_enable_compilation_cache
+    return (is_kept and _settings().jax_compilation_cache_dir) or ""
 
 
 _is_configured = False
@@ -133,6 +139,8 @@ _is_configured = False
 
 def processor() -> str:
     """What JAX computes on: "cpu", "cuda" for Nvidia's graphics processors, or another name."""
+    import jax
+
     device = jax.local_devices()[0]
     is_cuda = "cuda" in getattr(device.client, "platform_version", "").lower()
     return "cuda" if device.platform == "gpu" and is_cuda else str(device.platform)
@@ -149,13 +157,13 @@ def require_configured() -> None:
 
 def is_backend_started() -> bool:
     """Whether JAX has started its devices, after which compiler flags are no longer read."""
-    count = settings.jax_num_cpu_devices
+    count = _settings().jax_num_cpu_devices
     try:
         # The public sign of it: JAX refuses to change this setting once it has started.
-        settings.update("jax_num_cpu_devices", count + 1)
+        _settings().update("jax_num_cpu_devices", count + 1)
     except RuntimeError:
         return True
-    settings.update("jax_num_cpu_devices", count)
+    _settings().update("jax_num_cpu_devices", count)
     return False
 
 
@@ -171,6 +179,8 @@ def _extended(present: str, devices: int | None, flags: bool) -> str:
 
 def _require_in_force(present: str, devices: int | None, flags: bool) -> None:
     """Raise StudyError where a JAX that has already started lacks what is asked for."""
+    import jax
+
     lacking = [name for name in COMPILER_FLAGS if flags and name not in present]
     count = len(jax.local_devices(backend="cpu"))
     if devices not in (None, count):
@@ -185,17 +195,17 @@ def _require_in_force(present: str, devices: int | None, flags: bool) -> None:
 
 def _set_cache(cache: bool) -> None:
     """Turn the persistent cache of compiled programs on or off."""
-    settings.update("jax_enable_compilation_cache", cache)
+    _settings().update("jax_enable_compilation_cache", cache)
     if not cache:
         return
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(_default_cache_folder())
     if not _is_usable_folder(folder):
         # The cache saves time only: a home that cannot be written to must not stop a study.
-        settings.update("jax_enable_compilation_cache", False)
+        _settings().update("jax_enable_compilation_cache", False)
         return
-    settings.update("jax_compilation_cache_dir", folder)
+    _settings().update("jax_compilation_cache_dir", folder)
     # Reading an entry costs tens of milliseconds: not worth it for quick compilations.
-    settings.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    _settings().update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def _is_usable_folder(folder: str) -> bool:

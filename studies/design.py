@@ -12,8 +12,9 @@ from jaxmodel.metrics import METRICS
 from studies.errors import StudyError, field_error, nearest
 from studies.runs import Run, metric_variables
 from studies.spec import Study, load_study
+from studies.sweeps.columns import NOT_RUN
 from studies.sweeps.folder import MANIFEST, TUNING, read_manifest
-from studies.sweeps.results import NOT_RUN, SweepData, load
+from studies.sweeps.results import SweepData, load
 from studies.sweeps.spec import parse_sweep, ready_spec
 from studies.sweeps.table import build_table, case_study
 

@@ -17,6 +17,7 @@ from rich.table import Column, Table
 from studies.batches import Tell
 from studies.errors import StudyError
 from studies.figures import styled, write_figure
+from studies.labels import STATUS_LABEL, describe
 from studies.pages import write_report
 from studies.paper_cases import (
     EXECUTOR,
@@ -30,7 +31,7 @@ from studies.paper_cases import (
 from studies.paper_figures import PAPER_FIGURES, draw_figure
 from studies.paper_measures import Measures, measure, middle_station
 from studies.report import report
-from studies.runs import STATUS_LABEL, describe, metric_variables, run_attributes
+from studies.runs import metric_variables, run_attributes
 from studies.sketch import sketch
 from studies.spec import Study, paper_study
 from studies.store import Variable, check_target, staged, write_store

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from studies.labels import describe
 from studies.pages import table
 from studies.paper_cases import HIGH_DAMPING, MOVES, OFF, TWO
 from studies.report_context import PLACES, Context, change, move_text, settings
-from studies.runs import describe
 
 
 def platform(context: Context) -> list[str]:

@@ -14,18 +14,12 @@ from jaxmodel.axial import euler_force
 from jaxmodel.laws import LAWS
 from studies import figures
 from studies.errors import StudyError
+from studies.labels import describe
+from studies.margin import ENOUGH, caution, margin_text
 from studies.pages import literal, opening, picture, table, write_report
-from studies.runs import (
-    Run,
-    chord_deflection,
-    describe,
-    run_attributes,
-    run_variables,
-    uncontrolled_twin,
-)
+from studies.runs import Run, chord_deflection, run_attributes, run_variables, uncontrolled_twin
 from studies.sketch import CAPTION, sketch
 from studies.spec import Study
-from studies.stability import ENOUGH, caution, margin_text
 from studies.store import check_target, write_store
 
 #: Captions of what is drawn, by the end of the file's name.

@@ -39,20 +39,15 @@ from studies import config
 from studies.cases import as_arrays, build_case, build_structure, powered
 from studies.consistency import check_locked, each_link
 from studies.errors import field_error
+from studies.labels import DISTANCE_TEXT, STATUS_LABEL
+from studies.margin import MARGIN_MODES
 from studies.spec import Study
-from studies.stability import (
-    MARGIN_MODES,
-    LoopReport,
-    MotionReport,
-    loop_report,
-    motion_report,
-)
+from studies.stability import LoopReport, MotionReport, loop_report, motion_report
 from studies.store import Variable
 
-#: What `singularity_distance` means.
-DISTANCE_TEXT = "of link angles from 0 and 90 deg, and of the links from lines through one point"
 #: More plant steps per sample than this are refused.
 SUBSTEP_LIMIT = 200
+
 
 _simulate = jax.jit(simulate, static_argnums=(0, 2))
 
@@ -416,10 +411,6 @@ def _ideal_substeps(study: Study, structure: Structure, case: Case) -> int:
     return given or int(step_counts(needed))
 
 
-#: Unit, long name and flags of a status in a file.
-STATUS_LABEL = ("1", "how the run ended", status.REASONS)
-
-
 def metric_variables(result: Result) -> dict[str, Variable]:
     """Labelled metrics of a run."""
     return {
@@ -545,8 +536,3 @@ def run_attributes(study: Study) -> dict[str, Any]:
         "study": json.dumps(study.model_dump(mode="json")),
         **{name.replace("-", "_"): fact for name, fact in config.origin().items()},
     }
-
-
-def describe(code: int) -> str:
-    """A status code in words."""
-    return status.REASONS.get(code, f"status {code}")

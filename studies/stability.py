@@ -24,15 +24,12 @@ from jaxmodel.motion import PathSample, end_of_path, sample_path
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
+from studies.margin import HIGHEST, LOWEST, MARGIN_MODES
 
-#: Plant modes that a margin rests on at least: modes that nobody controls limit the gains [1].
-MARGIN_MODES = 12
-#: Margins below this are pointed out [1].
-ENOUGH = 2.0
-#: Margins beyond this are given as it, and those below the other as 0 [1].
-HIGHEST, LOWEST = 64.0, 0.01
 #: Gain factors that are looked at are no further apart than this [1].
 STRIDE = 1.25
+
+
 #: Gain factors at which modes are followed from no control to the given gains [1].
 STEPS = np.linspace(0, 1, 41)[1:]
 
@@ -51,26 +48,6 @@ def with_margin_modes(
         is_smooth=True, feedback="sampled", has_position_gain=True,
     )  # fmt: skip
     return structure, case
-
-
-def caution(margin: float) -> str:
-    """What must be said of a gain margin, "" where it is `ENOUGH`, or there is none."""
-    if margin < 1:
-        return (
-            "UNSTABLE LOOP: the linearised sampled loop grows by itself; saturation and the end of "
-            "the run bound what is seen here. Lower the gains below "
-            f"{margin:.3g} of these."
-        )
-    if margin < ENOUGH:
-        return (
-            f"CAUTION: a gain margin of {margin:.3g}; below {ENOUGH:g} a machine may go unstable."
-        )
-    return ""
-
-
-def margin_text(value: float, digits: int = 4) -> str:
-    """A gain margin in words; beyond `HIGHEST` nobody looks."""
-    return f"> {HIGHEST:g}" if value >= HIGHEST else f"{value:.{digits}g}"
 
 
 class LoopReport(NamedTuple):
@@ -96,6 +73,8 @@ class MotionReport(NamedTuple):
 
 
 _closed_loop = jax.jit(closed_loop, static_argnums=0)
+
+
 #: Instants of a motion whose axial forces are looked at.
 INSTANTS = 401
 

@@ -7,6 +7,8 @@ import contextlib
 import io
 import json
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -350,3 +352,21 @@ def test_an_unstable_loop_is_said_loudly_and_beside_no_control(capsys, tmp_path)
     column = [cell.strip() for cell in table[0]].index("residual rms without control [µm]")
     found = [float(row[column]) for row in table[2:5]]
     np.testing.assert_allclose(found, wanted, rtol=1e-3)
+
+
+def test_commands_that_run_nothing_need_no_jax(capsys):
+    """Nor drawing: they would wait seconds for both."""
+    code = (
+        "import sys\n"
+        "from studies.cli import main\n"
+        "import studies.sweeps.show\n"
+        "for arguments in (['--help'], ['init']):\n"
+        "    try:\n"
+        "        main(arguments)\n"
+        "    except SystemExit:\n"
+        "        pass\n"
+        "print(sorted({'jax', 'matplotlib', 'scipy'} & set(sys.modules)), file=sys.stderr)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "gain_factor" in done.stdout
+    assert done.stderr.strip() == "[]"

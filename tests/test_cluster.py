@@ -23,8 +23,9 @@ from studies.cluster.worker import identity
 from studies.errors import StudyError
 from studies.sweeps import plan
 from studies.sweeps.chunks import Here
+from studies.sweeps.columns import NOT_RUN
 from studies.sweeps.folder import CHUNKS, SweepFolder, finished_cases, read_manifest
-from studies.sweeps.results import NOT_RUN, load
+from studies.sweeps.results import load
 from studies.sweeps.run import run_sweep
 from studies.tuning.run import make_evaluator
 from tests.clusters import machines

@@ -21,10 +21,11 @@ from studies.paths import EACH_LINK, field_value
 from studies.runs import check_run, run_study
 from studies.sketch import sketch, standing
 from studies.spec import load_study, parse_study
+from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.plots import plot
 from studies.sweeps.results import load, metric_values
 from studies.sweeps.run import run_sweep
-from studies.sweeps.show import axis_rows, select, written_name
+from studies.sweeps.show import select, written_name
 from studies.sweeps.spec import parse_sweep
 from studies.sweeps.table import build_table
 from studies.template import study_template

@@ -22,8 +22,9 @@ from jaxmodel.return_difference import (
 )
 from jaxmodel.sampled_loop import closed_loop
 from studies.cases import as_arrays, build_case, build_structure
+from studies.margin import HIGHEST
 from studies.spec import paper_study
-from studies.stability import HIGHEST, loop_report, with_margin_modes
+from studies.stability import loop_report, with_margin_modes
 from studies.sweeps import lanes
 from studies.sweeps.margins import judge_loops
 from studies.sweeps.plan import chunk_cases, local_layout, plan_groups

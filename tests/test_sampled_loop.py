@@ -19,8 +19,9 @@ from jaxmodel.sampled_loop import (
 )
 from jaxmodel.simulate import simulate
 from studies.cases import as_arrays, build_case, build_structure
+from studies.margin import LOWEST
 from studies.spec import paper_study
-from studies.stability import LOWEST, gain_margin, loop_report
+from studies.stability import gain_margin, loop_report
 
 STUDY = paper_study()
 HOME_POSE = np.array(HOME)

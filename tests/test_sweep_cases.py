@@ -312,7 +312,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("sweep", "words"), REFUSED, ids=range(len(REFUSED)))
 def test_a_bad_sweep_is_refused_in_one_clear_line(sweep, words):
-    from studies.sweeps.results import kept_metrics
+    from studies.sweeps.stored import kept_metrics
 
     with pytest.raises(StudyError) as caught:
         spec = small_spec(sweep)
@@ -387,7 +387,7 @@ def test_any_sweep_is_spread_or_refused(sweep):
 
 
 def test_single_precision_keeps_only_metrics_that_it_holds():
-    from studies.sweeps.results import kept_metrics
+    from studies.sweeps.stored import kept_metrics
 
     axes = {"axes": {"gain": [1.0]}}
     held = ["structural_rms", "control_energy"]

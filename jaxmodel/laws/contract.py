@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-import jax.numpy as jnp
-
 from jaxmodel.case import Case, Control, Structure
 from jaxmodel.control import force_gains
 from jaxmodel.estimator import Estimator, design_estimator
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
-
 from jaxmodel.case import Case, Control, Structure
 from jaxmodel.control import PoleGains
 from jaxmodel.laws.contract import (
@@ -15,6 +13,7 @@ from jaxmodel.laws.contract import (
     modal_gains,
     on_and_off,
 )
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 
 

@@ -6,11 +6,10 @@ sample (`jaxmodel.controller.strongest`).
 
 from __future__ import annotations
 
-import jax.numpy as jnp
-
 from jaxmodel.case import Case, Structure
 from jaxmodel.laws.contract import Feedback, Known, Law, modal_feedback, modal_gains
 from jaxmodel.laws.imsc import same
+from jaxmodel.lazy import jnp
 
 
 def design(structure: Structure, case: Case, known: Known) -> Feedback:

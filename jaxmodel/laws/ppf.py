@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
-
 from jaxmodel.case import Case, Electronics, Structure
 from jaxmodel.electronics import measurement_chain
 from jaxmodel.estimator import Estimator, second_order
 from jaxmodel.laws.contract import Feedback, Known, Law, Parameter, modal_feedback, modal_gains
 from jaxmodel.laws.imsc import same
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 
 #: Highest corner over the assembled frequency, for where the chain lags by 90 degrees itself [1].

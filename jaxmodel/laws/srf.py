@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
-
 from jaxmodel.case import Case, Structure
 from jaxmodel.estimator import design_estimator
 from jaxmodel.laws.contract import Feedback, Known, Law
+from jaxmodel.lazy import jnp
 
 
 def design(structure: Structure, case: Case, known: Known) -> Feedback:

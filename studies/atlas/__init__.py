@@ -7,10 +7,15 @@ responses. `claims` holds the paper's statements against all that. `findings` is
 `plots`, `drawing` and `figures` show it, `report` writes it down, and `run` is `studies atlas`.
 """
 
-from studies.atlas.attribution import effects, interaction, shapley
-from studies.atlas.platform import platform_error, responses
-from studies.atlas.subsets import Subsets, atlas_sweep, read_subsets
-from studies.atlas.workspace import map_workspace, natural_modes_at
+from typing import TYPE_CHECKING
+
+from studies.lazy import lazily
+
+if TYPE_CHECKING:
+    from studies.atlas.attribution import effects, interaction, shapley
+    from studies.atlas.platform import platform_error, responses
+    from studies.atlas.subsets import Subsets, atlas_sweep, read_subsets
+    from studies.atlas.workspace import map_workspace, natural_modes_at
 
 __all__ = [
     "Subsets",
@@ -24,3 +29,19 @@ __all__ = [
     "responses",
     "shapley",
 ]
+
+__getattr__ = lazily(
+    __name__,
+    {
+        "Subsets": "studies.atlas.subsets",
+        "atlas_sweep": "studies.atlas.subsets",
+        "effects": "studies.atlas.attribution",
+        "interaction": "studies.atlas.attribution",
+        "map_workspace": "studies.atlas.workspace",
+        "natural_modes_at": "studies.atlas.workspace",
+        "platform_error": "studies.atlas.platform",
+        "read_subsets": "studies.atlas.subsets",
+        "responses": "studies.atlas.platform",
+        "shapley": "studies.atlas.attribution",
+    },
+)

@@ -15,7 +15,8 @@ from studies.errors import field_error
 from studies.paper_measures import EARLY_PART
 from studies.runs import preflight, resolved_study
 from studies.spec import Study
-from studies.sweeps.results import NOT_RUN, SweepData
+from studies.sweeps.columns import NOT_RUN
+from studies.sweeps.results import SweepData
 from studies.sweeps.spec import SweepSpec, parse_sweep
 
 #: Time of a move [s] and input shaper: the paper's move, and faster ones, which leave more.

@@ -17,7 +17,7 @@ from studies.export.cost import Cost
 from studies.export.fixed import FixedPoint, rail_samples
 from studies.export.in_the_loop import LoopRun
 from studies.export.verify import Verification, reference_run
-from studies.runs import describe
+from studies.labels import describe
 from studies.stability import LoopReport, loop_report
 
 

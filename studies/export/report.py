@@ -9,8 +9,9 @@ from studies.export.controller import FixedController
 from studies.export.cost import Cost
 from studies.export.fixed import MARGIN, FixedPoint
 from studies.export.verify import AIM, Verification
+from studies.margin import caution, margin_text
 from studies.pages import literal, opening
-from studies.stability import LoopReport, caution, margin_text
+from studies.stability import LoopReport
 
 
 def report(

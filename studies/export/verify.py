@@ -23,7 +23,7 @@ from studies.export.in_the_loop import LoopRun, jax_law, replay, run_in_the_loop
 from studies.export.integers import Response, shifted
 from studies.export.integers import respond as respond_fixed
 from studies.export.sequences import hard_sequences, stuck_at_end
-from studies.runs import describe
+from studies.labels import describe
 
 #: Double precision against JAX, largest difference over largest value [1].
 DOUBLE = 1e-12

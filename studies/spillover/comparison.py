@@ -13,12 +13,13 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, linear_parts
 from jaxmodel.simulate import Result, simulate
 from studies.export.controller import FixedController, fixed_controller
+from studies.margin import HIGHEST, LOWEST
 from studies.runs import check_run
 from studies.spec import Study
 from studies.spillover.judgement import STEPS, breaking_motion, damping, follow
 from studies.spillover.laws import Candidate, all_laws
 from studies.spillover.plants import LoopMaker, Plant, plant_sizes
-from studies.stability import HIGHEST, LOWEST, gain_margin
+from studies.stability import gain_margin
 
 #: The fast move has the acceleration of a move as long as the first in the time of the second.
 FAST = (0.01, 0.03)  # [m], [s]

@@ -22,7 +22,8 @@ from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
 from studies.errors import field_error
 from studies.export.controller import FixedController
-from studies.stability import MARGIN_MODES, link_poles
+from studies.margin import MARGIN_MODES
+from studies.stability import link_poles
 
 #: Plant modes per link at most.
 LARGEST = MARGIN_MODES

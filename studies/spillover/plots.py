@@ -11,12 +11,12 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from jaxmodel import status
 from studies import figures
-from studies.runs import describe
+from studies.labels import describe
+from studies.margin import margin_text
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import WITHOUT, Comparison
 from studies.spillover.judgement import LOWEST
 from studies.spillover.plants import Departure
-from studies.stability import margin_text
 
 #: Leakage from here on has its own colour [1].
 FLOOR = 0.01

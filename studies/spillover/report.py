@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
+from studies.labels import describe
+from studies.margin import margin_text
 from studies.pages import literal, opening, picture, table
-from studies.runs import describe
 from studies.sketch import CAPTION
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import FAST, GIVEN, SETTLING, WINDOW, WITHOUT, Comparison
 from studies.spillover.plants import Plant
-from studies.stability import margin_text
 
 #: Leakage below this is rounding [1].
 TINY = 1e-9

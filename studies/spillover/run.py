@@ -13,8 +13,9 @@ from rich.console import Console
 from studies import figures
 from studies.design import Design
 from studies.errors import StudyError
+from studies.labels import STATUS_LABEL
 from studies.pages import write_report
-from studies.runs import STATUS_LABEL, resolved_study, run_attributes
+from studies.runs import resolved_study, run_attributes
 from studies.sketch import sketch
 from studies.spec import Study
 from studies.spillover import plots

@@ -36,7 +36,8 @@ from jaxmodel.return_difference import (
     controlled_first,
     loop_response,
 )
-from studies.stability import HIGHEST, with_margin_modes
+from studies.margin import HIGHEST
+from studies.stability import with_margin_modes
 from studies.sweeps.damping import damping_ratios
 from studies.sweeps.lanes import BLOCK, run_steps
 from studies.sweeps.steps import PREPARING

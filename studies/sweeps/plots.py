@@ -17,9 +17,10 @@ from jaxmodel import status
 from studies import figures
 from studies.consistency import each_link
 from studies.errors import StudyError
-from studies.stability import ENOUGH, HIGHEST
+from studies.margin import ENOUGH, HIGHEST
 from studies.sweeps.axes import SHOWN_AS
-from studies.sweeps.results import SweepData, metric_values, swept_names, variable_name
+from studies.sweeps.columns import variable_name
+from studies.sweeps.results import SweepData, metric_values, swept_names
 from studies.sweeps.show import MARGIN, label, recommended, shown_metric, shown_value
 from studies.sweeps.spec import Node
 

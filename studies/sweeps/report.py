@@ -11,11 +11,12 @@ from matplotlib.figure import Figure
 from jaxmodel import status
 from studies.errors import StudyError, shown
 from studies.figures import styled
+from studies.margin import ENOUGH, margin_text
 from studies.pages import literal, opening, picture, table, write_report
 from studies.sketch import CAPTION, sketch
 from studies.spec import Study
-from studies.stability import ENOUGH, margin_text
 from studies.sweeps.axes import SHOWN_AS
+from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.methods import METHODS
 from studies.sweeps.plots import front, plot, save_plot
 from studies.sweeps.results import SweepData, load, metric_values, swept_names
@@ -23,7 +24,6 @@ from studies.sweeps.show import (
     MARGIN,
     SHARES,
     Rows,
-    axis_rows,
     best_cases,
     case_rows,
     cause_rows,

@@ -26,8 +26,8 @@ from studies.sweeps.folder import (
 )  # fmt: skip
 from studies.sweeps.plan import Group, chunk_cases, local_layout, plan_groups
 from studies.sweeps.progress import Reporter
-from studies.sweeps.results import chunk_variables, kept_metrics, manifest_attributes, merge
 from studies.sweeps.spec import SweepSpec
+from studies.sweeps.stored import chunk_variables, kept_metrics, manifest_attributes, merge
 from studies.sweeps.table import Table, build_table
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2_contingency, ks_2samp
 
 from jaxmodel import status
 from studies.errors import StudyError
 from studies.sweeps.axes import build_axis
+from studies.sweeps.columns import NOT_RUN
 from studies.sweeps.designs import unit_points
 from studies.sweeps.methods import METHODS, Analysis
-from studies.sweeps.results import NOT_RUN, SweepData, metric_values, swept_names
+from studies.sweeps.results import SweepData, metric_values, swept_names
 
 
 class Cause(NamedTuple):
@@ -31,6 +31,8 @@ def failure_causes(data: SweepData) -> list[Cause]:
     Args:
         data: the sweep.
     """
+    from scipy.stats import ks_2samp  # takes a third of a second
+
     codes = data["status"]
     is_run = codes != NOT_RUN
     is_failed = (codes != status.OK)[is_run]
@@ -57,6 +59,8 @@ def failure_causes(data: SweepData) -> list[Cause]:
 
 def _cause_of_choice(name: str, value: np.ndarray, is_failed: np.ndarray) -> Cause:
     """The same for texts: total variation instead of the Kolmogorov distance, chi-squared test."""
+    from scipy.stats import chi2_contingency
+
     names, which = np.unique(value, return_inverse=True)
     bad = np.bincount(which, is_failed, len(names))
     good = np.bincount(which, ~is_failed, len(names))

@@ -14,31 +14,26 @@ from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.entries import links_text
 from studies.errors import StudyError
-from studies.paths import field_unit, parse_entry
-from studies.runs import check_run
-from studies.stability import ENOUGH, margin_text
+from studies.margin import ENOUGH, margin_text
+from studies.sweeps.columns import NOT_RUN, variable_name
 from studies.sweeps.condition import evaluate
-from studies.sweeps.plan import peak_memory
-from studies.sweeps.results import (
-    NOT_RUN,
-    SweepData,
-    counted_links,
-    kept_metrics,
-    metric_values,
-    swept_names,
-    variable_name,
-)
-from studies.sweeps.run import Plan, calibrate
+from studies.sweeps.results import SweepData, counted_links, metric_values, swept_names
 from studies.sweeps.sensitivity import failure_causes
-from studies.sweeps.table import Table, case_study
+from studies.sweeps.stored import kept_metrics
 from studies.units import headed, readable
 
 #: Stands beside every metric of a case that has it.
 MARGIN = "gain_margin"
+
+
 #: Digits of a case's id that tables show.
 ID_DIGITS = 8
+
+
 #: Rows of a table of failed cases.
 LONGEST_TABLE = 100
+
+
 #: What the last columns of `cause_rows` are.
 SHARES = (
     "their share in the lowest and highest quarter of a number, and at the best and worst value of "
@@ -53,7 +48,7 @@ class Rows(NamedTuple):
     rows: list[list[str]]
 
 
-def _print(found: Rows, console: Console) -> None:
+def print_rows(found: Rows, console: Console) -> None:
     table = RichTable(*found.heads)
     for row in found.rows:
         table.add_row(*row)
@@ -107,7 +102,7 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
         _print_failed(data, codes, console)
         return
     console.print(f"{data.spec.study.title}: {data.n_cases} cases, {', '.join(swept_names(data))}")
-    _print(status_rows(data), console)
+    print_rows(status_rows(data), console)
     by = ranking(data)
     if np.isfinite(metric_values(data, by)[codes == status.OK]).any():
         best = recommended(data, by)
@@ -136,7 +131,7 @@ def _print_failed(data: SweepData, codes: np.ndarray, console: Console) -> None:
         is_whole = codes[k] in status.FINISHED  # it ran to its end
         time = "" if is_whole else f"{data['bad_time'][k]:.4g}"
         rows.append([str(k), short_id(data, int(k)), reason(int(codes[k])), time, *cells])
-    _print(Rows(["case", "id", "status", "from [s]", *names], rows), console)
+    print_rows(Rows(["case", "id", "status", "from [s]", *names], rows), console)
     if len(failed) > LONGEST_TABLE:
         console.print(
             f"and {len(failed) - LONGEST_TABLE} more; all of them: studies.load in Python"
@@ -145,7 +140,7 @@ def _print_failed(data: SweepData, codes: np.ndarray, console: Console) -> None:
 
 def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console: Console) -> None:
     """Print `case_rows`, and what must be said of them."""
-    _print(case_rows(data, cases, metrics), console)
+    print_rows(case_rows(data, cases, metrics), console)
     warning = margin_warning(data, cases)
     if warning:
         console.print(f"[bold red]{escape(warning)}[/]", soft_wrap=True, markup=True)
@@ -255,12 +250,12 @@ def recommended(data: SweepData, by: str, count: int = 10) -> np.ndarray:
 
 def shown_value(data: SweepData, name: str, case: int) -> str:
     """A value of one case, short."""
-    return _short(data[name][case])
+    return short_value(data[name][case])
 
 
-def _short(value: Any) -> str:
+def short_value(value: Any) -> str:
     if isinstance(value, np.ndarray):
-        return "[" + ", ".join(_short(entry) for entry in value) + "]"
+        return "[" + ", ".join(short_value(entry) for entry in value) + "]"
     if isinstance(value, (float, np.floating)):
         return f"{value:.4g}"
     return str(value)
@@ -273,59 +268,12 @@ def unit_of_metric(data: SweepData, name: str) -> str:
     return "" if variable is None or variable.units == "1" else variable.units
 
 
-def print_plan(plan: Plan, console: Console) -> None:
-    """What a sweep would run, a sample case, and the time it takes, after a short calibration."""
-    table = plan.table
-    console.print(
-        f"{len(table)} cases ({table.n_dropped} left out by where, {table.n_double} doubles, "
-        f"{plan.n_before} done before)"
-    )
-    _print(axis_rows(table), console)
-    for group in plan.groups:
-        layout, structure = group.layout, group.structure
-        console.print(
-            f"program: {structure.basis}, {structure.n_modes} modes, {structure.feedback} "
-            f"feedback, {structure.n_steps} samples of {structure.substeps} plant steps: "
-            f"{len(group.rows)} "
-            f"cases in {len(group.chunks())} chunks of {layout.devices} devices x {layout.blocks} "
-            f"blocks x {layout.lanes} lanes"
-        )
-    middle = len(table) // 2
-    values = ", ".join(f"{name} = {_short(c[middle])}" for name, c in table.columns.items())
-    console.print(f"sample: case {middle}, id {table.case_id[middle].decode()}: {values}")
-    try:
-        check_run(case_study(table, middle))
-    except StudyError as error:
-        console.print(f"the sample cannot run: {error}")
-    if not plan.groups:
-        console.print("nothing left to run")
-        return
-    found = calibrate(plan)
-    console.print(
-        f"estimate: {found.total:.0f} s, of which {found.compile_time * len(plan.groups):.0f} s "
-        f"compiling; {found.chunk_time:.2g} s a chunk; memory so far "
-        f"{peak_memory() / 2**20:.0f} MiB"
-    )
-
-
-def axis_rows(table: Table) -> Rows:
-    """How many values each column of a sweep takes, and between which ends."""
-    rows = []
-    for name, column in table.columns.items():
-        entry = parse_entry(name)
-        unit = field_unit(entry.field if entry else name)
-        is_numeric = column.dtype.kind in "fi"
-        ends = [f"{column.min():.4g}", f"{column.max():.4g}"] if is_numeric else ["", ""]
-        rows.append([name, unit, str(len({str(value) for value in column.tolist()})), *ends])
-    return Rows(["axis", "unit", "values", "smallest", "largest"], rows)
-
-
 def print_causes(data: SweepData, console: Console) -> None:
     """Print which parameters go with the failures, if any do."""
     found = cause_rows(data)
     if found.rows:
         console.print(f"what the failures depend on ({SHARES}):", soft_wrap=True)
-        _print(found, console)
+        print_rows(found, console)
 
 
 def cause_rows(data: SweepData) -> Rows:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -19,7 +19,9 @@ from studies.cluster.connect import (
 )
 from studies.config import start
 from studies.errors import StudyError
-from studies.tuning.spec import TuneSpec, load_tuning
+
+if TYPE_CHECKING:
+    from studies.tuning.spec import TuneSpec
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -43,6 +45,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         start(cpu_only=workers.are_named)
         from studies.sweeps.spec import ready_spec
         from studies.tuning.run import REPORT, run_tuning
+        from studies.tuning.spec import load_tuning
 
         asked = load_tuning(ready_spec(spec))
         if audit and (out or resume or quiet or workers.are_named):

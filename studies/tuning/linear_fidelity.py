@@ -23,8 +23,9 @@ from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spillover
 from studies.cases import as_arrays, build_case, build_structure
+from studies.margin import MARGIN_MODES
 from studies.spec import Study
-from studies.stability import MARGIN_MODES, gain_margin
+from studies.stability import gain_margin
 from studies.tuning.scenarios import nominal
 from studies.tuning.spec import OWN, Family, TuneSpec
 

@@ -10,9 +10,9 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.entries import links_text, parse_entries
+from studies.margin import MARGIN_MODES, caution, margin_text
 from studies.pages import literal, opening, picture, table
 from studies.sketch import CAPTION
-from studies.stability import MARGIN_MODES, caution, margin_text
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
 from studies.tuning.check import Judged, Searched, patch_centers
 from studies.tuning.free import PLACEMENT

@@ -6,10 +6,10 @@ import numpy as np
 
 from jaxmodel.metrics import METRICS
 from studies.entries import links_text, parse_entries
+from studies.labels import STATUS_LABEL
 from studies.paths import field_unit, parse_entry
-from studies.runs import STATUS_LABEL
 from studies.store import Variable
-from studies.sweeps.results import variable_name
+from studies.sweeps.columns import variable_name
 from studies.sweeps.table import as_numbers
 from studies.tuning.check import Judged, fresh_columns, patch_centers
 from studies.tuning.free import POLES

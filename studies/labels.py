@@ -1,0 +1,17 @@
+"""What codes and numbers of a run are called in files, tables and reports."""
+
+from __future__ import annotations
+
+from jaxmodel import status
+
+#: What `singularity_distance` means.
+DISTANCE_TEXT = "of link angles from 0 and 90 deg, and of the links from lines through one point"
+
+
+#: Unit, long name and flags of a status in a file.
+STATUS_LABEL = ("1", "how the run ended", status.REASONS)
+
+
+def describe(code: int) -> str:
+    """A status code in words."""
+    return status.REASONS.get(code, f"status {code}")

@@ -1,0 +1,60 @@
+"""What a sweep would take, before it runs."""
+
+from __future__ import annotations
+
+from rich.console import Console
+
+from studies.errors import StudyError
+from studies.paths import field_unit, parse_entry
+from studies.runs import check_run
+from studies.sweeps.plan import peak_memory
+from studies.sweeps.run import Plan, calibrate
+from studies.sweeps.show import Rows, print_rows, short_value
+from studies.sweeps.table import Table, case_study
+
+
+def print_plan(plan: Plan, console: Console) -> None:
+    """What a sweep would run, a sample case, and the time it takes, after a short calibration."""
+    table = plan.table
+    console.print(
+        f"{len(table)} cases ({table.n_dropped} left out by where, {table.n_double} doubles, "
+        f"{plan.n_before} done before)"
+    )
+    print_rows(axis_rows(table), console)
+    for group in plan.groups:
+        layout, structure = group.layout, group.structure
+        console.print(
+            f"program: {structure.basis}, {structure.n_modes} modes, {structure.feedback} "
+            f"feedback, {structure.n_steps} samples of {structure.substeps} plant steps: "
+            f"{len(group.rows)} "
+            f"cases in {len(group.chunks())} chunks of {layout.devices} devices x {layout.blocks} "
+            f"blocks x {layout.lanes} lanes"
+        )
+    middle = len(table) // 2
+    values = ", ".join(f"{name} = {short_value(c[middle])}" for name, c in table.columns.items())
+    console.print(f"sample: case {middle}, id {table.case_id[middle].decode()}: {values}")
+    try:
+        check_run(case_study(table, middle))
+    except StudyError as error:
+        console.print(f"the sample cannot run: {error}")
+    if not plan.groups:
+        console.print("nothing left to run")
+        return
+    found = calibrate(plan)
+    console.print(
+        f"estimate: {found.total:.0f} s, of which {found.compile_time * len(plan.groups):.0f} s "
+        f"compiling; {found.chunk_time:.2g} s a chunk; memory so far "
+        f"{peak_memory() / 2**20:.0f} MiB"
+    )
+
+
+def axis_rows(table: Table) -> Rows:
+    """How many values each column of a sweep takes, and between which ends."""
+    rows = []
+    for name, column in table.columns.items():
+        entry = parse_entry(name)
+        unit = field_unit(entry.field if entry else name)
+        is_numeric = column.dtype.kind in "fi"
+        ends = [f"{column.min():.4g}", f"{column.max():.4g}"] if is_numeric else ["", ""]
+        rows.append([name, unit, str(len({str(value) for value in column.tolist()})), *ends])
+    return Rows(["axis", "unit", "values", "smallest", "largest"], rows)
