@@ -7,7 +7,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help study explore test test-long check clean venv
+.PHONY: help study explore test test-long lint check clean venv
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 16
@@ -32,10 +32,13 @@ test: .venv/installed  ## run the tests
 test-long: .venv/installed  ## run the long campaigns
 	$(PYTEST) -m long
 
-check: .venv/installed  ## lint, check types, run the tests
+lint: .venv/installed  ## lint, check format, types and the contract of imports
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(PYTEST)
+	$(BIN)/lint-imports
+
+check: lint test  ## all of it, as continuous integration does
 
 clean:  ## remove the environment, caches and build products; results stay
 	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -302,7 +302,7 @@ def advance(
         state: at the sampling instant.
         inputs: of this sample.
         voltage: command of this sample [V], (3, K).
-        after: the controller's next state, whoever computed it.
+        after: the controller's next state.
         clipped: 1 where an ADC channel is at its end, else 0, ().
 
     Returns:

@@ -82,7 +82,7 @@ def paper(
 ) -> None:
     """Run the paper's study: data, counterparts of its figures, report beside its numbers."""
     start(precision)
-    from studies.paper import run_paper
+    from studies.paper.run import run_paper
 
     run_paper(out, console)
 
@@ -96,12 +96,12 @@ def simulate(
 ) -> None:
     """Run one study with full trajectories."""
     start(precision)
-    from studies.labels import describe
-    from studies.margin import caution, margin_text
-    from studies.run_report import check_results, settling_text, write_results
-    from studies.runs import run_study
-    from studies.spec import load_study
-    from studies.sweeps.spec import ready_spec
+    from studies.engine.runs import run_study
+    from studies.show.run_report import check_results, settling_text, write_results
+    from studies.space.spec import ready_spec
+    from studies.study.labels import describe
+    from studies.study.margin import caution, margin_text
+    from studies.study.spec import load_study
 
     spec = load_study(ready_spec(study))
     check_results(out, report)
@@ -134,10 +134,10 @@ def replay(
 ) -> None:
     """Run one case of a sweep again with full trajectories, and compare with what it found."""
     start()
-    from studies.design import deviation, load_design
-    from studies.labels import describe
-    from studies.run_report import check_results, write_results
-    from studies.runs import run_study
+    from studies.engine.design import deviation, load_design
+    from studies.engine.runs import run_study
+    from studies.show.run_report import check_results, write_results
+    from studies.study.labels import describe
 
     if report and out is None:
         raise StudyError("--report: is written beside the trajectories; name their file by --out")
@@ -180,9 +180,9 @@ def modes(
 ) -> None:
     """Natural frequencies and damping ratios of the assembled machine."""
     start()
-    from studies.modes import machine_modes
-    from studies.spec import load_study
-    from studies.sweeps.spec import ready_spec
+    from studies.engine.modes import machine_modes
+    from studies.space.spec import ready_spec
+    from studies.study.spec import load_study
 
     found = machine_modes(
         None if study is None else load_study(ready_spec(study)),
@@ -287,7 +287,7 @@ def init(
 ) -> None:
     """Write a commented study file with every field and its default."""
     from studies.store import replacing
-    from studies.template import study_template
+    from studies.study.template import study_template
 
     if out is None:
         print(study_template(), end="")

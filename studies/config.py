@@ -211,7 +211,7 @@ def _set_cache(cache: bool) -> None:
 def _is_usable_folder(folder: str) -> bool:
     """Whether `folder` is there, made where it was missing, and can be written to."""
     try:
-        # For this user alone: whoever can write to the cache can run code through it.
+        # For this user alone: anyone who can write to the cache can run code through it.
         Path(folder).mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError:
         return False

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
@@ -24,7 +24,7 @@ from jaxmodel.metrics import METRICS, Metric
 from jaxmodel.table import Table
 from studies import sources
 from studies.errors import StudyError
-from studies.sweeps.methods import METHODS, Method
+from studies.space.methods import METHODS, Method
 
 #: Where processes started from here find what was taken in, as paths or module names.
 VARIABLE = "FLEXLINK_WITH"
@@ -80,10 +80,8 @@ def extend_as_told() -> None:
 
 
 def _table(kind: str) -> Table[Any]:
-    if kind == "targets":  # compilers and templates are needed for exports alone
-        from studies.export.targets import TARGETS
-
-        return TARGETS
+    if kind == "targets":  # a feature above, whose templates and compilers only exports need
+        return cast("Table[Any]", importlib.import_module("studies.export.targets").TARGETS)
     tables: dict[str, Table[Any]] = {"laws": LAWS, "metrics": METRICS, "methods": METHODS}
     return tables[kind]
 

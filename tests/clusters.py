@@ -18,7 +18,7 @@ PRELOAD = """
 import json, os, time
 from pathlib import Path
 from studies.cluster import worker
-from studies.sweeps import plan
+from studies.engine import plan
 
 plan.LANES, plan.LARGEST_CHUNK = 8, 16
 trouble = Path(os.environ["TROUBLE"])

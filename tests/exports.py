@@ -6,8 +6,8 @@ import subprocess
 import pytest
 
 from studies.export.compiler import find_compiler
-from studies.spec import paper_study, parse_study
-from studies.template import study_template
+from studies.study.spec import paper_study, parse_study
+from studies.study.template import study_template
 
 _HOME = list(paper_study().motion.waypoints[0])
 _SHORT = {

@@ -12,9 +12,9 @@ from threadpoolctl import threadpool_limits
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.sampled_loop import closed_loop
-from studies.cases import build_cases, build_structure
-from studies.spec import paper_study
-from studies.stability import gain_margin, with_margin_modes
+from studies.engine.stability import gain_margin, with_margin_modes
+from studies.study.cases import build_cases, build_structure
+from studies.study.spec import paper_study
 
 STUDY = paper_study().change(link__modes=8)
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxmodel.parameters import ASSEMBLIES, HOME
-from studies.spec import parse_study
+from studies.study.spec import parse_study
 
 ANGLES = np.array([2 * np.pi / 3, 4 * np.pi / 3, 0.0])
 SIDE = 0.6

@@ -4,7 +4,7 @@ import copy
 
 import numpy as np
 
-from studies.sweeps.spec import parse_sweep
+from studies.space.spec import parse_sweep
 
 HOME_PHI = float(np.pi / 6)
 #: 2 mm in 15 ms, then 10 ms; two modes.

@@ -16,10 +16,10 @@ from rich.console import Console
 import studies
 from studies.atlas import attribution, claims, figures, findings, run, subsets, workspace
 from studies.atlas.platform import LINK_SETS, responses
+from studies.engine.modes import machine_modes
+from studies.engine.runs import run_study
 from studies.errors import StudyError
-from studies.modes import machine_modes
-from studies.runs import run_study
-from studies.spec import paper_study
+from studies.study.spec import paper_study
 from tests.pages import Page
 from tests.test_cli import run as command
 

@@ -16,11 +16,11 @@ from jaxmodel.parameters import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
 from studies.bench import reference
-from studies.cases import as_arrays, build_case, build_structure
+from studies.engine.runs import check_run
+from studies.engine.stability import loop_report, motion_report
 from studies.errors import StudyError
-from studies.runs import check_run
-from studies.spec import load_study, paper_study
-from studies.stability import loop_report, motion_report
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.spec import load_study, paper_study
 
 DATA = Path(__file__).parent / "data"
 SPECS = Path(studies.__file__).parent / "specs"

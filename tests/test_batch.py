@@ -7,8 +7,8 @@ import pytest
 from jaxmodel import status
 from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import simulate
-from studies.cases import as_arrays, build_case, build_structure
-from studies.spec import paper_study
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.spec import paper_study
 
 N_CASES = 64
 

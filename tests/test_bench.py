@@ -9,7 +9,7 @@ import pytest
 from studies import cli
 from studies.bench import peers
 from studies.bench.works import WORKS
-from studies.sweeps.kernels import KernelExecutor
+from studies.engine.kernel_executor import KernelExecutor
 
 KEYS = "work executor configs_per_s compile_s peak_mib device dtype batch steps fingerprint"
 

@@ -17,17 +17,17 @@ from rich.console import Console
 
 from studies.cluster import connect
 from studies.cluster.connect import Workers, connected
-from studies.cluster.designs import ClusterEvaluator
 from studies.cluster.runner import ClusterRunner
 from studies.cluster.worker import identity
+from studies.engine import plan
+from studies.engine.chunks import Here
+from studies.engine.columns import NOT_RUN
+from studies.engine.folder import CHUNKS, SweepFolder, finished_cases, read_manifest
+from studies.engine.results import load
+from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
-from studies.sweeps import plan
-from studies.sweeps.chunks import Here
-from studies.sweeps.columns import NOT_RUN
-from studies.sweeps.folder import CHUNKS, SweepFolder, finished_cases, read_manifest
-from studies.sweeps.results import load
-from studies.sweeps.run import run_sweep
 from studies.tuning.run import make_evaluator
+from studies.tuning.workers import ClusterEvaluator
 from tests.clusters import machines
 from tests.sweeps import MIXED, small_spec
 from tests.test_cli import refused

@@ -17,17 +17,17 @@ from jaxmodel.table import Table
 from studies import sources
 from studies.bench.works import EXECUTORS
 from studies.cli import main
+from studies.engine.plan import chunk_cases, local_layout, plan_groups
+from studies.engine.results import load
+from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.export.targets import TARGETS
 from studies.extensions import VARIABLE, extend
-from studies.runs import run_study
-from studies.spec import parse_study
+from studies.space.methods import METHODS
+from studies.space.spec import parse_sweep
+from studies.space.table import build_table
 from studies.store import read_store
-from studies.sweeps.methods import METHODS
-from studies.sweeps.plan import chunk_cases, local_layout, plan_groups
-from studies.sweeps.results import load
-from studies.sweeps.spec import parse_sweep
-from studies.sweeps.table import build_table
+from studies.study.spec import parse_study
 
 DOCS = Path(__file__).parents[1] / "docs" / "own-parts.md"
 #: One fast move of a small model.
@@ -187,16 +187,16 @@ def test_every_source_of_a_number_is_in_the_digest(tmp_path):
         shutil.copytree(
             sources.TOP / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__")
         )
-    sweeps = ("studies.sweeps.chunks", "studies.sweeps.table")
-    workers = ("studies.cluster.worker", "studies.cluster.designs")
+    sweeps = ("studies.engine.chunks", "studies.space.table")
+    workers = ("studies.cluster.worker", "studies.tuning.workers")
     before = {roots: sources.digest(*roots, top=tmp_path) for roots in (sweeps, workers)}
     for name, roots in (
         ("jaxmodel/laws/ppf.py", sweeps),
         ("jaxmodel/laws/__init__.py", sweeps),
-        ("studies/runs.py", sweeps),
-        ("studies/consistency.py", sweeps),
+        ("studies/engine/runs.py", sweeps),
+        ("studies/study/consistency.py", sweeps),
         ("studies/kernels/tangents.py", sweeps),
-        ("studies/sweeps/gradients.py", workers),
+        ("studies/engine/gradients.py", workers),
         ("studies/tuning/merit.py", workers),
     ):
         path = tmp_path / name

@@ -11,9 +11,9 @@ from jaxmodel.piezo import sensor_capacitance
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import closed_loop
 from jaxmodel.simulate import simulate
-from studies.cases import as_arrays, build_case, build_structure
-from studies.spec import paper_study
-from studies.stability import loop_report
+from studies.engine.stability import loop_report
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.spec import paper_study
 
 HERTZ = 2 * np.pi
 STUDY = paper_study().change(electronics__sensor_highpass_hz=24.0, electronics__amplifier_hz=800.0)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 import studies
+from studies.engine.controller import fixed_controller
 from studies.export import run as export_run
 from studies.export import sequences, targets
 from studies.export.compiler import STRICT
-from studies.export.controller import fixed_controller
 from studies.export.document import document, import_study, study_hash
 from studies.export.verify import AIM
-from studies.spec import load_study
+from studies.study.spec import load_study
 from tests.exports import (
     DESIGNS,
     needs_compiler,

@@ -8,21 +8,21 @@ import pytest
 
 from jaxmodel.laws import n_channels
 from jaxmodel.loop import step
+from studies.engine.channels import fold, unfold
+from studies.engine.controller import fixed_controller
 from studies.errors import StudyError
 from studies.export import fixed as fixed_point
 from studies.export import in_the_loop
 from studies.export.c_fixed import fixed_source
 from studies.export.c_floating import floating_source
-from studies.export.channels import fold, unfold
 from studies.export.compiler import compiled
-from studies.export.controller import fixed_controller
 from studies.export.fixed import design_fixed, peak_gains, rail_samples, rounded, shaper_row
 from studies.export.floating import respond as respond_floating
 from studies.export.in_the_loop import replay
 from studies.export.integers import respond
 from studies.export.job import judged
 from studies.export.verify import reference_run
-from studies.spec import parse_study
+from studies.study.spec import parse_study
 from tests.exports import PAPER, SINGLE, TUNED, needs_compiler
 
 RAIL = 100

@@ -16,15 +16,15 @@ import pytest
 from jaxmodel import status
 from studies import config
 from studies.bench.works import METRICS, WORKS
-from studies.cases import build_cases, build_structure
+from studies.engine import kernel_executor as kernels
+from studies.engine.executor import make_executor
+from studies.engine.kernel_executor import GpuExecutor, KernelExecutor
+from studies.engine.plan import Layout
+from studies.engine.scan import ScanExecutor
 from studies.kernels import cpu, gpu, llvm
 from studies.kernels.traced import Leaf, trace_loop
-from studies.spec import paper_study
-from studies.sweeps import kernels
-from studies.sweeps.executor import make_executor
-from studies.sweeps.kernels import GpuExecutor, KernelExecutor
-from studies.sweeps.plan import Layout
-from studies.sweeps.scan import ScanExecutor
+from studies.study.cases import build_cases, build_structure
+from studies.study.spec import paper_study
 from tests.test_kernel import check_equal, every_operation
 
 LAYOUT = Layout(devices=1, blocks=2, lanes=gpu.BLOCK)
@@ -114,7 +114,7 @@ def test_without_the_call_target_the_scan_runs(monkeypatch):
 
 def test_it_is_chosen_on_a_graphics_processor(monkeypatch):
     structure, _ = work("W1")
-    monkeypatch.setattr("studies.sweeps.executor.processor", lambda: "cuda")
+    monkeypatch.setattr("studies.engine.executor.processor", lambda: "cuda")
     assert isinstance(make_executor(structure, LAYOUT, False), GpuExecutor)
     slow = structure._replace(substeps=100)
     assert isinstance(make_executor(slow, LAYOUT, False), ScanExecutor)

@@ -11,7 +11,7 @@ import pytest
 from jaxmodel.bases import find_bases
 from jaxmodel.control import pole_placement
 from jaxmodel.simulate import simulate
-from studies.cases import as_arrays, build_case, build_structure
+from studies.study.cases import as_arrays, build_case, build_structure
 from tests.test_batch import short_study
 
 

@@ -16,8 +16,8 @@ from jaxmodel.loop import PlantState, plant_rates, plant_step
 from jaxmodel.parameters import HOME
 from jaxmodel.prepare import prepare
 from studies.bench import reference
-from studies.cases import as_arrays, build_case, build_structure
-from studies.spec import paper_study
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.spec import paper_study
 
 SAMPLE = 1e-4  # [s]
 MOVE_TIME, MOVE = 0.05, 0.01  # [s], [m]

@@ -7,19 +7,18 @@ import pytest
 
 from jaxmodel import status
 from jaxmodel.trigonometry import sine_cosine
-from studies import compilation
 from studies.bench.works import METRICS, WORKS
-from studies.cases import build_cases, build_structure
-from studies.compilation import ObjectCache
-from studies.kernels import cpu, llvm
+from studies.engine.executor import make_executor
+from studies.engine.kernel_executor import KernelExecutor
+from studies.engine.plan import Layout, chunk_cases, local_layout, plan_groups
+from studies.engine.program import TRACES
+from studies.engine.scan import ScanExecutor
+from studies.kernels import compilation, cpu, llvm
+from studies.kernels.compilation import ObjectCache
 from studies.kernels.traced import Leaf, trace_loop
-from studies.spec import paper_study
-from studies.sweeps.executor import make_executor
-from studies.sweeps.kernels import KernelExecutor
-from studies.sweeps.plan import Layout, chunk_cases, local_layout, plan_groups
-from studies.sweeps.program import TRACES
-from studies.sweeps.scan import ScanExecutor
-from studies.sweeps.table import build_table
+from studies.space.table import build_table
+from studies.study.cases import build_cases, build_structure
+from studies.study.spec import paper_study
 from tests.sweeps import MIXED, small_spec
 
 LAYOUT = Layout(devices=2, blocks=1, lanes=16)

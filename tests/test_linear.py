@@ -13,8 +13,8 @@ from jaxmodel.loop import PlantState
 from jaxmodel.parameters import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
-from studies.cases import as_arrays, build_case, build_structure
-from studies.spec import paper_study
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.spec import paper_study
 
 DATA = Path(__file__).parent / "data"
 UNDAMPED = paper_study().change(

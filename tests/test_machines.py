@@ -14,21 +14,21 @@ from jaxmodel.parameters import HOME
 from jaxmodel.plant import build_plant
 from studies import cli
 from studies.bench import reference
-from studies.cases import as_arrays, build_case, build_cases, build_structure
+from studies.engine.results import load, metric_values
+from studies.engine.runs import check_run, run_study
+from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
-from studies.figures import styled
-from studies.paths import EACH_LINK, field_value
-from studies.runs import check_run, run_study
-from studies.sketch import sketch, standing
-from studies.spec import load_study, parse_study
+from studies.show.figures import styled
+from studies.show.sketch import sketch, standing
+from studies.space.spec import parse_sweep
+from studies.space.table import build_table
+from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.study.paths import EACH_LINK, field_value
+from studies.study.spec import load_study, parse_study
+from studies.study.template import study_template
 from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.plots import plot
-from studies.sweeps.results import load, metric_values
-from studies.sweeps.run import run_sweep
 from studies.sweeps.show import select, written_name
-from studies.sweeps.spec import parse_sweep
-from studies.sweeps.table import build_table
-from studies.template import study_template
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import parse_tuning
 from tests.machines import random_machine

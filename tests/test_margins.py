@@ -21,18 +21,18 @@ from jaxmodel.return_difference import (
     spectrum_polynomial,
 )
 from jaxmodel.sampled_loop import closed_loop
-from studies.cases import as_arrays, build_case, build_structure
-from studies.margin import HIGHEST
-from studies.spec import paper_study
-from studies.stability import loop_report, with_margin_modes
-from studies.sweeps import lanes
-from studies.sweeps.margins import judge_loops
-from studies.sweeps.plan import chunk_cases, local_layout, plan_groups
-from studies.sweeps.results import load
-from studies.sweeps.run import run_sweep
+from studies.engine import lanes
+from studies.engine.margins import judge_loops
+from studies.engine.plan import chunk_cases, local_layout, plan_groups
+from studies.engine.results import load
+from studies.engine.stability import loop_report, with_margin_modes
+from studies.engine.sweep import run_sweep
+from studies.space.spec import parse_sweep
+from studies.space.table import build_table
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.margin import HIGHEST
+from studies.study.spec import paper_study
 from studies.sweeps.show import best_cases
-from studies.sweeps.spec import parse_sweep
-from studies.sweeps.table import build_table
 from tests.loops import Loops, _matrices, exact_margins, random_loops
 from tests.sweeps import FAST_MOVE
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from studies import spec as spec_module
-from studies.pages import literal, page, picture, report_files, table
-from studies.template import toml_text
+from studies.show.pages import literal, page, picture, report_files, table
+from studies.study import spec as spec_module
+from studies.study.template import toml_text
 from tests.pages import TITLE, parsed, rendered
 from tests.sweeps import MIXED, small
 
@@ -83,7 +83,7 @@ def test_the_parser_of_these_tests_finds_faults(inside):
 
 
 def test_toml_is_read_back():
-    files = sorted(Path(spec_module.__file__).parent.glob("specs/*.toml"))
+    files = sorted(Path(spec_module.__file__).parents[1].glob("specs/*.toml"))
     assert len(files) > 5
     written = [tomllib.loads(path.read_text()) for path in files]
     odd = {"title": 'a "b"\n', "a": {"b.c": {"x": [{"y": 1}], "z": {}}, "t": {"u": {"v": True}}}}

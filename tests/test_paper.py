@@ -11,17 +11,24 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from jaxmodel.metrics import Metrics
-from studies import load, paper, paper_cases, paper_figures, report, report_context
+from studies import load
 from studies.atlas import atlas_sweep, read_subsets
 from studies.cli import main
+from studies.engine.runs import run_study
+from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
-from studies.figures import comparison
-from studies.paper_cases import ALL, MOVES, OFF, ONE, SHAPERS, TWO, run_cases
-from studies.paper_measures import measure
-from studies.runs import run_study
-from studies.spec import paper_study
+from studies.paper import cases as paper_cases
+from studies.paper import context as report_context
+from studies.paper import figures as paper_figures
+from studies.paper import report
+from studies.paper import run as paper
+from studies.paper.cases import ALL, MOVES, OFF, ONE, SHAPERS, TWO, run_cases
+from studies.paper.measures import measure
+from studies.show.figures import comparison
+from studies.show.units import span
 from studies.store import read_store
-from studies.sweeps.run import run_sweep
+from studies.study.printed import TABLE_1
+from studies.study.spec import paper_study
 
 #: Figures that are written; the others are only drawn.
 FIGURES = ("fig03", "shapers")
@@ -218,7 +225,7 @@ def test_every_figure_stands_beside_its_table():
 
 def test_table_1_percentages_are_the_papers():
     """The constants against the percentages printed in the paper's table."""
-    percent = [[100 * (v / row[0] - 1) for v in row[1:]] for row in report.TABLE_1]
+    percent = [[100 * (v / row[0] - 1) for v in row[1:]] for row in TABLE_1]
     printed = [[-44.97, -43.62, -42.30], [-42.92, -43.23, -1.50], [-42.32, -1.84, 0.92]]
     np.testing.assert_allclose(percent, printed, atol=0.006)
 
@@ -226,7 +233,7 @@ def test_table_1_percentages_are_the_papers():
 def test_formatting():
     assert report_context.change(0.5, 2.0) == "-75.0 %"
     assert report_context.change(1.0, 0.0) == "-"
-    assert report_context.span([0.1, 0.1]) == "0.1"
+    assert span([0.1, 0.1]) == "0.1"
 
 
 def test_every_figure_has_units_on_its_axes(short):

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 
 from jaxmodel import status
-from studies.runs import run_study
+from studies.engine.runs import run_study
 from tests.test_batch import short_study
 
 CHANGES = {"link__modes": 2, "control__modes": 1, "shaper__kind": "zv"}
@@ -15,7 +15,7 @@ import sys
 sys.path.insert(0, sys.argv[1])
 from studies.config import configure
 configure("float32")
-from studies.runs import run_study
+from studies.engine.runs import run_study
 from tests.test_batch import short_study
 from tests.test_precision import CHANGES
 result = run_study(short_study(**CHANGES), has_record=False, has_loop=False).result

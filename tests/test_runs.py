@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jaxmodel import status
+from studies.engine.runs import check_run, run_study
 from studies.errors import StudyError
-from studies.runs import check_run, run_study
 from tests.test_batch import short_study
 
 SMALL = {"link__modes": 2, "control__modes": 2}
@@ -77,7 +77,7 @@ def test_ratios_of_the_own_run():
 
 
 def test_configure_comes_first():
-    code = "from studies.spec import paper_study; from studies.runs import run_study\n"
+    code = "from studies.study.spec import paper_study; from studies.engine.runs import run_study\n"
     code += "run_study(paper_study())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 1 and "studies.configure() must be called first" in done.stderr

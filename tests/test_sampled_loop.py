@@ -18,10 +18,10 @@ from jaxmodel.sampled_loop import (
     summed_squares,
 )
 from jaxmodel.simulate import simulate
-from studies.cases import as_arrays, build_case, build_structure
-from studies.margin import LOWEST
-from studies.spec import paper_study
-from studies.stability import gain_margin, loop_report
+from studies.engine.stability import gain_margin, loop_report
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.margin import LOWEST
+from studies.study.spec import paper_study
 
 STUDY = paper_study()
 HOME_POSE = np.array(HOME)

@@ -5,8 +5,8 @@ import pytest
 from scipy.stats import qmc
 
 from studies.errors import StudyError
-from studies.sweeps.indices import elementary_effects, sobol_indices
-from studies.sweeps.methods import morris_points, saltelli_points
+from studies.space.indices import elementary_effects, sobol_indices
+from studies.space.methods import morris_points, saltelli_points
 
 A, B = 7.0, 0.1
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from jaxmodel.prepare import prepare
 from studies import Study, StudyError, load_study, paper_study, parse_study
-from studies.cases import as_arrays, build_case, build_structure
-from studies.explain import allowed_values
-from studies.template import study_template, toml_value
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.explain import allowed_values
+from studies.study.template import study_template, toml_value
 
 REFUSED = [
     # unknown or misspelt

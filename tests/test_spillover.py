@@ -19,20 +19,20 @@ from jaxmodel.controller import (
 from jaxmodel.electronics import measurement_chain
 from jaxmodel.laws.lqr import optimal_gains
 from jaxmodel.laws.ppf import HIGHEST_RATIO, design_position_filter
-from studies.cases import as_arrays, build_case, build_structure
+from studies.engine.controller import fixed_controller
+from studies.engine.runs import run_study
+from studies.engine.stability import loop_report
 from studies.errors import StudyError
-from studies.export.controller import fixed_controller
-from studies.margin import HIGHEST
-from studies.runs import run_study
-from studies.spec import paper_study
 from studies.spillover import Departure, certify, compare_laws, patch_lengths
 from studies.spillover import run as spillover_run
 from studies.spillover.comparison import _controlled_links, _View
 from studies.spillover.judgement import damping, follow
 from studies.spillover.laws import all_laws
 from studies.spillover.plants import LoopMaker, Plant, all_plants, widened
-from studies.stability import loop_report
-from studies.template import study_template
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.margin import HIGHEST
+from studies.study.spec import paper_study
+from studies.study.template import study_template
 from tests.pages import parsed
 from tests.test_cli import refused, run
 

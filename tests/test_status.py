@@ -7,10 +7,10 @@ import pytest
 from jaxmodel import status
 from jaxmodel.parameters import HOME
 from jaxmodel.simulate import _share_on, simulate
-from studies.cases import as_arrays, build_case, build_structure
+from studies.engine.runs import run_study
 from studies.errors import StudyError
-from studies.runs import run_study
-from studies.spec import paper_study
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.spec import paper_study
 
 STUDY = paper_study().change(
     link__modes=2, control__modes=2, run__duration=0.08, shaper__kind="none",

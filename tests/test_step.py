@@ -7,7 +7,7 @@ import pytest
 from jaxmodel.loop import initial_state, step
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import command
-from studies.cases import as_arrays, build_case, build_structure
+from studies.study.cases import as_arrays, build_case, build_structure
 from tests.test_batch import short_study
 
 ELEMENTWISE = {

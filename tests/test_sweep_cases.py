@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from studies.cases import as_arrays, build_case, build_cases, build_structure
 from studies.errors import StudyError
-from studies.fields import Fields, padded
-from studies.sweeps.methods import morris_points, saltelli_points
-from studies.sweeps.spec import load_sweep, parse_sweep, ready_spec
-from studies.sweeps.table import build_table, case_study
+from studies.space.methods import morris_points, saltelli_points
+from studies.space.spec import load_sweep, parse_sweep, ready_spec
+from studies.space.table import build_table, case_study
+from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.study.fields import Fields, padded
 from tests.sweeps import BASE, MIXED, small, small_spec
 
 
@@ -312,7 +312,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("sweep", "words"), REFUSED, ids=range(len(REFUSED)))
 def test_a_bad_sweep_is_refused_in_one_clear_line(sweep, words):
-    from studies.sweeps.stored import kept_metrics
+    from studies.engine.stored import kept_metrics
 
     with pytest.raises(StudyError) as caught:
         spec = small_spec(sweep)
@@ -334,7 +334,7 @@ def test_deep_nesting_is_refused(depth):
 
 
 def test_a_study_is_no_sweep_and_a_sweep_no_study(tmp_path):
-    from studies.spec import load_study
+    from studies.study.spec import load_study
 
     with pytest.raises(StudyError, match="sweep: missing"):
         parse_sweep(BASE)
@@ -387,7 +387,7 @@ def test_any_sweep_is_spread_or_refused(sweep):
 
 
 def test_single_precision_keeps_only_metrics_that_it_holds():
-    from studies.sweeps.stored import kept_metrics
+    from studies.engine.stored import kept_metrics
 
     axes = {"axes": {"gain": [1.0]}}
     held = ["structural_rms", "control_energy"]

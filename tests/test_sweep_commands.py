@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from studies.design import load_design
+from studies.engine import plan
+from studies.engine.design import load_design
+from studies.engine.results import load
 from studies.errors import StudyError
-from studies.sweeps import plan
+from studies.study.template import toml_value
 from studies.sweeps.report import report
-from studies.sweeps.results import load
-from studies.template import toml_value
 from tests.pages import parsed
 from tests.sweeps import BASE
 from tests.test_cli import refused, run

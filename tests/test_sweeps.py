@@ -20,15 +20,15 @@ from rich.console import Console
 
 import studies
 from jaxmodel import status
-from studies.design import deviation, load_design
+from studies.engine import plan
+from studies.engine import sweep as run_module
+from studies.engine.design import deviation, load_design
+from studies.engine.folder import CHUNKS, finished_cases, make_manifest, open_folder
+from studies.engine.program import TRACES
+from studies.engine.results import load, metric_values
+from studies.engine.runs import run_study
+from studies.engine.sweep import make_plan, run_sweep
 from studies.errors import StudyError
-from studies.runs import run_study
-from studies.sweeps import plan
-from studies.sweeps import run as run_module
-from studies.sweeps.folder import CHUNKS, finished_cases, make_manifest, open_folder
-from studies.sweeps.program import TRACES
-from studies.sweeps.results import load, metric_values
-from studies.sweeps.run import make_plan, run_sweep
 from studies.sweeps.show import best_cases, case_rows, margin_warning
 from tests.sweeps import FAST_MOVE, MIXED, small, small_spec
 
@@ -243,9 +243,9 @@ sys.path.insert(0, sys.argv[3])
 import studies
 studies.configure()
 from pathlib import Path
-from studies.sweeps import plan
-from studies.sweeps.run import run_sweep
-from studies.sweeps.spec import parse_sweep
+from studies.engine import plan
+from studies.engine.sweep import run_sweep
+from studies.space.spec import parse_sweep
 plan.LANES, plan.LARGEST_CHUNK = 8, 16
 run_sweep(parse_sweep(json.loads(sys.argv[1])), Path(sys.argv[2]), "--resume" in sys.argv)
 """
@@ -311,7 +311,7 @@ def test_killed_at_many_random_moments(tmp_path, seed):
 def partly_done(out, spec=None):
     """A sweep that stopped after two chunks, as Ctrl-C leaves it."""
     spec = spec or small_spec()
-    from studies.sweeps import run as module
+    from studies.engine import sweep as module
 
     original, count = module.SweepFolder.write_chunk, [0]
 

@@ -4,19 +4,19 @@ import jax
 import numpy as np
 import pytest
 
-from studies.cases import as_arrays, build_cases, build_structure
-from studies.kernels.cpu import build_kernel
-from studies.kernels.graph import Graph, objects
-from studies.kernels.tangents import push_forward
-from studies.kernels.traced import Leaf, trace_loop
-from studies.spec import paper_study
-from studies.sweeps.gradients import (
+from studies.engine.gradients import (
     KernelGradients,
     ScanGradients,
     is_forward_cheaper,
     reverse_gradients,
 )
-from studies.sweeps.plan import Layout
+from studies.engine.plan import Layout
+from studies.kernels.cpu import build_kernel
+from studies.kernels.graph import Graph, objects
+from studies.kernels.tangents import push_forward
+from studies.kernels.traced import Leaf, trace_loop
+from studies.study.cases import as_arrays, build_cases, build_structure
+from studies.study.spec import paper_study
 from tests.test_kernel import every_operation, translated
 
 LAYOUT = Layout(devices=1, blocks=1, lanes=16)

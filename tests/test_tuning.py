@@ -8,10 +8,10 @@ import pytest
 
 from jaxmodel.sampled_loop import summed_squares
 from jaxmodel.shaper import Impulses, residual_vibration, zv
+from studies.engine.runs import run_study
 from studies.errors import StudyError
-from studies.runs import run_study
-from studies.spec import paper_study
-from studies.sweeps.axes import Range
+from studies.space.axes import Range
+from studies.study.spec import paper_study
 from studies.tuning import linear_fidelity
 from studies.tuning.check import tuned_study
 from studies.tuning.evaluate import Evaluation

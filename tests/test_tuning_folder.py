@@ -10,15 +10,15 @@ from rich.console import Console
 from scipy.stats import spearmanr
 
 from studies import cli
-from studies import spec as spec_module
+from studies.engine.results import load
+from studies.engine.runs import run_study
+from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
-from studies.runs import run_study
-from studies.spec import load_study, paper_study, read_toml
+from studies.space.spec import parse_sweep
 from studies.store import read_store
-from studies.sweeps.results import load
-from studies.sweeps.run import run_sweep
+from studies.study import spec as spec_module
+from studies.study.spec import load_study, paper_study, read_toml
 from studies.sweeps.show import best_cases
-from studies.sweeps.spec import parse_sweep
 from studies.tuning import audit as audit_module
 from studies.tuning.audit import Disagreement
 from studies.tuning.check import Judged, OwnRun
@@ -220,7 +220,7 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
 @pytest.mark.long
 def test_placement_by_gradient_is_as_good_as_the_sweep(tmp_path):
     """The ready sweep of 4,096 placements and gains, and `tune_placement`, as they are run."""
-    specs = Path(spec_module.__file__).parent / "specs"
+    specs = Path(spec_module.__file__).parents[1] / "specs"
     spec = load_tuning(specs / "tune_placement.toml")
     asked = read_toml(specs / "placement.toml")
     for section in ("run", "link", "motion", "shaper", "drive", "metrics"):

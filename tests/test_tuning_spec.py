@@ -6,11 +6,11 @@ import jax
 import numpy as np
 import pytest
 
-from studies import spec as spec_module
-from studies.cases import as_arrays, build_case
 from studies.errors import StudyError
-from studies.paths import set_value
-from studies.spec import parse_study
+from studies.study import spec as spec_module
+from studies.study.cases import as_arrays, build_case
+from studies.study.paths import set_value
+from studies.study.spec import parse_study
 from studies.tuning.merit import tail_weights
 from studies.tuning.scenarios import lane_columns, scenario_columns
 from studies.tuning.spec import load_tuning, parse_tuning
@@ -120,7 +120,7 @@ def deep(n):
         ({"free": {"placement": {"from": 0, "to": 1}}}, "allowed {kind = 'same'}"),
         ({"free": GAIN, "objective": {"residual": 1.0}}, "did you mean 'residual_rms'"),
         ({"free": GAIN, "objective": {"residual_rms": -1.0}}, "allowed a number > 0"),
-        ({"free": GAIN, "objective": {"gain_margin": 1.0}}, "'gain_margin' is no metric"),
+        ({"free": GAIN, "objective": {"gain_margin": 1.0}}, "'gain_margin': unknown metric"),
         ({"free": GAIN, "limits": {"peak_volt": 1.0}}, "did you mean 'peak_voltage'"),
         ({"free": GAIN, "objective": {"residual_rms[3]": 1.0}},
          r"has no such entry; allowed residual_rms\[0 to 2\]\[0 to 2\]"),
@@ -162,7 +162,7 @@ def deep(n):
         ({"free": GAIN, "objective": {"residual_rms[link=4]": 1.0}},
          r"allowed \[link=1 to 3\], \[station=1 to 3\]"),
         ({"free": {"pole.decay": {"from": 5.0, "to": 50.0}}}, "did you mean 'poles.decay'"),
-        ({"free": GAIN, "objective": {"qqq": 1.0}}, "is no metric; allowed residual_rms, "),
+        ({"free": GAIN, "objective": {"qqq": 1.0}}, "unknown metric; allowed residual_rms, "),
         ({"free": GAIN, "limits": {"peak_voltage": deep(400)}}, "peak_voltage = .* or 'own'"),
         ({"free": GAIN, "families": {"one": {"sets": {}}}}, "allowed {free = "),
         ({"free": GAIN, "pareto": {"limit": "peak_voltage", "values": [1.0, 2.0]}},
@@ -231,5 +231,5 @@ def test_moves_may_have_unequal_paths():
 
 
 def test_ready_tunings_are_valid():
-    for path in sorted(Path(spec_module.__file__).parent.glob("specs/tune*.toml")):
+    for path in sorted(Path(spec_module.__file__).parents[1].glob("specs/tune*.toml")):
         assert len(load_tuning(path).free.names) > 1

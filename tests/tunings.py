@@ -1,6 +1,6 @@
 """A tuning of a small machine that the tests of tunings share."""
 
-from studies.spec import paper_study
+from studies.study.spec import paper_study
 from studies.tuning.spec import parse_tuning
 
 HOME = list(paper_study().motion.waypoints[0])

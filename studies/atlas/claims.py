@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from studies.atlas.subsets import Subsets, link_label
-from studies.report import TABLE_1
+from studies.study.printed import TABLE_1
 
 #: Columns of Table 1 after the uncontrolled one: links 1 to 3, links 1 and 2, link 1.
 TABLE_1_LINKS = (0b111, 0b011, 0b001)

@@ -31,9 +31,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         """Every subset of controlled links and modes; modes over the workspace; platform error."""
         start()
         from studies.atlas.run import run_atlas
-        from studies.design import load_design
+        from studies.engine.design import load_design
         from studies.errors import StudyError
-        from studies.spec import paper_study
+        from studies.study.spec import paper_study
 
         if design is not None:
             study = load_design(design, case).study

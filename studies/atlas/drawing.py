@@ -18,11 +18,11 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.dynamics import modal_chain
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
-from studies.consistency import each_link
-from studies.figures import SERIES, axes_or_new, styled
-from studies.runs import check_run
-from studies.sketch import guides
-from studies.spec import Study
+from studies.engine.runs import check_run
+from studies.show.figures import SERIES, axes_or_new, styled
+from studies.show.sketch import guides
+from studies.study.consistency import each_link
+from studies.study.spec import Study
 
 #: Points along a link.
 _POINTS = 41

@@ -15,8 +15,8 @@ from studies.atlas.drawing import Clip, animate, draw_mode, mode_skeleton, skele
 from studies.atlas.findings import Findings
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.subsets import TARGETS, link_label, player_labels, setting_label
-from studies.consistency import each_link
-from studies.figures import SERIES, comparison, legend_above, new_figure
+from studies.show.figures import SERIES, comparison, legend_above, new_figure
+from studies.study.consistency import each_link
 
 #: Place of the late window.
 LATE = -1
@@ -231,7 +231,7 @@ def _platform(found: Findings) -> Figure:
 
 
 def _vibration_after(found: Findings) -> Figure:
-    """Vibration error once the command has ended, for the paper's choices of links."""
+    """Vibration error after the command, for the paper's choices of links."""
     runs = found.platform
     figure, axes = new_figure(3, len(RUNS), 1.9)
     for column, setting in enumerate(RUNS):

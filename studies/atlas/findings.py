@@ -9,10 +9,10 @@ import numpy as np
 from studies.atlas.platform import PlatformError, Responses, platform_error, responses
 from studies.atlas.subsets import Subsets, setting_label
 from studies.atlas.workspace import Map, PoseModes, map_workspace, natural_modes_at
-from studies.batches import Tell
-from studies.paper_cases import frame_of
-from studies.runs import check_run
-from studies.spec import Study
+from studies.engine.batches import Tell
+from studies.engine.frame import frame_of
+from studies.engine.runs import check_run
+from studies.study.spec import Study
 
 #: The pose near the border is at least this far from a singularity [rad].
 NEAR = np.radians(5.0)

@@ -19,11 +19,11 @@ from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
 from studies.atlas.subsets import WINDOWS, link_label, long_enough, residual_window
-from studies.batches import run_batches
-from studies.cases import powered
-from studies.consistency import each_link
-from studies.runs import check_run, resolved_study, with_ratio
-from studies.spec import Study
+from studies.engine.batches import run_batches
+from studies.engine.runs import check_run, resolved_study, with_ratio
+from studies.study.cases import powered
+from studies.study.consistency import each_link
+from studies.study.spec import Study
 
 #: Controlled links of the paper's cases.
 LINK_SETS = ((False, False, False), (True, False, False), (True, True, False), (True, True, True))

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import TwoSlopeNorm
 
 from studies.atlas.subsets import link_label
-from studies.figures import CONTROLLED, SERIES, WITHOUT, axes_or_new
+from studies.show.figures import CONTROLLED, SERIES, WITHOUT, axes_or_new
 
 #: Changes: blue is less vibration, orange is more.
 CHANGES = "PuOr_r"

@@ -28,17 +28,17 @@ from studies.atlas.subsets import (
     setting_label,
 )
 from studies.atlas.workspace import PAIRS
-from studies.batches import Tell
+from studies.engine.batches import Tell
+from studies.engine.folder import locked_folder, refuse_others
+from studies.engine.results import load
+from studies.engine.runs import run_attributes
+from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
-from studies.figures import save, styled, write_figure
-from studies.pages import write_report
-from studies.runs import run_attributes
-from studies.sketch import sketch
-from studies.spec import Study
+from studies.show.figures import save, styled, write_figure
+from studies.show.pages import write_report
+from studies.show.sketch import sketch
 from studies.store import Variable, staged, write_store
-from studies.sweeps.folder import locked_folder, refuse_others
-from studies.sweeps.results import load
-from studies.sweeps.run import run_sweep
+from studies.study.spec import Study
 
 DATA, RUNS_FOLDER = "atlas.h5", "runs"
 #: What an end at a bad moment may leave behind.

@@ -10,14 +10,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from studies.cases import as_arrays, build_case, build_structure
+from jaxmodel.laws import LAWS
+from studies.engine.columns import NOT_RUN
+from studies.engine.frame import EARLY_PART
+from studies.engine.results import SweepData
+from studies.engine.runs import preflight, resolved_study
 from studies.errors import field_error
-from studies.paper_measures import EARLY_PART
-from studies.runs import preflight, resolved_study
-from studies.spec import Study
-from studies.sweeps.columns import NOT_RUN
-from studies.sweeps.results import SweepData
-from studies.sweeps.spec import SweepSpec, parse_sweep
+from studies.space.spec import SweepSpec, parse_sweep
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.spec import Study
 
 #: Time of a move [s] and input shaper: the paper's move, and faster ones, which leave more.
 SETTINGS = tuple((time, shaper) for time in (0.1, 0.05, 0.03) for shaper in ("ei", "none"))
@@ -175,11 +176,14 @@ def _check(study: Study) -> None:
     if control.gain_factor == 0 or not any(gains):
         name = "control.gain_factor" if control.gain_factor == 0 else "control.velocity_gain"
         raise field_error(name, 0.0, "gains that do something, whose effect can be shared out")
-    for name, value, allowed in (
-        ("control.feedback", control.feedback, "sampled"), ("control.law", control.law, "imsc"),
-    ):  # fmt: skip
-        if value != allowed:
-            raise field_error(name, value, f"{allowed!r}, whose links and modes can be chosen")
+    modal = [name for name, law in LAWS.items() if law.channel == "mode"]
+    for name, value, choices in (
+        ("control.feedback", control.feedback, ["sampled"]),
+        ("control.law", control.law, modal),
+    ):
+        if value not in choices:
+            names = " or ".join(map(repr, choices))
+            raise field_error(name, value, f"{names}, whose links and modes can be chosen")
 
 
 def _masks(modes: int) -> np.ndarray:

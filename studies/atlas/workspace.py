@@ -21,8 +21,8 @@ from jaxmodel.kinematics import close_chain, lift, link_angle, path_status
 from jaxmodel.linear import linearise, mechanical, resting
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
-from studies.runs import check_pose, check_run
-from studies.spec import Study
+from studies.engine.runs import check_pose, check_run
+from studies.study.spec import Study
 
 #: Modes per link in these matrices; assembled frequencies converge with the first one.
 MAP_MODES = 3

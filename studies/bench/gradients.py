@@ -11,7 +11,7 @@ from jaxmodel.case import Case
 from jaxmodel.parameters import Array
 from studies import config
 from studies.bench.works import build_work, check_executor, describe, make_layout, timed
-from studies.sweeps.gradients import Gradients, KernelGradients, ScanGradients, make_gradients
+from studies.engine.gradients import Gradients, KernelGradients, ScanGradients, make_gradients
 
 GRADIENTS: dict[str, Callable[..., Gradients]] = {"kernel": KernelGradients, "scan": ScanGradients}
 

@@ -30,12 +30,12 @@ from jaxmodel.simulate import Start, begin
 from studies import config
 from studies.bench import reference
 from studies.bench.works import build_work, make_layout, timed
-from studies.cases import as_arrays
+from studies.engine.kernel_executor import KernelExecutor
+from studies.engine.plan import Layout
+from studies.engine.scan import ScanExecutor
 from studies.kernels.llvm import is_available
-from studies.spec import paper_study
-from studies.sweeps.kernels import KernelExecutor
-from studies.sweeps.plan import Layout
-from studies.sweeps.scan import ScanExecutor
+from studies.study.cases import as_arrays
+from studies.study.spec import paper_study
 
 #: Sample period of W0, and step of the peers with a constant one [s].
 PERIOD = 1e-4

@@ -16,19 +16,19 @@ from rich.console import Console
 from jaxmodel.case import Case, Structure
 from jaxmodel.simulate import Result
 from studies import config
-from studies.cases import build_cases, build_structure, in_working_precision
-from studies.compilation import compiler_time
+from studies.engine.executor import make_executor
+from studies.engine.kernel_executor import GpuExecutor, KernelExecutor
+from studies.engine.plan import Layout, even_layout, most_lanes, peak_memory
+from studies.engine.program import Executor
+from studies.engine.results import load
+from studies.engine.scan import ScanExecutor
+from studies.engine.sweep import run_sweep
 from studies.errors import StudyError, field_error
+from studies.kernels.compilation import compiler_time
 from studies.kernels.llvm import is_available
-from studies.spec import paper_study
-from studies.sweeps.executor import make_executor
-from studies.sweeps.kernels import GpuExecutor, KernelExecutor
-from studies.sweeps.plan import Layout, even_layout, most_lanes, peak_memory
-from studies.sweeps.program import Executor
-from studies.sweeps.results import load
-from studies.sweeps.run import run_sweep
-from studies.sweeps.scan import ScanExecutor
-from studies.sweeps.spec import parse_sweep
+from studies.space.spec import parse_sweep
+from studies.study.cases import build_cases, build_structure, in_working_precision
+from studies.study.spec import paper_study
 
 #: A sweep of very short runs: ten samples of a released link, so that the engine itself is timed.
 SHORT_RUNS: dict[str, Any] = {

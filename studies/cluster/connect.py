@@ -22,19 +22,23 @@ from studies.errors import StudyError, field_error
 if TYPE_CHECKING:
     from distributed import Client
 
-    from studies.sweeps.chunks import Runner
-    from studies.sweeps.spec import SweepSpec
-    from studies.tuning.evaluate import Evaluator
-    from studies.tuning.spec import TuneSpec
+    from studies.engine.chunks import Runner
+    from studies.space.spec import SweepSpec
+
 
 #: Options of the commands that can use workers.
 Scheduler = Annotated[
     str | None, typer.Option(help="work on a Dask cluster: tcp://HOST:PORT or its JSON file")
 ]
+
+
 LocalWorkers = Annotated[int | None, typer.Option(help="work on so many processes of this machine")]
+
+
 WorkerTimeout = Annotated[
     float, typer.Option(help="a worker that is busy for longer without an answer is restarted [s]")
 ]
+
 
 #: A scheduler answers, and its first worker comes, within these times [s].
 PATIENCE, WORKER_PATIENCE = 15, 300
@@ -75,24 +79,6 @@ def runner_for(
         from studies.cluster.runner import ClusterRunner
 
         yield ClusterRunner(client, spec, workers.timeout)
-
-
-@contextmanager
-def evaluator_for(
-    spec: TuneSpec, workers: Workers, tell: Callable[[str], None]
-) -> Iterator[Evaluator | None]:
-    """What evaluates the designs of a tuning on workers, None for this process.
-
-    Raises:
-        StudyError: as `connected`.
-    """
-    if not workers.are_named:
-        yield None
-        return
-    with connected(workers, tell) as client:
-        from studies.cluster.designs import ClusterEvaluator
-
-        yield ClusterEvaluator(client, spec, workers.timeout, tell)
 
 
 @contextmanager

@@ -18,12 +18,12 @@ from studies import config
 from studies.cluster.connect import wait_for_workers
 from studies.cluster.watch import Watch
 from studies.cluster.worker import Answer, Job, chunk_size, identity, run_chunk
+from studies.engine.chunks import Done, Lost, has_own_ratio
+from studies.engine.plan import Chunk, Group, Layout
+from studies.engine.progress import Reporter
 from studies.errors import StudyError
-from studies.sweeps.chunks import Done, Lost, has_own_ratio
-from studies.sweeps.plan import Chunk, Group, Layout
-from studies.sweeps.progress import Reporter
-from studies.sweeps.spec import SweepSpec
-from studies.sweeps.table import Table
+from studies.space.spec import SweepSpec
+from studies.space.table import Table
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -44,7 +44,7 @@ class Flight(NamedTuple):
 
 
 class ClusterRunner:
-    """Runs the chunks of one sweep on a cluster; a `studies.sweeps.chunks.Runner`."""
+    """Runs the chunks of one sweep on a cluster; a `studies.engine.chunks.Runner`."""
 
     def __init__(self, client: Client, spec: SweepSpec, timeout: float) -> None:
         """

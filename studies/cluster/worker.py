@@ -18,14 +18,14 @@ from distributed import Worker, get_worker
 
 from jaxmodel.case import Structure
 from studies import config, sources
+from studies.engine.chunks import Judged, start_chunk
+from studies.engine.executor import make_executor
+from studies.engine.plan import chunk_cases, even_layout, local_layout
+from studies.engine.program import Executor
 from studies.errors import StudyError
 from studies.extensions import extend_as_told
-from studies.sweeps.chunks import Judged, start_chunk
-from studies.sweeps.executor import make_executor
-from studies.sweeps.plan import chunk_cases, even_layout, local_layout
-from studies.sweeps.program import Executor
-from studies.sweeps.spec import parse_sweep
-from studies.sweeps.table import Table, build_table
+from studies.space.spec import parse_sweep
+from studies.space.table import Table, build_table
 
 #: One chunk at a time: it takes all that the worker has.
 alone = RLock()
@@ -57,7 +57,7 @@ def identity() -> dict[str, str]:
     """What must be the same on client and workers."""
     extend_as_told()
     return {
-        "code": sources.digest("studies.cluster.worker", "studies.cluster.designs"),
+        "code": sources.digest("studies.cluster.worker", "studies.tuning.workers"),
         "python": ".".join(platform.python_version_tuple()[:2]),
         **{name: version(name) for name in ("jax", "jaxlib", "numpy")},
     }

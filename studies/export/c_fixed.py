@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from studies.engine.controller import FixedController
 from studies.export.c_text import (
     GAINS,
     Parts,
@@ -19,7 +20,6 @@ from studies.export.c_text import (
     starred,
     structure_tables,
 )
-from studies.export.controller import FixedController
 from studies.export.fixed import WORD, FixedPoint, Format, Row, shaper_row
 
 _FEEDTHROUGH = """\

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from studies.engine.controller import FixedController
 from studies.export.c_text import (
     GAINS,
     Parts,
@@ -18,7 +19,6 @@ from studies.export.c_text import (
     shaper_tables,
     structure_tables,
 )
-from studies.export.controller import FixedController
 
 _FEEDTHROUGH = """\
     for (k = 0; k < @_N_CHANNELS; k++) {

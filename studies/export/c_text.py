@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from studies.export.channels import Channels
-from studies.export.controller import FixedController
+from studies.engine.channels import Channels
+from studies.engine.controller import FixedController
 from studies.export.fixed import rail_samples
 
 _TEMPLATES = Path(__file__).parent / "templates"

@@ -38,7 +38,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     ) -> None:
         """Write the controller of a design for a real-time target, with proof."""
         start()
-        from studies.design import load_design
+        from studies.engine.design import load_design
         from studies.export.run import export_design
 
         found = load_design(design, case)
@@ -54,7 +54,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         start()
         from studies.export.document import import_study
         from studies.store import check_target, replacing
-        from studies.template import study_template
+        from studies.study.template import study_template
 
         check_target(out)
         if out.exists():

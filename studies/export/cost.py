@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from studies.export.controller import FixedController
+from studies.engine.controller import FixedController
 from studies.export.fixed import FixedPoint
 
 

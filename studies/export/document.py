@@ -15,10 +15,10 @@ from jaxmodel.estimator import Estimator
 from jaxmodel.laws import LAWS
 from jaxmodel.shaper import Taps
 from studies import config
-from studies.choices import OneOf
+from studies.engine.controller import FixedController, fixed_controller
 from studies.errors import StudyError, shown
-from studies.export.controller import FixedController, fixed_controller
-from studies.spec import Study, parse_study
+from studies.study.choices import OneOf
+from studies.study.spec import Study, parse_study
 
 FORMAT = "flexlink-controller"
 #: Numbers worked out again on another machine may differ by so much of themselves, and by so much

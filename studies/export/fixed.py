@@ -16,9 +16,9 @@ from scipy.signal import lfilter
 
 from jaxmodel.controller import Controller
 from jaxmodel.shaper import Taps
+from studies.engine.channels import Channels
+from studies.engine.controller import FixedController
 from studies.errors import StudyError, field_error
-from studies.export.channels import Channels
-from studies.export.controller import FixedController
 from studies.export.floating import Signals, respond_from
 
 #: Bits of a word, sign included.

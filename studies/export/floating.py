@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.controller import Controller, read_back
-from studies.export.channels import Channels
+from studies.engine.channels import Channels
 
 
 class Signals(NamedTuple):

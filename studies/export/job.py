@@ -10,15 +10,15 @@ import numpy as np
 from rich.console import Console
 
 from jaxmodel import status
+from studies.engine.channels import Channels, unfold
+from studies.engine.controller import FixedController
+from studies.engine.stability import LoopReport, loop_report
 from studies.errors import StudyError, field_error
-from studies.export.channels import Channels, unfold
-from studies.export.controller import FixedController
 from studies.export.cost import Cost
 from studies.export.fixed import FixedPoint, rail_samples
 from studies.export.in_the_loop import LoopRun
 from studies.export.verify import Verification, reference_run
-from studies.labels import describe
-from studies.stability import LoopReport, loop_report
+from studies.study.labels import describe
 
 
 class Job(NamedTuple):

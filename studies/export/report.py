@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from studies.engine.controller import FixedController
+from studies.engine.stability import LoopReport
 from studies.export.c_fixed import format_lines
-from studies.export.controller import FixedController
 from studies.export.cost import Cost
 from studies.export.fixed import MARGIN, FixedPoint
 from studies.export.verify import AIM, Verification
-from studies.margin import caution, margin_text
-from studies.pages import literal, opening
-from studies.stability import LoopReport
+from studies.show.pages import literal, opening
+from studies.study.margin import caution, margin_text
 
 
 def report(

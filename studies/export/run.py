@@ -10,10 +10,10 @@ from rich.console import Console
 
 from jaxmodel.laws import LAWS
 from studies import config
-from studies.design import Design
+from studies.engine.controller import FixedController, fixed_controller
+from studies.engine.design import Design
 from studies.errors import StudyError, field_error, nearest
 from studies.export.compiler import NO_COMPILER, find_compiler
-from studies.export.controller import FixedController, fixed_controller
 from studies.export.document import study_hash
 from studies.export.job import Job
 from studies.export.report import report
@@ -21,7 +21,7 @@ from studies.export.targets import TARGETS
 from studies.export.verify import (
     Verification,
 )
-from studies.pages import report_files
+from studies.show.pages import report_files
 from studies.store import check_folder, replacing
 
 REPORT, FAILED = "verification", "verification-failed"

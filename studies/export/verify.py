@@ -12,10 +12,10 @@ import numpy as np
 from jaxmodel.laws import LAWS, n_channels
 from jaxmodel.motion import sample_path, shape_path
 from jaxmodel.shaper import Taps
+from studies.engine.channels import fold
+from studies.engine.controller import FixedController
 from studies.export.c_text import Source
-from studies.export.channels import fold
 from studies.export.compiler import Code, compiled
-from studies.export.controller import FixedController
 from studies.export.document import Document, controller_of
 from studies.export.fixed import FixedPoint, rail_samples, shaper_row
 from studies.export.floating import respond as respond_floating
@@ -23,7 +23,7 @@ from studies.export.in_the_loop import LoopRun, jax_law, replay, run_in_the_loop
 from studies.export.integers import Response, shifted
 from studies.export.integers import respond as respond_fixed
 from studies.export.sequences import hard_sequences, stuck_at_end
-from studies.labels import describe
+from studies.study.labels import describe
 
 #: Double precision against JAX, largest difference over largest value [1].
 DOUBLE = 1e-12

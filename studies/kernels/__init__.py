@@ -3,5 +3,5 @@
 - `traced`: one sample of the step, as operations on single numbers and the arrays they come from;
   it builds on `graph` (from JAX's equations), `fusion` (fewer, better ordered) and `tangents`.
 - `cpu`: that loop for this processor's vectors, written by `llvm`; needs the extra `fast`.
-- `gpu`: the same loop for graphics processors, by JAX's Pallas.
+- `gpu`: the same loop for graphics processors, as PTX.
 """

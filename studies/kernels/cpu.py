@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from studies import sources
-from studies.compilation import ObjectCache, compiling
+from studies.kernels.compilation import ObjectCache, compiling
 from studies.kernels.graph import is_known
 from studies.kernels.llvm import Frame, Writer, binding, ir
 from studies.kernels.traced import Change, TracedLoop

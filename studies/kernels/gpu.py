@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from studies.compilation import compiling
+from studies.kernels.compilation import compiling
 from studies.kernels.llvm import Frame, Writer, binding, ir
 from studies.kernels.traced import TracedLoop
 

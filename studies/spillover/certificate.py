@@ -10,10 +10,8 @@ from threadpoolctl import threadpool_limits
 from jaxmodel.beam import BASES
 from jaxmodel.controller import linear_parts
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
-from studies.consistency import each_link
+from studies.engine.controller import FixedController, fixed_controller
 from studies.errors import StudyError, field_error
-from studies.export.controller import FixedController, fixed_controller
-from studies.spec import Study
 from studies.spillover.judgement import Judgement, judge, worst_of
 from studies.spillover.plants import (
     DEPARTURES,
@@ -24,6 +22,8 @@ from studies.spillover.plants import (
     plant_sizes,
     widened,
 )
+from studies.study.consistency import each_link
+from studies.study.spec import Study
 
 
 class Certificate(NamedTuple):

@@ -30,7 +30,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     ) -> None:
         """Certify a controller on plants that are not as it believes."""
         start()
-        from studies.design import load_design
+        from studies.engine.design import load_design
         from studies.spillover.run import spillover_design
 
         if not spillover_design(load_design(design, case), out, margin, console):

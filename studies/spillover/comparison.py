@@ -11,15 +11,16 @@ from threadpoolctl import threadpool_limits
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, linear_parts
+from jaxmodel.laws import SRF
 from jaxmodel.simulate import Result, simulate
-from studies.export.controller import FixedController, fixed_controller
-from studies.margin import HIGHEST, LOWEST
-from studies.runs import check_run
-from studies.spec import Study
+from studies.engine.controller import FixedController, fixed_controller
+from studies.engine.runs import check_run
+from studies.engine.stability import gain_margin
 from studies.spillover.judgement import STEPS, breaking_motion, damping, follow
 from studies.spillover.laws import Candidate, all_laws
 from studies.spillover.plants import LoopMaker, Plant, plant_sizes
-from studies.stability import gain_margin
+from studies.study.margin import HIGHEST, LOWEST
+from studies.study.spec import Study
 
 #: The fast move has the acceleration of a move as long as the first in the time of the second.
 FAST = (0.01, 0.03)  # [m], [s]
@@ -172,7 +173,7 @@ def _run(found: FixedController, laws: list[Controller]) -> tuple[Study, Result]
     structure, case = check_run(study)
     # a channel for each patch, whatever the law
     structure = structure._replace(
-        law="srf", n_frequencies=1, metrics=("residual_rms", "peak_voltage", "control_energy")
+        law=SRF.name, n_frequencies=1, metrics=("residual_rms", "peak_voltage", "control_energy")
     )
     stacked = jax.tree.map(lambda *x: np.stack(x), *laws)
     return study, jax.tree.map(np.asarray, _simulate(structure, case, stacked))

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from studies.margin import HIGHEST, LOWEST
+from studies.engine.stability import follow_poles, gain_margin
 from studies.spillover.plants import SampledLoop
-from studies.stability import follow_poles, gain_margin
+from studies.study.margin import HIGHEST, LOWEST
 
 #: Gain factors at which modes are followed from no control to the design's gains.
 STEPS = np.linspace(0, 1, 17)[1:]

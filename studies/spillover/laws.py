@@ -19,10 +19,10 @@ from jaxmodel.laws import IMSC, LAWS
 from jaxmodel.laws.contract import Law, as_modal
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import design_controller
-from studies.cases import law_parameters
+from studies.engine.controller import FixedController
 from studies.errors import field_error
-from studies.export.controller import FixedController
 from studies.spillover.plants import LoopMaker, Plant, widened
+from studies.study.cases import law_parameters
 
 #: Damping of mode 1 below this share of that of other modes is rounding [1].
 ROUNDING = 1e-9

@@ -16,14 +16,15 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
+from jaxmodel.laws import SRF
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import placement_faults
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
+from studies.engine.controller import FixedController
+from studies.engine.stability import link_poles
 from studies.errors import field_error
-from studies.export.controller import FixedController
-from studies.margin import MARGIN_MODES
-from studies.stability import link_poles
+from studies.study.margin import MARGIN_MODES
 
 #: Plant modes per link at most.
 LARGEST = MARGIN_MODES
@@ -158,7 +159,7 @@ class LoopMaker:
         structure = Structure(
             n_modes=LARGEST, n_controlled=known.n_controlled, n_patches=known.n_patches,
             n_steps=1, n_frequencies=1, basis=plant.basis, has_shortening=known.has_shortening,
-            law="srf",
+            law=SRF.name,  # a channel for each patch, see `widened`
             has_feedforward=known.has_feedforward, has_friction=known.has_friction,
             has_position_gain=False, is_coupled=known.is_coupled, has_wrench=known.has_wrench,
             has_sensor_highpass=known.has_sensor_highpass, has_amplifier=known.has_amplifier,

@@ -10,13 +10,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from jaxmodel import status
-from studies import figures
-from studies.labels import describe
-from studies.margin import margin_text
+from studies.show import figures
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import WITHOUT, Comparison
 from studies.spillover.judgement import LOWEST
 from studies.spillover.plants import Departure
+from studies.study.labels import describe
+from studies.study.margin import margin_text
 
 #: Leakage from here on has its own colour [1].
 FLOOR = 0.01

@@ -7,14 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from jaxmodel.laws import LAWS
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
-from studies.labels import describe
-from studies.margin import margin_text
-from studies.pages import literal, opening, picture, table
-from studies.sketch import CAPTION
+from studies.show.pages import literal, opening, picture, table
+from studies.show.sketch import CAPTION
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import FAST, GIVEN, SETTLING, WINDOW, WITHOUT, Comparison
 from studies.spillover.plants import Plant
+from studies.study.labels import describe
+from studies.study.margin import margin_text
 
 #: Leakage below this is rounding [1].
 TINY = 1e-9
@@ -159,11 +160,10 @@ def _free(found: Certificate) -> str:
 
 
 def _leakage(found: Certificate) -> list[str]:
-    if found.study.control.law != "imsc":
-        return [
-            "## Leakage", "",
-            "Strain rate feedback has no modal filter: each patch feeds back all modes.",
-        ]  # fmt: skip
+    law = LAWS[found.study.control.law]
+    if law.channel != "mode":
+        told = f"{law.text.capitalize()} has no modal filter: each patch feeds back all modes."
+        return ["## Leakage", "", told]
     first = found.n_controlled
     size = np.abs(found.observation)
     rows = []

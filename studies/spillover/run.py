@@ -10,19 +10,20 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from studies import figures
-from studies.design import Design
+from jaxmodel.laws import LAWS
+from studies.engine.design import Design
+from studies.engine.runs import resolved_study, run_attributes
 from studies.errors import StudyError
-from studies.labels import STATUS_LABEL
-from studies.pages import write_report
-from studies.runs import resolved_study, run_attributes
-from studies.sketch import sketch
-from studies.spec import Study
+from studies.show import figures
+from studies.show.pages import write_report
+from studies.show.sketch import sketch
 from studies.spillover import plots
 from studies.spillover.certificate import Certificate, certify
 from studies.spillover.comparison import Comparison, compare_laws
 from studies.spillover.report import document, report, verdict
 from studies.store import Variable, check_folder, staged, write_store
+from studies.study.labels import STATUS_LABEL
+from studies.study.spec import Study
 
 DOCUMENT, DATA = "certificate.json", "spillover.h5"
 
@@ -100,7 +101,7 @@ def _draw(folder: Path, found: Certificate, laws: Comparison | None) -> None:
             figure, axes = figures.new_figure(1, 1, 2.65)
             plot(data, axes[0, 0])
             figures.save(figure, folder, name)
-        if found.study.control.law == "imsc":
+        if LAWS[found.study.control.law].channel == "mode":
             figures.save(plots.leakage(found), folder, "leakage")
         figures.write_figure(sketch(found.study), folder / "machine.png")
 

@@ -1,8 +1,6 @@
-"""Thousands of cases from one file.
+"""What `studies sweep` shows of a sweep's folder: tables, figures, a report.
 
-A sweep goes one way: `spec` reads the file; `axes` and `designs` spread its axes into a `table` of
-cases; `plan` groups them by program and cuts them into chunks; `program` is what comes before and
-after the steps; `executor` runs chunks, by `scan` or by `kernels` (whose `steps` are traced), and
-`gradients` differentiates them; `folder` keeps each finished chunk, whatever happens, and joins
-them; `run` drives all this; `results` reads it again for `show`, `plots` and `sensitivity`.
+`show` makes tables, `plots` figures, `sensitivity` says what matters and what failures depend
+on, `dry_run` what a sweep would take, `report` puts it together; `commands` is the command
+line. The sweep itself is run by `studies.engine`, from the cases of `studies.space`.
 """

@@ -42,9 +42,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         """Run thousands of cases from one file; finished ones survive whatever happens."""
         workers = Workers(scheduler, local_workers, worker_timeout)
         start(precision, cpu_only=workers.are_named)
+        from studies.engine.sweep import make_plan, run_sweep
+        from studies.space.spec import load_sweep, ready_spec
         from studies.sweeps.dry_run import print_plan
-        from studies.sweeps.run import make_plan, run_sweep
-        from studies.sweeps.spec import load_sweep, ready_spec
 
         asked = load_sweep(ready_spec(spec))
         if dry_run and workers.are_named:
@@ -97,7 +97,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         failed: Annotated[bool, typer.Option("--failed", help="list failed cases")] = False,
     ) -> None:
         """Overview of a sweep: statuses, best cases; or its failed cases."""
-        from studies.sweeps.results import load
+        from studies.engine.results import load
         from studies.sweeps.show import print_causes
         from studies.sweeps.show import show as show_sweep
 
@@ -113,7 +113,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         count: Annotated[int, typer.Option(min=1, help="how many")] = 10,
     ) -> None:
         """Best cases of a sweep by a metric."""
-        from studies.sweeps.results import load
+        from studies.engine.results import load
         from studies.sweeps.show import best_cases, print_cases, tell_left_out
 
         data = load(folder)
@@ -131,10 +131,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         out: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG; default: folder")] = None,
     ) -> None:
         """One figure of a sweep; its kind follows from the axes."""
-        from studies.sweeps.columns import variable_name
+        from studies.engine.columns import variable_name
+        from studies.engine.results import load
         from studies.sweeps.plots import plot as draw
         from studies.sweeps.plots import save_plot
-        from studies.sweeps.results import load
         from studies.sweeps.show import ranking, tell_left_out
 
         data = load(folder)
@@ -151,7 +151,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         by: Annotated[str, typer.Option(help="metric")] = "residual_rms",
     ) -> None:
         """Which parameters matter: from a sweep with a method made for it (morris, saltelli)."""
-        from studies.sweeps.results import load
+        from studies.engine.results import load
         from studies.sweeps.sensitivity import analyse
         from studies.sweeps.show import label
 

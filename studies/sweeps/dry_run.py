@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from rich.console import Console
 
+from studies.engine.plan import peak_memory
+from studies.engine.runs import check_run
+from studies.engine.sweep import Plan, calibrate
 from studies.errors import StudyError
-from studies.paths import field_unit, parse_entry
-from studies.runs import check_run
-from studies.sweeps.plan import peak_memory
-from studies.sweeps.run import Plan, calibrate
+from studies.space.table import Table, case_study
+from studies.study.paths import field_unit, parse_entry
 from studies.sweeps.show import Rows, print_rows, short_value
-from studies.sweeps.table import Table, case_study
 
 
 def print_plan(plan: Plan, console: Console) -> None:

@@ -14,15 +14,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxmodel import status
-from studies import figures
-from studies.consistency import each_link
+from studies.engine.columns import variable_name
+from studies.engine.results import SweepData, metric_values, swept_names
 from studies.errors import StudyError
-from studies.margin import ENOUGH, HIGHEST
-from studies.sweeps.axes import SHOWN_AS
-from studies.sweeps.columns import variable_name
-from studies.sweeps.results import SweepData, metric_values, swept_names
+from studies.show import figures
+from studies.space.axes import SHOWN_AS
+from studies.space.spec import Node
+from studies.study.consistency import each_link
+from studies.study.margin import ENOUGH, HIGHEST
 from studies.sweeps.show import MARGIN, label, recommended, shown_metric, shown_value
-from studies.sweeps.spec import Node
 
 #: More distinct values than this are no grid.
 FEW = 60

@@ -9,17 +9,21 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxmodel import status
+from studies.engine.results import SweepData, load, metric_values, swept_names
 from studies.errors import StudyError, shown
-from studies.figures import styled
-from studies.margin import ENOUGH, margin_text
-from studies.pages import literal, opening, picture, table, write_report
-from studies.sketch import CAPTION, sketch
-from studies.spec import Study
-from studies.sweeps.axes import SHOWN_AS
+from studies.show.figures import styled
+from studies.show.pages import literal, opening, picture, table, write_report
+from studies.show.sketch import CAPTION, sketch
+from studies.show.units import count_text, readable
+from studies.space.axes import SHOWN_AS
+from studies.space.methods import METHODS
+from studies.space.spec import Node
+from studies.space.table import Table, case_study
+from studies.study.margin import ENOUGH, margin_text
+from studies.study.spec import Study
+from studies.study.template import study_template, toml_text, toml_value
 from studies.sweeps.dry_run import axis_rows
-from studies.sweeps.methods import METHODS
 from studies.sweeps.plots import front, plot, save_plot
-from studies.sweeps.results import SweepData, load, metric_values, swept_names
 from studies.sweeps.show import (
     MARGIN,
     SHARES,
@@ -38,10 +42,6 @@ from studies.sweeps.show import (
     unit_of_metric,
     written_name,
 )
-from studies.sweeps.spec import Node
-from studies.sweeps.table import Table, case_study
-from studies.template import study_template, toml_text, toml_value
-from studies.units import count_text, readable
 
 REPORT, FIGURE, FRONT, MACHINE = "report.html", "cases.png", "front.png", "machine.png"
 #: Metrics to ask as well.

@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel import status
+from studies.engine.columns import NOT_RUN
+from studies.engine.results import SweepData, metric_values, swept_names
 from studies.errors import StudyError
-from studies.sweeps.axes import build_axis
-from studies.sweeps.columns import NOT_RUN
-from studies.sweeps.designs import unit_points
-from studies.sweeps.methods import METHODS, Analysis
-from studies.sweeps.results import SweepData, metric_values, swept_names
+from studies.space.axes import build_axis
+from studies.space.designs import unit_points
+from studies.space.methods import METHODS, Analysis
 
 
 class Cause(NamedTuple):

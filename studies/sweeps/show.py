@@ -12,15 +12,15 @@ from rich.table import Table as RichTable
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
-from studies.entries import links_text
+from studies.engine.columns import NOT_RUN, variable_name
+from studies.engine.results import SweepData, counted_links, metric_values, swept_names
+from studies.engine.stored import kept_metrics
 from studies.errors import StudyError
-from studies.margin import ENOUGH, margin_text
-from studies.sweeps.columns import NOT_RUN, variable_name
-from studies.sweeps.condition import evaluate
-from studies.sweeps.results import SweepData, counted_links, metric_values, swept_names
+from studies.show.units import headed, readable
+from studies.space.condition import evaluate
+from studies.study.entries import links_text
+from studies.study.margin import ENOUGH, margin_text
 from studies.sweeps.sensitivity import failure_causes
-from studies.sweeps.stored import kept_metrics
-from studies.units import headed, readable
 
 #: Stands beside every metric of a case that has it.
 MARGIN = "gain_margin"

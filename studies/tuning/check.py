@@ -13,13 +13,13 @@ from jaxmodel import status
 from jaxmodel.case import Case, Structure
 from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import Result
-from studies.cases import as_arrays, build_case, build_cases, in_working_precision
+from studies.engine.executor import make_executor
+from studies.engine.plan import even_layout
+from studies.engine.runs import run_study
 from studies.errors import StudyError
-from studies.paths import set_values
-from studies.runs import run_study
-from studies.spec import Study, parse_study
-from studies.sweeps.executor import make_executor
-from studies.sweeps.plan import even_layout
+from studies.study.cases import as_arrays, build_case, build_cases, in_working_precision
+from studies.study.paths import set_values
+from studies.study.spec import Study, parse_study
 from studies.tuning.evaluate import first_residual, tuned_structure
 from studies.tuning.free import PLACEMENT, POLES
 from studies.tuning.linear_fidelity import LoopFigures, loop_figures

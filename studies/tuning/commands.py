@@ -15,7 +15,6 @@ from studies.cluster.connect import (
     Scheduler,
     Workers,
     WorkerTimeout,
-    evaluator_for,
 )
 from studies.config import start
 from studies.errors import StudyError
@@ -43,9 +42,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         """Move free numbers of a study downhill, within limits, for many machines at once."""
         workers = Workers(scheduler, local_workers, worker_timeout)
         start(cpu_only=workers.are_named)
-        from studies.sweeps.spec import ready_spec
+        from studies.space.spec import ready_spec
         from studies.tuning.run import REPORT, run_tuning
         from studies.tuning.spec import load_tuning
+        from studies.tuning.workers import evaluator_for
 
         asked = load_tuning(ready_spec(spec))
         if audit and (out or resume or quiet or workers.are_named):

@@ -1,6 +1,6 @@
 """Designs under all scenarios: objective, limits, and their derivatives by the free numbers.
 
-Runs are differentiated forward (`studies.sweeps.gradients`), all scenarios of all designs in one
+Runs are differentiated forward (`studies.engine.gradients`), all scenarios of all designs in one
 batch, with limits and rounding made smooth (`Structure.is_smooth`). The study itself is in every
 batch: everything is measured against it.
 """
@@ -15,12 +15,12 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.case import Structure
-from studies.cases import build_cases, build_structure, in_working_precision
 from studies.config import processor
+from studies.engine.gradients import make_gradients
+from studies.engine.plan import Layout, even_layout, lane_unit
+from studies.engine.runs import check_run
 from studies.errors import StudyError
-from studies.runs import check_run
-from studies.sweeps.gradients import make_gradients
-from studies.sweeps.plan import Layout, even_layout, lane_unit
+from studies.study.cases import build_cases, build_structure, in_working_precision
 from studies.tuning.linear_fidelity import LinearFidelity
 from studies.tuning.merit import (
     Merit,

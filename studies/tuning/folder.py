@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from studies.engine.folder import TUNING, locked_folder, refuse_others
 from studies.errors import StudyError
 from studies.store import check_target, replacing
-from studies.sweeps.folder import TUNING, locked_folder, refuse_others
 from studies.tuning.optimise import Progress
 
 MANIFEST, PROGRESS, RESULTS = TUNING, "progress.npz", "tune.h5"

@@ -22,12 +22,12 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.control import pole_placement
 from jaxmodel.laws import LAWS
 from jaxmodel.parameters import Array
-from studies.cases import build_structure
-from studies.consistency import each_link, patch_centers, patch_pitch
 from studies.errors import StudyError, field_error, nearest, shown_name
-from studies.paths import checked_value, known_field, parse_entry
-from studies.spec import OWN_FIELDS, Study
-from studies.sweeps.axes import ALIASES, READY_MADE, Range, parse_range
+from studies.space.axes import ALIASES, READY_MADE, Range, parse_range
+from studies.study.cases import build_structure
+from studies.study.consistency import each_link, patch_centers, patch_pitch
+from studies.study.paths import checked_value, known_field, parse_entry
+from studies.study.spec import OWN_FIELDS, Study
 
 TWO_PI = 2 * np.pi
 

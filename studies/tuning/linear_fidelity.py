@@ -22,10 +22,10 @@ from jaxmodel.linear_residual import linear_residual
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spillover
-from studies.cases import as_arrays, build_case, build_structure
-from studies.margin import MARGIN_MODES
-from studies.spec import Study
-from studies.stability import gain_margin
+from studies.engine.stability import gain_margin
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.margin import MARGIN_MODES
+from studies.study.spec import Study
 from studies.tuning.scenarios import nominal
 from studies.tuning.spec import OWN, Family, TuneSpec
 

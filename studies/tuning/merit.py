@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxmodel.metrics import Metrics
 from jaxmodel.parameters import Array
-from studies.entries import parse_entries
+from studies.study.entries import parse_entries
 from studies.tuning.spec import OWN, Family, TuneSpec
 
 #: What a report shows of every design, whatever it is tuned for.

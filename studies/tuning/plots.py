@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from jaxmodel.metrics import METRICS
-from studies import figures
+from studies.show import figures
 from studies.tuning.optimise import KEPT, excess
 from studies.tuning.report import Findings, is_kept
 from studies.tuning.scenarios import move_label

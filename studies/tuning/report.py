@@ -9,10 +9,11 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
-from studies.entries import links_text, parse_entries
-from studies.margin import MARGIN_MODES, caution, margin_text
-from studies.pages import literal, opening, picture, table
-from studies.sketch import CAPTION
+from studies.show.pages import literal, opening, picture, table
+from studies.show.sketch import CAPTION
+from studies.show.units import count_text, headed, number, readable
+from studies.study.entries import links_text, parse_entries
+from studies.study.margin import MARGIN_MODES, caution, margin_text
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
 from studies.tuning.check import Judged, Searched, patch_centers
 from studies.tuning.free import PLACEMENT
@@ -20,7 +21,6 @@ from studies.tuning.merit import SHOWN
 from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
 from studies.tuning.scenarios import move_label
 from studies.tuning.spec import LOOP_LIMITS, OWN, Family, TuneSpec, label
-from studies.units import count_text, headed, number, readable
 
 #: Limits that hold from below.
 LOWER = ("gain_margin", "slowest_decay", "singularity_distance")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from jaxmodel.metrics import METRICS
-from studies.entries import links_text, parse_entries
-from studies.labels import STATUS_LABEL
-from studies.paths import field_unit, parse_entry
+from studies.engine.columns import variable_name
+from studies.space.table import as_numbers
 from studies.store import Variable
-from studies.sweeps.columns import variable_name
-from studies.sweeps.table import as_numbers
+from studies.study.entries import links_text, parse_entries
+from studies.study.labels import STATUS_LABEL
+from studies.study.paths import field_unit, parse_entry
 from studies.tuning.check import Judged, fresh_columns, patch_centers
 from studies.tuning.free import POLES
 from studies.tuning.report import Findings

@@ -14,14 +14,15 @@ import numpy as np
 from rich.console import Console
 
 from studies import config
+from studies.engine.folder import make_manifest
+from studies.engine.runs import run_attributes
 from studies.errors import StudyError
-from studies.figures import save, styled, write_figure
-from studies.pages import write_report
-from studies.runs import run_attributes
-from studies.sketch import sketch
+from studies.show.figures import save, styled, write_figure
+from studies.show.pages import write_report
+from studies.show.sketch import sketch
+from studies.show.units import duration_text
 from studies.store import replacing, write_store
-from studies.sweeps.folder import make_manifest
-from studies.template import study_template, toml_text
+from studies.study.template import study_template, toml_text
 from studies.tuning import plots
 from studies.tuning.audit import audit
 from studies.tuning.check import judge, search, tuned_study
@@ -39,7 +40,6 @@ from studies.tuning.report import (
 )
 from studies.tuning.results import variables
 from studies.tuning.spec import TuneSpec
-from studies.units import duration_text
 
 REPORT = "report.html"
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import qmc
 
-from studies.fields import Columns
-from studies.paths import known_field, set_value
-from studies.spec import Study, parse_study
-from studies.sweeps.axes import column_of
+from studies.space.axes import column_of
+from studies.study.fields import Columns
+from studies.study.paths import known_field, set_value
+from studies.study.spec import Study, parse_study
 from studies.tuning.spec import Family, TuneSpec
 
 

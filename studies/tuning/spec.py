@@ -23,13 +23,13 @@ from pydantic import ValidationError
 from jaxmodel.case import Structure
 from jaxmodel.laws import LAWS
 from jaxmodel.metrics import METRICS
-from studies.cases import build_structure
-from studies.entries import controlled_links, parse_entries
+from studies.engine.runs import check_run
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
-from studies.explain import explain
-from studies.paths import checked_value, is_each_link, known_field, set_value
-from studies.runs import check_run
-from studies.spec import Section, Study, described, parse_study, read_toml
+from studies.study.cases import build_structure
+from studies.study.entries import controlled_links, parse_entries
+from studies.study.explain import explain
+from studies.study.paths import checked_value, is_each_link, known_field, set_value
+from studies.study.spec import Section, Study, described, parse_study, read_toml
 from studies.tuning.free import FreeNumbers, free_numbers, writes
 
 #: Limits that no run is needed for; all but `spillover` are lower ones. Those of the loop:
@@ -234,7 +234,7 @@ def _check_metric(name: str, path: str, has_loop: bool, study: Study) -> None:
     if _field(name) not in known:
         hint = nearest(name, known)
         raise StudyError(
-            f"{path}: {name!r} is no metric; "
+            f"{path}: {name!r}: unknown metric; "
             + (f"did you mean {hint!r}?" if hint else f"allowed {', '.join(known)}")
         )
     if not has_loop and not METRICS[_field(name)].has_slope:

@@ -1,0 +1,146 @@
+"""Chunks of a sweep, run: by this process, or wherever another `Runner` takes them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Generator
+from typing import NamedTuple, Protocol
+
+import jax
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.simulate import Result
+from studies.engine.executor import make_executor, own_ratios
+from studies.engine.margins import LoopMargins, judge_loops
+from studies.engine.plan import Chunk, Group, Layout, chunk_cases, local_layout
+from studies.engine.program import Executor
+from studies.engine.progress import Reporter
+from studies.engine.runs import with_ratio
+from studies.kernels.compilation import compiler_time
+from studies.space.table import Table
+from studies.study.cases import powered
+
+
+class Done(NamedTuple):
+    """A chunk that has been run."""
+
+    chunk: Chunk
+    substeps: int  # plant steps per sample of its program
+    judged: Judged  # padded
+
+
+class Judged(NamedTuple):
+    """Runs of a chunk, and its loops judged."""
+
+    result: Result
+    margins: LoopMargins
+
+
+class Started(NamedTuple):
+    """A chunk on its way; as `Running`, with the judgement of its loops."""
+
+    wait: Callable[[], Judged]
+    cancel: Callable[[], None]
+
+
+class Lost(NamedTuple):
+    """A chunk that is given up."""
+
+    chunk: Chunk
+    reason: str
+
+
+class Runner(Protocol):
+    """Where chunks are run."""
+
+    def layout(self, n: int, structure: Structure) -> Layout:
+        """Shape of the chunks of n cases of one structure."""
+        ...
+
+    def run(
+        self, table: Table, groups: list[Group], reporter: Reporter, stop: threading.Event
+    ) -> Generator[Done | Lost]:
+        """Run all chunks; closed early, it leaves none behind.
+
+        Args:
+            table: all cases.
+            groups: those to run.
+            reporter: told of compilations.
+            stop: once it is set no more chunks are begun.
+        """
+        ...
+
+
+class Here:
+    """Runs chunks in this process, on its own devices."""
+
+    def layout(self, n: int, structure: Structure) -> Layout:
+        return local_layout(n, structure)
+
+    def run(
+        self, table: Table, groups: list[Group], reporter: Reporter, stop: threading.Event
+    ) -> Generator[Done | Lost]:
+        for group in groups:
+            has_own = has_own_ratio(table, group)
+            executor = make_executor(group.structure, group.layout, has_own)
+            pending: tuple[Chunk, Started] | None = None
+            for chunk in group.chunks():
+                is_first = executor.compile_time == 0
+                cases = chunk_cases(table, chunk.rows, group.structure, group.layout.size)
+                started = start_chunk(executor, table, chunk.rows, cases, has_own)
+                if is_first:
+                    reporter.compiled(executor.name, executor.compile_time)
+                # the device computes this chunk while the one before is written
+                if pending is not None:
+                    yield _waited(group, *pending)
+                pending = chunk, started
+                if stop.is_set():
+                    break
+            if pending is not None:
+                if stop.is_set() and reporter.n_run:  # the one before is safe, this one just begun
+                    pending[1].cancel()
+                    return
+                yield _waited(group, *pending)
+            if stop.is_set():
+                return
+
+
+def _waited(group: Group, chunk: Chunk, running: Started) -> Done:
+    return Done(chunk, group.structure.substeps, running.wait())
+
+
+def has_own_ratio(table: Table, group: Group) -> bool:
+    """Whether EMC ratios come from an uncontrolled pass for some cases of a group."""
+    return bool((table.values("control.ratio_source")[group.rows] == "own_run").any())
+
+
+def start_chunk(
+    executor: Executor, table: Table, rows: np.ndarray, cases: Case, has_own_ratio: bool
+) -> Started:
+    """Judge the loops of a chunk and start its runs.
+
+    Where gain ratios come from an uncontrolled pass, that is done first.
+
+    Args:
+        executor: of the group.
+        table: all cases.
+        rows: those of the chunk.
+        cases: from `chunk_cases`.
+        has_own_ratio: whether such a pass is needed.
+    """
+    is_first = executor.compile_time == 0
+    if has_own_ratio:
+        size = max(map(len, jax.tree.leaves(cases)))
+        filled = np.concatenate([rows, np.full(size - len(rows), rows[-1])])
+        is_own = table.values("control.ratio_source")[filled] == "own_run"
+        exponent = table.values("control.ratio_exponent")[filled][:, None, None]
+        own = powered(own_ratios(executor, cases), exponent)
+        cases = with_ratio(cases, np.where(is_own[:, None, None], own, cases.control.ratio))
+    before = compiler_time()
+    margins = judge_loops(executor.structure, cases)
+    spent = compiler_time() - before
+    running = executor.start(cases)
+    if is_first:
+        executor.compile_time += spent
+    return Started(lambda: Judged(running.wait(), margins), running.cancel)

@@ -1,0 +1,124 @@
+"""What the files of a sweep hold: names, axes, units and texts of their variables."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+
+from jaxmodel.metrics import METRICS
+from jaxmodel.prepare import SPECTRUM_SPAN
+from studies.space.table import Table, as_numbers
+from studies.store import Variable
+from studies.study.labels import DISTANCE_TEXT, STATUS_LABEL
+from studies.study.margin import HIGHEST, MARGIN_MODES
+from studies.study.paths import field_unit, field_value, parse_entry
+
+#: Status of a case that has not been run.
+NOT_RUN = -1
+
+
+#: Names of the axes of fields that are lists, outermost first.
+_LIST_AXES = {
+    "patches.centers": ("link", "patch"),
+    "control.links": ("link",),
+    # lists of their own lengths
+    "control.mode_mask": ("link", "mode_mask_entry"),
+    "control.ratios": ("link", "ratios_entry"),
+    "control.velocity_gain": ("link",),
+    "control.position_gain": ("link",),
+    "control.frequencies_hz": ("link", "frequencies_hz_entry"),
+    "link.damping_ratio": ("link", "damping_ratio_entry"),
+    "drive.pulse_force": ("slider_axis",),
+    "load.wrench": ("pose_axis",),
+    "load.pulse": ("pose_axis",),
+    "metrics.stations": ("station",),
+}
+
+
+#: What every case has, finished or not: axes after `case`, unit, long name and any flags.
+PER_CASE: dict[str, tuple] = {
+    "status": ((), *STATUS_LABEL[:2], {NOT_RUN: "not run", **STATUS_LABEL[2]}),
+    "bad_time": ((), "s", "when the status appeared, 0 if ok"),
+    "command_end": ((), "s", "end of the shaped command"),
+    "substeps": ((), "1", "plant steps per sample"),
+    "sensor_condition": (("link",), "1", "condition number of the modal filter"),
+    "actuator_condition": (("link",), "1", "condition number of the synthesizer"),
+    "singularity_distance": ((), "rad", DISTANCE_TEXT),
+    "gain_margin": (
+        (), "1", "largest factor on all gains with every smaller one stable, at the first "
+        f"way-point with {MARGIN_MODES} plant modes or more; {HIGHEST:g}: that or more",
+    ),
+    "breaking_frequency": ((), "Hz", "of what goes unstable at the gain margin, NaN: nothing"),
+    "breaking_mode": (
+        (), "1", "order of the link mode nearest to that frequency, 0: the drive, NaN: nothing"
+    ),
+    "damping_ratio": (
+        ("controlled_mode",), "1", "least of the modes of each order, of as many as links are "
+        "controlled, the most damped ones",
+    ),
+}  # fmt: skip
+
+
+#: Of these the smallest entry is the worst.
+LEAST = ("damping_ratio",)
+
+
+def forget(data: np.ndarray, axis: int, count: np.ndarray) -> None:
+    """NaN beyond the first `count` entries of an axis (after the one of cases)."""
+    shape = [1] * data.ndim
+    shape[axis + 1] = -1
+    order = np.arange(data.shape[axis + 1]).reshape(shape)
+    limit = count.reshape((-1,) + (1,) * (data.ndim - 1))
+    data[np.broadcast_to(order >= limit, data.shape)] = np.nan
+
+
+def variable_name(field: str) -> str:
+    """Name in a file: `control.velocity_gain[0]` is `control_velocity_gain_0`."""
+    return re.sub(r"\W+", "_", field).strip("_")
+
+
+def case_variables(table: Table) -> dict[str, Variable]:
+    """What tells the cases apart: number, id, seed, repeat and every column."""
+    axis = ("case",)
+    variables = {
+        "case": Variable(np.arange(len(table)), axis, "1", "number of the case"),
+        "case_id": Variable(table.case_id.astype(str), axis, "1", "hash of the case's parameters"),
+        "seed": Variable(table.seed, axis, "1", "seed of noise and ripple"),
+        "repeat": Variable(table.repeat, axis, "1", "number of the repeat"),
+    }
+    for name, column in table.columns.items():
+        array = as_numbers(column)
+        entry = parse_entry(name)
+        field = entry.field if entry else name
+        dims = _LIST_AXES.get(field, ())[-(array.ndim - 1) :] if array.ndim > 1 else ()
+        if len(dims) != array.ndim - 1:
+            dims = tuple(f"{variable_name(name)}_{k}" for k in range(1, array.ndim))
+        variables[variable_name(name)] = Variable(array, (*axis, *dims), field_unit(field), name)
+    return variables
+
+
+def axis_variables(table: Table, sizes: Mapping[str, int]) -> dict[str, Variable]:
+    """Coordinates of the metrics' axes."""
+    found = {"link": Variable(np.arange(1, 4), ("link",), "1", "link number")}
+    if "pose_axis" in sizes:
+        names = np.array(["x", "y", "phi"])
+        found["pose_axis"] = Variable(names, ("pose_axis",), "1", "pose component")
+    if "station" in sizes and "metrics.stations" not in table.columns:
+        stations = np.array(field_value(table.study, "metrics.stations"))
+        found["station"] = Variable(stations, ("station",), "m", "position along the link")
+    if "spectrum_point" in sizes:
+        ratio = np.linspace(1 - SPECTRUM_SPAN, 1 + SPECTRUM_SPAN, sizes["spectrum_point"])
+        found["spectrum_point"] = Variable(
+            ratio, ("spectrum_point",), "1", "frequency over the modal frequency"
+        )
+    return found
+
+
+def label_of(name: str) -> tuple:
+    """Axes after `case`, unit, long name and any flags of what a chunk holds."""
+    if name in PER_CASE:
+        return PER_CASE[name]
+    metric = METRICS[name]
+    return metric.dims, metric.unit, metric.text

@@ -1,0 +1,110 @@
+"""What a real-time controller needs of a study: fixed numbers, or why there are none."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxmodel.bases import find_bases
+from jaxmodel.case import Case, Structure
+from jaxmodel.controller import Controller
+from jaxmodel.laws import LAWS, is_modal
+from jaxmodel.shaper import Taps
+from studies.engine.channels import Channels, fold
+from studies.engine.runs import check_run, preflight, resolved_study
+from studies.errors import StudyError, field_error
+from studies.study.spec import Study
+
+
+class FixedController(NamedTuple):
+    """A study and the numbers of its controller, as NumPy arrays in SI units."""
+
+    study: Study  # complete: its ratios are given
+    structure: Structure
+    case: Case
+    controller: Controller
+    channels: Channels  # the same, folded
+    taps: Taps  # shaper on the sample grid, one tap per delay, delays rising
+    frequency: np.ndarray  # each channel's velocity estimate is exact there [Hz], (3, C)
+
+    @property
+    def n_patches(self) -> int:
+        return self.controller.filter.shape[2]
+
+    @property
+    def is_modal(self) -> bool:
+        """Whether channels are modes, in metres and newtons; volts otherwise."""
+        return is_modal(self.structure)
+
+
+def fixed_controller(study: Study) -> FixedController:
+    """Numbers of a study's controller.
+
+    Args:
+        study: with sampled feedback; ratios from an own run are worked out here.
+
+    Raises:
+        StudyError: nothing to export, or the study cannot run.
+    """
+    _check_exportable(study)
+    study = resolved_study(study)
+    structure, case = check_run(study)
+    known = preflight(structure, case)
+    controller, taps = known.controller, known.taps
+    if not np.any(controller.velocity_gain) and not _any(controller.position_gain):
+        raise field_error(
+            "control.gain_factor", study.control.gain_factor,
+            "gains of which at least one is not zero (control.links, control.mode_mask, "
+            "control.velocity_gain, control.ratios)", "1",
+        )  # fmt: skip
+    _check_finite(controller, taps)
+    return FixedController(
+        study, structure, case, controller, fold(controller, LAWS[study.control.law].channel),
+        _merged(taps), _frequencies(structure, case),
+    )  # fmt: skip
+
+
+def _check_exportable(study: Study) -> None:
+    control, electronics = study.control, study.electronics
+    step = electronics.adc_range / 2**electronics.adc_bits
+    if not step < electronics.conditioner_bias < electronics.adc_range - 2 * step:
+        raise field_error(
+            "electronics.conditioner_bias", electronics.conditioner_bias,
+            f"inside the ADC's range, {step:.4g} to {electronics.adc_range - 2 * step:.4g}: a "
+            "sensor at rest at an end of it is taken for a broken one", "V",
+        )  # fmt: skip
+    if control.feedback != "sampled":
+        raise field_error(
+            "control.feedback", control.feedback, "'sampled', a controller that samples"
+        )
+    if not any(control.links):
+        raise field_error("control.links", control.links, "at least one link that is controlled")
+
+
+def _any(gain: np.ndarray | None) -> bool:
+    return gain is not None and bool(np.any(gain))
+
+
+def _frequencies(structure: Structure, case: Case) -> np.ndarray:
+    """Where the velocity estimate of each channel is exact [Hz], (3, C)."""
+    hertz = np.asarray(find_bases(structure, case).believed_omega) / (2 * np.pi)
+    return hertz if is_modal(structure) else np.repeat(hertz[:, :1], structure.n_patches, axis=1)
+
+
+def _merged(taps: Taps) -> Taps:
+    """One tap for each delay, none without weight."""
+    weight, sample = (np.asarray(x) for x in taps)
+    delays = np.unique(sample[weight != 0])
+    return Taps(np.array([weight[sample == delay].sum() for delay in delays]), delays.astype(int))
+
+
+def _check_finite(controller: Controller, taps: Taps) -> None:
+    for name, value in {**controller._asdict(), **taps._asdict()}.items():
+        for leaf in jax.tree.leaves(value):
+            if not np.all(np.isfinite(leaf)):
+                raise StudyError(
+                    f"{name} of the controller is not finite; allowed: gains, filters and a shaper "
+                    "whose numbers are (see `studies simulate`)"
+                )

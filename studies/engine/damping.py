@@ -1,0 +1,94 @@
+"""Damping ratios of the controlled modes of every case, from poles followed as gains rise.
+
+`jaxmodel.pole_paths` says how; poles that do not come to rest are followed again in finer steps.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxmodel.pairs import Pair
+from jaxmodel.pole_paths import Trio, follow, settle
+from jaxmodel.return_difference import AssembledModes, LoopResponse
+from studies.engine.lanes import run_steps
+
+#: Iterations towards the poles without control.
+SETTLING = 6
+#: Shares of the gains on the way to all of them, an iteration each; the second way is for poles
+#: that did not come to rest on the first.
+WAYS = (
+    np.concatenate([np.arange(1, 17) / 16, np.ones(6)]),
+    np.concatenate([np.repeat(np.arange(1, 61) / 60, 2), np.ones(10)]),
+)
+#: A last step, as a share of the pole, that counts as none.
+AT_REST = 1e-4
+#: Poles begin this far from one another and from poles of the function [1].
+ASIDE = 1e-4
+
+
+def damping_ratios(
+    response: LoopResponse, modes: AssembledModes, n_links: np.ndarray, n_orders: int
+) -> np.ndarray:
+    """Least damping ratio of the controlled modes of each order [1], (n, n_orders).
+
+    Of the three modes of an order as many count as links are controlled, the most damped ones. NaN
+    where no link is controlled, or the poles were not found.
+
+    Args:
+        response: of the loops, lanes last.
+        modes: of the machines without control, lanes last.
+        n_links: controlled ones of each case, (n,).
+        n_orders: of modes to look at.
+    """
+    count = len(n_links)
+    found = np.full((count, n_orders), np.nan)
+    for order in range(min(n_orders, response.square.shape[1])):
+        poles = _poles(response, modes, order)
+        ratio = np.sort(-poles.real / np.abs(poles), axis=0)[::-1]  # the most damped first
+        least = ratio[np.maximum(n_links, 1) - 1, np.arange(count)]
+        found[:, order] = np.where(n_links > 0, least, np.nan)
+    return found
+
+
+def _poles(response: LoopResponse, modes: AssembledModes, order: int) -> np.ndarray:
+    """The three poles of an order [1/s], complex, NaN where they were not found, (3, n)."""
+    square, decay = response.square[:, order], response.decay[:, order] / 2
+    held = _pair(-decay + 1j * np.sqrt(square - decay**2))
+    which = np.argsort(-modes.share[order + 1], axis=0)[:3]
+    omega, loss = (np.take_along_axis(x, which, axis=0) for x in (modes.omega, modes.decay))
+    first = _trio(-loss + 1j * np.sqrt(omega**2 - loss**2), response.period)
+    own = run_steps(_settle, (response, held), (), first, SETTLING).pole
+    poles, is_found = _followed(response, own, WAYS[0])
+    again = np.flatnonzero(~is_found)
+    if len(again):
+        here, start = jax.tree.map(lambda x: x[..., again], (response, own))
+        poles[:, again], is_found[again] = _followed(here, start, WAYS[1])
+    return np.where(is_found, poles, np.nan)
+
+
+def _followed(response: LoopResponse, own: Pair, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    start = _trio(own.re + 1j * own.im, response.period)
+    last = run_steps(_follow, (response, own), 1 / way, start, len(way))
+    is_found = np.all((last.step < AT_REST) & np.isfinite(last.pole.re), axis=0)
+    return last.pole.re + 1j * last.pole.im, is_found
+
+
+def _trio(poles: np.ndarray, period: np.ndarray) -> Trio:
+    """Guesses a little apart."""
+    poles = poles + ASIDE * np.abs(poles) * np.exp(1j * np.array([0.3, 2.4, 4.4]))[:, None]
+    return Trio(_pair(poles), _pair(np.exp(-poles * period)), np.zeros(poles.shape))
+
+
+def _pair(x: np.ndarray) -> Pair:
+    return Pair(np.ascontiguousarray(x.real), np.ascontiguousarray(x.imag))
+
+
+def _settle(constants: tuple[LoopResponse, Pair], _: tuple, trio: Trio) -> Trio:
+    return settle(*constants, trio)
+
+
+def _follow(constants: tuple[LoopResponse, Pair], inverse: Any, trio: Trio) -> Trio:
+    return follow(*constants, trio, inverse)

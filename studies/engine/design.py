@@ -1,0 +1,126 @@
+"""A DESIGN: a study file, a family of a tuning or a case of a sweep; each ends in one study."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxmodel import status
+from jaxmodel.metrics import METRICS
+from studies.engine.columns import NOT_RUN
+from studies.engine.folder import MANIFEST, TUNING, read_manifest
+from studies.engine.results import SweepData, load
+from studies.engine.runs import Run, metric_variables
+from studies.errors import StudyError, field_error, nearest
+from studies.space.spec import parse_sweep, ready_spec
+from studies.space.table import build_table, case_study
+from studies.study.spec import Study, load_study
+
+
+class Design(NamedTuple):
+    """One study and, for a case of a sweep, what the sweep found."""
+
+    study: Study
+    stored: dict[str, np.ndarray]  # metrics and status of the sweep; {} where there is none
+    case_id: str = ""  # of the case in its sweep
+
+
+def load_design(path: Path, case: int | str | None = None) -> Design:
+    """Read a DESIGN.
+
+    Args:
+        path: study file, name of a ready one, folder of a tuning or of a sweep.
+        case: of a sweep the number of the case, or "id:" and the first digits of its id; of a
+            tuning the family, as in the names of its files.
+
+    Raises:
+        StudyError: not found, case missing or not allowed, or a case that does not stand alone.
+    """
+    is_folder = path.is_dir()
+    if is_folder and not any((path / name).is_file() for name in (MANIFEST, TUNING)):
+        is_folder = ready_spec(path) == path  # "paper" may be the report's folder, too
+    if not is_folder:
+        path = ready_spec(path)
+        if case is not None:
+            raise StudyError(f"--case {case}: {path} is a file; leave --case out")
+        return Design(load_study(path), {})
+    if (path / TUNING).is_file():
+        return Design(load_study(_tuned(path, case)), {})
+    data = load(path)
+    number = _number(data, None if case is None else str(case), path)
+    table = build_table(parse_sweep(read_manifest(path)["spec"]))
+    code = int(data["status"][number])
+    try:
+        study = case_study(table, number)
+    except StudyError as error:
+        raise StudyError(
+            f"--case {case}: {status.REASONS.get(code, 'not run')}; it cannot run alone ({error})"
+        ) from None
+    steps = int(data["substeps"][number]) if "substeps" in data.variables else -1
+    if steps > 0:
+        study = study.change(run__substeps=steps)
+    case_id = str(data["case_id"][number])
+    if code == NOT_RUN:
+        return Design(study, {}, case_id)
+    names = ["status", *(name for name in METRICS if name in data.variables)]
+    return Design(study, {name: data[name][number] for name in names}, case_id)
+
+
+def _tuned(path: Path, case: str | int | None) -> Path:
+    """File of the tuned study that is meant."""
+    files = {file.stem.removeprefix("tuned").lstrip("_"): file for file in path.glob("tuned*.toml")}
+    if not files:
+        raise StudyError(f"{path}: the tuning is not finished; go on with studies tune --resume")
+    if case is None and len(files) == 1:
+        return next(iter(files.values()))
+    known = f"{', '.join(sorted(filter(None, files)))}, the families of {path}"
+    if case is None:
+        raise StudyError(f"--case is missing: allowed {known}")
+    if str(case) not in files:
+        raise field_error("--case", case, known, hint=nearest(str(case), files))
+    return files[str(case)]
+
+
+def _number(data: SweepData, case: str | None, path: Path) -> int:
+    """Number of the case that is meant."""
+    known = (
+        f"allowed 0 to {data.n_cases - 1}, the cases of {path}, or id: and the first digits of a "
+        "case's id"
+    )
+    if case is None:
+        raise StudyError(f"--case is missing: {known}")
+    if case.startswith("id:"):
+        ids = data["case_id"].astype(str)
+        found = np.flatnonzero(np.char.startswith(ids, case.removeprefix("id:").lower()))
+        if len(found) != 1:
+            raise StudyError(f"--case {case}: fits {len(found)} cases of {path}; allowed: one")
+        return int(found[0])
+    is_number = case.isascii() and case.isdigit() and len(case) < 20
+    if not is_number or int(case) >= data.n_cases:
+        raise StudyError(f"--case {case}: {known}")
+    return int(case)
+
+
+def deviation(run: Run, stored: dict[str, np.ndarray]) -> tuple[float, str]:
+    """Largest difference between a run's metrics and stored ones, relative to each metric's size.
+
+    Args:
+        run: the run.
+        stored: metrics of the same case; NaN where a mode does not exist.
+
+    Returns:
+        (difference [1], name of the metric); (0, "") where there is nothing to compare.
+    """
+    found = {name: variable.data for name, variable in metric_variables(run.result).items()}
+    worst = (0.0, "")
+    for name, wanted in stored.items():
+        if name == "status":
+            continue
+        own = np.asarray(found[name])
+        part = np.asarray(wanted)[tuple(slice(0, n) for n in own.shape)]
+        size = np.nanmax(np.abs(part), initial=0.0)
+        difference = np.nanmax(np.abs(own - part), initial=0.0) / size if size > 0 else 0.0
+        worst = max(worst, (float(difference), name))
+    return worst

@@ -1,0 +1,340 @@
+"""The folder of a sweep: every finished chunk survives whatever ends the run.
+
+`sweep.json` says what is being run and by which code; each chunk is one file in `chunks/`, whose
+name holds the hash of its bytes, so that a half-written or damaged one is recognised; at the end
+`results.h5`, whose hash is in `sweep.json`, joins them and they go. A lock keeps a second process
+out.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+import subprocess
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from hashlib import file_digest
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+
+from studies import config, sources
+from studies.errors import StudyError
+from studies.store import Variable, replacing, write_store
+
+RESULTS, MANIFEST, CHUNKS, LOCK = "results.h5", "sweep.json", "chunks", ".lock"
+#: Where the manifest lists chunks that were given up.
+GIVEN_UP = "given_up"
+#: What a tuning has in its folder instead.
+TUNING = "tune.json"
+#: The results before they get their name.
+JOINED = ".joined.h5"
+#: What an end at a bad moment may leave behind.
+_LEFTOVER = re.compile(r"\.joined\.h5|\.(joined\.h5|sweep\.json)\.[0-9a-f]{8}\.tmp")
+_CHUNK = re.compile(r"(\d{6,})-([0-9a-f]{16})\.h5")
+_SOURCES = Path(__file__).parents[2]
+
+
+class Finished(NamedTuple):
+    """Where finished cases are."""
+
+    case_id: np.ndarray  # (n,)
+    file: np.ndarray  # position in `files`, (n,)
+    row: np.ndarray  # in that file, (n,)
+    files: list[Path]
+
+
+class SweepFolder:
+    """One folder, open for writing by this process alone. Make it with `open_folder`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @property
+    def results(self) -> Path:
+        return self.path / RESULTS
+
+    @property
+    def chunks(self) -> Path:
+        return self.path / CHUNKS
+
+    def write_chunk(self, variables: Mapping[str, Variable]) -> None:
+        """Keep a finished chunk: write beside, flush, rename.
+
+        Raises:
+            StudyError: the disk is full or cannot be written to; nothing half-written stays.
+        """
+        temporary = self.chunks / "unfinished.tmp"
+        try:
+            self.chunks.mkdir(exist_ok=True)
+            write_store(temporary, variables, {})
+            number = 1 + max((n for n, _ in _chunk_files(self.chunks)), default=-1)
+            os.replace(temporary, self.chunks / f"{number:06d}-{file_hash(temporary)}.h5")
+            _sync(self.chunks)
+        except OSError as error:
+            raise StudyError(f"{self.chunks}: cannot write a chunk ({error})") from error
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    def begin(self, manifest: dict[str, Any]) -> None:
+        """From here on the folder holds this sweep, or the one that was there extended to it."""
+        old = read_manifest(self.path) if (self.path / MANIFEST).is_file() else {}
+        self._write_manifest({**manifest, "results": old.get("results", [])})
+
+    def give_up(self, rows: np.ndarray, reason: str) -> None:
+        """Write down that cases are left out, until a resumed sweep tries them again.
+
+        Args:
+            rows: numbers of the cases, (k,).
+            reason: why.
+        """
+        manifest = read_manifest(self.path)
+        entry = {"cases": ranges(rows), "reason": reason}
+        self._write_manifest({**manifest, GIVEN_UP: [*manifest.get(GIVEN_UP, []), entry]})
+
+    def publish(self) -> None:
+        """Give the joined file its name; chunks that it holds go."""
+        joined = self.path / JOINED
+        manifest = read_manifest(self.path)
+        try:
+            # both files are good until the new one is in place
+            old = [file_hash(self.results)] if self.results.is_file() else []
+            manifest["results"] = [*old, file_hash(joined)]
+            self._write_manifest(manifest)
+            os.replace(joined, self.results)
+            _sync(self.path)
+            self._remove_chunks()
+        except OSError as error:
+            raise StudyError(f"{self.results}: cannot write it ({error})") from error
+
+    def _write_manifest(self, manifest: dict[str, Any]) -> None:
+        text, path = json.dumps(manifest, indent=1), self.path / MANIFEST
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            with replacing(path) as temporary:
+                temporary.write_text(text, encoding="utf-8")
+
+    def _remove_chunks(self) -> None:
+        for _, path in _chunk_files(self.chunks):
+            path.unlink()
+        if self.chunks.is_dir() and not any(self.chunks.iterdir()):
+            self.chunks.rmdir()
+
+
+@contextmanager
+def open_folder(path: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterator[SweepFolder]:
+    """Open a sweep's folder, made where it is missing, and lock it.
+
+    Args:
+        path: the folder.
+        manifest: from `make_manifest`.
+        is_resumed: go on with what is there.
+
+    Raises:
+        StudyError: not writable, in use, holds something else, or a sweep that does not fit.
+    """
+    with locked_folder(path, "sweep"):
+        folder = SweepFolder(path)
+        _check_content(folder, manifest, is_resumed)
+        for left in (*path.iterdir(), *path.glob(f"{CHUNKS}/*.tmp")):
+            if left.is_file() and (left.parent != path or _LEFTOVER.fullmatch(left.name)):
+                left.unlink()
+        yield folder
+
+
+@contextmanager
+def locked_folder(path: Path, what: str) -> Iterator[None]:
+    """Keep a folder, made where it is missing, to this process alone.
+
+    Args:
+        path: the folder.
+        what: is done there, for messages.
+
+    Raises:
+        StudyError: not writable or in use.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        lock = open(path / LOCK, "a")
+    except FileExistsError:
+        raise StudyError(f"--out {path}: this is a file; name a folder") from None
+    except OSError as error:
+        raise StudyError(f"--out {path}: cannot write there ({error.strerror})") from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise StudyError(f"--out {path}: another process is running a {what} there") from None
+        yield
+
+
+#: Modules that decide the numbers of a sweep, with all that they import.
+DECISIVE = ("studies.engine.chunks", "studies.space.table")
+
+
+def make_manifest(data: dict[str, Any], modules: Iterable[str] = DECISIVE) -> dict[str, Any]:
+    """What decides a sweep's numbers, and what ran it.
+
+    Args:
+        data: the sweep file as read.
+        modules: what decides them, with all that they import.
+    """
+    return {
+        "spec": data,
+        "code": sources.digest(*modules),
+        "git": git_state(),
+        **config.origin(),
+    }
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """The manifest of a sweep's folder.
+
+    Raises:
+        StudyError: no sweep there.
+    """
+    try:
+        manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+        spec = manifest.get("spec") if isinstance(manifest, dict) else None
+        if not isinstance(spec, dict) or not isinstance(spec.get("sweep"), dict):
+            raise ValueError("no sweep in it")
+    except RecursionError:
+        raise StudyError(f"{path / MANIFEST}: damaged (nested too deeply)") from None
+    except OSError:
+        if (path / TUNING).is_file():
+            raise StudyError(
+                f"{path}: holds a tuning, no sweep; see its report.md, or tune.h5 with xarray"
+            ) from None
+        raise StudyError(f"{path}: no folder of a sweep ({MANIFEST} is missing)") from None
+    except ValueError as error:
+        raise StudyError(f"{path / MANIFEST}: damaged ({error})") from None
+    return manifest
+
+
+def refuse_others(path: Path, leftover: re.Pattern[str]) -> None:
+    """Raise StudyError where a new folder holds anything but its lock and leftovers of a kill."""
+    names = [found.name for found in path.iterdir() if found.name != LOCK]
+    others = sorted(name for name in names if not leftover.fullmatch(name))
+    if others:
+        raise StudyError(
+            f"--out {path}: holds other files ({', '.join(others[:3])}); name a new or empty folder"
+        )
+
+
+def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bool) -> None:
+    """Refuse a folder of something else, a sweep already there, other code, other precision."""
+    if not (folder.path / MANIFEST).exists():
+        if is_resumed:
+            raise StudyError(f"--resume: {folder.path} holds no sweep; leave --resume out")
+        refuse_others(folder.path, _LEFTOVER)
+        return
+    if not is_resumed:
+        raise StudyError(
+            f"--out {folder.path}: holds a sweep already; add --resume to go on with it or to "
+            "extend it, or name a new folder"
+        )
+    old = read_manifest(folder.path)
+    kept, wanted = (m["spec"]["sweep"].get("metrics", []) for m in (old, manifest))
+    if kept != wanted:
+        raise StudyError(
+            f"--resume: {folder.path} keeps sweep.metrics = {kept}, now {wanted}; a resumed sweep "
+            "keeps the same"
+        )
+    for key, what in (
+        ("code", "code"),
+        ("precision", "precision"),
+        ("jaxlib", "version of jaxlib"),
+    ):
+        if old.get(key) != manifest[key]:
+            raise StudyError(
+                f"--resume: {folder.path} was begun with another {what} ({old.get(key)}, now "
+                f"{manifest[key]}), so its cases would not fit new ones; name a new folder"
+            )
+
+
+def finished_cases(path: Path, tell: Any = None) -> Finished:
+    """Cases that are done, each once; damaged chunks are set aside and told about.
+
+    Args:
+        path: the sweep's folder.
+        tell: called with a text for every damaged file; None: leave it where it is.
+    """
+    check_results(path)
+    files = [path / RESULTS] if (path / RESULTS).is_file() else []
+    for _, chunk in _chunk_files(path / CHUNKS):
+        if file_hash(chunk) == _CHUNK.fullmatch(chunk.name)[2]:  # type: ignore[index]
+            files.append(chunk)
+        elif tell is not None:
+            tell(f"{chunk.name} is damaged; its cases run again")
+            chunk.rename(chunk.with_suffix(".damaged"))
+    ids, sources, rows = [], [], []
+    kept: list[Path] = []
+    for file in files:
+        try:
+            with h5py.File(file, "r") as store:
+                status, names = store["status"][()], store["case_id"][()]
+        except (OSError, RuntimeError, KeyError) as error:
+            if file.name == RESULTS:
+                raise StudyError(
+                    f"{file}: damaged ({error}); remove it to run its cases again"
+                ) from None
+            continue
+        is_run = status >= 0
+        ids.append(np.array(names, "S16")[is_run])
+        rows.append(np.flatnonzero(is_run))
+        sources.append(np.full(is_run.sum(), len(kept)))
+        kept.append(file)
+    if not ids:
+        return Finished(np.empty(0, "S16"), np.empty(0, int), np.empty(0, int), [])
+    case_id, first = np.unique(np.concatenate(ids), return_index=True)
+    return Finished(case_id, np.concatenate(sources)[first], np.concatenate(rows)[first], kept)
+
+
+def check_results(path: Path) -> None:
+    """Raise StudyError where `results.h5` is not what this sweep wrote."""
+    results = path / RESULTS
+    if results.is_file() and file_hash(results) not in read_manifest(path).get("results", []):
+        raise StudyError(
+            f"{results}: damaged, or not of this sweep; put the right one back, or remove it "
+            "and run its cases again with --resume"
+        )
+
+
+def ranges(numbers: np.ndarray) -> str:
+    """Numbers, rising, in short: "3, 8-11"."""
+    parts = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
+    return ", ".join(str(p[0]) if len(p) == 1 else f"{p[0]}-{p[-1]}" for p in parts if len(p))
+
+
+def file_hash(path: Path) -> str:
+    """First 16 digits of a file's SHA-256."""
+    with open(path, "rb") as file:
+        return file_digest(file, "sha256").hexdigest()[:16]
+
+
+def _chunk_files(folder: Path) -> list[tuple[int, Path]]:
+    if not folder.is_dir():
+        return []
+    found = ((_CHUNK.fullmatch(path.name), path) for path in folder.iterdir())
+    return sorted((int(match[1]), path) for match, path in found if match)
+
+
+def _sync(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def git_state() -> str:
+    """Commit of the sources, "unknown" outside a repository."""
+    command = ["git", "-C", str(_SOURCES), "describe", "--always", "--dirty"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return done.stdout.strip()

@@ -1,0 +1,42 @@
+"""What all runs of one machine share: the controller's modes, the ADC's step in them."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.beam import build_basis
+from jaxmodel.case import Case, Structure
+from jaxmodel.prepare import prepare
+
+#: The late window is the residual window without this part, in which the drive settles [1].
+EARLY_PART = 1 / 3
+
+
+class Frame(NamedTuple):
+    """What all cases share."""
+
+    modal_omega: np.ndarray  # frequencies of the controller's modes [rad/s], (3, C)
+    mode_shape: np.ndarray  # of the controller's modes at the stations [1], (3, S, C)
+    adc_step: np.ndarray  # of one ADC step, in the deflection of mode 1 [m], (3,)
+
+
+@partial(jax.jit, static_argnums=0)
+def _prepare_frame(structure: Structure, case: Case) -> Frame:
+    loop = prepare(structure, case).loop
+    machine, n = case.machine, structure.n_controlled
+    shape = build_basis(
+        structure.controller_basis, machine.beam, machine.patches, n, case.windows.stations
+    ).deflection_at
+    one_step = loop.controller.adc_step / loop.controller.adc_gain
+    largest = jnp.max(jnp.abs(loop.sensor[:, :, 0]), axis=1)
+    return Frame(loop.modal_omega, shape, one_step / largest)
+
+
+def frame_of(structure: Structure, case: Case) -> Frame:
+    """Modes of the controller and its ADC step, which all cases of one machine share."""
+    return jax.tree.map(np.asarray, _prepare_frame(structure, case))

@@ -1,0 +1,190 @@
+"""Executors by traced kernels: XLA prepares and judges the cases, the kernel steps them."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.simulate import Result, Start
+from studies.engine.plan import Layout
+from studies.engine.program import (
+    Parts,
+    Program,
+    Running,
+    Split,
+    begin_block,
+    conclude_all,
+    lane_blocks,
+    split_cases,
+)
+from studies.engine.scan import ScanExecutor
+from studies.engine.steps import (
+    Steps,
+    Traced,
+    compile_steps,
+    read_leaves,
+    start_block,
+    trace_steps,
+)
+from studies.kernels import cpu, gpu
+
+
+class KernelExecutor:
+    """Blocks of lanes on a pool of threads."""
+
+    name = "traced kernel"
+
+    def __init__(self, structure: Structure, layout: Layout, has_own_ratio: bool) -> None:
+        self.structure, self.layout, self.has_own_ratio = structure, layout, has_own_ratio
+        self.compile_time = 0.0
+        self._steps: Steps | None = None
+        self._pool = ThreadPoolExecutor(layout.devices)
+
+    @property
+    def operations(self) -> Counter[str]:
+        """Operations of one sample by kind; none before the first chunk."""
+        return Counter() if self._steps is None else self._steps.run.operations
+
+    def start(self, cases: Case) -> Running:
+        split = split_cases(cases, self.layout, self.structure, self.has_own_ratio)
+        program = Program(self.structure, self.layout, split.tree, split.is_varying)
+        blocks = lane_blocks(split, self.layout)
+        if self._steps is None:
+            started = time.perf_counter()
+            self._steps = compile_steps(program, split)
+            start_block(program, self._steps, blocks[0], split.shared)
+            self.compile_time = time.perf_counter() - started
+        steps = self._steps
+        running = [self._pool.submit(_step_block, program, steps, b, split.shared) for b in blocks]
+        return Running(lambda: _concluded(running), lambda: _cancel(running))
+
+
+def _step_block(
+    program: Program, steps: Steps, varying: list[np.ndarray], shared: list[np.ndarray]
+) -> Start:
+    """A Start whose state is that after the last step; state and outline lanes last."""
+    ready = start_block(program, steps, varying, shared)
+    code = ready.state.status.copy()
+    leaves = [*ready.loop, *ready.inputs, *jax.tree.leaves(ready.state)]
+    steps.run.run(leaves, program.structure.n_steps, program.layout.lanes)
+    return Start((), code, ready.state, ready.outline)  # type: ignore[arg-type]
+
+
+def _cancel(running: list[Future]) -> None:
+    for future in running:
+        future.cancel()
+
+
+def _concluded(running: list[Future]) -> Result:
+    done = [future.result() for future in running]
+    whole = jax.tree.map(lambda *x: np.concatenate(x, axis=-1), *done)
+    return jax.tree.map(np.asarray, conclude_all(whole.outline, whole.inputs, whole.state))
+
+
+# --- graphics processors --------------------------------------------------------------------------
+
+#: Largest difference to this machine's own processor, as a share of the largest value.
+TOLERANCE = {8: 1e-6, 4: 1e-2}
+
+
+class GpuExecutor:
+    """Blocks of lanes on graphics processors, each case a thread.
+
+    The first cases of the first chunk are run on the CPU too; if they differ, or the kernel cannot
+    be used, XLA's scan does the work and `name` says why.
+    """
+
+    name = "GPU kernel"
+
+    def __init__(self, structure: Structure, layout: Layout, has_own_ratio: bool) -> None:
+        self.structure, self.layout, self.has_own_ratio = structure, layout, has_own_ratio
+        self.compile_time = 0.0
+        self._run: Any = None
+        self._instead: ScanExecutor | None = None
+
+    def start(self, cases: Case) -> Running:
+        if self._instead is not None:
+            return self._instead.start(cases)
+        split = split_cases(cases, self.layout, self.structure, self.has_own_ratio)
+        blocks = lane_blocks(split, self.layout)
+        if self._run is None:
+            started = time.perf_counter()
+            program = Program(self.structure, self.layout, split.tree, split.is_varying)
+            fault = self._build(program, split, blocks[0])
+            if fault:
+                self.name = f"XLA scan (the GPU kernel {fault})"
+                self._instead = ScanExecutor(self.structure, self.layout, self.has_own_ratio)
+                running = self._instead.start(cases)
+                self.compile_time = time.perf_counter() - started
+                return running
+            self.compile_time = time.perf_counter() - started
+        devices = jax.local_devices()[: self.layout.devices]
+        launched = [
+            self._run(*jax.device_put((block, split.shared), devices[k % len(devices)])).result
+            for k, block in enumerate(blocks)
+        ]
+        return Running(lambda: _gathered(launched), lambda: None)
+
+    def _build(self, program: Program, split: Split, block: list) -> str:
+        """Make the program; what is wrong with it, or "" if nothing is."""
+        try:
+            traced = trace_steps(program, split)
+            if traced.loop.operations()["tanh"]:
+                return "knows no tanh, which friction needs"
+            kernel = gpu.build_kernel(traced.loop, program.structure.n_steps, program.layout.lanes)
+            self._run = jax.jit(partial(_run_block, program, traced.parts, kernel))
+            first = self._run(block, split.shared)
+            jax.block_until_ready(first)
+        except RuntimeError as error:  # of JAX, LLVM or the tracer
+            return f"failed: {str(error).splitlines()[0]}"
+        difference = _difference(traced, first, program.structure.n_steps)
+        if difference > TOLERANCE[traced.loop.dtype.itemsize]:
+            return f"differs by {difference:.1g} from the same on the CPU"
+        return ""
+
+
+class Block(NamedTuple):
+    """A block of cases after its last sample, and what a few of them began with."""
+
+    result: Result
+    given: list  # leaves as the kernel reads them, the first lanes
+    last: list  # leaves of their state after the last sample
+
+
+def _run_block(program: Program, parts: Parts, kernel: Any, own: list, common: list) -> Block:
+    start = begin_block(program, parts, own, common)
+    leaves = [
+        *read_leaves(start, parts), *jax.tree.leaves(start.inputs), *jax.tree.leaves(start.state)
+    ]  # fmt: skip
+    last = kernel(leaves)
+    state = jax.tree.unflatten(jax.tree.structure(start.state), last)
+    few = cpu.VECTOR_BYTES // last[0].dtype.itemsize
+    return Block(
+        conclude_all(start.outline, start.state.status, state),
+        [x[..., :few] for x in leaves],
+        [x[..., :few] for x in last],
+    )
+
+
+def _difference(traced: Traced, block: Block, n_steps: int) -> float:
+    """Largest difference of a block's first cases to the CPU, as a share of the largest value."""
+    given = [np.array(x, order="C") for x in block.given]
+    cpu.build_kernel(traced.loop).run(given, n_steps, block.last[0].shape[-1])
+    worst = 0.0
+    for a, b in zip(block.last, given[len(given) - len(block.last) :], strict=True):
+        if not np.array_equal(np.isnan(a), np.isnan(b)):
+            return np.inf
+        size = np.nanmax(np.abs(b), initial=1e-300)
+        worst = max(worst, float(np.nanmax(np.abs(np.asarray(a) - b), initial=0.0) / size))
+    return worst
+
+
+def _gathered(running: list[Result]) -> Result:
+    return jax.tree.map(lambda *x: np.concatenate([np.asarray(part) for part in x]), *running)

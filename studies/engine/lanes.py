@@ -1,0 +1,119 @@
+"""Elementwise steps over lanes, as traced kernels where there are any, else in XLA's scan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+from threading import Lock
+from typing import Any
+
+import jax
+import numpy as np
+
+from studies.config import processor
+from studies.engine.plan import lane_unit
+from studies.kernels import cpu
+from studies.kernels.llvm import is_available
+from studies.kernels.traced import Leaf, TracedLoop, trace_loop
+
+#: Lanes that XLA compiles for.
+BLOCK = 64
+
+
+def run_steps(
+    step: Callable[..., Any], constants: Any, inputs: Any, state: Any, n_steps: int
+) -> Any:
+    """Take all steps; arrays lanes last, those of inputs with the steps first.
+
+    Args:
+        step: of (constants, inputs of one step, state) to state; a function of a module.
+        constants: what no step changes.
+        inputs: of each step; those that are the same for all lanes have one axis.
+        state: before the first step.
+        n_steps: how many.
+
+    Returns:
+        State after the last one.
+    """
+    lanes = jax.tree.leaves(state)[0].shape[-1]
+    if lanes == 0:
+        return state
+    parts = [jax.tree.flatten(part) for part in (constants, inputs, state)]
+    varies = tuple(leaf.ndim > 1 for leaf in parts[1][0])
+    with _TRACING:
+        run = _runner(
+            step,
+            tuple(tree for _, tree in parts),
+            tuple(leaf.shape[:-1] for leaf in parts[0][0]),
+            varies,
+            tuple(leaf.shape[:-1] for leaf in parts[2][0]),
+        )
+    # whole vectors; whole blocks for XLA, which compiles for each size
+    more = -lanes % (lane_unit() if _has_kernels() else BLOCK)
+
+    def filled(x: Any, is_wide: bool = True) -> np.ndarray:
+        x = np.asarray(x)
+        if is_wide and more:
+            x = np.concatenate([x, np.repeat(x[..., -1:], more, axis=-1)], axis=-1)
+        return np.array(x, order="C", copy=True)
+
+    leaves = [
+        *map(filled, parts[0][0]),
+        *(filled(x, is_wide) for x, is_wide in zip(parts[1][0], varies, strict=True)),
+        *map(filled, parts[2][0]),
+    ]
+    last = run(leaves, n_steps, lanes + more)
+    return jax.tree.unflatten(parts[2][1], [x[..., :lanes] for x in last])
+
+
+#: One thread makes a kernel, others wait for it.
+_TRACING = Lock()
+
+
+def _has_kernels() -> bool:
+    return processor() == "cpu" and is_available()
+
+
+@lru_cache(maxsize=32)
+def _runner(
+    step: Callable[..., Any], trees: tuple, constants: tuple, varies: tuple, state: tuple
+) -> Callable[[list, int, int], list]:
+    """Runs the step on leaves of constants, inputs and state."""
+    sizes = len(constants), len(varies), len(state)
+
+    def flat(*parts: list) -> list:
+        return jax.tree.leaves(step(*map(jax.tree.unflatten, trees, parts)))
+
+    if _has_kernels():
+        real = jax.dtypes.canonicalize_dtype(np.float64)
+
+        def make() -> TracedLoop:
+            return trace_loop(
+                flat,
+                [Leaf(shape, True) for shape in constants],
+                [Leaf((), is_wide) for is_wide in varies],
+                [Leaf(shape, True) for shape in state],
+                real,
+            )
+
+        name = f"{step.__name__} {real} {trees[0]} {constants} {varies} {state}"
+        kernel = cpu.kept_kernel(name, make)
+
+        def run(leaves: list, n_steps: int, lanes: int) -> list:
+            kernel.run(leaves, n_steps, lanes)
+            return leaves[sizes[0] + sizes[1] :]
+
+        return run
+
+    @partial(jax.jit, static_argnums=3)
+    def scanned(constants: list, inputs: list, state: list, n_steps: int) -> list:
+        def body(at: list, row: list | None) -> tuple[list, None]:
+            return flat(constants, row or [], at), None
+
+        return jax.lax.scan(body, state, inputs or None, length=n_steps)[0]
+
+    def run_scan(leaves: list, n_steps: int, lanes: int) -> list:
+        given, inputs = leaves[: sizes[0]], leaves[sizes[0] : sizes[0] + sizes[1]]
+        return list(map(np.asarray, scanned(given, inputs, leaves[-sizes[2] :], n_steps)))
+
+    return run_scan

@@ -1,0 +1,384 @@
+"""Stability of every case of a chunk: gain margin, what breaks beyond it, and damping.
+
+`jaxmodel.loci` says how. The steps run as traced kernels where there are any, else in XLA's scan:
+along the axis first; then between the two frequencies of each crossing, with more iterations; then
+by Newton's iteration, once more with what was found divided out, since links that are alike have
+crossings side by side. Rests on `MARGIN_MODES` plant modes, at rest at the first way-point.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.laws import IMSC, LAWS
+from jaxmodel.loci import (
+    Known,
+    Loci,
+    Meeting,
+    Station,
+    approach,
+    start_approach,
+    start_walk,
+    walk,
+)
+from jaxmodel.pairs import Pair
+from jaxmodel.prepare import prepare
+from jaxmodel.return_difference import (
+    AssembledModes,
+    LoopResponse,
+    assembled_modes,
+    controlled_first,
+    loop_response,
+)
+from studies.engine.damping import damping_ratios
+from studies.engine.lanes import BLOCK, run_steps
+from studies.engine.stability import with_margin_modes
+from studies.engine.steps import PREPARING
+from studies.study.margin import HIGHEST
+
+
+class Walk(NamedTuple):
+    """Frequencies of a walk along the axis."""
+
+    background: int  # between `LOWEST_HZ` and half the sample rate
+    beside: tuple[float, ...]  # beside each mode of the machine, multiples of its zeta omega
+    repeats: int  # iterations' turns at each
+
+
+#: The walk, and the one of cases in which it saw what is not there.
+WALKS = (
+    Walk(160, (-9.0, -4.5, -2.2, -1.0, -0.3, 0.3, 1.0, 2.2, 4.5, 9.0), 1),
+    Walk(400, tuple(np.tan(np.linspace(-1.5, 1.5, 24)).tolist()), 3),
+)
+LOWEST_HZ = 5.0
+#: Modes are taken to be at least as wide as this share of their frequency [1].
+NARROWEST = 2e-4
+#: What keeps eigenvalues of idle channels apart, on the way and in the second look.
+SPREAD, FINE_SPREAD = 1e-3, 1e-6
+#: Crossings looked at again per case, and kept of each place looked at.
+CHOSEN, KEPT = 4, 2
+#: Steps of Newton's iteration, and the last one that counts as none.
+NEWTON, CONVERGED = 10, 1e-3
+#: Where to start for crossings beside the rightmost that was found, as multiples of it.
+AGAIN = (1.02, 1.1, 1.005)
+#: A crossing seen from afar is looked at once more if nothing is found within this factor of it.
+NEAR = 1.2
+
+
+class Look(NamedTuple):
+    """How the neighbourhood of a crossing is looked at."""
+
+    wider: float  # beyond the two frequencies on either side of it, as a share of their distance
+    frequencies: int
+    repeats: int  # at each of them
+    starts: int  # before the first
+
+
+LOOK = Look(0.3, 10, 3, 24)
+
+
+class LoopMargins(NamedTuple):
+    """Of each case, (n,); NaN where there is no sampled loop."""
+
+    gain_margin: np.ndarray  # largest factor on all gains with every smaller one stable [1]
+    breaking_frequency: np.ndarray  # of what goes unstable there [Hz], NaN where nothing does
+    breaking_mode: np.ndarray  # order of the nearest link mode, 0: the drive, NaN as before
+    damping_ratio: np.ndarray  # of the modes of each order under control, the least [1], (n, C)
+
+
+def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
+    """Judge the sampled loops of cases.
+
+    Args:
+        structure: of their runs.
+        cases: leaves with a leading axis, all cases or 1.
+    """
+    count = max(len(leaf) for leaf in jax.tree.leaves(cases))
+    if structure.feedback != "sampled":
+        return _nothing(count, structure)
+    if LAWS[structure.law].is_switching:
+        return _judge_one_by_one(structure, cases)
+    structure, cases = with_margin_modes(structure, cases)
+    whole = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
+    n_links = np.sum(whole.control.link_mask > 0, axis=1)
+    threads = len(jax.local_devices())
+    figures = _nothing(count, structure)
+    with ThreadPoolExecutor(threads) as pool:
+
+        def judge(rows: np.ndarray, way: Walk) -> np.ndarray:
+            """Write the figures of these cases; which of them are doubtful."""
+            parts = _alike(rows, n_links, threads)
+            found = list(pool.map(partial(_judge_block, structure, way, whole), parts))
+            doubtful = []
+            for part, (those, is_doubtful) in zip(parts, found, strict=True):
+                for old, new in zip(figures, those, strict=True):
+                    old[part] = new
+                doubtful.append(part[is_doubtful])
+            return np.concatenate(doubtful)
+
+        again = judge(np.arange(count), WALKS[0])
+        if len(again):
+            judge(again, WALKS[1])
+    return figures
+
+
+def _judge_one_by_one(structure: Structure, cases: Case) -> LoopMargins:
+    """Worst figures of loops whose controlled modes act one at a time, each by itself."""
+    alone = structure._replace(law=IMSC.name)
+    parts = []
+    for j in range(structure.n_controlled):
+        mask = cases.control.mode_mask * (np.arange(structure.n_controlled) == j)
+        control = cases.control._replace(mode_mask=mask)
+        parts.append(judge_loops(alone, cases._replace(control=control)))
+    margins = np.stack([part.gain_margin for part in parts])
+    worst = np.argmin(np.where(np.isnan(margins), -np.inf, margins), axis=0)[None]
+
+    def of_worst(name: str) -> np.ndarray:
+        values = np.stack([getattr(part, name) for part in parts])
+        return np.take_along_axis(values, worst, axis=0)[0]
+
+    return LoopMargins(
+        gain_margin=of_worst("gain_margin"),
+        breaking_frequency=of_worst("breaking_frequency"),
+        breaking_mode=of_worst("breaking_mode"),
+        damping_ratio=np.stack([part.damping_ratio[:, j] for j, part in enumerate(parts)], axis=1),
+    )
+
+
+def _nothing(count: int, structure: Structure) -> LoopMargins:
+    one, two, three = np.full((3, count), np.nan)
+    return LoopMargins(one, two, three, np.full((count, structure.n_controlled), np.nan))
+
+
+def _alike(rows: np.ndarray, n_links: np.ndarray, threads: int) -> list[np.ndarray]:
+    """Blocks of cases with as many links under control: idle ones take no time."""
+    parts = []
+    for count in np.unique(n_links[rows]):
+        mine = rows[n_links[rows] == count]
+        share = min(BLOCK, -(-len(mine) // threads))
+        parts += [mine[k : k + share] for k in range(0, len(mine), share)]
+    return parts
+
+
+class Crossings(NamedTuple):
+    """Where eigenvalues may be real and positive, (k,) each."""
+
+    case: np.ndarray  # number in the block
+    value: np.ndarray  # eigenvalue [1]
+    omega: np.ndarray  # [rad/s]
+
+
+def _judge_block(
+    structure: Structure, way: Walk, cases: Case, rows: np.ndarray
+) -> tuple[LoopMargins, np.ndarray]:
+    """Figures of some cases, at most a block, and of which the walk saw what is not there."""
+    mask = cases.control.link_mask[rows].T
+    n_links = np.sum(mask > 0, axis=0)
+    filled = rows[np.minimum(np.arange(BLOCK), len(rows) - 1)]  # one size, one compilation
+    block = jax.tree.map(lambda x: x[filled], cases)
+    with PREPARING:
+        found = jax.tree.map(np.asarray, _respond(structure, block))
+    response, modes = jax.tree.map(lambda x: x[..., : len(rows)], found)
+    response = controlled_first(response, mask, max(1, n_links[0]))
+    with np.errstate(all="ignore"):  # what is not finite finds no crossing
+        ratio = damping_ratios(response, modes, n_links, structure.n_controlled)
+        return _judged(response, modes, way, ratio)
+
+
+# compiled in haste: it takes a fiftieth of the time
+@partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
+def _respond(structure: Structure, cases: Case) -> tuple[LoopResponse, AssembledModes]:
+    """Lanes last."""
+
+    def one(case: Case) -> tuple[LoopResponse, AssembledModes]:
+        loop = prepare(structure, case).loop
+        response = loop_response(structure, case, loop, case.path.waypoints[0])
+        return response, assembled_modes(response)
+
+    return jax.vmap(one, out_axes=-1)(cases)
+
+
+def _judged(
+    response: LoopResponse, modes: AssembledModes, way: Walk, ratio: np.ndarray
+) -> tuple[LoopMargins, np.ndarray]:
+    count, top = len(response.period), np.pi / response.period
+    seen, left, right = _walk_along(response, modes, way)
+    start = _look_closer(response, seen, left, right)
+    known = np.zeros(count)
+    np.maximum.at(known, start.case, start.value)
+    is_strange = ~_is_confirmed(seen, start) & (seen.value > known[seen.case])
+    is_doubtful = np.isin(np.arange(count), seen.case[is_strange])
+    value, omega = np.zeros(count), np.full(count, np.nan)
+    met, is_met = _meet(response, start, _known(count, None))
+    best = _rightmost(met.value, is_met, start.case, count)
+    found = np.flatnonzero(best >= 0)
+    met = jax.tree.map(lambda x: x[best[found]], met)
+    here = jax.tree.map(lambda x: x[..., found], response)
+    for start_at in AGAIN if len(found) else ():
+        # once more, a little to the right, without what was found
+        again = Crossings(np.arange(len(found)), met.value * start_at, met.omega)
+        other, is_other = _meet(here, again, _known(len(found), met))
+        is_more = is_other & (other.value > met.value)
+        met = jax.tree.map(lambda a, b, more=is_more: np.where(more, b, a), met, other)
+    value[found], omega[found] = met.value, met.omega
+    breaks = value > 1 / HIGHEST
+    margin = np.where(breaks, 1 / np.where(breaks, value, 1.0), HIGHEST)
+    omega = np.where(breaks, omega, np.nan)
+    apart = np.abs(_folded(modes.omega, top) - np.abs(omega))
+    order = np.take_along_axis(
+        np.argmax(modes.share, axis=0), np.argmin(apart, axis=0)[None], axis=0
+    )[0]
+    leaves = jax.tree.leaves(response)
+    is_finite = np.all([np.isfinite(x).reshape(-1, count).all(axis=0) for x in leaves], axis=0)
+    figures = LoopMargins(
+        np.where(is_finite, margin, np.nan),
+        np.where(is_finite, np.abs(omega) / (2 * np.pi), np.nan),
+        np.where(is_finite & breaks, order, np.nan),
+        ratio,
+    )
+    return figures, is_doubtful & is_finite
+
+
+def _folded(omega: np.ndarray, top: np.ndarray) -> np.ndarray:
+    """Where sampling shows frequencies, 0 to pi/T."""
+    return np.abs((omega + top) % (2 * top) - top)
+
+
+def stations(modes: AssembledModes, period: np.ndarray, way: Walk) -> np.ndarray:
+    """Frequencies to walk along, rising [rad/s], (F, lanes)."""
+    top = np.pi / period
+    lowest = 2 * np.pi * LOWEST_HZ
+    background = lowest * (top / lowest) ** np.linspace(0, 1, way.background)[:, None]
+    width = np.maximum(modes.decay, NARROWEST * modes.omega)
+    beside = [np.abs(_folded(modes.omega, top) + x * width) for x in way.beside]
+    omega = np.concatenate([background, *beside])
+    omega = np.where(omega > top, 2 * top - omega, omega)
+    return np.sort(np.clip(omega, 1.0, top * (1 - 1e-6)), axis=0)
+
+
+def _walk_along(
+    response: LoopResponse, modes: AssembledModes, way: Walk
+) -> tuple[Crossings, np.ndarray, np.ndarray]:
+    """The rightmost crossings of each case and the frequencies [rad/s] on either side."""
+    omega = np.repeat(stations(modes, response.period, way), way.repeats, axis=0)
+    turn = np.arange(len(omega)) + 1
+    kind = np.where(turn % way.repeats > 0, 0.0, np.where(turn == way.repeats, 1.0, 2.0))
+    spread = _spread(response, SPREAD)
+    first = -spread.reshape(-1, spread.shape[2])
+    loci = _walked(response, spread, Pair(first, 0 * first), omega, kind)
+    return _crossings(loci, np.arange(spread.shape[2]), CHOSEN)
+
+
+def _crossings(loci: Loci, case: np.ndarray, most: int) -> tuple[Crossings, np.ndarray, np.ndarray]:
+    """The rightmost crossings of each lane, and the frequencies [rad/s] on either side.
+
+    Args:
+        loci: after a walk.
+        case: of each lane.
+        most: crossings of a lane.
+    """
+    order = np.argsort(-loci.crossing, axis=0)[:most]
+    value, place, left, right = (
+        np.take_along_axis(x, order, axis=0)
+        for x in (loci.crossing, loci.place, loci.left, loci.right)
+    )
+    at = np.nonzero(value > 0.8 / HIGHEST)
+    return Crossings(case[at[1]], value[at], place[at]), left[at], right[at]
+
+
+def _is_confirmed(seen: Crossings, found: Crossings) -> np.ndarray:
+    """Whether something near each crossing has been found, (k,)."""
+    order = np.argsort(found.case, kind="stable")
+    begin, end = (np.searchsorted(found.case[order], seen.case, side) for side in ("left", "right"))
+    width = int(np.max(end - begin, initial=0))
+    place = begin[:, None] + np.arange(width)
+    value = (
+        found.value[order[np.minimum(place, len(order) - 1)]] if width else np.ones((len(end), 0))
+    )
+    near = np.abs(np.log(value / seen.value[:, None])) < np.log(NEAR)
+    return np.any(near & (place < end[:, None]), axis=1)
+
+
+def _look_closer(
+    response: LoopResponse, seen: Crossings, left: np.ndarray, right: np.ndarray
+) -> Crossings:
+    """The rightmost crossings of each interval."""
+    more = LOOK.wider * (right - left)
+    share = (np.arange(LOOK.frequencies)[:, None] + 0.382) / (LOOK.frequencies - 0.5)
+    omega = left - more + (right - left + 2 * more) * share
+    first, others = np.repeat(omega[:1], LOOK.starts, 0), np.repeat(omega[1:], LOOK.repeats, 0)
+    omega = np.concatenate([first, others])
+    kind = [0.0] * (LOOK.starts - 1) + [1.0]
+    kind += ([0.0] * (LOOK.repeats - 1) + [2.0]) * (LOOK.frequencies - 1)
+    here = jax.tree.map(lambda x: x[..., seen.case], response)
+    spread = _spread(here, FINE_SPREAD)
+    n = spread.shape[0] * spread.shape[1]
+    k = np.arange(n)[:, None]
+    ring = np.exp(2j * np.pi * (k + 0.3) / n) * (0.2 + 0.8 * ((4 * k) % n) / n) * seen.value
+    loci = _walked(here, spread, Pair(ring.real, ring.imag), omega, np.array(kind))
+    return _crossings(loci, seen.case, KEPT)[0]
+
+
+def _spread(response: LoopResponse, size: float) -> np.ndarray:
+    """See `go_round`: up to `size`, another for each channel, (n, C, lanes)."""
+    shape = response.velocity_gain.shape
+    n = shape[0] * shape[1]
+    return np.broadcast_to(size * (1 + np.arange(n).reshape(*shape[:2], 1)) / n, shape)
+
+
+def _known(count: int, found: Meeting | None) -> Known:
+    if found is None:
+        zero = np.zeros(count)
+        return Known(zero, zero, zero, Pair(zero, zero), Pair(zero, zero))
+    return Known(np.ones(count), found.omega, found.value, found.by_omega, found.by_value)
+
+
+def _meet(response: LoopResponse, start: Crossings, known: Known) -> tuple[Meeting, np.ndarray]:
+    """Newton's iteration from each crossing; where it ended, and whether it came to rest."""
+    here = jax.tree.map(lambda x: x[..., start.case], response)
+    known = jax.tree.map(lambda x: x[start.case], known)
+    angle = start.omega * here.period
+    guess = start_approach(start.omega, start.value, np.cos(angle), np.sin(angle))
+    found = _approached(here, known, guess)
+    is_met = (found.step < CONVERGED) & (found.value > 0) & np.isfinite(found.value)
+    return found, is_met
+
+
+def _rightmost(value: np.ndarray, is_met: np.ndarray, case: np.ndarray, count: int) -> np.ndarray:
+    """Number of the largest value of each case, -1 where it has none, (count,)."""
+    best = np.full(count, -1)
+    for k in np.argsort(np.where(is_met, value, -np.inf)):
+        if is_met[k]:
+            best[case[k]] = k
+    return best
+
+
+# --- the steps on this machine --------------------------------------------------------------------
+
+
+def _walked(
+    response: LoopResponse, spread: np.ndarray, first: Pair, omega: np.ndarray, kind: np.ndarray
+) -> Loci:
+    angle = omega * response.period
+    inputs = Station(omega, np.cos(angle), np.sin(angle), kind)
+    return run_steps(_walk, (response, spread), inputs, start_walk(first), len(omega))
+
+
+def _walk(constants: tuple[LoopResponse, Any], station: Station, loci: Loci) -> Loci:
+    response, spread = constants
+    return walk(response, spread, loci, station)
+
+
+def _approached(response: LoopResponse, known: Known, guess: Meeting) -> Meeting:
+    return run_steps(_approach, (response, known), (), guess, NEWTON)
+
+
+def _approach(constants: tuple[LoopResponse, Known], _: tuple, meeting: Meeting) -> Meeting:
+    response, known = constants
+    return approach(response, known, meeting)

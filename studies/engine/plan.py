@@ -1,0 +1,295 @@
+"""How a table of cases is run: grouped by program, cut into chunks of one size."""
+
+from __future__ import annotations
+
+import os
+import resource
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.laws import LAWS
+from jaxmodel.prepare import STIFFNESS_LIMIT, drive_rate
+from studies.config import processor
+from studies.engine.runs import SUBSTEP_LIMIT, mechanics_at, step_counts
+from studies.errors import StudyError
+from studies.kernels.cpu import VECTOR_BYTES
+from studies.kernels.gpu import BLOCK
+from studies.space.table import Table, loose_study
+from studies.study.cases import build_cases, build_structure, in_working_precision
+from studies.study.fields import Fields
+
+#: Fields that change the program; each combination of their values is compiled by itself.
+STATIC = (
+    "run.model", "link.basis", "link.shortening", "control.basis", "control.feedback",
+    "control.law", "drive.kind", "run.substeps", "run.smooth", "run.duration",
+    "electronics.sample_rate_hz",
+)  # fmt: skip
+_POSITION = "control.position_gain"
+_WRENCH = ("load.wrench", "load.pulse")
+#: More programs than this are refused.
+PROGRAM_LIMIT = 32
+#: Cases side by side on one device: enough to fill vectors, few enough to stay in its cache.
+LANES = 64
+#: On a graphics processor: enough for all its threads.
+GPU_LANES = 2**15
+#: Samples times cases in a chunk: a few seconds of work on two cores.
+CHUNK_WORK = 2**22
+#: Most cases in a chunk.
+LARGEST_CHUNK = 8192
+#: Cases whose poles are looked at together.
+POLE_BATCH = 256
+
+
+class Layout(NamedTuple):
+    """Shape of a chunk: devices x blocks x lanes."""
+
+    devices: int
+    blocks: int  # run one after the other on a device
+    lanes: int  # run side by side
+
+    @property
+    def size(self) -> int:
+        """Cases in a chunk."""
+        return self.devices * self.blocks * self.lanes
+
+    def filled(self, count: int) -> np.ndarray:
+        """Which of `count` cases each place holds: all, then the last one again, (size,)."""
+        return np.minimum(np.arange(self.size), count - 1)
+
+
+class Chunk(NamedTuple):
+    """Cases that are run together."""
+
+    rows: np.ndarray  # of the table, (k,)
+    is_too_stiff: np.ndarray  # as in `Group`, (k,)
+
+
+class Group(NamedTuple):
+    """Cases that share a program."""
+
+    structure: Structure
+    rows: np.ndarray  # of the table, (m,)
+    is_too_stiff: np.ndarray  # drive or ideal feedback that no allowed step carries, (m,)
+    layout: Layout
+
+    def chunks(self) -> list[Chunk]:
+        """All of them, chunk by chunk."""
+        size = self.layout.size
+        return [
+            Chunk(self.rows[k : k + size], self.is_too_stiff[k : k + size])
+            for k in range(0, len(self.rows), size)
+        ]
+
+
+def plan_groups(
+    table: Table,
+    rows: np.ndarray,
+    lay_out: Callable[[int, Structure], Layout],
+    metrics: tuple[str, ...] = (),
+) -> list[Group]:
+    """Group cases by program and lay out their chunks.
+
+    Args:
+        table: all cases.
+        rows: those to run.
+        lay_out: shape of the chunks of so many cases of a structure.
+        metrics: those that are kept; () for all.
+
+    Raises:
+        StudyError: too many programs.
+    """
+    keys = np.zeros(len(table), int)
+    for name in STATIC:
+        if name in table.columns:
+            _, position = np.unique(table.columns[name], return_inverse=True)
+            keys = keys * (position.max() + 1) + position
+    # sizes come from the whole table: an extended or resumed sweep then runs the same program
+    distinct = np.unique(keys)
+    if len(distinct) > PROGRAM_LIMIT:
+        swept = ", ".join(name for name in STATIC if name in table.columns)
+        raise StudyError(
+            f"sweep: {len(distinct)} combinations of {swept}, each of which needs a compilation; "
+            f"allowed up to {PROGRAM_LIMIT}"
+        )
+    groups = []
+    for key in distinct:
+        members = np.flatnonzero(keys == key)
+        structure = _structure(table, members)._replace(metrics=_accumulated(table, metrics))
+        wanted = rows[np.isin(rows, members)]
+        if len(wanted) == 0:
+            continue
+        counts, is_too_stiff = _plant_steps(table, structure, members)
+        place = np.searchsorted(members, wanted)
+        for count in np.unique(counts[place]):
+            chosen = counts[place] == count
+            stepped = structure._replace(substeps=int(count))
+            layout = lay_out(int(chosen.sum()), stepped)
+            groups.append(Group(stepped, wanted[chosen], is_too_stiff[place][chosen], layout))
+    return groups
+
+
+def _accumulated(table: Table, kept: tuple[str, ...]) -> tuple[str, ...]:
+    """Metrics that the runs must accumulate for those that are kept; () for all."""
+    if not kept:
+        return ()
+    has_own = (table.values("control.ratio_source") == "own_run").any()
+    return tuple(sorted({*kept} | ({"energy_ratio"} if has_own else set())))
+
+
+def _structure(table: Table, members: np.ndarray) -> Structure:
+    """Sizes of the largest case, choices of all of them."""
+
+    def column(name: str) -> np.ndarray:
+        return table.values(name)[members]
+
+    one = build_structure(loose_study(table, int(members[0])))
+    noisy = (column("electronics.adc_noise") > 0).any() | (column("drive.ripple") > 0).any()
+    fields = Fields(table.study, table.fields)
+    return one._replace(
+        n_modes=int(column("link.modes").max()),
+        n_controlled=min(int(column("control.modes").max()), one.n_patches),
+        has_sensor_highpass=bool((column("electronics.sensor_highpass_hz") > 0).any()),
+        has_amplifier=bool((column("electronics.amplifier_hz") > 0).any()),
+        has_noise=bool(noisy) or one.is_smooth,
+        has_friction=bool((column("drive.coulomb_friction") > 0).any()),
+        has_position_gain=LAWS[one.law].has_position
+        or bool(np.any(fields.numbers(_POSITION) != 0)),
+        has_wrench=any(np.any(fields.numbers(name) != 0) for name in _WRENCH),
+        has_payload_offset=bool(np.any(fields.numbers("load.offset") != 0)),
+    )
+
+
+def chunk_cases(table: Table, rows: np.ndarray, structure: Structure, size: int) -> Case:
+    """Arrays of a chunk, filled up to `size` with its last case; leading axis `size` or 1.
+
+    Args:
+        table: all cases.
+        rows: cases of the chunk, at most `size`.
+        structure: of their group.
+        size: cases the program takes.
+
+    Returns:
+        Case of NumPy arrays in the working precision.
+    """
+    filled = np.concatenate([rows, np.full(size - len(rows), rows[-1])])
+    columns = {name: column[filled] for name, column in table.fields.items()}
+    columns["run.seed"] = table.seed[filled]
+    return in_working_precision(build_cases(table.study, columns, structure))
+
+
+@partial(jax.jit, static_argnums=0)
+def _mechanics(structure: Structure, cases: Case) -> Any:
+    """State matrices at every way-point of every case, (n, poses, s, s)."""
+
+    def one(case: Case) -> Any:
+        return jax.vmap(lambda pose: mechanics_at(structure, case, pose))(case.path.waypoints)
+
+    return jax.vmap(one)(cases)
+
+
+def _plant_steps(
+    table: Table, structure: Structure, members: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Plant steps per sample of each case, and which cases no allowed number carries."""
+    rate = _drive_rates(table, structure, members)
+    if structure.feedback == "ideal":
+        rate = np.maximum(rate, _pole_decay(table, structure, members))
+    period = 1 / table.values("electronics.sample_rate_hz")[members]
+    needed = np.maximum(np.ceil(rate * period / STIFFNESS_LIMIT), 1)
+    given = int(table.values("run.substeps")[members[0]])
+    is_too_stiff = needed > (given or SUBSTEP_LIMIT)
+    counts = np.full(len(members), given) if given else step_counts(needed)
+    return np.where(is_too_stiff, given or 1, counts), is_too_stiff
+
+
+#: Columns that `drive_rate` depends on.
+_DRIVE = ("drive.", "machine.slider_mass")
+
+
+def _drive_rates(table: Table, structure: Structure, members: np.ndarray) -> np.ndarray:
+    columns = {n: c[members] for n, c in table.fields.items() if n.startswith(_DRIVE)}
+    case = build_cases(table.study, columns, structure)
+    is_many = [len(leaf) > 1 for leaf in jax.tree.leaves(case)]
+    if not any(is_many):
+        one = float(drive_rate(jax.tree.map(lambda x: x[0], case)))
+        return np.full(len(members), one)
+    axes = jax.tree.map(lambda x: 0 if len(x) > 1 else None, case)
+    shared = jax.tree.map(lambda x: x if len(x) > 1 else x[0], case)
+    return np.asarray(jax.vmap(drive_rate, (axes,))(shared))
+
+
+def _pole_decay(table: Table, structure: Structure, members: np.ndarray) -> np.ndarray:
+    """Fastest decay |Re lambda| of each case at its way-points [1/s], (m,)."""
+    fastest = np.zeros(len(members))
+    for start in range(0, len(members), POLE_BATCH):
+        rows = members[start : start + POLE_BATCH]
+        cases = chunk_cases(table, rows, structure, POLE_BATCH)
+        whole = jax.tree.map(lambda x: np.repeat(x, POLE_BATCH // len(x), axis=0), cases)
+        small = structure._replace(n_steps=1, substeps=1)
+        matrices = np.asarray(_mechanics(small, whole))[: len(rows)]
+        is_finite = np.isfinite(matrices).all(axis=(1, 2, 3))
+        safe = np.where(is_finite[:, None, None, None], matrices, 0.0)
+        fastest[start : start + len(rows)] = np.abs(np.linalg.eigvals(safe).real).max(axis=(1, 2))
+    return fastest
+
+
+def local_layout(n: int, structure: Structure) -> Layout:
+    """Shape of the chunks that suits this process.
+
+    Args:
+        n: cases.
+        structure: of them.
+    """
+    devices = len(jax.local_devices())
+    # a case's command takes most of the memory: references at every point of every step
+    points = structure.n_steps * (2 * structure.substeps + 1)
+    lane_bytes = points * 3 * 8 * 8 + 2**16
+    lanes, unit = most_lanes(), lane_unit()
+    while lanes > unit and devices * lanes * lane_bytes > memory_budget():
+        lanes //= 2
+    per_device = -(-n // devices)
+    lanes = min(lanes, -(-per_device // unit) * unit)
+    wanted = min(max(CHUNK_WORK // (structure.n_steps * structure.substeps), 1), LARGEST_CHUNK)
+    blocks = max(min(wanted, n) // (devices * lanes), 1)
+    return Layout(devices, blocks, lanes)
+
+
+def even_layout(n: int) -> Layout:
+    """A chunk of n cases, or a few more, shared evenly by all devices.
+
+    Args:
+        n: cases.
+    """
+    devices, unit = len(jax.local_devices()), lane_unit()
+    lanes = min(most_lanes(), -(-n // (unit * devices)) * unit)
+    return Layout(devices, -(-n // (devices * lanes)), lanes)
+
+
+def most_lanes() -> int:
+    """Cases side by side on a device."""
+    return LANES if processor() == "cpu" else GPU_LANES
+
+
+def lane_unit() -> int:
+    """Lanes come in multiples of this: one vector of the processor, one block of threads."""
+    if processor() != "cpu":
+        return BLOCK
+    return int(VECTOR_BYTES // jax.dtypes.canonicalize_dtype(np.float64).itemsize)
+
+
+def memory_budget() -> int:
+    """Memory that the arrays of a chunk may take: a quarter of what the device has [bytes]."""
+    if processor() != "cpu":
+        devices = jax.local_devices()
+        return len(devices) * (devices[0].memory_stats() or {}).get("bytes_limit", 2**32) // 4
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4
+
+
+def peak_memory() -> int:
+    """Most memory that this process has held [bytes]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

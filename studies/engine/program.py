@@ -1,0 +1,253 @@
+"""What comes before and after the steps of a chunk, the same for all executors.
+
+A chunk's leaves are split into those that vary from case to case and those that all cases share, so
+that what is shared is worked out once. With a `place`, parameters set some numbers of each case,
+and what depends on them has tangents.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.parameters import Array
+from jaxmodel.simulate import Outline, Result, Start, begin, conclude
+from studies.engine.plan import Layout
+from studies.engine.runs import with_ratio
+
+#: How often a program was traced in this process; the tests count compilations with it.
+TRACES: list[Structure] = []
+#: Puts parameters (p,) into a case; the same object every time, or it is compiled anew.
+Place = Callable[[Case, Array], Case]
+
+
+class Running(NamedTuple):
+    """A chunk on its way."""
+
+    wait: Callable[[], Result]  # until it is done; NumPy arrays
+    cancel: Callable[[], None]  # give it up, as far as it has not begun
+
+
+class Executor(Protocol):
+    """Runs chunks of one group."""
+
+    name: str
+    structure: Structure
+    compile_time: float  # [s], 0 before the first chunk
+
+    def __init__(self, structure: Structure, layout: Layout, has_own_ratio: bool) -> None:
+        """
+        Args:
+            structure: of the group.
+            layout: of its chunks.
+            has_own_ratio: EMC ratios come from an uncontrolled pass for some cases.
+        """
+        ...
+
+    def start(self, cases: Case) -> Running:
+        """Start a chunk.
+
+        Args:
+            cases: from `chunk_cases`, `layout.size` of them.
+        """
+        ...
+
+
+class Split(NamedTuple):
+    """Leaves of a Case, those that vary apart from those that all cases share."""
+
+    tree: Any
+    is_varying: tuple[bool, ...]
+    varying: list[np.ndarray]  # cases first
+    shared: list[np.ndarray]
+
+
+def split_cases(cases: Case, layout: Layout, structure: Structure, has_own_ratio: bool) -> Split:
+    """Leaves of a chunk's cases.
+
+    Args:
+        cases: leaves with a leading axis, all cases or 1.
+        layout: of the chunk.
+        structure: of the cases.
+        has_own_ratio: EMC ratios come from an uncontrolled pass.
+    """
+    if has_own_ratio:  # the same program for both passes, which differ in ratios and links
+        shape = (layout.size, 3, structure.n_controlled)
+        cases = with_ratio(cases, np.broadcast_to(cases.control.ratio, shape))
+        links = np.broadcast_to(cases.control.link_mask, shape[:2])
+        cases = cases._replace(control=cases.control._replace(link_mask=links))
+    leaves, tree = jax.tree.flatten(cases)
+    leaves = [np.asarray(leaf) for leaf in leaves]
+    is_varying = tuple(len(leaf) == layout.size for leaf in leaves)
+    return Split(
+        tree,
+        is_varying,
+        [leaf for leaf, varies in zip(leaves, is_varying, strict=True) if varies],
+        [leaf[0] for leaf, varies in zip(leaves, is_varying, strict=True) if not varies],
+    )
+
+
+def lane_blocks(split: Split, layout: Layout) -> list[list[np.ndarray]]:
+    """Leaves that vary, cut into blocks of lanes."""
+    starts = range(0, layout.size, layout.lanes)
+    return [[leaf[k : k + layout.lanes] for leaf in split.varying] for k in starts]
+
+
+def joined(tree: Any, is_varying: tuple[bool, ...], varying: list, shared: list) -> Any:
+    """The tree of leaves that vary and leaves that do not."""
+    sources = {True: iter(varying), False: iter(shared)}
+    return jax.tree.unflatten(tree, [next(sources[varies]) for varies in is_varying])
+
+
+class Program(NamedTuple):
+    """What a compiled program depends on; hashable."""
+
+    structure: Structure
+    layout: Layout
+    tree: Any  # of a Case
+    is_varying: tuple[bool, ...]
+    place: Place | None = None  # the parameters are then the last leaf that varies
+
+
+class Parts(NamedTuple):
+    """A Start leaf by leaf: which leaves vary from case to case, and their shapes."""
+
+    tree: Any
+    is_varying: tuple[bool, ...]
+    shapes: tuple[tuple[int, ...], ...]  # of one case
+    is_moving: tuple[bool, ...]  # depends on the parameters
+
+
+def begin_case(program: Program, own: list, common: list) -> Start:
+    """The start of one case."""
+    if program.place is None:
+        case = joined(program.tree, program.is_varying, own, common)
+    else:
+        *own, parameters = own
+        case = joined(program.tree, program.is_varying, own, common)
+        case = program.place(case, parameters)
+    return begin(program.structure, case)
+
+
+def chosen(program: Program, parts: Parts, wanted: bool, own: list, common: list) -> list:
+    """Those leaves of a case's start that vary, or that do not."""
+    leaves = jax.tree.leaves(begin_case(program, own, common))
+    return [x for x, varies in zip(leaves, parts.is_varying, strict=True) if varies == wanted]
+
+
+def begin_block(program: Program, parts: Parts, own: list, common: list) -> Start:
+    """The start of a block of cases, lanes last, as part of a compiled program.
+
+    Args:
+        program, parts: of the cases.
+        own: leaves that vary, cases first.
+        common: those that do not.
+
+    Returns:
+        Start with state and outline of every case; what else all cases share has a last axis of 1.
+    """
+    varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
+    lanes = len(own[0])
+    own_parts = jax.vmap(partial(chosen, program, parts, True), (0, None), -1)(own, common)
+    same = chosen(program, parts, False, [x[0] for x in own], common)
+    start: Start = joined(parts.tree, parts.is_varying, own_parts, [x[..., None] for x in same])
+
+    def whole(x: Any, is_wide: bool) -> Any:
+        return x if is_wide else jnp.broadcast_to(x, (*x.shape[:-1], lanes))
+
+    return start._replace(
+        state=jax.tree.map(whole, start.state, varies.state),
+        outline=jax.tree.map(whole, start.outline, varies.outline),
+    )
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def prepare(program: Program, parts: Parts, own: list, common: list) -> list:
+    """The leaves that vary, lanes last."""
+    return jax.vmap(partial(chosen, program, parts, True), (0, None), -1)(own, common)
+
+
+# run once, so it is compiled in haste: a quarter off two to four seconds
+@partial(jax.jit, static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0})
+def prepare_shared(program: Program, parts: Parts, own: list, common: list) -> list:
+    """The others, of any one case."""
+    return chosen(program, parts, False, own, common)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def prepare_tangents(
+    program: Program, parts: Parts, own: list, common: list, directions: Array
+) -> list:
+    """Tangents of the leaves that move along directions (n, p) of parameters, (n, ..., lanes)."""
+
+    def one(own: list, common: list) -> list:
+        *fixed, parameters = own
+
+        def moving(parameters: Array) -> list:
+            leaves = jax.tree.leaves(begin_case(program, [*fixed, parameters], common))
+            return [x for x, moves in zip(leaves, parts.is_moving, strict=True) if moves]
+
+        along = partial(jax.jvp, moving, (parameters,))
+        return jax.vmap(lambda direction: along((direction,))[1])(directions)
+
+    return jax.vmap(one, (0, None), -1)(own, common)
+
+
+def find_parts(program: Program, own: list, common: list) -> Parts:
+    """Trace a case's start.
+
+    Args:
+        program: what to trace.
+        own, common: leaves of one case that vary, and that do not.
+    """
+    traced, shapes = jax.make_jaxpr(partial(begin_case, program), return_shape=True)(own, common)
+    given = traced.jaxpr.invars[: len(own)]
+    sizes = tuple(out.aval.shape for out in traced.jaxpr.outvars)
+    moving = given[-1:] if program.place else []
+    return Parts(
+        jax.tree.structure(shapes), _dependence(traced.jaxpr, given), sizes,
+        _dependence(traced.jaxpr, moving),
+    )  # fmt: skip
+
+
+def _dependence(jaxpr: Any, given: list) -> tuple[bool, ...]:
+    """Which results depend on some of the arguments."""
+    depends: set[Any] = set(given)
+    for equation in jaxpr.eqns:
+        if any(not hasattr(atom, "val") and atom in depends for atom in equation.invars):
+            depends.update(equation.outvars)
+    return tuple(not hasattr(out, "val") and out in depends for out in jaxpr.outvars)
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(-1, -1, -1))
+def conclude_all(outline: Any, code: Any, state: Any) -> Result:
+    """Results of cases whose start and last state lie lanes last."""
+    return conclude(outline, code, state)
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(-1, -1, -1, -1, -1))
+def conclude_slopes(outline: Outline, code: Array, state: Any, turn: Outline, slope: Any) -> Any:
+    """Results, and tangents of the metrics, (cases, p, ...).
+
+    Args:
+        outline, code, state: as in `conclude`, lanes last.
+        turn, slope: tangents of outline and state, directions first.
+    """
+
+    def judged(outline: Outline, state: Any) -> tuple:
+        result = conclude(outline, code, state)
+        return result.metrics, result
+
+    def along(turn: Outline, slope: Any) -> tuple:
+        _, tangent, result = jax.jvp(judged, (outline, state), (turn, slope), has_aux=True)
+        return result, tangent
+
+    return jax.vmap(along, out_axes=(None, 0))(turn, slope)

@@ -1,0 +1,231 @@
+"""Results of a sweep: as they are stored, and as they are read again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxmodel import status
+from jaxmodel.metrics import METRICS
+from studies.engine.columns import (
+    LEAST,
+    NOT_RUN,
+    PER_CASE,
+    axis_variables,
+    case_variables,
+    variable_name,
+)
+from studies.engine.folder import (
+    CHUNKS,
+    RESULTS,
+    check_results,
+    finished_cases,
+    read_manifest,
+)
+from studies.engine.stored import axis_sizes, gather
+from studies.errors import StudyError, nearest
+from studies.space.axes import LABELS, SHOWN_AS
+from studies.space.spec import SweepSpec, parse_sweep
+from studies.space.table import Table, build_table
+from studies.store import Variable, read_store, variable_labels
+from studies.study.fields import Fields
+from studies.study.paths import NAMED_INDEX, known_field, parse_entry
+
+
+@dataclass(frozen=True)
+class SweepData:
+    """A sweep as read: named arrays, and what belongs to them."""
+
+    variables: dict[str, Variable]
+    attributes: dict[str, Any]
+    spec: SweepSpec
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.variables[name].data
+
+    @cached_property
+    def table(self) -> Table:
+        """Its cases, spread once."""
+        return build_table(self.spec)
+
+    @property
+    def n_cases(self) -> int:
+        return len(self.variables["case"].data)
+
+    @property
+    def is_finished(self) -> np.ndarray:
+        """Cases whose metrics hold, (n,)."""
+        return np.isin(self["status"], status.FINISHED)
+
+    def __repr__(self) -> str:
+        done = int(np.sum(self["status"] != NOT_RUN))
+        return (
+            f"<sweep {self.spec.study.title!r}: {done} of {self.n_cases} cases, axes "
+            f"{', '.join(swept_names(self))}; {len(self.variables)} variables>"
+        )
+
+    def to_xarray(self) -> Any:
+        """The same as an xarray dataset.
+
+        Raises:
+            StudyError: xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError:
+            raise StudyError("xarray is missing: install flexlink-studies[xarray]") from None
+        return xarray.Dataset(
+            {name: (v.dims, v.data, variable_labels(v)) for name, v in self.variables.items()},
+            attrs=self.attributes,
+        )
+
+
+def swept_names(data: SweepData) -> list[str]:
+    """What varies, as variables of the file, in the order of the sweep; labels stand for fields."""
+    columns = data.table.columns
+    labelled = {LABELS[name] for name in columns if name in LABELS}
+    return [variable_name(name) for name in columns if name not in labelled]
+
+
+def load(path: str | Path) -> SweepData:
+    """Read a sweep, finished or not; cases that have not been run have status -1 and NaN.
+
+    Args:
+        path: the sweep's folder.
+
+    Raises:
+        StudyError: no sweep there, or a damaged file.
+    """
+    folder = Path(path)
+    written = read_manifest(folder)["spec"]
+    spec = parse_sweep(written)
+    if (folder / RESULTS).is_file() and not any((folder / CHUNKS).glob("*.h5")):
+        check_results(folder)
+        variables, attributes = read_store(folder / RESULTS)
+        if json.loads(attributes["spec"]) == written:  # else an extension has begun
+            return SweepData(variables, attributes, spec)
+    table = build_table(spec)
+    gathered = gather(table, finished_cases(folder))
+    sizes = axis_sizes(gathered)
+    variables = case_variables(table) | gathered | axis_variables(table, sizes)
+    for axis, size in (axis_sizes(variables)).items():
+        if axis not in variables:
+            variables[axis] = Variable(np.arange(1, size + 1), (axis,), "1", f"number of {axis}")
+    return SweepData(variables, {"title": spec.study.title}, spec)
+
+
+def metric_values(data: SweepData, name: str) -> np.ndarray:
+    """One number per case: a metric, an entry of it, or a field, (n,).
+
+    A metric or condition number with more axes counts with its largest value, of the links that
+    some case controls: `residual_rms` is that of the worst of them and its worst station,
+    `residual_rms[link=3]` that of the worst station of link 3, controlled or not. Indices without
+    a name count from 0. A field that does not vary has its value in every case.
+
+    Raises:
+        StudyError: unknown name or entry.
+    """
+    named = NAMED_INDEX.findall(name)
+    if named:
+        return _of_axes(data, NAMED_INDEX.sub("", name), named)
+    entry = parse_entry(name)
+    if entry is not None and entry.field in SHOWN_AS:
+        name = SHOWN_AS[entry.field] + name[len(entry.field) :]
+        entry = parse_entry(name)
+    key = entry.field if entry else name
+    variables = data.variables
+    for candidate in (variable_name(name), variable_name(key)):
+        if candidate in variables and variables[candidate].dims[:1] == ("case",):
+            return _entry(data, name, entry.indices if entry else (), candidate)
+    if "." in key:
+        swept = data.table.columns
+        if name == key and any(column.startswith(f"{key}[") for column in swept):
+            raise StudyError(f"{key}: differs between links here; name one, such as {key}[0]")
+        value = known_field(name, data.spec.study)
+        if isinstance(value, tuple):
+            raise StudyError(f"{name}: a list; name one entry of it, such as {name}[0]")
+        return np.full(data.n_cases, value)
+    known = [n for n, v in variables.items() if v.dims[:1] == ("case",)]
+    close = nearest(key, known) or _turned(key, known)
+    hint = f"did you mean {close!r}?" if close else f"known: {', '.join(known)}"
+    raise StudyError(f"{name!r}: unknown metric or axis; {hint}")
+
+
+def _of_axes(data: SweepData, name: str, named: list[tuple[str, str]]) -> np.ndarray:
+    """Values of a metric at numbers of some of its axes, counted from 1."""
+    if name not in data.variables or name not in (*METRICS, *PER_CASE):
+        metric_values(data, name)  # says what is wrong with it
+        raise StudyError(f"{name!r}: indices that name an axis are for metrics")
+    variable = data.variables[name]
+    array, dims = variable.data, list(variable.dims)
+    for axis, written in named:
+        number, size = int(written), array.shape[dims.index(axis)] if axis in dims[1:] else 0
+        if not 1 <= number <= size:
+            allowed = ", ".join(
+                f"{d} = 1 to {n}" for d, n in zip(dims[1:], array.shape[1:], strict=True)
+            )
+            raise StudyError(f"{name}[{axis}={written}]: allowed {allowed or 'no index'}")
+        array = np.take(array, number - 1, axis=dims.index(axis))
+        dims.remove(axis)
+    return _worst(data, array, tuple(dims), name in LEAST)
+
+
+def _worst(
+    data: SweepData, array: np.ndarray, dims: tuple[str, ...], is_least: bool = False
+) -> np.ndarray:
+    """Largest number of each case, or least, of the links that count, (n,)."""
+    if array.ndim == 1:
+        return array
+    if array.dtype.kind == "f" and "link" in dims:
+        shape = [3 if d == "link" else 1 for d in dims]
+        array = np.where(np.reshape(counted_links(data), shape), array, np.nan)
+    flat = array.reshape(len(array), -1)
+    if flat.dtype.kind != "f":
+        return flat.max(axis=1)
+    if is_least:
+        return -_worst(data, -flat, ("case", "entry"))
+    is_empty = np.all(np.isnan(flat), axis=1)
+    return np.where(is_empty, np.nan, np.nanmax(np.where(np.isnan(flat), -np.inf, flat), axis=1))
+
+
+def counted_links(data: SweepData) -> np.ndarray:
+    """Links that a metric counts: those that some case controls, all where none does, (3,).
+
+    The same for all cases, or fewer links under control would look like less vibration.
+    """
+    fields = Fields(data.spec.study, data.table.fields)
+    is_closed = fields.raw("control.feedback") != "none"
+    links = (fields.numbers("control.links") != 0) & is_closed[:, None]
+    found = links.any(axis=0)
+    return found if found.any() else np.ones(3, bool)
+
+
+def _turned(name: str, known: list[str]) -> str:
+    """A name of the same words in another order."""
+    words = sorted(name.split("_"))
+    return next((other for other in known if sorted(other.split("_")) == words), "")
+
+
+def _entry(data: SweepData, name: str, indices: tuple[int, ...], candidate: str) -> np.ndarray:
+    variable = data.variables[candidate]
+    array, dims = variable.data, variable.dims
+    if variable_name(name) != candidate or "[" not in name:
+        used = indices
+    else:
+        used = ()  # the entry is a variable of its own
+    for index in used:
+        if array.ndim < 2 or index >= array.shape[1]:
+            sizes = ", ".join(
+                f"{axis}: 0 to {size - 1}"
+                for axis, size in zip(variable.dims[1:], variable.data.shape[1:], strict=True)
+            )
+            raise StudyError(f"{name!r}: no such entry; indices allowed: {sizes or 'none'}")
+        array, dims = array[:, index], (dims[0], *dims[2:])
+    if array.ndim > 1 and candidate not in (*METRICS, *PER_CASE):
+        raise StudyError(f"{name!r}: a list; name one entry of it, such as {name}[0]")
+    return _worst(data, array, dims, candidate in LEAST)

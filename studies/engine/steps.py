@@ -1,0 +1,177 @@
+"""The steps of a group as a traced loop: which numbers it reads, and its code for this processor.
+
+Numbers that all cases of a chunk share are written into the code.
+"""
+
+from __future__ import annotations
+
+from threading import Lock
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxmodel.case import Structure
+from jaxmodel.loop import State, step
+from jaxmodel.simulate import Outline, Start
+from studies.engine.program import (
+    TRACES,
+    Parts,
+    Program,
+    Split,
+    find_parts,
+    joined,
+    prepare,
+    prepare_shared,
+)
+from studies.kernels import cpu, llvm
+from studies.kernels.traced import Leaf, TracedLoop, trace_loop
+
+#: More plant steps in a sample than this would make the kernel's code too long.
+KERNEL_SUBSTEPS = 4
+
+
+def fits_kernel(structure: Structure) -> bool:
+    """Whether a structure can be written as a kernel here."""
+    return llvm.is_available() and structure.substeps <= KERNEL_SUBSTEPS
+
+
+class Traced(NamedTuple):
+    """The loop of a group of cases, for the numbers that all of them share."""
+
+    parts: Parts
+    shared: list[np.ndarray]  # leaves of a Start that do not vary
+    loop: TracedLoop
+
+
+class Steps(NamedTuple):
+    """The same, compiled for this processor."""
+
+    parts: Parts
+    shared: list[np.ndarray]
+    run: cpu.Kernel
+    directions: int  # tangents that it carries along
+
+
+#: One at a time: of two runs of a program with an eigenvalue problem in it (basis loaded) XLA's
+#: CPU client now and then never ends one (jax 0.10).
+PREPARING = Lock()
+_STEPS: dict[tuple, Steps] = {}
+#: Kernels kept in memory.
+KEPT_KERNELS = 8
+
+
+def compile_steps(program: Program, split: Split, directions: int = 0) -> Steps:
+    """Compile the steps, once per process for the same program and shared numbers.
+
+    Args:
+        program: of the cases.
+        split: their leaves.
+        directions: tangents to carry along at once.
+    """
+    numbers = tuple((leaf.shape, leaf.tobytes()) for leaf in split.shared)
+    shapes = tuple(leaf.shape for leaf in split.varying)
+    key = (program, shapes, numbers, _real(), directions)
+    if key not in _STEPS:
+        while len(_STEPS) >= KEPT_KERNELS:
+            del _STEPS[next(iter(_STEPS))]
+        parts, shared, loop = trace_steps(program, split, directions)
+        _STEPS[key] = Steps(parts, shared, cpu.build_kernel(loop), directions)
+    return _STEPS[key]
+
+
+def trace_steps(program: Program, split: Split, directions: int = 0) -> Traced:
+    """Trace the steps of a group.
+
+    Args:
+        program, split, directions: as in `compile_steps`.
+    """
+    one = [leaf[0] for leaf in split.varying]
+    parts = find_parts(program, one, split.shared)
+    found = prepare_shared(program, parts, one, split.shared)
+    shared = [np.asarray(leaf, order="C") for leaf in found]
+    TRACES.append(program.structure)
+    return Traced(parts, shared, _trace(program.structure, parts, shared, directions))
+
+
+def _real() -> Any:
+    return jax.dtypes.canonicalize_dtype(np.float64)
+
+
+def _trace(
+    structure: Structure, parts: Parts, shared: list[np.ndarray], directions: int
+) -> TracedLoop:
+    """The loop of a structure, with what is shared written into it."""
+    kinds = zip(parts.shapes, parts.is_varying, parts.is_moving, strict=True)
+    leaves = [Leaf(*kind) for kind in kinds]
+    start: Start = jax.tree.unflatten(parts.tree, range(len(leaves)))
+    trees = [jax.tree.structure(part) for part in start[:3]]
+    known = iter(shared)
+    values = [leaf if leaf.is_varying else next(known) for leaf in leaves]
+    loop = [values[k] for k in jax.tree.leaves(start.loop)]
+    inputs = [leaves[k] for k in jax.tree.leaves(start.inputs)]
+    state = [leaves[k] for k in jax.tree.leaves(start.state)]
+
+    def sample(constants: list, row: list, carried: list) -> list:
+        at_loop, at_inputs, at_state = (
+            jax.tree.unflatten(t, x) for t, x in zip(trees, (constants, row, carried), strict=True)
+        )
+        return jax.tree.leaves(step(structure, at_loop, at_state, at_inputs)[0])
+
+    return trace_loop(
+        sample,
+        loop,
+        [leaf._replace(shape=leaf.shape[1:]) for leaf in inputs],
+        [leaf._replace(is_varying=True) for leaf in state],
+        _real(),
+        directions,
+    )
+
+
+class Ready(NamedTuple):
+    """A block of lanes before its first step, as the kernel reads it."""
+
+    loop: list[np.ndarray]  # leaves that are not written into the code
+    inputs: list[np.ndarray]
+    state: State  # a copy, lanes last
+    outline: Outline  # lanes last
+
+
+def start_block(
+    program: Program, steps: Steps, varying: list[np.ndarray], shared: list[np.ndarray]
+) -> Ready:
+    """Prepare a block of lanes.
+
+    Args:
+        program: of the cases.
+        steps: compiled for it.
+        varying, shared: leaves of the block's cases.
+    """
+    lanes, parts = program.layout.lanes, steps.parts
+    with PREPARING:
+        own = [np.asarray(x, order="C") for x in prepare(program, parts, varying, shared)]
+    start: Start = joined(parts.tree, parts.is_varying, own, steps.shared)
+    varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
+
+    def widened(tree: Any, variation: Any) -> Any:
+        return jax.tree.map(lambda x, v: _wide(x, v, lanes), tree, variation)
+
+    return Ready(
+        read_leaves(start, parts),
+        jax.tree.leaves(start.inputs),
+        widened(start.state, varies.state),
+        widened(start.outline, varies.outline),
+    )
+
+
+def read_leaves(start: Start, parts: Parts) -> list:
+    """Leaves of the loop's constants that are not written into the code."""
+    varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
+    loop = zip(jax.tree.leaves(start.loop), jax.tree.leaves(varies.loop), strict=True)
+    return [leaf for leaf, is_read in loop if is_read]
+
+
+def _wide(x: np.ndarray, is_varying: bool, lanes: int) -> np.ndarray:
+    """A copy with one value per lane, lanes last."""
+    whole = x if is_varying else np.broadcast_to(np.asarray(x)[..., None], (*np.shape(x), lanes))
+    return np.array(whole, order="C", copy=True)

@@ -1,0 +1,57 @@
+"""What every section of the paper's report reads and how it writes numbers."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from studies.paper.cases import ALL, MOVES, ONE, SHAPERS, TWO, PaperRuns
+from studies.paper.measures import Measures
+
+#: Cases of a comparison: controlled links and heading.
+PLACES = ((ALL, "three links"), (TWO, "first two"), (ONE, "first only"))
+
+
+class Context(NamedTuple):
+    """What every section reads."""
+
+    runs: PaperRuns
+    measures: Measures
+
+    def find(self, move: str, shaper: str, modes: int, links: tuple[bool, ...]) -> int:
+        """Index of a case at the default structural damping."""
+        damping = self.runs.study.link.first_damping
+        return self.runs.where(
+            move=move, shaper=shaper, modes=modes, links=links, damping_ratio=damping
+        )
+
+    def named(self, name: str) -> int | None:
+        """Index of the case of this name, None where it was not run."""
+        names = [case.name for case in self.runs.cases]
+        return names.index(name) if name in names else None
+
+    def drop(self, k: int, mode: int) -> list[str]:
+        """Change of the spectral peak of a mode against no control, per link."""
+        peak, off = self.measures.spectral_peak[:, :, mode - 1], self.measures.counterpart[k]
+        return [change(peak[k, i], peak[off, i]) for i in range(3)]
+
+
+def change(value: float, reference: float) -> str:
+    """Change against a reference in percent, "-" where that is zero."""
+    return f"{100 * (value / reference - 1):+.1f} %" if reference > 0 else "-"
+
+
+def move_text(move: str, shaper: str) -> str:
+    kind = {"ei": "EI shaper", "none": "no shaper"}[shaper]
+    text = {"paper": "paper's move", "fast": "fast move"}[move]
+    return f"{text} ({MOVES[move]:g} s), {kind}"
+
+
+def settings() -> list[tuple[str, str]]:
+    return [(move, shaper) for move in MOVES for shaper in SHAPERS]
+
+
+def residual(context: Context, case: int, link: int) -> str:
+    """Late rms deflection of a link [µm], marked where the converter cannot see it."""
+    value = context.measures.late_deflection[case, link]
+    mark = " †" if value < context.runs.frame.adc_step[link] else ""
+    return f"{1e6 * value:.3g}{mark}"

@@ -1,0 +1,92 @@
+"""What the paper's report reads from the runs, beyond the metrics the loop accumulates."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import periodogram
+
+from studies.engine.frame import EARLY_PART
+from studies.paper.cases import PaperRuns
+from studies.study.consistency import each_link
+
+#: The peak of a mode is looked for within this fraction of its frequency [1].
+PEAK_SPAN = 0.2
+
+
+#: Spectra are kept up to this frequency [Hz].
+TOP_HZ = 1200.0
+
+
+#: A link has settled when it stays below this part of the residual peak without control [1].
+SETTLED = 0.05
+
+
+class Measures(NamedTuple):
+    """Leading axis: cases."""
+
+    frequency: np.ndarray  # [Hz], (F,)
+    spectral_density: np.ndarray  # one-sided, Hann periodogram of the run [m2/Hz], (n, 3, C, F)
+    spectral_peak: np.ndarray  # largest value within PEAK_SPAN of the mode [m2/Hz], (n, 3, C)
+    late_start: np.ndarray  # of the late window [s], (n,)
+    late_deflection: np.ndarray  # rms mid-span deflection in the late window [m], (n, 3)
+    late_pose_error: np.ndarray  # rms [m, m, rad], (n, 3)
+    settling: np.ndarray  # from the command's end to SETTLED of the uncontrolled peak [s], (n, 3)
+    counterpart: np.ndarray  # index of the uncontrolled counterpart, (n,)
+
+
+def middle_station(runs: PaperRuns) -> int:
+    """Index of the station nearest to mid-span."""
+    stations = np.array(runs.study.metrics.stations)
+    return int(np.argmin(np.abs(stations - each_link(runs.study.link.length).mean() / 2)))
+
+
+def measure(runs: PaperRuns) -> Measures:
+    """Spectra, their peaks, the late window and settling of all runs."""
+    record, end = runs.result.record, np.asarray(runs.result.command_end)
+    assert record is not None
+    rate, length = runs.study.electronics.sample_rate_hz, runs.study.metrics.residual_length
+    time = record.time[0]
+    frequency, density = periodogram(record.controlled_coordinate, rate, window="hann", axis=1)
+    keep = frequency <= TOP_HZ
+    frequency, density = frequency[keep], np.moveaxis(density[:, keep], 1, -1)
+    start = end + EARLY_PART * length
+    is_late = (time >= start[:, None] - 0.5 / rate) & (time < (end + length)[:, None] - 0.5 / rate)
+    deflection = record.chord_deflection_stations[:, :, :, middle_station(runs)]
+    counterpart = _counterparts(runs)
+    limit = SETTLED * runs.result.metrics.residual_peak.max(axis=-1)[counterpart]
+    return Measures(
+        frequency,
+        density,
+        _peaks(runs, frequency, density),
+        start,
+        _rms(deflection, is_late),
+        _rms(record.pose_error, is_late),
+        _settling(time, end, np.abs(record.chord_deflection_stations).max(axis=-1), limit),
+        counterpart,
+    )
+
+
+def _counterparts(runs: PaperRuns) -> np.ndarray:
+    off = {case.counterpart: k for k, case in enumerate(runs.cases) if not case.is_controlled}
+    return np.array([off[case.counterpart] for case in runs.cases])
+
+
+def _peaks(runs: PaperRuns, frequency: np.ndarray, density: np.ndarray) -> np.ndarray:
+    center = runs.frame.modal_omega / (2 * np.pi)
+    is_near = np.abs(frequency / center[..., None] - 1) <= PEAK_SPAN
+    return np.max(np.where(is_near, density, 0.0), axis=-1)
+
+
+def _rms(signal: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Root mean square over time of (n, T, k) where mask (n, T), (n, k)."""
+    total = np.einsum("ntk,nt->nk", signal**2, mask)
+    return np.sqrt(total / np.maximum(mask.sum(axis=1), 1)[:, None])
+
+
+def _settling(time: np.ndarray, end: np.ndarray, size: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """Last time after `end` at which size (n, T, 3) exceeds limit (n, 3), from `end` on."""
+    is_outside = (size > limit[:, None]) & (time >= end[:, None])[..., None]
+    last = np.max(np.where(is_outside, time[:, None], 0.0), axis=1)
+    return np.maximum(last - end[:, None], 0.0)

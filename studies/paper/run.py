@@ -1,0 +1,286 @@
+"""`studies paper`: the paper's sections 4 and 5 from one command, into one folder.
+
+The folder gets `paper.h5` (all runs), the counterparts of the paper's figures, and the report,
+as Markdown and as a web page.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Column, Table
+
+from studies.engine.batches import Tell
+from studies.engine.runs import metric_variables, run_attributes
+from studies.errors import StudyError
+from studies.paper.cases import (
+    EXECUTOR,
+    MOVES,
+    PaperCase,
+    PaperRuns,
+    paper_cases,
+    run_cases,
+    work_of,
+)  # fmt: skip
+from studies.paper.figures import PAPER_FIGURES, draw_figure
+from studies.paper.measures import Measures, measure, middle_station
+from studies.paper.report import report
+from studies.show.figures import styled, write_figure
+from studies.show.pages import write_report
+from studies.show.sketch import sketch
+from studies.store import Variable, check_target, staged, write_store
+from studies.study.labels import STATUS_LABEL, describe
+from studies.study.spec import Study, paper_study
+
+DATA, REPORT = "paper.h5", "report.html"
+
+
+def run_paper(out: Path, console: Console) -> None:
+    """Run the paper's study and write data, figures and report.
+
+    Args:
+        out: folder, made where missing; files of an earlier run are replaced.
+        console: where progress and the outcome go.
+
+    Raises:
+        StudyError: the folder cannot be made or written to.
+    """
+    study = paper_study()
+    write_paper(out, console, study, paper_cases(study.control.gain_factor))
+
+
+def write_paper(out: Path, console: Console, study: Study, cases: list[PaperCase]) -> None:
+    """`run_paper` for a chosen machine and choice of cases.
+
+    Args:
+        out: folder.
+        console: where progress and the outcome go.
+        study: the machine.
+        cases: from `paper_cases`.
+
+    Raises:
+        StudyError: as `run_paper` and `run_cases`.
+    """
+    _open_folder(out)
+    columns = (TextColumn("{task.description:<44}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as progress:
+        work = work_of(cases) + 1 + len(PAPER_FIGURES) / 4
+        task = progress.add_task("starting", total=work)
+
+        def tell(text: str, share: float) -> None:
+            progress.update(task, description=text, advance=share)
+
+        runs = run_cases(study, cases, tell)
+        measures = measure(runs)
+        try:
+            _write(out, runs, measures, tell)
+        except OSError as error:
+            raise StudyError(f"--out {out}: cannot write there ({error})") from error
+        progress.update(task, description="done", completed=work)
+    _print_outcome(out, console, runs)
+
+
+def _write(out: Path, runs: PaperRuns, measures: Measures, tell: Tell) -> None:
+    """Write everything beside its place first: an interrupted run leaves the old files whole."""
+    with staged(out) as staging:
+        tell("writing data", 0.0)
+        write_store(staging / DATA, paper_variables(runs, measures), run_attributes(runs.study))
+        tell("writing data", 1.0)
+        for name in PAPER_FIGURES:
+            tell(f"drawing {name}", 0.25)
+            draw_figure(name, runs, measures, staging)
+        with styled():
+            write_figure(sketch(runs.study), staging / "machine.png")
+        write_report(staging, report(runs, measures), runs.study)
+
+
+def _open_folder(out: Path) -> None:
+    """Make the folder, or raise StudyError where that or writing into it is impossible."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise StudyError(f"--out {out}: this is a file; name a folder") from None
+    except OSError as error:
+        raise StudyError(
+            f"--out {out}: cannot make this folder ({error.strerror}); name one in a place "
+            "that can be written to"
+        ) from None
+    check_target(out / DATA)
+
+
+def _print_outcome(out: Path, console: Console, runs: PaperRuns) -> None:
+    table = Table(Column("case", no_wrap=True), "links", "modes", "status")
+    for case, code in zip(runs.cases, runs.status, strict=True):
+        table.add_row(case.name, case.links_text, str(case.modes), describe(int(code)))
+    console.print(table)
+    console.print(f"executor: {EXECUTOR}")
+    console.print(f"report:  {out / REPORT}")
+    console.print(f"figures: {out}{os.sep}*.png and *.pdf")
+    console.print(f"data:    {out / DATA}")
+
+
+def paper_variables(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
+    """Everything `paper.h5` holds; the first axis is `case`.
+
+    Args:
+        runs: from `run_cases`.
+        measures: of these runs.
+
+    Returns:
+        Variables for `write_store`; controlled modes that a case does not separate are NaN.
+    """
+    metrics = {
+        name: Variable(v.data, ("case", *v.dims), v.units, v.long_name)
+        for name, v in metric_variables(runs.result).items()
+        if name != "spectral_density"  # the periodograms below cover more
+    }
+    result, per_case = runs.result, ("case",)
+    return {
+        **_axes(runs, measures),
+        **_case_labels(runs.cases),
+        "status": Variable(runs.status, per_case, *STATUS_LABEL),
+        "status_text": Variable(
+            np.array([describe(int(k)) for k in runs.status]), per_case, "1", "status in words"
+        ),
+        "bad_time": Variable(result.bad_time, per_case, "s", "when the status appeared, 0 if ok"),
+        "command_end": Variable(result.command_end, per_case, "s", "end of the shaped command"),
+        **metrics,
+        **_measured(runs, measures),
+        **_trajectories(runs),
+        **_loops(runs),
+    }
+
+
+def _axes(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
+    count = runs.frame.modal_omega.shape[1]
+    names = np.array([case.name for case in runs.cases])
+    return {
+        "case": Variable(names, ("case",), "1", "name of the case"),
+        "time": Variable(runs.record.time[0], ("time",), "s", "time"),
+        "link": Variable(np.arange(1, 4), ("link",), "1", "link number"),
+        "station": Variable(
+            np.array(runs.study.metrics.stations), ("station",), "m", "position along the link"
+        ),
+        "patch": Variable(np.arange(1, 4), ("patch",), "1", "patch pair, from the slider on"),
+        "controlled_mode": Variable(
+            np.arange(1, count + 1), ("controlled_mode",), "1", "mode of the controller"
+        ),
+        "pose_axis": Variable(np.array(["x", "y", "phi"]), ("pose_axis",), "1", "pose component"),
+        "frequency": Variable(measures.frequency, ("frequency",), "Hz", "frequency"),
+    }
+
+
+def _case_labels(cases: list[PaperCase]) -> dict[str, Variable]:
+    def label(values: list, unit: str, text: str) -> Variable:
+        return Variable(np.array(values), ("case",), unit, text)
+
+    return {
+        "move": label([c.move for c in cases], "1", "the paper's move or the faster one"),
+        "move_time": label([MOVES[c.move] for c in cases], "s", "duration of each of the moves"),
+        "shaper": label([c.shaper for c in cases], "1", "input shaper"),
+        "controlled_links": label([c.links_text for c in cases], "1", "links under control"),
+        "controlled_modes": label([c.modes for c in cases], "1", "modes separated by the filter"),
+        "ratio_from": label([c.ratio_from for c in cases], "1", "where the gain ratios come from"),
+        "gain_factor": label([c.gain_factor for c in cases], "1", "factor on the paper's gains"),
+        "feedback": label([c.feedback for c in cases], "1", "sampled or ideal feedback"),
+        "estimator": label([c.estimator for c in cases], "1", "velocity estimate"),
+        "damping_ratio": label([c.damping_ratio for c in cases], "1", "structural damping"),
+    }
+
+
+def _measured(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
+    modal = ("case", "link", "controlled_mode")
+    rows = runs.energy_ratio
+    return {
+        "gain_ratio": Variable(
+            runs.ratio, modal, "1", "gain of a mode over that of mode 1 (24); 0 without control"
+        ),
+        "energy_ratio": Variable(
+            np.array([row.ratio for row in rows]), ("energy_run", *modal[1:]), "1",
+            "ratios (24) from the modal energies of an uncontrolled run",
+        ),
+        "energy_run": Variable(
+            np.array([f"{r.move}-{r.shaper}-{r.basis}" for r in rows]), ("energy_run",), "1",
+            "move, shaper and modal coordinates of energy_ratio",
+        ),
+        "spectral_density": Variable(
+            _separated(runs, measures.spectral_density), (*modal, "frequency"), "m2/Hz",
+            "one-sided power spectral density of the controller's modes, Hann periodogram of the "
+            "run",
+        ),
+        "spectral_peak": Variable(
+            _separated(runs, measures.spectral_peak), modal, "m2/Hz",
+            "largest spectral density near the mode's frequency",
+        ),
+        "late_start": Variable(measures.late_start, ("case",), "s", "begin of the late window"),
+        "late_deflection_rms": Variable(
+            measures.late_deflection, modal[:2], "m", "rms mid-span deflection in the late window"
+        ),
+        "late_pose_error_rms": Variable(
+            measures.late_pose_error, ("case", "pose_axis"), "m; m; rad",
+            "rms pose error in the late window",
+        ),
+        "relative_settling_time": Variable(
+            measures.settling, modal[:2], "s",
+            "from the command's end to 5 % of the residual peak without control",
+        ),
+    }  # fmt: skip
+
+
+def _separated(runs: PaperRuns, values: np.ndarray) -> np.ndarray:
+    """Copy of (n, 3, C, ...) with the modes that a case does not separate as NaN."""
+    values = np.array(values)
+    for k, case in enumerate(runs.cases):
+        values[k, :, case.modes :] = np.nan
+    return values
+
+
+def _trajectories(runs: PaperRuns) -> dict[str, Variable]:
+    record = runs.record
+    deflection = record.chord_deflection_stations
+    series = ("case", "time")
+    modal = np.moveaxis(_separated(runs, np.moveaxis(record.controlled_coordinate, 1, -1)), -1, 1)
+    return {
+        "chord_deflection": Variable(
+            deflection[..., middle_station(runs)], (*series, "link"), "m",
+            "deflection of mid-span from the chord B-C",
+        ),
+        "chord_deflection_stations": Variable(
+            deflection, (*series, "link", "station"), "m",
+            "deflection relative to the chord B-C at the stations",
+        ),
+        "pose_error": Variable(
+            record.pose_error, (*series, "pose_axis"), "m; m; rad", "pose minus shaped command"
+        ),
+        "controlled_coordinate": Variable(
+            modal, (*series, "link", "controlled_mode"), "m",
+            "controller's modes seen by an ideal modal filter",
+        ),
+        "sensor_voltage": Variable(
+            record.sensor_voltage, (*series, "link", "patch"), "V", "raw sensor voltage"
+        ),
+        "actuator_voltage": Variable(
+            record.actuator_voltage, (*series, "link", "patch"), "V", "actuator voltage"
+        ),
+    }  # fmt: skip
+
+
+def _loops(runs: PaperRuns) -> dict[str, Variable]:
+    """Judgement of the linearised sampled loops, NaN where none was made."""
+    values = np.full((2, len(runs.cases)), np.nan)
+    for k, case in enumerate(runs.cases):
+        if case.name in runs.loops:
+            report = runs.loops[case.name]
+            values[:, k] = report.spectral_radius, report.gain_margin
+    return {
+        "loop_spectral_radius": Variable(
+            values[0], ("case",), "1", "of the linearised sampled loop; NaN: not judged"
+        ),
+        "gain_margin": Variable(
+            values[1], ("case",), "1", "common gain factor before instability; NaN: not judged"
+        ),
+    }

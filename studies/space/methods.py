@@ -1,0 +1,186 @@
+"""Sweep methods: how the axes of a block become cases, and what may be analysed afterwards.
+
+A `Method` says which fields of a block it reads, how axes combine or which points of the unit cube
+they take, how a report puts it, and which analysis its points are made for. `METHODS` is the only
+list of them; `METHODS.add` puts in one of your own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from jaxmodel.table import Table
+from studies.errors import field_error
+from studies.space.indices import elementary_effects, sobol_indices
+
+
+class Asked(NamedTuple):
+    """What a sampling method is asked for."""
+
+    block: Any  # `studies.space.spec.Block`: count, size, levels
+    dimensions: int  # of the unit cube
+    seed: int
+    path: str  # of the block, for messages
+
+
+class Analysis(NamedTuple):
+    """A table of what a design tells about its factors."""
+
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]  # most important factor first
+    n_left_out: int  # by failed cases
+    what: str  # is left out
+    notes: tuple[str, ...] = ()
+
+
+class Method(NamedTuple):
+    """One way to spread a block."""
+
+    name: str
+    text: str  # in reports; {} is the number of points or cases
+    fields: tuple[str, ...] = ()  # of a block that it reads, besides axes and blocks
+    # points of the unit cube (n, d); the first stay the same when more are asked for. None: the
+    # axes' own values, combined as follows
+    points: Callable[[Asked], np.ndarray] | None = None
+    combine: Literal["product", "side by side"] = "product"
+    # of the design's points (n, d), a metric there (n,), NaN where the case failed, and the names
+    # of the factors; a design made for it stands alone
+    analysis: Callable[[np.ndarray, np.ndarray, list[str]], Analysis] | None = None
+
+
+# --- points ---------------------------------------------------------------------------------------
+
+
+def random_points(asked: Asked) -> np.ndarray:
+    """Independent and uniform."""
+    return np.random.default_rng(asked.seed).random((asked.block.count, asked.dimensions))
+
+
+def hypercube_points(asked: Asked) -> np.ndarray:
+    """One Latin hypercube of `size` points after the other."""
+    from scipy.stats import qmc
+
+    size = asked.block.size or asked.block.count
+    parts = [
+        qmc.LatinHypercube(asked.dimensions, rng=np.random.default_rng([asked.seed, k])).random(
+            size
+        )
+        for k in range(asked.block.count // size)
+    ]
+    return np.concatenate(parts)
+
+
+def sobol_points(asked: Asked) -> np.ndarray:
+    """Scrambled Sobol points: the next power of two, cut, which is a balanced sequence."""
+    from scipy.stats import qmc
+
+    if asked.dimensions > 21201:
+        raise field_error(
+            f"{asked.path}.axes", asked.dimensions, "up to 21201 dimensions for Sobol points"
+        )
+    exponent = int(np.ceil(np.log2(max(asked.block.count, 1))))
+    rng = np.random.default_rng(asked.seed)
+    engine = qmc.Sobol(asked.dimensions, scramble=True, rng=rng)
+    return engine.random_base2(exponent)[: asked.block.count]
+
+
+def saltelli_points(points: np.ndarray) -> np.ndarray:
+    """Design for Sobol indices from (n, 2 d) points: rows A, B, A with column i of B; (n (d+2), d).
+
+    The d + 2 rows of each base point follow one another. Saltelli et al. 2010.
+    """
+    n, d = len(points), points.shape[1] // 2
+    a, b = points[:, :d], points[:, d:]
+    mixed = np.repeat(a[:, None], d, axis=1)
+    mixed[:, np.arange(d), np.arange(d)] = b
+    return np.concatenate([a[:, None], b[:, None], mixed], axis=1).reshape(n * (d + 2), d)
+
+
+def morris_points(count: int, dimensions: int, levels: int, seed: int) -> np.ndarray:
+    """Trajectories for elementary effects, (count (d + 1), d); Morris 1991.
+
+    Each starts on a random point of the grid and changes one coordinate after the other, in random
+    order, by +-levels/(2 (levels - 1)). The ends of the cube are part of the grid.
+    """
+    step = (levels // 2) / (levels - 1)
+    rows = []
+    for k in range(count):
+        rng = np.random.default_rng([seed, k])
+        start = rng.integers(0, levels, dimensions) / (levels - 1)
+        sign = np.where(start + step > 1 + 1e-12, -1.0, 1.0)
+        is_free = (start + step <= 1 + 1e-12) & (start - step >= -1e-12)
+        sign = np.where(is_free & (rng.random(dimensions) < 0.5), -1.0, sign)
+        moved = np.zeros((dimensions + 1, dimensions))
+        for position, axis in enumerate(rng.permutation(dimensions)):
+            moved[position + 1 :, axis] = sign[axis] * step
+        rows.append(start + moved)
+    return np.concatenate(rows).clip(0.0, 1.0)
+
+
+# --- analyses -------------------------------------------------------------------------------------
+
+
+def _morris(points: np.ndarray, value: np.ndarray, names: list[str]) -> Analysis:
+    effects = elementary_effects(points, value)
+    rows = [
+        (names[k], *(f"{x[k]:.4g}" for x in effects[:3]), str(effects.n_used[k]))
+        for k in np.argsort(-effects.mean_size, kind="stable")
+    ]
+    heads = ("factor", "mean |effect|", "mean effect", "deviation", "effects used")
+    return Analysis(heads, tuple(rows), effects.n_left_out, "effects")
+
+
+def _sobol(points: np.ndarray, value: np.ndarray, names: list[str]) -> Analysis:
+    found = sobol_indices(value, len(names))
+    rows = []
+    for k in np.argsort(-found.total):
+        a, b = found.first_interval[k], found.total_interval[k]
+        first, total = f"{found.first[k]:.3f}", f"{found.total[k]:.3f}"
+        between = (f"{x[0]:.3f} to {x[1]:.3f}" for x in (a, b))
+        rows.append((names[k], first, next(between), total, next(between)))
+    notes = ("a first index beyond the total one: not settled yet, take more base points",)
+    is_unsettled = bool(np.any(found.first > found.total_interval[:, 1]))
+    heads = ("factor", "first", "95 %", "total", "95 %")
+    return Analysis(
+        heads, tuple(rows), found.n_left_out, "base points", notes if is_unsettled else ()
+    )
+
+
+#: All methods by name.
+METHODS: Table[Method] = Table(
+    "method",
+    [
+        Method("grid", "every combination of"),
+        Method("zip", "side by side", combine="side by side"),
+        Method("list", "{} cases, spelt out in the file", ("cases",)),
+        Method("random", "{} random points of", ("count",), random_points),
+        Method(
+            "latin_hypercube",
+            "{} points of Latin hypercubes of",
+            ("count", "size"),
+            hypercube_points,
+        ),
+        Method("sobol", "{} Sobol points of", ("count",), sobol_points),
+        Method(
+            "morris",
+            "{} trajectories of a Morris design of",
+            ("count", "levels"),
+            lambda asked: morris_points(
+                asked.block.count, asked.dimensions, asked.block.levels, asked.seed
+            ),
+            analysis=_morris,
+        ),
+        Method(
+            "saltelli",
+            "{} base points of a Saltelli design of",
+            ("count",),
+            lambda asked: saltelli_points(
+                sobol_points(asked._replace(dimensions=2 * asked.dimensions))
+            ),
+            analysis=_sobol,
+        ),
+    ],
+)

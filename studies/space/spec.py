@@ -1,0 +1,182 @@
+"""The file of a sweep: a study plus `[sweep]`, which says what varies and how.
+
+`[sweep]` is a block; a block holds axes and further blocks, and its method combines them:
+
+- `grid`: every combination; `zip`: all side by side, of equal length; `list`: `cases`, spelt out;
+- `random`, `latin_hypercube`, `sobol`: `count` points of its axes, combined with every further
+  block; a Latin hypercube of `size` points follows the next, so that more can be asked for later;
+- `morris`: `count` trajectories on a grid of `levels`; `saltelli`: `count` base points: the designs
+  that `studies sensitivity` reads.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+from pydantic import ValidationError
+
+from studies.errors import StudyError, field_error, nearest
+from studies.space.methods import METHODS
+from studies.study.choices import OneOf
+from studies.study.entries import parse_entries
+from studies.study.explain import explain
+from studies.study.spec import Section, Study, described, parse_study, read_toml
+
+
+class Block(Section):
+    """Axes and how they combine."""
+
+    method: Annotated[str, OneOf(lambda: METHODS)] = described(
+        "grid", "-", "how axes and blocks combine"
+    )
+    axes: dict[str, Any] = described({}, "-", "field or ready-made axis = values")
+    blocks: tuple[dict[str, Any], ...] = described((), "-", "further blocks")
+    cases: tuple[dict[str, Any], ...] = described(
+        (), "-", "for method list: field = value, per case"
+    )
+    count: int = described(0, "1", "points of a sampling method", ge=0, le=10**7)
+    size: int = described(0, "1", "points of one Latin hypercube; 0: count", ge=0, le=10**7)
+    levels: int = described(4, "1", "levels of a Morris grid", ge=2, le=100)
+
+
+class Sweep(Block):
+    """What varies, and what is kept."""
+
+    where: str = described("", "-", "condition on the fields; other cases are left out")
+    repeats: int = described(1, "1", "runs of each case, with seeds of their own", ge=1, le=10**6)
+    seed: int = described(0, "1", "of the sampling methods", ge=0, le=10**9)
+    metrics: tuple[str, ...] = described((), "-", "metrics to keep; empty: all")
+    by: str = described("residual_rms", "-", "metric, or entry of one, that cases are ranked by")
+
+
+class Node(NamedTuple):
+    """A validated block with its validated blocks; `path` names it in messages."""
+
+    block: Block
+    children: tuple[Node, ...]
+    path: str
+
+
+class SweepSpec(NamedTuple):
+    """A sweep as asked for."""
+
+    study: Study  # values of all fields that do not vary
+    sweep: Sweep
+    root: Node  # the tree of blocks; its block is `sweep`
+    data: dict[str, Any]  # as read, for the record
+
+
+def ready_spec(name: Path) -> Path:
+    """A file, or the ready-made one of that name where there is no such file.
+
+    Raises:
+        StudyError: neither, but a ready one of nearly that name.
+    """
+    if name.is_file() or len(name.parts) > 1 or name.suffix not in ("", ".toml"):
+        return name
+    ready = {path.stem: path for path in (Path(__file__).parents[1] / "specs").glob("*.toml")}
+    hint = nearest(name.stem, ready)
+    if name.stem not in ready and hint and not name.exists():
+        raise StudyError(f"{name}: cannot be read (no such file); did you mean {hint!r}?")
+    return ready.get(name.stem, name)
+
+
+def load_sweep(path: str | Path) -> SweepSpec:
+    """Read a sweep file.
+
+    Raises:
+        StudyError: unreadable, not TOML, or not a valid sweep.
+    """
+    return parse_sweep(read_toml(path))
+
+
+def parse_sweep(data: dict[str, Any]) -> SweepSpec:
+    """Validate a dictionary as a sweep.
+
+    Raises:
+        StudyError: first fault found, with field, value, allowed range and unit.
+    """
+    if "sweep" not in data:
+        raise StudyError("sweep: missing; a sweep is a study file with a section [sweep]")
+    if isinstance(data["sweep"], (dict, list)):
+        _check_depth(data["sweep"])
+    study = parse_study({name: value for name, value in data.items() if name != "sweep"})
+    sweep = _parse_block(Sweep, data["sweep"], "sweep")
+    assert isinstance(sweep, Sweep)
+    ranking = parse_entries(sweep.by, "sweep.by").metric
+    if "by" in data["sweep"] and sweep.metrics and ranking not in sweep.metrics:
+        raise field_error("sweep.by", sweep.by, f"one of sweep.metrics = {list(sweep.metrics)}")
+    return SweepSpec(study, sweep, _node(sweep, "sweep"), data)
+
+
+def _check_depth(data: Any, depth: int = 0) -> None:
+    """Lists and tables inside one another, as far as any sweep needs them."""
+    if depth > 10 * DEEPEST:
+        raise StudyError("sweep: lists or tables nested too deep")
+    for entry in data.values() if isinstance(data, dict) else data:
+        if isinstance(entry, (dict, list, tuple)):
+            _check_depth(entry, depth + 1)
+
+
+def _parse_block(model: type[Block], data: Any, path: str) -> Block:
+    try:
+        block = model.model_validate(_tuples(data))
+    except ValidationError as error:
+        raise explain(error, model, data, inside=path) from None
+    _check_block(block, path)
+    return block
+
+
+def _tuples(data: Any) -> Any:
+    """Lists of blocks and cases as tuples; what is inside them is checked where it is used."""
+    if not isinstance(data, dict):
+        return data
+    listed = ("blocks", "cases", "metrics")
+    return {k: tuple(v) if k in listed and isinstance(v, list) else v for k, v in data.items()}
+
+
+#: Blocks may lie this deep in one another.
+DEEPEST = 20
+
+
+def _node(block: Block, path: str, depth: int = 0) -> Node:
+    children = []
+    if depth > DEEPEST:
+        raise StudyError(f"sweep.blocks: nested {depth} deep; allowed up to {DEEPEST}")
+    for k, data in enumerate(block.blocks):
+        inner = f"{path}.blocks.{k}"
+        children.append(_node(_parse_block(Block, data, inner), inner, depth + 1))
+    return Node(block, tuple(children), path)
+
+
+def _check_block(block: Block, path: str) -> None:
+    """What a method needs, and nothing that it would ignore."""
+    name, method = block.method, METHODS[block.method]
+    if "count" in method.fields and block.count < 1:
+        raise field_error(f"{path}.count", block.count, f"1 or more, for method {name}")
+    for field in ("count", "size", "levels"):
+        value, default = getattr(block, field), Block.model_fields[field].default
+        if field not in method.fields and value != default:
+            readers = ", ".join(other.name for other in METHODS.values() if field in other.fields)
+            raise field_error(
+                f"{path}.{field}", value, f"{default}, method {name} has no {field} ({readers})"
+            )
+    if block.size and block.count % block.size:
+        raise field_error(
+            f"{path}.count", block.count, f"a multiple of {path}.size = {block.size}", "1"
+        )
+    if ("cases" in method.fields) != bool(block.cases):
+        raise field_error(f"{path}.cases", block.cases, "one or more, with method list only")
+    if block.cases and block.axes:
+        raise field_error(f"{path}.axes", list(block.axes), "none with method list")
+    if method.points is not None and not block.axes:
+        raise field_error(f"{path}.axes", {}, "one axis or more")
+    if not (block.axes or block.blocks or block.cases) and path != "sweep":
+        raise field_error(path, {}, "a block with axes, blocks or cases")
+    if path != "sweep" and method.analysis is not None:
+        raise field_error(
+            f"{path}.method", name, "any other inside a block; these stand alone in [sweep]"
+        )
+    if method.analysis is not None and block.blocks:
+        raise field_error(f"{path}.blocks", len(block.blocks), "none with method " + name)

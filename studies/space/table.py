@@ -1,0 +1,280 @@
+"""The cases of a sweep as a table: columns of values, and for each case its id and its seed.
+
+The id is a hash of all parameters of the case, swept or not, and of its repeat; the seed follows
+from the study's seed and the id. Both are thus the same in whichever sweep a case turns up.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from hashlib import blake2b
+from typing import Any
+
+import numpy as np
+
+from studies.errors import StudyError, field_error
+from studies.space.axes import ALIASES, LIMIT, READY_MADE
+from studies.space.condition import evaluate
+from studies.space.designs import length, spread
+from studies.space.spec import SweepSpec
+from studies.study.consistency import SAMPLE_LIMIT
+from studies.study.fields import Columns, Fields, padded
+from studies.study.paths import (
+    as_list,
+    is_each_link,
+    known_field,
+    parse_entry,
+    replaced,
+    set_value,
+)
+from studies.study.spec import Study, parse_study
+
+
+@dataclass(frozen=True)
+class Table:
+    """All cases; a column whose name has no dot is a label that stands for other columns."""
+
+    study: Study  # values of all fields without a column
+    columns: Columns  # one row per case
+    repeat: np.ndarray  # number of the repeat, (n,)
+    case_id: np.ndarray  # 16 hexadecimal digits as bytes, (n,)
+    seed: np.ndarray  # (n,)
+    n_dropped: int  # cases that `where` left out
+    origin: np.ndarray  # for each row of the design, doubles included, the number of its case
+
+    def __len__(self) -> int:
+        return len(self.repeat)
+
+    @property
+    def n_double(self) -> int:
+        """Rows of the design that are the same as an earlier one."""
+        return len(self.origin) - len(self)
+
+    @property
+    def fields(self) -> dict[str, np.ndarray]:
+        """Columns of fields, without labels."""
+        return {name: column for name, column in self.columns.items() if "." in name}
+
+    def values(self, name: str) -> np.ndarray:
+        """Values of a field, an entry or a label for every case, (n,); errors as `values`."""
+        return np.broadcast_to(values(self.study, self.columns, name), (len(self),))
+
+    def rows(self, chosen: np.ndarray) -> Table:
+        """Some of the cases."""
+        return replace(
+            self,
+            columns={name: column[chosen] for name, column in self.columns.items()},
+            repeat=self.repeat[chosen],
+            case_id=self.case_id[chosen],
+            seed=self.seed[chosen],
+        )
+
+
+def build_table(spec: SweepSpec) -> Table:
+    """Spread a sweep into its cases.
+
+    Raises:
+        StudyError: a bad axis or condition, no case left, columns that do not fit one program.
+    """
+    columns = spread(spec.root, spec.study, spec.sweep.seed)
+    _check_shapes(columns)
+    _check_samples(spec.study, columns)
+    _check_moves(spec.study, columns)
+    n = length(columns)
+    kept = np.arange(n)
+    if spec.sweep.where:
+        truth = evaluate(spec.sweep.where, lambda name: values(spec.study, columns, name),
+                         "sweep.where")  # fmt: skip
+        kept = np.flatnonzero(np.broadcast_to(truth, (n,)))
+    if len(kept) == 0:
+        raise StudyError(f"sweep.where = {spec.sweep.where!r}: true for none of {n} cases")
+    repeats = spec.sweep.repeats
+    if len(kept) * repeats > LIMIT:
+        raise field_error(
+            "sweep.repeats", repeats, f"at most {LIMIT // len(kept)} with {len(kept)} cases"
+        )
+    index = np.repeat(kept, repeats)
+    columns = {name: column[index] for name, column in columns.items()}
+    repeat = np.tile(np.arange(repeats), len(kept))
+    ids = case_ids(spec.study, columns, repeat)
+    _, first, which = np.unique(ids, return_index=True, return_inverse=True)
+    single = np.sort(first)
+    origin = np.searchsorted(single, first[which])
+    seeds = _seeds(spec.study, columns, ids)
+    table = Table(spec.study, columns, repeat, ids, seeds, n - len(kept), origin)
+    return table if len(single) == len(ids) else table.rows(single)
+
+
+def values(study: Study, columns: Columns, name: str) -> np.ndarray:
+    """Values of a field, an entry or a label for all cases, (n,) or (1,) where it does not vary.
+
+    Raises:
+        StudyError: no such name, or a whole list where one value is needed.
+    """
+    name = ALIASES.get(name, name)
+    if name in columns and columns[name].ndim == 1 and columns[name].dtype != object:
+        return columns[name]
+    value = known_field(name, study, others=READY_MADE)
+    entry = parse_entry(name)
+    assert entry is not None
+    if isinstance(value, tuple):
+        raise StudyError(f"{name}: a list; name one entry of it, such as {name}[0]")
+    if is_each_link(name) and any(column.startswith(f"{name}[") for column in columns):
+        raise StudyError(f"{name}: differs between links here; name one, such as {name}[0]")
+    if not entry.indices and name in columns:
+        raise StudyError(f"{name}: a list in this sweep; name one entry of it, such as {name}[0]")
+    if not entry.indices or isinstance(value, str):
+        return np.array([value])
+    array = Fields(study, columns).numbers(entry.field)
+    if array.ndim - 1 != len(entry.indices):
+        raise StudyError(f"{name}: a list in this sweep; name one entry of it, such as {name}[0]")
+    chosen = np.moveaxis(array, 0, -1)[entry.indices]
+    return chosen > 0 if isinstance(value, bool) else chosen
+
+
+def _check_shapes(columns: Columns) -> None:
+    """Lists that the program cannot take in different lengths."""
+    for name in ("patches.centers", "shaper.frequencies_hz", "metrics.stations"):
+        if name in columns and columns[name].dtype == object:
+            raise StudyError(f"{name}: lists of different shape in one sweep; use equal ones")
+    for name in ("motion.move_time", "motion.dwell"):
+        if name in columns and columns[name].dtype == object:
+            kinds = {isinstance(value, tuple) for value in columns[name]}
+            if len(kinds) > 1:
+                raise StudyError(f"{name}: numbers and lists mixed; use one of them")
+
+
+def _check_samples(study: Study, columns: Columns) -> None:
+    """Runs longer than a program can take."""
+    rate = Fields(study, columns).numbers("electronics.sample_rate_hz")
+    longest = float(np.max(Fields(study, columns).numbers("run.duration") * rate))
+    if longest > SAMPLE_LIMIT:
+        raise StudyError(
+            f"run.duration: a case with {longest:.3g} samples; allowed up to {SAMPLE_LIMIT}"
+        )
+
+
+def _check_moves(study: Study, columns: Columns) -> None:
+    """Times of moves that a case does not have, and locked sliders with a path."""
+    fields = Fields(study, columns)
+    count = np.sum(~np.isnan(fields.numbers("motion.waypoints")[..., 0]), axis=1)
+    for name in ("motion.move_time", "motion.dwell"):
+        times = fields.numbers(name)
+        if times.ndim == 2 and np.any(np.sum(~np.isnan(times), axis=1) != count - 1):
+            raise StudyError(
+                f"{name}: lists and motion.waypoints that do not fit in some cases; allowed: one "
+                "number, or as many as there are moves"
+            )
+    if np.any((fields.numbers("drive.locked") > 0) & (count > 1)):
+        raise StudyError(
+            "drive.locked: true in cases with more than one of motion.waypoints; locked sliders "
+            "follow no path"
+        )
+
+
+def case_study(table: Table, index: int) -> Study:
+    """The study of one case, as a file of its own would say it.
+
+    Raises:
+        StudyError: the case does not stand as a single study (its status says so too).
+    """
+    data = loose_study(table, index).model_dump()
+    data["run"]["seed"] = int(table.seed[index])
+    modes = data["control"]["modes"]  # a mask of all cases may name more than this one has
+    data["control"]["mode_mask"] = tuple(row[:modes] for row in data["control"]["mode_mask"])
+    data["title"] = f"{table.study.title}: case {table.case_id[index].decode()}"[:200]
+    return parse_study(data)
+
+
+def loose_study(table: Table, index: int) -> Study:
+    """The study of one case, whether or not its fields fit together."""
+    study = table.study
+    for name, column in table.fields.items():
+        data = set_value(study, name, _python(column[index]))
+        study = Study.model_construct(**dict(_sections(data)))
+    return study
+
+
+def _sections(data: dict[str, Any]):
+    """Sections rebuilt without checks: single columns may only fit together."""
+    for name, value in data.items():
+        model: Any = Study.model_fields[name].annotation
+        yield name, model.model_construct(**value) if isinstance(value, dict) else value
+
+
+def _python(value: Any) -> Any:
+    """A column's entry as Python's numbers and tuples."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    return tuple(map(_python, value)) if isinstance(value, (list, tuple)) else value
+
+
+def case_ids(study: Study, columns: Columns, repeat: np.ndarray) -> np.ndarray:
+    """Hash of all parameters of each case, 16 hexadecimal digits as bytes, (n,)."""
+    varying = _varying_text(study, columns)
+    varying["repeat"] = [str(k) for k in repeat.tolist()]
+    data = study.model_dump(mode="json")
+    fixed = {
+        f"{section}.{leaf}": json.dumps(value)
+        for section, fields in data.items()
+        if isinstance(fields, dict)  # the title is no parameter
+        for leaf, value in fields.items()
+        if value != {}
+    }
+    names = sorted(fixed.keys() | varying.keys())
+    # fixed lines that follow one another are joined once
+    pieces: list[bytes] = [b""]
+    lists: list[list[str]] = []
+    for name in names:
+        if name in varying:
+            pieces[-1] += f"{name}=".encode()
+            pieces.append(b"\n")
+            lists.append(varying[name])
+        else:
+            pieces[-1] += f"{name}={fixed[name]}\n".encode()
+    start, rest = blake2b(pieces[0], digest_size=8), pieces[1:]
+    ids = np.empty(len(repeat), "S16")
+    for k, texts in enumerate(zip(*lists, strict=True)):
+        digest = start.copy()
+        for text, piece in zip(texts, rest, strict=True):
+            digest.update(text.encode())
+            digest.update(piece)
+        ids[k] = digest.hexdigest()
+    return ids
+
+
+def _varying_text(study: Study, columns: Columns) -> dict[str, list[str]]:
+    """Text of each field that varies, for all cases."""
+    whole: dict[str, list[Any]] = {}
+    for name, column in columns.items():
+        entry = parse_entry(name)
+        if entry is not None and not entry.indices and "." in name:
+            whole[name] = column.tolist()
+    for name, column in columns.items():
+        entry = parse_entry(name)
+        if entry is None or not entry.indices:
+            continue
+        base = whole.get(entry.field) or [known_field(entry.field, study)] * len(column)
+        base = [as_list(entry.field, value) for value in base]
+        whole[entry.field] = [
+            replaced(value, entry.indices, new)
+            for value, new in zip(base, column.tolist(), strict=True)
+        ]
+    return {name: [_text(value) for value in values] for name, values in whole.items()}
+
+
+def _text(value: Any) -> str:
+    return repr(value) if type(value) in (float, int) else json.dumps(value)
+
+
+def _seeds(study: Study, columns: Columns, ids: np.ndarray) -> np.ndarray:
+    bases = columns["run.seed"].tolist() if "run.seed" in columns else [study.run.seed] * len(ids)
+    pairs = zip(bases, ids.tolist(), strict=True)
+    digests = (blake2b(b"%d:%s" % pair, digest_size=8).digest() for pair in pairs)
+    return np.fromiter((int.from_bytes(d, "big") % 10**9 for d in digests), np.int64, len(ids))
+
+
+def as_numbers(column: np.ndarray) -> np.ndarray:
+    """A column as an array that a file can hold: lists of unequal length filled with NaN."""
+    return padded(list(column)) if column.dtype == object else column

@@ -1,0 +1,246 @@
+"""Faults of a study that involve more than one field."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxmodel.laws import LAWS
+from jaxmodel.piezo import VACUUM_PERMITTIVITY
+from studies.errors import field_error, nearest
+
+if TYPE_CHECKING:
+    from studies.study.spec import Study
+
+#: A run of more plant steps than this would not fit into memory with its trajectories.
+SAMPLE_LIMIT = 2_000_000
+#: Bandwidth of the slowest amplifier [Hz].
+SLOWEST_AMPLIFIER = 1.0
+
+
+def each_link(value: Any) -> np.ndarray:
+    """One number for all links, or three of them, as (3,)."""
+    return np.broadcast_to(np.asarray(value, float), (3,))
+
+
+def patch_pitch(study: Study) -> np.ndarray:
+    """Room along each link that one patch pair takes, the longer of both [m], (3,)."""
+    patches = study.patches
+    return np.maximum(each_link(patches.sensor_length), each_link(patches.actuator_length))
+
+
+def patch_centers(study: Study) -> np.ndarray:
+    """Patch centres of every link [m], (3, K)."""
+    centers = study.patches.centers
+    is_nested = len(centers) > 0 and isinstance(centers[0], tuple)
+    rows = centers if is_nested else (centers,) * 3
+    if len(rows) != 3 or len({len(row) for row in rows}) != 1 or not rows[0]:  # type: ignore[arg-type]
+        raise field_error(
+            "patches.centers", centers, "one list of centres, or three lists of equal length", "m"
+        )
+    return np.array(rows, float)
+
+
+def check_consistency(study: Study) -> None:
+    """Faults that involve more than one field. Those of poses are found in `studies.engine.runs`.
+
+    Raises:
+        StudyError: the first fault.
+    """
+    link, control = study.link, study.control
+    _check_patches(study)
+    n_patches = patch_centers(study).shape[1]
+    if LAWS[control.law].channel == "mode" and control.modes > n_patches:
+        raise field_error(
+            "control.modes",
+            control.modes,
+            f"1 to {n_patches}, the number of patch pairs of a link",
+            "1",
+        )
+    _check_lists(study)
+    _check_own_fields(study)
+    if link.basis != "loaded" and any(map(np.any, (link.joint_inertia_b, link.joint_inertia_c))):
+        raise field_error("link.basis", link.basis, "loaded, where a joint has rotary inertia")
+    if study.drive.locked and link.basis == "pinned_free":
+        raise field_error(
+            "link.basis", link.basis, "pinned_pinned or loaded, where drive.locked is true"
+        )
+    if study.run.model == "ked" and link.basis == "pinned_free":
+        raise field_error(
+            "link.basis", link.basis,
+            "pinned_pinned or loaded, where run.model is ked: rigid motion prescribes both ends",
+        )  # fmt: skip
+    stations = ("metrics.stations", study.metrics.stations)
+    shortest = each_link(link.length).min()
+    for name, values in (stations, ("initial.load_station", (study.initial.load_station,))):
+        for value in values:
+            if not 0 < value < shortest:
+                raise field_error(
+                    name, value, f"between 0 and link.length = {shortest:g}, exclusive", "m"
+                )
+    _check_sampling(study)
+    _check_pulses(study)
+    _check_coupling(study)
+
+
+def _check_own_fields(study: Study) -> None:
+    """Fields of laws' own; those of a law that is not chosen may stand there for a sweep."""
+    for name, fields in study.control.laws.items():
+        path = f"control.laws.{name}"
+        if name not in LAWS:
+            raise field_error(path, fields, ", ".join(LAWS), hint=nearest(name, LAWS))
+        known = {parameter.name: parameter for parameter in LAWS[name].parameters}
+        for leaf, value in fields.items():
+            if leaf not in known:
+                allowed = ", ".join(known) or "no field of its own"
+                raise field_error(f"{path}.{leaf}", value, allowed, hint=nearest(leaf, known))
+            low, high, unit = known[leaf].low, known[leaf].high, known[leaf].unit
+            if not np.all((each_link(value) >= low) & (each_link(value) <= high)):
+                raise field_error(f"{path}.{leaf}", value, f"{low:g} to {high:g}", unit)
+
+
+def _check_patches(study: Study) -> None:
+    """Patches that leave their link, or overlap."""
+    patches, link = study.patches, study.link
+    pitches, lengths, is_own = patch_pitch(study), each_link(link.length), _differs(link.length)
+    sensor = each_link(patches.sensor_length)
+    for i, (row, pitch, length) in enumerate(
+        zip(patch_centers(study), pitches, lengths, strict=True)
+    ):
+        of_link = f" (link {i + 1})" if is_own or _differs(list(pitches)) else ""
+        if pitch > length:
+            name = "sensor" if sensor[i] == pitch else "actuator"
+            raise field_error(
+                f"patches.{name}_length", pitch, f"at most link.length = {length:g}{of_link}", "m"
+            )
+        ordered, given = np.sort(row), [float(f"{x:.9g}") for x in row]
+        if ordered[0] < pitch / 2 - 1e-12 or ordered[-1] > length - pitch / 2 + 1e-12:
+            raise field_error(
+                "patches.centers", given,
+                f"{pitch / 2:g} to {length - pitch / 2:g}, so that no patch leaves the "
+                f"link{of_link}", "m",
+            )  # fmt: skip
+        if np.any(np.diff(ordered) < pitch - 1e-12):
+            raise field_error(
+                "patches.centers", given,
+                f"centres at least {pitch:g} apart, so that no patches overlap{of_link}", "m",
+            )  # fmt: skip
+    widths = each_link(patches.width)
+    for i in np.flatnonzero(widths > each_link(link.width) * (1 + 1e-9))[:1]:
+        raise field_error(
+            "patches.width", widths[i], f"at most link.width = {each_link(link.width)[i]:g}", "m"
+        )
+
+
+def _differs(value: Any) -> bool:
+    return bool(np.ptp(each_link(value)) > 0)
+
+
+def check_locked(study: Study) -> None:
+    """Locked sliders follow no path; a linearisation does not mind, a run does.
+
+    Raises:
+        StudyError: more than one way-point.
+    """
+    if study.drive.locked and len(study.motion.waypoints) > 1:
+        raise field_error(
+            "motion.waypoints", study.motion.waypoints,
+            "one pose where drive.locked is true: locked sliders follow no path", "m, m, rad",
+        )  # fmt: skip
+
+
+def _check_coupling(study: Study) -> None:
+    """The ceramic must couple, and less than completely: k31^2 = d31^2 E_p/eps33T in (0, 1)."""
+    patches = study.patches
+    permittivity = each_link(patches.relative_permittivity) * VACUUM_PERMITTIVITY
+    highest = np.sqrt(permittivity / each_link(patches.youngs_modulus))
+    size = np.abs(each_link(patches.d31))
+    for i in np.flatnonzero((size <= 1e-6 * highest) | (size >= highest))[:1]:
+        raise field_error(
+            "patches.d31", patches.d31,
+            f"{1e-6 * highest[i]:.3g} to {highest[i]:.3g} in size, for a coupling k31^2 below 1 "
+            "with patches.youngs_modulus and patches.relative_permittivity", "C/N",
+        )  # fmt: skip
+
+
+def _check_pulses(study: Study) -> None:
+    """A pulse that begins after the run would do nothing, without a word."""
+    for name, pulse, start in (
+        ("drive.pulse_start", study.drive.pulse_force, study.drive.pulse_start),
+        ("load.pulse_start", study.load.pulse, study.load.pulse_start),
+    ):
+        if any(pulse) and start >= study.run.duration:
+            raise field_error(name, start, f"below run.duration = {study.run.duration:g}", "s")
+
+
+def _check_sampling(study: Study) -> None:
+    """What must fit the sample rate."""
+    electronics, rate = study.electronics, study.electronics.sample_rate_hz
+    for name in ("antialias_hz", "sensor_highpass_hz"):
+        value = getattr(electronics, name)
+        if value >= rate / 2:
+            raise field_error(
+                f"electronics.{name}", value, f"below half the sample rate, {rate / 2:g}", "Hz"
+            )
+    if 0 < electronics.amplifier_hz < SLOWEST_AMPLIFIER:
+        raise field_error(
+            "electronics.amplifier_hz", electronics.amplifier_hz,
+            f"0 (no limit) or {SLOWEST_AMPLIFIER:g} and more", "Hz",
+        )  # fmt: skip
+    for value in study.shaper.frequencies_hz:
+        if value >= rate / 2:
+            raise field_error(
+                "shaper.frequencies_hz", value, f"below half the sample rate, {rate / 2:g}", "Hz"
+            )
+    longest = SAMPLE_LIMIT / (rate * max(study.run.substeps, 1))
+    if study.run.duration > longest:
+        raise field_error(
+            "run.duration",
+            study.run.duration,
+            f"up to {longest:g} at this electronics.sample_rate_hz and run.substeps, "
+            f"{SAMPLE_LIMIT} plant steps",
+            "s",
+        )
+
+
+def _nested(lists: Any) -> tuple:
+    """A table of three lists; empty where one number or list serves all links."""
+    return lists if isinstance(lists, tuple) and lists and isinstance(lists[0], tuple) else ()
+
+
+def _check_lists(study: Study) -> None:
+    moves = len(study.motion.waypoints) - 1
+    for name in ("move_time", "dwell"):
+        value = getattr(study.motion, name)
+        if isinstance(value, tuple) and len(value) != moves:
+            raise field_error(
+                f"motion.{name}", value, f"one number, or {moves} of them (one per move)", "s"
+            )
+    control = study.control
+    tables = (
+        ("control.ratios", control.ratios, control.modes, "1"),
+        ("control.mode_mask", control.mode_mask, control.modes, ""),
+        ("initial.modal", study.initial.modal, study.link.modes, "m"),
+        ("control.frequencies_hz", _nested(control.frequencies_hz), control.modes, "Hz"),
+        ("link.damping_ratio", _nested(study.link.damping_ratio), study.link.modes, "1"),
+    )
+    damping = study.link.damping_ratio
+    if damping == () or any(row == () for row in _nested(damping)):
+        raise field_error("link.damping_ratio", damping, "at least one number per link", "1")
+    given = control.frequencies_hz
+    for row in _nested(given) or (given,):
+        if any(b <= a for a, b in zip(row, row[1:], strict=False)):
+            raise field_error("control.frequencies_hz", given, "rising from mode to mode", "Hz")
+    for name, flat, most, limit, unit in (
+        ("control.frequencies_hz", given, "control.modes", control.modes, "Hz"),
+        ("link.damping_ratio", damping, "link.modes", study.link.modes, "1"),
+    ):
+        if isinstance(flat, tuple) and not _nested(flat) and len(flat) > limit:
+            raise field_error(name, flat, f"at most {most} = {limit} entries", unit)
+    for name, table, _width, unit in tables:
+        if table and len(table) != 3:
+            raise field_error(name, table, "three lists, one per link", unit)
+    for name, table, width, unit in tables[1:]:
+        if any(len(row) > width for row in table):
+            raise field_error(name, table, f"at most {width} entries per link", unit)

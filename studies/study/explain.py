@@ -1,0 +1,179 @@
+"""What a field of a study allows, in words: for error messages and for a template's comments."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+
+from studies.errors import StudyError, field_error, nearest, shown, shown_name
+from studies.study.choices import OneOf
+
+_SIGNS = (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
+_WORDS = {bool: "true or false", str: "text", float: "a finite number", int: "a whole number"}
+_PLURALS = {bool: "values true or false", float: "finite numbers", str: "texts", dict: "tables"}
+
+#: Sections that make more than a study of a file; commands of the same name read them.
+COMMANDS = ("sweep", "tune")
+
+
+def unit_of(info: FieldInfo) -> str:
+    """Unit of a field, "" where it has none."""
+    extra = info.json_schema_extra
+    unit = str(extra.get("unit", "")) if isinstance(extra, dict) else ""
+    return "" if unit == "-" else unit
+
+
+def choices_of(annotation: Any, metadata: Iterable[Any] = ()) -> tuple[Any, ...]:
+    """What a field that is a choice may be; () for others."""
+    tables = [item.names for item in metadata if isinstance(item, OneOf)]
+    literal = get_args(annotation) if get_origin(annotation) is Literal else ()
+    return tables[0] if tables else literal
+
+
+def allowed_values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
+    """What a type with its limits allows: "a number > 0 and <= 100", "'a' or 'b'", "3 numbers".
+
+    annotation: the type of a field or of an entry. metadata: its limits, as pydantic keeps them.
+    """
+    names = choices_of(annotation, metadata)
+    if names:
+        return " or ".join(filter(None, (", ".join(map(repr, names[:-1])), repr(names[-1]))))
+    for item in metadata:
+        if hasattr(item, "allowed"):  # says it itself
+            return str(item.allowed)
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if hasattr(annotation, "__metadata__"):
+        return allowed_values(arguments[0], _limits(annotation))
+    if origin in (Union, UnionType):
+        several = get_args(arguments[-1])
+        if several == arguments[:1] * len(several):  # one number, or some of the same kind
+            inner, limits = get_args(arguments[0])[0], _range(_limits(arguments[0]))
+            return f"{_WORDS[inner]}, or a list of {len(several)}, each {limits}"
+        return ", or ".join(allowed_values(each, metadata) for each in arguments)
+    if origin is dict:
+        return "a table"
+    if origin is tuple:
+        return _entries(arguments, metadata)
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return f"a section with fields {', '.join(annotation.model_fields)}"
+    return " ".join(filter(None, (_WORDS[annotation], _range(metadata))))
+
+
+def _entries(arguments: tuple[Any, ...], metadata: Iterable[Any]) -> str:
+    """A list: how many entries, and of what."""
+    if not arguments:
+        return "an empty list"
+    entry = arguments[0]
+    inner = get_args(entry)[0] if hasattr(entry, "__metadata__") else entry
+    inner = dict if get_origin(inner) is dict else inner
+    least, most = _bound(metadata, "min_length"), _bound(metadata, "max_length")
+    if arguments[-1] is not Ellipsis:
+        count = f"{len(arguments)} "
+    elif most is not None:
+        count = f"{least or 0} to {most} "
+    else:
+        count = f"{least} or more " if least else "a list of "
+    if get_origin(inner) is tuple:
+        return f"{count}lists, each of {_entries(get_args(inner), ()).removeprefix('a list of ')}"
+    limits = _range(_limits(entry))
+    return f"{count}{_PLURALS[inner]}" + (f", each {limits}" if limits else "")
+
+
+def _limits(annotation: Any) -> list[Any]:
+    """Limits of an `Annotated` type; pydantic keeps them in a FieldInfo there."""
+    found: list[Any] = []
+    for item in getattr(annotation, "__metadata__", ()):
+        found += item.metadata if isinstance(item, FieldInfo) else [item]
+    return found
+
+
+def _bound(metadata: Iterable[Any], name: str) -> Any:
+    values = (getattr(item, name, None) for item in metadata)
+    return next((value for value in values if value is not None), None)
+
+
+def _range(metadata: Iterable[Any]) -> str:
+    limits = [
+        f"{sign} {value:g}"
+        for name, sign in _SIGNS
+        if (value := _bound(metadata, name)) is not None
+    ]
+    longest = _bound(metadata, "max_length")
+    if longest is not None:
+        limits.append(f"of at most {longest} characters")
+    if _bound(metadata, "pattern") is not None:  # the only one there is
+        limits.append("without NUL characters")
+    return " and ".join(limits)
+
+
+def explain(
+    error: ValidationError, study: type[BaseModel], data: dict[str, Any], inside: str = ""
+) -> StudyError:
+    """The first fault that pydantic found, in the words of the study file.
+
+    error: what validation raised. study: the outermost model. data: what was validated.
+    inside: name of the section that the model describes, "" for a whole study.
+    """
+    fault = error.errors(include_url=False)[0]
+    location = list(fault["loc"])
+    model, used, info = study, 0, None
+    for used, part in enumerate(location, 1):
+        info = model.model_fields.get(str(part))
+        if info is None:
+            return _unknown(study, model, location[:used], fault["input"], inside)
+        inner = info.annotation
+        if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
+            break
+        model = inner
+    if info is None:
+        return field_error(inside or "study", fault["input"], allowed_values(study))
+    is_missing = fault["type"] == "missing"
+    return _bad_value(info, location[:used], location[used:], is_missing, data, inside)
+
+
+def _unknown(
+    study: type[BaseModel], model: type[BaseModel], location: list[Any], value: Any, inside: str
+) -> StudyError:
+    name = str(location[-1])
+    prefix = "".join(f"{part}." for part in [inside, *location[:-1]] if part != "")
+    field = prefix + name
+    close = nearest(name, model.model_fields)
+    hint = f"did you mean {prefix + close!r}?" if close else ""
+    for section, info in study.model_fields.items() if not close else ():
+        if name in getattr(info.annotation, "model_fields", ()):
+            hint = f"did you mean {f'{section}.{name}'!r}?"
+    where = f"in [{prefix.rstrip('.')}]" if prefix else "at the top"
+    if not prefix and name in COMMANDS:
+        hint = f"`studies {name}` reads that; a study alone has none"
+    hint = hint or f"allowed {where}: {', '.join(model.model_fields)}"
+    return StudyError(f"{shown_name(field)} = {shown(value)}: unknown field; {hint}")
+
+
+def _bad_value(
+    info: FieldInfo,
+    name: list[Any],
+    entries: list[Any],
+    is_missing: bool,
+    data: dict[str, Any],
+    inside: str,
+) -> StudyError:
+    annotation, metadata = info.annotation, list(info.metadata)
+    value: Any = data
+    for part in name:
+        value = value[part]
+    # an entry of a list is named by its index, as far as its type is clear
+    for part in entries[:-1] if is_missing else entries:
+        if get_origin(annotation) is not tuple or not isinstance(part, int):
+            break
+        arguments = get_args(annotation)
+        annotation = arguments[0] if arguments[-1] is Ellipsis else arguments[part]
+        metadata, value = [], value[part]
+        name = [*name, part]
+    choices = choices_of(annotation, metadata)
+    hint = nearest(value, choices) if isinstance(value, str) else ""
+    field = ".".join(str(part) for part in [inside, *name] if part != "")
+    return field_error(field, value, allowed_values(annotation, metadata), unit_of(info), hint)

@@ -1,0 +1,104 @@
+"""Fields of a study as arrays with a leading case axis, of length 1 where nothing varies.
+
+A *column* holds the values of one field for many cases: numbers, or lists of equal shape, as a
+NumPy array with the cases first; lists of unequal shape as an object array of tuples. A column may
+also be named after an entry of a list, `control.velocity_gain[0]`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from studies.study.paths import LINKS, as_list, field_value, is_each_link, parse_entry
+from studies.study.spec import Study
+
+Columns = Mapping[str, np.ndarray]
+
+
+def padded(values: list[Any]) -> np.ndarray:
+    """Numbers, or lists of them of any lengths, as one float array, missing entries NaN."""
+    if not isinstance(values[0], (tuple, list, np.ndarray)):
+        return np.array(values, float)
+    if all(np.size(np.array(value, object)) == 0 for value in values):
+        return np.zeros((len(values), 0))
+    depth = _depth(values)
+    shape = [len(values)] + [0] * depth
+    _measure(values, shape, 0)
+    array = np.full(shape, np.nan)
+    _fill(array, values)
+    return array
+
+
+def _depth(value: Any) -> int:
+    if not isinstance(value, (tuple, list, np.ndarray)):
+        return -1
+    return 1 + max((_depth(entry) for entry in value), default=-1)
+
+
+def _measure(value: Any, shape: list[int], level: int) -> None:
+    for entry in value:
+        if isinstance(entry, (tuple, list, np.ndarray)):
+            shape[level + 1] = max(shape[level + 1], len(entry))
+            _measure(entry, shape, level + 1)
+
+
+def _fill(array: np.ndarray, value: Any) -> None:
+    for k, entry in enumerate(value):
+        if isinstance(entry, (tuple, list, np.ndarray)):
+            _fill(array[k], entry)
+        else:
+            array[k] = entry
+
+
+class Fields:
+    """Every field of a study, some of them with one value per case.
+
+    study: values of all fields that no column names. columns: the others.
+    """
+
+    def __init__(self, study: Study, columns: Columns | None = None) -> None:
+        self.study = study
+        self.columns = columns or {}
+
+    def raw(self, field: str) -> np.ndarray:
+        """Values as they were written, (m,) or (m, ...), m = 1 or the number of cases."""
+        if field in self.columns:
+            return self.columns[field]
+        value = field_value(self.study, field)
+        if isinstance(value, tuple):
+            column = np.empty(1, object)
+            column[0] = value
+            return column
+        return np.array([value])
+
+    def numbers(self, field: str) -> np.ndarray:
+        """As floats, entries of lists put in; what ragged lists lack is NaN."""
+        raw = self.raw(field)
+        if raw.dtype == object:
+            is_mixed = is_each_link(field) and any(isinstance(value, tuple) for value in raw)
+            array = padded([as_list(field, x) for x in raw] if is_mixed else list(raw))
+        else:
+            array = raw.astype(float)
+        for name, column in self.columns.items():
+            entry = parse_entry(name)
+            if entry is not None and entry.field == field and entry.indices:
+                if array.ndim == 1:
+                    array = np.repeat(array[:, None], LINKS, axis=1)
+                if len(array) != len(column):
+                    array = np.repeat(array, len(column), axis=0)
+                np.moveaxis(array, 0, -1)[entry.indices] = np.moveaxis(column, 0, -1)
+        return array
+
+    def each_link(self, field: str) -> np.ndarray:
+        """As floats, one for each link where one stands for all, (m, 3)."""
+        array = self.numbers(field)
+        return np.repeat(array[:, None], LINKS, axis=1) if array.ndim == 1 else array
+
+    def choices(self, field: str, names: tuple[str, ...]) -> np.ndarray:
+        """Position of each text value in `names`, (m,)."""
+        raw = self.raw(field)
+        distinct, inverse = np.unique(raw.astype(str), return_inverse=True)
+        return np.array([names.index(name) for name in distinct])[inverse]

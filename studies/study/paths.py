@@ -1,0 +1,221 @@
+"""Fields of a study by name: the one language, the one getter, the one setter.
+
+A name is a field and, of a list, the indices of an entry: `link.length`, `control.ratios[0][1]`.
+Fields of a control law's own are `control.laws.LAW.FIELD`; where a study does not set one it has
+the law's default.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple, get_args
+
+from pydantic import BaseModel, ValidationError
+
+from jaxmodel.laws import LAWS
+from jaxmodel.laws.contract import Parameter
+from studies.errors import StudyError, nearest, shown
+from studies.study.consistency import check_consistency
+from studies.study.explain import choices_of, explain, unit_of
+from studies.study.spec import OWN_FIELDS, Study
+
+LINKS = 3
+#: An index that names its axis and counts from 1, as the files do: `residual_rms[link=1]`.
+NAMED_INDEX = re.compile(r"\[(\w+)=(\d{1,6})\]")
+_ENTRY = re.compile(r"(?P<field>[^\s\[\]]+)(?P<indices>(\[(0|[1-9]\d{0,5})\])*)")
+#: Faults in these fields are a status of the case, so that a sweep may run into them.
+JUDGED_BY_STATUS = (
+    "patches.",
+    "motion.",
+    "machine.",
+    "link.length",
+    "link.modes",
+    "control.modes",
+    "electronics.",
+    "shaper.frequencies_hz",
+    "run.duration",
+    "metrics.",
+)
+
+
+class Entry(NamedTuple):
+    """A field, or an entry of a list: `control.ratios[0][1]` is ("control.ratios", (0, 1))."""
+
+    field: str
+    indices: tuple[int, ...]
+
+
+def parse_entry(name: str) -> Entry | None:
+    """Split a name into field and indices; None where it is no such name."""
+    match = _ENTRY.fullmatch(name)
+    if match is None:
+        return None
+    return Entry(match["field"], tuple(map(int, re.findall(r"\d+", match["indices"]))))
+
+
+def all_fields() -> list[str]:
+    """Every field that a study can have."""
+    names = []
+    for section, info in Study.model_fields.items():
+        inner = info.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            names += [f"{section}.{leaf}" for leaf in inner.model_fields]
+    names.remove(OWN_FIELDS)
+    return names + [
+        f"{OWN_FIELDS}.{law.name}.{x.name}" for law in LAWS.values() for x in law.parameters
+    ]
+
+
+def own_parameter(field: str) -> Parameter | None:
+    """The law's parameter that a field is, if it is one."""
+    if not field.startswith(f"{OWN_FIELDS}."):
+        return None
+    law, _, leaf = field.removeprefix(f"{OWN_FIELDS}.").partition(".")
+    known = LAWS[law].parameters if law in LAWS else ()
+    return next((parameter for parameter in known if parameter.name == leaf), None)
+
+
+def is_each_link(field: str) -> bool:
+    """Whether one number stands for all links, or three for one each."""
+    return field in EACH_LINK or field.startswith(f"{OWN_FIELDS}.")
+
+
+def field_value(study: Study, field: str) -> Any:
+    """Value of a field of a study."""
+    parameter = own_parameter(field)
+    value: Any = study
+    for part in field.split("."):
+        if isinstance(value, dict):
+            assert parameter is not None
+            value = value.get(part, {} if part in LAWS else parameter.default)
+        else:
+            value = getattr(value, part)
+    return value
+
+
+def field_unit(field: str) -> str:
+    """Unit of a field of a study, "1" for none."""
+    parameter, (section, _, leaf) = own_parameter(field), field.partition(".")
+    if parameter is not None:
+        return parameter.unit
+    if not leaf:
+        return "1"
+    model: Any = Study.model_fields[section].annotation
+    return unit_of(model.model_fields[leaf]) or "1"
+
+
+def field_choices(field: str) -> tuple[str, ...]:
+    """What a field that is a choice may be; () for others."""
+    section, _, leaf = field.partition(".")
+    fields = getattr(Study.model_fields[section].annotation, "model_fields", {})
+    return choices_of(fields[leaf].annotation, fields[leaf].metadata) if leaf in fields else ()
+
+
+def as_list(field: str, value: Any) -> Any:
+    """A field's value where its entries are asked for: three, where one stands for all links."""
+    return (value,) * LINKS if is_each_link(field) and not isinstance(value, tuple) else value
+
+
+def known_field(name: str, study: Study, path: str = "", others: Iterable[str] = ()) -> Any:
+    """Value of a field or an entry of it in a study.
+
+    Args:
+        name: of the field or entry.
+        study: where to look.
+        path: where the name was written, for messages.
+        others: names that may be meant as well.
+
+    Raises:
+        StudyError: no such field or entry, with the nearest name.
+    """
+    entry = parse_entry(name)
+    names = all_fields()
+    where = f"{path}: " if path else ""
+    if entry is None or entry.field not in names:
+        wanted = entry.field if entry else name
+        close = nearest(wanted, [*names, *others]) or _by_leaf(wanted, names)
+        hint = f"did you mean {close!r}?" if close else "see studies init for all fields"
+        raise StudyError(f"{where}{shown(name)}: unknown field; {hint}")
+    value = field_value(study, entry.field)
+    value = as_list(entry.field, value) if entry.indices else value
+    for index in entry.indices:
+        if not isinstance(value, tuple) or index >= len(value):
+            size = f"0 to {len(value) - 1}" if isinstance(value, tuple) and value else "none"
+            raise StudyError(
+                f"{where}{name!r}: no such entry; {entry.field} = "
+                f"{field_value(study, entry.field)}, allowed index here {size}"
+            )
+        value = value[index]
+    return value
+
+
+def _by_leaf(wanted: str, names: list[str]) -> str:
+    leaf = wanted.rsplit(".", 1)[-1]
+    return next((name for name in names if name.endswith(f".{leaf}")), "")
+
+
+def set_value(study: Study, name: str, value: Any) -> dict[str, Any]:
+    """The study as a dictionary, with a field or an entry of it replaced."""
+    return set_values(study, {name: value})
+
+
+def set_values(study: Study, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The study as a dictionary, with fields or entries of fields replaced, one after the other."""
+    data = study.model_dump()
+    for name, value in values.items():
+        entry = parse_entry(name)
+        assert entry is not None
+        *sections, leaf = entry.field.split(".")
+        target = data
+        for section in sections:
+            target = target.setdefault(section, {})
+        if entry.indices:
+            whole = target[leaf] if leaf in target else field_value(study, entry.field)
+            value = replaced(as_list(entry.field, whole), entry.indices, value)
+        target[leaf] = value
+    return data
+
+
+def replaced(whole: Any, indices: tuple[int, ...], value: Any) -> Any:
+    """A nested tuple with one entry replaced."""
+    if not indices:
+        return value
+    first, *rest = indices
+    return (*whole[:first], replaced(whole[first], tuple(rest), value), *whole[first + 1 :])
+
+
+def checked_value(study: Study, name: str, value: Any, path: str) -> Any:
+    """A value as the field takes it (numbers as floats where it holds floats).
+
+    Raises:
+        StudyError: not allowed there, alone or with the other fields of the study.
+    """
+    data = set_value(study, name, _plain(value))
+    try:
+        changed = Study.model_validate(data)
+        if not name.startswith(JUDGED_BY_STATUS):
+            check_consistency(changed)
+    except ValidationError as error:
+        raise StudyError(f"{path}: {explain(error, Study, data)}") from None
+    except StudyError as error:
+        raise StudyError(f"{path}: {error}") from None
+    return known_field(name, changed)
+
+
+def _plain(value: Any) -> Any:
+    return tuple(map(_plain, value)) if isinstance(value, (list, tuple)) else value
+
+
+def _each_link_fields() -> frozenset[str]:
+    """Fields that take one number for all links, or one for each."""
+    found = set()
+    for section, outer in Study.model_fields.items():
+        for leaf, info in getattr(outer.annotation, "model_fields", {}).items():
+            one, *others = get_args(info.annotation) or (None,)
+            if [get_args(other) for other in others] == [(one,) * LINKS]:
+                found.add(f"{section}.{leaf}")
+    return frozenset(found)
+
+
+EACH_LINK = _each_link_fields()

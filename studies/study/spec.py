@@ -1,0 +1,471 @@
+"""The study file: every field with unit, default and allowed range; the only place of defaults.
+
+`load_study(path)` reads TOML into a frozen `Study`, or raises `StudyError` naming field, value,
+allowed range, unit and the nearest valid name. `studies.study.cases` turns a `Study` into arrays.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from jaxmodel.laws import LAWS
+from jaxmodel.parameters import HOME
+from studies.errors import StudyError, field_error
+from studies.study.choices import OneOf
+from studies.study.consistency import check_consistency
+from studies.study.explain import explain
+
+#: Where fields of laws' own are.
+OWN_FIELDS = "control.laws"
+Basis = Literal["pinned_pinned", "pinned_free", "loaded"]
+
+
+# numbers within bounds, as entries of a list
+Coordinate = Annotated[float, Field(ge=-10, le=10)]
+Deflection = Annotated[float, Field(ge=-0.1, le=0.1)]
+Force = Annotated[float, Field(ge=-1e4, le=1e4)]
+Wrench = tuple[Force, Force, Force]
+Gain = Annotated[float, Field(ge=-1e9, le=1e9)]
+Hertz = Annotated[float, Field(ge=0.1, le=1e5)]
+Zeta = Annotated[float, Field(ge=0, lt=1)]
+Time = Annotated[float, Field(ge=1e-4, le=100)]
+Pause = Annotated[float, Field(ge=0, le=100)]
+Degrees = Annotated[float, Field(ge=-360, le=360)]
+Offset = Annotated[float, Field(ge=-1, le=1)]
+Flags = tuple[bool, bool, bool]
+Number = TypeVar("Number")
+#: One number for all links, or one for each.
+EachLink: TypeAlias = Number | tuple[Number, Number, Number]
+
+
+class OwnFields:
+    """Annotation of `control.laws`: says what it may hold."""
+
+    @property
+    def allowed(self) -> str:
+        known = [
+            f"{law.name}.{x.name} ({x.text} [{x.unit}], {x.low:g} to {x.high:g}; {x.default:g})"
+            for law in LAWS.values()
+            for x in law.parameters
+        ]
+        return f"tables by law; {', '.join(known)}"
+
+
+def described(default: Any, unit: str, text: str, **bounds: Any) -> Any:
+    return Field(default, description=text, json_schema_extra={"unit": unit}, **bounds)
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, validate_default=True
+    )
+
+
+class Run(Section):
+    """How long, how finely, and by which model."""
+
+    duration: float = described(0.8, "s", "length of the run", gt=0, le=100)
+    seed: int = described(0, "1", "of ADC noise and force ripple", ge=0, le=10**9)
+    substeps: int = described(0, "1", "plant steps per sample; 0: as many as needed", ge=0, le=200)
+    smooth: bool = described(False, "-", "smooth limits, noise instead of rounding (for gradients)")
+    model: Literal["coupled", "ked"] = described(
+        "coupled", "-", "ked: rigid motion bends the links, nothing acts back (two passes)"
+    )
+
+
+class Machine(Section):
+    """Guides, platform, sliders."""
+
+    guide_side: float = described(0.6, "m", "side of the guide triangle", ge=0.01, le=10)
+    guide_angles_deg: tuple[Degrees, Degrees, Degrees] = described(
+        (120.0, 240.0, 0.0), "deg", "direction alpha of each guide; the platform is on its left"
+    )
+    guide_offsets: EachLink[Annotated[float, Field(ge=-10, le=10)]] = described(
+        0.0, "m", "by which a guide lies outside its side of the triangle"
+    )
+    assembly: Literal["inward", "outward"] = described(
+        "inward", "-", "which of the paper's two assemblies: joints at 90, 210, 330 deg or opposite"
+    )
+    joint_angles_deg: tuple[()] | tuple[Degrees, Degrees, Degrees] = described(
+        (), "deg", "of the platform's joints in its own axes; empty: as assembly says"
+    )
+    joint_radius: EachLink[Annotated[float, Field(ge=1e-4, le=5)]] = described(
+        round(0.12 / 3**0.5, 12), "m", "reference point of the platform to its joints"
+    )
+    platform_mass: float = described(0.25, "kg", "m_p", ge=1e-3, le=1e3)
+    platform_inertia: float = described(
+        3.0e-4, "kg m2", "I_p about the reference point", ge=1e-7, le=1e2
+    )
+    slider_mass: EachLink[Annotated[float, Field(ge=1e-3, le=1e3)]] = described(
+        0.15, "kg", "m_s of each slider"
+    )
+
+
+class Link(Section):
+    """The three flexible links; dimensions and material: one number for all, or three."""
+
+    basis: Basis = described("pinned_pinned", "-", "modal basis of the plant")
+    modes: int = described(8, "1", "plant modes per link", ge=1, le=16)
+    shortening: bool = described(
+        True,
+        "-",
+        "a bent link's chord is shorter: axial force acts on bending (not in pinned_free)",
+    )
+    length: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(0.2, "m", "L")
+    thickness: EachLink[Annotated[float, Field(ge=1e-5, le=0.1)]] = described(2e-3, "m", "t_b")
+    width: EachLink[Annotated[float, Field(ge=1e-4, le=1)]] = described(10e-3, "m", "width")
+    density: EachLink[Annotated[float, Field(ge=1, le=3e4)]] = described(2750.0, "kg/m3", "density")
+    youngs_modulus: EachLink[Annotated[float, Field(ge=1e3, le=2e12)]] = described(70e9, "Pa", "E")
+    stiffness_factor: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(
+        1.0, "1", "true bending stiffness over the one controller and shaper believe"
+    )
+    damping_ratio: Zeta | tuple[Zeta, ...] | tuple[tuple[Zeta, ...], ...] = described(
+        0.01, "1", "of mode 1; or by mode as measured, one list for all links, or three"
+    )
+    damping_law: Literal["constant", "mass", "stiffness"] = described(
+        "constant", "-", "of the modes beyond: same ratio, falling with frequency, or rising"
+    )
+    joint_inertia_b: EachLink[Annotated[float, Field(ge=0, le=1)]] = described(
+        0.0, "kg m2", "at the slider joint (basis loaded)"
+    )
+    joint_inertia_c: EachLink[Annotated[float, Field(ge=0, le=1)]] = described(
+        0.0, "kg m2", "at the platform joint (basis loaded)"
+    )
+
+    @property
+    def first_damping(self) -> float:
+        """Damping ratio of mode 1 of link 1 [1]."""
+        ratio: Any = self.damping_ratio
+        while isinstance(ratio, tuple):
+            ratio = ratio[0]
+        return ratio
+
+
+class Patches(Section):
+    """Piezo pairs: sensor and actuator on opposite faces share a centre; one number, or three."""
+
+    centers: tuple[float, ...] | tuple[tuple[float, ...], ...] = described(
+        (0.05, 0.10, 0.15), "m", "centres along the link; one list for all links, or three lists"
+    )
+    sensor_length: EachLink[Annotated[float, Field(ge=1e-5, le=1)]] = described(
+        0.010, "m", "sensor length"
+    )
+    actuator_length: EachLink[Annotated[float, Field(ge=1e-5, le=1)]] = described(
+        0.030, "m", "actuator length"
+    )
+    width: EachLink[Annotated[float, Field(ge=1e-5, le=1)]] = described(0.010, "m", "patch width")
+    thickness: EachLink[Annotated[float, Field(ge=1e-6, le=0.01)]] = described(0.2e-3, "m", "t_p")
+    youngs_modulus: EachLink[Annotated[float, Field(ge=1e3, le=2e12)]] = described(
+        66e9, "Pa", "E_p"
+    )
+    d31: EachLink[Annotated[float, Field(ge=-1e-9, le=1e-9)]] = described(
+        -180e-12, "C/N", "piezoelectric constant (its sign has no effect)"
+    )
+    relative_permittivity: EachLink[Annotated[float, Field(ge=1, le=1e5)]] = described(
+        1750.0, "1", "eps33T/eps0"
+    )
+    density: EachLink[Annotated[float, Field(ge=0, le=3e4)]] = described(
+        7800.0, "kg/m3", "density of the ceramic"
+    )
+
+
+class Motion(Section):
+    """The platform's path: point-to-point moves."""
+
+    waypoints: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = described(
+        (
+            (0.0, 0.0, HOME[2]), (0.0, 0.01, HOME[2]), (0.01, 0.01, HOME[2]),
+            (0.01, 0.0, HOME[2]), (0.0, 0.0, HOME[2]),
+        ),
+        "m, m, rad", "poses (x, y, phi) to visit", min_length=1, max_length=100,
+    )  # fmt: skip
+    move_time: Time | tuple[Time, ...] = described(0.1, "s", "t_f of each move, or one per move")
+    dwell: Pause | tuple[Pause, ...] = described(0.0, "s", "rest after each move, or one per move")
+    profile: Literal["cycloid", "quintic"] = described("cycloid", "-", "cycloid is (25)")
+
+
+class Shaper(Section):
+    """Input shaper on the motion."""
+
+    kind: Literal["none", "zv", "zvd", "zvdd", "ei", "ei_damped", "ei2", "ei3"] = described(
+        "ei", "-", "ei is the paper's (13)"
+    )
+    frequencies_hz: tuple[Hertz, ...] = described(
+        (),
+        "Hz",
+        "modes to shape for, in series; empty: mode 1 as the controller believes it",
+        max_length=3,
+    )
+    damping_ratio: float = described(0.01, "1", "zeta the shaper assumes", ge=0, lt=0.9)
+    tolerance: float = described(0.05, "1", "V of the EI family", ge=0, lt=1)
+    split: Literal["linear", "exact"] = described("linear", "-", "impulses onto the sample grid")
+
+
+class Control(Section):
+    """Active vibration control of the links."""
+
+    feedback: Literal["sampled", "ideal", "none"] = described(
+        "sampled", "-", "digital loop, the paper's continuous state feedback, or none"
+    )
+    law: Annotated[str, OneOf(lambda: LAWS)] = described("imsc", "-", "control law")
+    laws: Annotated[dict[str, dict[str, EachLink[float]]], OwnFields()] = described(
+        {}, "-", "fields of laws' own, by law"
+    )
+    basis: Basis = described("pinned_pinned", "-", "modal basis the controller believes in")
+    modes: int = described(3, "1", "controlled modes per link", ge=1, le=12)
+    frequencies_hz: tuple[Hertz, ...] | tuple[tuple[Hertz, ...], ...] = described(
+        (),
+        "Hz",
+        "assembled links as measured, by mode; one list for all links, or three; "
+        "modes not given: those of control.basis",
+    )
+    links: Flags = described((True, True, True), "-", "controlled links")
+    mode_mask: tuple[tuple[bool, ...], ...] = described(
+        (), "-", "on/off per link and controlled mode; empty: all on"
+    )
+    velocity_gain: tuple[Gain, Gain, Gain] = described(
+        (3.1, 3.5, 3.4), "N s/m or 1/s", "k_d of mode 1 per link (SRF: s)"
+    )
+    position_gain: tuple[Gain, Gain, Gain] = described(
+        (0.0, 0.0, 0.0), "N/m or 1/s2", "k_p of mode 1 per link (SRF: 1)"
+    )
+    gain_unit: Literal["N s/m", "1/s"] = described(
+        "N s/m", "-", "modal force or modal acceleration"
+    )
+    ratios: tuple[tuple[Gain, ...], ...] = described(
+        ((1.0, 0.345, 0.045), (1.0, 0.304, 0.041), (1.0, 0.321, 0.038)),
+        "1", "EMC ratios k_dj : k_d1 per link (24); missing ones are 0",
+    )  # fmt: skip
+    ratio_source: Literal["given", "own_run"] = described(
+        "given", "-", "ratios as given, or by (24) from the same case's uncontrolled run"
+    )
+    ratio_exponent: float = described(
+        1.0, "1", "exponent on the ratios: 0 makes all gains equal", ge=0, le=10
+    )
+    gain_factor: float = described(0.5, "1", "f, common factor on all gains", ge=0, le=1e3)
+    feedthrough_factor: float = described(
+        0.0, "1", "share of the residual modes' feed-through that is subtracted", ge=0, le=1
+    )
+
+
+class Electronics(Section):
+    """Sampling, converters, velocity estimate."""
+
+    sample_rate_hz: float = described(10_000.0, "Hz", "f_s", gt=100, le=1e6)
+    antialias_hz: float = described(2_000.0, "Hz", "2nd-order Butterworth corner", gt=10, le=1e6)
+    sensor_highpass_hz: float = described(
+        0.0, "Hz", "corner 1/(2 pi R C) of a patch's capacitance C (6.7 nF by default) into its "
+        "amplifier's input R; 0: none",
+        ge=0, le=1e5,
+    )  # fmt: skip
+    amplifier_hz: float = described(
+        0.0, "Hz", "bandwidth (-3 dB) of the actuators' amplifiers; 0: no limit", ge=0, le=1e6
+    )
+    estimator: Literal["modal_phase", "difference"] = described(
+        "modal_phase", "-", "velocity estimate"
+    )
+    highpass_hz: float = described(60.0, "Hz", "high-pass of modal_phase", gt=0, le=1e5)
+    lowpass_ratio: tuple[Annotated[float, Field(gt=0.1, le=100)], ...] = described(
+        (3.0, 2.0, 2.0),
+        "1",
+        "kappa_j, low-pass corner over omega_j; the last one goes on",
+        min_length=1,
+    )
+    lowpass_zeta: tuple[Annotated[float, Field(gt=0, le=5)], ...] = described(
+        (0.7, 0.7, 0.7), "1", "damping of the low-pass; the last one goes on", min_length=1
+    )
+    difference_cutoff_hz: float = described(
+        2_000.0, "Hz", "low-pass of the difference", gt=0, le=1e6
+    )
+    conditioner_gain: float = described(0.1, "1", "ADC volt per sensor volt", gt=0, le=1e3)
+    conditioner_bias: float = described(1.5, "V", "bias at the ADC", ge=0, le=100)
+    adc_range: float = described(3.0, "V", "full scale, from 0", gt=0, le=100)
+    adc_bits: int = described(12, "1", "resolution", ge=4, le=32)
+    adc_noise: float = described(0.0, "V", "rms at the ADC input", ge=0, le=10)
+    voltage_limit: float = described(100.0, "V", "actuators, +-", gt=0, le=1e4)
+
+
+class Drive(Section):
+    """Slider servo and disturbances."""
+
+    kind: Literal["pd", "computed_torque"] = described("pd", "-", "PD, or PD with computed torque")
+    kp: float = described(2e4, "N/m", "Kp", ge=0, le=1e8)
+    kd: float = described(60.0, "N s/m", "Kd", ge=0, le=1e5)
+    force_limit: float = described(1e3, "N", "motors, +-", gt=0, le=1e6)
+    coulomb_friction: float = described(0.0, "N", "F_c of F_c tanh(v/v_0)", ge=0, le=1e3)
+    friction_speed: float = described(1e-3, "m/s", "v_0", gt=0, le=1)
+    viscous_friction: float = described(0.0, "N s/m", "viscous friction", ge=0, le=1e4)
+    ripple: float = described(
+        0.0, "N", "seeded force ripple, rms, new at every sample", ge=0, le=1e3
+    )
+    pulse_force: tuple[Force, Force, Force] = described(
+        (0.0, 0.0, 0.0), "N", "disturbance on the sliders"
+    )
+    pulse_start: float = described(0.0, "s", "its start", ge=0, le=100)
+    pulse_length: float = described(0.001, "s", "its length", ge=0, le=100)
+    locked: bool = described(False, "-", "hold the sliders (bases with Y(L) = 0)")
+
+
+class Load(Section):
+    """What the platform carries and what acts on it, at its reference point (the pose)."""
+
+    mass: float = described(0.0, "kg", "payload, added to m_p", ge=0, le=1e3)
+    inertia: float = described(
+        0.0, "kg m2", "payload about its own centre of mass, added to I_p", ge=0, le=1e2
+    )
+    offset: tuple[Offset, Offset] = described(
+        (0.0, 0.0), "m", "payload's centre of mass in the platform's axes"
+    )
+    wrench: Wrench = described(
+        (0.0, 0.0, 0.0), "N, N, N m", "steady force and moment; the run starts in equilibrium"
+    )
+    pulse: Wrench = described((0.0, 0.0, 0.0), "N, N, N m", "disturbance on top")
+    pulse_start: float = described(0.0, "s", "its start", ge=0, le=100)
+    pulse_length: float = described(0.001, "s", "its length", ge=0, le=100)
+
+
+class Initial(Section):
+    """State at t = 0."""
+
+    modal: tuple[tuple[Deflection, ...], ...] = described(
+        (), "m", "modal coordinates per link; missing ones 0"
+    )
+    load_station: float = described(0.1, "m", "where a static transverse load acts", gt=0, le=10)
+    load_deflection: tuple[Deflection, Deflection, Deflection] = described(
+        (0.0, 0.0, 0.0), "m", "chord deflection there, per link"
+    )
+
+
+class Metrics(Section):
+    """How a run is judged."""
+
+    residual_delay: float = described(
+        0.0, "s", "residual window starts this long after the command", ge=0, le=100
+    )
+    residual_length: float = described(0.3, "s", "length of the residual window", gt=0, le=100)
+    settling_band: float = described(
+        1e-6, "m", "chord deflection that counts as settled", gt=0, le=0.1
+    )
+    saturation_limit: float = described(
+        0.05,
+        "1",
+        "tolerated share of samples with an actuator, motor or ADC channel at its limit",
+        ge=0,
+        le=1,
+    )
+    arrival_tolerance: float = described(
+        1e-3, "m", "tolerated rms error of the platform's joints in the residual window", gt=0, le=1
+    )
+    singularity_margin: float = described(
+        0.05, "rad", "tolerated distance of link angles from 0 and 90 deg", ge=0, le=0.7
+    )
+    condition_limit: float = described(
+        1e3, "1", "tolerated condition number of filter and synthesizer", ge=1, le=1e6
+    )
+    stations: tuple[float, ...] = described(
+        (0.05, 0.10, 0.15), "m", "where chord deflection is taken", min_length=1, max_length=20
+    )
+
+
+class Study(Section):
+    """One study file."""
+
+    title: str = described("study", "-", "what this is", max_length=200, pattern="^[^\0]*$")
+    run: Run = Run()
+    machine: Machine = Machine()
+    link: Link = Link()
+    patches: Patches = Patches()
+    motion: Motion = Motion()
+    shaper: Shaper = Shaper()
+    control: Control = Control()
+    electronics: Electronics = Electronics()
+    drive: Drive = Drive()
+    load: Load = Load()
+    initial: Initial = Initial()
+    metrics: Metrics = Metrics()
+
+    def change(self, **fields: Any) -> Study:
+        """Copy with other values; dots are double underscores: `change(control__gain_factor=1.0)`.
+
+        Raises:
+            StudyError: unknown field or bad value.
+        """
+        data = self.model_dump()
+        for name, value in fields.items():
+            *sections, leaf = name.split("__")
+            target = data
+            for section in sections:
+                target = target.setdefault(section, {})
+                if not isinstance(target, dict):
+                    field = name.replace("__", ".")
+                    raise StudyError(f"{field}: {section} is no section of a study")
+            target[leaf] = value
+        return parse_study(data)
+
+
+def parse_study(data: dict[str, Any]) -> Study:
+    """Validate a dictionary as a study.
+
+    Raises:
+        StudyError: first fault found, with field, value, allowed range and unit.
+    """
+    if not isinstance(data, dict):
+        raise field_error("study", data, "a table of sections")
+    data = {name: _plain(value) for name, value in data.items()}
+    try:
+        study = Study.model_validate(data)
+    except ValidationError as error:
+        raise explain(error, Study, data) from None
+    check_consistency(study)
+    return study
+
+
+def _plain(value: Any) -> Any:
+    """Lists as tuples and NumPy's numbers as Python's, all the way down."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {name: _plain(entry) for name, entry in value.items()}
+    return tuple(map(_plain, value)) if isinstance(value, (list, tuple)) else value
+
+
+def load_study(path: str | Path) -> Study:
+    """Read a study file.
+
+    Args:
+        path: TOML file.
+
+    Raises:
+        StudyError: unreadable, not TOML, or not a valid study.
+    """
+    data = read_toml(path)
+    if "sweep" in data:
+        raise StudyError(f"{path}: has a section [sweep]; run it with studies sweep")
+    return parse_study(data)
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Read a TOML file as a dictionary.
+
+    Raises:
+        StudyError: unreadable or not TOML.
+    """
+    try:
+        text = Path(path).read_bytes().decode("utf-8")
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise StudyError(f"study file {path}: cannot be read ({reason})") from None
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # ValueError: also a number of 5000 digits
+        raise StudyError(f"study file {path}: not valid TOML ({error})") from None
+
+
+def paper_study() -> Study:
+    """The paper's case, `studies/specs/paper.toml`."""
+    return load_study(Path(__file__).parents[1] / "specs" / "paper.toml")

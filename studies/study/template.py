@@ -1,0 +1,66 @@
+"""`studies init`: a study file with every field, its unit, its meaning and its default."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel
+
+from studies.study.explain import allowed_values, unit_of
+from studies.study.spec import Study
+
+
+def study_template(study: Study | None = None) -> str:
+    """A complete commented study file that reads back as `study`, default: all defaults."""
+    study = study or Study()
+    lines = ["# Study file: every field, in SI units unless its name says otherwise.", ""]
+    lines += _field(study, "title")
+    for name in Study.model_fields:
+        section = getattr(study, name)
+        if isinstance(section, BaseModel):
+            lines += ["", f"[{name}]  # {(type(section).__doc__ or '').strip()}"]
+            for field in type(section).model_fields:
+                lines += _field(section, field)
+    return "\n".join(lines) + "\n"
+
+
+def _field(section: BaseModel, name: str) -> list[str]:
+    info = type(section).model_fields[name]
+    unit = unit_of(info)
+    allowed = allowed_values(info.annotation, info.metadata)
+    note = f"{info.description}{f' [{unit}]' if unit else ''}; {allowed}"
+    return [f"# {note}", f"{name} = {toml_value(getattr(section, name))}"]
+
+
+def toml_text(data: Mapping[str, Any], path: tuple[str, ...] = ()) -> str:
+    """A dictionary as a TOML file that reads back as it, such as the file of a sweep.
+
+    Args:
+        data: as read from a file; what is nested deeper than [a.b] is written on one line.
+        path: of the section that it is; () for the whole file.
+    """
+    tables = [key for key, value in data.items() if isinstance(value, Mapping) and len(path) < 2]
+    lines = [f"[{'.'.join(map(_key, path))}]"] if path else []
+    lines += [f"{_key(key)} = {toml_value(data[key])}" for key in data if key not in tables]
+    sections = [toml_text(data[key], (*path, key)) for key in tables]
+    return "\n".join(["".join(f"{line}\n" for line in lines), *sections]).lstrip("\n")
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_value(name)
+
+
+def toml_value(value: Any) -> str:
+    """A Python value as TOML."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):  # JSON escapes all that TOML wants escaped but one
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, (tuple, list)):
+        return "[" + ", ".join(toml_value(entry) for entry in value) + "]"
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{_key(key)} = {toml_value(value[key])}" for key in value) + " }"
+    return repr(value)

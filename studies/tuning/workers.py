@@ -1,0 +1,142 @@
+"""Designs of a tuning on the workers of a cluster: each evaluates and differentiates a part."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from distributed import get_worker
+
+from studies import config
+from studies.cluster.connect import Workers, connected
+from studies.cluster.watch import Watch
+from studies.cluster.worker import alone, get_ready, identity, refuse_difference
+from studies.errors import StudyError
+from studies.tuning.evaluate import Evaluation, Evaluator
+from studies.tuning.optimise import start_families
+from studies.tuning.spec import TuneSpec, parse_tuning
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from distributed import Client, Future
+
+
+class Part(NamedTuple):
+    """Designs for one worker."""
+
+    identity: dict[str, str]  # of the client
+    precision: str
+    spec: str  # the tuning as JSON
+    families: tuple[int, ...]  # of the designs, positions in `spec.moving`
+    values: np.ndarray  # of the free numbers, (designs, p)
+    has_slope: np.ndarray  # (designs,)
+
+
+class Answer(NamedTuple):
+    """What a worker has made of its part."""
+
+    found: Evaluation
+    worker: str  # address
+
+
+def evaluate_part(part: Part) -> Answer:
+    """Evaluate designs on a worker.
+
+    Raises:
+        StudyError: the worker has other versions than the client; a fault of the tuning.
+    """
+    with alone:
+        worker = get_worker()
+        refuse_difference(part.identity, worker)
+        get_ready(part.precision, worker)
+        evaluator = _evaluator(part.precision, part.spec, part.families)
+        return Answer(evaluator.evaluate(part.values, part.has_slope), worker.address)
+
+
+@lru_cache(maxsize=2)
+def _evaluator(precision: str, text: str, families: tuple[int, ...]) -> Evaluator:
+    spec = parse_tuning(json.loads(text))
+    return Evaluator(spec, [spec.moving[k] for k in families])
+
+
+class ClusterEvaluator(Evaluator):
+    """The same designs in the same order, evaluated in parts by the workers there are now."""
+
+    def __init__(
+        self, client: Client, spec: TuneSpec, timeout: float, tell: Callable[[str], None]
+    ) -> None:
+        """
+        Args:
+            client: from `connected`.
+            spec: the tuning.
+            timeout: a worker that is busy for longer without an answer is restarted [s].
+            tell: called with what users should know.
+        """
+        families = start_families(spec)
+        super().__init__(spec, [spec.moving[k] for k in families])
+        self._client, self._watch = client, Watch(client, timeout, tell)
+        self._text, self._identity = json.dumps(spec.data), identity()
+        self._precision = config.origin()["precision"]
+        count = min(max(self._watch.n_workers, 1), len(families))
+        self._parts = np.array_split(np.arange(len(families)), count)
+        self._families = [tuple(map(int, families[part])) for part in self._parts]
+        self._is_compiled = False
+        tell(f"workers: {self._watch.n_workers}, each with {len(self._parts[0])} starts or fewer")
+
+    def evaluate(self, values: np.ndarray, has_slope: np.ndarray | bool = True) -> Evaluation:
+        wanted, started = np.broadcast_to(has_slope, len(values)), time.perf_counter()
+        futures = [
+            self._client.submit(
+                evaluate_part,
+                Part(
+                    self._identity, self._precision, self._text, families, values[part],
+                    wanted[part],
+                ),
+                pure=False,
+            )
+            for part, families in zip(self._parts, self._families, strict=True)
+        ]  # fmt: skip
+        found = self._gathered(futures)
+        if self._is_compiled:
+            self.run_time = (time.perf_counter() - started) / self.lanes
+        self._is_compiled = True
+        return Evaluation(*(np.concatenate(x) for x in zip(*found, strict=True)))
+
+    def _gathered(self, futures: list[Future]) -> list[Evaluation]:
+        """Answers in the order of the parts."""
+        answers: dict[Future, Any] = {}
+        try:
+            while len(answers) < len(futures):
+                left = [future for future in futures if future not in answers]
+                for future in self._watch.landed(left):
+                    answers[future] = self._watch.outcome(future)
+                    if isinstance(answers[future], str):
+                        raise StudyError(
+                            f"a part of the designs cannot be evaluated: {answers[future]}; "
+                            "iterations before are safe, go on with --resume"
+                        )
+        finally:
+            self._client.cancel(futures)
+        return [answers[future].found for future in futures]
+
+
+@contextmanager
+def evaluator_for(
+    spec: TuneSpec, workers: Workers, tell: Callable[[str], None]
+) -> Iterator[Evaluator | None]:
+    """What evaluates the designs of a tuning on workers, None for this process.
+
+    Raises:
+        StudyError: as `connected`.
+    """
+    if not workers.are_named:
+        yield None
+        return
+    with connected(workers, tell) as client:
+        yield ClusterEvaluator(client, spec, workers.timeout, tell)
