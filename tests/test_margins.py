@@ -222,6 +222,20 @@ def test_margins_are_those_of_single_runs(basis):
     np.testing.assert_allclose(single(study).gain_margin, wanted.gain_margin, rtol=1e-3)
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [{"control__law": "ppf", "control__gain_factor": 0.4}, {"control__position_gain": (-1e3,) * 3}],
+)
+def test_margins_of_position_feedback(changes):
+    """Positive position feedback takes the static stiffness away: no curve crosses, one ends."""
+    study = STUDY.change(link__modes=3, **changes)
+    wanted = loop_report(build_structure(study), as_arrays(build_case(study)), HOME)
+    found = single(study)
+    np.testing.assert_allclose(found.gain_margin, wanted.gain_margin, rtol=1e-4)
+    is_static = study.control.law == "ppf"
+    assert (found.breaking_frequency == 0) == is_static == np.isnan(found.breaking_mode)
+
+
 def test_what_breaks_is_named():
     """The paper's gains on mode 1 alone break the mode that three patches show as mode 1."""
     found = single(STUDY)

@@ -24,6 +24,16 @@ class Channels(NamedTuple):
     force: np.ndarray  # its numerator times the gains, sign included [N/m] or [V/V], (M, 3)
     direct: np.ndarray  # force per channel signal past the filters [N/m] or [V/V], (M,)
     synthesizer: np.ndarray  # voltages from the channel's force [V/N] or [1], (M, K)
+    # where channels of a link act one at a time: per rival two rows of (inner, old, older, signal)
+    # whose squares add up to its modal energy (omega q)^2 + q'^2 [m2/s2], 0 for others, (M, 2, 4)
+    energy: np.ndarray | None = None
+
+    @property
+    def is_rival(self) -> np.ndarray:
+        """Channels that act only where no other one of their link has more energy, (M,)."""
+        if self.energy is None:
+            return np.zeros(len(self.link), bool)
+        return np.any(self.energy, axis=(1, 2))
 
     @property
     def names(self) -> list[str]:
@@ -46,6 +56,21 @@ class Channels(NamedTuple):
         return bool(np.any(self.direct))
 
 
+def acting(link: np.ndarray, is_rival: np.ndarray, energy: np.ndarray) -> np.ndarray:
+    """Which channels act: of the rivals of a link only those of highest energy, (..., M).
+
+    Args:
+        link: of each channel, (M,).
+        is_rival: see `Channels`, (M,).
+        energy: in any common unit, (..., M).
+    """
+    is_served = np.ones(energy.shape, bool)
+    for m in np.flatnonzero(is_rival):
+        others = np.flatnonzero(is_rival & (link == link[m]))
+        is_served[..., m] = energy[..., m] >= energy[..., others].max(axis=-1)
+    return is_served
+
+
 def fold(controller: Controller, kind: str) -> Channels:
     """Channels of a controller.
 
@@ -65,6 +90,12 @@ def fold(controller: Controller, kind: str) -> Channels:
     def gathered(parts: tuple) -> np.ndarray:
         return np.stack([np.broadcast_to(part, velocity.shape)[at] for part in parts], axis=1)
 
+    energy, rival = None, controller.rival_omega
+    if rival is not None and np.any(rival):
+        omega, direct = np.broadcast_to(rival, velocity.shape)[at], gathered((estimator.direct,))
+        rate = np.hstack([gathered(estimator.velocity), 0 * direct])
+        place = omega[:, None] * np.hstack([gathered(estimator.position), direct])
+        energy = np.stack([rate * (omega > 0)[:, None], place], axis=1)
     force = -velocity[at][:, None] * gathered(estimator.velocity)
     force = force - position[at][:, None] * gathered(estimator.position)
     return Channels(
@@ -77,6 +108,7 @@ def fold(controller: Controller, kind: str) -> Channels:
         force=force,
         direct=-position[at] * np.broadcast_to(estimator.direct, velocity.shape)[at],
         synthesizer=np.swapaxes(controller.synthesizer, 1, 2)[at],
+        energy=energy,
     )
 
 

@@ -57,6 +57,8 @@ WALKS = (
     Walk(400, tuple(np.tan(np.linspace(-1.5, 1.5, 24)).tolist()), 3),
 )
 LOWEST_HZ = 5.0
+#: Stands for 0 [rad/s], where the hold would be 0/0.
+STILL = 0.01
 #: Modes are taken to be at least as wide as this share of their frequency [1].
 NARROWEST = 2e-4
 #: What keeps eigenvalues of idle channels apart, on the way and in the second look.
@@ -88,7 +90,8 @@ class LoopMargins(NamedTuple):
 
     gain_margin: np.ndarray  # largest factor on all gains with every smaller one stable [1]
     breaking_frequency: np.ndarray  # of what goes unstable there [Hz], NaN where nothing does
-    breaking_mode: np.ndarray  # order of the nearest link mode, 0: the drive, NaN as before
+    # order of the nearest link mode, 0: the drive, NaN as before and where it is the static stiffness
+    breaking_mode: np.ndarray
     damping_ratio: np.ndarray  # of the modes of each order under control, the least [1], (n, C)
 
 
@@ -227,6 +230,9 @@ def _judged(
         is_more = is_other & (other.value > met.value)
         met = jax.tree.map(lambda a, b, more=is_more: np.where(more, b, a), met, other)
     value[found], omega[found] = met.value, met.omega
+    at_end, where = _at_the_ends(response)
+    is_more = at_end > value
+    value, omega = np.where(is_more, at_end, value), np.where(is_more, where, omega)
     breaks = value > 1 / HIGHEST
     margin = np.where(breaks, 1 / np.where(breaks, value, 1.0), HIGHEST)
     omega = np.where(breaks, omega, np.nan)
@@ -236,6 +242,7 @@ def _judged(
     )[0]
     leaves = jax.tree.leaves(response)
     is_finite = np.all([np.isfinite(x).reshape(-1, count).all(axis=0) for x in leaves], axis=0)
+    order = np.where(is_more & (omega == 0), np.nan, order)  # static: no mode's frequency
     figures = LoopMargins(
         np.where(is_finite, margin, np.nan),
         np.where(is_finite, np.abs(omega) / (2 * np.pi), np.nan),
@@ -323,6 +330,27 @@ def _look_closer(
     ring = np.exp(2j * np.pi * (k + 0.3) / n) * (0.2 + 0.8 * ((4 * k) % n) / n) * seen.value
     loci = _walked(here, spread, Pair(ring.real, ring.imag), omega, np.array(kind))
     return _crossings(loci, seen.case, KEPT)[0]
+
+
+def _at_the_ends(response: LoopResponse) -> tuple[np.ndarray, np.ndarray]:
+    """Largest positive eigenvalue at the ends of the axis, 0: none, and where [rad/s], (n,) each.
+
+    L is real there, so its curves end on the real axis without crossing it: feedback of positions
+    loses its static stiffness at 0, differences their sign at pi/T.
+    """
+    spread, top = _spread(response, FINE_SPREAD), np.pi / response.period
+    k = np.arange(spread.shape[0] * spread.shape[1])[:, None]
+    ring = np.exp(2j * np.pi * (k + 0.3) / len(k)) * (0.5 + k / len(k)) * np.ones_like(top)
+    value, omega = np.zeros(len(top)), np.full(len(top), np.nan)
+    for place, name in ((0 * top + STILL, 0 * top), (top * (1 - 1e-6), top)):
+        steps = np.repeat(place[None], LOOK.starts, axis=0)
+        first = Pair(ring.real.copy(), ring.imag.copy())
+        found = _walked(response, spread, first, steps, np.zeros(LOOK.starts)).value
+        is_real = (found.re > 1 / HIGHEST) & (np.abs(found.im) < 1e-3 * found.re)
+        largest = np.max(np.where(is_real, found.re, 0.0), axis=0)
+        omega = np.where(largest > value, name, omega)
+        value = np.maximum(value, largest)
+    return value, omega
 
 
 def _spread(response: LoopResponse, size: float) -> np.ndarray:

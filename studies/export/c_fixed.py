@@ -10,11 +10,13 @@ from studies.engine.controller import FixedController
 from studies.export.c_text import (
     GAINS,
     Parts,
+    Rivals,
     Source,
     Table,
     filled,
     literal,
     patch_names,
+    rival_table,
     section_comments,
     shaper_tables,
     starred,
@@ -34,6 +36,30 @@ _FEEDTHROUGH = """\
         }
     }
 """
+_ALL = Rivals("", "", "")
+#: Of the rivals of a link the one of highest energy acts.
+_ONE = Rivals(
+    """    int64_t energy[@_N_MODES]; /* of the channels */
+""",
+    """        energy[m] = 0;
+        for (k = 0; k < 2; k++) {
+            int64_t part;
+
+            sum = (int64_t)ENERGY[2 * m + k][0] * inner + (int64_t)ENERGY[2 * m + k][1] * line[0]
+                + (int64_t)ENERGY[2 * m + k][2] * line[1] + (int64_t)ENERGY[2 * m + k][3] * signal;
+            part = limited(shifted(sum, ENERGY_SHIFT[2 * m + k]));
+            energy[m] += part * part;
+        }
+""",
+    """    for (m = 0; m < @_N_MODES; m++) {
+        for (k = 0; k < @_N_MODES; k++) {
+            if (IS_RIVAL[m] && IS_RIVAL[k] && LINK[k] == LINK[m] && energy[k] > energy[m]) {
+                force[m] = 0;
+            }
+        }
+    }
+""",
+)
 _WORD = "int32_t"
 
 
@@ -81,6 +107,7 @@ def fixed_source(
         subtract_feedthrough=_FEEDTHROUGH,
         keep_command="        state->command[k] = command;\n",
         direct="\n            + (int64_t)DIRECT[m] * signal",
+        rivals=_ALL if fixed.energy is None else _ONE,
         more={
             "formats": starred(format_lines(fixed, found)),
             "cost": cost,
@@ -162,6 +189,12 @@ def _tables(found: FixedController, fixed: FixedPoint) -> list[Table]:
         *shaper_tables(found, _WORD, shaper.integers[0]),
         Table("int", "WEIGHT_SHIFT", shaper.shift[0], "[bit] of all weights"),
     ]  # fmt: skip
+    if fixed.energy is not None:
+        rows = [f"{name}, {what}" for name in names for what in ("velocity", "position")]
+        words = fixed.energy.integers.reshape(-1, 4)
+        comment = "[energy root/delay line; energy root/signal] modal velocity, omega position"
+        tables += [rival_table(channels), word("ENERGY", words, comment, rows)]
+        tables.append(shift("ENERGY", fixed.energy))
     if channels.has_direct:
         comment = "[force/signal] force past the filters, shifted as FORCE; control.position_gain"
         tables.append(word("DIRECT", fixed.numerator.integers[:, 3], comment))

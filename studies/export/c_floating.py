@@ -10,11 +10,13 @@ from studies.engine.controller import FixedController
 from studies.export.c_text import (
     GAINS,
     Parts,
+    Rivals,
     Source,
     Table,
     filled,
     literal,
     patch_names,
+    rival_table,
     section_comments,
     shaper_tables,
     structure_tables,
@@ -28,6 +30,39 @@ _FEEDTHROUGH = """\
         }
     }
 """
+#: All channels act.
+_ALL = Rivals(
+    "", "", "",
+    """        for (k = 0; k < @_N_PATCHES; k++) {
+            wanted[first + k] += SYNTHESIZER[m][k] * force;
+        }
+""",
+)  # fmt: skip
+#: Of the rivals of a link the one of highest energy acts.
+_ONE = Rivals(
+    """    real forces[@_N_MODES], energy[@_N_MODES]; /* of the channels */
+""",
+    """        rate = RATE[m][0] * inner + RATE[m][1] * line[0] + RATE[m][2] * line[1];
+        place = PLACE[m][0] * inner + PLACE[m][1] * line[0] + PLACE[m][2] * line[1]
+            + PLACE[m][3] * signal;
+        energy[m] = rate * rate + place * place;
+        forces[m] = force;
+""",
+    """    for (m = 0; m < @_N_MODES; m++) {
+        int acts = 1;
+
+        for (k = 0; k < @_N_MODES; k++) {
+            if (IS_RIVAL[m] && IS_RIVAL[k] && LINK[k] == LINK[m] && energy[k] > energy[m]) {
+                acts = 0;
+            }
+        }
+        first = @_N_PATCHES * LINK[m];
+        for (k = 0; acts && k < @_N_PATCHES; k++) {
+            wanted[first + k] += SYNTHESIZER[m][k] * forces[m];
+        }
+    }
+""",
+)
 _TYPES = """\
 /* double, or float with -D@_REAL=float. */
 #ifndef @_REAL
@@ -73,6 +108,7 @@ def floating_source(found: FixedController, name: str, origin: Iterable[str]) ->
         subtract_feedthrough=_FEEDTHROUGH,
         keep_command="        state->command[k] = wanted[k];\n",
         direct="\n            + DIRECT[m] * signal",
+        rivals=_ALL if found.channels.energy is None else _ONE,
     )
     return filled(parts, found, name, origin)
 
@@ -113,6 +149,12 @@ def _tables(found: FixedController) -> list[Table]:
         ),
         *shaper_tables(found, "real", found.taps.weight),
     ]  # fmt: skip
+    if channels.energy is not None:
+        tables += [
+            rival_table(channels),
+            real("RATE", channels.energy[:, 0, :3], "[1/s] modal velocity; energy", names),
+            real("PLACE", channels.energy[:, 1], "[1/s] omega times modal position", names),
+        ]
     if channels.has_direct:
         comment = f"[{force}] force past the filters; control.position_gain"
         tables.append(real("DIRECT", channels.direct, comment))

@@ -51,6 +51,15 @@ def section_comments(found: FixedController) -> tuple[str, str]:
 GAINS = "-k_d n_v - k_p n_x; control.gain_factor, velocity_gain, position_gain, ratios, gain_unit"
 
 
+class Rivals(NamedTuple):
+    """What serves one channel of a link at a time, in one kind of arithmetic."""
+
+    declare: str  # variables
+    weigh: str  # energy of channel m
+    choose: str  # whose forces stay
+    apply: str = ""  # the force of a channel on the actuators at once, where all act
+
+
 class Parts(NamedTuple):
     """What sets one kind of arithmetic apart; @ stands for the prefix in capitals."""
 
@@ -61,6 +70,7 @@ class Parts(NamedTuple):
     subtract_feedthrough: str
     keep_command: str
     direct: str  # share of the force past the filters
+    rivals: Rivals  # where channels act one at a time
     more: dict[str, str] = {}  # for the code's template
 
 
@@ -76,6 +86,12 @@ def structure_tables(channels: Channels) -> list[Table]:
         Table("uint16_t", "IS_USED", used.astype(int), "1: link is controlled; control.links"),
         Table("uint16_t", "LINK", channels.link, "link of each controlled mode, from 0; control"),
     ]
+
+
+def rival_table(channels: Channels) -> Table:
+    """Which channels act one at a time."""
+    comment = "1: acts where no other one of its link has more energy; control.law"
+    return Table("uint16_t", "IS_RIVAL", channels.is_rival.astype(int), comment)
 
 
 def shaper_tables(found: FixedController, kind: str, weight: np.ndarray) -> list[Table]:
@@ -125,6 +141,11 @@ def filled(parts: Parts, found: FixedController, name: str, origin: Iterable[str
         "subtract_feedthrough": parts.subtract_feedthrough if has_memory else "",
         "keep_command": parts.keep_command if has_memory else "",
         "direct": parts.direct if found.channels.has_direct else "",
+        "rivals": parts.rivals.declare,
+        "weigh": parts.rivals.weigh,
+        "choose": parts.rivals.choose,
+        "apply": parts.rivals.apply,
+        "more_reals": ", rate, place" if parts.rivals.weigh else "",
         "tables": "\n\n".join(_constant(table) for table in parts.tables),
     }
     texts = (

@@ -43,6 +43,8 @@ def cost_of(found: FixedController, fixed: FixedPoint) -> Cost:
     products = n * (2 * k + 1 + 2 + 3 + 3 + direct) + n_channels + 3 * n_taps
     roundings = 5 * n + 2 * n_channels + 3
     words = 2 * 3 * n + 3 * k + 1 + 2 * (3 * (int(found.taps.sample.max()) + 1) + 1)
+    if fixed.energy is not None:
+        products, roundings = products + 10 * n, roundings + 2 * n
     if fixed.feedthrough is not None:
         products, roundings = products + n_channels * k, roundings + n_channels
         words += 2 * 3 * k

@@ -81,6 +81,11 @@ STEPS = [
     "started again",
     "reference: shaped pose = sum over taps of shaper_weight * pose shaper_delay samples ago",
 ]
+#: One more step, before the synthesizer, where channels of a link act one at a time.
+RIVALS = (
+    "energy = (rival_frequency * (position + position_direct * signal))^2 + velocity^2; of the "
+    "channels of a link with rival_frequency above 0 the force is 0 where another has more energy"
+)
 _LINK, _PATCH = "link", "patch"
 
 
@@ -106,7 +111,7 @@ def document(found: FixedController, case_id: str = "") -> Document:
         law=study.control.law,
         estimator=study.electronics.estimator,
         order=ORDER,
-        steps=STEPS,
+        steps=STEPS if controller.rival_omega is None else [*STEPS[:8], RIVALS, *STEPS[8:]],
         masks=Masks(links=[bool(x) for x in on.any(axis=1)], modes=on.tolist()),
         numbers=_numbers(found),
         study=json.loads(json.dumps(study.model_dump(mode="json"))),
@@ -181,6 +186,12 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
         "position_gain": each(
             _position_gain(controller), on_value, "k_p, masks and factors put in"
         ),
+        **({} if controller.rival_omega is None else {
+            "rival_frequency": each(
+                controller.rival_omega, "rad/s", "above 0: of the channels of a link with one only "
+                "those of highest energy act, (rival_frequency position)^2 + velocity^2",
+            )
+        }),
         "synthesizer": one(
             controller.synthesizer, from_force, "voltages of a channel's force",
             [_LINK, _PATCH, channel],
@@ -219,6 +230,7 @@ def controller_of(document: Document) -> tuple[Controller, Taps]:
         adc_step=number["adc_step"],
         adc_top=number["adc_top"],
         adc_noise=np.zeros(()),
+        rival_omega=number.get("rival_frequency"),
     )  # fmt: skip
     return controller, Taps(number["shaper_weight"], number["shaper_delay"].astype(int))
 

@@ -90,6 +90,8 @@ class FixedPoint(NamedTuple):
     numerator: Row  # three taps and the direct share, (M, 4)
     synthesizer: Row  # channels that are not of the link are 0, (3, K, M)
     feedthrough: Row | None  # sensor counts per DAC code, (3, K, K)
+    is_rival: np.ndarray  # channels that act one at a time, (M,)
+    energy: Row | None  # roots of the modal energies of rivals, in one unit, (M, 2, 4)
     error: ErrorBound
 
 
@@ -134,6 +136,12 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
     """
     controller, channels = found.controller, found.channels
     check_words(found)
+    if channels.energy is not None and np.any(controller.feedthrough):
+        raise field_error(
+            "control.feedthrough_factor", found.study.control.feedthrough_factor,
+            "0 for fixed point with a law whose channels act one at a time (or --target c): "
+            "what a switch brings back by feed-through has no bound", "1",
+        )  # fmt: skip
     rest = 2 ** (dac_bits - 1)
     dac_step = float(controller.voltage_limit) / (rest - 1)
     memory = channels.memory(FORGOTTEN)
@@ -185,6 +193,8 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
         ),
         synthesizer=_row(back * force.step / dac_step, "synthesizer"),
         feedthrough=through,
+        is_rival=channels.is_rival,
+        energy=_energy(channels, bound, inner, signal, memory),
         error=ErrorBound(*np.zeros((3, 3, found.n_patches))),
     )  # fmt: skip
     error = _error_bound(found, fixed, gains, memory)
@@ -214,6 +224,36 @@ def check_words(found: FixedController) -> None:
             f"with its pole at {found.channels.slowest_pole:.12g} keeps rounding errors for too "
             "long (or --target c)", "Hz",
         )  # fmt: skip
+
+
+def _energy(
+    channels: Channels, bound: np.ndarray, inner: Format, signal: Format, memory: int
+) -> Row | None:
+    """Roots of the energies of rivals: squares of two of them add up within 63 bits.
+
+    Args:
+        channels: folded controller.
+        bound: largest signals, (M,).
+        inner, signal: formats of what the roots are made of.
+        memory: samples of the impulse responses.
+    """
+    if channels.energy is None:
+        return None
+    impulse = np.zeros(memory)
+    impulse[0] = 1.0
+    largest = np.zeros((len(bound), 2))
+    for m, (rows, first, below) in enumerate(
+        zip(channels.energy, channels.first, channels.denominator, strict=True)
+    ):
+        line = lfilter([1.0], [1.0, *below], lfilter(first[:2], [1.0, first[2]], impulse))
+        for part, row in enumerate(rows):
+            root = lfilter(row[:3], [1.0], line)
+            root[0] += row[3]
+            largest[m, part] = bound[m] * np.abs(root).sum()
+    step = largest.max() / 2.0 ** (WORD - 3)
+    factors = channels.energy * inner.step[:, None, None] / step
+    factors[..., 3] = channels.energy[..., 3] * signal.step[:, None] / step
+    return _row(factors, "modal energies")
 
 
 def _responses(channels: Channels, m: int, n: int) -> tuple[np.ndarray, ...]:

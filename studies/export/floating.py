@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.controller import Controller, read_back
-from studies.engine.channels import Channels
+from studies.engine.channels import Channels, acting
 
 
 class Signals(NamedTuple):
@@ -53,6 +53,11 @@ def respond_from(
         memory = b1 * signal - a1 * high
         inner = high - d1 * line[0] - d2 * line[1]
         force = c0 * inner + c1 * line[0] + c2 * line[1] + channels.direct * signal
+        if channels.energy is not None:
+            taps = np.stack([inner, *line, signal], axis=-1)
+            parts = np.einsum("mpt,...mt->...mp", channels.energy, taps)
+            energy = np.sum(parts**2, axis=-1)
+            force = force * acting(link, channels.is_rival, energy)
         line = (inner, line[0])
         command = np.clip(np.einsum("imk,...m->...ik", back, force), -limit, limit)
         rows.append((signal, high, inner, force, command))

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from studies.engine.channels import acting
 from studies.export.fixed import FixedPoint, Row
 
 #: Axes of one sequence's numbers.
@@ -52,6 +53,10 @@ def respond(fixed: FixedPoint, codes: np.ndarray, rail: int) -> Response:
         inner = _limited(_products(fixed.low_pass, np.stack([high, old, older], -1)), cut)
         taps = np.stack([inner, old, older, signal], -1)
         force = _limited(_products(fixed.numerator, taps), cut)
+        if fixed.energy is not None:
+            roots = _limited(_products(fixed.energy, taps[..., None, :]), cut, SENSORS)
+            energy = np.sum(roots * roots, axis=-1)
+            force = np.where(acting(fixed.link, fixed.is_rival, energy), force, 0)
         older, old = old, inner
         wanted = _limited(_products(fixed.synthesizer, force[..., None, None, :]), cut, SENSORS)
         command = np.minimum(np.maximum(wanted, 1 - fixed.dac_rest), fixed.dac_rest - 1)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from jaxmodel.laws import LAWS
 from studies import config
 from studies.engine.controller import FixedController, fixed_controller
 from studies.engine.design import Design
@@ -65,11 +64,6 @@ def export_design(
     is_verified = True if is_verified is None else is_verified
 
     found = fixed_controller(design.study)
-    if LAWS[found.study.control.law].is_switching:
-        raise field_error(
-            "control.law", found.study.control.law, "a law whose channels all act; code for one "
-            "that serves one mode at a time cannot be written yet",
-        )  # fmt: skip
     job = Job(
         found, name, _origin(found, design.case_id), design.case_id, compiler, is_verified,
         dac_bits or DAC_BITS, console,

@@ -67,7 +67,7 @@ int ${name}_step(${name}_state *state, const uint16_t sensor[${NAME}_N_CHANNELS]
 {
     int32_t sensed[${NAME}_N_CHANNELS]; /* sensor signals */
     int32_t force[${NAME}_N_MODES]; /* channel forces */
-    int64_t sum;
+$rivals    int64_t sum;
     int k, m, first;
 
     if (!state->fault) {
@@ -105,10 +105,10 @@ $subtract_feedthrough    for (m = 0; m < ${NAME}_N_MODES; m++) {
         sum = (int64_t)FORCE[m][0] * inner + (int64_t)FORCE[m][1] * line[0]
             + (int64_t)FORCE[m][2] * line[1]$direct;
         force[m] = limited(shifted(sum, FORCE_SHIFT[m]));
-        line[1] = line[0];
+$weigh        line[1] = line[0];
         line[0] = inner;
     }
-    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
+$choose    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
         int32_t command;
 
         sum = 0;

@@ -50,7 +50,7 @@ int ${name}_step(${name}_state *state, const real sensor[${NAME}_N_CHANNELS],
 {
     real volt[${NAME}_N_CHANNELS]; /* of the sensors [V] */
     real wanted[${NAME}_N_CHANNELS]; /* of the actuators, without limit [V] */
-    int k, m, first;
+$rivals    int k, m, first;
 
     if (!state->fault) {
         state->fault = check(state, sensor);
@@ -67,7 +67,7 @@ int ${name}_step(${name}_state *state, const real sensor[${NAME}_N_CHANNELS],
         wanted[k] = 0;
     }
 $subtract_feedthrough    for (m = 0; m < ${NAME}_N_MODES; m++) {
-        real signal = 0, high, inner, force;
+        real signal = 0, high, inner, force$more_reals;
         real *line = state->line[m];
 
         first = ${NAME}_N_PATCHES * LINK[m];
@@ -78,13 +78,10 @@ $subtract_feedthrough    for (m = 0; m < ${NAME}_N_MODES; m++) {
         state->high[m] = HIGH_PASS[m][1] * signal - HIGH_PASS[m][2] * high;
         inner = high - LOW_PASS[m][0] * line[0] - LOW_PASS[m][1] * line[1];
         force = FORCE[m][0] * inner + FORCE[m][1] * line[0] + FORCE[m][2] * line[1]$direct;
-        line[1] = line[0];
+$weigh        line[1] = line[0];
         line[0] = inner;
-        for (k = 0; k < ${NAME}_N_PATCHES; k++) {
-            wanted[first + k] += SYNTHESIZER[m][k] * force;
-        }
-    }
-    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
+$apply    }
+$choose    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
         if (wanted[k] > LIMIT) {
             wanted[k] = LIMIT;
         } else if (wanted[k] < -LIMIT) {
