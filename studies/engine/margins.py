@@ -90,7 +90,7 @@ class LoopMargins(NamedTuple):
 
     gain_margin: np.ndarray  # largest factor on all gains with every smaller one stable [1]
     breaking_frequency: np.ndarray  # of what goes unstable there [Hz], NaN where nothing does
-    # order of the nearest link mode, 0: the drive, NaN as before and where it is the static stiffness
+    # order of the nearest link mode, 0: the drive; NaN as before, and for the static stiffness
     breaking_mode: np.ndarray
     damping_ratio: np.ndarray  # of the modes of each order under control, the least [1], (n, C)
 
