@@ -196,7 +196,7 @@ def controlled_first(response: LoopResponse, link_mask: np.ndarray, count: int) 
     Args:
         response: with channels on all links, lanes last.
         link_mask: above 0 for links under control, (3, lanes).
-        count: how many these are in every lane (static).
+        count: how many links keep channels, as many as are under control in any lane (static).
     """
     order = np.argsort(link_mask <= 0, axis=0, kind="stable")
 

@@ -238,6 +238,7 @@ def test_many_killed_workers_lose_nothing(cluster, local, tmp_path, seed):
     check_kills(cluster, local, tmp_path / "out", 4, seed)
 
 
+@pytest.mark.long  # in short: a chunk that fails, and workers that are killed
 def test_a_chunk_that_kills_workers_is_left_out_until_resumed(cluster, local, tmp_path):
     cluster.trouble(kill=70)
     out = tmp_path / "out"

@@ -106,7 +106,7 @@ GAINS = {"srf": {"velocity_gain": (2e-4,) * 3}, "ppf": {"gain_factor": 0.2}}
 
 
 #: The others are run, judged and exported by the tests of exports.
-SHORT = ("lqr", "modified_imsc", "ppf")
+SHORT = ("modified_imsc", "ppf")
 
 
 @pytest.mark.parametrize(
@@ -197,6 +197,7 @@ def test_own_target_is_written(own, tmp_path, capsys):
     assert len(rows) == 6 and rows[0].startswith("link 1, mode 1,")
 
 
+@pytest.mark.long  # in short: the target of a user's own, and laws of the package in fixed point
 def test_own_law_becomes_c(own, tmp_path, capsys):
     text = run(
         capsys, own, "export", written(tmp_path, OWN), "--target", "c", "--out", tmp_path / "c"

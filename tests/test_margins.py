@@ -196,10 +196,7 @@ def test_idle_links_cost_nothing_and_change_nothing():
 
 
 def test_scan_gives_the_same_as_kernels(monkeypatch):
-    loops = random_loops(20, 5)
-    is_pair = np.sum(loops.cases.control.link_mask, axis=1) == 2  # one number, one compilation
-    assert np.sum(is_pair) > 4
-    loops = loops._replace(cases=jax.tree.map(lambda x: x[is_pair], loops.cases))
+    loops = random_loops(8, 5)
     kernels = judge_loops(*loops)
     monkeypatch.setattr(lanes, "_has_kernels", lambda: False)
     lanes._runner.cache_clear()

@@ -109,15 +109,17 @@ def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
         return _judge_one_by_one(structure, cases)
     structure, cases = with_margin_modes(structure, cases)
     whole = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
-    n_links = np.sum(whole.control.link_mask > 0, axis=1)
+    # idle links cost nothing; one number for all cases, since each has programs of its own
+    most = max(1, int(np.sum(whole.control.link_mask > 0, axis=1).max()))
     threads = len(jax.local_devices())
     figures = _nothing(count, structure)
     with ThreadPoolExecutor(threads) as pool:
 
         def judge(rows: np.ndarray, way: Walk) -> np.ndarray:
             """Write the figures of these cases; which of them are doubtful."""
-            parts = _alike(rows, n_links, threads)
-            found = list(pool.map(partial(_judge_block, structure, way, whole), parts))
+            share = min(BLOCK, -(-len(rows) // threads))
+            parts = [rows[k : k + share] for k in range(0, len(rows), share)]
+            found = list(pool.map(partial(_judge_block, structure, way, most, whole), parts))
             doubtful = []
             for part, (those, is_doubtful) in zip(parts, found, strict=True):
                 for old, new in zip(figures, those, strict=True):
@@ -159,16 +161,6 @@ def _nothing(count: int, structure: Structure) -> LoopMargins:
     return LoopMargins(one, two, three, np.full((count, structure.n_controlled), np.nan))
 
 
-def _alike(rows: np.ndarray, n_links: np.ndarray, threads: int) -> list[np.ndarray]:
-    """Blocks of cases with as many links under control: idle ones take no time."""
-    parts = []
-    for count in np.unique(n_links[rows]):
-        mine = rows[n_links[rows] == count]
-        share = min(BLOCK, -(-len(mine) // threads))
-        parts += [mine[k : k + share] for k in range(0, len(mine), share)]
-    return parts
-
-
 class Crossings(NamedTuple):
     """Where eigenvalues may be real and positive, (k,) each."""
 
@@ -178,7 +170,7 @@ class Crossings(NamedTuple):
 
 
 def _judge_block(
-    structure: Structure, way: Walk, cases: Case, rows: np.ndarray
+    structure: Structure, way: Walk, most: int, cases: Case, rows: np.ndarray
 ) -> tuple[LoopMargins, np.ndarray]:
     """Figures of some cases, at most a block, and of which the walk saw what is not there."""
     mask = cases.control.link_mask[rows].T
@@ -188,7 +180,7 @@ def _judge_block(
     with PREPARING:
         found = jax.tree.map(np.asarray, _respond(structure, block))
     response, modes = jax.tree.map(lambda x: x[..., : len(rows)], found)
-    response = controlled_first(response, mask, max(1, n_links[0]))
+    response = controlled_first(response, mask, most)
     with np.errstate(all="ignore"):  # what is not finite finds no crossing
         ratio = damping_ratios(response, modes, n_links, structure.n_controlled)
         return _judged(response, modes, way, ratio)
