@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import tomllib
@@ -65,8 +66,8 @@ TUNE = (
     + """
 [tune]
 objective = { residual_rms = 1.0, turning = 0.1 }
-iterations = 4
-starts = 2
+iterations = 2
+starts = 1
 free = { "control.laws.even_damping.constant" = { from = 0.2, to = 4.0 } }
 """
 )
@@ -85,8 +86,7 @@ def own(tmp_path_factory):
     for table, entries in zip(tables, before, strict=True):
         table._entries = entries
     sources.OUTSIDE.remove(file)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.delenv(VARIABLE)
+    os.environ.pop(VARIABLE)
     jax.clear_caches()
 
 

@@ -100,11 +100,11 @@ def assert_margins(found, wanted):
 
 
 def test_margins_of_random_loops():
-    loops = random_loops(40, 5)
+    loops = random_loops(28, 5)
     wanted = exact_margins(loops)
     assert_margins(judge_loops(*loops).gain_margin, wanted)
     # neither all stable nor all unstable
-    assert 5 < np.sum(wanted > 1) < 35
+    assert 5 < np.sum(wanted > 1) < 23
 
 
 @pytest.mark.long
@@ -146,7 +146,7 @@ def check_damping(loops):
 
 
 def test_damping_ratios_are_those_of_the_loops_poles():
-    assert check_damping(random_loops(40, 3)) > 0.98
+    assert check_damping(random_loops(28, 3)) > 0.98
 
 
 @pytest.mark.long
@@ -196,7 +196,10 @@ def test_idle_links_cost_nothing_and_change_nothing():
 
 
 def test_scan_gives_the_same_as_kernels(monkeypatch):
-    loops = random_loops(8, 5)
+    loops = random_loops(24, 5)
+    is_single = np.sum(loops.cases.control.link_mask, axis=1) == 1  # the smallest programs
+    assert np.sum(is_single) > 3
+    loops = loops._replace(cases=jax.tree.map(lambda x: x[is_single], loops.cases))
     kernels = judge_loops(*loops)
     monkeypatch.setattr(lanes, "_has_kernels", lambda: False)
     lanes._runner.cache_clear()
