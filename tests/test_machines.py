@@ -106,6 +106,7 @@ def sections(study):
     return tomllib.loads(study_template(study))
 
 
+@pytest.mark.long  # in short: entries of one link in a sweep, below
 def test_a_sweep_over_machines_is_their_single_runs(tmp_path):
     """All ten in one batch: links, patches, guides, joints, payload as columns."""
     studies = [random_machine(seed, **SHORT) for seed in SEEDS]
