@@ -186,11 +186,7 @@ def finish(totals: Totals, ending: Ending) -> Metrics:
 # --- totals ---------------------------------------------------------------------------------------
 
 
-def _counted(name: str, weight: Callable[[Instant], Array | float]) -> Total:
-    return Total(name, (), lambda totals, at: totals[name] + weight(at))
-
-
-def _summed(name: str, dims: tuple[str, ...], term: Callable[[Instant], Array]) -> Total:
+def _summed(name: str, dims: tuple[str, ...], term: Callable[[Instant], Array | float]) -> Total:
     return Total(name, dims, lambda totals, at: totals[name] + term(at))
 
 
@@ -226,10 +222,10 @@ _STATIONS, _MODES = ("link", "station"), ("link", "mode")
 _CONTROLLED = ("link", "controlled_mode")
 _LINES = (*_CONTROLLED, "spectrum_point")
 
-_COUNT = _counted("count", lambda at: 1)
-_MOVING = _counted("moving_count", lambda at: at.window.is_moving)
-_RESIDUAL = _counted("residual_count", lambda at: at.window.is_residual)
-_TAPER = _counted("taper_square", lambda at: at.window.taper * at.window.taper)
+_COUNT = _summed("count", (), lambda at: 1)
+_MOVING = _summed("moving_count", (), lambda at: at.window.is_moving)
+_RESIDUAL = _summed("residual_count", (), lambda at: at.window.is_residual)
+_TAPER = _summed("taper_square", (), lambda at: at.window.taper * at.window.taper)
 _PHASOR = Total("phasor", _LINES, _turned, (1.0, 0.0))
 _SPECTRUM = Total("spectrum", _LINES, _transformed, (0.0, 0.0))
 
@@ -240,6 +236,10 @@ _SPECTRUM = Total("spectrum", _LINES, _transformed, (0.0, 0.0))
 def _root(x: Array) -> Array:
     # the inner where keeps the gradient finite at zero
     return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0)
+
+
+def _average(totals: Totals, total: Total, count: Total) -> Array:
+    return totals[total.name] / jnp.maximum(totals[count.name], 1)
 
 
 def _rms(
@@ -254,8 +254,8 @@ def _rms(
     """Root of the mean over a window."""
     total = _summed(f"{name}_square", dims, square)
 
-    def finished(totals: Totals, ending: Ending) -> Array:
-        return _root(totals[total.name] / jnp.maximum(totals[count.name], 1))
+    def finished(totals: Totals, _: Ending) -> Array:
+        return _root(_average(totals, total, count))
 
     return Metric(name, dims, unit, text, (count, total), finished, **about)
 
@@ -271,8 +271,8 @@ def _mean(
 ) -> Metric:
     total = _summed(f"{name}_sum", dims, term)
 
-    def finished(totals: Totals, ending: Ending) -> Array:
-        return totals[total.name] / jnp.maximum(totals[count.name], 1)
+    def finished(totals: Totals, _: Ending) -> Array:
+        return _average(totals, total, count)
 
     return Metric(name, dims, unit, text, (count, total), finished, **about)
 
@@ -317,10 +317,6 @@ def _density(totals: Totals, ending: Ending) -> Array:
 _MODAL_ENERGY = _summed(
     "modal_energy_sum", _CONTROLLED, lambda at: at.window.is_moving * _modal_energy(at)
 )
-
-
-def _over_moving(totals: Totals, name: str) -> Array:
-    return totals[name] / jnp.maximum(totals["moving_count"], 1)
 
 
 #: All metrics by name, in the order of the files.
@@ -504,7 +500,7 @@ METRICS: Table[Metric] = Table(
             "m2/s2",
             "the same in the controller's modes",
             (_MOVING, _MODAL_ENERGY),
-            lambda totals, _: _over_moving(totals, "modal_energy_sum"),
+            lambda totals, _: _average(totals, _MODAL_ENERGY, _MOVING),
         ),
         Metric(
             "spectral_density",
@@ -523,7 +519,7 @@ METRICS: Table[Metric] = Table(
             "EMC ratios (24) that the run's modal energies give",
             (_MOVING, _MODAL_ENERGY),
             lambda totals, ending: efficient_modal_control(
-                _over_moving(totals, "modal_energy_sum"), ending.modal_omega
+                _average(totals, _MODAL_ENERGY, _MOVING), ending.modal_omega
             ),
         ),
     ],

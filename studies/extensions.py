@@ -67,16 +67,18 @@ def extend(
     file = Path(str(found.__file__)).resolve()
     if file not in sources.OUTSIDE:
         sources.OUTSIDE.append(file)
-        before = os.environ.get(VARIABLE, "")
-        os.environ[VARIABLE] = os.pathsep.join(filter(None, (before, str(file))))
+    os.environ[VARIABLE] = os.pathsep.join(dict.fromkeys([*_told(), str(file)]))
 
 
 def extend_as_told() -> None:
     """Take in what the environment names, as a process started by another one does."""
-    for module in filter(None, os.environ.get(VARIABLE, "").split(os.pathsep)):
-        if Path(module).resolve() not in sources.OUTSIDE:
-            sources.OUTSIDE.append(Path(module).resolve())
+    for module in _told():
+        if Path(module).resolve() not in sources.OUTSIDE:  # it may have another module name here
             extend(module)
+
+
+def _told() -> list[str]:
+    return [name for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
 
 
 def _table(kind: str) -> Table[Any]:

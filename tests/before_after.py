@@ -21,10 +21,8 @@ import h5py
 import numpy as np
 
 TOLERANCE = 1e-12
-#: What differs from run to run.
-VOLATILE = (
-    "time", "second", "version", "created", "host", "digest", "hash", "git", "code", "results",
-)  # fmt: skip
+#: What names the code in JSON, and so differs.
+VOLATILE = ("code", "git", "results", "study_hash")
 DESIGNS = ("paper", "paper_gains", "difference", "disturbance", "measured")
 SWEEPS = ("placement", "gains", "links", "mistuning", "models", "robustness", "spillover")
 TUNING = "tune_placement"
@@ -93,17 +91,12 @@ def arrays(path: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
 
     def visit(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and not is_volatile(name):
+        if isinstance(item, h5py.Dataset):
             found[name] = item[()]
 
     with h5py.File(path) as file:
         file.visititems(visit)
     return found
-
-
-def is_volatile(name: str) -> bool:
-    last = name.rsplit("/", 1)[-1]
-    return any(word in last for word in VOLATILE) and last not in ("settling_time", "ringing_time")
 
 
 def numbers(path: Path) -> dict[str, Any]:
@@ -113,7 +106,7 @@ def numbers(path: Path) -> dict[str, Any]:
         pairs = item.items() if isinstance(item, dict) else enumerate(item)
         for key, value in pairs:
             at = f"{name}/{key}"
-            if is_volatile(at):
+            if key in VOLATILE:
                 continue
             if isinstance(value, dict | list):
                 visit(at, value)

@@ -9,10 +9,10 @@ import os
 import re
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeVar
 
 import typer
 
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from studies.engine.chunks import Runner
     from studies.space.spec import SweepSpec
 
+
+Made = TypeVar("Made")
 
 #: Options of the commands that can use workers.
 Scheduler = Annotated[
@@ -63,11 +65,33 @@ class Workers(NamedTuple):
         return self.scheduler is not None or self.local is not None
 
 
-@contextmanager
 def runner_for(
     spec: SweepSpec, workers: Workers, tell: Callable[[str], None]
-) -> Iterator[Runner | None]:
+) -> AbstractContextManager[Runner | None]:
     """What runs a sweep on workers, None for this process.
+
+    Raises:
+        StudyError: as `connected`.
+    """
+
+    def make(client: Client) -> Runner:
+        from studies.cluster.runner import ClusterRunner
+
+        return ClusterRunner(client, spec, workers.timeout)
+
+    return on_workers(workers, tell, make)
+
+
+@contextmanager
+def on_workers(
+    workers: Workers, tell: Callable[[str], None], make: Callable[[Client], Made]
+) -> Iterator[Made | None]:
+    """What is made of a client of the workers, None where none are named.
+
+    Args:
+        workers: which ones.
+        tell: called with what is going on.
+        make: of the client.
 
     Raises:
         StudyError: as `connected`.
@@ -76,9 +100,7 @@ def runner_for(
         yield None
         return
     with connected(workers, tell) as client:
-        from studies.cluster.runner import ClusterRunner
-
-        yield ClusterRunner(client, spec, workers.timeout)
+        yield make(client)
 
 
 @contextmanager

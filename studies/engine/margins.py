@@ -317,10 +317,7 @@ def _look_closer(
     kind += ([0.0] * (LOOK.repeats - 1) + [2.0]) * (LOOK.frequencies - 1)
     here = jax.tree.map(lambda x: x[..., seen.case], response)
     spread = _spread(here, FINE_SPREAD)
-    n = spread.shape[0] * spread.shape[1]
-    k = np.arange(n)[:, None]
-    ring = np.exp(2j * np.pi * (k + 0.3) / n) * (0.2 + 0.8 * ((4 * k) % n) / n) * seen.value
-    loci = _walked(here, spread, Pair(ring.real, ring.imag), omega, np.array(kind))
+    loci = _walked(here, spread, _ring(spread, seen.value), omega, np.array(kind))
     return _crossings(loci, seen.case, KEPT)[0]
 
 
@@ -331,18 +328,24 @@ def _at_the_ends(response: LoopResponse) -> tuple[np.ndarray, np.ndarray]:
     loses its static stiffness at 0, differences their sign at pi/T.
     """
     spread, top = _spread(response, FINE_SPREAD), np.pi / response.period
-    k = np.arange(spread.shape[0] * spread.shape[1])[:, None]
-    ring = np.exp(2j * np.pi * (k + 0.3) / len(k)) * (0.5 + k / len(k)) * np.ones_like(top)
+    ring = _ring(spread, np.ones_like(top))
     value, omega = np.zeros(len(top)), np.full(len(top), np.nan)
     for place, name in ((0 * top + STILL, 0 * top), (top * (1 - 1e-6), top)):
         steps = np.repeat(place[None], LOOK.starts, axis=0)
-        first = Pair(ring.real.copy(), ring.imag.copy())
-        found = _walked(response, spread, first, steps, np.zeros(LOOK.starts)).value
+        found = _walked(response, spread, ring, steps, np.zeros(LOOK.starts)).value
         is_real = (found.re > 1 / HIGHEST) & (np.abs(found.im) < 1e-3 * found.re)
         largest = np.max(np.where(is_real, found.re, 0.0), axis=0)
         omega = np.where(largest > value, name, omega)
         value = np.maximum(value, largest)
     return value, omega
+
+
+def _ring(spread: np.ndarray, size: np.ndarray) -> Pair:
+    """First guesses at the eigenvalues of each lane, scattered up to its size [1]."""
+    n = spread.shape[0] * spread.shape[1]
+    k = np.arange(n)[:, None]
+    ring = np.exp(2j * np.pi * (k + 0.3) / n) * (0.2 + 0.8 * ((4 * k) % n) / n) * size
+    return Pair(ring.real, ring.imag)
 
 
 def _spread(response: LoopResponse, size: float) -> np.ndarray:

@@ -12,7 +12,6 @@ import jax
 import numpy as np
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.laws import LAWS
 from jaxmodel.prepare import STIFFNESS_LIMIT, drive_rate
 from studies.config import processor
 from studies.engine.runs import SUBSTEP_LIMIT, mechanics_at, step_counts
@@ -157,8 +156,7 @@ def _structure(table: Table, members: np.ndarray) -> Structure:
         has_amplifier=bool((column("electronics.amplifier_hz") > 0).any()),
         has_noise=bool(noisy) or one.is_smooth,
         has_friction=bool((column("drive.coulomb_friction") > 0).any()),
-        has_position_gain=LAWS[one.law].has_position
-        or bool(np.any(fields.numbers(_POSITION) != 0)),
+        has_position_gain=one.has_position_gain or bool(np.any(fields.numbers(_POSITION) != 0)),
         has_wrench=any(np.any(fields.numbers(name) != 0) for name in _WRENCH),
         has_payload_offset=bool(np.any(fields.numbers("load.offset") != 0)),
     )

@@ -174,15 +174,26 @@ def loop_report(
         reports = [
             _judged(_closed_loop(plain, case, pose, part), period, n_tracked) for _, part in parts
         ]
-    frequency, zeta = np.array(reports[0].frequency_hz), np.array(reports[0].damping_ratio)
-    for (modes, _), one in zip(parts, reports, strict=True):
-        frequency[modes], zeta[modes] = one.frequency_hz[modes], one.damping_ratio[modes]
+    chosen = [modes for modes, _ in parts]
     return LoopReport(
         max(one.spectral_radius for one in reports),
         min(one.gain_margin for one in reports),
-        frequency,
-        zeta,
+        mode_by_mode(chosen, [one.frequency_hz for one in reports]),
+        mode_by_mode(chosen, [one.damping_ratio for one in reports]),
     )
+
+
+def mode_by_mode(modes: list[slice], each: list[np.ndarray]) -> np.ndarray:
+    """What the parts of a law say, each of its own modes; the first one of those of none.
+
+    Args:
+        modes: that each part tells about, see `linear_parts`.
+        each: what it says of all of them, (J, ...).
+    """
+    whole = np.array(each[0])
+    for chosen, values in zip(modes, each, strict=True):
+        whole[chosen] = values[chosen]
+    return whole
 
 
 def _judged(matrices: LoopMatrices, period: float, n_tracked: int) -> LoopReport:

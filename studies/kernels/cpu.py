@@ -86,9 +86,7 @@ def kept_kernel(name: str, make: Callable[[], TracedLoop]) -> Kernel:
         name: of the loop, with all sizes.
         make: traces it.
     """
-    kept = ObjectCache(
-        "loop", name, sources.digest(__name__, "jaxmodel"), jax.__version__, *_target()
-    )
+    kept = ObjectCache("loop", name, _code(), jax.__version__, *_target())
     found = kept.take(None)
     if found is None:
         kernel, code = _build(make())
@@ -103,6 +101,12 @@ def kept_kernel(name: str, make: Callable[[], TracedLoop]) -> Kernel:
     engine.finalize_object()
     dtype = np.dtype(f"f{VECTOR_BYTES // width}")
     return Kernel(engine, width, np.array(numbers, dtype), Counter(operations))
+
+
+@cache
+def _code() -> str:
+    """Of the code that a traced loop comes from."""
+    return sources.digest(__name__, "jaxmodel")
 
 
 class _VectorWriter(Writer):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from studies.engine.stability import follow_poles, gain_margin
+from studies.engine.stability import follow_poles, gain_margin, mode_by_mode
 from studies.spillover.plants import SampledLoop
 from studies.study.margin import HIGHEST, LOWEST
 
@@ -56,13 +56,12 @@ def judge(loop: SampledLoop) -> Judgement:
 
 def worst_of(parts: list[tuple[slice, Judgement]]) -> Judgement:
     """Of a law whose channels act one at a time, each with the modes it tells about."""
-    each = [judgement for _, judgement in parts]
-    frequency, zeta = np.array(each[0].frequency_hz), np.array(each[0].damping_ratio)
-    for modes, one in parts:
-        frequency[modes], zeta[modes] = one.frequency_hz[modes], one.damping_ratio[modes]
+    modes, each = [modes for modes, _ in parts], [judgement for _, judgement in parts]
     lowest = min(each, key=lambda one: one.margin)
     return lowest._replace(
-        radius=max(one.radius for one in each), frequency_hz=frequency, damping_ratio=zeta
+        radius=max(one.radius for one in each),
+        frequency_hz=mode_by_mode(modes, [one.frequency_hz for one in each]),
+        damping_ratio=mode_by_mode(modes, [one.damping_ratio for one in each]),
     )
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,7 +12,7 @@ import numpy as np
 from distributed import get_worker
 
 from studies import config
-from studies.cluster.connect import Workers, connected
+from studies.cluster.connect import Workers, on_workers
 from studies.cluster.watch import Watch
 from studies.cluster.worker import alone, get_ready, identity, refuse_difference
 from studies.errors import StudyError
@@ -126,17 +125,14 @@ class ClusterEvaluator(Evaluator):
         return [answers[future].found for future in futures]
 
 
-@contextmanager
 def evaluator_for(
     spec: TuneSpec, workers: Workers, tell: Callable[[str], None]
-) -> Iterator[Evaluator | None]:
+) -> AbstractContextManager[Evaluator | None]:
     """What evaluates the designs of a tuning on workers, None for this process.
 
     Raises:
         StudyError: as `connected`.
     """
-    if not workers.are_named:
-        yield None
-        return
-    with connected(workers, tell) as client:
-        yield ClusterEvaluator(client, spec, workers.timeout, tell)
+    return on_workers(
+        workers, tell, lambda client: ClusterEvaluator(client, spec, workers.timeout, tell)
+    )
