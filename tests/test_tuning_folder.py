@@ -191,7 +191,9 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
     page = parsed((out / "report.html").read_text())
     for name in ("descent", "gains", "front"):
         assert (out / f"{name}.png").stat().st_size > 10_000 and f"({name}.png)" in text
-    assert len(page.images) == 3 and "[tune.free]" in page.text
+    assert len(page.images) == 4  # the sketch of the machine, then these
+    assert page.images[0][1].startswith("The machine at its first way-point")
+    assert "[tune.free]" in page.text
     tuned = load_study(out / "tuned_gains.toml")
     assert tuned.control.gain_factor != paper_study().control.gain_factor
     check_report(out)
