@@ -92,9 +92,16 @@ def axial_force(
     still = jnp.zeros_like(plant.b)
     force = inverse_dynamics(plant, pose, pose_rate, pose_acc, wrench)
     found = accelerations(
-        plant, close_chain(plant, pose, pose_rate), pose_rate, still, still, force, still, wrench,
+        plant,
+        close_chain(plant, pose, pose_rate),
+        pose_rate,
+        still,
+        still,
+        force,
+        still,
+        wrench,
         is_coupled=False,
-    )  # fmt: skip
+    )
     return found.axial
 
 
@@ -123,12 +130,14 @@ def stretch_error(chain: Chain, stretch: Array) -> Array:
         y[0] * turn[1] - y[1] * turn[0],
     )
     over = 1 / (x[0] * cross[0] + x[1] * cross[1] + x[2] * cross[2])
-    return over * jnp.stack([
-        stretch[0] * cross[0] + stretch[1] * cross[1] + stretch[2] * cross[2],
-        stretch[0] * (turn[1] * x[2] - turn[2] * x[1])
-        + stretch[1] * (turn[2] * x[0] - turn[0] * x[2])
-        + stretch[2] * (turn[0] * x[1] - turn[1] * x[0]),
-        stretch[0] * (x[1] * y[2] - x[2] * y[1])
-        + stretch[1] * (x[2] * y[0] - x[0] * y[2])
-        + stretch[2] * (x[0] * y[1] - x[1] * y[0]),
-    ])  # fmt: skip
+    return over * jnp.stack(
+        [
+            stretch[0] * cross[0] + stretch[1] * cross[1] + stretch[2] * cross[2],
+            stretch[0] * (turn[1] * x[2] - turn[2] * x[1])
+            + stretch[1] * (turn[2] * x[0] - turn[0] * x[2])
+            + stretch[2] * (turn[0] * x[1] - turn[1] * x[0]),
+            stretch[0] * (x[1] * y[2] - x[2] * y[1])
+            + stretch[1] * (x[2] * y[0] - x[0] * y[2])
+            + stretch[2] * (x[0] * y[1] - x[1] * y[0]),
+        ]
+    )

@@ -138,16 +138,27 @@ def plant_rates(
     else:
         chain = close_chain(loop.plant, state.pose, state.pose_rate)
     force = slider_force(
-        loop.drive, reference, chain.rho, chain.rho_rate, structure.has_friction,
+        loop.drive,
+        reference,
+        chain.rho,
+        chain.rho_rate,
+        structure.has_friction,
         structure.is_smooth,
-    )  # fmt: skip
+    )
     if structure.feedback == "ideal":
         voltage = ideal_voltage(structure, loop, state.q, state.q_rate)
     piezo = jnp.sum(loop.actuator * voltage[:, None], axis=2)
     rates = accelerations(
-        loop.plant, chain, state.pose_rate, state.q, state.q_rate, force, piezo, reference.wrench,
+        loop.plant,
+        chain,
+        state.pose_rate,
+        state.q,
+        state.q_rate,
+        force,
+        piezo,
+        reference.wrench,
         structure.is_coupled,
-    )  # fmt: skip
+    )
     return Rates(chain, rates)
 
 
@@ -270,9 +281,12 @@ def step(structure: Structure, loop: Loop, state: State, inputs: Inputs) -> tupl
     after = state.controller
     if structure.feedback == "sampled":
         after, info = controller_step(
-            loop.controller, after, filtered_voltage(loop, state.plant), inputs.adc_noise,
+            loop.controller,
+            after,
+            filtered_voltage(loop, state.plant),
+            inputs.adc_noise,
             structure.is_smooth,
-        )  # fmt: skip
+        )
         clipped = jnp.max(jnp.max(info.is_clipped, axis=1), axis=0)
     elif structure.feedback == "ideal":
         voltage = ideal_voltage(structure, loop, state.plant.q, state.plant.q_rate)

@@ -128,8 +128,14 @@ def _ideal(controller: Controller, sensor: Array) -> tuple[Array, Array | None]:
 
 
 _PER_LINK_DRIVE = (
-    "kp", "kd", "force_limit", "coulomb_friction", "friction_speed", "viscous_friction", "ripple",
-)  # fmt: skip
+    "kp",
+    "kd",
+    "force_limit",
+    "coulomb_friction",
+    "friction_speed",
+    "viscous_friction",
+    "ripple",
+)
 
 
 def spectrum_frequencies(structure: Structure, bases: Bases) -> Array:
@@ -188,7 +194,7 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         adc_top=jnp.asarray(electronics.adc_levels - 1.0),
         adc_noise=jnp.asarray(electronics.adc_noise),
         rival_omega=feedback.rival_omega,
-    )  # fmt: skip
+    )
     return ControllerDesign(
         controller=controller,
         known=known,

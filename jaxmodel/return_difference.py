@@ -185,9 +185,7 @@ def _normal_modes(plant: Plant, inertia: Array | None, springs: Array | None) ->
 
 #: Fields of links, and those that only links with channels need.
 _LINK_FIELDS = ("square", "decay", "lightness", "enter", "leave")
-_CHANNEL_FIELDS = (
-    "observe", "act", "feedthrough", "estimator", "velocity_gain", "position_gain"
-)  # fmt: skip
+_CHANNEL_FIELDS = ("observe", "act", "feedthrough", "estimator", "velocity_gain", "position_gain")
 
 
 def controlled_first(response: LoopResponse, link_mask: np.ndarray, count: int) -> LoopResponse:
@@ -291,9 +289,11 @@ def go_round(response: LoopResponse, s: Pair, shift: Pair, spread: Array | None 
             entering = _through(response.enter[:n], act, own) * at2
             links = _through(response.enter, response.leave, inverse).sum(0)
             pose = (
-                at2 * response.mass + at * response.damping + response.stiffness
+                at2 * response.mass
+                + at * response.damping
+                + response.stiffness
                 - links * (at2 * at2)
-            )  # fmt: skip
+            )
     channel = _channel(response, shift)[:, :, None]
     loop, leaving = (seen - response.feedthrough) * channel, leaving * channel
     if spread is not None:

@@ -116,17 +116,30 @@ def ei_damped(omega: Array, zeta: Array, tolerance: Array) -> Impulses:
     """
     v, z = jnp.asarray(tolerance), jnp.asarray(zeta)
     first = (
-        0.249684 + 0.249623 * v + 0.800081 * z + 1.23328 * v * z + 0.495987 * z**2
+        0.249684
+        + 0.249623 * v
+        + 0.800081 * z
+        + 1.23328 * v * z
+        + 0.495987 * z**2
         + 3.17316 * v * z**2
-    )  # fmt: skip
+    )
     third = (
-        0.251489 + 0.21474 * v - 0.832493 * z + 1.41498 * v * z + 0.851806 * z**2
+        0.251489
+        + 0.21474 * v
+        - 0.832493 * z
+        + 1.41498 * v * z
+        + 0.851806 * z**2
         - 4.90094 * v * z**2
-    )  # fmt: skip
+    )
     middle = (
-        0.499899 + 0.461586 * v * z + 4.26169 * v * z**2 + 1.75601 * v * z**3
-        + 8.57843 * v**2 * z - 108.644 * v**2 * z**2 + 336.989 * v**2 * z**3
-    )  # fmt: skip
+        0.499899
+        + 0.461586 * v * z
+        + 4.26169 * v * z**2
+        + 1.75601 * v * z**3
+        + 8.57843 * v**2 * z
+        - 108.644 * v**2 * z**2
+        + 336.989 * v**2 * z**3
+    )
     period = 2 * np.pi / damped_frequency(omega, z)
     return Impulses(
         jnp.stack([first, 1 - first - third, third]),

@@ -30,8 +30,15 @@ OVERDAMPED = 22
 
 #: A case with one of these ran to its end, and its metrics hold.
 FINISHED = (
-    OK, SATURATED, UNSTABLE, CLIPPED, MOTORS_SATURATED, NOT_ARRIVED, NEAR_SINGULAR, OVERLOADED
-)  # fmt: skip
+    OK,
+    SATURATED,
+    UNSTABLE,
+    CLIPPED,
+    MOTORS_SATURATED,
+    NOT_ARRIVED,
+    NEAR_SINGULAR,
+    OVERLOADED,
+)
 
 REASONS = {
     OK: "ok",

@@ -22,8 +22,10 @@ from studies.sweeps.commands import add_commands
 from studies.tuning.commands import add_commands as add_tuning
 
 app = typer.Typer(
-        no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
-)  # fmt: skip
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
 #: Columns of tables where nobody watches; a terminal's own width otherwise.
 FILE_WIDTH = 240
 is_watched = sys.stdout.isatty() or "COLUMNS" in os.environ
@@ -112,9 +114,11 @@ def simulate(
     table = Table("link", "residual rms, worst station [um]", "settling [ms]", "peak voltage [V]")
     for i in range(3):
         table.add_row(
-            str(i + 1), f"{1e6 * metrics.residual_rms[i].max():.4g}",
-            settling_text(run, i), f"{metrics.peak_voltage[i]:.4g}",
-        )  # fmt: skip
+            str(i + 1),
+            f"{1e6 * metrics.residual_rms[i].max():.4g}",
+            settling_text(run, i),
+            f"{metrics.peak_voltage[i]:.4g}",
+        )
     console.print(table)
     if run.loop is not None:
         margin = margin_text(run.loop.gain_margin)
@@ -186,8 +190,14 @@ def modes(
 
     found = machine_modes(
         None if study is None else load_study(ready_spec(study)),
-        pose=pose, kp=kp, kd=kd, damping=damping, locked=locked, basis=basis, n_modes=n_modes,
-    )  # fmt: skip
+        pose=pose,
+        kp=kp,
+        kd=kd,
+        damping=damping,
+        locked=locked,
+        basis=basis,
+        n_modes=n_modes,
+    )
     if as_json:
         text = {
             "frequencies_hz": found.frequency.tolist(),

@@ -51,9 +51,11 @@ class Machines:
         self._preload.write_text(PRELOAD)
         root = str(Path(studies.__file__).parents[1])
         self._environment = os.environ | {
-            "TROUBLE": str(self._trouble), "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
-            "DASK_TEMPORARY_DIRECTORY": str(folder), "PYTHONPATH": root,
-        }  # fmt: skip
+            "TROUBLE": str(self._trouble),
+            "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
+            "DASK_TEMPORARY_DIRECTORY": str(folder),
+            "PYTHONPATH": root,
+        }
         self.processes = []
         self.trouble()
         self._start("dask_scheduler", "--port", "0", "--no-dashboard", "--no-show")

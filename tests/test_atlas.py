@@ -29,11 +29,19 @@ SETTINGS = ((0.05, "ei"), (0.03, "none"))
 def small_study(**fields):
     """One move, one controlled mode."""
     home = paper_study().motion.waypoints[0]
-    return paper_study().change(
-        link__modes=2, control__modes=1, control__ratio_source="own_run", run__duration=0.18,
-        metrics__residual_length=0.06, motion__move_time=0.05,
-        motion__waypoints=(home, (0.0, 0.01, home[2])),
-    ).change(**fields)  # fmt: skip
+    return (
+        paper_study()
+        .change(
+            link__modes=2,
+            control__modes=1,
+            control__ratio_source="own_run",
+            run__duration=0.18,
+            metrics__residual_length=0.06,
+            motion__move_time=0.05,
+            motion__waypoints=(home, (0.0, 0.01, home[2])),
+        )
+        .change(**fields)
+    )
 
 
 def drawn(name):
@@ -219,9 +227,15 @@ def made_up(link, platform):
     both = np.stack([link, link])[None]
     pose = np.stack([platform, 0 * platform, 0 * platform], axis=-1)
     return subsets.Subsets(
-        ((0.1, "ei"),), 1, np.zeros((1, 2, 8), int), both[..., None], np.stack([pose, pose])[None],
-        both[..., None] ** 2, both, both,
-    )  # fmt: skip
+        ((0.1, "ei"),),
+        1,
+        np.zeros((1, 2, 8), int),
+        both[..., None],
+        np.stack([pose, pose])[None],
+        both[..., None] ** 2,
+        both,
+        both,
+    )
 
 
 def test_claims_are_counted():

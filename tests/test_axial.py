@@ -72,9 +72,14 @@ def fast_square(**changes):
     """
     given = np.genfromtxt(DATA / "fast_50ms.csv", delimiter=",", skip_header=3)
     study = BARE.change(
-        drive__kd=60.0, motion__move_time=0.05, shaper__kind="none", run__duration=0.3001,
-        metrics__stations=(0.1,), metrics__residual_length=0.1, **changes,
-    )  # fmt: skip
+        drive__kd=60.0,
+        motion__move_time=0.05,
+        shaper__kind="none",
+        run__duration=0.3001,
+        metrics__stations=(0.1,),
+        metrics__residual_length=0.1,
+        **changes,
+    )
     record = jax.jit(simulate, static_argnums=(0, 2))(*arrays(study), True).record
     at = np.round(given[:, 0] / 1e-4).astype(int)
     deflection = np.asarray(record.chord_deflection_stations)[at, :, 0]
@@ -124,10 +129,15 @@ def test_axial_force_changes_the_frequency_of_a_link_between_held_ends(wrench):
 def test_axial_force_of_straight_links_is_the_same_in_every_basis():
     wrench, acceleration = np.array([7.0, -3.0, 0.2]), np.array([5.0, 20.0, -30.0])
     forces = [
-        axial.axial_force(plant_of(*arrays(BARE.change(link__basis=kind))), HOME_POSE,
-                          np.array([0.2, 0.1, 0.5]), acceleration, wrench)
+        axial.axial_force(
+            plant_of(*arrays(BARE.change(link__basis=kind))),
+            HOME_POSE,
+            np.array([0.2, 0.1, 0.5]),
+            acceleration,
+            wrench,
+        )
         for kind in ("pinned_pinned", "pinned_free")
-    ]  # fmt: skip
+    ]
     np.testing.assert_allclose(forces[1], forces[0], rtol=1e-9)
 
 
@@ -144,9 +154,11 @@ def test_a_load_beyond_the_critical_force_is_a_status(share, code):
     """The moment that compresses all links alike up to N_cr, and a little beyond."""
     moment = -share * N_CR * 5.0 / statics((0.0, 0.0, 5.0))[0]
     study = BARE.change(
-        run__duration=0.02, metrics__residual_length=0.001, shaper__kind="none",
+        run__duration=0.02,
+        metrics__residual_length=0.001,
+        shaper__kind="none",
         motion__waypoints=(HOME,),
-    )  # fmt: skip
+    )
     structure, case = arrays(study)
     load = case.load._replace(wrench=np.array([0.0, 0.0, moment]))
     result = jax.jit(simulate, static_argnums=0)(
@@ -161,9 +173,14 @@ def test_a_load_beyond_the_critical_force_is_a_status(share, code):
 
 def test_a_steady_load_is_held_and_a_pulse_moves_the_platform():
     study = BARE.change(
-        drive__kd=60.0, run__duration=0.1, metrics__residual_length=0.02, shaper__kind="none",
-        motion__waypoints=(HOME,), load__wrench=(20.0, 0.0, 0.1), link__damping_ratio=0.01,
-    )  # fmt: skip
+        drive__kd=60.0,
+        run__duration=0.1,
+        metrics__residual_length=0.02,
+        shaper__kind="none",
+        motion__waypoints=(HOME,),
+        load__wrench=(20.0, 0.0, 0.1),
+        link__damping_ratio=0.01,
+    )
     run = jax.jit(simulate, static_argnums=(0, 2))
     held = run(*arrays(study), True)
     np.testing.assert_allclose(held.record.pose, np.tile(HOME, (1000, 1)), atol=1e-12)
@@ -205,9 +222,13 @@ def test_ked_has_no_coupled_frequencies():
 def test_ked_leaves_uncontrolled_links_as_they_are():
     """Table 1 would read exactly 0 %: control of link 1 changes links 2 and 3 by nothing."""
     study = paper_study().change(
-        link__modes=3, motion__move_time=0.03, shaper__kind="none", run__duration=0.2,
-        metrics__residual_length=0.03, metrics__residual_delay=0.05,
-    )  # fmt: skip
+        link__modes=3,
+        motion__move_time=0.03,
+        shaper__kind="none",
+        run__duration=0.2,
+        metrics__residual_length=0.03,
+        metrics__residual_delay=0.05,
+    )
     run = jax.jit(simulate, static_argnums=0)
 
     def residual(links, model):
@@ -225,11 +246,19 @@ def test_ked_leaves_uncontrolled_links_as_they_are():
 def test_ked_bends_links_by_the_rigid_motion_alone():
     """A heavy, stiffly driven machine follows its command, and both models bend alike."""
     study = paper_study().change(
-        link__modes=3, motion__move_time=0.1, shaper__kind="none", run__duration=0.5,
-        metrics__residual_length=0.05, control__feedback="none", drive__kp=1e7, drive__kd=3e3,
-        machine__slider_mass=20.0, machine__platform_mass=50.0, machine__platform_inertia=0.05,
+        link__modes=3,
+        motion__move_time=0.1,
+        shaper__kind="none",
+        run__duration=0.5,
+        metrics__residual_length=0.05,
+        control__feedback="none",
+        drive__kp=1e7,
+        drive__kd=3e3,
+        machine__slider_mass=20.0,
+        machine__platform_mass=50.0,
+        machine__platform_inertia=0.05,
         link__shortening=False,
-    )  # fmt: skip
+    )
     run = jax.jit(simulate, static_argnums=0)
     ked, coupled = (
         np.asarray(run(*arrays(study.change(run__model=m))).metrics.structural_peak)
@@ -242,10 +271,15 @@ def test_ked_bends_links_by_the_rigid_motion_alone():
 def test_ked_fails_where_the_drive_rings_with_the_links(kp, peak, residual):
     """Two cells of the map of docs/exploring.md: 10 mm in 0.05 s."""
     study = load_study(SPECS / "paper.toml").change(
-        motion__waypoints=(HOME, (0.0, 0.01, HOME[2])), motion__move_time=0.05, link__modes=3,
-        shaper__kind="none", control__feedback="none", run__duration=0.2,
-        metrics__residual_length=0.1, drive__kp=kp,
-    )  # fmt: skip
+        motion__waypoints=(HOME, (0.0, 0.01, HOME[2])),
+        motion__move_time=0.05,
+        link__modes=3,
+        shaper__kind="none",
+        control__feedback="none",
+        run__duration=0.2,
+        metrics__residual_length=0.1,
+        drive__kp=kp,
+    )
     run = jax.jit(simulate, static_argnums=0)
     coupled, ked = (
         run(*arrays(study.change(run__model=model))).metrics for model in ("coupled", "ked")
@@ -300,9 +334,12 @@ def test_the_measured_machine_has_a_margin(modes):
 
 def test_spectra_of_the_measured_machine_stand_on_their_peaks():
     study = load_study(SPECS / "measured.toml").change(
-        motion__move_time=0.03, control__links=(False,) * 3, shaper__kind="none",
-        run__duration=0.5, metrics__residual_length=0.1,
-    )  # fmt: skip
+        motion__move_time=0.03,
+        control__links=(False,) * 3,
+        shaper__kind="none",
+        run__duration=0.5,
+        metrics__residual_length=0.1,
+    )
     result = jax.jit(simulate, static_argnums=0)(*arrays(study))
     density = np.asarray(result.metrics.spectral_density)
     assert (np.abs(density[:, 0].argmax(axis=-1) - 4) <= 1).all()  # of 9 points, +-10 %
@@ -314,10 +351,14 @@ def test_spectra_of_the_measured_machine_stand_on_their_peaks():
 def test_one_step_per_sample_is_enough_for_the_fastest_moves():
     """20 mm in 0.03 s, actuators at their limit, 8 modes: a step against eight."""
     study = paper_study().change(
-        motion__waypoints=(HOME, (0.0, 0.02, HOME[2])), motion__move_time=0.03,
-        shaper__kind="none", run__duration=0.08, metrics__residual_length=0.02,
-        control__gain_factor=1.0, run__smooth=True,
-    )  # fmt: skip
+        motion__waypoints=(HOME, (0.0, 0.02, HOME[2])),
+        motion__move_time=0.03,
+        shaper__kind="none",
+        run__duration=0.08,
+        metrics__residual_length=0.02,
+        control__gain_factor=1.0,
+        run__smooth=True,
+    )
     run = jax.jit(simulate, static_argnums=(0, 2))
     one, eight = (run(*arrays(study.change(run__substeps=n)), True) for n in (1, 8))
     assert eight.metrics.peak_voltage.max() > 90

@@ -121,8 +121,11 @@ def test_pinned_free_roots_and_frequencies():
 
 def test_frequencies_of_held_ends():
     soft = BEAM._replace(stiffness_factor=np.array([1.0, 0.8, 0.8]))
-    for kind, like in (("pinned_pinned", "pinned_pinned"), ("pinned_free", "pinned_pinned"),
-                       ("loaded", "loaded")):  # fmt: skip
+    for kind, like in (
+        ("pinned_pinned", "pinned_pinned"),
+        ("pinned_free", "pinned_pinned"),
+        ("loaded", "loaded"),
+    ):
         found = np.asarray(held_frequency(kind, soft, low_basis(kind, soft))) / (2 * np.pi)
         np.testing.assert_allclose(found, frequencies_hz(low_basis(like, soft)), rtol=1e-12)
     bare = np.asarray(held_frequency("pinned_free", BEAM, low_basis("pinned_free"))) / (2 * np.pi)

@@ -61,17 +61,24 @@ def test_gradient_figures(monkeypatch, capsys):
     assert found["parameters"] == 3 and found["configs_per_s"] > 0 < found["fingerprint"]
 
 
-@pytest.mark.parametrize("arguments", [["pears"], ["--work", "W2"], ["--work", "grad",
-                                       "--executor", "gpu"]])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments", [["pears"], ["--work", "W2"], ["--work", "grad", "--executor", "gpu"]]
+)
 def test_unknown_choices_are_refused(arguments, capsys):
     with pytest.raises(SystemExit, match="2"):
         cli.main(["bench", *arguments])
     assert "allowed" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("arguments", [["peers", "--work", "W8"], ["peers", "--batch", "8"],
-                                       ["--work", "sweep", "--executor", "scan"],
-                                       ["--work", "W1", "--cases", "5"]])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["peers", "--work", "W8"],
+        ["peers", "--batch", "8"],
+        ["--work", "sweep", "--executor", "scan"],
+        ["--work", "W1", "--cases", "5"],
+    ],
+)
 def test_options_that_would_be_ignored_are_refused(arguments, capsys):
     with pytest.raises(SystemExit, match="2"):
         cli.main(["bench", *arguments])

@@ -140,8 +140,16 @@ def test_the_report_of_a_run_is_whole(short_folder, short_run):
     rms = f"{1e6 * float(short_run.residual_rms[1].max()):.4g}"
     margin = f"gain margin {float(short_run.gain_margin):.4g}, spectral radius"
     watched = f"to the end of the run, {50 - 1e3 * float(short_run.command_end):.4g} ms after"
-    for part in ("Status: ok.", watched, f"\n2\n{rms}\n", margin, "settling time [ms]", "φ [µrad]",
-                 "flexlink-studies", "residual_length = 0.02"):  # fmt: skip
+    for part in (
+        "Status: ok.",
+        watched,
+        f"\n2\n{rms}\n",
+        margin,
+        "settling time [ms]",
+        "φ [µrad]",
+        "flexlink-studies",
+        "residual_length = 0.02",
+    ):
         assert part in found.text
     assert "/" not in found.text.partition("Versions")[2].partition("Study file")[0]  # no path
 

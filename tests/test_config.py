@@ -135,7 +135,9 @@ def test_what_keeps_jax_from_starting_is_said():
     """An accelerator that is not there, for one."""
     done = subprocess.run(
         [sys.executable, "-m", "studies.cli", "info"],
-        env={**os.environ, "JAX_PLATFORMS": "nonsense"}, capture_output=True, text=True,
-    )  # fmt: skip
+        env={**os.environ, "JAX_PLATFORMS": "nonsense"},
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 2 and done.stderr.startswith("studies: JAX cannot start: ")
     assert "JAX_PLATFORMS='nonsense'" in done.stderr and "Traceback" not in done.stderr

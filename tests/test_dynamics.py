@@ -35,8 +35,13 @@ def make(kind, machine=MACHINE, mask=1.0, stations=(0.1,), has_shortening=True):
 
 
 #: Bases, and whether a bent link's chord is shorter.
-KINDS = [("pinned_pinned", True), ("pinned_pinned", False), ("pinned_free", False),
-         ("loaded", True), ("loaded", False)]  # fmt: skip
+KINDS = [
+    ("pinned_pinned", True),
+    ("pinned_pinned", False),
+    ("pinned_free", False),
+    ("loaded", True),
+    ("loaded", False),
+]
 
 
 @pytest.fixture(scope="module")
@@ -84,9 +89,13 @@ def test_accelerations_equal_lagrangian_and_multiplier_form(kind, has_shortening
 
     found, (pose_l, q_l), (pose_m, q_m, rho_m, gamma_m) = all_forms(basis, plant, *states)
     pairs = (
-        (found.pose, pose_l), (found.modal, q_l), (found.pose, pose_m), (found.modal, q_m),
-        (found.rho, rho_m), (found.gamma, gamma_m),
-    )  # fmt: skip
+        (found.pose, pose_l),
+        (found.modal, q_l),
+        (found.pose, pose_m),
+        (found.modal, q_m),
+        (found.rho, rho_m),
+        (found.gamma, gamma_m),
+    )
     for mine, wanted in pairs:
         axes = tuple(range(1, wanted.ndim))
         error = np.abs(mine - wanted).max(axis=axes) / np.abs(wanted).max(axis=axes)

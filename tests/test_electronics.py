@@ -61,10 +61,13 @@ def test_course_of_the_amplifier_has_the_moments_of_its_exponential(rate):
 
 
 RELEASED = {
-    "run__duration": 0.05, "run__smooth": True, "electronics__adc_bits": 32,
-    "motion__waypoints": ((0.0, 0.0, np.pi / 6),), "shaper__kind": "none",
+    "run__duration": 0.05,
+    "run__smooth": True,
+    "electronics__adc_bits": 32,
+    "motion__waypoints": ((0.0, 0.0, np.pi / 6),),
+    "shaper__kind": "none",
     "initial__modal": ((1e-7,), (), ()),
-}  # fmt: skip
+}
 
 
 @cache

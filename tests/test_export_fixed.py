@@ -49,10 +49,14 @@ KINDS = {
     ),
     "other converters": changed(
         PAPER,
-        electronics={"conditioner_bias": 1.234, "adc_bits": 10, "voltage_limit": 30.0,
-                     "conditioner_gain": 0.7},
+        electronics={
+            "conditioner_bias": 1.234,
+            "adc_bits": 10,
+            "voltage_limit": 30.0,
+            "conditioner_gain": 0.7,
+        },
     ),
-}  # fmt: skip
+}
 
 
 def found_and_codes(data, length=500):
@@ -252,7 +256,7 @@ UNFIT = {
         ),
         "electronics.sample_rate_hz = 1e",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", UNFIT)

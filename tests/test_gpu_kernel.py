@@ -58,10 +58,13 @@ def rehearsed(loop, n_steps, lanes):
 def work(name, size=LAYOUT.size):
     """Structure and cases of a workload over its first move."""
     study = paper_study().change(
-        **{**WORKS[name], "link__modes": 2}, run__duration=0.06, motion__move_time=0.03,
+        **{**WORKS[name], "link__modes": 2},
+        run__duration=0.06,
+        motion__move_time=0.03,
         motion__waypoints=paper_study().motion.waypoints[:2],
-        metrics__residual_length=0.01, metrics__residual_delay=0.002,
-    )  # fmt: skip
+        metrics__residual_length=0.01,
+        metrics__residual_delay=0.002,
+    )
     structure = build_structure(study)._replace(metrics=METRICS.get(name, ()))
     force = np.zeros((size, 3))
     force[3] = 1e6  # a case that is thrown off its course
@@ -128,8 +131,11 @@ def every_loop():
         lambda constants, row, state: [
             every_operation(state[0], constants[0], lambda x: x) + row[0][0] * constants[1]
         ],
-        [Leaf((3, 4), True), np.ones(1)], [Leaf((1,), False)], [Leaf((3, 4), True)], np.float64,
-    )  # fmt: skip
+        [Leaf((3, 4), True), np.ones(1)],
+        [Leaf((1,), False)],
+        [Leaf((3, 4), True)],
+        np.float64,
+    )
 
 
 def test_every_operation_becomes_ptx(every_loop):

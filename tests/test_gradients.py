@@ -19,9 +19,12 @@ from tests.test_batch import short_study
 def objective():
     """Residual vibration [um^2] as a function of one vector of 15 numbers of order 1."""
     study = short_study(
-        run__smooth=True, link__modes=5, electronics__adc_noise=1e-4, drive__ripple=0.1,
+        run__smooth=True,
+        link__modes=5,
+        electronics__adc_noise=1e-4,
+        drive__ripple=0.1,
         control__position_gain=(10.0, 10.0, 10.0),
-    )  # fmt: skip
+    )
     # what nobody asks for must not cost a compilation
     structure = build_structure(study)._replace(metrics=("residual_rms",), n_frequencies=1)
     case = as_arrays(build_case(study))

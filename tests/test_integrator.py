@@ -32,13 +32,15 @@ OMEGA_H = [1e-4, 1e-2, 0.3, 1.0, 4.6, 12.0]
 
 def oscillator(omega, zeta, drain):
     """A and force direction of (q, q'/omega, z, z'/omega_f, s): states of one size."""
-    a = np.array([
-        [0, omega, 0, 0, 0],
-        [-omega, -2 * zeta * omega, 0, 0, 0],
-        [0, 0, 0, CORNER, 0],
-        [CORNER, 0, -CORNER, -np.sqrt(2) * CORNER, -CORNER],
-        [drain, 0, 0, 0, -drain],
-    ])  # fmt: skip
+    a = np.array(
+        [
+            [0, omega, 0, 0, 0],
+            [-omega, -2 * zeta * omega, 0, 0, 0],
+            [0, 0, 0, CORNER, 0],
+            [CORNER, 0, -CORNER, -np.sqrt(2) * CORNER, -CORNER],
+            [drain, 0, 0, 0, -drain],
+        ]
+    )
     return a, np.array([0, 1 / omega, 0, 0, 0]), np.array([1, omega, 1, CORNER, 1])
 
 
@@ -250,10 +252,12 @@ def test_energy_is_kept_for_a_second(free_machine, method):
 @pytest.mark.parametrize(
     ("modes", "is_released", "step"),
     [
-        (3, True, 5e-5), (8, True, 1e-5), (3, False, 2e-5),
+        (3, True, 5e-5),
+        (8, True, 1e-5),
+        (3, False, 2e-5),
         pytest.param(8, False, 2.5e-6, marks=pytest.mark.long),
     ],
-)  # fmt: skip
+)
 def test_energy_of_many_modes_is_kept_once_the_step_is_small(modes, is_released, step):
     """Nothing is lost but by time stepping; the links shorten their chords all the while."""
     machine = bent_machine(modes, is_released)

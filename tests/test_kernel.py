@@ -66,9 +66,12 @@ OTHER_SORTS = {
     "control": {"law": "srf", "velocity_gain": [1e-6, 2e-6, 1e-6]},
     "electronics": {"adc_noise": 0.01, "sensor_highpass_hz": 5.0, "amplifier_hz": 2e3},
     "drive": {
-        "coulomb_friction": 0.5, "friction_speed": 0.05, "kind": "computed_torque", "kd": 6e3
+        "coulomb_friction": 0.5,
+        "friction_speed": 0.05,
+        "kind": "computed_torque",
+        "kd": 6e3,
     },
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(
@@ -77,11 +80,12 @@ OTHER_SORTS = {
         (ALL_SORTS, {"metrics": {"residual_length": 0.004}}),
         pytest.param(
             {"method": "random", "count": 32, "axes": {"drive.kp": {"from": 1e4, "to": 2e4}}},
-            OTHER_SORTS, marks=pytest.mark.long,
+            OTHER_SORTS,
+            marks=pytest.mark.long,
         ),
     ],
     ids=["mixed sampled cases", "strain rate, noise, friction, steps"],
-)  # fmt: skip
+)
 def test_kernel_equals_scan(sweep, sections):
     fast, reference = both(small_spec(sweep, **sections))
     assert np.sum(reference.status == status.OK) >= 8
@@ -100,8 +104,11 @@ def test_odd_numbers_of_cases_fill_whole_vectors():
                 assert group.layout.lanes % unit == 0 and group.layout.size >= count
     loop = trace_loop(
         lambda constants, row, state: [state[0] + row[0]],
-        [], [Leaf((), False)], [Leaf((), True)], np.float32,
-    )  # fmt: skip
+        [],
+        [Leaf((), False)],
+        [Leaf((), True)],
+        np.float32,
+    )
     with pytest.raises(ValueError, match="lanes = 24: allowed multiples of 16"):
         cpu.build_kernel(loop).run([np.zeros(1, np.float32), np.zeros(24, np.float32)], 1, 24)
 
@@ -124,8 +131,11 @@ def translated(function, shape, dtype=np.float64, lanes=16):
     c = rng.normal(size=shape).astype(dtype)
     loop = trace_loop(
         lambda constants, row, state: [function(state[0], constants[0]) + 0 * row[0][0]],
-        [c], [Leaf((1,), False)], [Leaf(shape, True)], dtype,
-    )  # fmt: skip
+        [c],
+        [Leaf((1,), False)],
+        [Leaf(shape, True)],
+        dtype,
+    )
     out = x.copy()
     cpu.build_kernel(loop).run([np.zeros((1, 1), dtype), out], 1, lanes)
     wanted = np.asarray(jax.vmap(function, (-1, None), -1)(x, c))

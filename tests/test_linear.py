@@ -147,11 +147,15 @@ def test_flatten_and_unflatten_are_inverse():
 def test_released_link_moves_like_the_finite_element_link():
     given = np.loadtxt(DATA / "free_response.csv", delimiter=",")
     study = UNDAMPED.change(
-        link__modes=8, drive__locked=True, run__duration=0.0501,
-        motion__waypoints=((0.0, 0.0, HOME[2]),), shaper__kind="none",
-        initial__load_station=0.1, initial__load_deflection=(5e-5, 0.0, 0.0),
+        link__modes=8,
+        drive__locked=True,
+        run__duration=0.0501,
+        motion__waypoints=((0.0, 0.0, HOME[2]),),
+        shaper__kind="none",
+        initial__load_station=0.1,
+        initial__load_deflection=(5e-5, 0.0, 0.0),
         metrics__stations=(0.1,),
-    )  # fmt: skip
+    )
     structure, case = build_structure(study), as_arrays(build_case(study))
     record = jax.jit(simulate, static_argnums=(0, 2))(structure, case, True).record
     deflection = np.asarray(record.chord_deflection_stations)[:, :, 0]

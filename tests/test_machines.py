@@ -65,9 +65,14 @@ def both_ways(kind, machine, motion, loads):
     plant = build_plant(machine, basis, False, kind != "pinned_free")
     chain = dynamics.modal_chain(plant, *motion)
     found = dynamics.accelerations(
-        plant, chain, motion.pose_rate, motion.q, motion.q_rate,
-        loads.slider, loads.modal / plant.modal_mass[:, None],
-    )  # fmt: skip
+        plant,
+        chain,
+        motion.pose_rate,
+        motion.q,
+        motion.q_rate,
+        loads.slider,
+        loads.modal / plant.modal_mass[:, None],
+    )
     own = basis._replace(shortening=plant.shortening, mixed_shortening=plant.mixed_shortening)
     return (found.pose, found.modal), reference.by_lagrangian(machine, own, motion, loads)
 
@@ -110,8 +115,16 @@ def sections(study):
 def test_a_sweep_over_machines_is_their_single_runs(tmp_path):
     """All ten in one batch: links, patches, guides, joints, payload as columns."""
     studies = [random_machine(seed, **SHORT) for seed in SEEDS]
-    names = [*EACH_LINK, "machine.guide_angles_deg", "machine.joint_angles_deg", "load.offset",
-             "load.mass", "load.inertia", "link.damping_ratio", "patches.centers"]  # fmt: skip
+    names = [
+        *EACH_LINK,
+        "machine.guide_angles_deg",
+        "machine.joint_angles_deg",
+        "load.offset",
+        "load.mass",
+        "load.inertia",
+        "link.damping_ratio",
+        "patches.centers",
+    ]
     axes = {name: [field_value(study, name) for study in studies] for name in names}
     axes = {name: values for name, values in axes.items() if len(set(values)) > 1}
     assert len(axes) == 20
@@ -173,9 +186,12 @@ def tune(study, folder):
         "placement": {"kind": "per_link"},
     }
     tuning = {
-        "free": free, "starts": 2, "iterations": 3, "limits": {"gain_margin": 1.5},
+        "free": free,
+        "starts": 2,
+        "iterations": 3,
+        "limits": {"gain_margin": 1.5},
         "scenarios": {"count": 1, "check": 2, "spread": {"link.youngs_modulus": 2.0}},
-    }  # fmt: skip
+    }
     run_tuning(parse_tuning(sections(study) | {"tune": tuning}), folder, is_quiet=True)
 
 
@@ -259,7 +275,7 @@ IN_LINE = (0.6 / np.sqrt(12) + 0.06) / np.sin(np.pi / 3)
         ({"link__length": (0.2, 0.2)}, "allowed a finite number, or a list of 3, each >= 0.001"),
         ({"machine__joint_angles_deg": (0.0,)}, "allowed an empty list, or 3 finite numbers"),
     ],
-)  # fmt: skip
+)
 def test_a_machine_that_cannot_be_built_is_refused(change, words):
     with pytest.raises(StudyError) as error:
         check_run(parse_study({}).change(**change))

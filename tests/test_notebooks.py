@@ -17,9 +17,13 @@ QUICK = [name for name in NOTEBOOKS if name not in LONG]
 
 def test_there_are_notebooks():
     assert sorted(NOTEBOOKS) == [
-        "1_first_run", "2_coupling", "3_placement_sweep", "4_gradient_tuning", "5_spillover",
+        "1_first_run",
+        "2_coupling",
+        "3_placement_sweep",
+        "4_gradient_tuning",
+        "5_spillover",
         "6_from_design_to_c",
-    ]  # fmt: skip
+    ]
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)

@@ -54,17 +54,39 @@ def test_a_figure_without_its_image_is_a_fault_of_the_program(tmp_path):
 
 @pytest.mark.parametrize(
     "text",
-    [TITLE, "# x", "- 1. x", "1. x", "12) y", "+", "===", "--- a", "***", "~~~", "> q", "-0.5",
-     "[x]: http://e", "[a][b] [c](d)", "a\\*b", "`x`", "<http://e.org>", "_a_ b_c", "&lt;"],
-)  # fmt: skip
+    [
+        TITLE,
+        "# x",
+        "- 1. x",
+        "1. x",
+        "12) y",
+        "+",
+        "===",
+        "--- a",
+        "***",
+        "~~~",
+        "> q",
+        "-0.5",
+        "[x]: http://e",
+        "[a][b] [c](d)",
+        "a\\*b",
+        "`x`",
+        "<http://e.org>",
+        "_a_ b_c",
+        "&lt;",
+    ],
+)
 def test_texts_of_users_are_shown_as_they_are(text):
     for before in ("# ", "- ", "| a |\n| --- |\n| ", "# a\n\n"):
         found = parsed(
             page(f"{before}{literal(text)}" + "\n\n# b" * (before[0] != "#"), {}, {}, VERSIONS)
         )
         assert text in found.text.splitlines()
-        assert set(found.tags) <= {*"html head meta title style body main h1 h2 p".split(), "div",
-                                   *"table thead tbody tr th td ul li".split()}  # fmt: skip
+        assert set(found.tags) <= {
+            *"html head meta title style body main h1 h2 p".split(),
+            "div",
+            *"table thead tbody tr th td ul li".split(),
+        }
 
 
 HEAD = '<!DOCTYPE html>\n<html lang="en"><body><h1>a</h1>'
@@ -72,10 +94,20 @@ HEAD = '<!DOCTYPE html>\n<html lang="en"><body><h1>a</h1>'
 
 @pytest.mark.parametrize(
     "inside",
-    ["<p>", "<b><i></b></i>", "<script></script>", "<link>", '<img src="http://e.org/x.png">',
-     '<img src="data:image/png;base64,AAAA" alt="x">', "<style>@import 'x'</style>", "<h1>b</h1>",
-     "<table><tr><td></td></tr><tr></tr></table>", '<p onclick="x()"></p>', "<figure></figure>"],
-)  # fmt: skip
+    [
+        "<p>",
+        "<b><i></b></i>",
+        "<script></script>",
+        "<link>",
+        '<img src="http://e.org/x.png">',
+        '<img src="data:image/png;base64,AAAA" alt="x">',
+        "<style>@import 'x'</style>",
+        "<h1>b</h1>",
+        "<table><tr><td></td></tr><tr></tr></table>",
+        '<p onclick="x()"></p>',
+        "<figure></figure>",
+    ],
+)
 def test_the_parser_of_these_tests_finds_faults(inside):
     parsed(HEAD + "</body></html>")
     with pytest.raises(AssertionError):

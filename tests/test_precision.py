@@ -29,8 +29,11 @@ def test_float32_runs_and_agrees_with_float64(pytestconfig):
     assert whole.metrics.residual_rms.dtype == np.float64
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, str(pytestconfig.rootpath)],
-        capture_output=True, text=True, timeout=300, check=True,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=True,
+    )
     kind, code, *values = done.stdout.split()
     assert kind == "float32" and int(code) == int(whole.status) == status.OK
     wanted = whole.metrics.residual_rms.ravel()

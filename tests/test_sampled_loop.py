@@ -369,9 +369,13 @@ def test_spillover_is_what_damping_of_the_uncontrolled_modes_loses():
         matrices = loop_matrices(structure, case, HOME_POSE)
         found.append(float(lengthening(structure, case, matrices)))
         period = float(case.electronics.period)
-        plant, poles = (np.linalg.eigvals(np.asarray(m)) for m in (
-            matrices.plant, matrices.open + matrices.feedback,
-        ))  # fmt: skip
+        plant, poles = (
+            np.linalg.eigvals(np.asarray(m))
+            for m in (
+                matrices.plant,
+                matrices.open + matrices.feedback,
+            )
+        )
         weak = plant[(np.abs(plant) > 4**2 * 100 * 2 * np.pi) & (plant.imag > 0)]
         weak = weak[-weak.real < 0.1 * np.abs(weak)]  # filters are damped well
         near = np.array([poles[np.argmin(np.abs(poles - np.exp(s * period)))] for s in weak])
@@ -408,10 +412,13 @@ def test_spillover_has_a_gradient():
 
 def test_linear_residual_agrees_with_the_run():
     changes = {
-        "run__duration": 0.15, "motion__waypoints": (HOME, (0.0, 0.002, HOME[2])),
-        "motion__move_time": 0.03, "shaper__kind": "none", "metrics__residual_delay": 0.02,
+        "run__duration": 0.15,
+        "motion__waypoints": (HOME, (0.0, 0.002, HOME[2])),
+        "motion__move_time": 0.03,
+        "shaper__kind": "none",
+        "metrics__residual_delay": 0.02,
         "metrics__residual_length": 0.09,
-    }  # fmt: skip
+    }
     study = STUDY.change(**changes)
     structure, case = build_structure(study), as_arrays(build_case(study))
     matrices = loop_matrices(arrays()[0], case, HOME_POSE)

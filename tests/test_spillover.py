@@ -103,8 +103,9 @@ def test_margins_and_damping_are_those_of_the_loop_report():
     np.testing.assert_allclose(one.margin[0, 0, 0], report.gain_margin, rtol=2e-4)
     np.testing.assert_allclose(one.radius[0, 0, 0], report.spectral_radius, rtol=1e-9)
     for own, wanted in (
-        (one.damping_ratio, report.damping_ratio), (one.frequency_hz, report.frequency_hz),
-    ):  # fmt: skip
+        (one.damping_ratio, report.damping_ratio),
+        (one.frequency_hz, report.frequency_hz),
+    ):
         own = np.sort(own[0, 0, 0, :3], axis=1)
         np.testing.assert_allclose(own, np.sort(wanted, axis=1), rtol=1e-6)
     # and, with eight modes, those computed elsewhere
@@ -131,8 +132,9 @@ def test_longer_actuators_take_margin_and_give_damping():
 def test_leakage_of_the_papers_filter():
     """In its own basis and on pinned-pinned plants: the numbers known beforehand."""
     changes = {"control__basis": "pinned_free"}
-    found = certified(changes, sizes=(8,), bases=("pinned_free", "pinned_pinned"),
-                      departures=(Departure(),))  # fmt: skip
+    found = certified(
+        changes, sizes=(8,), bases=("pinned_free", "pinned_pinned"), departures=(Departure(),)
+    )
     own, other = found.observation[:, 0, 0, 0]
     np.testing.assert_allclose(own[:3], [1, 0, 0], atol=1e-9)
     np.testing.assert_allclose(own[3:6], [0.21, 1.29, 10.4], atol=0.04)
@@ -143,8 +145,12 @@ def test_leakage_of_the_papers_filter():
 
 def test_plants_that_do_not_exist_are_left_out():
     centers = (0.05, 0.085, 0.15)
-    found = certify(STUDY.change(patches__centers=centers), sizes=(3,), bases=SAME["bases"],
-                    departures=patch_lengths((1.0, 1.25)))  # fmt: skip
+    found = certify(
+        STUDY.change(patches__centers=centers),
+        sizes=(3,),
+        bases=SAME["bases"],
+        departures=patch_lengths((1.0, 1.25)),
+    )
     np.testing.assert_array_equal(found.exists[0, :, 0], [True, False] * 2)
     assert np.all(np.isnan(found.margin[~found.exists])) and found.breaking[0, 1, 0] == ""
     assert found.notes[0] == "left out: sensors x 1, actuators x 1.25: patches overlap"
@@ -175,9 +181,10 @@ def test_links_that_are_softer_and_joints_with_inertia():
         report = loop_report(structure, case, home, law=law)
         np.testing.assert_allclose(found.margin[at][0], report.gain_margin, rtol=2e-4)
         np.testing.assert_allclose(
-            np.sort(found.frequency_hz[at][0, :3], axis=1), np.sort(report.frequency_hz, axis=1),
+            np.sort(found.frequency_hz[at][0, :3], axis=1),
+            np.sort(report.frequency_hz, axis=1),
             rtol=1e-6,
-        )  # fmt: skip
+        )
 
 
 def test_plants_that_buckle_by_themselves_are_left_out():
@@ -446,8 +453,11 @@ def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_
     design, out = write(tmp_path), tmp_path / "deep" / "out"
     code, text, _ = run(capsys, "spillover", design, "--out", out)
     assert code == 0 and "passed: gain margin 2.5, 2 required" in text
-    figures = [f"{name}.{kind}" for name in ("margins", "damping", "leakage", "laws")
-               for kind in ("png", "pdf")]  # fmt: skip
+    figures = [
+        f"{name}.{kind}"
+        for name in ("margins", "damping", "leakage", "laws")
+        for kind in ("png", "pdf")
+    ]
     files = {"report.md", "report.html", "certificate.json", "spillover.h5", *figures}
     assert {path.name for path in out.iterdir()} == files | {"machine.png"}
     report = (out / "report.md").read_text()

@@ -13,10 +13,15 @@ from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study
 
 STUDY = paper_study().change(
-    link__modes=2, control__modes=2, run__duration=0.08, shaper__kind="none",
-    motion__waypoints=(HOME, (0.0, 0.01, HOME[2])), motion__move_time=0.04,
-    metrics__residual_length=0.02, metrics__residual_delay=0.01,
-)  # fmt: skip
+    link__modes=2,
+    control__modes=2,
+    run__duration=0.08,
+    shaper__kind="none",
+    motion__waypoints=(HOME, (0.0, 0.01, HOME[2])),
+    motion__move_time=0.04,
+    metrics__residual_length=0.02,
+    metrics__residual_delay=0.01,
+)
 
 
 def run(**changes):

@@ -214,10 +214,15 @@ def test_designs_for_sensitivity():
 @pytest.mark.parametrize(
     ("name", "count"),
     [
-        ("placement", 4096), ("gains", 216), ("links", 48), ("spillover", 120),
-        ("robustness", 400), ("mistuning", 507), ("models", 90),
+        ("placement", 4096),
+        ("gains", 216),
+        ("links", 48),
+        ("spillover", 120),
+        ("robustness", 400),
+        ("mistuning", 507),
+        ("models", 90),
     ],
-)  # fmt: skip
+)
 def test_ready_sweeps_are_valid(name, count):
     from pathlib import Path
 
@@ -245,8 +250,11 @@ REFUSED = [
     (range_of(to=1e9), "control.gain_factor = 1000000000.0: allowed a finite number >= 0 and <="),
     (range_of(frm=1), "did you mean 'from'?"),
     (range_of(scale="lg"), "allowed 'linear' or 'log'"),
-    (range_of(scale="log") | {"axes": {"gain": {"from": 0, "to": 1, "count": 2, "scale": "log"}}},
-     "more than 0 on a log scale"),
+    (
+        range_of(scale="log")
+        | {"axes": {"gain": {"from": 0, "to": 1, "count": 2, "scale": "log"}}},
+        "more than 0 on a log scale",
+    ),
     (range_of(count=0), "a range needs count"),
     (range_of(count=10**9), "sweep.axes.gain.count = 1000000000: allowed a whole number"),
     ({"axes": {"plant_modes": {"from": 1.5, "to": 3, "count": 2}}}, "whole numbers at both ends"),
@@ -273,8 +281,15 @@ REFUSED = [
     ({"blocks": [{}]}, "sweep.blocks.0 = {}"),
     ({"blocks": [{"method": "grid", "axs": {}}]}, "sweep.blocks.0.axs"),
     ({"blocks": [{"method": "morris", "count": 2, "axes": {"gain": [1.0]}}]}, "stand alone"),
-    ({"axes": {"gain": {"from": 1, "to": 2, "count": 10**4}, "drive.kp": {"from": 1, "to": 2,
-      "count": 10**4}}}, "1e+08 cases; allowed up to 10000000"),
+    (
+        {
+            "axes": {
+                "gain": {"from": 1, "to": 2, "count": 10**4},
+                "drive.kp": {"from": 1, "to": 2, "count": 10**4},
+            }
+        },
+        "1e+08 cases; allowed up to 10000000",
+    ),
     ({"where": "gain >", "axes": {"gain": [1.0]}}, "no condition"),
     ({"where": "gian > 1", "axes": {"gain": [1.0]}}, "unknown field; did you mean 'gain'?"),
     ({"where": "gain", "axes": {"gain": [1.0]}}, "gives no true or false"),
@@ -299,15 +314,26 @@ REFUSED = [
     ({"axes": {"motion.move_time": [[]]}}, "as many as there are moves"),
     ({"axes": {"motion.dwell": [[0.01, 0.02]]}}, "as many as there are moves"),
     ({"axes": {"drive.locked": "all"}}, "locked sliders follow no path"),
-    ({"axes": {"control.velocity_gain": [[1.0, 1.0, 1.0]], "motion.waypoints[1]": [[0.0]]}},
-     "motion.waypoints"),
+    (
+        {"axes": {"control.velocity_gain": [[1.0, 1.0, 1.0]], "motion.waypoints[1]": [[0.0]]}},
+        "motion.waypoints",
+    ),
     ({"axes": {"control.velocity_gain[" + "1" * 5000 + "]": [1.0]}}, "unknown field"),
-    ({"axes": {"gain": {"from": 1, "to": 2, "count": 20}}, "repeats": 10**6},
-     "sweep.repeats = 1000000: allowed at most 500000 with 20 cases"),
+    (
+        {"axes": {"gain": {"from": 1, "to": 2, "count": 20}}, "repeats": 10**6},
+        "sweep.repeats = 1000000: allowed at most 500000 with 20 cases",
+    ),
     ({"axes": {"run.duration": [100.0], "electronics.sample_rate_hz": [1e6]}}, "1e+08 samples"),
-    ({"method": "sobol", "count": 4, "axes": {"placement": {"kind": "per_link"}},
-      "where": "patches.centers[0] > 0.01"}, "name one entry of it, such as patches.centers[0][0]"),
-]  # fmt: skip
+    (
+        {
+            "method": "sobol",
+            "count": 4,
+            "axes": {"placement": {"kind": "per_link"}},
+            "where": "patches.centers[0] > 0.01",
+        },
+        "name one entry of it, such as patches.centers[0][0]",
+    ),
+]
 
 
 @pytest.mark.parametrize(("sweep", "words"), REFUSED, ids=range(len(REFUSED)))
@@ -347,9 +373,13 @@ def test_a_study_is_no_sweep_and_a_sweep_no_study(tmp_path):
 
 # Anything that TOML can hold, put anywhere in a valid sweep.
 scalars = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=8),
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=8),
     st.sampled_from(["all", "sobol", "grid", "list", "gain", "log", "placement", "gain[0]"]),
-)  # fmt: skip
+)
 anything = st.recursive(
     scalars,
     lambda inner: (
@@ -357,12 +387,39 @@ anything = st.recursive(
     ),
     max_leaves=6,
 )
-KEYS = ("method", "axes", "blocks", "cases", "count", "size", "levels", "where", "repeats", "seed",
-        "metrics", "axs")  # fmt: skip
-AXES = ("gain", "placement", "link_subsets", "link_mode_masks", "shaper_frequency", "plant_modes",
-        "frequency_error", "control.ratios", "control.links[1]", "motion.waypoints", "run.seed",
-        "run.duration", "link.basis", "patches.centers", "initial.modal", "shaper",
-        "nonsense")  # fmt: skip
+KEYS = (
+    "method",
+    "axes",
+    "blocks",
+    "cases",
+    "count",
+    "size",
+    "levels",
+    "where",
+    "repeats",
+    "seed",
+    "metrics",
+    "axs",
+)
+AXES = (
+    "gain",
+    "placement",
+    "link_subsets",
+    "link_mode_masks",
+    "shaper_frequency",
+    "plant_modes",
+    "frequency_error",
+    "control.ratios",
+    "control.links[1]",
+    "motion.waypoints",
+    "run.seed",
+    "run.duration",
+    "link.basis",
+    "patches.centers",
+    "initial.modal",
+    "shaper",
+    "nonsense",
+)
 
 
 @settings(max_examples=400, deadline=None, database=None, derandomize=True)

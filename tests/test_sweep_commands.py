@@ -65,9 +65,16 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     assert "residual_rms [µm]" in text
     assert run(capsys, "show", out, "--failed")[0] == 0
     code, text, _ = run(
-        capsys, "best", out, "--by", "control_energy", "--subject-to",
-        "peak_voltage<100 and gain > 0.1", "--count", "3",
-    )  # fmt: skip
+        capsys,
+        "best",
+        out,
+        "--by",
+        "control_energy",
+        "--subject-to",
+        "peak_voltage<100 and gain > 0.1",
+        "--count",
+        "3",
+    )
     assert code == 0 and "V2 s" in text
     code, text, _ = run(capsys, "sensitivity", out, "--by", "control_energy")
     assert code == 0 and "placement" in text and "first" in text
@@ -102,8 +109,13 @@ def check_report(folder):
     data = load(folder)
     code, gain = data["status"], data["control_gain_factor"]
     count = int(np.sum(code == 0))
-    for part in ("- 8 base points of a Saltelli design of", "0.05 to 1, log scale", "40 cases.",
-                 "| drive.kp | N/m |", f"| ok | {count} | {count / 0.4:.1f} |"):  # fmt: skip
+    for part in (
+        "- 8 base points of a Saltelli design of",
+        "0.05 to 1, log scale",
+        "40 cases.",
+        "| drive.kp | N/m |",
+        f"| ok | {count} | {count / 0.4:.1f} |",
+    ):
         assert part in text
     assert page.title == "small: sweep" and len(page.images) == 3 and "[sweep.axes]" in page.text
     safe = (code == 0) & (data["gain_margin"] >= 2)

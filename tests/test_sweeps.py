@@ -126,19 +126,26 @@ def test_equal_sweeps_have_equal_datasets(mixed, tmp_path):
 def test_impossible_cases_do_not_touch_the_others(tmp_path):
     # what goes wrong in a case differs between the good ones, too: both sweeps share a program
     named = {
-        "patches.centers": [0.05, 0.1, 0.15], "motion.waypoints": [[0, 0, 0.5], [0, 0.002, 0.5]],
-        "metrics.residual_length": 0.01, "control.modes": 3, "drive.coulomb_friction": 0.0,
+        "patches.centers": [0.05, 0.1, 0.15],
+        "motion.waypoints": [[0, 0, 0.5], [0, 0.002, 0.5]],
+        "metrics.residual_length": 0.01,
+        "control.modes": 3,
+        "drive.coulomb_friction": 0.0,
         "electronics.antialias_hz": 2e3,
-    }  # fmt: skip
+    }
     good = [
-        named | {
-            "patches.centers": [0.05, 0.1, 0.15 + 1e-3 * k], "control.gain_factor": 0.1 * k,
+        named
+        | {
+            "patches.centers": [0.05, 0.1, 0.15 + 1e-3 * k],
+            "control.gain_factor": 0.1 * k,
             "motion.waypoints": [[0, 0, 0.5], [0, 0.002 + 1e-5 * k, 0.5]],
-            "metrics.residual_length": 0.01 - 1e-4 * k, "control.modes": 1 + k % 3,
-            "drive.coulomb_friction": 0.01 * k, "electronics.antialias_hz": 2e3 - k,
+            "metrics.residual_length": 0.01 - 1e-4 * k,
+            "control.modes": 1 + k % 3,
+            "drive.coulomb_friction": 0.01 * k,
+            "electronics.antialias_hz": 2e3 - k,
         }
         for k in range(1, 10)
-    ]  # fmt: skip
+    ]
     bad = [
         {"patches.centers": [0.05, 0.06, 0.15]},
         {"motion.waypoints": [[0, 0, 0.5], [0, 0.5, 0.5]]},
@@ -157,9 +164,14 @@ def test_impossible_cases_do_not_touch_the_others(tmp_path):
     codes = dirty["status"]
     is_bad = np.isin(np.arange(len(codes)), range(4, 11))
     wanted = [
-        status.PATCHES_OVERLAP, status.OUT_OF_REACH, status.PATCH_OFF_LINK, status.WINDOW_TOO_LONG,
-        status.TOO_MANY_MODES, status.TOO_STIFF, status.TOO_FAST,
-    ]  # fmt: skip
+        status.PATCHES_OVERLAP,
+        status.OUT_OF_REACH,
+        status.PATCH_OFF_LINK,
+        status.WINDOW_TOO_LONG,
+        status.TOO_MANY_MODES,
+        status.TOO_STIFF,
+        status.TOO_FAST,
+    ]
     np.testing.assert_array_equal(codes[is_bad], wanted)
     np.testing.assert_array_equal(codes[~is_bad], clean["status"])
     assert np.isnan(dirty["residual_rms"][is_bad]).all()
@@ -210,9 +222,10 @@ def test_noise_differs_between_repeats_and_is_the_same_again(tmp_path):
 def test_each_case_takes_the_plant_steps_that_it_takes_alone(tmp_path):
     spec = small_spec(
         {"axes": {"control.velocity_gain[0]": [0.1, 3e3, 1e6]}},
-        link={"modes": 1}, shaper={"kind": "none"},
+        link={"modes": 1},
+        shaper={"kind": "none"},
         control={"modes": 1, "feedback": "ideal", "velocity_gain": [0.1] * 3},
-    )  # fmt: skip
+    )
     run(spec, tmp_path / "s")
     data = load(tmp_path / "s")
     np.testing.assert_array_equal(data["status"], [status.OK, status.SATURATED, status.TOO_STIFF])

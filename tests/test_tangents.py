@@ -27,21 +27,27 @@ def place(case, parameters):
     """Gains, a number of the drive and one of the shaper, which moves the reference."""
     control, drive, shaping = case.control, case.drive, case.shaping
     return case._replace(
-        control=control._replace(velocity_gain=control.velocity_gain * parameters[0],
-                                 ratio=control.ratio * parameters[1]),
+        control=control._replace(
+            velocity_gain=control.velocity_gain * parameters[0], ratio=control.ratio * parameters[1]
+        ),
         drive=drive._replace(kp=drive.kp * parameters[2]),
         shaping=shaping._replace(tolerance=parameters[3]),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
 def chunk():
     """A machine that is thrown off its course in one case, after one short move."""
     study = paper_study().change(
-        link__modes=2, control__modes=2, run__smooth=True, run__duration=0.06,
-        motion__waypoints=paper_study().motion.waypoints[:2], motion__move_time=0.03,
-        metrics__residual_length=0.01, metrics__residual_delay=0.002,
-    )  # fmt: skip
+        link__modes=2,
+        control__modes=2,
+        run__smooth=True,
+        run__duration=0.06,
+        motion__waypoints=paper_study().motion.waypoints[:2],
+        motion__move_time=0.03,
+        metrics__residual_length=0.01,
+        metrics__residual_delay=0.002,
+    )
     structure = build_structure(study)
     force = np.zeros((LAYOUT.size, 3))
     force[3] = 1e6
@@ -81,9 +87,12 @@ def test_every_operation_is_differentiated():
     c, along = random.normal(size=shape), random.normal(size=(directions, *shape, lanes))
     loop = trace_loop(
         lambda constants, row, state: [every_operation(state[0], constants[0]) + 0 * row[0][0]],
-        [c], [Leaf((1,), False)], [Leaf(shape, True)],
-        np.float64, directions,
-    )  # fmt: skip
+        [c],
+        [Leaf((1,), False)],
+        [Leaf(shape, True)],
+        np.float64,
+        directions,
+    )
     built = build_kernel(loop)
     out, pushed = x.copy(), along.copy()
     built.run([np.zeros((1, 1)), out, pushed], 1, lanes)

@@ -30,7 +30,10 @@ from tests.tunings import EACH, EVERY_KIND, GAIN, tuning
 JUDGED = {
     "objective": {"residual_rms": 1.0, "control_energy": 0.1},
     "limits": {
-        "peak_voltage": "own", "gain_margin": 3.0, "slowest_decay": 20.0, "spillover": 1.1,
+        "peak_voltage": "own",
+        "gain_margin": 3.0,
+        "slowest_decay": 20.0,
+        "spillover": 1.1,
         "singularity_distance": 0.1,
     },
     "scenarios": {"count": 2, "spread": {"link.youngs_modulus": 5.0}, **EACH},
@@ -38,7 +41,7 @@ JUDGED = {
         "gains": {"free": ["control.gain_factor", "control.velocity_gain[0]"]},
         "all": {"set": {"shaper.kind": "zv"}},
     },
-}  # fmt: skip
+}
 STARTS = 7
 
 
@@ -98,10 +101,11 @@ def test_figures_can_be_recomputed_from_runs(evaluated):
     objective, excess = [], []
     for k in range(4):
         scenario = {
-            "run__smooth": True, "run__seed": int(columns["run.seed"][k]),
+            "run__smooth": True,
+            "run__seed": int(columns["run.seed"][k]),
             "link__youngs_modulus": float(columns["link.youngs_modulus"][k]),
             "motion__move_time": float(columns["motion.move_time"][k]),
-        }  # fmt: skip
+        }
         tuned = {
             "control__gain_factor": float(values[0]),
             "control__velocity_gain": (float(values[1]), *spec.study.control.velocity_gain[1:]),
@@ -279,8 +283,9 @@ def test_zero_vibration_shaper_is_found_from_scratch():
     wanted = zv(omega, 0.0)
     np.testing.assert_allclose(
         spec.free.values(end.best_place[end.winner(0)]),
-        [wanted.amplitude[1], wanted.time[1]], rtol=1e-3,
-    )  # fmt: skip
+        [wanted.amplitude[1], wanted.time[1]],
+        rtol=1e-3,
+    )
     assert end.best_objective.min() < 1e-6
 
 

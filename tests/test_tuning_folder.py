@@ -131,14 +131,21 @@ def check_report(out):
 
 def test_a_report_says_what_its_numbers_are():
     """Of made-up results: units, peaks, what has not settled, what must be warned of."""
-    spec = parse_tuning({**SMALL, "control": {**SMALL["control"], "links": [True, False, True]},
-                         "tune": {"free": GAIN, "starts": 1, "iterations": 40,
-                                  "limits": {"peak_voltage": 30.0}}})  # fmt: skip
+    spec = parse_tuning(
+        {
+            **SMALL,
+            "control": {**SMALL["control"], "links": [True, False, True]},
+            "tune": {"free": GAIN, "starts": 1, "iterations": 40, "limits": {"peak_voltage": 30.0}},
+        }
+    )
     at = begin(spec, SimpleNamespace(linear=None))
     at = at._replace(
-        iteration=np.array(14), best_objective=np.array([0.5]), best_limits=np.array([[0.1]]),
-        best_place=np.array([[0.7]]), best_peaks=np.array([[33.0]]),
-    )  # fmt: skip
+        iteration=np.array(14),
+        best_objective=np.array([0.5]),
+        best_limits=np.array([[0.1]]),
+        best_place=np.array([[0.7]]),
+        best_peaks=np.array([[33.0]]),
+    )
 
     def judged(share, margin, settling):
         metrics = {"residual_rms": share * 8e-6, "peak_voltage": 33.0, "settling_time": settling}
@@ -154,9 +161,16 @@ def test_a_report_says_what_its_numbers_are():
     audited = [Disagreement("control.gain_factor", "tuned", 0, "objective", 1.0, 1.0, 0.0)]
     nothing = np.full(1, np.nan)
     found = Findings(
-        at, judged(1.0, 3.0, 0.02995), [judged(0.5, 1.3, 0.012)], audited, nothing, nothing, None,
-        0.1, 14,
-    )  # fmt: skip
+        at,
+        judged(1.0, 3.0, 0.02995),
+        [judged(0.5, 1.3, 0.012)],
+        audited,
+        nothing,
+        nothing,
+        None,
+        0.1,
+        14,
+    )
     text = report(spec, found)
     head = text.split("## ")[0]
     for words in (
@@ -165,8 +179,9 @@ def test_a_report_says_what_its_numbers_are():
         "residual_rms 4 instead of 8 µm, settling_time 12 instead of not within 30 ms, "
         "peak_voltage 33 instead of 33 V, gain margin 1.3 instead of 3",
         "**CAUTION: a gain margin of 1.3; below 2 a machine may go unstable.**",
-        "**A limit is violated.**", "`studies simulate tuned.toml",
-    ):  # fmt: skip
+        "**A limit is violated.**",
+        "`studies simulate tuned.toml",
+    ):
         assert words in head, words
     own = table_of(text, "On the study's own machine")
     assert own["tuned"]["peak_voltage [V]"] == "33" and own["tuned"]["residual_rms [µm]"] == "4"
@@ -183,10 +198,15 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
     cli.main(["tune", str(file), "--out", str(out)])
     text = (out / "report.md").read_text()
     for part in (
-        "**Asked:** the least residual_rms of all links with peak_voltage at most", "| gains |",
-        "| loud |", "| all, peak_voltage 20 |", "worst disagreement is", "Sobol designs of all",
-        "Linear fidelity", "**Next:** `studies simulate",
-    ):  # fmt: skip
+        "**Asked:** the least residual_rms of all links with peak_voltage at most",
+        "| gains |",
+        "| loud |",
+        "| all, peak_voltage 20 |",
+        "worst disagreement is",
+        "Sobol designs of all",
+        "Linear fidelity",
+        "**Next:** `studies simulate",
+    ):
         assert part in text
     page = parsed((out / "report.html").read_text())
     for name in ("descent", "gains", "front"):
@@ -275,19 +295,27 @@ def test_a_folder_belongs_to_its_tuning(tmp_path):
     with pytest.raises(StudyError, match="holds a tuning already"):
         opened(tmp_path, False)
     for other, word in (
-        ({"spec": {"tune": {"seed": 1}}}, "tuning file"), ({"code": "b"}, "program"),
-        ({"jaxlib": "2"}, "jaxlib"), ({"precision": "y"}, "precision"),
+        ({"spec": {"tune": {"seed": 1}}}, "tuning file"),
+        ({"code": "b"}, "program"),
+        ({"jaxlib": "2"}, "jaxlib"),
+        ({"precision": "y"}, "precision"),
         ({"spec": {"tune": {"iterations": 9, "method": "adam"}}}, "tuning file"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(StudyError, match=f"begun with another {word}"):
             opened(tmp_path, True, **other)
 
 
 @pytest.mark.parametrize(
     ("name", "content"),
-    [("tune.json", b"[" * 100_000), ("tune.json", b"\xff"), ("tune.json", b"[]"),
-     ("progress.npz", b""), ("progress.npz", b"PK"), ("progress.npz", "array")],
-)  # fmt: skip
+    [
+        ("tune.json", b"[" * 100_000),
+        ("tune.json", b"\xff"),
+        ("tune.json", b"[]"),
+        ("progress.npz", b""),
+        ("progress.npz", b"PK"),
+        ("progress.npz", "array"),
+    ],
+)
 def test_damaged_files_are_named(tmp_path, name, content):
     opened(tmp_path, False)
     if content == "array":
@@ -318,8 +346,15 @@ def test_progress_of_other_shapes_is_damaged():
 
 def test_own_limits_need_something_to_be_a_share_of():
     silent = {**SMALL, "control": {**SMALL["control"], "velocity_gain": [0.0, 0.0, 0.0]}}
-    spec = parse_tuning({**silent, "tune": {"free": {"drive.kp": {"from": 1e4, "to": 4e4}},
-                                            "limits": {"peak_voltage": "own"}}})  # fmt: skip
+    spec = parse_tuning(
+        {
+            **silent,
+            "tune": {
+                "free": {"drive.kp": {"from": 1e4, "to": 4e4}},
+                "limits": {"peak_voltage": "own"},
+            },
+        }
+    )
     checked = SimpleNamespace(spec=spec, families=list(spec.families), merit=merit_of(spec))
     metrics = SimpleNamespace(residual_rms=np.ones((1, 3, 3)), peak_voltage=np.zeros((1, 3)))
     with pytest.raises(StudyError, match="peak_voltage = 'own': the study itself has 0"):

@@ -27,8 +27,9 @@ def test_free_numbers_get_to_where_the_study_would_put_them():
     placed = spec.free.place(as_arrays(build_case(spec.study)), values)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13),
-        placed, as_arrays(build_case(study)),
-    )  # fmt: skip
+        placed,
+        as_arrays(build_case(study)),
+    )
     assert len(values) == 1 + 3 + 2 + 6
 
 
@@ -108,77 +109,160 @@ def deep(n):
         ({}, "tune.free = .*: allowed one free field or more"),
         ({"free": {"control.gainfactor": {}}}, "did you mean 'control.gain_factor'"),
         ({"free": {"run.duration": {"from": 0.1, "to": 1.0}}}, "cannot be free; fields that can"),
-        ({"free": {"control.gain_factor": {"from": 0.6, "to": 2.0}}},
-         "control.gain_factor = 0.5: allowed 0.6 to 2, the bounds"),
+        (
+            {"free": {"control.gain_factor": {"from": 0.6, "to": 2.0}}},
+            "control.gain_factor = 0.5: allowed 0.6 to 2, the bounds",
+        ),
         ({"free": {"control.gain_factor": {"from": -1.0, "to": 2.0}}}, "a finite number >= 0"),
         ({"free": {"control.gain_factor": {"from": 2.0, "to": 1.0}}}, "= 1.0: allowed more than"),
         ({"free": {"poles.decay": {"from": 1.0, "to": 2.0}}}, "needs poles.frequency_hz beside it"),
-        ({"free": {**GAIN, "control.velocity_gain": {"from": 1.0, "to": 100.0},
-                   "control.velocity_gain[0]": {"from": 1.0, "to": 100.0}}}, "free twice"),
-        ({"free": {"link.thickness": {"from": 1e-3, "to": 3e-3},
-                   "link.thickness[0]": {"from": 1e-3, "to": 3e-3}}}, "free twice"),
+        (
+            {
+                "free": {
+                    **GAIN,
+                    "control.velocity_gain": {"from": 1.0, "to": 100.0},
+                    "control.velocity_gain[0]": {"from": 1.0, "to": 100.0},
+                }
+            },
+            "free twice",
+        ),
+        (
+            {
+                "free": {
+                    "link.thickness": {"from": 1e-3, "to": 3e-3},
+                    "link.thickness[0]": {"from": 1e-3, "to": 3e-3},
+                }
+            },
+            "free twice",
+        ),
         ({"free": {"placement": {"from": 0, "to": 1}}}, "allowed {kind = 'same'}"),
         ({"free": GAIN, "objective": {"residual": 1.0}}, "did you mean 'residual_rms'"),
         ({"free": GAIN, "objective": {"residual_rms": -1.0}}, "allowed a number > 0"),
         ({"free": GAIN, "objective": {"gain_margin": 1.0}}, "'gain_margin': unknown metric"),
         ({"free": GAIN, "limits": {"peak_volt": 1.0}}, "did you mean 'peak_voltage'"),
-        ({"free": GAIN, "objective": {"residual_rms[3]": 1.0}},
-         r"has no such entry; allowed residual_rms\[0 to 2\]\[0 to 2\]"),
+        (
+            {"free": GAIN, "objective": {"residual_rms[3]": 1.0}},
+            r"has no such entry; allowed residual_rms\[0 to 2\]\[0 to 2\]",
+        ),
         ({"free": GAIN, "objective": {"settling_time": 1.0}}, "no derivative; take ringing_time"),
         ({"free": GAIN, "limits": {"gain_margin[0]": 2.0}}, "no such entry; allowed gain_margin"),
         ({"free": GAIN, "limits": {"peak_voltage": "mine"}}, "> 0 and <= 1e\\+30 or 'own'"),
-        ({"free": GAIN, "limits": {"peak_voltage": 40.0, "peak_voltage[1]": 50.0}},
-         r"peak_voltage\[1\] = 50 allows more than peak_voltage = 40"),
+        (
+            {"free": GAIN, "limits": {"peak_voltage": 40.0, "peak_voltage[1]": 50.0}},
+            r"peak_voltage\[1\] = 50 allows more than peak_voltage = 40",
+        ),
         ({"free": GAIN, "scenarios": {"spread": {"link.basis": 5.0}}}, "for a number"),
         ({"free": GAIN, "scenarios": {"spread": {"electronics.adc_noise": 5.0}}}, "not 0 where"),
         ({"free": GAIN, "scenarios": {"each": {"motion.move_time": 0.03}}}, "a list of values"),
         ({"free": GAIN, "scenarios": {"each": {"motion.move_time": [-1.0]}}}, "move_time = -1.0"),
         ({"free": GAIN, "scenarios": {"tail": 2.0}}, "tune.scenarios.tail = 2.0: allowed"),
-        ({"free": GAIN, "families": {"one": {"free": ["control.gainfactor"]}}},
-         "did you mean 'control.gain_factor'"),
+        (
+            {"free": GAIN, "families": {"one": {"free": ["control.gainfactor"]}}},
+            "did you mean 'control.gain_factor'",
+        ),
         ({"free": GAIN, "families": {"one": {"free": []}}}, "one with free numbers or more"),
         ({"free": GAIN, "families": {"one": {"set": {"link.modes": 3}}}}, "n_modes = 3 where"),
-        ({"free": GAIN, "families": {"one": {"set": {"motion.move_time": 0.06}}}},
-         "tune.families.one: .* run.duration"),
+        (
+            {"free": GAIN, "families": {"one": {"set": {"motion.move_time": 0.06}}}},
+            "tune.families.one: .* run.duration",
+        ),
         ({"free": GAIN, "families": {"..": {}}}, "not first a sign"),
         ({"free": GAIN, "families": {"$x$": {}}}, "not first a sign"),
         ({"free": GAIN, "families": {"a b": {}, "A+B": {}}}, "'a b' is one already"),
-        ({"free": GAIN, "families": {"a": {}, "a, peak_voltage 20": {}},
-          "limits": {"peak_voltage": 50.0},
-          "pareto": {"limit": "peak_voltage", "values": [20.0, 30.0], "family": "a"}},
-         "is one already"),
-        ({"free": GAIN, "limits": {"gain_margin": 2.0},
-          "pareto": {"limit": "gain_margin", "values": [1.0, 2.0]}}, "one of the metrics in"),
-        ({"free": GAIN, "limits": {"peak_voltage": 50.0},
-          "pareto": {"limit": "peak_voltage", "values": [1.0, 2.0], "family": []}}, "one of tuned"),
+        (
+            {
+                "free": GAIN,
+                "families": {"a": {}, "a, peak_voltage 20": {}},
+                "limits": {"peak_voltage": 50.0},
+                "pareto": {"limit": "peak_voltage", "values": [20.0, 30.0], "family": "a"},
+            },
+            "is one already",
+        ),
+        (
+            {
+                "free": GAIN,
+                "limits": {"gain_margin": 2.0},
+                "pareto": {"limit": "gain_margin", "values": [1.0, 2.0]},
+            },
+            "one of the metrics in",
+        ),
+        (
+            {
+                "free": GAIN,
+                "limits": {"peak_voltage": 50.0},
+                "pareto": {"limit": "peak_voltage", "values": [1.0, 2.0], "family": []},
+            },
+            "one of tuned",
+        ),
         ({"free": GAIN, "scenarios": {"spread": {"run.duration": 5.0}}}, "for the machine and its"),
-        ({"free": GAIN, "scenarios": {"spread": {"link.damping_ratio": 99.0},
-                                      "each": {"link.damping_ratio": [0.9]}}}, "both in"),
+        (
+            {
+                "free": GAIN,
+                "scenarios": {
+                    "spread": {"link.damping_ratio": 99.0},
+                    "each": {"link.damping_ratio": [0.9]},
+                },
+            },
+            "both in",
+        ),
         ({"free": GAIN, "starts": 1000, "scenarios": {"count": 1000}}, "runs at once; allowed up"),
-        ({"free": {"placement": {"kind": "same"}, "patches.centers": {"from": 0.02, "to": 0.18}}},
-         "patches.centers: placement is free too"),
+        (
+            {
+                "free": {
+                    "placement": {"kind": "same"},
+                    "patches.centers": {"from": 0.02, "to": 0.18},
+                }
+            },
+            "patches.centers: placement is free too",
+        ),
         ({"free": {"gain": {"from": 0.1, "to": 1.0}}}, "did you mean 'control.gain_factor'"),
         ({"free": {"link_subsets": "all"}}, "cannot be free; an axis of sweeps alone"),
-        ({"free": GAIN, "objective": {"residual_rms[link=4]": 1.0}},
-         r"allowed \[link=1 to 3\], \[station=1 to 3\]"),
+        (
+            {"free": GAIN, "objective": {"residual_rms[link=4]": 1.0}},
+            r"allowed \[link=1 to 3\], \[station=1 to 3\]",
+        ),
         ({"free": {"pole.decay": {"from": 5.0, "to": 50.0}}}, "did you mean 'poles.decay'"),
         ({"free": GAIN, "objective": {"qqq": 1.0}}, "unknown metric; allowed residual_rms, "),
         ({"free": GAIN, "limits": {"peak_voltage": deep(400)}}, "peak_voltage = .* or 'own'"),
         ({"free": GAIN, "families": {"one": {"sets": {}}}}, "allowed {free = "),
-        ({"free": GAIN, "pareto": {"limit": "peak_voltage", "values": [1.0, 2.0]}},
-         "tune.pareto.limit = 'peak_voltage': allowed one of the metrics in tune.limits"),
-        ({"free": GAIN, "limits": {"peak_voltage": 50.0},
-          "pareto": {"limit": "peak_voltage", "values": [1.0]}}, "two limits or more"),
-        ({"free": GAIN, "limits": {"peak_voltage": 50.0},
-          "pareto": {"limit": "peak_voltage", "values": [1.0, 1.0]}}, "each limit once"),
-        ({"free": GAIN, "scenarios": {"each": {"link.youngs_modulus": [7e10]},
-                                      "spread": {"link.youngs_modulus": 5.0}}}, "both in spread"),
+        (
+            {"free": GAIN, "pareto": {"limit": "peak_voltage", "values": [1.0, 2.0]}},
+            "tune.pareto.limit = 'peak_voltage': allowed one of the metrics in tune.limits",
+        ),
+        (
+            {
+                "free": GAIN,
+                "limits": {"peak_voltage": 50.0},
+                "pareto": {"limit": "peak_voltage", "values": [1.0]},
+            },
+            "two limits or more",
+        ),
+        (
+            {
+                "free": GAIN,
+                "limits": {"peak_voltage": 50.0},
+                "pareto": {"limit": "peak_voltage", "values": [1.0, 1.0]},
+            },
+            "each limit once",
+        ),
+        (
+            {
+                "free": GAIN,
+                "scenarios": {
+                    "each": {"link.youngs_modulus": [7e10]},
+                    "spread": {"link.youngs_modulus": 5.0},
+                },
+            },
+            "both in spread",
+        ),
         ({"free": GAIN, "scenarios": {"each": {"control.gain_factor": [0.5]}}}, "is free in fam"),
-        ({"free": GAIN, "families": {"one": {"set": {"control.gain_factor": 1.0}}}},
-         "tune.families.one.set: control.gain_factor is free in family 'one'"),
+        (
+            {"free": GAIN, "families": {"one": {"set": {"control.gain_factor": 1.0}}}},
+            "tune.families.one.set: control.gain_factor is free in family 'one'",
+        ),
         ({"free": GAIN, "starts_": 3}, "starts_"),
     ],
-)  # fmt: skip
+)
 def test_faults_are_named(tune, message):
     with pytest.raises(StudyError, match=message):
         parse_tuning({**SMALL, "tune": tune})
@@ -205,11 +289,19 @@ def test_what_all_runs_share_is_no_column():
 def test_three_values_are_spread_together_on_every_move():
     own = [2.0e-3, 2.1e-3, 1.9e-3]
     spec = parse_tuning(
-        {**SMALL, "link": {"modes": 2, "thickness": own},
-         "tune": {"free": GAIN, "scenarios": {
-             "count": 3, "spread": {"link.thickness": 5.0},
-             "each": {"motion.move_time": [0.03, 0.035]}}}}
-    )  # fmt: skip
+        {
+            **SMALL,
+            "link": {"modes": 2, "thickness": own},
+            "tune": {
+                "free": GAIN,
+                "scenarios": {
+                    "count": 3,
+                    "spread": {"link.thickness": 5.0},
+                    "each": {"motion.move_time": [0.03, 0.035]},
+                },
+            },
+        }
+    )
     column = scenario_columns(spec, 3, 0)["link.thickness"]
     assert column.shape == (6, 3)
     np.testing.assert_array_equal(column[:3], column[3:])

@@ -19,15 +19,17 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     def atlas(
         out: Annotated[Path, typer.Option(help="folder for data, figures and report")],
         design: Annotated[
-            Path | None, typer.Argument(help="study file, folder of a tuning or a sweep; "
-                                             "default: the paper's design")
+            Path | None,
+            typer.Argument(
+                help="study file, folder of a tuning or a sweep; default: the paper's design"
+            ),
         ] = None,
         case: Annotated[
             str | None, typer.Option(help="of a sweep: number or id:...; of a tuning: its family")
         ] = None,
         resume: Annotated[bool, typer.Option("--resume", help="go on with what is there")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", help="no progress")] = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Every subset of controlled links and modes; modes over the workspace; platform error."""
         start()
         from studies.atlas.run import run_atlas

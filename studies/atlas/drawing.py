@@ -68,9 +68,12 @@ def _positions(
     machine = case.machine
     along = jnp.linspace(0.0, 1.0, _POINTS)
     shape = build_basis(
-        structure.basis, machine.beam, machine.patches, structure.n_modes,
+        structure.basis,
+        machine.beam,
+        machine.patches,
+        structure.n_modes,
         plant.length[:, None] * along,
-    ).deflection_at  # fmt: skip
+    ).deflection_at
     u = jnp.stack([plant.ux, plant.uy], axis=1)
     n = jnp.stack([-plant.uy, plant.ux], axis=1)
     corner = -plant.h0[:, None] * n - plant.s0[:, None] * u
@@ -120,9 +123,14 @@ def number_links(parts: Skeleton, k: int, ax: Axes) -> None:
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     for i, (slider, side) in enumerate(zip(parts.slider[k], away, strict=True)):
         ax.annotate(
-            str(i + 1), 1e3 * slider, 10 * side, textcoords="offset points", fontsize=8,
-            ha="center", va="center",
-        )  # fmt: skip
+            str(i + 1),
+            1e3 * slider,
+            10 * side,
+            textcoords="offset points",
+            fontsize=8,
+            ha="center",
+            va="center",
+        )
 
 
 def mode_skeleton(study: Study, pose: np.ndarray, shape: np.ndarray) -> Skeleton:

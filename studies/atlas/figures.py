@@ -123,9 +123,11 @@ def _interactions(found: Findings) -> Figure:
     for ax, index in zip(axes, every, strict=True):
         image = plots.interaction_map(index, player_labels(subsets.modes), limit, ax)
     figure.colorbar(
-        image, ax=list(axes), shrink=0.5,
+        image,
+        ax=list(axes),
+        shrink=0.5,
         label="interaction [% of the mean square],\npositive: more is removed together",
-    )  # fmt: skip
+    )
     return figure
 
 
@@ -144,9 +146,14 @@ def _workspace(found: Findings) -> Figure:
             ax = axes[row, column]
             is_own = np.allclose(path[:, 2], phi)
             image = plots.workspace_map(
-                chart.x, chart.y, value[column], chart.margin[column],
-                path[:, :2] if is_own else None, ax, limits,
-            )  # fmt: skip
+                chart.x,
+                chart.y,
+                value[column],
+                chart.margin[column],
+                path[:, :2] if is_own else None,
+                ax,
+                limits,
+            )
             if row == 0:
                 ax.set_title(f"φ = {np.degrees(phi):.0f}°")
             if row == 2:
@@ -215,9 +222,13 @@ def _platform(found: Findings) -> Figure:
         axes[0, column].set_title(setting_label(setting))
         for k, name in enumerate("xy"):
             axes[0, column].plot(
-                runs.time, 1e6 * runs.drive[column, :, k], color=SERIES[k], linewidth=1.0,
-                linestyle=("-", "--")[k], label=name,
-            )  # fmt: skip
+                runs.time,
+                1e6 * runs.drive[column, :, k],
+                color=SERIES[k],
+                linewidth=1.0,
+                linestyle=("-", "--")[k],
+                label=name,
+            )
         for k, label in enumerate(_ERRORS):
             ax = axes[k + 1, column]
             error = 1e9 * runs.vibration[column, :, :, k]
@@ -288,16 +299,17 @@ FIGURES = {
     ),
     "workspace": AtlasFigure(
         "natural modes over the workspace; orange: singular border, white: distance of the "
-        "nearest link angle from it, black: the path", _workspace,
+        "nearest link angle from it, black: the path",
+        _workspace,
     ),
     "participation": AtlasFigure("who bends in the three first bending modes", _participation),
-    "modes": AtlasFigure("natural modes, drawn large, and links' shares of the strain energy",
-                         _modes),
+    "modes": AtlasFigure(
+        "natural modes, drawn large, and links' shares of the strain energy", _modes
+    ),
     "platform": AtlasFigure("error of the platform: drive, and what bending links add", _platform),
-    "vibration": AtlasFigure("vibration error of the platform after the command",
-                             _vibration_after),
+    "vibration": AtlasFigure("vibration error of the platform after the command", _vibration_after),
     "responses": AtlasFigure("frequency responses of the sampled loop", _responses),
-}  # fmt: skip
+}
 
 
 def write_animation(found: Findings, folder: Path) -> None:

@@ -32,8 +32,14 @@ LINK_LABELS = tuple(link_label(sum(1 << i for i in range(3) if links[i])) for li
 #: Move time [s] and shaper of the runs: the paper's, and a fast move without shaper.
 SETTINGS = ((0.1, "ei"), (0.05, "none"))
 #: Forces of `Responses`, in order.
-SOURCES = ("slider 1 [N]", "slider 2 [N]", "slider 3 [N]", "platform x [N]", "platform y [N]",
-           "platform turn [N m]")  # fmt: skip
+SOURCES = (
+    "slider 1 [N]",
+    "slider 2 [N]",
+    "slider 3 [N]",
+    "platform x [N]",
+    "platform y [N]",
+    "platform turn [N m]",
+)
 #: Their effects, in order.
 OUTPUTS = ("link 1 [m]", "link 2 [m]", "link 3 [m]", "x [m]", "y [m]", "phi [rad]")
 
@@ -96,9 +102,14 @@ def platform_error(study: Study, tell: Any = None) -> PlatformError:
     since = time - end[:, None, None] - begin[:, None]
     window = (since > -tick) & (since < length[:, None] - tick)
     return PlatformError(
-        time, end, window, drive, joined("pose_error") - drive[:, None], joined("pose"),
+        time,
+        end,
+        window,
+        drive,
+        joined("pose_error") - drive[:, None],
+        joined("pose"),
         joined("modal_coordinate"),
-    )  # fmt: skip
+    )
 
 
 def _rigid(case: Case) -> Case:
@@ -175,5 +186,6 @@ def _response(
     pose = np.eye(3, len(transition))
     output = np.concatenate([np.asarray(matrices.deflection), pose])
     turn = np.exp(2j * np.pi * share)
-    return np.stack([output @ np.linalg.solve(z * np.eye(len(transition)) - transition, source)
-                     for z in turn])  # fmt: skip
+    return np.stack(
+        [output @ np.linalg.solve(z * np.eye(len(transition)) - transition, source) for z in turn]
+    )

@@ -15,9 +15,11 @@ from studies.show.figures import CONTROLLED, SERIES, WITHOUT, axes_or_new
 CHANGES = "PuOr_r"
 #: No link, one, two and three of them controlled.
 SET_STYLES: tuple[dict[str, Any], ...] = (
-    WITHOUT, {"color": SERIES[2], "linewidth": 1.2}, {"color": SERIES[3], "linewidth": 1.2},
+    WITHOUT,
+    {"color": SERIES[2], "linewidth": 1.2},
+    {"color": SERIES[3], "linewidth": 1.2},
     CONTROLLED,
-)  # fmt: skip
+)
 BETTER, WORSE = "#4C3F91", "#D9730D"
 
 
@@ -51,9 +53,14 @@ def change_map(
     for (row, column), value in np.ndenumerate(100 * change):
         is_dark = abs(value) > 50
         ax.text(
-            column, row, _whole(value), ha="center", va="center", fontsize=7,
+            column,
+            row,
+            _whole(value),
+            ha="center",
+            va="center",
+            fontsize=7,
             color="white" if is_dark else "black",
-        )  # fmt: skip
+        )
     ax.set_xticks(range(len(columns)), columns)
     ax.set_yticks(range(len(rows)), rows)
     ax.tick_params(length=0)
@@ -70,20 +77,35 @@ def lattice(residual: np.ndarray, ax: Axes | None = None) -> Axes:
     """
     ax = axes_or_new(ax)
     place = {
-        0: (0, 1), 1: (1, 2), 2: (1, 1), 4: (1, 0), 3: (2, 2), 5: (2, 1), 6: (2, 0), 7: (3, 1),
-    }  # fmt: skip
+        0: (0, 1),
+        1: (1, 2),
+        2: (1, 1),
+        4: (1, 0),
+        3: (2, 2),
+        5: (2, 1),
+        6: (2, 0),
+        7: (3, 1),
+    }
     for a in range(8):
         for b in (a | 1 << i for i in range(3) if not a >> i & 1):
             is_better = residual[b] <= residual[a]
             ax.plot(
-                *zip(place[a], place[b], strict=True), color=BETTER if is_better else WORSE,
-                linestyle="-" if is_better else "--", linewidth=1.6, zorder=0,
-            )  # fmt: skip
+                *zip(place[a], place[b], strict=True),
+                color=BETTER if is_better else WORSE,
+                linestyle="-" if is_better else "--",
+                linewidth=1.6,
+                zorder=0,
+            )
     for subset, (x, y) in place.items():
         ax.text(
-            x, y, f"{link_label(subset)}\n{length_text(residual[subset])}", ha="center",
-            va="center", fontsize=8, bbox={"boxstyle": "round", "fc": "white", "ec": "#888888"},
-        )  # fmt: skip
+            x,
+            y,
+            f"{link_label(subset)}\n{length_text(residual[subset])}",
+            ha="center",
+            va="center",
+            fontsize=8,
+            bbox={"boxstyle": "round", "fc": "white", "ec": "#888888"},
+        )
     ax.set_xlim(-0.5, 3.5)
     ax.set_ylim(-0.5, 2.5)
     ax.set_xticks(range(4), ["no link", "one", "two", "three"])

@@ -48,7 +48,8 @@ def _head(found: Findings) -> list[str]:
     count, settings = subsets.status.shape[-1], len(subsets.setting)
     delay, length = study.metrics.residual_delay, study.metrics.residual_length
     return [
-        "# Coupling atlas", "",
+        "# Coupling atlas",
+        "",
         *opening(
             f"{literal(study.title)}: which of the three links and {subsets.modes} modes a link "
             "are worth controlling, who "
@@ -59,25 +60,33 @@ def _head(found: Findings) -> list[str]:
             "fewer subsets in more settings, `studies spillover DESIGN --out DIR` says how far the "
             "design may be trusted.",
         ),
-        picture("machine.png", CAPTION), "",
-        "## How to read it", "",
+        picture("machine.png", CAPTION),
+        "",
+        "## How to read it",
+        "",
         f"{count} subsets of controlled links and modes "
         f"({subsets.modes} a link), "
         f"{settings} setting{'s' if settings > 1 else ''} of move time and shaper, "
         f"{subsets.status.size} runs; "
         f"gain factor {study.control.gain_factor:g}, ratios "
-        + ("by (24) from each setting's uncontrolled run."
-           if study.control.ratio_source == "own_run" else "as given."), "",
+        + (
+            "by (24) from each setting's uncontrolled run."
+            if study.control.ratio_source == "own_run"
+            else "as given."
+        ),
+        "",
         f"Two windows: *whole* is the design's residual window, {length:g} s from {delay:g} s "
         "after the command; *late* is that without its first third, in which the sliders' drive "
         "may still settle and bend the links with it. Residual of a "
         "link: rms of its chord deflection over the window and all stations; of the platform: rms "
-        "error of its centre. Tables show the late window where they name none.", "",
+        "error of its centre. Tables show the late window where they name none.",
+        "",
         f"One ADC step is {length_text(found.adc_step.max())} of mode 1. Where a link has less "
         "than that left without control, late (setting marked †), the controller hardly sees it, "
-        "and percentages of it say little.", "",
+        "and percentages of it say little.",
+        "",
         *_stability(found),
-    ]  # fmt: skip
+    ]
 
 
 def _came_out(found: Findings) -> str:
@@ -108,15 +117,19 @@ def _stability(found: Findings) -> list[str]:
     """What the linearised sampled loop says, which no run can."""
     radius = found.responses.radius
     if found.responses.is_stable.all():
-        return ["The linearised sampled loop is stable at the path's first pose with no link, link "
-                f"1, links 1 and 2, and all links controlled (spectral radius {radius.max():.5f} "
-                "at most)."]  # fmt: skip
+        return [
+            "The linearised sampled loop is stable at the path's first pose with no link, link "
+            f"1, links 1 and 2, and all links controlled (spectral radius {radius.max():.5f} "
+            "at most)."
+        ]
     bad = [
         name for name, fine in zip(LINK_LABELS, found.responses.is_stable, strict=True) if not fine
     ]
-    return [f"**Unstable**: the linearised sampled loop with controlled links {', '.join(bad)} "
-            f"(spectral radius {radius.max():.5f}). Runs stay bounded by the actuators' limit; "
-            "what follows describes limit cycles, not a design to use."]  # fmt: skip
+    return [
+        f"**Unstable**: the linearised sampled loop with controlled links {', '.join(bad)} "
+        f"(spectral radius {radius.max():.5f}). Runs stay bounded by the actuators' limit; "
+        "what follows describes limit cycles, not a design to use."
+    ]
 
 
 def _verdict(kept: int, count: int) -> str:
@@ -130,9 +143,14 @@ def _verdict(kept: int, count: int) -> str:
 
 def _claims(found: Findings) -> list[str]:
     return [
-        "## Where the paper's statements hold", "",
-        *_table_1(found), "", *_more_links(found), "", *_halved(found),
-    ]  # fmt: skip
+        "## Where the paper's statements hold",
+        "",
+        *_table_1(found),
+        "",
+        *_more_links(found),
+        "",
+        *_halved(found),
+    ]
 
 
 def _table_1(found: Findings) -> list[str]:
@@ -140,36 +158,59 @@ def _table_1(found: Findings) -> list[str]:
     on = signs.is_controlled
     rows = []
     for k, (ours, agree) in enumerate(zip(signs.ours, signs.agree, strict=True)):
-        rows.append([
-            found.setting(k), f"{int(np.sum(ours[on] < 0))} of {on.sum()}",
-            span(100 * ours[on], ".1f"), f"{int(agree[~on].sum())} of {np.sum(~on)}",
-            ", ".join(f"{100 * x:+.1f}" for x in ours[~on]),
-        ])  # fmt: skip
+        rows.append(
+            [
+                found.setting(k),
+                f"{int(np.sum(ours[on] < 0))} of {on.sum()}",
+                span(100 * ours[on], ".1f"),
+                f"{int(agree[~on].sum())} of {np.sum(~on)}",
+                ", ".join(f"{100 * x:+.1f}" for x in ours[~on]),
+            ]
+        )
     paper = signs.paper
-    rows.insert(0, [
-        "paper", f"{int(np.sum(paper[on] < 0))} of {on.sum()}", span(100 * paper[on], ".1f"), "",
-        ", ".join(f"{100 * x:+.1f}" for x in paper[~on]),
-    ])  # fmt: skip
+    rows.insert(
+        0,
+        [
+            "paper",
+            f"{int(np.sum(paper[on] < 0))} of {on.sum()}",
+            span(100 * paper[on], ".1f"),
+            "",
+            ", ".join(f"{100 * x:+.1f}" for x in paper[~on]),
+        ],
+    )
     fallen = signs.ours[:, on] < 0
     largest = np.abs(signs.ours[:, ~on]).max()
     deeper = bool(np.all(signs.ours[:, on] < paper[on]))
     modes = "two modes" if found.subsets.modes > 1 else "mode 1"
     return [
-        "### Table 1: signs", "",
+        "### Table 1: signs",
+        "",
         "Change of the spectral peak of mode 1 against no control, as in Table 1: three links with "
-        f"{modes} each, links 1 and 2 and link 1 with mode 1.", "",
+        f"{modes} each, links 1 and 2 and link 1 with mode 1.",
+        "",
         *table(
-            ("setting", "controlled links fall", "by [%]", "uncontrolled: same sign as the paper",
-             "link 3 with 1 and 2, links 2 and 3 with 1 [%]"), rows,
-        ), "",
+            (
+                "setting",
+                "controlled links fall",
+                "by [%]",
+                "uncontrolled: same sign as the paper",
+                "link 3 with 1 and 2, links 2 and 3 with 1 [%]",
+            ),
+            rows,
+        ),
+        "",
         f"{_verdict(int(fallen.sum()), fallen.size)} for controlled links: {int(fallen.sum())} of "
         f"{fallen.size} fall"
-        + (", all of them further than the paper's: the gains add more damping here "
-           "(docs/theory.md). " if deeper else ". ")
+        + (
+            ", all of them further than the paper's: the gains add more damping here "
+            "(docs/theory.md). "
+            if deeper
+            else ". "
+        )
         + f"Signs of the uncontrolled ones agree in {int(signs.agree[:, ~on].sum())} of "
         f"{signs.agree[:, ~on].size} cases. Ours change by up to {100 * largest:.0f} %, "
         f"the paper's by {100 * np.abs(paper[~on]).max():.1f} %.",
-    ]  # fmt: skip
+    ]
 
 
 def _more_links(found: Findings) -> list[str]:
@@ -183,9 +224,12 @@ def _more_links(found: Findings) -> list[str]:
                 worst = int(np.argmax(change))
                 cells.append(
                     f"{int(steps.rises[k, window, TARGETS.index(target)])} of {change.size}"
-                    + (f" ({steps.labels[worst]}: {_percent(change[worst])})"
-                       if change[worst] > NO_CHANGE else "")
-                )  # fmt: skip
+                    + (
+                        f" ({steps.labels[worst]}: {_percent(change[worst])})"
+                        if change[worst] > NO_CHANGE
+                        else ""
+                    )
+                )
         rows.append([found.setting(k), *cells])
     late = steps.rises[:, LATE, [TARGETS.index("all links"), TARGETS.index("platform")]]
     is_worse = steps.change[:, LATE, :3] > NO_CHANGE
@@ -194,18 +238,23 @@ def _more_links(found: Findings) -> list[str]:
     kept = [count - int(late[:, k].sum()) for k in range(2)]
     whole = steps.rises[:, 0, TARGETS.index("all links")]
     return [
-        "### \"More links, better\"", "",
+        '### "More links, better"',
+        "",
         "Each of the 12 steps from one choice of links to one with a link more: how many make it "
-        "worse, and the worst of them.", "",
-        *table(("setting", "whole: all links", "whole: platform", "late: all links",
-                "late: platform"), rows), "",
+        "worse, and the worst of them.",
+        "",
+        *table(
+            ("setting", "whole: all links", "whole: platform", "late: all links", "late: platform"),
+            rows,
+        ),
+        "",
         f"Late: {_verdict(kept[0], count)} for all links together ({count - kept[0]} of {count} "
         f"steps make it worse), {_verdict(kept[1], count).lower()} for the platform "
         f"({count - kept[1]} of {count}). Link by link, in {int(is_worse.sum())} of "
         f"{is_worse.size} cases a step makes a single link worse, {left_alone} times one that is "
         f"not controlled. Whole window: {int(whole.sum())} of {count} steps make the links worse."
         + _at_drive(found),
-    ]  # fmt: skip
+    ]
 
 
 def _at_drive(found: Findings) -> str:
@@ -231,14 +280,15 @@ def _halved(found: Findings) -> list[str]:
         rows.append([found.setting(k), *cells])
     late, whole = halved.change[:, LATE], halved.change[:, 0]
     return [
-        "### Two links controlled: platform error down by more than 50 %", "",
+        "### Two links controlled: platform error down by more than 50 %",
+        "",
         *table(("setting", *(f"{w}: links {', '.join(halved.labels)}" for w in WINDOWS)), rows),
         "",
         f"Late: {_verdict(int(np.sum(late < -0.5)), late.size).lower()}, in "
         f"{int(np.sum(late < -0.5))} of {late.size} cases (by {span(100 * late, '.0f')} %). "
         f"Whole window: {_verdict(int(np.sum(whole < -0.5)), whole.size).lower()}, in "
         f"{int(np.sum(whole < -0.5))} of {whole.size} (by {span(100 * whole, '.2g')} %).",
-    ]  # fmt: skip
+    ]
 
 
 def _subsets(found: Findings) -> list[str]:
@@ -249,8 +299,12 @@ def _subsets(found: Findings) -> list[str]:
         rms = np.sqrt(np.mean(subsets.link[:, window, chosen] ** 2, axis=-1))
         rows = [[found.setting(k), *(length_text(x) for x in row)] for k, row in enumerate(rms)]
         header = ("setting", *(link_label(k) for k in range(8)))
-        lines += [f"Residual of all three links, rms, {name} window, by controlled links:", "",
-                  *table(header, rows), ""]  # fmt: skip
+        lines += [
+            f"Residual of all three links, rms, {name} window, by controlled links:",
+            "",
+            *table(header, rows),
+            "",
+        ]
     return lines + _figure("subsets") + _figure("helps") + _figure("lattice")
 
 
@@ -262,19 +316,36 @@ def _shares(found: Findings) -> list[str]:
     for k, (one, total) in enumerate(zip(share, game[:, -1], strict=True)):
         by_link = one.reshape(3, -1).sum(axis=1)
         beyond = one.reshape(3, -1)[:, 1:]
-        rows.append([
-            found.setting(k), *(f"{100 * x:.2f}" for x in by_link),
-            f"{100 * np.abs(beyond).sum():.2f}", f"{100 * total:.4g}",
-        ])  # fmt: skip
+        rows.append(
+            [
+                found.setting(k),
+                *(f"{100 * x:.2f}" for x in by_link),
+                f"{100 * np.abs(beyond).sum():.2f}",
+                f"{100 * total:.4g}",
+            ]
+        )
     return [
-        "## Who contributes what", "",
+        "## Who contributes what",
+        "",
         "Shapley shares of links and modes in the mean square that control of all of them takes "
         "away from all links (late window), in percent of what is there without control. Mean "
-        "squares of motions that do not touch add up, so interactions are coupling.", "",
-        *table(("setting", "link 1", "link 2", "link 3", "modes 2 and up, sizes added",
-                "removed by all"), rows), "",
-        *_figure("shares"), *_figure("interactions"),
-    ]  # fmt: skip
+        "squares of motions that do not touch add up, so interactions are coupling.",
+        "",
+        *table(
+            (
+                "setting",
+                "link 1",
+                "link 2",
+                "link 3",
+                "modes 2 and up, sizes added",
+                "removed by all",
+            ),
+            rows,
+        ),
+        "",
+        *_figure("shares"),
+        *_figure("interactions"),
+    ]
 
 
 def _workspace(found: Findings) -> list[str]:
@@ -285,21 +356,26 @@ def _workspace(found: Findings) -> list[str]:
     step = (chart.x[1] - chart.x[0]) * (chart.y[1] - chart.y[0])
     area = 1e4 * reach * chart.margin[0].size * step
     return [
-        "## Along the workspace", "",
+        "## Along the workspace",
+        "",
         f"Natural modes with the sliders on their drive, "
         f"{min(MAP_MODES, found.study.link.modes)} modes a link, no damping. "
         "The platform can reach "
-        + ", ".join(f"{a:.0f} cm² at φ = {np.degrees(p):.0f}°"
-                    for a, p in zip(area, chart.phi, strict=True))
+        + ", ".join(
+            f"{a:.0f} cm² at φ = {np.degrees(p):.0f}°" for a, p in zip(area, chart.phi, strict=True)
+        )
         + f"; at its border a link stands {_border(chart)} its guide. "
         f"At φ = {np.degrees(chart.phi[turn]):.0f}° the lowest mode lies at "
         f"{_reach(chart.frequency[turn, ..., 0])} Hz, the three first bending modes at "
         f"{_reach(chart.bending[turn])} Hz, {_reach(spread)} % apart; coupling of two links' first "
         f"modes through platform and sliders is {_reach(coupling, '.2f')} %. "
         "Left alone, energy would go from link to link and back in "
-        f"{_beat(modes.frequency[0], modes.order_share[0])} s; {_decay(found)}.", "",
-        *_figure("workspace"), *_figure("participation"), *_figure("modes"),
-    ]  # fmt: skip
+        f"{_beat(modes.frequency[0], modes.order_share[0])} s; {_decay(found)}.",
+        "",
+        *_figure("workspace"),
+        *_figure("participation"),
+        *_figure("modes"),
+    ]
 
 
 def _reach(values: np.ndarray, digits: str = ".4g") -> str:
@@ -344,22 +420,34 @@ def _platform(found: Findings) -> list[str]:
         ["platform y to " + OUTPUTS[i].split(" [")[0], *map(_number, peak[:, i, 4])] for i in (0, 4)
     ]
     return [
-        "## Rigid and elastic", "",
+        "## Rigid and elastic",
+        "",
         "The platform's error is split in two: what the same drive leaves on the same machine with "
         "rigid links, and what bending links add to that (figures 5, 6, 8, 10 show the sum). Rms:",
         "",
-        *table(("setting", "error", *(f"{what}, {w}" for what in ("centre [nm]", "φ [nrad]")
-                                      for w in WINDOWS)), rows), "",
+        *table(
+            (
+                "setting",
+                "error",
+                *(f"{what}, {w}" for what in ("centre [nm]", "φ [nrad]") for w in WINDOWS),
+            ),
+            rows,
+        ),
+        "",
         *(_split(setting_label(setting), drive[k], vibration[k]) for k, setting in enumerate(RUNS)),
         "",
-        *_figure("platform"), *_figure("vibration"),
+        *_figure("platform"),
+        *_figure("vibration"),
         "Largest values of the frequency responses to forces on slider and platform [m/N], sampled "
-        "loop linearised at the path's first pose:", "",
-        *table(("from, to", *(f"controlled: {name}" for name in LINK_LABELS)), fall), "",
+        "loop linearised at the path's first pose:",
+        "",
+        *table(("from, to", *(f"controlled: {name}" for name in LINK_LABELS)), fall),
+        "",
         "A dash: the loop is unstable, or a force on the platform bends the links at once, for "
-        "which there is no number here.", "",
+        "which there is no number here.",
+        "",
         *_figure("responses"),
-    ]  # fmt: skip
+    ]
 
 
 def _number(value: float) -> str:
@@ -383,8 +471,10 @@ def _split(name: str, drive: np.ndarray, vibration: np.ndarray) -> str:
 
 def _motion(found: Findings) -> list[str]:
     return [
-        "## The machine moving", "",
+        "## The machine moving",
+        "",
         f"The last milliseconds of the {setting_label(RUNS[-1])} move and what is left after it, "
-        "slowed down 50 times.", "",
+        "slowed down 50 times.",
+        "",
         picture(ANIMATION, "the machine without control and with three links controlled"),
-    ]  # fmt: skip
+    ]

@@ -143,7 +143,9 @@ def _subset_variables(subsets: Subsets) -> dict[str, Variable]:
         "setting": _names([setting_label(s) for s in subsets.setting], "setting", "move, shaper"),
         "window": _names(list(WINDOWS), "window", "residual window"),
         "subset": Variable(
-            np.arange(game.shape[-1]), ("subset",), "1",
+            np.arange(game.shape[-1]),
+            ("subset",),
+            "1",
             "which players are controlled: bit p for player p",
         ),
         "player": _names(player_labels(subsets.modes), "player", "link.mode"),
@@ -158,24 +160,32 @@ def _subset_variables(subsets: Subsets) -> dict[str, Variable]:
             subsets.pose, (*axes, "pose_axis"), "m; m; rad", "rms error in the window"
         ),
         "spectral_peak": Variable(
-            subsets.peak, (*per_link, "controlled_mode"), "m2/Hz",
+            subsets.peak,
+            (*per_link, "controlled_mode"),
+            "m2/Hz",
             "largest spectral density near each mode of the controller",
         ),
         "settling_time": Variable(subsets.settling, per_link, "s", "after the command"),
         "peak_voltage": Variable(subsets.voltage, per_link, "V", "peak actuator voltage"),
         "removed": Variable(
-            game, ("setting", "window", "target", "subset"), "1",
+            game,
+            ("setting", "window", "target", "subset"),
+            "1",
             "share of the uncontrolled mean square that control takes away",
         ),
         "shapley_share": Variable(
-            shapley(game), ("setting", "window", "target", "player"), "1",
+            shapley(game),
+            ("setting", "window", "target", "player"),
+            "1",
             "Shapley share of it",
         ),
         "interaction": Variable(
-            interaction(game), ("setting", "window", "target", "player", "other_player"), "1",
+            interaction(game),
+            ("setting", "window", "target", "player", "other_player"),
+            "1",
             "Shapley interaction index of pairs",
         ),
-    }  # fmt: skip
+    }
 
 
 def _map_variables(found: Findings) -> dict[str, Variable]:
@@ -206,10 +216,12 @@ def _map_variables(found: Findings) -> dict[str, Variable]:
             found.modes.frequency, ("mode_pose", "natural_mode"), "Hz", "at these poses"
         ),
         "mode_shape": Variable(
-            found.modes.shape, ("mode_pose", "coordinate", "natural_mode"), "m; m; rad; m ...",
+            found.modes.shape,
+            ("mode_pose", "coordinate", "natural_mode"),
+            "m; m; rad; m ...",
             "pose and modal coordinates, largest entry 1",
         ),
-    }  # fmt: skip
+    }
 
 
 def _run_variables(found: Findings) -> dict[str, Variable]:
@@ -230,11 +242,15 @@ def _run_variables(found: Findings) -> dict[str, Variable]:
             answers.frequency, ("response_frequency",), "Hz", "of the responses"
         ),
         "response_size": Variable(
-            np.abs(answers.value), ("run_links", "response_frequency", "output", "source"),
-            "m/N and alike", "magnitude of the response of the sampled loop",
+            np.abs(answers.value),
+            ("run_links", "response_frequency", "output", "source"),
+            "m/N and alike",
+            "magnitude of the response of the sampled loop",
         ),
         "response_phase": Variable(
-            np.angle(answers.value), ("run_links", "response_frequency", "output", "source"),
-            "rad", "its phase",
+            np.angle(answers.value),
+            ("run_links", "response_frequency", "output", "source"),
+            "rad",
+            "its phase",
         ),
-    }  # fmt: skip
+    }

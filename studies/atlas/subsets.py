@@ -27,8 +27,12 @@ WINDOWS = ("whole", "late")
 #: More controlled modes have too many subsets.
 MODE_LIMIT = 3
 _KEPT = (
-    "residual_rms", "pose_error_rms", "spectral_density", "settling_time", "peak_voltage",
-)  # fmt: skip
+    "residual_rms",
+    "pose_error_rms",
+    "spectral_density",
+    "settling_time",
+    "peak_voltage",
+)
 
 
 class Subsets(NamedTuple):
@@ -116,8 +120,9 @@ def atlas_sweep(
     masks = _masks(modes) if has_modes else _masks(modes)[_whole_links(modes)]
     study = long_enough(study, settings).change(
         title=f"{study.title[:150]}: subsets of controlled links and modes",
-        control__links=(True,) * 3, control__mode_mask=(),
-    )  # fmt: skip
+        control__links=(True,) * 3,
+        control__mode_mask=(),
+    )
     cases = []
     for time, shaper in settings:
         moved = study.change(motion__move_time=time, shaper__kind=shaper)
@@ -125,11 +130,15 @@ def atlas_sweep(
         ratios = np.vectorize(_rounded)(resolved_study(moved).control.ratios)
         for window in windows:
             delay, length = residual_window(study, window)
-            cases.append({
-                "motion.move_time": time, "shaper.kind": shaper,
-                "metrics.residual_delay": delay, "metrics.residual_length": length,
-                "control.ratios": ratios.tolist(),
-            })  # fmt: skip
+            cases.append(
+                {
+                    "motion.move_time": time,
+                    "shaper.kind": shaper,
+                    "metrics.residual_delay": delay,
+                    "metrics.residual_length": length,
+                    "control.ratios": ratios.tolist(),
+                }
+            )
     data = study.model_dump(mode="json")
     data["control"] |= {"ratio_source": "given", "ratio_exponent": 1.0}
     data["sweep"] = {
@@ -166,9 +175,11 @@ def _check(study: Study) -> None:
     control, motion = study.control, study.motion
     if control.modes > MODE_LIMIT:
         raise field_error(
-            "control.modes", control.modes,
-            f"1 to {MODE_LIMIT}, whose {2 ** (3 * MODE_LIMIT)} subsets can all be run", "1",
-        )  # fmt: skip
+            "control.modes",
+            control.modes,
+            f"1 to {MODE_LIMIT}, whose {2 ** (3 * MODE_LIMIT)} subsets can all be run",
+            "1",
+        )
     if len(set(motion.waypoints)) < 2:
         allowed = "a path of two different poses or more"
         raise field_error("motion.waypoints", motion.waypoints, allowed, "m, m, rad")
@@ -210,8 +221,9 @@ def read_subsets(data: SweepData) -> Subsets:
     """
     mask = data["control_mode_mask"].astype(bool)
     modes = mask.shape[2]
-    setting = list(zip(data["motion_move_time"].tolist(), data["shaper_kind"].tolist(),
-                       strict=True))  # fmt: skip
+    setting = list(
+        zip(data["motion_move_time"].tolist(), data["shaper_kind"].tolist(), strict=True)
+    )
     settings = list(dict.fromkeys(setting))
     windows, window = np.unique(data["metrics_residual_delay"], return_inverse=True)
     subset = mask.reshape(len(mask), -1) @ 2 ** np.arange(3 * modes)

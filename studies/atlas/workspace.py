@@ -118,22 +118,26 @@ def map_workspace(study: Study, count: int = GRID, turns: tuple[float, ...] = TU
         return whole.reshape(*grid.shape[:-1], *values.shape[1:])
 
     return Map(
-        x, y, phi,
+        x,
+        y,
+        phi,
         codes.astype(int).reshape(grid.shape[:-1]),
         placed(gamma[good]),
         placed(found.frequency),
         placed(np.take_along_axis(found.frequency, chosen, axis=1)),
         placed(np.take_along_axis(found.share, chosen[..., None], axis=1)),
         placed(found.coupling),
-    )  # fmt: skip
+    )
 
 
 def _machine(study: Study) -> tuple[Structure, Case]:
     """The machine with few modes and without anything that controls or shapes."""
     plain = study.change(
-        link__modes=min(study.link.modes, MAP_MODES), control__feedback="none",
-        shaper__kind="none", control__ratio_source="given",
-    )  # fmt: skip
+        link__modes=min(study.link.modes, MAP_MODES),
+        control__feedback="none",
+        shaper__kind="none",
+        control__ratio_source="given",
+    )
     structure, case = check_run(plain)
     return structure._replace(n_steps=1, substeps=1), case
 

@@ -91,9 +91,10 @@ def make_work(is_short: bool = False) -> Work:
         is_short: one move only and 20 ms after it, to see that all agree.
     """
     short = {
-        "run__duration": 0.15, "motion__waypoints": paper_study().motion.waypoints[:2],
+        "run__duration": 0.15,
+        "motion__waypoints": paper_study().motion.waypoints[:2],
         "metrics__residual_length": 0.02,
-    }  # fmt: skip
+    }
     layout = make_layout(8 * len(jax.local_devices()) if is_short else 0)
     return Work(*build_work("W0", layout, **(short if is_short else {})), layout)
 
@@ -190,10 +191,15 @@ def by_diffrax(work: Work, n: int) -> Callable[[], Any]:
         count = structure.n_steps
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda t, y, _: _slopes(structure, start, t, y)),
-            diffrax.Tsit5(), 0.0, count * PERIOD, PERIOD, start.state.plant,
+            diffrax.Tsit5(),
+            0.0,
+            count * PERIOD,
+            PERIOD,
+            start.state.plant,
             saveat=diffrax.SaveAt(ts=PERIOD * jnp.arange(count), fn=lambda t, y, _: y.q),
-            stepsize_controller=diffrax.ConstantStepSize(), max_steps=count + 2,
-        )  # fmt: skip
+            stepsize_controller=diffrax.ConstantStepSize(),
+            max_steps=count + 2,
+        )
         return _rms(start, solution.ys)
 
     return partial(jax.jit(jax.vmap(one)), cases)
@@ -215,9 +221,14 @@ def by_scipy(work: Work) -> Callable[[], Any]:
     def run() -> Any:
         times = PERIOD * np.arange(structure.n_steps)
         solution = solve_ivp(
-            lambda t, y: np.asarray(slope(t, y)), (0.0, times[-1]), np.asarray(flat), "DOP853",
-            times, rtol=TOLERANCES[0], atol=TOLERANCES[1],
-        )  # fmt: skip
+            lambda t, y: np.asarray(slope(t, y)),
+            (0.0, times[-1]),
+            np.asarray(flat),
+            "DOP853",
+            times,
+            rtol=TOLERANCES[0],
+            atol=TOLERANCES[1],
+        )
         return _rms(start, jax.vmap(whole)(jnp.asarray(solution.y.T)).q)[None]
 
     return run
@@ -272,14 +283,29 @@ def by_c(work: Work, compiler: str) -> Callable[[], Any]:
     start = jax.jit(begin, static_argnums=0)(structure, jax.tree.map(lambda x: x[0], work.first(1)))
     plant, drive, n = start.loop.plant, start.loop.drive, structure.n_steps
     fields = (
-        plant.ux, plant.uy, plant.joint_cos, plant.joint_sin, plant.s0, plant.h0, plant.length,
-        plant.slider_link_mass, plant.tip_mass, plant.inertia, plant.platform_mass,
-        plant.platform_inertia, plant.modal_mass, plant.stiffness, plant.damping, plant.b, plant.c,
+        plant.ux,
+        plant.uy,
+        plant.joint_cos,
+        plant.joint_sin,
+        plant.s0,
+        plant.h0,
+        plant.length,
+        plant.slider_link_mass,
+        plant.tip_mass,
+        plant.inertia,
+        plant.platform_mass,
+        plant.platform_inertia,
+        plant.modal_mass,
+        plant.stiffness,
+        plant.damping,
+        plant.b,
+        plant.c,
         plant.shortening,
-        start.loop.actuator, start.loop.deflection_at,
+        start.loop.actuator,
+        start.loop.deflection_at,
         *(np.broadcast_to(x, (3,)) for x in (drive.kp, drive.kd, drive.force_limit)),
         start.loop.controller.voltage_limit,
-    )  # fmt: skip
+    )
     machine = np.concatenate([np.ravel(x) for x in fields])
     wanted = np.ascontiguousarray(np.stack([start.inputs.rho, start.inputs.rho_rate], axis=2))
     weight = np.asarray(start.inputs.window.is_residual)
@@ -292,9 +318,7 @@ def by_c(work: Work, compiler: str) -> Callable[[], Any]:
     def group(gain: np.ndarray) -> np.ndarray:
         square = _aligned(np.zeros((9, 8)))
         arrays = (wanted, weight, home, gain, square)
-        function(
-            machine.ctypes.data, n, ctypes.c_double(PERIOD), *(x.ctypes.data for x in arrays)
-        )  # fmt: skip
+        function(machine.ctypes.data, n, ctypes.c_double(PERIOD), *(x.ctypes.data for x in arrays))
         return square.T.reshape(8, 3, 3)
 
     def run() -> Any:
@@ -325,10 +349,21 @@ def _compiled(compiler: str) -> Any:
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder) / "w0.so"
         subprocess.run(
-            [compiler, "-O3", "-march=native", "-ffp-contract=fast", "-Wno-psabi", "-shared",
-             "-fPIC", "-o", str(library), str(source)],
-            check=True, capture_output=True,
-        )  # fmt: skip
+            [
+                compiler,
+                "-O3",
+                "-march=native",
+                "-ffp-contract=fast",
+                "-Wno-psabi",
+                "-shared",
+                "-fPIC",
+                "-o",
+                str(library),
+                str(source),
+            ],
+            check=True,
+            capture_output=True,
+        )
         function = ctypes.CDLL(str(library)).run
     address = ctypes.c_void_p
     function.argtypes = [address, ctypes.c_long, ctypes.c_double, *[address] * 5]

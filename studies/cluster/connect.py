@@ -186,8 +186,10 @@ def _started(count: int) -> Iterator[Client]:
     if not 1 <= count <= cores:
         raise field_error("--local-workers", count, f"1 to {cores}, the cores of this machine")
     options = {
-        "nthreads": cores // count, "host": "127.0.0.1", "silence_logs": logging.CRITICAL,
-    }  # fmt: skip
+        "nthreads": cores // count,
+        "host": "127.0.0.1",
+        "silence_logs": logging.CRITICAL,
+    }
     workers = {k: {"cls": Nanny, "options": options | {"env": _graphics(k)}} for k in range(count)}
     ports = {"host": "127.0.0.1", "port": 0, "dashboard": False, "dashboard_address": "127.0.0.1:0"}
     heart = {"cls": Scheduler, "options": ports}

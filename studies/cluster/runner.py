@@ -119,7 +119,12 @@ class ClusterRunner:
     def _submit(self, flight: Flight) -> Future:
         group = flight.group
         job = Job(
-            self._identity, self._precision, self._spec, group.structure, flight.has_own_ratio,
-            group.layout.size, flight.chunk.rows,
-        )  # fmt: skip
+            self._identity,
+            self._precision,
+            self._spec,
+            group.structure,
+            flight.has_own_ratio,
+            group.layout.size,
+            flight.chunk.rows,
+        )
         return self._client.submit(run_chunk, job, pure=False)

@@ -99,6 +99,10 @@ class Watch:
         """Stop a worker; its nanny starts another, where it has one."""
         call: Any = self._client.scheduler.restart_workers
         self._client.sync(
-            call, workers=[address], timeout=KILL_TIME, wait_for_workers=False,
-            on_error="return", stimulus_id=f"studies-overdue-{time.monotonic()}",
-        )  # fmt: skip
+            call,
+            workers=[address],
+            timeout=KILL_TIME,
+            wait_for_workers=False,
+            on_error="return",
+            stimulus_id=f"studies-overdue-{time.monotonic()}",
+        )

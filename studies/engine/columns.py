@@ -47,18 +47,24 @@ PER_CASE: dict[str, tuple] = {
     "actuator_condition": (("link",), "1", "condition number of the synthesizer"),
     "singularity_distance": ((), "rad", DISTANCE_TEXT),
     "gain_margin": (
-        (), "1", "largest factor on all gains with every smaller one stable, at the first "
+        (),
+        "1",
+        "largest factor on all gains with every smaller one stable, at the first "
         f"way-point with {MARGIN_MODES} plant modes or more; {HIGHEST:g}: that or more",
     ),
     "breaking_frequency": ((), "Hz", "of what goes unstable at the gain margin, NaN: nothing"),
     "breaking_mode": (
-        (), "1", "order of the link mode nearest to that frequency, 0: the drive, NaN: nothing"
+        (),
+        "1",
+        "order of the link mode nearest to that frequency, 0: the drive, NaN: nothing",
     ),
     "damping_ratio": (
-        ("controlled_mode",), "1", "least of the modes of each order, of as many as links are "
+        ("controlled_mode",),
+        "1",
+        "least of the modes of each order, of as many as links are "
         "controlled, the most damped ones",
     ),
-}  # fmt: skip
+}
 
 
 #: Of these the smallest entry is the worst.

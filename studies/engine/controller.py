@@ -55,15 +55,22 @@ def fixed_controller(study: Study) -> FixedController:
     controller, taps = known.controller, known.taps
     if not np.any(controller.velocity_gain) and not _any(controller.position_gain):
         raise field_error(
-            "control.gain_factor", study.control.gain_factor,
+            "control.gain_factor",
+            study.control.gain_factor,
             "gains of which at least one is not zero (control.links, control.mode_mask, "
-            "control.velocity_gain, control.ratios)", "1",
-        )  # fmt: skip
+            "control.velocity_gain, control.ratios)",
+            "1",
+        )
     _check_finite(controller, taps)
     return FixedController(
-        study, structure, case, controller, fold(controller, LAWS[study.control.law].channel),
-        _merged(taps), _frequencies(structure, case),
-    )  # fmt: skip
+        study,
+        structure,
+        case,
+        controller,
+        fold(controller, LAWS[study.control.law].channel),
+        _merged(taps),
+        _frequencies(structure, case),
+    )
 
 
 def _check_exportable(study: Study) -> None:
@@ -71,10 +78,12 @@ def _check_exportable(study: Study) -> None:
     step = electronics.adc_range / 2**electronics.adc_bits
     if not step < electronics.conditioner_bias < electronics.adc_range - 2 * step:
         raise field_error(
-            "electronics.conditioner_bias", electronics.conditioner_bias,
+            "electronics.conditioner_bias",
+            electronics.conditioner_bias,
             f"inside the ADC's range, {step:.4g} to {electronics.adc_range - 2 * step:.4g}: a "
-            "sensor at rest at an end of it is taken for a broken one", "V",
-        )  # fmt: skip
+            "sensor at rest at an end of it is taken for a broken one",
+            "V",
+        )
     if control.feedback != "sampled":
         raise field_error(
             "control.feedback", control.feedback, "'sampled', a controller that samples"

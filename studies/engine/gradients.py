@@ -160,11 +160,16 @@ def _pass(
     along = jax.tree.map(partial(_filled, count), ready.state, turn.state)
     steps.run.run(
         [
-            *ready.loop, *_moving(turn.loop), *ready.inputs, *_by_sample(turn.inputs),
-            *jax.tree.leaves(state), *jax.tree.leaves(along),
+            *ready.loop,
+            *_moving(turn.loop),
+            *ready.inputs,
+            *_by_sample(turn.inputs),
+            *jax.tree.leaves(state),
+            *jax.tree.leaves(along),
         ],
-        program.structure.n_steps, program.layout.lanes,
-    )  # fmt: skip
+        program.structure.n_steps,
+        program.layout.lanes,
+    )
     return jax.tree.map(partial(_filled, count), ready.outline, turn.outline), along
 
 

@@ -161,8 +161,10 @@ class Block(NamedTuple):
 def _run_block(program: Program, parts: Parts, kernel: Any, own: list, common: list) -> Block:
     start = begin_block(program, parts, own, common)
     leaves = [
-        *read_leaves(start, parts), *jax.tree.leaves(start.inputs), *jax.tree.leaves(start.state)
-    ]  # fmt: skip
+        *read_leaves(start, parts),
+        *jax.tree.leaves(start.inputs),
+        *jax.tree.leaves(start.state),
+    ]
     last = kernel(leaves)
     state = jax.tree.unflatten(jax.tree.structure(start.state), last)
     few = cpu.VECTOR_BYTES // last[0].dtype.itemsize

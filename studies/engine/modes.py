@@ -33,10 +33,15 @@ def modes_study(
     if pose is not None:
         data["motion"] = {"waypoints": [list(pose)]}
     given = (
-        ("link", "basis", basis), ("link", "modes", n_modes), ("link", "damping_ratio", damping),
-        ("drive", "kp", kp), ("drive", "kd", kd), ("drive", "locked", locked),
-        ("control", "feedback", "none"), ("shaper", "kind", "none"),
-    )  # fmt: skip
+        ("link", "basis", basis),
+        ("link", "modes", n_modes),
+        ("link", "damping_ratio", damping),
+        ("drive", "kp", kp),
+        ("drive", "kd", kd),
+        ("drive", "locked", locked),
+        ("control", "feedback", "none"),
+        ("shaper", "kind", "none"),
+    )
     for section, name, value in given:
         if value is not None:
             data[section] = data.get(section, {}) | {name: value}

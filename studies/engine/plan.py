@@ -24,10 +24,18 @@ from studies.study.fields import Fields
 
 #: Fields that change the program; each combination of their values is compiled by itself.
 STATIC = (
-    "run.model", "link.basis", "link.shortening", "control.basis", "control.feedback",
-    "control.law", "drive.kind", "run.substeps", "run.smooth", "run.duration",
+    "run.model",
+    "link.basis",
+    "link.shortening",
+    "control.basis",
+    "control.feedback",
+    "control.law",
+    "drive.kind",
+    "run.substeps",
+    "run.smooth",
+    "run.duration",
     "electronics.sample_rate_hz",
-)  # fmt: skip
+)
 _POSITION = "control.position_gain"
 _WRENCH = ("load.wrench", "load.pulse")
 #: More programs than this are refused.

@@ -211,9 +211,11 @@ def find_parts(program: Program, own: list, common: list) -> Parts:
     sizes = tuple(out.aval.shape for out in traced.jaxpr.outvars)
     moving = given[-1:] if program.place else []
     return Parts(
-        jax.tree.structure(shapes), _dependence(traced.jaxpr, given), sizes,
+        jax.tree.structure(shapes),
+        _dependence(traced.jaxpr, given),
+        sizes,
         _dependence(traced.jaxpr, moving),
-    )  # fmt: skip
+    )
 
 
 def _dependence(jaxpr: Any, given: list) -> tuple[bool, ...]:

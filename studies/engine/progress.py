@@ -37,9 +37,12 @@ class Reporter:
     def __enter__(self) -> Reporter:
         if self.console.is_terminal and not self.is_quiet:
             columns = (
-                TextColumn("cases"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+                TextColumn("cases"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeRemainingColumn(),
                 TextColumn("{task.description}"),
-            )  # fmt: skip
+            )
             self._bar = Progress(*columns, console=self.console)
             self._task = self._bar.add_task("", total=self.total, completed=self.done)
             self._bar.start()

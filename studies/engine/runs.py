@@ -32,7 +32,7 @@ from jaxmodel.prepare import (
     lowpass_corner,
     prepare,
     spectrum_frequencies,
-)  # fmt: skip
+)
 from jaxmodel.shaper import Taps, last_sample
 from jaxmodel.simulate import Result, simulate, steady_load
 from studies import config
@@ -180,18 +180,36 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
     corner = lowpass_corner(structure, case, prepared.bases)
     damping = jnp.max(damping_ratio(case.machine.damping, prepared.loop.omega))
     return Preflight(
-        *each, code, time[index], poses[index], end, shaper_length, worst,
-        jnp.max(prepared.loop.omega), damping, corner, steady_load(structure, case, plant),
-        critical_force(plant), prepared.loop.controller, prepared.taps,
-    )  # fmt: skip
+        *each,
+        code,
+        time[index],
+        poses[index],
+        end,
+        shaper_length,
+        worst,
+        jnp.max(prepared.loop.omega),
+        damping,
+        corner,
+        steady_load(structure, case, plant),
+        critical_force(plant),
+        prepared.loop.controller,
+        prepared.taps,
+    )
 
 
 def _without_run(structure: Structure) -> Structure:
     """Only what describes machine and controller, so that runs of any kind share a compilation."""
     kept = (
-        "n_modes", "n_controlled", "n_patches", "basis", "has_shortening", "is_coupled",
-        "has_wrench", "controller_basis", "law",
-    )  # fmt: skip
+        "n_modes",
+        "n_controlled",
+        "n_patches",
+        "basis",
+        "has_shortening",
+        "is_coupled",
+        "has_wrench",
+        "controller_basis",
+        "law",
+    )
     fields = {name: getattr(structure, name) for name in kept}
     return Structure(n_steps=1, feedback="none", **fields)
 
@@ -215,18 +233,21 @@ def check_run(study: Study) -> tuple[Structure, Case]:
             "motion.waypoints",
             f"path at t = {known.path_time:.4g} s, pose ({x:.4g}, {y:.4g}, {phi:.4g})",
             "a path on which every link angle gamma stays inside (0, 90) deg "
-            f"(here: {status.REASONS[int(known.path_status)]})", "m, m, rad",
-        )  # fmt: skip
+            f"(here: {status.REASONS[int(known.path_status)]})",
+            "m, m, rad",
+        )
     _check_load(study, known)
     _check_duration(study, structure, known)
     is_filtered = is_modal(structure) and structure.feedback != "none"
     if is_filtered and known.condition > study.metrics.condition_limit:
         raise field_error(
-            "patches.centers", study.patches.centers,
+            "patches.centers",
+            study.patches.centers,
             f"a placement whose modal filter for control.modes = {study.control.modes} has on each "
             f"link a condition number up to metrics.condition_limit = "
-            f"{study.metrics.condition_limit:g}; the largest is {known.condition:.3g}", "1",
-        )  # fmt: skip
+            f"{study.metrics.condition_limit:g}; the largest is {known.condition:.3g}",
+            "1",
+        )
     _check_rates(study, structure, known)
     if structure.feedback == "ideal":
         structure = structure._replace(substeps=_ideal_substeps(study, structure, case))
@@ -258,16 +279,20 @@ def check_pose(
     ]
     if not wrong:
         raise field_error(
-            field, pose,
+            field,
+            pose,
             "a pose where the lines of the links do not meet in one point "
-            f"(here: {status.REASONS[code]})", "m, m, rad",
-        )  # fmt: skip
+            f"(here: {status.REASONS[code]})",
+            "m, m, rad",
+        )
     raise field_error(
-        field, pose,
+        field,
+        pose,
         "a pose where the joint of each link lies inside its guide by more than 0 and less than "
         f"link.length, so that gamma is inside (0, 90) deg (here: {status.REASONS[code]}; "
-        f"{wrong[0]}; machine.guide_offsets moves it)", "m, m, rad",
-    )  # fmt: skip
+        f"{wrong[0]}; machine.guide_offsets moves it)",
+        "m, m, rad",
+    )
 
 
 def _check_load(study: Study, known: Preflight) -> None:
@@ -276,11 +301,12 @@ def _check_load(study: Study, known: Preflight) -> None:
     at, link = np.unravel_index(np.argmax(known.steady_load), known.steady_load.shape)
     critical = known.critical_force[link]
     raise field_error(
-        "load.wrench", study.load.wrench,
+        "load.wrench",
+        study.load.wrench,
         f"a load that compresses no link by its critical force, {critical:.4g} N (here link "
         f"{link + 1}: {known.steady_load[at, link] * critical:.4g} N at way-point {at + 1})",
         "N, N, N m",
-    )  # fmt: skip
+    )
 
 
 def _check_duration(study: Study, structure: Structure, known: Preflight) -> None:
@@ -292,48 +318,58 @@ def _check_duration(study: Study, structure: Structure, known: Preflight) -> Non
     end = float(known.motion_end + known.shaper_length)
     if end > duration * (1 + 1e-12):
         raise field_error(
-            "run.duration", study.run.duration,
+            "run.duration",
+            study.run.duration,
             f"at least {end:.6g}, the end of the motion with its shaper of "
-            f"{known.shaper_length:.4g} s", "s",
-        )  # fmt: skip
+            f"{known.shaper_length:.4g} s",
+            "s",
+        )
     left = duration - end - study.metrics.residual_delay
     # free vibration of a platform at rest: the window may end with the run
     longest = left if len(study.motion.waypoints) > 1 else np.inf
     period = 1 / study.electronics.sample_rate_hz
     if not period * (1 - 1e-9) <= study.metrics.residual_length <= longest + 1e-9:
         raise field_error(
-            "metrics.residual_length", study.metrics.residual_length,
+            "metrics.residual_length",
+            study.metrics.residual_length,
             f"{period:g} to {max(left, 0):.6g}, from one sample to what run.duration = "
-            f"{duration:g} leaves after the shaped motion and metrics.residual_delay", "s",
-        )  # fmt: skip
+            f"{duration:g} leaves after the shaped motion and metrics.residual_delay",
+            "s",
+        )
 
 
 def _check_rates(study: Study, structure: Structure, known: Preflight) -> None:
     """Plant modes that the step can carry, and low-passes that the sample rate can carry."""
     if known.damping >= 1:
         raise field_error(
-            "link.damping_ratio", study.link.damping_ratio,
+            "link.damping_ratio",
+            study.link.damping_ratio,
             f"ratios that with link.damping_law = {study.link.damping_law!r} stay below 1 for all "
-            f"link.modes = {study.link.modes} (here up to {known.damping:.3g})", "1",
-        )  # fmt: skip
+            f"link.modes = {study.link.modes} (here up to {known.damping:.3g})",
+            "1",
+        )
     rate = study.electronics.sample_rate_hz
     needed = known.highest / MODE_STEP_LIMIT
     if needed > rate * structure.substeps:
         raise field_error(
-            "link.modes", study.link.modes,
+            "link.modes",
+            study.link.modes,
             f"modes up to {MODE_STEP_LIMIT * rate * structure.substeps / (2 * np.pi):.4g} Hz at "
             f"electronics.sample_rate_hz = {rate:g} and run.substeps = {structure.substeps}; the "
-            f"highest one has {known.highest / (2 * np.pi):.4g} Hz", "1",
-        )  # fmt: skip
+            f"highest one has {known.highest / (2 * np.pi):.4g} Hz",
+            "1",
+        )
     is_modal_phase = study.electronics.estimator == "modal_phase"
     corner = known.corner / (2 * np.pi)
     if structure.feedback == "sampled" and is_modal_phase and corner >= rate / 2:
         raise field_error(
-            "electronics.lowpass_ratio", study.electronics.lowpass_ratio,
+            "electronics.lowpass_ratio",
+            study.electronics.lowpass_ratio,
             f"low-pass corners below half the sample rate, {rate / 2:g} Hz; the highest of the "
             f"{n_channels(structure)} is at {corner:.5g} Hz (lower it, control.modes or raise "
-            "electronics.sample_rate_hz)", "1",
-        )  # fmt: skip
+            "electronics.sample_rate_hz)",
+            "1",
+        )
 
 
 def pole_decay(structure: Structure, case: Case, pose: Any) -> float:
@@ -369,24 +405,28 @@ def _drive_substeps(study: Study, structure: Structure, case: Case) -> int:
         return given or int(step_counts(needed))
     if needed <= SUBSTEP_LIMIT:
         raise field_error(
-            "run.substeps", given,
+            "run.substeps",
+            given,
             f"{needed} to {SUBSTEP_LIMIT}, or 0 for as many as needed; drive and friction have a "
-            f"rate of {rate:.3g} 1/s", "1",
-        )  # fmt: skip
+            f"rate of {rate:.3g} 1/s",
+            "1",
+        )
     slope = drive.coulomb_friction / drive.friction_speed
     parts = {
-        "drive.kd": drive.kd, "drive.viscous_friction": drive.viscous_friction,
+        "drive.kd": drive.kd,
+        "drive.viscous_friction": drive.viscous_friction,
         "drive.coulomb_friction": slope,
-    }  # fmt: skip
+    }
     name = max(parts, key=parts.__getitem__)
     value = drive.coulomb_friction if name == "drive.coulomb_friction" else parts[name]
     raise field_error(
-        name, value,
+        name,
+        value,
         f"so much that {SUBSTEP_LIMIT} plant steps per sample carry drive.kd, "
         f"drive.viscous_friction and drive.coulomb_friction/drive.friction_speed = {slope:g} N s/m "
         f"on machine.slider_mass; {needed} would be needed",
         "N" if name == "drive.coulomb_friction" else "N s/m",
-    )  # fmt: skip
+    )
 
 
 def _ideal_substeps(study: Study, structure: Structure, case: Case) -> int:
@@ -398,16 +438,20 @@ def _ideal_substeps(study: Study, structure: Structure, case: Case) -> int:
     given = study.run.substeps
     if given and given < needed <= SUBSTEP_LIMIT:
         raise field_error(
-            "run.substeps", given,
+            "run.substeps",
+            given,
             f"{needed} to {SUBSTEP_LIMIT}, or 0 for as many as needed; ideal feedback has a pole "
-            f"at {fastest:.3g} 1/s", "1",
-        )  # fmt: skip
+            f"at {fastest:.3g} 1/s",
+            "1",
+        )
     if needed > SUBSTEP_LIMIT:
         raise field_error(
-            "control.gain_factor", study.control.gain_factor,
+            "control.gain_factor",
+            study.control.gain_factor,
             f"gains low enough for {SUBSTEP_LIMIT} plant steps per sample; ideal feedback has a "
-            f"pole at {fastest:.3g} 1/s, which needs {needed}", "1",
-        )  # fmt: skip
+            f"pole at {fastest:.3g} 1/s, which needs {needed}",
+            "1",
+        )
     return given or int(step_counts(needed))
 
 
@@ -425,15 +469,19 @@ _RECORD_LABELS = {
     "slider": (("time", "slider_axis"), "m", "slider position rho"),
     "modal_coordinate": (("time", "link", "mode"), "m", "modal coordinates q of the plant"),
     "controlled_coordinate": (
-        ("time", "link", "controlled_mode"), "m", "controller's modes seen by an ideal modal filter"
+        ("time", "link", "controlled_mode"),
+        "m",
+        "controller's modes seen by an ideal modal filter",
     ),
     "chord_deflection_stations": (
-        ("time", "link", "station"), "m", "deflection relative to the chord B-C at the stations"
+        ("time", "link", "station"),
+        "m",
+        "deflection relative to the chord B-C at the stations",
     ),
     "sensor_voltage": (("time", "link", "patch"), "V", "raw sensor voltage"),
     "actuator_voltage": (("time", "link", "patch"), "V", "actuator voltage"),
     "slider_force": (("time", "slider_axis"), "N", "motor force"),
-}  # fmt: skip
+}
 
 
 @partial(jax.jit, static_argnums=0)

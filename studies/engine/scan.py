@@ -50,9 +50,12 @@ def _run(program: Program, parts: Parts, varying: list, shared: list) -> Result:
     devices = np.array(jax.local_devices()[: layout.devices])
     each, all_same = PartitionSpec("cases"), PartitionSpec()
     return jax.shard_map(
-        device, mesh=Mesh(devices, ("cases",)), in_specs=(each, all_same), out_specs=each,
+        device,
+        mesh=Mesh(devices, ("cases",)),
+        in_specs=(each, all_same),
+        out_specs=each,
         check_vma=False,
-    )(varying, shared)  # fmt: skip
+    )(varying, shared)
 
 
 class ScanExecutor:

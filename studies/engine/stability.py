@@ -44,9 +44,16 @@ def with_margin_modes(
     case = case._replace(n_modes=modes, initial=case.initial._replace(modal=still))
     # nothing that a loop about rest does not depend on, which would cost a compilation
     structure = structure._replace(
-        n_modes=n_modes, n_steps=1, substeps=1, n_frequencies=1, has_noise=False, metrics=(),
-        is_smooth=True, feedback="sampled", has_position_gain=True,
-    )  # fmt: skip
+        n_modes=n_modes,
+        n_steps=1,
+        substeps=1,
+        n_frequencies=1,
+        has_noise=False,
+        metrics=(),
+        is_smooth=True,
+        feedback="sampled",
+        has_position_gain=True,
+    )
     return structure, case
 
 

@@ -49,10 +49,11 @@ def kept_metrics(spec: SweepSpec) -> list[str]:
     if lost and jax.dtypes.canonicalize_dtype(np.float64) == np.float32:
         written = lost if spec.sweep.metrics else []
         raise field_error(
-            "sweep.metrics", written,
+            "sweep.metrics",
+            written,
             f"with float32 a list of {', '.join(single)}, which it has within 1 %; "
             "leave --precision out for the others",
-        )  # fmt: skip
+        )
     return kept
 
 
@@ -191,9 +192,7 @@ def merge(folder: Path, table: Table, finished: Finished, attributes: dict[str, 
     with h5py.File(finished.files[-1], "r") as store:
         for name, shape in largest.items():
             dims, *label = label_of(name)
-            streamed = Streamed(
-                (len(table), *shape[1:]), store[name].dtype, partial(parts, name)
-            )  # fmt: skip
+            streamed = Streamed((len(table), *shape[1:]), store[name].dtype, partial(parts, name))
             variables[name] = Variable(streamed, ("case", *dims), *label)
     variables |= axis_variables(table, axis_sizes(variables))
     write_store(folder / JOINED, variables, attributes)

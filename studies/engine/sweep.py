@@ -22,7 +22,7 @@ from studies.engine.folder import (
     finished_cases,
     make_manifest,
     open_folder,
-)  # fmt: skip
+)
 from studies.engine.plan import Group, chunk_cases, local_layout, plan_groups
 from studies.engine.progress import Reporter
 from studies.engine.stored import chunk_variables, kept_metrics, manifest_attributes, merge
@@ -121,9 +121,15 @@ def run_sweep(
                 merge(out, table, finished, attributes | timings)
                 folder.publish()
         return Outcome(
-            table, reporter.done, reporter.n_run, reporter.compile_time, reporter.run_time,
-            is_interrupted, reporter.executor, lost,
-        )  # fmt: skip
+            table,
+            reporter.done,
+            reporter.n_run,
+            reporter.compile_time,
+            reporter.run_time,
+            is_interrupted,
+            reporter.executor,
+            lost,
+        )
 
 
 def _headline(table: Table, groups: list[Group], n_before: int) -> str:

@@ -96,9 +96,11 @@ def fixed_source(
             f"    {_WORD} line[@_N_MODES][2]; /* delay line of the second section */",
         ],
         "faulty": "a code beyond the ADC's, or stuck at one end",
-        "sensor_type": "uint16_t", "actuator_type": "uint16_t",
-        "reference_type": _WORD, "reference_unit": ", each in any unit that fits 32 bits",
-    }  # fmt: skip
+        "sensor_type": "uint16_t",
+        "actuator_type": "uint16_t",
+        "reference_type": _WORD,
+        "reference_unit": ", each in any unit that fits 32 bits",
+    }
     parts = Parts(
         template="fixed.c",
         tables=_tables(found, fixed),
@@ -126,9 +128,11 @@ def format_lines(fixed: FixedPoint, found: FixedController) -> list[str]:
         f"{'sensors':<30}{fixed.adc_bits:>4}{'1 code':>20}",
     ]
     parts: list[tuple[str, Format, str]] = [
-        ("signal", fixed.signal, value), ("high-passed", fixed.high, value),
-        ("delay line", fixed.inner, value), ("force", fixed.force, force),
-    ]  # fmt: skip
+        ("signal", fixed.signal, value),
+        ("high-passed", fixed.high, value),
+        ("delay line", fixed.inner, value),
+        ("force", fixed.force, force),
+    ]
     for m, name in enumerate(found.channels.names):
         for text, form, unit in parts:
             lines.append(
@@ -161,34 +165,45 @@ def _tables(found: FixedController, fixed: FixedPoint) -> list[Table]:
         Table("int64_t", "BIAS", fixed.bias, "[count] sensor at rest; conditioner_bias"),
         word("DAC_REST", np.array(fixed.dac_rest), "[code] of 0 V at an actuator; the DAC's bits"),
         word(
-            "FILTER", fixed.filter.integers, "[signal/sensor] modal filter pinv(lambda_s Phi_s^t); "
-            "control.basis, patches", names,
+            "FILTER",
+            fixed.filter.integers,
+            "[signal/sensor] modal filter pinv(lambda_s Phi_s^t); control.basis, patches",
+            names,
         ),
         shift("FILTER", fixed.filter),
         word(
-            "HIGH_PASS", high, "[high/signal; high/signal, 1] b0; b1, -a1 of the velocity "
-            f"estimate's first section: {section[0]}", names,
+            "HIGH_PASS",
+            high,
+            "[high/signal; high/signal, 1] b0; b1, -a1 of the velocity "
+            f"estimate's first section: {section[0]}",
+            names,
         ),
         Table("uint16_t", "HIGH_PASS_SHIFT", high_shift, "[bit] of b0; of b1 and -a1"),
         word(
-            "LOW_PASS", fixed.low_pass.integers, "[delay line/high, 1, 1] scale, -a1, -a2 of its "
-            f"second section: {section[1]}", names,
+            "LOW_PASS",
+            fixed.low_pass.integers,
+            f"[delay line/high, 1, 1] scale, -a1, -a2 of its second section: {section[1]}",
+            names,
         ),
         shift("LOW_PASS", fixed.low_pass),
         word(
-            "FORCE", numerator.integers,
+            "FORCE",
+            numerator.integers,
             "[force/delay line] its numerator times the gains, " + GAINS,
             names,
         ),
         shift("FORCE", numerator),
         word(
-            "SYNTHESIZER", back.integers[channels.link, :, each], "[code/force] of each actuator "
-            "of the link, pinv(lambda_a Phi_a); control.basis, patches", names,
+            "SYNTHESIZER",
+            back.integers[channels.link, :, each],
+            "[code/force] of each actuator "
+            "of the link, pinv(lambda_a Phi_a); control.basis, patches",
+            names,
         ),
         Table("uint16_t", "SYNTHESIZER_SHIFT", back.shift.ravel(), "[bit] of each actuator"),
         *shaper_tables(found, _WORD, shaper.integers[0]),
         Table("int", "WEIGHT_SHIFT", shaper.shift[0], "[bit] of all weights"),
-    ]  # fmt: skip
+    ]
     if fixed.energy is not None:
         rows = [f"{name}, {what}" for name in names for what in ("velocity", "position")]
         words = fixed.energy.integers.reshape(-1, 4)

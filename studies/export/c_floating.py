@@ -32,12 +32,14 @@ _FEEDTHROUGH = """\
 """
 #: All channels act.
 _ALL = Rivals(
-    "", "", "",
+    "",
+    "",
+    "",
     """        for (k = 0; k < @_N_PATCHES; k++) {
             wanted[first + k] += SYNTHESIZER[m][k] * force;
         }
 """,
-)  # fmt: skip
+)
 #: Of the rivals of a link the one of highest energy acts.
 _ONE = Rivals(
     """    real forces[@_N_MODES], energy[@_N_MODES]; /* of the channels */
@@ -97,9 +99,11 @@ def floating_source(found: FixedController, name: str, origin: Iterable[str]) ->
             f"    {real} line[@_N_MODES][2]; /* delay line of the second section */",
         ],
         "faulty": "not a number, out of range or stuck at one end of it",
-        "sensor_type": real, "actuator_type": real,
-        "reference_type": real, "reference_unit": ", in any units",
-    }  # fmt: skip
+        "sensor_type": real,
+        "actuator_type": real,
+        "reference_type": real,
+        "reference_unit": ", in any units",
+    }
     parts = Parts(
         template="floating.c",
         tables=_tables(found),
@@ -130,25 +134,39 @@ def _tables(found: FixedController) -> list[Table]:
         real("CONDITIONER_GAIN", controller.adc_gain, "[1] ADC volt per sensor volt; electronics"),
         real("LIMIT", controller.voltage_limit, "[V] of every actuator, +-; voltage_limit"),
         real(
-            "FILTER", channels.filter, f"[{to_signal}] modal filter pinv(lambda_s Phi_s^t): signal "
-            "per volt of each sensor of the link; control.basis, patches", names,
+            "FILTER",
+            channels.filter,
+            f"[{to_signal}] modal filter pinv(lambda_s Phi_s^t): signal "
+            "per volt of each sensor of the link; control.basis, patches",
+            names,
         ),
         real(
-            "HIGH_PASS", channels.first, f"[{rate}; {rate}; 1] b0, b1, a1 of the velocity "
-            f"estimate's first section: {first}", names,
+            "HIGH_PASS",
+            channels.first,
+            f"[{rate}; {rate}; 1] b0, b1, a1 of the velocity estimate's first section: {first}",
+            names,
         ),
         real(
-            "LOW_PASS", channels.denominator, f"[1] a1, a2 of its second section: {second}", names,
+            "LOW_PASS",
+            channels.denominator,
+            f"[1] a1, a2 of its second section: {second}",
+            names,
         ),
         real(
-            "FORCE", channels.force, f"[{force}] its numerator times the gains, {GAINS}", names,
+            "FORCE",
+            channels.force,
+            f"[{force}] its numerator times the gains, {GAINS}",
+            names,
         ),
         real(
-            "SYNTHESIZER", channels.synthesizer, f"[{to_volt}] voltage of each actuator of the "
-            "link per force, pinv(lambda_a Phi_a); control.basis, patches", names,
+            "SYNTHESIZER",
+            channels.synthesizer,
+            f"[{to_volt}] voltage of each actuator of the "
+            "link per force, pinv(lambda_a Phi_a); control.basis, patches",
+            names,
         ),
         *shaper_tables(found, "real", found.taps.weight),
-    ]  # fmt: skip
+    ]
     if channels.energy is not None:
         tables += [
             rival_table(channels),

@@ -122,20 +122,29 @@ def filled(parts: Parts, found: FixedController, name: str, origin: Iterable[str
     header = parts.header | {
         "members": "\n".join(members),
         "border": starred(parts.header["border"]),
-        "n_links": 3, "n_patches": found.n_patches, "n_channels": 3 * found.n_patches,
+        "n_links": 3,
+        "n_patches": found.n_patches,
+        "n_channels": 3 * found.n_patches,
         "kind": f"{found.channels.kind}s".replace("patchs", "patches"),
         "settle": found.channels.memory(1e-4),
-        "adc_bits": electronics.adc_bits, "adc_range": f"{electronics.adc_range:g}",
-        "gain": f"{electronics.conditioner_gain:g}", "bias": f"{electronics.conditioner_bias:g}",
+        "adc_bits": electronics.adc_bits,
+        "adc_range": f"{electronics.adc_range:g}",
+        "gain": f"{electronics.conditioner_gain:g}",
+        "bias": f"{electronics.conditioner_bias:g}",
         "antialias": f"{electronics.antialias_hz:g}",
-        "n_modes": len(found.channels.link), "rate": f"{rate:g}", "rate_literal": literal(rate),
-        "rail": rail, "rail_ms": f"{1e3 * rail / rate:.3g}",
+        "n_modes": len(found.channels.link),
+        "rate": f"{rate:g}",
+        "rate_literal": literal(rate),
+        "rail": rail,
+        "rail_ms": f"{1e3 * rail / rate:.3g}",
         "shaper_length": int(found.taps.sample.max()) + 1,
-    }  # fmt: skip
+    }
     common = {
-        "name": name, "NAME": name.upper(), "origin": starred(origin),
+        "name": name,
+        "NAME": name.upper(),
+        "origin": starred(origin),
         "forget_command": "        state->command[k] = 0;\n" if has_memory else "",
-    }  # fmt: skip
+    }
     code = parts.more | {
         "state": _template("state.c").substitute(common | header).rstrip(),
         "subtract_feedthrough": parts.subtract_feedthrough if has_memory else "",

@@ -44,9 +44,7 @@ class Code(NamedTuple):
         """One sample: actuator values and the fault, from sensor values (3 K,)."""
         given: np.ndarray = np.ascontiguousarray(sensor, self.real).ravel()
         out: np.ndarray = np.empty(self.n_channels, self.real)
-        fault = getattr(self.library, f"{self.name}_step")(
-            self.state, _at(given), _at(out)
-        )  # fmt: skip
+        fault = getattr(self.library, f"{self.name}_step")(self.state, _at(given), _at(out))
         return out, fault
 
     def respond(self, sensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -107,8 +105,17 @@ def compiled(
         header.write_text(source.header, encoding="utf-8")
         code.write_text(source.code, encoding="utf-8")
         single = [f"-D{name.upper()}_REAL=float"] if real is np.float32 else []
-        command = [*compiler, *STRICT, "-O2", *single, "-shared", "-fPIC", "-o", str(library),
-                   str(code)]  # fmt: skip
+        command = [
+            *compiler,
+            *STRICT,
+            "-O2",
+            *single,
+            "-shared",
+            "-fPIC",
+            "-o",
+            str(library),
+            str(code),
+        ]
         _run(command)
         # no word per state takes more than 8 bytes
         room = ctypes.create_string_buffer(8 * (3 * n_modes + 2 * n_channels) + 64)

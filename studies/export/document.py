@@ -149,7 +149,8 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
     return {
         "sample_rate": one(electronics.sample_rate_hz, "Hz", "how often a sample is taken"),
         "antialias": one(
-            electronics.antialias_hz, "Hz",
+            electronics.antialias_hz,
+            "Hz",
             "corner of the analogue second-order Butterworth filter before the ADC",
         ),
         "adc_bits": one(float(electronics.adc_bits), "1", "resolution of the ADC"),
@@ -158,11 +159,15 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
         "conditioner_gain": one(controller.adc_gain, "1", "ADC volt per sensor volt"),
         "conditioner_bias": one(controller.adc_bias, "V", "at the ADC for a sensor at rest"),
         "feedthrough": one(
-            controller.feedthrough, "1", "sensor volts that an actuator volt causes by modes that "
-            "are not controlled", [_LINK, _PATCH, "actuator"],
+            controller.feedthrough,
+            "1",
+            "sensor volts that an actuator volt causes by modes that are not controlled",
+            [_LINK, _PATCH, "actuator"],
         ),
         "modal_filter": one(
-            controller.filter, to_signal, "channel signal of each sensor voltage",
+            controller.filter,
+            to_signal,
+            "channel signal of each sensor voltage",
             [*each_axes, _PATCH],
         ),
         "channel_frequency": each(found.frequency, "Hz", "the velocity estimate is exact there"),
@@ -172,36 +177,44 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
         "low_pass_a1": each(estimator.denominator[0], "1", "second section, denominator of z^-1"),
         "low_pass_a2": each(estimator.denominator[1], "1", "second section, denominator of z^-2"),
         "velocity_numerator": one(
-            np.stack([np.broadcast_to(x, shape) for x in estimator.velocity], axis=2), last,
-            "second section, numerator of the velocity", [*each_axes, "power of z^-1"],
+            np.stack([np.broadcast_to(x, shape) for x in estimator.velocity], axis=2),
+            last,
+            "second section, numerator of the velocity",
+            [*each_axes, "power of z^-1"],
         ),
         "position_numerator": one(
-            np.stack([np.broadcast_to(x, shape) for x in estimator.position], axis=2), "1",
-            "second section, numerator of the position", [*each_axes, "power of z^-1"],
+            np.stack([np.broadcast_to(x, shape) for x in estimator.position], axis=2),
+            "1",
+            "second section, numerator of the position",
+            [*each_axes, "power of z^-1"],
         ),
         "position_direct": each(estimator.direct, "1", "share of the signal in the position"),
-        "velocity_gain": each(
-            controller.velocity_gain, on_rate, "k_d, masks and factors put in"
-        ),
+        "velocity_gain": each(controller.velocity_gain, on_rate, "k_d, masks and factors put in"),
         "position_gain": each(
             _position_gain(controller), on_value, "k_p, masks and factors put in"
         ),
-        **({} if controller.rival_omega is None else {
-            "rival_frequency": each(
-                controller.rival_omega, "rad/s", "above 0: of the channels of a link with one only "
-                "those of highest energy act, (rival_frequency position)^2 + velocity^2",
-            )
-        }),
+        **(
+            {}
+            if controller.rival_omega is None
+            else {
+                "rival_frequency": each(
+                    controller.rival_omega,
+                    "rad/s",
+                    "above 0: of the channels of a link with one only "
+                    "those of highest energy act, (rival_frequency position)^2 + velocity^2",
+                )
+            }
+        ),
         "synthesizer": one(
-            controller.synthesizer, from_force, "voltages of a channel's force",
+            controller.synthesizer,
+            from_force,
+            "voltages of a channel's force",
             [_LINK, _PATCH, channel],
         ),
         "voltage_limit": one(controller.voltage_limit, "V", "of every actuator, +-"),
         "shaper_weight": one(found.taps.weight, "1", "of each tap of the input shaper", ["tap"]),
-        "shaper_delay": one(
-            found.taps.sample.astype(float), "1", "of each tap [samples]", ["tap"]
-        ),
-    }  # fmt: skip
+        "shaper_delay": one(found.taps.sample.astype(float), "1", "of each tap [samples]", ["tap"]),
+    }
 
 
 def controller_of(document: Document) -> tuple[Controller, Taps]:
@@ -231,15 +244,16 @@ def controller_of(document: Document) -> tuple[Controller, Taps]:
         adc_top=number["adc_top"],
         adc_noise=np.zeros(()),
         rival_omega=number.get("rival_frequency"),
-    )  # fmt: skip
+    )
     return controller, Taps(number["shaper_weight"], number["shaper_delay"].astype(int))
 
 
 def schema() -> dict[str, Any]:
     """JSON schema (2020-12) of a document."""
     return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema", **Document.model_json_schema()
-    }  # fmt: skip
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **Document.model_json_schema(),
+    }
 
 
 def to_json(part: Document) -> str:

@@ -138,10 +138,12 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
     check_words(found)
     if channels.energy is not None and np.any(controller.feedthrough):
         raise field_error(
-            "control.feedthrough_factor", found.study.control.feedthrough_factor,
+            "control.feedthrough_factor",
+            found.study.control.feedthrough_factor,
             "0 for fixed point with a law whose channels act one at a time (or --target c): "
-            "what a switch brings back by feed-through has no bound", "1",
-        )  # fmt: skip
+            "what a switch brings back by feed-through has no bound",
+            "1",
+        )
     rest = 2 ** (dac_bits - 1)
     dac_step = float(controller.voltage_limit) / (rest - 1)
     memory = channels.memory(FORGOTTEN)
@@ -188,15 +190,13 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
             np.stack([one * high.step / inner.step, *-channels.denominator.T], 1),
             "low-pass",
         ),
-        numerator=_row(
-            np.column_stack([tap, channels.direct * signal.step / force.step]), "gains"
-        ),
+        numerator=_row(np.column_stack([tap, channels.direct * signal.step / force.step]), "gains"),
         synthesizer=_row(back * force.step / dac_step, "synthesizer"),
         feedthrough=through,
         is_rival=channels.is_rival,
         energy=_energy(channels, bound, inner, signal, memory),
         error=ErrorBound(*np.zeros((3, 3, found.n_patches))),
-    )  # fmt: skip
+    )
     error = _error_bound(found, fixed, gains, memory)
     _check_error(found, error, dac_step)
     return fixed._replace(error=error)
@@ -211,19 +211,23 @@ def check_words(found: FixedController) -> None:
     electronics = found.study.electronics
     if electronics.adc_bits > ADC_BITS:
         raise field_error(
-            "electronics.adc_bits", electronics.adc_bits, f"up to {ADC_BITS} for fixed point: "
-            "codes are 16-bit words (or --target c)", "1",
-        )  # fmt: skip
+            "electronics.adc_bits",
+            electronics.adc_bits,
+            f"up to {ADC_BITS} for fixed point: codes are 16-bit words (or --target c)",
+            "1",
+        )
     slowest = 1 + np.log(FORGOTTEN) / LONGEST_MEMORY  # pole that forgets just in time
     if found.channels.slowest_pole > slowest:
         rate = electronics.sample_rate_hz
         lowest = -np.log(slowest) * rate / (2 * np.pi)
         raise field_error(
-            "electronics.highpass_hz", electronics.highpass_hz,
+            "electronics.highpass_hz",
+            electronics.highpass_hz,
             f"from {lowest:.3g} for fixed point at electronics.sample_rate_hz = {rate:g}: a filter "
             f"with its pole at {found.channels.slowest_pole:.12g} keeps rounding errors for too "
-            "long (or --target c)", "Hz",
-        )  # fmt: skip
+            "long (or --target c)",
+            "Hz",
+        )
 
 
 def _energy(
@@ -348,10 +352,12 @@ def _error_bound(found: FixedController, fixed: FixedPoint, gains: Gains, n: int
     force = force + 2 * half * fixed.high.step * gains.force_of_high
     force = force + half * fixed.inner.step * gains.force_of_inner
     size, volts = np.abs(exact.synthesizer), _sensor_bound(found.controller)[exact.link]
-    change = np.array([
-        np.abs(_responses(near, m, n)[2] - _responses(exact, m, n)[2]).sum()
-        for m in range(len(exact.link))
-    ])  # fmt: skip
+    change = np.array(
+        [
+            np.abs(_responses(near, m, n)[2] - _responses(exact, m, n)[2]).sum()
+            for m in range(len(exact.link))
+        ]
+    )
     signal = np.sum(np.abs(exact.filter) * volts, axis=1)
     moved = np.sum(np.abs(near.filter - exact.filter) * volts, axis=1)
     wrong = signal * change + moved * gains.force

@@ -61,10 +61,12 @@ def judged(found: FixedController, channels: Channels, note: str) -> LoopReport:
         if loop.gain_margin == 0:
             way = "smaller ones do not help either: see studies simulate and docs/theory.md"
         raise field_error(
-            "control.gain_factor", factor,
+            "control.gain_factor",
+            factor,
             f"gains whose sampled loop is stable{note}: its spectral radius is "
-            f"{loop.spectral_radius:.6f}, its gain margin {loop.gain_margin:.3g} ({way})", "1",
-        )  # fmt: skip
+            f"{loop.spectral_radius:.6f}, its gain margin {loop.gain_margin:.3g} ({way})",
+            "1",
+        )
     return loop
 
 
@@ -95,9 +97,11 @@ def _check_clipping(found: FixedController, run: LoopRun) -> None:
             if length.max() >= rail:
                 link, patch = np.unravel_index(np.argmax(length), length.shape)
                 raise field_error(
-                    "electronics.conditioner_gain", electronics.conditioner_gain,
+                    "electronics.conditioner_gain",
+                    electronics.conditioner_gain,
                     f"so small that the motion does not hold sensor {patch + 1} of link {link + 1} "
                     f"at an end of the ADC's range for {1e3 * rail / electronics.sample_rate_hz:g} "
                     f"ms, as until t = {k / electronics.sample_rate_hz:.4g} s: that is taken for a "
-                    "broken sensor (see electronics.conditioner_bias, too)", "1",
-                )  # fmt: skip
+                    "broken sensor (see electronics.conditioner_bias, too)",
+                    "1",
+                )

@@ -30,9 +30,14 @@ DAC_BITS = 12
 
 
 def export_design(
-    design: Design, target: str, out: Path, is_verified: bool | None = None,
-    name: str = "flexlink", dac_bits: int | None = None, console: Console | None = None,
-) -> bool:  # fmt: skip
+    design: Design,
+    target: str,
+    out: Path,
+    is_verified: bool | None = None,
+    name: str = "flexlink",
+    dac_bits: int | None = None,
+    console: Console | None = None,
+) -> bool:
     """Write a controller, verified where asked for.
 
     Args:
@@ -65,9 +70,15 @@ def export_design(
 
     found = fixed_controller(design.study)
     job = Job(
-        found, name, _origin(found, design.case_id), design.case_id, compiler, is_verified,
-        dac_bits or DAC_BITS, console,
-    )  # fmt: skip
+        found,
+        name,
+        _origin(found, design.case_id),
+        design.case_id,
+        compiler,
+        is_verified,
+        dac_bits or DAC_BITS,
+        console,
+    )
     made = TARGETS[target].make(job)
     verified = made.verified
     is_good = verified is None or verified.is_passed

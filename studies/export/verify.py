@@ -98,20 +98,25 @@ def verify_document(found: FixedController, reference: LoopRun, document: Docume
     channels = fold(controller, LAWS[document.law].channel)
     checks = [
         _compare(
-            f"open loop, {name}", respond_floating(channels, controller, codes).command,
-            _replayed(found, codes), DOUBLE,
+            f"open loop, {name}",
+            respond_floating(channels, controller, codes).command,
+            _replayed(found, codes),
+            DOUBLE,
         )
         for name, codes in {"recorded codes": reference.codes, **_hard(found, reference)}.items()
-    ]  # fmt: skip
+    ]
     path, shaped = _references(found)
     checks.append(_compare("shaper, the case's motion", _shaped(taps, path), shaped, DOUBLE))
     return Verification(checks, [], {"JAX": reference}, {})
 
 
 def verify_floating(
-    found: FixedController, reference: LoopRun, source: Source, name: str,
+    found: FixedController,
+    reference: LoopRun,
+    source: Source,
+    name: str,
     compiler: list[str],
-) -> Verification:  # fmt: skip
+) -> Verification:
     """C in double and single precision against the JAX controller."""
     checks, runs = [], {"JAX": reference}
     with _loaded(found, source, name, compiler, np.float64, np.float64) as code:
@@ -142,9 +147,13 @@ def verify_floating(
 
 
 def verify_fixed(
-    found: FixedController, fixed: FixedPoint, reference: LoopRun,
-    source: Source, name: str, compiler: list[str],
-) -> Verification:  # fmt: skip
+    found: FixedController,
+    fixed: FixedPoint,
+    reference: LoopRun,
+    source: Source,
+    name: str,
+    compiler: list[str],
+) -> Verification:
     """C in fixed point against its integer model, bit by bit, and against the JAX controller."""
     rail = rail_samples(found.study.electronics.sample_rate_hz)
     checks, runs = [], {"JAX": reference}
@@ -160,21 +169,26 @@ def verify_fixed(
         code.begin()
         runs["C, fixed point"] = own = run_in_the_loop(found.structure, found.case, in_volts)
         sequences = {
-            "recorded codes": reference.codes, "own run in the loop": own.codes,
+            "recorded codes": reference.codes,
+            "own run in the loop": own.codes,
             **_hard(found, reference),
             "stuck at the end of the range": _stuck(found, reference),
             "words beyond the ADC's codes": np.random.default_rng(1).integers(
                 0, 2**16, (50, *shape)
             ),
-        }  # fmt: skip
+        }
         counts = _modelled(fixed, sequences, rail)
         for label, codes in sequences.items():
             given, _ = code.respond(codes)
             differing = int(np.sum(given != counts[label].codes))
             checks.append(
-                Check(f"bit by bit, {label}", f"{differing} of {given.size} codes differ", "0",
-                      differing == 0)
-            )  # fmt: skip
+                Check(
+                    f"bit by bit, {label}",
+                    f"{differing} of {given.size} codes differ",
+                    "0",
+                    differing == 0,
+                )
+            )
         # a 16-bit word can be no higher than the highest code of such an ADC
         bad = {"beyond the range": fixed.adc_top + 1.0} if fixed.adc_top < 2**16 - 1 else {}
         checks += _faults(found, code, reference, bad, 1.0, float(fixed.dac_rest))
@@ -204,9 +218,13 @@ def _modelled(
 
 
 def _loaded(
-    found: FixedController, source: Source, name: str, compiler: list[str],
-    real: type, reference: type,
-) -> AbstractContextManager[Code]:  # fmt: skip
+    found: FixedController,
+    source: Source,
+    name: str,
+    compiler: list[str],
+    real: type,
+    reference: type,
+) -> AbstractContextManager[Code]:
     sizes = (3 * found.n_patches, len(found.channels.link), int(found.taps.sample.max()) + 1)
     return compiled(source, name, compiler, real, reference, sizes)
 
@@ -235,9 +253,14 @@ def _stuck(found: FixedController, reference: LoopRun) -> np.ndarray:
 
 
 def _faults(
-    found: FixedController, code: Code, reference: LoopRun, bad: dict[str, float], scale: float,
-    rest: float, note: str = "",
-) -> list[Check]:  # fmt: skip
+    found: FixedController,
+    code: Code,
+    reference: LoopRun,
+    bad: dict[str, float],
+    scale: float,
+    rest: float,
+    note: str = "",
+) -> list[Check]:
     """A faulty sensor must be named, and all actuators at rest from then on.
 
     Args:
@@ -315,9 +338,11 @@ def _check_shaper(found: FixedController, code: Code) -> Check:
     off = np.abs(given / scale - shaped).max() * scale
     # half a count of the reference, half of the result, and what JAX's path differs by
     return Check(
-        "shaper, the case's motion", f"{differing} counts differ, {off:.2f} counts from JAX's",
-        "0, 1.1", bool(differing == 0 and off <= 1.1),
-    )  # fmt: skip
+        "shaper, the case's motion",
+        f"{differing} counts differ, {off:.2f} counts from JAX's",
+        "0, 1.1",
+        bool(differing == 0 and off <= 1.1),
+    )
 
 
 def _check_error(
@@ -335,8 +360,10 @@ def _check_error(
         share = float(np.mean(is_other))
         return Check(
             "open loop against JAX, recorded codes: samples in which another mode is served",
-            f"{100 * share:.2g} %", f"{100 * OTHER_MODE:g} %, equal energies", share <= OTHER_MODE,
-        )  # fmt: skip
+            f"{100 * share:.2g} %",
+            f"{100 * OTHER_MODE:g} %, equal energies",
+            share <= OTHER_MODE,
+        )
     difference = each.max(axis=0)
     bound, reason = fixed.error.total, "rounding of the DAC, and inside"
     peak = np.abs(reference.voltage).max()
@@ -347,9 +374,11 @@ def _check_error(
         reason = "1 % and two steps of the DAC: its rounding comes back by feed-through"
     worst = np.unravel_index(np.argmax(difference / bound), bound.shape)
     return Check(
-        "open loop against JAX, recorded codes", f"{difference[worst]:.4g} V",
-        f"{bound[worst]:.4g} V: {reason}", bool(np.all(difference <= bound * (1 + 1e-9))),
-    )  # fmt: skip
+        "open loop against JAX, recorded codes",
+        f"{difference[worst]:.4g} V",
+        f"{bound[worst]:.4g} V: {reason}",
+        bool(np.all(difference <= bound * (1 + 1e-9))),
+    )
 
 
 def _same_status(runs: dict[str, LoopRun]) -> list[Check]:

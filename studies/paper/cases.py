@@ -136,7 +136,9 @@ def paper_cases(gain_factor: float) -> list[PaperCase]:
     fast = partial(PaperCase, move="fast", shaper="none", modes=3, links=ALL)
     on += [
         fast(
-            "damped-links123", ratio_from="own run", gain_factor=gain_factor,
+            "damped-links123",
+            ratio_from="own run",
+            gain_factor=gain_factor,
             damping_ratio=HIGH_DAMPING,
         ),
         fast("weak", ratio_from="own run", gain_factor=0.01),
@@ -145,7 +147,7 @@ def paper_cases(gain_factor: float) -> list[PaperCase]:
         fast("paper-preset", ratio_from="paper (26)", gain_factor=1.0),
         fast("difference", ratio_from="paper (26)", gain_factor=1.0, estimator="difference"),
         fast("ideal", ratio_from="paper (26)", gain_factor=1.0, feedback="ideal"),
-    ]  # fmt: skip
+    ]
     return off + on
 
 

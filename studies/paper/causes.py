@@ -93,21 +93,37 @@ def variants(context: Context) -> list[str]:
         if loop is not None:
             margin = f"{loop.gain_margin:.3g}, {loop.spectral_radius:.5f}"
             zeta = ", ".join(f"{z:.3f}" for z in loop.damping_ratio.min(axis=1))
-        rows.append([
-            f"`{case.name}`", case.feedback, case.estimator, f"{case.gain_factor:g}",
-            case.ratio_from, describe(int(runs.status[k])), margin, zeta,
-            ", ".join(context.drop(k, mode=1)),
-            f"{1e6 * measures.late_deflection[k].max():.3g}",
-            f"{runs.result.metrics.peak_voltage[k].max():.3g}",
-        ])  # fmt: skip
+        rows.append(
+            [
+                f"`{case.name}`",
+                case.feedback,
+                case.estimator,
+                f"{case.gain_factor:g}",
+                case.ratio_from,
+                describe(int(runs.status[k])),
+                margin,
+                zeta,
+                ", ".join(context.drop(k, mode=1)),
+                f"{1e6 * measures.late_deflection[k].max():.3g}",
+                f"{runs.result.metrics.peak_voltage[k].max():.3g}",
+            ]
+        )
     return [
         "## Other designs: three links, three modes, fast move without shaper",
         "",
         *table(
             (
-                "case", "feedback", "velocity", "factor", "ratios", "status",
-                "gain margin, spectral radius", "damping of modes 1, 2, 3", "PSD peak of mode 1",
-                "late rms [µm]", "peak voltage [V]",
+                "case",
+                "feedback",
+                "velocity",
+                "factor",
+                "ratios",
+                "status",
+                "gain margin, spectral radius",
+                "damping of modes 1, 2, 3",
+                "PSD peak of mode 1",
+                "late rms [µm]",
+                "peak voltage [V]",
             ),
             rows,
         ),
@@ -115,7 +131,7 @@ def variants(context: Context) -> list[str]:
         "Margin, radius and damping are those of the linearised sampled loop at home. A loop that "
         "it finds unstable counts as unstable even where saturation keeps the run bounded; cases "
         "that are not judged have the status of their run.",
-    ]  # fmt: skip
+    ]
 
 
 def differences(context: Context) -> list[str]:

@@ -68,9 +68,12 @@ def _responses(
         axes[-1, column].set_xlabel("time [s]")
         for row, label in enumerate(labels):
             figures.comparison(
-                time, signal[off, :, row] / unit, signal[on, :, row] / unit,
-                label if column == 0 else "", axes[row, column],
-            )  # fmt: skip
+                time,
+                signal[off, :, row] / unit,
+                signal[on, :, row] / unit,
+                label if column == 0 else "",
+                axes[row, column],
+            )
     figures.legend_above(figure, axes[0, 0])
     return figure, axes
 
@@ -86,9 +89,13 @@ def _with_views(
         for row in range(len(labels)):
             limit = 1.5 * _left_over(runs, (off, on), signal[..., row]) / unit
             figures.magnified(
-                time, signal[off, :, row] / unit, signal[on, :, row] / unit,
-                (begin, begin + VIEW_LENGTH), limit, axes[row, column],
-            )  # fmt: skip
+                time,
+                signal[off, :, row] / unit,
+                signal[on, :, row] / unit,
+                (begin, begin + VIEW_LENGTH),
+                limit,
+                axes[row, column],
+            )
     return figure
 
 
@@ -160,11 +167,13 @@ def _spectra(
         for i in range(3):
             density = measures.spectral_density[:, i, mode - 1, shown]
             figures.spectrum(
-                measures.frequency[shown], density[off], None if links is None else density[on],
+                measures.frequency[shown],
+                density[off],
+                None if links is None else density[on],
                 float(runs.frame.modal_omega[i, mode - 1] / (2 * np.pi)),
                 f"link {i + 1}: PSD of\nmode {mode} [m²/Hz]" if column == 0 else "",
                 axes[i, column],
-            )  # fmt: skip
+            )
             _limit_decades(axes[i, column], density[[off, on], 2:])
     figures.legend_above(figure, axes[0, 0])
     return figure
@@ -206,9 +215,12 @@ def _shapers(runs: PaperRuns, measures: Measures) -> Figure:
         part = (time >= begin) & (time <= begin + VIEW_LENGTH)
         deflection = runs.record.chord_deflection_stations[case, part, 0, station]
         axes[1, 0].plot(
-            time[part] - begin, deflection / 1e-6, color=figures.SERIES[1 - k],
-            linewidth=1.5 - 0.5 * k, label={"none": "no shaper", "ei": "EI shaper"}[kind],
-        )  # fmt: skip
+            time[part] - begin,
+            deflection / 1e-6,
+            color=figures.SERIES[1 - k],
+            linewidth=1.5 - 0.5 * k,
+            label={"none": "no shaper", "ei": "EI shaper"}[kind],
+        )
     axes[1, 0].set_xlabel("time after the command [s]")
     axes[1, 0].set_ylabel("link 1: deflection\nat 150 mm [µm]")
     axes[1, 0].legend()

@@ -260,8 +260,11 @@ def _settling(context: Context) -> list[str]:
         "",
         *table(
             (
-                "", f"to {1e6 * band:g} µm [ms]", f"to {100 * SETTLED:g} % [ms]",
-                "residual rms [µm]", "late rms [µm]",
+                "",
+                f"to {1e6 * band:g} µm [ms]",
+                f"to {100 * SETTLED:g} % [ms]",
+                "residual rms [µm]",
+                "late rms [µm]",
             ),
             rows,
         ),
@@ -273,7 +276,7 @@ def _settling(context: Context) -> list[str]:
         "settles.",
         "",
         *_window_words(context, [(off, on, text) for off, on, text in pairs]),
-    ]  # fmt: skip
+    ]
 
 
 def _window_words(context: Context, pairs: list[tuple[int, int, str]]) -> list[str]:

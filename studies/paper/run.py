@@ -25,7 +25,7 @@ from studies.paper.cases import (
     paper_cases,
     run_cases,
     work_of,
-)  # fmt: skip
+)
 from studies.paper.figures import PAPER_FIGURES, draw_figure
 from studies.paper.measures import Measures, measure, middle_station
 from studies.paper.report import report
@@ -200,20 +200,28 @@ def _measured(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
             runs.ratio, modal, "1", "gain of a mode over that of mode 1 (24); 0 without control"
         ),
         "energy_ratio": Variable(
-            np.array([row.ratio for row in rows]), ("energy_run", *modal[1:]), "1",
+            np.array([row.ratio for row in rows]),
+            ("energy_run", *modal[1:]),
+            "1",
             "ratios (24) from the modal energies of an uncontrolled run",
         ),
         "energy_run": Variable(
-            np.array([f"{r.move}-{r.shaper}-{r.basis}" for r in rows]), ("energy_run",), "1",
+            np.array([f"{r.move}-{r.shaper}-{r.basis}" for r in rows]),
+            ("energy_run",),
+            "1",
             "move, shaper and modal coordinates of energy_ratio",
         ),
         "spectral_density": Variable(
-            _separated(runs, measures.spectral_density), (*modal, "frequency"), "m2/Hz",
+            _separated(runs, measures.spectral_density),
+            (*modal, "frequency"),
+            "m2/Hz",
             "one-sided power spectral density of the controller's modes, Hann periodogram of the "
             "run",
         ),
         "spectral_peak": Variable(
-            _separated(runs, measures.spectral_peak), modal, "m2/Hz",
+            _separated(runs, measures.spectral_peak),
+            modal,
+            "m2/Hz",
             "largest spectral density near the mode's frequency",
         ),
         "late_start": Variable(measures.late_start, ("case",), "s", "begin of the late window"),
@@ -221,14 +229,18 @@ def _measured(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
             measures.late_deflection, modal[:2], "m", "rms mid-span deflection in the late window"
         ),
         "late_pose_error_rms": Variable(
-            measures.late_pose_error, ("case", "pose_axis"), "m; m; rad",
+            measures.late_pose_error,
+            ("case", "pose_axis"),
+            "m; m; rad",
             "rms pose error in the late window",
         ),
         "relative_settling_time": Variable(
-            measures.settling, modal[:2], "s",
+            measures.settling,
+            modal[:2],
+            "s",
             "from the command's end to 5 % of the residual peak without control",
         ),
-    }  # fmt: skip
+    }
 
 
 def _separated(runs: PaperRuns, values: np.ndarray) -> np.ndarray:
@@ -246,18 +258,24 @@ def _trajectories(runs: PaperRuns) -> dict[str, Variable]:
     modal = np.moveaxis(_separated(runs, np.moveaxis(record.controlled_coordinate, 1, -1)), -1, 1)
     return {
         "chord_deflection": Variable(
-            deflection[..., middle_station(runs)], (*series, "link"), "m",
+            deflection[..., middle_station(runs)],
+            (*series, "link"),
+            "m",
             "deflection of mid-span from the chord B-C",
         ),
         "chord_deflection_stations": Variable(
-            deflection, (*series, "link", "station"), "m",
+            deflection,
+            (*series, "link", "station"),
+            "m",
             "deflection relative to the chord B-C at the stations",
         ),
         "pose_error": Variable(
             record.pose_error, (*series, "pose_axis"), "m; m; rad", "pose minus shaped command"
         ),
         "controlled_coordinate": Variable(
-            modal, (*series, "link", "controlled_mode"), "m",
+            modal,
+            (*series, "link", "controlled_mode"),
+            "m",
             "controller's modes seen by an ideal modal filter",
         ),
         "sensor_voltage": Variable(
@@ -266,7 +284,7 @@ def _trajectories(runs: PaperRuns) -> dict[str, Variable]:
         "actuator_voltage": Variable(
             record.actuator_voltage, (*series, "link", "patch"), "V", "actuator voltage"
         ),
-    }  # fmt: skip
+    }
 
 
 def _loops(runs: PaperRuns) -> dict[str, Variable]:

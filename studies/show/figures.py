@@ -111,9 +111,13 @@ def traces(
     ax = axes_or_new(ax)
     for k, curve in enumerate(values.T):
         ax.plot(
-            time, curve, color=SERIES[k % len(SERIES)], linestyle=DASHES[k % len(DASHES)],
-            linewidth=0.9, label=names[k] if names else None,
-        )  # fmt: skip
+            time,
+            curve,
+            color=SERIES[k % len(SERIES)],
+            linestyle=DASHES[k % len(DASHES)],
+            linewidth=0.9,
+            label=names[k] if names else None,
+        )
     ax.set_ylabel(label)
     ax.margins(x=0.01)
     return ax

@@ -99,20 +99,28 @@ def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str]) -> str:
         return [picture(_figure(out, name), FIGURES[name]), ""]
 
     lines = [
-        f"# {literal(run.study.title) or 'study'}: one run", "",
+        f"# {literal(run.study.title) or 'study'}: one run",
+        "",
         *opening(_asked(run), _came_out(run, twin, notes), _next(run, twin)),
         *shown("machine"),
-        "## Links", "",
-        *_links(run, twin), "",
-        f"Over time; dotted: the end of the shaped command at {round(end, 9):.4g} s.", "",
+        "## Links",
+        "",
+        *_links(run, twin),
+        "",
+        f"Over time; dotted: the end of the shaped command at {round(end, 9):.4g} s.",
+        "",
         *shown("deflection"),
-        "## Platform", "",
-        *_platform(run), "",
+        "## Platform",
+        "",
+        *_platform(run),
+        "",
         *shown("error"),
-        "## Control loop", "",
-        *_loop(run), "",
+        "## Control loop",
+        "",
+        *_loop(run),
+        "",
         *shown("voltage"),
-    ]  # fmt: skip
+    ]
     return "\n".join(lines)
 
 
@@ -138,10 +146,11 @@ def motion_text(study: Study) -> str:
     blows = [
         f"a pulse of {max(map(abs, force)):.4g} {unit} on the {where}"
         for force, unit, where in (
-            (drive.pulse_force, "N", "sliders"), (load.pulse, "N or N m", "platform"),
+            (drive.pulse_force, "N", "sliders"),
+            (load.pulse, "N or N m", "platform"),
         )
         if any(force)
-    ]  # fmt: skip
+    ]
     if drive.ripple:
         blows.append(f"force ripple of {drive.ripple:g} N rms")
     if any(study.initial.load_deflection) or any(map(any, study.initial.modal)):
@@ -232,14 +241,16 @@ def _links(run: Run, twin: Run | None) -> list[str]:
     metrics, own = run.result.metrics, run.study.metrics
     rows = [
         [
-            str(i + 1), f"{1e6 * metrics.residual_rms[i].max():.4g}",
+            str(i + 1),
+            f"{1e6 * metrics.residual_rms[i].max():.4g}",
             f"{1e6 * metrics.residual_peak[i].max():.4g}",
             f"{1e6 * metrics.structural_peak[i].max():.4g}",
-            settling_text(run, i), f"{metrics.peak_voltage[i]:.4g}",
+            settling_text(run, i),
+            f"{metrics.peak_voltage[i]:.4g}",
             f"{metrics.peak_force[i]:.4g}",
         ]
         for i in range(3)
-    ]  # fmt: skip
+    ]
     more: tuple[str, ...] = ()
     told = ""
     if twin is not None:
@@ -250,16 +261,23 @@ def _links(run: Run, twin: Run | None) -> list[str]:
             told = f" Without control the run ends early: {describe(twin.status)}."
     stations = ", ".join(f"{1e3 * x:g}" for x in own.stations)
     heads = (
-        "link", "residual rms [µm]", *more, "residual peak [µm]", "peak while moving [µm]",
-        "settling time [ms]", "peak voltage [V]", "peak motor force [N]",
-    )  # fmt: skip
+        "link",
+        "residual rms [µm]",
+        *more,
+        "residual peak [µm]",
+        "peak while moving [µm]",
+        "settling time [ms]",
+        "peak voltage [V]",
+        "peak motor force [N]",
+    )
     return [
         f"Deflections: the largest of the stations at {stations} mm. Residual window: "
         f"{own.residual_length:g} s, from {own.residual_delay:g} s after the shaped command. "
         f"Settled: within {1e6 * own.settling_band:g} µm from then to the end of the run, "
-        f"{1e3 * _watched(run):.4g} ms after the shaped command.{told}", "",
+        f"{1e3 * _watched(run):.4g} ms after the shaped command.{told}",
+        "",
         *table(heads, rows),
-    ]  # fmt: skip
+    ]
 
 
 def _watched(run: Run) -> float:
@@ -285,11 +303,12 @@ def _platform(run: Run) -> list[str]:
         "stretching by N L/(E A) would add. "
         f"Largest tension in a link {np.max(metrics.peak_tension):.4g} N, largest compression "
         f"{np.max(metrics.peak_compression):.4g} N (a bare link buckles at {np.min(critical):.4g} "
-        "N).", "",
+        "N).",
+        "",
         *table(
             ("", "largest while moving", "rms in the residual window", "stretch of the links"), rows
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _loop(run: Run) -> list[str]:
@@ -308,12 +327,14 @@ def _loop(run: Run) -> list[str]:
         for k, (frequency, zeta) in enumerate(modes)
     ]
     return [
-        *lines, "",
+        *lines,
+        "",
         f"Linearised at the first pose: gain margin {margin_text(run.loop.gain_margin)}, spectral "
         f"radius {run.loop.spectral_radius:.6f}. {_motion(run)}The lowest modes of the links with "
-        "control, three of each order:", "",
+        "control, three of each order:",
+        "",
         *table(("order", "frequencies [Hz]", "damping ratios [1]"), rows),
-    ]  # fmt: skip
+    ]
 
 
 def _motion(run: Run) -> str:

@@ -38,9 +38,13 @@ def sketch(study: Study) -> Figure:
     for i, start in enumerate(slider):
         away = (start - joint.mean(axis=0)) / np.linalg.norm(start - joint.mean(axis=0))
         ax.annotate(
-            str(i + 1), 1e3 * start, 12 * away, textcoords="offset points", ha="center",
+            str(i + 1),
+            1e3 * start,
+            12 * away,
+            textcoords="offset points",
+            ha="center",
             va="center",
-        )  # fmt: skip
+        )
     _path(ax, study, pose)
     if study.load.mass:
         turn = np.array([[np.cos(pose[2]), -np.sin(pose[2])], [np.sin(pose[2]), np.cos(pose[2])]])
@@ -91,9 +95,12 @@ def _link(ax: Axes, study: Study, i: int, start: np.ndarray, end: np.ndarray) ->
         half = each_link(study.patches.actuator_length)[i] / 2
         places = [start + (end - start) * (center + x) / length for x in (-half, half)]
         ax.plot(
-            *(1e3 * np.stack(places, axis=1)), color=PATCH, linewidth=5, zorder=3,
+            *(1e3 * np.stack(places, axis=1)),
+            color=PATCH,
+            linewidth=5,
+            zorder=3,
             solid_capstyle="butt",
-        )  # fmt: skip
+        )
 
 
 def _path(ax: Axes, study: Study, pose: np.ndarray) -> None:

@@ -352,9 +352,11 @@ class _Room:
         self.play = end - taken
         if self.free == 0 or self.play < 0:
             raise field_error(
-                path, f"{count} patches of {self.size:g} m",
-                f"patches that fit on link.length = {self.length:g}, two or more if mirrored", "m",
-            )  # fmt: skip
+                path,
+                f"{count} patches of {self.size:g} m",
+                f"patches that fit on link.length = {self.length:g}, two or more if mirrored",
+                "m",
+            )
 
     def place(self, u: np.ndarray) -> np.ndarray:
         """Points of the unit cube (n, free) to placements (n, count), uniform where they fit."""

@@ -107,9 +107,13 @@ def sobol_indices(value: np.ndarray, dimensions: int, seed: int = 0) -> Indices:
     low, high = np.nanpercentile(resampled, (tail, 100 - tail), axis=0)
     first, total = _indices(used)
     return Indices(
-        first, np.stack([low[0], high[0]], axis=1), total, np.stack([low[1], high[1]], axis=1),
-        len(used), len(rows) - len(used),
-    )  # fmt: skip
+        first,
+        np.stack([low[0], high[0]], axis=1),
+        total,
+        np.stack([low[1], high[1]], axis=1),
+        len(used),
+        len(rows) - len(used),
+    )
 
 
 def _indices(rows: np.ndarray) -> np.ndarray:

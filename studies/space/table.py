@@ -84,8 +84,9 @@ def build_table(spec: SweepSpec) -> Table:
     n = length(columns)
     kept = np.arange(n)
     if spec.sweep.where:
-        truth = evaluate(spec.sweep.where, lambda name: values(spec.study, columns, name),
-                         "sweep.where")  # fmt: skip
+        truth = evaluate(
+            spec.sweep.where, lambda name: values(spec.study, columns, name), "sweep.where"
+        )
         kept = np.flatnonzero(np.broadcast_to(truth, (n,)))
     if len(kept) == 0:
         raise StudyError(f"sweep.where = {spec.sweep.where!r}: true for none of {n} cases")

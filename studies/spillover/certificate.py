@@ -169,7 +169,19 @@ def _collected(
         observation[at] = leakage.observation[:, :channels]
         actuation[at] = leakage.actuation[:, :, :channels]
     return Certificate(
-        found.study, margin, found.structure.n_controlled, plants, exists, radius, limit,
-        frequency, zeta, free, weakest.astype(str), breaking.astype(str), observation, actuation,
+        found.study,
+        margin,
+        found.structure.n_controlled,
+        plants,
+        exists,
+        radius,
+        limit,
+        frequency,
+        zeta,
+        free,
+        weakest.astype(str),
+        breaking.astype(str),
+        observation,
+        actuation,
         tuple(dict.fromkeys(f"left out: {fault}" for fault in faults.ravel() if fault)),
-    )  # fmt: skip
+    )

@@ -194,7 +194,11 @@ def _made_fast(study: Study) -> Study:
         time = max(FAST[1] * np.sqrt(distance / FAST[0]), 1e-3)
     moving = time if len(points) > 1 else 0.0
     return study.change(
-        motion__waypoints=points, motion__move_time=float(time), motion__dwell=0.0,
-        shaper__kind="none", metrics__residual_delay=SETTLING, metrics__residual_length=WINDOW,
+        motion__waypoints=points,
+        motion__move_time=float(time),
+        motion__dwell=0.0,
+        shaper__kind="none",
+        metrics__residual_delay=SETTLING,
+        metrics__residual_length=WINDOW,
         run__duration=moving + SETTLING + WINDOW + 0.01,
-    )  # fmt: skip
+    )

@@ -41,17 +41,23 @@ def judge(loop: SampledLoop) -> Judgement:
     frequency, zeta = damping(loop, tracked)
     free = np.pad(
         -loop.mode_poles.real / np.abs(loop.mode_poles),
-        ((0, loop.n_modes - len(loop.mode_poles)), (0, 0)), constant_values=np.nan,
-    )  # fmt: skip
+        ((0, loop.n_modes - len(loop.mode_poles)), (0, 0)),
+        constant_values=np.nan,
+    )
     weakest = ""
     if not np.all(np.isnan(zeta)):
         at = np.unravel_index(np.nanargmin(zeta), zeta.shape)
         weakest = name_motion(loop, 1.0, tracked[at])
     margin = gain_margin(poles, STEPS)
     return Judgement(
-        float(np.abs(poles(1.0)).max()), margin, frequency, zeta, free, weakest,
+        float(np.abs(poles(1.0)).max()),
+        margin,
+        frequency,
+        zeta,
+        free,
+        weakest,
         breaking_motion(loop, margin),
-    )  # fmt: skip
+    )
 
 
 def worst_of(parts: list[tuple[slice, Judgement]]) -> Judgement:

@@ -68,17 +68,19 @@ def all_laws(found: FixedController, maker: LoopMaker, plant: Plant) -> list[Can
     wanted = strength(given if np.any(given.velocity_gain) else modal)
     if not np.any(wanted > 0) or np.any(wanted < 0):
         raise field_error(
-            "control.velocity_gain", control.velocity_gain,
+            "control.velocity_gain",
+            control.velocity_gain,
             "with control.ratios and control.mode_mask, gains that damp mode 1, to compare laws of "
             "equal strength",
-        )  # fmt: skip
+        )
     if modal is not given:
         has = strength(modal)
         if np.any((wanted > 0) & (has == 0)):
             raise field_error(
-                "control.ratios", control.ratios,
+                "control.ratios",
+                control.ratios,
                 "with control.mode_mask, mode 1 on, to compare with IMSC of equal strength",
-            )  # fmt: skip
+            )
         modal = _scaled(modal, wanted, has)
 
     def as_strong(law: Law) -> Controller:
@@ -129,9 +131,10 @@ def _designed(found: FixedController, law: Law, modal: Controller | None = None)
         modal: modal control that it is to be as strong as; None: with the study's own settings.
     """
     structure = found.structure._replace(
-        law=law.name, n_steps=1,
+        law=law.name,
+        n_steps=1,
         has_position_gain=law.has_position or found.structure.has_position_gain,
-    )  # fmt: skip
+    )
     control = found.case.control._replace(parameters=law_parameters(found.study, law))
     gains = None
     if modal is not None:

@@ -59,9 +59,11 @@ def patch_lengths(lengths: tuple[float, ...]) -> tuple[Departure, ...]:
 #: What may be otherwise: patches, the links' stiffness, the joints (none, and as was measured).
 DEPARTURES = (
     *patch_lengths((0.8, 1.0, 1.25)),
-    Departure(frequency=0.9), Departure(frequency=1.1),
-    Departure(joint_inertia=0.0), Departure(joint_inertia=1.1e-5),
-)  # fmt: skip
+    Departure(frequency=0.9),
+    Departure(frequency=1.1),
+    Departure(joint_inertia=0.0),
+    Departure(joint_inertia=1.1e-5),
+)
 
 
 class Plant(NamedTuple):
@@ -157,13 +159,22 @@ class LoopMaker:
         known = self._found.structure
         # nothing that only a controller's own design depends on: one program for all laws
         structure = Structure(
-            n_modes=LARGEST, n_controlled=known.n_controlled, n_patches=known.n_patches,
-            n_steps=1, n_frequencies=1, basis=plant.basis, has_shortening=known.has_shortening,
+            n_modes=LARGEST,
+            n_controlled=known.n_controlled,
+            n_patches=known.n_patches,
+            n_steps=1,
+            n_frequencies=1,
+            basis=plant.basis,
+            has_shortening=known.has_shortening,
             law=SRF.name,  # a channel for each patch, see `widened`
-            has_feedforward=known.has_feedforward, has_friction=known.has_friction,
-            has_position_gain=False, is_coupled=known.is_coupled, has_wrench=known.has_wrench,
-            has_sensor_highpass=known.has_sensor_highpass, has_amplifier=known.has_amplifier,
-        )  # fmt: skip
+            has_feedforward=known.has_feedforward,
+            has_friction=known.has_friction,
+            has_position_gain=False,
+            is_coupled=known.is_coupled,
+            has_wrench=known.has_wrench,
+            has_sensor_highpass=known.has_sensor_highpass,
+            has_amplifier=known.has_amplifier,
+        )
         law = jax.tree.map(jnp.asarray, law)
         return jax.tree.map(np.asarray, _look(structure, self._placed(plant), self._pose, law))
 

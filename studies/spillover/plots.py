@@ -57,14 +57,22 @@ def margins(found: Certificate, ax: Axes | None = None) -> Axes:
             ax.plot(sizes, line, color=color, linestyle=dash, marker="o", markersize=3, label=name)
     ax.axhline(found.required, color="black", linewidth=0.9, linestyle="--")
     ax.annotate(
-        "required", (1, found.required), xycoords=("axes fraction", "data"), ha="right",
-        va="bottom", fontsize=8,
-    )  # fmt: skip
+        "required",
+        (1, found.required),
+        xycoords=("axes fraction", "data"),
+        ha="right",
+        va="bottom",
+        fontsize=8,
+    )
     ax.axhline(1, color="black", linewidth=0.9)
     ax.annotate(
-        "unstable below", (1, 1), xycoords=("axes fraction", "data"), ha="right", va="bottom",
+        "unstable below",
+        (1, 1),
+        xycoords=("axes fraction", "data"),
+        ha="right",
+        va="bottom",
         fontsize=8,
-    )  # fmt: skip
+    )
     ax.set(xlabel="plant modes per link [1]", ylabel="gain margin [1]", yscale="log")
     _plain_ticks(ax.yaxis)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -86,13 +94,23 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
         if np.all(np.isnan(zeta[b])):
             continue
         ax.plot(
-            frequency[b].ravel(), zeta[b].ravel(), marker, color=color, markersize=3, alpha=0.6,
-            markeredgewidth=0, label=found.plants[b, 0, 0].basis,
-        )  # fmt: skip
+            frequency[b].ravel(),
+            zeta[b].ravel(),
+            marker,
+            color=color,
+            markersize=3,
+            alpha=0.6,
+            markeredgewidth=0,
+            label=found.plants[b, 0, 0].basis,
+        )
     ax.plot(
-        frequency.ravel(), found.free_damping[:, :, -1].ravel(), "_", color="black", markersize=4,
+        frequency.ravel(),
+        found.free_damping[:, :, -1].ravel(),
+        "_",
+        color="black",
+        markersize=4,
         label="without control",
-    )  # fmt: skip
+    )
     ax.set_xscale("log")
     ax.set_yscale("symlog", linthresh=0.02, linscale=1.5)
     ax.set_ylim(1.3 * min(np.nanmin(zeta), -0.001), 1.3 * np.nanmax(zeta))
@@ -173,9 +191,12 @@ def law_bars(found: Comparison, ax: Axes | None = None) -> Axes:
     height = 0.25
     for i in range(3):
         ax.barh(
-            rows + (i - 1) * height, 1e6 * found.residual_rms[:, i], height,
-            color=figures.SERIES[i], label=f"link {i + 1}",
-        )  # fmt: skip
+            rows + (i - 1) * height,
+            1e6 * found.residual_rms[:, i],
+            height,
+            color=figures.SERIES[i],
+            label=f"link {i + 1}",
+        )
     most = 1e6 * np.nanmax(found.residual_rms)
     for k, name in enumerate(found.names):
         if name == WITHOUT:

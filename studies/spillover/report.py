@@ -87,21 +87,26 @@ def _head(found: Certificate) -> list[str]:
         told += f" With fewer than {found.fails_from} plant modes a link all of them pass."
     return [
         f"# Spillover certificate {'passed' if found.is_passed else 'failed'}: gain margin "
-        f"{margin_text(found.margin[at], 3)}, {found.required:g} required", "",
+        f"{margin_text(found.margin[at], 3)}, {found.required:g} required",
+        "",
         *opening(
             f"is the controller of {literal(study.title) or 'the study'} safe on plants that it "
             f"does not know: {total} of them, a gain margin of {found.required:g} on each.",
             f"**{verdict(found)[0].upper()}{verdict(found)[1:]}.** {good} of {total} plants pass.",
             _next(found),
         ),
-        picture("machine.png", CAPTION), "",
-        "## The design", "",
+        picture("machine.png", CAPTION),
+        "",
+        "## The design",
+        "",
         f"{literal(study.title) or 'study'}: law {control.law}, basis {control.basis}, "
         f"{found.n_controlled} controlled modes on links {links}, gain factor "
         f"{control.gain_factor:g}; {electronics.sample_rate_hz:g} Hz, anti-alias filter "
         f"{electronics.antialias_hz:g} Hz, "
-        f"one sample of delay, velocity estimate {electronics.estimator}.", "", told,
-    ]  # fmt: skip
+        f"one sample of delay, velocity estimate {electronics.estimator}.",
+        "",
+        told,
+    ]
 
 
 def _next(found: Certificate) -> str:
@@ -128,29 +133,45 @@ def _margins(found: Certificate) -> list[str]:
         zeta = np.where(exists, found.least_damping[b, :, n], np.inf)
         low, weak = int(np.argmin(margin)), int(np.argmin(zeta))
         plant = found.plants[b, low, n]
-        rows.append([
-            plant.basis, str(plant.n_modes), margin_text(margin[low], 3),
-            str(plant.departure), found.breaking[b, low, n] or "-",
-            f"{zeta[weak]:.3g}", found.weakest[b, weak, n],
-            "yes" if found.passes[b, :, n][exists].all() else "**no**",
-        ])  # fmt: skip
+        rows.append(
+            [
+                plant.basis,
+                str(plant.n_modes),
+                margin_text(margin[low], 3),
+                str(plant.departure),
+                found.breaking[b, low, n] or "-",
+                f"{zeta[weak]:.3g}",
+                found.weakest[b, weak, n],
+                "yes" if found.passes[b, :, n][exists].all() else "**no**",
+            ]
+        )
     names = (
-        "basis", "modes", "smallest margin", "where", "broken by",
-        "least damping ratio", "of", "all pass",
-    )  # fmt: skip
+        "basis",
+        "modes",
+        "smallest margin",
+        "where",
+        "broken by",
+        "least damping ratio",
+        "of",
+        "all pass",
+    )
     return [
-        "## Margins and damping", "",
+        "## Margins and damping",
+        "",
         "For each basis and number of plant modes per link: the smallest gain margin of all "
         "departures from what the controller believes (sensors and actuators of other lengths, "
         "links of other stiffness, joints of other inertia), what goes unstable beyond it, and the "
         "least damping ratio of all link modes "
         f"at the design's gains (without control: {_free(found)}). The mode is "
-        "the one that holds most energy of the motion; \"through a filter\" says that the pole is "
-        "one of the controller's filters, which the mode, far stiffer, feeds.", "",
-        *table(names, rows), "",
-        picture("margins.png", "Gain margin over the number of plant modes"), "",
+        'the one that holds most energy of the motion; "through a filter" says that the pole is '
+        "one of the controller's filters, which the mode, far stiffer, feeds.",
+        "",
+        *table(names, rows),
+        "",
+        picture("margins.png", "Gain margin over the number of plant modes"),
+        "",
         picture("damping.png", "Damping ratio of every link mode at the design's gains"),
-    ]  # fmt: skip
+    ]
 
 
 def _free(found: Certificate) -> str:
@@ -181,15 +202,18 @@ def _leakage(found: Certificate) -> list[str]:
     r, j, basis = int(at[3]), int(at[4]), found.plants[at[0], 0, 0].basis
     names = [f"mode {r + 1}" for r in range(first, size.shape[4])]
     return [
-        "## Leakage", "",
+        "## Leakage",
+        "",
         "What a unit of a mode that is not controlled adds to the estimate q^j of a controlled one "
         "(modal filter times sensors): the largest of all links and departures, in the scale of "
         f"the plant's basis. {_worst_leak(found)} The other way round a force on a "
         f"controlled mode pushes others by up to {pushed.max():.3g} of itself (mode {j + 1} on "
-        f"mode {r + first + 1}, {basis}).", "",
-        *table(("basis", "estimate", *names), rows), "",
+        f"mode {r + first + 1}, {basis}).",
+        "",
+        *table(("basis", "estimate", *names), rows),
+        "",
         picture("leakage.png", "Leakage of plant modes into the estimated ones"),
-    ]  # fmt: skip
+    ]
 
 
 def _worst_leak(found: Certificate) -> str:
@@ -207,20 +231,33 @@ def _laws(laws: Comparison) -> list[str]:
     rows = []
     for k, name in enumerate(laws.names):
         rms = laws.residual_rms[k]
-        rows.append([
-            name, f"{laws.factor[k]:.3g}",
-            *(f"{zeta:.3g}" if np.isfinite(zeta) else "-" for zeta in laws.damping_ratio[k]),
-            margin_text(laws.margin[k], 3) if np.isfinite(laws.margin[k]) else "-",
-            laws.breaking[k] or "-", " / ".join(f"{1e6 * x:.3g}" for x in rms),
-            f"{100 * np.mean(rms / off):.3g} %" if np.all(off > 0) else "-",
-            f"{laws.peak_voltage[k]:.3g}", f"{laws.control_energy[k]:.3g}",
-            describe(int(laws.status[k])),
-        ])  # fmt: skip
+        rows.append(
+            [
+                name,
+                f"{laws.factor[k]:.3g}",
+                *(f"{zeta:.3g}" if np.isfinite(zeta) else "-" for zeta in laws.damping_ratio[k]),
+                margin_text(laws.margin[k], 3) if np.isfinite(laws.margin[k]) else "-",
+                laws.breaking[k] or "-",
+                " / ".join(f"{1e6 * x:.3g}" for x in rms),
+                f"{100 * np.mean(rms / off):.3g} %" if np.all(off > 0) else "-",
+                f"{laws.peak_voltage[k]:.3g}",
+                f"{laws.control_energy[k]:.3g}",
+                describe(int(laws.status[k])),
+            ]
+        )
     modes = [f"zeta {j + 1}" for j in range(laws.damping_ratio.shape[1])]
     names = (
-        "law", "factor", *modes, "margin", "broken by", "residual rms of links 1 / 2 / 3 [µm]",
-        "of no control", "peak [V]", "energy [V² s]", "run",
-    )  # fmt: skip
+        "law",
+        "factor",
+        *modes,
+        "margin",
+        "broken by",
+        "residual rms of links 1 / 2 / 3 [µm]",
+        "of no control",
+        "peak [V]",
+        "energy [V² s]",
+        "run",
+    )
     motion = "the study's own start, without a move"
     if len(laws.study.motion.waypoints) > 1:
         motion = (
@@ -228,7 +265,8 @@ def _laws(laws: Comparison) -> list[str]:
             f"{1e3 * FAST[0]:g} mm in {FAST[1]:g} s), no shaper"
         )
     return [
-        "## Laws", "",
+        "## Laws",
+        "",
         "The same machine, patches, electronics and controlled modes. Factor 1 is the design's own "
         "damping constant of mode 1. Each law has the largest factor that leaves a margin of "
         f"{laws.required:g} on the design's own plants ({laws.plant.basis}, as believed), "
@@ -237,10 +275,12 @@ def _laws(laws: Comparison) -> list[str]:
         f"nonlinear: {motion}; residual over {WINDOW:g} s from {SETTLING:g} s after the command "
         "on, when the drives have nearly settled; of no control: mean of the three links' shares.",
         "",
-        *table(names, rows), "",
-        picture("laws.png", "Residual vibration of the laws"), "",
+        *table(names, rows),
+        "",
+        picture("laws.png", "Residual vibration of the laws"),
+        "",
         *(f"- {note}" for note in _LAW_NOTES),
-    ]  # fmt: skip
+    ]
 
 
 def document(found: Certificate, laws: Comparison | None) -> str:

@@ -92,8 +92,9 @@ def _write(out: Path, found: Certificate, laws: Comparison | None) -> None:
 
 def _draw(folder: Path, found: Certificate, laws: Comparison | None) -> None:
     drawn: list[tuple[str, Callable[..., Any], Any]] = [
-        ("margins", plots.margins, found), ("damping", plots.mode_damping, found),
-    ]  # fmt: skip
+        ("margins", plots.margins, found),
+        ("damping", plots.mode_damping, found),
+    ]
     if laws is not None:
         drawn.append(("laws", plots.law_bars, laws))
     with figures.styled():
@@ -117,7 +118,9 @@ def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable
             np.array([p.basis for p in axes[:, 0, 0]]), ("basis",), "1", "of the plant"
         ),
         "departure": Variable(
-            np.array([str(d) for d in true]), ("departure",), "1",
+            np.array([str(d) for d in true]),
+            ("departure",),
+            "1",
             "from what the controller believes",
         ),
         "sensor_factor": Variable(
@@ -127,7 +130,9 @@ def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable
             np.array([d.actuator for d in true]), ("departure",), "1", "true over believed length"
         ),
         "frequency_factor": Variable(
-            np.array([d.frequency for d in true]), ("departure",), "1",
+            np.array([d.frequency for d in true]),
+            ("departure",),
+            "1",
             "true frequencies of the links over the study's",
         ),
         "plant_modes": Variable(
@@ -144,15 +149,19 @@ def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable
         "least_damped": Variable(found.weakest, plants, "1", "mode of least damping"),
         "broken_by": Variable(found.breaking, plants, "1", "what goes unstable beyond the margin"),
         "observation": Variable(
-            found.observation, (*place, "link", "channel", "link_mode"), "1",
+            found.observation,
+            (*place, "link", "channel", "link_mode"),
+            "1",
             "channel signal per modal coordinate of the plant (SRF: V/m)",
         ),
         "actuation": Variable(
-            found.actuation, (*place, "link", "link_mode", "channel"), "1",
+            found.actuation,
+            (*place, "link", "link_mode", "channel"),
+            "1",
             "modal force on the plant per force of a channel (SRF: N/V)",
         ),
         "required_margin": Variable(np.array(found.required), (), "1", "gain margin required"),
-    }  # fmt: skip
+    }
     if laws is None:
         return part
     law = ("law",)

@@ -23,7 +23,7 @@ from jaxmodel.case import (
     Shaping,
     Structure,
     Windows,
-)  # fmt: skip
+)
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
 from jaxmodel.parameters import ASSEMBLIES, Beam, Damping, Geometry, Machine, Masses, Patches
@@ -300,7 +300,15 @@ def _electronics(fields: Fields, structure: Structure) -> Electronics:
 
 def _drive(fields: Fields) -> Drive:
     same = (
-        "kp", "kd", "force_limit", "coulomb_friction", "friction_speed", "viscous_friction",
-        "ripple", "pulse_force", "pulse_start", "pulse_length",
-    )  # fmt: skip
+        "kp",
+        "kd",
+        "force_limit",
+        "coulomb_friction",
+        "friction_speed",
+        "viscous_friction",
+        "ripple",
+        "pulse_force",
+        "pulse_start",
+        "pulse_length",
+    )
     return Drive(*(fields.numbers(f"drive.{name}") for name in (*same, "locked")))

@@ -68,9 +68,10 @@ def check_consistency(study: Study) -> None:
         )
     if study.run.model == "ked" and link.basis == "pinned_free":
         raise field_error(
-            "link.basis", link.basis,
+            "link.basis",
+            link.basis,
             "pinned_pinned or loaded, where run.model is ked: rigid motion prescribes both ends",
-        )  # fmt: skip
+        )
     stations = ("metrics.stations", study.metrics.stations)
     shortest = each_link(link.length).min()
     for name, values in (stations, ("initial.load_station", (study.initial.load_station,))):
@@ -117,15 +118,19 @@ def _check_patches(study: Study) -> None:
         ordered, given = np.sort(row), [float(f"{x:.9g}") for x in row]
         if ordered[0] < pitch / 2 - 1e-12 or ordered[-1] > length - pitch / 2 + 1e-12:
             raise field_error(
-                "patches.centers", given,
+                "patches.centers",
+                given,
                 f"{pitch / 2:g} to {length - pitch / 2:g}, so that no patch leaves the "
-                f"link{of_link}", "m",
-            )  # fmt: skip
+                f"link{of_link}",
+                "m",
+            )
         if np.any(np.diff(ordered) < pitch - 1e-12):
             raise field_error(
-                "patches.centers", given,
-                f"centres at least {pitch:g} apart, so that no patches overlap{of_link}", "m",
-            )  # fmt: skip
+                "patches.centers",
+                given,
+                f"centres at least {pitch:g} apart, so that no patches overlap{of_link}",
+                "m",
+            )
     widths = each_link(patches.width)
     for i in np.flatnonzero(widths > each_link(link.width) * (1 + 1e-9))[:1]:
         raise field_error(
@@ -145,9 +150,11 @@ def check_locked(study: Study) -> None:
     """
     if study.drive.locked and len(study.motion.waypoints) > 1:
         raise field_error(
-            "motion.waypoints", study.motion.waypoints,
-            "one pose where drive.locked is true: locked sliders follow no path", "m, m, rad",
-        )  # fmt: skip
+            "motion.waypoints",
+            study.motion.waypoints,
+            "one pose where drive.locked is true: locked sliders follow no path",
+            "m, m, rad",
+        )
 
 
 def _check_coupling(study: Study) -> None:
@@ -158,10 +165,12 @@ def _check_coupling(study: Study) -> None:
     size = np.abs(each_link(patches.d31))
     for i in np.flatnonzero((size <= 1e-6 * highest) | (size >= highest))[:1]:
         raise field_error(
-            "patches.d31", patches.d31,
+            "patches.d31",
+            patches.d31,
             f"{1e-6 * highest[i]:.3g} to {highest[i]:.3g} in size, for a coupling k31^2 below 1 "
-            "with patches.youngs_modulus and patches.relative_permittivity", "C/N",
-        )  # fmt: skip
+            "with patches.youngs_modulus and patches.relative_permittivity",
+            "C/N",
+        )
 
 
 def _check_pulses(study: Study) -> None:
@@ -185,9 +194,11 @@ def _check_sampling(study: Study) -> None:
             )
     if 0 < electronics.amplifier_hz < SLOWEST_AMPLIFIER:
         raise field_error(
-            "electronics.amplifier_hz", electronics.amplifier_hz,
-            f"0 (no limit) or {SLOWEST_AMPLIFIER:g} and more", "Hz",
-        )  # fmt: skip
+            "electronics.amplifier_hz",
+            electronics.amplifier_hz,
+            f"0 (no limit) or {SLOWEST_AMPLIFIER:g} and more",
+            "Hz",
+        )
     for value in study.shaper.frequencies_hz:
         if value >= rate / 2:
             raise field_error(

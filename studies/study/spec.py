@@ -179,11 +179,17 @@ class Motion(Section):
 
     waypoints: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = described(
         (
-            (0.0, 0.0, HOME[2]), (0.0, 0.01, HOME[2]), (0.01, 0.01, HOME[2]),
-            (0.01, 0.0, HOME[2]), (0.0, 0.0, HOME[2]),
+            (0.0, 0.0, HOME[2]),
+            (0.0, 0.01, HOME[2]),
+            (0.01, 0.01, HOME[2]),
+            (0.01, 0.0, HOME[2]),
+            (0.0, 0.0, HOME[2]),
         ),
-        "m, m, rad", "poses (x, y, phi) to visit", min_length=1, max_length=100,
-    )  # fmt: skip
+        "m, m, rad",
+        "poses (x, y, phi) to visit",
+        min_length=1,
+        max_length=100,
+    )
     move_time: Time | tuple[Time, ...] = described(0.1, "s", "t_f of each move, or one per move")
     dwell: Pause | tuple[Pause, ...] = described(0.0, "s", "rest after each move, or one per move")
     profile: Literal["cycloid", "quintic"] = described("cycloid", "-", "cycloid is (25)")
@@ -239,8 +245,9 @@ class Control(Section):
     )
     ratios: tuple[tuple[Gain, ...], ...] = described(
         ((1.0, 0.345, 0.045), (1.0, 0.304, 0.041), (1.0, 0.321, 0.038)),
-        "1", "EMC ratios k_dj : k_d1 per link (24); missing ones are 0",
-    )  # fmt: skip
+        "1",
+        "EMC ratios k_dj : k_d1 per link (24); missing ones are 0",
+    )
     ratio_source: Literal["given", "own_run"] = described(
         "given", "-", "ratios as given, or by (24) from the same case's uncontrolled run"
     )
@@ -259,10 +266,13 @@ class Electronics(Section):
     sample_rate_hz: float = described(10_000.0, "Hz", "f_s", gt=100, le=1e6)
     antialias_hz: float = described(2_000.0, "Hz", "2nd-order Butterworth corner", gt=10, le=1e6)
     sensor_highpass_hz: float = described(
-        0.0, "Hz", "corner 1/(2 pi R C) of a patch's capacitance C (6.7 nF by default) into its "
+        0.0,
+        "Hz",
+        "corner 1/(2 pi R C) of a patch's capacitance C (6.7 nF by default) into its "
         "amplifier's input R; 0: none",
-        ge=0, le=1e5,
-    )  # fmt: skip
+        ge=0,
+        le=1e5,
+    )
     amplifier_hz: float = described(
         0.0, "Hz", "bandwidth (-3 dB) of the actuators' amplifiers; 0: no limit", ge=0, le=1e6
     )

@@ -112,17 +112,28 @@ def front(data: SweepData, y: str) -> Figure:
         if VOLTAGE in data.variables:
             color = metric_values(data, VOLTAGE)[chosen]
         dots = ax.scatter(
-            margin, value, s=5, c=color, cmap=MAP, linewidths=0, rasterized=True,
+            margin,
+            value,
+            s=5,
+            c=color,
+            cmap=MAP,
+            linewidths=0,
+            rasterized=True,
             norm="log" if VOLTAGE in data.variables and _is_wide(color) else None,
-        )  # fmt: skip
+        )
         if VOLTAGE in data.variables:
             figure.colorbar(dots, ax=ax, label=label(data, VOLTAGE))
         best = np.array(sorted(not_beaten(margin, value), key=lambda k: margin[k]), int)
         ax.plot(margin[best], value[best], "-", color="black", linewidth=0.8, zorder=3)
         ax.plot(
-            margin[best], value[best], "o", color="black", markerfacecolor="none", markersize=4,
+            margin[best],
+            value[best],
+            "o",
+            color="black",
+            markerfacecolor="none",
+            markersize=4,
             zorder=3,
-        )  # fmt: skip
+        )
         ax.axvline(ENOUGH, color="black", linewidth=0.8, linestyle=":")
         ends = f" ({HIGHEST:g}: that or more)" if margin.max(initial=0.0) >= HIGHEST else ""
         ax.set(xlabel=f"gain margin{ends}", ylabel=label(data, y))
@@ -307,9 +318,14 @@ def _short(value: object) -> str:
 
 
 def _points(
-    figure: Figure, ax: Axes, across: np.ndarray, value: np.ndarray, group: np.ndarray | None,
-    hue: str, best: np.ndarray,
-) -> None:  # fmt: skip
+    figure: Figure,
+    ax: Axes,
+    across: np.ndarray,
+    value: np.ndarray,
+    group: np.ndarray | None,
+    hue: str,
+    best: np.ndarray,
+) -> None:
     size = 9 if len(value) < 2000 else 4
     if group is None:
         ax.scatter(across, value, s=size, color=figures.SERIES[0], linewidths=0)
@@ -325,9 +341,15 @@ def _points(
             )
         ax.legend(fontsize=7, title=hue)
     ax.plot(
-        across[best], value[best], "o", color="black", markerfacecolor="none", markersize=5,
-        markeredgewidth=0.9, zorder=3,
-    )  # fmt: skip
+        across[best],
+        value[best],
+        "o",
+        color="black",
+        markerfacecolor="none",
+        markersize=5,
+        markeredgewidth=0.9,
+        zorder=3,
+    )
     _scale_ordinate(ax, value)
 
 
@@ -375,9 +397,10 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
         ax.set_xticks(range(len(names) + 1), [*names, label(data, y)], rotation=15, ha="right")
         ax.set_yticks([])
         ax.set_title(
-            f"red: the {_best_text(data, len(best))}; else dark: smallest", fontsize=7.5,
+            f"red: the {_best_text(data, len(best))}; else dark: smallest",
+            fontsize=7.5,
             loc="right",
-        )  # fmt: skip
+        )
         _say_left_out(figure, data, chosen)
     return figure
 
@@ -414,18 +437,32 @@ def _placements(data: SweepData, y: str) -> Figure:
         top.grid(False)
         top.set_title(
             f"{label(data, y)}, the {_best_text(data, len(chosen))}; blue: actuator, orange: "
-            "sensor", fontsize=8.5, loc="left",
-        )  # fmt: skip
+            "sensor",
+            fontsize=8.5,
+            loc="left",
+        )
         for k in range(centers.shape[1]):
             color = figures.SERIES[k % len(figures.SERIES)]
             bottom.scatter(
-                centers[is_ok, k] * unit, value[is_ok], s=3, color=color, linewidths=0,
-                label=f"pair {k + 1}", alpha=0.5, rasterized=True,
-            )  # fmt: skip
+                centers[is_ok, k] * unit,
+                value[is_ok],
+                s=3,
+                color=color,
+                linewidths=0,
+                label=f"pair {k + 1}",
+                alpha=0.5,
+                rasterized=True,
+            )
             bottom.plot(
-                centers[chosen, k] * unit, value[chosen], "o", color="black", markersize=4,
-                markerfacecolor="none", markeredgewidth=0.8, zorder=3,
-            )  # fmt: skip
+                centers[chosen, k] * unit,
+                value[chosen],
+                "o",
+                color="black",
+                markersize=4,
+                markerfacecolor="none",
+                markeredgewidth=0.8,
+                zorder=3,
+            )
         _scale_ordinate(bottom, value[is_ok])
         bottom.set_xlabel("centre of the patch pair along the link [mm]")
         bottom.set_ylabel(label(data, y))

@@ -109,31 +109,43 @@ def report(data: SweepData, metric: str, drawn: list[str]) -> str:
     """
     cases = data.table
     lines = [
-        f"# {literal(data.spec.study.title)}: sweep", "",
+        f"# {literal(data.spec.study.title)}: sweep",
+        "",
         *opening(_asked(data, cases, metric), *_answer(data, metric)),
         *_figure(MACHINE, f"{CAPTION}. Of the best case, where cases differ", drawn),
-        f"## Best cases by {metric}", "",
-        *_best(data, metric), "",
-    ]  # fmt: skip
+        f"## Best cases by {metric}",
+        "",
+        *_best(data, metric),
+        "",
+    ]
     told = f"{metric} over the gain margin; the line: cases that no other beats in both"
     lines += [
         *_figure(FIGURE, f"Cases of status ok and their {metric}", drawn),
         *_figure(FRONT, told, drawn),
-        "## How the cases ended", "",
-        *_table(status_rows(data)), "",
-        "## What varied", "",
-        *_blocks(data.spec.root), "",
-        *_counts(data, cases), "",
-        *_table(axis_rows(cases)), "",
-    ]  # fmt: skip
+        "## How the cases ended",
+        "",
+        *_table(status_rows(data)),
+        "",
+        "## What varied",
+        "",
+        *_blocks(data.spec.root),
+        "",
+        *_counts(data, cases),
+        "",
+        *_table(axis_rows(cases)),
+        "",
+    ]
     causes = cause_rows(data)
     if causes.rows:
         lines += [
-            "## What the failures depend on", "",
+            "## What the failures depend on",
+            "",
             "Distance: between a parameter's distributions in failed cases and in those of status "
-            f"ok, 0 to 1. Failures: {SHARES}.", "",
-            *_table(causes), "",
-        ]  # fmt: skip
+            f"ok, 0 to 1. Failures: {SHARES}.",
+            "",
+            *_table(causes),
+            "",
+        ]
     return "\n".join(lines)
 
 
@@ -250,10 +262,11 @@ def _best(data: SweepData, metric: str) -> list[str]:
                 f"{data[MARGIN][free[0]]:.3g}."
             )
     return [
-        told, "",
+        told,
+        "",
         *([f"**{literal(warning)}**", ""] if warning else []),
         *_table(case_rows(data, best, [metric])),
-    ]  # fmt: skip
+    ]
 
 
 def _table(found: Rows) -> list[str]:

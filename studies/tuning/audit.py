@@ -74,9 +74,12 @@ def audit(spec: TuneSpec, places: np.ndarray) -> list[Disagreement]:
         for k, number in enumerate(numbers):
             n, m = np.unravel_index(np.argmax(share[..., k]), share.shape[:2])
             worst[number] = Disagreement(
-                spec.free.names[number], spec.moving[position].name, int(n),
-                ("objective", *spec.limit_names)[m], *(float(x[n, m, k]) for x in (a, b, share)),
-            )  # fmt: skip
+                spec.free.names[number],
+                spec.moving[position].name,
+                int(n),
+                ("objective", *spec.limit_names)[m],
+                *(float(x[n, m, k]) for x in (a, b, share)),
+            )
     return [worst[number] for number in sorted(worst)]
 
 

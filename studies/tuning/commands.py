@@ -76,9 +76,14 @@ def _audit(spec: TuneSpec, console: Console) -> None:
     table, found = Table(*names), audit(spec, places)
     for one in found:
         table.add_row(
-            one.name, one.family, one.figure, f"{one.place + 1}", f"{one.derivative:.6g}",
-            f"{one.difference:.6g}", f"{one.share:.1e}",
-        )  # fmt: skip
+            one.name,
+            one.family,
+            one.figure,
+            f"{one.place + 1}",
+            f"{one.derivative:.6g}",
+            f"{one.difference:.6g}",
+            f"{one.share:.1e}",
+        )
     console.print(table)
     console.print(f"Design 1 lies beside the study. {MEANING}", soft_wrap=True)
     worst = max(one.share for one in found)

@@ -107,9 +107,11 @@ class Evaluator:
         reached = own_limits(self.merit, own_metrics)
         allowed = [allowed_limits(self.merit, family, reached) for family in self.families]
         found = judged_slopes(
-            self.merit, *(jax.tree.map(lambda x: x[1:], part) for part in (metrics, slopes)),
-            own_metrics, np.stack(allowed),
-        )  # fmt: skip
+            self.merit,
+            *(jax.tree.map(lambda x: x[1:], part) for part in (metrics, slopes)),
+            own_metrics,
+            np.stack(allowed),
+        )
         found = jax.tree.map(np.asarray, found)
         beyond, change = self.linear.limits(values)
         limit_slope = np.concatenate([found.limit_slope, change], axis=1)

@@ -60,12 +60,10 @@ LEAVES: dict[str, Leaf] = {
     **_same("patches", "machine.patches", "sensor_length", "actuator_length", "width", "thickness"),
     **_same("drive", "drive", "kp", "kd"),
     **_same("link", "machine.beam", "length", "thickness", "width"),
-    **_same(
-        "machine", "machine.masses", "platform_mass", "platform_inertia", "slider_mass"
-    ),
+    **_same("machine", "machine.masses", "platform_mass", "platform_inertia", "slider_mass"),
     "load.mass": Leaf("machine.masses.payload_mass"),
     "load.inertia": Leaf("machine.masses.payload_inertia"),
-}  # fmt: skip
+}
 #: Free names that stand for several numbers of a Case.
 POLES = ("poles.decay", "poles.frequency_hz")
 PLACEMENT = "placement"

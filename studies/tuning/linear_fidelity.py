@@ -99,9 +99,14 @@ class LinearFidelity:
         if not self.names:
             return np.zeros((len(values), 0)), np.zeros((len(values), 0, values.shape[1]))
         found = _limit_slopes(
-            self._plain, self.names, self._spec.free.place, self._stacked, self._pose,
-            self._limits, values,
-        )  # fmt: skip
+            self._plain,
+            self.names,
+            self._spec.free.place,
+            self._stacked,
+            self._pose,
+            self._limits,
+            values,
+        )
         return np.asarray(found[0]), np.asarray(found[1])
 
     def screen(self, position: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -120,9 +125,15 @@ class LinearFidelity:
         names = self.names or ("slowest_decay",)
         limits = self._limits[position] if self.names else np.array([STABLE])
         look = partial(
-            _look, self._structure, names, self._spec.free.place, self._cases[position],
-            self._pose, limits, self._links,
-        )  # fmt: skip
+            _look,
+            self._structure,
+            names,
+            self._spec.free.place,
+            self._cases[position],
+            self._pose,
+            limits,
+            self._links,
+        )
         count = len(values)
         rows = np.minimum(np.arange(-(-count // BATCH) * BATCH), count - 1)
         parts = np.split(values[rows], len(rows) // BATCH)
@@ -172,9 +183,14 @@ def _singularity_distance(structure: Structure, case: Case) -> Array:
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _limit_slopes(
-    structure: Structure, names: tuple, place: Any, cases: Case, pose: Array, limits: Array,
+    structure: Structure,
+    names: tuple,
+    place: Any,
+    cases: Case,
+    pose: Array,
+    limits: Array,
     values: Array,
-) -> tuple[Array, Array]:  # fmt: skip
+) -> tuple[Array, Array]:
     def figures(x: Array, case: Case, limit: Array) -> tuple[Array, Array]:
         placed = place(case, x)
         found = _excess(structure, names, placed, closed_loop(structure, placed, pose), limit)
@@ -189,9 +205,15 @@ def _limit_slopes(
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 6))
 def _look(
-    structure: Structure, names: tuple, place: Any, case: Case, pose: Array, limits: Array,
-    links: tuple[int, ...], values: Array,
-) -> tuple[Array, Array]:  # fmt: skip
+    structure: Structure,
+    names: tuple,
+    place: Any,
+    case: Case,
+    pose: Array,
+    limits: Array,
+    links: tuple[int, ...],
+    values: Array,
+) -> tuple[Array, Array]:
     def one(x: Array) -> tuple[Array, Array]:
         placed = place(case, x)
         matrices = closed_loop(structure, placed, pose)

@@ -164,10 +164,13 @@ def advance(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> Progress:
         at, at.base_objective, at.base_slope, at.base_limits, at.base_limit_slope
     )
     trial = Trial(
-        at.base, at.place,
-        np.where(np.isfinite(base_merit), base_merit, np.inf), np.where(is_fine, merit, np.nan),
-        base_slope, np.where(is_fine[:, None], merit_slope, 0.0),
-    )  # fmt: skip
+        at.base,
+        at.place,
+        np.where(np.isfinite(base_merit), base_merit, np.inf),
+        np.where(is_fine, merit, np.nan),
+        base_slope,
+        np.where(is_fine[:, None], merit_slope, 0.0),
+    )
     state, is_taken, place = method(spec).step(at.descent, trial)
 
     def taken(new: np.ndarray, old: np.ndarray) -> np.ndarray:
@@ -228,9 +231,12 @@ def _kept(at: Progress, found: Evaluation, is_fine: np.ndarray) -> Progress:
 
 
 def _lagrangian(
-    at: Progress, objective: np.ndarray, slope: np.ndarray, limits: np.ndarray,
+    at: Progress,
+    objective: np.ndarray,
+    slope: np.ndarray,
+    limits: np.ndarray,
     limit_slope: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray]:
     """f + sum (rho/2) max(0, c + lambda/rho)^2 and its slope, (B,) and (B, p)."""
     force = np.maximum(at.multiplier + at.penalty[:, None] * limits, 0.0)
     merit = objective + np.sum(force**2, axis=1) / (2 * at.penalty)

@@ -53,13 +53,22 @@ def gains(spec: TuneSpec, found: Findings) -> Figure:
             for row, one in enumerate(found.judged):
                 value, first = one.objective[k * count : (k + 1) * count], row == 0
                 ax.plot(
-                    value, np.full(len(value), row), "|", color=GREY, markersize=9,
+                    value,
+                    np.full(len(value), row),
+                    "|",
+                    color=GREY,
+                    markersize=9,
                     label="one fresh machine" if first else None,
-                )  # fmt: skip
+                )
                 ax.plot(
-                    value.mean(), row, "d", color=figures.SERIES[0], markersize=5, zorder=3,
+                    value.mean(),
+                    row,
+                    "d",
+                    color=figures.SERIES[0],
+                    markersize=5,
+                    zorder=3,
                     label="their mean" if first else None,
-                )  # fmt: skip
+                )
             ax.axvline(1.0, color="black", linewidth=0.8)
             ax.set(xlabel=OBJECTIVE, title=move_label(move), ylim=(rows - 0.4, -0.6))
             figures.log_scale(ax, "x")
@@ -88,15 +97,24 @@ def front(spec: TuneSpec, found: Findings, limit: str) -> Figure:
             ):
                 if chosen.any():
                     ax.scatter(
-                        seen.peaks[chosen, column], seen.objective[chosen], s=5, color=color,
-                        linewidths=0, label=label, rasterized=True,
-                    )  # fmt: skip
+                        seen.peaks[chosen, column],
+                        seen.objective[chosen],
+                        s=5,
+                        color=color,
+                        linewidths=0,
+                        label=label,
+                        rasterized=True,
+                    )
         at = found.at
         done = np.isfinite(at.best_objective) & (excess(at.best_limits) == 0)
         ax.plot(
-            at.best_peaks[done, column], at.best_objective[done], "x", color=figures.SERIES[1],
-            markersize=4, label="every start, machines of the tuning",
-        )  # fmt: skip
+            at.best_peaks[done, column],
+            at.best_objective[done],
+            "x",
+            color=figures.SERIES[1],
+            markersize=4,
+            label="every start, machines of the tuning",
+        )
         points = [(x.metrics[limit].max(), x.objective.mean()) for x in found.judged]
         line = np.array(
             [p for p, family in zip(points, spec.families, strict=True) if family.front]
@@ -116,9 +134,13 @@ def front(spec: TuneSpec, found: Findings, limit: str) -> Figure:
         for point, family in zip(points, spec.families, strict=True):
             if not family.front:
                 ax.plot(
-                    *point, next(marks, "h"), color="black", markerfacecolor="white",
-                    zorder=3, label=f"{family.name}, fresh machines",
-                )  # fmt: skip
+                    *point,
+                    next(marks, "h"),
+                    color="black",
+                    markerfacecolor="white",
+                    zorder=3,
+                    label=f"{family.name}, fresh machines",
+                )
         limits = {family.limits.get(limit) for family in spec.moving if not family.front}
         for value in sorted(x for x in limits if isinstance(x, float)):
             ax.axvline(value, color="black", linewidth=0.8, linestyle=":", label="limit")

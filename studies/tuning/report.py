@@ -58,11 +58,18 @@ def report(spec: TuneSpec, found: Findings) -> str:
     lines = [f"# {literal(spec.study.title) or 'study'}: tuning", ""]
     lines += [
         *opening(_asked(spec, found), _came_out(spec, found), _next(spec, found)),
-        picture("machine.png", f"{CAPTION}. Of the best design"), "",
-        *_own_machine(spec, found), *_fresh(spec, found), *_by_move(spec, found),
-        *_limits(spec, found), *_numbers(spec, found), *_search(spec, found),
-        *_fidelity(spec, found), "## Derivatives", "",
-    ]  # fmt: skip
+        picture("machine.png", f"{CAPTION}. Of the best design"),
+        "",
+        *_own_machine(spec, found),
+        *_fresh(spec, found),
+        *_by_move(spec, found),
+        *_limits(spec, found),
+        *_numbers(spec, found),
+        *_search(spec, found),
+        *_fidelity(spec, found),
+        "## Derivatives",
+        "",
+    ]
     worst = max(found.audited, key=lambda entry: entry.share)
     place = ("half way to the best design", "at the best design")[worst.place]
     verdict = "below" if worst.share <= ALLOWED else "**above**"
@@ -212,30 +219,45 @@ def _own_machine(spec: TuneSpec, found: Findings) -> list[str]:
         loop = ["-"] * 3
         if one.loop is not None:
             loop = [
-                margin_text(one.loop.gain_margin), f"{one.loop.slowest_decay:.4g}",
+                margin_text(one.loop.gain_margin),
+                f"{one.loop.slowest_decay:.4g}",
                 f"{one.loop.spillover:.4g}",
-            ]  # fmt: skip
+            ]
         file = f"`{files[k]}`" if k < len(files) else "-"
         rows.append(
             [name, file, f"{one.own.objective:.4f}", *cells, *loop, status.REASONS[one.own.status]]
         )
     return [
-        "## On the study's own machine", "",
+        "## On the study's own machine",
+        "",
         "What `studies simulate` gives for the file of each design, with the real converters and "
         f"limits. Of {links_text(spec.counted_links)}"
         + (", those under control, " if len(spec.counted_links) < 3 else " ")
         + "the largest value counts: peaks are the highest peak, an rms that of the worst link and "
         f"station, a time that of the slowest link. {_weighing(spec)} Gain margin, slowest decay "
-        f"and spillover are those of the linearised loop with {modes} plant modes.", "",
+        f"and spillover are those of the linearised loop with {modes} plant modes.",
+        "",
         *table(
-            ("design", "file", "objective", *heads, "gain margin", "slowest decay [1/s]",
-             "spillover", "status"), rows,
-        ), "",
+            (
+                "design",
+                "file",
+                "objective",
+                *heads,
+                "gain margin",
+                "slowest decay [1/s]",
+                "spillover",
+                "status",
+            ),
+            rows,
+        ),
+        "",
         picture(
-            "descent.png", "Best objective that keeps the limits, over iterations, on the machines "
+            "descent.png",
+            "Best objective that keeps the limits, over iterations, on the machines "
             "of the tuning; thin: every start",
-        ), "",
-    ]  # fmt: skip
+        ),
+        "",
+    ]
 
 
 def _weighing(spec: TuneSpec) -> str:
@@ -274,20 +296,25 @@ def _fresh(spec: TuneSpec, found: Findings) -> list[str]:
             [name, f"{one.objective.mean():.4f}", f"{one.objective.max():.4f}", *cells, _codes(one)]
         )
     return [
-        "## On fresh machines", "",
+        "## On fresh machines",
+        "",
         f"{_machines(spec)} Metrics: the largest value as above, on the worst of all machines and "
-        "moves.", "",
-        *table(("design", "objective, mean", "objective, worst", *heads, "statuses"), rows), "",
-    ]  # fmt: skip
+        "moves.",
+        "",
+        *table(("design", "objective, mean", "objective, worst", *heads, "statuses"), rows),
+        "",
+    ]
 
 
 def _by_move(spec: TuneSpec, found: Findings) -> list[str]:
     """Change of every figure on each move, mean of the fresh machines."""
     count = spec.tune.scenarios.check
     lines = [
-        "## Change against the study itself", "",
-        "Of the mean over the fresh machines.", "",
-    ]  # fmt: skip
+        "## Change against the study itself",
+        "",
+        "Of the mean over the fresh machines.",
+        "",
+    ]
     names = list(found.own.metrics)
     lines += ["| design | move | objective | " + " | ".join(names) + " |"]
     lines += ["|---" * (len(names) + 3) + "|"]
@@ -410,14 +437,18 @@ def _search(spec: TuneSpec, found: Findings) -> list[str]:
     cost = found.run_time / seen.run_time
     tuned = found.at.best_objective[found.at.winner(spec.main)]
     lines = [
-        "## Against random search", "",
+        "## Against random search",
+        "",
         f"{len(seen.objective)} Sobol designs of {main.name}, {seen.runs} runs: {count} keep all "
-        "limits" + (f", the best of them has objective {seen.objective[best]:.4f}" if count else "")
-        + f"; the tuned design has {tuned:.4f} on the same scenarios.", "",
+        "limits"
+        + (f", the best of them has objective {seen.objective[best]:.4f}" if count else "")
+        + f"; the tuned design has {tuned:.4f} on the same scenarios.",
+        "",
         f"All families together took {found.runs} differentiated runs, each at the cost of "
         f"{cost:.2f} plain ones (measured): {found.runs * cost:.0f} in all, "
-        f"{found.runs * cost / len(spec.moving):.0f} for {main.name}.", "",
-    ]  # fmt: skip
+        f"{found.runs * cost / len(spec.moving):.0f} for {main.name}.",
+        "",
+    ]
     return lines
 
 
@@ -446,11 +477,13 @@ def _fidelity(spec: TuneSpec, found: Findings) -> list[str]:
     elif spread < NARROW:
         rank = f"too much alike ({100 * spread:.1f} %) to compare their order"
     return [
-        "## Linear fidelity", "",
+        "## Linear fidelity",
+        "",
         f"Residual vibration of the linearised loop (H2 norm) over that of the run, {len(a)} "
         f"designs that keep the limits of their loop: median {ratio[1]:.3f}, 90 % between "
-        f"{ratio[0]:.3f} and {ratio[2]:.3f}; {rank}.", "",
-    ]  # fmt: skip
+        f"{ratio[0]:.3f} and {ratio[2]:.3f}; {rank}.",
+        "",
+    ]
 
 
 def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:

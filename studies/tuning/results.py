@@ -93,10 +93,12 @@ def _starts(spec: TuneSpec, found: Findings) -> dict[str, Variable]:
     }
     if spec.limit_names:
         starts["excess"] = Variable(
-            at.best_limits, ("start", "limit"), "1",
+            at.best_limits,
+            ("start", "limit"),
+            "1",
             "negative: kept; value over limit - 1 of a metric, for the loop a smooth figure that "
             "has the same sign",
-        )  # fmt: skip
+        )
     return starts
 
 

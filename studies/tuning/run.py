@@ -162,13 +162,15 @@ def find(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> Findings:
     ]
     own, *judged = judge(spec, designs)
     main = int(np.flatnonzero(at.family == spec.main)[0])
-    linear = np.concatenate([
-        evaluator.linear.screen(
-            int(np.flatnonzero(at.family == k)[0]),
-            np.where(family.is_free, values[at.family == k], np.nan),
-        )[1]
-        for k, family in enumerate(spec.moving)
-    ])  # fmt: skip
+    linear = np.concatenate(
+        [
+            evaluator.linear.screen(
+                int(np.flatnonzero(at.family == k)[0]),
+                np.where(family.is_free, values[at.family == k], np.nan),
+            )[1]
+            for k, family in enumerate(spec.moving)
+        ]
+    )
     last = evaluator.evaluate(values)
     if np.isnan(evaluator.run_time):  # that one has compiled
         evaluator.evaluate(values)

@@ -214,9 +214,10 @@ def _check_feedback(tune: Tune, study: Study) -> None:
     wanted = [name for name in tune.limits if name in OF_LOOP]
     if study.control.feedback != "sampled" and wanted:
         raise field_error(
-            "control.feedback", study.control.feedback,
+            "control.feedback",
+            study.control.feedback,
             "'sampled' where tune.limits holds " + " or ".join(wanted),
-        )  # fmt: skip
+        )
 
 
 def _check_positive(number: Any, most: float, path: str, unit: str = "", more: str = "") -> None:
@@ -243,9 +244,11 @@ def _check_metric(name: str, path: str, has_loop: bool, study: Study) -> None:
             + ("; take ringing_time" if _field(name) == "settling_time" else "; limit it instead")
         )
     sizes = {
-        "station": len(study.metrics.stations), "mode": study.link.modes,
-        "controlled_mode": study.control.modes, "spectrum_point": Structure().n_frequencies,
-    }  # fmt: skip
+        "station": len(study.metrics.stations),
+        "mode": study.link.modes,
+        "controlled_mode": study.control.modes,
+        "spectrum_point": Structure().n_frequencies,
+    }
     parse_entries(name, path, sizes)
 
 
@@ -271,9 +274,10 @@ def _check_clashes(tune: Tune, free: FreeNumbers, families: tuple[Family, ...]) 
         numbers = zip(free.numbers, family.is_free, strict=True)
         moved = {_field(x) for number, is_free in numbers if is_free for x in writes(number)}
         for where, names in (
-            ("tune.scenarios.spread", asked.spread), ("tune.scenarios.each", asked.each),
+            ("tune.scenarios.spread", asked.spread),
+            ("tune.scenarios.each", asked.each),
             (f"tune.families.{shown_name(family.name)}.set", family.columns),
-        ):  # fmt: skip
+        ):
             for name in names:
                 if _field(name) in moved:
                     raise StudyError(f"{where}: {name} is free in family {family.name!r}")
@@ -285,10 +289,13 @@ def _check_size(tune: Tune, families: tuple[Family, ...], moves: int) -> None:
     """What a machine of some memory can hold in one batch."""
     moving = sum(bool(family.is_free.any()) for family in families)
     for what, designs, machines in (
-        (f"tune.starts = {tune.starts} of {moving} families, tune.scenarios.count",
-         1 + tune.starts * moving, tune.scenarios.count),
+        (
+            f"tune.starts = {tune.starts} of {moving} families, tune.scenarios.count",
+            1 + tune.starts * moving,
+            tune.scenarios.count,
+        ),
         ("tune.scenarios.check", 1 + len(families), tune.scenarios.check),
-    ):  # fmt: skip
+    ):
         runs = designs * machines * moves
         if runs > MOST_RUNS:
             raise StudyError(
@@ -314,10 +321,11 @@ def _families(tune: Tune, study: Study, free: FreeNumbers) -> tuple[Family, ...]
     for k, name in enumerate(names):
         if name in names[:k]:
             raise field_error(
-                "tune.families", found[k].name,
+                "tune.families",
+                found[k].name,
                 f"names that differ in letters and digits, {found[names.index(name)].name!r} is "
                 "one already",
-            )  # fmt: skip
+            )
     return tuple(sorted(found, key=lambda family: not family.is_free.any()))
 
 
@@ -330,9 +338,10 @@ def _family(name: str, written: Any, tune: Tune, study: Study, free: FreeNumbers
     path = f"tune.families.{shown_name(name)}"
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9 _.,+=()'-]{0,59}", name):
         raise field_error(
-            "tune.families", name,
+            "tune.families",
+            name,
             "names of up to 60 letters a to z, digits, spaces and _.,+=()'-, not first a sign",
-        )  # fmt: skip
+        )
     if not isinstance(written, dict) or not set(written) <= {"free", "set"}:
         raise field_error(path, written, "{free = [names], set = {field = value}}")
     names = written.get("free", list(tune.free))
@@ -380,11 +389,12 @@ def _front(tune: Tune, families: list[Family]) -> list[Family]:
     base = moving[name]
     return [
         base._replace(
-            name=f"{name}, {limit} {value:.10g}", limits={**base.limits, limit: float(value)},
+            name=f"{name}, {limit} {value:.10g}",
+            limits={**base.limits, limit: float(value)},
             front=name,
         )
         for value in sorted(values)
-    ]  # fmt: skip
+    ]
 
 
 def _check_family(family: Family, move: dict[str, Any], study: Study) -> None:

@@ -94,13 +94,17 @@ class ClusterEvaluator(Evaluator):
             self._client.submit(
                 evaluate_part,
                 Part(
-                    self._identity, self._precision, self._text, families, values[part],
+                    self._identity,
+                    self._precision,
+                    self._text,
+                    families,
+                    values[part],
                     wanted[part],
                 ),
                 pure=False,
             )
             for part, families in zip(self._parts, self._families, strict=True)
-        ]  # fmt: skip
+        ]
         found = self._gathered(futures)
         if self._is_compiled:
             self.run_time = (time.perf_counter() - started) / self.lanes
