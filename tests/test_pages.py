@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from studies.show.pages import literal, page, picture, report_files, table
+from studies.show.markdown import literal, picture, table
+from studies.show.pages import page, report_files
 from studies.study import spec as spec_module
 from studies.study.template import toml_text
 from tests.pages import TITLE, parsed, rendered

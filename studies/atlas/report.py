@@ -13,7 +13,7 @@ from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.plots import length_text
 from studies.atlas.subsets import TARGETS, WINDOWS, link_label, setting_label
 from studies.atlas.workspace import MAP_MODES, Map
-from studies.show.pages import literal, opening, picture, table
+from studies.show.markdown import literal, opening, picture, table
 from studies.show.sketch import CAPTION
 from studies.show.units import span
 

@@ -10,7 +10,7 @@ from studies.export.c_fixed import format_lines
 from studies.export.cost import Cost
 from studies.export.fixed import MARGIN, FixedPoint
 from studies.export.verify import AIM, Verification
-from studies.show.pages import literal, opening
+from studies.show.markdown import literal, opening
 from studies.study.margin import caution, margin_text
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from studies.paper.cases import HIGH_DAMPING, MOVES, OFF, TWO
 from studies.paper.context import PLACES, Context, change, move_text, settings
-from studies.show.pages import table
+from studies.show.markdown import table
 from studies.study.labels import describe
 
 

@@ -22,7 +22,7 @@ from studies.paper.context import (
 )
 from studies.paper.figures import PAPER_FIGURES
 from studies.paper.measures import PEAK_SPAN, SETTLED, Measures, middle_station
-from studies.show.pages import opening, picture, table
+from studies.show.markdown import opening, picture, table
 from studies.show.sketch import CAPTION
 from studies.show.units import span
 from studies.study.consistency import each_link

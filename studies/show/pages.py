@@ -8,113 +8,27 @@ from __future__ import annotations
 
 import re
 from base64 import b64encode
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
-from html import escape
 from mimetypes import guess_type
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote, unquote
+from urllib.parse import unquote
 
 from markdown_it import MarkdownIt
 from markdown_it.token import Token
 
 from studies import config
+from studies.show.markdown import literal
+from studies.show.templates import render
 from studies.store import replacing
 from studies.study.spec import Study
 from studies.study.template import study_template
 
 _PARSER = MarkdownIt("commonmark", {"html": False, "xhtmlOut": False}).enable("table")
-#: What Markdown takes for a mark wherever it stands (not [ alone, or _ inside a word).
-_MARKS = re.compile(
-    r"[\\`*|#]|<(?=[A-Za-z/!?])|&(?=[#\w])|\](?=[(\[:])|(?<!\w)_|_(?!\w)",
-)
-#: What it takes for one at the begin of a line.
-_FIRST_MARKS = re.compile(r"^(\d*)([-+.)](?=\s|$)|[>=~]|--)")
 
 #: What sections begin with.
 HEADING = ("heading_open", "h2")
-
-STYLE = """
-:root { color-scheme: light; }
-body {
-  margin: 2rem auto; padding: 0 1.5rem; max-width: 72rem; background: #fff; color: #1a1a1a;
-  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif;
-}
-h1, h2, h3 { line-height: 1.25; margin: 2rem 0 0.75rem; break-after: avoid; }
-h1 { font-size: 1.75rem; margin-top: 0; }
-h2 { font-size: 1.3rem; padding-bottom: 0.2rem; border-bottom: 1px solid #ccc; }
-h3 { font-size: 1.1rem; }
-p, ul, ol { max-width: 48rem; overflow-wrap: break-word; }
-.contents { padding: 0.5rem 0; border-top: 1px solid #ccc; font-size: 0.9rem; line-height: 1.9; }
-.contents a { white-space: nowrap; }
-a { color: #0b3c6f; }
-.table { overflow-x: auto; margin: 1rem 0; }
-table { border-collapse: collapse; font-size: 0.875rem; font-variant-numeric: tabular-nums; }
-th, td { padding: 0.3rem 0.6rem; border-bottom: 1px solid #ddd; text-align: left; }
-th { vertical-align: bottom; }
-td, tbody th { vertical-align: top; }
-thead th { border-bottom: 2px solid #888; }
-tbody th { font-weight: normal; }
-figure { margin: 1.5rem 0; max-width: 60rem; }
-img { display: block; max-width: 100%; height: auto; }
-figcaption { margin-top: 0.4rem; font-size: 0.9rem; color: #444; }
-code, pre { font-family: ui-monospace, Menlo, Consolas, "DejaVu Sans Mono", monospace; }
-code { font-size: 0.9em; }
-pre { padding: 0.75rem; overflow-x: auto; background: #f6f6f6; font-size: 0.8rem; }
-pre code { font-size: inherit; }
-@page { margin: 16mm 14mm; }
-@media print {
-  body { margin: 0; padding: 0; max-width: none; font-size: 10pt; }
-  p, ul, ol, figure { max-width: none; }
-  p, li { orphans: 3; widows: 3; }
-  a { color: inherit; text-decoration: none; }
-  .contents { display: none; }
-  .table { overflow: visible; }
-  table { font-size: 7.5pt; }
-  th, td { padding: 0.15rem 0.3rem; overflow-wrap: break-word; }
-  thead { display: table-header-group; }
-  tr, figure { break-inside: avoid; }
-  tr:first-child { break-after: avoid; }
-  tr:last-child { break-before: avoid; }
-  figure { margin: 3mm 0; }
-  img { max-height: 110mm; }
-  pre { padding: 0; overflow: visible; background: none; font-size: 7.5pt; white-space: pre-wrap;
-    overflow-wrap: anywhere; }
-}
-"""
-
-
-def literal(text: str) -> str:
-    """A user's text, such as a title, as Markdown shows it unchanged, on one line."""
-    line = " ".join(text.split())
-    return _FIRST_MARKS.sub(r"\1\\\2", _MARKS.sub(r"\\\g<0>", line))
-
-
-def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
-    """Lines of a Markdown table."""
-    names = list(header)
-    return [_row(names), _row(["---"] * len(names)), *(_row(row) for row in rows)]
-
-
-def _row(cells: Iterable[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
-def opening(asked: str, found: str, following: str) -> list[str]:
-    """First lines of a report: what was asked, what came out, what to do next; Markdown."""
-    parts = (("Asked", asked), ("Came out", found), ("Next", following))
-    return [line for head, text in parts for line in (f"**{head}:** {text}", "")]
-
-
-def picture(name: str, caption: str) -> str:
-    """Line of a figure, to stand alone.
-
-    Args:
-        name: of its PNG or GIF file, which lies beside the text.
-        caption: Markdown.
-    """
-    return f"![{caption}]({quote(name)})"
 
 
 def page(
@@ -137,22 +51,12 @@ def page(
     tokens = _arranged(_PARSER.parse(text), images)
     tokens = _with_contents(tokens, ["Versions", *files])
     body = _PARSER.renderer.render(tokens, _PARSER.options, {})
-    rows = "".join(
-        f'<tr><th scope="row">{escape(name)}</th><td>{escape(str(value))}</td></tr>\n'
-        for name, value in facts.items()
-    )
-    appended = "".join(
-        f'<h2 id="{_anchor(title)}">{escape(title)}</h2>\n'
-        f"<pre><code>{escape(content)}</code></pre>\n"
-        for title, content in files.items()
-    )
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(_title(tokens))}</title>\n<style>{STYLE}</style>\n</head>\n"
-        f'<body>\n<main>\n{body}<h2 id="versions">Versions</h2>\n'
-        f'<div class="table">\n<table>\n<tbody>\n{rows}</tbody>\n</table>\n</div>\n{appended}'
-        "</main>\n</body>\n</html>\n"
+    return render(
+        "show/page.html",
+        title=_title(tokens),
+        body=body,
+        facts=facts,
+        files=[(title, _anchor(title), content) for title, content in files.items()],
     )
 
 

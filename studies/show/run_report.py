@@ -21,20 +21,17 @@ from studies.engine.runs import (
 )
 from studies.errors import StudyError
 from studies.show import figures
-from studies.show.pages import literal, opening, picture, table, write_report
+from studies.show.markdown import picture
+from studies.show.pages import write_report
 from studies.show.sketch import CAPTION, sketch
+from studies.show.templates import render
+from studies.show.units import number
 from studies.store import check_target, write_store
-from studies.study.labels import describe
-from studies.study.margin import ENOUGH, caution, margin_text
+from studies.study.margin import ENOUGH, caution
 from studies.study.spec import Study
 
-#: Captions of what is drawn, by the end of the file's name.
-FIGURES = {
-    "deflection": "Deflection of the links' middle from the chord between their ends",
-    "error": "Platform: pose minus shaped command",
-    "voltage": "Voltages of the actuators, numbered from the slider on",
-    "machine": CAPTION,
-}
+#: What is drawn, by the end of the file's name.
+FIGURES = ("deflection", "error", "voltage", "machine")
 _FREE = "without control"
 _POSE = ("x [µm]", "y [µm]", "φ [µrad]")
 
@@ -92,40 +89,52 @@ def _figure(out: Path, name: str) -> str:
 
 def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str]) -> str:
     """Markdown text; arguments of `write_results`, and the same run without control."""
+    result, study = run.result, run.study
+    worst = int(np.argmax(np.nan_to_num(result.metrics.residual_rms.max(axis=1), nan=-1.0)))
+    has_free = twin is not None and twin.status in status.FINISHED
+    return render(
+        "show/run_report.md",
+        run=run,
+        study=study,
+        twin=twin,
+        metrics=result.metrics,
+        loop=run.loop,
+        planned=run.motion,
+        notes=notes,
+        motion=motion_text(study),
+        control=control_text(study),
+        is_finished=run.status in status.FINISHED,
+        worst=worst,
+        rms=result.metrics.residual_rms.max(axis=1),
+        free_rms=twin.result.metrics.residual_rms.max(axis=1) if twin and has_free else None,
+        settled=[settling_text(run, link) for link in range(3)],
+        caution=caution(run.loop.gain_margin) if run.loop is not None else "",
+        case=_situation(run, twin),
+        band=study.metrics.settling_band,
+        stations=", ".join(f"{1e3 * x:g}" for x in study.metrics.stations),
+        watched=_watched(run),
+        command_end=round(float(result.command_end), 9),
+        buckling=np.min(euler_force(run.case.machine.beam)),
+        links=_links(run, twin),
+        platform=_platform(run),
+        modes=_modes(run),
+        sketch_caption=CAPTION,
+        figure=lambda name, caption: picture(_figure(out, name), caption),
+    )
 
-    end = float(run.result.command_end)
 
-    def shown(name: str) -> list[str]:
-        return [picture(_figure(out, name), FIGURES[name]), ""]
-
-    lines = [
-        f"# {literal(run.study.title) or 'study'}: one run",
-        "",
-        *opening(_asked(run), _came_out(run, twin, notes), _next(run, twin)),
-        *shown("machine"),
-        "## Links",
-        "",
-        *_links(run, twin),
-        "",
-        f"Over time; dotted: the end of the shaped command at {round(end, 9):.4g} s.",
-        "",
-        *shown("deflection"),
-        "## Platform",
-        "",
-        *_platform(run),
-        "",
-        *shown("error"),
-        "## Control loop",
-        "",
-        *_loop(run),
-        "",
-        *shown("voltage"),
-    ]
-    return "\n".join(lines)
-
-
-def _asked(run: Run) -> str:
-    return f"{motion_text(run.study)}; {control_text(run.study)}."
+def _situation(run: Run, twin: Run | None) -> str:
+    """What decides what to do next."""
+    if run.loop is not None and run.loop.gain_margin < ENOUGH:
+        return "margin"
+    if run.study.control.feedback == "none" or not any(run.study.control.links):
+        return "uncontrolled"
+    if twin is None:
+        return "well"
+    left, free = (x.result.metrics.residual_rms.max() for x in (run, twin))
+    if free < run.study.metrics.settling_band:
+        return "calm"
+    return "worse" if left > 1.05 * free else "well"
 
 
 def motion_text(study: Study) -> str:
@@ -172,111 +181,21 @@ def control_text(study: Study) -> str:
     )
 
 
-def _came_out(run: Run, twin: Run | None, notes: Sequence[str]) -> str:
-    metrics, worst = run.result.metrics, _worst_link(run)
-    told = [_status(run, [f"{note.rstrip('.')}." for note in notes])]
-    if run.status in status.FINISHED:
-        rms = 1e6 * metrics.residual_rms[worst].max()
-        without = ""
-        if twin is not None and twin.status in status.FINISHED:
-            without = (
-                f" ({1e6 * twin.result.metrics.residual_rms[worst].max():.4g} without control)"
-            )
-        told.append(
-            f"Link {worst + 1} vibrates most: {rms:.4g} µm rms{without}, settled: "
-            f"{settling_text(run, worst)} ms after the command; peak voltage "
-            f"{metrics.peak_voltage.max():.4g} of "
-            f"{run.study.electronics.voltage_limit:g} V."
-        )
-    if run.loop is not None:
-        told.append(f"Gain margin {margin_text(run.loop.gain_margin)}.")
-        warning = caution(run.loop.gain_margin)
-        told += [f"**{literal(warning)}**"] if warning else []
-    return " ".join(told)
-
-
-def _is_worse(run: Run, twin: Run) -> bool:
-    mine, theirs = (x.result.metrics.residual_rms.max() for x in (run, twin))
-    return bool(mine > 1.05 * theirs)
-
-
-def _worst_link(run: Run) -> int:
-    return int(np.argmax(np.nan_to_num(run.result.metrics.residual_rms.max(axis=1), nan=-1.0)))
-
-
-def _next(run: Run, twin: Run | None) -> str:
-    if run.loop is not None and run.loop.gain_margin < ENOUGH:
-        return (
-            "lower `control.gain_factor`, or move the patches: a sweep over `gain` and `placement` "
-            "(`studies sweep placement`) shows where margins are."
-        )
-    if run.study.control.feedback == "none" or not any(run.study.control.links):
-        return "control the links (`[control]`) and compare."
-    band = run.study.metrics.settling_band
-    if twin is not None and twin.result.metrics.residual_rms.max() < band:
-        return (
-            f"there is hardly anything to suppress, without control less than {1e6 * band:g} µm "
-            "is left: a faster move, or a disturbance (`studies simulate disturbance`), shows what "
-            "control does."
-        )
-    if twin is not None and _is_worse(run, twin):
-        return (
-            "control leaves more than no control does: the window begins with the slider drive's "
-            "own settling, which bends the links too, and the loop answers to it. "
-            "`metrics.residual_delay = 0.04` looks at the links' own vibration."
-        )
-    return (
-        "`studies spillover STUDY --out certificate` for how far the design may be trusted, "
-        "`studies tune SPEC` for better numbers, `studies export STUDY` for the controller."
-    )
-
-
-def _status(run: Run, notes: Sequence[str]) -> str:
-    bad = float(run.result.bad_time)
-    since = f" from {bad:.4g} s on" if bad > 0 else ""
-    return " ".join([f"Status: **{describe(run.status)}**{since}.", *map(literal, notes)])
-
-
-def _links(run: Run, twin: Run | None) -> list[str]:
-    metrics, own = run.result.metrics, run.study.metrics
-    rows = [
+def _links(run: Run, twin: Run | None) -> list[list[str]]:
+    """Row of each link."""
+    metrics = run.result.metrics
+    lengths = [metrics.residual_rms, metrics.residual_peak, metrics.structural_peak]
+    if twin is not None:
+        lengths.insert(1, twin.result.metrics.residual_rms)
+    return [
         [
             str(i + 1),
-            f"{1e6 * metrics.residual_rms[i].max():.4g}",
-            f"{1e6 * metrics.residual_peak[i].max():.4g}",
-            f"{1e6 * metrics.structural_peak[i].max():.4g}",
+            *(number(values[i].max(), "m") for values in lengths),
             settling_text(run, i),
-            f"{metrics.peak_voltage[i]:.4g}",
-            f"{metrics.peak_force[i]:.4g}",
+            number(metrics.peak_voltage[i], "V"),
+            number(metrics.peak_force[i], "N"),
         ]
         for i in range(3)
-    ]
-    more: tuple[str, ...] = ()
-    told = ""
-    if twin is not None:
-        more = ("residual rms without control [µm]",)
-        for row, rms in zip(rows, twin.result.metrics.residual_rms, strict=True):
-            row.insert(2, f"{1e6 * rms.max():.4g}")
-        if twin.status not in status.FINISHED:
-            told = f" Without control the run ends early: {describe(twin.status)}."
-    stations = ", ".join(f"{1e3 * x:g}" for x in own.stations)
-    heads = (
-        "link",
-        "residual rms [µm]",
-        *more,
-        "residual peak [µm]",
-        "peak while moving [µm]",
-        "settling time [ms]",
-        "peak voltage [V]",
-        "peak motor force [N]",
-    )
-    return [
-        f"Deflections: the largest of the stations at {stations} mm. Residual window: "
-        f"{own.residual_length:g} s, from {own.residual_delay:g} s after the shaped command. "
-        f"Settled: within {1e6 * own.settling_band:g} µm from then to the end of the run, "
-        f"{1e3 * _watched(run):.4g} ms after the shaped command.{told}",
-        "",
-        *table(heads, rows),
     ]
 
 
@@ -294,61 +213,22 @@ def settling_text(run: Run, link: int) -> str:
     return f"{1e3 * seconds:.4g}"
 
 
-def _platform(run: Run) -> list[str]:
-    metrics, critical = run.result.metrics, euler_force(run.case.machine.beam)
-    errors = metrics.pose_error_peak, metrics.pose_error_rms, metrics.stretch_error_peak
-    rows = [[name, *(f"{1e6 * error[k]:.4g}" for error in errors)] for k, name in enumerate(_POSE)]
-    return [
-        "Pose minus shaped command. The links of the model do not stretch; the last column is what "
-        "stretching by N L/(E A) would add. "
-        f"Largest tension in a link {np.max(metrics.peak_tension):.4g} N, largest compression "
-        f"{np.max(metrics.peak_compression):.4g} N (a bare link buckles at {np.min(critical):.4g} "
-        "N).",
-        "",
-        *table(
-            ("", "largest while moving", "rms in the residual window", "stretch of the links"), rows
-        ),
-    ]
-
-
-def _loop(run: Run) -> list[str]:
+def _platform(run: Run) -> list[list[str]]:
+    """Row of each coordinate."""
     metrics = run.result.metrics
-    lines = [
-        f"Samples with an actuator at its limit: {100 * metrics.saturated_fraction:.3g} %; with an "
-        f"ADC channel at its end: {100 * metrics.clipped_fraction:.3g} %; with a motor at its "
-        f"limit of {run.study.drive.force_limit:g} N: "
-        f"{100 * metrics.motor_saturated_fraction:.3g} %.",
-    ]
+    errors = metrics.pose_error_peak, metrics.pose_error_rms, metrics.stretch_error_peak
+    return [[name, *(number(error[k], "m") for error in errors)] for k, name in enumerate(_POSE)]
+
+
+def _modes(run: Run) -> list[list[str]]:
+    """Row of each order of the modes, of a loop that is judged."""
     if run.loop is None:
-        return lines
+        return []
     modes = zip(run.loop.frequency_hz, run.loop.damping_ratio, strict=True)
-    rows = [
+    return [
         [str(k + 1), ", ".join(f"{f:.2f}" for f in frequency), ", ".join(f"{z:.4f}" for z in zeta)]
         for k, (frequency, zeta) in enumerate(modes)
     ]
-    return [
-        *lines,
-        "",
-        f"Linearised at the first pose: gain margin {margin_text(run.loop.gain_margin)}, spectral "
-        f"radius {run.loop.spectral_radius:.6f}. {_motion(run)}The lowest modes of the links with "
-        "control, three of each order:",
-        "",
-        *table(("order", "frequencies [Hz]", "damping ratios [1]"), rows),
-    ]
-
-
-def _motion(run: Run) -> str:
-    if run.motion is None:
-        return ""
-    margin, force = run.motion.gain_margin, run.motion.axial_force
-    told = (
-        f"With the forces that the planned motion puts on the links ({force.min():.3g} to "
-        f"{force.max():.3g} N; the drive's own ringing and pulses come on top, see the table) the "
-        f"margin goes from {margin_text(margin.min())} to {margin_text(margin.max())}. "
-    )
-    if margin.min() == 0:
-        told += "0: at that instant the loop is unstable at any gain, as of a link that buckles. "
-    return told
 
 
 def draw(run: Run, twin: Run | None = None) -> dict[str, Figure]:

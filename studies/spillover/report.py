@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxmodel.laws import LAWS
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
-from studies.show.pages import literal, opening, picture, table
+from studies.show.markdown import literal, opening, picture, table
 from studies.show.sketch import CAPTION
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import FAST, GIVEN, SETTLING, WINDOW, WITHOUT, Comparison

@@ -12,7 +12,8 @@ from jaxmodel import status
 from studies.engine.results import SweepData, load, metric_values, swept_names
 from studies.errors import StudyError, shown
 from studies.show.figures import styled
-from studies.show.pages import literal, opening, picture, table, write_report
+from studies.show.markdown import literal, opening, picture, table
+from studies.show.pages import write_report
 from studies.show.sketch import CAPTION, sketch
 from studies.show.units import count_text, readable
 from studies.space.axes import SHOWN_AS

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
-from studies.show.pages import literal, opening, picture, table
+from studies.show.markdown import literal, opening, picture, table
 from studies.show.sketch import CAPTION
 from studies.show.units import count_text, headed, number, readable
 from studies.study.entries import links_text, parse_entries

@@ -1,0 +1,46 @@
+"""Markdown: a user's text as it is, tables, figures."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from urllib.parse import quote
+
+#: What Markdown takes for a mark wherever it stands (not [ alone, or _ inside a word).
+_MARKS = re.compile(
+    r"[\\`*|#]|<(?=[A-Za-z/!?])|&(?=[#\w])|\](?=[(\[:])|(?<!\w)_|_(?!\w)",
+)
+#: What it takes for one at the begin of a line.
+_FIRST_MARKS = re.compile(r"^(\d*)([-+.)](?=\s|$)|[>=~]|--)")
+
+
+def literal(text: str) -> str:
+    """A user's text, such as a title, as Markdown shows it unchanged, on one line."""
+    line = " ".join(text.split())
+    return _FIRST_MARKS.sub(r"\1\\\2", _MARKS.sub(r"\\\g<0>", line))
+
+
+def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
+    """Lines of a Markdown table."""
+    names = list(header)
+    return [_row(names), _row(["---"] * len(names)), *(_row(row) for row in rows)]
+
+
+def _row(cells: Iterable[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def picture(name: str, caption: str) -> str:
+    """Line of a figure, to stand alone.
+
+    Args:
+        name: of its PNG or GIF file, which lies beside the text.
+        caption: Markdown.
+    """
+    return f"![{caption}]({quote(name)})"
+
+
+def opening(asked: str, found: str, following: str) -> list[str]:
+    """First lines of a report: what was asked, what came out, what to do next; Markdown."""
+    parts = (("Asked", asked), ("Came out", found), ("Next", following))
+    return [line for head, text in parts for line in (f"**{head}:** {text}", "")]

@@ -1,0 +1,101 @@
+"""Texts from their templates (Jinja2): the words of reports, pages, the text of C.
+
+A template lies in the folder of the module that fills it: `report.md` beside `report.py`. In
+Markdown a paragraph may break its lines anywhere, and blocks leave no trace: `paragraphs` puts
+each paragraph on one line.
+
+To add one: write the template, and call `render` with the values it names. A name that has no
+value is an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+
+from studies.show.markdown import literal, picture, table
+from studies.show.units import count_text, headed, number, span
+from studies.study.entries import links_text
+from studies.study.labels import describe
+from studies.study.margin import margin_text
+
+_ROOT = Path(__file__).parents[1]
+
+
+def _short(value: float, digits: int = 4) -> str:
+    """A number with this many significant digits."""
+    return f"{value:.{digits}g}"
+
+
+def _percent(share: float, digits: int = 3) -> str:
+    """A share in percent."""
+    return f"{100 * share:.{digits}g} %"
+
+
+def _table(header: list[str], rows: list[list[str]]) -> str:
+    return "\n".join(table(header, rows))
+
+
+#: How templates write values: `{{ value | name }}`.
+FILTERS: dict[str, Callable[..., str]] = {
+    "short": _short,
+    "percent": _percent,
+    "number": number,
+    "count": count_text,
+    "headed": headed,
+    "span": span,
+    "links": links_text,
+    "literal": literal,
+    "margin": margin_text,
+    "status": describe,
+}
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(_ROOT),
+        undefined=StrictUndefined,
+        autoescape=select_autoescape(["html"], default=False),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters.update(FILTERS)
+    environment.globals.update(table=_table, picture=picture)
+    return environment
+
+
+def render(name: str, **values: Any) -> str:
+    """A template with its values put in.
+
+    Args:
+        name: of its file, from `studies` on: "tuning/report.md".
+        values: by the names that it uses; FILTERS, `table` and `picture` are there for all.
+
+    Returns:
+        The text; of Markdown with each paragraph on one line.
+
+    Raises:
+        jinja2.UndefinedError: a name without a value.
+    """
+    text = _environment().get_template(name).render(values)
+    return paragraphs(text) if name.endswith(".md") else text
+
+
+def paragraphs(text: str) -> str:
+    """Markdown with each paragraph and list entry on one line, and one empty line between."""
+    blocks: list[str] = [""]
+    for line in text.splitlines():
+        if not line.startswith("|"):
+            line = " ".join(line.split())
+        is_alone = line.startswith(("#", "|", "![")) or blocks[-1].startswith(("#", "|", "!["))
+        if line and blocks[-1] and not is_alone and not line.startswith("- "):
+            blocks[-1] += f" {line}"
+        elif line or blocks[-1]:
+            blocks.append(line)
+    return "\n".join(blocks).strip("\n") + "\n"
