@@ -51,7 +51,7 @@ def sketch(study: Study) -> Figure:
         center = pose[:2] + turn @ np.array(study.load.offset)
         ax.plot(*(1e3 * center), "P", color="black", markersize=6, zorder=5)
     ax.set_aspect("equal")
-    ax.margins(0.08)
+    ax.margins(0.14)
     ax.set(xlabel="x [mm]", ylabel="y [mm]")
     return figure
 
