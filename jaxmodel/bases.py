@@ -37,8 +37,8 @@ def find_bases(structure: Structure, case: Case) -> Bases:
     load = jnp.broadcast_to(case.initial.load_station, (*stations.shape[:-1], 1))
     stations = jnp.concatenate([stations, load], axis=-1)
     both = structure.basis, structure.controller_basis
-    if both == ("loaded", "loaded"):
-        plant, model = _side_by_side(beam, belief, patches, size, stations)
+    if both[0] == both[1]:
+        plant, model = _side_by_side(both[0], beam, belief, patches, size, stations)
     else:
         plant = build_basis(both[0], beam, patches, size, stations)
         model = build_basis(both[1], belief, patches, size, stations)
@@ -56,17 +56,18 @@ def find_bases(structure: Structure, case: Case) -> Bases:
 
 
 def _side_by_side(
-    one: Beam, other: Beam, patches: Patches, size: int, stations: Array
+    kind: str, one: Beam, other: Beam, patches: Patches, size: int, stations: Array
 ) -> tuple[ModalBasis, ModalBasis]:
-    """Two loaded bases by one eigenvalue problem.
+    """Two bases of one kind by one call.
 
-    Two of them in one program now and then never end on CPUs (jax 0.10): XLA loses the second.
+    Two eigenvalue problems in one program now and then never end on CPUs (jax 0.10): XLA loses the
+    second.
     """
     pairs = zip(one, other, strict=True)
     beam = Beam(*(jnp.concatenate([jnp.broadcast_to(x, (3,)) for x in pair]) for pair in pairs))
     twice = (jnp.asarray(x) for x in patches)
     both = Patches(*(jnp.concatenate([x, x]) if x.ndim else x for x in twice))
-    six = build_basis("loaded", beam, both, size, jnp.tile(stations, (stations.ndim, 1)))
+    six = build_basis(kind, beam, both, size, jnp.tile(stations, (stations.ndim, 1)))
     return jax.tree.map(lambda x: x[:3], six), jax.tree.map(lambda x: x[3:], six)
 
 

@@ -7,10 +7,13 @@
 
 A gain in N s/m assumes a mode-shape scale: unit tip for `pinned_free` (m_j = m_b/4), unit
 amplitude for `pinned_pinned` (m_j = m_b/2), modal mass half the link's for `loaded`.
+
+To add one: a function of a link's data that returns `ModalBasis`, and its entry in `BASES`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -18,8 +21,7 @@ import numpy as np
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array, Beam, Patches
 from jaxmodel.piezo import bare_stiffness, one_sided_section, patch_ends, two_sided_section
-
-BASES = ("pinned_pinned", "pinned_free", "loaded")
+from jaxmodel.table import Table
 
 _Parts = TypeVar("_Parts", Beam, Patches)
 
@@ -44,13 +46,22 @@ class ModalBasis(NamedTuple):
     actuator_slope: Array  # Phi_a: the same for the actuators [1/m], (3, R, n_patches)
 
 
+class Basis(NamedTuple):
+    """A family of mode shapes: what sets it apart, and how to compute it for one link."""
+
+    name: str
+    modes: Callable[[Beam, Patches, int, Array], ModalBasis]  # of R modes, deflection at stations
+    is_on_chord: bool  # both ends lie on the frame's axis: Y_j(L) = 0
+    has_joints: bool = False  # takes in rotary inertia at the joints
+
+
 def build_basis(
     kind: str, beam: Beam, patches: Patches, n_modes: int, stations: Array, mode_mask: Array = 1.0
 ) -> ModalBasis:
     """Modal basis of all links, three of them as a rule.
 
     Args:
-        kind: one of `BASES` (static).
+        kind: name of one of `BASES` (static).
         beam: link data, () or (3,) fields.
         patches: patch data, () or (3,) fields; one row of centres per link.
         n_modes: R, modes per link (static).
@@ -69,7 +80,6 @@ def build_basis(
         raise ValueError(f"basis = {kind!r}: allowed {', '.join(BASES)}")
     if n_modes < 1:
         raise ValueError(f"n_modes = {n_modes}: allowed 1 or more [1]")
-    link = {"pinned_pinned": _pinned_pinned, "pinned_free": _pinned_free, "loaded": _loaded}[kind]
     centers = jnp.asarray(patches.center)
     n_links = len(centers)
     stations = jnp.asarray(stations)
@@ -77,7 +87,7 @@ def build_basis(
     own = _each_link(patches._replace(center=0.0), n_links)._replace(center=centers)
 
     def one_link(beam_i: Beam, patches_i: Patches, stations_i: Array) -> ModalBasis:
-        return link(beam_i, patches_i, n_modes, stations_i)
+        return BASES[kind].modes(beam_i, patches_i, n_modes, stations_i)
 
     return mask_modes(jax.vmap(one_link)(_each_link(beam, n_links), own, stations), mode_mask)
 
@@ -110,15 +120,15 @@ def held_frequency(kind: str, beam: Beam, basis: ModalBasis) -> Array:
     """Frequencies of links between held ends [rad/s], (3, R).
 
     The links of the assembled machine vibrate like this (docs/theory.md). A basis whose ends lie on
-    the chord has them itself; `pinned_free` belongs to links that no platform holds, so the bare
-    link's (j pi)^2 sqrt(E I/(rhoA L^4)) stand for it.
+    the chord has them itself; any other belongs to links that no platform holds, so the bare link's
+    (j pi)^2 sqrt(E I/(rhoA L^4)) stand for it.
 
     Args:
         kind: modal basis (static).
         beam: link data, () or (3,) fields.
         basis: of that kind and beam.
     """
-    if kind != "pinned_free":
+    if BASES[kind].is_on_chord:
         return jnp.sqrt(basis.stiffness / basis.mass)
     beam = _each_link(beam, basis.mass.shape[0])
     order = jnp.arange(1, basis.mass.shape[1] + 1)
@@ -300,3 +310,13 @@ def _gauss(n_points: int) -> tuple[np.ndarray, np.ndarray]:
     """Nodes and weights of Gauss-Legendre quadrature on [0, 1]."""
     node, weight = np.polynomial.legendre.leggauss(n_points)
     return (node + 1) / 2, weight / 2
+
+
+BASES = Table(
+    "modal basis",
+    (
+        Basis("pinned_pinned", _pinned_pinned, is_on_chord=True),
+        Basis("pinned_free", _pinned_free, is_on_chord=False),
+        Basis("loaded", _loaded, is_on_chord=True, has_joints=True),
+    ),
+)

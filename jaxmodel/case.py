@@ -79,7 +79,7 @@ class Electronics(NamedTuple):
 class Shaping(NamedTuple):
     """Input shaper of the reference, one entry per shaped frequency."""
 
-    kind: Array  # index in `shaper.KINDS`, ()
+    kind: Array  # position in `shaper.SHAPERS`, ()
     omega: Array  # [rad/s], 0: mode 1 as the controller believes it, (n,)
     zeta: Array  # [1], (n,)
     tolerance: Array  # V of the EI family [1], ()

@@ -1,5 +1,6 @@
 """Reference motion of the platform: point-to-point moves (25) and their shaped form."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -7,8 +8,7 @@ import numpy as np
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.shaper import Taps
-
-PROFILES = ("cycloid", "quintic")
+from jaxmodel.table import Table
 
 
 class Path(NamedTuple):
@@ -17,7 +17,7 @@ class Path(NamedTuple):
     waypoints: poses (x, y, phi) [m, m, rad], shape (n + 1, 3).
     move_time: duration of each move, positive [s], shape (n,).
     dwell: pause after each move, the last one included [s], shape (n,).
-    profile: index of the time law in `PROFILES` [1], shape ().
+    profile: position of the time law in `PROFILES` [1], shape ().
     """
 
     waypoints: Array
@@ -56,7 +56,7 @@ def square_path(
         waypoints=jnp.stack([x * side, y * side, jnp.full(5, phi)], axis=1),
         move_time=jnp.broadcast_to(jnp.asarray(move_time), (4,)),
         dwell=jnp.broadcast_to(jnp.asarray(dwell), (4,)),
-        profile=jnp.asarray(PROFILES.index("cycloid")),
+        profile=jnp.asarray(PROFILES.position("cycloid")),
     )
 
 
@@ -89,11 +89,22 @@ def quintic(u: Array) -> tuple[Array, Array, Array]:
     )
 
 
+class Profile(NamedTuple):
+    """A time law of moves from rest to rest."""
+
+    name: str
+    time_law: Callable[[Array], tuple[Array, Array, Array]]  # s, s', s'' of u in [0, 1] [1]
+
+
+#: To add one: its function above, and an entry here.
+PROFILES = Table("motion profile", (Profile("cycloid", cycloid), Profile("quintic", quintic)))
+
+
 def sample_path(path: Path, time: Array) -> PathSample:
     """Return the pose and its rates at the given times.
 
     X(t) = w_0 + sum_k (w_{k+1} - w_k) s(clip((t - t_k)/tf_k, 0, 1)): at rest in the first waypoint
-    before 0 and in the last one after the end. Time law (25), or the quintic.
+    before 0 and in the last one after the end. s: the path's profile, (25) as a rule.
 
     Args:
         path: the moves.
@@ -112,10 +123,9 @@ def sample_path(path: Path, time: Array) -> PathSample:
         k = jnp.clip(jnp.sum(instant >= starts) - 1, 0, last)
         duration = path.move_time[k]
         u = jnp.clip((instant - starts[k]) / duration, 0, 1)
-        is_cycloid = path.profile == PROFILES.index("cycloid")
-        s, rate, bend = (
-            jnp.where(is_cycloid, a, b) for a, b in zip(cycloid(u), quintic(u), strict=True)
-        )
+        laws = [profile.time_law(u) for profile in PROFILES.values()]
+        which = path.profile.astype(jnp.int32)
+        s, rate, bend = (jax.lax.select_n(which, *values) for values in zip(*laws, strict=True))
         return PathSample(
             path.waypoints[k] + s * steps[k],
             rate / duration * steps[k],

@@ -305,7 +305,7 @@ def _is_ill_conditioned(structure: Structure, case: Case, design: ControllerDesi
 def _is_too_fast(structure: Structure, case: Case, bases: Bases) -> Array:
     """Whether a filter or the shaper is beyond half the sample rate."""
     half = jnp.pi / case.electronics.period
-    is_shaped = case.shaping.kind != shaper.KINDS.index("none")
+    is_shaped = case.shaping.kind != shaper.SHAPERS.position("none")
     is_fast = jnp.any(case.shaping.omega >= half) & is_shaped
     if structure.feedback != "sampled":
         return is_fast

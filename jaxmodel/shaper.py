@@ -5,6 +5,7 @@ Singhose, Seering and Singer 1994 (EI); Singhose, Porter, Tuttle and Singer 1997
 humps); the paper, section 3.1.
 """
 
+from collections.abc import Callable
 from math import comb
 from typing import NamedTuple
 
@@ -12,9 +13,7 @@ import numpy as np
 
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
-
-KINDS = ("none", "zv", "zvd", "zvdd", "ei", "ei_damped", "ei2", "ei3")
-MAX_IMPULSES = 5
+from jaxmodel.table import Table
 
 
 class Impulses(NamedTuple):
@@ -25,6 +24,14 @@ class Impulses(NamedTuple):
 
     amplitude: Array
     time: Array
+
+
+class Shaper(NamedTuple):
+    """A kind of shaper."""
+
+    name: str
+    length: int  # impulses [1]
+    impulses: Callable[[Array, Array, Array], Impulses]  # of omega, zeta and the tolerance V
 
 
 class Taps(NamedTuple):
@@ -176,28 +183,37 @@ def ei3(omega: Array, zeta: Array, tolerance: Array) -> Impulses:
     return Impulses(jnp.stack([outer, inner, middle, inner, outer]), _half_periods(5, omega, zeta))
 
 
+#: To add one: its function above, and an entry here.
+SHAPERS = Table(
+    "shaper",
+    (
+        Shaper("none", 1, lambda omega, zeta, tolerance: none()),
+        Shaper("zv", 2, lambda omega, zeta, tolerance: zv(omega, zeta)),
+        Shaper("zvd", 3, lambda omega, zeta, tolerance: zvd(omega, zeta)),
+        Shaper("zvdd", 4, lambda omega, zeta, tolerance: zvdd(omega, zeta)),
+        Shaper("ei", 3, ei),
+        Shaper("ei_damped", 3, ei_damped),
+        Shaper("ei2", 4, ei2),
+        Shaper("ei3", 5, ei3),
+    ),
+)
+#: Impulses of the longest one.
+MAX_IMPULSES = max(shaper.length for shaper in SHAPERS.values())
+
+
 def design_shaper(kind: Array, omega: Array, zeta: Array, tolerance: Array) -> Impulses:
-    """Return the shaper of the given kind, padded with zero amplitudes to shape (5,).
+    """Return the shaper of the given kind, padded with zero amplitudes to `MAX_IMPULSES`.
 
     Args:
-        kind: index in `KINDS`, may be traced [1], shape ().
+        kind: position in `SHAPERS`, may be traced [1], shape ().
         omega: natural frequency of the mode [rad/s], shape ().
         zeta: its damping ratio, in [0, 1) [1], shape ().
         tolerance: V of the extra-insensitive kinds, in [0, 1) [1], shape ().
     """
-    shapers = (
-        none(),
-        zv(omega, zeta),
-        zvd(omega, zeta),
-        zvdd(omega, zeta),
-        ei(omega, zeta, tolerance),
-        ei_damped(omega, zeta, tolerance),
-        ei2(omega, zeta, tolerance),
-        ei3(omega, zeta, tolerance),
-    )
+    designed = [shaper.impulses(omega, zeta, tolerance) for shaper in SHAPERS.values()]
 
     def select(field: int) -> Array:
-        rows = [jnp.pad(s[field], (0, MAX_IMPULSES - len(s[field]))) for s in shapers]
+        rows = [jnp.pad(s[field], (0, MAX_IMPULSES - len(s[field]))) for s in designed]
         return jnp.stack(rows)[kind]
 
     return Impulses(select(0), select(1))

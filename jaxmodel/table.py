@@ -37,6 +37,10 @@ class Table(Mapping[str, _Entry], Generic[_Entry]):
     def __len__(self) -> int:
         return len(self._entries)
 
+    def position(self, name: str) -> int:
+        """Where an entry stands, by which arrays name it."""
+        return list(self._entries).index(name)
+
     def add(self, entry: _Entry) -> None:
         """Put in another one.
 

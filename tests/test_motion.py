@@ -15,7 +15,7 @@ from jaxmodel.motion import (
     shape_path,
     square_path,
 )
-from jaxmodel.shaper import KINDS, Taps, design_shaper, split_exact
+from jaxmodel.shaper import SHAPERS, Taps, design_shaper, split_exact
 
 sample = jax.jit(sample_path)
 
@@ -25,7 +25,7 @@ def uneven_path(profile="cycloid"):
         jnp.array([[0.01, -0.02, 0.5], [0.02, 0.01, 0.4], [-0.01, 0.0, 0.6], [0.0, 0.02, 0.6]]),
         jnp.array([0.05, 0.1, 0.08]),
         jnp.array([0.02, 0.0, 0.03]),
-        jnp.asarray(PROFILES.index(profile)),
+        jnp.asarray(PROFILES.position(profile)),
     )
 
 
@@ -38,7 +38,7 @@ def test_first_move_of_the_square_is_equation_25():
 
 
 def test_quintic_is_its_polynomial():
-    path = square_path()._replace(profile=jnp.asarray(PROFILES.index("quintic")))
+    path = square_path()._replace(profile=jnp.asarray(PROFILES.position("quintic")))
     t = np.linspace(0, 0.1, 101)
     s = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
     got = sample(path, t)
@@ -67,7 +67,7 @@ def test_formula_with_all_moves_summed(profile):
         u = np.clip((t - start) / float(path.move_time[k]), 0, 1)
         laws = (u - np.sin(2 * np.pi * u) / (2 * np.pi), 10 * u**3 - 15 * u**4 + 6 * u**5)
         delta = np.asarray(path.waypoints[k + 1] - path.waypoints[k])
-        position += laws[PROFILES.index(profile)][:, None] * delta
+        position += laws[PROFILES.position(profile)][:, None] * delta
     np.testing.assert_allclose(sample(path, t).position, position, rtol=0, atol=1e-15)
 
 
@@ -186,7 +186,7 @@ def quick_path(profile="cycloid"):
 def test_shaped_path_is_the_sum_of_delayed_paths(profile):
     path = quick_path(profile)
     omega = 2 * np.pi * 114.4
-    impulses = design_shaper(KINDS.index("ei_damped"), omega, 0.02, 0.05)
+    impulses = design_shaper(SHAPERS.position("ei_damped"), omega, 0.02, 0.05)
     taps = split_exact(impulses, PER_SAMPLE * STEP, omega, 0.02)
     got = shape(path, taps, N_TIMES, PER_SAMPLE, STEP)
     assert_same_motion(got, direct(path, taps))
@@ -213,7 +213,7 @@ def test_shaped_paths_in_a_batch_and_their_gradients():
 
     @jax.jit
     def velocity(omega):
-        impulses = design_shaper(KINDS.index("zvd"), omega, 0.01, 0.05)
+        impulses = design_shaper(SHAPERS.position("zvd"), omega, 0.01, 0.05)
         taps = split_exact(impulses, 1e-3, omega, 0.01)
         return shape_path(path, taps, 60, 5, 2e-4).velocity[37, 1]
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 
 from jaxmodel.shaper import (
-    KINDS,
     MAX_IMPULSES,
+    SHAPERS,
     Impulses,
     convolve,
     damped_frequency,
@@ -46,7 +46,7 @@ modes = {"omega": st.floats(1.0, 1e4), "zeta": st.floats(0, 0.3)}
 
 
 def index(kind):
-    return KINDS.index(kind)
+    return SHAPERS.position(kind)
 
 
 def sampled(taps, period=PERIOD):
@@ -54,7 +54,7 @@ def sampled(taps, period=PERIOD):
     return Impulses(taps.weight, taps.sample * period)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", SHAPERS)
 @settings(max_examples=50, deadline=None)
 @given(**modes, tolerance=st.floats(0, 0.3))
 def test_amplitudes_sum_to_one(kind, omega, zeta, tolerance):
@@ -238,7 +238,7 @@ def test_exact_split_keeps_the_zero_where_the_linear_split_loses_it():
     assert linear > 1e-3
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", SHAPERS)
 @settings(max_examples=50, deadline=None)
 @given(omega=st.floats(500.0, 5000.0), zeta=st.floats(0, 0.2))
 def test_splits_are_harmless(kind, omega, zeta):
@@ -273,11 +273,11 @@ def test_impulse_on_the_grid_stays_one_impulse():
 
 
 def test_traced_kinds_in_one_batch():
-    kinds = jnp.arange(len(KINDS))
-    omega, zeta = OMEGA * jnp.linspace(0.8, 1.2, len(KINDS)), jnp.linspace(0, 0.2, len(KINDS))
-    v = jnp.linspace(0.03, 0.1, len(KINDS))
+    kinds = jnp.arange(len(SHAPERS))
+    omega, zeta = OMEGA * jnp.linspace(0.8, 1.2, len(SHAPERS)), jnp.linspace(0, 0.2, len(SHAPERS))
+    v = jnp.linspace(0.03, 0.1, len(SHAPERS))
     amplitude, time = jax.jit(jax.vmap(design_shaper))(kinds, omega, zeta, v)
-    for k, kind in enumerate(KINDS):
+    for k, kind in enumerate(SHAPERS):
         mode = (omega[k], zeta[k])
         alone = {
             "none": lambda mode, v: none(),
@@ -308,7 +308,7 @@ def everything(kind, omega, zeta, tolerance):
     )
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", SHAPERS)
 def test_gradients(kind):
     check_grads(
         lambda *inputs: everything(index(kind), *inputs),
@@ -321,7 +321,7 @@ def test_gradients(kind):
     )
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", SHAPERS)
 def test_gradients_are_finite_at_the_limits(kind):
     """No damping and no tolerance; no residual vibration of the ZV family."""
 

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jaxmodel.controller import Controller
-from jaxmodel.estimator import Estimator
+from jaxmodel.estimator import KINDS, Estimator
 from jaxmodel.laws import LAWS
 from jaxmodel.shaper import Taps
 from studies import config
@@ -58,7 +58,7 @@ class Document(Part):
     study_hash: str = Field(description="SHA-256 of the study below as compact sorted JSON")
     versions: dict[str, str]
     law: Annotated[str, OneOf(lambda: LAWS)]
-    estimator: Literal["modal_phase", "difference"]
+    estimator: Annotated[str, OneOf(lambda: KINDS)]
     order: str = Field(description="how wires of sensors and actuators are numbered")
     steps: list[str] = Field(description="the arithmetic of one sample, in words")
     masks: Masks

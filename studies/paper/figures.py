@@ -203,7 +203,7 @@ def _shapers(runs: PaperRuns, measures: Measures) -> Figure:
     level = runs.study.shaper.tolerance
     ratio = np.linspace(0.5, 1.5, 401)
     kinds = {"ZV": "zv", "ZVD": "zvd", "EI (the paper's)": "ei", "two-hump EI": "ei2"}
-    indices = np.array([shaper.KINDS.index(kind) for kind in kinds.values()])
+    indices = np.array([shaper.SHAPERS.position(kind) for kind in kinds.values()])
     curves = np.asarray(_sensitivity(indices, ratio, omega, zeta, level))
     figures.sensitivity(ratio, dict(zip(kinds, curves, strict=True)), level, axes[0, 0])
     axes[0, 0].set_ylim(0, 40)

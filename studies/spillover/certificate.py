@@ -81,7 +81,7 @@ class Certificate(NamedTuple):
 def certify(
     study: Study,
     margin: float = 2.0,
-    bases: tuple[str, ...] = BASES,
+    bases: tuple[str, ...] = tuple(BASES),
     sizes: tuple[int, ...] = (),
     departures: tuple[Departure, ...] = DEPARTURES,
 ) -> Certificate:
@@ -95,7 +95,7 @@ def certify(
         margin: gain margin that every plant must leave [1], above 1.
         bases: modal bases of the plant.
         sizes: plant modes per link; empty: from the controlled ones to 12.
-        departures: from what the controller believes; joints in basis "loaded" only.
+        departures: from what the controller believes; joints in a basis that has them only.
 
     Raises:
         StudyError: no controller to judge (ideal feedback, no link controlled, gains of zero), a

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
 from jaxmodel.laws import SRF
@@ -28,8 +29,6 @@ from studies.study.margin import MARGIN_MODES
 
 #: Plant modes per link at most.
 LARGEST = MARGIN_MODES
-#: The only basis with rotary inertia at the joints.
-WITH_JOINTS = "loaded"
 
 
 class Departure(NamedTuple):
@@ -129,11 +128,11 @@ class LoopMaker:
         if is_off or is_overlapping:
             what = "patches leave the link" if is_off else "patches overlap"
             return f"{plant.departure}: {what}"
-        if plant.basis == "pinned_free" and study.drive.locked:
+        if not BASES[plant.basis].is_on_chord and study.drive.locked:
             return f"{plant.basis}: its sliders cannot be locked"
         link, joint = study.link, plant.departure.joint_inertia
         inertia = (link.joint_inertia_b, link.joint_inertia_c, joint or 0.0)
-        if plant.basis != WITH_JOINTS and any(np.any(part) for part in inertia):
+        if not BASES[plant.basis].has_joints and any(np.any(part) for part in inertia):
             size = f" of {joint:g} kg m2" if joint else ""
             return f"{plant.basis}: it has no rotary inertia{size} at the joints"
         return ""

@@ -204,7 +204,7 @@ def _path(fields: Fields) -> motion.Path:
         points,
         times("motion.move_time", NO_TIME),
         times("motion.dwell", 0.0),
-        fields.choices("motion.profile", motion.PROFILES),
+        fields.choices("motion.profile", tuple(motion.PROFILES)),
     )
 
 
@@ -214,7 +214,7 @@ def _shaping(fields: Fields) -> Shaping:
         given = np.zeros((len(given), 1))  # as the controller believes, see `design_taps`
     zeta = fields.numbers("shaper.damping_ratio")
     return Shaping(
-        fields.choices("shaper.kind", shaper.KINDS),
+        fields.choices("shaper.kind", tuple(shaper.SHAPERS)),
         given,
         np.repeat(zeta[:, None], given.shape[1], axis=1),
         fields.numbers("shaper.tolerance"),

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxmodel.beam import BASES
 from jaxmodel.laws import LAWS
 from jaxmodel.piezo import VACUUM_PERMITTIVITY
 from studies.errors import field_error, nearest
@@ -60,18 +61,7 @@ def check_consistency(study: Study) -> None:
         )
     _check_lists(study)
     _check_own_fields(study)
-    if link.basis != "loaded" and any(map(np.any, (link.joint_inertia_b, link.joint_inertia_c))):
-        raise field_error("link.basis", link.basis, "loaded, where a joint has rotary inertia")
-    if study.drive.locked and link.basis == "pinned_free":
-        raise field_error(
-            "link.basis", link.basis, "pinned_pinned or loaded, where drive.locked is true"
-        )
-    if study.run.model == "ked" and link.basis == "pinned_free":
-        raise field_error(
-            "link.basis",
-            link.basis,
-            "pinned_pinned or loaded, where run.model is ked: rigid motion prescribes both ends",
-        )
+    _check_basis(study)
     stations = ("metrics.stations", study.metrics.stations)
     shortest = each_link(link.length).min()
     for name, values in (stations, ("initial.load_station", (study.initial.load_station,))):
@@ -218,6 +208,23 @@ def _check_sampling(study: Study) -> None:
 def _nested(lists: Any) -> tuple:
     """A table of three lists; empty where one number or list serves all links."""
     return lists if isinstance(lists, tuple) and lists and isinstance(lists[0], tuple) else ()
+
+
+def _check_basis(study: Study) -> None:
+    link, basis = study.link, BASES[study.link.basis]
+    with_joints = " or ".join(name for name, one in BASES.items() if one.has_joints)
+    on_chord = " or ".join(name for name, one in BASES.items() if one.is_on_chord)
+    faults = {
+        f"{with_joints}, where a joint has rotary inertia": not basis.has_joints
+        and any(map(np.any, (link.joint_inertia_b, link.joint_inertia_c))),
+        f"{on_chord}, where drive.locked is true": not basis.is_on_chord and study.drive.locked,
+        f"{on_chord}, where run.model is ked: rigid motion prescribes both ends": (
+            not basis.is_on_chord and study.run.model == "ked"
+        ),
+    }
+    for allowed, is_fault in faults.items():
+        if is_fault:
+            raise field_error("link.basis", link.basis, allowed)
 
 
 def _check_lists(study: Study) -> None:

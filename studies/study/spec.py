@@ -13,8 +13,12 @@ from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from jaxmodel.beam import BASES
+from jaxmodel.estimator import KINDS
 from jaxmodel.laws import LAWS
+from jaxmodel.motion import PROFILES
 from jaxmodel.parameters import HOME
+from jaxmodel.shaper import SHAPERS
 from studies.errors import StudyError, field_error
 from studies.study.choices import OneOf
 from studies.study.consistency import check_consistency
@@ -22,7 +26,7 @@ from studies.study.explain import explain
 
 #: Where fields of laws' own are.
 OWN_FIELDS = "control.laws"
-Basis = Literal["pinned_pinned", "pinned_free", "loaded"]
+Basis = Annotated[str, OneOf(lambda: BASES)]
 
 
 # numbers within bounds, as entries of a list
@@ -192,15 +196,13 @@ class Motion(Section):
     )
     move_time: Time | tuple[Time, ...] = described(0.1, "s", "t_f of each move, or one per move")
     dwell: Pause | tuple[Pause, ...] = described(0.0, "s", "rest after each move, or one per move")
-    profile: Literal["cycloid", "quintic"] = described("cycloid", "-", "cycloid is (25)")
+    profile: Annotated[str, OneOf(lambda: PROFILES)] = described("cycloid", "-", "cycloid is (25)")
 
 
 class Shaper(Section):
     """Input shaper on the motion."""
 
-    kind: Literal["none", "zv", "zvd", "zvdd", "ei", "ei_damped", "ei2", "ei3"] = described(
-        "ei", "-", "ei is the paper's (13)"
-    )
+    kind: Annotated[str, OneOf(lambda: SHAPERS)] = described("ei", "-", "ei is the paper's (13)")
     frequencies_hz: tuple[Hertz, ...] = described(
         (),
         "Hz",
@@ -276,7 +278,7 @@ class Electronics(Section):
     amplifier_hz: float = described(
         0.0, "Hz", "bandwidth (-3 dB) of the actuators' amplifiers; 0: no limit", ge=0, le=1e6
     )
-    estimator: Literal["modal_phase", "difference"] = described(
+    estimator: Annotated[str, OneOf(lambda: KINDS)] = described(
         "modal_phase", "-", "velocity estimate"
     )
     highpass_hz: float = described(60.0, "Hz", "high-pass of modal_phase", gt=0, le=1e5)
