@@ -26,6 +26,8 @@ from jaxmodel.plant import Plant
 
 #: Images n of the spectrum that are summed; those left out change the sum by 1e-4.
 IMAGES = (0, -1, 1, -2)
+#: Modes are taken to be at least as wide as this share of their frequency [1].
+NARROWEST = 2e-4
 
 
 class LoopResponse(NamedTuple):
@@ -181,6 +183,33 @@ def _normal_modes(plant: Plant, inertia: Array | None, springs: Array | None) ->
         jnp.einsum("ijr,irs,iks->ijk", half, stiffness / mass[:, None], half)
     )
     return _NormalModes(square, jnp.einsum("ikr,iks->irs", half, shape))
+
+
+def loop_strength(response: LoopResponse) -> Array:
+    """Largest eigenvalue of L that a mode of a link between held ends gives at its resonance, ().
+
+    Of its own part of L, which has rank one; without the images of the spectrum and the pose. So it
+    is a measure of size, not a bound.
+    """
+    n = response.observe.shape[0]
+    square, decay = response.square[:n], response.decay[:n]
+    omega = jnp.sqrt(jnp.maximum(square, 1.0))
+    angle, zero = omega * response.period, jnp.zeros_like(omega)
+    shift = Pair(jnp.cos(angle), -jnp.sin(angle))
+
+    def force(cosine: Array, sine: Array) -> Pair:
+        return _channel(response, Pair(cosine[:, None], sine[:, None]))
+
+    channel = jax.vmap(force, in_axes=1, out_axes=2)(shift.re, shift.im)  # (n, C, R)
+    s = Pair(zero, omega)
+    passed = _electronics(response, s, s * s, -shift + 1.0)
+    round_once = jnp.abs(response.observe * response.act) * _size(channel)
+    narrow = jnp.maximum(decay, NARROWEST * omega) * omega
+    return jnp.max(jnp.sum(round_once, axis=1) * _size(passed) / narrow)
+
+
+def _size(x: Pair) -> Array:
+    return jnp.hypot(x.re, x.im)
 
 
 #: Fields of links, and those that only links with channels need.

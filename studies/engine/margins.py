@@ -16,7 +16,8 @@ import jax
 import numpy as np
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.laws import IMSC, LAWS
+from jaxmodel.laws import LAWS
+from jaxmodel.laws.imsc import IMSC
 from jaxmodel.loci import (
     Known,
     Loci,
@@ -30,17 +31,19 @@ from jaxmodel.loci import (
 from jaxmodel.pairs import Pair
 from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import (
+    NARROWEST,
     AssembledModes,
     LoopResponse,
     assembled_modes,
     controlled_first,
     loop_response,
+    loop_strength,
 )
 from studies.engine.damping import damping_ratios
 from studies.engine.lanes import BLOCK, run_steps
 from studies.engine.stability import with_margin_modes
 from studies.engine.steps import PREPARING
-from studies.study.margin import HIGHEST
+from studies.study.margin import HIGHEST, LOWEST
 
 
 class Walk(NamedTuple):
@@ -59,12 +62,12 @@ WALKS = (
 LOWEST_HZ = 5.0
 #: Stands for 0 [rad/s], where the hold would be 0/0.
 STILL = 0.01
-#: Modes are taken to be at least as wide as this share of their frequency [1].
-NARROWEST = 2e-4
 #: What keeps eigenvalues of idle channels apart, on the way and in the second look.
 SPREAD, FINE_SPREAD = 1e-3, 1e-6
 #: Crossings looked at again per case, and kept of each place looked at.
 CHOSEN, KEPT = 4, 2
+#: The walk starts from small numbers, so stronger loops are looked at with weaker gains [1].
+STRONG = 30.0
 #: Steps of Newton's iteration, and the last one that counts as none.
 NEWTON, CONVERGED = 10, 1e-3
 #: Where to start for crossings beside the rightmost that was found, as multiples of it.
@@ -179,32 +182,39 @@ def _judge_block(
     block = jax.tree.map(lambda x: x[filled], cases)
     with PREPARING:
         found = jax.tree.map(np.asarray, _respond(structure, block))
-    response, modes = jax.tree.map(lambda x: x[..., : len(rows)], found)
+    response, modes, strength = jax.tree.map(lambda x: x[..., : len(rows)], found)
     response = controlled_first(response, mask, most)
     with np.errstate(all="ignore"):  # what is not finite finds no crossing
         ratio = damping_ratios(response, modes, n_links, structure.n_controlled)
-        return _judged(response, modes, way, ratio)
+        return _judged(response, modes, np.maximum(strength / STRONG, 1.0), way, ratio)
 
 
 # compiled in haste: it takes a fiftieth of the time
 @partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
-def _respond(structure: Structure, cases: Case) -> tuple[LoopResponse, AssembledModes]:
-    """Lanes last."""
+def _respond(structure: Structure, cases: Case) -> tuple[LoopResponse, AssembledModes, Any]:
+    """The loops, their modes and their strength, lanes last."""
 
-    def one(case: Case) -> tuple[LoopResponse, AssembledModes]:
+    def one(case: Case) -> tuple[LoopResponse, AssembledModes, Any]:
         loop = prepare(structure, case).loop
         response = loop_response(structure, case, loop, case.path.waypoints[0])
-        return response, assembled_modes(response)
+        return response, assembled_modes(response), loop_strength(response)
 
     return jax.vmap(one, out_axes=-1)(cases)
 
 
 def _judged(
-    response: LoopResponse, modes: AssembledModes, way: Walk, ratio: np.ndarray
+    response: LoopResponse,
+    modes: AssembledModes,
+    weaker: np.ndarray,
+    way: Walk,
+    ratio: np.ndarray,
 ) -> tuple[LoopMargins, np.ndarray]:
+    """Figures of loops, looked at with gains `weaker` by these factors, (lanes,)."""
     count, top = len(response.period), np.pi / response.period
-    seen, left, right = _walk_along(response, modes, way)
-    start = _look_closer(response, seen, left, right)
+    response = _with_gains(response, 1 / weaker)
+    least = np.maximum(1 / (HIGHEST * weaker), SPREAD)
+    seen, left, right = _walk_along(response, modes, way, 0.8 * least)
+    start = _look_closer(response, seen, left, right, 0.8 * least)
     known = np.zeros(count)
     np.maximum.at(known, start.case, start.value)
     is_strange = ~_is_confirmed(seen, start) & (seen.value > known[seen.case])
@@ -222,11 +232,12 @@ def _judged(
         is_more = is_other & (other.value > met.value)
         met = jax.tree.map(lambda a, b, more=is_more: np.where(more, b, a), met, other)
     value[found], omega[found] = met.value, met.omega
-    at_end, where = _at_the_ends(response)
+    at_end, where = _at_the_ends(response, least)
     is_more = at_end > value
     value, omega = np.where(is_more, at_end, value), np.where(is_more, where, omega)
-    breaks = value > 1 / HIGHEST
-    margin = np.where(breaks, 1 / np.where(breaks, value, 1.0), HIGHEST)
+    breaks = value > least
+    margin = np.where(breaks, 1 / (weaker * np.where(breaks, value, 1.0)), HIGHEST)
+    margin = np.where(margin < LOWEST, 0.0, margin)
     omega = np.where(breaks, omega, np.nan)
     apart = np.abs(_folded(modes.omega, top) - np.abs(omega))
     order = np.take_along_axis(
@@ -242,6 +253,15 @@ def _judged(
         ratio,
     )
     return figures, is_doubtful & is_finite
+
+
+def _with_gains(response: LoopResponse, factor: np.ndarray) -> LoopResponse:
+    """The loops with all gains times a factor, (lanes,)."""
+    position = response.position_gain
+    return response._replace(
+        velocity_gain=response.velocity_gain * factor,
+        position_gain=None if position is None else position * factor,
+    )
 
 
 def _folded(omega: np.ndarray, top: np.ndarray) -> np.ndarray:
@@ -262,7 +282,7 @@ def stations(modes: AssembledModes, period: np.ndarray, way: Walk) -> np.ndarray
 
 
 def _walk_along(
-    response: LoopResponse, modes: AssembledModes, way: Walk
+    response: LoopResponse, modes: AssembledModes, way: Walk, least: np.ndarray
 ) -> tuple[Crossings, np.ndarray, np.ndarray]:
     """The rightmost crossings of each case and the frequencies [rad/s] on either side."""
     omega = np.repeat(stations(modes, response.period, way), way.repeats, axis=0)
@@ -271,23 +291,26 @@ def _walk_along(
     spread = _spread(response, SPREAD)
     first = -spread.reshape(-1, spread.shape[2])
     loci = _walked(response, spread, Pair(first, 0 * first), omega, kind)
-    return _crossings(loci, np.arange(spread.shape[2]), CHOSEN)
+    return _crossings(loci, np.arange(spread.shape[2]), CHOSEN, least)
 
 
-def _crossings(loci: Loci, case: np.ndarray, most: int) -> tuple[Crossings, np.ndarray, np.ndarray]:
+def _crossings(
+    loci: Loci, case: np.ndarray, most: int, least: np.ndarray
+) -> tuple[Crossings, np.ndarray, np.ndarray]:
     """The rightmost crossings of each lane, and the frequencies [rad/s] on either side.
 
     Args:
         loci: after a walk.
         case: of each lane.
         most: crossings of a lane.
+        least: value that counts [1], by case.
     """
     order = np.argsort(-loci.crossing, axis=0)[:most]
     value, place, left, right = (
         np.take_along_axis(x, order, axis=0)
         for x in (loci.crossing, loci.place, loci.left, loci.right)
     )
-    at = np.nonzero(value > 0.8 / HIGHEST)
+    at = np.nonzero(value > least[case])
     return Crossings(case[at[1]], value[at], place[at]), left[at], right[at]
 
 
@@ -305,7 +328,11 @@ def _is_confirmed(seen: Crossings, found: Crossings) -> np.ndarray:
 
 
 def _look_closer(
-    response: LoopResponse, seen: Crossings, left: np.ndarray, right: np.ndarray
+    response: LoopResponse,
+    seen: Crossings,
+    left: np.ndarray,
+    right: np.ndarray,
+    least: np.ndarray,
 ) -> Crossings:
     """The rightmost crossings of each interval."""
     more = LOOK.wider * (right - left)
@@ -318,11 +345,11 @@ def _look_closer(
     here = jax.tree.map(lambda x: x[..., seen.case], response)
     spread = _spread(here, FINE_SPREAD)
     loci = _walked(here, spread, _ring(spread, seen.value), omega, np.array(kind))
-    return _crossings(loci, seen.case, KEPT)[0]
+    return _crossings(loci, seen.case, KEPT, least)[0]
 
 
-def _at_the_ends(response: LoopResponse) -> tuple[np.ndarray, np.ndarray]:
-    """Largest positive eigenvalue at the ends of the axis, 0: none, and where [rad/s], (n,) each.
+def _at_the_ends(response: LoopResponse, least: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Largest eigenvalue above `least` at the ends of the axis, 0: none, and where [rad/s], (n,).
 
     L is real there, so its curves end on the real axis without crossing it: feedback of positions
     loses its static stiffness at 0, differences their sign at pi/T.
@@ -333,7 +360,7 @@ def _at_the_ends(response: LoopResponse) -> tuple[np.ndarray, np.ndarray]:
     for place, name in ((0 * top + STILL, 0 * top), (top * (1 - 1e-6), top)):
         steps = np.repeat(place[None], LOOK.starts, axis=0)
         found = _walked(response, spread, ring, steps, np.zeros(LOOK.starts)).value
-        is_real = (found.re > 1 / HIGHEST) & (np.abs(found.im) < 1e-3 * found.re)
+        is_real = (found.re > least) & (np.abs(found.im) < 1e-3 * found.re)
         largest = np.max(np.where(is_real, found.re, 0.0), axis=0)
         omega = np.where(largest > value, name, omega)
         value = np.maximum(value, largest)
@@ -402,6 +429,8 @@ def _approached(response: LoopResponse, known: Known, guess: Meeting) -> Meeting
     return run_steps(_approach, (response, known), (), guess, NEWTON)
 
 
-def _approach(constants: tuple[LoopResponse, Known], _: tuple, meeting: Meeting) -> Meeting:
+def _approach(
+    constants: tuple[LoopResponse, Known], _: tuple[Any, ...], meeting: Meeting
+) -> Meeting:
     response, known = constants
     return approach(response, known, meeting)

@@ -28,6 +28,8 @@ from studies.study.margin import HIGHEST, LOWEST, MARGIN_MODES
 
 #: Gain factors that are looked at are no further apart than this [1].
 STRIDE = 1.25
+#: The first one, and how far apart those below it are where it is unstable [1].
+FIRST, DESCENT = 0.01, 4.0
 
 
 #: Gain factors at which modes are followed from no control to the given gains [1].
@@ -227,7 +229,7 @@ def gain_margin(
 
     Args:
         poles: discrete poles by factor; called more than once for a factor, so cache it.
-        first: factors to begin with, rising [1]; default: `LOWEST` alone.
+        first: factors to begin with, rising [1]; default: `FIRST` alone.
         highest: where to stop [1].
 
     Returns:
@@ -238,7 +240,7 @@ def gain_margin(
     def excess(factor: float) -> float:
         return float(np.log(np.abs(poles(factor)).max()) - np.log1p(RADIUS_TOLERANCE))
 
-    first = np.array([LOWEST]) if first is None else first
+    first = np.array([FIRST]) if first is None else first
     count = int(np.ceil(np.log(highest / first[-1]) / np.log(STRIDE)))
     low = 0.0
     for high in map(float, [*first[:-1], *np.geomspace(first[-1], highest, count + 1)]):
@@ -247,10 +249,11 @@ def gain_margin(
         low = high
     else:
         return highest
-    if low == 0.0:
-        if high <= LOWEST or excess(LOWEST) > 0:
+    low = low or high / DESCENT
+    while excess(low) > 0:
+        if low <= LOWEST:
             return 0.0
-        low = LOWEST
+        high, low = low, low / DESCENT
     return float(brentq(excess, low, high, xtol=2e-5 * low, rtol=2e-5))
 
 

@@ -13,13 +13,14 @@ from jaxmodel import status
 from studies.show import figures
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import WITHOUT, Comparison
-from studies.spillover.judgement import LOWEST
 from studies.spillover.plants import Departure
 from studies.study.labels import describe
 from studies.study.margin import margin_text
 
 #: Leakage from here on has its own colour [1].
 FLOOR = 0.01
+#: Smaller margins are drawn as this [1].
+LEAST = 0.01
 
 
 def _plain_ticks(axis: Axis) -> None:
@@ -46,7 +47,7 @@ def margins(found: Certificate, ax: Axes | None = None) -> Axes:
         range(len(found.plants)), figures.SERIES, figures.DASHES, strict=False
     ):
         sizes = [plant.n_modes for plant in found.plants[b, 0]]
-        values = np.maximum(found.margin[b], LOWEST)
+        values = np.maximum(found.margin[b], LEAST)
         if np.all(np.isnan(values)):
             continue
         low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)

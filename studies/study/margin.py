@@ -11,11 +11,15 @@ ENOUGH = 2.0
 
 
 #: Margins beyond this are given as it, and those below the other as 0 [1].
-HIGHEST, LOWEST = 64.0, 0.01
+HIGHEST, LOWEST = 64.0, 1e-6
 
 
 def caution(margin: float) -> str:
     """What must be said of a gain margin, "" where it is `ENOUGH`, or there is none."""
+    if margin == 0:
+        return (
+            "UNSTABLE LOOP: the linearised sampled loop grows by itself, however small the gains."
+        )
     if margin < 1:
         return (
             "UNSTABLE LOOP: the linearised sampled loop grows by itself; saturation and the end of "
