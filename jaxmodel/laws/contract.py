@@ -57,8 +57,9 @@ class Law(NamedTuple):
     channel: Literal["mode", "patch"]  # what a channel is: a controlled mode, or a patch pair
     design: Callable[[Structure, Case, Known], Feedback]
     parameters: tuple[Parameter, ...] = ()
-    # positions are always fed back; else where `control.position_gain` is not zero
-    has_position: bool = False
+    # position gains count always; False: they are zero, and cost nothing, where
+    # `control.position_gain` is
+    has_position: bool = True
     # the channels of a link act one at a time, so each is judged by itself
     is_switching: bool = False
     # settings with which it damps mode 1 as much as modal control does with those of the case;

@@ -16,4 +16,4 @@ def same(case: Case, known: Known) -> Control:
     return case.control
 
 
-IMSC = Law("imsc", "IMSC", "mode", design, as_strong=same)
+IMSC = Law("imsc", "IMSC", "mode", design, has_position=False, as_strong=same)

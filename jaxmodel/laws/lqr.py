@@ -79,6 +79,5 @@ LQR = Law(
             1e3,
         ),
     ),
-    has_position=True,
     as_strong=as_strong,
 )

@@ -21,5 +21,11 @@ def design(structure: Structure, case: Case, known: Known) -> Feedback:
 
 
 MODIFIED_IMSC = Law(
-    "modified_imsc", "modified IMSC", "mode", design, is_switching=True, as_strong=same
+    "modified_imsc",
+    "modified IMSC",
+    "mode",
+    design,
+    has_position=False,
+    is_switching=True,
+    as_strong=same,
 )

@@ -84,6 +84,5 @@ PPF = Law(
     parameters=(
         Parameter("filter_damping", 0.5, "1", "zeta_f, damping ratio of the filters", 0.01, 2.0),
     ),
-    has_position=True,
     as_strong=same,
 )

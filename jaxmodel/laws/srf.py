@@ -27,4 +27,4 @@ def design(structure: Structure, case: Case, known: Known) -> Feedback:
     )
 
 
-SRF = Law("srf", "strain rate feedback", "patch", design)
+SRF = Law("srf", "strain rate feedback", "patch", design, has_position=False)
