@@ -152,7 +152,7 @@ def _rigid(beam: Beam) -> tuple[Array, Array, Array, Array]:
     return line_mass, mass, mass * beam.length / 2, mass * beam.length**2 / 3
 
 
-def _slope_difference(slope, patches: Patches, length: Array) -> Array:
+def _slope_difference(slope: Callable[[Array], Array], patches: Patches, length: Array) -> Array:
     left, right = patch_ends(patches.center, length)
     return slope(right) - slope(left)
 

@@ -6,7 +6,7 @@ channels (C), then lanes.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -51,7 +51,7 @@ class ControllerInfo(NamedTuple):
     is_clipped: Array  # ADC at its end, 0 or 1 per channel, (3, K)
 
 
-def rest_controller(n_channels: int, n_patches: int, dtype) -> ControllerState:
+def rest_controller(n_channels: int, n_patches: int, dtype: Any) -> ControllerState:
     """All zeros."""
     zero = jnp.zeros((3, n_channels), dtype)
     return ControllerState(zero, (zero, zero), jnp.zeros((3, n_patches), dtype))
@@ -81,7 +81,9 @@ def soft_limit(x: Array, bound: Array, is_smooth: bool) -> Array:
     return bound * (jnp.clip(share, -straight, straight) + bent)
 
 
-def convert(controller: Controller, voltage: Array, noise: Array | None, is_smooth: bool):
+def convert(
+    controller: Controller, voltage: Array, noise: Array | None, is_smooth: bool
+) -> tuple[Array, Array]:
     """Conditioner and ADC: sensor voltage [V] as read back from the code, and where it clips.
 
     Args:

@@ -20,7 +20,9 @@ class Reference(NamedTuple):
     wrench: Array | None = None  # on the platform, held over the sample [N, N, N m]
 
 
-def motor_force(drive: Drive, reference: Reference, rho: Array, rho_rate: Array, is_smooth: bool):
+def motor_force(
+    drive: Drive, reference: Reference, rho: Array, rho_rate: Array, is_smooth: bool
+) -> Array:
     """Force of the motors F = Kp (rho_d - rho) + Kd (rho_d' - rho') (+ feed-forward) [N], (3,).
 
     Args:
@@ -43,7 +45,7 @@ def slider_force(
     rho_rate: Array,
     has_friction: bool,
     is_smooth: bool,
-):
+) -> Array:
     """Force on the sliders [N], (3,): motors, friction F_c tanh(rho'/v) + c rho', disturbance.
 
     Args:

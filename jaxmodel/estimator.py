@@ -50,7 +50,7 @@ def design_estimator(
     plain = _difference(omega, electronics.period, electronics.difference_cutoff)
     is_phase = jnp.asarray(electronics.estimator) == KINDS.index("modal_phase")
 
-    def choose(a, b):
+    def choose(a: Array, b: Array) -> Array:
         return jnp.where(is_phase, a, b)
 
     return Estimator(

@@ -8,7 +8,7 @@ and its first status code. Shapes: structure first, lanes last (see `jaxmodel.pl
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxmodel import metrics, status
 from jaxmodel.axial import stretch_error
@@ -198,7 +198,9 @@ def plant_step(
 
     rates = partial(plant_rates, structure, loop)
 
-    def stage(origin: PlantState, x: tuple, slope: tuple, length: Array, push: Array) -> PlantState:
+    def stage(
+        origin: PlantState, x: tuple[Any, ...], slope: tuple[Any, ...], length: Array, push: Array
+    ) -> PlantState:
         """exp(A h/2) on the modes of `origin`, Euler from x along `slope` for the pose."""
         pose, pose_rate = x
         return state._replace(
@@ -368,7 +370,7 @@ def _advance_plant(
             return None
         return jnp.stack([x[0:-2:2], x[1::2], x[2::2]], axis=1)
 
-    def body(at: PlantState, points: tuple) -> tuple[PlantState, Rates]:
+    def body(at: PlantState, points: tuple[Any, ...]) -> tuple[PlantState, Rates]:
         rho, rho_rate, forward = points
         start, middle, end = (
             Reference(

@@ -7,7 +7,7 @@ own `controller_step`, linear once rounding and limits are left out.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -232,7 +232,7 @@ def summed_squares(matrix: Array, start: Array) -> Summed:
         start: S, symmetric, not negative, (n, n).
     """
 
-    def double(carried: tuple, _: None) -> tuple[tuple, None]:
+    def double(carried: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], None]:
         power, log_power, total, log_total = carried
         size = jnp.sqrt(jnp.sum(power * power))
         power, log_power = power / size, log_power + jnp.log(size)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, partial, reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -151,7 +151,9 @@ def _windows(structure: Structure, case: Case, time: Array, end: Array) -> metri
     )
 
 
-def _disturbance(structure: Structure, case: Case, prepared: Prepared, time: Array):
+def _disturbance(
+    structure: Structure, case: Case, prepared: Prepared, time: Array
+) -> tuple[Array | None, Array]:
     """(standard normal ADC noise or None, slider disturbance [N])."""
     drive, n = prepared.loop.drive, structure.n_steps
     share = _share_on(time, drive.pulse_start, drive.pulse_length)
@@ -164,7 +166,7 @@ def _disturbance(structure: Structure, case: Case, prepared: Prepared, time: Arr
     return noise, force + drive.ripple * ripple
 
 
-def _scan_in_blocks(body, start, inputs: Inputs, is_checkpointed: bool):
+def _scan_in_blocks(body: Any, start: Any, inputs: Inputs, is_checkpointed: bool) -> Any:
     """`lax.scan` in about sqrt(n) blocks, for runs that keep something of every step.
 
     XLA copies the store of a scan at each step; so it copies a block's store, not the run's. With
@@ -177,7 +179,7 @@ def _scan_in_blocks(body, start, inputs: Inputs, is_checkpointed: bool):
     size = divisor if divisor > root // 4 else root
     count = n // size
 
-    def block(state, part):
+    def block(state: Any, part: Any) -> Any:
         return jax.lax.scan(body, state, part)
 
     block = jax.checkpoint(block) if is_checkpointed else block
@@ -336,7 +338,7 @@ def _rounded() -> Callable[..., Result]:
 
 
 def _smooth_tangent(
-    structure: Structure, has_record: bool, primals: tuple, tangents: tuple
+    structure: Structure, has_record: bool, primals: tuple[Any, ...], tangents: tuple[Any, ...]
 ) -> tuple[Result, Result]:
     """What rounds has the derivative 0, and the loop closed through it one that means nothing."""
     smooth = partial(_run, structure._replace(is_smooth=True), has_record)
@@ -346,7 +348,7 @@ def _smooth_tangent(
 def _run(structure: Structure, has_record: bool, case: Case, law: Controller | None) -> Result:
     start = begin(structure, case, law)
 
-    def body(state, inputs):
+    def body(state: Any, inputs: Any) -> Any:
         after, record = step(structure, start.loop, state, inputs)
         return after, record if has_record else None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -186,7 +186,7 @@ def animate(clip: Clip, path: Path) -> None:
         for parts, ax in zip(clip.parts, axes, strict=True):
             number_links(parts, 0, ax)
 
-        def frame(k: int) -> list:
+        def frame(k: int) -> list[Any]:
             label.set_text(
                 f"{1e3 * clip.time[k]:+.0f} ms from the end of the command; bending drawn "
                 f"{clip.exaggeration:.0f} times"
@@ -206,7 +206,7 @@ def animate(clip: Clip, path: Path) -> None:
         film.save(path, writer=PillowWriter(fps=20), dpi=80)
 
 
-def _moving(parts: Skeleton, ax: Axes) -> tuple:
+def _moving(parts: Skeleton, ax: Axes) -> tuple[Any, ...]:
     draw_machine(parts, 0, ax)
     links = ax.lines[3:6]
     return links, ax.lines[6], ax.lines[7], ax.patches[0]

@@ -131,7 +131,9 @@ def share_map(share: np.ndarray, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def interaction_map(index: np.ndarray, labels: list[str], limit: float, ax: Axes | None = None):
+def interaction_map(
+    index: np.ndarray, labels: list[str], limit: float, ax: Axes | None = None
+) -> Any:
     """Interaction of pairs of players.
 
     Args:

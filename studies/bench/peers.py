@@ -249,7 +249,7 @@ def by_lagrangian(work: Work, n: int) -> Callable[[], Any]:
         loop = start.loop
         mass, drive = loop.plant.modal_mass[:, None], loop.drive
 
-        def slope(at: reference.Motion, wanted: tuple) -> reference.Motion:
+        def slope(at: reference.Motion, wanted: tuple[Any, ...]) -> reference.Motion:
             rho, rho_rate = wanted
             place = partial(reference.close, machine, basis)
             (now, _), (rate, _) = jax.jvp(place, (at.pose, at.q), (at.pose_rate, at.q_rate))
@@ -261,7 +261,7 @@ def by_lagrangian(work: Work, n: int) -> Callable[[], Any]:
             pose, q = reference.by_lagrangian(machine, basis, at, loads)
             return reference.Motion(at.pose_rate, pose, at.q_rate, q)
 
-        def body(at: reference.Motion, wanted: tuple) -> tuple:
+        def body(at: reference.Motion, wanted: tuple[Any, ...]) -> tuple[Any, ...]:
             points = [(wanted[0][k], wanted[1][k]) for k in range(3)]
             return reference.rk4_step(slope, at, PERIOD, points), at.q
 

@@ -7,11 +7,14 @@ with multipliers, and the classical Runge-Kutta step. Everything dense, nothing 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from jaxmodel.beam import ModalBasis
+from jaxmodel.parameters import Geometry, Machine
 
 
 class Motion(NamedTuple):
@@ -30,7 +33,7 @@ class Loads(NamedTuple):
     modal: jax.Array  # on the modal coordinates [N], (3, R)
 
 
-def guides(geometry):
+def guides(geometry: Geometry) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Starting corners A_i [m], directions u_i and inward normals n_i, (3, 2) each."""
     angle = geometry.guide_angle
     u = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
@@ -39,18 +42,18 @@ def guides(geometry):
     return -away[:, None] * n - geometry.guide_side / 2 * u, u, n
 
 
-def platform_joints(geometry, pose):
+def platform_joints(geometry: Geometry, pose: jax.Array) -> jax.Array:
     """Joints C_i [m] of the platform, (3, 2)."""
     angle = geometry.joint_angle + pose[2]
     radius = jnp.broadcast_to(geometry.joint_radius, (3,))
     return pose[:2] + radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
 
 
-def payload_energy(masses, pose, pose_rate):
+def payload_energy(masses: Any, pose: jax.Array, pose_rate: jax.Array) -> Any:
     """T [J] of the payload from the velocity of its centre of mass."""
     offset = jnp.zeros(2) if masses.payload_offset is None else jnp.asarray(masses.payload_offset)
 
-    def center(pose):
+    def center(pose: jax.Array) -> Any:
         cosine, sine = jnp.cos(pose[2]), jnp.sin(pose[2])
         return pose[:2] + jnp.array([[cosine, -sine], [sine, cosine]]) @ offset
 
@@ -59,12 +62,12 @@ def payload_energy(masses, pose, pose_rate):
     return (masses.payload_mass * jnp.sum(velocity**2) + turning) / 2
 
 
-def tip_deflection(basis, q):
+def tip_deflection(basis: ModalBasis, q: jax.Array) -> Any:
     """w = sum Y_j(L) q_j [m], (3,)."""
     return jnp.zeros(3) if basis.tip is None else jnp.sum(basis.tip * q, axis=1)
 
 
-def chord_length(machine, basis, q):
+def chord_length(machine: Machine, basis: ModalBasis, q: jax.Array) -> Any:
     """c = L - 1/2 q^t S q [m], (3,): a bent link's ends are closer."""
     length = jnp.broadcast_to(machine.beam.length, (3,))
     if basis.shortening is None:
@@ -75,7 +78,7 @@ def chord_length(machine, basis, q):
     return length - jnp.einsum("ij,ijk,ik->i", q, slopes, q) / 2
 
 
-def link_tips(machine, basis, rho, gamma, q):
+def link_tips(machine: Machine, basis: ModalBasis, rho: jax.Array, gamma: Any, q: jax.Array) -> Any:
     """Joints C_i [m] from the side of slider and bent link, (3, 2)."""
     corner, u, _ = guides(machine.geometry)
     beta = gamma + machine.geometry.guide_angle
@@ -85,7 +88,7 @@ def link_tips(machine, basis, rho, gamma, q):
     return corner + rho[:, None] * u + chord[:, None] * along + tip[:, None] * across
 
 
-def close(machine, basis, pose, q):
+def close(machine: Machine, basis: ModalBasis, pose: jax.Array, q: jax.Array) -> Any:
     """(rho [m], gamma [rad]), (3,) each, from the triangle of slider, joint and guide."""
     corner, u, n = guides(machine.geometry)
     to_joint = platform_joints(machine.geometry, pose) - corner
@@ -96,7 +99,17 @@ def close(machine, basis, pose, q):
     return rho, slant - jnp.arctan2(tip, length)
 
 
-def kinetic_energy(machine, basis, gamma, pose, q, rho_rate, gamma_rate, pose_rate, q_rate):
+def kinetic_energy(
+    machine: Machine,
+    basis: ModalBasis,
+    gamma: Any,
+    pose: jax.Array,
+    q: jax.Array,
+    rho_rate: jax.Array,
+    gamma_rate: jax.Array,
+    pose_rate: jax.Array,
+    q_rate: jax.Array,
+) -> Any:
     """T [J] from the velocity a + x b + sum_j Y_j(x) c_j of the points of a link.
 
     The centre of mass moves in along the chord with half of what the chord shortens by; squares of
@@ -126,30 +139,32 @@ def kinetic_energy(machine, basis, gamma, pose, q, rho_rate, gamma_rate, pose_ra
     return (jnp.sum(links) + platform) / 2 + payload_energy(masses, pose, pose_rate)
 
 
-def modal_load(machine, basis, q, q_rate, force):
+def modal_load(
+    machine: Machine, basis: ModalBasis, q: jax.Array, q_rate: jax.Array, force: Any
+) -> Any:
     """Generalised forces of the modes: actuators, structural damping and stiffness, (3, R)."""
     damping = 2 * machine.damping.ratio * jnp.sqrt(basis.stiffness * basis.mass)
     return force - damping * q_rate - basis.stiffness * q
 
 
-def inertia(energy, z, z_rate):
+def inertia(energy: Any, z: Any, z_rate: Any) -> Any:
     """Mass matrix and velocity terms of d/dt dT/dz' - dT/dz."""
     mass = jax.hessian(energy, 1)(z, z_rate)
     change = jax.jvp(lambda at: jax.grad(energy, 1)(at, z_rate), (z,), (z_rate,))[1]
     return mass, change - jax.grad(energy)(z, z_rate)
 
 
-def by_lagrangian(machine, basis, motion: Motion, loads: Loads):
+def by_lagrangian(machine: Machine, basis: ModalBasis, motion: Motion, loads: Loads) -> Any:
     """Accelerations (X'' (3,), q'' (3, R)) from the Lagrangian in (X, q)."""
     shape = motion.q.shape
 
-    def split(z):
+    def split(z: Any) -> Any:
         return z[:3], z[3:].reshape(shape)
 
-    def joint_coordinates(z):
+    def joint_coordinates(z: Any) -> Any:
         return close(machine, basis, *split(z))
 
-    def energy(z, z_rate):
+    def energy(z: Any, z_rate: Any) -> Any:
         (_, gamma), (rho_rate, gamma_rate) = jax.jvp(joint_coordinates, (z,), (z_rate,))
         rates = (rho_rate, gamma_rate, *split(z_rate))
         return kinetic_energy(machine, basis, gamma, *split(z), *rates)
@@ -163,23 +178,23 @@ def by_lagrangian(machine, basis, motion: Motion, loads: Loads):
     return split(jnp.linalg.solve(mass, load - inertial))
 
 
-def by_multipliers(machine, basis, motion: Motion, loads: Loads):
+def by_multipliers(machine: Machine, basis: ModalBasis, motion: Motion, loads: Loads) -> Any:
     """(X'', q'', rho'', gamma'') from (5): coordinates (rho, gamma, X, q), constraints (6)."""
     shape = motion.q.shape
 
-    def split(y):
+    def split(y: Any) -> Any:
         return y[:3], y[3:6], y[6:9], y[9:].reshape(shape)
 
-    def constraints(y):
+    def constraints(y: Any) -> Any:
         rho, gamma, pose, q = split(y)
         tips = link_tips(machine, basis, rho, gamma, q)
         return (tips - platform_joints(machine.geometry, pose)).ravel()
 
-    def energy(y, y_rate):
+    def energy(y: Any, y_rate: Any) -> Any:
         _, gamma, pose, q = split(y)
         return kinetic_energy(machine, basis, gamma, pose, q, *split(y_rate))
 
-    def all_coordinates(z):
+    def all_coordinates(z: Any) -> Any:
         pose, q = z
         return jnp.concatenate([*close(machine, basis, pose, q), pose, q.ravel()])
 
@@ -197,10 +212,10 @@ def by_multipliers(machine, basis, motion: Motion, loads: Loads):
     return pose_acc, q_acc, rho_acc, gamma_acc
 
 
-def rk4_step(derivative, state, step, inputs):
+def rk4_step(derivative: Any, state: Any, step: Any, inputs: Any) -> Any:
     """One classical Runge-Kutta step; `inputs` at start, middle and end."""
 
-    def along(slope, length):
+    def along(slope: Any, length: Any) -> Any:
         return jax.tree.map(lambda x, dx: x + length * dx, state, slope)
 
     start, middle, end = inputs

@@ -11,7 +11,7 @@ import json
 import threading
 from collections import deque
 from collections.abc import Generator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jaxmodel.case import Structure
 from studies import config
@@ -82,7 +82,7 @@ class ClusterRunner:
             for chunk in group.chunks()
         )
         suspects: deque[Flight] = deque()
-        flying: dict[Future, Flight] = {}
+        flying: dict[Future[Any], Flight] = {}
         compiled: set[Structure] = set()
 
         def begin(flight: Flight | None) -> bool:
@@ -116,7 +116,7 @@ class ClusterRunner:
             if flying:
                 self._client.cancel(list(flying))
 
-    def _submit(self, flight: Flight) -> Future:
+    def _submit(self, flight: Flight) -> Future[Any]:
         group = flight.group
         job = Job(
             self._identity,

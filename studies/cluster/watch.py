@@ -35,7 +35,7 @@ class Watch:
         self._looked = 0.0
         self.n_workers = len(client.ncores())
 
-    def landed(self, flying: Iterable[Future]) -> list[Future]:
+    def landed(self, flying: Iterable[Future[Any]]) -> list[Future[Any]]:
         """What needs no more waiting for; after a while without any, nothing."""
         from distributed import CancelledError, wait
 
@@ -48,7 +48,7 @@ class Watch:
         self._look({future.key for future in futures})
         return [future for future in futures if future.status != "pending"]
 
-    def outcome(self, future: Future) -> Any:
+    def outcome(self, future: Future[Any]) -> Any:
         """What a worker answered, or a text that says why there is nothing.
 
         Raises:
@@ -97,9 +97,9 @@ class Watch:
 
     def _restart(self, address: str) -> None:
         """Stop a worker; its nanny starts another, where it has one."""
-        call: Any = self._client.scheduler.restart_workers
+        scheduler: Any = self._client.scheduler
         self._client.sync(
-            call,
+            scheduler.restart_workers,
             workers=[address],
             timeout=KILL_TIME,
             wait_for_workers=False,

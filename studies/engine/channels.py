@@ -5,7 +5,7 @@ A channel is a controlled mode of a link (modal control) or a patch (strain rate
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -87,7 +87,7 @@ def fold(controller: Controller, kind: str) -> Channels:
     link, number = np.nonzero((velocity != 0) | (position != 0))
     at = link, number
 
-    def gathered(parts: tuple) -> np.ndarray:
+    def gathered(parts: tuple[Any, ...]) -> np.ndarray:
         return np.stack([np.broadcast_to(part, velocity.shape)[at] for part in parts], axis=1)
 
     energy, rival = None, controller.rival_omega
@@ -128,7 +128,7 @@ def unfold(channels: Channels, like: Controller) -> Controller:
         whole[at] = values
         return whole
 
-    def columns(table: np.ndarray, rest: tuple) -> tuple:
+    def columns(table: np.ndarray, rest: tuple[Any, ...]) -> tuple[Any, ...]:
         return tuple(spread(column, part) for column, part in zip(table.T, rest, strict=True))
 
     estimator = like.estimator

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -38,7 +39,7 @@ _LIST_AXES = {
 
 
 #: What every case has, finished or not: axes after `case`, unit, long name and any flags.
-PER_CASE: dict[str, tuple] = {
+PER_CASE: dict[str, tuple[Any, ...]] = {
     "status": ((), *STATUS_LABEL[:2], {NOT_RUN: "not run", **STATUS_LABEL[2]}),
     "bad_time": ((), "s", "when the status appeared, 0 if ok"),
     "command_end": ((), "s", "end of the shaped command"),
@@ -122,7 +123,7 @@ def axis_variables(table: Table, sizes: Mapping[str, int]) -> dict[str, Variable
     return found
 
 
-def label_of(name: str) -> tuple:
+def label_of(name: str) -> tuple[Any, ...]:
     """Axes after `case`, unit, long name and any flags of what a chunk holds."""
     if name in PER_CASE:
         return PER_CASE[name]

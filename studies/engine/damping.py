@@ -86,7 +86,7 @@ def _pair(x: np.ndarray) -> Pair:
     return Pair(np.ascontiguousarray(x.real), np.ascontiguousarray(x.imag))
 
 
-def _settle(constants: tuple[LoopResponse, Pair], _: tuple, trio: Trio) -> Trio:
+def _settle(constants: tuple[LoopResponse, Pair], _: tuple[Any, ...], trio: Trio) -> Trio:
     return settle(*constants, trio)
 
 

@@ -134,7 +134,9 @@ class KernelGradients:
         return Slopes(*jax.tree.map(np.asarray, conclude_slopes(*whole)))
 
 
-def _slopes(program: Program, steps: Steps, block: list, used: Array, shared: list) -> tuple:
+def _slopes(
+    program: Program, steps: Steps, block: list[Any], used: Array, shared: list[Any]
+) -> tuple[Any, ...]:
     """(outline, status at the start, last state, tangents of outline and state), lanes last."""
     ready, n = start_block(program, steps, block, shared), block[-1].shape[1]
     passes = [k for k in range(0, n, steps.directions) if used[:, k : k + steps.directions].any()]
@@ -149,8 +151,14 @@ def _slopes(program: Program, steps: Steps, block: list, used: Array, shared: li
 
 
 def _pass(
-    program: Program, steps: Steps, block: list, shared: list, ready: Ready, state: Any, k: int
-) -> tuple:
+    program: Program,
+    steps: Steps,
+    block: list[Any],
+    shared: list[Any],
+    ready: Ready,
+    state: Any,
+    k: int,
+) -> tuple[Any, ...]:
     """Step a block once, `state` in place; tangents of outline and state from direction k on."""
     count = steps.directions
     directions = np.eye(count, block[-1].shape[1], k, dtype=block[-1].dtype)
@@ -202,7 +210,9 @@ def _by_sample(tree: Any) -> list[np.ndarray]:
 # --- XLA ------------------------------------------------------------------------------------------
 
 
-def _metrics(program: Program, own: list, common: list, parameters: Array) -> tuple:
+def _metrics(
+    program: Program, own: list[Any], common: list[Any], parameters: Array
+) -> tuple[Any, ...]:
     case = joined(program.tree, program.is_varying, own, common)
     assert program.place is not None
     result = simulate(program.structure, program.place(case, parameters))
@@ -210,13 +220,15 @@ def _metrics(program: Program, own: list, common: list, parameters: Array) -> tu
 
 
 @partial(jax.jit, static_argnums=0)
-def _forward(program: Program, own: list, parameters: Array, common: list) -> tuple:
+def _forward(
+    program: Program, own: list[Any], parameters: Array, common: list[Any]
+) -> tuple[Any, ...]:
     TRACES.append(program.structure)
 
-    def one(case: tuple) -> tuple:
+    def one(case: tuple[Any, ...]) -> tuple[Any, ...]:
         own, parameters = case
 
-        def along(direction: Array) -> tuple:
+        def along(direction: Array) -> tuple[Any, ...]:
             function = partial(_metrics, program, own, common)
             _, tangent, result = jax.jvp(function, (parameters,), (direction,), has_aux=True)
             return result, tangent
@@ -252,7 +264,11 @@ class ScanGradients:
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def reverse_gradients(
-    structure: Structure, place: Place, objective: Callable, cases: Case, parameters: Array
+    structure: Structure,
+    place: Place,
+    objective: Callable[..., Any],
+    cases: Case,
+    parameters: Array,
 ) -> tuple[Array, Array]:
     """An objective and its gradients by reverse mode with checkpoints.
 

@@ -77,12 +77,12 @@ def _step_block(
     return Start((), code, ready.state, ready.outline)  # type: ignore[arg-type]
 
 
-def _cancel(running: list[Future]) -> None:
+def _cancel(running: list[Future[Any]]) -> None:
     for future in running:
         future.cancel()
 
 
-def _concluded(running: list[Future]) -> Result:
+def _concluded(running: list[Future[Any]]) -> Result:
     done = [future.result() for future in running]
     whole = jax.tree.map(lambda *x: np.concatenate(x, axis=-1), *done)
     return jax.tree.map(np.asarray, conclude_all(whole.outline, whole.inputs, whole.state))
@@ -132,7 +132,7 @@ class GpuExecutor:
         ]
         return Running(lambda: _gathered(launched), lambda: None)
 
-    def _build(self, program: Program, split: Split, block: list) -> str:
+    def _build(self, program: Program, split: Split, block: list[Any]) -> str:
         """Make the program; what is wrong with it, or "" if nothing is."""
         try:
             traced = trace_steps(program, split)
@@ -154,11 +154,13 @@ class Block(NamedTuple):
     """A block of cases after its last sample, and what a few of them began with."""
 
     result: Result
-    given: list  # leaves as the kernel reads them, the first lanes
-    last: list  # leaves of their state after the last sample
+    given: list[Any]  # leaves as the kernel reads them, the first lanes
+    last: list[Any]  # leaves of their state after the last sample
 
 
-def _run_block(program: Program, parts: Parts, kernel: Any, own: list, common: list) -> Block:
+def _run_block(
+    program: Program, parts: Parts, kernel: Any, own: list[Any], common: list[Any]
+) -> Block:
     start = begin_block(program, parts, own, common)
     leaves = [
         *read_leaves(start, parts),

@@ -76,12 +76,16 @@ def _has_kernels() -> bool:
 
 @lru_cache(maxsize=32)
 def _runner(
-    step: Callable[..., Any], trees: tuple, constants: tuple, varies: tuple, state: tuple
-) -> Callable[[list, int, int], list]:
+    step: Callable[..., Any],
+    trees: tuple[Any, ...],
+    constants: tuple[Any, ...],
+    varies: tuple[Any, ...],
+    state: tuple[Any, ...],
+) -> Callable[[list[Any], int, int], list[Any]]:
     """Runs the step on leaves of constants, inputs and state."""
     sizes = len(constants), len(varies), len(state)
 
-    def flat(*parts: list) -> list:
+    def flat(*parts: list[Any]) -> list[Any]:
         return jax.tree.leaves(step(*map(jax.tree.unflatten, trees, parts)))
 
     if _has_kernels():
@@ -99,20 +103,22 @@ def _runner(
         name = f"{step.__name__} {real} {trees[0]} {constants} {varies} {state}"
         kernel = cpu.kept_kernel(name, make)
 
-        def run(leaves: list, n_steps: int, lanes: int) -> list:
+        def run(leaves: list[Any], n_steps: int, lanes: int) -> list[Any]:
             kernel.run(leaves, n_steps, lanes)
             return leaves[sizes[0] + sizes[1] :]
 
         return run
 
     @partial(jax.jit, static_argnums=3)
-    def scanned(constants: list, inputs: list, state: list, n_steps: int) -> list:
-        def body(at: list, row: list | None) -> tuple[list, None]:
+    def scanned(
+        constants: list[Any], inputs: list[Any], state: list[Any], n_steps: int
+    ) -> list[Any]:
+        def body(at: list[Any], row: list[Any] | None) -> tuple[list[Any], None]:
             return flat(constants, row or [], at), None
 
         return jax.lax.scan(body, state, inputs or None, length=n_steps)[0]
 
-    def run_scan(leaves: list, n_steps: int, lanes: int) -> list:
+    def run_scan(leaves: list[Any], n_steps: int, lanes: int) -> list[Any]:
         given, inputs = leaves[: sizes[0]], leaves[sizes[0] : sizes[0] + sizes[1]]
         return list(map(np.asarray, scanned(given, inputs, leaves[-sizes[2] :], n_steps)))
 

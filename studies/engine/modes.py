@@ -29,7 +29,9 @@ def modes_study(
 ) -> Study:
     """The study whose linearisation is wanted; bad values are refused as in a study file."""
     undamped = {"link": {"modes": 3, "damping_ratio": 0.0}, "drive": {"kd": 0.0}}
-    data: dict = undamped if study is None else study.model_dump(mode="json", exclude_unset=True)
+    data: dict[str, Any] = (
+        undamped if study is None else study.model_dump(mode="json", exclude_unset=True)
+    )
     if pose is not None:
         data["motion"] = {"waypoints": [list(pose)]}
     given = (
@@ -71,7 +73,7 @@ def machine_modes(study: Study | None = None, **changes: Any) -> NaturalModes:
 
 
 @partial(jax.jit, static_argnums=0)
-def _at_pose(structure: Structure, case: Case, pose: np.ndarray):
+def _at_pose(structure: Structure, case: Case, pose: np.ndarray) -> Any:
     loop = prepare(structure, case).loop
     code, _ = path_status(loop.plant, pose[None])
     return code, lift(loop.plant, pose), linearise(structure, loop, pose, resting(structure, case))

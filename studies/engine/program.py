@@ -99,7 +99,7 @@ def lane_blocks(split: Split, layout: Layout) -> list[list[np.ndarray]]:
     return [[leaf[k : k + layout.lanes] for leaf in split.varying] for k in starts]
 
 
-def joined(tree: Any, is_varying: tuple[bool, ...], varying: list, shared: list) -> Any:
+def joined(tree: Any, is_varying: tuple[bool, ...], varying: list[Any], shared: list[Any]) -> Any:
     """The tree of leaves that vary and leaves that do not."""
     sources = {True: iter(varying), False: iter(shared)}
     return jax.tree.unflatten(tree, [next(sources[varies]) for varies in is_varying])
@@ -124,7 +124,7 @@ class Parts(NamedTuple):
     is_moving: tuple[bool, ...]  # depends on the parameters
 
 
-def begin_case(program: Program, own: list, common: list) -> Start:
+def begin_case(program: Program, own: list[Any], common: list[Any]) -> Start:
     """The start of one case."""
     if program.place is None:
         case = joined(program.tree, program.is_varying, own, common)
@@ -135,13 +135,15 @@ def begin_case(program: Program, own: list, common: list) -> Start:
     return begin(program.structure, case)
 
 
-def chosen(program: Program, parts: Parts, wanted: bool, own: list, common: list) -> list:
+def chosen(
+    program: Program, parts: Parts, wanted: bool, own: list[Any], common: list[Any]
+) -> list[Any]:
     """Those leaves of a case's start that vary, or that do not."""
     leaves = jax.tree.leaves(begin_case(program, own, common))
     return [x for x, varies in zip(leaves, parts.is_varying, strict=True) if varies == wanted]
 
 
-def begin_block(program: Program, parts: Parts, own: list, common: list) -> Start:
+def begin_block(program: Program, parts: Parts, own: list[Any], common: list[Any]) -> Start:
     """The start of a block of cases, lanes last, as part of a compiled program.
 
     Args:
@@ -168,28 +170,28 @@ def begin_block(program: Program, parts: Parts, own: list, common: list) -> Star
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def prepare(program: Program, parts: Parts, own: list, common: list) -> list:
+def prepare(program: Program, parts: Parts, own: list[Any], common: list[Any]) -> list[Any]:
     """The leaves that vary, lanes last."""
     return jax.vmap(partial(chosen, program, parts, True), (0, None), -1)(own, common)
 
 
 # run once, so it is compiled in haste: a quarter off two to four seconds
 @partial(jax.jit, static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0})
-def prepare_shared(program: Program, parts: Parts, own: list, common: list) -> list:
+def prepare_shared(program: Program, parts: Parts, own: list[Any], common: list[Any]) -> list[Any]:
     """The others, of any one case."""
     return chosen(program, parts, False, own, common)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def prepare_tangents(
-    program: Program, parts: Parts, own: list, common: list, directions: Array
-) -> list:
+    program: Program, parts: Parts, own: list[Any], common: list[Any], directions: Array
+) -> list[Any]:
     """Tangents of the leaves that move along directions (n, p) of parameters, (n, ..., lanes)."""
 
-    def one(own: list, common: list) -> list:
+    def one(own: list[Any], common: list[Any]) -> list[Any]:
         *fixed, parameters = own
 
-        def moving(parameters: Array) -> list:
+        def moving(parameters: Array) -> list[Any]:
             leaves = jax.tree.leaves(begin_case(program, [*fixed, parameters], common))
             return [x for x, moves in zip(leaves, parts.is_moving, strict=True) if moves]
 
@@ -199,7 +201,7 @@ def prepare_tangents(
     return jax.vmap(one, (0, None), -1)(own, common)
 
 
-def find_parts(program: Program, own: list, common: list) -> Parts:
+def find_parts(program: Program, own: list[Any], common: list[Any]) -> Parts:
     """Trace a case's start.
 
     Args:
@@ -218,7 +220,7 @@ def find_parts(program: Program, own: list, common: list) -> Parts:
     )
 
 
-def _dependence(jaxpr: Any, given: list) -> tuple[bool, ...]:
+def _dependence(jaxpr: Any, given: list[Any]) -> tuple[bool, ...]:
     """Which results depend on some of the arguments."""
     depends: set[Any] = set(given)
     for equation in jaxpr.eqns:
@@ -244,11 +246,11 @@ def conclude_slopes(outline: Outline, code: Array, state: Any, turn: Outline, sl
         turn, slope: tangents of outline and state, directions first.
     """
 
-    def judged(outline: Outline, state: Any) -> tuple:
+    def judged(outline: Outline, state: Any) -> tuple[Any, ...]:
         result = conclude(outline, code, state)
         return result.metrics, result
 
-    def along(turn: Outline, slope: Any) -> tuple:
+    def along(turn: Outline, slope: Any) -> tuple[Any, ...]:
         _, tangent, result = jax.jvp(judged, (outline, state), (turn, slope), has_aux=True)
         return result, tangent
 

@@ -27,12 +27,12 @@ from studies.engine.program import (
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _run(program: Program, parts: Parts, varying: list, shared: list) -> Result:
+def _run(program: Program, parts: Parts, varying: list[Any], shared: list[Any]) -> Result:
     """Results of a chunk; what its cases share is computed once for all."""
     layout = program.layout
     TRACES.append(program.structure)
 
-    def block(own: list, common: list) -> Result:
+    def block(own: list[Any], common: list[Any]) -> Result:
         """Cases side by side in the last axis; XLA fuses little of a step under `vmap`."""
         start = begin_block(program, parts, own, common)
 
@@ -42,7 +42,7 @@ def _run(program: Program, parts: Parts, varying: list, shared: list) -> Result:
         last, _ = jax.lax.scan(body, start.state, start.inputs)
         return conclude_all(start.outline, start.state.status, last)
 
-    def device(own: list, common: list) -> Result:
+    def device(own: list[Any], common: list[Any]) -> Result:
         blocks = [x.reshape((layout.blocks, layout.lanes, *x.shape[1:])) for x in own]
         done = jax.lax.map(lambda lanes: block(lanes, common), blocks)
         return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), done)

@@ -56,7 +56,7 @@ class Steps(NamedTuple):
 #: One at a time: of two runs of a program with an eigenvalue problem in it (basis loaded) XLA's
 #: CPU client now and then never ends one (jax 0.10).
 PREPARING = Lock()
-_STEPS: dict[tuple, Steps] = {}
+_STEPS: dict[tuple[Any, ...], Steps] = {}
 #: Kernels kept in memory.
 KEPT_KERNELS = 8
 
@@ -112,7 +112,7 @@ def _trace(
     inputs = [leaves[k] for k in jax.tree.leaves(start.inputs)]
     state = [leaves[k] for k in jax.tree.leaves(start.state)]
 
-    def sample(constants: list, row: list, carried: list) -> list:
+    def sample(constants: list[Any], row: list[Any], carried: list[Any]) -> list[Any]:
         at_loop, at_inputs, at_state = (
             jax.tree.unflatten(t, x) for t, x in zip(trees, (constants, row, carried), strict=True)
         )
@@ -164,7 +164,7 @@ def start_block(
     )
 
 
-def read_leaves(start: Start, parts: Parts) -> list:
+def read_leaves(start: Start, parts: Parts) -> list[Any]:
     """Leaves of the loop's constants that are not written into the code."""
     varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
     loop = zip(jax.tree.leaves(start.loop), jax.tree.leaves(varies.loop), strict=True)

@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,7 +34,7 @@ class Code(NamedTuple):
     reference: type  # and of the shaper
     n_channels: int
     shaper_length: int
-    state: ctypes.Array  # room for the controller's state
+    state: ctypes.Array[Any]  # room for the controller's state
 
     def begin(self) -> None:
         """Forget everything."""
@@ -84,7 +84,12 @@ def find_compiler() -> list[str]:
 
 @contextmanager
 def compiled(
-    source: Source, name: str, compiler: list[str], real: type, reference: type, sizes: tuple
+    source: Source,
+    name: str,
+    compiler: list[str],
+    real: type,
+    reference: type,
+    sizes: tuple[Any, ...],
 ) -> Iterator[Code]:
     """Compile a controller and load it.
 

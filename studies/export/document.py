@@ -226,8 +226,8 @@ def controller_of(document: Document) -> tuple[Controller, Taps]:
     estimator = Estimator(
         (number["high_pass_b0"], number["high_pass_b1"], number["high_pass_a1"]),
         (number["low_pass_a1"], number["low_pass_a2"]),
-        velocity,  # type: ignore[arg-type]
-        position,  # type: ignore[arg-type]
+        velocity,
+        position,
         number["position_direct"],
     )
     controller = Controller(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -59,7 +59,7 @@ _begin: Callable[[Structure, Case], Start] = jax.jit(begin, static_argnums=0)
 _conclude = jax.jit(conclude)
 
 
-def _read(loop: Loop, inputs: Inputs, k, state: State):
+def _read(loop: Loop, inputs: Inputs, k: Any, state: State) -> Any:
     """ADC codes of a state at sample k, and whether any is clipped."""
     noise = None if inputs.adc_noise is None else inputs.adc_noise[k]
     code, is_clipped = adc_code(loop.controller, filtered_voltage(loop, state.plant), noise)
@@ -70,7 +70,15 @@ _look = jax.jit(_read)
 
 
 @partial(jax.jit, static_argnums=0)
-def _sample(structure: Structure, loop: Loop, inputs: Inputs, k, state: State, voltage, clipped):
+def _sample(
+    structure: Structure,
+    loop: Loop,
+    inputs: Inputs,
+    k: Any,
+    state: State,
+    voltage: Any,
+    clipped: Any,
+) -> Any:
     """The plant over sample k; what the ADC reads after it."""
     own = jax.tree.map(lambda x: x[k], inputs)
     after = state.controller._replace(voltage=voltage)
@@ -103,15 +111,15 @@ def jax_law(controller: Controller, n_channels: int, dac_step: float | None = No
 
 
 @jax.jit
-def _step(controller: Controller, state, code):
+def _step(controller: Controller, state: Any, code: Any) -> Any:
     return controller_step(controller, state, read_back(controller, code))[0]
 
 
 @partial(jax.jit, static_argnums=1)
-def replay(controller: Controller, n_channels: int, codes):
+def replay(controller: Controller, n_channels: int, codes: Any) -> Any:
     """The JAX controller from rest on a sequence of ADC codes (T, 3, K): voltages (T, 3, K)."""
 
-    def body(state, code):
+    def body(state: Any, code: Any) -> Any:
         after = _step(controller, state, code)
         return after, after.voltage
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -304,11 +304,11 @@ def _references(found: FixedController) -> tuple[np.ndarray, np.ndarray]:
 
 
 @jax.jit
-def _plan(path, time):
+def _plan(path: Any, time: Any) -> Any:
     return sample_path(path, time).position
 
 
-def _shape_path(path, taps, n: int, period):
+def _shape_path(path: Any, taps: Any, n: int, period: Any) -> Any:
     return shape_path(path, taps, n, 1, period).position
 
 

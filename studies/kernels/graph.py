@@ -22,7 +22,12 @@ class Node:
     __slots__ = ("args", "is_truth", "is_varying", "operation", "place")
 
     def __init__(
-        self, operation: str, args: tuple, is_varying: bool, is_truth: bool, place: Any = None
+        self,
+        operation: str,
+        args: tuple[Any, ...],
+        is_varying: bool,
+        is_truth: bool,
+        place: Any = None,
     ) -> None:
         self.operation, self.args = operation, args
         self.is_varying, self.is_truth = is_varying, is_truth
@@ -33,7 +38,7 @@ class Graph:
     """Makes nodes; one instance for one traced function."""
 
     def __init__(self) -> None:
-        self._made: dict[tuple, Node] = {}
+        self._made: dict[tuple[Any, ...], Node] = {}
 
     def read(self, place: Any, is_varying: bool) -> Node:
         """A number from memory."""
@@ -61,7 +66,7 @@ class Graph:
 
     # --- equations --------------------------------------------------------------------------------
 
-    def _evaluate(self, jaxpr: Any, consts: Sequence[Any], given: list[np.ndarray]) -> list:
+    def _evaluate(self, jaxpr: Any, consts: Sequence[Any], given: list[np.ndarray]) -> list[Any]:
         known: dict[Any, np.ndarray] = {}
 
         def value(atom: Any) -> np.ndarray:

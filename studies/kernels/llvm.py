@@ -13,7 +13,8 @@ from studies.kernels.graph import Node, is_known
 from studies.kernels.traced import Change, Leaf, TracedLoop
 
 try:
-    from llvmlite import binding, ir
+    from llvmlite import binding as binding
+    from llvmlite import ir as ir
 except ImportError:  # the extra is not installed
     binding = ir = None
 

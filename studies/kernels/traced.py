@@ -124,8 +124,12 @@ def _tangent(leaf: Leaf, directions: int) -> Leaf:
 
 
 def _tangents(
-    graph: Graph, results: list, moving: list[list], rest: list[Iterator], directions: int
-) -> list:
+    graph: Graph,
+    results: list[Any],
+    moving: list[list[Any]],
+    rest: list[Iterator[Any]],
+    directions: int,
+) -> list[Any]:
     """Tangents of the results in the order of the state's tangent leaves.
 
     Args:

@@ -66,7 +66,7 @@ class PaperCase(NamedTuple):
     damping_ratio: float = 0.01  # of the links
 
     @property
-    def counterpart(self) -> tuple:
+    def counterpart(self) -> tuple[Any, ...]:
         """What a controlled case shares with the uncontrolled one its ratios come from."""
         return self.move, self.shaper, self.modes, self.damping_ratio
 
@@ -237,7 +237,7 @@ def _run_ideal(base: Study, case: PaperCase, tell: Tell) -> Result:
     return jax.tree.map(lambda x: np.asarray(x)[None], result)
 
 
-def _ratio(case: PaperCase, by_counterpart: dict[tuple, np.ndarray]) -> np.ndarray:
+def _ratio(case: PaperCase, by_counterpart: dict[tuple[Any, ...], np.ndarray]) -> np.ndarray:
     if case.ratio_from == "own run":
         return by_counterpart[case.counterpart]
     return np.array(PAPER_RATIOS if case.ratio_from == "paper (26)" else FIRST_MODE)

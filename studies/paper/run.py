@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -175,7 +176,7 @@ def _axes(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
 
 
 def _case_labels(cases: list[PaperCase]) -> dict[str, Variable]:
-    def label(values: list, unit: str, text: str) -> Variable:
+    def label(values: list[Any], unit: str, text: str) -> Variable:
         return Variable(np.array(values), ("case",), unit, text)
 
     return {

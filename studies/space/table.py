@@ -197,7 +197,7 @@ def loose_study(table: Table, index: int) -> Study:
     return study
 
 
-def _sections(data: dict[str, Any]):
+def _sections(data: dict[str, Any]) -> Any:
     """Sections rebuilt without checks: single columns may only fit together."""
     for name, value in data.items():
         model: Any = Study.model_fields[name].annotation

@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, linear_parts
-from jaxmodel.laws import SRF
+from jaxmodel.laws.srf import SRF
 from jaxmodel.simulate import Result, simulate
 from studies.engine.controller import FixedController, fixed_controller
 from studies.engine.runs import check_run

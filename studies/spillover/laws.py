@@ -15,8 +15,9 @@ import numpy as np
 from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
-from jaxmodel.laws import IMSC, LAWS
+from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law, as_modal
+from jaxmodel.laws.imsc import IMSC
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import design_controller
 from studies.engine.controller import FixedController

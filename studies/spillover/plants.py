@@ -17,7 +17,7 @@ import numpy as np
 from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
-from jaxmodel.laws import SRF
+from jaxmodel.laws.srf import SRF
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import placement_faults
 from jaxmodel.prepare import prepare

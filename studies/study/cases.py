@@ -131,7 +131,7 @@ def as_arrays(case: Case) -> Case:
     """Every leaf as an array of the working precision (integers stay integers)."""
     real = jnp.result_type(float)
 
-    def leaf(x):
+    def leaf(x: Any) -> Any:
         x = np.asarray(x)
         return jnp.asarray(x, None if np.issubdtype(x.dtype, np.integer) else real)
 

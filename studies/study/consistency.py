@@ -205,7 +205,7 @@ def _check_sampling(study: Study) -> None:
         )
 
 
-def _nested(lists: Any) -> tuple:
+def _nested(lists: Any) -> tuple[Any, ...]:
     """A table of three lists; empty where one number or list serves all links."""
     return lists if isinstance(lists, tuple) and lists and isinstance(lists[0], tuple) else ()
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -390,7 +391,7 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
                 ax.annotate(text, (k, place), xytext=(3, 0), textcoords="offset points", fontsize=7)
         matrix = np.array(lines)
         for case in order[-3000:]:
-            color = figures.matplotlib.colormaps[MAP](rank[case])
+            color = matplotlib.colormaps[MAP](rank[case])
             ax.plot(matrix[:, case], color=color, linewidth=0.5, alpha=0.4)
         for case in best:
             ax.plot(matrix[:, case], color=BEST, linewidth=1.3)

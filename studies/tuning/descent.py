@@ -65,7 +65,7 @@ class Adam:
     def begin(self, place: np.ndarray) -> tuple[np.ndarray, ...]:
         return _arrays(self._optimiser.init(place))
 
-    def step(self, state, trial):
+    def step(self, state: Any, trial: Any) -> Any:
         is_fine = np.isfinite(trial.merit)
         slope = np.where(is_fine[:, None], trial.slope, 0.0)
         tree = jax.tree.structure(self._optimiser.init(trial.place))
@@ -82,7 +82,7 @@ class Lbfgs:
         # direction, share of it that the trial goes, then what optax remembers
         return np.zeros_like(place), np.ones(len(place)), *_arrays(jax.vmap(_LBFGS.init)(place))
 
-    def step(self, state, trial):
+    def step(self, state: Any, trial: Any) -> Any:
         direction, share, *memory = state
         is_first = ~np.isfinite(trial.base_merit)
         promised = np.sum(trial.base_slope * (trial.place - trial.base), axis=1)
@@ -103,7 +103,7 @@ class Lbfgs:
         after = direction, share, *memory
         return after, is_taken, np.clip(base + share[:, None] * direction, 0.0, 1.0)
 
-    def _remember(self, memory, trial, is_taken):
+    def _remember(self, memory: Any, trial: Any, is_taken: Any) -> Any:
         """(slopes turned into steps by what optax remembers, (B, p), the new memory)."""
         ahead, memory = trial.slope.copy(), [np.array(x) for x in memory]
         tree = jax.tree.structure(_LBFGS.init(trial.place[0]))

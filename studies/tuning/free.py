@@ -180,20 +180,22 @@ def _check_twice(numbers: list[Free]) -> None:
                 raise StudyError(f"tune.free.{own_key}: {key} is free too and decides it")
 
 
-def _place_all(places: tuple, case: Case, values: Array) -> Case:
+def _place_all(places: tuple[Any, ...], case: Case, values: Array) -> Case:
     for place in places:
         case = place(case, values)
     return case
 
 
-def _part(put: Callable, first: int, after: int, case: Case, values: Array) -> Case:
+def _part(put: Callable[..., Any], first: int, after: int, case: Case, values: Array) -> Case:
     return put(case, values[first:after])
 
 
 # --- plain fields ---------------------------------------------------------------------------------
 
 
-def _plain(name: str, bounds: Any, study: Study, path: str) -> tuple[list[Free], Callable]:
+def _plain(
+    name: str, bounds: Any, study: Study, path: str
+) -> tuple[list[Free], Callable[..., Any]]:
     entry, ready = parse_entry(name), nearest(name, DECIDED)
     if ready and name.partition(".")[0] not in Study.model_fields:
         raise StudyError(f"{path}: cannot be free; did you mean {ready!r}?")
@@ -297,7 +299,7 @@ def _safe(value: Array) -> Array:
 # --- ready-made ones ------------------------------------------------------------------------------
 
 
-def _poles(written: dict[str, Any], study: Study) -> tuple[list[Free], Callable]:
+def _poles(written: dict[str, Any], study: Study) -> tuple[list[Free], Callable[..., Any]]:
     for one, other in (POLES, POLES[::-1]):
         if one in written and other not in written:
             raise StudyError(f"tune.free.{one}: needs {other} beside it, (22)-(23) take both")
@@ -329,7 +331,7 @@ def _place_poles(structure: Structure, case: Case, values: Array) -> Case:
     return case._replace(control=control)
 
 
-def _placement(bounds: Any, study: Study, path: str) -> tuple[list[Free], Callable]:
+def _placement(bounds: Any, study: Study, path: str) -> tuple[list[Free], Callable[..., Any]]:
     if not isinstance(bounds, dict) or set(bounds) != {"kind"} or bounds["kind"] not in PLACEMENTS:
         raise field_error(path, bounds, "{kind = 'same'} or {kind = 'per_link'}")
     centers, pitch, length = patch_centers(study), patch_pitch(study), each_link(study.link.length)

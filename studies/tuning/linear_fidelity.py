@@ -153,7 +153,7 @@ class LinearFidelity:
 
 
 def _excess(
-    structure: Structure, names: tuple, case: Case, matrices: LoopMatrices, limits: Array
+    structure: Structure, names: tuple[Any, ...], case: Case, matrices: LoopMatrices, limits: Array
 ) -> Array:
     """x/(1 + |x|) for each limit, (m,): decay rates reach hundreds of their limit on both sides.
 
@@ -184,7 +184,7 @@ def _singularity_distance(structure: Structure, case: Case) -> Array:
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _limit_slopes(
     structure: Structure,
-    names: tuple,
+    names: tuple[Any, ...],
     place: Any,
     cases: Case,
     pose: Array,
@@ -196,7 +196,7 @@ def _limit_slopes(
         found = _excess(structure, names, placed, closed_loop(structure, placed, pose), limit)
         return found, found
 
-    def one(given: tuple) -> tuple[Array, Array]:
+    def one(given: tuple[Any, ...]) -> tuple[Array, Array]:
         slope, found = jax.jacrev(figures, has_aux=True)(*given)  # the figures come with it
         return found, slope
 
@@ -206,7 +206,7 @@ def _limit_slopes(
 @partial(jax.jit, static_argnums=(0, 1, 2, 6))
 def _look(
     structure: Structure,
-    names: tuple,
+    names: tuple[Any, ...],
     place: Any,
     case: Case,
     pose: Array,

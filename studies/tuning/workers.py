@@ -111,9 +111,9 @@ class ClusterEvaluator(Evaluator):
         self._is_compiled = True
         return Evaluation(*(np.concatenate(x) for x in zip(*found, strict=True)))
 
-    def _gathered(self, futures: list[Future]) -> list[Evaluation]:
+    def _gathered(self, futures: list[Future[Any]]) -> list[Evaluation]:
         """Answers in the order of the parts."""
-        answers: dict[Future, Any] = {}
+        answers: dict[Future[Any], Any] = {}
         try:
             while len(answers) < len(futures):
                 left = [future for future in futures if future not in answers]
