@@ -512,7 +512,7 @@ def test_best_cases_obey_conditions(mixed):
         best_cases(data, "residual_rms[link=4]")
     with pytest.raises(StudyError, match="did you mean 'peak_voltage'"):
         best_cases(data, "voltage_peak")
-    with pytest.raises(StudyError, match="true for no case"):
+    with pytest.raises(StudyError, match="no case with status ok"):
         best_cases(data, "residual_rms", "peak_voltage < 0")
 
 

@@ -70,6 +70,8 @@ PER_CASE: dict[str, tuple[Any, ...]] = {
 
 #: Of these the smallest entry is the worst.
 LEAST = ("damping_ratio",)
+#: Of these the largest value is the best one.
+WANTED_LARGE = ("gain_margin", "damping_ratio", "singularity_distance")
 
 
 def forget(data: np.ndarray, axis: int, count: np.ndarray) -> None:

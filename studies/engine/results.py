@@ -153,6 +153,8 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
     known = [n for n, v in variables.items() if v.dims[:1] == ("case",)]
     close = nearest(key, known) or _turned(key, known)
     hint = f"did you mean {close!r}?" if close else f"known: {', '.join(known)}"
+    if any(np.any(data[n] == key) for n in known if data[n].dtype.kind in "OSUT"):
+        hint = f"a text stands in quotes: '{key}'"
     raise StudyError(f"{name!r}: unknown metric or axis; {hint}")
 
 

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from studies.errors import StudyError, field_error, nearest
 from studies.space.methods import METHODS
-from studies.study.choices import OneOf
+from studies.study.choices import OWN, OneOf
 from studies.study.entries import parse_entries
 from studies.study.explain import explain
 from studies.study.spec import Section, Study, described, parse_study, read_toml
@@ -27,7 +27,7 @@ from studies.study.spec import Section, Study, described, parse_study, read_toml
 class Block(Section):
     """Axes and how they combine."""
 
-    method: Annotated[str, OneOf(lambda: METHODS)] = described(
+    method: Annotated[str, OneOf(lambda: METHODS, OWN)] = described(
         "grid", "-", "how axes and blocks combine"
     )
     axes: dict[str, Any] = described({}, "-", "field or ready-made axis = values")

@@ -8,12 +8,20 @@ from typing import Any
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
+#: What messages add to the names in tables to which users may add.
+OWN = "one of your own with studies --with FILE.py"
+
 
 class OneOf:
     """Annotation of a text field: one of the names that a table has now."""
 
-    def __init__(self, names: Callable[[], Iterable[str]]) -> None:
-        self._names = names
+    def __init__(self, names: Callable[[], Iterable[str]], note: str = "") -> None:
+        """
+        Args:
+            names: of the table.
+            note: what messages add to the names.
+        """
+        self._names, self.note = names, note
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -41,7 +41,9 @@ def allowed_values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
     """
     names = choices_of(annotation, metadata)
     if names:
-        return " or ".join(filter(None, (", ".join(map(repr, names[:-1])), repr(names[-1]))))
+        notes = [f", or {item.note}" for item in metadata if isinstance(item, OneOf) and item.note]
+        told = " or ".join(filter(None, (", ".join(map(repr, names[:-1])), repr(names[-1]))))
+        return "".join([told, *notes])
     for item in metadata:
         if hasattr(item, "allowed"):  # says it itself
             return str(item.allowed)

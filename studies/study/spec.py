@@ -20,7 +20,7 @@ from jaxmodel.motion import PROFILES
 from jaxmodel.parameters import HOME
 from jaxmodel.shaper import SHAPERS
 from studies.errors import StudyError, field_error
-from studies.study.choices import OneOf
+from studies.study.choices import OWN, OneOf
 from studies.study.consistency import check_consistency
 from studies.study.explain import explain
 
@@ -220,7 +220,7 @@ class Control(Section):
     feedback: Literal["sampled", "ideal", "none"] = described(
         "sampled", "-", "digital loop, the paper's continuous state feedback, or none"
     )
-    law: Annotated[str, OneOf(lambda: LAWS)] = described("imsc", "-", "control law")
+    law: Annotated[str, OneOf(lambda: LAWS, OWN)] = described("imsc", "-", "control law")
     laws: Annotated[dict[str, dict[str, EachLink[float]]], OwnFields()] = described(
         {}, "-", "fields of laws' own, by law"
     )

@@ -8,6 +8,7 @@ from studies.engine.plan import peak_memory
 from studies.engine.runs import check_run
 from studies.engine.sweep import Plan, calibrate
 from studies.errors import StudyError
+from studies.show.units import count_text
 from studies.space.table import Table, case_study
 from studies.study.paths import field_unit, parse_entry
 from studies.sweeps.show import Rows, print_rows, short_value
@@ -24,11 +25,13 @@ def print_plan(plan: Plan, console: Console) -> None:
     for group in plan.groups:
         layout, structure = group.layout, group.structure
         console.print(
-            f"program: {structure.basis}, {structure.n_modes} modes, {structure.feedback} "
-            f"feedback, {structure.n_steps} samples of {structure.substeps} plant steps: "
-            f"{len(group.rows)} "
-            f"cases in {len(group.chunks())} chunks of {layout.devices} devices x {layout.blocks} "
-            f"blocks x {layout.lanes} lanes"
+            f"program: law {structure.law}, {structure.basis}, "
+            f"{count_text(structure.n_modes, 'mode')}, {structure.feedback} feedback, "
+            f"{count_text(structure.n_steps, 'sample')} of "
+            f"{count_text(structure.substeps, 'plant step')}: "
+            f"{count_text(len(group.rows), 'case')} in {count_text(len(group.chunks()), 'chunk')} "
+            f"of {count_text(layout.devices, 'device')} x {count_text(layout.blocks, 'block')} x "
+            f"{count_text(layout.lanes, 'lane')}"
         )
     middle = len(table) // 2
     values = ", ".join(f"{name} = {short_value(c[middle])}" for name, c in table.columns.items())

@@ -12,7 +12,7 @@ from rich.table import Table as RichTable
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
-from studies.engine.columns import NOT_RUN, variable_name
+from studies.engine.columns import NOT_RUN, WANTED_LARGE, variable_name
 from studies.engine.results import SweepData, counted_links, metric_values, swept_names
 from studies.engine.stored import kept_metrics
 from studies.errors import StudyError
@@ -74,25 +74,26 @@ def select(data: SweepData, subject_to: str) -> np.ndarray:
 
 
 def best_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) -> np.ndarray:
-    """Numbers of the cases with the smallest metric, best first.
+    """Numbers of the cases with the smallest metric, best first; of `WANTED_LARGE` the largest.
 
     Args:
         data: the sweep.
-        by: metric or entry of one; "-" before it: largest first.
+        by: metric or entry of one; "-" before it: the other way round.
         subject_to: condition on metrics and axes.
         count: how many.
 
     Raises:
         StudyError: unknown metric, or no case left.
     """
-    sign, name = (-1, by[1:]) if by.startswith("-") else (1, by)
+    name = by.removeprefix("-")
+    is_large = (name.partition("[")[0] in WANTED_LARGE) != by.startswith("-")
     value = metric_values(data, name)
     if value.dtype.kind not in "fiub":
         raise StudyError(f"--by {by}: a text, not a number")
     chosen = np.flatnonzero(select(data, subject_to) & np.isfinite(value))
     if len(chosen) == 0:
-        raise StudyError(f"--subject-to {subject_to!r}: true for no case of status ok")
-    return chosen[np.argsort(sign * value[chosen], kind="stable")][:count]
+        raise StudyError(f"--subject-to {subject_to!r}: no case with status ok meets it")
+    return chosen[np.argsort(-value[chosen] if is_large else value[chosen], kind="stable")][:count]
 
 
 def show(data: SweepData, console: Console, is_failed: bool) -> None:
