@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -32,13 +31,6 @@ _SETS = ("no link controlled", "link 1", "links 1+2", "links 1+2+3")
 #: Components of the platform's error.
 _ERRORS = ("x [nm]", "y [nm]", "φ [nrad]")
 _COLUMNS = ["link 1", "link 2", "link 3", "platform"]
-
-
-class AtlasFigure(NamedTuple):
-    """A figure and what it shows."""
-
-    caption: str
-    draw: Callable[[Findings], Figure]
 
 
 def _subsets(found: Findings) -> Figure:
@@ -284,31 +276,19 @@ def _responses(found: Findings) -> Figure:
     return figure
 
 
-FIGURES = {
-    "subsets": AtlasFigure("which links are controlled, and what that does to each", _subsets),
-    "helps": AtlasFigure("who helps or hurts whom: one link controlled", _helps),
-    "lattice": AtlasFigure(
-        "residual of all links, one more link a step; dashed: it gets worse", _lattice
-    ),
-    "shares": AtlasFigure(
-        "Shapley shares of links and modes in what control removes [% of the mean square]", _shares
-    ),
-    "interactions": AtlasFigure(
-        "pairs of links and modes that do more or less together; 2.1: mode 1 of link 2",
-        _interactions,
-    ),
-    "workspace": AtlasFigure(
-        "natural modes over the workspace; orange: singular border, white: distance of the "
-        "nearest link angle from it, black: the path",
-        _workspace,
-    ),
-    "participation": AtlasFigure("who bends in the three first bending modes", _participation),
-    "modes": AtlasFigure(
-        "natural modes, drawn large, and links' shares of the strain energy", _modes
-    ),
-    "platform": AtlasFigure("error of the platform: drive, and what bending links add", _platform),
-    "vibration": AtlasFigure("vibration error of the platform after the command", _vibration_after),
-    "responses": AtlasFigure("frequency responses of the sampled loop", _responses),
+#: What draws each figure, by its name.
+FIGURES: dict[str, Callable[[Findings], Figure]] = {
+    "subsets": _subsets,
+    "helps": _helps,
+    "lattice": _lattice,
+    "shares": _shares,
+    "interactions": _interactions,
+    "workspace": _workspace,
+    "participation": _participation,
+    "modes": _modes,
+    "platform": _platform,
+    "vibration": _vibration_after,
+    "responses": _responses,
 }
 
 

@@ -95,8 +95,8 @@ def _finish(study: Study, out: Path, tell: Tell) -> None:
             write_store(staging / DATA, variables(found), run_attributes(study))
             tell("drawing", 0.0)
             with styled():
-                for name, figure in FIGURES.items():
-                    save(figure.draw(found), staging, name)
+                for name, draw in FIGURES.items():
+                    save(draw(found), staging, name)
                 write_figure(sketch(study), staging / "machine.png")
             write_animation(found, staging)
             write_report(staging, report(found, dropped), study)
