@@ -72,9 +72,6 @@ class Plant(NamedTuple):
     n_modes: int  # per link
     departure: Departure = Departure()
 
-    def __str__(self) -> str:
-        return f"{self.basis}, {self.n_modes} modes a link, {self.departure}"
-
 
 class SampledLoop(NamedTuple):
     """A linearised loop on the host, with nothing in it of modes that its plant does not have."""

@@ -48,6 +48,7 @@ def report(found: Certificate, laws: Comparison | None) -> str:
         laws=laws,
         verdict=verdict(found),
         margin=margin,
+        worst=found.plants[found.worst],
         share=margin / found.required,
         total=int(found.exists.sum()),
         good=int(found.passes[found.exists].sum()),
