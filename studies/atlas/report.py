@@ -51,7 +51,7 @@ def report(found: Findings, dropped: list[str]) -> str:
         workspace=_workspace(found),
         runs=_runs(found),
         responses=_responses(found),
-        link_sets=LINK_LABELS,
+        link_sets=list(LINK_LABELS),
         filmed=setting_label(RUNS[-1]),
         sketch_caption=CAPTION,
     )
