@@ -21,6 +21,7 @@ from jaxmodel.return_difference import (
     go_round,
     spectrum_polynomial,
 )
+from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 
 #: Iterations at each frequency.
 ITERATIONS = 4
@@ -66,10 +67,8 @@ def walk(response: LoopResponse, spread: Array, loci: Loci, station: Station) ->
         loci: so far.
         station: the next frequency.
     """
-    zero = jnp.zeros_like(station.omega)
-    turn = go_round(
-        response, Pair(zero, station.omega), Pair(station.cosine, -station.sine), spread
-    )
+    s = Pair(_growth(response) + jnp.zeros_like(station.omega), station.omega)
+    turn = go_round(response, s, Pair(station.cosine, -station.sine), spread)
     value, last = _iterated(turn, loci.value), loci.last
     # where the straight line between two values meets the real axis
     rise = value.im - last.im
@@ -88,6 +87,11 @@ def walk(response: LoopResponse, spread: Array, loci: Loci, station: Station) ->
         jnp.where(is_more, loci.omega, loci.left),
         jnp.where(is_more, station.omega, loci.right),
     )
+
+
+def _growth(response: LoopResponse) -> Array:
+    """What counts as stable grows no faster [1/s], ()."""
+    return RADIUS_TOLERANCE / response.period
 
 
 def _iterated(turn: Turn, values: Pair) -> Pair:
@@ -157,7 +161,7 @@ def approach(response: LoopResponse, known: Known, meeting: Meeting) -> Meeting:
         away = known.by_omega * (s.im - known.omega) + known.by_value * (x - known.value)
         return found * (away * known.is_there + (1 - known.is_there)).inverse()
 
-    at = (Pair(zero, omega), shift, value)
+    at = (Pair(zero + _growth(response), omega), shift, value)
     turning = shift * Pair(zero, -response.period * one)  # d/d omega of exp(-j omega T)
     found, by_omega = jax.jvp(wanted, at, (Pair(zero, one), turning, zero))
     _, by_value = jax.jvp(wanted, at, (none, none, one))

@@ -27,7 +27,7 @@ from jaxmodel.plant import Plant
 #: Images n of the spectrum that are summed; those left out change the sum by 1e-4.
 IMAGES = (0, -1, 1, -2)
 #: Modes are taken to be at least as wide as this share of their frequency [1].
-NARROWEST = 2e-4
+NARROWEST = 1e-6
 
 
 class LoopResponse(NamedTuple):
@@ -245,6 +245,7 @@ class AssembledModes(NamedTuple):
     omega: Array  # ascending [rad/s], (m,)
     decay: Array  # zeta omega [1/s], (m,)
     share: Array  # of kinetic energy in the pose, then in the links' modes by order, (1 + R, m)
+    growth: Array  # rate at which it leaves its place by itself, 0: it does not [1/s], ()
 
 
 def assembled_modes(response: LoopResponse) -> AssembledModes:
@@ -277,6 +278,7 @@ def assembled_modes(response: LoopResponse) -> AssembledModes:
         jnp.sqrt(jnp.maximum(square, 0.0)),
         jnp.sum(shape * (damping @ shape), axis=0) / 2,
         jnp.concatenate([jnp.sum(energy[:3], axis=0)[None], links]),
+        jnp.sqrt(jnp.maximum(-square[0], 0.0)),
     )
 
 

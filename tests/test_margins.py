@@ -277,6 +277,24 @@ def test_loops_without_feedback_have_no_limit():
     assert np.isnan(single(STUDY.change(control__feedback="ideal")).gain_margin)
 
 
+@pytest.mark.parametrize(
+    "fields",
+    [
+        # pushed towards the drives, which are too soft to hold the platform
+        {"drive__kp": 300.0, "load__wrench": (0.0, 100.0, 0.0), "control__gain_factor": 0.1},
+        {"link__damping_ratio": 0.0, "control__links": (True, False, False)},
+        {"link__damping_ratio": 1e-6, "control__links": (True, False, False)},
+    ],
+    ids=["falls by itself", "no damping", "hardly any"],
+)
+def test_machines_that_hardly_stand_alone(fields):
+    study = STUDY.change(**fields)
+    wanted = loop_report(build_structure(study), as_arrays(build_case(study)), HOME)
+    found = single(study).gain_margin
+    assert (found == 0) == (wanted.gain_margin == 0) == ("load__wrench" in fields)
+    np.testing.assert_allclose(found, wanted.gain_margin, rtol=0.02)
+
+
 TWO_LINKS = (
     """
 [run]

@@ -39,9 +39,10 @@ from jaxmodel.return_difference import (
     loop_response,
     loop_strength,
 )
+from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.engine.damping import damping_ratios
 from studies.engine.lanes import BLOCK, run_steps
-from studies.engine.stability import with_margin_modes
+from studies.engine.stability import loop_report, with_margin_modes
 from studies.engine.steps import PREPARING
 from studies.study.margin import HIGHEST, LOWEST
 
@@ -62,6 +63,8 @@ WALKS = (
 LOWEST_HZ = 5.0
 #: Stands for 0 [rad/s], where the hold would be 0/0.
 STILL = 0.01
+#: Peaks of links damped less [1] are too sharp for a walk: those loops are judged by eigenvalues.
+LEAST_DAMPED = 3e-5
 #: What keeps eigenvalues of idle channels apart, on the way and in the second look.
 SPREAD, FINE_SPREAD = 1e-3, 1e-6
 #: Crossings looked at again per case, and kept of each place looked at.
@@ -133,7 +136,27 @@ def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
         again = judge(np.arange(count), WALKS[0])
         if len(again):
             judge(again, WALKS[1])
+    for k in np.flatnonzero(_least_damping(structure, whole) < LEAST_DAMPED):
+        _judge_by_eigenvalues(structure, jax.tree.map(lambda x, k=k: x[k], whole), figures, int(k))
     return figures
+
+
+def _least_damping(structure: Structure, cases: Case) -> np.ndarray:
+    """Smallest damping ratio of a link's modes, as far as they are given [1], (n,)."""
+    damping = cases.machine.damping
+    falling = np.minimum(np.asarray(damping.exponent), 0.0)
+    return np.min(damping.ratio, axis=(1, 2)) * float(structure.n_modes) ** (2 * falling)
+
+
+def _judge_by_eigenvalues(structure: Structure, case: Case, figures: LoopMargins, k: int) -> None:
+    """Write the figures of one case, but for what breaks; half a second."""
+    try:
+        found = loop_report(structure, case, case.path.waypoints[0], structure.n_controlled)
+    except np.linalg.LinAlgError:  # not finite
+        return
+    figures.gain_margin[k] = found.gain_margin
+    figures.damping_ratio[k] = np.min(found.damping_ratio, axis=1)
+    figures.breaking_frequency[k] = figures.breaking_mode[k] = np.nan
 
 
 def _judge_one_by_one(structure: Structure, cases: Case) -> LoopMargins:
@@ -237,15 +260,17 @@ def _judged(
     value, omega = np.where(is_more, at_end, value), np.where(is_more, where, omega)
     breaks = value > least
     margin = np.where(breaks, 1 / (weaker * np.where(breaks, value, 1.0)), HIGHEST)
-    margin = np.where(margin < LOWEST, 0.0, margin)
-    omega = np.where(breaks, omega, np.nan)
+    falls = modes.growth * response.period > RADIUS_TOLERANCE  # even without control
+    margin = np.where(falls | (margin < LOWEST), 0.0, margin)
+    breaks, omega = breaks | falls, np.where(falls, 0.0, np.where(breaks, omega, np.nan))
     apart = np.abs(_folded(modes.omega, top) - np.abs(omega))
     order = np.take_along_axis(
         np.argmax(modes.share, axis=0), np.argmin(apart, axis=0)[None], axis=0
     )[0]
     leaves = jax.tree.leaves(response)
     is_finite = np.all([np.isfinite(x).reshape(-1, count).all(axis=0) for x in leaves], axis=0)
-    order = np.where(is_more & (omega == 0), np.nan, order)  # static: no mode's frequency
+    # static: no mode's frequency
+    order = np.where(is_more & (omega == 0) & ~falls, np.nan, order)
     figures = LoopMargins(
         np.where(is_finite, margin, np.nan),
         np.where(is_finite, np.abs(omega) / (2 * np.pi), np.nan),
