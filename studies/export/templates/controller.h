@@ -1,23 +1,39 @@
+{% set kinds = "patches" if channels.kind == "patch" else "modes" %}
 /* Vibration controller of a planar 3-PRR robot with flexible links.
  *
-$origin
+{% for line in origin %}
+ * {{ line }}
+{% endfor %}
  *
- * Once per sample, at $rate Hz:
+ * Once per sample, at {{ electronics.sample_rate_hz | short(6) }} Hz:
  *   1. put the actuator values of the last call on the actuators, and sample all sensors;
- *   2. call ${name}_step; its actuator values go out at the next sample.
- * That one sample of delay is part of the design. Begin with ${name}_init.
+ *   2. call {{ name }}_step; its actuator values go out at the next sample.
+ * That one sample of delay is part of the design. Begin with {{ name }}_init.
  *
- * Wires: $n_patches patch pairs per link, link 1 first, each link's from the slider to the platform.
- * Front end: ADC of $adc_bits bits for 0 to $adc_range V; before it a conditioner of gain $gain and bias
- * $bias V, and a second-order Butterworth filter at $antialias Hz, which the design counts on.
+ * Wires: {{ n_patches }} patch pairs per link, link 1 first; on each link from slider to platform.
  * Polarity: a positive voltage at actuator n must raise sensor n.
-$border
- * Start: amplifiers off, ${name}_init, then ${name}_step for ${NAME}_SETTLE_SAMPLES samples.
+ * Front end, which the design counts on:
+ *   - a second-order Butterworth filter at {{ electronics.antialias_hz | short(6) }} Hz;
+ *   - a conditioner of gain {{ electronics.conditioner_gain | short(6) }};
+ *   - a bias of {{ electronics.conditioner_bias | short(6) }} V at the ADC;
+ *   - an ADC of {{ electronics.adc_bits }} bits for 0 to {{ electronics.adc_range | short(6) }} V.
+{% if fixed %}
+ * Sensors: codes of the ADC, 0 to {{ fixed.adc_top }}. A sensor is faulty if its code is too
+ * high, or too long at one end of the range.
+ * Actuators: codes of the DAC, 1 to {{ 2 * fixed.dac_rest - 1 }}, which span
+ * +-{{ electronics.voltage_limit | short(6) }} V at the piezo patch; {{ fixed.dac_rest }} is 0 V.
+{% else %}
+ * Sensors: volts at the ADC's input, the code times {{ NAME }}_ADC_STEP; conditioner gain and
+ * bias are taken off here. A sensor is faulty if it is no number or out of range, or too long at
+ * one end of it.
+ * Actuators: volts at the piezo patch, so divide by the gain of the amplifier.
+{% endif %}
+ * Start: amplifiers off, {{ name }}_init, then {{ NAME }}_SETTLE_SAMPLES times {{ name }}_step.
  *
  * No allocation, no recursion, no library; all memory is in the two structures below.
  */
-#ifndef ${NAME}_H
-#define ${NAME}_H
+#ifndef {{ NAME }}_H
+#define {{ NAME }}_H
 
 #include <stdint.h>
 
@@ -25,49 +41,78 @@ $border
 extern "C" {
 #endif
 
-$types
-#define ${NAME}_N_LINKS $n_links
-#define ${NAME}_N_PATCHES $n_patches
-#define ${NAME}_N_CHANNELS $n_channels
-#define ${NAME}_N_MODES $n_modes /* controlled $kind of all links together */
-#define ${NAME}_SAMPLE_RATE $rate_literal /* Hz */
-#define ${NAME}_RAIL_SAMPLES $rail /* $rail_ms ms at one end of its range: a faulty sensor */
-#define ${NAME}_SETTLE_SAMPLES $settle /* until the filters have forgotten 99.99 % of the start */
-#define ${NAME}_SHAPER_LENGTH $shaper_length /* samples that the shaper remembers */
-$constants
+{% if not fixed %}
+/* double, or float with -D{{ NAME }}_REAL=float. */
+#ifndef {{ NAME }}_REAL
+#define {{ NAME }}_REAL double
+#endif
+typedef {{ NAME }}_REAL {{ name }}_real;
+{% endif %}
+
+#define {{ NAME }}_N_LINKS 3
+#define {{ NAME }}_N_PATCHES {{ n_patches }}
+#define {{ NAME }}_N_CHANNELS {{ 3 * n_patches }}
+#define {{ NAME }}_N_MODES {{ channels.link | length }} /* controlled {{ kinds }} of all links */
+#define {{ NAME }}_SAMPLE_RATE {{ exact(electronics.sample_rate_hz) }} /* Hz */
+#define {{ NAME }}_RAIL_SAMPLES {{ rail }} /* {{ rail_ms }} ms at one end: a faulty sensor */
+#define {{ NAME }}_SETTLE_SAMPLES {{ settle }} /* until 99.99 % of the start are forgotten */
+#define {{ NAME }}_SHAPER_LENGTH {{ shaper_length }} /* samples that the shaper remembers */
+{% if fixed %}
+#define {{ NAME }}_ADC_TOP {{ fixed.adc_top }} /* highest code */
+#define {{ NAME }}_DAC_REST {{ fixed.dac_rest }} /* code of 0 V */
+#define {{ NAME }}_DAC_STEP {{ exact(fixed.dac_step) }} /* V per code at the patch */
+{% else %}
+#define {{ NAME }}_ADC_TOP {{ controller.adc_top | int }} /* highest code */
+#define {{ NAME }}_ADC_STEP {{ exact(controller.adc_step) }} /* V per code */
+#define {{ NAME }}_LIMIT {{ exact(controller.voltage_limit) }} /* V, of every actuator, +- */
+{% endif %}
 
 /* What the controller remembers from sample to sample. */
 typedef struct {
-$members
-    int16_t rail[${NAME}_N_CHANNELS]; /* consecutive samples at the top, or minus those at 0 */
+    {{ word }} high[{{ NAME }}_N_MODES]; /* memory of the first section */
+    {{ word }} line[{{ NAME }}_N_MODES][2]; /* delay line of the second section */
+    {% if has_feedthrough %}
+    {{ word }} command[{{ NAME }}_N_CHANNELS]; /* on the actuators now */
+    {% endif %}
+    int16_t rail[{{ NAME }}_N_CHANNELS]; /* consecutive samples at the top, or minus those at 0 */
     int fault; /* number of the first faulty sensor, from 1; 0: none */
-} ${name}_state;
+} {{ name }}_state;
 
 /* Forget everything, faults too: the state of a machine at rest. */
-void ${name}_init(${name}_state *state);
+void {{ name }}_init({{ name }}_state *state);
 
 /* One sample: sensors in, values for the actuators of the next sample out.
  *
  * Returns 0, or the number (from 1) of a faulty sensor:
- * $faulty.
- * From then on all actuators are at rest, whatever the sensors say, until ${name}_init. Sensors of
- * links that are not controlled are not looked at; their actuators stay at rest.
+{% if fixed %}
+ * a code beyond the ADC's, or stuck at one end.
+{% else %}
+ * not a number, out of range or stuck at one end of it.
+{% endif %}
+ * From then on all actuators are at rest, whatever the sensors say, until {{ name }}_init. Sensors
+ * of links that are not controlled are not looked at; their actuators stay at rest.
  */
-int ${name}_step(${name}_state *state, const $sensor_type sensor[${NAME}_N_CHANNELS],
-    $actuator_type actuator[${NAME}_N_CHANNELS]);
+int {{ name }}_step({{ name }}_state *state, const {{ wire }} sensor[{{ NAME }}_N_CHANNELS],
+    {{ wire }} actuator[{{ NAME }}_N_CHANNELS]);
 
 /* What the shaper remembers: references of the past, newest at `newest`. */
 typedef struct {
-    $reference_type past[${NAME}_SHAPER_LENGTH][3];
+    {{ word }} past[{{ NAME }}_SHAPER_LENGTH][3];
     uint32_t newest;
-} ${name}_shaper;
+} {{ name }}_shaper;
 
 /* Begin at rest in a pose. */
-void ${name}_shape_init(${name}_shaper *shaper, const $reference_type reference[3]);
+void {{ name }}_shape_init({{ name }}_shaper *shaper, const {{ word }} reference[3]);
 
-/* One sample of the reference pose (x, y, phi)$reference_unit: as planned in, shaped out. */
-void ${name}_shape_step(${name}_shaper *shaper, const $reference_type reference[3],
-    $reference_type shaped[3]);
+/* One sample of the reference pose (x, y, phi): as planned in, shaped out.
+{% if fixed %}
+ * In any units that fit 32 bits.
+{% else %}
+ * In any units.
+{% endif %}
+ */
+void {{ name }}_shape_step({{ name }}_shaper *shaper, const {{ word }} reference[3],
+    {{ word }} shaped[3]);
 
 #ifdef __cplusplus
 }

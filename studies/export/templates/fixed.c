@@ -1,45 +1,128 @@
-/* Controller and input shaper in fixed point, see $name.h.
+{% import "export/templates/shared.c" as shared with context %}
+/* Controller and input shaper in fixed point, see {{ name }}.h.
  *
-$origin
+{% for line in origin %}
+ * {{ line }}
+{% endfor %}
  *
- * Every signal is a 32-bit integer; its unit is in the table of formats. A sum of products is made in
- * 64 bits, which it cannot leave (the coefficients of a row add up to less than 2^31), then shifted
- * right with rounding and limited to 32 bits. So coefficient = integer / 2^shift, and its unit is counts
- * of the result per count of what it multiplies.
+ * Every signal is a 32-bit integer; its unit is in the table of formats. A sum of products is made
+ * in 64 bits, which it cannot leave (the coefficients of a row add up to less than 2^31), then
+ * shifted right with rounding and limited to 32 bits. So coefficient = integer / 2^shift, and its
+ * unit is counts of the result per count of what it multiplies.
  *
- * Formats: value = base * integer / 2^Q. The base is the largest value in the simulated motion; a word
- * has room for `room` times that, and no ADC codes can make more than `reach` times that. A coefficient
- * from signal a to signal b, in SI units, is integer / 2^shift * (base_b / 2^Q_b) / (base_a / 2^Q_a);
- * one ADC code is $code V at a sensor, one DAC code $dac V at an actuator.
+ * Formats: value = base * integer / 2^Q. The base is the largest value in the simulated motion; a
+ * word has room for `room` times that, and no ADC codes can make more than `reach` times that. A
+ * coefficient from signal a to signal b, in SI units, is
+ * integer / 2^shift * (base_b / 2^Q_b) / (base_a / 2^Q_a); one ADC code is {{ code | short(9) }} V
+ * at a sensor, one DAC code {{ fixed.dac_step | short(9) }} V at an actuator.
  *
-$formats
+{% for line in formats %}
+ * {{ line }}
+{% endfor %}
  *
  * Each constant: [unit], and the section or field of the study file that it comes from.
- * $cost
+ * {{ cost }}
  */
-#include "$name.h"
+#include "{{ name }}.h"
 
-$tables
+{{ shared.structure() }}
+
+/* first mode of each link, and the end; control */
+static const uint16_t FIRST_MODE{{ array(first_mode) }};
+
+/* [code] highest one; adc_bits */
+static const uint16_t ADC_TOP = {{ fixed.adc_top }};
+
+/* [count] of a sensor per code; adc_bits */
+static const int32_t ADC_UNIT = {{ 2 ** fixed.adc_bits }};
+
+/* [count] sensor at rest; conditioner_bias */
+static const int64_t BIAS = {{ fixed.bias }};
+
+/* [code] of 0 V at an actuator; the DAC's bits */
+static const int32_t DAC_REST = {{ fixed.dac_rest }};
+
+/* [signal/sensor] modal filter pinv(lambda_s Phi_s^t); control.basis, patches */
+static const int32_t FILTER{{ array(fixed.filter.integers, channels.names) }};
+
+/* [bit] of each row */
+static const uint16_t FILTER_SHIFT{{ array(fixed.filter.shift) }};
+
+/* [high/signal; high/signal, 1] b0; b1, -a1 of the velocity estimate's first section:
+ * {{ shared.first_section() }} */
+static const int32_t HIGH_PASS{{ array(high_pass, channels.names) }};
+
+/* [bit] of b0; of b1 and -a1 */
+static const uint16_t HIGH_PASS_SHIFT{{ array(high_pass_shift) }};
+
+/* [delay line/high, 1, 1] scale, -a1, -a2 of its second section:
+ * {{ shared.second_section() }} */
+static const int32_t LOW_PASS{{ array(fixed.low_pass.integers, channels.names) }};
+
+/* [bit] of each row */
+static const uint16_t LOW_PASS_SHIFT{{ array(fixed.low_pass.shift) }};
+
+/* [force/delay line] its numerator times the gains, -k_d n_v - k_p n_x;
+ * control.gain_factor, velocity_gain, position_gain, ratios, gain_unit */
+static const int32_t FORCE{{ array(force, channels.names) }};
+
+/* [bit] of each row */
+static const uint16_t FORCE_SHIFT{{ array(fixed.numerator.shift) }};
+
+/* [code/force] of each actuator of the link, pinv(lambda_a Phi_a); control.basis, patches */
+static const int32_t SYNTHESIZER{{ array(synthesizer, channels.names) }};
+
+/* [bit] of each actuator */
+static const uint16_t SYNTHESIZER_SHIFT{{ array(fixed.synthesizer.shift.ravel()) }};
+
+{{ shared.taps("int32_t", weight) }}
+
+/* [bit] of all weights */
+static const int WEIGHT_SHIFT = {{ weight_shift }};
+{% if fixed.energy %}
+
+{{ shared.rivals() }}
+
+/* [energy root/delay line; energy root/signal] modal velocity, omega position */
+static const int32_t ENERGY{{ array(energy, energy_names) }};
+
+/* [bit] of each row */
+static const uint16_t ENERGY_SHIFT{{ array(fixed.energy.shift.ravel()) }};
+{% endif %}
+{% if channels.has_direct %}
+
+/* [force/signal] force past the filters, shifted as FORCE; control.position_gain */
+static const int32_t DIRECT{{ array(direct) }};
+{% endif %}
+{% if has_feedthrough %}
+
+/* [sensor/code] of each actuator of the link, by modes that are not controlled;
+ * control.feedthrough_factor */
+static const int32_t FEEDTHROUGH{{ array(feedthrough, patches) }};
+
+/* [bit] of each row */
+static const uint16_t FEEDTHROUGH_SHIFT{{ array(fixed.feedthrough.shift.ravel()) }};
+{% endif %}
 
 static int32_t limited(int64_t x)
 {
     return x > INT32_MAX ? INT32_MAX : x < INT32_MIN ? INT32_MIN : (int32_t)x;
 }
 
-/* Round to nearest, halves up. Needs a right shift that keeps the sign, as all compilers have it. */
+/* Round to nearest, halves up. Needs a right shift that keeps the sign; all compilers have it. */
 static int64_t shifted(int64_t sum, int shift)
 {
     return (sum + ((int64_t)1 << (shift - 1))) >> shift;
 }
 
 /* Whether a sensor is faulty: its number from 1, else 0. */
-static int check(${name}_state *state, const uint16_t sensor[${NAME}_N_CHANNELS])
+static int check({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_CHANNELS])
 {
     int16_t *at;
     int k;
 
-    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
-        if (!IS_USED[k / ${NAME}_N_PATCHES]) {
+    for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
+        if (!IS_USED[k / {{ NAME }}_N_PATCHES]) {
             continue;
         }
         if (sensor[k] > ADC_TOP) {
@@ -53,21 +136,24 @@ static int check(${name}_state *state, const uint16_t sensor[${NAME}_N_CHANNELS]
         } else {
             *at = 0;
         }
-        if (*at >= ${NAME}_RAIL_SAMPLES || *at <= -${NAME}_RAIL_SAMPLES) {
+        if (*at >= {{ NAME }}_RAIL_SAMPLES || *at <= -{{ NAME }}_RAIL_SAMPLES) {
             return k + 1;
         }
     }
     return 0;
 }
 
-$state
+{{ shared.state() }}
 
-int ${name}_step(${name}_state *state, const uint16_t sensor[${NAME}_N_CHANNELS],
-    uint16_t actuator[${NAME}_N_CHANNELS])
+int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_CHANNELS],
+    uint16_t actuator[{{ NAME }}_N_CHANNELS])
 {
-    int32_t sensed[${NAME}_N_CHANNELS]; /* sensor signals */
-    int32_t force[${NAME}_N_MODES]; /* channel forces */
-$rivals    int64_t sum;
+    int32_t sensed[{{ NAME }}_N_CHANNELS]; /* sensor signals */
+    int32_t force[{{ NAME }}_N_MODES]; /* channel forces */
+    {% if fixed.energy %}
+    int64_t energy[{{ NAME }}_N_MODES]; /* of the channels */
+    {% endif %}
+    int64_t sum;
     int k, m, first;
 
     if (!state->fault) {
@@ -75,23 +161,35 @@ $rivals    int64_t sum;
     }
     if (state->fault) {
         forget(state);
-        for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
+        for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
             actuator[k] = (uint16_t)DAC_REST;
         }
         return state->fault;
     }
-    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
-        if (IS_USED[k / ${NAME}_N_PATCHES]) {
+    for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
+        if (IS_USED[k / {{ NAME }}_N_PATCHES]) {
             sensed[k] = limited((int64_t)sensor[k] * ADC_UNIT - BIAS);
         }
     }
-$subtract_feedthrough    for (m = 0; m < ${NAME}_N_MODES; m++) {
+    {% if has_feedthrough %}
+    for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
+        first = {{ NAME }}_N_PATCHES * (k / {{ NAME }}_N_PATCHES);
+        sum = 0;
+        for (m = 0; IS_USED[k / {{ NAME }}_N_PATCHES] && m < {{ NAME }}_N_PATCHES; m++) {
+            sum += (int64_t)FEEDTHROUGH[k][m] * state->command[first + m];
+        }
+        if (IS_USED[k / {{ NAME }}_N_PATCHES]) {
+            sensed[k] = limited(sensed[k] - shifted(sum, FEEDTHROUGH_SHIFT[k]));
+        }
+    }
+    {% endif %}
+    for (m = 0; m < {{ NAME }}_N_MODES; m++) {
         int32_t signal, high, inner;
         int32_t *line = state->line[m];
 
-        first = ${NAME}_N_PATCHES * LINK[m];
+        first = {{ NAME }}_N_PATCHES * LINK[m];
         sum = 0;
-        for (k = 0; k < ${NAME}_N_PATCHES; k++) {
+        for (k = 0; k < {{ NAME }}_N_PATCHES; k++) {
             sum += (int64_t)FILTER[m][k] * sensed[first + k];
         }
         signal = limited(shifted(sum, FILTER_SHIFT[m]));
@@ -103,17 +201,40 @@ $subtract_feedthrough    for (m = 0; m < ${NAME}_N_MODES; m++) {
             + (int64_t)LOW_PASS[m][2] * line[1];
         inner = limited(shifted(sum, LOW_PASS_SHIFT[m]));
         sum = (int64_t)FORCE[m][0] * inner + (int64_t)FORCE[m][1] * line[0]
-            + (int64_t)FORCE[m][2] * line[1]$direct;
+            + (int64_t)FORCE[m][2] * line[1]
+            {%- if channels.has_direct +%}
+            + (int64_t)DIRECT[m] * signal
+            {%- endif %};
         force[m] = limited(shifted(sum, FORCE_SHIFT[m]));
-$weigh        line[1] = line[0];
+        {% if fixed.energy %}
+        energy[m] = 0;
+        for (k = 0; k < 2; k++) {
+            int64_t part;
+
+            sum = (int64_t)ENERGY[2 * m + k][0] * inner + (int64_t)ENERGY[2 * m + k][1] * line[0]
+                + (int64_t)ENERGY[2 * m + k][2] * line[1] + (int64_t)ENERGY[2 * m + k][3] * signal;
+            part = limited(shifted(sum, ENERGY_SHIFT[2 * m + k]));
+            energy[m] += part * part;
+        }
+        {% endif %}
+        line[1] = line[0];
         line[0] = inner;
     }
-$choose    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
+    {% if fixed.energy %}
+    for (m = 0; m < {{ NAME }}_N_MODES; m++) {
+        for (k = 0; k < {{ NAME }}_N_MODES; k++) {
+            if (IS_RIVAL[m] && IS_RIVAL[k] && LINK[k] == LINK[m] && energy[k] > energy[m]) {
+                force[m] = 0;
+            }
+        }
+    }
+    {% endif %}
+    for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
         int32_t command;
 
         sum = 0;
-        for (m = FIRST_MODE[k / ${NAME}_N_PATCHES]; m < FIRST_MODE[k / ${NAME}_N_PATCHES + 1]; m++) {
-            sum += (int64_t)SYNTHESIZER[m][k % ${NAME}_N_PATCHES] * force[m];
+        for (m = FIRST_MODE[k / {{ NAME }}_N_PATCHES]; m < FIRST_MODE[k / {{ NAME }}_N_PATCHES + 1]; m++) {
+            sum += (int64_t)SYNTHESIZER[m][k % {{ NAME }}_N_PATCHES] * force[m];
         }
         command = limited(shifted(sum, SYNTHESIZER_SHIFT[k]));
         if (command > DAC_REST - 1) {
@@ -121,25 +242,28 @@ $choose    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
         } else if (command < 1 - DAC_REST) {
             command = 1 - DAC_REST;
         }
-$keep_command        actuator[k] = (uint16_t)(command + DAC_REST);
+        {% if has_feedthrough %}
+        state->command[k] = command;
+        {% endif %}
+        actuator[k] = (uint16_t)(command + DAC_REST);
     }
     return 0;
 }
 
-void ${name}_shape_step(${name}_shaper *shaper, const int32_t reference[3], int32_t shaped[3])
+void {{ name }}_shape_step({{ name }}_shaper *shaper, const int32_t reference[3], int32_t shaped[3])
 {
     int64_t sum[3] = {0, 0, 0};
     uint32_t at;
     int k, axis;
 
-    shaper->newest = (shaper->newest == 0 ? ${NAME}_SHAPER_LENGTH : shaper->newest) - 1;
+    shaper->newest = (shaper->newest == 0 ? {{ NAME }}_SHAPER_LENGTH : shaper->newest) - 1;
     for (axis = 0; axis < 3; axis++) {
         shaper->past[shaper->newest][axis] = reference[axis];
     }
     for (k = 0; k < N_TAPS; k++) {
         at = shaper->newest + DELAY[k];
-        if (at >= ${NAME}_SHAPER_LENGTH) {
-            at -= ${NAME}_SHAPER_LENGTH;
+        if (at >= {{ NAME }}_SHAPER_LENGTH) {
+            at -= {{ NAME }}_SHAPER_LENGTH;
         }
         for (axis = 0; axis < 3; axis++) {
             sum[axis] += (int64_t)WEIGHT[k] * shaper->past[at][axis];

@@ -1,28 +1,90 @@
-/* Controller and input shaper, see $name.h.
+{% import "export/templates/shared.c" as shared with context %}
+{% set force_unit = "N/m" if is_modal else "1" %}
+{% set rate_unit = "1" if electronics.estimator == "modal_phase" else "1/s" %}
+/* Controller and input shaper, see {{ name }}.h.
  *
-$origin
+{% for line in origin %}
+ * {{ line }}
+{% endfor %}
  *
  * Each constant: [unit], and the section or field of the study file that it comes from.
  */
-#include "$name.h"
+#include "{{ name }}.h"
 
 #if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
 #error "compile without -ffast-math and -ffinite-math-only: they leave out the check for NaN"
 #endif
 
-typedef ${name}_real real;
+typedef {{ name }}_real real;
 #define R(x) ((real)(x))
 
-$tables
+{{ shared.structure() }}
+
+/* [V] one code at the ADC; adc_range, adc_bits */
+static const real ADC_STEP = {{ real(controller.adc_step) }};
+
+/* [V] highest code; adc_range */
+static const real ADC_TOP = {{ real(controller.adc_top * controller.adc_step) }};
+
+/* [V] at the ADC, sensor at rest; conditioner_bias */
+static const real BIAS = {{ real(controller.adc_bias) }};
+
+/* [1] ADC volt per sensor volt; electronics */
+static const real CONDITIONER_GAIN = {{ real(controller.adc_gain) }};
+
+/* [V] of every actuator, +-; voltage_limit */
+static const real LIMIT = {{ real(controller.voltage_limit) }};
+
+/* [{{ "m/V" if is_modal else "1" }}] modal filter pinv(lambda_s Phi_s^t): signal per volt of each
+ * sensor of the link; control.basis, patches */
+static const real FILTER{{ array(channels.filter, channels.names) }};
+
+/* [{{ rate_unit }}; {{ rate_unit }}; 1] b0, b1, a1 of the velocity estimate's first section:
+ * {{ shared.first_section() }} */
+static const real HIGH_PASS{{ array(channels.first, channels.names) }};
+
+/* [1] a1, a2 of its second section: {{ shared.second_section() }} */
+static const real LOW_PASS{{ array(channels.denominator, channels.names) }};
+
+/* [{{ force_unit }}] its numerator times the gains, -k_d n_v - k_p n_x;
+ * control.gain_factor, velocity_gain, position_gain, ratios, gain_unit */
+static const real FORCE{{ array(channels.force, channels.names) }};
+
+/* [{{ "V/N" if is_modal else "1" }}] voltage of each actuator of the link per force,
+ * pinv(lambda_a Phi_a); control.basis, patches */
+static const real SYNTHESIZER{{ array(channels.synthesizer, channels.names) }};
+
+{{ shared.taps("real", weight) }}
+{% if has_rivals %}
+
+{{ shared.rivals() }}
+
+/* [1/s] modal velocity; energy */
+static const real RATE{{ array(velocity, channels.names) }};
+
+/* [1/s] omega times modal position */
+static const real PLACE{{ array(position, channels.names) }};
+{% endif %}
+{% if channels.has_direct %}
+
+/* [{{ force_unit }}] force past the filters; control.position_gain */
+static const real DIRECT{{ array(channels.direct) }};
+{% endif %}
+{% if has_feedthrough %}
+
+/* [1] sensor volts per volt of each actuator of the link, by modes that are not controlled;
+ * control.feedthrough_factor */
+static const real FEEDTHROUGH{{ array(feedthrough, patches) }};
+{% endif %}
 
 /* Whether a sensor is faulty: its number from 1, else 0. A NaN fails every comparison. */
-static int check(${name}_state *state, const real sensor[${NAME}_N_CHANNELS])
+static int check({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHANNELS])
 {
     int16_t *at;
     int k;
 
-    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
-        if (!IS_USED[k / ${NAME}_N_PATCHES]) {
+    for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
+        if (!IS_USED[k / {{ NAME }}_N_PATCHES]) {
             continue;
         }
         if (!(sensor[k] >= -ADC_STEP && sensor[k] <= ADC_TOP + ADC_STEP)) {
@@ -36,76 +98,120 @@ static int check(${name}_state *state, const real sensor[${NAME}_N_CHANNELS])
         } else {
             *at = 0;
         }
-        if (*at >= ${NAME}_RAIL_SAMPLES || *at <= -${NAME}_RAIL_SAMPLES) {
+        if (*at >= {{ NAME }}_RAIL_SAMPLES || *at <= -{{ NAME }}_RAIL_SAMPLES) {
             return k + 1;
         }
     }
     return 0;
 }
 
-$state
+{{ shared.state() }}
 
-int ${name}_step(${name}_state *state, const real sensor[${NAME}_N_CHANNELS],
-    real actuator[${NAME}_N_CHANNELS])
+int {{ name }}_step({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHANNELS],
+    real actuator[{{ NAME }}_N_CHANNELS])
 {
-    real volt[${NAME}_N_CHANNELS]; /* of the sensors [V] */
-    real wanted[${NAME}_N_CHANNELS]; /* of the actuators, without limit [V] */
-$rivals    int k, m, first;
+    real volt[{{ NAME }}_N_CHANNELS]; /* of the sensors [V] */
+    real wanted[{{ NAME }}_N_CHANNELS]; /* of the actuators, without limit [V] */
+    {% if has_rivals %}
+    real forces[{{ NAME }}_N_MODES], energy[{{ NAME }}_N_MODES]; /* of the channels */
+    {% endif %}
+    int k, m, first;
 
     if (!state->fault) {
         state->fault = check(state, sensor);
     }
     if (state->fault) {
         forget(state);
-        for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
+        for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
             actuator[k] = 0;
         }
         return state->fault;
     }
-    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
-        volt[k] = IS_USED[k / ${NAME}_N_PATCHES] ? (sensor[k] - BIAS) / CONDITIONER_GAIN : 0;
+    for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
+        volt[k] = IS_USED[k / {{ NAME }}_N_PATCHES] ? (sensor[k] - BIAS) / CONDITIONER_GAIN : 0;
         wanted[k] = 0;
     }
-$subtract_feedthrough    for (m = 0; m < ${NAME}_N_MODES; m++) {
-        real signal = 0, high, inner, force$more_reals;
+    {% if has_feedthrough %}
+    for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
+        first = {{ NAME }}_N_PATCHES * (k / {{ NAME }}_N_PATCHES);
+        for (m = 0; IS_USED[k / {{ NAME }}_N_PATCHES] && m < {{ NAME }}_N_PATCHES; m++) {
+            volt[k] -= FEEDTHROUGH[k][m] * state->command[first + m];
+        }
+    }
+    {% endif %}
+    for (m = 0; m < {{ NAME }}_N_MODES; m++) {
+        real signal = 0, high, inner, force{% if has_rivals %}, rate, place{% endif %};
         real *line = state->line[m];
 
-        first = ${NAME}_N_PATCHES * LINK[m];
-        for (k = 0; k < ${NAME}_N_PATCHES; k++) {
+        first = {{ NAME }}_N_PATCHES * LINK[m];
+        for (k = 0; k < {{ NAME }}_N_PATCHES; k++) {
             signal += FILTER[m][k] * volt[first + k];
         }
         high = HIGH_PASS[m][0] * signal + state->high[m];
         state->high[m] = HIGH_PASS[m][1] * signal - HIGH_PASS[m][2] * high;
         inner = high - LOW_PASS[m][0] * line[0] - LOW_PASS[m][1] * line[1];
-        force = FORCE[m][0] * inner + FORCE[m][1] * line[0] + FORCE[m][2] * line[1]$direct;
-$weigh        line[1] = line[0];
+        force = FORCE[m][0] * inner + FORCE[m][1] * line[0] + FORCE[m][2] * line[1]
+            {%- if channels.has_direct +%}
+            + DIRECT[m] * signal
+            {%- endif %};
+        {% if has_rivals %}
+        rate = RATE[m][0] * inner + RATE[m][1] * line[0] + RATE[m][2] * line[1];
+        place = PLACE[m][0] * inner + PLACE[m][1] * line[0] + PLACE[m][2] * line[1]
+            + PLACE[m][3] * signal;
+        energy[m] = rate * rate + place * place;
+        forces[m] = force;
+        {% endif %}
+        line[1] = line[0];
         line[0] = inner;
-$apply    }
-$choose    for (k = 0; k < ${NAME}_N_CHANNELS; k++) {
+        {% if not has_rivals %}
+        for (k = 0; k < {{ NAME }}_N_PATCHES; k++) {
+            wanted[first + k] += SYNTHESIZER[m][k] * force;
+        }
+        {% endif %}
+    }
+    {% if has_rivals %}
+    for (m = 0; m < {{ NAME }}_N_MODES; m++) {
+        int acts = 1;
+
+        for (k = 0; k < {{ NAME }}_N_MODES; k++) {
+            if (IS_RIVAL[m] && IS_RIVAL[k] && LINK[k] == LINK[m] && energy[k] > energy[m]) {
+                acts = 0;
+            }
+        }
+        first = {{ NAME }}_N_PATCHES * LINK[m];
+        for (k = 0; acts && k < {{ NAME }}_N_PATCHES; k++) {
+            wanted[first + k] += SYNTHESIZER[m][k] * forces[m];
+        }
+    }
+    {% endif %}
+    for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
         if (wanted[k] > LIMIT) {
             wanted[k] = LIMIT;
         } else if (wanted[k] < -LIMIT) {
             wanted[k] = -LIMIT;
         }
-$keep_command        actuator[k] = wanted[k];
+        {% if has_feedthrough %}
+        state->command[k] = wanted[k];
+        {% endif %}
+        actuator[k] = wanted[k];
     }
     return 0;
 }
 
-void ${name}_shape_step(${name}_shaper *shaper, const real reference[3], real shaped[3])
+void {{ name }}_shape_step({{ name }}_shaper *shaper, const real reference[3], real shaped[3])
 {
     real sum[3] = {0, 0, 0};
     uint32_t at;
     int k, axis;
 
-    shaper->newest = (shaper->newest == 0 ? ${NAME}_SHAPER_LENGTH : shaper->newest) - 1;
+    shaper->newest = (shaper->newest == 0 ? {{ NAME }}_SHAPER_LENGTH : shaper->newest) - 1;
     for (axis = 0; axis < 3; axis++) {
         shaper->past[shaper->newest][axis] = reference[axis];
     }
     for (k = 0; k < N_TAPS; k++) {
         at = shaper->newest + DELAY[k];
-        if (at >= ${NAME}_SHAPER_LENGTH) {
-            at -= ${NAME}_SHAPER_LENGTH;
+        if (at >= {{ NAME }}_SHAPER_LENGTH) {
+            at -= {{ NAME }}_SHAPER_LENGTH;
         }
         for (axis = 0; axis < 3; axis++) {
             sum[axis] += WEIGHT[k] * shaper->past[at][axis];

@@ -1,0 +1,78 @@
+{# Pieces that floating and fixed point have in common. #}
+{% macro structure() %}
+/* 1: link is controlled; control.links */
+static const uint16_t IS_USED{{ array(is_used) }};
+
+/* link of each controlled mode, from 0; control */
+static const uint16_t LINK{{ array(channels.link) }};
+{%- endmacro %}
+
+{% macro taps(type, weight) %}
+/* taps of the input shaper {{ shaper }}; shaper */
+#define N_TAPS {{ weight | length }}
+
+/* [1] of each tap of the input shaper {{ shaper }}; shaper */
+static const {{ type }} WEIGHT{{ array(weight) }};
+
+/* [samples] of each tap of the input shaper {{ shaper }}; shaper */
+static const uint32_t DELAY{{ array(delay) }};
+{%- endmacro %}
+
+{% macro rivals() %}
+/* 1: acts where no other one of its link has more energy; control.law */
+static const uint16_t IS_RIVAL{{ array(is_rival) }};
+{%- endmacro %}
+
+{% macro first_section() %}
+{% if electronics.estimator == "difference" %}
+difference behind a low-pass; electronics.difference_cutoff_hz
+{%- else %}
+high-pass; electronics.highpass_hz
+{%- endif %}
+{%- endmacro %}
+
+{% macro second_section() %}
+{% if electronics.estimator == "difference" %}
+no second section for the estimator `difference`
+{%- else %}
+low-pass; electronics.lowpass_ratio, lowpass_zeta, antialias_hz
+{%- endif %}
+{%- endmacro %}
+
+{% macro state() %}
+static void forget({{ name }}_state *state)
+{
+    int k;
+
+    for (k = 0; k < {{ NAME }}_N_MODES; k++) {
+        state->high[k] = 0;
+        state->line[k][0] = 0;
+        state->line[k][1] = 0;
+    }
+    for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
+        {% if has_feedthrough %}
+        state->command[k] = 0;
+        {% endif %}
+        state->rail[k] = 0;
+    }
+}
+
+void {{ name }}_init({{ name }}_state *state)
+{
+    forget(state);
+    state->fault = 0;
+}
+
+void {{ name }}_shape_init({{ name }}_shaper *shaper, const {{ word }} reference[3])
+{
+    uint32_t k;
+    int axis;
+
+    for (k = 0; k < {{ NAME }}_SHAPER_LENGTH; k++) {
+        for (axis = 0; axis < 3; axis++) {
+            shaper->past[k][axis] = reference[axis];
+        }
+    }
+    shaper->newest = 0;
+}
+{%- endmacro %}
