@@ -83,6 +83,7 @@ def test_export_is_verified(capsys, designs, folders, name, target):
         loss = float(re.search(r"Residual vibration: ([+-][\d.]+) % against", report)[1])
         assert abs(loss) < 100 * AIM
         assert re.search(r"\| bit by bit, recorded codes \| 0 of \d+ codes differ", report)
+        assert re.search(r"\n```\nsignal {20,}Q {10,}base +room +reach\nsensors {20,}", report)
     else:
         found = [
             float(x) for x in re.findall(r"open loop, [^|]*codes \| ([\d.e+-]+) \| 1e-12", report)

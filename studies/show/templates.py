@@ -24,6 +24,8 @@ from studies.study.labels import describe
 from studies.study.margin import margin_text
 
 _ROOT = Path(__file__).parents[1]
+#: Lines of Markdown that begin so stand alone.
+_ALONE = ("#", "|", "![", "```")
 
 
 def _short(value: float, digits: int = 4) -> str:
@@ -88,12 +90,17 @@ def render(name: str, /, **values: Any) -> str:
 
 
 def paragraphs(text: str) -> str:
-    """Markdown with each paragraph and list entry on one line, and one empty line between."""
+    """Markdown with each paragraph and list entry on one line, and one empty line between.
+
+    Code between lines of ``` stays as it is.
+    """
     blocks: list[str] = [""]
+    is_code = False
     for line in text.splitlines():
-        if not line.startswith("|"):
+        is_code ^= line.startswith("```")
+        if not is_code and not line.startswith("|"):
             line = " ".join(line.split())
-        is_alone = line.startswith(("#", "|", "![")) or blocks[-1].startswith(("#", "|", "!["))
+        is_alone = is_code or line.startswith(_ALONE) or blocks[-1].startswith(_ALONE)
         if line and blocks[-1] and not is_alone and not line.startswith("- "):
             blocks[-1] += f" {line}"
         elif line or blocks[-1]:
