@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from studies.paper.cases import ALL, MOVES, ONE, SHAPERS, TWO, PaperRuns
+from studies.paper.cases import ALL, MOVES, OFF, ONE, SHAPERS, TWO, PaperRuns
 from studies.paper.measures import Measures
 
 #: Cases of a comparison: controlled links and heading.
@@ -24,15 +24,23 @@ class Context(NamedTuple):
             move=move, shaper=shaper, modes=modes, links=links, damping_ratio=damping
         )
 
-    def named(self, name: str) -> int | None:
-        """Index of the case of this name, None where it was not run."""
-        names = [case.name for case in self.runs.cases]
-        return names.index(name) if name in names else None
-
-    def drop(self, k: int, mode: int) -> list[str]:
+    def drop(self, k: int, mode: int) -> str:
         """Change of the spectral peak of a mode against no control, per link."""
         peak, off = self.measures.spectral_peak[:, :, mode - 1], self.measures.counterpart[k]
-        return [change(peak[k, i], peak[off, i]) for i in range(3)]
+        return ", ".join(change(peak[k, i], peak[off, i]) for i in range(3))
+
+    def pairs(self) -> list[tuple[int, int, str]]:
+        """Cases without control and with three links, and what moves both; also the damped ones."""
+        found = [
+            (self.find(m, s, 3, OFF), self.find(m, s, 3, ALL), move_text(m, s))
+            for m, s in settings()
+        ]
+        cases, usual = self.runs.cases, self.runs.study.link.first_damping
+        damped = [k for k, case in enumerate(cases) if case.damping_ratio != usual]
+        if len(damped) == 2:
+            zeta = cases[damped[0]].damping_ratio
+            found.append((damped[0], damped[1], f"{move_text('fast', 'none')}, damping {zeta:g}"))
+        return found
 
 
 def change(value: float, reference: float) -> str:

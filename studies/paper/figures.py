@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -35,17 +35,10 @@ SCALE_DELAY = 0.05
 Pairs = list[tuple[int, int]]
 
 
-class PaperFigure(NamedTuple):
-    """One figure."""
-
-    caption: str
-    draw: Callable[[PaperRuns, Measures], Figure]
-
-
 def draw_figure(name: str, runs: PaperRuns, measures: Measures, folder: Path) -> None:
     """Write one of PAPER_FIGURES as PNG and PDF into a folder."""
     with figures.styled():
-        figures.save(PAPER_FIGURES[name].draw(runs, measures), folder, name)
+        figures.save(PAPER_FIGURES[name](runs, measures), folder, name)
 
 
 def _pairs(runs: PaperRuns, links: tuple[bool, ...], modes: int) -> Pairs:
@@ -227,24 +220,22 @@ def _shapers(runs: PaperRuns, measures: Measures) -> Figure:
     return figure
 
 
-PAPER_FIGURES = {
-    name: PaperFigure(caption, draw)
-    for name, caption, draw in (
-        ("fig03", "deflection at 150 mm, three links controlled", partial(_deflection, links=ALL)),
-        ("fig04", "modes 1 to 3 of link 1, three links controlled", _modes),
-        ("fig05", "platform error, three links controlled", _pose),
-        ("fig06", "platform error after the motion, three links", partial(_pose_after, links=ALL)),
-        ("fig07", "deflection at 150 mm, link 1 controlled", partial(_deflection, links=ONE)),
-        ("fig08", "platform error after the motion, link 1", partial(_pose_after, links=ONE)),
-        ("fig09", "deflection at 150 mm, links 1, 2 controlled", partial(_deflection, links=TWO)),
-        ("fig10", "platform error after the motion, links 1, 2", partial(_pose_after, links=TWO)),
-        ("fig12", "sensor voltage at 150 mm, two modes controlled", _sensor),
-        ("fig13", "PSD of mode 1 without control", partial(_spectra, mode=1, links=None)),
-        ("fig14", "PSD of mode 1, three links controlled", partial(_spectra, mode=1, links=ALL)),
-        ("fig15", "PSD of mode 2 without control", partial(_spectra, mode=2, links=None)),
-        ("fig16", "PSD of mode 2, three links controlled", partial(_spectra, mode=2, links=ALL)),
-        ("fig17", "PSD of mode 1, link 1 controlled", partial(_spectra, mode=1, links=ONE)),
-        ("fig18", "PSD of mode 1, links 1, 2 controlled", partial(_spectra, mode=1, links=TWO)),
-        ("shapers", "input shapers: sensitivity, and what EI leaves", _shapers),
-    )
+#: Figures by the names of their files; captions stand in `report.md`.
+PAPER_FIGURES: dict[str, Callable[[PaperRuns, Measures], Figure]] = {
+    "fig03": partial(_deflection, links=ALL),
+    "fig04": _modes,
+    "fig05": _pose,
+    "fig06": partial(_pose_after, links=ALL),
+    "fig07": partial(_deflection, links=ONE),
+    "fig08": partial(_pose_after, links=ONE),
+    "fig09": partial(_deflection, links=TWO),
+    "fig10": partial(_pose_after, links=TWO),
+    "fig12": _sensor,
+    "fig13": partial(_spectra, mode=1, links=None),
+    "fig14": partial(_spectra, mode=1, links=ALL),
+    "fig15": partial(_spectra, mode=2, links=None),
+    "fig16": partial(_spectra, mode=2, links=ALL),
+    "fig17": partial(_spectra, mode=1, links=ONE),
+    "fig18": partial(_spectra, mode=1, links=TWO),
+    "shapers": _shapers,
 }
