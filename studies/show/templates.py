@@ -92,16 +92,18 @@ def render(name: str, /, **values: Any) -> str:
 def paragraphs(text: str) -> str:
     """Markdown with each paragraph and list entry on one line, and one empty line between.
 
-    Code between lines of ``` stays as it is.
+    Entries keep their depth, and code between lines of ``` stays as it is.
     """
     blocks: list[str] = [""]
     is_code = False
     for line in text.splitlines():
         is_code ^= line.startswith("```")
+        is_entry = line.lstrip().startswith("- ")
         if not is_code and not line.startswith("|"):
-            line = " ".join(line.split())
+            depth = len(line) - len(line.lstrip()) if is_entry else 0
+            line = " " * depth + " ".join(line.split())
         is_alone = is_code or line.startswith(_ALONE) or blocks[-1].startswith(_ALONE)
-        if line and blocks[-1] and not is_alone and not line.startswith("- "):
+        if line and blocks[-1] and not is_alone and not is_entry:
             blocks[-1] += f" {line}"
         elif line or blocks[-1]:
             blocks.append(line)
