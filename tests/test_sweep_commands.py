@@ -111,7 +111,7 @@ def check_report(folder):
     count = int(np.sum(code == 0))
     for part in (
         "- 8 base points of a Saltelli design of",
-        "0.05 to 1, log scale",
+        "\n  - `gain` (`control.gain_factor`): 0.05 to 1, log scale",
         "40 cases.",
         "| drive.kp | N/m |",
         f"| ok | {count} | {count / 0.4:.1f} |",

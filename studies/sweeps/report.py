@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,15 +13,16 @@ from jaxmodel import status
 from studies.engine.results import SweepData, load, metric_values, swept_names
 from studies.errors import StudyError, shown
 from studies.show.figures import styled
-from studies.show.markdown import literal, opening, picture, table
+from studies.show.markdown import literal
 from studies.show.pages import write_report
 from studies.show.sketch import CAPTION, sketch
-from studies.show.units import count_text, readable
+from studies.show.templates import render
+from studies.show.units import readable
 from studies.space.axes import SHOWN_AS
 from studies.space.methods import METHODS
 from studies.space.spec import Node
-from studies.space.table import Table, case_study
-from studies.study.margin import ENOUGH, margin_text
+from studies.space.table import case_study
+from studies.study.margin import ENOUGH
 from studies.study.spec import Study
 from studies.study.template import study_template, toml_text, toml_value
 from studies.sweeps.dry_run import axis_rows
@@ -33,7 +35,6 @@ from studies.sweeps.show import (
     case_rows,
     cause_rows,
     counted_text,
-    label,
     margin_warning,
     ranking,
     recommended,
@@ -49,11 +50,31 @@ REPORT, FIGURE, FRONT, MACHINE = "report.html", "cases.png", "front.png", "machi
 OTHERS = ("settling_time", "peak_voltage")
 #: The best cases are as good as one where they differ by less than this share.
 ALIKE = 0.02
-#: More listed values of an axis are not spelt out.
-MOST_VALUES = 12
 
 
-#: What a block makes of its axes.
+class Rival(NamedTuple):
+    """A case that is better than the best one, but has a smaller gain margin."""
+
+    case: int
+    value: str  # of the metric, with its unit
+    margin: float
+
+
+class Best(NamedTuple):
+    """What a report says of the best cases; values of the metric have their unit."""
+
+    case: int  # the first of them
+    value: str  # of the metric there
+    setting: str  # what varies, and its values there
+    margin: float | None  # gain margin there, None where it is not known
+    median: str  # of the metric, over all cases of status ok
+    spread: float | None  # of the metric among them as a share, None where it tells them apart
+    warning: str  # of small gain margins among them
+    is_safe: bool  # their gain margins are `ENOUGH`
+    rival: Rival | None
+    table: Rows
+
+
 def write_sweep_report(folder: Path) -> None:
     """Write `report.md` and `report.html` of a sweep, with its figures, into its folder.
 
@@ -85,11 +106,15 @@ def _all_axes(data: SweepData, metric: str) -> Figure:
 
 
 def _front(data: SweepData, metric: str) -> Figure:
-    known = data[MARGIN] if MARGIN in data.variables else np.full(data.n_cases, np.nan)
-    fine = known[(data["status"] == status.OK) & np.isfinite(metric_values(data, metric))]
+    fine = _margins(data)[(data["status"] == status.OK) & np.isfinite(metric_values(data, metric))]
     if len(fine) < 3 or not np.isfinite(fine).all() or np.ptp(fine) <= 0:
         raise StudyError("too few gain margins to draw over")
     return front(data, metric)
+
+
+def _margins(data: SweepData) -> np.ndarray:
+    """Gain margins, nan where they are not known, (n,)."""
+    return data[MARGIN] if MARGIN in data.variables else np.full(data.n_cases, np.nan)
 
 
 def _best_study(data: SweepData, metric: str) -> Study:
@@ -108,167 +133,91 @@ def report(data: SweepData, metric: str, drawn: list[str]) -> str:
         metric: what the best cases are ranked by.
         drawn: figures that there are, of `FIGURE`, `FRONT` and `MACHINE`.
     """
-    cases = data.table
-    lines = [
-        f"# {literal(data.spec.study.title)}: sweep",
-        "",
-        *opening(_asked(data, cases, metric), *_answer(data, metric)),
-        *_figure(MACHINE, f"{CAPTION}. Of the best case, where cases differ", drawn),
-        f"## Best cases by {metric}",
-        "",
-        *_best(data, metric),
-        "",
-    ]
-    told = f"{metric} over the gain margin; the line: cases that no other beats in both"
-    lines += [
-        *_figure(FIGURE, f"Cases of status ok and their {metric}", drawn),
-        *_figure(FRONT, told, drawn),
-        "## How the cases ended",
-        "",
-        *_table(status_rows(data)),
-        "",
-        "## What varied",
-        "",
-        *_blocks(data.spec.root),
-        "",
-        *_counts(data, cases),
-        "",
-        *_table(axis_rows(cases)),
-        "",
-    ]
-    causes = cause_rows(data)
-    if causes.rows:
-        lines += [
-            "## What the failures depend on",
-            "",
-            "Distance: between a parameter's distributions in failed cases and in those of status "
-            f"ok, 0 to 1. Failures: {SHARES}.",
-            "",
-            *_table(causes),
-            "",
-        ]
-    return "\n".join(lines)
-
-
-def _figure(name: str, caption: str, drawn: list[str]) -> list[str]:
-    return [picture(name, caption), ""] if name in drawn else []
-
-
-def _asked(data: SweepData, cases: Table, metric: str) -> str:
-    axes = literal(", ".join(written_name(data, name) for name in swept_names(data)))
-    return (
-        f"{count_text(len(cases), 'case')} of {axes or 'a list'}, ranked by {metric} "
-        f"(smallest first; {counted_text(data, metric)})."
+    endings = status_rows(data)
+    return render(
+        "sweeps/report.md",
+        title=data.spec.study.title,
+        sweep=data.spec.sweep,
+        cases=data.table,
+        metric=metric,
+        others=[x for x in OTHERS if x in data.variables and x != metric.partition("[")[0]],
+        counted=counted_text(data, metric),
+        axes=[written_name(data, name) for name in swept_names(data)],
+        n_ok=int(np.sum(data["status"] == status.OK)),
+        failures=[f"{count}: {name}" for name, count, _ in endings.rows if name != "ok"][:3],
+        endings=_literal(endings),
+        best=_best(data, metric),
+        enough=ENOUGH,
+        blocks=_blocks(data.spec.root),
+        columns=_literal(axis_rows(data.table)),
+        causes=_literal(cause_rows(data)),
+        shares=SHARES,
+        sketch_caption=CAPTION,
+        drawn=drawn,
     )
 
 
-def _answer(data: SweepData, metric: str) -> tuple[str, str]:
-    """What came out, and what to do next."""
-    codes = data["status"]
-    n_ok = int(np.sum(codes == status.OK))
-    ended = f"{n_ok} of {count_text(data.n_cases, 'case')} ended ok"
-    others = [f"{count}: {name}" for name, count, _ in status_rows(data).rows if name != "ok"][:3]
-    told = f"{ended}{' (' + '; '.join(others) + ')' if others else ''}."
-    value = metric_values(data, metric)
-    if not np.isfinite(value[codes == status.OK]).any():
-        return told, "look at what the failures depend on, below, and at `studies show --failed`."
+def _best(data: SweepData, metric: str) -> Best | None:
+    """The best cases; None where no case of status ok has the metric."""
+    value, margin = metric_values(data, metric), _margins(data)
+    is_known = (data["status"] == status.OK) & np.isfinite(value)
+    if not is_known.any():
+        return None
     best = recommended(data, metric)
-    first, shown = int(best[0]), shown_metric(data, metric)
-    unit = readable(unit_of_metric(data, metric))[1]
-    names = ", ".join(
-        f"{written_name(data, name)} = {shown_value(data, name, first)}"
-        for name in swept_names(data)
-    )
-    told += f" Best: case {first} with {shown[first]:.4g} {unit} ({literal(names)})"
-    safe = MARGIN in data.variables and np.isfinite(data[MARGIN][first])
-    if safe:
-        told += f", gain margin {margin_text(data[MARGIN][first])}"
-    others_ok = shown[(codes == status.OK) & np.isfinite(shown)]
-    told += f"; half of the ok cases have {np.median(others_ok):.4g} {unit} or more."
-    spread = float(np.ptp(shown[best]) / max(abs(shown[first]), 1e-300))
-    if len(best) > 3 and spread < ALIKE:
-        told += (
-            f" **The {len(best)} best differ by {100 * spread:.2g} % only: {metric} does not tell "
-            "them apart, ask another metric.**"
-        )
-    warning = margin_warning(data, best) if safe else ""
-    if warning:
-        told += f" **{literal(warning)}**"
-    condition = ""
-    if safe and data[MARGIN][first] >= ENOUGH:
-        condition = f' --subject-to "{MARGIN} >= {ENOUGH:g}"'
-    others = [x for x in OTHERS if x in data.variables and x != metric.partition("[")[0]]
-    rivals = " or ".join(f"`--by {name}`" for name in others)
-    rank = f"; before acting on it, see whether another metric ranks alike ({rivals})"
-    return told, (
-        f'`studies best DIR --by "{metric}"{condition}` for more of them, `studies replay DIR '
-        f"--case {first} --out run.h5 --report` for the trajectories of the best"
-        f"{rank if others else ''}."
-    )
-
-
-def _blocks(node: Node, depth: int = 0) -> list[str]:
-    """A block with its axes and further blocks, as a nested list."""
-    block, indent = node.block, "  " * depth
-    lines = [f"{indent}- " + METHODS[block.method].text.format(block.count or len(block.cases))]
-    for name, written in block.axes.items():
-        field = f" (`{SHOWN_AS[name]}`)" if name in SHOWN_AS else ""
-        lines.append(f"{indent}  - `{name}`{field}: {literal(_values(written))}")
-    for child in node.children:
-        lines += _blocks(child, depth + 1)
-    return lines
-
-
-def _values(written: Any) -> str:
-    """Values of an axis in words."""
-    if isinstance(written, str):
-        return written
-    if isinstance(written, list):
-        names = [value if isinstance(value, str) else shown(value) for value in written]
-        more = f", ... ({len(names)} values)" if len(names) > MOST_VALUES else ""
-        return ", ".join(names[:MOST_VALUES]) + more
-    if "from" in written:
-        count = f", {written['count']} values" if "count" in written else ""
-        scale = ", log scale" if written.get("scale") == "log" else ""
-        return f"{written['from']:g} to {written['to']:g}{count}{scale}"
-    return toml_value(written)
-
-
-def _counts(data: SweepData, cases: Table) -> list[str]:
-    sweep = data.spec.sweep
-    words = f"{len(cases)} cases"
-    if sweep.repeats > 1:
-        words += f", {sweep.repeats} runs of each with noise of its own among them"
-    if sweep.where:
-        words += f"; {cases.n_dropped} left out that do not fulfil {literal(sweep.where)}"
-    if cases.n_double:
-        words += f"; {cases.n_double} doubles run once"
-    return [f"{words}. Seed of the design: {sweep.seed}. Columns that vary:"]
-
-
-def _best(data: SweepData, metric: str) -> list[str]:
-    value = metric_values(data, metric)
-    if not np.isfinite(value[data["status"] == status.OK]).any():
-        return ["No case of status ok has it."]
-    best = recommended(data, metric)
+    first, free = int(best[0]), int(best_cases(data, metric, count=1)[0])
     warning = margin_warning(data, best)
-    told = f"Cases of status ok, smallest {label(data, metric)} first."
-    if not warning and MARGIN in data.variables and np.isfinite(data[MARGIN][best]).any():
-        told = f"Cases with a gain margin of {ENOUGH:g} or more, smallest {metric} first."
-        free = best_cases(data, metric, count=1)
-        if value[free[0]] < value[best[0]]:
-            told += (
-                f" Without regard to the margin case {free[0]} is first with "
-                f"{shown_metric(data, metric)[free[0]]:.4g} at a margin of "
-                f"{data[MARGIN][free[0]]:.3g}."
-            )
-    return [
-        told,
-        "",
-        *([f"**{literal(warning)}**", ""] if warning else []),
-        *_table(case_rows(data, best, [metric])),
-    ]
+    is_safe = not warning and bool(np.isfinite(margin[best]).any())
+    is_beaten = is_safe and value[free] < value[first]
+    readings, names = shown_metric(data, metric), swept_names(data)
+    unit = readable(unit_of_metric(data, metric))[1]
+    spread = float(np.ptp(readings[best]) / max(abs(readings[first]), 1e-300))
+
+    def told(number: float) -> str:
+        return f"{number:.4g} {unit}".rstrip()
+
+    return Best(
+        case=first,
+        value=told(readings[first]),
+        setting=", ".join(
+            f"{written_name(data, x)} = {shown_value(data, x, first)}" for x in names
+        ),
+        margin=float(margin[first]) if np.isfinite(margin[first]) else None,
+        median=told(np.median(readings[is_known])),
+        spread=spread if len(best) > 3 and spread < ALIKE else None,
+        warning=warning,
+        is_safe=is_safe,
+        rival=Rival(free, told(readings[free]), margin[free]) if is_beaten else None,
+        table=_literal(case_rows(data, best, [metric])),
+    )
 
 
-def _table(found: Rows) -> list[str]:
-    return table(found.heads, [map(literal, row) for row in found.rows])
+def _blocks(node: Node, depth: int = 0) -> list[tuple[int, str, list[tuple]]]:
+    """A block and the further blocks in it.
+
+    Args:
+        node: of the block.
+        depth: how deep it lies.
+
+    Returns:
+        Of each block its depth, how it combines its axes, and of each axis its name, the field that
+        it stands for ("" where that is its name) and its values.
+    """
+    block = node.block
+    text = METHODS[block.method].text.format(block.count or len(block.cases))
+    axes = [(name, SHOWN_AS.get(name, ""), _values(x)) for name, x in block.axes.items()]
+    further = [entry for child in node.children for entry in _blocks(child, depth + 1)]
+    return [(depth, text, axes), *further]
+
+
+def _values(written: Any) -> Mapping[str, Any] | list[str]:
+    """Values of an axis: a range as it is written, or each in words."""
+    if isinstance(written, str):
+        return [written]
+    if isinstance(written, list):
+        return [value if isinstance(value, str) else shown(value) for value in written]
+    return written if "from" in written else [toml_value(written)]
+
+
+def _literal(found: Rows) -> Rows:
+    """A table whose cells Markdown shows unchanged."""
+    return Rows(found.heads, [list(map(literal, row)) for row in found.rows])
