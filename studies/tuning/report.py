@@ -9,10 +9,11 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
-from studies.show.markdown import literal, opening, picture, table
+from studies.show.markdown import literal
 from studies.show.sketch import CAPTION
+from studies.show.templates import render
 from studies.show.units import count_text, headed, number, readable
-from studies.study.entries import links_text, parse_entries
+from studies.study.entries import parse_entries
 from studies.study.margin import MARGIN_MODES, caution, margin_text
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
 from studies.tuning.check import Judged, Searched, patch_centers
@@ -32,6 +33,8 @@ NEAR = 0.02
 ALIKE = 0.01
 #: Fewer designs, or such with less between the smallest and the largest, have no rank to speak of.
 FEW, NARROW = 8, 0.05
+#: Heads the row of what everything is measured against.
+ITSELF = "the study itself"
 
 
 class Findings(NamedTuple):
@@ -48,6 +51,38 @@ class Findings(NamedTuple):
     runs: int  # how many there were
 
 
+class Best(NamedTuple):
+    """The design to recommend."""
+
+    family: str
+    file: str  # of its study
+    gains: list[tuple[str, str, str]]  # figure, its value, that of the study itself with unit
+    objective: np.ndarray  # on the fresh machines
+    caution: str  # of its gain margin, "" where there is none
+    is_violated: bool  # a limit
+
+
+class Limit(NamedTuple):
+    """How the best design of a family keeps a limit."""
+
+    name: str
+    value: float | str  # as the tuning file gives it
+    state: str  # violated, kept, active or inactive
+    left: float | None  # share of the limit, negative where violated; None if not known
+
+
+class Fidelity(NamedTuple):
+    """Residual vibration of the linearised loop over that of the run."""
+
+    designs: int
+    low: float  # 90 % of the ratios lie from here
+    median: float
+    high: float  # to here
+    case: str  # ranked, or why the order of designs tells nothing: few, alike
+    spread: float  # of the runs' residual vibration, as a share of the least
+    rank: float  # coefficient of correlation
+
+
 def report(spec: TuneSpec, found: Findings) -> str:
     """Markdown text.
 
@@ -55,58 +90,40 @@ def report(spec: TuneSpec, found: Findings) -> str:
         spec: of the tuning.
         found: what it found.
     """
-    lines = [f"# {literal(spec.study.title) or 'study'}: tuning", ""]
-    lines += [
-        *opening(_asked(spec, found), _came_out(spec, found), _next(spec, found)),
-        picture("machine.png", f"{CAPTION}. Of the best design"),
-        "",
-        *_own_machine(spec, found),
-        *_fresh(spec, found),
-        *_by_move(spec, found),
-        *_limits(spec, found),
-        *_numbers(spec, found),
-        *_search(spec, found),
-        *_fidelity(spec, found),
-        "## Derivatives",
-        "",
-    ]
-    worst = max(found.audited, key=lambda entry: entry.share)
-    place = ("half way to the best design", "at the best design")[worst.place]
-    verdict = "below" if worst.share <= ALLOWED else "**above**"
-    lines.append(
-        f"Against differences at the best design of {spec.families[spec.main].name} and half way "
-        f"to it the worst disagreement is {worst.share:.1e}, of {worst.figure} by {worst.name} "
-        f"{place}, {verdict} {ALLOWED:g}. {MEANING}"
+    at, seen = found.at, found.searched
+    names = list(found.own.metrics)
+    return render(
+        "tuning/report.md",
+        spec=spec,
+        tune=spec.tune,
+        found=found,
+        ended=ended(spec, at),
+        n_frozen=int(at.is_frozen.sum()),
+        names_links=all(parse_entries(name).names_a_link for name in spec.tune.objective),
+        lower=LOWER,
+        best=_best(spec, found),
+        heads=[headed(x, METRICS[parse_entries(x).metric].unit) for x in names],
+        own=_own_machine(spec, found, names),
+        n_modes=max(MARGIN_MODES, spec.study.link.modes),
+        fresh=_fresh(spec, found, names),
+        metrics=names,
+        changes=_changes(spec, found, names),
+        limits=_limits(spec, found),
+        front=spec.tune.pareto.get("limit", spec.metric_limits[0]) if spec.metric_limits else "",
+        families=[literal(family.name) for family in spec.moving],
+        numbers=_numbers(spec, found),
+        alike=ALIKE,
+        centers=_centers(spec, found) if PLACEMENT in spec.tune.free else [],
+        main=spec.families[spec.main].name,
+        searched=seen,
+        kept=seen.objective[is_kept(spec, seen)] if seen is not None else [],
+        tuned=at.best_objective[at.winner(spec.main)],
+        fidelity=_fidelity(spec, found),
+        worst=max(found.audited, key=lambda entry: entry.share),
+        allowed=ALLOWED,
+        meaning=MEANING,
+        sketch_caption=CAPTION,
     )
-    return "\n".join(lines) + "\n"
-
-
-def _asked(spec: TuneSpec, found: Findings) -> str:
-    goals = ", ".join(
-        name if len(spec.tune.objective) == 1 else f"{name} (weight {weight:g})"
-        for name, weight in spec.tune.objective.items()
-    )
-    limits = [
-        f"{name} {'at least' if name in LOWER else 'at most'} "
-        + ("the study's own" if limit == OWN else f"{limit:g}")
-        for name, limit in spec.tune.limits.items()
-    ]
-    at, scenarios = found.at, spec.tune.scenarios
-    return (
-        f"the least {goals}{_of_links(spec)}"
-        + (f" with {', '.join(limits)}" if limits else "")
-        + f"; {count_text(len(spec.free.numbers), 'free number')} in "
-        f"{count_text(len(spec.moving), 'family')}, {count_text(len(at.family), 'start')}, "
-        f"{count_text(scenarios.count, 'machine')} on {count_text(len(spec.moves), 'move')}. "
-        f"{ended(spec, at)}"
-        + (f" {at.is_frozen.sum()} starts were frozen." if at.is_frozen.any() else "")
-    )
-
-
-def _of_links(spec: TuneSpec) -> str:
-    if all(parse_entries(name).names_a_link for name in spec.tune.objective):
-        return ""
-    return f" of {links_text(spec.counted_links)}"
 
 
 def ended(spec: TuneSpec, at: Progress) -> str:
@@ -120,25 +137,25 @@ def ended(spec: TuneSpec, at: Progress) -> str:
     return f"Ended after all {asked} iterations ({spec.tune.method})."
 
 
-def _came_out(spec: TuneSpec, found: Findings) -> str:
-    """The best family in numbers, before and after."""
+def _best(spec: TuneSpec, found: Findings) -> Best:
     k = best_family(spec, found)
-    one, own, name = found.judged[k], found.own, spec.families[k].name
-    told = []
-    for metric in (*spec.tune.objective, *(x for x in SHOWN if x not in spec.tune.objective)):
-        before, after = (_value(metric, x.own.metrics, x.own.watched) for x in (own, one))
-        told.append(f"{metric} {after} instead of {before} {_unit(metric)}".strip())
+    one, own, family = found.judged[k], found.own, spec.families[k]
+    gains = []
+    for metric in dict.fromkeys((*spec.tune.objective, *SHOWN)):
+        after, before = (_value(metric, x.own.metrics, x.own.watched) for x in (one, own))
+        unit = readable(METRICS[parse_entries(metric).metric].unit)[1]
+        gains.append((metric, after, before if unit == "1" else f"{before} {unit}"))
     if one.loop is not None and own.loop is not None:
-        told.append(f"gain margin {one.loop.gain_margin:.3g} instead of {own.loop.gain_margin:.3g}")
-    machines = count_text(spec.tune.scenarios.check, "fresh machine")
-    text = (
-        f"{name}: {', '.join(told)} on the study's own machine; on {machines} "
-        f"{one.objective.mean():.3g} of the objective, {one.objective.max():.3g} on the worst."
+        margins = one.loop.gain_margin, own.loop.gain_margin
+        gains.append(("gain margin", f"{margins[0]:.3g}", f"{margins[1]:.3g}"))
+    return Best(
+        family.name,
+        file_name(spec, family),
+        gains,
+        one.objective,
+        caution(one.loop.gain_margin) if one.loop is not None else "",
+        found.at.beyond(found.at.winner(k)) > 0,
     )
-    warnings = [caution(one.loop.gain_margin)] if one.loop is not None else []
-    if found.at.beyond(found.at.winner(k)) > 0:
-        warnings.append("A limit is violated.")
-    return " ".join([text, *(f"**{warning}**" for warning in warnings if warning)])
 
 
 def best_family(spec: TuneSpec, found: Findings) -> int:
@@ -151,15 +168,6 @@ def best_family(spec: TuneSpec, found: Findings) -> int:
         return beyond > 0, not np.isfinite(value), value
 
     return min(range(len(spec.moving)), key=rank)
-
-
-def _next(spec: TuneSpec, found: Findings) -> str:
-    file = file_name(spec, spec.families[best_family(spec, found)])
-    return (
-        f"`studies simulate {file} --out run.h5 --report` for its trajectories, `studies spillover "
-        f"{file} --out certificate` before it meets a machine, `studies export {file} --target c "
-        "--out dsp` to take it there."
-    )
 
 
 def file_name(spec: TuneSpec, family: Family) -> str:
@@ -184,14 +192,10 @@ def summary(spec: TuneSpec, found: Findings) -> list[str]:
     return lines
 
 
-def _rows(spec: TuneSpec, found: Findings) -> list[tuple[str, Judged]]:
-    pairs = zip(spec.families, found.judged, strict=True)
-    return [("the study itself", found.own), *((family.name, one) for family, one in pairs)]
-
-
-def _unit(metric: str) -> str:
-    unit = readable(METRICS[parse_entries(metric).metric].unit)[1]
-    return "" if unit == "1" else unit
+def _designs(spec: TuneSpec, found: Findings) -> list[tuple[str, Judged]]:
+    """The study itself and the best design of every family, by names for Markdown."""
+    names = [literal(family.name) for family in spec.families]
+    return [(ITSELF, found.own), *zip(names, found.judged, strict=True)]
 
 
 def _value(metric: str, values: Mapping[str, Any], watched: float) -> str:
@@ -203,18 +207,10 @@ def _value(metric: str, values: Mapping[str, Any], watched: float) -> str:
     return number(value, unit)
 
 
-def _columns(spec: TuneSpec, found: Findings) -> tuple[list[str], list[str]]:
-    """Metrics that tables show, and their heads."""
-    names = list(found.own.metrics)
-    return names, [headed(x, METRICS[parse_entries(x).metric].unit) for x in names]
-
-
-def _own_machine(spec: TuneSpec, found: Findings) -> list[str]:
-    names, heads = _columns(spec, found)
-    modes = max(MARGIN_MODES, spec.study.link.modes)
-    rows = []
-    files = ["study.toml", *(file_name(spec, x) for x in spec.moving)]
-    for k, (name, one) in enumerate(_rows(spec, found)):
+def _own_machine(spec: TuneSpec, found: Findings, names: list[str]) -> list[list[str]]:
+    """Row of each design on the machine of its own file; `names`: of metrics."""
+    rows, files = [], ["study.toml", *(file_name(spec, family) for family in spec.moving)]
+    for k, (name, one) in enumerate(_designs(spec, found)):
         cells = [_value(metric, one.own.metrics, one.own.watched) for metric in names]
         loop = ["-"] * 3
         if one.loop is not None:
@@ -224,138 +220,56 @@ def _own_machine(spec: TuneSpec, found: Findings) -> list[str]:
                 f"{one.loop.spillover:.4g}",
             ]
         file = f"`{files[k]}`" if k < len(files) else "-"
-        rows.append(
-            [name, file, f"{one.own.objective:.4f}", *cells, *loop, status.REASONS[one.own.status]]
-        )
-    return [
-        "## On the study's own machine",
-        "",
-        "What `studies simulate` gives for the file of each design, with the real converters and "
-        f"limits. Of {links_text(spec.counted_links)}"
-        + (", those under control, " if len(spec.counted_links) < 3 else " ")
-        + "the largest value counts: peaks are the highest peak, an rms that of the worst link and "
-        f"station, a time that of the slowest link. {_weighing(spec)} Gain margin, slowest decay "
-        f"and spillover are those of the linearised loop with {modes} plant modes.",
-        "",
-        *table(
-            (
-                "design",
-                "file",
-                "objective",
-                *heads,
-                "gain margin",
-                "slowest decay [1/s]",
-                "spillover",
-                "status",
-            ),
-            rows,
-        ),
-        "",
-        picture(
-            "descent.png",
-            "Best objective that keeps the limits, over iterations, on the machines "
-            "of the tuning; thin: every start",
-        ),
-        "",
-    ]
+        end = status.REASONS[one.own.status]
+        rows.append([name, file, f"{one.own.objective:.4f}", *cells, *loop, end])
+    return rows
 
 
-def _weighing(spec: TuneSpec) -> str:
-    count = len(spec.tune.objective)
-    whole = "the weighted mean of these shares; " if count > 1 else ""
-    return (
-        "Objective: " + whole + f"the root of the mean square of all entries of "
-        f"{' or '.join(spec.tune.objective)} (links, stations) over that of the study itself, so "
-        "1 is the study."
-    )
-
-
-def _machines(spec: TuneSpec) -> str:
-    count = count_text(spec.tune.scenarios.check, "machine")
-    if not spec.tune.scenarios.spread:
-        return (
-            f"{count} for each move with noise of their own, the real converters and limits; "
-            "`tune.scenarios.spread` is empty, so all are the study's own machine."
-        )
-    return (
-        f"{count} for each move, none of which the tuning has seen (`scenario_...` in `tune.h5`), "
-        "with the real converters and limits."
-    )
-
-
-def _fresh(spec: TuneSpec, found: Findings) -> list[str]:
-    names, heads = _columns(spec, found)
+def _fresh(spec: TuneSpec, found: Findings, names: list[str]) -> list[list[str]]:
+    """Row of each design on the worst of all fresh machines and moves; `names`: of metrics."""
     rows = []
-    for name, one in _rows(spec, found):
+    for name, one in _designs(spec, found):
         worst = [int(np.argmax(np.nan_to_num(one.metrics[x], nan=-np.inf))) for x in names]
         cells = [
             _value(x, {x: one.metrics[x][k]}, one.watched[k])
             for x, k in zip(names, worst, strict=True)
         ]
-        rows.append(
-            [name, f"{one.objective.mean():.4f}", f"{one.objective.max():.4f}", *cells, _codes(one)]
-        )
-    return [
-        "## On fresh machines",
-        "",
-        f"{_machines(spec)} Metrics: the largest value as above, on the worst of all machines and "
-        "moves.",
-        "",
-        *table(("design", "objective, mean", "objective, worst", *heads, "statuses"), rows),
-        "",
-    ]
+        objective = [f"{one.objective.mean():.4f}", f"{one.objective.max():.4f}"]
+        rows.append([name, *objective, *cells, _codes(one)])
+    return rows
 
 
-def _by_move(spec: TuneSpec, found: Findings) -> list[str]:
-    """Change of every figure on each move, mean of the fresh machines."""
-    count = spec.tune.scenarios.check
-    lines = [
-        "## Change against the study itself",
-        "",
-        "Of the mean over the fresh machines.",
-        "",
-    ]
-    names = list(found.own.metrics)
-    lines += ["| design | move | objective | " + " | ".join(names) + " |"]
-    lines += ["|---" * (len(names) + 3) + "|"]
-    for name, one in _rows(spec, found)[1:]:
+def _changes(spec: TuneSpec, found: Findings, names: list[str]) -> list[list[str]]:
+    """Row of each design and move: changes of the mean over the fresh machines."""
+    count, own, rows = spec.tune.scenarios.check, found.own, []
+    for name, one in _designs(spec, found)[1:]:
         for k, move in enumerate(spec.moves):
             part = slice(k * count, (k + 1) * count)
             changes = [_change(1.0, one.objective[part].mean())]
             changes += [
-                _change(found.own.metrics[x][part].mean(), one.metrics[x][part].mean())
-                for x in names
+                _change(own.metrics[x][part].mean(), one.metrics[x][part].mean()) for x in names
             ]
-            lines.append(f"| {name} | {move_label(move) or '-'} | " + " | ".join(changes) + " |")
-    return [*lines, "", picture("gains.png", "Objective on each fresh machine, by move"), ""]
+            rows.append([name, literal(move_label(move)) or "-", *changes])
+    return rows
 
 
 def _change(before: float, after: float) -> str:
     return f"{100 * (after / before - 1):+.1f} %" if before else f"{after:.3g} (was 0)"
 
 
-def _limits(spec: TuneSpec, found: Findings) -> list[str]:
-    if not spec.limit_names:
-        return []
-    lines = ["## Limits on the scenarios of the tuning", ""]
+def _limits(spec: TuneSpec, found: Findings) -> list[tuple[str, list[Limit]]]:
+    """Limits of each family on the scenarios of the tuning."""
+    told = []
     for k, family in enumerate(spec.moving):
         excesses = found.at.best_limits[found.at.winner(k)]
-        told = []
+        limits = []
         for name, beyond in zip(spec.limit_names, excesses, strict=True):
             limit = family.limits[name]
-            margin = _loop_margin(found, k, name, limit) if name in LOOP_LIMITS else -float(beyond)
-            wanted = "of the study" if limit == OWN else f"{limit:g}"
-            told.append(f"{name} {wanted} {_told(float(beyond), margin)}")
-        lines.append(f"- {family.name}: " + "; ".join(told))
-    if spec.metric_limits:
-        limit = spec.tune.pareto.get("limit", spec.metric_limits[0])
-        lines += [
-            "",
-            picture(
-                "front.png", f"Objective over {limit}: random designs, tuned ones, the study itself"
-            ),
-        ]
-    return [*lines, ""]
+            left = _loop_margin(found, k, name, limit) if name in LOOP_LIMITS else -float(beyond)
+            known = left if np.isfinite(left) else None
+            limits.append(Limit(name, limit, _state(float(beyond), left), known))
+        told.append((family.name, limits))
+    return told if spec.limit_names else []
 
 
 def _loop_margin(found: Findings, k: int, name: str, limit: float | str) -> float:
@@ -368,55 +282,45 @@ def _loop_margin(found: Findings, k: int, name: str, limit: float | str) -> floa
     return -margin if name == "spillover" else margin
 
 
-def _told(beyond: float, margin: float) -> str:
+def _state(beyond: float, left: float) -> str:
+    """How a limit stands, from its violation and from what is left of it, nan if not known."""
     if beyond > KEPT:
-        return "**violated**" + (f" by {-100 * margin:.2f} %" if np.isfinite(margin) else "")
-    if np.isnan(margin):
+        return "violated"
+    if np.isnan(left):
         return "kept"
-    return ("active" if margin < NEAR else "not active") + f", {100 * margin:.2f} % left"
+    return "active" if left < NEAR else "inactive"
 
 
-def _numbers(spec: TuneSpec, found: Findings) -> list[str]:
-    heads = [family.name for family in spec.moving]
-    lines = ["## Numbers", "", "| free number | bounds | study | " + " | ".join(heads) + " |"]
-    lines += ["|---" * (len(heads) + 3) + "|"]
-    at = found.at
-    places = [at.best_place[at.winner(k)] for k in range(len(heads))]
-    alike = [at.best_place[_alike(at, k)] for k in range(len(heads))]
+def _numbers(spec: TuneSpec, found: Findings) -> list[list[str]]:
+    """Row of each free number: its bounds, the study's, and that of every family."""
+    at, families, rows = found.at, spec.moving, []
+    places = [at.best_place[at.winner(k)] for k in range(len(families))]
+    alike = [at.best_place[_alike(at, k)] for k in range(len(families))]
     for n, free in enumerate(spec.free.numbers):
-        start = f"{free.start:.4g}" if np.isfinite(free.start) else "-"
         cells = []
-        for k, family in enumerate(spec.moving):
+        for k, family in enumerate(families):
             value = spec.free.values(places[k])[n]
             low, high = (spec.free.values(x)[n] for x in (alike[k].min(0), alike[k].max(0)))
             mark = "*" if places[k][n] in (0.0, 1.0) else ""
             span = f" ({low:.3g}..{high:.3g})" if len(alike[k]) > 1 else ""
             cells.append(f"{value:.4g}{mark}{span}" if family.is_free[n] else "-")
-        bounds = f"{free.span.low:g} to {free.span.high:g}"
-        lines.append(f"| {free.name} | {bounds} | {start} | " + " | ".join(cells) + " |")
-    lines += [
-        "",
-        "`*`: at its bound; `-`: not moved; in brackets the range of all starts that end within "
-        f"{100 * ALIKE:g} % of the best, where there are several: a wide one means that the number "
-        "hardly matters there.",
-        "",
-    ]
-    return lines + (_centers(spec, places) if PLACEMENT in spec.tune.free else [])
+        start = f"{free.start:.4g}" if np.isfinite(free.start) else "-"
+        rows.append([free.name, f"{free.span.low:g} to {free.span.high:g}", start, *cells])
+    return rows
 
 
-def _centers(spec: TuneSpec, places: list[np.ndarray]) -> list[str]:
-    """Where the patches are, which shares of the room that is left do not tell."""
-    lines = []
-    own = spec.moving[0]._replace(columns={}), np.full(len(spec.free.numbers), np.nan)
-    designs = [("the study itself", *own)]
-    for family, place in zip(spec.moving, places, strict=True):
-        designs.append((family.name, family, spec.free.values(place)))
+def _centers(spec: TuneSpec, found: Findings) -> list[list[str]]:
+    """Row of each design: its patches [mm], which shares of the free room do not tell."""
+    at, unmoved = found.at, np.full(len(spec.free.numbers), np.nan)
+    designs = [(ITSELF, spec.moving[0]._replace(columns={}), unmoved)]
+    for k, family in enumerate(spec.moving):
+        place = at.best_place[at.winner(k)]
+        designs.append((literal(family.name), family, spec.free.values(place)))
+    rows = []
     for name, family, values in designs:
         centers = 1e3 * patch_centers(spec, family, values)
-        cells = [", ".join(f"{x:.1f}" for x in row) for row in centers]
-        lines.append([name, *cells])
-    heads = [f"centres on link {i + 1} [mm]" for i in range(3)]
-    return [*table(("design", *heads), lines), ""]
+        rows.append([name, *(", ".join(f"{x:.1f}" for x in row) for row in centers)])
+    return rows
 
 
 def _alike(at: Progress, family: int) -> np.ndarray:
@@ -427,38 +331,14 @@ def _alike(at: Progress, family: int) -> np.ndarray:
     return np.flatnonzero((at.family == family) & is_near & is_kept)
 
 
-def _search(spec: TuneSpec, found: Findings) -> list[str]:
-    seen = found.searched
-    if seen is None:
-        return []
-    main = spec.families[spec.main]
-    order = np.argsort(np.where(is_kept(spec, seen), seen.objective, np.inf))
-    best, count = int(order[0]), int(is_kept(spec, seen).sum())
-    cost = found.run_time / seen.run_time
-    tuned = found.at.best_objective[found.at.winner(spec.main)]
-    lines = [
-        "## Against random search",
-        "",
-        f"{len(seen.objective)} Sobol designs of {main.name}, {seen.runs} runs: {count} keep all "
-        "limits"
-        + (f", the best of them has objective {seen.objective[best]:.4f}" if count else "")
-        + f"; the tuned design has {tuned:.4f} on the same scenarios.",
-        "",
-        f"All families together took {found.runs} differentiated runs, each at the cost of "
-        f"{cost:.2f} plain ones (measured): {found.runs * cost:.0f} in all, "
-        f"{found.runs * cost / len(spec.moving):.0f} for {main.name}.",
-        "",
-    ]
-    return lines
-
-
 def is_kept(spec: TuneSpec, seen: Searched) -> np.ndarray:
     """Which random designs finish and keep all limits, (n,)."""
     loop = seen.beyond_loop if spec.loop_limits else np.full(len(seen.objective), -np.inf)
     return np.isfinite(seen.objective) & (excess(seen.limits) == 0) & (loop <= KEPT)
 
 
-def _fidelity(spec: TuneSpec, found: Findings) -> list[str]:
+def _fidelity(spec: TuneSpec, found: Findings) -> Fidelity | None:
+    """Linear residual vibration beside that of runs; None where there is too little of it."""
     kept = excess(found.at.best_limits) == 0
     linear, residual = found.linear[kept], found.residual[kept]
     if found.searched is not None:
@@ -467,23 +347,12 @@ def _fidelity(spec: TuneSpec, found: Findings) -> list[str]:
         residual = np.concatenate([residual, found.searched.residual[stable]])
     is_known = np.isfinite(linear) & np.isfinite(residual) & (residual > 0)
     if is_known.sum() < 3:
-        return []
+        return None
     a, b = linear[is_known], residual[is_known]
-    ratio = np.percentile(a / b, [5, 50, 95])
-    spread = b.max() / b.min() - 1
-    rank = f"rank correlation {rank_correlation(a, b):.3f}"
-    if len(b) < FEW:
-        rank = "too few to compare their order"
-    elif spread < NARROW:
-        rank = f"too much alike ({100 * spread:.1f} %) to compare their order"
-    return [
-        "## Linear fidelity",
-        "",
-        f"Residual vibration of the linearised loop (H2 norm) over that of the run, {len(a)} "
-        f"designs that keep the limits of their loop: median {ratio[1]:.3f}, 90 % between "
-        f"{ratio[0]:.3f} and {ratio[2]:.3f}; {rank}.",
-        "",
-    ]
+    spread = float(b.max() / b.min() - 1)
+    case = "few" if len(b) < FEW else "alike" if spread < NARROW else "ranked"
+    low, median, high = np.percentile(a / b, [5, 50, 95])
+    return Fidelity(len(b), low, median, high, case, spread, rank_correlation(a, b))
 
 
 def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
