@@ -28,7 +28,7 @@ def png(width=400):
 
 def test_a_text_becomes_a_whole_page():
     lines = [f"# {literal(TITLE)}: study", "", "E = ω²q² in <b>µm</b>, 5 %", ""]
-    lines += [*table(("", "x [µm]"), [["a", "1.2 †"], [literal("b | c"), "`k`"]]), ""]
+    lines += [table(("", "x [µm]"), [["a", "1.2 †"], [literal("b | c"), "`k`"]]), ""]
     lines += [picture("my run 100%.png", "Bending of `link`, *all*")]
     files = {"Study file": 'title = "</pre><script>"\n'}
     html = page("\n".join(lines), {"my run 100%.png": png()}, files, VERSIONS)
@@ -127,7 +127,7 @@ def test_toml_is_read_back():
 @pytest.mark.parametrize("width", [1280, 600])
 def test_a_wide_report_fits_a_browsers_window(tmp_path, width):
     wide = table([f"column {k}" for k in range(30)], [["123456789"] * 30])
-    lines = ["# Title", "", "a" * 300, "", *wide, "", picture("a.png", "a figure")]
+    lines = ["# Title", "", "a" * 300, "", wide, "", picture("a.png", "a figure")]
     files = {"Study file": "x = " + "1" * 500}
     html = page("\n".join(lines), {"a.png": png(3000)}, files, VERSIONS)
     assert rendered(html, tmp_path, width) == (1, 0, 0)

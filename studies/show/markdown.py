@@ -20,10 +20,10 @@ def literal(text: str) -> str:
     return _FIRST_MARKS.sub(r"\1\\\2", _MARKS.sub(r"\\\g<0>", line))
 
 
-def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
-    """Lines of a Markdown table."""
+def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A Markdown table."""
     names = list(header)
-    return [_row(names), _row(["---"] * len(names)), *(_row(row) for row in rows)]
+    return "\n".join([_row(names), _row(["---"] * len(names)), *(_row(row) for row in rows)])
 
 
 def _row(cells: Iterable[str]) -> str:
@@ -38,9 +38,3 @@ def picture(name: str, caption: str) -> str:
         caption: Markdown.
     """
     return f"![{caption}]({quote(name)})"
-
-
-def opening(asked: str, found: str, following: str) -> list[str]:
-    """First lines of a report: what was asked, what came out, what to do next; Markdown."""
-    parts = (("Asked", asked), ("Came out", found), ("Next", following))
-    return [line for head, text in parts for line in (f"**{head}:** {text}", "")]

@@ -38,10 +38,6 @@ def _percent(share: float, digits: int = 3) -> str:
     return f"{100 * share:.{digits}g} %"
 
 
-def _table(header: list[str], rows: list[list[str]]) -> str:
-    return "\n".join(table(header, rows))
-
-
 #: How templates write values: `{{ value | name }}`.
 FILTERS: dict[str, Callable[..., str]] = {
     "short": _short,
@@ -68,7 +64,7 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     environment.filters.update(FILTERS)
-    environment.globals.update(table=_table, picture=picture)
+    environment.globals.update(table=table, picture=picture)
     return environment
 
 

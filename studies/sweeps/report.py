@@ -191,7 +191,7 @@ def _best(data: SweepData, metric: str) -> Best | None:
     )
 
 
-def _blocks(node: Node, depth: int = 0) -> list[tuple[int, str, list[tuple]]]:
+def _blocks(node: Node, depth: int = 0) -> list[tuple[int, str, list[tuple[str, str, Any]]]]:
     """A block and the further blocks in it.
 
     Args:

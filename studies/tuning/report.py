@@ -161,7 +161,7 @@ def _best(spec: TuneSpec, found: Findings) -> Best:
 def best_family(spec: TuneSpec, found: Findings) -> int:
     """Position of the family to recommend: limits kept first, then the least objective."""
 
-    def rank(k: int) -> tuple:
+    def rank(k: int) -> tuple[bool, bool, float]:
         is_moving = k < len(spec.moving)
         beyond = found.at.beyond(found.at.winner(k)) if is_moving else 0.0
         value = found.judged[k].objective.mean()
