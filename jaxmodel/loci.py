@@ -68,7 +68,8 @@ def walk(response: LoopResponse, spread: Array, loci: Loci, station: Station) ->
         station: the next frequency.
     """
     s = Pair(_growth(response) + jnp.zeros_like(station.omega), station.omega)
-    turn = go_round(response, s, Pair(station.cosine, -station.sine), spread)
+    shift = Pair(station.cosine, -station.sine) * (1 - RADIUS_TOLERANCE)
+    turn = go_round(response, s, shift, spread)
     value, last = _iterated(turn, loci.value), loci.last
     # where the straight line between two values meets the real axis
     rise = value.im - last.im
@@ -153,7 +154,7 @@ def approach(response: LoopResponse, known: Known, meeting: Meeting) -> Meeting:
     """
     omega, value, zero = meeting.omega, meeting.value, jnp.zeros_like(meeting.omega)
     one = jnp.ones_like(zero)
-    shift = Pair(meeting.cosine, -meeting.sine)
+    shift = Pair(meeting.cosine, -meeting.sine) * (1 - RADIUS_TOLERANCE)
     none = Pair(zero, zero)
 
     def wanted(s: Pair, shift: Pair, x: Array) -> Pair:
@@ -179,5 +180,5 @@ def approach(response: LoopResponse, known: Known, meeting: Meeting) -> Meeting:
     turn = angle * (1 / _TERMS) + 1.0
     for n in range(_TERMS - 1, 0, -1):
         turn = turn * angle * (1 / n) + 1.0
-    after = shift * turn
+    after = shift * turn * (1 / (1 - RADIUS_TOLERANCE))
     return Meeting(omega + d_omega, value + d_value, after.re, -after.im, step, by_omega, by_value)

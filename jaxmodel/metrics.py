@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from jaxmodel.control import efficient_modal_control
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
-from jaxmodel.table import Table
+from jaxmodel.table import PartError, Table
 
 
 class Sample(NamedTuple):
@@ -171,16 +171,35 @@ def accumulate(totals: Totals, instant: Instant) -> Totals:
         instant: the instant's signals and weights.
     """
     known = {total.name: total for metric in METRICS.values() for total in metric.totals}
-    return {name: known[name].update(totals, instant) for name in totals}
+    after = {name: known[name].update(totals, instant) for name in totals}
+    for name, new in after.items():
+        shapes = [jax.tree.map(jnp.shape, x) for x in (totals[name], new)]
+        if shapes[0] != shapes[1]:
+            raise PartError(f"total {name!r}: shape {shapes[1]} after a sample, {shapes[0]} before")
+    return after
 
 
 def finish(totals: Totals, ending: Ending) -> Metrics:
     """All metrics that the totals of a run allow."""
-    return Metrics(
+    found = Metrics(
         (name, metric.finish(totals, ending))
         for name, metric in METRICS.items()
         if all(total.name in totals for total in metric.totals)
     )
+    for name, value in found.items():
+        dims = METRICS[name].dims
+        if jnp.ndim(value) != len(dims):
+            raise PartError(f"metric {name!r}: {jnp.ndim(value)} axes found; its dims are {dims}")
+    return found
+
+
+def check_metric(metric: Metric) -> None:
+    """Raise PartError for a metric whose axes nobody knows."""
+    axes = Sizes(1, 1, 1, 1).axes
+    for dims in (metric.dims, *(total.dims for total in metric.totals)):
+        for name in dims:
+            if name not in axes:
+                raise PartError(f"metric {metric.name!r}: axis {name!r}; allowed {', '.join(axes)}")
 
 
 # --- totals ---------------------------------------------------------------------------------------
@@ -523,6 +542,7 @@ METRICS: Table[Metric] = Table(
             ),
         ),
     ],
+    check_metric,
 )
 
 #: Metrics that the status of a run depends on.

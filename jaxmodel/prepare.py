@@ -14,8 +14,8 @@ from jaxmodel.controller import Controller
 from jaxmodel.electronics import design_amplifier
 from jaxmodel.estimator import KINDS
 from jaxmodel.integrator import exponential_step
-from jaxmodel.laws import LAWS, is_modal
-from jaxmodel.laws.contract import Known
+from jaxmodel.laws import LAWS, is_modal, n_channels
+from jaxmodel.laws.contract import Known, check_feedback
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Loop
 from jaxmodel.parameters import Array
@@ -177,7 +177,9 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
     observer, synthesizer = inverse[:3], jnp.swapaxes(inverse[3:], 1, 2)
 
     known = Known(observer, synthesizer, assembled, model.mass[:, :n], mask)
-    feedback = LAWS[structure.law].design(structure, case, known)
+    law = LAWS[structure.law]
+    feedback = law.design(structure, case, known)
+    check_feedback(law, feedback, n_channels(structure), structure.n_patches)
     residual = (1.0 - jnp.pad(mask, (0, size - n))) / model.stiffness
     feedthrough = jnp.einsum("ikr,ir,irl->ikl", sensor, residual, actuator)
     controller = Controller(

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Generic, Protocol, TypeVar
+
+
+class PartError(ValueError):
+    """A part that does not keep its contract; the text says which and how."""
 
 
 class Named(Protocol):
@@ -19,13 +23,19 @@ _Entry = TypeVar("_Entry", bound=Named)
 class Table(Mapping[str, _Entry], Generic[_Entry]):
     """Entries by name, in the order in which they came."""
 
-    def __init__(self, kind: str, entries: Iterable[_Entry] = ()) -> None:
+    def __init__(
+        self,
+        kind: str,
+        entries: Iterable[_Entry],
+        check: Callable[[_Entry], None] = lambda entry: None,
+    ) -> None:
         """
         Args:
             kind: what an entry is called.
-            entries: the first ones.
+            entries: the first ones, one at least.
+            check: raises `PartError` for an entry that does not keep its contract.
         """
-        self.kind = kind
+        self.kind, self._check = kind, check
         self._entries = {entry.name: entry for entry in entries}
 
     def __getitem__(self, name: str) -> _Entry:
@@ -45,13 +55,16 @@ class Table(Mapping[str, _Entry], Generic[_Entry]):
         """Put in another one.
 
         Raises:
-            ValueError: the name is taken by another entry, or is no name.
+            PartError: it is something else, its name is taken by another entry or is no name, or it
+                does not keep its contract.
         """
+        wanted = type(next(iter(self._entries.values())))
+        if not isinstance(entry, wanted):
+            raise PartError(f"{self.kind} {entry!r}: a {wanted.__name__} is wanted")
         name = entry.name
         plain = name.replace("-", "_")
         if not plain.isidentifier() or name.startswith("_") or hasattr(dict, name):
-            raise ValueError(
-                f"{self.kind} {name!r}: letters, digits, - and _ are allowed in a name"
-            )
+            raise PartError(f"{self.kind} {name!r}: letters, digits, - and _ are allowed in a name")
+        self._check(entry)
         if self._entries.setdefault(name, entry) is not entry:
-            raise ValueError(f"{self.kind} {name!r}: there is one of that name; choose another")
+            raise PartError(f"{self.kind} {name!r}: there is one of that name; choose another")

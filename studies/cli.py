@@ -55,6 +55,13 @@ def main(arguments: list[str] | None = None) -> None:
     except (KeyboardInterrupt, Abort):
         print("studies: interrupted", file=sys.stderr)
         sys.exit(INTERRUPTED)
+    except Exception as error:
+        from studies.extensions import blamed
+
+        if not (reason := blamed(error)):
+            raise
+        print(f"studies: {reason}", file=sys.stderr)
+        sys.exit(2)
 
 
 @app.callback()

@@ -13,6 +13,7 @@ import importlib
 import importlib.util
 import os
 import sys
+import traceback
 from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
@@ -21,7 +22,7 @@ from typing import Any, cast
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
 from jaxmodel.metrics import METRICS, Metric
-from jaxmodel.table import Table
+from jaxmodel.table import PartError, Table
 from studies import sources
 from studies.errors import StudyError
 from studies.space.methods import METHODS, Method
@@ -54,12 +55,14 @@ def extend(
         ("methods", methods),
         ("targets", targets),
     ):
-        entries = [*getattr(found, kind, ()), *given]
-        for entry in entries:
+        own = getattr(found, kind, ())
+        if not isinstance(own, (list, tuple)):
+            raise StudyError(f"{module}: {kind} = {own!r}; a list is wanted")
+        for entry in [*own, *given]:
             try:
                 _table(kind).add(entry)
-            except (ValueError, AttributeError) as error:
-                raise StudyError(f"{module or 'extend'}: {kind}: {error}") from None
+            except PartError as error:
+                raise StudyError(f"{module or 'extend'}: {error}") from None
     if found is None:
         return
     if not any(hasattr(found, kind) for kind in ("laws", "metrics", "methods", "targets")):
@@ -75,6 +78,21 @@ def extend_as_told() -> None:
     for module in _told():
         if Path(module).resolve() not in sources.OUTSIDE:  # it may have another module name here
             extend(module)
+
+
+def blamed(error: BaseException) -> str:
+    """Where a file of one's own has failed and why, in a sentence; "" where it was another.
+
+    Args:
+        error: as caught.
+    """
+    if isinstance(error, PartError):
+        return str(error)
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if Path(frame.filename).resolve() in sources.OUTSIDE:
+            reason = (str(error).strip().splitlines() or [""])[0]
+            return f"{frame.filename}, line {frame.lineno}: {type(error).__name__}: {reason}"
+    return ""
 
 
 def _told() -> list[str]:
@@ -107,7 +125,7 @@ def _imported(module: str) -> ModuleType:
         found = importlib.util.module_from_spec(spec)
         sys.modules[name] = found
         spec.loader.exec_module(found)
-    except Exception as error:  # whatever the file does
+    except (Exception, SystemExit) as error:  # whatever the file does
         sys.modules.pop(name, None)
         raise StudyError(
             f"{module}: cannot be imported ({type(error).__name__}: {error})"

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from jaxmodel.laws import LAWS
+from jaxmodel.laws.contract import Law, Parameter, modal_feedback, on_and_off
 from jaxmodel.metrics import METRICS, Metric
 from jaxmodel.table import Table
 from studies import sources
@@ -75,9 +76,14 @@ free = { "control.laws.even_damping.constant" = { from = 0.2, to = 4.0 } }
 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory):
-    """The tables with the parts of the docs in them, and as they were afterwards."""
-    file = tmp_path_factory.mktemp("own") / "own_parts.py"
-    file.write_text("\n".join(re.findall("```python\n(.*?)```", DOCS.read_text(), re.S)))
+    """The tables with the parts of the docs in them."""
+    blocks = re.findall("```python\n(.*?)```", DOCS.read_text(), re.S)
+    yield from taken_in(tmp_path_factory.mktemp("own") / "own_parts.py", "\n".join(blocks))
+
+
+def taken_in(file, text):
+    """A file of parts while its tables hold them; afterwards they are as before."""
+    file.write_text(text)
     tables = (LAWS, METRICS, METHODS, TARGETS)
     before = [dict(table._entries) for table in tables]
     extend(file)
@@ -86,7 +92,7 @@ def own(tmp_path_factory):
     for table, entries in zip(tables, before, strict=True):
         table._entries = entries
     sources.OUTSIDE.remove(file)
-    os.environ.pop(VARIABLE)
+    os.environ.pop(VARIABLE, None)
     jax.clear_caches()
 
 
@@ -206,9 +212,15 @@ def test_own_law_becomes_c(own, tmp_path, capsys):
 
 
 def test_what_is_taken_or_empty_is_refused(tmp_path):
-    with pytest.raises(StudyError, match="metrics: metric 'residual_rms': there is one"):
+    with pytest.raises(StudyError, match="metric 'residual_rms': there is one"):
         extend(metrics=[METRICS["residual_rms"]._replace(text="another")])
-    for text, message in (("", "none of the lists laws"), ("1/0", "ZeroDivisionError")):
+    for text, message in (
+        ("", "none of the lists laws"),
+        ("1/0", "ZeroDivisionError"),
+        ("raise SystemExit(3)", "SystemExit: 3"),
+        ("laws = 5", "laws = 5; a list is wanted"),
+        ("methods = ['sobol']", "method 'sobol': a Method is wanted"),
+    ):
         path = tmp_path / f"part{len(text)}.py"
         path.write_text(text)
         with pytest.raises(StudyError, match=message):
@@ -219,9 +231,125 @@ def test_what_is_taken_or_empty_is_refused(tmp_path):
 
 @pytest.mark.parametrize("name", ["a b", "items", "_a", ""])
 def test_names_that_are_none_are_refused(name):
-    table: Table[Metric] = Table("metric")
+    table: Table[Metric] = Table("metric", METRICS.values())
     with pytest.raises(ValueError, match="letters, digits"):
         table.add(METRICS["residual_rms"]._replace(name=name))
+
+
+def stiff(structure, case, known):
+    """Positions alone."""
+    position = 20.0 * known.modal_mass * known.omega * on_and_off(case, known)
+    return modal_feedback(case, known, 0 * known.omega, position)
+
+
+def test_position_gains_of_an_own_law_are_fed_back(monkeypatch):
+    monkeypatch.setitem(LAWS._entries, "stiff", Law("stiff", "stiff", "mode", stiff))
+    study = parse_study(tomllib.loads(SMALL)).change(control__modes=2, control__law="stiff")
+    found = run_study(study, has_record=False).result.metrics
+    none = run_study(study.change(control__gain_factor=0.0), has_record=False).result.metrics
+    assert np.max(found.peak_voltage) > 0.1 and np.max(none.peak_voltage) == 0
+
+
+BETWEEN = Parameter("share", 0.5, "1", "share", 0.0, 1.0)
+BEYOND = BETWEEN._replace(default=2.0)
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ({"laws": [LAWS["imsc"]._replace(name="x", channel="wheel")]}, "channel = 'wheel'"),
+        ({"laws": [LAWS["imsc"]._replace(name="x", design="imsc")]}, "design = 'imsc'"),
+        ({"laws": [LAWS["imsc"]._replace(name="x", parameters="a")]}, "a Parameter is wanted"),
+        (
+            {"laws": [LAWS["imsc"]._replace(name="x", parameters=(BETWEEN, BETWEEN))]},
+            "parameter 'share'; a name of its own is wanted",
+        ),
+        (
+            {"laws": [LAWS["imsc"]._replace(name="x", parameters=(BEYOND,))]},
+            "'share': default 2; allowed 0 to 1",
+        ),
+        ({"metrics": [METRICS["residual_rms"]._replace(name="x", dims=("leg",))]}, "axis 'leg'"),
+    ],
+)
+def test_parts_that_do_not_keep_their_contract_are_refused(part, message):
+    with pytest.raises(StudyError, match=re.escape(message)):
+        extend(**part)
+    assert "x" not in LAWS and "x" not in METRICS
+
+
+WRONG = """
+import jax.numpy as jnp
+import numpy as np
+from jaxmodel.laws.contract import Law, modal_feedback
+from jaxmodel.metrics import Metric, Total
+from studies.export.job import Made, judged
+from studies.export.targets import Target
+from studies.space.methods import Method
+
+def wide(structure, case, known):
+    return modal_feedback(case, known, jnp.ones((3, 7)), jnp.ones((3, 7)))
+
+def asks(structure, case, known):
+    if case.control.gain_factor > 0.1:
+        raise RuntimeError
+
+laws = [Law(f.__name__, f.__name__, "mode", f) for f in (wide, asks)]
+total = Total("pose_sum", (), lambda totals, at: at.sample.pose_error)
+metrics = [Metric("drift", (), "m", "drift", (total,), lambda totals, ending: totals["pose_sum"])]
+methods = [
+    Method("nowhere", "nowhere", ("count",), lambda asked: np.full((2, asked.dimensions), np.nan)),
+    Method("none", "none", ("count",), lambda asked: np.zeros((0, asked.dimensions))),
+]
+
+def up(job):
+    return Made({"../up.txt": ""}, judged(job.found, job.found.channels, ""), None)
+
+targets = [Target("up", "up", up)]
+"""
+
+
+@pytest.fixture(scope="module")
+def wrong(tmp_path_factory):
+    """A file of parts that load, and fail."""
+    yield from taken_in(tmp_path_factory.mktemp("wrong") / "wrong_parts.py", WRONG)
+
+
+@pytest.mark.parametrize(
+    ("changes", "command", "message"),
+    [
+        (
+            {"control__law": "wide"},
+            "simulate",
+            "velocity_gain has shape (3, 7); (3, 2)",
+        ),
+        (
+            {"control__law": "asks"},
+            "simulate",
+            "wrong_parts.py, line 14: TracerBool",
+        ),
+        ({}, "sweep", "total 'pose_sum': shape (3,) after a sample, () before"),
+        ({"sweep": "nowhere"}, "sweep", "sweep.method = 'nowhere': gives float64 of shape (2, 1)"),
+        ({"sweep": "none"}, "sweep", "sweep.method = 'none': gives float64 of shape (0, 1)"),
+        ({}, "export --target up", "it makes '../up.txt'; a plain file name is wanted"),
+    ],
+)
+def test_own_parts_that_fail_are_named(wrong, changes, command, message, tmp_path, capsys):
+    """In one line, and without a file."""
+    method = changes.pop("sweep", "sobol")
+    study = parse_study(tomllib.loads(SMALL)).change(control__modes=2, **changes)
+    text = study_template(study)
+    if command == "sweep":
+        text += (
+            f'[sweep]\nmethod = "{method}"\ncount = 2\nmetrics = ["drift"]\n'
+            "[sweep.axes]\ngain = { from = 0.1, to = 0.2 }\n"
+        )
+    name, *options = command.split()
+    out = tmp_path / ("run.h5" if name == "simulate" else "out")
+    with pytest.raises(SystemExit) as stopped:
+        run(capsys, wrong, name, written(tmp_path, text), *options, "--out", out)
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and message in error and error.count("\n") == 1
+    assert not list(tmp_path.glob("*.txt")) and not (out.is_dir() and list(out.glob("*.txt")))
 
 
 def test_every_source_of_a_number_is_in_the_digest(tmp_path):

@@ -9,7 +9,7 @@ below; `LAWS.add` puts one in from outside.
 from __future__ import annotations
 
 from jaxmodel.case import Structure
-from jaxmodel.laws.contract import Law
+from jaxmodel.laws.contract import Law, check_law
 from jaxmodel.laws.imsc import IMSC
 from jaxmodel.laws.lqr import LQR
 from jaxmodel.laws.modified_imsc import MODIFIED_IMSC
@@ -17,7 +17,7 @@ from jaxmodel.laws.ppf import PPF
 from jaxmodel.laws.srf import SRF
 from jaxmodel.table import Table
 
-LAWS: Table[Law] = Table("law", [IMSC, SRF, LQR, MODIFIED_IMSC, PPF])
+LAWS: Table[Law] = Table("law", [IMSC, SRF, LQR, MODIFIED_IMSC, PPF], check_law)
 
 
 def is_modal(structure: Structure) -> bool:

@@ -8,13 +8,17 @@ channel forces, V_a = `synthesizer` f. Per link; shapes (3, C, ...) with C chann
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 from jaxmodel.case import Case, Control, Structure
 from jaxmodel.control import force_gains
 from jaxmodel.estimator import Estimator, design_estimator
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
+from jaxmodel.table import PartError
+
+#: What a channel is: a controlled mode, or a patch pair.
+Channel = Literal["mode", "patch"]
 
 
 class Parameter(NamedTuple):
@@ -54,7 +58,7 @@ class Law(NamedTuple):
 
     name: str  # in study files
     text: str  # in reports
-    channel: Literal["mode", "patch"]  # what a channel is: a controlled mode, or a patch pair
+    channel: Channel
     design: Callable[[Structure, Case, Known], Feedback]
     parameters: tuple[Parameter, ...] = ()
     # position gains count always; False: they are zero, and cost nothing, where
@@ -65,6 +69,43 @@ class Law(NamedTuple):
     # settings with which it damps mode 1 as much as modal control does with those of the case;
     # None: its velocity gains are scaled to that
     as_strong: Callable[[Case, Known], Control] | None = None
+
+
+def check_law(law: Law) -> None:
+    """Raise PartError for a law whose description cannot be meant."""
+    place = f"law {law.name!r}"
+    if law.channel not in get_args(Channel):
+        raise PartError(f"{place}: channel = {law.channel!r}; allowed 'mode' or 'patch'")
+    if not callable(law.design):
+        raise PartError(f"{place}: design = {law.design!r}; a function is wanted")
+    seen: set[str] = set()
+    for x in law.parameters:
+        if not isinstance(x, Parameter):
+            raise PartError(f"{place}: parameters: {x!r}; a Parameter is wanted")
+        if not x.name.isidentifier() or x.name in seen:
+            raise PartError(f"{place}: parameter {x.name!r}; a name of its own is wanted")
+        if not x.low <= x.default <= x.high:
+            raise PartError(
+                f"{place}: parameter {x.name!r}: default {x.default:g}; "
+                f"allowed {x.low:g} to {x.high:g}"
+            )
+        seen.add(x.name)
+
+
+def check_feedback(law: Law, made: Feedback, n_channels: int, n_patches: int) -> None:
+    """Raise PartError unless a law has made a `Feedback` of the right shapes."""
+    if not isinstance(made, Feedback):
+        raise PartError(f"law {law.name!r}: design gives {made!r}; a Feedback is wanted")
+    wanted = {
+        "filter": (3, n_channels, n_patches),
+        "synthesizer": (3, n_patches, n_channels),
+        "velocity_gain": (3, n_channels),
+        "position_gain": (3, n_channels),
+    }
+    for name, shape in wanted.items():
+        found = jnp.shape(getattr(made, name))
+        if found != shape:
+            raise PartError(f"law {law.name!r}: {name} has shape {found}; {shape} is wanted")
 
 
 def on_and_off(case: Case, known: Known) -> Array:

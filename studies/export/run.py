@@ -80,6 +80,9 @@ def export_design(
         console,
     )
     made = TARGETS[target].make(job)
+    for file in made.files:
+        if Path(file).name != file or file.startswith("."):
+            raise StudyError(f"--target {target}: it makes {file!r}; a plain file name is wanted")
     verified = made.verified
     is_good = verified is None or verified.is_passed
     texts = made.files if is_good else {}  # what an earlier export has left stays as it is

@@ -135,7 +135,18 @@ def _sampled(node: Node, study: Study, seed: int) -> Columns:
 
 
 def unit_points(node: Node, dimensions: int, seed: int) -> np.ndarray:
-    """Points of the unit cube for a sampling method, (n, dimensions)."""
-    points = METHODS[node.block.method].points
-    assert points is not None
-    return points(Asked(node.block, dimensions, seed, node.path))
+    """Points of the unit cube for a sampling method, (n, dimensions).
+
+    Raises:
+        StudyError: the method gives something else.
+    """
+    method = METHODS[node.block.method]
+    assert method.points is not None
+    found = np.asarray(method.points(Asked(node.block, dimensions, seed, node.path)))
+    is_right = found.dtype.kind == "f" and found.shape == (len(found) or 1, dimensions)
+    if not is_right or not np.all((found >= 0) & (found <= 1)):
+        raise StudyError(
+            f"{node.path}.method = {method.name!r}: gives {found.dtype} of shape {found.shape}; "
+            f"wanted one or more points of {dimensions} numbers from 0 to 1"
+        )
+    return found
