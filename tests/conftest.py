@@ -1,7 +1,7 @@
 """Float64, one CPU device per core and the compilation cache for every test.
 
-Tests compile much and run little, so XLA's code generator leaves its optimisations out here: the
-same programs, compiled in a third of the time.
+Tests compile much and run little, so the code generators of XLA and of the kernels leave their
+optimisations out here: the same programs, compiled in a third of the time.
 """
 
 import os

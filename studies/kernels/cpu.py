@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import ctypes
 import json
+import os
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -24,6 +26,8 @@ from studies.kernels.traced import Change, TracedLoop
 
 #: Bytes of the vectors: what one register of the widest common instruction set holds.
 VECTOR_BYTES = 64
+#: In XLA_FLAGS, how much XLA's code generator optimises; the kernels' does the same.
+_LEVEL = re.compile(r"--xla_backend_optimization_level=([0-3])")
 
 
 class Kernel:
@@ -189,17 +193,29 @@ def initialise() -> None:
         getattr(binding, part)()
 
 
+def _effort() -> int:
+    """How much LLVM optimises; 0 compiles six times as fast as 3 what runs half as fast."""
+    found = _LEVEL.search(os.environ.get("XLA_FLAGS", ""))
+    return int(found[1]) if found else 3
+
+
 def _target() -> tuple[str, ...]:
     """What machine code depends on besides its text."""
     features, version = binding.get_host_cpu_features().flatten(), binding.llvm_version_info
     triple = binding.get_default_triple()
-    return binding.get_host_cpu_name(), features, triple, ".".join(map(str, version))
+    return (
+        binding.get_host_cpu_name(),
+        features,
+        triple,
+        ".".join(map(str, version)),
+        str(_effort()),
+    )
 
 
 def _machine() -> Any:
     cpu, features, *_ = _target()
     return binding.Target.from_default_triple().create_target_machine(
-        cpu=cpu, features=features, opt=3, jit=True
+        cpu=cpu, features=features, opt=_effort(), jit=True
     )
 
 

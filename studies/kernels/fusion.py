@@ -99,27 +99,27 @@ def in_order(wanted: Iterable[Any]) -> list[Node]:
     """
     wanted = list(wanted)
     height: dict[int, int] = {}
-    for node in _depth_first(wanted, lambda x: 0):
-        height[id(node)] = 1 + max((height.get(id(x), 0) for x in node.args), default=0)
+    for node in _depth_first(wanted):
+        height[id(node)] = 1 + max([height.get(id(x), 0) for x in node.args], default=0)
     return _depth_first(wanted, lambda x: height.get(id(x), 0))
 
 
-def _depth_first(wanted: list[Any], priority: Callable[[Any], int]) -> list[Node]:
+def _depth_first(wanted: list[Any], priority: Callable[[Any], int] | None = None) -> list[Node]:
+    """Each node after its arguments, of which those of the highest priority come first."""
     order: list[Node] = []
     seen: set[int] = set()
-    for result in wanted:
-        stack = [(result, False)]
-        while stack:
-            node, is_ready = stack.pop()
-            if is_ready:
-                order.append(node)
-            elif not is_known(node) and id(node) not in seen:
-                seen.add(id(node))
-                stack.append((node, True))
-                stack.extend((x, False) for x in sorted(node.args, key=priority))
+    stack: list[Any] = wanted[::-1]
+    while stack:
+        node = stack.pop()
+        if type(node) is tuple:  # its arguments are done
+            order.append(node[0])
+        elif type(node) is Node and id(node) not in seen:
+            seen.add(id(node))
+            stack.append((node,))
+            stack += sorted(node.args, key=priority) if priority else node.args
     return order
 
 
 def count_operations(wanted: Iterable[Any]) -> Counter[str]:
     """How many operations of each kind some results need."""
-    return Counter(node.operation for node in in_order(wanted))
+    return Counter(node.operation for node in _depth_first(list(wanted)))

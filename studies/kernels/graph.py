@@ -148,12 +148,15 @@ class Graph:
         return found
 
     def _node(self, operation: str, *args: Any, is_truth: bool = False) -> Node:
-        names = [(type(x), x) if is_known(x) else id(x) for x in args]
-        key = (operation, *(sorted(names, key=str) if operation in _SYMMETRIC else names))
-        if key not in self._made:
-            is_varying = any(isinstance(x, Node) and x.is_varying for x in args)
-            self._made[key] = Node(operation, args, is_varying, is_truth)
-        return self._made[key]
+        names = [id(x) if type(x) is Node else (type(x), x) for x in args]
+        if operation in _SYMMETRIC:
+            names.sort(key=hash)
+        key = (operation, *names)
+        found = self._made.get(key)
+        if found is None:
+            is_varying = any([type(x) is Node and x.is_varying for x in args])
+            found = self._made[key] = Node(operation, args, is_varying, is_truth)
+        return found
 
     def _op_add(self, a: Any, b: Any) -> Any:
         if is_known(a) and is_known(b):
