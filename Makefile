@@ -4,7 +4,7 @@ PYTHON ?= python3
 # Small eigenvalue problems are slower on several BLAS threads, much slower beside other processes.
 export OPENBLAS_NUM_THREADS ?= 1
 BIN := .venv/bin
-PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile
+PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help study explore test test-long lint check clean venv

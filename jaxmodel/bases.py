@@ -47,11 +47,11 @@ def find_bases(structure: Structure, case: Case) -> Bases:
     is_there = (jnp.arange(structure.n_modes) < case.n_modes).astype(plant.mass.dtype)
     cut = _first_modes(plant, structure.n_modes)
     return Bases(
-        mask_modes(cut._replace(deflection_at=cut.deflection_at[:, :-1]), is_there),
-        cut.deflection_at[:, -1] * is_there,
-        held_frequency(both[0], beam, plant)[:, :n],
-        model._replace(deflection_at=model.deflection_at[:, :-1]),
-        jnp.where(given > 0, given, own),
+        plant=mask_modes(cut._replace(deflection_at=cut.deflection_at[:, :-1]), is_there),
+        at_load=cut.deflection_at[:, -1] * is_there,
+        plant_omega=held_frequency(both[0], beam, plant)[:, :n],
+        model=model._replace(deflection_at=model.deflection_at[:, :-1]),
+        believed_omega=jnp.where(given > 0, given, own),
     )
 
 

@@ -136,7 +136,14 @@ def accelerations(
     axial = tension - plant.tip_mass * chain.cosine * rho_acc
     if not is_coupled and plant.shortening is not None:
         coupling = coupling - shortening_row(plant, q) * (axial / plant.modal_mass)[:, None]
-    return Accelerations(pose_acc, coupling - own, coupling, rho_acc, gamma_acc, axial)
+    return Accelerations(
+        pose=pose_acc,
+        modal=coupling - own,
+        coupling=coupling,
+        rho=rho_acc,
+        gamma=gamma_acc,
+        axial=axial,
+    )
 
 
 def _is_rigid(plant: Plant) -> bool:

@@ -54,11 +54,11 @@ def design_estimator(
         return jnp.where(is_phase, a, b)
 
     return Estimator(
-        tuple(map(choose, phase.first, plain.first)),
-        tuple(map(choose, phase.denominator, plain.denominator)),
-        tuple(map(choose, phase.velocity, plain.velocity)),
-        tuple(map(choose, phase.position, plain.position)),
-        choose(phase.direct, plain.direct),
+        first=tuple(map(choose, phase.first, plain.first)),
+        denominator=tuple(map(choose, phase.denominator, plain.denominator)),
+        velocity=tuple(map(choose, phase.velocity, plain.velocity)),
+        position=tuple(map(choose, phase.position, plain.position)),
+        direct=choose(phase.direct, plain.direct),
     )
 
 
@@ -101,7 +101,11 @@ def _modal_phase(omega: Array, electronics: Electronics, kappa: Array, zeta: Arr
         return low * (value + slope), low * 2 * value, low * (value - slope)
 
     return Estimator(
-        first, (a1, a2), numerator(1j * omega), numerator(1.0 + 0j * omega), jnp.zeros_like(omega)
+        first=first,
+        denominator=(a1, a2),
+        velocity=numerator(1j * omega),
+        position=numerator(1.0 + 0j * omega),
+        direct=jnp.zeros_like(omega),
     )
 
 
@@ -110,9 +114,9 @@ def _difference(omega: Array, period: Array, cutoff: Array) -> Estimator:
     pole = jnp.exp(-cutoff * period)
     gain = (1 - pole) / period
     return Estimator(
-        (gain * one, -gain * one, -pole * one),
-        (zero, zero),
-        (one, zero, zero),
-        (zero, zero, zero),
-        one,
+        first=(gain * one, -gain * one, -pole * one),
+        denominator=(zero, zero),
+        velocity=(one, zero, zero),
+        position=(zero, zero, zero),
+        direct=one,
     )

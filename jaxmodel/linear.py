@@ -99,11 +99,11 @@ def linearise(
         rest, jnp.zeros((n_voltages,), rest.dtype), still
     )
     return LinearPlant(
-        a,
-        b_voltage,
-        b_force,
-        _rows(loop.deflection_at, structure.n_modes),
-        _rows(loop.sensor, structure.n_modes),
+        state=a,
+        voltage=b_voltage,
+        force=b_force,
+        deflection=_rows(loop.deflection_at, structure.n_modes),
+        sensor=_rows(loop.sensor, structure.n_modes),
     )
 
 

@@ -55,7 +55,9 @@ class Station(NamedTuple):
 def start_walk(value: Pair) -> Loci:
     """State before the first station, with first guesses, (n, ...)."""
     zero = 0 * value.re
-    return Loci(value, value, zero[0], zero, zero, zero, zero)
+    return Loci(
+        value=value, last=value, omega=zero[0], crossing=zero, place=zero, left=zero, right=zero
+    )
 
 
 def walk(response: LoopResponse, spread: Array, loci: Loci, station: Station) -> Loci:
@@ -80,13 +82,13 @@ def walk(response: LoopResponse, spread: Array, loci: Loci, station: Station) ->
     is_more = is_through & (station.kind > 1) & (meets > loci.crossing)
     is_kept = station.kind > 0
     return Loci(
-        value,
-        Pair(jnp.where(is_kept, value.re, last.re), jnp.where(is_kept, value.im, last.im)),
-        jnp.where(is_kept, station.omega, loci.omega),
-        jnp.where(is_more, meets, loci.crossing),
-        jnp.where(is_more, loci.omega + share * (station.omega - loci.omega), loci.place),
-        jnp.where(is_more, loci.omega, loci.left),
-        jnp.where(is_more, station.omega, loci.right),
+        value=value,
+        last=Pair(jnp.where(is_kept, value.re, last.re), jnp.where(is_kept, value.im, last.im)),
+        omega=jnp.where(is_kept, station.omega, loci.omega),
+        crossing=jnp.where(is_more, meets, loci.crossing),
+        place=jnp.where(is_more, loci.omega + share * (station.omega - loci.omega), loci.place),
+        left=jnp.where(is_more, loci.omega, loci.left),
+        right=jnp.where(is_more, station.omega, loci.right),
     )
 
 
@@ -122,7 +124,7 @@ class Meeting(NamedTuple):
     by_value: Pair
 
 
-class Known(NamedTuple):
+class FoundMeeting(NamedTuple):
     """A meeting point that has been found and is not wanted again."""
 
     is_there: Array  # 1 or 0, ()
@@ -141,10 +143,12 @@ def start_approach(omega: Array, value: Array, cosine: Array, sine: Array) -> Me
     """State before the first step from a guess, see `Meeting`, (...)."""
     zero = 0 * omega
     none = Pair(zero, zero)
-    return Meeting(omega, value, cosine, sine, zero, none, none)
+    return Meeting(
+        omega=omega, value=value, cosine=cosine, sine=sine, step=zero, by_omega=none, by_value=none
+    )
 
 
-def approach(response: LoopResponse, known: Known, meeting: Meeting) -> Meeting:
+def approach(response: LoopResponse, known: FoundMeeting, meeting: Meeting) -> Meeting:
     """A step of Newton's iteration on det(x - L(j omega)) = 0 for real omega and x.
 
     Args:
@@ -181,4 +185,12 @@ def approach(response: LoopResponse, known: Known, meeting: Meeting) -> Meeting:
     for n in range(_TERMS - 1, 0, -1):
         turn = turn * angle * (1 / n) + 1.0
     after = shift * turn * (1 / (1 - RADIUS_TOLERANCE))
-    return Meeting(omega + d_omega, value + d_value, after.re, -after.im, step, by_omega, by_value)
+    return Meeting(
+        omega=omega + d_omega,
+        value=value + d_value,
+        cosine=after.re,
+        sine=-after.im,
+        step=step,
+        by_omega=by_omega,
+        by_value=by_value,
+    )

@@ -237,14 +237,14 @@ def plant_step(
         return forced + sum(full[row, k] * x for k, x in enumerate(read) if x is not None)
 
     after = PlantState(
-        state.pose + h / 6 * combine(0),
-        state.pose_rate + h / 6 * combine(1),
-        mode(0),
-        mode(1),
-        mode(2),
-        mode(3),
-        mode(4),
-        last_voltage,
+        pose=state.pose + h / 6 * combine(0),
+        pose_rate=state.pose_rate + h / 6 * combine(1),
+        q=mode(0),
+        q_rate=mode(1),
+        z=mode(2),
+        z_rate=mode(3),
+        s=mode(4),
+        voltage=last_voltage,
     )
     return after, first
 
@@ -346,14 +346,24 @@ def advance(
         actuator_voltage=voltage,
         slider_force=motors,
     )
-    proposed = State(next_plant, after, totals, state.status, state.bad_time)
+    proposed = State(
+        plant=next_plant,
+        controller=after,
+        totals=totals,
+        status=state.status,
+        bad_time=state.bad_time,
+    )
     return _freeze_if_bad(structure, loop, state, proposed, rates.chain, inputs), record
 
 
 def _reference(inputs: Inputs, point: int) -> Reference:
     forward = None if inputs.feedforward is None else inputs.feedforward[point]
     return Reference(
-        inputs.rho[point], inputs.rho_rate[point], forward, inputs.disturbance, inputs.wrench
+        rho=inputs.rho[point],
+        rho_rate=inputs.rho_rate[point],
+        feedforward=forward,
+        disturbance=inputs.disturbance,
+        wrench=inputs.wrench,
     )
 
 
@@ -374,11 +384,11 @@ def _advance_plant(
         rho, rho_rate, forward = points
         start, middle, end = (
             Reference(
-                rho[k],
-                rho_rate[k],
-                None if forward is None else forward[k],
-                inputs.disturbance,
-                inputs.wrench,
+                rho=rho[k],
+                rho_rate=rho_rate[k],
+                feedforward=None if forward is None else forward[k],
+                disturbance=inputs.disturbance,
+                wrench=inputs.wrench,
             )
             for k in range(3)
         )
@@ -470,7 +480,7 @@ def initial_state(
     )
     totals = metrics.zero_totals(sizes, q.dtype, structure.metrics)
     return State(
-        PlantState(
+        plant=PlantState(
             pose,
             still,
             q,
@@ -480,8 +490,8 @@ def initial_state(
             s=drained if is_drained else None,
             voltage=controller.voltage if is_sampled and structure.has_amplifier else None,
         ),
-        controller,
-        totals,
-        code,
-        jnp.zeros_like(code),
+        controller=controller,
+        totals=totals,
+        status=code,
+        bad_time=jnp.zeros_like(code),
     )

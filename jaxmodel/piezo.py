@@ -10,7 +10,7 @@ from jaxmodel.parameters import Array, Beam, Patches
 VACUUM_PERMITTIVITY = 8.8541878128e-12  # [F/m]
 
 
-class Section(NamedTuple):
+class CrossSection(NamedTuple):
     """A laminated cross-section, added to the bare link's."""
 
     stiffness: Array  # bending stiffness beyond the bare link's [N m2]
@@ -22,7 +22,7 @@ def bare_stiffness(beam: Beam) -> Array:
     return beam.youngs_modulus * beam.width * beam.thickness**3 / 12
 
 
-def one_sided_section(beam: Beam, patches: Patches) -> Section:
+def one_sided_section(beam: Beam, patches: Patches) -> CrossSection:
     """Link with one patch on one face; the neutral axis moves towards the patch.
 
     z_n = E_p A_p z_p/(E A + E_p A_p) with z_p = (t_b + t_p)/2; parallel-axis theorem for the rest.
@@ -40,15 +40,15 @@ def one_sided_section(beam: Beam, patches: Patches) -> Section:
     shift = axial_patch * offset / (axial_beam + axial_patch)
     own = axial_patch * patches.thickness**2 / 12
     stiffness = axial_beam * shift**2 + axial_patch * (offset - shift) ** 2 + own
-    return Section(stiffness, shift)
+    return CrossSection(stiffness, shift)
 
 
-def two_sided_section(beam: Beam, patches: Patches) -> Section:
+def two_sided_section(beam: Beam, patches: Patches) -> CrossSection:
     """Link with a patch on both faces; symmetric, so the neutral axis stays in the middle."""
     offset = (beam.thickness + patches.thickness) / 2
     axial_patch = patches.youngs_modulus * patches.width * patches.thickness
     stiffness = 2 * axial_patch * (offset**2 + patches.thickness**2 / 12)
-    return Section(stiffness, jnp.zeros_like(stiffness))
+    return CrossSection(stiffness, jnp.zeros_like(stiffness))
 
 
 def actuator_constant(beam: Beam, patches: Patches) -> Array:

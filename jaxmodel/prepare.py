@@ -105,13 +105,13 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         settling_band=jnp.asarray(case.windows.settling_band),
     )
     return Prepared(
-        loop,
-        bases,
-        design_taps(case, bases),
-        _initial_modes(structure, case, bases),
-        design.sensor_condition,
-        design.actuator_condition,
-        _static_status(structure, case, bases, design, omega * step, zeta),
+        loop=loop,
+        bases=bases,
+        taps=design_taps(case, bases),
+        initial_q=_initial_modes(structure, case, bases),
+        sensor_condition=design.sensor_condition,
+        actuator_condition=design.actuator_condition,
+        status=_static_status(structure, case, bases, design, omega * step, zeta),
     )
 
 
@@ -176,7 +176,13 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
     inverse = jax.vmap(left_inverse, (0, None))(jnp.concatenate([seen, driven]), mask)
     observer, synthesizer = inverse[:3], jnp.swapaxes(inverse[3:], 1, 2)
 
-    known = Known(observer, synthesizer, assembled, model.mass[:, :n], mask)
+    known = Known(
+        observer=observer,
+        synthesizer=synthesizer,
+        omega=assembled,
+        modal_mass=model.mass[:, :n],
+        mask=mask,
+    )
     law = LAWS[structure.law]
     feedback = law.design(structure, case, known)
     check_feedback(law, feedback, n_channels(structure), structure.n_patches)

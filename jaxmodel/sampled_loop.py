@@ -89,11 +89,11 @@ def closed_loop(
     jacobian = jax.jacfwd(advance)
     without = jacobian(start, 0.0)
     return LoopMatrices(
-        without,
-        jacobian(start, 1.0) - without,
-        plant.state,
-        jnp.pad(exact[:, n + n_sensors :], ((0, start.size - n), (0, 0))),
-        jnp.pad(plant.deflection, ((0, 0), (0, start.size - plant.deflection.shape[1]))),
+        open=without,
+        feedback=jacobian(start, 1.0) - without,
+        plant=plant.state,
+        force=jnp.pad(exact[:, n + n_sensors :], ((0, start.size - n), (0, 0))),
+        deflection=jnp.pad(plant.deflection, ((0, 0), (0, start.size - plant.deflection.shape[1]))),
     )
 
 

@@ -102,7 +102,14 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
         adc_noise=adc_noise,
         window=_windows(structure, case, time, end),
     )
-    return Command(inputs, wanted.position[0], end, code, bad_time, distance)
+    return Command(
+        inputs=inputs,
+        start_pose=wanted.position[0],
+        end=end,
+        status=code,
+        bad_time=bad_time,
+        singularity_distance=distance,
+    )
 
 
 def steady_load(structure: Structure, case: Case, plant: Plant) -> Array:

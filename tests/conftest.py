@@ -5,6 +5,7 @@ optimisations out here: the same programs, compiled in a third of the time.
 """
 
 import os
+from pathlib import Path
 
 import jaxlib
 
@@ -19,3 +20,26 @@ os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FLAGS}"
 configure()
 # tables as wide as they need to be, wherever the tests run
 os.environ["COLUMNS"] = "240"
+
+#: Files that take longest, begun first so that the workers end together.
+HEAVY = (
+    "notebooks",
+    "margins",
+    "contracts",
+    "atlas",
+    "cluster",
+    "sweeps",
+    "axial",
+    "gradients",
+    "tuning",
+    "spillover",
+    "paper",
+    "export",
+    "sampled_loop",
+)
+
+
+def pytest_collection_modifyitems(items):
+    """Heavy files first; otherwise as collected."""
+    place = {f"test_{name}.py": k for k, name in enumerate(HEAVY)}
+    items.sort(key=lambda item: place.get(Path(item.fspath).name, len(HEAVY)))

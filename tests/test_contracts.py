@@ -112,7 +112,7 @@ GAINS = {"srf": {"velocity_gain": (2e-4,) * 3}, "ppf": {"gain_factor": 0.2}}
 
 
 #: The others are run, judged and exported by the tests of exports.
-SHORT = ("modified_imsc", "ppf")
+SHORT = ("modified_imsc",)
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def states():
     """Random states far from rest: bending up to 3 mm, speeds of the fast moves."""
     rng = np.random.default_rng(7)
     scale = np.array([0.012, 0.012, 0.06])
-    motion = reference.Motion(
+    motion = reference.RigidState(
         pose=HOME_POSE + scale * rng.uniform(-1, 1, size=(N_STATES, 3)),
         pose_rate=rng.normal(size=(N_STATES, 3)) * [0.3, 0.3, 1.0],
         q=3e-3 * rng.uniform(-1, 1, size=(N_STATES, 3, R)) / np.arange(1, R + 1),
@@ -249,7 +249,7 @@ def test_singular_poses_are_reported_and_keep_gradients_finite(kind):
     loads = reference.Loads(np.ones(3), np.ones((3, R)))
 
     def total(pose):
-        motion = reference.Motion(pose, rate, q, 10 * q)
+        motion = reference.RigidState(pose, rate, q, 10 * q)
         found = closed_form(plant, motion, loads)
         return sum(jnp.sum(part) for part in found)
 
@@ -310,7 +310,7 @@ def test_inverse_dynamics_is_the_inverse_of_accelerations_for_rigid_links(states
     @jax.vmap
     def round_trip(pose, rate, acceleration):
         force = dynamics.inverse_dynamics(plant, pose, rate, acceleration)
-        still = reference.Motion(pose, rate, jnp.zeros((3, R)), jnp.zeros((3, R)))
+        still = reference.RigidState(pose, rate, jnp.zeros((3, R)), jnp.zeros((3, R)))
         return closed_form(plant, still, reference.Loads(force, jnp.zeros((3, R)))).pose
 
     found = round_trip(motion.pose, motion.pose_rate, wanted)

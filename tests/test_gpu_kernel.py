@@ -22,7 +22,7 @@ from studies.engine.kernel_executor import GpuExecutor, KernelExecutor
 from studies.engine.plan import Layout
 from studies.engine.scan import ScanExecutor
 from studies.kernels import cpu, gpu, llvm
-from studies.kernels.traced import Leaf, trace_loop
+from studies.kernels.traced import InputLeaf, trace_loop
 from studies.study.cases import build_cases, build_structure
 from studies.study.spec import paper_study
 from tests.test_kernel import check_equal, every_operation
@@ -131,9 +131,9 @@ def every_loop():
         lambda constants, row, state: [
             every_operation(state[0], constants[0], lambda x: x) + row[0][0] * constants[1]
         ],
-        [Leaf((3, 4), True), np.ones(1)],
-        [Leaf((1,), False)],
-        [Leaf((3, 4), True)],
+        [InputLeaf((3, 4), True), np.ones(1)],
+        [InputLeaf((1,), False)],
+        [InputLeaf((3, 4), True)],
         np.float64,
     )
 

@@ -15,7 +15,7 @@ from studies.engine.program import TRACES
 from studies.engine.scan import ScanExecutor
 from studies.kernels import compilation, cpu, llvm
 from studies.kernels.compilation import ObjectCache
-from studies.kernels.traced import Leaf, trace_loop
+from studies.kernels.traced import InputLeaf, trace_loop
 from studies.space.table import build_table
 from studies.study.cases import build_cases, build_structure
 from studies.study.spec import paper_study
@@ -105,8 +105,8 @@ def test_odd_numbers_of_cases_fill_whole_vectors():
     loop = trace_loop(
         lambda constants, row, state: [state[0] + row[0]],
         [],
-        [Leaf((), False)],
-        [Leaf((), True)],
+        [InputLeaf((), False)],
+        [InputLeaf((), True)],
         np.float32,
     )
     with pytest.raises(ValueError, match="lanes = 24: allowed multiples of 16"):
@@ -132,8 +132,8 @@ def translated(function, shape, dtype=np.float64, lanes=16):
     loop = trace_loop(
         lambda constants, row, state: [function(state[0], constants[0]) + 0 * row[0][0]],
         [c],
-        [Leaf((1,), False)],
-        [Leaf(shape, True)],
+        [InputLeaf((1,), False)],
+        [InputLeaf(shape, True)],
         dtype,
     )
     out = x.copy()

@@ -47,7 +47,7 @@ def machines():
 def states(count):
     """Random states far from rest, and loads."""
     rng = np.random.default_rng(11)
-    motion = reference.Motion(
+    motion = reference.RigidState(
         pose=np.array(HOME) + [0.012, 0.012, 0.06] * rng.uniform(-1, 1, (count, 3)),
         pose_rate=rng.normal(size=(count, 3)) * [0.3, 0.3, 1.0],
         q=3e-3 * rng.uniform(-1, 1, (count, 3, R)) / np.arange(1, R + 1),

@@ -261,7 +261,7 @@ def test_margins_of_position_feedback(changes):
 def test_what_breaks_is_named():
     """The paper's gains on mode 1 alone break the mode that three patches show as mode 1."""
     found = single(STUDY)
-    matrices = closed_loop(*looked_at(STUDY), HOME)
+    matrices = jax.jit(closed_loop, static_argnums=0)(*looked_at(STUDY), HOME)
     poles = np.linalg.eigvals(matrices.open + 1.001 * found.gain_margin * matrices.feedback)
     worst = poles[np.argmax(np.abs(poles))]
     hertz = abs(np.angle(worst)) * STUDY.electronics.sample_rate_hz / (2 * np.pi)

@@ -28,7 +28,7 @@ from studies.spillover import run as spillover_run
 from studies.spillover.comparison import _controlled_links, _View
 from studies.spillover.judgement import damping, follow
 from studies.spillover.laws import all_laws
-from studies.spillover.plants import LoopMaker, Plant, all_plants, widened
+from studies.spillover.plants import LoopMaker, PlantVariant, all_plants, widened
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.margin import HIGHEST
 from studies.study.spec import paper_study
@@ -257,13 +257,13 @@ def test_position_filter_is_its_continuous_formula_at_its_own_frequency():
 def laws():
     """All laws of the default design, by name."""
     found = fixed_controller(STUDY)
-    plant = Plant("pinned_pinned", 8)
+    plant = PlantVariant("pinned_pinned", 8)
     return {law.law.text: law for law in all_laws(found, LoopMaker(found), plant)}
 
 
 def test_laws_are_equally_strong_on_mode_1(laws):
     found = fixed_controller(STUDY)
-    maker, plant = LoopMaker(found), Plant("pinned_pinned", 8)
+    maker, plant = LoopMaker(found), PlantVariant("pinned_pinned", 8)
 
     def strength(name):
         seen, driven = maker.leakage(plant, laws[name].controller)
@@ -421,7 +421,7 @@ def test_damping_is_that_of_links_that_control_the_mode():
     mask = ((True, False, False), (False, True, False), (False, False, False))
     found = fixed_controller(STUDY.change(control__mode_mask=mask))
     np.testing.assert_array_equal(_controlled_links(found.controller), [1, 1, 2])
-    maker, plant = LoopMaker(found), Plant("pinned_pinned", 3)
+    maker, plant = LoopMaker(found), PlantVariant("pinned_pinned", 3)
     law = all_laws(found, maker, plant)[0]
     view = _View(found, law, plant, (3,))
     loop = maker.loop(plant, law.controller)

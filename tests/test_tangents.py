@@ -14,7 +14,7 @@ from studies.engine.plan import Layout
 from studies.kernels.cpu import build_kernel
 from studies.kernels.graph import Graph, objects
 from studies.kernels.tangents import push_forward
-from studies.kernels.traced import Leaf, trace_loop
+from studies.kernels.traced import InputLeaf, trace_loop
 from studies.study.cases import as_arrays, build_cases, build_structure
 from studies.study.spec import paper_study
 from tests.test_kernel import every_operation, translated
@@ -88,8 +88,8 @@ def test_every_operation_is_differentiated():
     loop = trace_loop(
         lambda constants, row, state: [every_operation(state[0], constants[0]) + 0 * row[0][0]],
         [c],
-        [Leaf((1,), False)],
-        [Leaf(shape, True)],
+        [InputLeaf((1,), False)],
+        [InputLeaf(shape, True)],
         np.float64,
         directions,
     )

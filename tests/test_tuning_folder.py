@@ -21,13 +21,13 @@ from studies.study.spec import load_study, paper_study, read_toml
 from studies.sweeps.show import best_cases
 from studies.tuning import audit as audit_module
 from studies.tuning.audit import Disagreement
-from studies.tuning.check import Judged, OwnRun
+from studies.tuning.check import JudgedDesign, OwnRun
 from studies.tuning.evaluate import Evaluation, Evaluator
 from studies.tuning.folder import open_tuning
 from studies.tuning.linear_fidelity import LoopFigures
 from studies.tuning.merit import merit_of
 from studies.tuning.optimise import begin, fits
-from studies.tuning.report import Findings, report
+from studies.tuning.report import TuneFindings, report
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import load_tuning, parse_tuning
 from tests.pages import parsed
@@ -149,7 +149,7 @@ def test_a_report_says_what_its_numbers_are():
 
     def judged(share, margin, settling):
         metrics = {"residual_rms": share * 8e-6, "peak_voltage": 33.0, "settling_time": settling}
-        return Judged(
+        return JudgedDesign(
             np.array([share, share + 0.1]),
             {name: np.array([value, 1.1 * value]) for name, value in metrics.items()},
             np.zeros(2, int),
@@ -160,7 +160,7 @@ def test_a_report_says_what_its_numbers_are():
 
     audited = [Disagreement("control.gain_factor", "tuned", 0, "objective", 1.0, 1.0, 0.0)]
     nothing = np.full(1, np.nan)
-    found = Findings(
+    found = TuneFindings(
         at,
         judged(1.0, 3.0, 0.02995),
         [judged(0.5, 1.3, 0.012)],

@@ -166,4 +166,11 @@ def modal_feedback(
         estimator = design_estimator(
             known.omega, electronics, electronics.lowpass_ratio, electronics.lowpass_zeta
         )
-    return Feedback(known.observer, known.synthesizer, estimator, velocity, position, rival_omega)
+    return Feedback(
+        filter=known.observer,
+        synthesizer=known.synthesizer,
+        estimator=estimator,
+        velocity_gain=velocity,
+        position_gain=position,
+        rival_omega=rival_omega,
+    )

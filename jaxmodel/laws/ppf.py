@@ -56,7 +56,13 @@ def design_position_filter(omega: Array, zeta: Array, electronics: Electronics) 
     corner = jnp.minimum(corner, HIGHEST_SHARE * jnp.pi / period)
     low, a1, a2 = second_order(corner, zeta, period)
     one, zero = jnp.ones_like(corner), jnp.zeros_like(corner)
-    estimator = Estimator((one, zero, zero), (a1, a2), (zero,) * 3, (low, 2 * low, low), zero)
+    estimator = Estimator(
+        first=(one, zero, zero),
+        denominator=(a1, a2),
+        velocity=(zero,) * 3,
+        position=(low, 2 * low, low),
+        direct=zero,
+    )
     z = jnp.exp(-1j * omega * period)  # z^-1 on the unit circle
     response = low * (1 + z) ** 2 / (1 + a1 * z + a2 * z * z)
     whole = measurement_chain(omega, electronics) * response

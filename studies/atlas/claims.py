@@ -46,7 +46,7 @@ def _modes_of(subsets: Subsets, links: int, count: int) -> int:
     return sum(1 << player for player in players)
 
 
-class Steps(NamedTuple):
+class LinkSteps(NamedTuple):
     """One more controlled link: all 12 steps between the 8 choices of links."""
 
     labels: list[str]  # "1 -> 1+3", (12,)
@@ -59,14 +59,14 @@ class Steps(NamedTuple):
         return np.sum(self.change > NO_CHANGE, axis=-1)
 
 
-def one_more_link(subsets: Subsets) -> Steps:
+def one_more_link(subsets: Subsets) -> LinkSteps:
     """Change of every residual when one more link is controlled."""
     left = np.sqrt(np.maximum(1 - subsets.removed()[..., subsets.link_subsets], 0.0))
     steps = [(a, a | 1 << i) for a in range(8) for i in range(3) if not a >> i & 1]
     labels = [f"{link_label(a)} -> {link_label(b)}" for a, b in steps]
     before, after = (left[..., [step[k] for step in steps]] for k in (0, 1))
     on = (np.array(steps)[:, 1:] >> np.arange(3)) & 1
-    return Steps(labels, on.astype(bool), after / before - 1)
+    return LinkSteps(labels, on.astype(bool), after / before - 1)
 
 
 class Halved(NamedTuple):

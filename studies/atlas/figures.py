@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from studies.atlas import plots
 from studies.atlas.attribution import effects, interaction, shapley
 from studies.atlas.drawing import Clip, animate, draw_mode, mode_skeleton, skeleton
-from studies.atlas.findings import Findings
+from studies.atlas.findings import AtlasFindings
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.subsets import TARGETS, link_label, player_labels, setting_label
 from studies.show.figures import SERIES, comparison, legend_above, new_figure
@@ -33,7 +33,7 @@ _ERRORS = ("x [nm]", "y [nm]", "φ [nrad]")
 _COLUMNS = ["link 1", "link 2", "link 3", "platform"]
 
 
-def _subsets(found: Findings) -> Figure:
+def _subsets(found: AtlasFindings) -> Figure:
     subsets = found.subsets
     figure, axes = _panels(found, 2.2)
     rows = [link_label(k) for k in range(1, 8)]
@@ -47,7 +47,7 @@ def _subsets(found: Findings) -> Figure:
     return figure
 
 
-def _link_changes(found: Findings) -> np.ndarray:
+def _link_changes(found: AtlasFindings) -> np.ndarray:
     """Change of the late residual of links 1 to 3 and platform, (settings, 8, 4)."""
     subsets = found.subsets
     chosen = subsets.link_subsets
@@ -57,7 +57,7 @@ def _link_changes(found: Findings) -> np.ndarray:
     return residual / residual[:, :1] - 1
 
 
-def _panels(found: Findings, height: float) -> tuple[Figure, np.ndarray]:
+def _panels(found: AtlasFindings, height: float) -> tuple[Figure, np.ndarray]:
     """Two panels a row, one for each setting."""
     settings = found.subsets.setting
     figure, axes = new_figure(-(-len(settings) // 2), min(len(settings), 2), height, False)
@@ -68,7 +68,7 @@ def _panels(found: Findings, height: float) -> tuple[Figure, np.ndarray]:
     return figure, axes.ravel()[: len(settings)]
 
 
-def _lattice(found: Findings) -> Figure:
+def _lattice(found: AtlasFindings) -> Figure:
     subsets = found.subsets
     figure, axes = _panels(found, 1.9)
     every = np.sqrt(np.mean(subsets.link[:, LATE, subsets.link_subsets] ** 2, axis=-1))
@@ -77,7 +77,7 @@ def _lattice(found: Findings) -> Figure:
     return figure
 
 
-def _helps(found: Findings) -> Figure:
+def _helps(found: AtlasFindings) -> Figure:
     figure, axes = _panels(found, 1.5)
     for ax, change in zip(axes, _link_changes(found), strict=True):
         image = plots.change_map(effects(1 + change), _COLUMNS[:3], _COLUMNS, ax)
@@ -89,7 +89,7 @@ def _helps(found: Findings) -> Figure:
     return figure
 
 
-def _shares(found: Findings) -> Figure:
+def _shares(found: AtlasFindings) -> Figure:
     subsets = found.subsets
     share = shapley(subsets.removed()[:, LATE]).reshape(-1, len(TARGETS), 3, subsets.modes)
     figure, axes = new_figure(len(subsets.setting), len(TARGETS), 1.3, False)
@@ -107,7 +107,7 @@ def _shares(found: Findings) -> Figure:
     return figure
 
 
-def _interactions(found: Findings) -> Figure:
+def _interactions(found: AtlasFindings) -> Figure:
     subsets = found.subsets
     figure, axes = _panels(found, 2.4)
     every = interaction(subsets.removed()[:, LATE, TARGETS.index("all links")])
@@ -123,7 +123,7 @@ def _interactions(found: Findings) -> Figure:
     return figure
 
 
-def _workspace(found: Findings) -> Figure:
+def _workspace(found: AtlasFindings) -> Figure:
     chart = found.map
     figure, axes = new_figure(3, len(chart.phi), 1.8, False)
     rows = (
@@ -155,7 +155,7 @@ def _workspace(found: Findings) -> Figure:
     return figure
 
 
-def _participation(found: Findings) -> Figure:
+def _participation(found: AtlasFindings) -> Figure:
     """Who bends in each of the three first bending modes, over the workspace."""
     chart = found.map
     turn = len(chart.phi) // 2
@@ -179,7 +179,7 @@ def _participation(found: Findings) -> Figure:
     return figure
 
 
-def _modes(found: Findings) -> Figure:
+def _modes(found: AtlasFindings) -> Figure:
     figure, axes = new_figure(3, 3, 2.2, False)
     home, far = found.poses
     first = np.sort(np.argsort(-found.modes.order_share[:, :, 0], axis=1)[:, :3], axis=1)
@@ -206,7 +206,7 @@ def _modes(found: Findings) -> Figure:
     return figure
 
 
-def _platform(found: Findings) -> Figure:
+def _platform(found: AtlasFindings) -> Figure:
     """Drive error above, what the bending of the links adds below."""
     runs = found.platform
     figure, axes = new_figure(4, len(RUNS), 1.7)
@@ -233,7 +233,7 @@ def _platform(found: Findings) -> Figure:
     return figure
 
 
-def _vibration_after(found: Findings) -> Figure:
+def _vibration_after(found: AtlasFindings) -> Figure:
     """Vibration error after the command, for the paper's choices of links."""
     runs = found.platform
     figure, axes = new_figure(3, len(RUNS), 1.9)
@@ -258,7 +258,7 @@ def _vibration_after(found: Findings) -> Figure:
     return figure
 
 
-def _responses(found: Findings) -> Figure:
+def _responses(found: AtlasFindings) -> Figure:
     size = np.abs(found.responses.value)
     figure, axes = new_figure(2, 2, 2.3)
     shown = (
@@ -277,7 +277,7 @@ def _responses(found: Findings) -> Figure:
 
 
 #: What draws each figure, by its name.
-FIGURES: dict[str, Callable[[Findings], Figure]] = {
+FIGURES: dict[str, Callable[[AtlasFindings], Figure]] = {
     "subsets": _subsets,
     "helps": _helps,
     "lattice": _lattice,
@@ -292,7 +292,7 @@ FIGURES: dict[str, Callable[[Findings], Figure]] = {
 }
 
 
-def write_animation(found: Findings, folder: Path) -> None:
+def write_animation(found: AtlasFindings, folder: Path) -> None:
     """The machine after its faster move, without control and with all links controlled."""
     runs, which = found.platform, len(RUNS) - 1
     end = runs.command_end[which]

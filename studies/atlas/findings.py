@@ -22,7 +22,7 @@ FREQUENCY = np.linspace(2.0, 600.0, 300)
 _ROUND = np.linspace(-3.0, 3.0, 13)
 
 
-class Findings(NamedTuple):
+class AtlasFindings(NamedTuple):
     """What the atlas found."""
 
     study: Study
@@ -40,7 +40,7 @@ class Findings(NamedTuple):
         return setting_label(self.subsets.setting[k]) + (" †" if is_small else "")
 
 
-def look_around(study: Study, subsets: Subsets, tell: Tell) -> Findings:
+def look_around(study: Study, subsets: Subsets, tell: Tell) -> AtlasFindings:
     """All of the atlas but the runs of the subsets.
 
     Args:
@@ -60,7 +60,16 @@ def look_around(study: Study, subsets: Subsets, tell: Tell) -> Findings:
     poses = np.stack([np.array(study.motion.waypoints[0]), _far_pose(chart)])
     modes = natural_modes_at(study, poses)
     step = frame_of(*check_run(study)).adc_step
-    return Findings(study, subsets, runs, linear, chart, poses, modes, step)
+    return AtlasFindings(
+        study=study,
+        subsets=subsets,
+        platform=runs,
+        responses=linear,
+        map=chart,
+        poses=poses,
+        modes=modes,
+        adc_step=step,
+    )
 
 
 def _frequencies(study: Study, own: np.ndarray) -> np.ndarray:

@@ -102,13 +102,13 @@ def platform_error(study: Study, tell: Any = None) -> PlatformError:
     since = time - end[:, None, None] - begin[:, None]
     window = (since > -tick) & (since < length[:, None] - tick)
     return PlatformError(
-        time,
-        end,
-        window,
-        drive,
-        joined("pose_error") - drive[:, None],
-        joined("pose"),
-        joined("modal_coordinate"),
+        time=time,
+        command_end=end,
+        window=window,
+        drive=drive,
+        vibration=joined("pose_error") - drive[:, None],
+        pose=joined("pose"),
+        modal=joined("modal_coordinate"),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from studies.atlas.attribution import shapley
 from studies.atlas.claims import NO_CHANGE, one_more_link, table_1_signs, two_links
-from studies.atlas.findings import Findings
+from studies.atlas.findings import AtlasFindings
 from studies.atlas.platform import LINK_LABELS, OUTPUTS
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.plots import length_text
@@ -23,7 +23,7 @@ LATE = WINDOWS.index("late")
 ALL_LINKS, PLATFORM = TARGETS.index("all links"), TARGETS.index("platform")
 
 
-def report(found: Findings, dropped: list[str]) -> str:
+def report(found: AtlasFindings, dropped: list[str]) -> str:
     """Text of the report, in Markdown.
 
     Args:
@@ -63,7 +63,7 @@ def _change(value: float) -> str:
     return f"{text if float(text) else '0.0'} %"
 
 
-def _by_setting(found: Findings, cells: Iterable[Iterable[str]]) -> list[list[str]]:
+def _by_setting(found: AtlasFindings, cells: Iterable[Iterable[str]]) -> list[list[str]]:
     """Row of each setting.
 
     Args:
@@ -73,13 +73,13 @@ def _by_setting(found: Findings, cells: Iterable[Iterable[str]]) -> list[list[st
     return [[found.setting(k), *row] for k, row in enumerate(cells)]
 
 
-def _all_links(found: Findings) -> np.ndarray:
+def _all_links(found: AtlasFindings) -> np.ndarray:
     """Residual of the three links by the choice of controlled ones [m], (settings, windows, 8)."""
     link = found.subsets.link[:, :, found.subsets.link_subsets]
     return np.sqrt(np.mean(link**2, axis=-1))
 
 
-def _most_vibration(found: Findings) -> dict[str, Any]:
+def _most_vibration(found: AtlasFindings) -> dict[str, Any]:
     """The answer in the setting that leaves most vibration, late window."""
     rms = _all_links(found)[:, LATE]
     k = int(np.argmax(rms[:, 0]))
@@ -99,7 +99,7 @@ def _most_vibration(found: Findings) -> dict[str, Any]:
     }
 
 
-def _residuals(found: Findings) -> dict[str, list[list[str]]]:
+def _residuals(found: AtlasFindings) -> dict[str, list[list[str]]]:
     """Rows of each window: residual of the three links by the choice of controlled ones."""
     rms = _all_links(found)
     return {
@@ -108,7 +108,7 @@ def _residuals(found: Findings) -> dict[str, list[list[str]]]:
     }
 
 
-def _shares(found: Findings) -> list[list[str]]:
+def _shares(found: AtlasFindings) -> list[list[str]]:
     """Row of each setting: Shapley shares of links, and of modes beyond the first."""
     game = found.subsets.removed()[:, LATE, ALL_LINKS]
     share = 100 * shapley(game).reshape(len(game), 3, -1)
@@ -119,7 +119,7 @@ def _shares(found: Findings) -> list[list[str]]:
     return _by_setting(found, cells)
 
 
-def _signs(found: Findings) -> dict[str, Any]:
+def _signs(found: AtlasFindings) -> dict[str, Any]:
     """Table 1: changes of the spectral peak [%], and how many of them agree."""
     signs = table_1_signs(found.subsets)
     on, paper, ours = signs.is_controlled, 100 * signs.paper, 100 * signs.ours
@@ -146,7 +146,7 @@ def _signs(found: Findings) -> dict[str, Any]:
     }
 
 
-def _steps(found: Findings) -> dict[str, Any]:
+def _steps(found: AtlasFindings) -> dict[str, Any]:
     """Steps to one more link: how many make it worse, of how many."""
     steps = one_more_link(found.subsets)
 
@@ -171,7 +171,7 @@ def _steps(found: Findings) -> dict[str, Any]:
     }
 
 
-def _at_drive(found: Findings) -> dict[str, float] | None:
+def _at_drive(found: AtlasFindings) -> dict[str, float] | None:
     """What control does to link 1 at the drive's lowest mode, if it can be said."""
     share, frequency = found.modes.share[0, :, 3], found.modes.frequency[0]
     at_drive = frequency[share > 0.5]
@@ -182,7 +182,7 @@ def _at_drive(found: Findings) -> dict[str, float] | None:
     return {"frequency": at_drive[0], "ratio": size[-1] / size[0]}
 
 
-def _pairs(found: Findings) -> dict[str, Any]:
+def _pairs(found: AtlasFindings) -> dict[str, Any]:
     """Two links controlled: change of the platform's error [%], by window."""
     pairs = two_links(found.subsets)
     cells = ((" / ".join(map(_change, window)) for window in one) for one in pairs.change)
@@ -199,7 +199,7 @@ def _pairs(found: Findings) -> dict[str, Any]:
     }
 
 
-def _workspace(found: Findings) -> dict[str, Any]:
+def _workspace(found: AtlasFindings) -> dict[str, Any]:
     """Natural modes over the workspace, at the turn of the path's first pose."""
     chart = found.map
     turn = int(np.argmin(np.abs(chart.phi - found.poses[0, 2])))
@@ -239,7 +239,7 @@ def _border(chart: Map) -> str:
     return "square" if high.all() else "both" if high.any() else "along"
 
 
-def _runs(found: Findings) -> list[dict[str, Any]]:
+def _runs(found: AtlasFindings) -> list[dict[str, Any]]:
     """Rms errors of the platform in each of the runs, due to drive and vibration."""
     runs = found.platform
     drive, vibration = runs.rms(runs.drive), runs.rms(runs.vibration)
@@ -276,7 +276,7 @@ def _part(window: int, drive: np.ndarray, vibration: np.ndarray) -> dict[str, An
     }
 
 
-def _responses(found: Findings) -> list[list[str]]:
+def _responses(found: AtlasFindings) -> list[list[str]]:
     """Largest magnitudes: a row for each pair of force and motion."""
     peak = np.abs(found.responses.value).max(axis=1)
     shown = [("slider 1", 0, i) for i in range(3)] + [("platform y", 4, i) for i in (0, 4)]

@@ -13,7 +13,7 @@ from jaxmodel import status
 from studies import config
 from studies.atlas.attribution import interaction, shapley
 from studies.atlas.figures import FIGURES, write_animation
-from studies.atlas.findings import Findings, look_around
+from studies.atlas.findings import AtlasFindings, look_around
 from studies.atlas.platform import LINK_LABELS
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.report import report
@@ -126,7 +126,7 @@ def sound_settings(subsets: Subsets) -> tuple[Subsets, list[str]]:
     return subsets._replace(setting=kept, **arrays), dropped
 
 
-def variables(found: Findings) -> dict[str, Variable]:
+def variables(found: AtlasFindings) -> dict[str, Variable]:
     """Everything `atlas.h5` holds."""
     return {**_subset_variables(found.subsets), **_map_variables(found), **_run_variables(found)}
 
@@ -188,7 +188,7 @@ def _subset_variables(subsets: Subsets) -> dict[str, Variable]:
     }
 
 
-def _map_variables(found: Findings) -> dict[str, Variable]:
+def _map_variables(found: AtlasFindings) -> dict[str, Variable]:
     chart = found.map
     grid = ("map_phi", "map_y", "map_x")
     pairs = [f"{i + 1}-{k + 1}" for i, k in PAIRS]
@@ -224,7 +224,7 @@ def _map_variables(found: Findings) -> dict[str, Variable]:
     }
 
 
-def _run_variables(found: Findings) -> dict[str, Variable]:
+def _run_variables(found: AtlasFindings) -> dict[str, Variable]:
     runs, answers = found.platform, found.responses
     series = ("run", "run_links", "time", "pose_axis")
     return {

@@ -236,12 +236,12 @@ def read_subsets(data: SweepData) -> Subsets:
         return whole
 
     return Subsets(
-        tuple(settings),
-        modes,
-        placed(data["status"], NOT_RUN),
-        placed(data["residual_rms"]),
-        placed(data["pose_error_rms"]),
-        placed(data["spectral_density"].max(axis=-1)),
-        placed(data["settling_time"]),
-        placed(data["peak_voltage"]),
+        setting=tuple(settings),
+        modes=modes,
+        status=placed(data["status"], NOT_RUN),
+        station=placed(data["residual_rms"]),
+        pose=placed(data["pose_error_rms"]),
+        peak=placed(data["spectral_density"].max(axis=-1)),
+        settling=placed(data["settling_time"]),
+        voltage=placed(data["peak_voltage"]),
     )

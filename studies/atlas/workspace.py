@@ -118,15 +118,15 @@ def map_workspace(study: Study, count: int = GRID, turns: tuple[float, ...] = TU
         return whole.reshape(*grid.shape[:-1], *values.shape[1:])
 
     return Map(
-        x,
-        y,
-        phi,
-        codes.astype(int).reshape(grid.shape[:-1]),
-        placed(gamma[good]),
-        placed(found.frequency),
-        placed(np.take_along_axis(found.frequency, chosen, axis=1)),
-        placed(np.take_along_axis(found.share, chosen[..., None], axis=1)),
-        placed(found.coupling),
+        x=x,
+        y=y,
+        phi=phi,
+        status=codes.astype(int).reshape(grid.shape[:-1]),
+        gamma=placed(gamma[good]),
+        frequency=placed(found.frequency),
+        bending=placed(np.take_along_axis(found.frequency, chosen, axis=1)),
+        share=placed(np.take_along_axis(found.share, chosen[..., None], axis=1)),
+        coupling=placed(found.coupling),
     )
 
 
@@ -213,11 +213,11 @@ def _modes(mass: np.ndarray, stiffness: np.ndarray, own: np.ndarray) -> PoseMode
     link = strain.sum(axis=3)
     peak = np.take_along_axis(shape, np.abs(shape).argmax(axis=1)[:, None], axis=1)
     return PoseModes(
-        np.sqrt(np.maximum(square, 0.0)) / (2 * np.pi),
-        shape / peak,
-        np.concatenate([link, 1 - link.sum(axis=2, keepdims=True)], axis=2),
-        strain.sum(axis=2),
-        _coupling(mass, own.shape[1]),
+        frequency=np.sqrt(np.maximum(square, 0.0)) / (2 * np.pi),
+        shape=shape / peak,
+        share=np.concatenate([link, 1 - link.sum(axis=2, keepdims=True)], axis=2),
+        order_share=strain.sum(axis=2),
+        coupling=_coupling(mass, own.shape[1]),
     )
 
 

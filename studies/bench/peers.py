@@ -63,7 +63,7 @@ class Work(NamedTuple):
         return as_arrays(jax.tree.unflatten(jax.tree.structure(self.cases), [x[:n] for x in wide]))
 
 
-class Row(NamedTuple):
+class PeerRow(NamedTuple):
     """What was measured of a peer."""
 
     peer: str
@@ -101,7 +101,7 @@ def make_work(is_short: bool = False) -> Work:
 
 def bench_peers(
     report: Callable[[str], None], is_short: bool = False, repeats: int = REPEATS
-) -> list[Row]:
+) -> list[PeerRow]:
     """Speed and error of every peer that can run here, fastest first.
 
     Args:
@@ -113,14 +113,14 @@ def bench_peers(
     work = make_work(is_short)
     finer = work.structure._replace(substeps=FINER)
     exact = ScanExecutor(finer, work.layout, False).start(work.cases).wait().metrics.residual_rms
-    rows: list[Row] = []
+    rows: list[PeerRow] = []
     for peer in find_peers(work, report):
         report(f"{peer.name}: {peer.n_cases} cases")
         found, timing = timed(peer.finish, repeats)
         right = exact[: peer.n_cases]
         error = float(np.max(np.abs(found - right)) / np.max(right))
         speed = peer.n_cases / timing.seconds
-        rows.append(Row(peer.name, speed, error, 1.0))
+        rows.append(PeerRow(peer.name, speed, error, 1.0))
     rows.sort(key=lambda row: -row.configs_per_s)
     best = rows[0].configs_per_s
     return [row._replace(times_slower=best / row.configs_per_s) for row in rows]
@@ -170,7 +170,14 @@ def _slopes(structure: Structure, start: Start, time: Any, state: PlantState) ->
     found = plant_rates(structure, start.loop, state, wanted, jnp.zeros((3, 3))).acceleration
     plant = start.loop.plant
     own = (plant.stiffness * state.q + plant.damping * state.q_rate) / plant.modal_mass[:, None]
-    return PlantState(state.pose_rate, found.pose, state.q_rate, found.coupling - own, None, None)
+    return PlantState(
+        pose=state.pose_rate,
+        pose_rate=found.pose,
+        q=state.q_rate,
+        q_rate=found.coupling - own,
+        z=None,
+        z_rate=None,
+    )
 
 
 def _rms(start: Start, q: Any) -> Any:
@@ -249,7 +256,7 @@ def by_lagrangian(work: Work, n: int) -> Callable[[], Any]:
         loop = start.loop
         mass, drive = loop.plant.modal_mass[:, None], loop.drive
 
-        def slope(at: reference.Motion, wanted: tuple[Any, ...]) -> reference.Motion:
+        def slope(at: reference.RigidState, wanted: tuple[Any, ...]) -> reference.RigidState:
             rho, rho_rate = wanted
             place = partial(reference.close, machine, basis)
             (now, _), (rate, _) = jax.jvp(place, (at.pose, at.q), (at.pose_rate, at.q_rate))
@@ -259,14 +266,14 @@ def by_lagrangian(work: Work, n: int) -> Callable[[], Any]:
             modal = mass * jnp.einsum("irk,ik->ir", loop.actuator, voltage)
             loads = reference.Loads(force, modal)
             pose, q = reference.by_lagrangian(machine, basis, at, loads)
-            return reference.Motion(at.pose_rate, pose, at.q_rate, q)
+            return reference.RigidState(at.pose_rate, pose, at.q_rate, q)
 
-        def body(at: reference.Motion, wanted: tuple[Any, ...]) -> tuple[Any, ...]:
+        def body(at: reference.RigidState, wanted: tuple[Any, ...]) -> tuple[Any, ...]:
             points = [(wanted[0][k], wanted[1][k]) for k in range(3)]
             return reference.rk4_step(slope, at, PERIOD, points), at.q
 
         plant = start.state.plant
-        first = reference.Motion(plant.pose, plant.pose_rate, plant.q, plant.q_rate)
+        first = reference.RigidState(plant.pose, plant.pose_rate, plant.q, plant.q_rate)
         kept: Any = jax.lax.scan(body, first, (start.inputs.rho, start.inputs.rho_rate))[1]
         return _rms(start, kept)
 

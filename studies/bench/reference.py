@@ -17,7 +17,7 @@ from jaxmodel.beam import ModalBasis
 from jaxmodel.parameters import Geometry, Machine
 
 
-class Motion(NamedTuple):
+class RigidState(NamedTuple):
     """State of the reduced machine: what is free after the closure (6)."""
 
     pose: jax.Array  # (3,)
@@ -154,7 +154,7 @@ def inertia(energy: Any, z: Any, z_rate: Any) -> Any:
     return mass, change - jax.grad(energy)(z, z_rate)
 
 
-def by_lagrangian(machine: Machine, basis: ModalBasis, motion: Motion, loads: Loads) -> Any:
+def by_lagrangian(machine: Machine, basis: ModalBasis, motion: RigidState, loads: Loads) -> Any:
     """Accelerations (X'' (3,), q'' (3, R)) from the Lagrangian in (X, q)."""
     shape = motion.q.shape
 
@@ -178,7 +178,7 @@ def by_lagrangian(machine: Machine, basis: ModalBasis, motion: Motion, loads: Lo
     return split(jnp.linalg.solve(mass, load - inertial))
 
 
-def by_multipliers(machine: Machine, basis: ModalBasis, motion: Motion, loads: Loads) -> Any:
+def by_multipliers(machine: Machine, basis: ModalBasis, motion: RigidState, loads: Loads) -> Any:
     """(X'', q'', rho'', gamma'') from (5): coordinates (rho, gamma, X, q), constraints (6)."""
     shape = motion.q.shape
 

@@ -17,13 +17,13 @@ from jaxmodel.case import Structure
 from studies import config
 from studies.cluster.connect import wait_for_workers
 from studies.cluster.watch import Watch
-from studies.cluster.worker import Answer, Job, chunk_size, identity, run_chunk
+from studies.cluster.worker import ChunkDone, ChunkJob, chunk_size, identity, run_chunk
 from studies.engine.chunks import Done, Lost, has_own_ratio
 from studies.engine.plan import Chunk, Group, Layout
 from studies.engine.progress import Reporter
 from studies.errors import StudyError
 from studies.space.spec import SweepSpec
-from studies.space.table import Table
+from studies.space.table import CaseTable
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -71,7 +71,7 @@ class ClusterRunner:
         return Layout(1, 1, size)
 
     def run(
-        self, table: Table, groups: list[Group], reporter: Reporter, stop: threading.Event
+        self, table: CaseTable, groups: list[Group], reporter: Reporter, stop: threading.Event
     ) -> Generator[Done | Lost]:
         watch = Watch(self._client, self._timeout, reporter.say)
         reporter.say(f"workers: {watch.n_workers}; each compiles before its first chunk")
@@ -103,7 +103,7 @@ class ClusterRunner:
                     flight = flying.pop(future)
                     structure = flight.group.structure
                     answer = watch.outcome(future)
-                    if isinstance(answer, Answer):
+                    if isinstance(answer, ChunkDone):
                         if answer.compile_time and structure not in compiled:
                             compiled.add(structure)
                             reporter.compiled(answer.executor, answer.compile_time)
@@ -118,13 +118,13 @@ class ClusterRunner:
 
     def _submit(self, flight: Flight) -> Future[Any]:
         group = flight.group
-        job = Job(
-            self._identity,
-            self._precision,
-            self._spec,
-            group.structure,
-            flight.has_own_ratio,
-            group.layout.size,
-            flight.chunk.rows,
+        job = ChunkJob(
+            identity=self._identity,
+            precision=self._precision,
+            spec=self._spec,
+            structure=group.structure,
+            has_own_ratio=flight.has_own_ratio,
+            size=group.layout.size,
+            rows=flight.chunk.rows,
         )
         return self._client.submit(run_chunk, job, pure=False)

@@ -18,20 +18,20 @@ from distributed import Worker, get_worker
 
 from jaxmodel.case import Structure
 from studies import config, sources
-from studies.engine.chunks import Judged, start_chunk
+from studies.engine.chunks import JudgedChunk, start_chunk
 from studies.engine.executor import make_executor
 from studies.engine.plan import chunk_cases, even_layout, local_layout
 from studies.engine.program import Executor
 from studies.errors import StudyError
 from studies.extensions import extend_as_told
 from studies.space.spec import parse_sweep
-from studies.space.table import Table, build_table
+from studies.space.table import CaseTable, build_table
 
 #: One chunk at a time: it takes all that the worker has.
 alone = RLock()
 
 
-class Job(NamedTuple):
+class ChunkJob(NamedTuple):
     """A chunk, by what decides its numbers."""
 
     identity: dict[str, str]  # of the client, see `identity`
@@ -43,10 +43,10 @@ class Job(NamedTuple):
     rows: np.ndarray  # of the sweep's table, (k,)
 
 
-class Answer(NamedTuple):
+class ChunkDone(NamedTuple):
     """What a worker has made of a job."""
 
-    judged: Judged  # padded, NumPy arrays
+    judged: JudgedChunk  # padded, NumPy arrays
     executor: str
     compile_time: float  # [s], 0 where the program was there already
     worker: str  # address
@@ -93,7 +93,7 @@ def chunk_size(n: int, structure: Structure, precision: str) -> int:
         return local_layout(n, structure).size
 
 
-def run_chunk(job: Job) -> Answer:
+def run_chunk(job: ChunkJob) -> ChunkDone:
     """Run a chunk.
 
     Raises:
@@ -110,11 +110,11 @@ def run_chunk(job: Job) -> Answer:
         cases = chunk_cases(table, job.rows, job.structure, size)
         judged = start_chunk(executor, table, job.rows, cases, job.has_own_ratio).wait()
         compile_time = executor.compile_time if is_first else 0.0
-        return Answer(judged, executor.name, compile_time, worker.address)
+        return ChunkDone(judged, executor.name, compile_time, worker.address)
 
 
 @lru_cache(maxsize=1)
-def _table(spec: str) -> Table:
+def _table(spec: str) -> CaseTable:
     return build_table(parse_sweep(json.loads(spec)))
 
 

@@ -18,7 +18,7 @@ from studies.engine.program import Executor
 from studies.engine.progress import Reporter
 from studies.engine.runs import with_ratio
 from studies.kernels.compilation import compiler_time
-from studies.space.table import Table
+from studies.space.table import CaseTable
 from studies.study.cases import powered
 
 
@@ -27,10 +27,10 @@ class Done(NamedTuple):
 
     chunk: Chunk
     substeps: int  # plant steps per sample of its program
-    judged: Judged  # padded
+    judged: JudgedChunk  # padded
 
 
-class Judged(NamedTuple):
+class JudgedChunk(NamedTuple):
     """Runs of a chunk, and its loops judged."""
 
     result: Result
@@ -40,7 +40,7 @@ class Judged(NamedTuple):
 class Started(NamedTuple):
     """A chunk on its way; as `Running`, with the judgement of its loops."""
 
-    wait: Callable[[], Judged]
+    wait: Callable[[], JudgedChunk]
     cancel: Callable[[], None]
 
 
@@ -59,7 +59,7 @@ class Runner(Protocol):
         ...
 
     def run(
-        self, table: Table, groups: list[Group], reporter: Reporter, stop: threading.Event
+        self, table: CaseTable, groups: list[Group], reporter: Reporter, stop: threading.Event
     ) -> Generator[Done | Lost]:
         """Run all chunks; closed early, it leaves none behind.
 
@@ -79,7 +79,7 @@ class Here:
         return local_layout(n, structure)
 
     def run(
-        self, table: Table, groups: list[Group], reporter: Reporter, stop: threading.Event
+        self, table: CaseTable, groups: list[Group], reporter: Reporter, stop: threading.Event
     ) -> Generator[Done | Lost]:
         for group in groups:
             has_own = has_own_ratio(table, group)
@@ -110,13 +110,13 @@ def _waited(group: Group, chunk: Chunk, running: Started) -> Done:
     return Done(chunk, group.structure.substeps, running.wait())
 
 
-def has_own_ratio(table: Table, group: Group) -> bool:
+def has_own_ratio(table: CaseTable, group: Group) -> bool:
     """Whether EMC ratios come from an uncontrolled pass for some cases of a group."""
     return bool((table.values("control.ratio_source")[group.rows] == "own_run").any())
 
 
 def start_chunk(
-    executor: Executor, table: Table, rows: np.ndarray, cases: Case, has_own_ratio: bool
+    executor: Executor, table: CaseTable, rows: np.ndarray, cases: Case, has_own_ratio: bool
 ) -> Started:
     """Judge the loops of a chunk and start its runs.
 
@@ -143,4 +143,4 @@ def start_chunk(
     running = executor.start(cases)
     if is_first:
         executor.compile_time += spent
-    return Started(lambda: Judged(running.wait(), margins), running.cancel)
+    return Started(lambda: JudgedChunk(running.wait(), margins), running.cancel)

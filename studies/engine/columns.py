@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxmodel.metrics import METRICS
 from jaxmodel.prepare import SPECTRUM_SPAN
-from studies.space.table import Table, as_numbers
+from studies.space.table import CaseTable, as_numbers
 from studies.store import Variable
 from studies.study.labels import DISTANCE_TEXT, STATUS_LABEL
 from studies.study.margin import HIGHEST, MARGIN_MODES
@@ -88,7 +88,7 @@ def variable_name(field: str) -> str:
     return re.sub(r"\W+", "_", field).strip("_")
 
 
-def case_variables(table: Table) -> dict[str, Variable]:
+def case_variables(table: CaseTable) -> dict[str, Variable]:
     """What tells the cases apart: number, id, seed, repeat and every column."""
     axis = ("case",)
     variables = {
@@ -108,7 +108,7 @@ def case_variables(table: Table) -> dict[str, Variable]:
     return variables
 
 
-def axis_variables(table: Table, sizes: Mapping[str, int]) -> dict[str, Variable]:
+def axis_variables(table: CaseTable, sizes: Mapping[str, int]) -> dict[str, Variable]:
     """Coordinates of the metrics' axes."""
     found = {"link": Variable(np.arange(1, 4), ("link",), "1", "link number")}
     if "pose_axis" in sizes:

@@ -63,13 +63,13 @@ def fixed_controller(study: Study) -> FixedController:
         )
     _check_finite(controller, taps)
     return FixedController(
-        study,
-        structure,
-        case,
-        controller,
-        fold(controller, LAWS[study.control.law].channel),
-        _merged(taps),
-        _frequencies(structure, case),
+        study=study,
+        structure=structure,
+        case=case,
+        controller=controller,
+        channels=fold(controller, LAWS[study.control.law].channel),
+        taps=_merged(taps),
+        frequency=_frequencies(structure, case),
     )
 
 

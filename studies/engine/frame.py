@@ -17,7 +17,7 @@ from jaxmodel.prepare import prepare
 EARLY_PART = 1 / 3
 
 
-class Frame(NamedTuple):
+class SharedFrame(NamedTuple):
     """What all cases share."""
 
     modal_omega: np.ndarray  # frequencies of the controller's modes [rad/s], (3, C)
@@ -26,7 +26,7 @@ class Frame(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=0)
-def _prepare_frame(structure: Structure, case: Case) -> Frame:
+def _prepare_frame(structure: Structure, case: Case) -> SharedFrame:
     loop = prepare(structure, case).loop
     machine, n = case.machine, structure.n_controlled
     shape = build_basis(
@@ -34,9 +34,9 @@ def _prepare_frame(structure: Structure, case: Case) -> Frame:
     ).deflection_at
     one_step = loop.controller.adc_step / loop.controller.adc_gain
     largest = jnp.max(jnp.abs(loop.sensor[:, :, 0]), axis=1)
-    return Frame(loop.modal_omega, shape, one_step / largest)
+    return SharedFrame(loop.modal_omega, shape, one_step / largest)
 
 
-def frame_of(structure: Structure, case: Case) -> Frame:
+def frame_of(structure: Structure, case: Case) -> SharedFrame:
     """Modes of the controller and its ADC step, which all cases of one machine share."""
     return jax.tree.map(np.asarray, _prepare_frame(structure, case))

@@ -48,7 +48,7 @@ DIRECTIONS = 3
 REVERSE_FROM = {"traced kernel": 48, "XLA scan": 3}
 
 
-class Slopes(NamedTuple):
+class ChunkSlopes(NamedTuple):
     """A chunk and how it changes; NumPy arrays."""
 
     result: Result  # cases first
@@ -63,7 +63,7 @@ class Gradients(Protocol):
 
     def evaluate(
         self, cases: Case, parameters: np.ndarray, is_used: np.ndarray | None = None
-    ) -> Slopes:
+    ) -> ChunkSlopes:
         """Run a chunk.
 
         Args:
@@ -116,9 +116,15 @@ class KernelGradients:
 
     def evaluate(
         self, cases: Case, parameters: np.ndarray, is_used: np.ndarray | None = None
-    ) -> Slopes:
+    ) -> ChunkSlopes:
         split = _split(cases, parameters, self.layout, self.structure)
-        program = Program(self.structure, self.layout, split.tree, split.is_varying, self.place)
+        program = Program(
+            structure=self.structure,
+            layout=self.layout,
+            tree=split.tree,
+            is_varying=split.is_varying,
+            place=self.place,
+        )
         blocks = lane_blocks(split, self.layout)
         if self._steps is None:
             started = time.perf_counter()
@@ -131,7 +137,7 @@ class KernelGradients:
         used = np.ones_like(parameters, bool) if is_used is None else is_used
         done = list(self._pool.map(one, blocks, np.split(used, len(blocks))))
         whole = jax.tree.map(lambda *x: np.concatenate(x, axis=-1), *done)
-        return Slopes(*jax.tree.map(np.asarray, conclude_slopes(*whole)))
+        return ChunkSlopes(*jax.tree.map(np.asarray, conclude_slopes(*whole)))
 
 
 def _slopes(
@@ -251,15 +257,21 @@ class ScanGradients:
 
     def evaluate(
         self, cases: Case, parameters: np.ndarray, is_used: np.ndarray | None = None
-    ) -> Slopes:
+    ) -> ChunkSlopes:
         split = _split(cases, parameters, self.layout, self.structure)
         *own, parameters = split.varying
         if self._compiled is None:
-            program = Program(self.structure, self.layout, split.tree, split.is_varying, self.place)
+            program = Program(
+                structure=self.structure,
+                layout=self.layout,
+                tree=split.tree,
+                is_varying=split.is_varying,
+                place=self.place,
+            )
             started = time.perf_counter()
             self._compiled = _forward.lower(program, own, parameters, split.shared).compile()
             self.compile_time = time.perf_counter() - started
-        return Slopes(*jax.tree.map(np.asarray, self._compiled(own, parameters, split.shared)))
+        return ChunkSlopes(*jax.tree.map(np.asarray, self._compiled(own, parameters, split.shared)))
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))

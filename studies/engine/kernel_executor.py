@@ -15,10 +15,10 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.simulate import Result, Start
 from studies.engine.plan import Layout
 from studies.engine.program import (
-    Parts,
     Program,
     Running,
     Split,
+    StartParts,
     begin_block,
     conclude_all,
     lane_blocks,
@@ -150,7 +150,7 @@ class GpuExecutor:
         return ""
 
 
-class Block(NamedTuple):
+class CaseBlock(NamedTuple):
     """A block of cases after its last sample, and what a few of them began with."""
 
     result: Result
@@ -159,8 +159,8 @@ class Block(NamedTuple):
 
 
 def _run_block(
-    program: Program, parts: Parts, kernel: Any, own: list[Any], common: list[Any]
-) -> Block:
+    program: Program, parts: StartParts, kernel: Any, own: list[Any], common: list[Any]
+) -> CaseBlock:
     start = begin_block(program, parts, own, common)
     leaves = [
         *read_leaves(start, parts),
@@ -170,14 +170,14 @@ def _run_block(
     last = kernel(leaves)
     state = jax.tree.unflatten(jax.tree.structure(start.state), last)
     few = cpu.VECTOR_BYTES // last[0].dtype.itemsize
-    return Block(
+    return CaseBlock(
         conclude_all(start.outline, start.state.status, state),
         [x[..., :few] for x in leaves],
         [x[..., :few] for x in last],
     )
 
 
-def _difference(traced: Traced, block: Block, n_steps: int) -> float:
+def _difference(traced: Traced, block: CaseBlock, n_steps: int) -> float:
     """Largest difference of a block's first cases to the CPU, as a share of the largest value."""
     given = [np.array(x, order="C") for x in block.given]
     cpu.build_kernel(traced.loop).run(given, n_steps, block.last[0].shape[-1])

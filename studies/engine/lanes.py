@@ -14,7 +14,7 @@ from studies.config import processor
 from studies.engine.plan import lane_unit
 from studies.kernels import cpu
 from studies.kernels.llvm import is_available
-from studies.kernels.traced import Leaf, TracedLoop, trace_loop
+from studies.kernels.traced import InputLeaf, TracedLoop, trace_loop
 
 #: Lanes that XLA compiles for.
 BLOCK = 64
@@ -94,9 +94,9 @@ def _runner(
         def make() -> TracedLoop:
             return trace_loop(
                 flat,
-                [Leaf(shape, True) for shape in constants],
-                [Leaf((), is_wide) for is_wide in varies],
-                [Leaf(shape, True) for shape in state],
+                [InputLeaf(shape, True) for shape in constants],
+                [InputLeaf((), is_wide) for is_wide in varies],
+                [InputLeaf(shape, True) for shape in state],
                 real,
             )
 

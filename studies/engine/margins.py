@@ -19,7 +19,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.imsc import IMSC
 from jaxmodel.loci import (
-    Known,
+    FoundMeeting,
     Loci,
     Meeting,
     Station,
@@ -407,14 +407,28 @@ def _spread(response: LoopResponse, size: float) -> np.ndarray:
     return np.broadcast_to(size * (1 + np.arange(n).reshape(*shape[:2], 1)) / n, shape)
 
 
-def _known(count: int, found: Meeting | None) -> Known:
+def _known(count: int, found: Meeting | None) -> FoundMeeting:
     if found is None:
         zero = np.zeros(count)
-        return Known(zero, zero, zero, Pair(zero, zero), Pair(zero, zero))
-    return Known(np.ones(count), found.omega, found.value, found.by_omega, found.by_value)
+        return FoundMeeting(
+            is_there=zero,
+            omega=zero,
+            value=zero,
+            by_omega=Pair(zero, zero),
+            by_value=Pair(zero, zero),
+        )
+    return FoundMeeting(
+        is_there=np.ones(count),
+        omega=found.omega,
+        value=found.value,
+        by_omega=found.by_omega,
+        by_value=found.by_value,
+    )
 
 
-def _meet(response: LoopResponse, start: Crossings, known: Known) -> tuple[Meeting, np.ndarray]:
+def _meet(
+    response: LoopResponse, start: Crossings, known: FoundMeeting
+) -> tuple[Meeting, np.ndarray]:
     """Newton's iteration from each crossing; where it ended, and whether it came to rest."""
     here = jax.tree.map(lambda x: x[..., start.case], response)
     known = jax.tree.map(lambda x: x[start.case], known)
@@ -450,12 +464,12 @@ def _walk(constants: tuple[LoopResponse, Any], station: Station, loci: Loci) -> 
     return walk(response, spread, loci, station)
 
 
-def _approached(response: LoopResponse, known: Known, guess: Meeting) -> Meeting:
+def _approached(response: LoopResponse, known: FoundMeeting, guess: Meeting) -> Meeting:
     return run_steps(_approach, (response, known), (), guess, NEWTON)
 
 
 def _approach(
-    constants: tuple[LoopResponse, Known], _: tuple[Any, ...], meeting: Meeting
+    constants: tuple[LoopResponse, FoundMeeting], _: tuple[Any, ...], meeting: Meeting
 ) -> Meeting:
     response, known = constants
     return approach(response, known, meeting)

@@ -18,7 +18,7 @@ from studies.engine.runs import SUBSTEP_LIMIT, mechanics_at, step_counts
 from studies.errors import StudyError
 from studies.kernels.cpu import VECTOR_BYTES
 from studies.kernels.gpu import BLOCK
-from studies.space.table import Table, loose_study
+from studies.space.table import CaseTable, loose_study
 from studies.study.cases import build_cases, build_structure, in_working_precision
 from studies.study.fields import Fields
 
@@ -94,7 +94,7 @@ class Group(NamedTuple):
 
 
 def plan_groups(
-    table: Table,
+    table: CaseTable,
     rows: np.ndarray,
     lay_out: Callable[[int, Structure], Layout],
     metrics: tuple[str, ...] = (),
@@ -140,7 +140,7 @@ def plan_groups(
     return groups
 
 
-def _accumulated(table: Table, kept: tuple[str, ...]) -> tuple[str, ...]:
+def _accumulated(table: CaseTable, kept: tuple[str, ...]) -> tuple[str, ...]:
     """Metrics that the runs must accumulate for those that are kept; () for all."""
     if not kept:
         return ()
@@ -148,7 +148,7 @@ def _accumulated(table: Table, kept: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(sorted({*kept} | ({"energy_ratio"} if has_own else set())))
 
 
-def _structure(table: Table, members: np.ndarray) -> Structure:
+def _structure(table: CaseTable, members: np.ndarray) -> Structure:
     """Sizes of the largest case, choices of all of them."""
 
     def column(name: str) -> np.ndarray:
@@ -170,7 +170,7 @@ def _structure(table: Table, members: np.ndarray) -> Structure:
     )
 
 
-def chunk_cases(table: Table, rows: np.ndarray, structure: Structure, size: int) -> Case:
+def chunk_cases(table: CaseTable, rows: np.ndarray, structure: Structure, size: int) -> Case:
     """Arrays of a chunk, filled up to `size` with its last case; leading axis `size` or 1.
 
     Args:
@@ -199,7 +199,7 @@ def _mechanics(structure: Structure, cases: Case) -> Any:
 
 
 def _plant_steps(
-    table: Table, structure: Structure, members: np.ndarray
+    table: CaseTable, structure: Structure, members: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Plant steps per sample of each case, and which cases no allowed number carries."""
     rate = _drive_rates(table, structure, members)
@@ -217,7 +217,7 @@ def _plant_steps(
 _DRIVE = ("drive.", "machine.slider_mass")
 
 
-def _drive_rates(table: Table, structure: Structure, members: np.ndarray) -> np.ndarray:
+def _drive_rates(table: CaseTable, structure: Structure, members: np.ndarray) -> np.ndarray:
     columns = {n: c[members] for n, c in table.fields.items() if n.startswith(_DRIVE)}
     case = build_cases(table.study, columns, structure)
     is_many = [len(leaf) > 1 for leaf in jax.tree.leaves(case)]
@@ -229,7 +229,7 @@ def _drive_rates(table: Table, structure: Structure, members: np.ndarray) -> np.
     return np.asarray(jax.vmap(drive_rate, (axes,))(shared))
 
 
-def _pole_decay(table: Table, structure: Structure, members: np.ndarray) -> np.ndarray:
+def _pole_decay(table: CaseTable, structure: Structure, members: np.ndarray) -> np.ndarray:
     """Fastest decay |Re lambda| of each case at its way-points [1/s], (m,)."""
     fastest = np.zeros(len(members))
     for start in range(0, len(members), POLE_BATCH):

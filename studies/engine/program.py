@@ -115,7 +115,7 @@ class Program(NamedTuple):
     place: Place | None = None  # the parameters are then the last leaf that varies
 
 
-class Parts(NamedTuple):
+class StartParts(NamedTuple):
     """A Start leaf by leaf: which leaves vary from case to case, and their shapes."""
 
     tree: Any
@@ -136,14 +136,14 @@ def begin_case(program: Program, own: list[Any], common: list[Any]) -> Start:
 
 
 def chosen(
-    program: Program, parts: Parts, wanted: bool, own: list[Any], common: list[Any]
+    program: Program, parts: StartParts, wanted: bool, own: list[Any], common: list[Any]
 ) -> list[Any]:
     """Those leaves of a case's start that vary, or that do not."""
     leaves = jax.tree.leaves(begin_case(program, own, common))
     return [x for x, varies in zip(leaves, parts.is_varying, strict=True) if varies == wanted]
 
 
-def begin_block(program: Program, parts: Parts, own: list[Any], common: list[Any]) -> Start:
+def begin_block(program: Program, parts: StartParts, own: list[Any], common: list[Any]) -> Start:
     """The start of a block of cases, lanes last, as part of a compiled program.
 
     Args:
@@ -170,21 +170,23 @@ def begin_block(program: Program, parts: Parts, own: list[Any], common: list[Any
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def prepare(program: Program, parts: Parts, own: list[Any], common: list[Any]) -> list[Any]:
+def prepare(program: Program, parts: StartParts, own: list[Any], common: list[Any]) -> list[Any]:
     """The leaves that vary, lanes last."""
     return jax.vmap(partial(chosen, program, parts, True), (0, None), -1)(own, common)
 
 
 # run once, so it is compiled in haste: a quarter off two to four seconds
 @partial(jax.jit, static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0})
-def prepare_shared(program: Program, parts: Parts, own: list[Any], common: list[Any]) -> list[Any]:
+def prepare_shared(
+    program: Program, parts: StartParts, own: list[Any], common: list[Any]
+) -> list[Any]:
     """The others, of any one case."""
     return chosen(program, parts, False, own, common)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def prepare_tangents(
-    program: Program, parts: Parts, own: list[Any], common: list[Any], directions: Array
+    program: Program, parts: StartParts, own: list[Any], common: list[Any], directions: Array
 ) -> list[Any]:
     """Tangents of the leaves that move along directions (n, p) of parameters, (n, ..., lanes)."""
 
@@ -201,7 +203,7 @@ def prepare_tangents(
     return jax.vmap(one, (0, None), -1)(own, common)
 
 
-def find_parts(program: Program, own: list[Any], common: list[Any]) -> Parts:
+def find_parts(program: Program, own: list[Any], common: list[Any]) -> StartParts:
     """Trace a case's start.
 
     Args:
@@ -212,7 +214,7 @@ def find_parts(program: Program, own: list[Any], common: list[Any]) -> Parts:
     given = traced.jaxpr.invars[: len(own)]
     sizes = tuple(out.aval.shape for out in traced.jaxpr.outvars)
     moving = given[-1:] if program.place else []
-    return Parts(
+    return StartParts(
         jax.tree.structure(shapes),
         _dependence(traced.jaxpr, given),
         sizes,

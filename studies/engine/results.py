@@ -31,7 +31,7 @@ from studies.engine.stored import axis_sizes, gather
 from studies.errors import StudyError, nearest
 from studies.space.axes import LABELS, SHOWN_AS
 from studies.space.spec import SweepSpec, parse_sweep
-from studies.space.table import Table, build_table
+from studies.space.table import CaseTable, build_table
 from studies.store import Variable, read_store, variable_labels
 from studies.study.fields import Fields
 from studies.study.paths import NAMED_INDEX, known_field, parse_entry
@@ -49,7 +49,7 @@ class SweepData:
         return self.variables[name].data
 
     @cached_property
-    def table(self) -> Table:
+    def table(self) -> CaseTable:
         """Its cases, spread once."""
         return build_table(self.spec)
 

@@ -85,9 +85,25 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
             loop = loop_report(structure, case, _home(study), min(3, structure.n_modes))
             motion = motion_report(structure, case)
         except np.linalg.LinAlgError:  # an entry that is not finite
-            return Run(study, structure, case, result, None, None, code or status.NON_FINITE)
+            return Run(
+                study=study,
+                structure=structure,
+                case=case,
+                result=result,
+                loop=None,
+                motion=None,
+                status=code or status.NON_FINITE,
+            )
         code = judged_status(code, loop)
-    return Run(study, structure, case, result, loop, motion, code)
+    return Run(
+        study=study,
+        structure=structure,
+        case=case,
+        result=result,
+        loop=loop,
+        motion=motion,
+        status=code,
+    )
 
 
 def _own_ratio(study: Study, structure: Structure, case: Case, has_record: bool) -> np.ndarray:
@@ -122,7 +138,15 @@ def uncontrolled_twin(run: Run) -> Run | None:
         return None
     case = uncontrolled(run.case)
     result = jax.tree.map(np.asarray, _simulate(run.structure, case, True))
-    return Run(run.study, run.structure, case, result, None, None, int(result.status))
+    return Run(
+        study=run.study,
+        structure=run.structure,
+        case=case,
+        result=result,
+        loop=None,
+        motion=None,
+        status=int(result.status),
+    )
 
 
 def with_ratio(case: Case, ratio: Any) -> Case:

@@ -16,9 +16,9 @@ from jaxmodel.simulate import Result
 from studies.engine.plan import Layout
 from studies.engine.program import (
     TRACES,
-    Parts,
     Program,
     Running,
+    StartParts,
     begin_block,
     conclude_all,
     find_parts,
@@ -27,7 +27,7 @@ from studies.engine.program import (
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _run(program: Program, parts: Parts, varying: list[Any], shared: list[Any]) -> Result:
+def _run(program: Program, parts: StartParts, varying: list[Any], shared: list[Any]) -> Result:
     """Results of a chunk; what its cases share is computed once for all."""
     layout = program.layout
     TRACES.append(program.structure)

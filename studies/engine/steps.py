@@ -16,16 +16,16 @@ from jaxmodel.loop import State, step
 from jaxmodel.simulate import Outline, Start
 from studies.engine.program import (
     TRACES,
-    Parts,
     Program,
     Split,
+    StartParts,
     find_parts,
     joined,
     prepare,
     prepare_shared,
 )
 from studies.kernels import cpu, llvm
-from studies.kernels.traced import Leaf, TracedLoop, trace_loop
+from studies.kernels.traced import InputLeaf, TracedLoop, trace_loop
 
 #: More plant steps in a sample than this would make the kernel's code too long.
 KERNEL_SUBSTEPS = 4
@@ -39,7 +39,7 @@ def fits_kernel(structure: Structure) -> bool:
 class Traced(NamedTuple):
     """The loop of a group of cases, for the numbers that all of them share."""
 
-    parts: Parts
+    parts: StartParts
     shared: list[np.ndarray]  # leaves of a Start that do not vary
     loop: TracedLoop
 
@@ -47,7 +47,7 @@ class Traced(NamedTuple):
 class Steps(NamedTuple):
     """The same, compiled for this processor."""
 
-    parts: Parts
+    parts: StartParts
     shared: list[np.ndarray]
     run: cpu.Kernel
     directions: int  # tangents that it carries along
@@ -99,11 +99,11 @@ def _real() -> Any:
 
 
 def _trace(
-    structure: Structure, parts: Parts, shared: list[np.ndarray], directions: int
+    structure: Structure, parts: StartParts, shared: list[np.ndarray], directions: int
 ) -> TracedLoop:
     """The loop of a structure, with what is shared written into it."""
     kinds = zip(parts.shapes, parts.is_varying, parts.is_moving, strict=True)
-    leaves = [Leaf(*kind) for kind in kinds]
+    leaves = [InputLeaf(*kind) for kind in kinds]
     start: Start = jax.tree.unflatten(parts.tree, range(len(leaves)))
     trees = [jax.tree.structure(part) for part in start[:3]]
     known = iter(shared)
@@ -164,7 +164,7 @@ def start_block(
     )
 
 
-def read_leaves(start: Start, parts: Parts) -> list[Any]:
+def read_leaves(start: Start, parts: StartParts) -> list[Any]:
     """Leaves of the loop's constants that are not written into the code."""
     varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
     loop = zip(jax.tree.leaves(start.loop), jax.tree.leaves(varies.loop), strict=True)

@@ -26,11 +26,11 @@ from studies.engine.columns import (
 from studies.engine.folder import JOINED, Finished
 from studies.errors import field_error, nearest
 from studies.space.spec import SweepSpec
-from studies.space.table import Table
+from studies.space.table import CaseTable
 from studies.store import Streamed, Variable, write_store
 
 if TYPE_CHECKING:
-    from studies.engine.chunks import Judged
+    from studies.engine.chunks import JudgedChunk
 
 
 def kept_metrics(spec: SweepSpec) -> list[str]:
@@ -58,9 +58,9 @@ def kept_metrics(spec: SweepSpec) -> list[str]:
 
 
 def chunk_variables(
-    table: Table,
+    table: CaseTable,
     rows: np.ndarray,
-    judged: Judged,
+    judged: JudgedChunk,
     is_too_stiff: np.ndarray,
     substeps: int,
     kept: list[str],
@@ -115,7 +115,7 @@ def axis_sizes(variables: Mapping[str, Variable]) -> dict[str, int]:
     }
 
 
-def gather(table: Table, finished: Finished) -> dict[str, Variable]:
+def gather(table: CaseTable, finished: Finished) -> dict[str, Variable]:
     """Status and metrics of all cases of a table, from the files that hold them.
 
     Args:
@@ -160,7 +160,7 @@ def manifest_attributes(manifest: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def merge(folder: Path, table: Table, finished: Finished, attributes: dict[str, Any]) -> None:
+def merge(folder: Path, table: CaseTable, finished: Finished, attributes: dict[str, Any]) -> None:
     """Join all finished cases in one file, file by file, so that memory stays small.
 
     Args:
@@ -198,7 +198,7 @@ def merge(folder: Path, table: Table, finished: Finished, attributes: dict[str, 
     write_store(folder / JOINED, variables, attributes)
 
 
-def _positions(table: Table, finished: Finished) -> tuple[np.ndarray, np.ndarray]:
+def _positions(table: CaseTable, finished: Finished) -> tuple[np.ndarray, np.ndarray]:
     """Number of each finished case in the table, and whether it is one of its cases."""
     order = np.argsort(table.case_id)
     at = np.searchsorted(table.case_id[order], finished.case_id)

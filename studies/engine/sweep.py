@@ -28,13 +28,13 @@ from studies.engine.progress import Reporter
 from studies.engine.stored import chunk_variables, kept_metrics, manifest_attributes, merge
 from studies.errors import StudyError
 from studies.space.spec import SweepSpec
-from studies.space.table import Table, build_table
+from studies.space.table import CaseTable, build_table
 
 
 class Outcome(NamedTuple):
     """How a sweep ended."""
 
-    table: Table
+    table: CaseTable
     n_done: int  # cases with results, those of earlier runs included
     n_run: int  # in this run
     compile_time: float  # [s]
@@ -47,7 +47,7 @@ class Outcome(NamedTuple):
 class Plan(NamedTuple):
     """What a sweep would do."""
 
-    table: Table
+    table: CaseTable
     groups: list[Group]
     n_before: int  # cases that are done already
 
@@ -121,18 +121,18 @@ def run_sweep(
                 merge(out, table, finished, attributes | timings)
                 folder.publish()
         return Outcome(
-            table,
-            reporter.done,
-            reporter.n_run,
-            reporter.compile_time,
-            reporter.run_time,
-            is_interrupted,
-            reporter.executor,
-            lost,
+            table=table,
+            n_done=reporter.done,
+            n_run=reporter.n_run,
+            compile_time=reporter.compile_time,
+            run_time=reporter.run_time,
+            is_interrupted=is_interrupted,
+            executor=reporter.executor,
+            lost=lost,
         )
 
 
-def _headline(table: Table, groups: list[Group], n_before: int) -> str:
+def _headline(table: CaseTable, groups: list[Group], n_before: int) -> str:
     text = f"{len(table)} cases"
     if table.n_dropped:
         text += f" ({table.n_dropped} left out by where)"
@@ -144,7 +144,7 @@ def _headline(table: Table, groups: list[Group], n_before: int) -> str:
     return f"{text}; chunks: {chunks}, programs to compile: {len(groups)}"
 
 
-def _rows_left(table: Table, done: np.ndarray, out: Path) -> np.ndarray:
+def _rows_left(table: CaseTable, done: np.ndarray, out: Path) -> np.ndarray:
     """Cases still to run. A resumed sweep may have more than the one that is there, but none less.
 
     Raises:
@@ -161,7 +161,7 @@ def _rows_left(table: Table, done: np.ndarray, out: Path) -> np.ndarray:
     return np.flatnonzero(~np.isin(table.case_id, done))
 
 
-def _check_whole(table: Table, done: np.ndarray, out: Path) -> None:
+def _check_whole(table: CaseTable, done: np.ndarray, out: Path) -> None:
     """Somebody may have removed chunks while the sweep ran."""
     lost = int(np.sum(~np.isin(table.case_id, done)))
     if lost:
@@ -173,7 +173,7 @@ def _check_whole(table: Table, done: np.ndarray, out: Path) -> None:
 
 def _run_chunks(
     done: Iterator[Done | Lost],
-    table: Table,
+    table: CaseTable,
     kept: list[str],
     folder: SweepFolder,
     reporter: Reporter,

@@ -8,7 +8,7 @@ import numpy as np
 
 from studies.engine.controller import FixedController
 from studies.export.c_text import Source, source
-from studies.export.fixed import WORD, FixedPoint, Format, Row, shaper_row
+from studies.export.fixed import WORD, FixedPoint, Format, IntegerRow, shaper_row
 
 
 def fixed_source(
@@ -55,7 +55,7 @@ def fixed_source(
     )
 
 
-def _rows(table: Row | None, length: int) -> np.ndarray | None:
+def _rows(table: IntegerRow | None, length: int) -> np.ndarray | None:
     """Integers of a table that not every controller has, in rows of this length."""
     return None if table is None else table.integers.reshape(-1, length)
 

@@ -131,7 +131,15 @@ def compiled(
                 f"C compiler {shlex.join(compiler)}: its code does not run here ({error}); "
                 f"{_WANTED}"
             ) from None
-        yield Code(loaded, name, real, reference, n_channels, length, room)
+        yield Code(
+            library=loaded,
+            name=name,
+            real=real,
+            reference=reference,
+            n_channels=n_channels,
+            shaper_length=length,
+            state=room,
+        )
 
 
 def _run(command: list[str]) -> None:

@@ -51,4 +51,4 @@ def cost_of(found: FixedController, fixed: FixedPoint) -> Cost:
     parts = (products, roundings, n_channels, 1)
     cycles = sum(count * each for count, each in zip(parts, CYCLES, strict=True))
     load = cycles * found.study.electronics.sample_rate_hz / CLOCK
-    return Cost(products, roundings, cycles, load, words)
+    return Cost(products=products, roundings=roundings, cycles=cycles, load=load, words=words)

@@ -26,11 +26,11 @@ FORMAT = "flexlink-controller"
 ROUNDING, CANCELLED = 1e-9, 1e-12
 
 
-class Part(BaseModel):
+class DocumentPart(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
-class Quantity(Part):
+class Quantity(DocumentPart):
     """Numbers with what they are; `value` is nested as `axes` says, none for a single number."""
 
     value: float | list[float] | list[list[float]] | list[list[list[float]]]
@@ -39,7 +39,7 @@ class Quantity(Part):
     meaning: str = Field(description="in words", min_length=1)
 
 
-class Masks(Part):
+class Masks(DocumentPart):
     """What is controlled."""
 
     links: list[bool] = Field(min_length=3, max_length=3)
@@ -48,7 +48,7 @@ class Masks(Part):
     )
 
 
-class Document(Part):
+class Document(DocumentPart):
     """A controller: what happens once per sample, in the order of `steps`."""
 
     format: Literal["flexlink-controller"]
@@ -224,11 +224,11 @@ def controller_of(document: Document) -> tuple[Controller, Taps]:
         tuple(np.moveaxis(number[f"{name}_numerator"], 2, 0)) for name in ("velocity", "position")
     )
     estimator = Estimator(
-        (number["high_pass_b0"], number["high_pass_b1"], number["high_pass_a1"]),
-        (number["low_pass_a1"], number["low_pass_a2"]),
-        velocity,
-        position,
-        number["position_direct"],
+        first=(number["high_pass_b0"], number["high_pass_b1"], number["high_pass_a1"]),
+        denominator=(number["low_pass_a1"], number["low_pass_a2"]),
+        velocity=velocity,
+        position=position,
+        direct=number["position_direct"],
     )
     controller = Controller(
         filter=number["modal_filter"],

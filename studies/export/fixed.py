@@ -58,7 +58,7 @@ class Format(NamedTuple):
         return np.where(self.seen > 0, largest / np.where(self.seen > 0, self.seen, 1.0), np.inf)
 
 
-class Row(NamedTuple):
+class IntegerRow(NamedTuple):
     """Coefficients of sums of products: integers / 2^shift."""
 
     integers: np.ndarray  # (..., n)
@@ -83,15 +83,15 @@ class FixedPoint(NamedTuple):
     high: Format
     inner: Format
     force: Format  # N or V
-    filter: Row  # (M, K)
-    high_pass: Row  # b0, (M, 1)
-    memory: Row  # b1, -a1, (M, 2)
-    low_pass: Row  # scale, -a1, -a2, (M, 3)
-    numerator: Row  # three taps and the direct share, (M, 4)
-    synthesizer: Row  # channels that are not of the link are 0, (3, K, M)
-    feedthrough: Row | None  # sensor counts per DAC code, (3, K, K)
+    filter: IntegerRow  # (M, K)
+    high_pass: IntegerRow  # b0, (M, 1)
+    memory: IntegerRow  # b1, -a1, (M, 2)
+    low_pass: IntegerRow  # scale, -a1, -a2, (M, 3)
+    numerator: IntegerRow  # three taps and the direct share, (M, 4)
+    synthesizer: IntegerRow  # channels that are not of the link are 0, (3, K, M)
+    feedthrough: IntegerRow | None  # sensor counts per DAC code, (3, K, K)
     is_rival: np.ndarray  # channels that act one at a time, (M,)
-    energy: Row | None  # roots of the modal energies of rivals, in one unit, (M, 2, 4)
+    energy: IntegerRow | None  # roots of the modal energies of rivals, in one unit, (M, 2, 4)
     error: ErrorBound
 
 
@@ -232,7 +232,7 @@ def check_words(found: FixedController) -> None:
 
 def _energy(
     channels: Channels, bound: np.ndarray, inner: Format, signal: Format, memory: int
-) -> Row | None:
+) -> IntegerRow | None:
     """Roots of the energies of rivals: squares of two of them add up within 63 bits.
 
     Args:
@@ -304,7 +304,7 @@ def _format(seen: np.ndarray, bound: np.ndarray) -> Format:
     return Format(base, _bits(np.maximum(bound, MARGIN * peak) / base), peak, bound)
 
 
-def _row(factors: np.ndarray, name: str) -> Row:
+def _row(factors: np.ndarray, name: str) -> IntegerRow:
     """Integers and shifts of rows of factors, (..., n)."""
     total = np.abs(factors).sum(axis=-1)
     safe = np.where(total > 0, total, 1.0)
@@ -315,7 +315,7 @@ def _row(factors: np.ndarray, name: str) -> Row:
             f"below {2.0 ** (WORD - 2):.3g}; lower control.gain_factor, or take --target c"
         )
     shift = np.minimum(shift, 62).astype(int)
-    return Row(np.round(factors * 2.0 ** shift[..., None]).astype(np.int64), shift)
+    return IntegerRow(np.round(factors * 2.0 ** shift[..., None]).astype(np.int64), shift)
 
 
 def rounded(fixed: FixedPoint, like: Channels) -> Channels:
@@ -410,7 +410,7 @@ def _check_error(found: FixedController, error: ErrorBound, dac_step: float) -> 
     )
 
 
-def shaper_row(taps: Taps) -> Row:
+def shaper_row(taps: Taps) -> IntegerRow:
     """Weights of the shaper in fixed point; they add up to exactly 1 (or to what they add up to).
 
     Raises:
@@ -421,4 +421,4 @@ def shaper_row(taps: Taps) -> Row:
     left = round(float(np.sum(taps.weight)) * 2**shift) - int(integers.sum())
     largest = np.argmax(np.abs(integers))
     integers[largest] += left  # a pose at rest stays where it is
-    return Row(integers[None], row.shift)
+    return IntegerRow(integers[None], row.shift)

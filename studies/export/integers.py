@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from studies.engine.channels import acting
-from studies.export.fixed import FixedPoint, Row
+from studies.export.fixed import FixedPoint, IntegerRow
 
 #: Axes of one sequence's numbers.
 SENSORS, CHANNELS = (-2, -1), (-1,)
@@ -77,7 +77,7 @@ def _limited(x: np.ndarray, cut: list[np.ndarray], axes: tuple[int, ...] = CHANN
     return inside
 
 
-def _products(row: Row, x: np.ndarray) -> np.ndarray:
+def _products(row: IntegerRow, x: np.ndarray) -> np.ndarray:
     """Rounded sums of products along the last axis."""
     return shifted(np.sum(row.integers * x, axis=-1), row.shift)
 

@@ -70,14 +70,14 @@ def export_design(
 
     found = fixed_controller(design.study)
     job = Job(
-        found,
-        name,
-        _origin(found, design.case_id),
-        design.case_id,
-        compiler,
-        is_verified,
-        dac_bits or DAC_BITS,
-        console,
+        found=found,
+        name=name,
+        origin=_origin(found, design.case_id),
+        case_id=design.case_id,
+        compiler=compiler,
+        is_verified=is_verified,
+        dac_bits=dac_bits or DAC_BITS,
+        console=console,
     )
     made = TARGETS[target].make(job)
     for file in made.files:

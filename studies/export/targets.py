@@ -69,7 +69,9 @@ def _as_fixed(job: Job) -> Made:
     verified = None
     if job.is_verified:
         verified = verify_fixed(found, fixed, reference, source, job.name, job.compiler)
-    return Made(_files(source, job.name), loop, verified, fixed, cost)
+    return Made(
+        files=_files(source, job.name), loop=loop, verified=verified, fixed=fixed, cost=cost
+    )
 
 
 def _files(source: Source, name: str) -> dict[str, str]:

@@ -21,7 +21,7 @@ import numpy as np
 from studies import sources
 from studies.kernels.compilation import ObjectCache, compiling
 from studies.kernels.graph import is_known
-from studies.kernels.llvm import Frame, Writer, binding, ir
+from studies.kernels.llvm import Arguments, Writer, binding, ir
 from studies.kernels.traced import Change, TracedLoop
 
 #: Bytes of the vectors: what one register of the widest common instruction set holds.
@@ -120,7 +120,7 @@ class _VectorWriter(Writer):
         super().__init__(loop, VECTOR_BYTES // loop.dtype.itemsize)
         self.numbers: list[float] = [0.0]  # known ones, in the order of their use
 
-    def open(self) -> Frame:
+    def open(self) -> Arguments:
         pointer = ir.PointerType()
         signature = ir.FunctionType(ir.VoidType(), [pointer, self.index, self.index, self.index])
         function = ir.Function(self.module, signature, "run")
@@ -133,7 +133,7 @@ class _VectorWriter(Writer):
         for kind, part in self.loop.leaves.items():
             bases[kind] = [self._base(leaves, k + n) for n in range(len(part))]
             k += len(part)
-        return Frame({**bases, "result": bases["state"]}, n_steps, lanes, first)
+        return Arguments({**bases, "result": bases["state"]}, n_steps, lanes, first)
 
     def close(self) -> None:
         if self._rounding is not None:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from studies.kernels.compilation import compiling
-from studies.kernels.llvm import Frame, Writer, binding, ir
+from studies.kernels.llvm import Arguments, Writer, binding, ir
 from studies.kernels.traced import TracedLoop
 
 #: Cases of one block of threads: two warps, so that registers are shared out in fine portions.
@@ -98,7 +98,7 @@ class ThreadWriter(Writer):
         super().__init__(loop, 1)
         self._n_steps, self._lanes = n_steps, lanes
 
-    def open(self) -> Frame:
+    def open(self) -> Arguments:
         kinds = {**self.loop.leaves, "result": self.loop.leaves["state"]}
         count = sum(map(len, kinds.values()))
         signature = ir.FunctionType(ir.VoidType(), [self.index, *[ir.PointerType()] * count])
@@ -110,7 +110,7 @@ class ThreadWriter(Writer):
         rest = iter(pointers)
         bases = {kind: [next(rest) for _ in leaves] for kind, leaves in kinds.items()}
         n_steps, lanes = (ir.Constant(self.index, x) for x in (self._n_steps, self._lanes))
-        return Frame(bases, n_steps, lanes, first)
+        return Arguments(bases, n_steps, lanes, first)
 
 
 def _add_entry(module: Any) -> None:

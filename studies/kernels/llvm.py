@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from studies.kernels.graph import Node, is_known
-from studies.kernels.traced import Change, Leaf, TracedLoop
+from studies.kernels.traced import Change, InputLeaf, TracedLoop
 
 try:
     from llvmlite import binding as binding
@@ -24,7 +24,7 @@ def is_available() -> bool:
     return binding is not None
 
 
-class Frame(NamedTuple):
+class Arguments(NamedTuple):
     """What the function is given; LLVM values."""
 
     bases: dict[str, list[Any]]  # address of every leaf, by kind; "result": of the last state
@@ -55,7 +55,7 @@ class Writer:
         self.builder: Any = None
         self.values: dict[int, Any] = {}  # LLVM value of a node, by identity
 
-    def open(self) -> Frame:
+    def open(self) -> Arguments:
         """Begin the function, with `self.builder` in its first block."""
         raise NotImplementedError
 
@@ -135,10 +135,10 @@ class Writer:
             value = self.builder.select(self._widened(change.mask), value, self._kept(slot))
         self._keep(value, slot)
 
-    def _places(self, kind: str, base: str, frame: Frame, sample: Any = None) -> list[Any]:
+    def _places(self, kind: str, base: str, frame: Arguments, sample: Any = None) -> list[Any]:
         """Address of every number, of this sample's row where there is one."""
         found = []
-        leaves: list[Leaf] = self.loop.leaves[kind]
+        leaves: list[InputLeaf] = self.loop.leaves[kind]
         for leaf, start_of_leaf in zip(leaves, frame.bases[base], strict=True):
             stride = frame.lanes if leaf.is_varying else ir.Constant(self.index, 1)
             start = frame.first if leaf.is_varying else ir.Constant(self.index, 0)

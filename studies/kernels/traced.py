@@ -17,7 +17,7 @@ from studies.kernels.graph import Graph, Node, is_known, objects
 from studies.kernels.tangents import push_forward
 
 
-class Leaf(NamedTuple):
+class InputLeaf(NamedTuple):
     """One input array of the step that is read from memory."""
 
     shape: tuple[int, ...]  # of one case (and of one sample)
@@ -41,7 +41,9 @@ class Change(NamedTuple):
 class TracedLoop(NamedTuple):
     """A loop over samples that is still to be written as code."""
 
-    leaves: dict[str, list[Leaf]]  # "constant", "input", "state": arrays in the order they are read
+    leaves: dict[
+        str, list[InputLeaf]
+    ]  # "constant", "input", "state": arrays in the order they are read
     changes: list[Change]  # the numbers of the state that change
     order: list[Node]  # what they need, each after its arguments; a read's place: (kind, number)
     dtype: np.dtype  # of all arrays
@@ -63,9 +65,9 @@ class TracedLoop(NamedTuple):
 
 def trace_loop(
     step: Callable[..., Any],
-    constants: Sequence[Leaf | np.ndarray],
-    inputs: Sequence[Leaf],
-    state: Sequence[Leaf],
+    constants: Sequence[InputLeaf | np.ndarray],
+    inputs: Sequence[InputLeaf],
+    state: Sequence[InputLeaf],
     dtype: Any,
     directions: int = 0,
 ) -> TracedLoop:
@@ -87,7 +89,7 @@ def trace_loop(
         NotImplementedError: an operation of the step that a graph does not know.
     """
     real, graph = np.dtype(dtype), Graph()
-    read = [leaf for leaf in constants if isinstance(leaf, Leaf)]
+    read = [leaf for leaf in constants if isinstance(leaf, InputLeaf)]
     state = [leaf._replace(is_moving=directions > 0) for leaf in state]
     stored = {
         kind: [*leaves, *(_tangent(leaf, directions) for leaf in leaves if leaf.is_moving)]
@@ -99,8 +101,8 @@ def trace_loop(
     ]
     rest = [iter(part) for part in places]
 
-    def array(kind: int, leaf: Leaf | np.ndarray) -> np.ndarray:
-        if not isinstance(leaf, Leaf):
+    def array(kind: int, leaf: InputLeaf | np.ndarray) -> np.ndarray:
+        if not isinstance(leaf, InputLeaf):
             return objects(leaf.ravel().tolist(), leaf.shape)
         return objects([next(rest[kind]) for _ in range(leaf.size)], leaf.shape)
 
@@ -118,9 +120,9 @@ def trace_loop(
     return TracedLoop(stored, changes, order, real)
 
 
-def _tangent(leaf: Leaf, directions: int) -> Leaf:
+def _tangent(leaf: InputLeaf, directions: int) -> InputLeaf:
     """Where the tangents of a leaf are read from."""
-    return Leaf((directions, *leaf.shape), True)
+    return InputLeaf((directions, *leaf.shape), True)
 
 
 def _tangents(
@@ -153,7 +155,7 @@ def _tangents(
     return found
 
 
-def _elements(leaves: Sequence[Leaf]) -> list[Leaf]:
+def _elements(leaves: Sequence[InputLeaf]) -> list[InputLeaf]:
     """Its leaf for every number."""
     return [leaf for leaf in leaves for _ in range(leaf.size)]
 

@@ -19,7 +19,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.loop import Record
 from jaxmodel.simulate import Result
 from studies.engine.batches import BATCH, Tell, run_batches
-from studies.engine.frame import Frame, frame_of
+from studies.engine.frame import SharedFrame, frame_of
 from studies.engine.runs import check_run, judged_status, run_study
 from studies.engine.stability import LoopReport, loop_report
 from studies.study.spec import Flags, Study
@@ -98,7 +98,7 @@ class PaperRuns(NamedTuple):
     """Everything the paper's study computed; leading axis of arrays: cases."""
 
     study: Study
-    frame: Frame
+    frame: SharedFrame
     cases: list[PaperCase]
     result: Result
     status: np.ndarray  # codes; UNSTABLE where the linearised sampled loop is, (n,)
@@ -226,7 +226,16 @@ def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:
     for k, case in enumerate(ordered):
         if case.name in loops:
             codes[k] = judged_status(int(codes[k]), loops[case.name])
-    return PaperRuns(base, frame, ordered, result, codes, gains, loops, rows)
+    return PaperRuns(
+        study=base,
+        frame=frame,
+        cases=ordered,
+        result=result,
+        status=codes,
+        ratio=gains,
+        loops=loops,
+        energy_ratio=rows,
+    )
 
 
 def _run_ideal(base: Study, case: PaperCase, tell: Tell) -> Result:

@@ -57,14 +57,14 @@ def measure(runs: PaperRuns) -> Measures:
     counterpart = _counterparts(runs)
     limit = SETTLED * runs.result.metrics.residual_peak.max(axis=-1)[counterpart]
     return Measures(
-        frequency,
-        density,
-        _peaks(runs, frequency, density),
-        start,
-        _rms(deflection, is_late),
-        _rms(record.pose_error, is_late),
-        _settling(time, end, np.abs(record.chord_deflection_stations).max(axis=-1), limit),
-        counterpart,
+        frequency=frequency,
+        spectral_density=density,
+        spectral_peak=_peaks(runs, frequency, density),
+        late_start=start,
+        late_deflection=_rms(deflection, is_late),
+        late_pose_error=_rms(record.pose_error, is_late),
+        settling=_settling(time, end, np.abs(record.chord_deflection_stations).max(axis=-1), limit),
+        counterpart=counterpart,
     )
 
 

@@ -9,13 +9,13 @@ import numpy as np
 from studies.errors import StudyError
 from studies.space.axes import LIMIT, READY_MADE, Axis, build_axis, column_of
 from studies.space.methods import METHODS, Asked
-from studies.space.spec import Node
+from studies.space.spec import BlockNode
 from studies.study.fields import Columns
 from studies.study.paths import checked_value, known_field
 from studies.study.spec import Study
 
 
-def spread(node: Node, study: Study, seed: int) -> Columns:
+def spread(node: BlockNode, study: Study, seed: int) -> Columns:
     """Columns of a block: what varies, one row per case; {} for a block without axes.
 
     Args:
@@ -39,7 +39,7 @@ def spread(node: Node, study: Study, seed: int) -> Columns:
     return _product(parts, node.path)
 
 
-def _axes(node: Node, study: Study) -> dict[str, Axis]:
+def _axes(node: BlockNode, study: Study) -> dict[str, Axis]:
     path = f"{node.path}.axes"
     return {
         f"{path}.{name}": build_axis(name, written, study, path)
@@ -98,7 +98,7 @@ def _product(parts: list[Columns], path: str) -> Columns:
     return result
 
 
-def _listed(node: Node, study: Study) -> Columns:
+def _listed(node: BlockNode, study: Study) -> Columns:
     """Spelt-out cases; what a case does not name has the base study's value."""
     path = f"{node.path}.cases"
     for k, case in enumerate(node.block.cases):
@@ -118,7 +118,7 @@ def _listed(node: Node, study: Study) -> Columns:
     return columns
 
 
-def _sampled(node: Node, study: Study, seed: int) -> Columns:
+def _sampled(node: BlockNode, study: Study, seed: int) -> Columns:
     axes = _axes(node, study)
     dimensions = sum(axis.dimensions for axis in axes.values())
     points = unit_points(node, dimensions, seed)
@@ -134,7 +134,7 @@ def _sampled(node: Node, study: Study, seed: int) -> Columns:
     return columns
 
 
-def unit_points(node: Node, dimensions: int, seed: int) -> np.ndarray:
+def unit_points(node: BlockNode, dimensions: int, seed: int) -> np.ndarray:
     """Points of the unit cube for a sampling method, (n, dimensions).
 
     Raises:

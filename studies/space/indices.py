@@ -67,11 +67,11 @@ def elementary_effects(points: np.ndarray, value: np.ndarray) -> Effects:
             "axes, or ask for more trajectories"
         )
     return Effects(
-        np.array([np.abs(group).mean() for group in groups]),
-        np.array([group.mean() for group in groups]),
-        np.array([group.std(ddof=1) for group in groups]),
-        count,
-        int((~is_there).sum()),
+        mean_size=np.array([np.abs(group).mean() for group in groups]),
+        mean=np.array([group.mean() for group in groups]),
+        deviation=np.array([group.std(ddof=1) for group in groups]),
+        n_used=count,
+        n_left_out=int((~is_there).sum()),
     )
 
 
@@ -107,12 +107,12 @@ def sobol_indices(value: np.ndarray, dimensions: int, seed: int = 0) -> Indices:
     low, high = np.nanpercentile(resampled, (tail, 100 - tail), axis=0)
     first, total = _indices(used)
     return Indices(
-        first,
-        np.stack([low[0], high[0]], axis=1),
-        total,
-        np.stack([low[1], high[1]], axis=1),
-        len(used),
-        len(rows) - len(used),
+        first=first,
+        first_interval=np.stack([low[0], high[0]], axis=1),
+        total=total,
+        total_interval=np.stack([low[1], high[1]], axis=1),
+        n_used=len(used),
+        n_left_out=len(rows) - len(used),
     )
 
 

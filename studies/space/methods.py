@@ -145,7 +145,11 @@ def _sobol(points: np.ndarray, value: np.ndarray, names: list[str]) -> Analysis:
     is_unsettled = bool(np.any(found.first > found.total_interval[:, 1]))
     heads = ("factor", "first", "95 %", "total", "95 %")
     return Analysis(
-        heads, tuple(rows), found.n_left_out, "base points", notes if is_unsettled else ()
+        heads=heads,
+        rows=tuple(rows),
+        n_left_out=found.n_left_out,
+        what="base points",
+        notes=notes if is_unsettled else (),
     )
 
 

@@ -50,11 +50,11 @@ class Sweep(Block):
     by: str = described("residual_rms", "-", "metric, or entry of one, that cases are ranked by")
 
 
-class Node(NamedTuple):
+class BlockNode(NamedTuple):
     """A validated block with its validated blocks; `path` names it in messages."""
 
     block: Block
-    children: tuple[Node, ...]
+    children: tuple[BlockNode, ...]
     path: str
 
 
@@ -63,7 +63,7 @@ class SweepSpec(NamedTuple):
 
     study: Study  # values of all fields that do not vary
     sweep: Sweep
-    root: Node  # the tree of blocks; its block is `sweep`
+    root: BlockNode  # the tree of blocks; its block is `sweep`
     data: dict[str, Any]  # as read, for the record
 
 
@@ -140,14 +140,14 @@ def _tuples(data: Any) -> Any:
 DEEPEST = 20
 
 
-def _node(block: Block, path: str, depth: int = 0) -> Node:
+def _node(block: Block, path: str, depth: int = 0) -> BlockNode:
     children = []
     if depth > DEEPEST:
         raise StudyError(f"sweep.blocks: nested {depth} deep; allowed up to {DEEPEST}")
     for k, data in enumerate(block.blocks):
         inner = f"{path}.blocks.{k}"
         children.append(_node(_parse_block(Block, data, inner), inner, depth + 1))
-    return Node(block, tuple(children), path)
+    return BlockNode(block, tuple(children), path)
 
 
 def _check_block(block: Block, path: str) -> None:

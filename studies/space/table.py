@@ -32,7 +32,7 @@ from studies.study.spec import Study, parse_study
 
 
 @dataclass(frozen=True)
-class Table:
+class CaseTable:
     """All cases; a column whose name has no dot is a label that stands for other columns."""
 
     study: Study  # values of all fields without a column
@@ -60,7 +60,7 @@ class Table:
         """Values of a field, an entry or a label for every case, (n,); errors as `values`."""
         return np.broadcast_to(values(self.study, self.columns, name), (len(self),))
 
-    def rows(self, chosen: np.ndarray) -> Table:
+    def rows(self, chosen: np.ndarray) -> CaseTable:
         """Some of the cases."""
         return replace(
             self,
@@ -71,7 +71,7 @@ class Table:
         )
 
 
-def build_table(spec: SweepSpec) -> Table:
+def build_table(spec: SweepSpec) -> CaseTable:
     """Spread a sweep into its cases.
 
     Raises:
@@ -103,7 +103,7 @@ def build_table(spec: SweepSpec) -> Table:
     single = np.sort(first)
     origin = np.searchsorted(single, first[which])
     seeds = _seeds(spec.study, columns, ids)
-    table = Table(spec.study, columns, repeat, ids, seeds, n - len(kept), origin)
+    table = CaseTable(spec.study, columns, repeat, ids, seeds, n - len(kept), origin)
     return table if len(single) == len(ids) else table.rows(single)
 
 
@@ -174,7 +174,7 @@ def _check_moves(study: Study, columns: Columns) -> None:
         )
 
 
-def case_study(table: Table, index: int) -> Study:
+def case_study(table: CaseTable, index: int) -> Study:
     """The study of one case, as a file of its own would say it.
 
     Raises:
@@ -188,7 +188,7 @@ def case_study(table: Table, index: int) -> Study:
     return parse_study(data)
 
 
-def loose_study(table: Table, index: int) -> Study:
+def loose_study(table: CaseTable, index: int) -> Study:
     """The study of one case, whether or not its fields fit together."""
     study = table.study
     for name, column in table.fields.items():

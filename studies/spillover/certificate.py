@@ -17,7 +17,7 @@ from studies.spillover.plants import (
     DEPARTURES,
     Departure,
     LoopMaker,
-    Plant,
+    PlantVariant,
     all_plants,
     plant_sizes,
     widened,
@@ -121,8 +121,8 @@ def certify(
 
 
 def _judged(
-    found: FixedController, maker: LoopMaker, plants: list[Plant]
-) -> dict[Plant, Judgement]:
+    found: FixedController, maker: LoopMaker, plants: list[PlantVariant]
+) -> dict[PlantVariant, Judgement]:
     """Judgement of every plant that stands by itself."""
     parts = [
         (modes, widened(part, found.n_patches)) for modes, part in linear_parts(found.controller)
@@ -145,7 +145,7 @@ def _collected(
     maker: LoopMaker,
     plants: np.ndarray,
     faults: np.ndarray,
-    judgements: dict[Plant, Judgement],
+    judgements: dict[PlantVariant, Judgement],
 ) -> Certificate:
     shape, largest = plants.shape, max(plant.n_modes for plant in plants.ravel())
     exists = faults == ""
@@ -169,19 +169,19 @@ def _collected(
         observation[at] = leakage.observation[:, :channels]
         actuation[at] = leakage.actuation[:, :, :channels]
     return Certificate(
-        found.study,
-        margin,
-        found.structure.n_controlled,
-        plants,
-        exists,
-        radius,
-        limit,
-        frequency,
-        zeta,
-        free,
-        weakest.astype(str),
-        breaking.astype(str),
-        observation,
-        actuation,
-        tuple(dict.fromkeys(f"left out: {fault}" for fault in faults.ravel() if fault)),
+        study=found.study,
+        required=margin,
+        n_controlled=found.structure.n_controlled,
+        plants=plants,
+        exists=exists,
+        radius=radius,
+        margin=limit,
+        frequency_hz=frequency,
+        damping_ratio=zeta,
+        free_damping=free,
+        weakest=weakest.astype(str),
+        breaking=breaking.astype(str),
+        observation=observation,
+        actuation=actuation,
+        notes=tuple(dict.fromkeys(f"left out: {fault}" for fault in faults.ravel() if fault)),
     )

@@ -18,7 +18,7 @@ from studies.engine.runs import check_run
 from studies.engine.stability import gain_margin
 from studies.spillover.judgement import STEPS, breaking_motion, damping, follow
 from studies.spillover.laws import Candidate, all_laws
-from studies.spillover.plants import LoopMaker, Plant, plant_sizes
+from studies.spillover.plants import LoopMaker, PlantVariant, plant_sizes
 from studies.study.margin import HIGHEST, LOWEST
 from studies.study.spec import Study
 
@@ -38,7 +38,7 @@ class Comparison(NamedTuple):
 
     study: Study  # of the runs: the design's first move made fast
     required: float  # margin that sets the factors [1]
-    plant: Plant  # whose damping is told, and the basis of all
+    plant: PlantVariant  # whose damping is told, and the basis of all
     names: tuple[str, ...]
     factor: np.ndarray  # on the gains of each law, 1: as strong on mode 1 as the design [1], (L,)
     damping_ratio: np.ndarray  # modes 1.., smallest of the links that control it [1], (L, J)
@@ -69,7 +69,7 @@ def compare_laws(study: Study, margin: float = 2.0, sizes: tuple[int, ...] = ())
     found = fixed_controller(study)
     sizes = plant_sizes(found, sizes)
     own = min(max(found.study.link.modes, sizes[0]), sizes[-1])
-    plant = Plant(found.study.link.basis, own)
+    plant = PlantVariant(found.study.link.basis, own)
     laws = all_laws(found, LoopMaker(found), plant)
     with threadpool_limits(1, "blas"):
         views = [_View(found, law, plant, sizes) for law in laws]
@@ -81,18 +81,18 @@ def compare_laws(study: Study, margin: float = 2.0, sizes: tuple[int, ...] = ())
     moved, result = _run(found, [view.law.at(factor) for _, view, factor in rows])
     metrics = result.metrics
     return Comparison(
-        moved,
-        margin,
-        plant,
-        tuple(name for name, _, _ in rows),
-        np.array([factor for _, _, factor in rows]),
-        zeta,
-        np.array([np.nan, *(view.margin(factor) for _, view, factor in rows[1:])]),
-        ("", *(view.breaking for _, view, _ in rows[1:])),
-        metrics.residual_rms.max(axis=2),
-        metrics.peak_voltage.max(axis=1),
-        metrics.control_energy,
-        result.status,
+        study=moved,
+        required=margin,
+        plant=plant,
+        names=tuple(name for name, _, _ in rows),
+        factor=np.array([factor for _, _, factor in rows]),
+        damping_ratio=zeta,
+        margin=np.array([np.nan, *(view.margin(factor) for _, view, factor in rows[1:])]),
+        breaking=("", *(view.breaking for _, view, _ in rows[1:])),
+        residual_rms=metrics.residual_rms.max(axis=2),
+        peak_voltage=metrics.peak_voltage.max(axis=1),
+        control_energy=metrics.control_energy,
+        status=result.status,
     )
 
 
@@ -100,7 +100,7 @@ class _View:
     """A law on the design's own plants."""
 
     def __init__(
-        self, found: FixedController, law: Candidate, plant: Plant, sizes: tuple[int, ...]
+        self, found: FixedController, law: Candidate, plant: PlantVariant, sizes: tuple[int, ...]
     ) -> None:
         self.law, maker = law, LoopMaker(found)
         self.limit, self.breaking = HIGHEST, ""

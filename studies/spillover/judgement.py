@@ -50,13 +50,13 @@ def judge(loop: SampledLoop) -> Judgement:
         weakest = name_motion(loop, 1.0, tracked[at])
     margin = gain_margin(poles, STEPS)
     return Judgement(
-        float(np.abs(poles(1.0)).max()),
-        margin,
-        frequency,
-        zeta,
-        free,
-        weakest,
-        breaking_motion(loop, margin),
+        radius=float(np.abs(poles(1.0)).max()),
+        margin=margin,
+        frequency_hz=frequency,
+        damping_ratio=zeta,
+        free_damping=free,
+        weakest=weakest,
+        breaking=breaking_motion(loop, margin),
     )
 
 

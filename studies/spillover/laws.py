@@ -22,7 +22,7 @@ from jaxmodel.parameters import Array
 from jaxmodel.prepare import design_controller
 from studies.engine.controller import FixedController
 from studies.errors import field_error
-from studies.spillover.plants import LoopMaker, Plant, widened
+from studies.spillover.plants import LoopMaker, PlantVariant, widened
 from studies.study.cases import law_parameters
 
 #: Damping of mode 1 below this share of that of other modes is rounding [1].
@@ -44,7 +44,7 @@ class Candidate(NamedTuple):
         )
 
 
-def all_laws(found: FixedController, maker: LoopMaker, plant: Plant) -> list[Candidate]:
+def all_laws(found: FixedController, maker: LoopMaker, plant: PlantVariant) -> list[Candidate]:
     """Every law there is; the one that the design is of with the design's own numbers.
 
     Args:

@@ -65,7 +65,7 @@ DEPARTURES = (
 )
 
 
-class Plant(NamedTuple):
+class PlantVariant(NamedTuple):
     """What sets one plant apart."""
 
     basis: str
@@ -118,7 +118,7 @@ class LoopMaker:
         )
         self._pose = np.array(found.study.motion.waypoints[0], float)
 
-    def fault(self, plant: Plant) -> str:
+    def fault(self, plant: PlantVariant) -> str:
         """Why there is no such plant, "" where there is one."""
         study, machine = self._found.study, self._placed(plant).machine
         is_off, is_overlapping = placement_faults(machine.patches, machine.beam.length)
@@ -134,24 +134,26 @@ class LoopMaker:
             return f"{plant.basis}: it has no rotary inertia{size} at the joints"
         return ""
 
-    def loop(self, plant: Plant, law: Controller) -> SampledLoop:
+    def loop(self, plant: PlantVariant, law: Controller) -> SampledLoop:
         """The loop of a plant and a controller with a channel for each patch, see `widened`."""
         matrices, omega, _ = self._look(plant, law)
         kept, of_plant = _kept(matrices, plant.n_modes)
         return SampledLoop(
-            matrices.open[np.ix_(kept, kept)],
-            matrices.feedback[np.ix_(kept, kept)],
-            link_poles(matrices.plant[np.ix_(of_plant, of_plant)], plant.n_modes),
-            omega[:, : plant.n_modes],
-            float(self._found.case.electronics.period),
+            open=matrices.open[np.ix_(kept, kept)],
+            feedback=matrices.feedback[np.ix_(kept, kept)],
+            mode_poles=link_poles(matrices.plant[np.ix_(of_plant, of_plant)], plant.n_modes),
+            omega=omega[:, : plant.n_modes],
+            period=float(self._found.case.electronics.period),
         )
 
-    def leakage(self, plant: Plant, law: Controller) -> Leakage:
+    def leakage(self, plant: PlantVariant, law: Controller) -> Leakage:
         """What the channels of a controller as `widened` see of a plant's modes, and do to them."""
         _, _, (observation, actuation) = self._look(plant, law)
         return Leakage(observation[:, :, : plant.n_modes], actuation[:, : plant.n_modes])
 
-    def _look(self, plant: Plant, law: Controller) -> tuple[LoopMatrices, np.ndarray, Leakage]:
+    def _look(
+        self, plant: PlantVariant, law: Controller
+    ) -> tuple[LoopMatrices, np.ndarray, Leakage]:
         known = self._found.structure
         # nothing that only a controller's own design depends on: one program for all laws
         structure = Structure(
@@ -174,7 +176,7 @@ class LoopMaker:
         law = jax.tree.map(jnp.asarray, law)
         return jax.tree.map(np.asarray, _look(structure, self._placed(plant), self._pose, law))
 
-    def _placed(self, plant: Plant) -> Case:
+    def _placed(self, plant: PlantVariant) -> Case:
         machine, true = self._case.machine, plant.departure
         patches, beam = machine.patches, machine.beam
         patches = patches._replace(
@@ -270,5 +272,5 @@ def all_plants(
     """
     plants = np.empty((len(bases), len(departures), len(sizes)), object)
     for b, d, n in np.ndindex(plants.shape):
-        plants[b, d, n] = Plant(bases[b], sizes[n], departures[d])
+        plants[b, d, n] = PlantVariant(bases[b], sizes[n], departures[d])
     return plants

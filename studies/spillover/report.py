@@ -13,7 +13,7 @@ from studies.show.sketch import CAPTION
 from studies.show.templates import render
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import FAST, GIVEN, SETTLING, SHOWN, WINDOW, WITHOUT, Comparison
-from studies.spillover.plants import Plant
+from studies.spillover.plants import PlantVariant
 from studies.study.labels import describe
 from studies.study.margin import margin_text
 
@@ -105,7 +105,7 @@ class Leak(NamedTuple):
     size: float  # [1]
     mode: int  # not under control
     controlled: int
-    plant: Plant
+    plant: PlantVariant
 
 
 def _leakage(found: Certificate) -> dict[str, Any] | None:
@@ -197,7 +197,7 @@ def _plant(found: Certificate, at: tuple[int, ...]) -> dict[str, Any]:
     }
 
 
-def _joint(found: Certificate, plant: Plant) -> Any:
+def _joint(found: Certificate, plant: PlantVariant) -> Any:
     """True J_C [kg m2], one for all links or three."""
     known = plant.departure.joint_inertia
     return found.study.link.joint_inertia_c if known is None else known

@@ -104,14 +104,14 @@ def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
             number("initial.load_deflection"),
         ),
         windows=Windows(
-            number("metrics.residual_delay"),
-            number("metrics.residual_length"),
-            number("metrics.settling_band"),
-            number("metrics.saturation_limit"),
-            number("metrics.arrival_tolerance"),
-            number("metrics.singularity_margin"),
-            number("metrics.condition_limit"),
-            number("metrics.stations"),
+            residual_delay=number("metrics.residual_delay"),
+            residual_length=number("metrics.residual_length"),
+            settling_band=number("metrics.settling_band"),
+            saturation_limit=number("metrics.saturation_limit"),
+            arrival_tolerance=number("metrics.arrival_tolerance"),
+            singularity_margin=number("metrics.singularity_margin"),
+            condition_limit=number("metrics.condition_limit"),
+            stations=number("metrics.stations"),
         ),
         seed=fields.raw("run.seed").astype(int),
     )
@@ -141,27 +141,27 @@ def as_arrays(case: Case) -> Case:
 def _machine(fields: Fields, structure: Structure) -> Machine:
     number, each = fields.numbers, fields.each_link
     return Machine(
-        Geometry(
-            number("machine.guide_side"),
-            np.radians(number("machine.guide_angles_deg")),
-            each("machine.joint_radius"),
-            _joint_angle(fields),
-            each("machine.guide_offsets"),
+        geometry=Geometry(
+            guide_side=number("machine.guide_side"),
+            guide_angle=np.radians(number("machine.guide_angles_deg")),
+            joint_radius=each("machine.joint_radius"),
+            joint_angle=_joint_angle(fields),
+            guide_offset=each("machine.guide_offsets"),
         ),
-        Masses(
-            number("machine.platform_mass"),
-            number("machine.platform_inertia"),
-            each("machine.slider_mass"),
-            number("load.mass"),
-            number("load.inertia"),
-            number("load.offset") if structure.has_payload_offset else None,
+        masses=Masses(
+            platform_mass=number("machine.platform_mass"),
+            platform_inertia=number("machine.platform_inertia"),
+            slider_mass=each("machine.slider_mass"),
+            payload_mass=number("load.mass"),
+            payload_inertia=number("load.inertia"),
+            payload_offset=number("load.offset") if structure.has_payload_offset else None,
         ),
-        Beam(*(each(f"link.{name}") for name in Beam._fields)),
-        Patches(
+        beam=Beam(*(each(f"link.{name}") for name in Beam._fields)),
+        patches=Patches(
             center=_per_link(number("patches.centers")),
             **{name: each(f"patches.{name}") for name in Patches._fields if name != "center"},
         ),
-        _damping(fields),
+        damping=_damping(fields),
     )
 
 
@@ -214,11 +214,11 @@ def _shaping(fields: Fields) -> Shaping:
         given = np.zeros((len(given), 1))  # as the controller believes, see `design_taps`
     zeta = fields.numbers("shaper.damping_ratio")
     return Shaping(
-        fields.choices("shaper.kind", tuple(shaper.SHAPERS)),
-        given,
-        np.repeat(zeta[:, None], given.shape[1], axis=1),
-        fields.numbers("shaper.tolerance"),
-        fields.choices("shaper.split", ("linear", "exact")).astype(float),
+        kind=fields.choices("shaper.kind", tuple(shaper.SHAPERS)),
+        omega=given,
+        zeta=np.repeat(zeta[:, None], given.shape[1], axis=1),
+        tolerance=fields.numbers("shaper.tolerance"),
+        is_exact=fields.choices("shaper.split", ("linear", "exact")).astype(float),
     )
 
 

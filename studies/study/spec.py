@@ -70,7 +70,7 @@ class Section(BaseModel):
     )
 
 
-class Run(Section):
+class RunSection(Section):
     """How long, how finely, and by which model."""
 
     duration: float = described(0.8, "s", "length of the run", gt=0, le=100)
@@ -82,7 +82,7 @@ class Run(Section):
     )
 
 
-class Machine(Section):
+class MachineSection(Section):
     """Guides, platform, sliders."""
 
     guide_side: float = described(0.6, "m", "side of the guide triangle", ge=0.01, le=10)
@@ -110,7 +110,7 @@ class Machine(Section):
     )
 
 
-class Link(Section):
+class LinkSection(Section):
     """The three flexible links; dimensions and material: one number for all, or three."""
 
     basis: Basis = described("pinned_pinned", "-", "modal basis of the plant")
@@ -150,7 +150,7 @@ class Link(Section):
         return ratio
 
 
-class Patches(Section):
+class PatchesSection(Section):
     """Piezo pairs: sensor and actuator on opposite faces share a centre; one number, or three."""
 
     centers: tuple[float, ...] | tuple[tuple[float, ...], ...] = described(
@@ -178,7 +178,7 @@ class Patches(Section):
     )
 
 
-class Motion(Section):
+class MotionSection(Section):
     """The platform's path: point-to-point moves."""
 
     waypoints: tuple[tuple[Coordinate, Coordinate, Coordinate], ...] = described(
@@ -199,7 +199,7 @@ class Motion(Section):
     profile: Annotated[str, OneOf(lambda: PROFILES)] = described("cycloid", "-", "cycloid is (25)")
 
 
-class Shaper(Section):
+class ShaperSection(Section):
     """Input shaper on the motion."""
 
     kind: Annotated[str, OneOf(lambda: SHAPERS)] = described("ei", "-", "ei is the paper's (13)")
@@ -214,7 +214,7 @@ class Shaper(Section):
     split: Literal["linear", "exact"] = described("linear", "-", "impulses onto the sample grid")
 
 
-class Control(Section):
+class ControlSection(Section):
     """Active vibration control of the links."""
 
     feedback: Literal["sampled", "ideal", "none"] = described(
@@ -262,7 +262,7 @@ class Control(Section):
     )
 
 
-class Electronics(Section):
+class ElectronicsSection(Section):
     """Sampling, converters, velocity estimate."""
 
     sample_rate_hz: float = described(10_000.0, "Hz", "f_s", gt=100, le=1e6)
@@ -302,7 +302,7 @@ class Electronics(Section):
     voltage_limit: float = described(100.0, "V", "actuators, +-", gt=0, le=1e4)
 
 
-class Drive(Section):
+class DriveSection(Section):
     """Slider servo and disturbances."""
 
     kind: Literal["pd", "computed_torque"] = described("pd", "-", "PD, or PD with computed torque")
@@ -323,7 +323,7 @@ class Drive(Section):
     locked: bool = described(False, "-", "hold the sliders (bases with Y(L) = 0)")
 
 
-class Load(Section):
+class LoadSection(Section):
     """What the platform carries and what acts on it, at its reference point (the pose)."""
 
     mass: float = described(0.0, "kg", "payload, added to m_p", ge=0, le=1e3)
@@ -341,7 +341,7 @@ class Load(Section):
     pulse_length: float = described(0.001, "s", "its length", ge=0, le=100)
 
 
-class Initial(Section):
+class InitialSection(Section):
     """State at t = 0."""
 
     modal: tuple[tuple[Deflection, ...], ...] = described(
@@ -353,7 +353,7 @@ class Initial(Section):
     )
 
 
-class Metrics(Section):
+class MetricsSection(Section):
     """How a run is judged."""
 
     residual_delay: float = described(
@@ -388,18 +388,18 @@ class Study(Section):
     """One study file."""
 
     title: str = described("study", "-", "what this is", max_length=200, pattern="^[^\0]*$")
-    run: Run = Run()
-    machine: Machine = Machine()
-    link: Link = Link()
-    patches: Patches = Patches()
-    motion: Motion = Motion()
-    shaper: Shaper = Shaper()
-    control: Control = Control()
-    electronics: Electronics = Electronics()
-    drive: Drive = Drive()
-    load: Load = Load()
-    initial: Initial = Initial()
-    metrics: Metrics = Metrics()
+    run: RunSection = RunSection()
+    machine: MachineSection = MachineSection()
+    link: LinkSection = LinkSection()
+    patches: PatchesSection = PatchesSection()
+    motion: MotionSection = MotionSection()
+    shaper: ShaperSection = ShaperSection()
+    control: ControlSection = ControlSection()
+    electronics: ElectronicsSection = ElectronicsSection()
+    drive: DriveSection = DriveSection()
+    load: LoadSection = LoadSection()
+    initial: InitialSection = InitialSection()
+    metrics: MetricsSection = MetricsSection()
 
     def change(self, **fields: Any) -> Study:
         """Copy with other values; dots are double underscores: `change(control__gain_factor=1.0)`.

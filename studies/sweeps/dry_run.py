@@ -9,7 +9,7 @@ from studies.engine.runs import check_run
 from studies.engine.sweep import Plan, calibrate
 from studies.errors import StudyError
 from studies.show.units import count_text
-from studies.space.table import Table, case_study
+from studies.space.table import CaseTable, case_study
 from studies.study.paths import field_unit, parse_entry
 from studies.sweeps.show import Rows, print_rows, short_value
 
@@ -51,7 +51,7 @@ def print_plan(plan: Plan, console: Console) -> None:
     )
 
 
-def axis_rows(table: Table) -> Rows:
+def axis_rows(table: CaseTable) -> Rows:
     """How many values each column of a sweep takes, and between which ends."""
     rows = []
     for name, column in table.columns.items():

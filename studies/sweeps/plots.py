@@ -20,7 +20,7 @@ from studies.engine.results import SweepData, metric_values, swept_names
 from studies.errors import StudyError
 from studies.show import figures
 from studies.space.axes import SHOWN_AS
-from studies.space.spec import Node
+from studies.space.spec import BlockNode
 from studies.study.consistency import each_link
 from studies.study.margin import ENOUGH, HIGHEST
 from studies.sweeps.show import MARGIN, label, recommended, shown_metric, shown_value
@@ -156,7 +156,7 @@ def not_beaten(margin: np.ndarray, value: np.ndarray) -> list[int]:
 def is_log(data: SweepData, name: str) -> bool:
     """Whether an axis was sampled on a logarithmic scale."""
 
-    def scales(node: Node) -> dict[str, Any]:
+    def scales(node: BlockNode) -> dict[str, Any]:
         own = {
             SHOWN_AS.get(axis, axis): written.get("scale")
             for axis, written in node.block.axes.items()

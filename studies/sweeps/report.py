@@ -20,7 +20,7 @@ from studies.show.templates import render
 from studies.show.units import readable
 from studies.space.axes import SHOWN_AS
 from studies.space.methods import METHODS
-from studies.space.spec import Node
+from studies.space.spec import BlockNode
 from studies.space.table import case_study
 from studies.study.margin import ENOUGH
 from studies.study.spec import Study
@@ -60,7 +60,7 @@ class Rival(NamedTuple):
     margin: float
 
 
-class Best(NamedTuple):
+class BestCase(NamedTuple):
     """What a report says of the best cases; values of the metric have their unit."""
 
     case: int  # the first of them
@@ -157,7 +157,7 @@ def report(data: SweepData, metric: str, drawn: list[str]) -> str:
     )
 
 
-def _best(data: SweepData, metric: str) -> Best | None:
+def _best(data: SweepData, metric: str) -> BestCase | None:
     """The best cases; None where no case of status ok has the metric."""
     value, margin = metric_values(data, metric), _margins(data)
     is_known = (data["status"] == status.OK) & np.isfinite(value)
@@ -175,7 +175,7 @@ def _best(data: SweepData, metric: str) -> Best | None:
     def told(number: float) -> str:
         return f"{number:.4g} {unit}".rstrip()
 
-    return Best(
+    return BestCase(
         case=first,
         value=told(readings[first]),
         setting=", ".join(
@@ -191,7 +191,7 @@ def _best(data: SweepData, metric: str) -> Best | None:
     )
 
 
-def _blocks(node: Node, depth: int = 0) -> list[tuple[int, str, list[tuple[str, str, Any]]]]:
+def _blocks(node: BlockNode, depth: int = 0) -> list[tuple[int, str, list[tuple[str, str, Any]]]]:
     """A block and the further blocks in it.
 
     Args:

@@ -53,7 +53,15 @@ def failure_causes(data: SweepData) -> list[Cause]:
             (float(rate), f"{sign} {end:.4g}")
             for rate, end, sign in zip(rates, ends, ("<=", ">="), strict=True)
         )
-        causes.append(Cause(name, float(test.statistic), float(test.pvalue), low, high))
+        causes.append(
+            Cause(
+                name=name,
+                distance=float(test.statistic),
+                p_value=float(test.pvalue),
+                low=low,
+                high=high,
+            )
+        )
     return sorted(causes, key=lambda cause: -cause.distance)
 
 
@@ -68,11 +76,11 @@ def _cause_of_choice(name: str, value: np.ndarray, is_failed: np.ndarray) -> Cau
     distance = np.abs(bad / bad.sum() - good / good.sum()).sum() / 2
     best, worst = int(np.argmin(rate)), int(np.argmax(rate))
     return Cause(
-        name,
-        float(distance),
-        float(chi2_contingency(np.stack([bad, good])).pvalue),
-        (float(rate[best]), str(names[best])),
-        (float(rate[worst]), str(names[worst])),
+        name=name,
+        distance=float(distance),
+        p_value=float(chi2_contingency(np.stack([bad, good])).pvalue),
+        low=(float(rate[best]), str(names[best])),
+        high=(float(rate[worst]), str(names[worst])),
     )
 
 

@@ -40,7 +40,7 @@ from studies.tuning.spec import Family, TuneSpec
 CHUNK = 256
 
 
-class Judged(NamedTuple):
+class JudgedDesign(NamedTuple):
     """One design: on fresh scenarios, machine by machine within each move, and as its file says."""
 
     objective: np.ndarray  # nan where a run did not finish, (S,)
@@ -121,7 +121,7 @@ def fresh_columns(spec: TuneSpec) -> dict[str, np.ndarray]:
     return scenario_columns(spec, scenarios.check, scenarios.seed + 1, is_fresh=True)
 
 
-def judge(spec: TuneSpec, designs: list[Study]) -> list[Judged]:
+def judge(spec: TuneSpec, designs: list[Study]) -> list[JudgedDesign]:
     """Run designs on scenarios that the tuning has not seen, and as their own files say.
 
     Args:
@@ -145,13 +145,13 @@ def judge(spec: TuneSpec, designs: list[Study]) -> list[Judged]:
         objective = np.asarray(objectives(merit, metrics, each[0]))
         objective = np.where(np.isin(codes, status.FINISHED), objective, np.nan)
         found.append(
-            Judged(
-                objective,
-                {name: np.asarray(largest(merit, metrics, name)) for name in merit.shown},
-                codes,
-                duration - result.command_end[rows],
-                loop_figures(study) if study.control.feedback == "sampled" else None,
-                _seen(merit, own[k], own[0], duration),
+            JudgedDesign(
+                objective=objective,
+                metrics={name: np.asarray(largest(merit, metrics, name)) for name in merit.shown},
+                status=codes,
+                watched=duration - result.command_end[rows],
+                loop=loop_figures(study) if study.control.feedback == "sampled" else None,
+                own=_seen(merit, own[k], own[0], duration),
             )
         )
     return found
@@ -244,4 +244,13 @@ def search(spec: TuneSpec, screen: Any) -> Searched:
     if kept.any():
         beyond[kept], linear[kept] = screen(values[kept])
     run_time = spent / (-(-n // CHUNK) * count * (1 + CHUNK))
-    return Searched(objective, limits, peaks, beyond, linear, residual, run_time, n * count)
+    return Searched(
+        objective=objective,
+        limits=limits,
+        peaks=peaks,
+        beyond_loop=beyond,
+        linear=linear,
+        residual=residual,
+        run_time=run_time,
+        runs=n * count,
+    )

@@ -116,13 +116,13 @@ class Evaluator:
         beyond, change = self.linear.limits(values)
         limit_slope = np.concatenate([found.limit_slope, change], axis=1)
         return Evaluation(
-            found.objective,
-            np.where(self.is_free, found.slope, 0.0),
-            np.concatenate([found.limits, beyond], axis=1),
-            np.where(self.is_free[:, None], limit_slope, 0.0),
-            np.concatenate([found.peaks, np.full(beyond.shape, np.nan)], axis=1),
-            codes[1:],
-            first_residual(self.merit, metrics)[1:],
+            objective=found.objective,
+            slope=np.where(self.is_free, found.slope, 0.0),
+            limits=np.concatenate([found.limits, beyond], axis=1),
+            limit_slope=np.where(self.is_free[:, None], limit_slope, 0.0),
+            peaks=np.concatenate([found.peaks, np.full(beyond.shape, np.nan)], axis=1),
+            status=codes[1:],
+            residual=first_residual(self.merit, metrics)[1:],
         )
 
     def _check_own(self, codes: np.ndarray, metrics: Any) -> None:

@@ -32,37 +32,37 @@ from studies.study.spec import OWN_FIELDS, Study
 TWO_PI = 2 * np.pi
 
 
-class Leaf(NamedTuple):
+class FieldPlace(NamedTuple):
     """Where a field of the study lies in a Case."""
 
     path: str
     factor: float = 1.0  # the Case's unit in the study's
 
 
-def _same(section: str, inside: str, *names: str) -> dict[str, Leaf]:
-    return {f"{section}.{name}": Leaf(f"{inside}.{name}") for name in names}
+def _same(section: str, inside: str, *names: str) -> dict[str, FieldPlace]:
+    return {f"{section}.{name}": FieldPlace(f"{inside}.{name}") for name in names}
 
 
 #: Fields that may be free.
-LEAVES: dict[str, Leaf] = {
+LEAVES: dict[str, FieldPlace] = {
     **_same(
         "control", "control", "velocity_gain", "position_gain", "gain_factor", "feedthrough_factor"
     ),
-    "control.ratios": Leaf("control.ratio"),
-    "electronics.highpass_hz": Leaf("electronics.highpass", TWO_PI),
-    "electronics.antialias_hz": Leaf("electronics.antialias", TWO_PI),
-    "electronics.difference_cutoff_hz": Leaf("electronics.difference_cutoff", TWO_PI),
+    "control.ratios": FieldPlace("control.ratio"),
+    "electronics.highpass_hz": FieldPlace("electronics.highpass", TWO_PI),
+    "electronics.antialias_hz": FieldPlace("electronics.antialias", TWO_PI),
+    "electronics.difference_cutoff_hz": FieldPlace("electronics.difference_cutoff", TWO_PI),
     **_same("electronics", "electronics", "lowpass_ratio", "lowpass_zeta"),
-    "shaper.frequencies_hz": Leaf("shaping.omega", TWO_PI),
-    "shaper.damping_ratio": Leaf("shaping.zeta"),
-    "shaper.tolerance": Leaf("shaping.tolerance"),
-    "patches.centers": Leaf("machine.patches.center"),
+    "shaper.frequencies_hz": FieldPlace("shaping.omega", TWO_PI),
+    "shaper.damping_ratio": FieldPlace("shaping.zeta"),
+    "shaper.tolerance": FieldPlace("shaping.tolerance"),
+    "patches.centers": FieldPlace("machine.patches.center"),
     **_same("patches", "machine.patches", "sensor_length", "actuator_length", "width", "thickness"),
     **_same("drive", "drive", "kp", "kd"),
     **_same("link", "machine.beam", "length", "thickness", "width"),
     **_same("machine", "machine.masses", "platform_mass", "platform_inertia", "slider_mass"),
-    "load.mass": Leaf("machine.masses.payload_mass"),
-    "load.inertia": Leaf("machine.masses.payload_inertia"),
+    "load.mass": FieldPlace("machine.masses.payload_mass"),
+    "load.inertia": FieldPlace("machine.masses.payload_inertia"),
 }
 #: Free names that stand for several numbers of a Case.
 POLES = ("poles.decay", "poles.frequency_hz")
@@ -230,11 +230,11 @@ def _plain(
     return numbers, partial(_set, tuple(setters))
 
 
-def _own_leaves(study: Study) -> dict[str, Leaf]:
+def _own_leaves(study: Study) -> dict[str, FieldPlace]:
     """Fields of the study's law's own."""
     law = LAWS[study.control.law]
     return {
-        f"{OWN_FIELDS}.{law.name}.{x.name}": Leaf(f"control.parameters.{x.name}")
+        f"{OWN_FIELDS}.{law.name}.{x.name}": FieldPlace(f"control.parameters.{x.name}")
         for x in law.parameters
     }
 

@@ -122,7 +122,7 @@ def all_judged(
     return jax.vmap(lambda x: judged(merit, x, own, allowed))(metrics)
 
 
-class Slopes(NamedTuple):
+class DesignSlopes(NamedTuple):
     """Designs judged, with derivatives by the free numbers."""
 
     objective: Array  # (designs,)
@@ -135,7 +135,7 @@ class Slopes(NamedTuple):
 @partial(jax.jit, static_argnums=0)
 def judged_slopes(
     merit: Merit, metrics: Metrics, slopes: Metrics, own: Metrics, allowed: Array
-) -> Slopes:
+) -> DesignSlopes:
     """Judge designs and differentiate.
 
     Args:
@@ -146,7 +146,7 @@ def judged_slopes(
         allowed: limits in each scenario, (designs, S, m).
     """
 
-    def one(metrics: Metrics, slopes: Metrics, allowed: Array) -> Slopes:
+    def one(metrics: Metrics, slopes: Metrics, allowed: Array) -> DesignSlopes:
         def figures(x: Metrics) -> tuple[Array, Array, Array]:
             return judged(merit, x, own, allowed)
 
@@ -154,7 +154,13 @@ def judged_slopes(
         (objective, limits, peaks), (slope, limit_slope, _) = jax.vmap(
             lambda x: jax.jvp(figures, (metrics,), (x,)), out_axes=((None, None, None), 0)
         )(along)
-        return Slopes(objective, slope, limits, jnp.moveaxis(limit_slope, 0, -1), peaks)
+        return DesignSlopes(
+            objective=objective,
+            slope=slope,
+            limits=limits,
+            limit_slope=jnp.moveaxis(limit_slope, 0, -1),
+            peaks=peaks,
+        )
 
     return jax.vmap(one)(metrics, slopes, allowed)
 

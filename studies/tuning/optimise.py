@@ -164,12 +164,12 @@ def advance(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> Progress:
         at, at.base_objective, at.base_slope, at.base_limits, at.base_limit_slope
     )
     trial = Trial(
-        at.base,
-        at.place,
-        np.where(np.isfinite(base_merit), base_merit, np.inf),
-        np.where(is_fine, merit, np.nan),
-        base_slope,
-        np.where(is_fine[:, None], merit_slope, 0.0),
+        base=at.base,
+        place=at.place,
+        base_merit=np.where(np.isfinite(base_merit), base_merit, np.inf),
+        merit=np.where(is_fine, merit, np.nan),
+        base_slope=base_slope,
+        slope=np.where(is_fine[:, None], merit_slope, 0.0),
     )
     state, is_taken, place = method(spec).step(at.descent, trial)
 

@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 from jaxmodel.metrics import METRICS
 from studies.show import figures
 from studies.tuning.optimise import KEPT, excess
-from studies.tuning.report import Findings, is_kept
+from studies.tuning.report import TuneFindings, is_kept
 from studies.tuning.scenarios import move_label
 from studies.tuning.spec import TuneSpec
 
@@ -18,7 +18,7 @@ GREY = "#999999"
 OBJECTIVE = "objective (the study itself: 1)"
 
 
-def descent(spec: TuneSpec, found: Findings) -> Figure:
+def descent(spec: TuneSpec, found: TuneFindings) -> Figure:
     """Best objective that keeps the limits, over iterations, by family; thin: every start."""
     with figures.styled():
         figure = Figure(figsize=(7.4, 3.6), layout="constrained")
@@ -42,7 +42,7 @@ def descent(spec: TuneSpec, found: Findings) -> Figure:
     return figure
 
 
-def gains(spec: TuneSpec, found: Findings) -> Figure:
+def gains(spec: TuneSpec, found: TuneFindings) -> Figure:
     """What each family gains on fresh machines, one panel for each move."""
     with figures.styled():
         rows = len(spec.families)
@@ -77,7 +77,7 @@ def gains(spec: TuneSpec, found: Findings) -> Figure:
     return figure
 
 
-def front(spec: TuneSpec, found: Findings, limit: str) -> Figure:
+def front(spec: TuneSpec, found: TuneFindings, limit: str) -> Figure:
     """Objective over a limited metric: random designs, the tuned ones, the study.
 
     Args:

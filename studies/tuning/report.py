@@ -16,7 +16,7 @@ from studies.show.units import count_text, headed, number, readable
 from studies.study.entries import parse_entries
 from studies.study.margin import MARGIN_MODES, caution, margin_text
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
-from studies.tuning.check import Judged, Searched, patch_centers
+from studies.tuning.check import JudgedDesign, Searched, patch_centers
 from studies.tuning.free import PLACEMENT
 from studies.tuning.merit import SHOWN
 from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
@@ -37,12 +37,12 @@ FEW, NARROW = 8, 0.05
 ITSELF = "the study itself"
 
 
-class Findings(NamedTuple):
+class TuneFindings(NamedTuple):
     """Everything that a tuning found."""
 
     at: Progress
-    own: Judged  # the study itself
-    judged: list[Judged]  # the best design of every family, in the order of `spec.families`
+    own: JudgedDesign  # the study itself
+    judged: list[JudgedDesign]  # the best design of every family, in the order of `spec.families`
     audited: list[Disagreement]  # at the best design of the family with most free numbers
     linear: np.ndarray  # linear residual vibration of each start's best design [m], (B,)
     residual: np.ndarray  # of its own run on the first scenario [m], (B,); nan if not judged by it
@@ -51,7 +51,7 @@ class Findings(NamedTuple):
     runs: int  # how many there were
 
 
-class Best(NamedTuple):
+class BestFamily(NamedTuple):
     """The design to recommend."""
 
     family: str
@@ -83,7 +83,7 @@ class Fidelity(NamedTuple):
     rank: float  # coefficient of correlation
 
 
-def report(spec: TuneSpec, found: Findings) -> str:
+def report(spec: TuneSpec, found: TuneFindings) -> str:
     """Markdown text.
 
     Args:
@@ -137,7 +137,7 @@ def ended(spec: TuneSpec, at: Progress) -> str:
     return f"Ended after all {asked} iterations ({spec.tune.method})."
 
 
-def _best(spec: TuneSpec, found: Findings) -> Best:
+def _best(spec: TuneSpec, found: TuneFindings) -> BestFamily:
     k = best_family(spec, found)
     one, own, family = found.judged[k], found.own, spec.families[k]
     gains = []
@@ -148,17 +148,17 @@ def _best(spec: TuneSpec, found: Findings) -> Best:
     if one.loop is not None and own.loop is not None:
         margins = one.loop.gain_margin, own.loop.gain_margin
         gains.append(("gain margin", f"{margins[0]:.3g}", f"{margins[1]:.3g}"))
-    return Best(
-        family.name,
-        file_name(spec, family),
-        gains,
-        one.objective,
-        caution(one.loop.gain_margin) if one.loop is not None else "",
-        found.at.beyond(found.at.winner(k)) > 0,
+    return BestFamily(
+        family=family.name,
+        file=file_name(spec, family),
+        gains=gains,
+        objective=one.objective,
+        caution=caution(one.loop.gain_margin) if one.loop is not None else "",
+        is_violated=found.at.beyond(found.at.winner(k)) > 0,
     )
 
 
-def best_family(spec: TuneSpec, found: Findings) -> int:
+def best_family(spec: TuneSpec, found: TuneFindings) -> int:
     """Position of the family to recommend: limits kept first, then the least objective."""
 
     def rank(k: int) -> tuple[bool, bool, float]:
@@ -177,7 +177,7 @@ def file_name(spec: TuneSpec, family: Family) -> str:
     return f"tuned_{label(family.name)}.toml"
 
 
-def summary(spec: TuneSpec, found: Findings) -> list[str]:
+def summary(spec: TuneSpec, found: TuneFindings) -> list[str]:
     """What was gained, a line for each family."""
     machines = count_text(spec.tune.scenarios.check, "fresh machine")
     lines = []
@@ -192,7 +192,7 @@ def summary(spec: TuneSpec, found: Findings) -> list[str]:
     return lines
 
 
-def _designs(spec: TuneSpec, found: Findings) -> list[tuple[str, Judged]]:
+def _designs(spec: TuneSpec, found: TuneFindings) -> list[tuple[str, JudgedDesign]]:
     """The study itself and the best design of every family, by names for Markdown."""
     names = [literal(family.name) for family in spec.families]
     return [(ITSELF, found.own), *zip(names, found.judged, strict=True)]
@@ -207,7 +207,7 @@ def _value(metric: str, values: Mapping[str, Any], watched: float) -> str:
     return number(value, unit)
 
 
-def _own_machine(spec: TuneSpec, found: Findings, names: list[str]) -> list[list[str]]:
+def _own_machine(spec: TuneSpec, found: TuneFindings, names: list[str]) -> list[list[str]]:
     """Row of each design on the machine of its own file; `names`: of metrics."""
     rows, files = [], ["study.toml", *(file_name(spec, family) for family in spec.moving)]
     for k, (name, one) in enumerate(_designs(spec, found)):
@@ -225,7 +225,7 @@ def _own_machine(spec: TuneSpec, found: Findings, names: list[str]) -> list[list
     return rows
 
 
-def _fresh(spec: TuneSpec, found: Findings, names: list[str]) -> list[list[str]]:
+def _fresh(spec: TuneSpec, found: TuneFindings, names: list[str]) -> list[list[str]]:
     """Row of each design on the worst of all fresh machines and moves; `names`: of metrics."""
     rows = []
     for name, one in _designs(spec, found):
@@ -239,7 +239,7 @@ def _fresh(spec: TuneSpec, found: Findings, names: list[str]) -> list[list[str]]
     return rows
 
 
-def _changes(spec: TuneSpec, found: Findings, names: list[str]) -> list[list[str]]:
+def _changes(spec: TuneSpec, found: TuneFindings, names: list[str]) -> list[list[str]]:
     """Row of each design and move: changes of the mean over the fresh machines."""
     count, own, rows = spec.tune.scenarios.check, found.own, []
     for name, one in _designs(spec, found)[1:]:
@@ -257,7 +257,7 @@ def _change(before: float, after: float) -> str:
     return f"{100 * (after / before - 1):+.1f} %" if before else f"{after:.3g} (was 0)"
 
 
-def _limits(spec: TuneSpec, found: Findings) -> list[tuple[str, list[Limit]]]:
+def _limits(spec: TuneSpec, found: TuneFindings) -> list[tuple[str, list[Limit]]]:
     """Limits of each family on the scenarios of the tuning."""
     told = []
     for k, family in enumerate(spec.moving):
@@ -272,7 +272,7 @@ def _limits(spec: TuneSpec, found: Findings) -> list[tuple[str, list[Limit]]]:
     return told if spec.limit_names else []
 
 
-def _loop_margin(found: Findings, k: int, name: str, limit: float | str) -> float:
+def _loop_margin(found: TuneFindings, k: int, name: str, limit: float | str) -> float:
     """How far a figure of the loop is from its limit, as a share of it; nan if not known."""
     loop, own = found.judged[k].loop, found.own.loop
     if loop is None or own is None:
@@ -291,7 +291,7 @@ def _state(beyond: float, left: float) -> str:
     return "active" if left < NEAR else "inactive"
 
 
-def _numbers(spec: TuneSpec, found: Findings) -> list[list[str]]:
+def _numbers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
     """Row of each free number: its bounds, the study's, and that of every family."""
     at, families, rows = found.at, spec.moving, []
     places = [at.best_place[at.winner(k)] for k in range(len(families))]
@@ -309,7 +309,7 @@ def _numbers(spec: TuneSpec, found: Findings) -> list[list[str]]:
     return rows
 
 
-def _centers(spec: TuneSpec, found: Findings) -> list[list[str]]:
+def _centers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
     """Row of each design: its patches [mm], which shares of the free room do not tell."""
     at, unmoved = found.at, np.full(len(spec.free.numbers), np.nan)
     designs = [(ITSELF, spec.moving[0]._replace(columns={}), unmoved)]
@@ -337,7 +337,7 @@ def is_kept(spec: TuneSpec, seen: Searched) -> np.ndarray:
     return np.isfinite(seen.objective) & (excess(seen.limits) == 0) & (loop <= KEPT)
 
 
-def _fidelity(spec: TuneSpec, found: Findings) -> Fidelity | None:
+def _fidelity(spec: TuneSpec, found: TuneFindings) -> Fidelity | None:
     """Linear residual vibration beside that of runs; None where there is too little of it."""
     kept = excess(found.at.best_limits) == 0
     linear, residual = found.linear[kept], found.residual[kept]
@@ -352,7 +352,15 @@ def _fidelity(spec: TuneSpec, found: Findings) -> Fidelity | None:
     spread = float(b.max() / b.min() - 1)
     case = "few" if len(b) < FEW else "alike" if spread < NARROW else "ranked"
     low, median, high = np.percentile(a / b, [5, 50, 95])
-    return Fidelity(len(b), low, median, high, case, spread, rank_correlation(a, b))
+    return Fidelity(
+        designs=len(b),
+        low=low,
+        median=median,
+        high=high,
+        case=case,
+        spread=spread,
+        rank=rank_correlation(a, b),
+    )
 
 
 def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
@@ -361,7 +369,7 @@ def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(rank[0], rank[1])[0, 1])
 
 
-def _codes(judged: Judged) -> str:
+def _codes(judged: JudgedDesign) -> str:
     codes, counts = np.unique(judged.status, return_counts=True)
     pairs = zip(codes, counts, strict=True)
     return ", ".join(f"{count} {status.REASONS[int(code)]}" for code, count in pairs)

@@ -11,9 +11,9 @@ from studies.store import Variable
 from studies.study.entries import links_text, parse_entries
 from studies.study.labels import STATUS_LABEL
 from studies.study.paths import field_unit, parse_entry
-from studies.tuning.check import Judged, fresh_columns, patch_centers
+from studies.tuning.check import JudgedDesign, fresh_columns, patch_centers
 from studies.tuning.free import POLES
-from studies.tuning.report import Findings
+from studies.tuning.report import TuneFindings
 from studies.tuning.spec import TuneSpec
 
 #: Figures of the linearised loop, and their units.
@@ -28,7 +28,7 @@ def free_unit(key: str) -> str:
     return field_unit(entry.field) if entry and "." in entry.field else "1"
 
 
-def variables(spec: TuneSpec, found: Findings) -> dict[str, Variable]:
+def variables(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
     """All starts, the best design of each family on fresh machines, random designs."""
     return {
         **_asked(spec),
@@ -65,7 +65,7 @@ def _asked(spec: TuneSpec) -> dict[str, Variable]:
     return asked
 
 
-def _starts(spec: TuneSpec, found: Findings) -> dict[str, Variable]:
+def _starts(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
     at = found.at
     family = [spec.moving[k] for k in at.family]
     values = spec.free.values(at.best_place)
@@ -102,7 +102,7 @@ def _starts(spec: TuneSpec, found: Findings) -> dict[str, Variable]:
     return starts
 
 
-def _fresh(spec: TuneSpec, found: Findings) -> dict[str, Variable]:
+def _fresh(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
     axis, both = ("scenario",), ("family", "scenario")
     fresh = {}
     for name, column in fresh_columns(spec).items():
@@ -141,11 +141,11 @@ def _fresh(spec: TuneSpec, found: Findings) -> dict[str, Variable]:
     return fresh
 
 
-def _loop_figure(judged: Judged, name: str) -> float:
+def _loop_figure(judged: JudgedDesign, name: str) -> float:
     return float("nan") if judged.loop is None else float(getattr(judged.loop, name))
 
 
-def _random(found: Findings) -> dict[str, Variable]:
+def _random(found: TuneFindings) -> dict[str, Variable]:
     seen = found.searched
     if seen is None:
         return {}

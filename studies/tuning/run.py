@@ -30,7 +30,7 @@ from studies.tuning.evaluate import Evaluator
 from studies.tuning.folder import PROGRESS, RESULTS, open_tuning, save_progress
 from studies.tuning.optimise import Progress, fits, optimise, start_families
 from studies.tuning.report import (
-    Findings,
+    TuneFindings,
     best_family,
     ended,
     file_name,
@@ -59,7 +59,7 @@ def run_tuning(
     console: Console | None = None,
     is_quiet: bool = False,
     evaluator: Evaluator | None = None,
-) -> Findings:
+) -> TuneFindings:
     """Tune, check the result on fresh scenarios, and write it.
 
     Args:
@@ -152,7 +152,7 @@ def _told(spec: TuneSpec, at: Progress) -> str:
     return f"{int(at.iteration)}/{spec.tune.iterations} best (study: 1): {', '.join(parts)}{lost}"
 
 
-def find(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> Findings:
+def find(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> TuneFindings:
     """Judge where a tuning ended."""
     values = spec.free.values(at.best_place)
     winners = [at.winner(k) for k in range(len(spec.moving))]
@@ -179,20 +179,20 @@ def find(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> Findings:
         searched = search(spec, lambda chosen: evaluator.linear.screen(main, chosen))
     best = at.best_place[at.winner(spec.main)]
     audited = audit(spec, np.stack([(spec.free.places() + best) / 2, best]))
-    return Findings(
-        at,
-        own,
-        judged,
-        audited,
-        linear,
-        last.residual,
-        searched,
-        evaluator.run_time,
-        int(at.iteration) * evaluator.lanes,
+    return TuneFindings(
+        at=at,
+        own=own,
+        judged=judged,
+        audited=audited,
+        linear=linear,
+        residual=last.residual,
+        searched=searched,
+        run_time=evaluator.run_time,
+        runs=int(at.iteration) * evaluator.lanes,
     )
 
 
-def _write(spec: TuneSpec, found: Findings, out: Path) -> None:
+def _write(spec: TuneSpec, found: TuneFindings, out: Path) -> None:
     at = found.at
     studies = {"study.toml": spec.study}
     for k, family in enumerate(spec.moving):

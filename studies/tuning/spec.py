@@ -171,7 +171,7 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
     for family in families:
         for move in moves:
             _check_family(family, move, study)
-    return TuneSpec(study, tune, free, families, moves, data)
+    return TuneSpec(study=study, tune=tune, free=free, families=families, moves=moves, data=data)
 
 
 def _check_figures(tune: Tune, study: Study) -> None:
@@ -311,7 +311,9 @@ def _field(name: str) -> str:
 def _families(tune: Tune, study: Study, free: FreeNumbers) -> tuple[Family, ...]:
     everything = np.ones(len(free.numbers), bool)
     if not tune.families:
-        found = [Family("tuned", everything, {}, dict(tune.limits), "")]
+        found = [
+            Family(name="tuned", is_free=everything, columns={}, limits=dict(tune.limits), front="")
+        ]
     else:
         found = [_family(name, x, tune, study, free) for name, x in tune.families.items()]
     if not any(family.is_free.any() for family in found):
@@ -362,7 +364,7 @@ def _family(name: str, written: Any, tune: Tune, study: Study, free: FreeNumbers
         known_field(field, study, f"{path}.set")
         columns[field] = checked_value(study, field, value, f"{path}.set.{shown_name(field)}")
     is_free = np.array([number.key in names for number in free.numbers])
-    return Family(name, is_free, columns, dict(tune.limits), "")
+    return Family(name=name, is_free=is_free, columns=columns, limits=dict(tune.limits), front="")
 
 
 def _front(tune: Tune, families: list[Family]) -> list[Family]:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 
-class Part(NamedTuple):
+class Share(NamedTuple):
     """Designs for one worker."""
 
     identity: dict[str, str]  # of the client
@@ -37,14 +37,14 @@ class Part(NamedTuple):
     has_slope: np.ndarray  # (designs,)
 
 
-class Answer(NamedTuple):
+class ShareDone(NamedTuple):
     """What a worker has made of its part."""
 
     found: Evaluation
     worker: str  # address
 
 
-def evaluate_part(part: Part) -> Answer:
+def evaluate_part(part: Share) -> ShareDone:
     """Evaluate designs on a worker.
 
     Raises:
@@ -55,7 +55,7 @@ def evaluate_part(part: Part) -> Answer:
         refuse_difference(part.identity, worker)
         get_ready(part.precision, worker)
         evaluator = _evaluator(part.precision, part.spec, part.families)
-        return Answer(evaluator.evaluate(part.values, part.has_slope), worker.address)
+        return ShareDone(evaluator.evaluate(part.values, part.has_slope), worker.address)
 
 
 @lru_cache(maxsize=2)
@@ -93,13 +93,13 @@ class ClusterEvaluator(Evaluator):
         futures = [
             self._client.submit(
                 evaluate_part,
-                Part(
-                    self._identity,
-                    self._precision,
-                    self._text,
-                    families,
-                    values[part],
-                    wanted[part],
+                Share(
+                    identity=self._identity,
+                    precision=self._precision,
+                    spec=self._text,
+                    families=families,
+                    values=values[part],
+                    has_slope=wanted[part],
                 ),
                 pure=False,
             )
