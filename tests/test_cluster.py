@@ -82,6 +82,7 @@ def test_numbers_are_those_of_the_local_run(cluster, local, tmp_path):
     assert "workers: 2" in text and "144/144 cases" in text
 
 
+@pytest.mark.long  # in short: numbers on workers are those of the local run, sweep after sweep
 def test_workers_do_not_mix_up_sweeps(cluster, tmp_path):
     """Same shapes, another number that all cases share: it is written into the program."""
     for kp in (2e4, 4e4):  # the first is that of the other tests: compiled already

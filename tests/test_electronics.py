@@ -80,6 +80,9 @@ def released():
     return structure, case, jax.tree.map(np.asarray, result.record)
 
 
+prepared = jax.jit(prepare, static_argnums=0)
+
+
 def test_run_follows_the_loop_matrix():
     structure, case, record = released()
     look = jax.jit(closed_loop, static_argnums=0)
@@ -90,7 +93,7 @@ def test_run_follows_the_loop_matrix():
     state = np.zeros(len(transition))
     state[6] = 1e-7
     # the patches are drained before the release: filters see nothing, s all of it
-    sensor = np.asarray(prepare(structure, case).loop.sensor)
+    sensor = np.asarray(prepared(structure, case).loop.sensor)
     n_sensors = sensor.shape[0] * sensor.shape[1]
     before = 6 + 2 * modes + 2 * n_sensors
     state[before : before + 3] = sensor[0, :, 0] * 1e-7
@@ -102,7 +105,7 @@ def test_run_follows_the_loop_matrix():
 def test_sensors_show_what_is_left_of_the_charge():
     """At first nothing of a steady bend; of the vibration after the release nearly all."""
     structure, case, record = released()
-    sensor = np.asarray(prepare(structure, case).loop.sensor)[0, :, 0]
+    sensor = np.asarray(prepared(structure, case).loop.sensor)[0, :, 0]
     first, later = record.sensor_voltage[0, 0], record.sensor_voltage[1:, 0]
     np.testing.assert_allclose(first, 0, atol=1e-15)
     assert np.abs(later).max() > 0.9 * np.abs(sensor).max() * 1e-7

@@ -10,8 +10,9 @@ from nbformat.v4 import new_code_cell, new_notebook
 NOTEBOOKS = {
     path.stem: path for path in sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 }
-#: Much to compile; in short: the same functions in test_tuning, test_atlas and test_spillover.
-LONG = ("2_coupling", "4_gradient_tuning", "5_spillover")
+#: Much to compile; in short: the same functions in test_sweeps, test_tuning, test_atlas and
+#: test_spillover.
+LONG = ("2_coupling", "3_placement_sweep", "4_gradient_tuning", "5_spillover")
 QUICK = [name for name in NOTEBOOKS if name not in LONG]
 
 

@@ -6,6 +6,7 @@ import inspect
 import re
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Shaped, jaxtyped
@@ -46,19 +47,24 @@ def promised(kind: type) -> dict[str, str]:
 @pytest.fixture(scope="module")
 def made():
     """One of each, with what stands before its promised axes."""
-    structure, case = build_structure(STUDY), as_arrays(build_case(STUDY))
-    prepared = jax.jit(prepare, static_argnums=0)(structure, case)
-    loop = prepared.loop
-    response = loop_response(structure, case, loop, case.path.waypoints[0])
-    patches = case.machine.patches
-    basis = build_basis("loaded", case.machine.beam, patches, 5, STUDY.metrics.stations)
-    result = simulate(structure, case, has_record=True)
+    structure = build_structure(STUDY)
+
+    @jax.jit
+    def make(case):
+        loop = prepare(structure, case).loop
+        response = loop_response(structure, case, loop, case.path.waypoints[0])
+        stations = jnp.asarray(STUDY.metrics.stations)
+        basis = build_basis("loaded", case.machine.beam, case.machine.patches, 5, stations)
+        result = simulate(structure, case, has_record=True)
+        return basis, loop.plant, loop.controller, response, assembled_modes(response), result
+
+    basis, plant, controller, response, modes, result = make(as_arrays(build_case(STUDY)))
     return {
         "basis": (basis, ""),
-        "plant": (loop.plant, ""),
-        "controller": (loop.controller, ""),
+        "plant": (plant, ""),
+        "controller": (controller, ""),
         "response": (response, ""),
-        "modes": (assembled_modes(response), ""),
+        "modes": (modes, ""),
         "result": (result, ""),
         "record": (result.record, "steps "),
     }
