@@ -77,9 +77,9 @@ def build_basis(
         ValueError: unknown kind, or no modes.
     """
     if kind not in BASES:
-        raise ValueError(f"basis = {kind!r}: allowed {', '.join(BASES)}")
+        raise ValueError(f"basis = {kind!r}; allowed: {', '.join(BASES)}")
     if n_modes < 1:
-        raise ValueError(f"n_modes = {n_modes}: allowed 1 or more [1]")
+        raise ValueError(f"n_modes = {n_modes}; allowed: 1 or more [1]")
     centers = jnp.asarray(patches.center)
     n_links = len(centers)
     stations = jnp.asarray(stations)

@@ -199,7 +199,9 @@ def check_metric(metric: Metric) -> None:
     for dims in (metric.dims, *(total.dims for total in metric.totals)):
         for name in dims:
             if name not in axes:
-                raise PartError(f"metric {metric.name!r}: axis {name!r}; allowed {', '.join(axes)}")
+                raise PartError(
+                    f"metric {metric.name!r}: axis {name!r}; allowed: {', '.join(axes)}"
+                )
 
 
 # --- totals ---------------------------------------------------------------------------------------

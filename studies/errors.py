@@ -16,12 +16,12 @@ class StudyError(Exception):
 def field_error(
     field: str, value: object, allowed: str, unit: str = "", hint: str = ""
 ) -> StudyError:
-    """Build the error `field = value: allowed ... [unit]; did you mean ...?`, to be raised.
+    """Build the error `field = value; allowed: ... [unit]; did you mean ...?`, to be raised.
 
     field: the name as the user wrote it. value: what was given. allowed: the range or the names.
     unit: unit of the range, "" for none. hint: the nearest valid name, "" for none (see `nearest`).
     """
-    message = f"{field} = {shown(value)}: allowed {allowed}"
+    message = f"{field} = {shown(value)}; allowed: {allowed}"
     if unit:
         message += f" [{unit}]"
     if hint:

@@ -109,7 +109,7 @@ def test_interaction_is_what_a_pair_adds_by_being_one():
 
 
 def test_values_that_are_no_game_are_refused():
-    with pytest.raises(ValueError, match="6 values: allowed 2\\^n"):
+    with pytest.raises(ValueError, match="6 values; allowed: 2\\^n"):
         attribution.shapley(np.zeros(6))
 
 
@@ -256,10 +256,10 @@ def test_claims_are_counted():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"control__feedback": "ideal"}, "control.feedback = 'ideal': allowed 'sampled'"),
-        ({"control__law": "srf"}, "control.law = 'srf': allowed 'imsc'"),
+        ({"control__feedback": "ideal"}, "control.feedback = 'ideal'; allowed: 'sampled'"),
+        ({"control__law": "srf"}, "control.law = 'srf'; allowed: 'imsc'"),
         ({"motion__waypoints": ((0.0, 0.0, 0.5),)}, "motion.waypoints"),
-        ({"control__gain_factor": 0.0}, "control.gain_factor = 0.0: allowed gains that do"),
+        ({"control__gain_factor": 0.0}, "control.gain_factor = 0.0; allowed: gains that do"),
     ],
 )
 def test_designs_without_subsets_are_refused(tmp_path, fields, message):

@@ -212,16 +212,16 @@ def test_modes_of_a_study_are_those_of_its_own_machine(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--kp", -1), "drive.kp = -1.0: allowed a finite number >= 0 and <= 1e+08 [N/m]"),
+        (("--kp", -1), "drive.kp = -1.0; allowed: a finite number >= 0 and <= 1e+08 [N/m]"),
         (("--kp", "stiff"), "Invalid value for '--kp'"),
-        (("--kd", "inf"), "drive.kd = inf: allowed a finite number"),
-        (("--damping", 1.5), "link.damping_ratio = 1.5: allowed a finite number >= 0 and < 1,"),
-        (("--modes", 0), "link.modes = 0: allowed a whole number >= 1 and <= 16 [1]"),
-        (("--modes", 17), "link.modes = 17: allowed a whole number >= 1 and <= 16 [1]"),
+        (("--kd", "inf"), "drive.kd = inf; allowed: a finite number"),
+        (("--damping", 1.5), "link.damping_ratio = 1.5; allowed: a finite number >= 0 and < 1,"),
+        (("--modes", 0), "link.modes = 0; allowed: a whole number >= 1 and <= 16 [1]"),
+        (("--modes", 17), "link.modes = 17; allowed: a whole number >= 1 and <= 16 [1]"),
         (("--basis", "pinned_pined"), "did you mean 'pinned_pinned'?"),
-        (("--locked", "--basis", "pinned_free"), "allowed pinned_pinned or loaded, where"),
+        (("--locked", "--basis", "pinned_free"), "allowed: pinned_pinned or loaded, where"),
         (("--pose", 1, 2), "Option '--pose' requires 3 arguments"),
-        (("--pose", "nan", 0, 0.5), "= nan: allowed a finite number"),
+        (("--pose", "nan", 0, 0.5), "= nan; allowed: a finite number"),
         (
             ("--modes", 2, "--pose", 0.5, 0, 0.5),
             "inside (0, 90) deg (here: pose out of reach; link 1 is 0.2 m long",
@@ -257,32 +257,32 @@ TURN = f"[[{X}, {Y}, 0], [{X}, {Y}, {-2 * math.pi / 3}]]"
         (change(WAYPOINTS, TURN), "(here: singular pose: a link parallel or perpendicular to its"),
         (
             change("duration = 0.05", "duration = 0.025"),
-            "run.duration = 0.025: allowed at least 0.0288, the end of the motion with its shaper",
+            "run.duration = 0.025; allowed: at least 0.0288, the end of the motion with its shaper",
         ),
         (
             change("residual_length = 0.02", "residual_length = 0.04"),
-            "metrics.residual_length = 0.04: allowed 0.0001 to 0.0212, from one sample to what "
+            "metrics.residual_length = 0.04; allowed: 0.0001 to 0.0212, from one sample to what "
             "run.duration = 0.05 leaves",
         ),
         (
             change("[control]", IDEAL + "[1e6, 1, 1]"),
-            "control.gain_factor = 0.5: allowed gains low enough for 200 plant steps per sample",
+            "control.gain_factor = 0.5; allowed: gains low enough for 200 plant steps per sample",
         ),
         (
             change("[control]", IDEAL + "[1e3, 1, 1]").replace("[run]", "[run]\nsubsteps = 1"),
-            "run.substeps = 1: allowed ",
+            "run.substeps = 1; allowed: ",
         ),
         (
             SHORT + "[electronics]\nlowpass_ratio = [3.0, 11.0]",
             "low-pass corners below half the sample rate, 5000 Hz; the highest of the 2 is at 5033",
         ),
-        (change("[link]", "[link]\nlength = 0.01"), "patches.actuator_length = 0.03: allowed at"),
+        (change("[link]", "[link]\nlength = 0.01"), "patches.actuator_length = 0.03; allowed: at"),
         (
             change("[link]", "[link]\nthickness = 0.1\nyoungs_modulus = 2e12\ndensity = 1"),
-            "link.modes = 2: allowed modes up to 1.592e+05 Hz at electronics.sample_rate_hz",
+            "link.modes = 2; allowed: modes up to 1.592e+05 Hz at electronics.sample_rate_hz",
         ),
         ("[patches]\ncenters = [0.05, 0.06, 0.15]", "so that no patches overlap [m]"),
-        ("[control]\nmodes = 4", "control.modes = 4: allowed 1 to 3, the number of patch pairs"),
+        ("[control]\nmodes = 4", "control.modes = 4; allowed: 1 to 3, the number of patch pairs"),
         ("[run]\nduration = ", "not valid TOML"),
     ],
 )
@@ -315,7 +315,7 @@ def test_a_bad_precision_or_command_is_refused(capsys, tmp_path):
     (tmp_path / "short.toml").write_text(SHORT)
     arguments = ("simulate", tmp_path / "short.toml", "--out", tmp_path / "run.h5")
     message = refused(capsys, *arguments, "--precision", "float16")
-    assert "precision = 'float16': allowed float64 or float32; did you mean 'float64'?" in message
+    assert "precision = 'float16'; allowed: float64 or float32; did you mean 'float64'?" in message
     assert "Missing option '--out'" in refused(capsys, *arguments[:2])
     assert "No such command 'simulat'" in refused(capsys, "simulat")
     code, out, _ = run(capsys)

@@ -60,10 +60,10 @@ def test_late_flags_are_refused_with_the_cure(monkeypatch):
     [
         (
             {"precision": "float46"},
-            "precision = 'float46': allowed float64 or float32; did you mean 'float64'?",
+            "precision = 'float46'; allowed: float64 or float32; did you mean 'float64'?",
         ),
-        ({"devices": 0}, "devices = 0: allowed a whole number from 1"),
-        ({"devices": 1.5}, "devices = 1.5: allowed a whole number from 1"),
+        ({"devices": 0}, "devices = 0; allowed: a whole number from 1"),
+        ({"devices": 1.5}, "devices = 1.5; allowed: a whole number from 1"),
     ],
 )
 def test_wrong_values_are_named(settings, words):

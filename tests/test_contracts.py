@@ -266,7 +266,7 @@ BEYOND = BETWEEN._replace(default=2.0)
         ),
         (
             {"laws": [LAWS["imsc"]._replace(name="x", parameters=(BEYOND,))]},
-            "'share': default 2; allowed 0 to 1",
+            "'share': default 2; allowed: 0 to 1",
         ),
         ({"metrics": [METRICS["residual_rms"]._replace(name="x", dims=("leg",))]}, "axis 'leg'"),
     ],

@@ -225,7 +225,7 @@ REFUSED = {
     "no gain": (changed(PAPER, control={"gain_factor": 0.0}), "control.gain_factor"),
     "sensors at rest at the end": (
         changed(PAPER, electronics={"conditioner_bias": 3.0}),
-        "conditioner_bias = 3.0: allowed",
+        "conditioner_bias = 3.0; allowed",
     ),
     "masked": (changed(PAPER, control={"mode_mask": [[False] * 3] * 3}), "mode_mask"),
 }
@@ -239,14 +239,14 @@ def test_what_is_no_controller_is_refused(name):
 
 
 UNFIT = {
-    "codes too long": (changed(PAPER, electronics={"adc_bits": 20}), "adc_bits = 20: allowed up"),
+    "codes too long": (changed(PAPER, electronics={"adc_bits": 20}), "adc_bits = 20; allowed: up"),
     "filter too slow": (
         changed(PAPER, electronics={"highpass_hz": 1e-3}),
-        r"highpass_hz = 0.001: allowed from 0.0\d+ .*--target c",
+        r"highpass_hz = 0.001; allowed: from 0.0\d+ .*--target c",
     ),
     "rounding too loud": (
         changed(PAPER, electronics={"voltage_limit": 1e-7}),
-        r"can add up to .* V at actuator \d of link \d: allowed .*--target c",
+        r"can add up to .* V at actuator \d of link \d; allowed: .*--target c",
     ),
     "too high a rate": (
         changed(
@@ -269,7 +269,7 @@ def test_what_does_not_fit_words_is_refused(name):
 
 
 def test_factors_beyond_a_word_are_refused():
-    with pytest.raises(StudyError, match=r"gains: factors add up to 3e\+09 .* allowed below"):
+    with pytest.raises(StudyError, match=r"gains: factors add up to 3e\+09 .* allowed: below"):
         fixed_point._row(np.array([[1e9, 2e9, 0.0]]), "gains")
     with pytest.raises(StudyError, match="nan"):
         fixed_point._row(np.array([[np.nan, 1.0]]), "gains")

@@ -109,7 +109,7 @@ def test_odd_numbers_of_cases_fill_whole_vectors():
         [InputLeaf((), True)],
         np.float32,
     )
-    with pytest.raises(ValueError, match="lanes = 24: allowed multiples of 16"):
+    with pytest.raises(ValueError, match="lanes = 24; allowed: multiples of 16"):
         cpu.build_kernel(loop).run([np.zeros(1, np.float32), np.zeros(24, np.float32)], 1, 24)
 
 

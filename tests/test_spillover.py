@@ -91,7 +91,7 @@ def test_verdicts_of_the_ladder_of_gains():
 def test_a_required_margin_decides():
     strict = certified({}, margin=2.6, **HARD)
     assert not strict.is_passed and strict.required == 2.6
-    with pytest.raises(StudyError, match="--margin = 1.0: allowed more than 1"):
+    with pytest.raises(StudyError, match="--margin = 1.0; allowed: more than 1"):
         certified({}, margin=1.0, **HARD)
 
 
@@ -535,10 +535,10 @@ def test_a_certificate_is_written_whole_or_not_at_all(capsys, monkeypatch, tmp_p
 @pytest.mark.parametrize(
     ("study", "more", "message"),
     [
-        ({"control__feedback": "ideal"}, (), "control.feedback = 'ideal': allowed 'sampled'"),
+        ({"control__feedback": "ideal"}, (), "control.feedback = 'ideal'; allowed: 'sampled'"),
         ({"control__links": (False,) * 3}, (), "at least one link"),
         ({"control__gain_factor": 0.0}, (), "at least one is not zero"),
-        ({}, ("--margin", "0.5"), "--margin = 0.5: allowed more than 1"),
+        ({}, ("--margin", "0.5"), "--margin = 0.5; allowed: more than 1"),
         ({}, ("--case", "3"), "leave --case out"),
     ],
 )

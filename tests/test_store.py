@@ -153,7 +153,7 @@ def changed(**fields):
         (
             changed() | {"case": Variable(np.arange(4), ("case",), "1", "case")},
             {},
-            "length of case along case = 4: allowed 3",
+            "length of case along case = 4; allowed: 3",
         ),
         (changed() | {"link": VARIABLES["span"]}, {}, "link.dims = []"),
         ({}, {"spec": None}, "attribute spec"),
@@ -247,7 +247,7 @@ def test_field_error_names_value_range_unit_and_nearest():
     error = field_error("plant.length", 0.5, "0.1 to 0.3", "m", hint)
     assert isinstance(error, StudyError)
     assert str(error) == (
-        "plant.length = 0.5: allowed 0.1 to 0.3 [m]; did you mean 'modal_filter'?"
+        "plant.length = 0.5; allowed: 0.1 to 0.3 [m]; did you mean 'modal_filter'?"
     )
-    assert str(field_error("method", "", "rk4")) == "method = '': allowed rk4"
+    assert str(field_error("method", "", "rk4")) == "method = ''; allowed: rk4"
     assert nearest("zzz", ["modal_filter"]) == ""

@@ -91,7 +91,7 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     design = load_design(out, int(number))
     assert re.fullmatch("[0-9a-f]{16}", design.case_id) and design.case_id.startswith(name)
     assert "fits 40 cases" in refused(capsys, "replay", out, "--case", "id:")
-    assert "allowed 0 to 39" in refused(capsys, "replay", out, "--case", "40")
+    assert "allowed: 0 to 39" in refused(capsys, "replay", out, "--case", "40")
     for options, name in (
         ((), "placement.png"),
         (("--x", "gain", "--hue", "drive.kp"), "points.pdf"),
@@ -149,7 +149,7 @@ def test_a_dry_run_says_why_its_sample_cannot_run(capsys, tmp_path):
     spec = tmp_path / "short.toml"
     spec.write_text("run.duration = 0.15\n[sweep.axes]\ngain = [0.1, 0.2]\n")
     code, text, _ = run(capsys, "sweep", spec, "--dry-run")
-    assert code == 0 and "the sample cannot run: run.duration = 0.15: allowed at least" in text
+    assert code == 0 and "the sample cannot run: run.duration = 0.15; allowed: at least" in text
 
 
 def test_a_folder_of_other_things_does_not_hide_a_ready_study(tmp_path, monkeypatch):

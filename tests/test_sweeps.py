@@ -243,7 +243,7 @@ def test_static_choices_make_groups():
     groups = make_plan(small_spec({"axes": axes})).groups
     assert {group.structure.feedback for group in groups} == {"none", "sampled"}
     assert all(len(group.rows) == 4 and group.structure.n_modes == 3 for group in groups)
-    with pytest.raises(StudyError, match="needs a compilation; allowed up to 32"):
+    with pytest.raises(StudyError, match="needs a compilation; allowed: up to 32"):
         many = {"run.duration": {"from": 0.021, "to": 0.025, "count": 40}}
         make_plan(small_spec({"axes": many}))
 
@@ -508,7 +508,7 @@ def test_best_cases_obey_conditions(mixed):
     np.testing.assert_array_equal(
         metric_values(data, "residual_rms[station=2][link=3]"), data["residual_rms"][:, 2, 1]
     )
-    with pytest.raises(StudyError, match="allowed link = 1 to 3, station = 1 to 3"):
+    with pytest.raises(StudyError, match="allowed: link = 1 to 3, station = 1 to 3"):
         best_cases(data, "residual_rms[link=4]")
     with pytest.raises(StudyError, match="did you mean 'peak_voltage'"):
         best_cases(data, "voltage_peak")

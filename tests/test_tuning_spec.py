@@ -106,15 +106,15 @@ def deep(n):
 @pytest.mark.parametrize(
     ("tune", "message"),
     [
-        ({}, "tune.free = .*: allowed one free field or more"),
+        ({}, "tune.free = .*; allowed: one free field or more"),
         ({"free": {"control.gainfactor": {}}}, "did you mean 'control.gain_factor'"),
         ({"free": {"run.duration": {"from": 0.1, "to": 1.0}}}, "cannot be free; fields that can"),
         (
             {"free": {"control.gain_factor": {"from": 0.6, "to": 2.0}}},
-            "control.gain_factor = 0.5: allowed 0.6 to 2, the bounds",
+            "control.gain_factor = 0.5; allowed: 0.6 to 2, the bounds",
         ),
         ({"free": {"control.gain_factor": {"from": -1.0, "to": 2.0}}}, "a finite number >= 0"),
-        ({"free": {"control.gain_factor": {"from": 2.0, "to": 1.0}}}, "= 1.0: allowed more than"),
+        ({"free": {"control.gain_factor": {"from": 2.0, "to": 1.0}}}, "= 1.0; allowed: more than"),
         ({"free": {"poles.decay": {"from": 1.0, "to": 2.0}}}, "needs poles.frequency_hz beside it"),
         (
             {
@@ -135,17 +135,17 @@ def deep(n):
             },
             "free twice",
         ),
-        ({"free": {"placement": {"from": 0, "to": 1}}}, "allowed {kind = 'same'}"),
+        ({"free": {"placement": {"from": 0, "to": 1}}}, "allowed: {kind = 'same'}"),
         ({"free": GAIN, "objective": {"residual": 1.0}}, "did you mean 'residual_rms'"),
-        ({"free": GAIN, "objective": {"residual_rms": -1.0}}, "allowed a number > 0"),
+        ({"free": GAIN, "objective": {"residual_rms": -1.0}}, "allowed: a number > 0"),
         ({"free": GAIN, "objective": {"gain_margin": 1.0}}, "'gain_margin': unknown metric"),
         ({"free": GAIN, "limits": {"peak_volt": 1.0}}, "did you mean 'peak_voltage'"),
         (
             {"free": GAIN, "objective": {"residual_rms[3]": 1.0}},
-            r"has no such entry; allowed residual_rms\[0 to 2\]\[0 to 2\]",
+            r"has no such entry; allowed: residual_rms\[0 to 2\]\[0 to 2\]",
         ),
         ({"free": GAIN, "objective": {"settling_time": 1.0}}, "no derivative; take ringing_time"),
-        ({"free": GAIN, "limits": {"gain_margin[0]": 2.0}}, "no such entry; allowed gain_margin"),
+        ({"free": GAIN, "limits": {"gain_margin[0]": 2.0}}, "no such entry; allowed: gain_margin"),
         ({"free": GAIN, "limits": {"peak_voltage": "mine"}}, "> 0 and <= 1e\\+30 or 'own'"),
         (
             {"free": GAIN, "limits": {"peak_voltage": 40.0, "peak_voltage[1]": 50.0}},
@@ -155,7 +155,7 @@ def deep(n):
         ({"free": GAIN, "scenarios": {"spread": {"electronics.adc_noise": 5.0}}}, "not 0 where"),
         ({"free": GAIN, "scenarios": {"each": {"motion.move_time": 0.03}}}, "a list of values"),
         ({"free": GAIN, "scenarios": {"each": {"motion.move_time": [-1.0]}}}, "move_time = -1.0"),
-        ({"free": GAIN, "scenarios": {"tail": 2.0}}, "tune.scenarios.tail = 2.0: allowed"),
+        ({"free": GAIN, "scenarios": {"tail": 2.0}}, "tune.scenarios.tail = 2.0; allowed"),
         (
             {"free": GAIN, "families": {"one": {"free": ["control.gainfactor"]}}},
             "did you mean 'control.gain_factor'",
@@ -205,7 +205,7 @@ def deep(n):
             },
             "both in",
         ),
-        ({"free": GAIN, "starts": 1000, "scenarios": {"count": 1000}}, "runs at once; allowed up"),
+        ({"free": GAIN, "starts": 1000, "scenarios": {"count": 1000}}, "runs at once; allowed: up"),
         (
             {
                 "free": {
@@ -219,15 +219,15 @@ def deep(n):
         ({"free": {"link_subsets": "all"}}, "cannot be free; an axis of sweeps alone"),
         (
             {"free": GAIN, "objective": {"residual_rms[link=4]": 1.0}},
-            r"allowed \[link=1 to 3\], \[station=1 to 3\]",
+            r"allowed: \[link=1 to 3\], \[station=1 to 3\]",
         ),
         ({"free": {"pole.decay": {"from": 5.0, "to": 50.0}}}, "did you mean 'poles.decay'"),
-        ({"free": GAIN, "objective": {"qqq": 1.0}}, "unknown metric; allowed residual_rms, "),
+        ({"free": GAIN, "objective": {"qqq": 1.0}}, "unknown metric; allowed: residual_rms, "),
         ({"free": GAIN, "limits": {"peak_voltage": deep(400)}}, "peak_voltage = .* or 'own'"),
-        ({"free": GAIN, "families": {"one": {"sets": {}}}}, "allowed {free = "),
+        ({"free": GAIN, "families": {"one": {"sets": {}}}}, "allowed: {free = "),
         (
             {"free": GAIN, "pareto": {"limit": "peak_voltage", "values": [1.0, 2.0]}},
-            "tune.pareto.limit = 'peak_voltage': allowed one of the metrics in tune.limits",
+            "tune.pareto.limit = 'peak_voltage'; allowed: one of the metrics in tune.limits",
         ),
         (
             {

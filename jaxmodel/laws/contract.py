@@ -75,7 +75,7 @@ def check_law(law: Law) -> None:
     """Raise PartError for a law whose description cannot be meant."""
     place = f"law {law.name!r}"
     if law.channel not in get_args(Channel):
-        raise PartError(f"{place}: channel = {law.channel!r}; allowed 'mode' or 'patch'")
+        raise PartError(f"{place}: channel = {law.channel!r}; allowed: 'mode' or 'patch'")
     if not callable(law.design):
         raise PartError(f"{place}: design = {law.design!r}; a function is wanted")
     seen: set[str] = set()
@@ -87,7 +87,7 @@ def check_law(law: Law) -> None:
         if not x.low <= x.default <= x.high:
             raise PartError(
                 f"{place}: parameter {x.name!r}: default {x.default:g}; "
-                f"allowed {x.low:g} to {x.high:g}"
+                f"allowed: {x.low:g} to {x.high:g}"
             )
         seen.add(x.name)
 

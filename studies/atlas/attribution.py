@@ -75,7 +75,7 @@ def effects(residual: np.ndarray) -> np.ndarray:
 def _players(value: np.ndarray) -> int:
     count = int(value.shape[-1]).bit_length() - 1
     if 2**count != value.shape[-1]:
-        raise ValueError(f"{value.shape[-1]} values: allowed 2^n, one per subset of n players")
+        raise ValueError(f"{value.shape[-1]} values; allowed: 2^n, one per subset of n players")
     return count
 
 

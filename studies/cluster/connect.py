@@ -169,7 +169,7 @@ def _written_address(file: str) -> str:
         address = json.loads(Path(file).read_text(encoding="utf-8"))["address"]
     except FileNotFoundError:
         raise StudyError(
-            f"--scheduler {file}: no such file; allowed tcp://HOST:PORT, tls://HOST:PORT, or a "
+            f"--scheduler {file}: no such file; allowed: tcp://HOST:PORT, tls://HOST:PORT, or a "
             "scheduler's JSON file"
         ) from None
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -77,7 +77,7 @@ def _tuned(path: Path, case: str | int | None) -> Path:
         return next(iter(files.values()))
     known = f"{', '.join(sorted(filter(None, files)))}, the families of {path}"
     if case is None:
-        raise StudyError(f"--case is missing: allowed {known}")
+        raise StudyError(f"--case is missing; allowed: {known}")
     if str(case) not in files:
         raise field_error("--case", case, known, hint=nearest(str(case), files))
     return files[str(case)]
@@ -86,7 +86,7 @@ def _tuned(path: Path, case: str | int | None) -> Path:
 def _number(data: SweepData, case: str | None, path: Path) -> int:
     """Number of the case that is meant."""
     known = (
-        f"allowed 0 to {data.n_cases - 1}, the cases of {path}, or id: and the first digits of a "
+        f"allowed: 0 to {data.n_cases - 1}, the cases of {path}, or id: and the first digits of a "
         "case's id"
     )
     if case is None:

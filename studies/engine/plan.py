@@ -121,7 +121,7 @@ def plan_groups(
         swept = ", ".join(name for name in STATIC if name in table.columns)
         raise StudyError(
             f"sweep: {len(distinct)} combinations of {swept}, each of which needs a compilation; "
-            f"allowed up to {PROGRAM_LIMIT}"
+            f"allowed: up to {PROGRAM_LIMIT}"
         )
     groups = []
     for key in distinct:

@@ -171,7 +171,7 @@ def _of_axes(data: SweepData, name: str, named: list[tuple[str, str]]) -> np.nda
             allowed = ", ".join(
                 f"{d} = 1 to {n}" for d, n in zip(dims[1:], array.shape[1:], strict=True)
             )
-            raise StudyError(f"{name}[{axis}={written}]: allowed {allowed or 'no index'}")
+            raise StudyError(f"{name}[{axis}={written}]; allowed: {allowed or 'no index'}")
         array = np.take(array, number - 1, axis=dims.index(axis))
         dims.remove(axis)
     return _worst(data, array, tuple(dims), name in LEAST)

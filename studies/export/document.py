@@ -312,7 +312,7 @@ def import_study(path: Path) -> Study:
     for field in ("title", "law", "estimator", "masks"):
         mine, own = getattr(given, field), getattr(wanted, field)
         if mine != own:
-            raise StudyError(f"{path}: {field} = {shown(mine)}: allowed {shown(own)}, {_AS_STUDY}")
+            raise StudyError(f"{path}: {field} = {shown(mine)}; allowed: {shown(own)}, {_AS_STUDY}")
     for name in sorted(set(wanted.numbers) | set(given.numbers)):
         if name not in given.numbers or name not in wanted.numbers:
             fault = "missing" if name in wanted.numbers else "unknown"
@@ -330,7 +330,7 @@ def _check_equal(path: Path, name: str, given: Quantity, wanted: Quantity) -> No
         mine, right = getattr(given, label), getattr(wanted, label)
         if mine != right:
             raise StudyError(
-                f"{path}: numbers.{name}.{label} = {shown(mine)}: allowed {shown(right)}"
+                f"{path}: numbers.{name}.{label} = {shown(mine)}; allowed: {shown(right)}"
             )
     try:
         found, own = np.array(given.value, float), np.array(wanted.value, float)
@@ -338,7 +338,7 @@ def _check_equal(path: Path, name: str, given: Quantity, wanted: Quantity) -> No
         raise StudyError(f"{path}: numbers.{name}: no table of numbers") from None
     if found.shape != own.shape:
         raise StudyError(
-            f"{path}: numbers.{name} has the shape {found.shape}: allowed {own.shape}, as its study"
+            f"{path}: numbers.{name} has shape {found.shape}; allowed: {own.shape}, as its study"
         )
     size = np.abs(own).max(initial=0.0)
     # a number that is not finite differs, too
@@ -346,6 +346,6 @@ def _check_equal(path: Path, name: str, given: Quantity, wanted: Quantity) -> No
     if np.any(wrong):
         at = tuple(int(k) for k in np.argwhere(wrong)[0])
         raise StudyError(
-            f"{path}: numbers.{name}{list(at) if at else ''} = {found[at]:.9g}: allowed "
+            f"{path}: numbers.{name}{list(at) if at else ''} = {found[at]:.9g}; allowed: "
             f"{own[at]:.9g} [{wanted.unit}], {_AS_STUDY}"
         )

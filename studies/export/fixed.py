@@ -153,7 +153,7 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
     adc_bits = int(_bits(sensor.max() / code))
     if adc_bits < 0:
         raise StudyError(
-            f"fixed point: sensor signals can be {sensor.max() / code:.3g} ADC codes: allowed "
+            f"fixed point: sensor signals can be {sensor.max() / code:.3g} ADC codes; allowed: "
             f"{2.0 ** (WORD - 1):.3g}; lower control.feedthrough_factor or "
             "electronics.voltage_limit, or take --target c"
         )
@@ -311,7 +311,7 @@ def _row(factors: np.ndarray, name: str) -> IntegerRow:
     shift = np.floor(WORD - 1 - np.log2(safe * (1 + 1e-6)))
     if not np.all(np.isfinite(total)) or shift.min() < 1:
         raise StudyError(
-            f"{name}: factors add up to {total.max():.3g} between words of {WORD} bits: allowed "
+            f"{name}: factors add up to {total.max():.3g} between words of {WORD} bits; allowed: "
             f"below {2.0 ** (WORD - 2):.3g}; lower control.gain_factor, or take --target c"
         )
     shift = np.minimum(shift, 62).astype(int)
@@ -403,7 +403,7 @@ def _check_error(found: FixedController, error: ErrorBound, dac_step: float) -> 
     link, patch = np.unravel_index(np.argmax(worst), worst.shape)
     raise StudyError(
         f"fixed point: rounding can add up to {worst.max():.3g} V at actuator {patch + 1} of link "
-        f"{link + 1}: allowed {ALLOWED_ERROR * dac_step:.3g} [V], half a step of the DAC; lower "
+        f"{link + 1}; allowed: {ALLOWED_ERROR * dac_step:.3g} [V], half a step of the DAC; lower "
         f"electronics.sample_rate_hz = {found.study.electronics.sample_rate_hz:g} or the gains, "
         f"raise electronics.highpass_hz = {found.study.electronics.highpass_hz:g}, choose "
         "patches.centers whose modal filter is better conditioned, or take --target c"

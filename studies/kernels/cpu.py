@@ -57,7 +57,7 @@ class Kernel:
             ValueError: another number of lanes, which would write beyond the arrays.
         """
         if lanes % self.width:
-            raise ValueError(f"lanes = {lanes}: allowed multiples of {self.width}")
+            raise ValueError(f"lanes = {lanes}; allowed: multiples of {self.width}")
         arrays = [self.numbers, *leaves]
         addresses = (ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays))
         for first in range(0, lanes, self.width):

@@ -64,7 +64,7 @@ def evaluate(text: str, lookup: Lookup, field: str) -> np.ndarray:
         StudyError: not a condition of this grammar, or one that mixes text and numbers.
     """
     if len(text) > LONGEST:
-        raise StudyError(f"{field}: {len(text)} characters; allowed up to {LONGEST}")
+        raise StudyError(f"{field}: {len(text)} characters; allowed: up to {LONGEST}")
     said = shown(text)
     try:
         tree = ast.parse(NAMED_INDEX.sub(r'["\1=\2"]', text.strip()), mode="eval").body
@@ -74,7 +74,9 @@ def evaluate(text: str, lookup: Lookup, field: str) -> np.ndarray:
         raise StudyError(f"{field} = {said}: {error}") from None
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         reason = error.msg if isinstance(error, SyntaxError) else str(error)
-        raise StudyError(f"{field} = {said}: no condition ({reason}); allowed {_ALLOWED}") from None
+        raise StudyError(
+            f"{field} = {said}: no condition ({reason}); allowed: {_ALLOWED}"
+        ) from None
     except (TypeError, OverflowError):
         raise StudyError(f"{field} = {said}: mixes text and numbers") from None
     if value.dtype != bool:
@@ -99,7 +101,7 @@ def _value(node: ast.AST, lookup: Lookup) -> Any:
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and not node.keywords:
         if node.func.id in _FUNCTIONS and node.args:
             return _FUNCTIONS[node.func.id](*(_value(item, lookup) for item in node.args))
-    raise StudyError(f"{ast.unparse(node)!r} cannot be used here; allowed {_ALLOWED}")
+    raise StudyError(f"{ast.unparse(node)!r} cannot be used here; allowed: {_ALLOWED}")
 
 
 def _truth(node: ast.AST, lookup: Lookup) -> np.ndarray:

@@ -87,7 +87,7 @@ def _product(parts: list[Columns], path: str) -> Columns:
     sizes = [length(columns) for columns in parts]
     total = int(np.prod([float(size) for size in sizes]))
     if total > LIMIT:
-        raise StudyError(f"{path}: {total:.3g} cases; allowed up to {LIMIT}")
+        raise StudyError(f"{path}: {total:.3g} cases; allowed: up to {LIMIT}")
     result: dict[str, np.ndarray] = {}
     inner, outer = total, 1
     for columns, size in zip(parts, sizes, strict=True):

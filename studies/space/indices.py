@@ -63,7 +63,7 @@ def elementary_effects(points: np.ndarray, value: np.ndarray) -> Effects:
         worst = int(np.argmin(count))
         raise StudyError(
             f"sensitivity: only {count[worst]} of {len(x)} effects of factor {worst} are left "
-            f"beside failed cases; allowed at least {max(LEAST_LEFT * len(x), 2):.0f}. Narrow the "
+            f"beside failed cases; allowed: at least {max(LEAST_LEFT * len(x), 2):.0f}. Narrow the "
             "axes, or ask for more trajectories"
         )
     return Effects(
@@ -96,7 +96,7 @@ def sobol_indices(value: np.ndarray, dimensions: int, seed: int = 0) -> Indices:
     if len(used) < max(LEAST_LEFT * len(rows), 4):
         raise StudyError(
             f"sensitivity: only {len(used)} of {len(rows)} base points have no failed case; "
-            f"allowed at least {max(LEAST_LEFT * len(rows), 4):.0f}. Narrow the axes"
+            f"allowed: at least {max(LEAST_LEFT * len(rows), 4):.0f}. Narrow the axes"
         )
     if np.ptp(used) == 0:
         raise StudyError("sensitivity: the metric is the same in every case")

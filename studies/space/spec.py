@@ -143,7 +143,7 @@ DEEPEST = 20
 def _node(block: Block, path: str, depth: int = 0) -> BlockNode:
     children = []
     if depth > DEEPEST:
-        raise StudyError(f"sweep.blocks: nested {depth} deep; allowed up to {DEEPEST}")
+        raise StudyError(f"sweep.blocks: nested {depth} deep; allowed: up to {DEEPEST}")
     for k, data in enumerate(block.blocks):
         inner = f"{path}.blocks.{k}"
         children.append(_node(_parse_block(Block, data, inner), inner, depth + 1))

@@ -152,7 +152,7 @@ def _check_samples(study: Study, columns: Columns) -> None:
     longest = float(np.max(Fields(study, columns).numbers("run.duration") * rate))
     if longest > SAMPLE_LIMIT:
         raise StudyError(
-            f"run.duration: a case with {longest:.3g} samples; allowed up to {SAMPLE_LIMIT}"
+            f"run.duration: a case with {longest:.3g} samples; allowed: up to {SAMPLE_LIMIT}"
         )
 
 

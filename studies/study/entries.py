@@ -68,7 +68,7 @@ def parse_entries(name: str, path: str = "", sizes: Mapping[str, int] | None = N
     plain = parse_entry(NAMED_INDEX.sub("", name))
     if plain is None or plain.field not in METRICS:
         hint = nearest(name.partition("[")[0], METRICS)
-        told = f"did you mean {hint!r}?" if hint else f"allowed {', '.join(METRICS)}"
+        told = f"did you mean {hint!r}?" if hint else f"allowed: {', '.join(METRICS)}"
         raise StudyError(f"{where}{name!r}: unknown metric; {told}")
     axes = METRICS[plain.field].dims
     size = {axis: (sizes or {}).get(axis, 3) for axis in axes}
@@ -76,7 +76,7 @@ def parse_entries(name: str, path: str = "", sizes: Mapping[str, int] | None = N
     for axis, written in NAMED_INDEX.findall(name):
         if axis not in axes or axis in at or not 1 <= int(written) <= size[axis]:
             allowed = ", ".join(f"[{one}=1 to {n}]" for one, n in size.items()) or "no index"
-            raise StudyError(f"{where}{name!r} has no such entry; allowed {allowed}")
+            raise StudyError(f"{where}{name!r} has no such entry; allowed: {allowed}")
         at[axis] = int(written) - 1
     left = [axis for axis in axes if axis not in at]
     for axis, number in zip(left, plain.indices, strict=False):
@@ -84,7 +84,7 @@ def parse_entries(name: str, path: str = "", sizes: Mapping[str, int] | None = N
     is_inside = all(number < size[axis] for axis, number in at.items())
     if len(plain.indices) > len(left) or not is_inside:
         shape = "".join(f"[0 to {n - 1}]" for n in size.values())
-        raise StudyError(f"{where}{name!r} has no such entry; allowed {plain.field}{shape}")
+        raise StudyError(f"{where}{name!r} has no such entry; allowed: {plain.field}{shape}")
     return Entries(plain.field, tuple(at.get(axis) for axis in axes))
 
 

@@ -151,7 +151,7 @@ def _unknown(
     where = f"in [{prefix.rstrip('.')}]" if prefix else "at the top"
     if not prefix and name in COMMANDS:
         hint = f"`studies {name}` reads that; a study alone has none"
-    hint = hint or f"allowed {where}: {', '.join(model.model_fields)}"
+    hint = hint or f"allowed: {where}: {', '.join(model.model_fields)}"
     return StudyError(f"{shown_name(field)} = {shown(value)}: unknown field; {hint}")
 
 

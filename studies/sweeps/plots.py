@@ -208,7 +208,7 @@ def save_plot(figure: Figure, path: Path) -> None:
         StudyError: another ending, or it cannot be written there.
     """
     if path.suffix not in (".png", ".pdf", ".svg"):
-        raise StudyError(f"--out {path}: allowed endings .png, .pdf, .svg")
+        raise StudyError(f"--out {path}; allowed: endings .png, .pdf, .svg")
     with figures.styled():
         figures.write_figure(figure, path)
 

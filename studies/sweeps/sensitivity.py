@@ -127,7 +127,7 @@ def factor_names(data: SweepData) -> list[str]:
     sweep = data.spec.sweep
     if METHODS[sweep.method].analysis is None:
         allowed = " or ".join(repr(name) for name, method in METHODS.items() if method.analysis)
-        raise StudyError(f"sensitivity: sweep.method = {sweep.method!r}; allowed {allowed}")
+        raise StudyError(f"sensitivity: sweep.method = {sweep.method!r}; allowed: {allowed}")
     if sweep.where or sweep.repeats > 1:
         raise StudyError("sensitivity: a design is read as a whole; leave out where and repeats")
     names = []

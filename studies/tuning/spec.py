@@ -230,13 +230,13 @@ def _check_metric(name: str, path: str, has_loop: bool, study: Study) -> None:
     if has_loop and name in LOOP_LIMITS:
         return
     if has_loop and _field(name) in LOOP_LIMITS:
-        raise StudyError(f"{path}: {name!r} has no such entry; allowed {_field(name)}")
+        raise StudyError(f"{path}: {name!r} has no such entry; allowed: {_field(name)}")
     known = [*METRICS, *(LOOP_LIMITS if has_loop else ())]
     if _field(name) not in known:
         hint = nearest(name, known)
         raise StudyError(
             f"{path}: {name!r}: unknown metric; "
-            + (f"did you mean {hint!r}?" if hint else f"allowed {', '.join(known)}")
+            + (f"did you mean {hint!r}?" if hint else f"allowed: {', '.join(known)}")
         )
     if not has_loop and not METRICS[_field(name)].has_slope:
         raise StudyError(
@@ -299,7 +299,7 @@ def _check_size(tune: Tune, families: tuple[Family, ...], moves: int) -> None:
         runs = designs * machines * moves
         if runs > MOST_RUNS:
             raise StudyError(
-                f"{what} = {machines}, with {moves} moves: {runs} runs at once; allowed up to "
+                f"{what} = {machines}, with {moves} moves: {runs} runs at once; allowed: up to "
                 f"{MOST_RUNS}"
             )
 
@@ -416,5 +416,5 @@ def _check_family(family: Family, move: dict[str, Any], study: Study) -> None:
         if a != b and field not in kept:
             raise StudyError(
                 f"tune.families.{shown_name(family.name)}: {field} = {shown(b)} where the study "
-                f"has {shown(a)}; allowed is what runs by the same program"
+                f"has {shown(a)}; allowed: is what runs by the same program"
             )
