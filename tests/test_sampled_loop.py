@@ -141,6 +141,9 @@ def test_gain_margin_of_known_poles():
     assert gain_margin(lambda factor: np.array([0.9]), highest=3.0) == 3
     found = gain_margin(lambda factor: np.array([0.99 + factor]), np.array([0.5]))
     np.testing.assert_allclose(found, 0.01, rtol=1e-4)
+    assert gain_margin(lambda factor: np.array([0.9]), highest=1e-3) == 1e-3
+    found = gain_margin(lambda factor: np.array([0.9 + 1e3 * factor]), highest=1e-3)
+    np.testing.assert_allclose(found, 1e-4, rtol=1e-4)
     weak = gain_margin(lambda factor: np.array([0.9 + 1e3 * factor]))
     np.testing.assert_allclose(weak, 1e-4, rtol=1e-4)
     assert gain_margin(lambda factor: np.array([0.9 + factor / LOWEST])) == 0

@@ -241,9 +241,11 @@ def gain_margin(
         return float(np.log(np.abs(poles(factor)).max()) - np.log1p(RADIUS_TOLERANCE))
 
     first = np.array([FIRST]) if first is None else first
-    count = int(np.ceil(np.log(highest / first[-1]) / np.log(STRIDE)))
+    first = first[first < highest]
+    last = float(first[-1]) if len(first) else highest
+    count = int(np.ceil(np.log(highest / last) / np.log(STRIDE)))
     low = 0.0
-    for high in map(float, [*first[:-1], *np.geomspace(first[-1], highest, count + 1)]):
+    for high in map(float, [*first[:-1], *np.geomspace(last, highest, count + 1)]):
         if excess(high) > 0:
             break
         low = high
