@@ -139,7 +139,7 @@ def test_the_report_of_a_run_is_whole(short_folder, short_run):
     assert len(found.images) == 4 and found.rows == [[8] * 4, [4] * 4, [3] * 3, [2] * 8]
     rms = f"{1e6 * float(short_run.residual_rms[1].max()):.4g}"
     margin = f"gain margin {float(short_run.gain_margin):.4g}, spectral radius"
-    watched = f"to the end of the run, {50 - 1e3 * float(short_run.command_end):.4g} ms after"
+    watched = f"the run ends {50 - 1e3 * float(short_run.command_end):.4g} ms after"
     for part in (
         "Status: ok.",
         watched,

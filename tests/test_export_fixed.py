@@ -278,7 +278,7 @@ def test_factors_beyond_a_word_are_refused():
 def test_unstable_loops_are_refused_with_their_margin():
     found = fixed_controller(parse_study(changed(PAPER, control={"gain_factor": 4.0})))
     with pytest.raises(
-        StudyError, match=r"gain_factor = 4.0: .* spectral radius is 1\.\d+.*margin"
+        StudyError, match=r"gain_factor = 4.0; .* spectral radius is 1\.\d+.*margin"
     ):
         judged(found, found.channels, "")
     # a design that is stable, until its filters are rounded to a few bits

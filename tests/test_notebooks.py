@@ -10,9 +10,15 @@ from nbformat.v4 import new_code_cell, new_notebook
 NOTEBOOKS = {
     path.stem: path for path in sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 }
-#: Much to compile; in short: the same functions in test_sweeps, test_tuning, test_atlas and
-#: test_spillover.
-LONG = ("2_coupling", "3_placement_sweep", "4_gradient_tuning", "5_spillover")
+#: Much to compile; in short: the same functions in test_sweeps, test_tuning, test_atlas,
+#: test_spillover and test_export.
+LONG = (
+    "2_coupling",
+    "3_placement_sweep",
+    "4_gradient_tuning",
+    "5_spillover",
+    "6_from_design_to_c",
+)
 QUICK = [name for name in NOTEBOOKS if name not in LONG]
 
 
