@@ -22,7 +22,7 @@ from jaxmodel.return_difference import (
 )
 from jaxmodel.sampled_loop import closed_loop
 from studies.engine import lanes
-from studies.engine.margins import judge_loops
+from studies.engine.margins import LEAST_DAMPED, judge_loops
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import load
 from studies.engine.stability import loop_report, with_margin_modes
@@ -293,6 +293,18 @@ def test_machines_that_hardly_stand_alone(fields):
     found = single(study).gain_margin
     assert (found == 0) == (wanted.gain_margin == 0) == ("load__wrench" in fields)
     np.testing.assert_allclose(found, wanted.gain_margin, rtol=0.02)
+
+
+def test_damping_by_eigenvalues_is_that_of_the_walk():
+    """Of one link under control out of three, on either side of what the walk can see."""
+    fields = {"control__links": (True, False, False), "control__gain_factor": 0.02}
+    walked, exact = (
+        single_damping(STUDY.change(link__damping_ratio=zeta, **fields))
+        for zeta in (1.02 * LEAST_DAMPED, 0.98 * LEAST_DAMPED)
+    )
+    np.testing.assert_allclose(exact[0], walked[0], rtol=0.01)
+    idle = STUDY.change(link__damping_ratio=0.0, control__links=(False, False, False))
+    assert np.all(np.isnan(single_damping(idle)))
 
 
 TWO_LINKS = (

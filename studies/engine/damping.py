@@ -47,10 +47,20 @@ def damping_ratios(
     found = np.full((count, n_orders), np.nan)
     for order in range(min(n_orders, response.square.shape[1])):
         poles = _poles(response, modes, order)
-        ratio = np.sort(-poles.real / np.abs(poles), axis=0)[::-1]  # the most damped first
-        least = ratio[np.maximum(n_links, 1) - 1, np.arange(count)]
-        found[:, order] = np.where(n_links > 0, least, np.nan)
+        found[:, order] = least_controlled(-poles.real / np.abs(poles), n_links)
     return found
+
+
+def least_controlled(ratio: np.ndarray, n_links: np.ndarray) -> np.ndarray:
+    """Least damping ratio of as many modes as links are controlled, the most damped ones [1], (n,).
+
+    Args:
+        ratio: of the three modes of an order [1], (3, n).
+        n_links: controlled ones, (n,).
+    """
+    falling = np.sort(ratio, axis=0)[::-1]
+    least = falling[np.maximum(n_links, 1) - 1, np.arange(len(n_links))]
+    return np.where(n_links > 0, least, np.nan)
 
 
 def _poles(response: LoopResponse, modes: AssembledModes, order: int) -> np.ndarray:

@@ -40,7 +40,7 @@ from jaxmodel.return_difference import (
     loop_strength,
 )
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
-from studies.engine.damping import damping_ratios
+from studies.engine.damping import damping_ratios, least_controlled
 from studies.engine.lanes import BLOCK, run_steps
 from studies.engine.stability import loop_report, with_margin_modes
 from studies.engine.steps import PREPARING
@@ -133,11 +133,13 @@ def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
                 doubtful.append(part[is_doubtful])
             return np.concatenate(doubtful)
 
-        again = judge(np.arange(count), WALKS[0])
-        if len(again):
-            judge(again, WALKS[1])
-    for k in np.flatnonzero(_least_damping(structure, whole) < LEAST_DAMPED):
-        _judge_by_eigenvalues(structure, jax.tree.map(lambda x, k=k: x[k], whole), figures, int(k))
+        is_sharp = _least_damping(structure, whole) < LEAST_DAMPED
+        rows = np.flatnonzero(~is_sharp)
+        for way in WALKS:
+            if len(rows):
+                rows = judge(rows, way)
+    for k in map(int, np.flatnonzero(is_sharp)):
+        _judge_by_eigenvalues(structure, jax.tree.map(lambda x, k=k: x[k], whole), figures, k)
     return figures
 
 
@@ -155,8 +157,10 @@ def _judge_by_eigenvalues(structure: Structure, case: Case, figures: LoopMargins
     except np.linalg.LinAlgError:  # not finite
         return
     figures.gain_margin[k] = found.gain_margin
-    figures.damping_ratio[k] = np.min(found.damping_ratio, axis=1)
-    figures.breaking_frequency[k] = figures.breaking_mode[k] = np.nan
+    n_links = np.sum(case.control.link_mask > 0)
+    figures.damping_ratio[k] = least_controlled(
+        found.damping_ratio.T, np.full(structure.n_controlled, n_links)
+    )
 
 
 def _judge_one_by_one(structure: Structure, cases: Case) -> LoopMargins:
