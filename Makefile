@@ -16,7 +16,7 @@ study: .venv/installed  ## run the study of the paper and a sweep of patch place
 	$(BIN)/studies paper --out results/paper
 	rm -rf results/placement
 	$(BIN)/studies sweep placement --out results/placement --report
-	$(BIN)/studies best results/placement --by residual_rms --count 5
+	$(BIN)/studies best results/placement --by residual_rms --subject-to "gain_margin > 2" --count 5
 	$(BIN)/studies plot results/placement --out results/placement/best.png
 
 explore: .venv/installed  ## coupling of the links, spillover of three designs, all notebooks
