@@ -3,18 +3,23 @@
 All short runs share one machine of two modes, so that it is compiled once.
 """
 
+import ast
 import contextlib
+import inspect
 import io
 import json
 import math
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray
 
-from studies.cli import main
+import studies
+from studies.cli import app, main
 from tests.pages import TITLE, parsed, rendered
 
 HOME_PHI = math.pi / 6
@@ -378,3 +383,17 @@ def test_commands_that_run_nothing_need_no_jax(capsys):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "gain_factor" in done.stdout
     assert done.stderr.strip() == "[]"
+
+
+def test_every_command_has_a_call_in_python():
+    """Rows of docs/python.md: all commands, calls that there are, with arguments that they take."""
+    table = (Path(studies.__file__).parents[1] / "docs" / "python.md").read_text()
+    rows = dict(re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|$", table, re.M))
+    known = {one.name or one.callback.__name__ for one in app.registered_commands}
+    assert {row.split()[0] for row in rows} == known
+    for text in rows.values():
+        for call in ast.walk(ast.parse(text)):
+            if isinstance(call, ast.Call):
+                names = [word.arg for word in call.keywords]
+                signature = inspect.signature(getattr(studies, call.func.id))
+                signature.bind(*call.args, **dict.fromkeys(names))

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from studies.errors import StudyError
 from studies.space.methods import morris_points, saltelli_points
-from studies.space.spec import load_sweep, parse_sweep, ready_spec
+from studies.space.spec import load_sweep, parse_sweep
 from studies.space.table import build_table, case_study
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
 from studies.study.fields import Fields, padded
@@ -224,9 +224,8 @@ def test_designs_for_sensitivity():
     ],
 )
 def test_ready_sweeps_are_valid(name, count):
-    from pathlib import Path
 
-    table = build_table(load_sweep(ready_spec(Path(name))))
+    table = build_table(load_sweep(name))
     assert len(table) == count
     case_study(table, len(table) - 1)
 

@@ -17,7 +17,8 @@ from studies.errors import StudyError
 from studies.space.spec import parse_sweep
 from studies.store import read_store
 from studies.study import spec as spec_module
-from studies.study.spec import load_study, paper_study, read_toml
+from studies.study.files import read_toml
+from studies.study.spec import load_study, paper_study
 from studies.sweeps.show import best_cases
 from studies.tuning import audit as audit_module
 from studies.tuning.audit import Disagreement

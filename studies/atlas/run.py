@@ -46,7 +46,11 @@ _LEFTOVER = re.compile(r"\.unfinished-.*")
 
 
 def run_atlas(
-    study: Study, out: Path, is_resumed: bool, console: Console, is_quiet: bool = False
+    study: Study,
+    out: str | Path,
+    is_resumed: bool = False,
+    console: Console | None = None,
+    is_quiet: bool = False,
 ) -> bool:
     """Run all subsets of a design, look at its workspace and platform, and write it all down.
 
@@ -54,7 +58,7 @@ def run_atlas(
         study: the design.
         out: folder.
         is_resumed: go on with the runs that are there; everything else is made anew.
-        console: where progress goes.
+        console: where progress goes; default: standard output.
         is_quiet: no progress.
 
     Returns:
@@ -64,6 +68,7 @@ def run_atlas(
         StudyError: a fault of the design or of the folder; no setting in which all cases run.
     """
     config.require_configured()
+    out, console = Path(out), console or Console(highlight=False, markup=False)
     spec = atlas_sweep(study)
     with locked_folder(out, "atlas"):
         if not (out / RUNS_FOLDER).is_dir():

@@ -14,8 +14,9 @@ from studies.engine.folder import MANIFEST, TUNING, read_manifest
 from studies.engine.results import SweepData, load
 from studies.engine.runs import Run, metric_variables
 from studies.errors import StudyError, field_error, nearest
-from studies.space.spec import parse_sweep, ready_spec
+from studies.space.spec import parse_sweep
 from studies.space.table import build_table, case_study
+from studies.study.files import find_spec
 from studies.study.spec import Study, load_study
 
 
@@ -27,7 +28,7 @@ class Design(NamedTuple):
     case_id: str = ""  # of the case in its sweep
 
 
-def load_design(path: Path, case: int | str | None = None) -> Design:
+def load_design(path: str | Path, case: int | str | None = None) -> Design:
     """Read a DESIGN.
 
     Args:
@@ -38,11 +39,12 @@ def load_design(path: Path, case: int | str | None = None) -> Design:
     Raises:
         StudyError: not found, case missing or not allowed, or a case that does not stand alone.
     """
+    path = Path(path)
     is_folder = path.is_dir()
     if is_folder and not any((path / name).is_file() for name in (MANIFEST, TUNING)):
-        is_folder = ready_spec(path) == path  # "paper" may be the report's folder, too
+        is_folder = find_spec(path) == path  # "paper" may be the report's folder, too
     if not is_folder:
-        path = ready_spec(path)
+        path = find_spec(path)
         if case is not None:
             raise StudyError(f"--case {case}: {path} is a file; leave --case out")
         return Design(load_study(path), {})

@@ -10,7 +10,6 @@ import typer
 from rich.console import Console
 
 from studies.config import start
-from studies.errors import StudyError
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -53,13 +52,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         """Read the study back from an exported JSON file, once its numbers are checked."""
         start()
         from studies.export.document import import_study
-        from studies.store import check_target, replacing
-        from studies.study.template import study_template
+        from studies.study.template import write_study
 
-        check_target(out)
-        if out.exists():
-            raise StudyError(f"--out {out}: exists already; name a new file")
-        text = study_template(import_study(file))
-        with replacing(out) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_study(out, import_study(file))
         console.print(f"written: {out}", soft_wrap=True)

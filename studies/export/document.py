@@ -292,12 +292,13 @@ def read_document(path: Path) -> Document:
         raise StudyError(f"{path}: {where} = {shown(first['input'])}: {first['msg']}") from None
 
 
-def import_study(path: Path) -> Study:
+def import_study(path: str | Path) -> Study:
     """The study of a document, once it is sure that its numbers are those of the document.
 
     Raises:
         StudyError: unreadable, no document, changed by hand.
     """
+    path = Path(path)
     given = read_document(path)
     try:
         study = parse_study(given.study)

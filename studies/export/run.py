@@ -32,7 +32,7 @@ DAC_BITS = 12
 def export_design(
     design: Design,
     target: str,
-    out: Path,
+    out: str | Path,
     is_verified: bool | None = None,
     name: str = "flexlink",
     dac_bits: int | None = None,
@@ -56,6 +56,7 @@ def export_design(
         StudyError: an argument out of range, or a controller that cannot be exported.
     """
     _check_arguments(target, name, dac_bits)
+    out = Path(out)
     check_folder(out)
     console = console or Console(highlight=False, markup=False)
     needs_compiler = TARGETS[target].needs_compiler

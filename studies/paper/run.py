@@ -40,18 +40,18 @@ from studies.study.spec import Study, paper_study
 DATA, REPORT = "paper.h5", "report.html"
 
 
-def run_paper(out: Path, console: Console) -> None:
+def run_paper(out: str | Path, console: Console | None = None) -> None:
     """Run the paper's study and write data, figures and report.
 
     Args:
         out: folder, made where missing; files of an earlier run are replaced.
-        console: where progress and the outcome go.
+        console: where progress and the outcome go; default: standard output.
 
     Raises:
         StudyError: the folder cannot be made or written to.
     """
-    study = paper_study()
-    write_paper(out, console, study, paper_cases(study.control.gain_factor))
+    study, console = paper_study(), console or Console(highlight=False, markup=False)
+    write_paper(Path(out), console, study, paper_cases(study.control.gain_factor))
 
 
 def write_paper(out: Path, console: Console, study: Study, cases: list[PaperCase]) -> None:

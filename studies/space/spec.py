@@ -16,12 +16,13 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import ValidationError
 
-from studies.errors import StudyError, field_error, nearest
+from studies.errors import StudyError, field_error
 from studies.space.methods import METHODS
 from studies.study.choices import OWN, OneOf
 from studies.study.entries import parse_entries
 from studies.study.explain import explain
-from studies.study.spec import Section, Study, described, parse_study, read_toml
+from studies.study.files import read_toml
+from studies.study.spec import Section, Study, described, parse_study
 
 
 class Block(Section):
@@ -67,23 +68,8 @@ class SweepSpec(NamedTuple):
     data: dict[str, Any]  # as read, for the record
 
 
-def ready_spec(name: Path) -> Path:
-    """A file, or the ready-made one of that name where there is no such file.
-
-    Raises:
-        StudyError: neither, but a ready one of nearly that name.
-    """
-    if name.is_file() or len(name.parts) > 1 or name.suffix not in ("", ".toml"):
-        return name
-    ready = {path.stem: path for path in (Path(__file__).parents[1] / "specs").glob("*.toml")}
-    hint = nearest(name.stem, ready)
-    if name.stem not in ready and hint and not name.exists():
-        raise StudyError(f"{name}: cannot be read (no such file); did you mean {hint!r}?")
-    return ready.get(name.stem, name)
-
-
 def load_sweep(path: str | Path) -> SweepSpec:
-    """Read a sweep file.
+    """Read a sweep file, or the ready one of that name.
 
     Raises:
         StudyError: unreadable, not TOML, or not a valid sweep.

@@ -28,14 +28,16 @@ from studies.study.spec import Study
 DOCUMENT, DATA = "certificate.json", "spillover.h5"
 
 
-def spillover_design(design: Design, out: Path, margin: float, console: Console) -> bool:
+def spillover_design(
+    design: Design, out: str | Path, margin: float = 2.0, console: Console | None = None
+) -> bool:
     """Write the certificate of a design, and the comparison of laws on its machine.
 
     Args:
         design: what to judge.
         out: folder for the files, made where it is missing.
         margin: gain margin that every plant must leave [1].
-        console: to tell what happens.
+        console: to tell what happens; default: standard output.
 
     Returns:
         whether the design passes.
@@ -43,6 +45,7 @@ def spillover_design(design: Design, out: Path, margin: float, console: Console)
     Raises:
         StudyError: as `certify`, or a folder that cannot be written to.
     """
+    out, console = Path(out), console or Console(highlight=False, markup=False)
     check_folder(out)
     study = resolved_study(design.study)
     _check_whose(out, study)

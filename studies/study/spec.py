@@ -6,7 +6,6 @@ allowed range, unit and the nearest valid name. `studies.study.cases` turns a `S
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
@@ -23,6 +22,7 @@ from studies.errors import StudyError, field_error
 from studies.study.choices import OWN, OneOf
 from studies.study.consistency import check_consistency
 from studies.study.explain import explain
+from studies.study.files import READY, read_toml
 
 #: Where fields of laws' own are.
 OWN_FIELDS = "control.laws"
@@ -450,7 +450,7 @@ def load_study(path: str | Path) -> Study:
     """Read a study file.
 
     Args:
-        path: TOML file.
+        path: TOML file, or the name of a ready one.
 
     Raises:
         StudyError: unreadable, not TOML, or not a valid study.
@@ -461,23 +461,6 @@ def load_study(path: str | Path) -> Study:
     return parse_study(data)
 
 
-def read_toml(path: str | Path) -> dict[str, Any]:
-    """Read a TOML file as a dictionary.
-
-    Raises:
-        StudyError: unreadable or not TOML.
-    """
-    try:
-        text = Path(path).read_bytes().decode("utf-8")
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise StudyError(f"study file {path}: cannot be read ({reason})") from None
-    try:
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # ValueError: also a number of 5000 digits
-        raise StudyError(f"study file {path}: not valid TOML ({error})") from None
-
-
 def paper_study() -> Study:
     """The paper's case, `studies/specs/paper.toml`."""
-    return load_study(Path(__file__).parents[1] / "specs" / "paper.toml")
+    return load_study(READY / "paper.toml")

@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
 
+from studies.errors import StudyError
+from studies.store import check_target, replacing
 from studies.study.explain import allowed_values, unit_of
 from studies.study.spec import Study
 
@@ -25,6 +28,24 @@ def study_template(study: Study | None = None) -> str:
             for field in type(section).model_fields:
                 lines += _field(section, field)
     return "\n".join(lines) + "\n"
+
+
+def write_study(out: str | Path, study: Study | None = None) -> None:
+    """Write such a file.
+
+    Args:
+        out: a new file.
+        study: what it is to read back as; None: all defaults.
+
+    Raises:
+        StudyError: there is such a file, or it cannot be written.
+    """
+    out = Path(out)
+    check_target(out)
+    if out.exists():
+        raise StudyError(f"{out}: exists already; name a new file")
+    with replacing(out) as temporary:
+        temporary.write_text(study_template(study), encoding="utf-8")
 
 
 def _field(section: BaseModel, name: str) -> list[str]:

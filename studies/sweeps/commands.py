@@ -43,10 +43,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         workers = Workers(scheduler, local_workers, worker_timeout)
         start(precision, cpu_only=workers.are_named)
         from studies.engine.sweep import make_plan, run_sweep
-        from studies.space.spec import load_sweep, ready_spec
+        from studies.space.spec import load_sweep
         from studies.sweeps.dry_run import print_plan
 
-        asked = load_sweep(ready_spec(spec))
+        asked = load_sweep(spec)
         if dry_run and workers.are_named:
             raise StudyError("--dry-run: plans for this process; leave the workers out")
         if dry_run and report:

@@ -41,7 +41,7 @@ MARKERS = ("o", "^", "s")
 MOST_BANDS = 4
 
 
-def plot(data: SweepData, x: str | None, y: str, hue: str | None) -> Figure:
+def plot(data: SweepData, x: str | None, y: str, hue: str | None = None) -> Figure:
     """The figure of a sweep.
 
     Args:

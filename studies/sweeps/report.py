@@ -75,7 +75,7 @@ class BestCase(NamedTuple):
     table: Rows
 
 
-def write_sweep_report(folder: Path) -> None:
+def write_sweep_report(folder: str | Path) -> None:
     """Write `report.md` and `report.html` of a sweep, with its figures, into its folder.
 
     Args:
@@ -84,6 +84,7 @@ def write_sweep_report(folder: Path) -> None:
     Raises:
         StudyError: no sweep there, or a file cannot be written.
     """
+    folder = Path(folder)
     data = load(folder)
     spec = data.spec
     metric = ranking(data)

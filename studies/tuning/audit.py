@@ -29,6 +29,8 @@ SMALLEST = 1e-3
 #: And where even that is smaller, they count as if they changed a figure, which is a share of the
 #: study's own, by this much from bound to bound: derivatives near zero are judged absolutely.
 NEAR_ZERO = 1e-3
+#: How many designs are looked at where none are named.
+DESIGNS = 3
 #: What a disagreement is, for a reader.
 MEANING = (
     "Derivatives along the way from bound to bound. A disagreement is a share of the larger of the "
@@ -49,16 +51,17 @@ class Disagreement(NamedTuple):
     share: float  # disagreement as a share of the larger one
 
 
-def audit(spec: TuneSpec, places: np.ndarray) -> list[Disagreement]:
+def audit(spec: TuneSpec, places: np.ndarray | None = None) -> list[Disagreement]:
     """Compare derivatives with differences; one entry for each free number.
 
     Each number is looked at in the family that moves most of them of those that move it.
 
     Args:
         spec: of the tuning.
-        places: designs to look at, between the bounds, (n, p).
+        places: designs to look at, between the bounds, (n, p); None: `audit_places`.
     """
     worst: dict[int, Disagreement] = {}
+    places = audit_places(spec) if places is None else places
     for position, numbers in _covering(spec).items():
         # as many designs as the tuning has starts, so that it needs no program of its own
         evaluator = Evaluator(spec, [spec.moving[position]] * len(start_families(spec)))
@@ -128,7 +131,7 @@ def _evaluated(spec: TuneSpec, evaluator: Evaluator, designs: np.ndarray) -> Eva
     return Evaluation(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
 
-def audit_places(spec: TuneSpec, count: int = 3) -> np.ndarray:
+def audit_places(spec: TuneSpec, count: int = DESIGNS) -> np.ndarray:
     """Beside the study itself and points spread over the bounds, those with the most stable loops.
 
     Args:

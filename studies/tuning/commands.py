@@ -42,12 +42,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         """Move free numbers of a study downhill, within limits, for many machines at once."""
         workers = Workers(scheduler, local_workers, worker_timeout)
         start(cpu_only=workers.are_named)
-        from studies.space.spec import ready_spec
         from studies.tuning.run import REPORT, run_tuning
         from studies.tuning.spec import load_tuning
         from studies.tuning.workers import evaluator_for
 
-        asked = load_tuning(ready_spec(spec))
+        asked = load_tuning(spec)
         if audit and (out or resume or quiet or workers.are_named):
             raise StudyError(
                 "--audit: writes nothing, here; leave --out, --resume, --quiet and workers out"
@@ -68,12 +67,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
 
 def _audit(spec: TuneSpec, console: Console) -> None:
-    from studies.tuning.audit import ALLOWED, MEANING, audit, audit_places
+    from studies.tuning.audit import ALLOWED, DESIGNS, MEANING, audit
 
-    places = audit_places(spec)
-    console.print(f"comparing derivatives with differences at {len(places)} designs")
+    console.print(f"comparing derivatives with differences at {DESIGNS} designs")
     names = "free number", "family", "worst for", "at", "derivative", "difference", "disagreement"
-    table, found = Table(*names), audit(spec, places)
+    table, found = Table(*names), audit(spec)
     for one in found:
         table.add_row(
             one.name,

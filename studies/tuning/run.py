@@ -54,7 +54,7 @@ def make_evaluator(spec: TuneSpec) -> Evaluator:
 
 def run_tuning(
     spec: TuneSpec,
-    out: Path,
+    out: str | Path,
     is_resumed: bool = False,
     console: Console | None = None,
     is_quiet: bool = False,
@@ -78,6 +78,7 @@ def run_tuning(
             limits that contradict one another (everything is written all the same).
     """
     config.require_configured()
+    out = Path(out)
     console = console or Console(highlight=False, markup=False)
     manifest = make_manifest(spec.data, DECISIVE)
 

@@ -28,8 +28,9 @@ from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.study.cases import build_structure
 from studies.study.entries import controlled_links, parse_entries
 from studies.study.explain import explain
+from studies.study.files import read_toml
 from studies.study.paths import checked_value, is_each_link, known_field, set_value
-from studies.study.spec import Section, Study, described, parse_study, read_toml
+from studies.study.spec import Section, Study, described, parse_study
 from studies.tuning.free import FreeNumbers, free_numbers, writes
 
 #: Limits that no run is needed for; all but `spillover` are lower ones. Those of the loop:
@@ -139,7 +140,7 @@ class TuneSpec(NamedTuple):
 
 
 def load_tuning(path: str | Path) -> TuneSpec:
-    """Read a tuning file.
+    """Read a tuning file, or the ready one of that name.
 
     Raises:
         StudyError: unreadable, not TOML, or not a valid tuning.

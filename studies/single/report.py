@@ -56,7 +56,7 @@ def check_results(out: Path, has_report: bool) -> None:
         check_target(out.with_name(name))
 
 
-def write_results(out: Path, run: Run, has_report: bool, notes: Sequence[str] = ()) -> str:
+def write_results(out: Path, run: Run, has_report: bool, notes: Sequence[str] = ()) -> None:
     """Write a run to its file and, if asked for, its report beside it.
 
     Args:
@@ -65,21 +65,17 @@ def write_results(out: Path, run: Run, has_report: bool, notes: Sequence[str] = 
         has_report: whether to write the report.
         notes: sentences that it adds to what it says of the run's status.
 
-    Returns:
-        What has been written, in words.
-
     Raises:
         StudyError: a file cannot be written.
     """
     write_store(out, run_variables(run), run_attributes(run.study))
     if not has_report:
-        return f"written: {out}"
+        return
     twin = uncontrolled_twin(run)
     with figures.styled():
         for name, figure in {**draw(run, twin), "machine": sketch(run.study)}.items():
             figures.write_figure(figure, out.with_name(_figure(out, name)))
     write_report(out.parent, report(out, run, twin, notes), run.study, out.stem)
-    return f"written: {out}\nreport: {out.with_name(out.stem)}.html"
 
 
 def _figure(out: Path, name: str) -> str:
@@ -93,7 +89,7 @@ def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str]) -> str:
     worst = int(np.argmax(np.nan_to_num(result.metrics.residual_rms.max(axis=1), nan=-1.0)))
     has_free = twin is not None and twin.status in status.FINISHED
     return render(
-        "show/run_report.md",
+        "single/report.md",
         run=run,
         study=study,
         twin=twin,

@@ -1,0 +1,69 @@
+"""The command `studies bench`."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from studies.config import start
+from studies.errors import StudyError
+
+
+def add_commands(app: typer.Typer, console: Console) -> None:
+    """Add the command to the command line."""
+
+    @app.command()
+    def bench(
+        what: Annotated[str, typer.Argument(help="runs, or peers: W0 by other means")] = "runs",
+        work: Annotated[str, typer.Option(help="W0, W1, W8, grad or sweep; default: W1")] = "",
+        executor: Annotated[
+            str, typer.Option(help="kernel, scan or gpu; default: the fastest one")
+        ] = "",
+        batch: Annotated[
+            int, typer.Option(min=0, max=2**20, help="cases of a chunk; 0: a good number")
+        ] = 0,
+        cases: Annotated[int, typer.Option(min=0, help="cases of the sweep; 0: 100,000")] = 0,
+        precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
+        as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    ) -> None:
+        """Measure speed and memory on this machine."""
+        if what == "peers" and precision != "float64":
+            raise StudyError(
+                f"--precision {precision}: not allowed with peers, which do W0 in double "
+                "precision; leave it out"
+            )
+        start(precision)
+        from studies.bench.run import run_bench
+
+        found = run_bench(what, work, executor, batch, cases)
+        if as_json:
+            print(json.dumps(found))
+        elif isinstance(found, list):
+            console.print(_peers(found))
+        else:
+            console.print(_figures(found))
+
+
+def _peers(rows: list[dict[str, Any]]) -> Table:
+    table = Table("W0 by", "configurations/s", "error [share of the largest rms]", "times slower")
+    for row in rows:
+        table.add_row(
+            row["peer"],
+            f"{row['configs_per_s']:.3g}",
+            f"{row['error']:.1e}",
+            f"{row['times_slower']:.3g}",
+        )
+    return table
+
+
+def _figures(found: dict[str, Any]) -> Table:
+    table = Table(show_header=False)
+    for name, value in found.items():
+        parts = value if isinstance(value, dict) else {"": value}
+        for part, number in parts.items():
+            table.add_row(f"{name} {part}".strip(), str(number))
+    return table

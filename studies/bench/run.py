@@ -1,0 +1,66 @@
+"""One call for everything that `studies bench` measures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console
+
+from studies.bench.gradients import bench_gradients
+from studies.bench.peers import bench_peers
+from studies.bench.works import bench_runs, bench_sweep
+from studies.errors import StudyError, field_error
+
+#: Cases of the work `sweep`.
+SWEEP_CASES = 100_000
+
+
+def run_bench(
+    what: str = "runs",
+    work: str = "",
+    executor: str = "",
+    batch: int = 0,
+    cases: int = 0,
+    console: Console | None = None,
+) -> dict[str, Any] | list[dict[str, Any]]:
+    """Measure speed and memory on this machine.
+
+    Args:
+        what: "runs" of this program, or "peers": W0 by other means.
+        work: W0, W1, W8, grad or sweep; "": W1.
+        executor: kernel, scan or gpu; "": the fastest one.
+        batch: cases of a chunk; 0: a good number.
+        cases: of the work `sweep`; 0: `SWEEP_CASES`.
+        console: where progress goes; default: standard error.
+
+    Returns:
+        figures by name; of peers a row each.
+
+    Raises:
+        StudyError: an unknown choice, or one that would be ignored.
+    """
+    if what not in ("runs", "peers"):
+        raise field_error("bench", what, "'runs' or 'peers'")
+    _check(what, work, executor, batch, cases)
+    console = console or Console(stderr=True, highlight=False, markup=False)
+    if what == "peers":
+        return [row._asdict() for row in bench_peers(console.print)]
+    if work == "sweep":
+        return bench_sweep(cases or SWEEP_CASES, console)
+    if work == "grad":
+        return bench_gradients(executor, batch)
+    return bench_runs(work or "W1", executor, batch)
+
+
+def _check(what: str, work: str, executor: str, batch: int, cases: int) -> None:
+    """Refuse options that would be ignored."""
+    if what == "peers":
+        given = {"--work": work, "--executor": executor, "--batch": batch, "--cases": cases}
+        reason = "with peers, which do W0 in double precision"
+    elif work == "sweep":
+        given, reason = {"--executor": executor, "--batch": batch}, "with --work sweep"
+    else:
+        given, reason = {"--cases": cases}, "but with --work sweep"
+    for name, value in given.items():
+        if value:
+            raise StudyError(f"{name} {value}: not allowed {reason}; leave it out")

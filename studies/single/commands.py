@@ -1,0 +1,142 @@
+"""The commands of one run: simulate, replay, modes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from studies.config import start
+
+if TYPE_CHECKING:
+    from studies.engine.runs import Run
+
+_Report = Annotated[
+    bool,
+    typer.Option("--report", help="write a report with figures, Markdown and HTML, beside it"),
+]
+
+
+def add_commands(app: typer.Typer, console: Console) -> None:
+    """Add the commands to the command line."""
+
+    @app.command()
+    def simulate(
+        study: Annotated[Path, typer.Argument(help="study file (TOML) or ready design")],
+        out: Annotated[Path, typer.Option(help="HDF5 file to write")],
+        report: _Report = False,
+        precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
+    ) -> None:
+        """Run one study with full trajectories."""
+        start(precision)
+        from studies.single.run import simulate as simulate_study
+        from studies.study.spec import load_study
+
+        run = simulate_study(load_study(study), out, report)
+        _print_run(run, console)
+        _print_files(out, report, console)
+
+    @app.command()
+    def replay(
+        design: Annotated[Path, typer.Argument(help="study file, folder of a tuning or a sweep")],
+        case: Annotated[
+            str | None, typer.Option(help="number, or id: and digits of its id")
+        ] = None,
+        out: Annotated[Path | None, typer.Option(help="HDF5 file for the trajectories")] = None,
+        report: _Report = False,
+    ) -> None:
+        """Run one case of a sweep again with full trajectories, and compare with what it found."""
+        start()
+        from studies.single.run import replay as replay_case
+        from studies.study.labels import describe
+
+        found = replay_case(design, case, out, report)
+        console.print(f"{found.run.study.title}: {describe(found.run.status)}")
+        for note in found.notes:
+            console.print(note)
+        _print_files(out, report, console)
+
+    @app.command()
+    def modes(
+        study: Annotated[
+            Path | None,
+            typer.Argument(
+                help="study file or ready design; default: the paper's machine, undamped"
+            ),
+        ] = None,
+        pose: Annotated[
+            tuple[float, float, float] | None,
+            typer.Option(help="x [m] y [m] phi [rad]; default: the first"),
+        ] = None,
+        kp: Annotated[
+            float | None, typer.Option(help="drive stiffness [N/m], 0 = free sliders")
+        ] = None,
+        kd: Annotated[float | None, typer.Option(help="drive damping [N s/m]")] = None,
+        damping: Annotated[float | None, typer.Option(help="structural damping ratio [1]")] = None,
+        locked: Annotated[bool | None, typer.Option("--locked", help="hold the sliders")] = None,
+        basis: Annotated[str | None, typer.Option(help="modal basis of the links")] = None,
+        n_modes: Annotated[int | None, typer.Option("--modes", help="modes per link")] = None,
+        as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    ) -> None:
+        """Natural frequencies and damping ratios of the assembled machine."""
+        start()
+        from studies.engine.modes import machine_modes
+        from studies.study.spec import load_study
+
+        found = machine_modes(
+            None if study is None else load_study(study),
+            pose=pose,
+            kp=kp,
+            kd=kd,
+            damping=damping,
+            locked=locked,
+            basis=basis,
+            n_modes=n_modes,
+        )
+        if as_json:
+            text = {
+                "frequencies_hz": found.frequency.tolist(),
+                "damping_ratios": found.damping_ratio.tolist(),
+            }
+            print(json.dumps(text))
+            return
+        table = Table("mode", "frequency [Hz]", "damping ratio [1]")
+        for k, (f, z) in enumerate(zip(found.frequency, found.damping_ratio, strict=True)):
+            table.add_row(str(k + 1), f"{f:.4f}", f"{z:.5f}")
+        console.print(table)
+
+
+def _print_run(run: Run, console: Console) -> None:
+    """Status, metrics of the links, stability."""
+    from studies.single.report import settling_text
+    from studies.study.labels import describe
+    from studies.study.margin import caution, margin_text
+
+    metrics = run.result.metrics
+    console.print(f"status: {describe(run.status)}")
+    table = Table("link", "residual rms, worst station [um]", "settling [ms]", "peak voltage [V]")
+    for i in range(3):
+        table.add_row(
+            str(i + 1),
+            f"{1e6 * metrics.residual_rms[i].max():.4g}",
+            settling_text(run, i),
+            f"{metrics.peak_voltage[i]:.4g}",
+        )
+    console.print(table)
+    if run.loop is None:
+        return
+    margin = margin_text(run.loop.gain_margin)
+    console.print(f"gain margin of the linearised sampled loop: {margin}")
+    if warning := caution(run.loop.gain_margin):
+        console.print(f"[bold red]{warning}[/]", soft_wrap=True, markup=True)
+
+
+def _print_files(out: Path | None, has_report: bool, console: Console) -> None:
+    if out is not None:
+        console.print(f"written: {out}", soft_wrap=True)
+    if out is not None and has_report:
+        console.print(f"report: {out.with_name(out.stem)}.html", soft_wrap=True)

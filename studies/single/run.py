@@ -1,0 +1,91 @@
+"""One run from a study or a design, with its file and its report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from studies.engine.design import deviation, load_design
+from studies.engine.runs import Run, run_study
+from studies.errors import StudyError
+from studies.single.report import check_results, write_results
+from studies.study.labels import describe
+from studies.study.spec import Study
+
+
+class Replay(NamedTuple):
+    """A case of a sweep once more, beside what the sweep found."""
+
+    run: Run
+    stored_status: int | None  # of the sweep; None where there is none
+    difference: float  # largest difference of a metric, relative to the metric's size [1]
+    metric: str  # which one; "" for none
+
+    @property
+    def notes(self) -> list[str]:
+        """The comparison as a sentence; [] where there is nothing to compare with."""
+        if self.stored_status is None:
+            return []
+        which = f" ({self.metric})" if self.metric else ""
+        return [
+            f"sweep: {describe(self.stored_status)}; largest difference of a metric "
+            f"{self.difference:.1e} of its size{which}"
+        ]
+
+
+def simulate(study: Study, out: str | Path | None = None, has_report: bool = False) -> Run:
+    """Run a study with full trajectories, and write what is asked for.
+
+    Args:
+        study: what to run.
+        out: HDF5 file for trajectories and metrics; None: nothing is written.
+        has_report: whether to write the report beside that file, too.
+
+    Raises:
+        StudyError: a fault of the study, or a file that cannot be written.
+    """
+    file = _checked(out, has_report)
+    run = run_study(study)
+    if file is not None:
+        write_results(file, run, has_report)
+    return run
+
+
+def replay(
+    design: str | Path,
+    case: int | str | None = None,
+    out: str | Path | None = None,
+    has_report: bool = False,
+) -> Replay:
+    """Run one case of a sweep again with full trajectories, and compare with what it found.
+
+    Args:
+        design: study file, folder of a tuning or a sweep.
+        case: as in `load_design`.
+        out, has_report: as in `simulate`.
+
+    Raises:
+        StudyError: as `load_design` and `simulate`.
+    """
+    file = _checked(out, has_report)
+    found = load_design(design, case)
+    run = run_study(found.study)
+    if found.stored:
+        again = Replay(run, int(found.stored["status"]), *deviation(run, found.stored))
+    else:
+        again = Replay(run, None, 0.0, "")
+    if file is not None:
+        write_results(file, run, has_report, again.notes)
+    return again
+
+
+def _checked(out: str | Path | None, has_report: bool) -> Path | None:
+    """The file to write, once it is known that this can be done."""
+    if out is None:
+        if has_report:
+            raise StudyError(
+                "--report: is written beside the trajectories; name their file by --out"
+            )
+        return None
+    check_results(Path(out), has_report)
+    return Path(out)

@@ -1,0 +1,46 @@
+"""Files of studies, sweeps and tunings: where they lie, and what TOML makes of them."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from studies.errors import StudyError, nearest
+
+#: Folder of the files that come with the package, which can be had by name.
+READY = Path(__file__).parents[1] / "specs"
+
+
+def find_spec(name: str | Path) -> Path:
+    """A file, or the ready-made one of that name where there is no such file.
+
+    Raises:
+        StudyError: neither, but a ready one of nearly that name.
+    """
+    path = Path(name)
+    if path.is_file() or len(path.parts) > 1 or path.suffix not in ("", ".toml"):
+        return path
+    ready = {file.stem: file for file in READY.glob("*.toml")}
+    hint = nearest(path.stem, ready)
+    if path.stem not in ready and hint and not path.exists():
+        raise StudyError(f"{path}: cannot be read (no such file); did you mean {hint!r}?")
+    return ready.get(path.stem, path)
+
+
+def read_toml(name: str | Path) -> dict[str, Any]:
+    """A TOML file, found by `find_spec`, as a dictionary.
+
+    Raises:
+        StudyError: not found, unreadable or not TOML.
+    """
+    path = find_spec(name)
+    try:
+        text = path.read_bytes().decode("utf-8")
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise StudyError(f"study file {path}: cannot be read ({reason})") from None
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # ValueError: also a number of 5000 digits
+        raise StudyError(f"study file {path}: not valid TOML ({error})") from None
