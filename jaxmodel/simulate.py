@@ -140,7 +140,7 @@ def _share_on(time: Array, start: Array, length: Array) -> Array:
 def _points(x: Array, n: int) -> Array:
     """Group a fine grid (n p + 1, ...) into the p + 1 points of each sample, (n, p + 1, ...)."""
     p = (x.shape[0] - 1) // n
-    body = jnp.reshape(x[:-1], (n, p) + x.shape[1:])
+    body = jnp.reshape(x[:-1], (n, p, *x.shape[1:]))
     return jnp.concatenate([body, x[p::p][:, None]], axis=1)
 
 
@@ -190,9 +190,9 @@ def _scan_in_blocks(body: Any, start: Any, inputs: Inputs, is_checkpointed: bool
         return jax.lax.scan(body, state, part)
 
     block = jax.checkpoint(block) if is_checkpointed else block
-    main = jax.tree.map(lambda x: x[: count * size].reshape((count, size) + x.shape[1:]), inputs)
+    main = jax.tree.map(lambda x: x[: count * size].reshape((count, size, *x.shape[1:])), inputs)
     state, kept = jax.lax.scan(block, start, main)
-    kept = jax.tree.map(lambda x: x.reshape((count * size,) + x.shape[2:]), kept)
+    kept = jax.tree.map(lambda x: x.reshape((count * size, *x.shape[2:])), kept)
     if count * size < n:
         state, rest = block(state, jax.tree.map(lambda x: x[count * size :], inputs))
         kept = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), kept, rest)

@@ -121,7 +121,7 @@ def numbers(path: Path) -> dict[str, Any]:
 
 def code(path: Path) -> dict[str, Any]:
     """C without its comments."""
-    return {"text": re.sub(r"/\*.*?\*/|//[^\n]*", "", path.read_text(), flags=re.S)}
+    return {"text": re.sub(r"/\*.*?\*/|//[^\n]*", "", path.read_text(), flags=re.DOTALL)}
 
 
 READERS = {".h5": arrays, ".json": numbers, ".c": code, ".h": code}

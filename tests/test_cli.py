@@ -388,7 +388,7 @@ def test_commands_that_run_nothing_need_no_jax(capsys):
 def test_every_command_has_a_call_in_python():
     """Rows of docs/python.md: all commands, calls that there are, with arguments that they take."""
     table = (Path(studies.__file__).parents[1] / "docs" / "python.md").read_text()
-    rows = dict(re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|$", table, re.M))
+    rows = dict(re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|$", table, re.MULTILINE))
     known = {one.name or one.callback.__name__ for one in app.registered_commands}
     assert {row.split()[0] for row in rows} == known
     for text in rows.values():

@@ -77,7 +77,7 @@ free = { "control.laws.even_damping.constant" = { from = 0.2, to = 4.0 } }
 @pytest.fixture(scope="module")
 def own(tmp_path_factory):
     """The tables with the parts of the docs in them."""
-    blocks = re.findall("```python\n(.*?)```", DOCS.read_text(), re.S)
+    blocks = re.findall("```python\n(.*?)```", DOCS.read_text(), re.DOTALL)
     yield from taken_in(tmp_path_factory.mktemp("own") / "own_parts.py", "\n".join(blocks))
 
 

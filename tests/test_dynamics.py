@@ -185,7 +185,7 @@ def test_a_dropped_term_of_the_shortening_would_be_noticed(states):
 
 def test_axial_force_is_the_one_that_bending_feels(states):
     """N from the equation of a mode equals N from the equilibrium of joint and slider."""
-    basis, plant = make("pinned_pinned")
+    _basis, plant = make("pinned_pinned")
     motion, loads = states
 
     @jax.jit
@@ -287,7 +287,7 @@ def test_inverse_kinematics_on_a_time_axis_equals_single_poses():
 
 
 def test_modal_mass_matrix_of_pinned_free_links_at_rest():
-    basis, plant = make("pinned_free")
+    _basis, plant = make("pinned_free")
     zero, still = jnp.zeros((3, R)), jnp.zeros(3)
 
     def energy(q_rate):

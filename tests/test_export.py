@@ -132,7 +132,7 @@ void sample_interrupt(void);
 def test_the_example_of_the_documentation_compiles(capsys, designs, folders, tmp_path):
     out, _ = exported(capsys, designs, folders, "paper", "c-fixed")
     page = (Path(__file__).parents[1] / "docs" / "export.md").read_text()
-    example = re.search(r"```c\n(#include.*?)```", page, re.S)[1]
+    example = re.search(r"```c\n(#include.*?)```", page, re.DOTALL)[1]
     (tmp_path / "main.c").write_text(STUBS + example)
     made = ["-I", out, "-c", "-o", tmp_path / "main.o", tmp_path / "main.c"]
     subprocess.run([*needs_compiler(), *STRICT, *made], check=True)
@@ -336,7 +336,7 @@ def test_export_refuses_folders_it_cannot_write(capsys, designs, tmp_path):
 def test_without_a_compiler_code_is_written_and_said_to_be_unverified(
     capsys, designs, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(export_run, "find_compiler", lambda: [])
+    monkeypatch.setattr(export_run, "find_compiler", list)
     arguments = ("export", designs["paper"], "--target", "c", "--out", tmp_path / "out")
     assert "no C compiler" in refused(capsys, *arguments, "--verify")
     code, text, _ = run(capsys, *arguments)
@@ -383,7 +383,7 @@ def test_a_title_stays_a_comment(capsys, tmp_path, title):
     made = ["-c", "-o", tmp_path / "object.o", tmp_path / "out" / "flexlink.c"]
     subprocess.run([*needs_compiler(), *STRICT, *made], check=True)
     assert "evil" not in re.sub(
-        r"/\*.*?\*/", "", (tmp_path / "out" / "flexlink.c").read_text(), flags=re.S
+        r"/\*.*?\*/", "", (tmp_path / "out" / "flexlink.c").read_text(), flags=re.DOTALL
     )
 
 

@@ -110,7 +110,8 @@ def fourth_order(f, x, step):
 def test_rounded_loops_have_the_slope_of_the_smooth_loop():
     """The code of the README: values with real converters, derivatives by smooth differences."""
     text = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
-    (code,) = (x for x in re.findall(r"```python\n(.*?)```", text, re.S) if "value_and_grad" in x)
+    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    (code,) = (x for x in blocks if "value_and_grad" in x)
     names = {}
     exec(code, names)
     many, value, slope = (np.asarray(names[name]) for name in ("many", "value", "slope"))
@@ -119,7 +120,7 @@ def test_rounded_loops_have_the_slope_of_the_smooth_loop():
 
     names["structure"] = names["structure"]._replace(is_smooth=True)
     residual = names["residual"]
-    smooth = jax.jit(lambda factor: residual(factor))
+    smooth = jax.jit(lambda factor: residual(factor))  # noqa: PLW0108 (traced anew)
     assert slope == pytest.approx(fourth_order(smooth, 0.5, 1e-3), rel=1e-6)
     # rounding shows in the value: these are not the same loop
     assert abs(float(smooth(0.5)) / value - 1) > 1e-6

@@ -1,5 +1,6 @@
 """ETDRK4: its coefficients, its order and its accuracy against classical Runge-Kutta."""
 
+import itertools
 from functools import partial
 
 import jax
@@ -191,7 +192,7 @@ def test_order_is_four(eight_modes):
     for substeps in (8, 16, 32):
         states = run("etdrk4", structure, loop, SAMPLE, substeps, voltages, start)
         ends.append(np.concatenate([states.pose, states.q[:, :, 0], states.z[:, :, 0]], axis=1))
-    change = [np.abs(b - a).max(axis=0) for a, b in zip(ends, ends[1:], strict=False)]
+    change = [np.abs(b - a).max(axis=0) for a, b in itertools.pairwise(ends)]
     np.testing.assert_allclose(np.log2(change[0] / change[1]), 4, atol=0.15)
 
 

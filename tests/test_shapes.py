@@ -33,7 +33,7 @@ STUDY = paper_study().change(
     shaper__kind="none",
 )
 #: "name: Array  # ..., (3, C)" or "... each"; of a comment that goes on, its last line.
-_FIELD = re.compile(r"^    (\w+): .*#.*?\(([\w, ]*)\)(?:;.*| each|, None .*)?$", re.M)
+_FIELD = re.compile(r"^    (\w+): .*#.*?\(([\w, ]*)\)(?:;.*| each|, None .*)?$", re.MULTILINE)
 
 
 def promised(kind: type) -> dict[str, str]:

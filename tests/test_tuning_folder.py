@@ -330,9 +330,9 @@ def test_damaged_files_are_named(tmp_path, name, content):
 
 def test_a_tuning_that_fails_at_once_leaves_the_folder_free(tmp_path):
     manifest = {"spec": {}, "code": "a", "jaxlib": "1", "precision": "x"}
-    with pytest.raises(StudyError, match="nothing depends"):
-        with open_tuning(tmp_path, manifest, False):
-            raise StudyError("nothing depends on it")
+    refused = pytest.raises(StudyError, match="nothing depends")
+    with refused, open_tuning(tmp_path, manifest, False):
+        raise StudyError("nothing depends on it")
     assert opened(tmp_path, False) is None
 
 

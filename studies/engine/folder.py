@@ -158,7 +158,7 @@ def locked_folder(path: Path, what: str) -> Iterator[None]:
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-        lock = open(path / LOCK, "a")
+        lock = open(path / LOCK, "a")  # noqa: SIM115 (held as long as the folder is)
     except FileExistsError:
         raise StudyError(f"--out {path}: this is a file; name a folder") from None
     except OSError as error:

@@ -216,10 +216,8 @@ def _turned(name: str, known: list[str]) -> str:
 def _entry(data: SweepData, name: str, indices: tuple[int, ...], candidate: str) -> np.ndarray:
     variable = data.variables[candidate]
     array, dims = variable.data, variable.dims
-    if variable_name(name) != candidate or "[" not in name:
-        used = indices
-    else:
-        used = ()  # the entry is a variable of its own
+    is_own = variable_name(name) == candidate and "[" in name  # the entry is a variable of its own
+    used = () if is_own else indices
     for index in used:
         if array.ndim < 2 or index >= array.shape[1]:
             sizes = ", ".join(

@@ -175,7 +175,7 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
         link=channels.link,
         adc_bits=adc_bits,
         adc_top=int(controller.adc_top),
-        bias=int(round(float(controller.adc_bias) / float(controller.adc_step) * 2**adc_bits)),
+        bias=round(float(controller.adc_bias) / float(controller.adc_step) * 2**adc_bits),
         dac_rest=rest,
         sensor_step=step,
         dac_step=dac_step,

@@ -154,7 +154,9 @@ class Graph:
         key = (operation, *names)
         found = self._made.get(key)
         if found is None:
-            is_varying = any([type(x) is Node and x.is_varying for x in args])
+            is_varying = any(
+                [type(x) is Node and x.is_varying for x in args]  # noqa: C419 (faster)
+            )
             found = self._made[key] = Node(operation, args, is_varying, is_truth)
         return found
 

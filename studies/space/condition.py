@@ -98,9 +98,14 @@ def _value(node: ast.AST, lookup: Lookup) -> Any:
         return reduce(join, (_truth(value, lookup) for value in node.values))
     if isinstance(node, ast.Compare):
         return _comparison(node, lookup)
-    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and not node.keywords:
-        if node.func.id in _FUNCTIONS and node.args:
-            return _FUNCTIONS[node.func.id](*(_value(item, lookup) for item in node.args))
+    if (
+        isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id in _FUNCTIONS
+        and node.args
+        and not node.keywords
+    ):
+        return _FUNCTIONS[node.func.id](*(_value(item, lookup) for item in node.args))
     raise StudyError(f"{ast.unparse(node)!r} cannot be used here; allowed: {_ALLOWED}")
 
 

@@ -43,7 +43,7 @@ def build_structure(study: Study, substeps: int | None = None) -> Structure:
         study: validated study.
         substeps: plant steps per sample, where `run.substeps` leaves it open; default 1.
     """
-    steps = int(round(study.run.duration * study.electronics.sample_rate_hz))
+    steps = round(study.run.duration * study.electronics.sample_rate_hz)
     noisy = study.electronics.adc_noise > 0 or study.drive.ripple > 0 or study.run.smooth
     n_patches = patch_centers(study).shape[1]
     return Structure(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -248,7 +249,7 @@ def _check_lists(study: Study) -> None:
         raise field_error("link.damping_ratio", damping, "at least one number per link", "1")
     given = control.frequencies_hz
     for row in _nested(given) or (given,):
-        if any(b <= a for a, b in zip(row, row[1:], strict=False)):
+        if any(b <= a for a, b in itertools.pairwise(row)):
             raise field_error("control.frequencies_hz", given, "rising from mode to mode", "Hz")
     for name, flat, most, limit, unit in (
         ("control.frequencies_hz", given, "control.modes", control.modes, "Hz"),

@@ -79,8 +79,7 @@ def parse_entries(name: str, path: str = "", sizes: Mapping[str, int] | None = N
             raise StudyError(f"{where}{name!r} has no such entry; allowed: {allowed}")
         at[axis] = int(written) - 1
     left = [axis for axis in axes if axis not in at]
-    for axis, number in zip(left, plain.indices, strict=False):
-        at[axis] = number
+    at |= dict(zip(left, plain.indices, strict=False))
     is_inside = all(number < size[axis] for axis, number in at.items())
     if len(plain.indices) > len(left) or not is_inside:
         shape = "".join(f"[0 to {n - 1}]" for n in size.values())

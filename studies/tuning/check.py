@@ -91,9 +91,11 @@ def tuned_study(spec: TuneSpec, family: Family, values: np.ndarray) -> Study:
     if any(name.startswith(POLES) for name in names):
         whole["control.velocity_gain"] = case.control.velocity_gain
         whole["control.position_gain"] = case.control.position_gain
-    for name, value in zip(spec.free.names, values, strict=True):
-        if name in names and not name.startswith((PLACEMENT, *POLES)):
-            whole[name] = value
+    whole |= {
+        name: value
+        for name, value in zip(spec.free.names, values, strict=True)
+        if name in names and not name.startswith((PLACEMENT, *POLES))
+    }
     return parse_study(set_values(study, {k: np.asarray(x).tolist() for k, x in whole.items()}))
 
 

@@ -69,9 +69,9 @@ def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterat
 def _settled(part: Any) -> Any:
     """What must not change: all but the number of iterations, which Adam's steps depend on."""
     part = copy.deepcopy(part)
-    if isinstance(part, dict) and isinstance(part.get("tune"), dict):
-        if part["tune"].get("method", "lbfgs") == "lbfgs":
-            part["tune"].pop("iterations", None)
+    tune = part.get("tune") if isinstance(part, dict) else None
+    if isinstance(tune, dict) and tune.get("method", "lbfgs") == "lbfgs":
+        tune.pop("iterations", None)
     return part
 
 
