@@ -26,6 +26,23 @@ def headed(name: str, unit: str) -> str:
     return name if shown in ("", "1") else f"{name} [{shown}]"
 
 
+#: Settled is what has been seen to stay in the band for this long [s]: a period of the links' first
+#: bending mode. A link that swings through the band once more may be anywhere in it.
+CALM = 0.01
+
+
+def settling_text(seconds: float, watched: float) -> str:
+    """A settling time [ms], or that it was not seen.
+
+    Args:
+        seconds: from the end of the command to the last time outside the band.
+        watched: from there to the end of the run [s].
+    """
+    if seconds > 0 and seconds > watched - CALM:
+        return f"not within {number(watched, 's')}"
+    return number(seconds, "s")
+
+
 def number(value: float, unit: str) -> str:
     """A value of an SI unit as a report shows it, without the unit."""
     return f"{readable(unit)[0] * value:.4g}"

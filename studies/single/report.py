@@ -20,7 +20,7 @@ from studies.engine.runs import (
     uncontrolled_twin,
 )
 from studies.errors import StudyError
-from studies.show import figures
+from studies.show import figures, units
 from studies.show.markdown import picture
 from studies.show.pages import write_report
 from studies.show.sketch import CAPTION, sketch
@@ -202,11 +202,7 @@ def _watched(run: Run) -> float:
 
 def settling_text(run: Run, link: int) -> str:
     """Settling time of a link [ms], or that it was outside the band to the end."""
-    seconds = float(run.result.metrics.settling_time[link])
-    last = _watched(run)
-    if seconds >= last - 1.5 / run.study.electronics.sample_rate_hz > 0:
-        return f"not within {1e3 * last:.4g}"
-    return f"{1e3 * seconds:.4g}"
+    return units.settling_text(float(run.result.metrics.settling_time[link]), _watched(run))
 
 
 def _platform(run: Run) -> list[list[str]]:

@@ -16,7 +16,7 @@ from studies.engine.columns import NOT_RUN, WANTED_LARGE, variable_name
 from studies.engine.results import SweepData, counted_links, metric_values, swept_names
 from studies.engine.stored import kept_metrics
 from studies.errors import StudyError
-from studies.show.units import headed, readable
+from studies.show.units import headed, readable, settling_text
 from studies.space.condition import evaluate
 from studies.study.entries import links_text
 from studies.study.margin import ENOUGH, margin_text
@@ -170,12 +170,22 @@ def case_rows(data: SweepData, cases: np.ndarray, metrics: list[str]) -> Rows:
     for k in cases:
         cells = [shown_value(data, name, k) for name in names]
         numbers = (
-            margin_text(column[k]) if name == MARGIN else f"{column[k]:.4g}"
+            _number_text(data, name, column, k)
             for name, column in zip(metrics, columns, strict=True)
         )
         rows.append([str(k), short_id(data, k), *cells, *numbers])
     heads = [*(written_name(data, name) for name in names), *(label(data, x) for x in metrics)]
     return Rows(["case", "id", *heads], rows)
+
+
+def _number_text(data: SweepData, name: str, column: np.ndarray, case: int) -> str:
+    """A number of a case, from the metric's values in the unit that they are shown in."""
+    if name == MARGIN:
+        return margin_text(column[case])
+    if name.startswith("settling_time") and "command_end" in data.variables:
+        watched = data.spec.study.run.duration - float(data["command_end"][case])
+        return settling_text(1e-3 * float(column[case]), watched)
+    return f"{column[case]:.4g}"
 
 
 def written_name(data: SweepData, name: str) -> str:

@@ -12,7 +12,7 @@ from jaxmodel.metrics import METRICS
 from studies.show.markdown import literal
 from studies.show.sketch import CAPTION
 from studies.show.templates import render
-from studies.show.units import count_text, headed, number, readable
+from studies.show.units import count_text, headed, number, readable, settling_text
 from studies.study.entries import parse_entries
 from studies.study.margin import MARGIN_MODES, caution, margin_text
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
@@ -25,8 +25,6 @@ from studies.tuning.spec import LOOP_LIMITS, OWN, Family, TuneSpec, label
 
 #: Limits that hold from below.
 LOWER = ("gain_margin", "slowest_decay", "singularity_distance")
-#: Settling times this near to the end of the run have not settled [s].
-NEARLY = 2e-4
 #: A limit nearer than this share counts as active.
 NEAR = 0.02
 #: Starts that end within this share of the best one count as equally good.
@@ -201,10 +199,9 @@ def _designs(spec: TuneSpec, found: TuneFindings) -> list[tuple[str, JudgedDesig
 def _value(metric: str, values: Mapping[str, Any], watched: float) -> str:
     """A figure of one run as a report shows it."""
     value = float(values[metric])
-    unit = METRICS[parse_entries(metric).metric].unit
-    if metric.startswith("settling_time") and value >= watched - NEARLY > 0:
-        return f"not within {number(watched, unit)}"
-    return number(value, unit)
+    if metric.startswith("settling_time"):
+        return settling_text(value, watched)
+    return number(value, METRICS[parse_entries(metric).metric].unit)
 
 
 def _own_machine(spec: TuneSpec, found: TuneFindings, names: list[str]) -> list[list[str]]:
