@@ -141,7 +141,7 @@ def test_a_chunk_that_fails_costs_no_worker(cluster, tmp_path):
 def test_other_versions_are_refused(cluster, tmp_path):
     cluster.trouble(identity={"jaxlib": "0.1", "code": "f00"})
     with (
-        pytest.raises(StudyError, match="do not fit this client: tcp://.*: code f00 .client: "),
+        pytest.raises(StudyError, match="do not match this client: tcp://.*: code f00 .client: "),
         connected(Workers(str(cluster.scheduler), None, 60.0), print),
     ):
         pass

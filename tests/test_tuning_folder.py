@@ -233,7 +233,7 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
     for more, message in (
         ([], "holds a tuning already"),
         (["--resume"], "another tuning file"),
-        (["--audit"], "--audit: writes nothing"),
+        (["--audit"], "--audit: writes no files"),
     ):
         with pytest.raises(SystemExit, match="2"):
             cli.main(["tune", str(file), "--out", str(out), *more])
