@@ -93,7 +93,7 @@ def on_workers(
     Args:
         workers: which ones.
         tell: called with progress messages.
-                make: called with the client.
+        make: called with the client.
 
     Raises:
         StudyError: as `connected`.
