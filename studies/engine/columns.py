@@ -1,4 +1,4 @@
-"""What the files of a sweep hold: names, axes, units and texts of their variables."""
+"""Contents of a sweep's files: names, axes, units and descriptions of their variables."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from studies.study.labels import DISTANCE_TEXT, STATUS_LABEL
 from studies.study.margin import HIGHEST, MARGIN_MODES
 from studies.study.paths import field_unit, field_value, parse_entry
 
-#: Status of a case that has not been run.
+#: Status of a case that has not run.
 NOT_RUN = -1
 
 
@@ -89,7 +89,7 @@ def variable_name(field: str) -> str:
 
 
 def case_variables(table: CaseTable) -> dict[str, Variable]:
-    """What tells the cases apart: number, id, seed, repeat and every column."""
+    """What distinguishes the cases: number, id, seed, repeat and every column."""
     axis = ("case",)
     variables = {
         "case": Variable(np.arange(len(table)), axis, "1", "number of the case"),
