@@ -39,7 +39,7 @@ class LoopResponse(NamedTuple):
     mass: Array  # of the pose with straight links, (3, 3)
     damping: Array  # of the drive in the pose, (3, 3)
     stiffness: Array  # (3, 3)
-    square: Array  # omega^2 of the modes of a link whose ends are held [1/s2], (3, R)
+    square: Array  # omega^2 of the modes of a link with held ends [1/s2], (3, R)
     decay: Array  # 2 zeta omega [1/s], (3, R)
     lightness: Array  # inertia left to a mode that drags only the pose's mass [1], (3, R)
     enter: Array  # generalised force on the pose per modal acceleration, (3, 3, R)

@@ -98,9 +98,7 @@ class Here:
                 if stop.is_set():
                     break
             if pending is not None:
-                if (
-                    stop.is_set() and reporter.n_run
-                ):  # the previous one is safe, this one just begun
+                if stop.is_set() and reporter.n_run:  # the previous is safe, this one just begun
                     pending[1].cancel()
                     return
                 yield _waited(group, *pending)

@@ -38,7 +38,7 @@ _LIST_AXES = {
 }
 
 
-#: What every case has, finished or not: axes after `case`, unit, long name and any flags.
+#: Variables of every case, finished or not: axes after `case`, unit, long name and any flags.
 PER_CASE: dict[str, tuple[Any, ...]] = {
     "status": ((), *STATUS_LABEL[:2], {NOT_RUN: "not run", **STATUS_LABEL[2]}),
     "bad_time": ((), "s", "when the status appeared, 0 if ok"),
@@ -68,9 +68,9 @@ PER_CASE: dict[str, tuple[Any, ...]] = {
 }
 
 
-#: Of these the smallest entry is the worst.
+#: For these, the smallest entry is the worst.
 LEAST = ("damping_ratio",)
-#: Of these the largest value is the best one.
+#: For these, the largest value is the best.
 WANTED_LARGE = ("gain_margin", "damping_ratio", "singularity_distance")
 
 
