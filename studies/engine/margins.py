@@ -216,7 +216,7 @@ def _judge_block(
         return _judged(response, modes, np.maximum(strength / STRONG, 1.0), way, ratio)
 
 
-# compiled with little optimisation: it takes a fiftieth of the time
+# compiled without optimisation: it takes a fiftieth of the time
 @partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
 def _respond(structure: Structure, cases: Case) -> tuple[LoopResponse, AssembledModes, Any]:
     """The loops, their modes and their strength, lanes last."""

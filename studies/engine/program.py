@@ -175,7 +175,7 @@ def prepare(program: Program, parts: StartParts, own: list[Any], common: list[An
     return jax.vmap(partial(chosen, program, parts, True), (0, None), -1)(own, common)
 
 
-# run once, so compiled with little optimisation: saves a quarter of two to four seconds
+# run once, so compiled without optimisation: saves a quarter of two to four seconds
 @partial(jax.jit, static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0})
 def prepare_shared(
     program: Program, parts: StartParts, own: list[Any], common: list[Any]
