@@ -44,7 +44,7 @@ class Block(Section):
 class Sweep(Block):
     """What varies, and what is kept."""
 
-    where: str = described("", "-", "condition on the fields; other cases are left out")
+    where: str = described("", "-", "condition on the fields; other cases are excluded")
     repeats: int = described(1, "1", "runs of each case, with seeds of their own", ge=1, le=10**6)
     seed: int = described(0, "1", "of the sampling methods", ge=0, le=10**9)
     metrics: tuple[str, ...] = described((), "-", "metrics to keep; empty: all")
