@@ -207,7 +207,7 @@ def _map_variables(found: AtlasFindings) -> dict[str, Variable]:
             chart.frequency, (*grid, "natural_mode"), "Hz", "of the machine on its drive"
         ),
         "bending_frequency": Variable(
-            chart.bending, (*grid, "bending_mode"), "Hz", "the three first bending modes"
+            chart.bending, (*grid, "bending_mode"), "Hz", "the first three bending modes"
         ),
         "strain_share": Variable(
             chart.share, (*grid, "bending_mode", "part"), "1", "strain energy in links and drive"

@@ -47,7 +47,7 @@ class Departure(NamedTuple):
             words.append(f"frequencies x {self.frequency:g}")
         if self.joint_inertia is not None:
             words.append(f"J_C = {self.joint_inertia:g} kg m2")
-        return ", ".join(words) or "as believed"
+        return ", ".join(words) or "as modelled"
 
 
 def patch_lengths(lengths: tuple[float, ...]) -> tuple[Departure, ...]:
