@@ -65,7 +65,7 @@ def build_basis(
         beam: link data, () or (3,) fields.
         patches: patch data, () or (3,) fields; one row of centres per link.
         n_modes: R, modes per link (static).
-        stations: positions where the chord deflection is wanted [m], (S,), or (3, S) for links with
+        stations: where to take the chord deflection [m], (S,), or (3, S) for links with
             positions of their own.
         mode_mask: 1 for modes that exist, 0 for modes switched off, () or (R,). A mode that is off
             keeps its oscillator but couples to nothing, so it stays at rest.

@@ -21,7 +21,7 @@ class Controller(NamedTuple):
     filter: Array  # channels from sensor voltages [m/V] (SRF: identity), (3, C, K)
     estimator: Estimator  # (3, C) each
     velocity_gain: Array  # [N s/m] (SRF: [s]), (3, C)
-    position_gain: Array | None  # [N/m] (SRF: [1]), (3, C), None where there is none
+    position_gain: Array | None  # [N/m] (SRF: [1]), (3, C), None if there is none
     synthesizer: Array  # voltages from channel forces [V/N] (SRF: identity), (3, K, C)
     feedthrough: Array  # sensor volts per actuator volt to subtract [1], (3, K, K)
     voltage_limit: Array  # [V], ()

@@ -52,8 +52,8 @@ class LoopResponse(NamedTuple):
     position_gain: Array | None
     period: Array  # T [s], ()
     antialias: Array  # [rad/s], ()
-    highpass: Array | None  # of the patches [rad/s], None where there is none, ()
-    lag: Array | None  # of the amplifiers [s], None where there are none, ()
+    highpass: Array | None  # of the patches [rad/s], None if there is none, ()
+    lag: Array | None  # of the amplifiers [s], None if there are none, ()
 
 
 def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> LoopResponse:

@@ -60,11 +60,11 @@ class Table(Mapping[str, _Entry], Generic[_Entry]):
         """
         wanted = type(next(iter(self._entries.values())))
         if not isinstance(entry, wanted):
-            raise PartError(f"{self.kind} {entry!r}: a {wanted.__name__} is wanted")
+            raise PartError(f"{self.kind} {entry!r}: expected a {wanted.__name__}")
         name = entry.name
         plain = name.replace("-", "_")
         if not plain.isidentifier() or name.startswith("_") or hasattr(dict, name):
             raise PartError(f"{self.kind} {name!r}: letters, digits, - and _ are allowed in a name")
         self._check(entry)
         if self._entries.setdefault(name, entry) is not entry:
-            raise PartError(f"{self.kind} {name!r}: there is one of that name; choose another")
+            raise PartError(f"{self.kind} {name!r}: this name is taken; choose another")

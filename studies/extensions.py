@@ -57,7 +57,7 @@ def extend(
     ):
         own = getattr(found, kind, ())
         if not isinstance(own, (list, tuple)):
-            raise StudyError(f"{module}: {kind} = {own!r}; a list is wanted")
+            raise StudyError(f"{module}: {kind} = {own!r}; expected a list")
         for entry in [*own, *given]:
             try:
                 _table(kind).add(entry)

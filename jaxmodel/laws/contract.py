@@ -77,13 +77,13 @@ def check_law(law: Law) -> None:
     if law.channel not in get_args(Channel):
         raise PartError(f"{place}: channel = {law.channel!r}; allowed: 'mode' or 'patch'")
     if not callable(law.design):
-        raise PartError(f"{place}: design = {law.design!r}; a function is wanted")
+        raise PartError(f"{place}: design = {law.design!r}; expected a function")
     seen: set[str] = set()
     for x in law.parameters:
         if not isinstance(x, Parameter):
-            raise PartError(f"{place}: parameters: {x!r}; a Parameter is wanted")
+            raise PartError(f"{place}: parameters: {x!r}; expected a Parameter")
         if not x.name.isidentifier() or x.name in seen:
-            raise PartError(f"{place}: parameter {x.name!r}; a name of its own is wanted")
+            raise PartError(f"{place}: parameter {x.name!r}; expected a unique name")
         if not x.low <= x.default <= x.high:
             raise PartError(
                 f"{place}: parameter {x.name!r}: default {x.default:g}; "
@@ -95,7 +95,7 @@ def check_law(law: Law) -> None:
 def check_feedback(law: Law, made: Feedback, n_channels: int, n_patches: int) -> None:
     """Raise PartError unless a law returned a `Feedback` with the right shapes."""
     if not isinstance(made, Feedback):
-        raise PartError(f"law {law.name!r}: design gives {made!r}; a Feedback is wanted")
+        raise PartError(f"law {law.name!r}: design returns {made!r}; expected a Feedback")
     wanted = {
         "filter": (3, n_channels, n_patches),
         "synthesizer": (3, n_patches, n_channels),
@@ -105,7 +105,7 @@ def check_feedback(law: Law, made: Feedback, n_channels: int, n_patches: int) ->
     for name, shape in wanted.items():
         found = jnp.shape(getattr(made, name))
         if found != shape:
-            raise PartError(f"law {law.name!r}: {name} has shape {found}; {shape} is wanted")
+            raise PartError(f"law {law.name!r}: {name} has shape {found}; expected {shape}")
 
 
 def on_and_off(case: Case, known: Known) -> Array:

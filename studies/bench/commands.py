@@ -49,7 +49,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
 
 def _peers(rows: list[dict[str, Any]]) -> Table:
-    table = Table("W0 by", "configurations/s", "error [share of the largest rms]", "times slower")
+    table = Table("W0 with", "configurations/s", "error [share of the largest rms]", "times slower")
     for row in rows:
         table.add_row(
             row["peer"],

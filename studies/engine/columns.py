@@ -62,8 +62,8 @@ PER_CASE: dict[str, tuple[Any, ...]] = {
     "damping_ratio": (
         ("controlled_mode",),
         "1",
-        "least of the modes of each order, of as many as links are "
-        "controlled, the most damped ones",
+        "least damping ratio of the modes of each order, among the most damped "
+        "ones, one per controlled link",
     ),
 }
 

@@ -446,7 +446,7 @@ def _drive_substeps(study: Study, structure: Structure, case: Case) -> int:
     raise field_error(
         name,
         value,
-        f"so much that {SUBSTEP_LIMIT} plant steps per sample carry drive.kd, "
+        f"small enough for {SUBSTEP_LIMIT} plant steps per sample with drive.kd, "
         f"drive.viscous_friction and drive.coulomb_friction/drive.friction_speed = {slope:g} N s/m "
         f"on machine.slider_mass; {needed} would be needed",
         "N" if name == "drive.coulomb_friction" else "N s/m",

@@ -54,7 +54,7 @@ class Document(DocumentPart):
     format: Literal["flexlink-controller"]
     format_version: Literal[1]
     title: str
-    case_id: str = Field(description="id of the case in its sweep; empty where there is none")
+    case_id: str = Field(description="id of the case in its sweep; empty if there is none")
     study_hash: str = Field(description="SHA-256 of the study below as compact sorted JSON")
     versions: dict[str, str]
     law: Annotated[str, OneOf(lambda: LAWS)]
@@ -265,7 +265,7 @@ def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     names = [name for name, _ in pairs]
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"{name} is there twice")
+            raise ValueError(f"{name} occurs twice")
     return dict(pairs)
 
 

@@ -83,7 +83,7 @@ def export_design(
     made = TARGETS[target].make(job)
     for file in made.files:
         if Path(file).name != file or file.startswith("."):
-            raise StudyError(f"--target {target}: it makes {file!r}; a plain file name is wanted")
+            raise StudyError(f"--target {target}: it makes {file!r}; expected a plain file name")
     verified = made.verified
     is_good = verified is None or verified.is_passed
     texts = made.files if is_good else {}  # files of an earlier export stay unchanged

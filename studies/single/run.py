@@ -84,7 +84,7 @@ def _checked(out: str | Path | None, has_report: bool) -> Path | None:
     if out is None:
         if has_report:
             raise StudyError(
-                "--report: is written beside the trajectories; name their file by --out"
+                "--report: is written next to the trajectories; name their file with --out"
             )
         return None
     check_results(Path(out), has_report)

@@ -63,8 +63,8 @@ def elementary_effects(points: np.ndarray, value: np.ndarray) -> Effects:
         worst = int(np.argmin(count))
         raise StudyError(
             f"sensitivity: only {count[worst]} of {len(x)} effects of factor {worst} are left "
-            f"beside failed cases; allowed: at least {max(LEAST_LEFT * len(x), 2):.0f}. Narrow the "
-            "axes, or ask for more trajectories"
+            f"after failed cases; allowed: at least {max(LEAST_LEFT * len(x), 2):.0f}. Narrow the "
+            "axes, or use more trajectories"
         )
     return Effects(
         mean_size=np.array([np.abs(group).mean() for group in groups]),

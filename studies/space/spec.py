@@ -45,7 +45,7 @@ class Sweep(Block):
     """What varies, and what is kept."""
 
     where: str = described("", "-", "condition on the fields; other cases are excluded")
-    repeats: int = described(1, "1", "runs of each case, with seeds of their own", ge=1, le=10**6)
+    repeats: int = described(1, "1", "runs of each case, with their own seeds", ge=1, le=10**6)
     seed: int = described(0, "1", "of the sampling methods", ge=0, le=10**9)
     metrics: tuple[str, ...] = described((), "-", "metrics to keep; empty: all")
     by: str = described("residual_rms", "-", "metric, or entry of one, that cases are ranked by")

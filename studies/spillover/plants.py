@@ -253,7 +253,7 @@ def plant_sizes(found: FixedController, sizes: tuple[int, ...] = ()) -> tuple[in
     """
     smallest = found.structure.n_controlled
     if smallest > LARGEST:
-        raise field_error("control.modes", smallest, f"1 to {LARGEST}, the plant modes looked at")
+        raise field_error("control.modes", smallest, f"1 to {LARGEST}, the most plant modes")
     sizes = tuple(sorted(sizes or range(smallest, LARGEST + 1)))
     if not smallest <= sizes[0] <= sizes[-1] <= LARGEST:
         raise field_error("sizes", sizes, f"{smallest}, as many as are controlled, to {LARGEST}")

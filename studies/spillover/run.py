@@ -61,7 +61,9 @@ def spillover_design(
     _write(out, found, laws)
     for note in found.notes:
         console.print(note, soft_wrap=True)
-    console.print(f"written: {out / 'report.html'}, data and figures beside it", soft_wrap=True)
+    console.print(
+        f"written: {out / 'report.html'}, data and figures in the same folder", soft_wrap=True
+    )
     return found.is_passed
 
 

@@ -22,7 +22,7 @@ from studies.study.entries import links_text
 from studies.study.margin import ENOUGH, margin_text
 from studies.sweeps.sensitivity import failure_causes
 
-#: Stands beside every metric of a case that has it.
+#: Shown next to every metric of a case that has it.
 MARGIN = "gain_margin"
 
 

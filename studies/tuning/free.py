@@ -302,7 +302,7 @@ def _safe(value: Array) -> Array:
 def _poles(written: dict[str, Any], study: Study) -> tuple[list[Free], Callable[..., Any]]:
     for one, other in (POLES, POLES[::-1]):
         if one in written and other not in written:
-            raise StudyError(f"tune.free.{one}: needs {other} beside it, (22)-(23) take both")
+            raise StudyError(f"tune.free.{one}: needs {other} too, (22)-(23) use both")
     if study.control.gain_unit != "1/s":
         raise field_error(
             "control.gain_unit",

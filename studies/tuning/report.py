@@ -58,7 +58,7 @@ class BestFamily(NamedTuple):
     file: str  # of its study
     gains: list[tuple[str, str, str]]  # figure, its value, that of the study itself with unit
     objective: np.ndarray  # on the fresh machines
-    caution: str  # of its gain margin, "" where there is none
+    caution: str  # warning about its gain margin, "" if there is none
     is_violated: bool  # a limit
 
 
