@@ -169,7 +169,7 @@ def test_bad_options_are_refused(capsys, tmp_path, cluster, monkeypatch):
     assert "name one of them" in refused(capsys, *sweep, *both)
     assert "no scheduler answers" in refused(capsys, *sweep, *both[:2])
     assert "tcp://HOST:PORT" in refused(capsys, *sweep, "--scheduler", "nowhere.json")
-    assert "no certificates" in refused(capsys, *sweep, "--scheduler", "tls://127.0.0.1:1")
+    assert "no client certificates" in refused(capsys, *sweep, "--scheduler", "tls://127.0.0.1:1")
     assert "allowed: 1 to " in refused(capsys, *sweep, "--local-workers", 0)
     scheduler = ("--scheduler", cluster.scheduler)
     assert "--worker-timeout = 0.0" in refused(capsys, *sweep, *scheduler, "--worker-timeout", 0)

@@ -212,7 +212,7 @@ def test_own_law_becomes_c(own, tmp_path, capsys):
 
 
 def test_what_is_taken_or_empty_is_refused(tmp_path):
-    with pytest.raises(StudyError, match="metric 'residual_rms': there is one"):
+    with pytest.raises(StudyError, match="metric 'residual_rms': this name is taken"):
         extend(metrics=[METRICS["residual_rms"]._replace(text="another")])
     for text, message in (
         ("", "none of the lists laws"),
@@ -320,7 +320,7 @@ def wrong(tmp_path_factory):
         (
             {"control__law": "wide"},
             "simulate",
-            "velocity_gain has shape (3, 7); (3, 2)",
+            "velocity_gain has shape (3, 7); expected (3, 2)",
         ),
         (
             {"control__law": "asks"},
