@@ -1,6 +1,6 @@
 """Model of a planar 3-PRR parallel robot with three flexible links: pure functions on pytrees.
 
-The data's way: `Machine` and `Case` (physical numbers) -> `prepare` (matrices, coefficients) ->
+Data flow: `Machine` and `Case` (physical numbers) -> `prepare` (matrices, coefficients) ->
 `command` (shaped reference, noise) -> `step` per sample (controller, plant, metrics, status) ->
 `Result`. Importing this package has no effect; set precision and devices before the first call.
 """

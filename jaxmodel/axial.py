@@ -1,8 +1,8 @@
-"""Forces along the links: what they do to the bending, and by how much they stretch the links.
+"""Axial forces in the links: how they change bending, and how much they stretch the links.
 
 A tension N stiffens bending, f_j = f_j0 sqrt(1 + N/(j^2 N_cr)) for a uniform link, and at N = -N_cr
 the link buckles; N_cr = pi^2 EI/L^2. The dynamics has this through the shortening of the chord. The
-links do not stretch there; `stretch_error` says by how much that would move the platform.
+links do not stretch there; `stretch_error` gives how far stretching would move the platform.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from jaxmodel.parameters import Array, Beam
 from jaxmodel.piezo import bare_stiffness
 from jaxmodel.plant import Plant
 
-#: Squarings of `critical_force`: eigenvalues that differ by 1 % are told apart.
+#: Squarings of `critical_force`: eigenvalues that differ by 1 % are resolved.
 SQUARINGS = 12
 
 
@@ -34,19 +34,19 @@ def critical_force(plant: Plant) -> Array:
         power = power @ power
         return power / jnp.trace(power, axis1=1, axis2=2)[:, None, None], None
 
-    # its largest eigenvalue by repeated squaring: batched on any executor
+    # its largest eigenvalue by repeated squaring: batched on every executor
     power, _ = jax.lax.scan(square, softness, None, length=SQUARINGS)
     return 1 / jnp.trace(power @ softness, axis1=1, axis2=2)
 
 
 def euler_force(beam: Beam) -> Array:
-    """N_cr of the bare links, pi^2 E I/L^2 [N], (3,): a bound where the model has no buckling."""
+    """N_cr of the bare links, pi^2 E I/L^2 [N], (3,): a bound if the model has no buckling."""
     force = jnp.pi**2 * bare_stiffness(beam) * beam.stiffness_factor / beam.length**2
     return jnp.broadcast_to(jnp.asarray(force), (3,))
 
 
 def loaded_frequency(plant: Plant, axial: Array) -> Array:
-    """Frequencies of links whose ends are held, under axial forces [rad/s], (3, R).
+    """Frequencies of links with held ends under axial forces [rad/s], (3, R).
 
     Args:
         plant: the machine.
@@ -80,7 +80,7 @@ def chord_slopes(plant: Plant) -> Array:
 def axial_force(
     plant: Plant, pose: Array, pose_rate: Array, pose_acc: Array, wrench: Array | None = None
 ) -> Array:
-    """Tension at mid-span of straight links that are moved as wanted [N], (3,).
+    """Tension at mid-span of straight links in a prescribed motion [N], (3,).
 
     Args:
         plant: the machine.
@@ -112,7 +112,7 @@ def axial_compliance(beam: Beam) -> Array:
 
 
 def stretch_error(chain: Chain, stretch: Array) -> Array:
-    """By how much links that stretch move the platform while the sliders stay [m, m, rad], (3,).
+    """Platform displacement by stretching links while the sliders stay put [m, m, rad], (3,).
 
     Each joint C moves by the stretch along its link: t.J X = stretch, three equations for X.
 

@@ -1,4 +1,4 @@
-"""The modal bases of a case: the links as they are, and as the controller believes them to be."""
+"""The modal bases of a case: of the real links, and of the links the controller believes in."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from jaxmodel.parameters import Array, Beam, Patches
 
 
 class Bases(NamedTuple):
-    """Links and belief."""
+    """Bases of the links and of the controller's model."""
 
     plant: ModalBasis  # R modes
     at_load: Array  # deflection of the plant's modes at the static load [1], (3, R)
     plant_omega: Array  # frequencies of the links between held ends [rad/s], (3, C)
-    model: ModalBasis  # what the controller believes, max(R, C) modes
+    model: ModalBasis  # the controller's model, max(R, C) modes
     believed_omega: Array  # what its filters and shaper are designed for [rad/s], (3, C)
 
 
 def find_bases(structure: Structure, case: Case) -> Bases:
     """Bases of plant and controller.
 
-    The belief has nominal stiffness; given frequencies (measured, perhaps) replace its own. Patches
-    and joint inertia are in a belief of basis `loaded`.
+    The controller's model has nominal stiffness; frequencies in the case (measured, perhaps)
+    replace its own. It includes patches and joint inertia only in basis `loaded`.
 
     Args:
         structure: static choices; bases and sizes are read.
@@ -58,9 +58,9 @@ def find_bases(structure: Structure, case: Case) -> Bases:
 def _side_by_side(
     kind: str, one: Beam, other: Beam, patches: Patches, size: int, stations: Array
 ) -> tuple[ModalBasis, ModalBasis]:
-    """Two bases of one kind by one call.
+    """Compute two bases of one kind in one call.
 
-    Two eigenvalue problems in one program now and then never end on CPUs (jax 0.10): XLA loses the
+    Two eigenvalue problems in one program occasionally hang on CPUs (jax 0.10): XLA loses the
     second.
     """
     pairs = zip(one, other, strict=True)

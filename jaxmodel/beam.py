@@ -1,4 +1,4 @@
-"""Modal bases of a link (4). A basis is data: the dynamics reads `ModalBasis` and nothing else.
+"""Modal bases of a link (4). A basis is data: the dynamics reads only `ModalBasis`.
 
 - `pinned_pinned`: Y_j = sin(j pi x/L), the frame turns with the chord B-C, Y_j(L) = 0.
 - `pinned_free`: tan kL = tanh kL, Y_j(L) = 1, the frame is tangent-like as in the paper.
@@ -27,7 +27,7 @@ _Parts = TypeVar("_Parts", Beam, Patches)
 
 
 class ModalBasis(NamedTuple):
-    """What the dynamics needs to know of three links with R modes each."""
+    """What the dynamics needs to know about three links with R modes each."""
 
     # m_j = int rhoA Y_j^2 [kg], (3, R); shapes are scaled so that it is the same for every mode
     mass: Array
@@ -47,31 +47,31 @@ class ModalBasis(NamedTuple):
 
 
 class Basis(NamedTuple):
-    """A family of mode shapes: what sets it apart, and how to compute it for one link."""
+    """A family of mode shapes: its properties, and how to compute it for one link."""
 
     name: str
     modes: Callable[[Beam, Patches, int, Array], ModalBasis]  # of R modes, deflection at stations
     is_on_chord: bool  # both ends lie on the frame's axis: Y_j(L) = 0
-    has_joints: bool = False  # takes in rotary inertia at the joints
+    has_joints: bool = False  # includes rotary inertia at the joints
 
 
 def build_basis(
     kind: str, beam: Beam, patches: Patches, n_modes: int, stations: Array, mode_mask: Array = 1.0
 ) -> ModalBasis:
-    """Modal basis of all links, three of them as a rule.
+    """Modal basis of all links, usually three.
 
     Args:
         kind: name of one of `BASES` (static).
         beam: link data, () or (3,) fields.
         patches: patch data, () or (3,) fields; one row of centres per link.
         n_modes: R, modes per link (static).
-        stations: positions where the chord deflection is wanted [m], (S,), or (3, S) for links with
+        stations: where to take the chord deflection [m], (S,), or (3, S) for links with
             positions of their own.
         mode_mask: 1 for modes that exist, 0 for modes switched off, () or (R,). A mode that is off
             keeps its oscillator but couples to nothing, so it stays at rest.
 
     Returns:
-        ModalBasis; the bending stiffness is the true one (with `stiffness_factor`).
+        ModalBasis with the true bending stiffness (with `stiffness_factor`).
 
     Raises:
         ValueError: unknown kind, or no modes.
@@ -93,7 +93,7 @@ def build_basis(
 
 
 def _each_link(parts: _Parts, n_links: int) -> _Parts:
-    """Data of links, one value of each for every link."""
+    """Link data, broadcast to one value per link."""
     return type(parts)(*(jnp.broadcast_to(jnp.asarray(field), (n_links,)) for field in parts))
 
 
@@ -117,11 +117,11 @@ def mask_modes(basis: ModalBasis, mode_mask: Array) -> ModalBasis:
 
 
 def held_frequency(kind: str, beam: Beam, basis: ModalBasis) -> Array:
-    """Frequencies of links between held ends [rad/s], (3, R).
+    """Frequencies of links with held ends [rad/s], (3, R).
 
-    The links of the assembled machine vibrate like this (docs/theory.md). A basis whose ends lie on
-    the chord has them itself; any other belongs to links that no platform holds, so the bare link's
-    (j pi)^2 sqrt(E I/(rhoA L^4)) stand for it.
+    This is how links vibrate in the assembled machine (docs/theory.md). A basis whose ends lie on
+    the chord has these frequencies itself; any other describes links that no platform holds, so
+    the bare link's (j pi)^2 sqrt(E I/(rhoA L^4)) replace its own.
 
     Args:
         kind: modal basis (static).
@@ -220,7 +220,7 @@ def _pinned_free(beam: Beam, patches: Patches, n_modes: int, stations: Array) ->
 def _ritz(xi: Array, n_sines: int) -> tuple[Array, Array, Array]:
     """Ritz functions of xi = x/L, their first and second derivatives, (len(xi), n_sines + 2) each.
 
-    Sines alone cannot carry an end moment, so two cubics complete them.
+    Sines alone cannot represent an end moment, so two cubics complete them.
     """
     xi = jnp.asarray(xi)[:, None]
     k = jnp.arange(1, n_sines + 1) * np.pi

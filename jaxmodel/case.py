@@ -1,4 +1,4 @@
-"""One case of a study: `Case` holds the traced numbers, `Structure` what fixes the program.
+"""One case of a study: `Case` holds the traced numbers, `Structure` what shapes the program.
 
 Cases of equal structure stack into one batch and share one compilation.
 """
@@ -35,9 +35,7 @@ class Structure(NamedTuple):
     has_friction: bool = False  # Coulomb friction on the sliders
     has_position_gain: bool = True  # feedback of modal positions, not of velocities alone
     metrics: tuple[str, ...] = ()  # to accumulate; (): all of them
-    is_smooth: bool = (
-        False  # rounding replaced by equal noise, limits with round corners: for gradients
-    )
+    is_smooth: bool = False  # for gradients: noise instead of rounding, limits with round corners
 
 
 class Control(NamedTuple):
@@ -87,7 +85,7 @@ class Shaping(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """Slider servo and what disturbs it; (3,) or ()."""
+    """Slider servo and its disturbances; (3,) or ()."""
 
     kp: Array  # [N/m]
     kd: Array  # [N s/m]
@@ -120,7 +118,7 @@ class Initial(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """How metrics look at the run."""
+    """Windows, limits and stations of the metrics."""
 
     residual_delay: Array  # from the end of the shaped command [s], ()
     residual_length: Array  # [s], ()

@@ -1,4 +1,4 @@
-"""What modal laws are made of: modal filter, synthesizer, pole placement (22)-(23), EMC (24).
+"""Building blocks of modal laws: modal filter, synthesizer, pole placement (22)-(23), EMC (24).
 
 Matrices act per link. A controller is data: channel signals y = `filter` V_s, rates of them from
 the estimator, channel forces, and V_a = `synthesizer` f. IMSC has one channel per controlled mode,
@@ -62,8 +62,8 @@ def left_inverse(matrix: Array, mask: Array) -> Array:
     """pinv of the columns of `matrix` (K, C) whose mask is 1; rows of the others are zero, (C, K).
 
     Modal filter: left_inverse(lambda_s Phi_s^t); synthesizer: left_inverse(lambda_a Phi_a^t)^t.
-    By normal equations with unit columns: at the condition numbers that pass as usable (below 1e3)
-    that is accurate to 1e-9, and it has a plain gradient.
+    Uses normal equations with unit columns: accurate to 1e-9 at usable condition numbers (below
+    1e3), and easy to differentiate.
     """
     masked = matrix * mask
     norm = jnp.sqrt(jnp.sum(masked * masked, axis=-2, keepdims=True) + (1 - mask))
@@ -80,7 +80,7 @@ def condition_number(matrix: Array, mask: Array) -> Array:
     mean = jnp.trace(gram, axis1=-2, axis2=-1) / jnp.maximum(jnp.sum(mask), 1)
     gram = gram + jnp.eye(mask.size) * (1 - mask) * mean[..., None, None]
     value = jnp.linalg.eigvalsh(gram)
-    # the floor is where squaring has lost all digits
+    # at this floor, squaring has lost all digits
     floor = value[..., -1] * 10 * jnp.finfo(gram.dtype).eps
     return jnp.sqrt(value[..., -1] / jnp.maximum(value[..., 0], floor))
 

@@ -16,12 +16,12 @@ from jaxmodel.parameters import Array
 
 
 class Controller(NamedTuple):
-    """Coefficients, worked out once per case."""
+    """Coefficients, computed once per case."""
 
     filter: Array  # channels from sensor voltages [m/V] (SRF: identity), (3, C, K)
     estimator: Estimator  # (3, C) each
     velocity_gain: Array  # [N s/m] (SRF: [s]), (3, C)
-    position_gain: Array | None  # [N/m] (SRF: [1]), (3, C), None where there is none
+    position_gain: Array | None  # [N/m] (SRF: [1]), (3, C), None if there is none
     synthesizer: Array  # voltages from channel forces [V/N] (SRF: identity), (3, K, C)
     feedthrough: Array  # sensor volts per actuator volt to subtract [1], (3, K, K)
     voltage_limit: Array  # [V], ()
@@ -30,7 +30,7 @@ class Controller(NamedTuple):
     adc_step: Array  # one code [V], ()
     adc_top: Array  # highest code [1], ()
     adc_noise: Array  # rms at the ADC input [V], ()
-    # [rad/s], (3, C): of the channels of a link where it is above 0 only the one of highest modal
+    # [rad/s], (3, C): among a link's channels with a value above 0, only the one of highest modal
     # energy acts (modified IMSC); None: all act
     rival_omega: Array | None = None
 
@@ -48,7 +48,7 @@ class ControllerInfo(NamedTuple):
 
     measured: Array  # sensor voltage as the controller sees it [V], (3, K)
     command: Array  # new command, applied from the next sample on [V], (3, K)
-    is_clipped: Array  # ADC at its end, 0 or 1 per channel, (3, K)
+    is_clipped: Array  # ADC at the end of its range, 0 or 1 per channel, (3, K)
 
 
 def rest_controller(n_channels: int, n_patches: int, dtype: Any) -> ControllerState:
@@ -62,7 +62,7 @@ CORNER = 0.1
 
 
 def soft_limit(x: Array, bound: Array, is_smooth: bool) -> Array:
-    """x limited to +-bound: clipped, or with parabolas for corners where a gradient is wanted.
+    """x limited to +-bound: clipped, or with parabolic corners where a gradient is needed.
 
     The smooth limit is x itself up to 0.9 bound and bound from 1.1 bound on; between them, where
     it is at most bound/40 below the sharp one, its slope falls linearly from 1 to 0.
@@ -105,7 +105,7 @@ def convert(
 
 
 def adc_code(controller: Controller, voltage: Array, noise: Array | None) -> tuple[Array, Array]:
-    """Code that conditioner and ADC make of a sensor voltage, and 1 where it clips, else 0.
+    """ADC code of a sensor voltage behind the conditioner, and 1 where it clips, else 0.
 
     Args:
         controller: coefficients.
@@ -121,7 +121,7 @@ def adc_code(controller: Controller, voltage: Array, noise: Array | None) -> tup
 
 
 def read_back(controller: Controller, code: Array) -> Array:
-    """Sensor voltage [V] that an ADC code stands for."""
+    """Sensor voltage [V] that an ADC code represents."""
     return (code * controller.adc_step - controller.adc_bias) / controller.adc_gain
 
 
@@ -129,7 +129,7 @@ def strongest(omega: Array, value: Array, rate: Array) -> Array:
     """1 for the channel of highest modal energy (omega q)^2 + q'^2 of each link, 0 for its rivals.
 
     Modified IMSC (Baz and Poh 1988): all actuators of a link serve one mode at a time. A channel
-    with omega = 0 is nobody's rival and always acts.
+    with omega = 0 has no rivals and always acts.
 
     Args:
         omega: frequency of each channel [rad/s], (3, C).
@@ -143,9 +143,9 @@ def strongest(omega: Array, value: Array, rate: Array) -> Array:
 
 
 def linear_parts(controller: Controller) -> list[tuple[slice, Controller]]:
-    """What a linear analysis can judge: the controller, or each rival channel by itself.
+    """Parts that a linear analysis can judge: the controller, or each rival channel by itself.
 
-    Each with the channels whose modes it tells about. That every part is stable proves nothing
+    Each comes with the channels whose modes it covers. Stability of every part proves nothing
     about switching between them.
 
     Args:

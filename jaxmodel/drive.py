@@ -11,12 +11,12 @@ from jaxmodel.parameters import Array
 
 
 class Reference(NamedTuple):
-    """Wanted motion of the sliders at one instant, (3,) each."""
+    """Desired motion of the sliders at one instant, (3,) each."""
 
     rho: Array  # [m]
     rho_rate: Array  # [m/s]
-    feedforward: Array | None  # force beside PD: computed torque, or what holds a steady load [N]
-    disturbance: Array  # force from outside, held over the sample [N]
+    feedforward: Array | None  # force added to PD: computed torque, or what holds a steady load [N]
+    disturbance: Array  # external force, held over the sample [N]
     wrench: Array | None = None  # on the platform, held over the sample [N, N, N m]
 
 
@@ -27,7 +27,7 @@ def motor_force(
 
     Args:
         drive: gains and limit, fields (3,) or ().
-        reference: wanted motion.
+        reference: desired motion.
         rho: slider positions [m], (3,).
         rho_rate: [m/s], (3,).
         is_smooth: limit with round corners, see `soft_limit`.
@@ -50,7 +50,7 @@ def slider_force(
 
     Args:
         drive, reference, rho, rho_rate, is_smooth: as in `motor_force`.
-        has_friction: whether there is Coulomb friction at all (tanh is costly).
+        has_friction: whether there is any Coulomb friction (tanh is costly).
     """
     force = motor_force(drive, reference, rho, rho_rate, is_smooth) + reference.disturbance
     force = force - drive.viscous_friction * rho_rate

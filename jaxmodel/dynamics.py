@@ -1,8 +1,8 @@
 """Equations of motion (1)-(9), reduced to pose and modes by Kane's method, O(R) per link.
 
-The mass matrix is a block arrow: links couple only through the three pose accelerations. Per link
-the modal accelerations are eliminated through a few sums, then one symmetric 3x3 system gives the
-pose and back-substitution the rest. docs/theory.md derives each line. Elementwise arithmetic only.
+The mass matrix is a block arrow: links couple only through the three pose accelerations. Per link,
+the modal accelerations are eliminated through a few sums; one symmetric 3x3 system then gives the
+pose, back-substitution the rest. docs/theory.md derives each line. Elementwise arithmetic only.
 Shapes as in `jaxmodel.plant`: structure first, lanes last.
 """
 
@@ -21,14 +21,14 @@ class Accelerations(NamedTuple):
 
     pose: Array  # X'' [m/s2, m/s2, rad/s2], (3,)
     modal: Array  # q'' [m/s2], (3, R)
-    coupling: Array  # q'' + (k q + d q')/m: all but the oscillator itself [m/s2], (3, R)
+    coupling: Array  # q'' + (k q + d q')/m: all except the oscillator itself [m/s2], (3, R)
     rho: Array  # rho'' [m/s2], (3,)
     gamma: Array  # gamma'' [rad/s2], (3,)
-    axial: Array  # N, tension in the link that works on its bending [N], (3,)
+    axial: Array  # N, tension in the link that acts on its bending [N], (3,)
 
 
 def shortening_row(plant: Plant, q: Array) -> Array:
-    """(S q)_j, by which the chord shortens per modal coordinate [1], (3, R)."""
+    """(S q)_j, shortening of the chord per modal coordinate [1], (3, R)."""
     row = plant.shortening * q
     if plant.mixed_shortening is not None:
         row = row + jnp.sum(plant.mixed_shortening * q[:, None], axis=2)
@@ -56,7 +56,7 @@ def modal_chain(plant: Plant, pose: Array, pose_rate: Array, q: Array, q_rate: A
 
 
 class _Link(NamedTuple):
-    """A link in (rho, gamma), its modes eliminated: K (rho'', gamma'') + load."""
+    """A link in (rho, gamma) with its modes eliminated: K (rho'', gamma'') + load."""
 
     k_rr: Array
     k_rg: Array
@@ -66,7 +66,7 @@ class _Link(NamedTuple):
 
 
 class _Joint(NamedTuple):
-    """What a link asks of the platform at C along f and g: W C'' + load."""
+    """Force that a link needs from the platform at C along f and g: W C'' + load."""
 
     ff: Array  # W [kg]
     fg: Array
@@ -98,7 +98,7 @@ def accelerations(
         piezo: generalised piezo forces (14) over the modal masses, Q_j/m_j [m/s2], (3, R).
         wrench: force and moment on the platform at its reference point [N, N, N m], (3,), or None.
         is_coupled: False: kineto-elastodynamics in two passes (static): the machine moves as if its
-            links were rigid, the motion and the axial forces bend them, and nothing acts back.
+            links were rigid, motion and axial forces bend the links, and nothing acts back.
 
     Returns:
         Accelerations.
@@ -147,21 +147,21 @@ def accelerations(
 
 
 def _is_rigid(plant: Plant) -> bool:
-    """Whether bending leaves the distance of a link's joints as it is."""
+    """Whether bending leaves the distance between a link's joints unchanged."""
     return plant.tip is None and plant.shortening is None
 
 
 class _Swing(NamedTuple):
-    """What gamma' and bending make of C'' [m/s2], (3,) each."""
+    """Contribution of gamma' and bending to C'' [m/s2], (3,) each."""
 
     f: Array  # along f and g, sign reversed: what rho'' and gamma'' must give
     g: Array
     inward: Array  # gamma'^2 c + e2, along the chord
-    across: Array  # 2 gamma' d', of a point that moves in along the chord
+    across: Array  # 2 gamma' d', of a point moving inwards along the chord
 
 
 def _swing(plant: Plant, chain: Chain, q_rate: Array) -> _Swing:
-    """In the link C is at (c, w) and moves by (-d', w'), which makes C'' by velocities alone
+    """In the link, C is at (c, w) and moves by (-d', w'); velocities alone make its acceleration
 
     -gamma'^2 (c, w) + 2 gamma' (-w', -d') + (-e2, 0), e2 = sum S_jk q_j' q_k'.
     """
@@ -186,10 +186,10 @@ def _link(
     pull: Array,
     slider_force: Array,
 ) -> _Link:
-    """Slider and link after q'' has been eliminated, but for what the modes do to C."""
+    """Slider and link after eliminating q'', except for the effect of the modes on C."""
     sine, cosine, rate, mass = chain.sine, chain.cosine, chain.gamma_rate, plant.modal_mass
     bq, bq_rate = jnp.sum(plant.b * q, axis=1), jnp.sum(plant.b * q_rate, axis=1)
-    # the centre of mass moves in with half the shortening
+    # the centre of mass moves inwards by half the shortening
     across = jnp.sum(plant.b * pull, axis=1) + bq * (rate * rate) + plant.tip_mass * swing.across
     along = plant.tip_mass * swing.inward + 2 * rate * bq_rate
     bb, bc, cc = (
@@ -206,7 +206,7 @@ def _link(
 
 
 def _rigid_link(plant: Plant, chain: Chain, swing: _Swing, slider_force: Array) -> _Link:
-    """Slider and link that does not bend."""
+    """Slider and rigid link."""
     return _Link(
         k_rr=plant.slider_link_mass,
         k_rg=-plant.tip_mass * chain.chord * chain.sine,
@@ -231,7 +231,7 @@ def _joint(chain: Chain, link: _Link) -> _Joint:
 
 
 class _End(NamedTuple):
-    """What the modes do to the far joint of a link, and it to them."""
+    """Interaction of the modes with the far joint of a link."""
 
     row: Array  # motion of C along f per modal coordinate, sign reversed [1], (3, R)
     # C'' along f that slider and link feel: -motion[0] + motion[1] C''_f + motion[2] C''_g
@@ -275,7 +275,7 @@ def _release_end(
 
 
 class Platform(NamedTuple):
-    """Platform and payload as the pose feels them: M_p X'' - phi'^2 moment = forces on it."""
+    """Inertia of platform and payload: M_p X'' - phi'^2 moment = forces on the platform."""
 
     matrix: tuple[Array | None, ...]  # M_p, upper triangle [kg, kg m, kg m2], () each; None: zero
     moment: tuple[Array, Array] | None  # mass times its centre from X [kg m]; None: centre at X
@@ -310,11 +310,11 @@ def _pose_acceleration(
     """
     platform = platform_mass(plant, chain.turn)
     x, y, cx, cy = chain.frame.x, chain.frame.y, chain.cx, chain.cy
-    # W in the plane's axes
+    # W in the axes of the plane
     f_x, g_x = x * joint.ff - y * joint.fg, x * joint.fg - y * joint.gg
     w_xx, w_xy = x * f_x - y * g_x, y * f_x + x * g_x
     w_yy = joint.ff + joint.gg - w_xx
-    turn_x, turn_y = cx * w_xy - cy * w_xx, cx * w_yy - cy * w_xy  # how phi'' meets x'' and y''
+    turn_x, turn_y = cx * w_xy - cy * w_xx, cx * w_yy - cy * w_xy  # phi'' with x'' and y''
     links = (w_xx, w_xy, turn_x, w_yy, turn_y, cx * turn_y - cy * turn_x)
     matrix = tuple(
         jnp.sum(part, axis=0) if own is None else own + jnp.sum(part, axis=0)
@@ -369,7 +369,7 @@ def mass_matrix(platform: Platform) -> Array:
 def inverse_dynamics(
     plant: Plant, pose: Array, pose_rate: Array, pose_acc: Array, wrench: Array | None = None
 ) -> Array:
-    """Slider forces [N] that give the unbent machine a wanted pose acceleration (computed torque).
+    """Slider forces [N] for a desired pose acceleration of the unbent machine (computed torque).
 
     M_p X'' + sum J^t T^t (K (rho'', gamma'') + load) = wrench + sum J^t T^t (F, 0) over the links.
 

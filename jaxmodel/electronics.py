@@ -1,6 +1,6 @@
-"""The analogue electronics between patches and converters, and what they do to a vibration.
+"""The analogue electronics between patches and converters, and their effect on a vibration.
 
-A sensor patch is a capacitance C that its amplifier's input R drains: the controller sees the
+A sensor patch is a capacitance C drained by the input R of its amplifier: the controller sees the
 voltage behind a high-pass of corner 1/(R C), then behind the anti-alias filter. A command passes
 an amplifier, a first-order lag, before it bends a link.
 """
@@ -15,20 +15,20 @@ from jaxmodel.case import Electronics
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 
-#: Samples over the lag from which on the linearised loop takes an amplifier for infinitely fast.
+#: Sample period over lag above which the linearised loop treats an amplifier as infinitely fast.
 FASTEST = 1e3
 _SERIES = 20  # terms for arguments up to 1
 
 
 class Amplifier(NamedTuple):
-    """What is left of a change of command during one plant step, 1 at its start [1]."""
+    """Remainder of a change of command during one plant step, 1 at its start [1]."""
 
     course: Array  # at start, middle and end of a parabola with the same effect, (3,)
     left: Array  # at the end, exp(-h/lag), ()
 
 
 def measurement_chain(omega: Array, electronics: Electronics) -> Array:
-    """Response from the command wanted to the signal sampled at omega [rad/s], links left out.
+    """Response from command to sampled signal at omega [rad/s], without the links.
 
     R = A H B exp(-j omega T (1/2 + 1)) sinc(omega T/2): amplifier 1/(1 + j omega lag), high-pass
     j omega/(j omega + omega_h), Butterworth anti-alias filter, delay of one sample, hold.
@@ -45,12 +45,12 @@ def design_amplifier(step: Array, lag: Array) -> Amplifier:
     """Amplifier over one plant step.
 
     exp(-t/lag) is replaced by the parabola that equals it in its first three moments over the
-    step, so that links feel the right impulse however short the lag is: the values of the
-    exponential itself at the three instants would leave a fast amplifier a sixth of a step behind.
+    step, so that links get the right impulse however short the lag: sampling the exponential
+    itself at the three instants would leave a fast amplifier a sixth of a step behind.
 
     Args:
         step: h [s], ().
-        lag: time constant of the amplifier [s], (); 0: it follows at once.
+        lag: time constant of the amplifier [s], (); 0: no lag.
 
     Returns:
         Amplifier.

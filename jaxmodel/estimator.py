@@ -1,11 +1,12 @@
 """Velocity (and position) estimates of the sampled controller, one filter chain per channel.
 
-Every estimator is a first-order section followed by a second-order one, so that they differ in
-numbers only. The second section keeps its state before the numerators and so serves two outputs.
+Every estimator is a first-order section followed by a second-order one, so that only their
+coefficients differ. The second section keeps its state before the numerators, so it serves two
+outputs.
 
 - `modal_phase`: high-pass (Tustin) times low-pass (Tustin, prewarped) whose output a q + b q' is
   chosen so that analogue electronics, delay, hold and filter together are exactly j omega at the
-  assembled frequency omega of the mode: right amplitude and phase where the vibration is.
+  assembled frequency omega of the mode: exact amplitude and phase where the mode vibrates.
 - `difference`: backward difference behind a first-order low-pass. A warning, not a proposal: it
   destabilises the paper's gains on a plant with seven modes or more.
 """
@@ -35,10 +36,10 @@ class Estimator(NamedTuple):
 def design_estimator(
     omega: Array, electronics: Electronics, lowpass_ratio: Array, lowpass_zeta: Array
 ) -> Estimator:
-    """Estimator of either kind, selected by a traced index.
+    """Design either kind of estimator, selected by a traced index.
 
     Args:
-        omega: assembled frequency the chain is exact at [rad/s], (3, C).
+        omega: assembled frequency at which the chain is exact [rad/s], (3, C).
         electronics: kind, sample time, filters; what lies between command and sample.
         lowpass_ratio: kappa, low-pass corner over omega [1], () or (C,).
         lowpass_zeta: damping of the low-pass [1], () or (C,).

@@ -5,7 +5,7 @@ small. ETDRK4 (Cox and Matthews 2002) therefore solves the oscillator exactly an
 as forcing, one step per controller sample for any number of modes. The filter is linear and equal
 on every sensor channel, so each modal coordinate q is filtered (to z) instead of each voltage:
 z'' = omega_f^2 (q - z) - sqrt(2) omega_f z' (Butterworth). One 4x4 block (q, q', z, z') per mode;
-where patches are drained by their amplifiers a fifth entry, s' = omega_h (q - s), is taken off q
+where amplifiers drain the patches, a fifth entry, s' = omega_h (q - s), is subtracted from q
 before the filter.
 """
 
@@ -24,7 +24,7 @@ _TERMS = 10
 
 
 class Exponential(NamedTuple):
-    """Coefficients of one step of length h; n rows and columns (q, q', z, z'), maybe s."""
+    """Coefficients of one step of length h; n rows and columns (q, q', z, z'; s if drained)."""
 
     half: Array  # exp(A h/2), upper left block, (2, 2, 3, R)
     half_force: Array  # h/2 phi_1(A h/2) times the force direction, (2, 3, R)
@@ -38,7 +38,7 @@ def exponential_step(
     """Coefficients of ETDRK4 for q'' = -omega^2 q - 2 zeta omega q' + N and its filter.
 
     phi_k are computed by their series at h/2^8 and doubled: phi_k(2x) from phi_0..phi_k(x), which
-    needs no division by omega h (Kassam and Trefethen 2005 take a contour mean for that reason).
+    needs no division by omega h (Kassam and Trefethen 2005 avoid it with a contour mean).
 
     Args:
         omega: natural frequency of each mode [rad/s], (3, R).

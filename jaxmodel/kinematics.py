@@ -27,19 +27,19 @@ TINY_AREA = 1e-20
 
 
 class Bend(NamedTuple):
-    """What bending does to a link's far joint, (3,) each; None: nothing."""
+    """Effect of bending on a link's far joint, (3,) each; None: none."""
 
     tip: Array | None = None  # w, deflection of C from the link's tangent frame [m]
     tip_rate: Array | None = None  # [m/s]
-    shortening: Array | None = None  # d, by which the chord is shorter than the link [m]
+    shortening: Array | None = None  # d, link length minus chord length [m]
     shortening_rate: Array | None = None  # [m/s]
 
 
 class Frame(NamedTuple):
     """Axes f and g (f turned by +90 deg) at the joints C, (3,) each.
 
-    f points where bending lets C go in its link: along t, by which a chord grows shorter, or along
-    -n_t where Y_j(L) is not zero. When C of a rigid link moves by (f, g), then rho by
+    f points where bending moves C within its link: along t as the chord shortens, or along -n_t
+    where Y_j(L) is not zero. When C of a rigid link moves by (f, g), rho moves by
     rho_f f + rho_g g and gamma by gamma_f f + gamma_g g.
     """
 
@@ -60,7 +60,7 @@ class Frame(NamedTuple):
         return rho, self.gamma_f * along_f + self.gamma_g * along_g
 
     def joint_force(self, on_rho: Array, on_gamma: Array) -> tuple[Array, Array]:
-        """Force at C along f and g that does the work of forces on rho and gamma."""
+        """Force at C along f and g equivalent to forces on rho and gamma."""
         g = self.gamma_g * on_gamma
         if self.rho_g is not None:
             g = g + self.rho_g * on_rho
@@ -108,7 +108,7 @@ def close_chain(plant: Plant, pose: Array, pose_rate: Array, bend: Bend | None =
 
     Returns:
         Chain. Out of reach or at a singular pose P is replaced by a safe value, so the numbers are
-        finite there but meaningless: `chain_status` tells.
+        finite there but meaningless: see `chain_status`.
     """
     bend = Bend() if bend is None else bend
     sine, cosine = sine_cosine(pose[2])
@@ -163,7 +163,7 @@ def close_chain(plant: Plant, pose: Array, pose_rate: Array, bend: Bend | None =
 def chain_status(plant: Plant, chain: Chain) -> Array:
     """Status of the pose: OK, OUT_OF_REACH (h^2 > l2) or SINGULAR (gamma at 0 or 90 deg).
 
-    Of the machine as it is: bent links reach less far.
+    Of the deformed machine: bent links reach less far.
 
     Returns:
         () code of `jaxmodel.status`, as a floating-point number.
@@ -181,7 +181,7 @@ def link_angle(chain: Chain) -> Array:
 
 
 def singularity_distance(plant: Plant, pose: Array) -> Array:
-    """Distance of a path from poses that sliders cannot reach through or cannot hold [rad], ().
+    """Distance of a path from poses that sliders cannot pass or cannot hold [rad], ().
 
     The smaller of two: of any link angle gamma from 0 and 90 deg, and `hold`.
 
@@ -197,7 +197,7 @@ def singularity_distance(plant: Plant, pose: Array) -> Array:
 
 
 def hold(chain: Chain) -> Array:
-    """How firmly links of given length hold the platform [1], (): 1 best, 0 not at all.
+    """How firmly links of given length hold the platform [1], (): from 0, not at all, to 1.
 
     Three links whose lines meet in one point, or are parallel, let the platform turn about that
     point. |det| of their directions and moments about the centre of the joints, over its largest
@@ -245,14 +245,14 @@ _LINK_FIELDS = ("ux", "uy", "joint_cos", "joint_sin", "s0", "h0", "length")
 def path_status(plant: Plant, pose: Array) -> Array:
     """First bad status along poses of the undeformed machine, with its index.
 
-    Beside that of the links, SINGULAR where they do not `hold` the platform.
+    Also SINGULAR where the links do not `hold` the platform.
 
     Args:
         plant: the machine.
         pose: (N, 3) [m, m, rad].
 
     Returns:
-        (code (), index ()): code OK and index 0 where the whole path is sound.
+        (code (), index ()): code OK and index 0 if the whole path is fine.
     """
     lanes = plant._replace(**{name: getattr(plant, name)[:, None] for name in _LINK_FIELDS})
     chain = close_chain(lanes, pose.T, jnp.zeros_like(pose.T))

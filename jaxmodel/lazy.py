@@ -1,4 +1,4 @@
-"""JAX under its usual names, loaded when it is first used: who only reads tables need not wait."""
+"""JAX under its usual names, loaded on first use, so that reading tables does not wait for it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 
 class _Late:
-    """A module that is imported when an attribute of it is asked for."""
+    """A module that is imported on first attribute access."""
 
     def __init__(self, name: str) -> None:
         self.__name__ = name

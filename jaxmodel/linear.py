@@ -1,8 +1,8 @@
 """Linearisation at a pose: frequencies, damping, mode shapes, frequency response.
 
-The state is x = (X, X', q, q'), flattened, about the machine at that pose with straight links,
-resting or in motion, the drive giving the forces that keep it so: what acts along the links then
-changes their stiffness. Matrices come from forward-mode differentiation of the loop's own plant;
+The state is x = (X, X', q, q'), flattened, about the machine at that pose with straight links, at
+rest or in motion; the drive supplies the forces that sustain it, and axial forces change the
+stiffness of the links. Matrices come from forward-mode differentiation of the loop's own plant;
 `jaxmodel.sampled_loop` adds electronics and controller.
 """
 
@@ -22,7 +22,7 @@ from jaxmodel.parameters import Array
 
 
 class LinearPlant(NamedTuple):
-    """x' = A x + B_voltage V_a + B_force F; outputs are rows to multiply with x."""
+    """x' = A x + B_voltage V_a + B_force F; outputs are rows that multiply x."""
 
     state: Array  # A [1/s and mixed], (n, n), n = 6 + 6 R
     voltage: Array  # B_voltage, (n, 3 K)
@@ -51,7 +51,7 @@ class Moment(NamedTuple):
 
 
 def resting(structure: Structure, case: Case) -> Moment | None:
-    """The machine at rest under the case's steady load; None where there is none."""
+    """The machine at rest under the case's steady load; None without load."""
     if not structure.has_wrench:
         return None
     still = jnp.zeros_like(jnp.asarray(case.load.wrench))
@@ -67,7 +67,7 @@ def linearise(
         structure: static choices.
         loop: constants of the case.
         pose: (x, y, phi) [m, m, rad], (3,).
-        moment: motion and load there, as if they lasted; None: at rest without load.
+        moment: motion and load there, taken as lasting; None: at rest without load.
 
     Returns:
         LinearPlant.
@@ -135,9 +135,9 @@ def natural_modes(plant: LinearPlant) -> NaturalModes:
     """Frequencies, damping ratios and shapes of the assembled machine (on the host).
 
     An undamped machine is solved as lambda^2 of the position block, which keeps rigid modes at
-    zero. Otherwise the 2 m poles are paired: conjugates, and real ones a slow with
-    a fast one of like shape, for which frequency means sqrt(lambda_1 lambda_2) and the damping
-    ratio is 1 or more (1 where the slow one is zero: held by nothing but damping).
+    zero. Otherwise the 2 m poles are paired: conjugates, and a slow real pole with a fast one of
+    similar shape. For these, frequency means sqrt(lambda_1 lambda_2) and the damping ratio is 1 or
+    more (1 where the slow one is zero: held only by damping).
     """
     a = np.asarray(mechanical(plant))
     m = a.shape[0] // 2
@@ -168,7 +168,7 @@ def natural_modes(plant: LinearPlant) -> NaturalModes:
 
 
 def _paired(real: np.ndarray, value: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Real poles in ascending size, reordered so that two that follow belong to one oscillator.
+    """Real poles in ascending size, reordered so that neighbouring pairs belong to one oscillator.
 
     Both poles of an overdamped oscillator move the machine in nearly the same shape.
     """

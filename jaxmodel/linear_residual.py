@@ -1,8 +1,8 @@
-"""Residual vibration from the linearised sampled loop: a fast look at a design before any run.
+"""Residual vibration from the linearised sampled loop: a quick estimate before any run.
 
 The shaped command moves the linear machine of the first way-point; what is left `residual_delay`
-after its end dies out by itself, and its energy until then comes from a Gramian by doubling
-(H2 norm of an initial state). Converters and their limits are left out.
+after its end decays freely, and its energy until then comes from a Gramian by doubling (H2 norm
+of an initial state). Converters and their limits are ignored.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from jaxmodel.simulate import begin
 
 
 def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) -> Array:
-    """H2 norm of what a move leaves behind; differentiable.
+    """H2 norm of the vibration that a move leaves behind; differentiable.
 
     sqrt(sum over k of y_k^2 T/L) with y the chord deflection from the window's start on, T the
     sample period and L the window's length: the nonlinear run's `residual_rms` where vibration dies
     out within the window.
 
     Args:
-        structure: static choices; `n_steps` samples of the command are looked at.
+        structure: static choices; `n_steps` samples of the command are considered.
         case: the numbers.
         matrices: from `closed_loop` at the first way-point.
 
@@ -63,6 +63,6 @@ def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) ->
     found = summed_squares(transition, jnp.outer(x, x) / size**2)
     share = jnp.sum((matrices.deflection @ found.share) * matrices.deflection, axis=1)
     samples = case.windows.residual_length / case.electronics.period
-    # an unstable loop's sum grows without end: large, but still a number
+    # an unstable loop's sum grows without bound: large, but still a number
     log_square = jnp.minimum(found.log_size, 100.0) + jnp.log(jnp.maximum(share, 1e-300) / samples)
     return jnp.reshape(size * jnp.exp(log_square / 2), (3, -1))

@@ -3,8 +3,8 @@
 The loop with all gains times k has a pole on the imaginary axis where an eigenvalue of L(j omega)
 is 1/k. So the gain margin is the inverse of the rightmost point at which one of the eigenvalues'
 curves crosses the positive real axis (characteristic loci; MacFarlane and Postlethwaite 1977).
-The curves turn as fast as modes without control are damped, never faster: the frequencies to look
-at are known beforehand. `walk` is an elementwise step for the same executors as the loop over
+The curves turn no faster than the damping of the uncontrolled modes allows, so the frequencies to
+visit are known beforehand. `walk` is an elementwise step for the same executors as the loop over
 samples; eigenvalues are carried from frequency to frequency by the iteration of Durand and Kerner.
 """
 
@@ -32,7 +32,7 @@ class Loci(NamedTuple):
 
     value: Pair  # [1], (n,)
     last: Pair  # at the last frequency where crossings were looked for [1], (n,)
-    omega: Array  # which that is [rad/s], ()
+    omega: Array  # that frequency [rad/s], ()
     # of the rightmost crossing of each curve: where it meets the axis [1], and the frequencies on
     # either side [rad/s], (n,) each; 0: none
     crossing: Array
@@ -47,8 +47,8 @@ class Station(NamedTuple):
     omega: Array  # [rad/s], rising, never 0, ()
     cosine: Array  # of omega T, ()
     sine: Array
-    # 0: only iterate there; 1: begin to look for crossings there; 2: look for them between the last
-    # frequency of that kind and this one, ()
+    # 0: only iterate; 1: start looking for crossings here; 2: look for them between the last
+    # frequency of this kind and this one, ()
     kind: Array
 
 
@@ -93,12 +93,12 @@ def walk(response: LoopResponse, spread: Array, loci: Loci, station: Station) ->
 
 
 def _growth(response: LoopResponse) -> Array:
-    """What counts as stable grows no faster [1/s], ()."""
+    """Largest growth rate that counts as stable [1/s], ()."""
     return RADIUS_TOLERANCE / response.period
 
 
 def _iterated(turn: Turn, values: Pair) -> Pair:
-    """Eigenvalues made better one after the other, the newest at once in use (Durand, Kerner)."""
+    """Eigenvalues improved one by one, each using the newest of the others (Durand, Kerner)."""
 
     def improve(values: Pair, _: None) -> tuple[Pair, None]:
         x = values[0]
@@ -113,7 +113,7 @@ def _iterated(turn: Turn, values: Pair) -> Pair:
 
 
 class Meeting(NamedTuple):
-    """A guess at where an eigenvalue is real and positive, to be made better."""
+    """An estimate of where an eigenvalue is real and positive, to be refined."""
 
     omega: Array  # [rad/s], ()
     value: Array  # the eigenvalue, 1/k [1], ()
@@ -125,7 +125,7 @@ class Meeting(NamedTuple):
 
 
 class FoundMeeting(NamedTuple):
-    """A meeting point that has been found and is not wanted again."""
+    """A meeting point already found, to be excluded."""
 
     is_there: Array  # 1 or 0, ()
     omega: Array  # [rad/s], ()
@@ -153,7 +153,7 @@ def approach(response: LoopResponse, known: FoundMeeting, meeting: Meeting) -> M
 
     Args:
         response: of the loop.
-        known: what is divided out.
+        known: the point to divide out.
         meeting: so far.
     """
     omega, value, zero = meeting.omega, meeting.value, jnp.zeros_like(meeting.omega)

@@ -1,7 +1,7 @@
 """One sample of the closed loop: the function every executor compiles.
 
 `step(structure, loop, state, inputs) -> (state, record)`: controller, plant (ETDRK4), metrics and
-status, elementwise arithmetic on short arrays only. A case that goes bad keeps its last good state
+status, elementwise arithmetic on short arrays only. A case that fails keeps its last good state
 and its first status code. Shapes: structure first, lanes last (see `jaxmodel.plant`).
 """
 
@@ -58,9 +58,9 @@ class Loop(NamedTuple):
 
 
 class PlantState(NamedTuple):
-    """Mechanism, modes and analogue electronics, which are None where there are none.
+    """Mechanism, modes and analogue electronics (None if absent).
 
-    Patches and filters are alike, so modal coordinates are filtered instead of voltages.
+    All patches and filters are equal, so modal coordinates are filtered instead of voltages.
     """
 
     pose: Array  # [m, m, rad], (3,)
@@ -74,22 +74,22 @@ class PlantState(NamedTuple):
 
 
 class State(NamedTuple):
-    """What must carry from sample to sample."""
+    """What is carried from sample to sample."""
 
     plant: PlantState
     controller: ControllerState
     totals: metrics.Totals
     status: Array  # code of `jaxmodel.status`, as a float, ()
-    bad_time: Array  # when the status appeared [s], 0 while fine, ()
+    bad_time: Array  # when the status appeared [s], 0 while OK, ()
 
 
 class Inputs(NamedTuple):
-    """What comes from outside at one sample, at P = 2 substeps + 1 points from start to end."""
+    """External inputs of one sample, at P = 2 substeps + 1 points from start to end."""
 
-    rho: Array  # wanted slider position [m], (P, 3)
+    rho: Array  # desired slider position [m], (P, 3)
     rho_rate: Array  # [m/s], (P, 3)
     feedforward: Array | None  # [N], (P, 3)
-    pose: Array  # wanted pose at the start [m, m, rad], (3,)
+    pose: Array  # desired pose at the start [m, m, rad], (3,)
     disturbance: Array  # slider force held over the sample [N], (3,)
     wrench: Array | None  # on the platform, held over the sample [N, N, N m], (3,)
     adc_noise: Array | None  # standard normal, (3, K)
@@ -249,14 +249,14 @@ def plant_step(
     return after, first
 
 
-#: What each of (q, q', z, z', s) reads of them: electronics do not act back on a mode.
+#: Which of them each of (q, q', z, z', s) reads: electronics do not act back on a mode.
 _READS = ((0, 1), (0, 1), (0, 1, 2, 3, 4), (0, 1, 2, 3, 4), (0, 1, 4))
 
 
 def _amplified(
     amplifier: Amplifier | None, before: Array | None, command: Array
 ) -> tuple[tuple[Array, Array, Array], Array | None]:
-    """Voltages [V] on the actuators at start, middle and end of a step, and what it leaves."""
+    """Voltages [V] on the actuators at start, middle and end of a step, and the remainder."""
     if amplifier is None or before is None:
         return (command, command, command), None
     change = before - command
@@ -310,7 +310,7 @@ def advance(
     after: ControllerState,
     clipped: Array,
 ) -> tuple[State, Record]:
-    """Everything of one sample but the controller: plant, metrics and status.
+    """One sample without the controller: plant, metrics and status.
 
     Args:
         structure: static choices.
@@ -319,7 +319,7 @@ def advance(
         inputs: of this sample.
         voltage: command of this sample [V], (3, K).
         after: the controller's next state.
-        clipped: 1 where an ADC channel is at its end, else 0, ().
+        clipped: 1 if an ADC channel clips, else 0, ().
 
     Returns:
         (state at the next instant, Record of this one).

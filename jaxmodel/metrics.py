@@ -1,12 +1,12 @@
-"""Numbers that judge a run, accumulated inside the loop so that no trajectory has to be kept.
+"""Metrics of a run, accumulated inside the loop so that no trajectory has to be stored.
 
-A `Metric` says what it is, which `Total`s it adds up sample by sample, and what it makes of them in
-the end; `METRICS` is the only list of them, and `METRICS.add` puts in one of your own.
+A `Metric` says what it is, which `Total`s it accumulates sample by sample, and how it computes its
+value from them at the end; `METRICS` is the only list of them, and `METRICS.add` adds your own.
 
 Windows: *moving* is from t = 0 to the end of the shaped command, *residual* starts
 `residual_delay` after it and lasts `residual_length`. Deflections are chord deflections (relative
 to the line B-C) at the stations, so they do not depend on the basis. Modal coordinates of the
-controller's modes are what a noise-free modal filter makes of the plant's deflection.
+controller's modes are the output of a noise-free modal filter on the plant's deflection.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Window(NamedTuple):
 
 
 class Fixed(NamedTuple):
-    """What the metrics read of the case at every sample."""
+    """What the metrics read from the case at every sample."""
 
     omega: Array  # plant modes [rad/s], (3, R)
     modal_omega: Array  # controller's modes [rad/s], (3, C)
@@ -67,7 +67,7 @@ class Instant(NamedTuple):
 
 
 class Ending(NamedTuple):
-    """What the metrics read of the case at the end."""
+    """What the metrics read from the case at the end."""
 
     period: Array  # between samples [s], ()
     modal_omega: Array  # controller's modes [rad/s], (3, C)
@@ -93,9 +93,9 @@ class Metric(NamedTuple):
     dims: tuple[str, ...]  # axes: keys of `Sizes.axes`
     unit: str  # SI; of each entry where they differ: "m; m; rad"
     text: str  # what it is
-    totals: tuple[Total, ...]  # what it is made of; totals of one name are added up once
+    totals: tuple[Total, ...]  # its inputs; totals of the same name are accumulated once
     finish: Callable[[Totals, Ending], Array]
-    has_slope: bool = True  # may be an objective; else it only tells designs apart
+    has_slope: bool = True  # can be an objective; otherwise it only compares designs
     is_single: bool = True  # float32 has it within 1 % (`studies bench --precision float32`)
 
 
@@ -122,7 +122,7 @@ class Sizes(NamedTuple):
 
 
 class Metrics(dict[str, Any]):
-    """Judgement of a run: arrays by name, also as attributes; None where not accumulated."""
+    """Metrics of a run: arrays by name, also as attributes; None if not accumulated."""
 
     def __new__(cls, *_: Any) -> Metrics:
         _make_known()  # before there is one
@@ -180,7 +180,7 @@ def accumulate(totals: Totals, instant: Instant) -> Totals:
 
 
 def finish(totals: Totals, ending: Ending) -> Metrics:
-    """All metrics that the totals of a run allow."""
+    """All metrics that can be computed from the totals of a run."""
     found = Metrics(
         (name, metric.finish(totals, ending))
         for name, metric in METRICS.items()
@@ -194,7 +194,7 @@ def finish(totals: Totals, ending: Ending) -> Metrics:
 
 
 def check_metric(metric: Metric) -> None:
-    """Raise PartError for a metric whose axes nobody knows."""
+    """Raise PartError for a metric with unknown axes."""
     axes = Sizes(1, 1, 1, 1).axes
     for dims in (metric.dims, *(total.dims for total in metric.totals)):
         for name in dims:
@@ -457,7 +457,7 @@ METRICS: Table[Metric] = Table(
             "clipped_fraction",
             (),
             "1",
-            "samples with an ADC channel at its end",
+            "samples with a clipped ADC channel",
             _COUNT,
             lambda at: at.sample.is_clipped,
             has_slope=False,
@@ -504,7 +504,7 @@ METRICS: Table[Metric] = Table(
             "stretch_error_peak",
             ("pose_axis",),
             "m; m; rad",
-            "peak pose error that stretching links would add, N L/(E A)",
+            "peak pose error that link stretching would add, N L/(E A)",
             lambda at: jnp.abs(at.sample.stretch_error),
         ),
         _mean(
@@ -537,7 +537,7 @@ METRICS: Table[Metric] = Table(
             "energy_ratio",
             _CONTROLLED,
             "1",
-            "EMC ratios (24) that the run's modal energies give",
+            "EMC ratios (24) from the run's modal energies",
             (_MOVING, _MODAL_ENERGY),
             lambda totals, ending: efficient_modal_control(
                 _average(totals, _MODAL_ENERGY, _MOVING), ending.modal_omega

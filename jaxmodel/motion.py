@@ -73,7 +73,7 @@ def end_of_path(path: Path) -> Array:
 
 def cycloid(u: Array) -> tuple[Array, Array, Array]:
     """Return (25), s = u - sin(2 pi u)/(2 pi), with s' and s'' for u in [0, 1] [1]."""
-    # The whole turn taken off makes the end exact: no acceleration is left at u = 1.
+    # Subtracting the whole turn makes the end exact: no acceleration is left at u = 1.
     angle = 2 * np.pi * (u - jnp.round(u))
     sine = jnp.sin(angle)
     return u - sine / (2 * np.pi), 1 - jnp.cos(angle), 2 * np.pi * sine
@@ -103,8 +103,8 @@ PROFILES = Table("motion profile", (Profile("cycloid", cycloid), Profile("quinti
 def sample_path(path: Path, time: Array) -> PathSample:
     """Return the pose and its rates at the given times.
 
-    X(t) = w_0 + sum_k (w_{k+1} - w_k) s(clip((t - t_k)/tf_k, 0, 1)): at rest in the first waypoint
-    before 0 and in the last one after the end. s: the path's profile, (25) as a rule.
+    X(t) = w_0 + sum_k (w_{k+1} - w_k) s(clip((t - t_k)/tf_k, 0, 1)): at rest at the first waypoint
+    before 0 and at the last one after the end. s: the path's profile, usually (25).
 
     Args:
         path: the moves.
@@ -119,7 +119,7 @@ def sample_path(path: Path, time: Array) -> PathSample:
     last = len(path.move_time) - 1
 
     def at(instant: Array) -> PathSample:
-        # One move at a time differs from rest, so the sum is its starting point plus one term.
+        # Only one move at a time differs from rest, so the sum is its starting point plus one term.
         k = jnp.clip(jnp.sum(instant >= starts) - 1, 0, last)
         duration = path.move_time[k]
         u = jnp.clip((instant - starts[k]) / duration, 0, 1)
@@ -152,7 +152,7 @@ def shape_path(path: Path, taps: Taps, n_times: int, per_sample: int, step: Arra
         PathSample with arrays of shape (n_times, 3).
     """
     sampled = sample_path(path, step * jnp.arange(n_times))
-    # The path is at rest at t = 0, so its first row also holds before.
+    # The path is at rest at t = 0, so its first row also holds before that.
     padded = jax.tree.map(lambda x: jnp.pad(x, ((n_times, 0), (0, 0)), mode="edge"), sampled)
     shifts = jnp.clip(taps.sample * per_sample, 0, n_times)
 

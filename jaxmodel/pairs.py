@@ -41,7 +41,7 @@ class Pair:
         return Pair(self.re[place], self.im[place])
 
     def inverse(self) -> Pair:
-        """1/x, and 0 of 0."""
+        """1/x, and 0 for x = 0."""
         least = float(jnp.finfo(self.re.dtype).tiny)
         size = 1 / (self.re * self.re + self.im * self.im + least)
         return Pair(self.re * size, -self.im * size)
@@ -66,7 +66,7 @@ def product(a: Pair, b: Pair) -> Pair:
 
 
 def determinant(matrix: Pair) -> Pair:
-    """Of a small matrix (n, n, ...) by elimination without exchange of rows."""
+    """Determinant of a small matrix (n, n, ...) by elimination without pivoting."""
     value = matrix[0, 0]
     while matrix.re.shape[0] > 1:
         factor = matrix[1:, :1] * matrix[0, 0].inverse()

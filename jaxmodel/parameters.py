@@ -23,13 +23,13 @@ HOME = (0.0, 0.0, np.pi / 6)
 
 
 class Geometry(NamedTuple):
-    """Guides and platform joints. The paper's guides are the sides of a triangle round O."""
+    """Guides and platform joints. The paper's guides are the sides of a triangle around O."""
 
     guide_side: Array  # a [m], ()
     guide_angle: Array  # alpha [rad], (3,)
     joint_radius: Array  # distance platform centre - C_i [m], () or (3,)
     joint_angle: Array  # psi, body angle of C_i [rad], (3,)
-    guide_offset: Array = 0.0  # by which a guide lies further from O than the side [m], () or (3,)
+    guide_offset: Array = 0.0  # how much further from O than the side a guide lies [m], () or (3,)
 
 
 class Masses(NamedTuple):
@@ -51,7 +51,7 @@ class Beam(NamedTuple):
     width: Array  # [m]
     density: Array  # [kg/m3]
     youngs_modulus: Array  # E [Pa]
-    stiffness_factor: Array  # true bending stiffness over the one controller and shaper believe [1]
+    stiffness_factor: Array  # true bending stiffness over the one controller and shaper assume [1]
     joint_inertia_b: Array  # rotary inertia J_B at the slider joint [kg m2]
     joint_inertia_c: Array  # rotary inertia J_C at the platform joint [kg m2]
 
@@ -59,7 +59,7 @@ class Beam(NamedTuple):
 class Patches(NamedTuple):
     """Piezo pairs: sensor and actuator of pair k share a centre, on opposite faces of the link.
 
-    () or (3,) each, but for the centres.
+    () or (3,) each, except the centres.
     """
 
     center: Array  # [m], (3, n_patches)
@@ -74,9 +74,9 @@ class Patches(NamedTuple):
 
 
 class Damping(NamedTuple):
-    """Structural damping of the links' modes: given ratios, and how they go on.
+    """Structural damping of the links' modes: given ratios, and their continuation.
 
-    Beyond the modes given zeta_j = zeta_n (omega_j/omega_n)^p of the last one, n: p = 0 for a
+    Beyond the last given mode n, zeta_j = zeta_n (omega_j/omega_n)^p: p = 0 for a
     constant ratio, -1 for damping in proportion to mass, 1 to stiffness.
     """
 
@@ -86,7 +86,7 @@ class Damping(NamedTuple):
 
 
 class Machine(NamedTuple):
-    """Everything physical about the mechanism with its patches."""
+    """All physical data of the mechanism with its patches."""
 
     geometry: Geometry
     masses: Masses
@@ -98,7 +98,7 @@ class Machine(NamedTuple):
 def paper_machine() -> Machine:
     """The paper's 3-PRR manipulator.
 
-    Values that the paper does not print (E, density, width, I_p, damping, PZT permittivity and
+    Values not given in the paper (E, density, width, I_p, damping, PZT permittivity and
     density) are the estimates listed in docs/theory.md.
     """
     return Machine(

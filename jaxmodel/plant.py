@@ -1,4 +1,4 @@
-"""The numbers one evaluation of the dynamics reads, worked out once per case.
+"""The numbers that one evaluation of the dynamics reads, computed once per case.
 
 Layout used by every per-step function: structure first, lanes last. Pose arrays have shape (3,),
 link arrays (3,), mode arrays (3, R); any further trailing axes are lanes of a batch. Link arrays
@@ -54,7 +54,7 @@ def damping_ratio(damping: Damping, omega: Array) -> Array:
     return known * (omega / jnp.take_along_axis(omega, own, axis=1)) ** damping.exponent
 
 
-#: Mass added to sliders that are locked [kg]: 1 N for 1 s moves it by 0.5 nm.
+#: Mass added to locked sliders [kg]: 1 N for 1 s moves it by 0.5 nm.
 LOCK_MASS = 1e9
 
 

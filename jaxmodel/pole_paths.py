@@ -1,10 +1,10 @@
-"""Poles of the closed loop, followed from those of the machine without control as gains rise.
+"""Poles of the closed loop, traced from those of the uncontrolled machine as gains rise.
 
-With gains times k the loop has its poles where det(1/k - L(s)) = 0. The three modes of one order,
-one of each link, lie side by side; their poles are looked for together, by the iteration of Ehrlich
-and Aberth, which keeps them apart. det has poles of its own where the machine without control has
-them: these are found first, the same way from those of links whose ends are held, and multiplied
-out. Elementwise steps for the same executors as `loci.walk`.
+With gains times k, the loop has its poles where det(1/k - L(s)) = 0. The three modes of one order,
+one per link, lie close together; their poles are found jointly by the Ehrlich-Aberth iteration,
+which keeps them apart. det itself has poles where the uncontrolled machine has them: these are
+found first, in the same way from those of links with held ends, and multiplied out. Elementwise
+steps for the same executors as `loci.walk`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _TERMS = 8
 
 
 class Trio(NamedTuple):
-    """Three poles on their way."""
+    """Three poles being traced."""
 
     pole: Pair  # s [1/s], (3,)
     shift: Pair  # exp(-s T), (3,)
@@ -31,7 +31,7 @@ class Trio(NamedTuple):
 
 
 def settle(response: LoopResponse, held: Pair, trio: Trio) -> Trio:
-    """Make three poles of the machine without control better.
+    """Refine three poles of the uncontrolled machine.
 
     Args:
         response: of the loop.
@@ -46,7 +46,7 @@ def settle(response: LoopResponse, held: Pair, trio: Trio) -> Trio:
 
 
 def follow(response: LoopResponse, own: Pair, trio: Trio, inverse: Array) -> Trio:
-    """Make three poles of the closed loop better.
+    """Refine three poles of the closed loop.
 
     Args:
         response: of the loop.

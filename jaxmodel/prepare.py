@@ -1,4 +1,4 @@
-"""From a `Case` to what the loop reads: matrices and coefficients, worked out once per case."""
+"""From a `Case` to what the loop reads: matrices and coefficients, computed once per case."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ class Prepared(NamedTuple):
     """A case ready to run."""
 
     loop: Loop
-    bases: Bases  # what it was made from
+    bases: Bases  # the modal bases it is built from
     taps: shaper.Taps  # shaper on the sample grid
     initial_q: Array  # [m], (3, R)
     sensor_condition: Array  # condition number of the modal filter per link [1], (3,)
     actuator_condition: Array  # of the synthesizer [1], (3,)
-    status: Array  # what is wrong before the run, as a float, ()
+    status: Array  # fault found before the run, as a float, ()
 
 
 class ControllerDesign(NamedTuple):
-    """Controller and what its design knows, before gains are chosen or judged."""
+    """Controller and the by-products of its design."""
 
     controller: Controller
     known: Known
@@ -53,14 +53,14 @@ class ControllerDesign(NamedTuple):
 
 
 def prepare(structure: Structure, case: Case) -> Prepared:
-    """Work out everything the loop needs.
+    """Compute everything the loop needs.
 
     Args:
         structure: static choices.
         case: the numbers.
 
     Returns:
-        Prepared; `status` says what makes the case unfit, the numbers stay finite all the same.
+        Prepared; `status` says what makes the case invalid; the numbers stay finite even then.
     """
     machine, electronics = case.machine, case.electronics
     bases = find_bases(structure, case)
@@ -139,7 +139,7 @@ _PER_LINK_DRIVE = (
 
 
 def spectrum_frequencies(structure: Structure, bases: Bases) -> Array:
-    """Where spectra are taken, round the plant's own frequencies [Hz], (3, C, n_frequencies)."""
+    """Where spectra are taken, around the plant's frequencies [Hz], (3, C, n_frequencies)."""
     span = jnp.linspace(1 - SPECTRUM_SPAN, 1 + SPECTRUM_SPAN, structure.n_frequencies)
     return bases.plant_omega[:, :, None] * span / (2 * jnp.pi)
 
@@ -153,8 +153,8 @@ def _constants(case: Case) -> tuple[Array, Array]:
 def design_controller(structure: Structure, case: Case, bases: Bases) -> ControllerDesign:
     """Controller of a case from what it believes, `Bases.model`.
 
-    Modal filter pinv(lambda_s Phi_s^t) and synthesizer pinv(lambda_a Phi_a), then what the law
-    makes of them (`jaxmodel.laws`).
+    Modal filter pinv(lambda_s Phi_s^t) and synthesizer pinv(lambda_a Phi_a), from which the law
+    designs the feedback (`jaxmodel.laws`).
 
     Args:
         structure: static choices; `law` and sizes are read.
@@ -172,7 +172,7 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
     actuator = lambda_a[:, None, None] * model.actuator_slope  # (3, size, K)
     mask = active_modes(control.n_active, n, structure.n_patches)
     seen, driven = sensor[:, :, :n], jnp.swapaxes(actuator[:, :n], 1, 2)
-    # in one call: XLA's CPU compiler aborts on two of them side by side where C = 1 (jax 0.10)
+    # in one call: XLA's CPU compiler aborts on two side by side if C = 1 (jax 0.10)
     inverse = jax.vmap(left_inverse, (0, None))(jnp.concatenate([seen, driven]), mask)
     observer, synthesizer = inverse[:3], jnp.swapaxes(inverse[3:], 1, 2)
 
@@ -215,7 +215,7 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
 def design_taps(case: Case, bases: Bases) -> shaper.Taps:
     """Shaper of the case on its sample grid; each frequency split for its own mode, in series.
 
-    A frequency of zero stands for mode 1 as the controller believes it, the mean of the links.
+    A frequency of zero stands for mode 1 of the controller's model, averaged over the links.
     """
     shaping, period = case.shaping, case.electronics.period
     known = jnp.mean(bases.believed_omega[:, 0])
@@ -296,7 +296,7 @@ def drive_rate(case: Case) -> Array:
     """Bound on the rate of the sliders' drive, d/m_s + sqrt(Kp/m_s) [1/s], ().
 
     d adds Kd, viscous friction and the steepest slope of the friction law; the mass that a slider
-    feels is at least its own. Sliders that are locked have none.
+    feels is at least its own. Locked sliders have none.
     """
     drive, mass = case.drive, case.machine.masses.slider_mass
     damping = drive.kd + drive.viscous_friction + drive.coulomb_friction / drive.friction_speed

@@ -1,10 +1,10 @@
-"""The sampled loop by its return difference: det(I - k L(s)) without one large matrix.
+"""Return difference of the sampled loop: det(I - k L(s)) without any large matrix.
 
 L(s) takes the forces of the controller's channels once round the loop: hold, amplifier, links and
-pose, patches, filters, controller. What a sampler sees is the sum of the plant's responses at
-s + 2 pi j n/T. Links meet in the pose alone, so each response is a sum over the modes of each link
-and a system of three equations for the pose, and det(x - L) is found link by link and then from
-3x3 matrices. docs/theory.md, "Gain margins of a batch". Shapes: structure first, lanes last.
+pose, patches, filters, controller. A sampler sees the sum of the plant's responses at
+s + 2 pi j n/T. Links couple only through the pose, so each response is a sum over the modes of each
+link and a system of three equations for the pose, and det(x - L) follows link by link and then
+from 3x3 matrices. docs/theory.md, "Gain margins of a batch". Shapes: structure first, lanes last.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class LoopResponse(NamedTuple):
     mass: Array  # of the pose with straight links, (3, 3)
     damping: Array  # of the drive in the pose, (3, 3)
     stiffness: Array  # (3, 3)
-    square: Array  # omega^2 of the modes of a link whose ends are held [1/s2], (3, R)
+    square: Array  # omega^2 of the modes of a link with held ends [1/s2], (3, R)
     decay: Array  # 2 zeta omega [1/s], (3, R)
-    lightness: Array  # inertia left to a mode that drags nothing but the pose's mass [1], (3, R)
+    lightness: Array  # inertia left to a mode that drags only the pose's mass [1], (3, R)
     enter: Array  # generalised force on the pose per modal acceleration, (3, 3, R)
     leave: Array  # inertia force on a mode per pose acceleration, (3, 3, R)
     observe: Array  # channels per modal coordinate, (n, C, R)
@@ -52,12 +52,12 @@ class LoopResponse(NamedTuple):
     position_gain: Array | None
     period: Array  # T [s], ()
     antialias: Array  # [rad/s], ()
-    highpass: Array | None  # of the patches [rad/s], None where there is none, ()
-    lag: Array | None  # of the amplifiers [s], None where there are none, ()
+    highpass: Array | None  # of the patches [rad/s], None if there is none, ()
+    lag: Array | None  # of the amplifiers [s], None if there are none, ()
 
 
 def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> LoopResponse:
-    """What the return difference reads.
+    """Collect what the return difference reads.
 
     Args:
         structure: static choices with feedback "sampled".
@@ -186,10 +186,10 @@ def _normal_modes(plant: Plant, inertia: Array | None, springs: Array | None) ->
 
 
 def loop_strength(response: LoopResponse) -> Array:
-    """Largest eigenvalue of L that a mode of a link between held ends gives at its resonance, ().
+    """Largest eigenvalue of L due to a mode of a link with held ends at its resonance, ().
 
-    Of its own part of L, which has rank one; without the images of the spectrum and the pose. So it
-    is a measure of size, not a bound.
+    It covers the mode's own part of L, which has rank one, without spectral images and pose: a
+    measure of size, not a bound.
     """
     n = response.observe.shape[0]
     square, decay = response.square[:n], response.decay[:n]
@@ -218,12 +218,12 @@ _CHANNEL_FIELDS = ("observe", "act", "feedthrough", "estimator", "velocity_gain"
 
 
 def controlled_first(response: LoopResponse, link_mask: np.ndarray, count: int) -> LoopResponse:
-    """The same loops with links under control first and no channels on the others; on the host.
+    """The same loops with controlled links first and no channels on the others; on the host.
 
     Args:
         response: with channels on all links, lanes last.
-        link_mask: above 0 for links under control, (3, lanes).
-        count: how many links keep channels, as many as are under control in any lane (static).
+        link_mask: above 0 for controlled links, (3, lanes).
+        count: how many links keep channels, the largest number controlled in any lane (static).
     """
     order = np.argsort(link_mask <= 0, axis=0, kind="stable")
 
@@ -240,12 +240,12 @@ def controlled_first(response: LoopResponse, link_mask: np.ndarray, count: int) 
 
 
 class AssembledModes(NamedTuple):
-    """Modes of the machine without control, m = 3 + 3 R; damping to first order."""
+    """Modes of the uncontrolled machine, m = 3 + 3 R; damping to first order."""
 
     omega: Array  # ascending [rad/s], (m,)
     decay: Array  # zeta omega [1/s], (m,)
     share: Array  # of kinetic energy in the pose, then in the links' modes by order, (1 + R, m)
-    growth: Array  # rate at which it leaves its place by itself, 0: it does not [1/s], ()
+    growth: Array  # growth rate of an unstable rest, 0: stable [1/s], ()
 
 
 def assembled_modes(response: LoopResponse) -> AssembledModes:
@@ -283,23 +283,23 @@ def assembled_modes(response: LoopResponse) -> AssembledModes:
 
 
 class Turn(NamedTuple):
-    """L at one s, as far as it is needed for its determinants; `spectrum_polynomial` reads it."""
+    """L at one s, in the form its determinants need; `spectrum_polynomial` reads it."""
 
     own: list[Pair]  # coefficients of det(x - L_i) of each link, highest power first, (n,) each
     joint: list[Pair]  # of entering adj(x - L_i) leaving, the same way, (n, 3, 3)
-    pose: Pair  # dynamic stiffness of the pose, its links on it, (3, 3)
+    pose: Pair  # dynamic stiffness of the pose including its links, (3, 3)
     pose_inverse: Pair  # 1/det of that, ()
 
 
 def go_round(response: LoopResponse, s: Pair, shift: Pair, spread: Array | None = None) -> Turn:
-    """L at s.
+    """Evaluate L at s.
 
     Args:
         response: of the loop.
         s: [1/s], ().
         shift: exp(-s T), ().
-        spread: what is taken from the diagonal of L, so that channels without gains have
-            eigenvalues of their own [1], (n, C); None: nothing.
+        spread: subtracted from the diagonal of L, so that channels without gains have distinct
+            eigenvalues [1], (n, C); None: nothing.
     """
     observe, act = response.observe, response.act
     n = observe.shape[0]
@@ -355,7 +355,7 @@ def _electronics(response: LoopResponse, s: Pair, s2: Pair, held: Pair) -> Pair:
 
 
 def _channel(response: LoopResponse, shift: Pair) -> Pair:
-    """Force of each channel per channel signal, a sample later, (n, C)."""
+    """Force of each channel per channel signal, one sample later, (n, C)."""
     estimator, shift2 = response.estimator, shift * shift
 
     def section(c0: Array, c1: Array, c2: Array) -> Pair:

@@ -1,8 +1,8 @@
 """The linearised sampled loop: exact discretisation, spectral radius, modal damping, gain margin.
 
-Stability is judged here and never from a run: saturation keeps an unstable loop bounded. Plant with
-drive and electronics is discretised exactly for held commands; the controller is the loop's
-own `controller_step`, linear once rounding and limits are left out.
+Stability is judged here, never from a run: saturation keeps an unstable loop bounded. The plant
+with drive and electronics is discretised exactly for held commands; the controller is the loop's
+own `controller_step`, which is linear without rounding and limits.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from jaxmodel.linear import LinearPlant, Moment, linearise, resting
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 
-#: Spectral radius above 1 by more than this is unstable; free rigid modes sit at 1 with rounding.
+#: A spectral radius this far above 1 is unstable; free rigid modes sit at 1 up to rounding.
 RADIUS_TOLERANCE = 1e-7
 
 
@@ -32,7 +32,7 @@ class LoopMatrices(NamedTuple):
 
     open: Array  # all gains zero, (n, n)
     feedback: Array  # what the gains add, (n, n)
-    plant: Array  # A of the continuous plant without control, for its poles, (m, m)
+    plant: Array  # A of the continuous uncontrolled plant, for its poles, (m, m)
     force: Array  # response to slider forces held over the sample, (n, 3)
     deflection: Array  # chord deflection at the stations [m], rows, (3 S, n)
 
@@ -50,7 +50,7 @@ def closed_loop(
         structure: static choices with feedback "sampled".
         case: the numbers; its gains belong to factor 1.
         pose: where to linearise [m, m, rad], (3,).
-        law: controller to judge instead of the case's own, its coefficients rounded for instance.
+        law: controller to judge instead of the case's own, for instance with rounded coefficients.
         moment: motion and load at that pose; None: at rest under the case's steady load.
 
     Returns:
@@ -65,7 +65,7 @@ def closed_loop(
     n, n_inputs = analogue.enters.shape
     held = jnp.zeros((n + n_inputs,) * 2, analogue.state.dtype)
     held = held.at[:n, :n].set(analogue.state).at[:n, n:].set(analogue.enters)
-    # balance velocities against positions, or the exponential loses digits to scaling
+    # balance velocities against positions, or scaling costs the exponential digits
     scale = jnp.concatenate([analogue.size, jnp.full((n_inputs,), 1e6)])
     exact = jax.scipy.linalg.expm(held / scale[:, None] * scale * case.electronics.period)
     exact = (exact * scale[:, None] / scale)[:n]
@@ -107,10 +107,10 @@ class _Analogue(NamedTuple):
 
 
 def _with_electronics(structure: Structure, plant: LinearPlant, case: Case) -> _Analogue:
-    """The plant with filters, and where there are any, drained patches and amplifiers.
+    """The plant with filters and, if present, drained patches and amplifiers.
 
-    Filters are alike, so filtering before or after adding modes up is one thing, and there are
-    fewer sensors than modes.
+    All filters are equal, so it does not matter whether modes are filtered before or after they
+    are summed, and there are fewer sensors than modes.
     """
     electronics, n_plant = case.electronics, plant.state.shape[0]
     n_sensors, n_modes = 3 * structure.n_patches, 3 * structure.n_modes
@@ -136,7 +136,7 @@ def _with_electronics(structure: Structure, plant: LinearPlant, case: Case) -> _
         state = state.at[at["s"], at["s"]].set(-highpass * eye)
     commands = jnp.zeros((n, n_sensors), state.dtype)
     if "voltage" in at:
-        # a batch may have cases without an amplifier
+        # a batch can contain cases without an amplifier
         shortest = electronics.period / FASTEST
         rate = 1 / jnp.maximum(electronics.amplifier_lag, shortest)
         state = state.at[:n_plant, at["voltage"]].set(plant.voltage)
@@ -150,9 +150,9 @@ def _with_electronics(structure: Structure, plant: LinearPlant, case: Case) -> _
     return _Analogue(state, jnp.concatenate([commands, forces], axis=1), at["z"], size)
 
 
-#: Squarings of `slowest_decay`: motions whose decay per sample differs by 1e-8 are told apart.
+#: Squarings of `slowest_decay`: motions whose decay per sample differs by 1e-8 are resolved.
 SQUARINGS = 32
-#: Motions that may share the largest modulus (a pair for each link, and as many again).
+#: Motions that can share the largest modulus (a pair for each link, and as many again).
 SHARED = 8
 
 
@@ -160,7 +160,7 @@ def slowest_decay(transition: Array, period: Array) -> Array:
     """Decay rate -ln(rho)/T of the slowest motion, rho the spectral radius; negative if unstable.
 
     By repeated squaring, rho = lim |M^n|^(1/n), with the norm taken out each time: batched
-    anywhere, where eigenvalues of unsymmetric matrices are not. What is left of M^n spans the
+    anywhere, which eigenvalues of unsymmetric matrices are not. The remainder of M^n spans the
     slowest motions; with bases Y of them and Z of their left counterparts the derivative is
     d ln(rho) = Re tr((Z'MY)^+ Z' dM Y)/r, r their number.
 
@@ -225,7 +225,7 @@ def summed_squares(matrix: Array, start: Array) -> Summed:
     """Sum of M^k S M'^k over 8192 samples by doubling; differentiable, also if M is unstable.
 
     With S = x x' it gives the energy of what comes after x, tr(C . C'); transposed, with S = C'C,
-    that of all starts (the Gramians of linear systems).
+    the energy from all starts (the Gramians of linear systems).
 
     Args:
         matrix: M, (n, n).
@@ -236,7 +236,7 @@ def summed_squares(matrix: Array, start: Array) -> Summed:
         power, log_power, total, log_total = carried
         size = jnp.sqrt(jnp.sum(power * power))
         power, log_power = power / size, log_power + jnp.log(size)
-        # both terms of total + power total power', without the factor that would be too large
+        # both terms of total + power total power', without the factor that could overflow
         most = jnp.maximum(log_power, 0.0)
         later = jnp.exp(2 * (log_power - most)) * (power @ total @ power.T)
         total = jnp.exp(-2 * most) * total + later
@@ -251,11 +251,12 @@ def summed_squares(matrix: Array, start: Array) -> Summed:
 
 
 def spillover(structure: Structure, case: Case, matrices: LoopMatrices) -> Array:
-    """By how much control lengthens the ringing of modes that it does not mean to damp [1], ().
+    """How much control prolongs the ringing of modes it is not meant to damp [1], ().
 
-    A mode is knocked, sum (j^2 q_j)^2 over all uncontrolled modes is added up until all is quiet,
-    with control and without; the largest ratio of all uncontrolled modes. For a mode that keeps to
-    itself it is the damping ratio without control over that with it; 1: control leaves them alone.
+    A mode is excited by an impulse, and sum (j^2 q_j)^2 over all uncontrolled modes is accumulated
+    until the vibration has died out, with and without control; the result is the largest ratio over
+    all uncontrolled modes. For an uncoupled mode it is the damping ratio without control over that
+    with control; 1: no effect.
 
     Args:
         structure: static choices.
@@ -289,9 +290,9 @@ def spillover(structure: Structure, case: Case, matrices: LoopMatrices) -> Array
 
 
 def _energy_slope(matrix: Array, gramian: Summed, entry: Array) -> Array:
-    """Something whose derivative is that of ln(Q_jj), Q the solution of Q = M'QM + C'C, ().
+    """An expression with the derivative of ln(Q_jj), Q the solution of Q = M'QM + C'C, ().
 
-    With P = M P M' + e_j e_j' that derivative is tr(2 P M'Q dM)/Q_jj: no need to go back through
+    With P = M P M' + e_j e_j' that derivative is tr(2 P M'Q dM)/Q_jj: no need to differentiate
     the doubling. The outputs C are constants.
     """
     fixed = jax.lax.stop_gradient(matrix)

@@ -66,7 +66,7 @@ def _zero_vibration(order: int, omega: Array, zeta: Array) -> Impulses:
 
 
 def none() -> Impulses:
-    """Return the single impulse that leaves a motion as it is, shape (1,)."""
+    """Return the single impulse that leaves a motion unchanged, shape (1,)."""
     return Impulses(jnp.ones(1), jnp.zeros(1))
 
 
@@ -102,7 +102,7 @@ def ei(omega: Array, zeta: Array, tolerance: Array) -> Impulses:
     """Return the paper's extra-insensitive shaper (13), shape (3,).
 
     A = [(1 + V)/4, (1 - V)/2, (1 + V)/4] at [0, T_d/2, T_d]: amplitudes of the undamped mode, times
-    of the damped one. Good up to zeta = 0.05; beyond that take `ei_damped`.
+    of the damped one. Good up to zeta = 0.05; beyond that, use `ei_damped`.
 
     Args:
         omega: natural frequency of the mode [rad/s], shape ().
@@ -164,7 +164,7 @@ def ei2(omega: Array, zeta: Array, tolerance: Array) -> Impulses:
     v = jnp.asarray(tolerance)
     c = 1 + _root(1 - v**2)
     x = jnp.where(v > 0, jnp.cbrt(jnp.where(v > 0, v**2 * c, 1)), 0)
-    # V^2/X = X^2/c leaves no division by X: at V = 0 the shaper becomes the ZVDD.
+    # V^2/X = X^2/c avoids dividing by X: at V = 0 the shaper becomes the ZVDD.
     outer = (2 + 3 * x + 3 * x**2 / c) / 16
     inner = 0.5 - outer
     return Impulses(jnp.stack([outer, inner, inner, outer]), _half_periods(4, omega, zeta))
@@ -197,7 +197,7 @@ SHAPERS = Table(
         Shaper("ei3", 5, ei3),
     ),
 )
-#: Impulses of the longest one.
+#: Number of impulses of the longest shaper.
 MAX_IMPULSES = max(shaper.length for shaper in SHAPERS.values())
 
 
@@ -222,7 +222,7 @@ def design_shaper(kind: Array, omega: Array, zeta: Array, tolerance: Array) -> I
 def convolve(first: Impulses, second: Impulses) -> Impulses:
     """Return two shapers in series, A_i B_j at t_i + s_j, shape (n m,).
 
-    Zero vibration of either shaper stays: so one shaper per mode serves several modes.
+    The zeros of both shapers remain, so one shaper per mode serves several modes.
 
     Args:
         first: shaper of shape (n,).
@@ -248,7 +248,7 @@ def _neighbours(impulses: Impulses, period: Array) -> tuple[Array, Array, Array]
 
 
 def split_linear(impulses: Impulses, period: Array) -> Taps:
-    """Return the shaper on a sample grid, each impulse shared linearly by its two neighbours.
+    """Return the shaper on a sample grid, each impulse split linearly between two samples.
 
     A (1 - f) at sample k and A f at k + 1, f = t/T - k. Keeps the mean delay, not the zeros.
 
@@ -265,7 +265,7 @@ def split_linear(impulses: Impulses, period: Array) -> Taps:
 
 
 def split_exact(impulses: Impulses, period: Array, omega: Array, zeta: Array) -> Taps:
-    """Return the shaper on a sample grid, each impulse shared so that one mode sees no difference.
+    """Return the shaper on a sample grid, each impulse split so that one mode sees no difference.
 
     A e^{z w (t - t_k)} sin(w_d (t_{k+1} - t))/sin(w_d T) at sample k and
     A e^{-z w (t_{k+1} - t)} sin(w_d (t - t_k))/sin(w_d T) at k + 1, both divided by their total so

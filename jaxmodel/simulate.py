@@ -26,11 +26,11 @@ from jaxmodel.shaper import last_sample
 class Result(NamedTuple):
     """Outcome of a run."""
 
-    # NaN where the run did not finish; their slopes are 0 there, so that a sum over the cases of a
-    # batch which masks those by `status` has the right slope
+    # NaN if the run did not finish; derivatives are 0 then, so that a sum over the cases of a batch
+    # that masks those by `status` has the right derivative
     metrics: metrics.Metrics
     status: Array  # code of `jaxmodel.status`, integer, ()
-    bad_time: Array  # when it appeared [s], 0 where fine or wrong from the start, ()
+    bad_time: Array  # when it appeared [s], 0 if OK or wrong from the start, ()
     command_end: Array  # end of the shaped command [s], ()
     sensor_condition: Array  # condition number of the modal filter per link [1], (3,)
     actuator_condition: Array  # of the synthesizer [1], (3,)
@@ -70,7 +70,7 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
     if structure.has_feedforward:
         each = jax.vmap(inverse_dynamics, (None, 0, 0, 0, None))
         forward = _points(each(plant, *wanted, wrench), n)
-    elif structure.has_wrench:  # what the drive's integrators have settled on
+    elif structure.has_wrench:  # the settled output of the drive's integrators
         still = jnp.zeros_like(wanted.position[0])
         held = inverse_dynamics(plant, wanted.position[0], still, still, wrench)
         forward = jnp.broadcast_to(held, (n, per_sample + 1, 3))
@@ -86,7 +86,7 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
     is_long = end > n * period
     code = jnp.where((code == status.OK) & is_long, float(status.SHAPER_TOO_LONG), code)
     left = n * period - end - case.windows.residual_delay
-    # free vibration of a platform at rest: the window may end with the run
+    # free vibration of a platform at rest: the window can end with the run
     is_moving = jnp.any(jnp.diff(case.path.waypoints, axis=0) != 0)
     is_cut = is_moving & (case.windows.residual_length > left + period / 2)
     is_cut |= case.windows.residual_length < period
@@ -176,13 +176,13 @@ def _disturbance(
 def _scan_in_blocks(body: Any, start: Any, inputs: Inputs, is_checkpointed: bool) -> Any:
     """`lax.scan` in about sqrt(n) blocks, for runs that keep something of every step.
 
-    XLA copies the store of a scan at each step; so it copies a block's store, not the run's. With
-    checkpoints reverse mode keeps the state of every block and computes the rest again.
+    XLA copies a scan's storage at each step; with blocks it copies only a block's, not the run's.
+    With checkpoints, reverse mode keeps the state of every block and recomputes the rest.
     """
     n = inputs.rho.shape[0]
     root = int(np.sqrt(n))
     divisor = max(k for k in range(1, root + 1) if n % k == 0)
-    # a remainder compiles the step a second time, so an even division is preferred
+    # a remainder compiles the step a second time, so prefer an even division
     size = divisor if divisor > root // 4 else root
     count = n // size
 
@@ -200,7 +200,7 @@ def _scan_in_blocks(body: Any, start: Any, inputs: Inputs, is_checkpointed: bool
 
 
 class Outline(NamedTuple):
-    """What is known of a case before its first step."""
+    """What is known about a case before its first step."""
 
     early_time: Array  # when a fault of the command appears [s], ()
     command_end: Array  # [s], ()
@@ -216,7 +216,7 @@ class Outline(NamedTuple):
 
 
 class Start(NamedTuple):
-    """A case ready to be stepped: what an executor reads, and what the end of the run needs."""
+    """A case ready to run: what an executor reads, and what the end of the run needs."""
 
     loop: Loop
     inputs: Inputs  # leading axis (n_steps,)
@@ -225,7 +225,7 @@ class Start(NamedTuple):
 
 
 def begin(structure: Structure, case: Case, law: Controller | None = None) -> Start:
-    """Everything before the first step.
+    """Do everything that precedes the first step.
 
     Args:
         structure: static choices.
@@ -269,7 +269,7 @@ def begin(structure: Structure, case: Case, law: Controller | None = None) -> St
 
 
 def _allowed_compression(case: Case, plant: Plant) -> Array:
-    """Critical force of the links, also where the model leaves buckling out [N], (3,)."""
+    """Critical force of the links, even if the model ignores buckling [N], (3,)."""
     if plant.shortening is None:
         return euler_force(case.machine.beam)
     return critical_force(plant)
@@ -280,9 +280,9 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
 
     Args:
         outline: of the case.
-        code: status it began with, as a float, ().
+        code: status at the start, as a float, ().
         last: state after the last step.
-        record: trajectories, to be passed on.
+        record: trajectories to pass on.
 
     Returns:
         Result.
@@ -301,7 +301,7 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
         (outline.singularity_distance < outline.singularity_margin, status.NEAR_SINGULAR),
     ):
         final = jnp.where((final == status.OK) & is_wrong, float(bad), final)
-    # zeros of a run that stopped would look like a perfect one
+    # zeros from a stopped run would look like perfect results
     is_finished = reduce(jnp.logical_or, (final == code for code in status.FINISHED))
     result = jax.tree.map(lambda x: jnp.where(is_finished, x, jnp.nan), result)
     return Result(
@@ -319,7 +319,7 @@ def conclude(outline: Outline, code: Array, last: State, record: Record | None =
 def simulate(
     structure: Structure, case: Case, has_record: bool = False, law: Controller | None = None
 ) -> Result:
-    """Run one case: the reference executor, a scan; other executors share all but that.
+    """Run one case with the reference executor, a scan; other executors replace only the scan.
 
     Args:
         structure: static choices.
@@ -347,7 +347,7 @@ def _rounded() -> Callable[..., Result]:
 def _smooth_tangent(
     structure: Structure, has_record: bool, primals: tuple[Any, ...], tangents: tuple[Any, ...]
 ) -> tuple[Result, Result]:
-    """What rounds has the derivative 0, and the loop closed through it one that means nothing."""
+    """Rounding has derivative 0, and a loop closed through it a meaningless one."""
     smooth = partial(_run, structure._replace(is_smooth=True), has_record)
     return _run(structure, has_record, *primals), jax.jvp(smooth, primals, tangents)[1]
 

@@ -28,7 +28,7 @@ NEAR_SINGULAR = 20
 OVERLOADED = 21
 OVERDAMPED = 22
 
-#: A case with one of these ran to its end, and its metrics hold.
+#: A case with one of these statuses ran to its end, and its metrics are valid.
 FINISHED = (
     OK,
     SATURATED,

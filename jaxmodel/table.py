@@ -1,4 +1,4 @@
-"""Things of one kind by name, to which users may add their own."""
+"""Named entries of one kind, extensible by users."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Generic, Protocol, TypeVar
 
 
 class PartError(ValueError):
-    """A part that does not keep its contract; the text says which and how."""
+    """A part that violates its contract; the message says which and how."""
 
 
 class Named(Protocol):
-    """What a table holds."""
+    """An entry of a table."""
 
     @property
     def name(self) -> str: ...
@@ -21,7 +21,7 @@ _Entry = TypeVar("_Entry", bound=Named)
 
 
 class Table(Mapping[str, _Entry], Generic[_Entry]):
-    """Entries by name, in the order in which they came."""
+    """Entries by name, in the order they were added."""
 
     def __init__(
         self,
@@ -32,8 +32,8 @@ class Table(Mapping[str, _Entry], Generic[_Entry]):
         """
         Args:
             kind: what an entry is called.
-            entries: the first ones, one at least.
-            check: raises `PartError` for an entry that does not keep its contract.
+            entries: the initial ones, at least one.
+            check: raises `PartError` for an entry that violates its contract.
         """
         self.kind, self._check = kind, check
         self._entries = {entry.name: entry for entry in entries}
@@ -48,23 +48,23 @@ class Table(Mapping[str, _Entry], Generic[_Entry]):
         return len(self._entries)
 
     def position(self, name: str) -> int:
-        """Where an entry stands, by which arrays name it."""
+        """Position of an entry, which stands for it in arrays."""
         return list(self._entries).index(name)
 
     def add(self, entry: _Entry) -> None:
-        """Put in another one.
+        """Add an entry.
 
         Raises:
-            PartError: it is something else, its name is taken by another entry or is no name, or it
-                does not keep its contract.
+            PartError: it has the wrong type, its name is taken or invalid, or it violates its
+                contract.
         """
         wanted = type(next(iter(self._entries.values())))
         if not isinstance(entry, wanted):
-            raise PartError(f"{self.kind} {entry!r}: a {wanted.__name__} is wanted")
+            raise PartError(f"{self.kind} {entry!r}: expected a {wanted.__name__}")
         name = entry.name
         plain = name.replace("-", "_")
         if not plain.isidentifier() or name.startswith("_") or hasattr(dict, name):
             raise PartError(f"{self.kind} {name!r}: letters, digits, - and _ are allowed in a name")
         self._check(entry)
         if self._entries.setdefault(name, entry) is not entry:
-            raise PartError(f"{self.kind} {name!r}: there is one of that name; choose another")
+            raise PartError(f"{self.kind} {name!r}: this name is taken; choose another")

@@ -1,7 +1,7 @@
-"""Sine and cosine by elementwise arithmetic alone: vectorised on every executor.
+"""Sine and cosine by elementwise arithmetic only: vectorised on every executor.
 
-XLA's CPU compiler calls the library for one number at a time in double precision; with these the
-plant runs a tenth faster, and other executors need no mathematical library.
+In double precision, XLA's CPU compiler calls the library for one number at a time; with these,
+the plant runs a tenth faster and other executors need no mathematical library.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxmodel.parameters import Array
 _QUARTER_HIGH = float.fromhex("0x1.921fb544p+0")
 _QUARTER_LOW = np.pi / 2 - _QUARTER_HIGH
 _QUARTER_REST = 6.123233995736766e-17
-#: Terms of the Taylor series up to pi/4: the first one left out is below 1e-17.
+#: Terms of the Taylor series up to pi/4: the first omitted one is below 1e-17.
 _TERMS = 9
 
 

@@ -1,4 +1,4 @@
-"""The command line. A command ends with exit code 0, or with 2 and one message; no traceback."""
+"""The command line. Commands exit with code 0, or with code 2 and one message; no traceback."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-#: Columns of tables where nobody watches; a terminal's own width otherwise.
+#: Width of tables in redirected output; a terminal uses its own width.
 FILE_WIDTH = 240
 is_watched = sys.stdout.isatty() or "COLUMNS" in os.environ
 console = Console(
     highlight=False,
-    markup=False,  # a unit in brackets is no markup
+    markup=False,  # units in brackets are not markup
     width=None if is_watched else FILE_WIDTH,
 )
 
@@ -48,7 +48,7 @@ def main(arguments: list[str] | None = None) -> None:
             raise KeyboardInterrupt
     except (StudyError, TyperException) as error:
         text = error.format_message() if isinstance(error, TyperException) else str(error)
-        if text:  # none where help has been printed for want of a command
+        if text:  # empty if help was printed because no command was given
             print(f"studies: {text}", file=sys.stderr)
         sys.exit(2)
     except (KeyboardInterrupt, Abort):
@@ -69,14 +69,14 @@ def prepare(
         list[str] | None,
         typer.Option(
             "--with",
-            help="Python file or module with laws, metrics, sweep methods or export targets of "
-            "your own",
+            help="Python file or module with your own laws, metrics, sweep methods or export "
+            "targets",
         ),
     ] = None,
 ) -> None:
     """Parameter studies of a planar 3-PRR manipulator with flexible links."""
     if own:
-        configure()  # before any JAX operation of these files
+        configure()  # before these files use JAX
         from studies.extensions import extend
 
         for module in own:
@@ -98,7 +98,7 @@ for add_commands in (
 
 @app.command()
 def init(
-    out: Annotated[Path | None, typer.Argument(help="file to write; default: print it")] = None,
+    out: Annotated[Path | None, typer.Argument(help="file to write; default: print")] = None,
 ) -> None:
     """Write a commented study file with every field and its default."""
     from studies.study.template import study_template, write_study
@@ -112,7 +112,7 @@ def init(
 
 @app.command()
 def info() -> None:
-    """Versions, devices, precision, compilation cache."""
+    """Show versions, devices, precision and compilation cache."""
     start()
     from studies.config import info as facts
 

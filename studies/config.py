@@ -1,6 +1,6 @@
-"""Settings of JAX that must be made before it starts: precision, compiler flags, devices, cache.
+"""JAX settings that must be made before it starts: precision, compiler flags, devices, cache.
 
-Importing this module changes nothing; `configure` does, and `info` says what is in force.
+Importing this module changes nothing; `configure` does, and `info` shows the current settings.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ from studies.errors import StudyError, field_error, nearest
 PACKAGE = "flexlink-studies"
 PRECISIONS = ("float64", "float32")
 
-# Flags of XLA's CPU compiler for a scan over time steps that are vectorised over cases.
-# An unknown flag of XLA ends the process, so each of them is checked on every supported JAX.
+# Flags of XLA's CPU compiler for a scan over time steps vectorised over cases.
+# XLA aborts on an unknown flag, so each one is tested with every supported JAX.
 COMPILER_FLAGS = {
-    # XLA stops at 256 bits by itself; twice the cases per instruction where the CPU has 512.
+    # XLA's default is at most 256 bits; CPUs with 512 take twice the cases per instruction.
     "--xla_cpu_prefer_vector_width": "512",
-    # Side by side, factorisations of small matrices now and then never end (jax 0.10): programs
-    # with eigenvalue problems in them (basis loaded) then hang.
+    # Run side by side, factorisations of small matrices occasionally hang (jax 0.10), and with
+    # them programs that contain eigenvalue problems (basis loaded).
     "--xla_cpu_enable_concurrency_optimized_scheduler": "false",
     "--xla_backend_extra_options": ",".join(
         (
-            # Without it each state output recomputes the expressions that it shares with the rest.
+            # Without it, each state output recomputes the expressions it shares with the others.
             "xla_cpu_use_multi_output_fusion",
             # Loops up to this many bytes run as one compiled function instead of one task per
-            # operation. Less leaves out the batched time loop. Reverse mode through a long scan
-            # then has to checkpoint blocks of steps: a scan that stores every step copies the
-            # whole store at each of them (measured: 30 to 100 times slower over 2000 steps).
+            # operation. A lower limit excludes the batched time loop. Reverse mode through a long
+            # scan must then checkpoint blocks of steps: a scan that stores every step copies the
+            # whole storage at each of them (measured: 30 to 100 times slower over 2000 steps).
             "xla_cpu_small_while_loop_byte_threshold=2000000",
         )
     ),
 }
-# XLA runs a program on one core of a device, so a device per core is how a batch uses them all.
+# XLA runs a program on one core per device, so a batch uses all cores through one device per core.
 DEVICE_FLAG = "--xla_force_host_platform_device_count"
 
 
 def _settings() -> Any:
-    """JAX's settings; type checkers do not see its attributes, which are made at run time."""
+    """JAX's settings; type checkers cannot see its attributes, which are created at run time."""
     import jax
 
     return jax.config
@@ -57,12 +57,12 @@ def configure(
     """Prepare JAX for studies; call it before the first JAX operation.
 
     precision: "float64" or "float32", the default floating type.
-    devices: number of CPU devices; None takes what XLA_FLAGS says, else one per usable core.
-    flags: add COMPILER_FLAGS to XLA_FLAGS, each only where the environment does not set it already.
-    cache: keep compiled programs in JAX_COMPILATION_CACHE_DIR, else in the user's cache folder.
+    devices: number of CPU devices; None: as in XLA_FLAGS, otherwise one per usable core.
+    flags: add COMPILER_FLAGS to XLA_FLAGS, except those the environment already sets.
+    cache: keep compiled programs in JAX_COMPILATION_CACHE_DIR or the user's cache folder.
 
-    Raises StudyError for a value outside its range, and where JAX has already started without the
-    flags or devices asked for. Calls with equal settings may be repeated at any time.
+    Raises StudyError for a value outside its range, or if JAX has already started without the
+    requested flags or devices. Calls with equal settings can be repeated at any time.
     """
     if precision not in PRECISIONS:
         hint = nearest(str(precision), PRECISIONS)
@@ -83,11 +83,11 @@ def configure(
 
 
 def start(precision: str = "float64", cpu_only: bool = False) -> None:
-    """Configure and start JAX, as every command does that computes.
+    """Configure and start JAX, as every computing command does.
 
-    cpu_only: leave graphics processors alone, to which others have a better right.
+    cpu_only: leave GPUs to the workers.
 
-    Raises StudyError as `configure`, and where JAX cannot start.
+    Raises StudyError as `configure`, or if JAX cannot start.
     """
     import jax
 
@@ -104,7 +104,7 @@ def start(precision: str = "float64", cpu_only: bool = False) -> None:
 
 
 def info() -> dict[str, Any]:
-    """Versions and settings in force, as plain values for `studies info`; starts JAX."""
+    """Versions and current settings, as plain values for `studies info`; starts JAX."""
     import jax
 
     kinds = [device.device_kind for device in jax.devices()]
@@ -122,7 +122,7 @@ def info() -> dict[str, Any]:
 
 
 def origin() -> dict[str, str]:
-    """What results are labelled with: versions, devices and precision; starts JAX."""
+    """Labels for results: versions, devices and precision; starts JAX."""
     facts = info()
     names = (PACKAGE, "python", "jax", "jaxlib", "numpy", "h5py", "devices", "precision")
     return {name: str(facts[name]) for name in names}
@@ -138,7 +138,7 @@ _is_configured = False
 
 
 def processor() -> str:
-    """What JAX computes on: "cpu", "cuda" for Nvidia's graphics processors, or another name."""
+    """What JAX computes on: "cpu", "cuda" for Nvidia GPUs, or another name."""
     import jax
 
     device = jax.local_devices()[0]
@@ -159,7 +159,7 @@ def is_backend_started() -> bool:
     """Whether JAX has started its devices, after which compiler flags are no longer read."""
     count = _settings().jax_num_cpu_devices
     try:
-        # The public sign of it: JAX refuses to change this setting once it has started.
+        # The only public sign: JAX refuses to change this setting once it has started.
         _settings().update("jax_num_cpu_devices", count + 1)
     except RuntimeError:
         return True
@@ -168,7 +168,7 @@ def is_backend_started() -> bool:
 
 
 def _extended(present: str, devices: int | None, flags: bool) -> str:
-    """XLA_FLAGS with what is missing from it; an explicit number of devices replaces its own."""
+    """XLA_FLAGS with missing flags added; an explicit number of devices replaces its own."""
     wanted = dict(COMPILER_FLAGS) if flags else {}
     if devices is not None:
         present = re.sub(rf"{DEVICE_FLAG}=\S*", "", present)
@@ -178,7 +178,7 @@ def _extended(present: str, devices: int | None, flags: bool) -> str:
 
 
 def _require_in_force(present: str, devices: int | None, flags: bool) -> None:
-    """Raise StudyError where a JAX that has already started lacks what is asked for."""
+    """Raise StudyError if JAX has already started without the requested settings."""
     import jax
 
     lacking = [name for name in COMPILER_FLAGS if flags and name not in present]
@@ -200,18 +200,18 @@ def _set_cache(cache: bool) -> None:
         return
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(_default_cache_folder())
     if not _is_usable_folder(folder):
-        # The cache saves time only: a home that cannot be written to must not stop a study.
+        # The cache only saves time: an unwritable home folder must not stop a study.
         _settings().update("jax_enable_compilation_cache", False)
         return
     _settings().update("jax_compilation_cache_dir", folder)
-    # Reading an entry costs tens of milliseconds: not worth it for quick compilations.
+    # Reading an entry takes tens of milliseconds: not worth it for quick compilations.
     _settings().update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def _is_usable_folder(folder: str) -> bool:
-    """Whether `folder` is there, made where it was missing, and can be written to."""
+    """Whether `folder` exists or can be created, and is writable."""
     try:
-        # For this user alone: anyone who can write to the cache can run code through it.
+        # For this user only: anyone who can write to the cache can run code through it.
         Path(folder).mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError:
         return False

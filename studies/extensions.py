@@ -1,10 +1,10 @@
-"""Laws, metrics, sweep methods and export targets of your own, from one Python file.
+"""Your own laws, metrics, sweep methods and export targets, from one Python file.
 
     laws = [Law("mine", ...)]
     metrics = [Metric("pose_speed", ...)]
 
-`studies --with mine.py sweep ...` takes it in, and so does `studies.extend("mine.py")`; a study
-file alone never runs code. Workers take in what the environment variable FLEXLINK_WITH names.
+`studies --with mine.py sweep ...` loads it, and so does `studies.extend("mine.py")`; a study file
+alone never runs code. Workers load what the environment variable FLEXLINK_WITH names.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from studies import sources
 from studies.errors import StudyError
 from studies.space.methods import METHODS, Method
 
-#: Where processes started from here find what was taken in, as paths or module names.
+#: Where child processes find what was loaded, as paths or module names.
 VARIABLE = "FLEXLINK_WITH"
 
 
@@ -38,15 +38,15 @@ def extend(
     methods: Iterable[Method] = (),
     targets: Iterable[Any] = (),
 ) -> None:
-    """Take in laws, metrics, sweep methods and export targets; the same ones again change nothing.
+    """Load laws, metrics, sweep methods and export targets; loading them again changes nothing.
 
     Args:
         module: Python file (`*.py`) or importable module with lists `laws`, `metrics`, `methods`,
             `targets`; "" for none.
-        laws, metrics, methods, targets: more of them.
+        laws, metrics, methods, targets: further ones.
 
     Raises:
-        StudyError: no such module, one that fails or has nothing, or a name that is taken.
+        StudyError: no such module, one that fails or is empty, or a name already taken.
     """
     found = _imported(str(module)) if str(module) else None
     for kind, given in (
@@ -57,7 +57,7 @@ def extend(
     ):
         own = getattr(found, kind, ())
         if not isinstance(own, (list, tuple)):
-            raise StudyError(f"{module}: {kind} = {own!r}; a list is wanted")
+            raise StudyError(f"{module}: {kind} = {own!r}; expected a list")
         for entry in [*own, *given]:
             try:
                 _table(kind).add(entry)
@@ -74,14 +74,14 @@ def extend(
 
 
 def extend_as_told() -> None:
-    """Take in what the environment names, as a process started by another one does."""
+    """Load what the environment names, in a process started by another one."""
     for module in _told():
-        if Path(module).resolve() not in sources.OUTSIDE:  # it may have another module name here
+        if Path(module).resolve() not in sources.OUTSIDE:  # it can have another module name here
             extend(module)
 
 
 def blamed(error: BaseException) -> str:
-    """Where a file of one's own has failed and why, in a sentence; "" where it was another.
+    """Where and why a user's own file failed, in a sentence; "" if the error is not from one.
 
     Args:
         error: as caught.
@@ -100,7 +100,7 @@ def _told() -> list[str]:
 
 
 def _table(kind: str) -> Table[Any]:
-    if kind == "targets":  # a feature above, whose templates and compilers only exports need
+    if kind == "targets":  # a higher layer, whose templates and compilers only exports need
         return cast("Table[Any]", importlib.import_module("studies.export.targets").TARGETS)
     tables: dict[str, Table[Any]] = {"laws": LAWS, "metrics": METRICS, "methods": METHODS}
     return tables[kind]
@@ -125,7 +125,7 @@ def _imported(module: str) -> ModuleType:
         found = importlib.util.module_from_spec(spec)
         sys.modules[name] = found
         spec.loader.exec_module(found)
-    except (Exception, SystemExit) as error:  # whatever the file does
+    except (Exception, SystemExit) as error:  # the file can do anything
         sys.modules.pop(name, None)
         raise StudyError(
             f"{module}: cannot be imported ({type(error).__name__}: {error})"

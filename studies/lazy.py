@@ -1,4 +1,4 @@
-"""Names of a package that are imported when they are first used, so that `--help` needs no JAX."""
+"""Names of a package that are imported on first use, so that `--help` does not load JAX."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def lazily(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
 
     Args:
         package: its name.
-        homes: module of each name that it offers.
+        homes: module of each name it exports.
     """
 
     def found(name: str) -> Any:

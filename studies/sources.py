@@ -1,4 +1,4 @@
-"""Which source files decide a number: the closure of what modules import, and its digest."""
+"""Which source files determine a number: the closure of imports, and its digest."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def digest(*modules: str, top: Path = TOP) -> str:
     """Hash of the sources of modules and all that they import, 16 hexadecimal digits.
 
     Args:
-        modules: dotted names; that of a package stands for all its modules.
+        modules: dotted names; a package stands for all its modules.
         top: folder of the packages.
     """
     found = sha256()
@@ -43,7 +43,7 @@ def closure(modules: Iterable[str], top: Path = TOP) -> list[Path]:
 
 
 def _files(name: str, top: Path, is_whole: bool = False) -> list[Path]:
-    """File of a module, or of the module that a name is in; what packages collect is left out."""
+    """File of a module, or of the module with a name; re-exports of packages are left out."""
     parts = name.split(".")
     if parts[0] not in PACKAGES:
         return []
@@ -60,7 +60,7 @@ def _files(name: str, top: Path, is_whole: bool = False) -> list[Path]:
 
 @cache
 def _imports(path: Path) -> tuple[str, ...]:
-    """Names that a file imports when it runs; those of other packages too."""
+    """Names that a file imports when it runs, including those of other packages."""
     return tuple(_imported(ast.parse(path.read_bytes())))
 
 

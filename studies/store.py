@@ -1,6 +1,6 @@
 """Labelled results in one file: netCDF-4 written as plain HDF5, which xarray opens by name.
 
-Every axis has a dimension scale, every variable its units and its long name, and the file appears
+Every axis has a dimension scale, every variable its units and long name, and the file appears
 whole or not at all.
 """
 
@@ -26,15 +26,15 @@ from studies.errors import StudyError, field_error
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 # What the words of flag_meanings may not contain.
 _NO_FLAG = re.compile(r"[^A-Za-z0-9_.+@-]+")
-#: How folders of `staged` begin.
+#: Name prefix of the folders of `staged`.
 _STAGED = ".unfinished-"
 _TEXT = h5py.string_dtype("utf-8")
 
 
 class Streamed(NamedTuple):
-    """Numbers too many for memory, written part by part along the first axis.
+    """Data too large for memory, written part by part along the first axis.
 
-    parts: called once, gives (first row, rows); what no part covers is NaN or -1.
+    parts: called once, yields (first row, rows); what no part covers is NaN or -1.
     """
 
     shape: tuple[int, ...]
@@ -49,9 +49,9 @@ class Streamed(NamedTuple):
 class Variable(NamedTuple):
     """One labelled array.
 
-    data: numbers, booleans or text, one axis per name in dims; `Streamed` only to be written.
+    data: numbers, booleans or text, one axis per name in dims; `Streamed` only for writing.
     dims: name of each axis; a one-dimensional variable named like its axis is its coordinate.
-    units: SI symbol such as "m" or "Hz", "1" for none. Not "seconds": xarray makes dates of that.
+    units: SI symbol such as "m" or "Hz", "1" for none. Not "seconds": xarray turns that into dates.
     long_name: what it is, in words.
     flags: meaning of each number, for codes; flag_values and flag_meanings in the file, _ for " ".
     """
@@ -66,13 +66,13 @@ class Variable(NamedTuple):
 def write_store(
     path: str | Path, variables: Mapping[str, Variable], attributes: Mapping[str, Any]
 ) -> None:
-    """Write variables and global attributes to a netCDF-4 file, replacing the one that is there.
+    """Write variables and global attributes to a netCDF-4 file, replacing an existing one.
 
     path: the file; its folder must exist. attributes: text, numbers or lists of one of them.
     An axis without a coordinate gets its numbers, from 1. Booleans become int8.
 
     Raises StudyError for a target that cannot be written, and for data that netCDF cannot label or
-    hold; whatever was at `path` is then still there.
+    hold; an existing file at `path` is then left unchanged.
     """
     check_target(path)
     arrays = {name: _stored(name, variable) for name, variable in variables.items()}
@@ -99,7 +99,7 @@ def write_store(
                     file[name].dims[position].attach_scale(file[axis])
 
     with replacing(path) as temporary:
-        # HDF5 itself may crash on a full disk: what fits is made in memory, the rest has room
+        # HDF5 itself can crash on a full disk: build small files in memory, check space for others
         if any(isinstance(array, Streamed) for array in arrays.values()):
             _check_room(path, arrays)
             with h5py.File(temporary, "w", track_order=True) as file:
@@ -124,8 +124,8 @@ def _dataset(file: h5py.File, name: str, array: np.ndarray | Streamed) -> h5py.D
 
 
 def _check_room(path: str | Path, arrays: Mapping[str, np.ndarray | Streamed]) -> None:
-    """Raise StudyError where the disk has no room for the arrays."""
-    text = 32  # bytes that a short text takes, as a guess
+    """Raise StudyError if the disk has no room for the arrays."""
+    text = 32  # estimated bytes of a short text
     needed = sum(
         float(np.prod(np.array(array.shape, float)))
         * (text if array.dtype.kind == "O" else array.dtype.itemsize)
@@ -140,7 +140,7 @@ def _check_room(path: str | Path, arrays: Mapping[str, np.ndarray | Streamed]) -
 
 
 def variable_labels(variable: Variable) -> dict[str, Any]:
-    """Attributes of a variable, named as the CF conventions do."""
+    """Attributes of a variable, named as in the CF conventions."""
     labels: dict[str, Any] = {"units": variable.units, "long_name": variable.long_name}
     if variable.flags:
         words = (_NO_FLAG.sub("_", text) for text in variable.flags.values())
@@ -152,7 +152,7 @@ def variable_labels(variable: Variable) -> dict[str, Any]:
 def read_store(path: str | Path) -> tuple[dict[str, Variable], dict[str, Any]]:
     """Read what `write_store` wrote: the variables, index coordinates with them, and attributes.
 
-    Raises StudyError where there is no such file or it is not a store.
+    Raises StudyError if there is no such file or it is not a store.
     """
     if not Path(path).is_file():
         raise StudyError(f"{path}: no such file")
@@ -180,7 +180,7 @@ def check_target(path: str | Path) -> None:
 
 
 def check_folder(out: Path) -> None:
-    """Raise StudyError where `out` cannot be a folder with files; call it before long work."""
+    """Raise StudyError if `out` cannot be a folder with files; call it before long work."""
     there = Path(os.path.abspath(out))
     while not os.path.lexists(there):
         there = there.parent
@@ -192,15 +192,15 @@ def check_folder(out: Path) -> None:
 
 @contextmanager
 def staged(out: Path) -> Iterator[Path]:
-    """Yield a folder inside `out` whose files move there at the end, so that a failure moves none.
+    """Yield a folder inside `out` whose files move to `out` at the end; on a failure, none does.
 
-    What a kill left of an earlier one is removed.
+    Leftovers of a killed process are removed.
 
     Args:
         out: folder that exists.
 
     Raises:
-        StudyError: a file cannot be put there; then none is.
+        StudyError: a file cannot be moved there; then none is.
     """
     for left in out.glob(f"{_STAGED}*"):
         shutil.rmtree(left, ignore_errors=True)
@@ -217,7 +217,7 @@ def staged(out: Path) -> Iterator[Path]:
 def replacing(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path that becomes `path` on success, and is removed on any failure.
 
-    Errors of writing are raised as StudyError.
+    Write errors are raised as StudyError.
     """
     check_target(path)
     target = Path(os.path.realpath(path))
@@ -254,7 +254,7 @@ def _stored(name: str, variable: Variable) -> np.ndarray | Streamed:
 
 
 def _storable(field: str, data: np.ndarray) -> np.ndarray:
-    """Text as UTF-8 strings, booleans as int8, numbers as they are; StudyError for the rest."""
+    """Text as UTF-8 strings, booleans as int8, numbers unchanged; StudyError for the rest."""
     if data.dtype.kind == "U" or (
         data.dtype.kind == "O" and all(isinstance(value, str) for value in data.flat)
     ):
@@ -316,7 +316,7 @@ def _read_variable(dataset: h5py.Dataset) -> Variable:
 
 
 def _plain(value: Any) -> Any:
-    """An attribute as Python text or number where it is one value, else as an array."""
+    """An attribute as Python text or number if it is one value, otherwise as an array."""
     if isinstance(value, np.ndarray) and value.dtype.kind == "O":
         return value.astype(str)
     return value.item() if isinstance(value, np.generic) else value

@@ -306,4 +306,4 @@ def test_an_interrupted_drawing_says_how_to_go_on(tmp_path, monkeypatch, capsys)
     monkeypatch.setattr(run, "run_sweep", lambda *arguments: SimpleNamespace(is_interrupted=False))
     monkeypatch.setattr(run, "_finish", stop)
     code, _, err = command(capsys, "atlas", "--out", tmp_path / "out")
-    assert code == 130 and f"go on with --resume --out {tmp_path / 'out'}" in err
+    assert code == 130 and f"continue with --resume --out {tmp_path / 'out'}" in err

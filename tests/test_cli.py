@@ -168,7 +168,7 @@ def test_a_browser_shows_all_of_a_report(short_folder, tmp_path, width):
 def test_reports_that_cannot_be_are_refused_before_the_run(capsys, tmp_path):
     study = tmp_path / "short.toml"
     study.write_text(SHORT)
-    assert "name their file by --out" in refused(capsys, "replay", study, "--report")
+    assert "name their file with --out" in refused(capsys, "replay", study, "--report")
     arguments = ("simulate", study, "--report", "--out")
     for name in ("run.html", "run.md"):
         assert "name it *.h5" in refused(capsys, *arguments, tmp_path / name)

@@ -141,7 +141,7 @@ def test_a_chunk_that_fails_costs_no_worker(cluster, tmp_path):
 def test_other_versions_are_refused(cluster, tmp_path):
     cluster.trouble(identity={"jaxlib": "0.1", "code": "f00"})
     with (
-        pytest.raises(StudyError, match="do not fit this client: tcp://.*: code f00 .client: "),
+        pytest.raises(StudyError, match="do not match this client: tcp://.*: code f00 .client: "),
         connected(Workers(str(cluster.scheduler), None, 60.0), print),
     ):
         pass
@@ -169,7 +169,7 @@ def test_bad_options_are_refused(capsys, tmp_path, cluster, monkeypatch):
     assert "name one of them" in refused(capsys, *sweep, *both)
     assert "no scheduler answers" in refused(capsys, *sweep, *both[:2])
     assert "tcp://HOST:PORT" in refused(capsys, *sweep, "--scheduler", "nowhere.json")
-    assert "no certificates" in refused(capsys, *sweep, "--scheduler", "tls://127.0.0.1:1")
+    assert "no client certificates" in refused(capsys, *sweep, "--scheduler", "tls://127.0.0.1:1")
     assert "allowed: 1 to " in refused(capsys, *sweep, "--local-workers", 0)
     scheduler = ("--scheduler", cluster.scheduler)
     assert "--worker-timeout = 0.0" in refused(capsys, *sweep, *scheduler, "--worker-timeout", 0)

@@ -212,14 +212,14 @@ def test_own_law_becomes_c(own, tmp_path, capsys):
 
 
 def test_what_is_taken_or_empty_is_refused(tmp_path):
-    with pytest.raises(StudyError, match="metric 'residual_rms': there is one"):
+    with pytest.raises(StudyError, match="metric 'residual_rms': this name is taken"):
         extend(metrics=[METRICS["residual_rms"]._replace(text="another")])
     for text, message in (
         ("", "none of the lists laws"),
         ("1/0", "ZeroDivisionError"),
         ("raise SystemExit(3)", "SystemExit: 3"),
-        ("laws = 5", "laws = 5; a list is wanted"),
-        ("methods = ['sobol']", "method 'sobol': a Method is wanted"),
+        ("laws = 5", "laws = 5; expected a list"),
+        ("methods = ['sobol']", "method 'sobol': expected a Method"),
     ):
         path = tmp_path / f"part{len(text)}.py"
         path.write_text(text)
@@ -259,10 +259,10 @@ BEYOND = BETWEEN._replace(default=2.0)
     [
         ({"laws": [LAWS["imsc"]._replace(name="x", channel="wheel")]}, "channel = 'wheel'"),
         ({"laws": [LAWS["imsc"]._replace(name="x", design="imsc")]}, "design = 'imsc'"),
-        ({"laws": [LAWS["imsc"]._replace(name="x", parameters="a")]}, "a Parameter is wanted"),
+        ({"laws": [LAWS["imsc"]._replace(name="x", parameters="a")]}, "expected a Parameter"),
         (
             {"laws": [LAWS["imsc"]._replace(name="x", parameters=(BETWEEN, BETWEEN))]},
-            "parameter 'share'; a name of its own is wanted",
+            "parameter 'share'; expected a unique name",
         ),
         (
             {"laws": [LAWS["imsc"]._replace(name="x", parameters=(BEYOND,))]},
@@ -320,7 +320,7 @@ def wrong(tmp_path_factory):
         (
             {"control__law": "wide"},
             "simulate",
-            "velocity_gain has shape (3, 7); (3, 2)",
+            "velocity_gain has shape (3, 7); expected (3, 2)",
         ),
         (
             {"control__law": "asks"},
@@ -330,7 +330,7 @@ def wrong(tmp_path_factory):
         ({}, "sweep", "total 'pose_sum': shape (3,) after a sample, () before"),
         ({"sweep": "nowhere"}, "sweep", "sweep.method = 'nowhere': gives float64 of shape (2, 1)"),
         ({"sweep": "none"}, "sweep", "sweep.method = 'none': gives float64 of shape (0, 1)"),
-        ({}, "export --target up", "it makes '../up.txt'; a plain file name is wanted"),
+        ({}, "export --target up", "it makes '../up.txt'; expected a plain file name"),
     ],
 )
 def test_own_parts_that_fail_are_named(wrong, changes, command, message, tmp_path, capsys):

@@ -183,7 +183,7 @@ def test_quiet_says_nothing(capsys, spec, tmp_path):
             "papr: cannot be read (no such file); did you mean 'paper'?",
         ),
         (("sweep", "gains"), "--out: name a folder"),
-        (("sweep", "gains", "--dry-run", "--report"), "a --dry-run has no results"),
+        (("sweep", "gains", "--dry-run", "--report"), "--dry-run produces no results"),
     ],
 )
 def test_commands_refuse(capsys, tmp_path, monkeypatch, arguments, words):

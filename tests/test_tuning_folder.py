@@ -189,7 +189,7 @@ def test_a_report_says_what_its_numbers_are():
     fresh = table_of(text, "On fresh machines")
     assert fresh["the study itself"]["settling_time [ms]"] == "not within 30"
     assert fresh["tuned"]["residual_rms [µm]"] == "4.4"
-    assert "Of links 1 and 3, those under control, the largest value counts" in text
+    assert "Of links 1 and 3, the controlled ones, the largest value counts" in text
 
 
 @pytest.mark.long
@@ -233,7 +233,7 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
     for more, message in (
         ([], "holds a tuning already"),
         (["--resume"], "another tuning file"),
-        (["--audit"], "--audit: writes nothing"),
+        (["--audit"], "--audit: writes no files"),
     ):
         with pytest.raises(SystemExit, match="2"):
             cli.main(["tune", str(file), "--out", str(out), *more])

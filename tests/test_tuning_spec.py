@@ -115,7 +115,7 @@ def deep(n):
         ),
         ({"free": {"control.gain_factor": {"from": -1.0, "to": 2.0}}}, "a finite number >= 0"),
         ({"free": {"control.gain_factor": {"from": 2.0, "to": 1.0}}}, "= 1.0; allowed: more than"),
-        ({"free": {"poles.decay": {"from": 1.0, "to": 2.0}}}, "needs poles.frequency_hz beside it"),
+        ({"free": {"poles.decay": {"from": 1.0, "to": 2.0}}}, "needs poles.frequency_hz too"),
         (
             {
                 "free": {

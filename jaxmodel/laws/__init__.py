@@ -1,9 +1,9 @@
-"""Control laws, a file each; `contract` says what a law is.
+"""Control laws, one file each; `contract` defines what a law is.
 
-In: a `Case` and what the controller believes of the machine. Out: coefficients of the sampled
-controller. A law that stands in `LAWS` can be chosen by `control.law` in a study file, swept,
-tuned, certified and exported. To add one, write a file like `imsc` and put its `Law` into the list
-below; `LAWS.add` puts one in from outside.
+In: a `Case` and the controller's model of the machine. Out: coefficients of the sampled
+controller. A law in `LAWS` can be selected by `control.law` in a study file, swept, tuned,
+certified and exported. To add one, write a file like `imsc` and add its `Law` to the list below;
+from outside the package, use `LAWS.add`.
 """
 
 from __future__ import annotations
@@ -26,5 +26,5 @@ def is_modal(structure: Structure) -> bool:
 
 
 def n_channels(structure: Structure) -> int:
-    """Signals that the estimator works on, per link."""
+    """Number of signals the estimator processes, per link."""
     return structure.n_controlled if is_modal(structure) else structure.n_patches

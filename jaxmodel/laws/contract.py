@@ -1,4 +1,4 @@
-"""What a control law is: how its channels are made and fed back, and what a study may set in it.
+"""What a control law is: how its channels are formed and fed back, and its parameters.
 
 A law turns the numbers of a case into coefficients of the one sampled controller
 (`jaxmodel.controller`): channel signals y = `filter` V_s, estimates of their rates and values,
@@ -22,7 +22,7 @@ Channel = Literal["mode", "patch"]
 
 
 class Parameter(NamedTuple):
-    """A field of a law's own in the study file, `[control.laws.NAME]`; one number, or three."""
+    """A law's own field in the study file, `[control.laws.NAME]`; one number, or three."""
 
     name: str
     default: float
@@ -33,17 +33,17 @@ class Parameter(NamedTuple):
 
 
 class Known(NamedTuple):
-    """What a law may build on: the controller's belief of the machine."""
+    """What a law can use: the controller's model of the machine."""
 
     observer: Array  # modal filter pinv(lambda_s Phi_s^t) of the controlled modes [m/V], (3, C, K)
     synthesizer: Array  # pinv(lambda_a Phi_a), voltages from modal forces [V/N], (3, K, C)
     omega: Array  # frequencies of the assembled links [rad/s], (3, C)
     modal_mass: Array  # [kg], (3, C)
-    mask: Array  # 1 for controlled modes, as many as patches can tell apart, (C,)
+    mask: Array  # 1 for controlled modes, at most as many as patches, (C,)
 
 
 class Feedback(NamedTuple):
-    """What a law makes; see `jaxmodel.controller.Controller`."""
+    """What a law returns; see `jaxmodel.controller.Controller`."""
 
     filter: Array  # (3, C, K)
     synthesizer: Array  # (3, K, C)
@@ -66,24 +66,24 @@ class Law(NamedTuple):
     has_position: bool = True
     # the channels of a link act one at a time, so each is judged by itself
     is_switching: bool = False
-    # settings with which it damps mode 1 as much as modal control does with those of the case;
-    # None: its velocity gains are scaled to that
+    # settings with which it damps mode 1 as much as modal control does with the case's settings;
+    # None: its velocity gains are scaled to match
     as_strong: Callable[[Case, Known], Control] | None = None
 
 
 def check_law(law: Law) -> None:
-    """Raise PartError for a law whose description cannot be meant."""
+    """Raise PartError if the description of a law is invalid."""
     place = f"law {law.name!r}"
     if law.channel not in get_args(Channel):
         raise PartError(f"{place}: channel = {law.channel!r}; allowed: 'mode' or 'patch'")
     if not callable(law.design):
-        raise PartError(f"{place}: design = {law.design!r}; a function is wanted")
+        raise PartError(f"{place}: design = {law.design!r}; expected a function")
     seen: set[str] = set()
     for x in law.parameters:
         if not isinstance(x, Parameter):
-            raise PartError(f"{place}: parameters: {x!r}; a Parameter is wanted")
+            raise PartError(f"{place}: parameters: {x!r}; expected a Parameter")
         if not x.name.isidentifier() or x.name in seen:
-            raise PartError(f"{place}: parameter {x.name!r}; a name of its own is wanted")
+            raise PartError(f"{place}: parameter {x.name!r}; expected a unique name")
         if not x.low <= x.default <= x.high:
             raise PartError(
                 f"{place}: parameter {x.name!r}: default {x.default:g}; "
@@ -93,9 +93,9 @@ def check_law(law: Law) -> None:
 
 
 def check_feedback(law: Law, made: Feedback, n_channels: int, n_patches: int) -> None:
-    """Raise PartError unless a law has made a `Feedback` of the right shapes."""
+    """Raise PartError unless a law returned a `Feedback` with the right shapes."""
     if not isinstance(made, Feedback):
-        raise PartError(f"law {law.name!r}: design gives {made!r}; a Feedback is wanted")
+        raise PartError(f"law {law.name!r}: design returns {made!r}; expected a Feedback")
     wanted = {
         "filter": (3, n_channels, n_patches),
         "synthesizer": (3, n_patches, n_channels),
@@ -105,7 +105,7 @@ def check_feedback(law: Law, made: Feedback, n_channels: int, n_patches: int) ->
     for name, shape in wanted.items():
         found = jnp.shape(getattr(made, name))
         if found != shape:
-            raise PartError(f"law {law.name!r}: {name} has shape {found}; {shape} is wanted")
+            raise PartError(f"law {law.name!r}: {name} has shape {found}; expected {shape}")
 
 
 def on_and_off(case: Case, known: Known) -> Array:
@@ -116,7 +116,7 @@ def on_and_off(case: Case, known: Known) -> Array:
 
 
 def modal_gains(case: Case, known: Known) -> tuple[Array, Array]:
-    """Velocity [N s/m] and position gains [N/m] of the study by mode, ratios (24), (3, C) each."""
+    """The study's velocity [N s/m] and position gains [N/m] by mode, ratios (24), (3, C) each."""
     control, on = case.control, on_and_off(case, known)
     velocity, position = (
         on * force_gains(first, control.ratio, known.modal_mass, control.is_per_mass)
@@ -126,9 +126,9 @@ def modal_gains(case: Case, known: Known) -> tuple[Array, Array]:
 
 
 def as_modal(control: Control, velocity: Array, position: Array) -> Control:
-    """Settings of modal control that make these gains, (3, C) each [N s/m], [N/m].
+    """Settings of modal control that give these gains, (3, C) each [N s/m], [N/m].
 
-    Positions must be the same multiple of velocities for all modes of a link.
+    Position gains must be the same multiple of velocity gains for all modes of a link.
     """
     is_on = velocity != 0
     share = jnp.where(is_on, position / jnp.where(is_on, velocity, 1.0), 0.0)

@@ -31,7 +31,7 @@ def optimal_gains(omega: Array, control_weight: Array) -> PoleGains:
         PoleGains per unit modal mass.
     """
     share = 1 / control_weight
-    # without the difference of two large numbers where control is expensive
+    # avoids the difference of two large numbers where control is expensive
     position = omega * share / (jnp.sqrt(omega**2 + share) + omega)
     return PoleGains(position, jnp.sqrt(2 * position + share))
 
@@ -45,7 +45,7 @@ def design(structure: Structure, case: Case, known: Known) -> Feedback:
 
 
 def as_strong(case: Case, known: Known) -> Control:
-    """One weight for all links, which gives the first mode k_d of modal control, and its modes.
+    """One weight for all links that gives the first mode the k_d of modal control, and its modes.
 
     From k_d^2 = 2 k_p + 1/R: 1/R = h (h - 2 omega) with h^2 = k_d^2 + 4 omega^2.
     """

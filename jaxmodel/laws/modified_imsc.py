@@ -1,7 +1,7 @@
 """Modified IMSC (Baz and Poh 1988): the actuators of a link serve one mode at a time.
 
-The mode of highest modal energy (omega q)^2 + q'^2 is served; which one that is may change at every
-sample (`jaxmodel.controller.strongest`).
+The mode with the highest modal energy (omega q)^2 + q'^2 is served; it may change at every sample
+(`jaxmodel.controller.strongest`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Positive position feedback (Goh and Caughey 1985; Fanson and Caughey 1990).
 
-A second-order filter per mode pushes along with its output, f = +g eta with
-eta'' + 2 zeta_f omega_f eta' + omega_f^2 eta = omega_f^2 q. Where the filter lags by 90 degrees
-that is a force against q'. In a sampled loop anti-alias filter, delay and hold lag as well, so the
+A second-order filter per mode feeds back its output positively, f = +g eta with
+eta'' + 2 zeta_f omega_f eta' + omega_f^2 eta = omega_f^2 q. Where the filter lags by 90 degrees,
+this is a force against q'. In a sampled loop, anti-alias filter, delay and hold lag as well, so the
 filter is tuned for all of them together.
 """
 
@@ -18,7 +18,7 @@ from jaxmodel.laws.imsc import same
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 
-#: Highest corner over the assembled frequency, for where the chain lags by 90 degrees itself [1].
+#: Highest corner over the assembled frequency, used where the chain itself lags by 90 degrees [1].
 HIGHEST_RATIO = 3.0
 #: Highest corner over half the sample rate [1].
 HIGHEST_SHARE = 0.9
@@ -44,7 +44,7 @@ def design_position_filter(omega: Array, zeta: Array, electronics: Electronics) 
         electronics: what lies between command and sample.
 
     Returns:
-        PositionFilter; where `damping` is not positive the chain lags too much for this law.
+        PositionFilter; where `damping` is not positive, the chain lags too much for this law.
     """
     period, share = electronics.period, omega / electronics.antialias
     lag = jnp.arctan2(jnp.sqrt(2.0) * share, 1 - share**2) + 1.5 * omega * period
@@ -70,7 +70,7 @@ def design_position_filter(omega: Array, zeta: Array, electronics: Electronics) 
 
 
 def design(structure: Structure, case: Case, known: Known) -> Feedback:
-    """Damp each assembled mode as much as the study's velocity gains are meant to: g = k_d/damping.
+    """Damp each assembled mode as much as the study's velocity gains intend: g = k_d/damping.
 
     Modes at which the measurement chain lags too much get no gain.
     """

@@ -1,10 +1,11 @@
-"""How the links of one machine couple, and who gains when one of them is controlled.
+"""How the links of one machine couple, and which links benefit when one is controlled.
 
-`subsets` runs every subset of controlled links and modes through the engine of sweeps, and
-`attribution` turns their residuals into effects, interactions and Shapley shares. `workspace` looks
-at natural modes on a grid of poses, `platform` splits the platform's error and takes frequency
-responses. `claims` holds the paper's statements against all that. `findings` is what they found;
-`plots`, `drawing` and `figures` show it, `report` writes it down, and `run` is `studies atlas`.
+`subsets` runs every subset of controlled links and modes through the sweep engine, and
+`attribution` turns their residuals into effects, interactions and Shapley shares. `workspace`
+computes natural modes on a grid of poses, `platform` splits the platform's error and computes
+frequency responses. `claims` checks the paper's statements against these results. `findings`
+collects everything; `plots`, `drawing` and `figures` show it, `report` writes the report, and `run`
+is `studies atlas`.
 """
 
 from typing import TYPE_CHECKING

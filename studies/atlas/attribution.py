@@ -1,9 +1,8 @@
-"""Who contributes what: a cooperative game whose players are controlled links, or links and modes.
+"""Attribution as a cooperative game whose players are controlled links, or links and modes.
 
 A game is an array of values over all subsets: axis of length 2^n, player p is in subset number s
-where bit p of s is set. The value is what control by that subset takes away. Mean squares are the
-thing to take: those of modes that do not touch each other add up, so every interaction that is left
-is coupling.
+where bit p of s is set. The value is the vibration that controlling that subset removes. Use mean
+squares: those of uncoupled modes add up, so any remaining interaction is coupling.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ def shapley(value: np.ndarray) -> np.ndarray:
 def interaction(value: np.ndarray) -> np.ndarray:
     """Shapley interaction index of pairs, sum over S with both of d(S)/(|S| - 1).
 
-    Positive where two players do more together than each by itself (Grabisch and Roubens 1999).
+    Positive where two players achieve more together than separately (Grabisch and Roubens 1999).
 
     Args:
         value: of every subset, (..., 2^n).

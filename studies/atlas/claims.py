@@ -1,4 +1,4 @@
-"""The paper's statements on coupling, held against all subsets."""
+"""The paper's statements on coupling, checked against all subsets."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from studies.study.printed import TABLE_1
 
 #: Columns of Table 1 after the uncontrolled one: links 1 to 3, links 1 and 2, link 1.
 TABLE_1_LINKS = (0b111, 0b011, 0b001)
-#: Changes smaller than this are no change, in counts of signs [1].
+#: Changes smaller than this do not count as a change of sign [1].
 NO_CHANGE = 1e-3
 
 
@@ -30,7 +30,7 @@ class Signs(NamedTuple):
 
 
 def table_1_signs(subsets: Subsets) -> Signs:
-    """Table 1 again: three links with two modes each, the others with the first mode only."""
+    """Our Table 1: three links with two modes each, the others with the first mode only."""
     table = np.array(TABLE_1).T
     columns = [_modes_of(subsets, TABLE_1_LINKS[0], 2)]
     columns += [_modes_of(subsets, links, 1) for links in TABLE_1_LINKS[1:]]

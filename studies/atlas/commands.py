@@ -25,12 +25,15 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             ),
         ] = None,
         case: Annotated[
-            str | None, typer.Option(help="of a sweep: number or id:...; of a tuning: its family")
+            str | None,
+            typer.Option(help="case of a sweep (number or id:...) or family of a tuning"),
         ] = None,
-        resume: Annotated[bool, typer.Option("--resume", help="go on with what is there")] = False,
-        quiet: Annotated[bool, typer.Option("--quiet", help="no progress")] = False,
+        resume: Annotated[
+            bool, typer.Option("--resume", help="continue an interrupted run")
+        ] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
     ) -> None:
-        """Every subset of controlled links and modes; modes over the workspace; platform error."""
+        """Map all subsets of controlled links and modes, workspace modes and platform error."""
         start()
         from studies.atlas.run import run_atlas
         from studies.engine.design import load_design
@@ -40,12 +43,12 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if design is not None:
             study = load_design(design, case).study
         elif case is not None:
-            raise StudyError(f"--case {case}: belongs to a DESIGN; name one, or leave --case out")
+            raise StudyError(f"--case {case}: needs a DESIGN; name one, or leave --case out")
         else:  # as in the paper, every run's ratios come from its own uncontrolled counterpart
             study = paper_study().change(control__ratio_source="own_run")
         if not run_atlas(study, out, resume, console, quiet):
             print(
-                f"studies: interrupted; finished runs are safe, go on with --resume --out {out}",
+                f"studies: interrupted; finished runs are safe; continue with --resume --out {out}",
                 file=sys.stderr,
             )
             sys.exit(130)

@@ -1,4 +1,4 @@
-"""The mechanism drawn: guides, sliders, bent links, platform; still, as mode shapes, and moving."""
+"""Drawings of the mechanism, still, as mode shapes, and animated."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ DRAWN_POSE = 0.05
 
 
 class Skeleton(NamedTuple):
-    """Where everything is, (T, ...) in metres."""
+    """Positions of all parts, (T, ...) in metres."""
 
     guide: np.ndarray  # ends of the guides, (3, 2, 2)
     slider: np.ndarray  # B, (T, 3, 2)
@@ -42,7 +42,7 @@ class Skeleton(NamedTuple):
 
 
 def skeleton(study: Study, pose: np.ndarray, q: np.ndarray, exaggeration: float) -> Skeleton:
-    """Positions of the machine's parts, with bending drawn larger than it is.
+    """Positions of the machine's parts, with exaggerated bending.
 
     Args:
         study: the machine.
@@ -99,7 +99,7 @@ def draw_machine(
     Args:
         parts: where everything is [m].
         k: which instant.
-        ax: where to draw; a new figure where left out.
+        ax: where to draw; default: a new figure.
         color: of links and platform.
         alpha: opacity [1].
     """
@@ -118,7 +118,7 @@ def draw_machine(
 
 
 def number_links(parts: Skeleton, k: int, ax: Axes) -> None:
-    """Link numbers beside the sliders, on the side away from the machine."""
+    """Write link numbers next to the sliders, on the side away from the machine."""
     away = parts.slider[k] - parts.joint[k].mean(axis=0)
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     for i, (slider, side) in enumerate(zip(parts.slider[k], away, strict=True)):
@@ -201,7 +201,7 @@ def animate(clip: Clip, path: Path) -> None:
 
         frame(0)
         figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # laying out every frame anew takes most of the time
+        figure.set_layout_engine("none")  # a new layout for every frame takes most of the time
         film = FuncAnimation(figure, frame, frames=len(clip.time), interval=50, blit=False)
         film.save(path, writer=PillowWriter(fps=20), dpi=80)
 

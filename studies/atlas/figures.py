@@ -1,4 +1,4 @@
-"""The atlas's figures, put together from its plots."""
+"""The atlas's figures, assembled from its plots."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from studies.atlas.subsets import TARGETS, link_label, player_labels, setting_la
 from studies.show.figures import SERIES, comparison, legend_above, new_figure
 from studies.study.consistency import each_link
 
-#: Place of the late window.
+#: Index of the late window.
 LATE = -1
 #: The animation: from before the command's end to after it, and its frames [s].
 CLIP = (-0.02, 0.07, 1e-3)
@@ -58,7 +58,7 @@ def _link_changes(found: AtlasFindings) -> np.ndarray:
 
 
 def _panels(found: AtlasFindings, height: float) -> tuple[Figure, np.ndarray]:
-    """Two panels a row, one for each setting."""
+    """Two panels per row, one for each setting."""
     settings = found.subsets.setting
     figure, axes = new_figure(-(-len(settings) // 2), min(len(settings), 2), height, False)
     for k, ax in enumerate(axes.flat[: len(settings)]):
@@ -156,7 +156,7 @@ def _workspace(found: AtlasFindings) -> Figure:
 
 
 def _participation(found: AtlasFindings) -> Figure:
-    """Who bends in each of the three first bending modes, over the workspace."""
+    """Participation of the links in the first three bending modes, over the workspace."""
     chart = found.map
     turn = len(chart.phi) // 2
     figure, axes = new_figure(3, 3, 1.8, False)

@@ -1,4 +1,4 @@
-"""Everything the atlas found, as its figures and its report read it."""
+"""Everything the atlas found, in the form its figures and report read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from studies.study.spec import Study
 NEAR = np.radians(5.0)
 #: Of the responses [Hz].
 FREQUENCY = np.linspace(2.0, 600.0, 300)
-#: Points round each resonance, in half widths of it [1].
+#: Points around each resonance, in half-widths [1].
 _ROUND = np.linspace(-3.0, 3.0, 13)
 
 
@@ -35,18 +35,18 @@ class AtlasFindings(NamedTuple):
     adc_step: np.ndarray  # of one ADC step, in the deflection of mode 1 [m], (3,)
 
     def setting(self, k: int) -> str:
-        """A setting in words, with † where a link has less than an ADC step left uncontrolled."""
+        """A setting in words, with † if a link's uncontrolled residual is below an ADC step."""
         is_small = (self.subsets.link[k, -1, 0] < self.adc_step).any()
         return setting_label(self.subsets.setting[k]) + (" †" if is_small else "")
 
 
 def look_around(study: Study, subsets: Subsets, tell: Tell) -> AtlasFindings:
-    """All of the atlas but the runs of the subsets.
+    """All of the atlas except the runs of the subsets.
 
     Args:
         study: the design.
         subsets: from `read_subsets`.
-        tell: called with what is done.
+        tell: called with progress messages.
 
     Raises:
         StudyError: as `check_run`.
@@ -81,7 +81,7 @@ def _frequencies(study: Study, own: np.ndarray) -> np.ndarray:
 
 
 def _far_pose(chart: Map) -> np.ndarray:
-    """The pose whose links differ most, not too near a singularity and at the path's own turn."""
+    """The pose whose links differ most, not too close to a singularity, at the path's own turn."""
     spread = np.where(chart.margin >= NEAR, chart.spread, -1.0)
     turn = int(np.argmin(np.abs(chart.phi - np.median(chart.phi))))
     row, column = np.unravel_index(int(np.argmax(spread[turn])), spread[turn].shape)

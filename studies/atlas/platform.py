@@ -1,7 +1,7 @@
-"""Rigid and elastic: where the platform's error comes from, and what forces do to it.
+"""Rigid and elastic: sources of the platform's error, and its response to forces.
 
-Drive error is what the same drive leaves on the same machine with rigid links; what the flexible
-machine has beyond that is vibration error (the paper's figures 5, 6, 8, 10 show the sum).
+Drive error is the error of the same drive on the same machine with rigid links; the rest of the
+flexible machine's error is vibration error (the paper's figures 5, 6, 8, 10 show the sum).
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def platform_error(study: Study, tell: Any = None) -> PlatformError:
 
     Args:
         study: the design; move time, shaper and links are replaced.
-        tell: called with what is running and the share of the work since the last call.
+        tell: called with the current step and the share of the work since the last call.
 
     Raises:
         StudyError: as `check_run`.
@@ -113,7 +113,7 @@ def platform_error(study: Study, tell: Any = None) -> PlatformError:
 
 
 def _rigid(case: Case) -> Case:
-    """The same machine with rigid links: modes that are off couple to nothing."""
+    """The same machine with rigid links: disabled modes couple to nothing."""
     return case._replace(n_modes=0 * case.n_modes)
 
 

@@ -1,4 +1,4 @@
-"""Figures of the atlas. Each function draws given data; units are all it computes."""
+"""Figures of the atlas. Each function only draws given data, after converting units."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def change_map(
     Args:
         change: relative change [1], (rows, columns).
         rows, columns: their names.
-        ax: where to draw; a new figure where left out.
+        ax: where to draw; default: a new figure.
 
     Returns:
         The image, for a colour bar.
@@ -69,11 +69,11 @@ def change_map(
 
 
 def lattice(residual: np.ndarray, ax: Axes | None = None) -> Axes:
-    """The 8 choices of links, each joined to those with one link more.
+    """The 8 choices of links, each joined to those with one more link.
 
     Args:
         residual: of each choice, bit i is link i [m], (8,).
-        ax: where to draw; a new figure where left out.
+        ax: where to draw; default: a new figure.
     """
     ax = axes_or_new(ax)
     place = {
@@ -121,7 +121,7 @@ def share_map(share: np.ndarray, ax: Axes | None = None) -> Axes:
 
     Args:
         share: of the mean square without control [1], (3, C).
-        ax: where to draw; a new figure where left out.
+        ax: where to draw; default: a new figure.
     """
     modes = [f"mode {j + 1}" for j in range(share.shape[1])]
     ax = axes_or_new(ax)
@@ -140,7 +140,7 @@ def interaction_map(
         index: share of the mean square without control [1], (n, n), symmetric.
         labels: of the players.
         limit: value of the full colour [1].
-        ax: where to draw; a new figure where left out.
+        ax: where to draw; default: a new figure.
 
     Returns:
         The image, for a colour bar.
@@ -164,7 +164,7 @@ def workspace_map(
     ax: Axes | None = None,
     limits: tuple[float, float] | None = None,
 ) -> Any:
-    """A quantity over the poses that can be reached.
+    """A quantity over the reachable poses.
 
     Args:
         x, y: grid lines [m], (n,), (m,).
@@ -172,7 +172,7 @@ def workspace_map(
         margin: distance of the nearest link angle from a singularity [rad], NaN out of reach,
             (m, n).
         path: of the platform [m], (k, 2), or None.
-        ax: where to draw; a new figure where left out.
+        ax: where to draw; default: a new figure.
         limits: of the colours.
 
     Returns:
@@ -183,7 +183,7 @@ def workspace_map(
     image = ax.pcolormesh(
         1e3 * x, 1e3 * y, value, cmap="cividis", vmin=low, vmax=high, rasterized=True
     )
-    # one more grid line round the map closes the border where poses reach the map's edge
+    # an extra grid line around the map closes the border where poses reach the map's edge
     reach = np.pad(np.where(np.isnan(margin), 0.0, 1.0), 1)
     around = (np.pad(1e3 * line, 1, mode="reflect", reflect_type="odd") for line in (x, y))
     ax.contour(*around, reach, [0.5], colors="#D55E00", linewidths=1.5)
@@ -207,7 +207,7 @@ def response(
         frequency: [Hz], (F,).
         curves: magnitudes in the unit of the label by name, (F,) each.
         label: quantity and unit of the ordinate.
-        ax: where to draw; a new figure where left out.
+        ax: where to draw; default: a new figure.
     """
     ax = axes_or_new(ax)
     for (name, curve), style in zip(curves.items(), SET_STYLES, strict=False):

@@ -28,7 +28,7 @@ def report(found: AtlasFindings, dropped: list[str]) -> str:
 
     Args:
         found: everything.
-        dropped: settings that are left out, and why.
+        dropped: settings left out, and why.
     """
     stable = found.responses.is_stable
     return render(
@@ -74,13 +74,13 @@ def _by_setting(found: AtlasFindings, cells: Iterable[Iterable[str]]) -> list[li
 
 
 def _all_links(found: AtlasFindings) -> np.ndarray:
-    """Residual of the three links by the choice of controlled ones [m], (settings, windows, 8)."""
+    """Residual of the three links by choice of controlled links [m], (settings, windows, 8)."""
     link = found.subsets.link[:, :, found.subsets.link_subsets]
     return np.sqrt(np.mean(link**2, axis=-1))
 
 
 def _most_vibration(found: AtlasFindings) -> dict[str, Any]:
-    """The answer in the setting that leaves most vibration, late window."""
+    """The answer for the setting with the most residual vibration, late window."""
     rms = _all_links(found)[:, LATE]
     k = int(np.argmax(rms[:, 0]))
     best = min((1, 2, 4), key=lambda subset: rms[k, subset])
@@ -100,7 +100,7 @@ def _most_vibration(found: AtlasFindings) -> dict[str, Any]:
 
 
 def _residuals(found: AtlasFindings) -> dict[str, list[list[str]]]:
-    """Rows of each window: residual of the three links by the choice of controlled ones."""
+    """Rows of each window: residual of the three links for each choice of controlled links."""
     rms = _all_links(found)
     return {
         name: _by_setting(found, (map(length_text, row) for row in rms[:, w]))
@@ -120,7 +120,7 @@ def _shares(found: AtlasFindings) -> list[list[str]]:
 
 
 def _signs(found: AtlasFindings) -> dict[str, Any]:
-    """Table 1: changes of the spectral peak [%], and how many of them agree."""
+    """Table 1: changes of the spectral peak [%], and how many agree."""
     signs = table_1_signs(found.subsets)
     on, paper, ours = signs.is_controlled, 100 * signs.paper, 100 * signs.ours
     agree = signs.agree[:, ~on]
@@ -147,7 +147,7 @@ def _signs(found: AtlasFindings) -> dict[str, Any]:
 
 
 def _steps(found: AtlasFindings) -> dict[str, Any]:
-    """Steps to one more link: how many make it worse, of how many."""
+    """Steps to one more controlled link: how many of them increase vibration."""
     steps = one_more_link(found.subsets)
 
     def cell(change: np.ndarray) -> str:
@@ -172,7 +172,7 @@ def _steps(found: AtlasFindings) -> dict[str, Any]:
 
 
 def _at_drive(found: AtlasFindings) -> dict[str, float] | None:
-    """What control does to link 1 at the drive's lowest mode, if it can be said."""
+    """Effect of control on link 1 at the drive's lowest mode, if it can be determined."""
     share, frequency = found.modes.share[0, :, 3], found.modes.frequency[0]
     at_drive = frequency[share > 0.5]
     if not len(at_drive) or not found.responses.is_stable[[0, -1]].all():
@@ -221,18 +221,18 @@ def _workspace(found: AtlasFindings) -> dict[str, Any]:
 
 
 def _reach(values: np.ndarray, digits: str = ".4g") -> str:
-    """Smallest and largest over the poses that can be reached."""
+    """Smallest and largest value over the reachable poses."""
     return span(values[np.isfinite(values)], digits)
 
 
 def _beat(frequency: np.ndarray, order_share: np.ndarray) -> float | None:
-    """Beat of the first bending triple at the first pose [s], None where it is one frequency."""
+    """Beat of the first bending triple at the first pose [s], None if it has one frequency."""
     bending = frequency[np.argsort(-order_share[:, 0])[:3]]
     return 1 / np.ptp(bending) if np.ptp(bending) > 0 else None
 
 
 def _border(chart: Map) -> str:
-    """How a link stands to its guide at the border: "square" to it, "along" it, or "both"."""
+    """A link's angle to its guide at the border: "square" to it, "along" it, or "both"."""
     near = chart.margin <= np.nanpercentile(chart.margin, 5)
     gamma = chart.gamma[near]
     high = np.pi / 2 - gamma.max(axis=-1) < gamma.min(axis=-1)
@@ -260,7 +260,7 @@ def _errors(rms: np.ndarray) -> list[str]:
 
 
 def _part(window: int, drive: np.ndarray, vibration: np.ndarray) -> dict[str, Any]:
-    """What the split says in one window.
+    """Result of the split in one window.
 
     Args:
         window: of WINDOWS.

@@ -1,4 +1,4 @@
-"""`studies atlas`: `runs/` (the sweep of all subsets), `atlas.h5`, figures, a film, report."""
+"""`studies atlas`: `runs/` (the sweep of all subsets), `atlas.h5`, figures, animation, report."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from studies.store import Variable, staged, write_store
 from studies.study.spec import Study
 
 DATA, RUNS_FOLDER = "atlas.h5", "runs"
-#: What an end at a bad moment may leave behind.
+#: What an interrupted run can leave behind.
 _LEFTOVER = re.compile(r"\.unfinished-.*")
 
 
@@ -52,20 +52,20 @@ def run_atlas(
     console: Console | None = None,
     is_quiet: bool = False,
 ) -> bool:
-    """Run all subsets of a design, look at its workspace and platform, and write it all down.
+    """Run all subsets of a design, analyse its workspace and platform, and write the report.
 
     Args:
         study: the design.
         out: folder.
-        is_resumed: go on with the runs that are there; everything else is made anew.
+        is_resumed: continue with existing runs; everything else is computed anew.
         console: where progress goes; default: standard output.
-        is_quiet: no progress.
+        is_quiet: hide progress.
 
     Returns:
-        Whether it has been finished (False: interrupted by Ctrl-C, finished runs are kept).
+        Whether it finished (False: interrupted by Ctrl-C; finished runs are kept).
 
     Raises:
-        StudyError: a fault of the design or of the folder; no setting in which all cases run.
+        StudyError: a fault of the design or the folder; no setting in which all cases finish.
     """
     config.require_configured()
     out, console = Path(out), console or Console(highlight=False, markup=False)
@@ -84,7 +84,7 @@ def run_atlas(
 
 def _teller(console: Console) -> Tell:
     def tell(text: str, share: float) -> None:
-        if share == 0:  # what begins; its end says nothing more
+        if share == 0:  # the beginning of a step; its end needs no message
             console.print(text, soft_wrap=True)
 
     return tell
@@ -93,7 +93,7 @@ def _teller(console: Console) -> Tell:
 def _finish(study: Study, out: Path, tell: Tell) -> None:
     """Everything after the runs of the subsets."""
     subsets, dropped = sound_settings(read_subsets(load(out / RUNS_FOLDER)))
-    with threadpool_limits(1, "blas"):  # many small matrices: more threads only get in the way
+    with threadpool_limits(1, "blas"):  # many small matrices: more threads only slow them down
         found = look_around(study, subsets, tell)
     try:
         with staged(out) as staging:
@@ -110,7 +110,7 @@ def _finish(study: Study, out: Path, tell: Tell) -> None:
 
 
 def sound_settings(subsets: Subsets) -> tuple[Subsets, list[str]]:
-    """Settings in which every case ran to its end, and in words what is wrong with the others.
+    """Settings in which every case finished, and, in words, what is wrong with the others.
 
     Raises:
         StudyError: there is none.
@@ -132,7 +132,7 @@ def sound_settings(subsets: Subsets) -> tuple[Subsets, list[str]]:
 
 
 def variables(found: AtlasFindings) -> dict[str, Variable]:
-    """Everything `atlas.h5` holds."""
+    """All variables of `atlas.h5`."""
     return {**_subset_variables(found.subsets), **_map_variables(found), **_run_variables(found)}
 
 
@@ -207,7 +207,7 @@ def _map_variables(found: AtlasFindings) -> dict[str, Variable]:
             chart.frequency, (*grid, "natural_mode"), "Hz", "of the machine on its drive"
         ),
         "bending_frequency": Variable(
-            chart.bending, (*grid, "bending_mode"), "Hz", "the three first bending modes"
+            chart.bending, (*grid, "bending_mode"), "Hz", "the first three bending modes"
         ),
         "strain_share": Variable(
             chart.share, (*grid, "bending_mode", "part"), "1", "strain energy in links and drive"

@@ -1,4 +1,4 @@
-"""Every subset of controlled links and modes, as the cases of one sweep, and what comes back.
+"""Every subset of controlled links and modes, as the cases of one sweep, and its results.
 
 Player p = i C + j stands for mode j of link i, C the number of controlled modes; bit p of a
 subset's number says whether it is controlled.
@@ -20,11 +20,11 @@ from studies.space.spec import SweepSpec, parse_sweep
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study
 
-#: Time of a move [s] and input shaper: the paper's move, and faster ones, which leave more.
+#: Time of a move [s] and input shaper: the paper's move, and faster ones that leave more vibration.
 SETTINGS = tuple((time, shaper) for time in (0.1, 0.05, 0.03) for shaper in ("ei", "none"))
-#: The residual window as the design has it, and without the part in which the drive settles.
+#: The design's residual window, and the same without the part in which the drive settles.
 WINDOWS = ("whole", "late")
-#: More controlled modes have too many subsets.
+#: More controlled modes than this have too many subsets.
 MODE_LIMIT = 3
 _KEPT = (
     "residual_rms",
@@ -65,10 +65,10 @@ class Subsets(NamedTuple):
         return ((np.arange(8)[:, None] >> np.arange(3)) & 1) @ shifts
 
     def removed(self) -> np.ndarray:
-        """Mean square that each subset takes away, by TARGETS.
+        """Mean square that each subset removes, by TARGETS.
 
         Returns:
-            Share of what is there without control [1], (..., 5, 2^(3C)): a game of `attribution`.
+            Share of the value without control [1], (..., 5, 2^(3C)): a game of `attribution`.
         """
         link = np.moveaxis(self.link, -1, -2) ** 2
         total = link.sum(axis=-2, keepdims=True)
@@ -77,7 +77,7 @@ class Subsets(NamedTuple):
         return 1 - square / np.where(first > 0, first, np.nan)
 
 
-#: What `Subsets.removed` counts, in order.
+#: Targets of `Subsets.removed`, in order.
 TARGETS = ("link 1", "link 2", "link 3", "all links", "platform")
 
 
@@ -107,10 +107,10 @@ def atlas_sweep(
 
     Args:
         study: the design; its links, masks, move time and shaper are replaced. Where its ratios
-            come from its own uncontrolled run, that of each setting is run here.
+            come from its own uncontrolled run, each setting's uncontrolled run is done here.
         settings: time of every move of its path [s], and shaper.
         windows: of WINDOWS.
-        has_modes: all subsets of links and modes; else the 8 of links.
+        has_modes: all subsets of links and modes; otherwise the 8 of links.
 
     Raises:
         StudyError: too many controlled modes, no motion, no sampled modal controller.
@@ -154,14 +154,14 @@ def _rounded(x: float) -> float:
 
 
 def residual_window(study: Study, window: str) -> tuple[float, float]:
-    """Begin after the command's end and length of one of WINDOWS [s]."""
+    """Start after the command's end and length of one of WINDOWS [s]."""
     delay, length = study.metrics.residual_delay, study.metrics.residual_length
     early = EARLY_PART * length if window == "late" else 0.0
     return delay + early, length - early
 
 
 def long_enough(study: Study, settings: tuple[tuple[float, str], ...]) -> Study:
-    """The study with a run that is long enough for the slowest setting and its windows."""
+    """The study with a run long enough for the slowest setting and its windows."""
     ends = []
     for time, shaper in settings:
         moved = study.change(motion__move_time=time, shaper__kind=shaper)
@@ -205,7 +205,7 @@ def _masks(modes: int) -> np.ndarray:
 
 
 def _whole_links(modes: int) -> np.ndarray:
-    """Which subsets are made of whole links."""
+    """Which subsets consist of whole links."""
     masks = _masks(modes)
     return np.flatnonzero((masks == masks[..., :1]).all(axis=(1, 2)))
 

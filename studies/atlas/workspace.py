@@ -1,6 +1,6 @@
-"""Natural modes of the machine on a grid of poses: frequencies, shapes, who takes part, coupling.
+"""Natural modes of the machine on a grid of poses: frequencies, shapes, participation, coupling.
 
-The sliders are held by their drive, damping is left out. Coupling is that of the links' first
+The sliders are held by their drive; damping is neglected. Coupling is that of the links' first
 modes through platform and sliders: with the pose condensed out of the mass matrix,
 M_c = M_qq - M_qX M_XX^-1 M_Xq, it is |M_c,ik|/sqrt(M_c,ii M_c,kk) for links i and k.
 """
@@ -26,13 +26,13 @@ from studies.study.spec import Study
 
 #: Modes per link in these matrices; assembled frequencies converge with the first one.
 MAP_MODES = 3
-#: Turns of the platform against the path's first pose [rad].
+#: Rotations of the platform relative to the path's first pose [rad].
 TURNS = (-np.pi / 18, 0.0, np.pi / 18)
 #: Points of the map along x and y.
 GRID = 61
 #: Pairs of links, as in the last axis of `Map.coupling`.
 PAIRS = ((0, 1), (0, 2), (1, 2))
-#: Poses that one call of the compiled program takes.
+#: Poses per call of the compiled program.
 _BATCH = 512
 
 
@@ -47,7 +47,7 @@ class PoseModes(NamedTuple):
 
 
 class Map(NamedTuple):
-    """Axes: phi, y, x; NaN where the machine cannot stand."""
+    """Axes: phi, y, x; NaN where a pose is infeasible."""
 
     x: np.ndarray  # [m], (n,)
     y: np.ndarray  # [m], (n,)
@@ -55,7 +55,7 @@ class Map(NamedTuple):
     status: np.ndarray  # code of the pose, (p, n, n)
     gamma: np.ndarray  # link angles [rad], (p, n, n, 3)
     frequency: np.ndarray  # all natural frequencies [Hz], (p, n, n, m)
-    bending: np.ndarray  # the three that are mostly first bending of links [Hz], (p, n, n, 3)
+    bending: np.ndarray  # the three dominated by the links' first bending [Hz], (p, n, n, 3)
     share: np.ndarray  # their strain energy in links 1, 2, 3 and drive [1], (p, n, n, 3, 4)
     coupling: np.ndarray  # of the links' first modes, by PAIRS [1], (p, n, n, 3)
 
@@ -92,12 +92,12 @@ def natural_modes_at(study: Study, poses: Any) -> PoseModes:
 
 
 def map_workspace(study: Study, count: int = GRID, turns: tuple[float, ...] = TURNS) -> Map:
-    """Natural modes over all that the platform can reach.
+    """Natural modes over everything the platform can reach.
 
     Args:
         study: the machine and its drive.
         count: points along x and along y.
-        turns: of the platform against the first pose of the study's path [rad].
+        turns: of the platform relative to the first pose of the study's path [rad].
 
     Returns:
         Map.
@@ -131,7 +131,7 @@ def map_workspace(study: Study, count: int = GRID, turns: tuple[float, ...] = TU
 
 
 def _machine(study: Study) -> tuple[Structure, Case]:
-    """The machine with few modes and without anything that controls or shapes."""
+    """The machine with few modes, without control or shaper."""
     plain = study.change(
         link__modes=min(study.link.modes, MAP_MODES),
         control__feedback="none",
@@ -145,7 +145,7 @@ def _machine(study: Study) -> tuple[Structure, Case]:
 def _extent(
     structure: Structure, case: Case, study: Study, phi: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Grid lines that hold all poses where the machine can stand."""
+    """Grid lines that cover all feasible poses."""
     look = np.linspace(-0.6, 0.6, 121) * study.machine.guide_side
     grid = np.stack(np.meshgrid(phi, look, look, indexing="ij")[::-1], axis=-1)
     codes, _, _ = _stand(structure, case, grid.reshape(-1, 3))
@@ -192,7 +192,7 @@ def _matrices(structure: Structure, case: Case, poses: Array) -> tuple[Array, Ar
 
 
 def _solve(structure: Structure, case: Case, poses: np.ndarray) -> PoseModes:
-    """Modes at sound poses, batch by batch of one compiled program."""
+    """Modes at feasible poses, batch by batch in one compiled program."""
     parts = []
     for start in range(0, len(poses), _BATCH):
         batch = poses[start : start + _BATCH]

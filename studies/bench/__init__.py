@@ -1,8 +1,8 @@
-"""`studies bench`: how fast and how large, on this machine.
+"""`studies bench`: speed and memory on this machine.
 
-In: a kind of work. Out: figures by name. `run` is the one call for all of it.
+In: a kind of work. Out: figures by name. `run` is the one call for everything.
 
 - `works`: runs and sweeps of this program.
 - `gradients`: derivatives of such runs.
-- `peers`: one of the runs by other means, with `reference.py` (plain equations) and `w0.c`.
+- `peers`: one of the runs with other solvers, with `reference.py` (plain equations) and `w0.c`.
 """

@@ -18,22 +18,22 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command()
     def bench(
-        what: Annotated[str, typer.Argument(help="runs, or peers: W0 by other means")] = "runs",
+        what: Annotated[str, typer.Argument(help="runs, or peers: W0 with other solvers")] = "runs",
         work: Annotated[str, typer.Option(help="W0, W1, W8, grad or sweep; default: W1")] = "",
         executor: Annotated[
-            str, typer.Option(help="kernel, scan or gpu; default: the fastest one")
+            str, typer.Option(help="kernel, scan or gpu; default: the fastest")
         ] = "",
         batch: Annotated[
-            int, typer.Option(min=0, max=2**20, help="cases of a chunk; 0: a good number")
+            int, typer.Option(min=0, max=2**20, help="cases per chunk; 0: automatic")
         ] = 0,
-        cases: Annotated[int, typer.Option(min=0, help="cases of the sweep; 0: 100,000")] = 0,
+        cases: Annotated[int, typer.Option(min=0, help="cases in the sweep; 0: 100,000")] = 0,
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
         as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
     ) -> None:
         """Measure speed and memory on this machine."""
         if what == "peers" and precision != "float64":
             raise StudyError(
-                f"--precision {precision}: not allowed with peers, which do W0 in double "
+                f"--precision {precision}: not allowed with peers, which run W0 in double "
                 "precision; leave it out"
             )
         start(precision)
@@ -49,7 +49,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
 
 def _peers(rows: list[dict[str, Any]]) -> Table:
-    table = Table("W0 by", "configurations/s", "error [share of the largest rms]", "times slower")
+    table = Table("W0 with", "configurations/s", "error [share of the largest rms]", "times slower")
     for row in rows:
         table.add_row(
             row["peer"],

@@ -1,4 +1,4 @@
-"""How fast metrics are differentiated by parameters."""
+"""Speed of differentiating metrics by parameters."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def place_gains(case: Case, parameters: Array) -> Case:
 
 
 def bench_gradients(executor: str = "", batch: int = 0) -> dict[str, Any]:
-    """Gradients a second of the residual rms of W0 by its nine gains.
+    """Gradients per second of the residual rms of W0 by its nine gains.
 
     Args:
-        executor: "kernel", "scan", or "" for the fastest one at hand.
-        batch: cases in a chunk; 0: two blocks of lanes on every device.
+        executor: "kernel", "scan", or "" for the fastest available.
+        batch: cases per chunk; 0: two blocks of lanes on every device.
 
     Returns:
         Figures by name; the fingerprint is the norm of the mean gradient.

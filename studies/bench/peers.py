@@ -1,8 +1,8 @@
-"""Work W0 by other means, in one table: what this program's speed is worth.
+"""W0 with other solvers, in one table: how this program's speed compares.
 
 All of them integrate the same cases: the drive's reference at start, middle and end of each sample,
 voltages from modal velocities, rms deflection in the residual window. Their accuracy is measured
-against this program's own scan at an eighth of the step, and stands beside their speed.
+against this program's own scan at an eighth of the step, and reported with their speed.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from studies.kernels.llvm import is_available
 from studies.study.cases import as_arrays
 from studies.study.spec import paper_study
 
-#: Sample period of W0, and step of the peers with a constant one [s].
+#: Sample period of W0, and step of the peers with a constant step [s].
 PERIOD = 1e-4
-#: Runs of which the median counts.
+#: Number of runs; the median counts.
 REPEATS = 3
-#: Steps of the reference in one of the peers'.
+#: Steps of the reference per step of the peers.
 FINER = 8
 #: Tolerances of `solve_ivp` that make it as accurate as the others, relative and absolute [m].
 TOLERANCES = (1e-7, 1e-11)
@@ -51,7 +51,7 @@ class Work(NamedTuple):
     """W0 for a number of cases."""
 
     structure: Structure
-    cases: Case  # leading axis 1 or the cases
+    cases: Case  # leading axis: 1 or the number of cases
     layout: Layout
 
     def first(self, n: int) -> Case:
@@ -64,31 +64,31 @@ class Work(NamedTuple):
 
 
 class PeerRow(NamedTuple):
-    """What was measured of a peer."""
+    """Measurements of a peer."""
 
     peer: str
     configs_per_s: float
-    error: float  # largest one of a residual rms, as a share of the largest residual rms
+    error: float  # largest error of a residual rms, as a share of the largest residual rms
     times_slower: float  # than the fastest peer
 
 
 class Peer(NamedTuple):
-    """A way to do the work."""
+    """One way to do the work."""
 
     name: str
     n_cases: int  # enough to time it, few enough to wait for
     run: Callable[[], Any]  # residual rms (n_cases, 3, S)
 
     def finish(self) -> np.ndarray:
-        """What it finds, once it is there."""
+        """Run it and wait for the result."""
         return np.asarray(self.run())
 
 
 def make_work(is_short: bool = False) -> Work:
-    """W0 with gains that differ.
+    """W0 with varied gains.
 
     Args:
-        is_short: one move only and 20 ms after it, to see that all agree.
+        is_short: only one move and 20 ms after it, to check that all agree.
     """
     short = {
         "run__duration": 0.15,
@@ -105,9 +105,9 @@ def bench_peers(
     """Speed and error of every peer that can run here, fastest first.
 
     Args:
-        report: takes a line on what is going on or left out.
+        report: called with a line on progress or on what is left out.
         is_short: see `make_work`.
-        repeats: runs of which the median counts.
+        repeats: number of runs; the median counts.
     """
     config.require_configured()
     work = make_work(is_short)
@@ -127,7 +127,7 @@ def bench_peers(
 
 
 def find_peers(work: Work, report: Callable[[str], None]) -> list[Peer]:
-    """Those that can run here; `report` hears of the others."""
+    """Peers that can run here; `report` is told about the others."""
     size = work.layout.size
 
     def own(executor: Any) -> Callable[[], Any]:
@@ -284,7 +284,7 @@ def by_lagrangian(work: Work, n: int) -> Callable[[], Any]:
 
 
 def by_c(work: Work, compiler: str) -> Callable[[], Any]:
-    """`w0.c`, a thread for every device."""
+    """`w0.c`, one thread per device."""
     structure = work.structure
     each = jax.jit(jax.vmap(partial(_ideal, structure)))(work.first(work.layout.size))
     start = jax.jit(begin, static_argnums=0)(structure, jax.tree.map(lambda x: x[0], work.first(1)))
@@ -342,7 +342,7 @@ def _ideal(structure: Structure, case: Case) -> Any:
 
 
 def _aligned(array: np.ndarray) -> np.ndarray:
-    """A copy at an address that vectors of 64 bytes may have."""
+    """A copy aligned to 64 bytes."""
     room = np.empty(array.size + 8)
     skip = -room.ctypes.data % 64 // 8
     copy = room[skip : skip + array.size].reshape(array.shape)

@@ -1,4 +1,4 @@
-"""Slow, plain forms of the model, written apart from `jaxmodel`, to test it against.
+"""Slow, plain forms of the model, written independently of `jaxmodel` to test it.
 
 Geometry in the plane's own coordinates, kinetic energy from the velocity field of a link,
 accelerations from the Lagrangian by automatic differentiation and from the index-3 equations (5)
@@ -18,7 +18,7 @@ from jaxmodel.parameters import Geometry, Machine
 
 
 class RigidState(NamedTuple):
-    """State of the reduced machine: what is free after the closure (6)."""
+    """State of the reduced machine: free coordinates after the closure (6)."""
 
     pose: jax.Array  # (3,)
     pose_rate: jax.Array  # (3,)
@@ -27,7 +27,7 @@ class RigidState(NamedTuple):
 
 
 class Loads(NamedTuple):
-    """Forces from outside."""
+    """External forces."""
 
     slider: jax.Array  # along the guides [N], (3,)
     modal: jax.Array  # on the modal coordinates [N], (3, R)
@@ -79,7 +79,7 @@ def chord_length(machine: Machine, basis: ModalBasis, q: jax.Array) -> Any:
 
 
 def link_tips(machine: Machine, basis: ModalBasis, rho: jax.Array, gamma: Any, q: jax.Array) -> Any:
-    """Joints C_i [m] from the side of slider and bent link, (3, 2)."""
+    """Joints C_i [m] from slider and bent link, (3, 2)."""
     corner, u, _ = guides(machine.geometry)
     beta = gamma + machine.geometry.guide_angle
     along = jnp.stack([jnp.cos(beta), jnp.sin(beta)], axis=1)
@@ -112,8 +112,8 @@ def kinetic_energy(
 ) -> Any:
     """T [J] from the velocity a + x b + sum_j Y_j(x) c_j of the points of a link.
 
-    The centre of mass moves in along the chord with half of what the chord shortens by; squares of
-    that motion are left out.
+    The centre of mass moves inwards along the chord by half the chord's shortening; squares of that
+    motion are neglected.
     """
     along = jnp.stack([jnp.cos(gamma), jnp.sin(gamma)], axis=1)  # in the guide's frame
     across = jnp.stack([-jnp.sin(gamma), jnp.cos(gamma)], axis=1)

@@ -26,18 +26,18 @@ def run_bench(
     """Measure speed and memory on this machine.
 
     Args:
-        what: "runs" of this program, or "peers": W0 by other means.
+        what: "runs" of this program, or "peers": W0 with other solvers.
         work: W0, W1, W8, grad or sweep; "": W1.
-        executor: kernel, scan or gpu; "": the fastest one.
-        batch: cases of a chunk; 0: a good number.
+        executor: kernel, scan or gpu; "": the fastest.
+        batch: cases per chunk; 0: automatic.
         cases: of the work `sweep`; 0: `SWEEP_CASES`.
         console: where progress goes; default: standard error.
 
     Returns:
-        figures by name; of peers a row each.
+        figures by name; for peers, one row each.
 
     Raises:
-        StudyError: an unknown choice, or one that would be ignored.
+        StudyError: an unknown option, or one that has no effect.
     """
     if what not in ("runs", "peers"):
         raise field_error("bench", what, "'runs' or 'peers'")
@@ -53,7 +53,7 @@ def run_bench(
 
 
 def _check(what: str, work: str, executor: str, batch: int, cases: int) -> None:
-    """Refuse options that would be ignored."""
+    """Reject options that have no effect."""
     if what == "peers":
         given = {"--work": work, "--executor": executor, "--batch": batch, "--cases": cases}
         reason = "with peers, which do W0 in double precision"

@@ -1,4 +1,4 @@
-"""Workloads, and how fast this program runs them."""
+"""Workloads, and their speed in this program."""
 
 from __future__ import annotations
 
@@ -52,31 +52,31 @@ SHORT_RUNS: dict[str, Any] = {
 }
 
 
-#: Workloads of closed-loop runs, 0.8 s at 10 kHz, by what differs from the paper's study.
+#: Workloads of closed-loop runs, 0.8 s at 10 kHz, by their differences from the paper's study.
 WORKS: dict[str, dict[str, Any]] = {
     # PD drive, ideal modal velocity feedback, unshaped square, residual rms only
     "W0": {"link__modes": 3, "control__feedback": "ideal", "shaper__kind": "none"},
-    # the default sampled design with all metrics, 3 and 8 modes a link
+    # the default sampled design with all metrics, 3 and 8 modes per link
     "W1": {"link__modes": 3},
     "W8": {"link__modes": 8},
 }
-#: Metrics they accumulate; all of them where not named.
+#: Metrics they accumulate; all if not named.
 METRICS = {"W0": ("residual_rms",)}
 EXECUTORS: dict[str, Callable[..., Executor]] = {
     "kernel": KernelExecutor,
     "scan": ScanExecutor,
     "gpu": GpuExecutor,
 }
-#: Runs of which the median counts.
+#: Number of runs; the median counts.
 REPEATS = 5
 
 
 def check_executor(executor: str, known: Iterable[str] = EXECUTORS) -> None:
-    """Refuse an executor that is unknown or cannot run here.
+    """Reject an executor that is unknown or cannot run here.
 
     Args:
         executor: name, or "".
-        known: the ones to choose from.
+        known: available names.
 
     Raises:
         StudyError: if so.
@@ -93,13 +93,13 @@ def check_executor(executor: str, known: Iterable[str] = EXECUTORS) -> None:
 
 
 def make_layout(batch: int) -> Layout:
-    """A chunk of about so many cases; 0: two blocks of lanes on every device, one on a GPU."""
+    """A chunk of about this many cases; 0: two blocks of lanes on every device, one on a GPU."""
     blocks = 2 if config.processor() == "cpu" else 1
     return even_layout(batch or blocks * most_lanes() * len(jax.local_devices()))
 
 
 def build_work(work: str, layout: Layout, **changes: Any) -> tuple[Structure, Case]:
-    """Cases of a workload that differ in their gains.
+    """Cases of a workload with different gains.
 
     Args:
         work: key of WORKS.
@@ -113,19 +113,19 @@ def build_work(work: str, layout: Layout, **changes: Any) -> tuple[Structure, Ca
 
 
 class Timing(NamedTuple):
-    """How long it takes."""
+    """Run and compile times."""
 
     seconds: float  # median of the later runs
     compile_time: float  # of compilers in the first run [s]
-    trace_time: float  # what the first run took beyond that and the median [s]
+    trace_time: float  # rest of the first run, beyond that and the median [s]
 
 
 def timed(run: Callable[[], Any], repeats: int | None = None) -> tuple[Any, Timing]:
-    """Result and timing of something that compiles when it first runs.
+    """Result and timing of a function that compiles on its first run.
 
     Args:
         run: what to do.
-        repeats: runs of which the median counts; REPEATS unless given.
+        repeats: number of runs, of which the median counts; default: REPEATS.
     """
     before, began = compiler_time(), time.perf_counter()
     run()
@@ -161,15 +161,15 @@ def describe(layout: Layout, structure: Structure, timing: Timing, dtype: Any) -
 
 
 def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
-    """Speed of a batch of closed-loop runs that differ in their gains.
+    """Speed of a batch of closed-loop runs with different gains.
 
     Args:
         work: key of WORKS.
-        executor: key of EXECUTORS; "" for the fastest one at hand.
-        batch: cases in a chunk; 0: as `make_layout`.
+        executor: key of EXECUTORS; "" for the fastest available.
+        batch: cases per chunk; 0: as `make_layout`.
 
     Returns:
-        Figures by name; configurations a second are those of the median run, compiling apart.
+        Figures by name; configurations per second are for the median run, without compiling.
 
     Raises:
         StudyError: unknown work or executor, or one that is not installed.

@@ -1,4 +1,4 @@
-"""The way to the workers: a scheduler that is there, or workers of our own on this machine."""
+"""Connect to workers: those of an existing scheduler, or new ones on this machine."""
 
 from __future__ import annotations
 
@@ -30,45 +30,47 @@ Made = TypeVar("Made")
 
 #: Options of the commands that can use workers.
 Scheduler = Annotated[
-    str | None, typer.Option(help="work on a Dask cluster: tcp://HOST:PORT or its JSON file")
+    str | None, typer.Option(help="run on a Dask cluster: tcp://HOST:PORT or its JSON file")
 ]
 
 
-LocalWorkers = Annotated[int | None, typer.Option(help="work on so many processes of this machine")]
+LocalWorkers = Annotated[
+    int | None, typer.Option(help="run in this many processes on this machine")
+]
 
 
 WorkerTimeout = Annotated[
-    float, typer.Option(help="a worker that is busy for longer without an answer is restarted [s]")
+    float, typer.Option(help="restart a worker that stays busy for longer without answering [s]")
 ]
 
 
-#: A scheduler answers, and its first worker comes, within these times [s].
+#: Time limits for the scheduler to answer and for its first worker to join [s].
 PATIENCE, WORKER_PATIENCE = 15, 300
 
 
 class Workers(NamedTuple):
-    """Where work is to be done, as asked for on the command line."""
+    """Where to run, as requested on the command line."""
 
     scheduler: str | None  # address (tcp://host:8786, tls://...) or the scheduler's file (JSON)
     local: int | None  # or how many processes to start on this machine
-    timeout: float  # a worker that is busy for longer without an answer is restarted [s]
+    timeout: float  # a worker that stays busy for longer without answering is restarted [s]
 
     @property
     def options(self) -> str:
-        """The same on the command line, "" for none."""
+        """These as command-line options, "" for none."""
         named = (("--scheduler", self.scheduler), ("--local-workers", self.local))
         return "".join(f" {name} {value}" for name, value in named if value is not None)
 
     @property
     def are_named(self) -> bool:
-        """Whether there are any; else work is done by this process."""
+        """Whether workers are requested; otherwise this process does the work."""
         return self.scheduler is not None or self.local is not None
 
 
 def runner_for(
     spec: SweepSpec, workers: Workers, tell: Callable[[str], None]
 ) -> AbstractContextManager[Runner | None]:
-    """What runs a sweep on workers, None for this process.
+    """The runner of a sweep on workers, None for this process.
 
     Raises:
         StudyError: as `connected`.
@@ -86,12 +88,12 @@ def runner_for(
 def on_workers(
     workers: Workers, tell: Callable[[str], None], make: Callable[[Client], Made]
 ) -> Iterator[Made | None]:
-    """What is made of a client of the workers, None where none are named.
+    """Make something from a client of the workers, None if no workers are named.
 
     Args:
         workers: which ones.
-        tell: called with what is going on.
-        make: of the client.
+        tell: called with progress messages.
+        make: called with the client.
 
     Raises:
         StudyError: as `connected`.
@@ -105,11 +107,11 @@ def on_workers(
 
 @contextmanager
 def connected(workers: Workers, tell: Callable[[str], None]) -> Iterator[Client]:
-    """A client of a cluster whose workers fit.
+    """A client of a cluster with compatible workers.
 
     Args:
         workers: which ones.
-        tell: called with what is going on.
+        tell: called with progress messages.
 
     Raises:
         StudyError: no extra `cluster`, no such scheduler, no worker, workers of other versions.
@@ -125,7 +127,7 @@ def connected(workers: Workers, tell: Callable[[str], None]) -> Iterator[Client]
         raise StudyError(
             f"{option}: Dask's distributed is missing: install flexlink-studies[cluster]"
         ) from None
-    # what users should know is said by this package
+    # this package itself reports what users should know
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     found = (
@@ -147,16 +149,16 @@ def _joined(scheduler: str) -> Iterator[Client]:
     address = scheduler if "://" in scheduler else _written_address(scheduler)
     if not re.fullmatch(r"(tcp|tls)://[^/]+:\d+", address):
         raise field_error("--scheduler", address, "tcp://HOST:PORT or tls://HOST:PORT")
-    # Dask would not clean up after these
+    # Dask does not clean up after these errors
     context = Security().get_connection_args("client").get("ssl_context")
     if address.startswith("tls://") and context is None:
         raise StudyError(
-            f"--scheduler {address}: no certificates of a client; set them for Dask "
+            f"--scheduler {address}: no client certificates; set them for Dask "
             "(distributed.comm.tls, docs/cluster.md)"
         )
     try:
         client = Client(address, timeout=PATIENCE, set_as_default=False)
-    except (OSError, ValueError, RuntimeError) as error:  # timeouts are among the first
+    except (OSError, ValueError, RuntimeError) as error:  # OSError covers timeouts
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise StudyError(f"--scheduler {scheduler}: no scheduler answers ({reason})") from None
     with client:
@@ -164,7 +166,7 @@ def _joined(scheduler: str) -> Iterator[Client]:
 
 
 def _written_address(file: str) -> str:
-    """Address in the file of a scheduler."""
+    """Address in a scheduler's file."""
     try:
         address = json.loads(Path(file).read_text(encoding="utf-8"))["address"]
     except FileNotFoundError:
@@ -173,13 +175,13 @@ def _written_address(file: str) -> str:
             "scheduler's JSON file"
         ) from None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StudyError(f"--scheduler {file}: no file of a scheduler ({error})") from None
+        raise StudyError(f"--scheduler {file}: not a scheduler's file ({error})") from None
     return str(address)
 
 
 @contextmanager
 def _started(count: int) -> Iterator[Client]:
-    """Workers on this machine that share its cores, or have a graphics processor each."""
+    """Workers on this machine that share its cores, or have one GPU each."""
     from distributed import Client, Nanny, Scheduler, SpecCluster
 
     cores = usable_cores()
@@ -196,20 +198,20 @@ def _started(count: int) -> Iterator[Client]:
     with _deaf():
         try:
             cluster = SpecCluster(workers, heart, silence_logs=logging.CRITICAL)
-        except (OSError, RuntimeError) as error:  # timeouts are among the first
+        except (OSError, RuntimeError) as error:  # OSError covers timeouts
             reason = str(error).partition("\n")[0] or type(error).__name__
-            raise StudyError(f"--local-workers: they do not start ({reason})") from None
+            raise StudyError(f"--local-workers: workers do not start ({reason})") from None
     with cluster, Client(cluster, timeout=PATIENCE, set_as_default=False) as client:
         yield client
 
 
 @contextmanager
 def _deaf() -> Iterator[None]:
-    """Threads and processes begun within it, and theirs, never hear of Ctrl-C.
+    """Shield threads and processes started in this context, and their children, from Ctrl-C.
 
-    On a terminal it reaches the workers too, but it is the client that ends in good order.
+    In a terminal, Ctrl-C would reach the workers too, but only the client shuts down cleanly.
     """
-    resource_tracker.ensure_running()  # which would let it through again
+    resource_tracker.ensure_running()  # started here, it would unblock the signal again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -218,7 +220,7 @@ def _deaf() -> Iterator[None]:
 
 
 def _graphics(number: int) -> dict[str, str]:
-    """Environment that shows a worker one of the graphics processors; empty where there is none."""
+    """Environment that shows a worker one of the GPUs; empty if there is none."""
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
     found = [str(k) for k in range(len(glob.glob("/dev/nvidia[0-9]*")))]
     devices = named.split(",") if named else found
@@ -226,7 +228,7 @@ def _graphics(number: int) -> dict[str, str]:
 
 
 def wait_for_workers(client: Client) -> None:
-    """Raise StudyError where no worker joins in time."""
+    """Raise StudyError if no worker joins in time."""
     try:
         client.wait_for_workers(1, timeout=WORKER_PATIENCE)
     except TimeoutError:
@@ -234,15 +236,15 @@ def wait_for_workers(client: Client) -> None:
 
 
 def refuse_other_versions(client: Client) -> None:
-    """Raise StudyError where a worker has other versions than this process."""
+    """Raise StudyError if a worker has other versions than this process."""
     from studies.cluster.worker import difference, identity
 
     wanted, faults = identity(), []
     try:
         answers = client.run(identity, on_error="return")
-    except Exception as error:  # Dask cannot hand on every fault of a worker
+    except Exception as error:  # Dask cannot pass on every error of a worker
         raise StudyError(
-            f"workers cannot be asked for their versions ({error or type(error).__name__}); is "
+            f"cannot ask workers for their versions ({error or type(error).__name__}); is "
             "flexlink-studies installed there?"
         ) from None
     for address, found in answers.items():
@@ -253,6 +255,6 @@ def refuse_other_versions(client: Client) -> None:
     if faults:
         more = f" (and {len(faults) - 3} more)" if len(faults) > 3 else ""
         raise StudyError(
-            f"workers do not fit this client: {'; '.join(faults[:3])}{more}; install the same "
+            f"workers do not match this client: {'; '.join(faults[:3])}{more}; install the same "
             "versions everywhere"
         )

@@ -1,8 +1,8 @@
 """Chunks of a sweep on the workers of a cluster: few in flight, none lost, none twice.
 
-Dask runs a chunk elsewhere when its worker dies. A chunk whose workers keep dying, or that fails
-there, is tried once more with nothing else in flight, since what dies beside a bad chunk is not
-bad itself; then it is given up.
+Dask reruns a chunk elsewhere when its worker dies. A chunk whose workers keep dying, or that fails
+there, is tried once more with nothing else in flight, since a bad chunk can take good ones down
+with it; then it is given up.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from studies.space.table import CaseTable
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-#: Chunks in flight for each worker: one that it runs, one that is there when it is ready.
+#: Chunks in flight per worker: one running, one waiting.
 AHEAD = 2
-#: Chunks for each worker at least, so that none waits long for the last ones.
+#: Minimum number of chunks per worker, so that none waits long for the last ones.
 LEAST_CHUNKS = 4
 
 
 class Flight(NamedTuple):
-    """A chunk that is under way."""
+    """A chunk in flight."""
 
     group: Group
     chunk: Chunk
@@ -51,7 +51,7 @@ class ClusterRunner:
         Args:
             client: from `connected`.
             spec: the sweep.
-            timeout: a worker that is busy for longer without an answer is restarted [s].
+            timeout: a worker that stays busy for longer without answering is restarted [s].
         """
         self._client, self._timeout = client, timeout
         self._spec, self._identity = json.dumps(spec.data), identity()
@@ -75,7 +75,7 @@ class ClusterRunner:
     ) -> Generator[Done | Lost]:
         watch = Watch(self._client, self._timeout, reporter.say)
         reporter.say(f"workers: {watch.n_workers}; each compiles before its first chunk")
-        owns = [has_own_ratio(table, group) for group in groups]  # structures may be alike
+        owns = [has_own_ratio(table, group) for group in groups]  # structures can be equal
         waiting = (
             Flight(group, chunk, own)
             for group, own in zip(groups, owns, strict=True)

@@ -1,4 +1,4 @@
-"""Work under way on a cluster: what came of it, and which workers hang."""
+"""Work in progress on a cluster: its outcome, and which workers hang."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from studies.errors import StudyError
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-#: Nobody answers any more.
-GONE = "the scheduler is gone; what is finished is safe, go on with --resume"
-#: How often workers are looked at [s].
+#: Message when the scheduler no longer answers.
+GONE = "the scheduler is gone; finished work is safe; continue with --resume"
+#: How often workers are checked [s].
 LOOK = 1.0
-#: Time for a worker that hangs to be stopped [s].
+#: Time allowed for stopping a worker that hangs [s].
 KILL_TIME = 10
 
 
 class Watch:
-    """Waits for work, counts workers, restarts those that are busy for too long."""
+    """Waits for work, counts workers, restarts those that stay busy for too long."""
 
     def __init__(self, client: Client, timeout: float, tell: Callable[[str], None]) -> None:
         """
         Args:
             client: from `connected`.
-            timeout: a worker that is busy for longer without an answer is restarted [s].
+            timeout: a worker that stays busy for longer without answering is restarted [s].
             tell: called with what users should know.
         """
         self._client, self._timeout, self._tell = client, timeout, tell
@@ -36,7 +36,7 @@ class Watch:
         self.n_workers = len(client.ncores())
 
     def landed(self, flying: Iterable[Future[Any]]) -> list[Future[Any]]:
-        """What needs no more waiting for; after a while without any, nothing."""
+        """Work that has finished; empty if none finishes for a while."""
         from distributed import CancelledError, wait
 
         futures = list(flying)
@@ -49,10 +49,10 @@ class Watch:
         return [future for future in futures if future.status != "pending"]
 
     def outcome(self, future: Future[Any]) -> Any:
-        """What a worker answered, or a text that says why there is nothing.
+        """A worker's answer, or a text that says why there is none.
 
         Raises:
-            StudyError: the worker refuses the work, or the scheduler is gone.
+            StudyError: the worker rejects the work, or the scheduler is gone.
         """
         from distributed import KilledWorker
 
@@ -65,7 +65,7 @@ class Watch:
         except Exception as error:
             if future.status != "error":  # no worker has raised it
                 raise StudyError(GONE) from None
-            # of JAX, LLVM, memory, disk: whatever may go wrong there
+            # from JAX, LLVM, memory, disk: anything can go wrong there
             return f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
         self._idle[answer.worker] = time.monotonic()
         return answer
@@ -75,7 +75,7 @@ class Watch:
         if now - self._looked < LOOK:
             return
         self._looked = now
-        with suppress(OSError):  # the work itself will tell of a scheduler that is gone
+        with suppress(OSError):  # the work itself will report a lost scheduler
             self._judge(self._client.processing(), keys, now)
 
     def _judge(self, busy: Mapping[str, Any], keys: set[Any], now: float) -> None:
@@ -96,7 +96,7 @@ class Watch:
                 self._idle[address] = now
 
     def _restart(self, address: str) -> None:
-        """Stop a worker; its nanny starts another, where it has one."""
+        """Stop a worker; its nanny, if any, starts another."""
         scheduler: Any = self._client.scheduler
         self._client.sync(
             scheduler.restart_workers,

@@ -1,7 +1,7 @@
-"""What runs on a worker: a chunk from the sweep's file and row numbers alone.
+"""What runs on a worker: a chunk, from just the sweep's file and row numbers.
 
-A worker process runs one chunk at a time, on as many cores as it has threads or on the graphics
-processors it sees, and keeps its table and its programs for the next one.
+A worker process runs one chunk at a time, on as many cores as it has threads or on the GPUs it
+sees, and keeps its table and its programs for the next one.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ from studies.extensions import extend_as_told
 from studies.space.spec import parse_sweep
 from studies.space.table import CaseTable, build_table
 
-#: One chunk at a time: it takes all that the worker has.
+#: One chunk at a time: it uses the whole worker.
 alone = RLock()
 
 
 class ChunkJob(NamedTuple):
-    """A chunk, by what decides its numbers."""
+    """A chunk, defined by everything that determines its numbers."""
 
     identity: dict[str, str]  # of the client, see `identity`
     precision: str
     spec: str  # the sweep as JSON
     structure: Structure  # of the chunk's group
     has_own_ratio: bool  # EMC ratios come from an uncontrolled pass
-    size: int  # cases in a full chunk, for one program whatever is left for the last one
+    size: int  # cases in a full chunk, so that a shorter last one runs the same program
     rows: np.ndarray  # of the sweep's table, (k,)
 
 
 class ChunkDone(NamedTuple):
-    """What a worker has made of a job."""
+    """A worker's result of a job."""
 
     judged: JudgedChunk  # padded, NumPy arrays
     executor: str
-    compile_time: float  # [s], 0 where the program was there already
+    compile_time: float  # [s], 0 if the program already existed
     worker: str  # address
 
 
@@ -64,7 +64,7 @@ def identity() -> dict[str, str]:
 
 
 def difference(found: dict[str, str], wanted: dict[str, str]) -> str:
-    """In what a worker differs from the client, "" for nothing."""
+    """How a worker differs from the client, "" if it does not."""
     parts = [
         f"{name} {found.get(name)} (client: {value})"
         for name, value in wanted.items()
@@ -74,20 +74,20 @@ def difference(found: dict[str, str], wanted: dict[str, str]) -> str:
 
 
 def refuse_difference(wanted: dict[str, str], worker: Worker) -> None:
-    """Raise StudyError where this worker, which may have come late, differs from the client."""
+    """Raise StudyError if this worker, which may have joined late, differs from the client."""
     found = difference(identity(), wanted)
     if found:
         raise StudyError(f"worker {worker.address}: {found}; install the same there")
 
 
 def get_ready(precision: str, worker: Worker) -> None:
-    """Start JAX on the worker's share of the machine: a core for each of its threads."""
+    """Start JAX on the worker's share of the machine: one core per thread."""
     config.configure(precision, worker.state.nthreads)
     config.start(precision)
 
 
 def chunk_size(n: int, structure: Structure, precision: str) -> int:
-    """How many cases of n this worker would like to run at once."""
+    """How many of n cases this worker prefers to run at once."""
     with alone:
         get_ready(precision, get_worker())
         return local_layout(n, structure).size
@@ -122,5 +122,5 @@ def _table(spec: str) -> CaseTable:
 def _executor(
     precision: str, spec: str, structure: Structure, size: int, has_own_ratio: bool
 ) -> Executor:
-    """One for each sweep: numbers that all its cases share are written into its program."""
+    """The sweep's own executor: numbers shared by all its cases are compiled into its program."""
     return make_executor(structure, even_layout(size), has_own_ratio)

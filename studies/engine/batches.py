@@ -15,7 +15,7 @@ from jaxmodel.simulate import Result, simulate
 #: Cases per call of the compiled program; the last batch is filled up with copies.
 BATCH = 8
 
-#: Says what is running: text, then share of the work since the last call.
+#: Called with the current step in words, and the share of the work since the last call.
 Tell = Callable[[str, float], None]
 
 
@@ -30,7 +30,7 @@ def run_batches(structure: Structure, cases: list[Case], tell: Tell) -> Result:
     Args:
         structure: of all of them.
         cases: one or more.
-        tell: called with what is running.
+        tell: called with progress messages.
 
     Returns:
         Result of NumPy arrays, (cases, ...).

@@ -1,4 +1,4 @@
-"""The controller as code wants it: only channels that feed back, gains folded into numerators.
+"""The controller in the form code needs: only active channels, gains folded into numerators.
 
 A channel is a controlled mode of a link (modal control) or a patch (strain rate feedback).
 """
@@ -24,20 +24,20 @@ class Channels(NamedTuple):
     force: np.ndarray  # its numerator times the gains, sign included [N/m] or [V/V], (M, 3)
     direct: np.ndarray  # force per channel signal past the filters [N/m] or [V/V], (M,)
     synthesizer: np.ndarray  # voltages from the channel's force [V/N] or [1], (M, K)
-    # where channels of a link act one at a time: per rival two rows of (inner, old, older, signal)
-    # whose squares add up to its modal energy (omega q)^2 + q'^2 [m2/s2], 0 for others, (M, 2, 4)
+    # where channels of a link act one at a time: per rival, two rows of (inner, old, older, signal)
+    # whose squares sum to its modal energy (omega q)^2 + q'^2 [m2/s2], 0 for others, (M, 2, 4)
     energy: np.ndarray | None = None
 
     @property
     def is_rival(self) -> np.ndarray:
-        """Channels that act only where no other one of their link has more energy, (M,)."""
+        """Channels that act only while no other channel of their link has more energy, (M,)."""
         if self.energy is None:
             return np.zeros(len(self.link), bool)
         return np.any(self.energy, axis=(1, 2))
 
     @property
     def names(self) -> list[str]:
-        """Of the channels, for people."""
+        """Readable names of the channels."""
         pairs = zip(self.link, self.number, strict=True)
         return [f"link {i + 1}, {self.kind} {j + 1}" for i, j in pairs]
 
@@ -48,7 +48,7 @@ class Channels(NamedTuple):
         return float(max(np.abs([*self.first[:, 2], *np.concatenate(poles)])))
 
     def memory(self, share: float) -> int:
-        """Samples after which only a share of the start is left, for a pole below 1."""
+        """Samples after which only this share of the start is left, for a pole below 1."""
         return int(np.ceil(np.log(share) / np.log(max(self.slowest_pole, 0.1)))) + 8
 
     @property
@@ -57,7 +57,7 @@ class Channels(NamedTuple):
 
 
 def acting(link: np.ndarray, is_rival: np.ndarray, energy: np.ndarray) -> np.ndarray:
-    """Which channels act: of the rivals of a link only those of highest energy, (..., M).
+    """Which channels act: among a link's rivals only those of highest energy, (..., M).
 
     Args:
         link: of each channel, (M,).
@@ -74,7 +74,7 @@ def acting(link: np.ndarray, is_rival: np.ndarray, energy: np.ndarray) -> np.nda
 def fold(controller: Controller, kind: str) -> Channels:
     """Channels of a controller.
 
-    u = -k_d v - k_p x with v and x two outputs of one filter, so one numerator -k_d n_v - k_p n_x.
+    u = -k_d v - k_p x, with v and x outputs of one filter, has one numerator -k_d n_v - k_p n_x.
 
     Args:
         controller: NumPy arrays; a channel without gains is left out.
@@ -113,11 +113,11 @@ def fold(controller: Controller, kind: str) -> Channels:
 
 
 def unfold(channels: Channels, like: Controller) -> Controller:
-    """A controller that feeds back as the channels do, gains of 1.
+    """A controller equivalent to the channels, with gains of 1.
 
     Args:
-        channels: of the same law as `like`, their coefficients rounded for instance.
-        like: what the channels leave open.
+        channels: of the same law as `like`, for instance with rounded coefficients.
+        like: supplies what the channels leave open.
     """
     at = channels.link, channels.number
     gain = np.zeros_like(like.velocity_gain)

@@ -1,4 +1,4 @@
-"""Chunks of a sweep, run: by this process, or wherever another `Runner` takes them."""
+"""Running the chunks of a sweep: in this process, or wherever another `Runner` sends them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from studies.study.cases import powered
 
 
 class Done(NamedTuple):
-    """A chunk that has been run."""
+    """A finished chunk."""
 
     chunk: Chunk
     substeps: int  # plant steps per sample of its program
@@ -31,21 +31,21 @@ class Done(NamedTuple):
 
 
 class JudgedChunk(NamedTuple):
-    """Runs of a chunk, and its loops judged."""
+    """Runs of a chunk, and the judgement of its loops."""
 
     result: Result
     margins: LoopMargins
 
 
 class Started(NamedTuple):
-    """A chunk on its way; as `Running`, with the judgement of its loops."""
+    """A running chunk; as `Running`, with the judgement of its loops."""
 
     wait: Callable[[], JudgedChunk]
     cancel: Callable[[], None]
 
 
 class Lost(NamedTuple):
-    """A chunk that is given up."""
+    """A chunk that was given up."""
 
     chunk: Chunk
     reason: str
@@ -61,13 +61,13 @@ class Runner(Protocol):
     def run(
         self, table: CaseTable, groups: list[Group], reporter: Reporter, stop: threading.Event
     ) -> Generator[Done | Lost]:
-        """Run all chunks; closed early, it leaves none behind.
+        """Run all chunks; if closed early, it leaves none running.
 
         Args:
             table: all cases.
             groups: those to run.
             reporter: told of compilations.
-            stop: once it is set no more chunks are begun.
+            stop: once set, no further chunks are started.
         """
         ...
 
@@ -91,14 +91,14 @@ class Here:
                 started = start_chunk(executor, table, chunk.rows, cases, has_own)
                 if is_first:
                     reporter.compiled(executor.name, executor.compile_time)
-                # the device computes this chunk while the one before is written
+                # the device computes this chunk while the previous one is written
                 if pending is not None:
                     yield _waited(group, *pending)
                 pending = chunk, started
                 if stop.is_set():
                     break
             if pending is not None:
-                if stop.is_set() and reporter.n_run:  # the one before is safe, this one just begun
+                if stop.is_set() and reporter.n_run:  # the previous is safe, this one just begun
                     pending[1].cancel()
                     return
                 yield _waited(group, *pending)
@@ -120,7 +120,7 @@ def start_chunk(
 ) -> Started:
     """Judge the loops of a chunk and start its runs.
 
-    Where gain ratios come from an uncontrolled pass, that is done first.
+    If gain ratios come from an uncontrolled pass, that pass runs first.
 
     Args:
         executor: of the group.

@@ -1,4 +1,4 @@
-"""What the files of a sweep hold: names, axes, units and texts of their variables."""
+"""Contents of a sweep's files: names, axes, units and descriptions of their variables."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from studies.study.labels import DISTANCE_TEXT, STATUS_LABEL
 from studies.study.margin import HIGHEST, MARGIN_MODES
 from studies.study.paths import field_unit, field_value, parse_entry
 
-#: Status of a case that has not been run.
+#: Status of a case that has not run.
 NOT_RUN = -1
 
 
@@ -38,7 +38,7 @@ _LIST_AXES = {
 }
 
 
-#: What every case has, finished or not: axes after `case`, unit, long name and any flags.
+#: Variables of every case, finished or not: axes after `case`, unit, long name and any flags.
 PER_CASE: dict[str, tuple[Any, ...]] = {
     "status": ((), *STATUS_LABEL[:2], {NOT_RUN: "not run", **STATUS_LABEL[2]}),
     "bad_time": ((), "s", "when the status appeared, 0 if ok"),
@@ -62,15 +62,15 @@ PER_CASE: dict[str, tuple[Any, ...]] = {
     "damping_ratio": (
         ("controlled_mode",),
         "1",
-        "least of the modes of each order, of as many as links are "
-        "controlled, the most damped ones",
+        "least damping ratio of the modes of each order, among the most damped "
+        "ones, one per controlled link",
     ),
 }
 
 
-#: Of these the smallest entry is the worst.
+#: For these, the smallest entry is the worst.
 LEAST = ("damping_ratio",)
-#: Of these the largest value is the best one.
+#: For these, the largest value is the best.
 WANTED_LARGE = ("gain_margin", "damping_ratio", "singularity_distance")
 
 
@@ -89,7 +89,7 @@ def variable_name(field: str) -> str:
 
 
 def case_variables(table: CaseTable) -> dict[str, Variable]:
-    """What tells the cases apart: number, id, seed, repeat and every column."""
+    """What distinguishes the cases: number, id, seed, repeat and every column."""
     axis = ("case",)
     variables = {
         "case": Variable(np.arange(len(table)), axis, "1", "number of the case"),

@@ -1,4 +1,4 @@
-"""What a real-time controller needs of a study: fixed numbers, or why there are none."""
+"""What a real-time controller needs from a study: fixed numbers, or why there are none."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def fixed_controller(study: Study) -> FixedController:
     """Numbers of a study's controller.
 
     Args:
-        study: with sampled feedback; ratios from an own run are worked out here.
+        study: with sampled feedback; ratios from its own run are computed here.
 
     Raises:
         StudyError: nothing to export, or the study cannot run.
@@ -103,7 +103,7 @@ def _frequencies(structure: Structure, case: Case) -> np.ndarray:
 
 
 def _merged(taps: Taps) -> Taps:
-    """One tap for each delay, none without weight."""
+    """One tap per delay, none without weight."""
     weight, sample = (np.asarray(x) for x in taps)
     delays = np.unique(sample[weight != 0])
     return Taps(np.array([weight[sample == delay].sum() for delay in delays]), delays.astype(int))

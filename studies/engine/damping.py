@@ -1,6 +1,6 @@
-"""Damping ratios of the controlled modes of every case, from poles followed as gains rise.
+"""Damping ratios of the controlled modes of every case, from poles traced as gains rise.
 
-`jaxmodel.pole_paths` says how; poles that do not come to rest are followed again in finer steps.
+See `jaxmodel.pole_paths`; poles that do not converge are traced again in finer steps.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from jaxmodel.pole_paths import Trio, follow, settle
 from jaxmodel.return_difference import AssembledModes, LoopResponse
 from studies.engine.lanes import run_steps
 
-#: Iterations towards the poles without control.
+#: Iterations to find the poles without control.
 SETTLING = 6
-#: Shares of the gains on the way to all of them, an iteration each; the second way is for poles
-#: that did not come to rest on the first.
+#: Gain factors on the way to 1, one iteration each; the second path is for poles that did not
+#: converge on the first.
 WAYS = (
     np.concatenate([np.arange(1, 17) / 16, np.ones(6)]),
     np.concatenate([np.repeat(np.arange(1, 61) / 60, 2), np.ones(10)]),
 )
-#: A last step, as a share of the pole, that counts as none.
+#: A last step, as a share of the pole, that counts as converged.
 AT_REST = 1e-4
-#: Poles begin this far from one another and from poles of the function [1].
+#: Initial distance of poles from one another and from poles of the function [1].
 ASIDE = 1e-4
 
 
@@ -34,14 +34,14 @@ def damping_ratios(
 ) -> np.ndarray:
     """Least damping ratio of the controlled modes of each order [1], (n, n_orders).
 
-    Of the three modes of an order as many count as links are controlled, the most damped ones. NaN
-    where no link is controlled, or the poles were not found.
+    Of the three modes of an order, only the most damped count, as many as there are controlled
+    links. NaN if no link is controlled, or the poles were not found.
 
     Args:
         response: of the loops, lanes last.
         modes: of the machines without control, lanes last.
         n_links: controlled ones of each case, (n,).
-        n_orders: of modes to look at.
+        n_orders: number of mode orders.
     """
     count = len(n_links)
     found = np.full((count, n_orders), np.nan)
@@ -52,7 +52,7 @@ def damping_ratios(
 
 
 def least_controlled(ratio: np.ndarray, n_links: np.ndarray) -> np.ndarray:
-    """Least damping ratio of as many modes as links are controlled, the most damped ones [1], (n,).
+    """Least damping ratio of the most damped modes, one per controlled link [1], (n,).
 
     Args:
         ratio: of the three modes of an order [1], (3, n).
@@ -87,7 +87,7 @@ def _followed(response: LoopResponse, own: Pair, way: np.ndarray) -> tuple[np.nd
 
 
 def _trio(poles: np.ndarray, period: np.ndarray) -> Trio:
-    """Guesses a little apart."""
+    """Initial guesses, slightly apart."""
     poles = poles + ASIDE * np.abs(poles) * np.exp(1j * np.array([0.3, 2.4, 4.4]))[:, None]
     return Trio(_pair(poles), _pair(np.exp(-poles * period)), np.zeros(poles.shape))
 

@@ -1,4 +1,4 @@
-"""A DESIGN: a study file, a family of a tuning or a case of a sweep; each ends in one study."""
+"""A DESIGN: a study file, a family of a tuning or a case of a sweep; each yields one study."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Design(NamedTuple):
     """One study and, for a case of a sweep, what the sweep found."""
 
     study: Study
-    stored: dict[str, np.ndarray]  # metrics and status of the sweep; {} where there is none
+    stored: dict[str, np.ndarray]  # metrics and status of the sweep; {} if there is none
     case_id: str = ""  # of the case in its sweep
 
 
@@ -32,9 +32,9 @@ def load_design(path: str | Path, case: int | str | None = None) -> Design:
     """Read a DESIGN.
 
     Args:
-        path: study file, name of a ready one, folder of a tuning or of a sweep.
-        case: of a sweep the number of the case, or "id:" and the first digits of its id; of a
-            tuning the family, as in the names of its files.
+        path: study file, name of a ready-made one, folder of a tuning or of a sweep.
+        case: for a sweep, the number of the case, or "id:" and the first digits of its id; for a
+            tuning, the family, as in the names of its files.
 
     Raises:
         StudyError: not found, case missing or not allowed, or a case that does not stand alone.
@@ -42,7 +42,7 @@ def load_design(path: str | Path, case: int | str | None = None) -> Design:
     path = Path(path)
     is_folder = path.is_dir()
     if is_folder and not any((path / name).is_file() for name in (MANIFEST, TUNING)):
-        is_folder = find_spec(path) == path  # "paper" may be the report's folder, too
+        is_folder = find_spec(path) == path  # "paper" can also be the report's folder
     if not is_folder:
         path = find_spec(path)
         if case is not None:
@@ -71,7 +71,7 @@ def load_design(path: str | Path, case: int | str | None = None) -> Design:
 
 
 def _tuned(path: Path, case: str | int | None) -> Path:
-    """File of the tuned study that is meant."""
+    """File of the requested tuned study."""
     files = {file.stem.removeprefix("tuned").lstrip("_"): file for file in path.glob("tuned*.toml")}
     if not files:
         raise StudyError(f"{path}: the tuning is not finished; go on with studies tune --resume")
@@ -86,7 +86,7 @@ def _tuned(path: Path, case: str | int | None) -> Path:
 
 
 def _number(data: SweepData, case: str | None, path: Path) -> int:
-    """Number of the case that is meant."""
+    """Number of the requested case."""
     known = (
         f"allowed: 0 to {data.n_cases - 1}, the cases of {path}, or id: and the first digits of a "
         "case's id"
@@ -113,7 +113,7 @@ def deviation(run: Run, stored: dict[str, np.ndarray]) -> tuple[float, str]:
         stored: metrics of the same case; NaN where a mode does not exist.
 
     Returns:
-        (difference [1], name of the metric); (0, "") where there is nothing to compare.
+        (difference [1], name of the metric); (0, "") if there is nothing to compare.
     """
     found = {name: variable.data for name, variable in metric_variables(run.result).items()}
     worst = (0.0, "")

@@ -1,10 +1,10 @@
 """Executors: how the cases of a chunk are run. All call the same physics.
 
 - `kernels.KernelExecutor`: the traced kernel on all cores; needs the extra `fast`.
-- `kernels.GpuExecutor`: the same on Nvidia's graphics processors.
+- `kernels.GpuExecutor`: the same on Nvidia GPUs.
 - `scan.ScanExecutor`: `lax.scan` compiled by XLA; everywhere, and the reference.
 
-`make_executor` takes the fastest one that can do the job.
+`make_executor` selects the fastest one that can do the job.
 """
 
 from __future__ import annotations

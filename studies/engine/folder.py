@@ -1,9 +1,9 @@
-"""The folder of a sweep: every finished chunk survives whatever ends the run.
+"""The folder of a sweep: every finished chunk survives however the run ends.
 
-`sweep.json` says what is being run and by which code; each chunk is one file in `chunks/`, whose
-name holds the hash of its bytes, so that a half-written or damaged one is recognised; at the end
-`results.h5`, whose hash is in `sweep.json`, joins them and they go. A lock keeps a second process
-out.
+`sweep.json` records what is run and by which code. Each chunk is one file in `chunks/`, whose name
+contains the hash of its bytes, so that half-written or damaged files are detected. At the end,
+`results.h5`, whose hash is in `sweep.json`, joins them and they are deleted. A lock keeps a second
+process out.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from studies.errors import StudyError
 from studies.store import Variable, replacing, write_store
 
 RESULTS, MANIFEST, CHUNKS, LOCK = "results.h5", "sweep.json", "chunks", ".lock"
-#: Where the manifest lists chunks that were given up.
+#: Key in the manifest that lists chunks that were given up.
 GIVEN_UP = "given_up"
-#: What a tuning has in its folder instead.
+#: The corresponding file in a tuning's folder.
 TUNING = "tune.json"
-#: The results before they get their name.
+#: Temporary name of the results.
 JOINED = ".joined.h5"
-#: What an end at a bad moment may leave behind.
+#: What an interrupted run can leave behind.
 _LEFTOVER = re.compile(r"\.joined\.h5|\.(joined\.h5|sweep\.json)\.[0-9a-f]{8}\.tmp")
 _CHUNK = re.compile(r"(\d{6,})-([0-9a-f]{16})\.h5")
 _SOURCES = Path(__file__).parents[2]
@@ -49,7 +49,7 @@ class Finished(NamedTuple):
 
 
 class SweepFolder:
-    """One folder, open for writing by this process alone. Make it with `open_folder`."""
+    """One folder, open for writing by this process only. Create it with `open_folder`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -63,10 +63,10 @@ class SweepFolder:
         return self.path / CHUNKS
 
     def write_chunk(self, variables: Mapping[str, Variable]) -> None:
-        """Keep a finished chunk: write beside, flush, rename.
+        """Save a finished chunk: write to a temporary file, flush, rename.
 
         Raises:
-            StudyError: the disk is full or cannot be written to; nothing half-written stays.
+            StudyError: the disk is full or not writable; nothing half-written remains.
         """
         temporary = self.chunks / "unfinished.tmp"
         try:
@@ -81,12 +81,12 @@ class SweepFolder:
             temporary.unlink(missing_ok=True)
 
     def begin(self, manifest: dict[str, Any]) -> None:
-        """From here on the folder holds this sweep, or the one that was there extended to it."""
+        """From now on the folder holds this sweep, or the previous one extended to it."""
         old = read_manifest(self.path) if (self.path / MANIFEST).is_file() else {}
         self._write_manifest({**manifest, "results": old.get("results", [])})
 
     def give_up(self, rows: np.ndarray, reason: str) -> None:
-        """Write down that cases are left out, until a resumed sweep tries them again.
+        """Record that cases are left out, until a resumed sweep retries them.
 
         Args:
             rows: numbers of the cases, (k,).
@@ -97,11 +97,11 @@ class SweepFolder:
         self._write_manifest({**manifest, GIVEN_UP: [*manifest.get(GIVEN_UP, []), entry]})
 
     def publish(self) -> None:
-        """Give the joined file its name; chunks that it holds go."""
+        """Rename the joined file to its final name; delete the chunks it contains."""
         joined = self.path / JOINED
         manifest = read_manifest(self.path)
         try:
-            # both files are good until the new one is in place
+            # both files are valid until the new one is in place
             old = [file_hash(self.results)] if self.results.is_file() else []
             manifest["results"] = [*old, file_hash(joined)]
             self._write_manifest(manifest)
@@ -126,15 +126,15 @@ class SweepFolder:
 
 @contextmanager
 def open_folder(path: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterator[SweepFolder]:
-    """Open a sweep's folder, made where it is missing, and lock it.
+    """Open a sweep's folder, creating it if necessary, and lock it.
 
     Args:
         path: the folder.
         manifest: from `make_manifest`.
-        is_resumed: go on with what is there.
+        is_resumed: continue the existing sweep.
 
     Raises:
-        StudyError: not writable, in use, holds something else, or a sweep that does not fit.
+        StudyError: not writable, in use, holds something else, or a different sweep.
     """
     with locked_folder(path, "sweep"):
         folder = SweepFolder(path)
@@ -147,11 +147,11 @@ def open_folder(path: Path, manifest: dict[str, Any], is_resumed: bool) -> Itera
 
 @contextmanager
 def locked_folder(path: Path, what: str) -> Iterator[None]:
-    """Keep a folder, made where it is missing, to this process alone.
+    """Reserve a folder for this process, creating it if necessary.
 
     Args:
         path: the folder.
-        what: is done there, for messages.
+        what: what is done there, for messages.
 
     Raises:
         StudyError: not writable or in use.
@@ -171,16 +171,16 @@ def locked_folder(path: Path, what: str) -> Iterator[None]:
         yield
 
 
-#: Modules that decide the numbers of a sweep, with all that they import.
+#: Modules that determine the numbers of a sweep, with everything they import.
 DECISIVE = ("studies.engine.chunks", "studies.space.table")
 
 
 def make_manifest(data: dict[str, Any], modules: Iterable[str] = DECISIVE) -> dict[str, Any]:
-    """What decides a sweep's numbers, and what ran it.
+    """What determines a sweep's numbers, and what ran it.
 
     Args:
         data: the sweep file as read.
-        modules: what decides them, with all that they import.
+        modules: those that determine them, with everything they import.
     """
     return {
         "spec": data,
@@ -215,7 +215,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
 
 
 def refuse_others(path: Path, leftover: re.Pattern[str]) -> None:
-    """Raise StudyError where a new folder holds anything but its lock and leftovers of a kill."""
+    """Raise StudyError if a new folder holds anything but its lock and leftovers of a kill."""
     names = [found.name for found in path.iterdir() if found.name != LOCK]
     others = sorted(name for name in names if not leftover.fullmatch(name))
     if others:
@@ -225,7 +225,7 @@ def refuse_others(path: Path, leftover: re.Pattern[str]) -> None:
 
 
 def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bool) -> None:
-    """Refuse a folder of something else, a sweep already there, other code, other precision."""
+    """Reject a folder of something else, an existing sweep, other code, other precision."""
     if not (folder.path / MANIFEST).exists():
         if is_resumed:
             raise StudyError(f"--resume: {folder.path} holds no sweep; leave --resume out")
@@ -256,11 +256,11 @@ def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bo
 
 
 def finished_cases(path: Path, tell: Any = None) -> Finished:
-    """Cases that are done, each once; damaged chunks are set aside and told about.
+    """Finished cases, each once; damaged chunks are set aside and reported.
 
     Args:
         path: the sweep's folder.
-        tell: called with a text for every damaged file; None: leave it where it is.
+        tell: called with a message for every damaged file; None: leave it in place.
     """
     check_results(path)
     files = [path / RESULTS] if (path / RESULTS).is_file() else []
@@ -294,7 +294,7 @@ def finished_cases(path: Path, tell: Any = None) -> Finished:
 
 
 def check_results(path: Path) -> None:
-    """Raise StudyError where `results.h5` is not what this sweep wrote."""
+    """Raise StudyError if `results.h5` is not the file this sweep wrote."""
     results = path / RESULTS
     if results.is_file() and file_hash(results) not in read_manifest(path).get("results", []):
         raise StudyError(
@@ -304,7 +304,7 @@ def check_results(path: Path) -> None:
 
 
 def ranges(numbers: np.ndarray) -> str:
-    """Numbers, rising, in short: "3, 8-11"."""
+    """Ascending numbers in short form: "3, 8-11"."""
     parts = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
     return ", ".join(str(p[0]) if len(p) == 1 else f"{p[0]}-{p[-1]}" for p in parts if len(p))
 

@@ -1,4 +1,4 @@
-"""What all runs of one machine share: the controller's modes, the ADC's step in them."""
+"""What all runs of one machine share: the controller's modes and the ADC step in them."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
 """Metrics of a chunk and their derivatives by parameters of each case.
 
-Forward mode: the state's tangents go through the steps beside it, so all metrics are differentiated
-in one pass, no step is stored, and the kernel of `studies.kernels` can do it.
+Forward mode: tangents are carried along with the state, so all metrics are differentiated in one
+pass, no step is stored, and the kernel of `studies.kernels` can do it.
 
 - `KernelGradients`: the traced kernel, `DIRECTIONS` tangents at once.
 - `ScanGradients`: `jax.jvp` of the reference; everywhere.
 - `reverse_gradients`: one number's gradient by reverse mode, whose cost does not grow with the
-  parameters; `is_forward_cheaper` says from where it pays (docs/performance.md).
+  parameters; `is_forward_cheaper` says when it pays off (docs/performance.md).
 """
 
 from __future__ import annotations
@@ -41,18 +41,18 @@ from studies.engine.program import (
 )
 from studies.engine.steps import Ready, Steps, compile_steps, fits_kernel, start_block
 
-#: Tangents that one pass of the kernel carries. More share the state's own arithmetic among more
-#: (1: 31 gradients/s by 9 numbers on a core, 3: 49) but take longer to compile (3 s, 5 s).
+#: Tangents per pass of the kernel. More of them share the state's own arithmetic (1: 31 gradients/s
+#: by 9 numbers on a core, 3: 49) but take longer to compile (3 s, 5 s).
 DIRECTIONS = 3
-#: Parameters from which reverse mode costs less than forward mode, by executor.
+#: Number of parameters from which reverse mode costs less than forward mode, by executor.
 REVERSE_FROM = {"traced kernel": 48, "XLA scan": 3}
 
 
 class ChunkSlopes(NamedTuple):
-    """A chunk and how it changes; NumPy arrays."""
+    """A chunk and its derivatives; NumPy arrays."""
 
     result: Result  # cases first
-    metrics: Metrics  # derivatives, (cases, p, ...); 0 where a run did not finish
+    metrics: Metrics  # derivatives, (cases, p, ...); 0 if a run did not finish
 
 
 class Gradients(Protocol):
@@ -67,9 +67,9 @@ class Gradients(Protocol):
         """Run a chunk.
 
         Args:
-            cases: `layout.size` of them; what the parameters set is overwritten.
+            cases: `layout.size` of them; fields set by the parameters are overwritten.
             parameters: (layout.size, p).
-            is_used: derivatives that are wanted; others may be anything, (layout.size, p).
+            is_used: requested derivatives; others can be anything, (layout.size, p).
         """
         ...
 
@@ -88,11 +88,11 @@ def make_gradients(structure: Structure, layout: Layout, place: Place) -> Gradie
 
 
 def is_forward_cheaper(n_parameters: int, executor: str) -> bool:
-    """Whether forward mode gives one number's gradient at less cost than reverse mode.
+    """Whether forward mode computes one number's gradient faster than reverse mode.
 
     Args:
         n_parameters: p.
-        executor: name of the one that would do it forward.
+        executor: name of the forward-mode executor.
     """
     return n_parameters < REVERSE_FROM[executor]
 
@@ -188,7 +188,7 @@ def _pass(
 
 
 class _Tangent:
-    """Tangents of a leaf, or None: a leaf of a tree even where it is None."""
+    """Tangents of a leaf, or None: a leaf of a tree even if it is None."""
 
     def __init__(self, array: Any) -> None:
         self.array = None if array is None else np.asarray(array, order="C")
@@ -209,7 +209,7 @@ def _moving(tree: Any) -> list[np.ndarray]:
 
 
 def _by_sample(tree: Any) -> list[np.ndarray]:
-    """The same for inputs, of which the kernel reads a row at each sample."""
+    """The same for inputs, of which the kernel reads one row per sample."""
     return [np.asarray(x.swapaxes(0, 1), order="C") for x in _moving(tree)]
 
 
@@ -246,7 +246,7 @@ def _forward(
 
 
 class ScanGradients:
-    """Forward mode through the reference, blocks of lanes one after the other."""
+    """Forward mode through the reference, one block of lanes after another."""
 
     name = "XLA scan"
 

@@ -1,4 +1,4 @@
-"""Executors by traced kernels: XLA prepares and judges the cases, the kernel steps them."""
+"""Executors with traced kernels: XLA prepares and judges the cases, the kernel steps them."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class KernelExecutor:
 def _step_block(
     program: Program, steps: Steps, varying: list[np.ndarray], shared: list[np.ndarray]
 ) -> Start:
-    """A Start whose state is that after the last step; state and outline lanes last."""
+    """A Start with the state after the last step; state and outline lanes last."""
     ready = start_block(program, steps, varying, shared)
     code = ready.state.status.copy()
     leaves = [*ready.loop, *ready.inputs, *jax.tree.leaves(ready.state)]
@@ -88,17 +88,17 @@ def _concluded(running: list[Future[Any]]) -> Result:
     return jax.tree.map(np.asarray, conclude_all(whole.outline, whole.inputs, whole.state))
 
 
-# --- graphics processors --------------------------------------------------------------------------
+# --- GPUs ----------------------------------------------------------------------------------------
 
-#: Largest difference to this machine's own processor, as a share of the largest value.
+#: Largest difference from the CPU, as a share of the largest value.
 TOLERANCE = {8: 1e-6, 4: 1e-2}
 
 
 class GpuExecutor:
-    """Blocks of lanes on graphics processors, each case a thread.
+    """Blocks of lanes on GPUs, one thread per case.
 
-    The first cases of the first chunk are run on the CPU too; if they differ, or the kernel cannot
-    be used, XLA's scan does the work and `name` says why.
+    The first cases of the first chunk also run on the CPU; if they differ, or the kernel cannot be
+    used, XLA's scan does the work and `name` says why.
     """
 
     name = "GPU kernel"
@@ -133,7 +133,7 @@ class GpuExecutor:
         return Running(lambda: _gathered(launched), lambda: None)
 
     def _build(self, program: Program, split: Split, block: list[Any]) -> str:
-        """Make the program; what is wrong with it, or "" if nothing is."""
+        """Build the program; returns what is wrong with it, "" if nothing."""
         try:
             traced = trace_steps(program, split)
             if traced.loop.operations()["tanh"]:
@@ -142,7 +142,7 @@ class GpuExecutor:
             self._run = jax.jit(partial(_run_block, program, traced.parts, kernel))
             first = self._run(block, split.shared)
             jax.block_until_ready(first)
-        except RuntimeError as error:  # of JAX, LLVM or the tracer
+        except RuntimeError as error:  # from JAX, LLVM or the tracer
             return f"failed: {str(error).splitlines()[0]}"
         difference = _difference(traced, first, program.structure.n_steps)
         if difference > TOLERANCE[traced.loop.dtype.itemsize]:
@@ -151,7 +151,7 @@ class GpuExecutor:
 
 
 class CaseBlock(NamedTuple):
-    """A block of cases after its last sample, and what a few of them began with."""
+    """A block of cases after its last sample, and the initial values of a few of them."""
 
     result: Result
     given: list[Any]  # leaves as the kernel reads them, the first lanes
@@ -178,7 +178,7 @@ def _run_block(
 
 
 def _difference(traced: Traced, block: CaseBlock, n_steps: int) -> float:
-    """Largest difference of a block's first cases to the CPU, as a share of the largest value."""
+    """Largest difference of a block's first cases from the CPU, as a share of the largest value."""
     given = [np.array(x, order="C") for x in block.given]
     cpu.build_kernel(traced.loop).run(given, n_steps, block.last[0].shape[-1])
     worst = 0.0

@@ -1,4 +1,4 @@
-"""Elementwise steps over lanes, as traced kernels where there are any, else in XLA's scan."""
+"""Elementwise steps over lanes, as traced kernels if available, otherwise in XLA's scan."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ BLOCK = 64
 def run_steps(
     step: Callable[..., Any], constants: Any, inputs: Any, state: Any, n_steps: int
 ) -> Any:
-    """Take all steps; arrays lanes last, those of inputs with the steps first.
+    """Run all steps; arrays have lanes last, inputs also have steps first.
 
     Args:
-        step: of (constants, inputs of one step, state) to state; a function of a module.
+        step: maps (constants, inputs of one step, state) to state; a module-level function.
         constants: what no step changes.
-        inputs: of each step; those that are the same for all lanes have one axis.
+        inputs: of each step; those shared by all lanes have one axis.
         state: before the first step.
         n_steps: how many.
 
@@ -48,7 +48,7 @@ def run_steps(
             varies,
             tuple(leaf.shape[:-1] for leaf in parts[2][0]),
         )
-    # whole vectors; whole blocks for XLA, which compiles for each size
+    # whole vectors; whole blocks for XLA, which compiles each size separately
     more = -lanes % (lane_unit() if _has_kernels() else BLOCK)
 
     def filled(x: Any, is_wide: bool = True) -> np.ndarray:
@@ -66,7 +66,7 @@ def run_steps(
     return jax.tree.unflatten(parts[2][1], [x[..., :lanes] for x in last])
 
 
-#: One thread makes a kernel, others wait for it.
+#: One thread builds a kernel, others wait for it.
 _TRACING = Lock()
 
 

@@ -1,9 +1,9 @@
 """Stability of every case of a chunk: gain margin, what breaks beyond it, and damping.
 
-`jaxmodel.loci` says how. The steps run as traced kernels where there are any, else in XLA's scan:
-along the axis first; then between the two frequencies of each crossing, with more iterations; then
-by Newton's iteration, once more with what was found divided out, since links that are alike have
-crossings side by side. Rests on `MARGIN_MODES` plant modes, at rest at the first way-point.
+See `jaxmodel.loci`. The steps run as traced kernels if available, otherwise in XLA's scan: first
+along the axis; then between the two frequencies of each crossing, with more iterations; then by
+Newton's iteration, repeated with the found points divided out, since similar links have crossings
+close together. Uses `MARGIN_MODES` plant modes, at rest at the first way-point.
 """
 
 from __future__ import annotations
@@ -51,36 +51,36 @@ class Walk(NamedTuple):
     """Frequencies of a walk along the axis."""
 
     background: int  # between `LOWEST_HZ` and half the sample rate
-    beside: tuple[float, ...]  # beside each mode of the machine, multiples of its zeta omega
-    repeats: int  # iterations' turns at each
+    beside: tuple[float, ...]  # next to each mode of the machine, multiples of its zeta omega
+    repeats: int  # iterations at each
 
 
-#: The walk, and the one of cases in which it saw what is not there.
+#: The walk, and a finer one for cases in which it saw spurious crossings.
 WALKS = (
     Walk(160, (-9.0, -4.5, -2.2, -1.0, -0.3, 0.3, 1.0, 2.2, 4.5, 9.0), 1),
     Walk(400, tuple(np.tan(np.linspace(-1.5, 1.5, 24)).tolist()), 3),
 )
 LOWEST_HZ = 5.0
-#: Stands for 0 [rad/s], where the hold would be 0/0.
+#: Replaces 0 [rad/s], where the hold would be 0/0.
 STILL = 0.01
-#: Peaks of links damped less [1] are too sharp for a walk: those loops are judged by eigenvalues.
+#: Links with less damping [1] have peaks too sharp for a walk; eigenvalues judge their loops.
 LEAST_DAMPED = 3e-5
-#: What keeps eigenvalues of idle channels apart, on the way and in the second look.
+#: Separates the eigenvalues of idle channels, on the walk and in the second look.
 SPREAD, FINE_SPREAD = 1e-3, 1e-6
-#: Crossings looked at again per case, and kept of each place looked at.
+#: Crossings examined again per case, and kept per examined place.
 CHOSEN, KEPT = 4, 2
-#: The walk starts from small numbers, so stronger loops are looked at with weaker gains [1].
+#: The walk starts from small numbers, so stronger loops are examined with weaker gains [1].
 STRONG = 30.0
-#: Steps of Newton's iteration, and the last one that counts as none.
+#: Steps of Newton's iteration, and the last step that counts as converged.
 NEWTON, CONVERGED = 10, 1e-3
-#: Where to start for crossings beside the rightmost that was found, as multiples of it.
+#: Starting points for crossings near the rightmost one found, as multiples of it.
 AGAIN = (1.02, 1.1, 1.005)
-#: A crossing seen from afar is looked at once more if nothing is found within this factor of it.
+#: A crossing seen on the walk is examined once more if nothing is found within this factor of it.
 NEAR = 1.2
 
 
 class Look(NamedTuple):
-    """How the neighbourhood of a crossing is looked at."""
+    """How the neighbourhood of a crossing is examined."""
 
     wider: float  # beyond the two frequencies on either side of it, as a share of their distance
     frequencies: int
@@ -92,13 +92,13 @@ LOOK = Look(0.3, 10, 3, 24)
 
 
 class LoopMargins(NamedTuple):
-    """Of each case, (n,); NaN where there is no sampled loop."""
+    """Margins of each case, (n,); NaN without a sampled loop."""
 
     gain_margin: np.ndarray  # largest factor on all gains with every smaller one stable [1]
-    breaking_frequency: np.ndarray  # of what goes unstable there [Hz], NaN where nothing does
-    # order of the nearest link mode, 0: the drive; NaN as before, and for the static stiffness
+    breaking_frequency: np.ndarray  # of what goes unstable there [Hz], NaN if nothing does
+    # order of the nearest link mode, 0: the drive; NaN as above, and for the static stiffness
     breaking_mode: np.ndarray
-    damping_ratio: np.ndarray  # of the modes of each order under control, the least [1], (n, C)
+    damping_ratio: np.ndarray  # least of the controlled modes of each order [1], (n, C)
 
 
 def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
@@ -115,14 +115,14 @@ def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
         return _judge_one_by_one(structure, cases)
     structure, cases = with_margin_modes(structure, cases)
     whole = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
-    # idle links cost nothing; one number for all cases, since each has programs of its own
+    # idle links cost nothing; one number for all cases, since each number has its own programs
     most = max(1, int(np.sum(whole.control.link_mask > 0, axis=1).max()))
     threads = len(jax.local_devices())
     figures = _nothing(count, structure)
     with ThreadPoolExecutor(threads) as pool:
 
         def judge(rows: np.ndarray, way: Walk) -> np.ndarray:
-            """Write the figures of these cases; which of them are doubtful."""
+            """Write the figures of these cases; returns the doubtful ones."""
             share = min(BLOCK, -(-len(rows) // threads))
             parts = [rows[k : k + share] for k in range(0, len(rows), share)]
             found = list(pool.map(partial(_judge_block, structure, way, most, whole), parts))
@@ -144,14 +144,14 @@ def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
 
 
 def _least_damping(structure: Structure, cases: Case) -> np.ndarray:
-    """Smallest damping ratio of a link's modes, as far as they are given [1], (n,)."""
+    """Smallest given damping ratio of a link's modes [1], (n,)."""
     damping = cases.machine.damping
     falling = np.minimum(np.asarray(damping.exponent), 0.0)
     return np.min(damping.ratio, axis=(1, 2)) * float(structure.n_modes) ** (2 * falling)
 
 
 def _judge_by_eigenvalues(structure: Structure, case: Case, figures: LoopMargins, k: int) -> None:
-    """Write the figures of one case, but for what breaks; half a second."""
+    """Write the figures of one case, except what breaks; takes half a second."""
     try:
         found = loop_report(structure, case, case.path.waypoints[0], structure.n_controlled)
     except np.linalg.LinAlgError:  # not finite
@@ -164,7 +164,7 @@ def _judge_by_eigenvalues(structure: Structure, case: Case, figures: LoopMargins
 
 
 def _judge_one_by_one(structure: Structure, cases: Case) -> LoopMargins:
-    """Worst figures of loops whose controlled modes act one at a time, each by itself."""
+    """Worst figures of loops whose controlled modes act one at a time, each judged alone."""
     alone = structure._replace(law=IMSC.name)
     parts = []
     for j in range(structure.n_controlled):
@@ -192,7 +192,7 @@ def _nothing(count: int, structure: Structure) -> LoopMargins:
 
 
 class Crossings(NamedTuple):
-    """Where eigenvalues may be real and positive, (k,) each."""
+    """Where eigenvalues can be real and positive, (k,) each."""
 
     case: np.ndarray  # number in the block
     value: np.ndarray  # eigenvalue [1]
@@ -202,7 +202,7 @@ class Crossings(NamedTuple):
 def _judge_block(
     structure: Structure, way: Walk, most: int, cases: Case, rows: np.ndarray
 ) -> tuple[LoopMargins, np.ndarray]:
-    """Figures of some cases, at most a block, and of which the walk saw what is not there."""
+    """Figures of some cases, at most a block, and which of them had spurious crossings."""
     mask = cases.control.link_mask[rows].T
     n_links = np.sum(mask > 0, axis=0)
     filled = rows[np.minimum(np.arange(BLOCK), len(rows) - 1)]  # one size, one compilation
@@ -211,12 +211,12 @@ def _judge_block(
         found = jax.tree.map(np.asarray, _respond(structure, block))
     response, modes, strength = jax.tree.map(lambda x: x[..., : len(rows)], found)
     response = controlled_first(response, mask, most)
-    with np.errstate(all="ignore"):  # what is not finite finds no crossing
+    with np.errstate(all="ignore"):  # non-finite values find no crossing
         ratio = damping_ratios(response, modes, n_links, structure.n_controlled)
         return _judged(response, modes, np.maximum(strength / STRONG, 1.0), way, ratio)
 
 
-# compiled in haste: it takes a fiftieth of the time
+# compiled without optimisation: it takes a fiftieth of the time
 @partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
 def _respond(structure: Structure, cases: Case) -> tuple[LoopResponse, AssembledModes, Any]:
     """The loops, their modes and their strength, lanes last."""
@@ -236,7 +236,7 @@ def _judged(
     way: Walk,
     ratio: np.ndarray,
 ) -> tuple[LoopMargins, np.ndarray]:
-    """Figures of loops, looked at with gains `weaker` by these factors, (lanes,)."""
+    """Figures of loops, examined with gains `weaker` by these factors, (lanes,)."""
     count, top = len(response.period), np.pi / response.period
     response = _with_gains(response, 1 / weaker)
     least = np.maximum(1 / (HIGHEST * weaker), SPREAD)
@@ -253,7 +253,7 @@ def _judged(
     met = jax.tree.map(lambda x: x[best[found]], met)
     here = jax.tree.map(lambda x: x[..., found], response)
     for start_at in AGAIN if len(found) else ():
-        # once more, a little to the right, without what was found
+        # once more, slightly to the right, with the found points divided out
         again = Crossings(np.arange(len(found)), met.value * start_at, met.omega)
         other, is_other = _meet(here, again, _known(len(found), met))
         is_more = is_other & (other.value > met.value)
@@ -273,7 +273,7 @@ def _judged(
     )[0]
     leaves = jax.tree.leaves(response)
     is_finite = np.all([np.isfinite(x).reshape(-1, count).all(axis=0) for x in leaves], axis=0)
-    # static: no mode's frequency
+    # static: not a mode's frequency
     order = np.where(is_more & (omega == 0) & ~falls, np.nan, order)
     figures = LoopMargins(
         np.where(is_finite, margin, np.nan),
@@ -294,12 +294,12 @@ def _with_gains(response: LoopResponse, factor: np.ndarray) -> LoopResponse:
 
 
 def _folded(omega: np.ndarray, top: np.ndarray) -> np.ndarray:
-    """Where sampling shows frequencies, 0 to pi/T."""
+    """Frequencies after aliasing, 0 to pi/T."""
     return np.abs((omega + top) % (2 * top) - top)
 
 
 def stations(modes: AssembledModes, period: np.ndarray, way: Walk) -> np.ndarray:
-    """Frequencies to walk along, rising [rad/s], (F, lanes)."""
+    """Frequencies of the walk, rising [rad/s], (F, lanes)."""
     top = np.pi / period
     lowest = 2 * np.pi * LOWEST_HZ
     background = lowest * (top / lowest) ** np.linspace(0, 1, way.background)[:, None]
@@ -344,7 +344,7 @@ def _crossings(
 
 
 def _is_confirmed(seen: Crossings, found: Crossings) -> np.ndarray:
-    """Whether something near each crossing has been found, (k,)."""
+    """Whether anything was found near each crossing, (k,)."""
     order = np.argsort(found.case, kind="stable")
     begin, end = (np.searchsorted(found.case[order], seen.case, side) for side in ("left", "right"))
     width = int(np.max(end - begin, initial=0))
@@ -380,8 +380,8 @@ def _look_closer(
 def _at_the_ends(response: LoopResponse, least: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Largest eigenvalue above `least` at the ends of the axis, 0: none, and where [rad/s], (n,).
 
-    L is real there, so its curves end on the real axis without crossing it: feedback of positions
-    loses its static stiffness at 0, differences their sign at pi/T.
+    L is real there, so its curves end on the real axis without crossing it: position feedback loses
+    its static stiffness at 0, differences their sign at pi/T.
     """
     spread, top = _spread(response, FINE_SPREAD), np.pi / response.period
     ring = _ring(spread, np.ones_like(top))
@@ -397,7 +397,7 @@ def _at_the_ends(response: LoopResponse, least: np.ndarray) -> tuple[np.ndarray,
 
 
 def _ring(spread: np.ndarray, size: np.ndarray) -> Pair:
-    """First guesses at the eigenvalues of each lane, scattered up to its size [1]."""
+    """Initial guesses of each lane's eigenvalues, scattered up to its size [1]."""
     n = spread.shape[0] * spread.shape[1]
     k = np.arange(n)[:, None]
     ring = np.exp(2j * np.pi * (k + 0.3) / n) * (0.2 + 0.8 * ((4 * k) % n) / n) * size
@@ -405,7 +405,7 @@ def _ring(spread: np.ndarray, size: np.ndarray) -> Pair:
 
 
 def _spread(response: LoopResponse, size: float) -> np.ndarray:
-    """See `go_round`: up to `size`, another for each channel, (n, C, lanes)."""
+    """See `go_round`: up to `size`, different for each channel, (n, C, lanes)."""
     shape = response.velocity_gain.shape
     n = shape[0] * shape[1]
     return np.broadcast_to(size * (1 + np.arange(n).reshape(*shape[:2], 1)) / n, shape)
@@ -433,7 +433,7 @@ def _known(count: int, found: Meeting | None) -> FoundMeeting:
 def _meet(
     response: LoopResponse, start: Crossings, known: FoundMeeting
 ) -> tuple[Meeting, np.ndarray]:
-    """Newton's iteration from each crossing; where it ended, and whether it came to rest."""
+    """Newton's iteration from each crossing; where it ended, and whether it converged."""
     here = jax.tree.map(lambda x: x[..., start.case], response)
     known = jax.tree.map(lambda x: x[start.case], known)
     angle = start.omega * here.period
@@ -444,7 +444,7 @@ def _meet(
 
 
 def _rightmost(value: np.ndarray, is_met: np.ndarray, case: np.ndarray, count: int) -> np.ndarray:
-    """Number of the largest value of each case, -1 where it has none, (count,)."""
+    """Index of the largest value of each case, -1 if it has none, (count,)."""
     best = np.full(count, -1)
     for k in np.argsort(np.where(is_met, value, -np.inf)):
         if is_met[k]:

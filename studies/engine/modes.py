@@ -27,7 +27,7 @@ def modes_study(
     basis: str | None = None,
     n_modes: int | None = None,
 ) -> Study:
-    """The study whose linearisation is wanted; bad values are refused as in a study file."""
+    """The study to linearise; bad values are rejected as in a study file."""
     undamped = {"link": {"modes": 3, "damping_ratio": 0.0}, "drive": {"kd": 0.0}}
     data: dict[str, Any] = (
         undamped if study is None else study.model_dump(mode="json", exclude_unset=True)
@@ -54,9 +54,9 @@ def machine_modes(study: Study | None = None, **changes: Any) -> NaturalModes:
     """Natural modes of the machine held by its drive at a pose, under the study's steady load.
 
     Args:
-        study: whose machine and damping, at its first way-point; None: the paper's machine at home
-            with three modes a link, undamped.
-        changes: what is to differ, by the names of `modes_study`.
+        study: supplies machine and damping, at its first way-point; None: the paper's machine at
+            home with three modes per link, undamped.
+        changes: overrides, by the names of `modes_study`.
 
     Raises:
         StudyError: value out of range, pose out of reach or singular.
@@ -67,7 +67,7 @@ def machine_modes(study: Study | None = None, **changes: Any) -> NaturalModes:
     code, lifts, plant = _at_pose(structure, case, np.array(where))
     check_pose(study, "pose", where, int(code), np.asarray(lifts))
     found = natural_modes(plant)
-    if study.drive.locked:  # the three coordinates that the sliders hold are no modes
+    if study.drive.locked:  # the three coordinates held by the sliders are not modes
         found = NaturalModes(found.frequency[3:], found.damping_ratio[3:], found.shape[:, 3:])
     return found
 

@@ -1,4 +1,4 @@
-"""How a table of cases is run: grouped by program, cut into chunks of one size."""
+"""How a table of cases is run: grouped by program, split into chunks of equal size."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from studies.space.table import CaseTable, loose_study
 from studies.study.cases import build_cases, build_structure, in_working_precision
 from studies.study.fields import Fields
 
-#: Fields that change the program; each combination of their values is compiled by itself.
+#: Fields that change the program; each combination of their values is compiled separately.
 STATIC = (
     "run.model",
     "link.basis",
@@ -38,17 +38,17 @@ STATIC = (
 )
 _POSITION = "control.position_gain"
 _WRENCH = ("load.wrench", "load.pulse")
-#: More programs than this are refused.
+#: More programs than this are rejected.
 PROGRAM_LIMIT = 32
-#: Cases side by side on one device: enough to fill vectors, few enough to stay in its cache.
+#: Cases side by side on one device: enough to fill vectors, few enough to fit into its cache.
 LANES = 64
-#: On a graphics processor: enough for all its threads.
+#: On a GPU: enough for all its threads.
 GPU_LANES = 2**15
-#: Samples times cases in a chunk: a few seconds of work on two cores.
+#: Samples times cases per chunk: a few seconds of work on two cores.
 CHUNK_WORK = 2**22
 #: Most cases in a chunk.
 LARGEST_CHUNK = 8192
-#: Cases whose poles are looked at together.
+#: Cases whose poles are computed together.
 POLE_BATCH = 256
 
 
@@ -81,7 +81,7 @@ class Group(NamedTuple):
 
     structure: Structure
     rows: np.ndarray  # of the table, (m,)
-    is_too_stiff: np.ndarray  # drive or ideal feedback that no allowed step carries, (m,)
+    is_too_stiff: np.ndarray  # drive or ideal feedback too stiff for any allowed step, (m,)
     layout: Layout
 
     def chunks(self) -> list[Chunk]:
@@ -104,8 +104,8 @@ def plan_groups(
     Args:
         table: all cases.
         rows: those to run.
-        lay_out: shape of the chunks of so many cases of a structure.
-        metrics: those that are kept; () for all.
+        lay_out: shape of the chunks for this many cases of a structure.
+        metrics: those to keep; () for all.
 
     Raises:
         StudyError: too many programs.
@@ -115,7 +115,7 @@ def plan_groups(
         if name in table.columns:
             _, position = np.unique(table.columns[name], return_inverse=True)
             keys = keys * (position.max() + 1) + position
-    # sizes come from the whole table: an extended or resumed sweep then runs the same program
+    # sizes come from the whole table, so that an extended or resumed sweep runs the same program
     distinct = np.unique(keys)
     if len(distinct) > PROGRAM_LIMIT:
         swept = ", ".join(name for name in STATIC if name in table.columns)
@@ -141,7 +141,7 @@ def plan_groups(
 
 
 def _accumulated(table: CaseTable, kept: tuple[str, ...]) -> tuple[str, ...]:
-    """Metrics that the runs must accumulate for those that are kept; () for all."""
+    """Metrics that runs must accumulate for the ones kept; () for all."""
     if not kept:
         return ()
     has_own = (table.values("control.ratio_source") == "own_run").any()
@@ -177,7 +177,7 @@ def chunk_cases(table: CaseTable, rows: np.ndarray, structure: Structure, size: 
         table: all cases.
         rows: cases of the chunk, at most `size`.
         structure: of their group.
-        size: cases the program takes.
+        size: cases per call of the program.
 
     Returns:
         Case of NumPy arrays in the working precision.
@@ -201,7 +201,7 @@ def _mechanics(structure: Structure, cases: Case) -> Any:
 def _plant_steps(
     table: CaseTable, structure: Structure, members: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Plant steps per sample of each case, and which cases no allowed number carries."""
+    """Plant steps per sample of each case, and which cases are too stiff for any allowed number."""
     rate = _drive_rates(table, structure, members)
     if structure.feedback == "ideal":
         rate = np.maximum(rate, _pole_decay(table, structure, members))
@@ -245,14 +245,14 @@ def _pole_decay(table: CaseTable, structure: Structure, members: np.ndarray) -> 
 
 
 def local_layout(n: int, structure: Structure) -> Layout:
-    """Shape of the chunks that suits this process.
+    """Chunk shape that suits this process.
 
     Args:
-        n: cases.
-        structure: of them.
+        n: number of cases.
+        structure: of the cases.
     """
     devices = len(jax.local_devices())
-    # a case's command takes most of the memory: references at every point of every step
+    # a case's command takes most memory: references at every point of every step
     points = structure.n_steps * (2 * structure.substeps + 1)
     lane_bytes = points * 3 * 8 * 8 + 2**16
     lanes, unit = most_lanes(), lane_unit()
@@ -266,10 +266,10 @@ def local_layout(n: int, structure: Structure) -> Layout:
 
 
 def even_layout(n: int) -> Layout:
-    """A chunk of n cases, or a few more, shared evenly by all devices.
+    """A chunk of n cases or slightly more, split evenly among all devices.
 
     Args:
-        n: cases.
+        n: number of cases.
     """
     devices, unit = len(jax.local_devices()), lane_unit()
     lanes = min(most_lanes(), -(-n // (unit * devices)) * unit)
@@ -289,7 +289,7 @@ def lane_unit() -> int:
 
 
 def memory_budget() -> int:
-    """Memory that the arrays of a chunk may take: a quarter of what the device has [bytes]."""
+    """Memory available for the arrays of a chunk: a quarter of the device's [bytes]."""
     if processor() != "cpu":
         devices = jax.local_devices()
         return len(devices) * (devices[0].memory_stats() or {}).get("bytes_limit", 2**32) // 4
@@ -297,5 +297,5 @@ def memory_budget() -> int:
 
 
 def peak_memory() -> int:
-    """Most memory that this process has held [bytes]."""
+    """Peak memory of this process [bytes]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -1,8 +1,8 @@
 """What comes before and after the steps of a chunk, the same for all executors.
 
-A chunk's leaves are split into those that vary from case to case and those that all cases share, so
-that what is shared is worked out once. With a `place`, parameters set some numbers of each case,
-and what depends on them has tangents.
+A chunk's leaves are split into those that vary from case to case and those that all cases share,
+which are computed once. With a `place`, parameters set some numbers of each case, and everything
+that depends on them has tangents.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from jaxmodel.simulate import Outline, Result, Start, begin, conclude
 from studies.engine.plan import Layout
 from studies.engine.runs import with_ratio
 
-#: How often a program was traced in this process; the tests count compilations with it.
+#: How often a program was traced in this process; tests use it to count compilations.
 TRACES: list[Structure] = []
-#: Puts parameters (p,) into a case; the same object every time, or it is compiled anew.
+#: Puts parameters (p,) into a case; pass the same object every time to avoid recompiling.
 Place = Callable[[Case, Array], Case]
 
 
 class Running(NamedTuple):
-    """A chunk on its way."""
+    """A running chunk."""
 
     wait: Callable[[], Result]  # until it is done; NumPy arrays
-    cancel: Callable[[], None]  # give it up, as far as it has not begun
+    cancel: Callable[[], None]  # cancel what has not started yet
 
 
 class Executor(Protocol):
@@ -60,7 +60,7 @@ class Executor(Protocol):
 
 
 class Split(NamedTuple):
-    """Leaves of a Case, those that vary apart from those that all cases share."""
+    """Leaves of a Case, split into those that vary and those that all cases share."""
 
     tree: Any
     is_varying: tuple[bool, ...]
@@ -100,7 +100,7 @@ def lane_blocks(split: Split, layout: Layout) -> list[list[np.ndarray]]:
 
 
 def joined(tree: Any, is_varying: tuple[bool, ...], varying: list[Any], shared: list[Any]) -> Any:
-    """The tree of leaves that vary and leaves that do not."""
+    """The tree rebuilt from varying and shared leaves."""
     sources = {True: iter(varying), False: iter(shared)}
     return jax.tree.unflatten(tree, [next(sources[varies]) for varies in is_varying])
 
@@ -112,7 +112,7 @@ class Program(NamedTuple):
     layout: Layout
     tree: Any  # of a Case
     is_varying: tuple[bool, ...]
-    place: Place | None = None  # the parameters are then the last leaf that varies
+    place: Place | None = None  # if set, the parameters are the last varying leaf
 
 
 class StartParts(NamedTuple):
@@ -138,7 +138,7 @@ def begin_case(program: Program, own: list[Any], common: list[Any]) -> Start:
 def chosen(
     program: Program, parts: StartParts, wanted: bool, own: list[Any], common: list[Any]
 ) -> list[Any]:
-    """Those leaves of a case's start that vary, or that do not."""
+    """Varying or shared leaves of a case's start."""
     leaves = jax.tree.leaves(begin_case(program, own, common))
     return [x for x, varies in zip(leaves, parts.is_varying, strict=True) if varies == wanted]
 
@@ -152,7 +152,7 @@ def begin_block(program: Program, parts: StartParts, own: list[Any], common: lis
         common: those that do not.
 
     Returns:
-        Start with state and outline of every case; what else all cases share has a last axis of 1.
+        Start with state and outline of every case; other shared leaves have a last axis of 1.
     """
     varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
     lanes = len(own[0])
@@ -175,12 +175,12 @@ def prepare(program: Program, parts: StartParts, own: list[Any], common: list[An
     return jax.vmap(partial(chosen, program, parts, True), (0, None), -1)(own, common)
 
 
-# run once, so it is compiled in haste: a quarter off two to four seconds
+# run once, so compiled without optimisation: saves a quarter of two to four seconds
 @partial(jax.jit, static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0})
 def prepare_shared(
     program: Program, parts: StartParts, own: list[Any], common: list[Any]
 ) -> list[Any]:
-    """The others, of any one case."""
+    """The shared leaves, from any one case."""
     return chosen(program, parts, False, own, common)
 
 
@@ -188,7 +188,7 @@ def prepare_shared(
 def prepare_tangents(
     program: Program, parts: StartParts, own: list[Any], common: list[Any], directions: Array
 ) -> list[Any]:
-    """Tangents of the leaves that move along directions (n, p) of parameters, (n, ..., lanes)."""
+    """Tangents of the moving leaves along directions (n, p) of parameters, (n, ..., lanes)."""
 
     def one(own: list[Any], common: list[Any]) -> list[Any]:
         *fixed, parameters = own
@@ -223,7 +223,7 @@ def find_parts(program: Program, own: list[Any], common: list[Any]) -> StartPart
 
 
 def _dependence(jaxpr: Any, given: list[Any]) -> tuple[bool, ...]:
-    """Which results depend on some of the arguments."""
+    """Which results depend on any of the given arguments."""
     depends: set[Any] = set(given)
     for equation in jaxpr.eqns:
         if any(not hasattr(atom, "val") and atom in depends for atom in equation.invars):
@@ -234,7 +234,7 @@ def _dependence(jaxpr: Any, given: list[Any]) -> tuple[bool, ...]:
 @jax.jit
 @partial(jax.vmap, in_axes=(-1, -1, -1))
 def conclude_all(outline: Any, code: Any, state: Any) -> Result:
-    """Results of cases whose start and last state lie lanes last."""
+    """Results of cases whose start and last state have lanes last."""
     return conclude(outline, code, state)
 
 

@@ -1,4 +1,4 @@
-"""What a running sweep says: a live bar on a terminal, plain lines elsewhere, nothing if quiet."""
+"""Output of a running sweep: a live bar on a terminal, plain lines elsewhere, nothing if quiet."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from studies.engine.folder import ranges
 
 
 class Reporter:
-    """Counts cases and failures, and tells of them.
+    """Counts cases and failures, and reports them.
 
-    console: where to; quiet: only what went wrong with the folder.
+    console: where output goes; quiet: report only problems with the folder.
     """
 
     def __init__(self, console: Console, total: int, done: int, is_quiet: bool) -> None:
@@ -53,18 +53,18 @@ class Reporter:
             self._bar.stop()
 
     def say(self, text: str) -> None:
-        """A line that matters, unless quiet."""
+        """Print a line, unless quiet."""
         if not self.is_quiet:
             self.console.print(text, soft_wrap=True)
 
     def compiled(self, executor: str, seconds: float) -> None:
-        """A program is ready."""
+        """Report that a program has compiled."""
         self.executor = executor
         self.compile_time += seconds
         self.say(f"executor: {executor}, compiled in {seconds:.1f} s")
 
     def chunk(self, codes: np.ndarray) -> None:
-        """A chunk is safe on the disk; codes are its statuses."""
+        """Count a chunk that is safely on disk; codes are its statuses."""
         self.done += len(codes)
         self.n_run += len(codes)
         self.failures.update(int(code) for code in codes if code != status.OK)
@@ -76,17 +76,17 @@ class Reporter:
             self.say(f"{self.done}/{self.total} cases, {text}, {left:.0f} s left")
 
     def lost(self, rows: np.ndarray, reason: str) -> None:
-        """A chunk is given up; rows are the numbers of its cases."""
+        """Report a chunk that was given up; rows are the numbers of its cases."""
         self.console.print(f"cases {ranges(rows)} are left out: {reason}", soft_wrap=True)
 
     @property
     def run_time(self) -> float:
-        """Since the start, without compiling [s]."""
+        """Time since the start, without compiling [s]."""
         return max(time.perf_counter() - self.started - self.compile_time, 1e-9)
 
     @property
     def rate(self) -> float:
-        """Cases a second, without compiling."""
+        """Cases per second, without compiling."""
         return self.n_run / self.run_time
 
     def failure_text(self) -> str:

@@ -1,4 +1,4 @@
-"""Results of a sweep: as they are stored, and as they are read again."""
+"""Results of a sweep: reading them, and their metrics."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from studies.study.paths import NAMED_INDEX, known_field, parse_entry
 
 @dataclass(frozen=True)
 class SweepData:
-    """A sweep as read: named arrays, and what belongs to them."""
+    """A sweep as read: named arrays and their metadata."""
 
     variables: dict[str, Variable]
     attributes: dict[str, Any]
@@ -50,7 +50,7 @@ class SweepData:
 
     @cached_property
     def table(self) -> CaseTable:
-        """Its cases, spread once."""
+        """Its cases, built once."""
         return build_table(self.spec)
 
     @property
@@ -59,7 +59,7 @@ class SweepData:
 
     @property
     def is_finished(self) -> np.ndarray:
-        """Cases whose metrics hold, (n,)."""
+        """Cases with valid metrics, (n,)."""
         return np.isin(self["status"], status.FINISHED)
 
     def __repr__(self) -> str:
@@ -93,7 +93,7 @@ def swept_names(data: SweepData) -> list[str]:
 
 
 def load(path: str | Path) -> SweepData:
-    """Read a sweep, finished or not; cases that have not been run have status -1 and NaN.
+    """Read a sweep, finished or not; cases that have not run have status -1 and NaN.
 
     Args:
         path: the sweep's folder.
@@ -107,7 +107,7 @@ def load(path: str | Path) -> SweepData:
     if (folder / RESULTS).is_file() and not any((folder / CHUNKS).glob("*.h5")):
         check_results(folder)
         variables, attributes = read_store(folder / RESULTS)
-        if json.loads(attributes["spec"]) == written:  # else an extension has begun
+        if json.loads(attributes["spec"]) == written:  # otherwise an extension has started
             return SweepData(variables, attributes, spec)
     table = build_table(spec)
     gathered = gather(table, finished_cases(folder))
@@ -122,10 +122,10 @@ def load(path: str | Path) -> SweepData:
 def metric_values(data: SweepData, name: str) -> np.ndarray:
     """One number per case: a metric, an entry of it, or a field, (n,).
 
-    A metric or condition number with more axes counts with its largest value, of the links that
-    some case controls: `residual_rms` is that of the worst of them and its worst station,
+    A metric or condition number with more axes counts with its largest value over the links that
+    any case controls: `residual_rms` is that of the worst link and its worst station,
     `residual_rms[link=3]` that of the worst station of link 3, controlled or not. Indices without
-    a name count from 0. A field that does not vary has its value in every case.
+    a name count from 0. A field that does not vary has the same value in every case.
 
     Raises:
         StudyError: unknown name or entry.
@@ -159,9 +159,9 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
 
 
 def _of_axes(data: SweepData, name: str, named: list[tuple[str, str]]) -> np.ndarray:
-    """Values of a metric at numbers of some of its axes, counted from 1."""
+    """Values of a metric at given indices of some of its axes, counted from 1."""
     if name not in data.variables or name not in (*METRICS, *PER_CASE):
-        metric_values(data, name)  # says what is wrong with it
+        metric_values(data, name)  # reports what is wrong with it
         raise StudyError(f"{name!r}: indices that name an axis are for metrics")
     variable = data.variables[name]
     array, dims = variable.data, list(variable.dims)
@@ -180,7 +180,7 @@ def _of_axes(data: SweepData, name: str, named: list[tuple[str, str]]) -> np.nda
 def _worst(
     data: SweepData, array: np.ndarray, dims: tuple[str, ...], is_least: bool = False
 ) -> np.ndarray:
-    """Largest number of each case, or least, of the links that count, (n,)."""
+    """Largest, or least, value of each case over the links that count, (n,)."""
     if array.ndim == 1:
         return array
     if array.dtype.kind == "f" and "link" in dims:
@@ -196,9 +196,9 @@ def _worst(
 
 
 def counted_links(data: SweepData) -> np.ndarray:
-    """Links that a metric counts: those that some case controls, all where none does, (3,).
+    """Links that a metric counts: those that any case controls, all if none does, (3,).
 
-    The same for all cases, or fewer links under control would look like less vibration.
+    The same for all cases; otherwise fewer controlled links would look like less vibration.
     """
     fields = Fields(data.spec.study, data.table.fields)
     is_closed = fields.raw("control.feedback") != "none"
@@ -208,7 +208,7 @@ def counted_links(data: SweepData) -> np.ndarray:
 
 
 def _turned(name: str, known: list[str]) -> str:
-    """A name of the same words in another order."""
+    """A known name with the same words in another order."""
     words = sorted(name.split("_"))
     return next((other for other in known if sorted(other.split("_")) == words), "")
 
@@ -216,7 +216,7 @@ def _turned(name: str, known: list[str]) -> str:
 def _entry(data: SweepData, name: str, indices: tuple[int, ...], candidate: str) -> np.ndarray:
     variable = data.variables[candidate]
     array, dims = variable.data, variable.dims
-    is_own = variable_name(name) == candidate and "[" in name  # the entry is a variable of its own
+    is_own = variable_name(name) == candidate and "[" in name  # the entry is itself a variable
     used = () if is_own else indices
     for index in used:
         if array.ndim < 2 or index >= array.shape[1]:

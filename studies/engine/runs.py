@@ -45,7 +45,7 @@ from studies.study.labels import DISTANCE_TEXT, STATUS_LABEL
 from studies.study.margin import MARGIN_MODES
 from studies.study.spec import Study
 
-#: More plant steps per sample than this are refused.
+#: More plant steps per sample than this are rejected.
 SUBSTEP_LIMIT = 200
 
 
@@ -59,18 +59,18 @@ class Run(NamedTuple):
     structure: Structure
     case: Case
     result: Result  # NumPy arrays
-    loop: LoopReport | None  # linearised sampled loop, where there is one
+    loop: LoopReport | None  # linearised sampled loop, if there is one
     motion: MotionReport | None  # the same with the forces of the motion
     status: int  # code of `jaxmodel.status`; UNSTABLE comes from the linearised loop
 
 
 def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> Run:
-    """Run one study after checking what can be known before.
+    """Run one study after checking what can be checked beforehand.
 
     Args:
         study: what to run.
         has_record: keep trajectories.
-        has_loop: judge the linearised sampled loop too (seconds).
+        has_loop: also judge the linearised sampled loop (takes seconds).
 
     Raises:
         StudyError: pose out of reach, singular path, motion longer than the run, stiff feedback.
@@ -84,7 +84,7 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
         try:
             loop = loop_report(structure, case, _home(study), min(3, structure.n_modes))
             motion = motion_report(structure, case)
-        except np.linalg.LinAlgError:  # an entry that is not finite
+        except np.linalg.LinAlgError:  # a non-finite entry
             return Run(
                 study=study,
                 structure=structure,
@@ -113,7 +113,7 @@ def _own_ratio(study: Study, structure: Structure, case: Case, has_record: bool)
 
 
 def resolved_study(study: Study) -> Study:
-    """The same study with its EMC ratios given, so that nothing has to run to know them.
+    """The same study with explicit EMC ratios, so that no run is needed to find them.
 
     Raises:
         StudyError: as `run_study`.
@@ -133,7 +133,7 @@ def uncontrolled(case: Case) -> Case:
 
 
 def uncontrolled_twin(run: Run) -> Run | None:
-    """The same run with no link controlled, trajectories included; None where none is anyway."""
+    """The same run with no link controlled, with trajectories; None if none is anyway."""
     if run.structure.feedback == "none" or not np.any(run.study.control.links):
         return None
     case = uncontrolled(run.case)
@@ -156,7 +156,7 @@ def with_ratio(case: Case, ratio: Any) -> Case:
 
 
 def judged_status(code: int, loop: LoopReport) -> int:
-    """Status of a run, UNSTABLE where its loop is and it did not stop for another reason."""
+    """Status of a run: UNSTABLE if its loop is and nothing else stopped it."""
     return status.UNSTABLE if code in status.FINISHED and not loop.is_stable else code
 
 
@@ -165,7 +165,7 @@ def _home(study: Study) -> np.ndarray:
 
 
 class Preflight(NamedTuple):
-    """What is known of a case before it runs."""
+    """What is known about a case before it runs."""
 
     pose_status: Any  # of every way-point, (n,)
     lift: Any  # of the links there, see `jaxmodel.kinematics.lift` [1], (n, 3)
@@ -185,7 +185,7 @@ class Preflight(NamedTuple):
 
 
 def preflight(structure: Structure, case: Case) -> Preflight:
-    """What is known of a case before it runs, as NumPy arrays."""
+    """What is known about a case before it runs, as NumPy arrays."""
     return jax.tree.map(np.asarray, _preflight(_without_run(structure), case))
 
 
@@ -222,7 +222,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
 
 
 def _without_run(structure: Structure) -> Structure:
-    """Only what describes machine and controller, so that runs of any kind share a compilation."""
+    """Only machine and controller, so that runs of any kind share a compilation."""
     kept = (
         "n_modes",
         "n_controlled",
@@ -281,10 +281,10 @@ def check_run(study: Study) -> tuple[Structure, Case]:
 def check_pose(
     study: Study, field: str, pose: tuple[float, float, float], code: int, lifts: np.ndarray
 ) -> None:
-    """Refuse a pose that no link can reach, or where a link is parallel or square to its guide.
+    """Reject a pose out of reach, or with a link parallel or square to its guide.
 
     Args:
-        study: whose machine it is.
+        study: supplies the machine.
         field: name for the message.
         pose: (x, y, phi) [m, m, rad].
         code: its status.
@@ -349,7 +349,7 @@ def _check_duration(study: Study, structure: Structure, known: Preflight) -> Non
             "s",
         )
     left = duration - end - study.metrics.residual_delay
-    # free vibration of a platform at rest: the window may end with the run
+    # free vibration of a platform at rest: the window can end with the run
     longest = left if len(study.motion.waypoints) > 1 else np.inf
     period = 1 / study.electronics.sample_rate_hz
     if not period * (1 - 1e-9) <= study.metrics.residual_length <= longest + 1e-9:
@@ -363,7 +363,7 @@ def _check_duration(study: Study, structure: Structure, known: Preflight) -> Non
 
 
 def _check_rates(study: Study, structure: Structure, known: Preflight) -> None:
-    """Plant modes that the step can carry, and low-passes that the sample rate can carry."""
+    """Check plant modes against the step, and low-passes against the sample rate."""
     if known.damping >= 1:
         raise field_error(
             "link.damping_ratio",
@@ -404,7 +404,7 @@ def pole_decay(structure: Structure, case: Case, pose: Any) -> float:
 
 
 def mechanics_at(structure: Structure, case: Case, pose: Any) -> Any:
-    """State matrix of the plant (with ideal feedback, where the structure has it) at a pose."""
+    """State matrix of the plant (with ideal feedback, if the structure has it) at a pose."""
     loop = prepare(structure, case).loop
     return mechanical(linearise(structure, loop, pose, resting(structure, case)))
 
@@ -413,15 +413,15 @@ _mechanics_at = jax.jit(mechanics_at, static_argnums=0)
 
 
 def step_counts(needed: Any) -> np.ndarray:
-    """Plant steps per sample to take where `needed` would do: the next power of two.
+    """Plant steps per sample to use when `needed` suffice: the next power of two.
 
-    So the cases of a sweep need few programs, and each takes the steps it takes anywhere.
+    Thus a sweep needs few programs, and a case uses the same steps in any sweep.
     """
     return 2 ** np.ceil(np.log2(np.maximum(needed, 1))).astype(int)
 
 
 def _drive_substeps(study: Study, structure: Structure, case: Case) -> int:
-    """Plant steps per sample that the sliders' drive and friction need, or given."""
+    """Plant steps per sample that the sliders' drive and friction need, or as given."""
     rate = float(drive_rate(case))
     needed = max(int(np.ceil(rate / study.electronics.sample_rate_hz / STIFFNESS_LIMIT)), 1)
     given, drive = study.run.substeps, study.drive
@@ -446,7 +446,7 @@ def _drive_substeps(study: Study, structure: Structure, case: Case) -> int:
     raise field_error(
         name,
         value,
-        f"so much that {SUBSTEP_LIMIT} plant steps per sample carry drive.kd, "
+        f"small enough for {SUBSTEP_LIMIT} plant steps per sample with drive.kd, "
         f"drive.viscous_friction and drive.coulomb_friction/drive.friction_speed = {slope:g} N s/m "
         f"on machine.slider_mass; {needed} would be needed",
         "N" if name == "drive.coulomb_friction" else "N s/m",
@@ -454,11 +454,11 @@ def _drive_substeps(study: Study, structure: Structure, case: Case) -> int:
 
 
 def _ideal_substeps(study: Study, structure: Structure, case: Case) -> int:
-    """Plant steps per sample for ideal feedback: what the worst way-point needs, or given."""
+    """Plant steps per sample for ideal feedback: as the worst way-point needs, or as given."""
     poses = set(study.motion.waypoints)
     fastest = max(pole_decay(structure, case, np.array(pose)) for pose in poses)
     needed = int(np.ceil(fastest / study.electronics.sample_rate_hz / STIFFNESS_LIMIT))
-    needed = max(needed, structure.substeps)  # what the drive wants
+    needed = max(needed, structure.substeps)  # what the drive needs
     given = study.run.substeps
     if given and given < needed <= SUBSTEP_LIMIT:
         raise field_error(
@@ -514,7 +514,7 @@ def _spectrum_frequencies(structure: Structure, case: Case) -> Any:
 
 
 def run_variables(run: Run) -> dict[str, Variable]:
-    """Everything a run's file holds: axes, trajectories (where kept), metrics, judgement."""
+    """Contents of a run's file: axes, trajectories (if kept), metrics, judgement."""
     stations = np.array(run.study.metrics.stations)
     frequency = np.asarray(_spectrum_frequencies(run.structure, run.case))
     variables = {
@@ -602,7 +602,7 @@ def chord_deflection(run: Run) -> np.ndarray:
 
 
 def run_attributes(study: Study) -> dict[str, Any]:
-    """What a file must say about its origin: the study, versions, device, precision."""
+    """A file's record of its origin: study, versions, device, precision."""
     return {
         "title": study.title,
         "study": json.dumps(study.model_dump(mode="json")),

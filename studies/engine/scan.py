@@ -28,12 +28,12 @@ from studies.engine.program import (
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _run(program: Program, parts: StartParts, varying: list[Any], shared: list[Any]) -> Result:
-    """Results of a chunk; what its cases share is computed once for all."""
+    """Results of a chunk; what its cases share is computed once."""
     layout = program.layout
     TRACES.append(program.structure)
 
     def block(own: list[Any], common: list[Any]) -> Result:
-        """Cases side by side in the last axis; XLA fuses little of a step under `vmap`."""
+        """Cases along the last axis; XLA fuses little of a step under `vmap`."""
         start = begin_block(program, parts, own, common)
 
         def body(at: State, inputs: Inputs) -> tuple[State, None]:

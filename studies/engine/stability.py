@@ -1,6 +1,6 @@
 """Stability of a linearised sampled loop: spectral radius, gain margin, damping of its modes.
 
-Eigenvalues of small matrices, on the host: `jaxmodel.sampled_loop` makes the matrices.
+Eigenvalues of small matrices, on the host; `jaxmodel.sampled_loop` builds the matrices.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
 from studies.study.margin import HIGHEST, LOWEST, MARGIN_MODES
 
-#: Gain factors that are looked at are no further apart than this [1].
+#: Largest ratio of successive gain factors [1].
 STRIDE = 1.25
-#: The first one, and how far apart those below it are where it is unstable [1].
+#: The first factor, and the ratio of smaller ones if it is unstable [1].
 FIRST, DESCENT = 0.01, 4.0
 
 
-#: Gain factors at which modes are followed from no control to the given gains [1].
+#: Gain factors at which modes are traced from no control to the given gains [1].
 STEPS = np.linspace(0, 1, 41)[1:]
 
 
 def with_margin_modes(
     structure: Structure, case: Case, least: int = MARGIN_MODES
 ) -> tuple[Structure, Case]:
-    """The same loop, or loops, with at least so many plant modes, before any motion."""
+    """The same loop, or loops, with at least this many plant modes, before any motion."""
     n_modes = max(least, structure.n_modes)
     modes = np.maximum(least, np.asarray(case.n_modes))
     still = np.zeros((*np.shape(case.initial.modal)[:-1], n_modes))
     case = case._replace(n_modes=modes, initial=case.initial._replace(modal=still))
-    # nothing that a loop about rest does not depend on, which would cost a compilation
+    # drop everything a loop about rest does not depend on, which would cost a compilation
     structure = structure._replace(
         n_modes=n_modes,
         n_steps=1,
@@ -64,7 +64,7 @@ class LoopReport(NamedTuple):
 
     spectral_radius: float  # of the closed loop [1]
     gain_margin: float  # largest common factor on all gains with every smaller one stable [1]
-    frequency_hz: np.ndarray  # of the tracked link modes with control [Hz], (J, 3)
+    frequency_hz: np.ndarray  # of the tracked controlled link modes [Hz], (J, 3)
     damping_ratio: np.ndarray  # [1], (J, 3): three assembled modes per link mode
 
     @property
@@ -74,17 +74,17 @@ class LoopReport(NamedTuple):
 
 
 class MotionReport(NamedTuple):
-    """How the forces of a motion move the margin: at rest, and where they are largest."""
+    """How the forces of a motion change the margin: at rest, and where they are largest."""
 
     time: np.ndarray  # [s], (k,)
     axial_force: np.ndarray  # tension in the links [N], (k, 3)
-    gain_margin: np.ndarray  # of the loop as if the instant lasted [1], (k,)
+    gain_margin: np.ndarray  # of the loop with the instant frozen [1], (k,)
 
 
 _closed_loop = jax.jit(closed_loop, static_argnums=0)
 
 
-#: Instants of a motion whose axial forces are looked at.
+#: Instants of a motion at which axial forces are evaluated.
 INSTANTS = 401
 
 
@@ -101,7 +101,7 @@ def _controller(structure: Structure, case: Case) -> Controller:
 def _parts(
     structure: Structure, case: Case, law: Controller | None = None
 ) -> list[tuple[slice, Controller | None]]:
-    """Controllers to judge, and the modes that each tells about; None: the case's own."""
+    """Controllers to judge, and the modes that each covers; None: the case's own."""
     if law is None and not LAWS[structure.law].is_switching:
         return [(slice(None), None)]
     law = _controller(structure, case) if law is None else law
@@ -121,8 +121,8 @@ def _forces(structure: Structure, case: Case) -> tuple[Array, PathSample, Array]
 def motion_report(structure: Structure, case: Case) -> MotionReport:
     """Gain margins with the forces that act during the unshaped motion.
 
-    Linearised at its start and where the tension in a link is largest or smallest, as if that
-    instant lasted, with `MARGIN_MODES` plant modes or more.
+    Linearised at its start and where the tension in a link is largest or smallest, with that
+    instant frozen, with at least `MARGIN_MODES` plant modes.
 
     Args:
         structure: static choices, feedback "sampled".
@@ -162,8 +162,8 @@ def loop_report(
 ) -> LoopReport:
     """Spectral radius, gain margin and damping of the lowest link modes.
 
-    Modes are followed from zero gain to full gain, so that filter poles are not mistaken for them.
-    Where channels act one at a time the report is the worst of them, each by itself.
+    Modes are traced from zero gain to full gain, so that filter poles are not mistaken for them.
+    If channels act one at a time, the report is the worst over them, each judged alone.
 
     Args:
         structure: static choices.
@@ -179,7 +179,7 @@ def loop_report(
     plain, case = with_margin_modes(structure, case, n_modes)
     parts = _parts(plain, case, law)
     period = float(case.electronics.period)
-    with threadpool_limits(1, "blas"):  # many small matrices: more threads only get in the way
+    with threadpool_limits(1, "blas"):  # many small matrices: more threads only slow them down
         reports = [
             _judged(_closed_loop(plain, case, pose, part), period, n_tracked) for _, part in parts
         ]
@@ -193,11 +193,11 @@ def loop_report(
 
 
 def mode_by_mode(modes: list[slice], each: list[np.ndarray]) -> np.ndarray:
-    """What the parts of a law say, each of its own modes; the first one of those of none.
+    """Merge the results of a law's parts, each for its own modes; the first part's for the rest.
 
     Args:
-        modes: that each part tells about, see `linear_parts`.
-        each: what it says of all of them, (J, ...).
+        modes: those each part covers, see `linear_parts`.
+        each: each part's result for all modes, (J, ...).
     """
     whole = np.array(each[0])
     for chosen, values in zip(modes, each, strict=True):
@@ -228,12 +228,12 @@ def gain_margin(
     """Largest factor on all gains with every smaller one stable.
 
     Args:
-        poles: discrete poles by factor; called more than once for a factor, so cache it.
-        first: factors to begin with, rising [1]; default: `FIRST` alone.
+        poles: discrete poles by factor; called repeatedly with the same factor, so cache it.
+        first: factors to start with, rising [1]; default: only `FIRST`.
         highest: where to stop [1].
 
     Returns:
-        [1], within 1e-4 of itself; 0 where even `LOWEST` is unstable.
+        [1], with a relative error of 1e-4; 0 if even `LOWEST` is unstable.
     """
 
     @cache
@@ -260,9 +260,9 @@ def gain_margin(
 
 
 def follow_poles(start: np.ndarray, sets: Iterable[np.ndarray]) -> np.ndarray:
-    """Where poles go while the loop changes step by step.
+    """Trace poles while the loop changes step by step.
 
-    Each is sought next to where its last step would take it again; none is taken twice.
+    Each is matched to the pole nearest to its extrapolated position; none is matched twice.
 
     Args:
         start: poles to follow, (m,).
@@ -283,9 +283,9 @@ def follow_poles(start: np.ndarray, sets: Iterable[np.ndarray]) -> np.ndarray:
 
 
 def link_poles(state: np.ndarray, n_tracked: int) -> np.ndarray:
-    """Poles [rad/s] of the uncontrolled link modes, by three in ascending frequency, (J, 3).
+    """Poles [rad/s] of the uncontrolled link modes, in threes by ascending frequency, (J, 3).
 
-    They are the eigenvalues whose eigenvectors live in the modal coordinates.
+    These are the eigenvalues whose eigenvectors lie mainly in the modal coordinates.
 
     Args:
         state: A of the plant, `LoopMatrices.plant`.
@@ -296,7 +296,7 @@ def link_poles(state: np.ndarray, n_tracked: int) -> np.ndarray:
     upper = value.imag > 0
     vector, value = vector[:, upper], value[upper]
     weight = np.abs(vector[:3]).max(axis=0) / np.abs(vector[6 : 6 + modes]).max(axis=0)
-    # at most three pairs belong to the pose on its drive: the ones with the largest pose share
+    # at most three pairs belong to the pose on its drive: those with the largest pose share
     n_rigid = value.size - modes
     flexible = np.sort_complex(1j * value[np.argsort(weight)[: value.size - max(n_rigid, 0)]])
     flexible = flexible[np.argsort(np.abs(flexible))] / 1j

@@ -1,6 +1,6 @@
 """The steps of a group as a traced loop: which numbers it reads, and its code for this processor.
 
-Numbers that all cases of a chunk share are written into the code.
+Numbers that all cases of a chunk share are embedded in the code.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from studies.engine.program import (
 from studies.kernels import cpu, llvm
 from studies.kernels.traced import InputLeaf, TracedLoop, trace_loop
 
-#: More plant steps in a sample than this would make the kernel's code too long.
+#: More plant steps per sample than this would make the kernel's code too long.
 KERNEL_SUBSTEPS = 4
 
 
 def fits_kernel(structure: Structure) -> bool:
-    """Whether a structure can be written as a kernel here."""
+    """Whether a structure can be compiled to a kernel here."""
     return llvm.is_available() and structure.substeps <= KERNEL_SUBSTEPS
 
 
 class Traced(NamedTuple):
-    """The loop of a group of cases, for the numbers that all of them share."""
+    """The loop of a group of cases, with the numbers they share."""
 
     parts: StartParts
     shared: list[np.ndarray]  # leaves of a Start that do not vary
@@ -50,11 +50,11 @@ class Steps(NamedTuple):
     parts: StartParts
     shared: list[np.ndarray]
     run: cpu.Kernel
-    directions: int  # tangents that it carries along
+    directions: int  # tangents carried along
 
 
-#: One at a time: of two runs of a program with an eigenvalue problem in it (basis loaded) XLA's
-#: CPU client now and then never ends one (jax 0.10).
+#: One at a time: of two concurrent runs of a program with an eigenvalue problem (basis loaded),
+#: XLA's CPU client occasionally never finishes one (jax 0.10).
 PREPARING = Lock()
 _STEPS: dict[tuple[Any, ...], Steps] = {}
 #: Kernels kept in memory.
@@ -101,7 +101,7 @@ def _real() -> Any:
 def _trace(
     structure: Structure, parts: StartParts, shared: list[np.ndarray], directions: int
 ) -> TracedLoop:
-    """The loop of a structure, with what is shared written into it."""
+    """The loop of a structure, with shared numbers embedded."""
     kinds = zip(parts.shapes, parts.is_varying, parts.is_moving, strict=True)
     leaves = [InputLeaf(*kind) for kind in kinds]
     start: Start = jax.tree.unflatten(parts.tree, range(len(leaves)))
@@ -131,7 +131,7 @@ def _trace(
 class Ready(NamedTuple):
     """A block of lanes before its first step, as the kernel reads it."""
 
-    loop: list[np.ndarray]  # leaves that are not written into the code
+    loop: list[np.ndarray]  # leaves not embedded in the code
     inputs: list[np.ndarray]
     state: State  # a copy, lanes last
     outline: Outline  # lanes last
@@ -165,7 +165,7 @@ def start_block(
 
 
 def read_leaves(start: Start, parts: StartParts) -> list[Any]:
-    """Leaves of the loop's constants that are not written into the code."""
+    """Leaves of the loop's constants that are not embedded in the code."""
     varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
     loop = zip(jax.tree.leaves(start.loop), jax.tree.leaves(varies.loop), strict=True)
     return [leaf for leaf, is_read in loop if is_read]

@@ -1,4 +1,4 @@
-"""A sweep's numbers on their way into files: chunks, and all of them joined."""
+"""Writing a sweep's numbers to files: chunks, and the joined results."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def kept_metrics(spec: SweepSpec) -> list[str]:
     """Metrics that a sweep keeps.
 
     Raises:
-        StudyError: unknown metric, or one that the working precision does not hold.
+        StudyError: unknown metric, or one too inaccurate in the working precision.
     """
     for name in spec.sweep.metrics:
         if name not in METRICS:
@@ -65,7 +65,7 @@ def chunk_variables(
     substeps: int,
     kept: list[str],
 ) -> dict[str, Variable]:
-    """What a chunk's file holds: ids, status, metrics of its cases, without padding.
+    """Contents of a chunk's file: ids, status, metrics of its cases, without padding.
 
     Args:
         table: all cases.
@@ -76,7 +76,7 @@ def chunk_variables(
         kept: metrics to keep.
 
     Returns:
-        Variables; metrics of a case that did not finish, and of modes that it does not have, NaN.
+        Variables; NaN for metrics of cases that did not finish, and of modes they do not have.
     """
     count, result = len(rows), judged.result
     margins = {name: data[:count] for name, data in judged.margins._asdict().items()}
@@ -123,7 +123,7 @@ def gather(table: CaseTable, finished: Finished) -> dict[str, Variable]:
         finished: from `finished_cases`.
 
     Returns:
-        Variables with the axis `case`; NaN and status -1 for what is not there.
+        Variables with the axis `case`; NaN and status -1 for missing cases.
     """
     target, is_known = _positions(table, finished)
     variables: dict[str, Variable] = {}
@@ -161,7 +161,7 @@ def manifest_attributes(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def merge(folder: Path, table: CaseTable, finished: Finished, attributes: dict[str, Any]) -> None:
-    """Join all finished cases in one file, file by file, so that memory stays small.
+    """Join all finished cases in one file, file by file to save memory.
 
     Args:
         folder: the sweep's folder.
@@ -170,7 +170,7 @@ def merge(folder: Path, table: CaseTable, finished: Finished, attributes: dict[s
         attributes: global ones.
 
     Raises:
-        StudyError: no room on the disk, or it cannot be written to.
+        StudyError: the disk is full or not writable.
     """
     target, is_known = _positions(table, finished)
     places = []
@@ -207,7 +207,7 @@ def _positions(table: CaseTable, finished: Finished) -> tuple[np.ndarray, np.nda
 
 
 def _largest(files: list[Path]) -> dict[str, tuple[int, ...]]:
-    """Largest shape of each variable: programs of one sweep may have different mode counts."""
+    """Largest shape of each variable: programs of one sweep can have different mode counts."""
     largest: dict[str, tuple[int, ...]] = {}
     for file in files:
         with h5py.File(file, "r") as store:
@@ -219,7 +219,7 @@ def _largest(files: list[Path]) -> dict[str, tuple[int, ...]]:
 
 
 def _fitted(data: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Rows of a larger shape, NaN where they have nothing."""
+    """Rows padded to a larger shape with NaN."""
     if data.shape[1:] == shape:
         return data
     whole = np.full((len(data), *shape), np.nan, data.dtype)

@@ -1,4 +1,4 @@
-"""`studies sweep`: runs what is not done yet, chunk by chunk, and joins the results."""
+"""`studies sweep`: runs the remaining cases, chunk by chunk, and joins the results."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Outcome(NamedTuple):
     compile_time: float  # [s]
     run_time: float  # [s]
     is_interrupted: bool  # by Ctrl-C
-    executor: str  # that ran the last chunks; "" where there were none
+    executor: str  # that ran the last chunks; "" if there were none
     lost: np.ndarray  # numbers of cases that were given up, with the reason in the folder
 
 
@@ -49,18 +49,18 @@ class Plan(NamedTuple):
 
     table: CaseTable
     groups: list[Group]
-    n_before: int  # cases that are done already
+    n_before: int  # cases already done
 
 
 def make_plan(spec: SweepSpec, out: Path | None = None) -> Plan:
-    """Cases of a sweep that are still to run, grouped by program.
+    """Remaining cases of a sweep, grouped by program.
 
     Args:
         spec: the sweep.
-        out: folder with a part of them, if it is to be resumed.
+        out: folder with some of them done, if the sweep is to be resumed.
 
     Raises:
-        StudyError: a fault of the sweep, or one that does not fit the folder.
+        StudyError: a fault of the sweep, or a folder with a different sweep.
     """
     config.require_configured()
     kept_metrics(spec)
@@ -85,13 +85,13 @@ def run_sweep(
     Args:
         spec: the sweep.
         out: its folder.
-        is_resumed: go on with, or extend, the sweep that is there.
+        is_resumed: continue or extend the existing sweep.
         console: where progress goes; default: standard output.
-        is_quiet: no progress.
+        is_quiet: hide progress.
         runner: where chunks are run; default: here.
 
     Returns:
-        Outcome; `results.h5` is there unless the run was interrupted.
+        Outcome; `results.h5` exists unless the run was interrupted.
 
     Raises:
         StudyError: a fault of the sweep, the folder or the disk. Finished chunks stay.
@@ -145,7 +145,7 @@ def _headline(table: CaseTable, groups: list[Group], n_before: int) -> str:
 
 
 def _rows_left(table: CaseTable, done: np.ndarray, out: Path) -> np.ndarray:
-    """Cases still to run. A resumed sweep may have more than the one that is there, but none less.
+    """Remaining cases. A resumed sweep can have more cases than the existing one, but not fewer.
 
     Raises:
         StudyError: finished cases that are not part of it.
@@ -162,7 +162,7 @@ def _rows_left(table: CaseTable, done: np.ndarray, out: Path) -> np.ndarray:
 
 
 def _check_whole(table: CaseTable, done: np.ndarray, out: Path) -> None:
-    """Somebody may have removed chunks while the sweep ran."""
+    """Check that no chunks were removed while the sweep ran."""
     lost = int(np.sum(~np.isin(table.case_id, done)))
     if lost:
         raise StudyError(
@@ -178,7 +178,7 @@ def _run_chunks(
     folder: SweepFolder,
     reporter: Reporter,
 ) -> np.ndarray:
-    """Keep what chunks give; rows of the table that were given up."""
+    """Save the results of chunks; returns the rows of the table that were given up."""
     lost = [np.empty(0, int)]
     for one in done:
         if isinstance(one, Lost):
@@ -216,7 +216,7 @@ def _interrupts() -> Iterator[threading.Event]:
 
 
 class Estimate(NamedTuple):
-    """What a sweep would take."""
+    """Estimated time of a sweep."""
 
     compile_time: float  # of the first program [s]
     chunk_time: float  # of one of its chunks [s]

@@ -1,12 +1,12 @@
-"""From a DESIGN to a real-time controller, with proof.
+"""From a DESIGN to a verified real-time controller.
 
-- What there is to export: a fixed controller (`studies.engine.controller`), ordered as code
-  wants it (`channels` there); `document` is its JSON file.
+- What is exported: a fixed controller (`studies.engine.controller`), arranged as code needs it
+  (`channels` there); `document` is its JSON file.
 - Code: `floating` is the arithmetic in NumPy; `fixed` finds formats, integer coefficients and
-  error bounds, `integers` is their arithmetic, `cost` what it takes; `c_floating` and `c_fixed`
-  gather what the templates of C99 need, which `c_text` fills.
-- Proof: `compiler` makes the code callable, `in_the_loop` runs it with the plant, `sequences`
-  are inputs that no plant would make, `verify` compares, `report` tells.
-- `targets` is the table of what can be written, each of a `job`; `run` leads from the design to
-  the files.
+  error bounds, `integers` is their arithmetic, `cost` its cost; `c_floating` and `c_fixed` gather
+  the values of the C99 templates, which `c_text` fills.
+- Verification: `compiler` makes the code callable, `in_the_loop` runs it with the plant,
+  `sequences` are inputs that no plant would produce, `verify` compares, `report` reports.
+- `targets` is the table of output formats, each made from a `job`; `run` leads from the design
+  to the files.
 """

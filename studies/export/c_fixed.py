@@ -25,7 +25,7 @@ def fixed_source(
         fixed: the same in integers.
         name: prefix of functions and types, and name of the files.
         origin: lines that say where the numbers come from.
-        cost: what a sample costs, for the file's head.
+        cost: cost of a sample, for the file's header.
     """
     channels, shaper = found.channels, shaper_row(found.taps)
     first, memory, numerator = fixed.high_pass, fixed.memory, fixed.numerator.integers
@@ -56,12 +56,12 @@ def fixed_source(
 
 
 def _rows(table: IntegerRow | None, length: int) -> np.ndarray | None:
-    """Integers of a table that not every controller has, in rows of this length."""
+    """Integers of an optional table, in rows of this length."""
     return None if table is None else table.integers.reshape(-1, length)
 
 
 def format_lines(fixed: FixedPoint, found: FixedController) -> list[str]:
-    """Table of formats; room of the word and reach of ADC codes in units of the base."""
+    """Table of formats; word range and reach of ADC codes in units of the base."""
     value, force = ("m", "N") if found.is_modal else ("V", "V")
     lines = [
         f"{'signal':<30}{'Q':>4}{'base':>20}{'room':>9}{'reach':>9}",

@@ -1,4 +1,4 @@
-"""A C module from the templates beside this file: the code is theirs, the numbers come from here.
+"""A C module from the templates next to this file: they hold the code, this file the numbers.
 
 Templates: `controller.h`; `floating.c` and `fixed.c`, one for each arithmetic; `shared.c`, what
 both have in common.
@@ -34,9 +34,9 @@ def source(
         found: the controller.
         name: prefix of functions and types, and name of the files.
         origin: lines that say where the numbers come from.
-        values: of one kind of arithmetic: `word` and `wire`, the types of what is remembered and of
+        values: for one kind of arithmetic: `word` and `wire`, the types of stored values and of
             sensors and actuators; `fixed`, the controller in integers or None; `weight` of the
-            shaper's taps; and what the code alone needs.
+            shaper's taps; and what only this code needs.
     """
     channels, electronics = found.channels, found.study.electronics
     rail = rail_samples(electronics.sample_rate_hz)
@@ -72,16 +72,16 @@ def exact(value: Any) -> str:
 
 
 def real(value: Any) -> str:
-    """A number in the precision that the code is compiled for."""
+    """A number in the precision the code is compiled for."""
     return f"R({exact(value)})"
 
 
 def array(values: Any, notes: Iterable[str] = ()) -> str:
-    """What stands behind the name of a constant array: its size, and its values.
+    """What follows the name of a constant array: its size and its values.
 
     Args:
-        values: whole numbers, or others that become `real`; of one axis or two.
-        notes: for two axes, meaning of each row; none: no comments.
+        values: whole numbers, or others that become `real`; one axis or two.
+        notes: for two axes, the meaning of each row; none: no comments.
     """
     values = np.asarray(values)
     write = real if values.dtype.kind == "f" else str
@@ -104,8 +104,8 @@ def _wrapped(numbers: list[str]) -> str:
 
 
 def plain(text: str) -> str:
-    """Text that can stand in a comment: printable ASCII that does not end it."""
+    """Text that is safe in a comment: printable ASCII that does not end it."""
     plain = "".join(c if c.isascii() and c.isprintable() else "?" for c in text)
-    # no line that goes on, no trigraph, no end of the comment
+    # no line continuation, no trigraph, no end of comment
     plain = re.sub(r"\?(?=\?)", "? ", plain.replace("\\", "/"))
     return plain.replace("*/", "* /").replace("/*", "/ *")

@@ -21,21 +21,22 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         target: Annotated[str, typer.Option(help="json, c, or c-fixed (32-bit fixed point)")],
         out: Annotated[Path, typer.Option(help="folder for the files")],
         case: Annotated[
-            str | None, typer.Option(help="of a sweep: number or id:...; of a tuning: its family")
+            str | None,
+            typer.Option(help="case of a sweep (number or id:...) or family of a tuning"),
         ] = None,
         verify: Annotated[
             bool | None,
             typer.Option(
                 "--verify/--no-verify",
-                help="compare with the JAX controller; default: if there is a C compiler",
+                help="compare with the JAX controller; default: if a C compiler is found",
             ),
         ] = None,
-        name: Annotated[str, typer.Option(help="of the files and C functions")] = "flexlink",
+        name: Annotated[str, typer.Option(help="name of the files and C functions")] = "flexlink",
         dac_bits: Annotated[
-            int | None, typer.Option(help="of the DAC, for c-fixed; default: 12")
+            int | None, typer.Option(help="DAC resolution [bit], for c-fixed; default: 12")
         ] = None,
     ) -> None:
-        """Write the controller of a design for a real-time target, with proof."""
+        """Export the controller of a design to a real-time target, and verify it."""
         start()
         from studies.engine.design import load_design
         from studies.export.run import export_design
@@ -46,10 +47,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command("import-gains")
     def import_gains(
-        file: Annotated[Path, typer.Argument(help="JSON file of studies export")],
+        file: Annotated[Path, typer.Argument(help="JSON file written by studies export")],
         out: Annotated[Path, typer.Option(help="study file to write")],
     ) -> None:
-        """Read the study back from an exported JSON file, once its numbers are checked."""
+        """Check the numbers of an exported JSON file and recover its study."""
         start()
         from studies.export.document import import_study
         from studies.study.template import write_study

@@ -18,7 +18,7 @@ import numpy as np
 from studies.errors import StudyError
 from studies.export.c_text import Source
 
-#: What exported code must compile under without a word.
+#: Flags with which exported code must compile without warnings.
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 _NAMES = ("cc", "gcc", "clang")
 _WANTED = "allowed: a C99 compiler for this machine, named by the variable CC; or --no-verify"
@@ -37,7 +37,7 @@ class Code(NamedTuple):
     state: ctypes.Array[Any]  # room for the controller's state
 
     def begin(self) -> None:
-        """Forget everything."""
+        """Reset the state."""
         getattr(self.library, f"{self.name}_init")(self.state)
 
     def step(self, sensor: np.ndarray) -> tuple[np.ndarray, int]:
@@ -55,7 +55,7 @@ class Code(NamedTuple):
         return values, np.array([fault for _, fault in pairs])
 
     def shape(self, reference: np.ndarray) -> np.ndarray:
-        """A reference (T, 3), shaped, beginning at rest in its first row."""
+        """A shaped reference (T, 3), starting at rest in its first row."""
         room = ctypes.create_string_buffer(self.shaper_length * 3 * 8 + 64)
         given: np.ndarray = np.ascontiguousarray(reference, self.reference)
         getattr(self.library, f"{self.name}_shape_init")(room, _at(given[0]))
@@ -71,7 +71,7 @@ def _at(array: np.ndarray) -> ctypes.c_void_p:
 
 
 def find_compiler() -> list[str]:
-    """Command of a C compiler, from the variable CC or by name; [] where there is none."""
+    """Command of a C compiler, from the variable CC or by name; [] if there is none."""
     try:
         given = shlex.split(os.environ.get("CC", ""))
     except ValueError as error:
@@ -99,10 +99,10 @@ def compiled(
         compiler: command, from `find_compiler`.
         real: NumPy's type of sensors and actuators.
         reference: of the shaper.
-        sizes: channels, modes, and samples that the shaper remembers.
+        sizes: channels, modes, and samples stored by the shaper.
 
     Raises:
-        StudyError: the compiler finds fault with the code, or does not work.
+        StudyError: the compiler rejects the code, or does not work.
     """
     n_channels, n_modes, length = sizes
     with tempfile.TemporaryDirectory() as folder:
@@ -122,7 +122,7 @@ def compiled(
             str(code),
         ]
         _run(command)
-        # no word per state takes more than 8 bytes
+        # no state word takes more than 8 bytes
         room = ctypes.create_string_buffer(8 * (3 * n_modes + 2 * n_channels) + 64)
         try:
             loaded = ctypes.CDLL(str(library))

@@ -1,4 +1,4 @@
-"""What a sample costs on a TMS320F2812-class DSP: 32-bit fixed point, no floating-point unit."""
+"""Cost of a sample on a TMS320F2812-class DSP: 32-bit fixed point, no floating-point unit."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from studies.export.fixed import FixedPoint
 
 
 class Cost(NamedTuple):
-    """What a sample of controller and shaper takes on a DSP without a floating-point unit."""
+    """Cost of a sample of controller and shaper on a DSP without a floating-point unit."""
 
     products: int  # of 32 by 32 bits
     roundings: int  # shifts and limits of 64-bit sums
     cycles: int  # estimate
-    load: float  # share of the time there is, estimate [1]
+    load: float  # share of the available time, estimate [1]
     words: int  # of 16 bits, for both states
 
     @property

@@ -1,4 +1,4 @@
-"""The JSON file of a controller: its study, and every number with unit, axes and meaning."""
+"""The JSON file of a controller: its study, and every number with its unit, axes and meaning."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from studies.study.choices import OneOf
 from studies.study.spec import Study, parse_study
 
 FORMAT = "flexlink-controller"
-#: Numbers worked out again on another machine may differ by so much of themselves, and by so much
-#: of the largest one in their table.
+#: Allowed differences of numbers recomputed on another machine: relative to themselves, and to the
+#: largest one in their table.
 ROUNDING, CANCELLED = 1e-9, 1e-12
 
 
@@ -31,7 +31,7 @@ class DocumentPart(BaseModel):
 
 
 class Quantity(DocumentPart):
-    """Numbers with what they are; `value` is nested as `axes` says, none for a single number."""
+    """Numbers and their meaning; `value` is nested as `axes` says, a single number not at all."""
 
     value: float | list[float] | list[list[float]] | list[list[list[float]]]
     unit: str = Field(description="SI symbol, 1 for none", min_length=1)
@@ -54,7 +54,7 @@ class Document(DocumentPart):
     format: Literal["flexlink-controller"]
     format_version: Literal[1]
     title: str
-    case_id: str = Field(description="id of the case in its sweep; empty where there is none")
+    case_id: str = Field(description="id of the case in its sweep; empty if there is none")
     study_hash: str = Field(description="SHA-256 of the study below as compact sorted JSON")
     versions: dict[str, str]
     law: Annotated[str, OneOf(lambda: LAWS)]
@@ -81,7 +81,7 @@ STEPS = [
     "started again",
     "reference: shaped pose = sum over taps of shaper_weight * pose shaper_delay samples ago",
 ]
-#: One more step, before the synthesizer, where channels of a link act one at a time.
+#: An extra step before the synthesizer if channels of a link act one at a time.
 RIVALS = (
     "energy = (rival_frequency * (position + position_direct * signal))^2 + velocity^2; of the "
     "channels of a link with rival_frequency above 0 the force is 0 where another has more energy"
@@ -131,7 +131,7 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
     on_rate, on_value = ("N s/m", "N/m") if found.is_modal else ("s", "1")
     shape = controller.velocity_gain.shape
     is_phase = electronics.estimator == "modal_phase"
-    # the section that differentiates makes a rate of the signal: the last one of modal_phase
+    # the section that differentiates turns the signal into a rate: the last one of modal_phase
     rate = "1" if is_phase else "1/s"
     last = "1/s" if is_phase else "1"
 
@@ -218,7 +218,7 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
 
 
 def controller_of(document: Document) -> tuple[Controller, Taps]:
-    """Controller and shaper built from nothing but a document's numbers."""
+    """Controller and shaper built only from a document's numbers."""
     number = {name: np.array(entry.value) for name, entry in document.numbers.items()}
     velocity, position = (
         tuple(np.moveaxis(number[f"{name}_numerator"], 2, 0)) for name in ("velocity", "position")
@@ -265,7 +265,7 @@ def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     names = [name for name, _ in pairs]
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"{name} is there twice")
+            raise ValueError(f"{name} occurs twice")
     return dict(pairs)
 
 
@@ -273,7 +273,7 @@ def read_document(path: Path) -> Document:
     """Read what `to_json` wrote.
 
     Raises:
-        StudyError: unreadable, or no such document; names the first entry that is wrong.
+        StudyError: unreadable, or not such a document; names the first wrong entry.
     """
     try:
         text = path.read_bytes().decode("utf-8")
@@ -293,10 +293,10 @@ def read_document(path: Path) -> Document:
 
 
 def import_study(path: str | Path) -> Study:
-    """The study of a document, once it is sure that its numbers are those of the document.
+    """The study of a document, after checking that it reproduces the document's numbers.
 
     Raises:
-        StudyError: unreadable, no document, changed by hand.
+        StudyError: unreadable, not a document, changed by hand.
     """
     path = Path(path)
     given = read_document(path)
@@ -326,7 +326,7 @@ _AS_STUDY = "which its study gives; change the study and export it again"
 
 
 def _check_equal(path: Path, name: str, given: Quantity, wanted: Quantity) -> None:
-    """Refuse numbers that the study does not give."""
+    """Reject numbers that the study does not reproduce."""
     for label in ("unit", "axes"):
         mine, right = getattr(given, label), getattr(wanted, label)
         if mine != right:
@@ -342,7 +342,7 @@ def _check_equal(path: Path, name: str, given: Quantity, wanted: Quantity) -> No
             f"{path}: numbers.{name} has shape {found.shape}; allowed: {own.shape}, as its study"
         )
     size = np.abs(own).max(initial=0.0)
-    # a number that is not finite differs, too
+    # a non-finite number also differs
     wrong = ~(np.abs(found - own) <= ROUNDING * np.abs(own) + CANCELLED * size)
     if np.any(wrong):
         at = tuple(int(k) for k in np.argwhere(wrong)[0])

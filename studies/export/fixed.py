@@ -1,10 +1,9 @@
-"""Fixed point: formats, integer coefficients, and bounds of what rounding can do.
+"""Fixed point: formats, integer coefficients, and bounds on rounding errors.
 
-Words have 32 bits, sums of products 64. A signal is `base * integer / 2^bits`, so it is per unit
-of a base of its own, the range that the simulation shows; bits are as many as leave room for the
-largest value that any sequence of ADC codes can produce. A coefficient is `integer / 2^shift`
-between the integers of two signals: gains of 570 V/N and filters of 1e-6 m/V end in numbers of like
-size.
+Words have 32 bits, sums of products 64. A signal is `base * integer / 2^bits`, per unit of its own
+base, the range seen in the simulation; it has as many bits as leave room for the largest value that
+any sequence of ADC codes can produce. A coefficient is `integer / 2^shift` between the integers of
+two signals, so that gains of 570 V/N and filters of 1e-6 m/V become numbers of similar size.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ from studies.export.floating import Signals, respond_from
 
 #: Bits of a word, sign included.
 WORD = 32
-#: A format has room for at least this many times what the simulation shows [1].
+#: A format has room for at least this many times the largest simulated value [1].
 MARGIN = 2
 #: ADC codes travel in 16 bits.
 ADC_BITS = 16
-#: All errors together may be this share of a DAC step.
+#: Allowed total error, as a share of a DAC step.
 ALLOWED_ERROR = 0.5
 #: Samples after which a filter must have forgotten (to 1e-16).
 LONGEST_MEMORY = 2**20
 FORGOTTEN = 1e-16
-#: Samples in which what a feed-through brings back must die out.
+#: Samples within which feed-through must die out.
 ECHO = 4000
-#: Time at the end of its range that makes a sensor faulty [s].
+#: Time at the end of its range after which a sensor counts as faulty [s].
 RAIL_TIME = 0.01
 
 
@@ -48,12 +47,12 @@ class Format(NamedTuple):
 
     @property
     def step(self) -> np.ndarray:
-        """What one count stands for, (M,)."""
+        """Value of one count, (M,)."""
         return self.base / 2.0**self.bits
 
     @property
     def margin(self) -> np.ndarray:
-        """Largest representable value over the largest one seen; inf where nothing was, (M,)."""
+        """Largest representable value over the largest one seen; inf if none was seen, (M,)."""
         largest = self.step * 2.0 ** (WORD - 1)
         return np.where(self.seen > 0, largest / np.where(self.seen > 0, self.seen, 1.0), np.inf)
 
@@ -88,7 +87,7 @@ class FixedPoint(NamedTuple):
     memory: IntegerRow  # b1, -a1, (M, 2)
     low_pass: IntegerRow  # scale, -a1, -a2, (M, 3)
     numerator: IntegerRow  # three taps and the direct share, (M, 4)
-    synthesizer: IntegerRow  # channels that are not of the link are 0, (3, K, M)
+    synthesizer: IntegerRow  # 0 for channels of other links, (3, K, M)
     feedthrough: IntegerRow | None  # sensor counts per DAC code, (3, K, K)
     is_rival: np.ndarray  # channels that act one at a time, (M,)
     energy: IntegerRow | None  # roots of the modal energies of rivals, in one unit, (M, 2, 4)
@@ -98,9 +97,9 @@ class FixedPoint(NamedTuple):
 class ErrorBound(NamedTuple):
     """Largest differences from exact arithmetic at the actuators, open loop [V], (3, K)."""
 
-    rounding: np.ndarray  # of all signals, all rounded the same wrong way in every sample
+    rounding: np.ndarray  # of all signals, each rounded in the worst direction in every sample
     coefficients: np.ndarray  # of rounded coefficients, at full-scale input
-    total: np.ndarray  # both with the DAC's rounding, and what a feed-through brings back
+    total: np.ndarray  # both with the DAC's rounding, and returned by the feed-through
 
     @property
     def inside(self) -> np.ndarray:
@@ -119,7 +118,7 @@ class Gains(NamedTuple):
 
 
 def rail_samples(rate: float) -> int:
-    """Samples that make a `RAIL_TIME` at a sample rate [Hz]; they are counted in 16 bits."""
+    """`RAIL_TIME` in samples at a sample rate [Hz]; they are counted in 16 bits."""
     return min(max(round(RAIL_TIME * rate), 2), 2**15 - 1)
 
 
@@ -132,7 +131,7 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
         dac_bits: resolution of the DAC, whose codes 1 to 2^bits - 1 span +-voltage_limit.
 
     Raises:
-        StudyError: what cannot be represented, with the number and the way out.
+        StudyError: what cannot be represented, with the number and a remedy.
     """
     controller, channels = found.controller, found.channels
     check_words(found)
@@ -203,10 +202,10 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
 
 
 def check_words(found: FixedController) -> None:
-    """Refuse converters and filters that words cannot carry, before anything runs.
+    """Reject converters and filters that do not fit into words, before anything runs.
 
     Raises:
-        StudyError: codes too long, or a filter that keeps rounding errors for too long.
+        StudyError: codes too long, or a filter that retains rounding errors for too long.
     """
     electronics = found.study.electronics
     if electronics.adc_bits > ADC_BITS:
@@ -216,7 +215,7 @@ def check_words(found: FixedController) -> None:
             f"up to {ADC_BITS} for fixed point: codes are 16-bit words (or --target c)",
             "1",
         )
-    slowest = 1 + np.log(FORGOTTEN) / LONGEST_MEMORY  # pole that forgets just in time
+    slowest = 1 + np.log(FORGOTTEN) / LONGEST_MEMORY  # slowest pole that forgets in time
     if found.channels.slowest_pole > slowest:
         rate = electronics.sample_rate_hz
         lowest = -np.log(slowest) * rate / (2 * np.pi)
@@ -233,12 +232,12 @@ def check_words(found: FixedController) -> None:
 def _energy(
     channels: Channels, bound: np.ndarray, inner: Format, signal: Format, memory: int
 ) -> IntegerRow | None:
-    """Roots of the energies of rivals: squares of two of them add up within 63 bits.
+    """Roots of the energies of rivals: the squares of two of them sum within 63 bits.
 
     Args:
         channels: folded controller.
         bound: largest signals, (M,).
-        inner, signal: formats of what the roots are made of.
+        inner, signal: formats of the terms of the roots.
         memory: samples of the impulse responses.
     """
     if channels.energy is None:
@@ -285,21 +284,21 @@ def peak_gains(channels: Channels, n: int) -> Gains:
 
 
 def _sensor_bound(controller: Controller) -> np.ndarray:
-    """Largest sensor signals that codes and own feed-through can make [V], (3, K)."""
+    """Largest sensor signals that codes and their own feed-through can produce [V], (3, K)."""
     ends = np.array([0.0, float(controller.adc_top)]) * controller.adc_step - controller.adc_bias
     own = np.abs(controller.feedthrough).sum(axis=2) * controller.voltage_limit
     return np.abs(ends / controller.adc_gain).max() + own
 
 
 def _bits(largest: np.ndarray) -> np.ndarray:
-    """Fraction bits with room for values up to `largest`, with a little to spare for rounding."""
+    """Fraction bits with room for values up to `largest`, with some margin for rounding."""
     return np.floor(WORD - 1 - np.log2(largest * (1 + 1e-4))).astype(int)
 
 
 def _format(seen: np.ndarray, bound: np.ndarray) -> Format:
-    """Format of a signal, (M,) from its values over time and the most it can be."""
+    """Format of a signal, (M,), from its values over time and its bound."""
     peak = np.abs(seen).max(axis=0)
-    # a channel at rest in the simulation has no range of its own
+    # a channel at rest in the simulation has no range
     base = np.where(peak > bound * 2.0**-20, peak, bound)
     return Format(base, _bits(np.maximum(bound, MARGIN * peak) / base), peak, bound)
 
@@ -319,7 +318,7 @@ def _row(factors: np.ndarray, name: str) -> IntegerRow:
 
 
 def rounded(fixed: FixedPoint, like: Channels) -> Channels:
-    """The channels that the integers stand for, in SI units."""
+    """The channels that the integers represent, in SI units."""
     f = fixed
     scale = f.low_pass.values[:, 0] * f.inner.step / f.high.step  # 1, rounded
     numerator = f.numerator.values * f.force.step[:, None]
@@ -342,7 +341,7 @@ def rounded(fixed: FixedPoint, like: Channels) -> Channels:
 
 
 def _error_bound(found: FixedController, fixed: FixedPoint, gains: Gains, n: int) -> ErrorBound:
-    """Peak errors at the actuators: every rounding through its peak gain, all adding up."""
+    """Peak errors at the actuators: the sum of every rounding through its peak gain."""
     exact = found.channels
     near = rounded(fixed, exact)
     half = 0.5
@@ -372,11 +371,11 @@ def _error_bound(found: FixedController, fixed: FixedPoint, gains: Gains, n: int
 
 
 def _brought_back(found: FixedController, error: np.ndarray) -> np.ndarray:
-    """Errors of commands with what feed-through makes of them, (3, K).
+    """Errors of commands including their feed-through, (3, K).
 
-    An error of a command enters the sensors in the next sample, and so the next command. Peak gains
-    of that recursion by its impulse response; they hold while no actuator is at its limit. Infinite
-    where it does not die out.
+    An error of a command enters the sensors in the next sample, and so the next command. Uses peak
+    gains of this recursion from its impulse response, valid while no actuator is at its limit.
+    Infinite if it does not die out.
     """
     controller = found.controller
     if not np.any(controller.feedthrough):
@@ -420,5 +419,5 @@ def shaper_row(taps: Taps) -> IntegerRow:
     integers, shift = row.integers[0], int(row.shift[0])
     left = round(float(np.sum(taps.weight)) * 2**shift) - int(integers.sum())
     largest = np.argmax(np.abs(integers))
-    integers[largest] += left  # a pose at rest stays where it is
+    integers[largest] += left  # a pose at rest stays unchanged
     return IntegerRow(integers[None], row.shift)

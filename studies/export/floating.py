@@ -1,4 +1,4 @@
-"""The exported arithmetic in floating point, in NumPy: what every signal is for given ADC codes."""
+"""The exported arithmetic in floating point, in NumPy: every signal for given ADC codes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Software in the loop: the plant in JAX, the controller whatever turns ADC codes into volts."""
+"""Software in the loop: the plant in JAX, the controller any function from ADC codes to volts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jaxmodel.controller import Controller, adc_code, controller_step, read_back
 from jaxmodel.loop import Inputs, Loop, State, advance, filtered_voltage
 from jaxmodel.simulate import Result, Start, begin, conclude
 
-#: ADC codes (3, K) of a sample to actuator voltages (3, K) [V] of the next one.
+#: Maps ADC codes (3, K) of a sample to actuator voltages (3, K) [V] of the next one.
 Law = Callable[[np.ndarray], np.ndarray]
 
 
@@ -29,14 +29,14 @@ class LoopRun(NamedTuple):
 
 
 def run_in_the_loop(structure: Structure, case: Case, law: Law) -> LoopRun:
-    """Run a case with a controller that stands outside the compiled program.
+    """Run a case with a controller outside the compiled program.
 
     Args:
         structure: static choices, feedback "sampled".
         case: the numbers.
         law: called once per sample, in order.
     """
-    # the controller is outside: its kind must not cost another compilation
+    # the controller is outside, so its kind must not cost another compilation
     structure = structure._replace(has_position_gain=False)
     start = _begin(structure, case)
     state, inputs = start.state, start.inputs
@@ -60,7 +60,7 @@ _conclude = jax.jit(conclude)
 
 
 def _read(loop: Loop, inputs: Inputs, k: Any, state: State) -> Any:
-    """ADC codes of a state at sample k, and whether any is clipped."""
+    """ADC codes of a state at sample k, and whether any of them clips."""
     noise = None if inputs.adc_noise is None else inputs.adc_noise[k]
     code, is_clipped = adc_code(loop.controller, filtered_voltage(loop, state.plant), noise)
     return code, is_clipped.max()
@@ -88,7 +88,7 @@ def _sample(
 
 
 def jax_law(controller: Controller, n_channels: int, dac_step: float | None = None) -> Law:
-    """The JAX controller as a `Law`; it remembers.
+    """The JAX controller as a `Law` with a state.
 
     Args:
         controller: coefficients.

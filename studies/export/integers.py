@@ -1,4 +1,4 @@
-"""The exported arithmetic in fixed point, in NumPy integers: what the C code does, bit by bit."""
+"""The exported fixed-point arithmetic in NumPy integers: what the C code does, bit by bit."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ SENSORS, CHANNELS = (-2, -1), (-1,)
 
 
 class Response(NamedTuple):
-    """What the integer arithmetic gives; counts are per sample, (T, ...)."""
+    """Results of the integer arithmetic; counts are per sample, (T, ...)."""
 
     codes: np.ndarray  # of the DAC, (T, ..., 3, K)
-    limited: np.ndarray  # internal signals cut to 32 bits
+    limited: np.ndarray  # internal signals clipped to 32 bits
     saturated: np.ndarray  # actuators at their limit
-    is_faulty: np.ndarray  # whether actuators are at rest for a faulty sensor
+    is_faulty: np.ndarray  # whether actuators are at rest because of a faulty sensor
 
 
 def respond(fixed: FixedPoint, codes: np.ndarray, rail: int) -> Response:
@@ -28,7 +28,7 @@ def respond(fixed: FixedPoint, codes: np.ndarray, rail: int) -> Response:
     Args:
         fixed: formats and coefficients.
         codes: 16-bit words, (T, ..., 3, K); sequences side by side.
-        rail: samples at one end of the range that make a sensor faulty.
+        rail: samples at one end of the range after which a sensor is faulty.
     """
     many, n = codes.shape[1:-2], len(fixed.link)
     memory, older, old = np.zeros((3, *many, n), np.int64)
@@ -42,7 +42,7 @@ def respond(fixed: FixedPoint, codes: np.ndarray, rail: int) -> Response:
         at_end = np.where(end * at_end > 0, at_end, 0) + end
         bad = ((code > fixed.adc_top) | (np.abs(at_end) >= rail)) & is_used
         is_faulty = is_faulty | bad.any(axis=(-2, -1))
-        cut: list[np.ndarray] = []  # per sequence, numbers cut to 32 bits
+        cut: list[np.ndarray] = []  # per sequence, how many were clipped
         sensor = _limited(code * 2**fixed.adc_bits - fixed.bias, cut, SENSORS)
         if fixed.feedthrough is not None:
             own = _products(fixed.feedthrough, command[..., None, :])
@@ -71,7 +71,7 @@ def respond(fixed: FixedPoint, codes: np.ndarray, rail: int) -> Response:
 
 
 def _limited(x: np.ndarray, cut: list[np.ndarray], axes: tuple[int, ...] = CHANNELS) -> np.ndarray:
-    """Cut to 32 bits; how many were cut in each sequence goes to `cut`."""
+    """Clip to 32 bits; the number clipped in each sequence is appended to `cut`."""
     inside = np.minimum(np.maximum(x, -(2**31)), 2**31 - 1)
     cut.append(np.sum(x != inside, axis=axes))
     return inside

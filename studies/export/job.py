@@ -1,4 +1,4 @@
-"""One export: what is asked for, the checks that every target makes, and what comes out."""
+"""One export: the request, the checks common to all targets, and the result."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from studies.study.labels import describe
 
 
 class Job(NamedTuple):
-    """What is to be exported, and how."""
+    """What to export, and how."""
 
     found: FixedController
     name: str
@@ -35,7 +35,7 @@ class Job(NamedTuple):
 
 
 class Made(NamedTuple):
-    """What came out."""
+    """The result of an export."""
 
     files: dict[str, str]
     loop: LoopReport  # with the exported coefficients
@@ -45,12 +45,12 @@ class Made(NamedTuple):
 
 
 def judged(found: FixedController, channels: Channels, note: str) -> LoopReport:
-    """Linearised sampled loop with given coefficients; refused where it is unstable."""
+    """Linearised sampled loop with given coefficients; rejected if unstable."""
     home = np.array(found.study.motion.waypoints[0], float)
     law = unfold(channels, found.controller)
     law = jax.tree.map(jnp.asarray, law)
     try:
-        # not the case's own controller: its kind must not cost another compilation
+        # not the case's own controller, so its kind must not cost another compilation
         structure = found.structure._replace(has_position_gain=False)
         loop = loop_report(structure, found.case, home, 1, law=law)
     except np.linalg.LinAlgError:
@@ -71,7 +71,7 @@ def judged(found: FixedController, channels: Channels, note: str) -> LoopReport:
 
 
 def reference_motion(job: Job) -> LoopRun:
-    """The case's motion with the JAX controller, which must run to its end."""
+    """The case's motion with the JAX controller; it must finish."""
     found = job.found
     job.console.print(f"in the loop: {found.structure.n_steps} samples for each controller")
     run = reference_run(found)
@@ -86,7 +86,7 @@ def reference_motion(job: Job) -> LoopRun:
 
 
 def _check_clipping(found: FixedController, run: LoopRun) -> None:
-    """Refuse a motion that the exported code would take for a broken sensor."""
+    """Reject a motion that the exported code would take for a broken sensor."""
     electronics = found.study.electronics
     rail = rail_samples(electronics.sample_rate_hz)
     used = np.isin(np.arange(3), found.channels.link)[:, None]

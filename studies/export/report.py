@@ -1,4 +1,4 @@
-"""The report of an export: what was exported, what was compared, what came out."""
+"""The report of an export: what was exported and compared, and the results."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def report(
 
     Args:
         found: the controller.
-        origin: lines that say where it comes from.
+        origin: lines that say where it came from.
         loop: linearised sampled loop with the exported coefficients.
         verified: what was compared.
         fixed, cost: formats and cost in fixed point.
@@ -58,7 +58,7 @@ def report(
 
 
 def _controllers(found: FixedController, verified: Verification) -> list[list[str]]:
-    """Row of each controller that ran in the loop; none where JAX's was the only one."""
+    """Row of each controller that ran in the loop; none if JAX's was the only one."""
     if len(verified.runs) == 1:
         return []
     rows = []

@@ -38,16 +38,16 @@ def export_design(
     dac_bits: int | None = None,
     console: Console | None = None,
 ) -> bool:
-    """Write a controller, verified where asked for.
+    """Write a controller, verified if requested.
 
     Args:
         design: what to export.
         target: one of `TARGETS`.
-        out: folder for the files, made where it is missing.
-        is_verified: whether to compare with the JAX controller; None: where there is a compiler.
+        out: folder for the files, created if missing.
+        is_verified: whether to compare with the JAX controller; None: if there is a compiler.
         name: of the files, prefix of C functions.
         dac_bits: resolution of the DAC, for targets that have one; None: `DAC_BITS`.
-        console: to tell what happens; default: standard output.
+        console: where messages go; default: standard output.
 
     Returns:
         whether everything agreed; the files are written only then.
@@ -83,10 +83,10 @@ def export_design(
     made = TARGETS[target].make(job)
     for file in made.files:
         if Path(file).name != file or file.startswith("."):
-            raise StudyError(f"--target {target}: it makes {file!r}; a plain file name is wanted")
+            raise StudyError(f"--target {target}: it makes {file!r}; expected a plain file name")
     verified = made.verified
     is_good = verified is None or verified.is_passed
-    texts = made.files if is_good else {}  # what an earlier export has left stays as it is
+    texts = made.files if is_good else {}  # files of an earlier export stay unchanged
     if verified is not None:
         text = report(found, job.origin, made.loop, verified, made.fixed, made.cost)
         texts |= report_files(out, text, found.study, REPORT if is_good else FAILED)
@@ -100,7 +100,7 @@ def export_design(
 def _check_arguments(target: str, name: str, dac_bits: int | None) -> None:
     if target not in TARGETS:
         raise field_error("--target", target, ", ".join(TARGETS), hint=nearest(target, TARGETS))
-    if not _NAME.fullmatch(name) or name == "stdint":  # the header that the code includes
+    if not _NAME.fullmatch(name) or name == "stdint":  # a header that the code includes
         raise field_error("--name", name, "letters, digits and _, 31 at most, a letter first")
     if dac_bits is None:
         return
@@ -112,7 +112,7 @@ def _check_arguments(target: str, name: str, dac_bits: int | None) -> None:
 
 
 def _origin(found: FixedController, case_id: str) -> list[str]:
-    """Where a controller comes from, for heads of files."""
+    """Where a controller comes from, for file headers."""
     study = found.study
     links = "+".join(str(i + 1) for i in range(3) if study.control.links[i])
     package = f"{config.PACKAGE} {config.info()[config.PACKAGE]}"
@@ -143,7 +143,7 @@ def _tell(verified: Verification, console: Console) -> None:
 
 
 def _write(out: Path, texts: dict[str, str], stale: list[str], console: Console) -> None:
-    """Write all files or none; `stale` are reports that would speak of other code."""
+    """Write all files or none; `stale` are reports about other code."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""ADC codes that no plant would make, to compare controllers on."""
+"""ADC codes that no plant would produce, for comparing controllers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def hard_sequences(recorded: np.ndarray, top: int, rail: int) -> dict[str, np.nd
     Args:
         recorded: codes of a run, (T, 3, K).
         top: highest code.
-        rail: samples at an end that make a sensor faulty.
+        rail: samples at an end after which a sensor is faulty.
 
     Returns:
         each (LENGTH, 3, K) or shorter.
@@ -22,7 +22,7 @@ def hard_sequences(recorded: np.ndarray, top: int, rail: int) -> dict[str, np.nd
     rng = np.random.default_rng(0)
     shape = (LENGTH, *recorded.shape[1:])
     sample = np.arange(LENGTH)[:, None, None]
-    # every channel its own period, all short of a fault
+    # every channel with its own period, all just short of a fault
     longest = max(rail - 1, 1)
     half = np.clip(rng.integers(1, 90, shape[1:]), 1, longest)
     stuck = np.clip(recorded[:LENGTH], 1, top - 1)

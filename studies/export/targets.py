@@ -1,7 +1,7 @@
 """Export targets: which files a controller becomes, and how they are verified.
 
-A `Target` makes the files of a `Job` and compares them with the JAX controller where that is asked
-for. `TARGETS` is the only list of them; `TARGETS.add` puts in one of your own.
+A `Target` makes the files of a `Job` and, if requested, compares them with the JAX controller.
+`TARGETS` is the only list of them; `TARGETS.add` adds your own.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class Target(NamedTuple):
     name: str
     text: str  # what they are
     make: Callable[[Job], Made]
-    needs_compiler: bool = False  # to be verified
-    has_dac: bool = False  # the resolution of a DAC may be given
+    needs_compiler: bool = False  # for verification
+    has_dac: bool = False  # accepts the resolution of a DAC
 
 
 def _as_json(job: Job) -> Made:

@@ -1,4 +1,4 @@
-"""Whether exported code does what the JAX controller does: open loop, in the loop, under abuse."""
+"""Compare exported code with the JAX controller: open loop, in the loop, under faults."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from studies.export.integers import respond as respond_fixed
 from studies.export.sequences import hard_sequences, stuck_at_end
 from studies.study.labels import describe
 
-#: Double precision against JAX, largest difference over largest value [1].
+#: Limit for double precision against JAX, largest difference over largest value [1].
 DOUBLE = 1e-12
-#: Single precision that differs by more is not worth using.
+#: Limit for single precision, beyond which it is useless.
 SINGLE = 1e-3
-#: Share of samples in which rounding may decide which of two rivals acts [1].
+#: Allowed share of samples in which rounding decides which of two rivals acts [1].
 OTHER_MODE = 0.01
-#: Residual vibration in fixed point may exceed that in floating point by this share [1].
+#: Allowed excess of residual vibration in fixed point over that in floating point [1].
 AIM = 0.01
 #: Counts per metre and radian of the shaper's reference in fixed point.
 REFERENCE_COUNTS = 1e9
@@ -47,7 +47,7 @@ class Check(NamedTuple):
 
 
 class InTheLoop(NamedTuple):
-    """A run in the loop beside that with the JAX controller."""
+    """A run in the loop compared with that of the JAX controller."""
 
     voltage: float  # largest difference of an actuator [V]
     pose: np.ndarray  # of the platform [m, m, rad], (3,)
@@ -56,15 +56,15 @@ class InTheLoop(NamedTuple):
 
 
 class Verification(NamedTuple):
-    """Everything compared."""
+    """All comparisons."""
 
     checks: list[Check]
-    notes: list[str]  # what is good to know, and no reason to refuse
-    runs: dict[str, LoopRun]  # by whose controller it was, that of JAX first
+    notes: list[str]  # remarks that do not fail the verification
+    runs: dict[str, LoopRun]  # by controller, JAX first
     counts: dict[str, Response]  # fixed point: by sequence
 
     def beside(self, name: str) -> InTheLoop:
-        """One of the runs against that with the JAX controller."""
+        """One of the runs against that of the JAX controller."""
         wanted, run = self.runs["JAX"], self.runs[name]
         differing = np.flatnonzero(np.any(run.codes != wanted.codes, axis=(1, 2)))
         size = vibration(wanted)
@@ -93,7 +93,7 @@ def reference_run(found: FixedController) -> LoopRun:
 
 
 def verify_document(found: FixedController, reference: LoopRun, document: Document) -> Verification:
-    """A controller built from nothing but its document, against the JAX controller."""
+    """A controller built only from its document, against the JAX controller."""
     controller, taps = controller_of(document)
     channels = fold(controller, LAWS[document.law].channel)
     checks = [
@@ -189,7 +189,7 @@ def verify_fixed(
                     differing == 0,
                 )
             )
-        # a 16-bit word can be no higher than the highest code of such an ADC
+        # a 16-bit word cannot exceed the highest code of such an ADC
         bad = {"beyond the range": fixed.adc_top + 1.0} if fixed.adc_top < 2**16 - 1 else {}
         checks += _faults(found, code, reference, bad, 1.0, float(fixed.dac_rest))
         checks.append(_check_shaper(found, code))
@@ -261,14 +261,14 @@ def _faults(
     rest: float,
     note: str = "",
 ) -> list[Check]:
-    """A faulty sensor must be named, and all actuators at rest from then on.
+    """Check that a faulty sensor is reported and all actuators rest from then on.
 
     Args:
         found: the controller.
-        code: it in C.
+        code: the same in C.
         reference: its run.
-        bad: codes that are faulty at once, by name.
-        scale: what the code takes for one ADC code.
+        bad: codes that are faulty immediately, by name.
+        scale: the code's value of one ADC code.
         rest: an actuator's value at rest.
         note: for the names of the checks.
     """
@@ -348,10 +348,10 @@ def _check_shaper(found: FixedController, code: Code) -> Check:
 def _check_error(
     found: FixedController, fixed: FixedPoint, reference: LoopRun, response: Response
 ) -> Check:
-    """Fixed point against the JAX controller on the same codes, beside what it may differ by.
+    """Fixed point against the JAX controller on the same codes, with the allowed difference.
 
-    Where rivals are so nearly equal that rounding decides which of them acts, no bound holds; these
-    samples are left out and must be few.
+    Where rivals are so close that rounding decides which of them acts, no bound holds; such samples
+    are left out and must be few.
     """
     volts = (response.codes - fixed.dac_rest) * fixed.dac_step
     each = np.abs(volts - reference.voltage)
@@ -382,7 +382,7 @@ def _check_error(
 
 
 def _same_status(runs: dict[str, LoopRun]) -> list[Check]:
-    """Every run must end as that with the JAX controller."""
+    """Check that every run ends like that of the JAX controller."""
     wanted, *others = (describe(int(run.result.status)) for run in runs.values())
     names = list(runs)[1:]
     return [

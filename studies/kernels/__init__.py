@@ -1,7 +1,7 @@
-"""The step as a loop of our own machine code, where XLA's would be slow (docs/performance.md).
+"""The step as our own compiled loop, where XLA's would be slow (docs/performance.md).
 
-- `traced`: one sample of the step, as operations on single numbers and the arrays they come from;
-  it builds on `graph` (from JAX's equations), `fusion` (fewer, better ordered) and `tangents`.
+- `traced`: one sample of the step, as operations on scalars and the arrays they come from; it
+  builds on `graph` (from JAX's equations), `fusion` (fewer, better ordered) and `tangents`.
 - `cpu`: that loop for this processor's vectors, written by `llvm`; needs the extra `fast`.
-- `gpu`: the same loop for graphics processors, as PTX.
+- `gpu`: the same loop for GPUs, as PTX.
 """

@@ -1,7 +1,7 @@
-"""Time that compilers take in this process, and a folder of what LLVM has compiled before.
+"""Compile time in this process, and a cache folder of LLVM's machine code.
 
-JAX keeps its compiled programs in a folder by itself (`studies.config`); the kernels of
-`studies.kernels.cpu` are kept beside them, under the hash of their code, compiler and processor.
+JAX caches its compiled programs in a folder itself (`studies.config`); the kernels of
+`studies.kernels.cpu` are kept there too, under the hash of their code, compiler and processor.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from studies.config import cache_folder
 from studies.errors import StudyError
 from studies.store import replacing
 
-#: What JAX calls the time its backend takes to compile, or to find a program in the cache.
+#: JAX's name for the time its backend takes to compile, or to find a program in the cache.
 _EVENT = "/jax/core/compile/backend_compile_duration"
 _spent = [0.0]
 
 
 def compiler_time() -> float:
-    """Seconds that XLA and LLVM have compiled for in this process, since the first call."""
+    """Seconds that XLA and LLVM have spent compiling in this process since the first call."""
     _listen()
     return _spent[0]
 
 
 @contextmanager
 def compiling() -> Iterator[None]:
-    """Count what happens inside as a compiler's time."""
+    """Count the time inside as compile time."""
     began = time.perf_counter()
     yield
     _spent[0] += time.perf_counter() - began
@@ -49,12 +49,12 @@ def _listen() -> None:
 
 
 class ObjectCache:
-    """Machine code of one module; `take` and `keep` are what llvmlite asks of a cache."""
+    """Machine code of one module; `take` and `keep` are llvmlite's cache interface."""
 
     def __init__(self, *names: str) -> None:
         """
         Args:
-            names: everything that the machine code depends on.
+            names: everything the machine code depends on.
         """
         folder = cache_folder()
         name = hashlib.sha256("\0".join(names).encode()).hexdigest()
@@ -69,7 +69,7 @@ class ObjectCache:
         return code if digest and digest == _digest(code) else None
 
     def keep(self, module: Any, code: bytes) -> None:
-        """Write it; a cache saves time only, so a folder that cannot be written to is no error."""
+        """Write it; the cache only saves time, so an unwritable folder is not an error."""
         if self._path is None:
             return
         try:

@@ -1,7 +1,7 @@
 """The traced loop on this processor: compiled by LLVM, vectors of cases side by side.
 
 XLA cannot do this: it fuses the step into many loops that recompute what they share. llvmlite is
-optional (extra `fast`); without it XLA runs the same step.
+optional (extra `fast`); without it, XLA runs the same step.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from studies.kernels.graph import is_known
 from studies.kernels.llvm import Arguments, Writer, binding, ir
 from studies.kernels.traced import Change, TracedLoop
 
-#: Bytes of the vectors: what one register of the widest common instruction set holds.
+#: Bytes per vector: one register of the widest common instruction set.
 VECTOR_BYTES = 64
-#: In XLA_FLAGS, how much XLA's code generator optimises; the kernels' does the same.
+#: Optimisation level of XLA's code generator in XLA_FLAGS; the kernels use the same.
 _LEVEL = re.compile(r"--xla_backend_optimization_level=([0-3])")
 
 
 class Kernel:
-    """A compiled loop. Call it with arrays; it runs without Python's lock."""
+    """A compiled loop. Call it with arrays; it releases Python's lock."""
 
     def __init__(
         self, code: Any, width: int, numbers: np.ndarray, operations: Counter[str]
@@ -45,16 +45,16 @@ class Kernel:
         self.operations = operations
 
     def run(self, leaves: Sequence[np.ndarray], n_steps: int, lanes: int) -> None:
-        """Step all lanes from begin to end; the state's arrays are changed in place.
+        """Step all lanes from start to end; the state's arrays are changed in place.
 
         Args:
-            leaves: arrays in the order of `build_kernel`, those known left out, contiguous; those
-                of inputs have the samples first, varying ones the lanes last.
+            leaves: contiguous arrays in the order of `build_kernel`, without known ones; inputs
+                have samples first, varying arrays have lanes last.
             n_steps: samples.
             lanes: cases side by side, a multiple of `width`.
 
         Raises:
-            ValueError: another number of lanes, which would write beyond the arrays.
+            ValueError: wrong number of lanes, which would write beyond the arrays.
         """
         if lanes % self.width:
             raise ValueError(f"lanes = {lanes}; allowed: multiples of {self.width}")
@@ -82,9 +82,9 @@ def _build(loop: TracedLoop) -> tuple[Kernel, bytes]:
 
 
 def kept_kernel(name: str, make: Callable[[], TracedLoop]) -> Kernel:
-    """The kernel of a loop that `name` and the code of model and kernels decide alone.
+    """The kernel of a loop that depends only on `name` and the code of model and kernels.
 
-    Found in the cache's folder it need not even be traced.
+    If found in the cache folder, it is not even traced.
 
     Args:
         name: of the loop, with all sizes.
@@ -109,7 +109,7 @@ def kept_kernel(name: str, make: Callable[[], TracedLoop]) -> Kernel:
 
 @cache
 def _code() -> str:
-    """Of the code that a traced loop comes from."""
+    """Hash of the code that a traced loop comes from."""
     return sources.digest(__name__, "jaxmodel")
 
 
@@ -147,9 +147,9 @@ class _VectorWriter(Writer):
         return self.builder.load(place, typ=ir.PointerType())
 
     def _flush_to_zero(self) -> Any:
-        """Where the processor's old mode is kept, while numbers too small to be normal become 0.
+        """Flush subnormal numbers to 0; returns where the processor's old mode is kept.
 
-        Working with them takes a hundred times as long, and sums in single precision meet them.
+        Arithmetic with them is a hundred times slower, and sums in single precision produce them.
         """
         if not binding.get_default_triple().startswith("x86_64"):
             return None
@@ -174,11 +174,10 @@ class _VectorWriter(Writer):
         self._call(name, ir.VoidType(), value, slot, alignment, mask)
 
     def _number(self, x: float) -> Any:
-        """A known number, read anew at each use.
+        """A known number, reloaded at each use.
 
-        LLVM would keep every one of them as a whole vector on the stack, more than the cache holds.
-        One of its own in memory costs an instruction nothing: it is spread over the vector as it is
-        read.
+        LLVM would keep each one as a full vector on the stack, more than the cache holds. A scalar
+        in memory costs nothing extra: it is broadcast over the vector as it is read.
         """
         place = ir.Constant(self.index, len(self.numbers))
         self.numbers.append(x)
@@ -188,19 +187,19 @@ class _VectorWriter(Writer):
 
 @cache
 def initialise() -> None:
-    """Make LLVM ready for this processor."""
+    """Prepare LLVM for this processor."""
     for part in ("initialize_native_target", "initialize_native_asmprinter"):
         getattr(binding, part)()
 
 
 def _effort() -> int:
-    """How much LLVM optimises; 0 compiles six times as fast as 3 what runs half as fast."""
+    """LLVM's optimisation level; 0 compiles six times as fast as 3, and runs half as fast."""
     found = _LEVEL.search(os.environ.get("XLA_FLAGS", ""))
     return int(found[1]) if found else 3
 
 
 def _target() -> tuple[str, ...]:
-    """What machine code depends on besides its text."""
+    """What machine code depends on besides its source."""
     features, version = binding.get_host_cpu_features().flatten(), binding.llvm_version_info
     triple = binding.get_default_triple()
     return (
@@ -220,7 +219,7 @@ def _machine() -> Any:
 
 
 def _compile(text: str) -> tuple[Any, bytes]:
-    """The engine that holds the machine code of a module, and that code."""
+    """The engine with the machine code of a module, and that code."""
     initialise()
     kept, code = ObjectCache(text, *_target()), []
 

@@ -1,7 +1,7 @@
-"""The last look at a graph before it becomes code: fewer operations, in an order that suits.
+"""Final pass over a graph before it becomes code: fewer operations, in a suitable order.
 
-A processor multiplies and adds in one instruction (`fma`) and holds 32 vectors at hand; whatever
-else is in flight goes to memory and back.
+A processor multiplies and adds in one instruction (`fma`) and has 32 vector registers; any further
+live values go to memory and back.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ _SUMS = ("add", "sub", "neg")
 
 
 def fused(results: Sequence[Any]) -> list[Any]:
-    """The same results with every sum as one chain of `fma`, rounded once a link.
+    """The same results with every sum as one chain of `fma`, each rounding once.
 
-    Sums within a sum that nothing else wants become terms of it; products that nothing else wants
-    are added as they are multiplied: `fma` is a b + c, `fnma` is c - a b.
+    Inner sums that nothing else reads become terms of the outer sum; products that nothing else
+    reads are added as they are multiplied: `fma` is a b + c, `fnma` is c - a b.
     """
     order = in_order(results)
-    reader: dict[int, Node | None] = {}  # the only node that reads a number; None: several
+    reader: dict[int, Node | None] = {}  # the only node reading a number; None: several
     for node in order:
         for x in node.args:
             reader[id(x)] = None if id(x) in reader else node
@@ -90,12 +90,12 @@ def _chain(products: list[tuple[int, Any, Any]], plain: list[tuple[int, Any]]) -
 
 
 def in_order(wanted: Iterable[Any]) -> list[Node]:
-    """Nodes that some results need, each after its arguments and as late as possible.
+    """Nodes needed by some results, each after its arguments and as late as possible.
 
     Depth first, the argument with the longest history first, keeps few numbers in flight.
 
     Args:
-        wanted: nodes; numbers are passed over.
+        wanted: nodes; plain numbers are ignored.
     """
     wanted = list(wanted)
     height: dict[int, int] = {}
@@ -105,7 +105,7 @@ def in_order(wanted: Iterable[Any]) -> list[Node]:
 
 
 def _depth_first(wanted: list[Any], priority: Callable[[Any], int] | None = None) -> list[Node]:
-    """Each node after its arguments, of which those of the highest priority come first."""
+    """Each node after its arguments, those with the highest priority first."""
     order: list[Node] = []
     seen: set[int] = set()
     stack: list[Any] = wanted[::-1]
@@ -121,5 +121,5 @@ def _depth_first(wanted: list[Any], priority: Callable[[Any], int] | None = None
 
 
 def count_operations(wanted: Iterable[Any]) -> Counter[str]:
-    """How many operations of each kind some results need."""
+    """Number of operations of each kind that some results need."""
     return Counter(node.operation for node in _depth_first(list(wanted)))

@@ -1,11 +1,11 @@
-"""The traced loop on an Nvidia graphics processor: one thread a case, its state in registers.
+"""The traced loop on an Nvidia GPU: one thread per case, its state in registers.
 
-XLA alone would launch several small programs a sample and keep the state in memory between them;
-here a case's whole run is one launch. LLVM writes the same instructions as for the CPU, on plain
-numbers, as PTX; XLA hands PTX to the driver by a call target of its own. Pallas would do for small
-loops: the same one written for it gives the same results, but Triton, which compiles it, walks
-through all operations again for every number that is read or written, and was not done with W0's
-2,600 operations after nine minutes (docs/performance.md).
+XLA alone would launch several small kernels per sample and keep the state in memory between them;
+here a case's whole run is one launch. LLVM writes the same instructions as for the CPU, on scalars,
+as PTX; XLA passes PTX to the driver through its own call target. Pallas would work for small loops:
+the same loop written in it gives the same results, but Triton, its compiler, traverses all
+operations again for every number read or written, and had not finished W0's 2,600 operations after
+nine minutes (docs/performance.md).
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from studies.kernels.compilation import compiling
 from studies.kernels.llvm import Arguments, Writer, binding, ir
 from studies.kernels.traced import TracedLoop
 
-#: Cases of one block of threads: two warps, so that registers are shared out in fine portions.
+#: Cases per thread block: two warps, so that registers are allocated in small portions.
 BLOCK = 64
-#: XLA's name for a call of a program in PTX (jaxlib 0.10).
+#: XLA's name for a call of a PTX program (jaxlib 0.10).
 TARGET = "__gpu$xla.gpu.ptx"
-#: The oldest processors the PTX is for; the driver compiles it for the one at hand.
+#: The oldest GPUs the PTX supports; the driver compiles it for the actual one.
 _ARCHITECTURE, _PTX = "sm_70", "+ptx63"
 _TRIPLE = "nvptx64-nvidia-cuda"
 
@@ -42,8 +42,8 @@ def build_kernel(
         lanes: cases side by side, a multiple of BLOCK.
 
     Returns:
-        A function of arrays as `studies.kernels.cpu.Kernel.run` takes them; it may be part of a
-        compiled program.
+        A function of arrays as for `studies.kernels.cpu.Kernel.run`; it can be part of a compiled
+        program.
     """
     source = write_ptx(loop, n_steps, lanes)
     state = loop.leaves["state"]
@@ -80,11 +80,11 @@ def write_ptx(loop: TracedLoop, n_steps: int, lanes: int) -> str:
 
 
 def optimise(module: Any, target: Any) -> None:
-    """LLVM's own passes, which bring the state from the stack to registers.
+    """Run LLVM's own passes, which move the state from the stack to registers.
 
     Args:
         module: parsed.
-        target: machine that it is for.
+        target: machine to optimise for.
     """
     tuning = binding.create_pipeline_tuning_options(speed_level=3)
     builder = binding.create_pass_builder(target, tuning)
@@ -114,7 +114,7 @@ class ThreadWriter(Writer):
 
 
 def _add_entry(module: Any) -> None:
-    """The function that every thread begins with: it finds its case."""
+    """Add the entry point of every thread, which finds its case."""
     case = module.globals["case"]
     case.attributes.add("alwaysinline")
     case.linkage = "internal"

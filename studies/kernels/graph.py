@@ -1,9 +1,9 @@
-"""A traced function as a graph of operations on single numbers, simplified while it is built.
+"""A traced function as a graph of scalar operations, simplified while it is built.
 
-`trace` carries out the equations of a jaxpr on arrays of nodes. A node is a number of one case:
-*known* (a Python number, arithmetic on it is done at once), *shared* (the same for all cases) or
-*varying*. Equal operations on equal nodes are one node, and what nobody reads is never visited, so
-the graph holds the arithmetic that has to be done and nothing else.
+`trace` executes the equations of a jaxpr on arrays of nodes. A node is a number of one case:
+*known* (a Python number, folded immediately), *shared* (the same for all cases) or *varying*. Equal
+operations on equal nodes are one node, and unused results are never visited, so the graph holds
+only the necessary arithmetic.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 
 class Node:
-    """One operation, or one number that is read from memory (`read`)."""
+    """One operation, or one number read from memory (`read`)."""
 
     __slots__ = ("args", "is_truth", "is_varying", "operation", "place")
 
@@ -31,11 +31,11 @@ class Node:
     ) -> None:
         self.operation, self.args = operation, args
         self.is_varying, self.is_truth = is_varying, is_truth
-        self.place = place  # of a `read`: whatever its reader knows it by
+        self.place = place  # of a `read`: its identification by the reader
 
 
 class Graph:
-    """Makes nodes; one instance for one traced function."""
+    """Creates nodes; one instance per traced function."""
 
     def __init__(self) -> None:
         self._made: dict[tuple[Any, ...], Node] = {}
@@ -47,7 +47,7 @@ class Graph:
     def trace(
         self, function: Callable[..., Any], arguments: Sequence[Any], dtype: Any
     ) -> list[np.ndarray]:
-        """Results of a function of lists of arrays.
+        """Trace a function of lists of arrays.
 
         Args:
             function: elementwise JAX function, `function(*arguments)`.
@@ -58,7 +58,7 @@ class Graph:
             Arrays of nodes and numbers, flat in the order of the function's result.
 
         Raises:
-            NotImplementedError: an operation that a graph does not know.
+            NotImplementedError: an operation that a graph does not support.
         """
         shapes = [[jax.ShapeDtypeStruct(x.shape, dtype) for x in part] for part in arguments]
         closed = jax.make_jaxpr(function)(*shapes)
@@ -91,7 +91,7 @@ class Graph:
         return [value(atom) for atom in jaxpr.outvars]
 
     def _unrolled(self, params: Any, given: list[np.ndarray]) -> list[np.ndarray]:
-        """A scan, one turn after the other."""
+        """A scan, unrolled."""
         body, n_consts, n_carry = params["jaxpr"], params["num_consts"], params["num_carry"]
         constants, carry = given[:n_consts], given[n_consts : n_consts + n_carry]
         stacked = given[n_consts + n_carry :]
@@ -135,10 +135,10 @@ class Graph:
     # --- operations on single numbers -------------------------------------------------------------
 
     def operation(self, name: str) -> Callable[..., Any]:
-        """What JAX calls `name`, on nodes and numbers.
+        """JAX's operation `name`, on nodes and numbers.
 
         Raises:
-            NotImplementedError: unknown here.
+            NotImplementedError: not supported here.
         """
         if name in _COMPARE:
             return partial(self._compared, name)
@@ -185,7 +185,7 @@ class Graph:
             if _is(one, -1):
                 return self._op_neg(other)
             if _is(one, 0):
-                return 0.0  # a number that is not finite shows in the state itself
+                return 0.0  # a non-finite number shows in the state itself
         return self._node("mul", a, b)
 
     def _op_div(self, a: Any, b: Any) -> Any:
@@ -249,7 +249,7 @@ class Graph:
     def _extreme(
         self, name: str, a: Any, b: Any, extreme: Callable[..., Any], no_limit: float
     ) -> Any:
-        """The larger or smaller one; not a number if either is none."""
+        """The larger or smaller one; NaN if either is NaN."""
         if is_known(b):
             a, b = b, a
         if is_known(b):
@@ -287,7 +287,7 @@ def objects(values: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def is_known(value: Any) -> bool:
-    """Whether it is a number, not a node."""
+    """Whether a value is a number, not a node."""
     return not isinstance(value, Node)
 
 
@@ -302,7 +302,6 @@ def _tree(join: Callable[..., Any], values: list[Any]) -> Any:
     return values[0]
 
 
-#: Operations whose arguments may change places.
 _SYMMETRIC = ("add", "mul")
 #: Comparisons by their names among JAX's operations.
 _COMPARE: dict[str, Callable[[Any, Any], Any]] = {

@@ -1,6 +1,6 @@
-"""A traced loop as LLVM's instructions, for the processors' own writers to complete.
+"""A traced loop as LLVM instructions, completed by a writer for each processor.
 
-The optional llvmlite is imported here alone.
+The optional llvmlite is imported only here.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def is_available() -> bool:
 
 
 class Arguments(NamedTuple):
-    """What the function is given; LLVM values."""
+    """Arguments of the function; LLVM values."""
 
     bases: dict[str, list[Any]]  # address of every leaf, by kind; "result": of the last state
     n_steps: Any
@@ -36,8 +36,8 @@ class Arguments(NamedTuple):
 class Writer:
     """Writes one loop as a module with one function.
 
-    Subclasses give the function its arguments (`open`, `close`) and may write stores and known
-    numbers in their own way.
+    Subclasses define the function's arguments (`open`, `close`) and can override how stores and
+    known numbers are written.
     """
 
     def __init__(self, loop: TracedLoop, width: int) -> None:
@@ -69,7 +69,7 @@ class Writer:
         entry, function = self.builder.block, self.builder.function
         loop, leave = map(function.append_basic_block, ("loop", "leave"))
         changes, order, is_fixed = self.loop.changes, self.loop.order, self.loop.fixed()
-        # the state lives on the stack, at constant offsets and overlapping nothing
+        # the state lives on the stack, at constant offsets without overlap
         at_state = self._places("state", "state", frame)
         slots = self._slots(len(at_state))
         for slot, place in zip(slots, at_state, strict=True):
@@ -129,14 +129,14 @@ class Writer:
         return self.builder.load(slot, align=self.bytes * self.width, typ=self.vector)
 
     def _store(self, change: Change, slot: Any) -> None:
-        """Keep a number where it changes."""
+        """Store a number where it changes."""
         value = self._widened(change.value)
         if not is_known(change.mask):
             value = self.builder.select(self._widened(change.mask), value, self._kept(slot))
         self._keep(value, slot)
 
     def _places(self, kind: str, base: str, frame: Arguments, sample: Any = None) -> list[Any]:
-        """Address of every number, of this sample's row where there is one."""
+        """Address of every number, in this sample's row if there is one."""
         found = []
         leaves: list[InputLeaf] = self.loop.leaves[kind]
         for leaf, start_of_leaf in zip(leaves, frame.bases[base], strict=True):
@@ -185,7 +185,7 @@ class Writer:
         return self.builder.shuffle_vector(start, nothing, order)
 
     def _number(self, x: float) -> Any:
-        """A known number that is to fill a vector."""
+        """A known number, to be broadcast to a vector."""
         return ir.Constant(self.scalar, float(x))
 
     def _plain(self, node: Node, *args: Any) -> Any:
@@ -225,8 +225,8 @@ class Writer:
         return self._extreme("<", node, a, b)
 
     def _extreme(self, sign: str, node: Node, a: Any, b: Any) -> Any:
-        """The larger or smaller one; not a number if either is none."""
-        # one instruction, which gives b where either is no number
+        """The larger or smaller one; NaN if either is NaN."""
+        # one instruction, which gives b if either is NaN
         chosen = self.builder.select(self.builder.fcmp_ordered(sign, a, b), a, b)
         if is_known(node.args[0]):
             return chosen
@@ -258,7 +258,7 @@ class Writer:
         return self.builder.call(function, args)
 
 
-#: Comparisons in LLVM's writing.
+#: Comparisons in LLVM's notation.
 _SIGNS = {"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "==", "ne": "!="}
 
 
@@ -267,7 +267,7 @@ def _due(
 ) -> dict[Any, list[Change]]:
     """After which node of the loop each change can be stored; None: before all of them.
 
-    That is when it is worked out and nothing reads the old number any more.
+    That is when it is computed and nothing reads the old number any more.
     """
     at = {id(node): k for k, node in enumerate(order)}
     read = {node.place[1]: node for node in order if node.place and node.place[0] == "state"}

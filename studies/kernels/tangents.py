@@ -1,8 +1,8 @@
-"""Forward differentiation of a graph: how its results change along given changes of its reads.
+"""Forward differentiation of a graph: tangents of its results for given tangents of its reads.
 
-Done on the graph, where equal operations are one already and a number that does not change has the
-known tangent 0: a sixth of the divisions and half the time to compile of JAX's own derivative of
-the step, which the tests compare it with.
+Done on the graph, where equal operations are already merged and a constant has the known tangent
+0: a sixth of the divisions and half the compile time of JAX's own derivative of the step, which
+the tests compare it with.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import Any
 from studies.kernels.fusion import in_order
 from studies.kernels.graph import Graph, is_known
 
-#: Operations whose results stay the same along any small change.
+#: Operations whose results do not change under small changes.
 _FLAT = ("read", "round", "lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not")
 
 
 def push_forward(graph: Graph, results: Sequence[Any], seeds: dict[int, Any]) -> list[Any]:
-    """Tangents of results.
+    """Compute tangents of results.
 
     Where two arguments of a minimum or maximum are equal, the second one counts.
 

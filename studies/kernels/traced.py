@@ -1,6 +1,6 @@
-"""One sample of a step as operations on single numbers, and the arrays that it reads.
+"""One sample of a step as scalar operations, and the arrays it reads.
 
-What a kernel is written from, for any processor: the state is carried from sample to sample,
+Kernels for all processors are generated from it: the state is carried from sample to sample,
 constants stay, inputs change with the sample.
 """
 
@@ -18,10 +18,10 @@ from studies.kernels.tangents import push_forward
 
 
 class InputLeaf(NamedTuple):
-    """One input array of the step that is read from memory."""
+    """One array that the step reads from memory."""
 
     shape: tuple[int, ...]  # of one case (and of one sample)
-    is_varying: bool  # one value per case, lanes last; else one for all
+    is_varying: bool  # one value per case, lanes last; otherwise one for all
     is_moving: bool = False  # has tangents; so has every leaf of the state
 
     @property
@@ -31,7 +31,7 @@ class InputLeaf(NamedTuple):
 
 
 class Change(NamedTuple):
-    """What a sample does to one number of the state."""
+    """Update of one number of the state by a sample."""
 
     slot: int
     mask: Any  # where it changes
@@ -39,7 +39,7 @@ class Change(NamedTuple):
 
 
 class TracedLoop(NamedTuple):
-    """A loop over samples that is still to be written as code."""
+    """A loop over samples, ready to be written as code."""
 
     leaves: dict[
         str, list[InputLeaf]
@@ -73,20 +73,20 @@ def trace_loop(
 ) -> TracedLoop:
     """Trace a loop over `step(constants, inputs, state) -> state`, all lists of arrays.
 
-    With directions, the state's tangents are carried along too: behind the constants, behind the
-    inputs and behind the state the loop then takes tangents of those that move, each varying and
-    with the directions before the leaf's own shape.
+    With directions, the state's tangents are carried along: constants, inputs and state are each
+    followed by the tangents of their moving leaves, all varying and with the directions before the
+    leaf's own shape.
 
     Args:
         step: elementwise JAX function of one case and one sample.
-        constants: arrays that stay the same over a run; the known ones themselves.
+        constants: arrays that stay the same over a run; known ones as values.
         inputs: arrays of one sample; in memory one row per sample.
         state: arrays carried from sample to sample; always varying.
         dtype: float64 or float32, of all arrays.
         directions: tangents of each number.
 
     Raises:
-        NotImplementedError: an operation of the step that a graph does not know.
+        NotImplementedError: an operation of the step that a graph does not support.
     """
     real, graph = np.dtype(dtype), Graph()
     read = [leaf for leaf in constants if isinstance(leaf, InputLeaf)]
@@ -121,7 +121,7 @@ def trace_loop(
 
 
 def _tangent(leaf: InputLeaf, directions: int) -> InputLeaf:
-    """Where the tangents of a leaf are read from."""
+    """The leaf from which the tangents of a leaf are read."""
     return InputLeaf((directions, *leaf.shape), True)
 
 
@@ -156,12 +156,12 @@ def _tangents(
 
 
 def _elements(leaves: Sequence[InputLeaf]) -> list[InputLeaf]:
-    """Its leaf for every number."""
+    """The leaf of every number."""
     return [leaf for leaf in leaves for _ in range(leaf.size)]
 
 
 def _changes(results: Sequence[Any]) -> list[Change]:
-    """The numbers of the state that change; a case that is frozen keeps its own."""
+    """The numbers of the state that change; a frozen case keeps its own."""
     changes = []
     for k, x in enumerate(results):
         if not is_known(x) and x.operation == "select" and _is_state(x.args[1], k):

@@ -1,8 +1,8 @@
 """The cases of the paper's sections 4 and 5, and how they run: two passes of one compiled batch.
 
 First pass: no control. Its modal energies give every controlled case the ratios (24) of its own
-uncontrolled counterpart, as in the paper. Second pass: the controlled cases. Both differ in numbers
-only, so one program, compiled once for a fixed number of cases, runs them all.
+uncontrolled counterpart, as in the paper. Second pass: the controlled cases. They differ only in
+numbers, so one program, compiled once for a fixed number of cases, runs them all.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from studies.engine.runs import check_run, judged_status, run_study
 from studies.engine.stability import LoopReport, loop_report
 from studies.study.spec import Flags, Study
 
-#: How they run. A kernel would take longer to trace than the scan takes for the few cases there are
+#: Executor. A kernel would take longer to trace than the scan takes for these few cases
 #: (docs/performance.md).
 EXECUTOR = "XLA scan, with trajectories"
 
 
-#: The paper's move and a faster one that leaves something to suppress [s].
+#: The paper's move and a faster one that leaves vibration to suppress [s].
 MOVES = {"paper": 0.1, "fast": 0.05}
 
 
@@ -43,7 +43,7 @@ OFF, ALL, TWO, ONE = (False,) * 3, (True,) * 3, (True, True, False), (True, Fals
 PAPER_RATIOS = ((1.0, 0.345, 0.045), (1.0, 0.304, 0.041), (1.0, 0.321, 0.038))
 
 
-#: Ratios that control mode 1 only, as in the paper's comparison experiments.
+#: Ratios that control only mode 1, as in the paper's comparison experiments.
 FIRST_MODE = ((1.0, 0.0, 0.0),) * 3
 
 
@@ -52,12 +52,12 @@ HIGH_DAMPING = 0.05
 
 
 class PaperCase(NamedTuple):
-    """One case, by what sets it apart."""
+    """One case, by its distinguishing settings."""
 
     name: str
     move: str  # key of MOVES
     shaper: str
-    modes: int  # modes the modal filter separates, 3 in section 4, 2 in section 5
+    modes: int  # modes separated by the modal filter, 3 in section 4, 2 in section 5
     links: Flags = OFF  # controlled
     ratio_from: str = "none"  # "own run", "paper (26)", "mode 1 only", "none"
     gain_factor: float = 0.5  # f
@@ -67,7 +67,7 @@ class PaperCase(NamedTuple):
 
     @property
     def counterpart(self) -> tuple[Any, ...]:
-        """What a controlled case shares with the uncontrolled one its ratios come from."""
+        """What a controlled case shares with the uncontrolled one that supplies its ratios."""
         return self.move, self.shaper, self.modes, self.damping_ratio
 
     @property
@@ -101,9 +101,9 @@ class PaperRuns(NamedTuple):
     frame: SharedFrame
     cases: list[PaperCase]
     result: Result
-    status: np.ndarray  # codes; UNSTABLE where the linearised sampled loop is, (n,)
+    status: np.ndarray  # codes; UNSTABLE if the linearised sampled loop is, (n,)
     ratio: np.ndarray  # gains of the modes over that of mode 1 [1], (n, 3, C)
-    loops: dict[str, LoopReport]  # by case name, where the loop was linearised
+    loops: dict[str, LoopReport]  # by case name, if the loop was linearised
     energy_ratio: list[EnergyRatio]
 
     @property
@@ -113,7 +113,7 @@ class PaperRuns(NamedTuple):
         return self.result.record
 
     def where(self, **wanted: Any) -> int:
-        """Position of the first case with these values."""
+        """Index of the first case with these values."""
         for k, case in enumerate(self.cases):
             if all(getattr(case, field) == value for field, value in wanted.items()):
                 return k
@@ -151,7 +151,7 @@ def paper_cases(gain_factor: float) -> list[PaperCase]:
     return off + on
 
 
-#: Cases whose linearised sampled loop is judged as well (seconds each).
+#: Cases whose linearised sampled loop is also judged (seconds each).
 JUDGED = ("fast-none-3modes-links123", "paper-ratios", "paper-preset", "difference")
 
 
@@ -163,7 +163,7 @@ def case_study(base: Study, case: PaperCase, ratio: np.ndarray | None = None) ->
         motion__move_time=MOVES[case.move],
         shaper__kind=case.shaper,
         link__damping_ratio=case.damping_ratio,
-        control__modes=3,  # the bound; `build_paper_case` sets how many of them are separated
+        control__modes=3,  # upper bound; `build_paper_case` sets how many are separated
         control__links=case.links,
         control__ratios=rows,
         control__gain_factor=case.gain_factor,
@@ -186,8 +186,8 @@ def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:
 
     Args:
         base: the machine; move, shaper and control come from the cases.
-        cases: uncontrolled counterparts of all controlled ones among them.
-        tell: called with what is running.
+        cases: including the uncontrolled counterparts of all controlled ones.
+        tell: called with progress messages.
 
     Returns:
         PaperRuns, cases in the order: uncontrolled, controlled, ideal feedback.
@@ -199,7 +199,7 @@ def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:
     off = [case for case in cases if not case.is_controlled]
     on = [case for case in cases if case.is_controlled and case.feedback == "sampled"]
     ideal = [case for case in cases if case.feedback == "ideal"]
-    # programs of their own, compiled on the second core while the first one runs the batches
+    # separate programs, compiled on the second core while the first one runs the batches
     with ThreadPoolExecutor(1) as side:
         free = side.submit(_pinned_free_ratios, base, off, tell)
         ideal_runs = [side.submit(_run_ideal, base, case, tell) for case in ideal]
@@ -283,7 +283,7 @@ def _unshaped(off: list[PaperCase]) -> list[PaperCase]:
 
 
 def work_of(cases: list[PaperCase]) -> int:
-    """How many steps `run_cases` reports for these cases."""
+    """Number of steps that `run_cases` reports for these cases."""
     off = [case for case in cases if not case.is_controlled]
     ideal = sum(case.feedback == "ideal" for case in cases)
     batches = -(-len(off) // BATCH) - (-(len(cases) - len(off) - ideal) // BATCH)

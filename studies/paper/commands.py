@@ -19,7 +19,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         out: Annotated[Path, typer.Option(help="folder for data, figures and report")],
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
     ) -> None:
-        """Run the paper's study: data, counterparts of its figures, report beside its numbers."""
+        """Run the paper's study: data, counterparts of its figures, comparison with its numbers."""
         start(precision)
         from studies.paper.run import run_paper
 

@@ -1,4 +1,4 @@
-"""What every section of the paper's report reads and how it writes numbers."""
+"""What every section of the paper's report reads, and how it formats numbers."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class Context(NamedTuple):
         )
 
     def drop(self, k: int, mode: int) -> str:
-        """Change of the spectral peak of a mode against no control, per link."""
+        """Change of a mode's spectral peak relative to no control, per link."""
         peak, off = self.measures.spectral_peak[:, :, mode - 1], self.measures.counterpart[k]
         return ", ".join(change(peak[k, i], peak[off, i]) for i in range(3))
 
     def pairs(self) -> list[tuple[int, int, str]]:
-        """Cases without control and with three links, and what moves both; also the damped ones."""
+        """Cases without control and with three links, and their motion; also the damped ones."""
         found = [
             (self.find(m, s, 3, OFF), self.find(m, s, 3, ALL), move_text(m, s))
             for m, s in settings()
@@ -44,7 +44,7 @@ class Context(NamedTuple):
 
 
 def change(value: float, reference: float) -> str:
-    """Change against a reference in percent, "-" where that is zero."""
+    """Change relative to a reference in percent, "-" if that is zero."""
     return f"{100 * (value / reference - 1):+.1f} %" if reference > 0 else "-"
 
 
@@ -59,7 +59,7 @@ def settings() -> list[tuple[str, str]]:
 
 
 def residual(context: Context, case: int, link: int) -> str:
-    """Late rms deflection of a link [µm], marked where the converter cannot see it."""
+    """Late rms deflection of a link [µm], marked if the converter cannot resolve it."""
     value = context.measures.late_deflection[case, link]
     mark = " †" if value < context.runs.frame.adc_step[link] else ""
     return f"{1e6 * value:.3g}{mark}"

@@ -1,7 +1,7 @@
-"""Which data go into the counterpart of which figure of the paper.
+"""The counterparts of the paper's figures, and the data they show.
 
 Left column: the paper's move with its EI shaper. Right column: the faster move without shaper,
-where there is vibration left for the controller.
+which leaves vibration for the controller.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from studies.study.consistency import each_link
 
 COLUMNS = (("paper", "ei"), ("fast", "none"))
 TITLES = (r"paper's move, $t_f$ = 0.1 s, EI shaper", r"faster move, $t_f$ = 0.05 s, no shaper")
-#: Magnified views begin with the end of the command and last so long [s].
+#: Duration of the magnified views, from the end of the command [s].
 VIEW_LENGTH = 0.2
-#: They are scaled to what is left this long after the command, when the drive's own transient is
+#: They are scaled to the vibration this long after the command, when the drive's transient is
 #: over [s].
 SCALE_DELAY = 0.05
 
@@ -52,7 +52,7 @@ def _pairs(runs: PaperRuns, links: tuple[bool, ...], modes: int) -> Pairs:
 def _responses(
     runs: PaperRuns, pairs: Pairs, signal: np.ndarray, labels: list[str], unit: float
 ) -> tuple[Figure, np.ndarray]:
-    """Rows of comparisons of signal (n, T, rows), in a unit of so many SI units."""
+    """Rows of comparisons of signal (n, T, rows), in a unit of this many SI units."""
     figure, axes = figures.new_figure(len(labels), 2)
     time = runs.record.time[0]
     for column, (off, on) in enumerate(pairs):
@@ -74,7 +74,7 @@ def _responses(
 def _with_views(
     runs: PaperRuns, pairs: Pairs, signal: np.ndarray, labels: list[str], unit: float
 ) -> Figure:
-    """`_responses` with a magnified view of the time after the command in each axes."""
+    """`_responses` with a magnified view after the command in each of the axes."""
     figure, axes = _responses(runs, pairs, signal, labels, unit)
     time = runs.record.time[0]
     for column, (off, on) in enumerate(pairs):
@@ -106,7 +106,7 @@ def _deflection(runs: PaperRuns, measures: Measures, links: tuple[bool, ...]) ->
 
 
 def _station(runs: PaperRuns) -> int:
-    """The station at three quarters of the link, or the one nearest to it."""
+    """The station nearest to three quarters of the link."""
     stations = np.array(runs.study.metrics.stations)
     return int(np.argmin(np.abs(stations - 0.75 * each_link(runs.study.link.length).mean())))
 
@@ -127,7 +127,7 @@ def _pose(runs: PaperRuns, measures: Measures) -> Figure:
 
 
 def _pose_after(runs: PaperRuns, measures: Measures, links: tuple[bool, ...]) -> Figure:
-    """After the command, scaled to the vibration that is left once the drive has settled."""
+    """Pose after the command, scaled to the vibration left once the drive has settled."""
     signal = runs.record.pose_error
     pairs = _pairs(runs, links, 3)
     labels = [label.replace("[µ", "[n") for label in _POSE_LABELS]
@@ -173,7 +173,7 @@ def _spectra(
 
 
 def _limit_decades(ax: Axes, density: np.ndarray) -> None:
-    """Same scale with and without control, 12 decades at most."""
+    """Same scale with and without control, at most 12 decades."""
     top = density.max()
     ax.set_ylim(max(density.min() / 3, 1e-12 * top), 5 * top)
 
@@ -220,7 +220,7 @@ def _shapers(runs: PaperRuns, measures: Measures) -> Figure:
     return figure
 
 
-#: Figures by the names of their files; captions stand in `report.md`.
+#: Figures by file name; captions are in `report.md`.
 PAPER_FIGURES: dict[str, Callable[[PaperRuns, Measures], Figure]] = {
     "fig03": partial(_deflection, links=ALL),
     "fig04": _modes,

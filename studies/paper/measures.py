@@ -1,4 +1,4 @@
-"""What the paper's report reads from the runs, beyond the metrics the loop accumulates."""
+"""What the paper's report reads from the runs, apart from the accumulated metrics."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from studies.engine.frame import EARLY_PART
 from studies.paper.cases import PaperRuns
 from studies.study.consistency import each_link
 
-#: The peak of a mode is looked for within this fraction of its frequency [1].
+#: The peak of a mode is sought within this fraction of its frequency [1].
 PEAK_SPAN = 0.2
 
 
@@ -19,7 +19,7 @@ PEAK_SPAN = 0.2
 TOP_HZ = 1200.0
 
 
-#: A link has settled when it stays below this part of the residual peak without control [1].
+#: A link has settled when it stays below this share of the residual peak without control [1].
 SETTLED = 0.05
 
 

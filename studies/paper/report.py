@@ -1,6 +1,6 @@
-"""The report of the paper's study: the paper's numbers and ours side by side, and why they differ.
+"""The report of the paper's study: its numbers next to ours, and why they differ.
 
-What it says stands in `report.md`; the rows of its tables come from `tables`.
+The text is in `report.md`; the rows of its tables come from `tables`.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def _figure(name: str, caption: str) -> str:
 
 
 def _peaks(context: Context) -> dict[str, Any]:
-    """What spectral peaks of the faster unshaped move show, where there is vibration to reduce."""
+    """Spectral peaks of the faster unshaped move, which leaves vibration to reduce."""
     peak = context.measures.spectral_peak
     off = context.find("fast", "none", 2, OFF)
     controlled: list[float] = []
@@ -102,7 +102,7 @@ def _peaks(context: Context) -> dict[str, Any]:
 
 
 def _grown(context: Context) -> list[tuple[str, str, str]]:
-    """Where the rms of the whole window grows with control: case, its change, that of the late."""
+    """Where control increases the rms of the whole window: case, its change, that of the late."""
     late = context.measures.late_deflection
     whole = context.runs.result.metrics.residual_rms[:, :, middle_station(context.runs)]
     return [
@@ -147,7 +147,7 @@ def _platform(context: Context) -> dict[str, Any]:
 
 
 def _shaped(context: Context) -> list[float]:
-    """What the EI shaper divides the late vibration by, per move."""
+    """Factor by which the EI shaper reduces the late vibration, per move."""
     late = context.measures.late_deflection.max(axis=1)
     unshaped, shaped = (
         np.array([late[context.find(move, shaper, 3, OFF)] for move in MOVES])
@@ -157,7 +157,7 @@ def _shaped(context: Context) -> list[float]:
 
 
 def _difference(context: Context, cases: dict[str, int]) -> dict[str, Any] | None:
-    """Outcome with the velocity as a difference, None where it was not run and judged."""
+    """Outcome with the velocity as a difference, None if it was not run and judged."""
     name, runs = "difference", context.runs
     if name not in cases or name not in runs.loops:
         return None

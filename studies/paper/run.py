@@ -1,4 +1,4 @@
-"""`studies paper`: the paper's sections 4 and 5 from one command, into one folder.
+"""`studies paper`: the paper's sections 4 and 5 with one command, in one folder.
 
 The folder gets `paper.h5` (all runs), the counterparts of the paper's figures, and the report,
 as Markdown and as a web page.
@@ -44,7 +44,7 @@ def run_paper(out: str | Path, console: Console | None = None) -> None:
     """Run the paper's study and write data, figures and report.
 
     Args:
-        out: folder, made where missing; files of an earlier run are replaced.
+        out: folder, created if missing; files of an earlier run are replaced.
         console: where progress and the outcome go; default: standard output.
 
     Raises:
@@ -86,7 +86,7 @@ def write_paper(out: Path, console: Console, study: Study, cases: list[PaperCase
 
 
 def _write(out: Path, runs: PaperRuns, measures: Measures, tell: Tell) -> None:
-    """Write everything beside its place first: an interrupted run leaves the old files whole."""
+    """Write everything elsewhere first, so that an interruption leaves old files intact."""
     with staged(out) as staging:
         tell("writing data", 0.0)
         write_store(staging / DATA, paper_variables(runs, measures), run_attributes(runs.study))
@@ -100,7 +100,7 @@ def _write(out: Path, runs: PaperRuns, measures: Measures, tell: Tell) -> None:
 
 
 def _open_folder(out: Path) -> None:
-    """Make the folder, or raise StudyError where that or writing into it is impossible."""
+    """Create the folder; raise StudyError if it cannot be created or written to."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
@@ -125,7 +125,7 @@ def _print_outcome(out: Path, console: Console, runs: PaperRuns) -> None:
 
 
 def paper_variables(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
-    """Everything `paper.h5` holds; the first axis is `case`.
+    """All variables of `paper.h5`; the first axis is `case`.
 
     Args:
         runs: from `run_cases`.
@@ -289,7 +289,7 @@ def _trajectories(runs: PaperRuns) -> dict[str, Variable]:
 
 
 def _loops(runs: PaperRuns) -> dict[str, Variable]:
-    """Judgement of the linearised sampled loops, NaN where none was made."""
+    """Judgement of the linearised sampled loops, NaN if not judged."""
     values = np.full((2, len(runs.cases)), np.nan)
     for k, case in enumerate(runs.cases):
         if case.name in runs.loops:

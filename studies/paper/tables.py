@@ -1,6 +1,6 @@
-"""Rows of the tables in the paper's report, ours beside the paper's.
+"""Rows of the tables in the paper's report: our numbers next to the paper's.
 
-Numbers of ours come from the runs; the paper's stand here as constants.
+Our numbers come from the runs; the paper's are constants in this file.
 """
 
 from __future__ import annotations

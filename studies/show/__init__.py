@@ -1,7 +1,7 @@
-"""What people see: figures, pages, words for numbers.
+"""Presentation: figures, pages, formatted numbers.
 
-In: results. Out: Markdown and HTML with figures inside. `templates` fills the texts that lie beside
-the modules as `report.md`; `pages` turns Markdown into a page; `markdown` writes tables and
-figures; `units` writes numbers in the scale people use; `sketch` draws a machine; `figures` is the
-style of all drawings.
+In: results. Out: Markdown and HTML with figures inside. `templates` fills the `report.md` texts
+next to the modules; `pages` turns Markdown into a page; `markdown` writes tables and figures;
+`units` writes numbers in readable units; `sketch` draws a machine; `figures` defines the style of
+all drawings.
 """

@@ -1,7 +1,7 @@
-"""Plots of the studies, in one style. Each takes data in SI units and an optional axes.
+"""Plots of the studies, in one style. Each takes data in SI units and optional axes.
 
-They compute nothing but units. Colours are those of Okabe and Ito, which colour-blind readers tell
-apart; in grey print the two curves of a comparison differ in lightness and width.
+They only convert units. The colours of Okabe and Ito are distinguishable for colour-blind readers;
+in greyscale, the two curves of a comparison differ in lightness and width.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ STYLE: dict[str, Any] = {
 
 
 def styled() -> Any:
-    """Context in which figures of this project are made and saved."""
+    """Context in which figures of this project are created and saved."""
     return matplotlib.rc_context(STYLE)  # type: ignore[arg-type]
 
 
@@ -65,14 +65,14 @@ def legend_above(figure: Figure, ax: Axes) -> None:
 
 
 def save(figure: Figure, folder: Path, name: str) -> None:
-    """Write the figure as PNG and PDF, each whole or not at all; StudyError where it cannot be."""
+    """Write the figure as PNG and PDF, each whole or not at all; StudyError if that fails."""
     write_figure(figure, folder / f"{name}.png")
-    figure.set_layout_engine("none")  # keeps what has been laid out, which takes half a second
+    figure.set_layout_engine("none")  # keeps the layout, which takes half a second
     write_figure(figure, folder / f"{name}.pdf")
 
 
 def write_figure(figure: Figure, path: Path) -> None:
-    """Write the figure in the format of its file's ending; errors as `save`."""
+    """Write the figure in the format of its file extension; errors as `save`."""
     with replacing(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:])
 
@@ -99,14 +99,14 @@ def axes_or_new(ax: Axes | None) -> Axes:
 def traces(
     time: np.ndarray, values: np.ndarray, names: list[str], label: str, ax: Axes | None = None
 ) -> Axes:
-    """Some quantities of one kind over time.
+    """Several quantities of one kind over time.
 
     Args:
         time: [s], (T,).
         values: in the unit of the label, (T, n).
         names: of the quantities, for a legend; [] for none.
         label: quantity and unit of the ordinate.
-        ax: where to draw; a new figure where left out.
+        ax: where to draw; default: a new figure.
     """
     ax = axes_or_new(ax)
     for k, curve in enumerate(values.T):
@@ -137,7 +137,7 @@ def comparison(
         without: response without control, in the unit of the label, (T,).
         controlled: the same with control, (T,).
         label: quantity and unit of the ordinate.
-        ax: where to draw; a new figure where left out.
+        ax: where to draw; default: a new figure.
     """
     ax = axes_or_new(ax)
     ax.plot(time, without, **WITHOUT)
@@ -187,7 +187,7 @@ def spectrum(
         controlled: with control [m2/Hz], (F,); None to leave it out.
         mode_hz: frequency to mark [Hz].
         label: quantity and unit of the ordinate.
-        ax: where to draw; a new figure where left out.
+        ax: where to draw; default: a new figure.
     """
     ax = axes_or_new(ax)
     ax.axvline(mode_hz, color="#888888", linewidth=0.8, linestyle=":")
@@ -208,7 +208,7 @@ def sensitivity(
         ratio: actual over assumed frequency [1], (n,).
         curves: residual vibration relative to the unshaped one [1], (n,), by shaper.
         level: tolerated residual vibration, marked [1].
-        ax: where to draw; a new figure where left out.
+        ax: where to draw; default: a new figure.
     """
     ax = axes_or_new(ax)
     ax.axhline(100 * level, color="#888888", linewidth=0.8, linestyle=":")

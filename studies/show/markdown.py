@@ -1,4 +1,4 @@
-"""Markdown: a user's text as it is, tables, figures."""
+"""Markdown: escaped text, tables, figures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FIRST_MARKS = re.compile(r"^(\d*)([-+.)](?=\s|$)|[>=~]|--)")
 
 
 def literal(text: str) -> str:
-    """A user's text, such as a title, as Markdown shows it unchanged, on one line."""
+    """A user's text, such as a title, escaped for Markdown, on one line."""
     line = " ".join(text.split())
     return _FIRST_MARKS.sub(r"\1\\\2", _MARKS.sub(r"\\\g<0>", line))
 
@@ -31,10 +31,10 @@ def _row(cells: Iterable[str]) -> str:
 
 
 def picture(name: str, caption: str) -> str:
-    """Line of a figure, to stand alone.
+    """Line of a figure, a paragraph of its own.
 
     Args:
-        name: of its PNG or GIF file, which lies beside the text.
+        name: of its PNG or GIF file, in the same folder as the text.
         caption: Markdown.
     """
     return f"![{caption}]({quote(name)})"

@@ -1,7 +1,7 @@
-"""Reports: Markdown texts, and the same as web pages that need nothing else.
+"""Reports: Markdown texts, and the same as self-contained web pages.
 
-A page is one HTML file with its figures inside, the files it speaks of and the versions that made
-it. It runs no script and loads nothing, so it opens offline, in a mail, and in many years.
+A page is one HTML file that contains its figures, the files it refers to and the versions that made
+it. It runs no scripts and loads nothing, so it opens offline, in an email, and in many years.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from studies.study.template import study_template
 
 _PARSER = MarkdownIt("commonmark", {"html": False, "xhtmlOut": False}).enable("table")
 
-#: What sections begin with.
+#: Heading level of sections.
 HEADING = ("heading_open", "h2")
 
 
@@ -37,10 +37,10 @@ def page(
     """A Markdown text as a self-contained web page.
 
     Args:
-        text: with figures in paragraphs of their own (`picture`); HTML in it is shown, not obeyed.
-        images: bytes of each figure, PNG or GIF, by the name it has in the text.
+        text: with figures in separate paragraphs (`picture`); HTML in it is shown as text.
+        images: bytes of each figure, PNG or GIF, by its name in the text.
         files: texts to append, by title.
-        facts: versions and the like, for a table before them.
+        facts: versions and the like, for a table before the files.
 
     Returns:
         HTML.
@@ -61,7 +61,7 @@ def page(
 
 
 def _with_contents(tokens: list[Token], more: list[str]) -> list[Token]:
-    """The same with anchors at the headings of sections, and links to them before the first."""
+    """Add anchors to section headings, and links to them before the first section."""
     starts = [k for k, token in enumerate(tokens) if (token.type, token.tag) == HEADING]
     if not starts:
         return tokens
@@ -80,7 +80,7 @@ def _anchor(title: str) -> str:
 
 
 def _arranged(tokens: list[Token], images: Mapping[str, bytes]) -> list[Token]:
-    """The same with tables in boxes that scroll, and paragraphs of one image as figures."""
+    """Put tables into scrolling boxes, and turn paragraphs with one image into figures."""
     arranged: list[Token] = []
     for k, token in enumerate(tokens):
         if token.type == "table_open":
@@ -91,7 +91,7 @@ def _arranged(tokens: list[Token], images: Mapping[str, bytes]) -> list[Token]:
             begin, end = (Token(f"caption_{n}", "figcaption", n) for n in (1, -1))
             token.children = [*inside, begin, *(inside[0].children or []), end]
         for child in inside:
-            if child.type == "text":  # a number and its sign stay on one line
+            if child.type == "text":  # keep a number and its sign on one line
                 child.content = re.sub(" (?=[%†])", "\N{NO-BREAK SPACE}", child.content)
             if child.type == "image":
                 child.children = [Token("text", "", 0, content=_plain(child.children))]
@@ -118,7 +118,7 @@ def _title(tokens: list[Token]) -> str:
 
 
 def _plain(inline: list[Token] | None) -> str:
-    """Text without marks, for places that take nothing else."""
+    """Text without markup, for places that accept nothing else."""
     return "".join(token.content for token in inline or [])
 
 
@@ -130,7 +130,7 @@ def report_files(
     Args:
         folder: where the figures of the text are.
         text: Markdown.
-        study: whose report it is, or the files to append, by title.
+        study: the study reported on, or the files to append, by title.
         name: of the files.
 
     Raises:
@@ -152,7 +152,7 @@ def write_report(
     Args:
         folder: where to write, and where the figures of the text are.
         text: Markdown.
-        study: whose report it is, or the files to append, by title.
+        study: the study reported on, or the files to append, by title.
         name: of the files.
 
     Raises:

@@ -12,7 +12,7 @@ from studies.study.cases import build_case
 from studies.study.consistency import each_link, patch_centers
 from studies.study.spec import Study
 
-#: Colours of links under control, of links that are not, and of patches.
+#: Colours of controlled links, other links, and patches.
 ON, OFF, PATCH = figures.SERIES[0], "#888888", figures.SERIES[1]
 CAPTION = (
     "The machine at its first way-point; blue: links under control, grey: the others, orange: "

@@ -1,11 +1,11 @@
-"""Texts from their templates (Jinja2): the words of reports, pages, the text of C.
+"""Rendering of templates (Jinja2): reports, pages, C code.
 
-A template lies in the folder of the module that fills it: `report.md` beside `report.py`. In
-Markdown a paragraph may break its lines anywhere, and blocks leave no trace: `paragraphs` puts
-each paragraph on one line.
+A template is in the folder of the module that fills it: `report.md` next to `report.py`. In
+Markdown, a paragraph can break its lines anywhere, and blocks leave no trace: `paragraphs` joins
+each paragraph into one line.
 
-To add one: write the template, and call `render` with the values it names. A name that has no
-value is an error.
+To add one, write the template and call `render` with the values it names. A name without a value
+is an error.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from studies.study.labels import describe
 from studies.study.margin import margin_text
 
 _ROOT = Path(__file__).parents[1]
-#: Lines of Markdown that begin so stand alone.
+#: Lines of Markdown with these beginnings stand alone.
 _ALONE = ("#", "|", "![", "```")
 
 
@@ -69,14 +69,14 @@ def _environment() -> Environment:
 
 
 def render(name: str, /, **values: Any) -> str:
-    """A template with its values put in.
+    """Fill in a template.
 
     Args:
-        name: of its file, from `studies` on: "tuning/report.md".
-        values: by the names that it uses; FILTERS, `table` and `picture` are there for all.
+        name: of its file, relative to `studies`: "tuning/report.md".
+        values: by the names it uses; FILTERS, `table` and `picture` are always available.
 
     Returns:
-        The text; of Markdown with each paragraph on one line.
+        The text; Markdown with each paragraph on one line.
 
     Raises:
         jinja2.UndefinedError: a name without a value.

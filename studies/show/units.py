@@ -1,4 +1,4 @@
-"""Numbers in the units that people use: micrometres, milliseconds."""
+"""Numbers in readable units: micrometres, milliseconds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-#: SI units of labels, with the factor to what reports show and its unit.
+#: SI units of labels, with the factor to the unit that reports show, and that unit.
 READABLE = {
     "m": (1e6, "µm"),
     "s": (1e3, "ms"),
@@ -16,12 +16,12 @@ READABLE = {
 
 
 def readable(unit: str) -> tuple[float, str]:
-    """Factor and unit that a report shows numbers of this unit in."""
+    """Factor and unit in which a report shows numbers of this unit."""
     return READABLE.get(unit, (1.0, unit))
 
 
 def headed(name: str, unit: str) -> str:
-    """A column's head: the name, and the unit that its numbers are shown in."""
+    """A column heading: the name, and the unit of its numbers."""
     shown = readable(unit)[1]
     return name if shown in ("", "1") else f"{name} [{shown}]"
 
@@ -49,13 +49,13 @@ def number(value: float, unit: str) -> str:
 
 
 def count_text(n: int, what: str) -> str:
-    """A number of things: "1 family", "2 families", "3 cases"."""
+    """A count with its noun: "1 family", "2 families", "3 cases"."""
     many = f"{what.removesuffix('y')}ies" if what.endswith("y") else f"{what}s"
     return f"{n} {what if n == 1 else many}"
 
 
 def duration_text(seconds: float) -> str:
-    """A time to wait in words: "40 s", "3 min", "2 h 10 min"."""
+    """A duration in words: "40 s", "3 min", "2 h 10 min"."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -63,6 +63,6 @@ def duration_text(seconds: float) -> str:
 
 
 def span(values: Any, digits: str = ".3g") -> str:
-    """Smallest and largest of numbers: "1.2 to 3.4"."""
+    """Smallest and largest number: "1.2 to 3.4"."""
     low, high = (f"{x:{digits}}" for x in (float(np.min(values)), float(np.max(values))))
     return low if low == high else f"{low} to {high}"

@@ -1,4 +1,4 @@
-"""The commands of one run: simulate, replay, modes."""
+"""The commands for single runs: simulate, replay, modes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _Report = Annotated[
     bool,
-    typer.Option("--report", help="write a report with figures, Markdown and HTML, beside it"),
+    typer.Option("--report", help="also write a report with figures, in Markdown and HTML"),
 ]
 
 
@@ -26,12 +26,12 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command()
     def simulate(
-        study: Annotated[Path, typer.Argument(help="study file (TOML) or ready design")],
+        study: Annotated[Path, typer.Argument(help="study file (TOML) or ready-made design")],
         out: Annotated[Path, typer.Option(help="HDF5 file to write")],
         report: _Report = False,
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
     ) -> None:
-        """Run one study with full trajectories."""
+        """Run one study and save full trajectories."""
         start(precision)
         from studies.single.run import simulate as simulate_study
         from studies.study.spec import load_study
@@ -44,12 +44,12 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     def replay(
         design: Annotated[Path, typer.Argument(help="study file, folder of a tuning or a sweep")],
         case: Annotated[
-            str | None, typer.Option(help="number, or id: and digits of its id")
+            str | None, typer.Option(help="case number, or id: and digits of the case's id")
         ] = None,
         out: Annotated[Path | None, typer.Option(help="HDF5 file for the trajectories")] = None,
         report: _Report = False,
     ) -> None:
-        """Run one case of a sweep again with full trajectories, and compare with what it found."""
+        """Rerun one case of a sweep with full trajectories; compare with the sweep's results."""
         start()
         from studies.single.run import replay as replay_case
         from studies.study.labels import describe
@@ -65,12 +65,12 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         study: Annotated[
             Path | None,
             typer.Argument(
-                help="study file or ready design; default: the paper's machine, undamped"
+                help="study file or ready-made design; default: the paper's machine, undamped"
             ),
         ] = None,
         pose: Annotated[
             tuple[float, float, float] | None,
-            typer.Option(help="x [m] y [m] phi [rad]; default: the first"),
+            typer.Option(help="x [m] y [m] phi [rad]; default: the first pose"),
         ] = None,
         kp: Annotated[
             float | None, typer.Option(help="drive stiffness [N/m], 0 = free sliders")
@@ -111,7 +111,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
 
 def _print_run(run: Run, console: Console) -> None:
-    """Status, metrics of the links, stability."""
+    """Print status, link metrics and stability."""
     from studies.single.report import settling_text
     from studies.study.labels import describe
     from studies.study.margin import caution, margin_text

@@ -30,7 +30,7 @@ from studies.store import check_target, write_store
 from studies.study.margin import ENOUGH, caution
 from studies.study.spec import Study
 
-#: What is drawn, by the end of the file's name.
+#: Figures, by the end of the file name.
 FIGURES = ("deflection", "error", "voltage", "machine")
 _FREE = "without control"
 _POSE = ("x [µm]", "y [µm]", "φ [µrad]")
@@ -41,7 +41,7 @@ def check_results(out: Path, has_report: bool) -> None:
 
     Args:
         out: file of the run.
-        has_report: whether its report is to be written beside it.
+        has_report: whether its report will be written next to it.
 
     Raises:
         StudyError: a file cannot be written, or `out` has the name of one of the report.
@@ -57,13 +57,13 @@ def check_results(out: Path, has_report: bool) -> None:
 
 
 def write_results(out: Path, run: Run, has_report: bool, notes: Sequence[str] = ()) -> None:
-    """Write a run to its file and, if asked for, its report beside it.
+    """Write a run to its file and, if requested, its report next to it.
 
     Args:
         out: file of the run.
         run: with trajectories.
         has_report: whether to write the report.
-        notes: sentences that it adds to what it says of the run's status.
+        notes: sentences added to the report's text on the run's status.
 
     Raises:
         StudyError: a file cannot be written.
@@ -120,7 +120,7 @@ def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str]) -> str:
 
 
 def _situation(run: Run, twin: Run | None) -> str:
-    """What decides what to do next."""
+    """The situation that determines the recommended next step."""
     if run.loop is not None and run.loop.gain_margin < ENOUGH:
         return "margin"
     if run.study.control.feedback == "none" or not any(run.study.control.links):
@@ -164,7 +164,7 @@ def motion_text(study: Study) -> str:
 
 
 def control_text(study: Study) -> str:
-    """Who is controlled and how, in words."""
+    """What is controlled and how, in words."""
     control = study.control
     links = [str(i + 1) for i in range(3) if control.links[i]]
     if control.feedback == "none" or not links:
@@ -213,7 +213,7 @@ def _platform(run: Run) -> list[list[str]]:
 
 
 def _modes(run: Run) -> list[list[str]]:
-    """Row of each order of the modes, of a loop that is judged."""
+    """Row of each mode order, for a judged loop."""
     if run.loop is None:
         return []
     modes = zip(run.loop.frequency_hz, run.loop.damping_ratio, strict=True)

@@ -14,16 +14,16 @@ from studies.study.spec import Study
 
 
 class Replay(NamedTuple):
-    """A case of a sweep once more, beside what the sweep found."""
+    """A rerun case of a sweep, compared with the sweep's results."""
 
     run: Run
-    stored_status: int | None  # of the sweep; None where there is none
+    stored_status: int | None  # of the sweep; None if there is none
     difference: float  # largest difference of a metric, relative to the metric's size [1]
     metric: str  # which one; "" for none
 
     @property
     def notes(self) -> list[str]:
-        """The comparison as a sentence; [] where there is nothing to compare with."""
+        """The comparison as a sentence; [] if there is nothing to compare with."""
         if self.stored_status is None:
             return []
         which = f" ({self.metric})" if self.metric else ""
@@ -34,12 +34,12 @@ class Replay(NamedTuple):
 
 
 def simulate(study: Study, out: str | Path | None = None, has_report: bool = False) -> Run:
-    """Run a study with full trajectories, and write what is asked for.
+    """Run a study with full trajectories, and write the requested files.
 
     Args:
         study: what to run.
         out: HDF5 file for trajectories and metrics; None: nothing is written.
-        has_report: whether to write the report beside that file, too.
+        has_report: whether to also write the report next to that file.
 
     Raises:
         StudyError: a fault of the study, or a file that cannot be written.
@@ -57,7 +57,7 @@ def replay(
     out: str | Path | None = None,
     has_report: bool = False,
 ) -> Replay:
-    """Run one case of a sweep again with full trajectories, and compare with what it found.
+    """Rerun one case of a sweep with full trajectories, and compare with the sweep's results.
 
     Args:
         design: study file, folder of a tuning or a sweep.
@@ -80,11 +80,11 @@ def replay(
 
 
 def _checked(out: str | Path | None, has_report: bool) -> Path | None:
-    """The file to write, once it is known that this can be done."""
+    """The file to write, after checking that it can be written."""
     if out is None:
         if has_report:
             raise StudyError(
-                "--report: is written beside the trajectories; name their file by --out"
+                "--report: is written next to the trajectories; name their file with --out"
             )
         return None
     check_results(Path(out), has_report)

@@ -2,8 +2,8 @@
 
 In: a study with `[sweep]`. Out: a `Table` with one row a case, its id and its seed.
 
-`spec` reads the file, `axes` knows how one axis is written, `methods` how axes become points
-and what may be analysed afterwards (`indices` are the sums behind it), `designs` spreads blocks
-of axes, `condition` reads expressions on fields and metrics, `table` puts it together. To add a
-method, put a `Method` into the list in `methods`.
+`spec` reads the file, `axes` parses one axis, `methods` defines how axes become points and what can
+be analysed afterwards (`indices` computes it), `designs` expands blocks of axes, `condition` reads
+expressions on fields and metrics, `table` puts everything together. To add a method, add a `Method`
+to the list in `methods`.
 """

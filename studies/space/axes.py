@@ -2,7 +2,7 @@
 
 An axis is written as a list of values, `"all"` (of a choice, a switch or a ready-made axis that
 knows all its values), or a range `{from = 0.1, to = 10, count = 8, scale = "log"}`, where `count`
-is for `grid` and `zip` only. Ready-made axes and what they stand for are in `READY_MADE`.
+is only for `grid` and `zip`. `READY_MADE` lists ready-made axes and what they stand for.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from studies.study.fields import Columns
 from studies.study.paths import checked_value, field_choices, known_field
 from studies.study.spec import Study
 
-#: Axes under a name of their own: what each varies, and how it is written.
+#: Axes with their own names: what each varies, and how it is written.
 READY_MADE = {
     "placement": "patches.centers, sorted and without overlap: {kind = 'same' | 'mirrored' | "
     "'per_link', candidates = 12}; candidates for grid and zip only",
@@ -64,9 +64,9 @@ LIMIT = 10**7
 
 
 class Axis(NamedTuple):
-    """One axis, ready to be spread."""
+    """One axis, ready to be expanded."""
 
-    dimensions: int  # of the unit cube that `sample` takes
+    dimensions: int  # of the unit cube for `sample`
     sample: Callable[[np.ndarray], Columns]  # (n, dimensions) in [0, 1) to columns of n values
     grid: Columns | None  # its values for grid and zip; None for a range without count
 
@@ -99,7 +99,7 @@ def build_axis(name: str, written: Any, study: Study, path: str) -> Axis:
         name: field, entry of a list, or ready-made axis.
         written: its values.
         study: the base study.
-        path: where it was written, for messages.
+        path: where it is written, for messages.
 
     Raises:
         StudyError: unknown name, bad value, bad range.
@@ -120,7 +120,7 @@ def build_axis(name: str, written: Any, study: Study, path: str) -> Axis:
 
 
 def column_of(values: list[Any]) -> np.ndarray:
-    """Values of one field as a column: an array where they have one shape, else of objects."""
+    """Values of one field as a column: an array if they have one shape, otherwise of objects."""
     if isinstance(values[0], (tuple, list)) or any(isinstance(v, tuple) for v in values):
         try:
             array = np.array(values)
@@ -173,7 +173,7 @@ def choice_axis(columns: Columns) -> Axis:
 
 
 def _is_number(value: Any) -> bool:
-    """Whether it is a number whose differences and squares are numbers too."""
+    """Whether it is a number whose differences and squares are finite too."""
     is_numeric = isinstance(value, (int, float)) and not isinstance(value, bool)
     return is_numeric and abs(value) <= LARGEST
 
@@ -202,7 +202,7 @@ def parse_range(written: dict[str, Any], path: str) -> Range:
 
 
 def _range_axis(name: str, base: Any, span: Range, study: Study, path: str) -> Axis:
-    """Numbers from end to end; whole numbers for a field that holds them."""
+    """Numbers from end to end; whole numbers for an integer field."""
     if isinstance(base, tuple) and name == "motion.move_time":
         base = 0.1
     if isinstance(base, bool) or not isinstance(base, (int, float)):
@@ -231,7 +231,7 @@ def _numeric_axis(name: str, span: Range, at: Callable[[np.ndarray], np.ndarray]
 
 
 def _mapped(axis: Axis, convert: Callable[[np.ndarray], Columns], name: str) -> Axis:
-    """An axis of the one column `name` whose values stand for other columns."""
+    """An axis with one column `name` whose values stand for other columns."""
     return Axis(
         axis.dimensions,
         lambda u: convert(axis.sample(u)[name]),
@@ -338,7 +338,7 @@ def _placement(written: Any, study: Study, path: str) -> Axis:
 
 
 class _Room:
-    """Where sorted patches fit: free play beyond the patches' own length, shared out in order."""
+    """Room for sorted patches: the length they leave free, distributed in order."""
 
     def __init__(
         self, length: float, size: float, count: int, is_mirrored: bool, path: str

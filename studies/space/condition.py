@@ -2,7 +2,7 @@
 
 Numbers, text, true and false, lists of them; names such as `link.modes`, `control.links[0]`;
 `+ - * / **`, comparisons (also chained), `in`, `not in`, `and`, `or`, `not`, `abs`, `min`, `max`.
-Everything is evaluated for all cases at once; nothing else can be written, so nothing can be run.
+Everything is evaluated for all cases at once. Nothing else is accepted, so no code can be run.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from studies.errors import StudyError, shown
 from studies.study.paths import NAMED_INDEX
 
-#: A longer condition is refused [characters].
+#: A longer condition is rejected [characters].
 LONGEST = 1000
 
 Lookup = Callable[[str], np.ndarray]
@@ -55,13 +55,13 @@ def evaluate(text: str, lookup: Lookup, field: str) -> np.ndarray:
     Args:
         text: the condition.
         lookup: values of a name for all cases, (n,); raises StudyError for an unknown one.
-        field: where the condition was written, for messages.
+        field: where the condition is written, for messages.
 
     Returns:
-        Booleans, (n,) or () where no name is used.
+        Booleans, (n,) or () if no name is used.
 
     Raises:
-        StudyError: not a condition of this grammar, or one that mixes text and numbers.
+        StudyError: not a valid condition, or one that mixes text and numbers.
     """
     if len(text) > LONGEST:
         raise StudyError(f"{field}: {len(text)} characters; allowed: up to {LONGEST}")
@@ -150,6 +150,6 @@ def _name(node: ast.AST) -> str:
     if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
         if type(node.slice.value) is int:
             return f"{_name(node.value)}[{node.slice.value}]"
-        if isinstance(node.slice.value, str):  # an index that names its axis
+        if isinstance(node.slice.value, str):  # an index with the name of its axis
             return f"{_name(node.value)}[{node.slice.value}]"
     raise StudyError(f"{ast.unparse(node)!r} is no name of a field")

@@ -16,7 +16,7 @@ from studies.study.spec import Study
 
 
 def spread(node: BlockNode, study: Study, seed: int) -> Columns:
-    """Columns of a block: what varies, one row per case; {} for a block without axes.
+    """Expand a block to columns: what varies, one row per case; {} for a block without axes.
 
     Args:
         node: the block.
@@ -99,7 +99,7 @@ def _product(parts: list[Columns], path: str) -> Columns:
 
 
 def _listed(node: BlockNode, study: Study) -> Columns:
-    """Spelt-out cases; what a case does not name has the base study's value."""
+    """Listed cases; fields that a case does not name have the base study's value."""
     path = f"{node.path}.cases"
     for k, case in enumerate(node.block.cases):
         for name in case:
@@ -138,7 +138,7 @@ def unit_points(node: BlockNode, dimensions: int, seed: int) -> np.ndarray:
     """Points of the unit cube for a sampling method, (n, dimensions).
 
     Raises:
-        StudyError: the method gives something else.
+        StudyError: the method returns something else.
     """
     method = METHODS[node.block.method]
     assert method.points is not None

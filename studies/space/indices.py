@@ -1,7 +1,7 @@
-"""What designs of a sensitivity analysis tell: elementary effects (Morris) and Sobol indices.
+"""Sensitivity analysis: elementary effects (Morris) and Sobol indices.
 
 Failed cases have no metric. What cannot be computed without them is left out and counted, never
-taken as zero; where too much is missing the analysis refuses.
+taken as zero; if too much is missing, the analysis is refused.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import numpy as np
 
 from studies.errors import StudyError
 
-#: Refuse where less than this share of the design is left [1].
+#: Refuse if less than this share of the design is left [1].
 LEAST_LEFT = 0.5
-#: Resamplings of the intervals.
+#: Number of resamplings for the intervals.
 N_BOOTSTRAP = 500
-#: The intervals hold this share of the resampled values [1].
+#: The intervals contain this share of the resampled values [1].
 CONFIDENCE = 0.95
 
 
@@ -63,8 +63,8 @@ def elementary_effects(points: np.ndarray, value: np.ndarray) -> Effects:
         worst = int(np.argmin(count))
         raise StudyError(
             f"sensitivity: only {count[worst]} of {len(x)} effects of factor {worst} are left "
-            f"beside failed cases; allowed: at least {max(LEAST_LEFT * len(x), 2):.0f}. Narrow the "
-            "axes, or ask for more trajectories"
+            f"after failed cases; allowed: at least {max(LEAST_LEFT * len(x), 2):.0f}. Narrow the "
+            "axes, or use more trajectories"
         )
     return Effects(
         mean_size=np.array([np.abs(group).mean() for group in groups]),
@@ -76,7 +76,7 @@ def elementary_effects(points: np.ndarray, value: np.ndarray) -> Effects:
 
 
 def sobol_indices(value: np.ndarray, dimensions: int, seed: int = 0) -> Indices:
-    """First and total indices from a design of `saltelli_points`.
+    """First-order and total indices from a design of `saltelli_points`.
 
     First: Saltelli et al. 2010, mean f_B (f_ABi - f_A)/V; total: Jansen 1999,
     mean (f_A - f_ABi)^2/(2 V). V is the variance of f_A and f_B together. Intervals: bootstrap over
@@ -118,7 +118,7 @@ def sobol_indices(value: np.ndarray, dimensions: int, seed: int = 0) -> Indices:
 
 def _indices(rows: np.ndarray) -> np.ndarray:
     """First and total indices, (2, d)."""
-    # without its mean the estimate of the first index has less noise
+    # subtracting the mean reduces noise in the first-order estimate
     rows = rows - rows[:, :2].mean()
     a, b, mixed = rows[:, :1], rows[:, 1:2], rows[:, 2:]
     variance = rows[:, :2].var()

@@ -1,8 +1,8 @@
-"""Sweep methods: how the axes of a block become cases, and what may be analysed afterwards.
+"""Sweep methods: how the axes of a block become cases, and what can be analysed afterwards.
 
 A `Method` says which fields of a block it reads, how axes combine or which points of the unit cube
-they take, how a report puts it, and which analysis its points are made for. `METHODS` is the only
-list of them; `METHODS.add` puts in one of your own.
+they take, how a report describes it, and which analysis its points are made for. `METHODS` is the
+only list of them; `METHODS.add` adds your own.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from studies.space.indices import elementary_effects, sobol_indices
 
 
 class Asked(NamedTuple):
-    """What a sampling method is asked for."""
+    """A request to a sampling method."""
 
     block: Any  # `studies.space.spec.Block`: count, size, levels
     dimensions: int  # of the unit cube
@@ -27,7 +27,7 @@ class Asked(NamedTuple):
 
 
 class Analysis(NamedTuple):
-    """A table of what a design tells about its factors."""
+    """Results of a design as a table, by factor."""
 
     heads: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]  # most important factor first
@@ -37,17 +37,17 @@ class Analysis(NamedTuple):
 
 
 class Method(NamedTuple):
-    """One way to spread a block."""
+    """One way to expand a block."""
 
     name: str
     text: str  # in reports; {} is the number of points or cases
-    fields: tuple[str, ...] = ()  # of a block that it reads, besides axes and blocks
-    # points of the unit cube (n, d); the first stay the same when more are asked for. None: the
-    # axes' own values, combined as follows
+    fields: tuple[str, ...] = ()  # of a block that it reads, in addition to axes and blocks
+    # points of the unit cube (n, d); the first ones stay the same when more are requested. None:
+    # the axes' own values, combined as follows
     points: Callable[[Asked], np.ndarray] | None = None
     combine: Literal["product", "side by side"] = "product"
     # of the design's points (n, d), a metric there (n,), NaN where the case failed, and the names
-    # of the factors; a design made for it stands alone
+    # of the factors; a design made for it cannot be combined with others
     analysis: Callable[[np.ndarray, np.ndarray, list[str]], Analysis] | None = None
 
 
@@ -74,7 +74,7 @@ def hypercube_points(asked: Asked) -> np.ndarray:
 
 
 def sobol_points(asked: Asked) -> np.ndarray:
-    """Scrambled Sobol points: the next power of two, cut, which is a balanced sequence."""
+    """Scrambled Sobol points: the next power of two, a balanced sequence, truncated."""
     from scipy.stats import qmc
 
     if asked.dimensions > 21201:
@@ -90,7 +90,7 @@ def sobol_points(asked: Asked) -> np.ndarray:
 def saltelli_points(points: np.ndarray) -> np.ndarray:
     """Design for Sobol indices from (n, 2 d) points: rows A, B, A with column i of B; (n (d+2), d).
 
-    The d + 2 rows of each base point follow one another. Saltelli et al. 2010.
+    The d + 2 rows of each base point are consecutive. Saltelli et al. 2010.
     """
     n, d = len(points), points.shape[1] // 2
     a, b = points[:, :d], points[:, d:]
@@ -102,8 +102,8 @@ def saltelli_points(points: np.ndarray) -> np.ndarray:
 def morris_points(count: int, dimensions: int, levels: int, seed: int) -> np.ndarray:
     """Trajectories for elementary effects, (count (d + 1), d); Morris 1991.
 
-    Each starts on a random point of the grid and changes one coordinate after the other, in random
-    order, by +-levels/(2 (levels - 1)). The ends of the cube are part of the grid.
+    Each starts at a random grid point and changes one coordinate after another, in random order,
+    by +-levels/(2 (levels - 1)). The grid includes the ends of the cube.
     """
     step = (levels // 2) / (levels - 1)
     rows = []

@@ -2,11 +2,11 @@
 
 `[sweep]` is a block; a block holds axes and further blocks, and its method combines them:
 
-- `grid`: every combination; `zip`: all side by side, of equal length; `list`: `cases`, spelt out;
+- `grid`: every combination; `zip`: axes in parallel, of equal length; `list`: explicit `cases`;
 - `random`, `latin_hypercube`, `sobol`: `count` points of its axes, combined with every further
-  block; a Latin hypercube of `size` points follows the next, so that more can be asked for later;
-- `morris`: `count` trajectories on a grid of `levels`; `saltelli`: `count` base points: the designs
-  that `studies sensitivity` reads.
+  block; Latin hypercubes of `size` points follow one another, so that more can be added later;
+- `morris`: `count` trajectories on a grid of `levels`; `saltelli`: `count` base points; both for
+  `studies sensitivity`.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Block(Section):
 class Sweep(Block):
     """What varies, and what is kept."""
 
-    where: str = described("", "-", "condition on the fields; other cases are left out")
-    repeats: int = described(1, "1", "runs of each case, with seeds of their own", ge=1, le=10**6)
+    where: str = described("", "-", "condition on the fields; other cases are excluded")
+    repeats: int = described(1, "1", "runs of each case, with their own seeds", ge=1, le=10**6)
     seed: int = described(0, "1", "of the sampling methods", ge=0, le=10**9)
     metrics: tuple[str, ...] = described((), "-", "metrics to keep; empty: all")
     by: str = described("residual_rms", "-", "metric, or entry of one, that cases are ranked by")
@@ -60,7 +60,7 @@ class BlockNode(NamedTuple):
 
 
 class SweepSpec(NamedTuple):
-    """A sweep as asked for."""
+    """A sweep as requested."""
 
     study: Study  # values of all fields that do not vary
     sweep: Sweep
@@ -69,7 +69,7 @@ class SweepSpec(NamedTuple):
 
 
 def load_sweep(path: str | Path) -> SweepSpec:
-    """Read a sweep file, or the ready one of that name.
+    """Read a sweep file, or the ready-made one of that name.
 
     Raises:
         StudyError: unreadable, not TOML, or not a valid sweep.
@@ -97,7 +97,7 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
 
 
 def _check_depth(data: Any, depth: int = 0) -> None:
-    """Lists and tables inside one another, as far as any sweep needs them."""
+    """Reject lists and tables nested deeper than any sweep needs."""
     if depth > 10 * DEEPEST:
         raise StudyError("sweep: lists or tables nested too deep")
     for entry in data.values() if isinstance(data, dict) else data:
@@ -115,14 +115,14 @@ def _parse_block(model: type[Block], data: Any, path: str) -> Block:
 
 
 def _tuples(data: Any) -> Any:
-    """Lists of blocks and cases as tuples; what is inside them is checked where it is used."""
+    """Lists of blocks and cases as tuples; their contents are checked where they are used."""
     if not isinstance(data, dict):
         return data
     listed = ("blocks", "cases", "metrics")
     return {k: tuple(v) if k in listed and isinstance(v, list) else v for k, v in data.items()}
 
 
-#: Blocks may lie this deep in one another.
+#: Blocks can be nested this deep.
 DEEPEST = 20
 
 
@@ -137,7 +137,7 @@ def _node(block: Block, path: str, depth: int = 0) -> BlockNode:
 
 
 def _check_block(block: Block, path: str) -> None:
-    """What a method needs, and nothing that it would ignore."""
+    """Check that a block has what its method needs, and nothing it would ignore."""
     name, method = block.method, METHODS[block.method]
     if "count" in method.fields and block.count < 1:
         raise field_error(f"{path}.count", block.count, f"1 or more, for method {name}")

@@ -1,7 +1,7 @@
 """The cases of a sweep as a table: columns of values, and for each case its id and its seed.
 
 The id is a hash of all parameters of the case, swept or not, and of its repeat; the seed follows
-from the study's seed and the id. Both are thus the same in whichever sweep a case turns up.
+from the study's seed and the id. Both are thus the same in any sweep that contains the case.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ class CaseTable:
     repeat: np.ndarray  # number of the repeat, (n,)
     case_id: np.ndarray  # 16 hexadecimal digits as bytes, (n,)
     seed: np.ndarray  # (n,)
-    n_dropped: int  # cases that `where` left out
-    origin: np.ndarray  # for each row of the design, doubles included, the number of its case
+    n_dropped: int  # cases excluded by `where`
+    origin: np.ndarray  # for each row of the design, including duplicates, the number of its case
 
     def __len__(self) -> int:
         return len(self.repeat)
 
     @property
     def n_double(self) -> int:
-        """Rows of the design that are the same as an earlier one."""
+        """Number of rows of the design that duplicate an earlier one."""
         return len(self.origin) - len(self)
 
     @property
@@ -72,7 +72,7 @@ class CaseTable:
 
 
 def build_table(spec: SweepSpec) -> CaseTable:
-    """Spread a sweep into its cases.
+    """Expand a sweep into its cases.
 
     Raises:
         StudyError: a bad axis or condition, no case left, columns that do not fit one program.
@@ -108,7 +108,7 @@ def build_table(spec: SweepSpec) -> CaseTable:
 
 
 def values(study: Study, columns: Columns, name: str) -> np.ndarray:
-    """Values of a field, an entry or a label for all cases, (n,) or (1,) where it does not vary.
+    """Values of a field, an entry or a label for all cases, (n,) or (1,) if it does not vary.
 
     Raises:
         StudyError: no such name, or a whole list where one value is needed.
@@ -135,7 +135,7 @@ def values(study: Study, columns: Columns, name: str) -> np.ndarray:
 
 
 def _check_shapes(columns: Columns) -> None:
-    """Lists that the program cannot take in different lengths."""
+    """Reject lists of different lengths where the program needs equal ones."""
     for name in ("patches.centers", "shaper.frequencies_hz", "metrics.stations"):
         if name in columns and columns[name].dtype == object:
             raise StudyError(f"{name}: lists of different shape in one sweep; use equal ones")
@@ -147,7 +147,7 @@ def _check_shapes(columns: Columns) -> None:
 
 
 def _check_samples(study: Study, columns: Columns) -> None:
-    """Runs longer than a program can take."""
+    """Reject runs longer than a program can take."""
     rate = Fields(study, columns).numbers("electronics.sample_rate_hz")
     longest = float(np.max(Fields(study, columns).numbers("run.duration") * rate))
     if longest > SAMPLE_LIMIT:
@@ -157,7 +157,7 @@ def _check_samples(study: Study, columns: Columns) -> None:
 
 
 def _check_moves(study: Study, columns: Columns) -> None:
-    """Times of moves that a case does not have, and locked sliders with a path."""
+    """Reject times of moves that a case does not have, and locked sliders with a path."""
     fields = Fields(study, columns)
     count = np.sum(~np.isnan(fields.numbers("motion.waypoints")[..., 0]), axis=1)
     for name in ("motion.move_time", "motion.dwell"):
@@ -175,14 +175,14 @@ def _check_moves(study: Study, columns: Columns) -> None:
 
 
 def case_study(table: CaseTable, index: int) -> Study:
-    """The study of one case, as a file of its own would say it.
+    """The study of one case, as its own file would define it.
 
     Raises:
-        StudyError: the case does not stand as a single study (its status says so too).
+        StudyError: the case is not valid as a single study (its status says so too).
     """
     data = loose_study(table, index).model_dump()
     data["run"]["seed"] = int(table.seed[index])
-    modes = data["control"]["modes"]  # a mask of all cases may name more than this one has
+    modes = data["control"]["modes"]  # a mask of all cases can name more than this one has
     data["control"]["mode_mask"] = tuple(row[:modes] for row in data["control"]["mode_mask"])
     data["title"] = f"{table.study.title}: case {table.case_id[index].decode()}"[:200]
     return parse_study(data)
@@ -198,14 +198,14 @@ def loose_study(table: CaseTable, index: int) -> Study:
 
 
 def _sections(data: dict[str, Any]) -> Any:
-    """Sections rebuilt without checks: single columns may only fit together."""
+    """Sections rebuilt without checks: columns may only be valid together."""
     for name, value in data.items():
         model: Any = Study.model_fields[name].annotation
         yield name, model.model_construct(**value) if isinstance(value, dict) else value
 
 
 def _python(value: Any) -> Any:
-    """A column's entry as Python's numbers and tuples."""
+    """A column's entry as Python numbers and tuples."""
     if isinstance(value, (np.ndarray, np.generic)):
         value = value.tolist()
     return tuple(map(_python, value)) if isinstance(value, (list, tuple)) else value
@@ -219,12 +219,12 @@ def case_ids(study: Study, columns: Columns, repeat: np.ndarray) -> np.ndarray:
     fixed = {
         f"{section}.{leaf}": json.dumps(value)
         for section, fields in data.items()
-        if isinstance(fields, dict)  # the title is no parameter
+        if isinstance(fields, dict)  # the title is not a parameter
         for leaf, value in fields.items()
         if value != {}
     }
     names = sorted(fixed.keys() | varying.keys())
-    # fixed lines that follow one another are joined once
+    # consecutive fixed lines are joined once
     pieces: list[bytes] = [b""]
     lists: list[list[str]] = []
     for name in names:
@@ -277,5 +277,5 @@ def _seeds(study: Study, columns: Columns, ids: np.ndarray) -> np.ndarray:
 
 
 def as_numbers(column: np.ndarray) -> np.ndarray:
-    """A column as an array that a file can hold: lists of unequal length filled with NaN."""
+    """A column as an array for a file: lists of unequal length padded with NaN."""
     return padded(list(column)) if column.dtype == object else column

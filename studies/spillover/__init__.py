@@ -1,10 +1,10 @@
-"""Spillover: a controller on plants with modes that it does not know, and laws side by side.
+"""Spillover: a controller on plants with modes it does not know, and a comparison of laws.
 
-- `plants` says which plants and makes their linearised loops, `judgement` reads their poles,
+- `plants` defines the plants and their linearised loops, `judgement` evaluates their poles,
   `certificate` puts them together: `certify(study)`.
 - `laws` are control laws of equal strength, `comparison` judges and runs them:
   `compare_laws(study)`.
-- `report`, `plots` and `run` write all of it into a folder, `commands` is `studies spillover`.
+- `report`, `plots` and `run` write everything into a folder, `commands` is `studies spillover`.
 """
 
 from typing import TYPE_CHECKING

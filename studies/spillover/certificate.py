@@ -1,4 +1,4 @@
-"""Spillover certificate: one design's controller judged on many plants that it does not know."""
+"""Spillover certificate: one design's controller judged on many plants it does not know."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from studies.study.spec import Study
 
 
 class Certificate(NamedTuple):
-    """What was found. Axes: B bases, D departures, N numbers of modes.
+    """The findings. Axes: B bases, D departures, N numbers of modes.
 
     Numbers of plants that do not exist (patches overlap, ...) are NaN, their texts "".
     """
 
     study: Study
-    required: float  # margin that every plant must leave [1]
+    required: float  # margin required on every plant [1]
     n_controlled: int  # r_c, controlled modes per link
     plants: np.ndarray  # `Plant`, (B, D, N)
     exists: np.ndarray  # (B, D, N)
@@ -57,7 +57,7 @@ class Certificate(NamedTuple):
 
     @property
     def passes(self) -> np.ndarray:
-        """Which plants are stable and leave the margin, (B, D, N)."""
+        """Which plants are stable with the required margin, (B, D, N)."""
         return (self.radius <= 1 + RADIUS_TOLERANCE) & (self.margin >= self.required)
 
     @property
@@ -67,13 +67,13 @@ class Certificate(NamedTuple):
 
     @property
     def worst(self) -> tuple[int, ...]:
-        """Where the smallest margin is; of nearly equal ones the plant with the fewest modes."""
+        """Where the margin is smallest; if nearly equal, the plant with the fewest modes."""
         near = np.argwhere(self.margin <= np.nanmin(self.margin) * (1 + 1e-3))
         return tuple(int(k) for k in min(near.tolist(), key=lambda at: at[2]))
 
     @property
     def fails_from(self) -> int:
-        """Fewest plant modes per link with which a plant does not pass, 0 where all do."""
+        """Fewest plant modes per link with which a plant fails, 0 if none does."""
         failing = self.plants[self.exists & ~self.passes]
         return min((plant.n_modes for plant in failing), default=0)
 
@@ -85,17 +85,17 @@ def certify(
     sizes: tuple[int, ...] = (),
     departures: tuple[Departure, ...] = DEPARTURES,
 ) -> Certificate:
-    """Judge a study's controller on plants that differ from what it believes.
+    """Judge a study's controller on plants that differ from its model.
 
-    Its coefficients are those of the study as it stands. Each plant is linearised at the first
-    way-point, with delay, hold and anti-alias filter.
+    Its coefficients are those of the study. Each plant is linearised at the first way-point, with
+    delay, hold and anti-alias filter.
 
     Args:
         study: with sampled feedback.
-        margin: gain margin that every plant must leave [1], above 1.
+        margin: gain margin required on every plant [1], above 1.
         bases: modal bases of the plant.
         sizes: plant modes per link; empty: from the controlled ones to 12.
-        departures: from what the controller believes; joints in a basis that has them only.
+        departures: from the controller's model; joints only in a basis that has them.
 
     Raises:
         StudyError: no controller to judge (ideal feedback, no link controlled, gains of zero), a
@@ -123,7 +123,7 @@ def certify(
 def _judged(
     found: FixedController, maker: LoopMaker, plants: list[PlantVariant]
 ) -> dict[PlantVariant, Judgement]:
-    """Judgement of every plant that stands by itself."""
+    """Judgement of every plant that is stable without control."""
     parts = [
         (modes, widened(part, found.n_patches)) for modes, part in linear_parts(found.controller)
     ]

@@ -18,17 +18,18 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     @app.command()
     def spillover(
         design: Annotated[
-            Path, typer.Argument(help="study file, ready design, folder of a tuning or a sweep")
+            Path, typer.Argument(help="study file, ready-made design, folder of a tuning or sweep")
         ],
         out: Annotated[Path, typer.Option(help="folder for report, data and figures")],
         case: Annotated[
-            str | None, typer.Option(help="of a sweep: number or id:...; of a tuning: its family")
+            str | None,
+            typer.Option(help="case of a sweep (number or id:...) or family of a tuning"),
         ] = None,
         margin: Annotated[
-            float, typer.Option(help="gain margin that every plant must leave [1]")
+            float, typer.Option(help="gain margin required on every plant [1]")
         ] = 2.0,
     ) -> None:
-        """Certify a controller on plants that are not as it believes."""
+        """Certify a controller on plants that differ from its model."""
         start()
         from studies.engine.design import load_design
         from studies.spillover.run import spillover_design

@@ -1,4 +1,4 @@
-"""The laws side by side: as strong as the required margin lets them be, then on one fast move."""
+"""Comparison of laws: each as strong as the required margin allows, then on one fast move."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from studies.spillover.plants import LoopMaker, PlantVariant, plant_sizes
 from studies.study.margin import HIGHEST, LOWEST
 from studies.study.spec import Study
 
-#: The fast move has the acceleration of a move as long as the first in the time of the second.
+#: The fast move has the acceleration of a move of this length in this time.
 FAST = (0.01, 0.03)  # [m], [s]
 #: The drives settle this long after the command; then the residual window begins [s].
 SETTLING = 0.02
 #: Length of the residual window [s].
 WINDOW = 0.15
-#: Modes whose damping is told.
+#: Number of modes whose damping is reported.
 SHOWN = 3
 GIVEN, WITHOUT = "design as given", "no control"
 
 
 class Comparison(NamedTuple):
-    """Laws, L of them: without control, the design as given, then each law at its own factor."""
+    """L laws: without control, the design as given, then each law at its own factor."""
 
     study: Study  # of the runs: the design's first move made fast
     required: float  # margin that sets the factors [1]
-    plant: PlantVariant  # whose damping is told, and the basis of all
+    plant: PlantVariant  # whose damping is reported, and whose basis all use
     names: tuple[str, ...]
     factor: np.ndarray  # on the gains of each law, 1: as strong on mode 1 as the design [1], (L,)
     damping_ratio: np.ndarray  # modes 1.., smallest of the links that control it [1], (L, J)
-    margin: np.ndarray  # smallest over the plants, 0 where no gains are stable [1], (L,)
+    margin: np.ndarray  # smallest over the plants, 0 if no gains are stable [1], (L,)
     breaking: tuple[str, ...]  # what goes unstable beyond it
     residual_rms: np.ndarray  # worst station of each link [m], (L, 3)
     peak_voltage: np.ndarray  # [V], (L,)
@@ -53,14 +53,14 @@ class Comparison(NamedTuple):
 def compare_laws(study: Study, margin: float = 2.0, sizes: tuple[int, ...] = ()) -> Comparison:
     """Compare control laws on a study's machine.
 
-    The factor on a law's gains is the largest that leaves the margin on the design's own plants,
-    but no more than damps mode 1 as the design as given does, or as well as it can be damped.
-    Modified IMSC switches and so is not linear: its loops are judged with each mode alone, which
-    proves nothing about switching.
+    The factor on a law's gains is the largest that keeps the margin on the design's own plants, but
+    no larger than needed to damp mode 1 like the given design, or as well as possible. Modified
+    IMSC switches, so it is not linear: its loops are judged with each mode alone, which proves
+    nothing about switching.
 
     Args:
         study: the design, with sampled feedback.
-        margin: gain margin that the factors leave [1].
+        margin: gain margin that the factors must keep [1].
         sizes: plant modes per link; empty: from the controlled ones to 12.
 
     Raises:
@@ -108,7 +108,7 @@ class _View:
         parts = linear_parts(law.controller)
         self._parts = [(modes, maker.loop(plant, part)) for modes, part in parts]
         for _, part in parts:
-            for n in sorted(sizes, reverse=True):  # where the limit is lowest, as a rule
+            for n in sorted(sizes, reverse=True):  # usually the lowest limit first
                 if self.limit <= LOWEST:
                     return
                 loop = maker.loop(plant._replace(n_modes=n), part)
@@ -117,7 +117,7 @@ class _View:
                     self.limit, self.breaking = limit, breaking_motion(loop, limit)
 
     def margin(self, factor: float) -> float:
-        """Smallest one of all plants with all gains times a factor; 0 where no gains are stable."""
+        """Smallest margin of all plants with all gains times a factor; 0 if no gains are stable."""
         return float(min(self.limit / factor, HIGHEST)) if factor else HIGHEST * (self.limit > 0)
 
     def damping(self, factor: float) -> np.ndarray:
@@ -125,16 +125,16 @@ class _View:
         return self._path(factor * STEPS)[-1]
 
     def fair(self, margin: float, target: float) -> float:
-        """Largest factor with the margin, but no further than mode 1's damping grows to a target.
+        """Largest factor with the margin, limited to where mode 1's damping reaches a target.
 
         Args:
-            margin: that the factor leaves [1].
+            margin: that the factor must keep [1].
             target: damping ratio of mode 1 [1].
         """
         highest = self.limit / margin
         if highest == 0:
             return 0.0
-        # 1 among them, for the design's own law
+        # including 1, for the design's own law
         factors = np.union1d(highest * STEPS, [min(1.0, highest)])
         first = np.append(self.damping(0.0)[0], self._path(factors)[:, 0])
         factors = np.append(0.0, factors)
@@ -145,11 +145,11 @@ class _View:
         return float(np.interp(target, first[k - 1 : k + 1], factors[k - 1 : k + 1]))
 
     def _path(self, factors: np.ndarray) -> np.ndarray:
-        """The same while the gains grow through factors, (steps, `SHOWN`)."""
+        """The same as the gains grow through factors, (steps, `SHOWN`)."""
         found = np.full((len(factors), SHOWN), np.nan)
         for modes, loop in self._parts:
             tracked = follow(loop, factors, loop.poles)
-            # the three poles of a mode belong to no link, but uncontrolled links keep the weak ones
+            # a mode's three poles belong to no single link; uncontrolled links keep the weak ones
             zeta = -np.sort(-damping(loop, tracked)[1][:, :SHOWN], axis=2)
             last = self._n_links[None, : zeta.shape[1], None] - 1
             zeta = np.take_along_axis(zeta, last, axis=2)[..., 0]
@@ -158,7 +158,7 @@ class _View:
 
 
 def _controlled_links(law: Controller) -> np.ndarray:
-    """How many links control each of modes 1 to `SHOWN`; of one that none does, all with gains."""
+    """How many links control each of modes 1 to `SHOWN`; if none does, all links with gains."""
     is_on = law.velocity_gain != 0
     if law.position_gain is not None:
         is_on = is_on | (law.position_gain != 0)
@@ -171,7 +171,7 @@ def _run(found: FixedController, laws: list[Controller]) -> tuple[Study, Result]
     """The design's first move made fast under each law, and the study of it."""
     study = _made_fast(found.study)
     structure, case = check_run(study)
-    # a channel for each patch, whatever the law
+    # a channel per patch, whatever the law
     structure = structure._replace(
         law=SRF.name, n_frequencies=1, metrics=("residual_rms", "peak_voltage", "control_energy")
     )
@@ -185,7 +185,7 @@ def _simulate(structure: Structure, case: Case, laws: Controller) -> Result:
 
 
 def _made_fast(study: Study) -> Study:
-    """The same with nothing but its first move, at the acceleration of `FAST`, without shaper."""
+    """The same with only its first move, at the acceleration of `FAST`, without shaper."""
     points = study.motion.waypoints[:2]
     distance = float(np.hypot(*np.subtract(points[-1], points[0])[:2]))
     time = study.motion.move_time

@@ -1,4 +1,4 @@
-"""What the poles of one loop say: damping of its modes, gain margin, the mode that breaks it."""
+"""Judgement of one loop by its poles: damping, gain margin, the mode that breaks it."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from studies.engine.stability import follow_poles, gain_margin, mode_by_mode
 from studies.spillover.plants import SampledLoop
 from studies.study.margin import HIGHEST, LOWEST
 
-#: Gain factors at which modes are followed from no control to the design's gains.
+#: Gain factors at which modes are traced from no control to the design's gains.
 STEPS = np.linspace(0, 1, 17)[1:]
-#: A mode or link with this share of the largest one's energy is named beside it [1].
+#: A mode or link with this share of the largest one's energy is named with it [1].
 PART = 1 / 3
 
 
 class Judgement(NamedTuple):
-    """Of one loop."""
+    """Judgement of one loop."""
 
     radius: float  # spectral radius at the given gains [1]
     margin: float  # largest common factor on all gains with every smaller one stable [1]
@@ -27,7 +27,7 @@ class Judgement(NamedTuple):
     damping_ratio: np.ndarray  # [1], (r, 3)
     free_damping: np.ndarray  # without control [1], (r, 3)
     weakest: str  # the mode of least damping
-    breaking: str  # what goes unstable first, "" where nothing does up to `HIGHEST`
+    breaking: str  # what goes unstable first, "" if nothing does up to `HIGHEST`
 
 
 def judge(loop: SampledLoop) -> Judgement:
@@ -61,7 +61,7 @@ def judge(loop: SampledLoop) -> Judgement:
 
 
 def worst_of(parts: list[tuple[slice, Judgement]]) -> Judgement:
-    """Of a law whose channels act one at a time, each with the modes it tells about."""
+    """Worst judgement of a law whose channels act one at a time, each with the modes it covers."""
     modes, each = [modes for modes, _ in parts], [judgement for _, judgement in parts]
     lowest = min(each, key=lambda one: one.margin)
     return lowest._replace(
@@ -79,7 +79,7 @@ def follow(
     Args:
         loop: the loop.
         factors: gain factors, rising from near 0 [1], (steps,).
-        poles: `loop.poles`, or what has them already.
+        poles: `loop.poles`, or a cached version.
 
     Returns:
         (steps, r, 3), NaN where modes are overdamped without control.
@@ -92,10 +92,10 @@ def follow(
 
 
 def damping(loop: SampledLoop, tracked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Frequency [Hz] and damping ratio of followed modes.
+    """Frequency [Hz] and damping ratio of traced modes.
 
-    A pole z of a mode above half the sample rate stands for exp(s T) of an s that is 2 pi/T away
-    from ln(z)/T, or several times that: the one next to the mode without control is meant.
+    A pole z of a mode above half the sample rate is exp(s T) of an s that differs from ln(z)/T by a
+    multiple of 2 pi/T: the one nearest to the mode without control is used.
 
     Args:
         loop: the loop.
@@ -113,7 +113,7 @@ def damping(loop: SampledLoop, tracked: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def breaking_motion(loop: SampledLoop, margin: float) -> str:
-    """What goes unstable just beyond the margin, "" where that is `HIGHEST`."""
+    """What goes unstable just beyond the margin, "" if that is `HIGHEST`."""
     if margin >= HIGHEST:
         return ""
     factor = max(1.001 * margin, LOWEST)
@@ -124,11 +124,11 @@ def breaking_motion(loop: SampledLoop, margin: float) -> str:
 def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
     """What moves at a pole: "mode 7 of links 1+2 (5606 Hz)", or the drive of the sliders.
 
-    The link modes named hold most of the energy omega^2 |q|^2 + |q'|^2 of the eigenvector. Whose
-    motion it is at all, a link's, the drive's or a filter's, participation factors tell,
-    products of entries of left and right eigenvector (Perez-Arriaga, Verghese and Schweppe 1982):
-    what leaves the unit circle can be a filter's pole, fed through by a mode that is far stiffer
-    and merely follows. The frequency is that of these modes of these links, their ends held.
+    The link modes named hold most of the energy omega^2 |q|^2 + |q'|^2 of the eigenvector. Whether
+    the motion belongs to a link, the drive or a filter is decided by participation factors,
+    products of entries of left and right eigenvectors (Perez-Arriaga, Verghese and Schweppe 1982):
+    the pole leaving the unit circle can be a filter's, fed through by a far stiffer mode that
+    merely follows. The frequency is that of these modes of these links with held ends.
 
     Args:
         loop: the loop.
@@ -137,7 +137,7 @@ def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
     """
     right, left = _eigenvectors(loop.open + factor * loop.feedback, pole)
     r = loop.n_modes
-    last = 6 + 6 * r  # what follows is sensors behind their filters and the controller
+    last = 6 + 6 * r  # the rest is sensors behind their filters and the controller
     share = left * right
     drive, links, filters = (abs(part.sum()) for part in (share[:6], share[6:last], share[last:]))
     hertz = abs(np.log(pole)) / loop.period / (2 * np.pi)
@@ -154,7 +154,7 @@ def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
 
 
 def _leading(energy: np.ndarray) -> list[int]:
-    """The largest and all that have at least `PART` of it."""
+    """The largest one and all with at least `PART` of it."""
     return [int(k) for k in np.flatnonzero(energy >= PART * energy.max())]
 
 
@@ -165,7 +165,7 @@ def _listed(name: str, numbers: list[int]) -> str:
 
 def _eigenvectors(matrix: np.ndarray, pole: complex) -> tuple[np.ndarray, np.ndarray]:
     """Right and left eigenvector of a pole by inverse iteration, (n,) each."""
-    # a little beside the pole lest the matrix be singular
+    # slightly off the pole to keep the matrix regular
     shifted = matrix - pole * (1 + 1e-9) * np.eye(len(matrix))
     right = left = np.ones(len(matrix), complex)
     for _ in range(3):

@@ -1,7 +1,7 @@
-"""Control laws for one machine: coefficients of the same sampled controller, equally strong.
+"""Control laws for one machine: coefficients of the same sampled controller, of equal strength.
 
-Each law has the design's patches, modes, electronics and feed-through compensation; factor 1 is as
-much damping of mode 1 as the design's own gains are meant to give.
+Each law has the design's patches, modes, electronics and feed-through compensation; factor 1 gives
+mode 1 the damping that the design's own gains intend.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from studies.errors import field_error
 from studies.spillover.plants import LoopMaker, PlantVariant, widened
 from studies.study.cases import law_parameters
 
-#: Damping of mode 1 below this share of that of other modes is rounding [1].
+#: Damping of mode 1 below this share of other modes' damping is rounding [1].
 ROUNDING = 1e-9
 
 
@@ -45,7 +45,7 @@ class Candidate(NamedTuple):
 
 
 def all_laws(found: FixedController, maker: LoopMaker, plant: PlantVariant) -> list[Candidate]:
-    """Every law there is; the one that the design is of with the design's own numbers.
+    """All available laws; the design's own law with the design's own numbers.
 
     Args:
         found: the design.
@@ -65,7 +65,7 @@ def all_laws(found: FixedController, maker: LoopMaker, plant: PlantVariant) -> l
         return np.where(np.abs(every[:, 0]) > ROUNDING * np.abs(every).max(), every[:, 0], 0.0)
 
     modal = given if control.law == IMSC.name else _designed(found, IMSC)
-    # a law that feeds back no velocities is as strong as modal control with the same settings
+    # a law without velocity feedback counts as strong as modal control with the same settings
     wanted = strength(given if np.any(given.velocity_gain) else modal)
     if not np.any(wanted > 0) or np.any(wanted < 0):
         raise field_error(
@@ -113,7 +113,7 @@ def _scaled(law: Controller, wanted: np.ndarray, has: np.ndarray) -> Controller:
 
 @partial(jax.jit, static_argnums=0)
 def _design(structure: Structure, case: Case, gains: tuple[Array, Array] | None) -> Controller:
-    """By the law of the structure; gains: of modal control that it is to be as strong as."""
+    """Design with the structure's law; gains: of the modal control whose strength it must match."""
     bases, law = find_bases(structure, case), LAWS[structure.law]
     if gains is not None:
         assert law.as_strong is not None
@@ -124,12 +124,12 @@ def _design(structure: Structure, case: Case, gains: tuple[Array, Array] | None)
 
 
 def _designed(found: FixedController, law: Law, modal: Controller | None = None) -> Controller:
-    """The study's controller by another law, NumPy arrays.
+    """The study's controller with another law, NumPy arrays.
 
     Args:
         found: the design.
         law: which one.
-        modal: modal control that it is to be as strong as; None: with the study's own settings.
+        modal: modal control whose strength it must match; None: the study's own settings.
     """
     structure = found.structure._replace(
         law=law.name,

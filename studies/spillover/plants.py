@@ -1,7 +1,7 @@
-"""The plants that a design is judged on, and the linearised loops with its controller.
+"""The plants on which a design is judged, and the linearised loops with its controller.
 
-The controller's coefficients stay what the design makes them; the plants differ in their number of
-modes, their modal basis and in one thing each that is not as the controller believes.
+The controller's coefficients stay those of the design; the plants differ in their number of modes,
+their modal basis and one departure each from the controller's model.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ LARGEST = MARGIN_MODES
 
 
 class Departure(NamedTuple):
-    """In what a plant is not as the controller believes."""
+    """How a plant departs from the controller's model."""
 
-    sensor: float = 1.0  # true sensor length over the one that the controller believes [1]
+    sensor: float = 1.0  # true sensor length over the one in the controller's model [1]
     actuator: float = 1.0  # the same for actuators [1]
     frequency: float = 1.0  # true frequencies of the bare links over those of the study [1]
     joint_inertia: float | None = None  # true J_C [kg m2]; None: the study's
@@ -47,15 +47,15 @@ class Departure(NamedTuple):
             words.append(f"frequencies x {self.frequency:g}")
         if self.joint_inertia is not None:
             words.append(f"J_C = {self.joint_inertia:g} kg m2")
-        return ", ".join(words) or "as believed"
+        return ", ".join(words) or "as modelled"
 
 
 def patch_lengths(lengths: tuple[float, ...]) -> tuple[Departure, ...]:
-    """Sensors and actuators of any of these lengths over the believed ones [1]."""
+    """Sensors and actuators with these lengths relative to the model's [1]."""
     return tuple(Departure(*pair) for pair in product(lengths, repeat=2))
 
 
-#: What may be otherwise: patches, the links' stiffness, the joints (none, and as was measured).
+#: Possible departures: patches, the links' stiffness, the joints (none, and as measured).
 DEPARTURES = (
     *patch_lengths((0.8, 1.0, 1.25)),
     Departure(frequency=0.9),
@@ -66,7 +66,7 @@ DEPARTURES = (
 
 
 class PlantVariant(NamedTuple):
-    """What sets one plant apart."""
+    """What distinguishes one plant."""
 
     basis: str
     n_modes: int  # per link
@@ -74,7 +74,7 @@ class PlantVariant(NamedTuple):
 
 
 class SampledLoop(NamedTuple):
-    """A linearised loop on the host, with nothing in it of modes that its plant does not have."""
+    """A linearised loop on the host, without the modes that its plant does not have."""
 
     open: np.ndarray  # transition over a sample without gains, (n, n)
     feedback: np.ndarray  # what the gains add, (n, n)
@@ -98,14 +98,14 @@ class SampledLoop(NamedTuple):
 
 
 class Leakage(NamedTuple):
-    """What passes between channels and plant modes, in the plant basis' own scale."""
+    """Coupling between channels and plant modes, in the scale of the plant's basis."""
 
     observation: Array  # channel signal per modal coordinate, filter x sensor, (3, C, R)
     actuation: Array  # modal force per channel force, actuator x synthesizer, (3, R, C)
 
 
 class LoopMaker:
-    """Makes loops of one design's machine with any controller; one compilation for each basis."""
+    """Builds loops of one design's machine with any controller; one compilation per basis."""
 
     def __init__(self, found: FixedController) -> None:
         """
@@ -119,7 +119,7 @@ class LoopMaker:
         self._pose = np.array(found.study.motion.waypoints[0], float)
 
     def fault(self, plant: PlantVariant) -> str:
-        """Why there is no such plant, "" where there is one."""
+        """Why there is no such plant, "" if there is one."""
         study, machine = self._found.study, self._placed(plant).machine
         is_off, is_overlapping = placement_faults(machine.patches, machine.beam.length)
         if is_off or is_overlapping:
@@ -147,7 +147,7 @@ class LoopMaker:
         )
 
     def leakage(self, plant: PlantVariant, law: Controller) -> Leakage:
-        """What the channels of a controller as `widened` see of a plant's modes, and do to them."""
+        """Coupling of the channels of a `widened` controller with a plant's modes, both ways."""
         _, _, (observation, actuation) = self._look(plant, law)
         return Leakage(observation[:, :, : plant.n_modes], actuation[:, : plant.n_modes])
 
@@ -155,7 +155,7 @@ class LoopMaker:
         self, plant: PlantVariant, law: Controller
     ) -> tuple[LoopMatrices, np.ndarray, Leakage]:
         known = self._found.structure
-        # nothing that only a controller's own design depends on: one program for all laws
+        # drop everything only a controller's own design depends on: one program for all laws
         structure = Structure(
             n_modes=LARGEST,
             n_controlled=known.n_controlled,
@@ -206,7 +206,7 @@ def _look(
 
 
 def _kept(matrices: LoopMatrices, n_modes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Entries of the loop's and of the plant's state that a plant with fewer modes has."""
+    """Entries of the loop's and the plant's state that exist with fewer modes."""
 
     def entries(size: int) -> np.ndarray:
         is_kept = np.ones(size, bool)
@@ -218,7 +218,7 @@ def _kept(matrices: LoopMatrices, n_modes: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def widened(law: Controller, n_channels: int) -> Controller:
-    """The same controller with idle channels behind its own, so that all laws have one shape.
+    """The same controller padded with idle channels, so that all laws have one shape.
 
     Args:
         law: NumPy arrays.
@@ -246,14 +246,14 @@ def widened(law: Controller, n_channels: int) -> Controller:
 
 
 def plant_sizes(found: FixedController, sizes: tuple[int, ...] = ()) -> tuple[int, ...]:
-    """Numbers of plant modes per link, rising; by default from the controlled ones to `LARGEST`.
+    """Numbers of plant modes per link, rising; default: from the controlled ones to `LARGEST`.
 
     Raises:
         StudyError: fewer than are controlled, or more than `LARGEST`.
     """
     smallest = found.structure.n_controlled
     if smallest > LARGEST:
-        raise field_error("control.modes", smallest, f"1 to {LARGEST}, the plant modes looked at")
+        raise field_error("control.modes", smallest, f"1 to {LARGEST}, the most plant modes")
     sizes = tuple(sorted(sizes or range(smallest, LARGEST + 1)))
     if not smallest <= sizes[0] <= sizes[-1] <= LARGEST:
         raise field_error("sizes", sizes, f"{smallest}, as many as are controlled, to {LARGEST}")
@@ -267,7 +267,7 @@ def all_plants(
 
     Args:
         bases: modal bases of the plant.
-        departures: from what the controller believes.
+        departures: from the controller's model.
         sizes: modes per link.
     """
     plants = np.empty((len(bases), len(departures), len(sizes)), object)

@@ -1,4 +1,4 @@
-"""Figures of a spillover certificate and of the laws beside it."""
+"""Figures of a spillover certificate and of the comparison of laws."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from studies.spillover.plants import Departure
 from studies.study.labels import describe
 from studies.study.margin import margin_text
 
-#: Leakage from here on has its own colour [1].
+#: Leakage above this has its own colour [1].
 FLOOR = 0.01
 #: Smaller margins are drawn as this [1].
 LEAST = 0.01
@@ -31,7 +31,7 @@ def _plain_ticks(axis: Axis) -> None:
 
 
 def _has_departures(found: Certificate) -> bool:
-    """Whether there are plants of one basis and size that differ."""
+    """Whether plants of the same basis and size differ."""
     return found.plants.shape[1] > 1
 
 
@@ -40,7 +40,7 @@ def margins(found: Certificate, ax: Axes | None = None) -> Axes:
 
     Args:
         found: the certificate.
-        ax: where to draw; a new figure where left out.
+        ax: where to draw; default: a new figure.
     """
     ax = figures.axes_or_new(ax)
     for b, color, dash in zip(
@@ -87,7 +87,7 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
 
     Args:
         found: the certificate.
-        ax: where to draw; a new figure where left out.
+        ax: where to draw; default: a new figure.
     """
     ax = figures.axes_or_new(ax)
     frequency, zeta = found.frequency_hz[:, :, -1], found.damping_ratio[:, :, -1]
@@ -143,9 +143,9 @@ def leakage_map(
 
     Args:
         factor: size of the leakage [1], (C, R).
-        n_controlled: the first ones are meant to be seen.
+        n_controlled: how many modes, the first ones, are meant to be seen.
         title: of the panel.
-        ax: where to draw; a new figure where left out.
+        ax: where to draw; default: a new figure.
     """
     ax = figures.axes_or_new(ax)
     channels, modes = factor.shape
@@ -185,7 +185,7 @@ def law_bars(found: Comparison, ax: Axes | None = None) -> Axes:
 
     Args:
         found: the comparison.
-        ax: where to draw; a new figure where left out.
+        ax: where to draw; default: a new figure.
     """
     ax = figures.axes_or_new(ax)
     rows = np.arange(len(found.names))

@@ -1,4 +1,4 @@
-"""The report of a spillover certificate: verdict first, then what it rests on."""
+"""The report of a spillover certificate: verdict first, then its basis."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TINY = 1e-9
 
 
 def verdict(found: Certificate) -> str:
-    """One line: passed or failed, and what decides."""
+    """One line: passed or failed, and the deciding plant."""
     at = found.worst
     margin, breaking = margin_text(found.margin[at], 3), found.breaking[at]
     if found.is_passed:
@@ -37,7 +37,7 @@ def report(found: Certificate, laws: Comparison | None) -> str:
 
     Args:
         found: the certificate.
-        laws: beside it, where they can be compared.
+        laws: comparison of laws, if they can be compared.
     """
     study, margin = found.study, float(found.margin[found.worst])
     return render(
@@ -68,7 +68,7 @@ def report(found: Certificate, laws: Comparison | None) -> str:
 
 
 def _free_damping(found: Certificate) -> list[float]:
-    """Least and largest damping ratio without control [1], or one where they hardly differ."""
+    """Least and largest damping ratio without control [1], or one if they hardly differ."""
     low, high = float(np.nanmin(found.free_damping)), float(np.nanmax(found.free_damping))
     return [low] if high - low < 0.1 * high else [low, high]
 
@@ -100,7 +100,7 @@ def _margins(found: Certificate) -> list[list[str]]:
 
 
 class Leak(NamedTuple):
-    """What passes between a mode under control and one that is not; modes count from 1."""
+    """Coupling between a controlled mode and an uncontrolled one; modes count from 1."""
 
     size: float  # [1]
     mode: int  # not under control
@@ -109,7 +109,7 @@ class Leak(NamedTuple):
 
 
 def _leakage(found: Certificate) -> dict[str, Any] | None:
-    """Modes that are not controlled in the estimates, and forces on them; None: no such modes."""
+    """Uncontrolled modes in the estimates, and forces on them; None: no such modes."""
     first, last = found.n_controlled, found.observation.shape[4]
     if first == last:
         return None
@@ -159,7 +159,7 @@ def _laws(laws: Comparison) -> list[list[str]]:
 
 
 def document(found: Certificate, laws: Comparison | None) -> str:
-    """JSON text: the verdict and every number, null where there is none."""
+    """JSON text: the verdict and every number, null if there is none."""
     whole: dict[str, Any] = {
         "format": "flexlink-spillover",
         "format_version": 2,

@@ -1,4 +1,4 @@
-"""From a design to the folder of its certificate."""
+"""From a design to the folder with its certificate."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def spillover_design(
 
     Args:
         design: what to judge.
-        out: folder for the files, made where it is missing.
-        margin: gain margin that every plant must leave [1].
-        console: to tell what happens; default: standard output.
+        out: folder for the files, created if missing.
+        margin: gain margin required on every plant [1].
+        console: where messages go; default: standard output.
 
     Returns:
         whether the design passes.
@@ -61,7 +61,9 @@ def spillover_design(
     _write(out, found, laws)
     for note in found.notes:
         console.print(note, soft_wrap=True)
-    console.print(f"written: {out / 'report.html'}, data and figures beside it", soft_wrap=True)
+    console.print(
+        f"written: {out / 'report.html'}, data and figures in the same folder", soft_wrap=True
+    )
     return found.is_passed
 
 
@@ -84,7 +86,7 @@ def _check_whose(out: Path, study: Study) -> None:
 def _write(out: Path, found: Certificate, laws: Comparison | None) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
-        with staged(out) as staging:  # an end in the midst of it leaves the old files whole
+        with staged(out) as staging:  # an interruption leaves the old files intact
             _draw(staging, found, laws)
             write_store(staging / DATA, variables(found, laws), run_attributes(found.study))
             (staging / DOCUMENT).write_text(document(found, laws), encoding="utf-8")
@@ -111,7 +113,7 @@ def _draw(folder: Path, found: Certificate, laws: Comparison | None) -> None:
 
 
 def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable]:
-    """Labelled numbers of a certificate and of the laws beside it."""
+    """Labelled numbers of a certificate and of the comparison of laws."""
     plants = ("basis", "departure", "plant_modes")
     modes = (*plants, "link_mode", "pole")
     place, axes = plants[:2], found.plants

@@ -1,7 +1,7 @@
 """From studies to the arrays of the model: `Structure` (static) and `Case` (traced).
 
-One way for one study and for many: every leaf is built with a leading case axis, of length 1 where
-no column makes it vary, so that a batch computes only once what its cases share.
+The same code handles one study and many: every leaf has a leading case axis, of length 1 if no
+column makes it vary, so that a batch computes only once what its cases share.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from studies.study.fields import Columns, Fields
 from studies.study.spec import OWN_FIELDS, Study
 
 TWO_PI = 2 * np.pi
-#: Duration of a move that only fills up a path of fewer moves [s].
+#: Duration of a move that only pads a path with fewer moves [s].
 NO_TIME = 1e-12
 
 
@@ -41,7 +41,7 @@ def build_structure(study: Study, substeps: int | None = None) -> Structure:
 
     Args:
         study: validated study.
-        substeps: plant steps per sample, where `run.substeps` leaves it open; default 1.
+        substeps: plant steps per sample if `run.substeps` leaves it open; default 1.
     """
     steps = round(study.run.duration * study.electronics.sample_rate_hz)
     noisy = study.electronics.adc_noise > 0 or study.drive.ripple > 0 or study.run.smooth
@@ -118,7 +118,7 @@ def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
 
 
 def in_working_precision(cases: Case) -> Case:
-    """NumPy leaves in the precision that JAX works in (integers stay integers)."""
+    """NumPy leaves in JAX's working precision (integers stay integers)."""
     real = np.dtype(jnp.result_type(float))
 
     def cast(x: np.ndarray) -> np.ndarray:
@@ -166,7 +166,7 @@ def _machine(fields: Fields, structure: Structure) -> Machine:
 
 
 def _joint_angle(fields: Fields) -> np.ndarray:
-    """psi [rad], (m, 3): as given, else those of the assembly."""
+    """psi [rad], (m, 3): as given, otherwise those of the assembly."""
     outward = fields.choices("machine.assembly", tuple(ASSEMBLIES))
     known = np.array(list(ASSEMBLIES.values()))[outward]
     given = np.radians(fields.numbers("machine.joint_angles_deg"))
@@ -190,7 +190,7 @@ def _per_link(lists: np.ndarray) -> np.ndarray:
 def _path(fields: Fields) -> motion.Path:
     points = fields.numbers("motion.waypoints")  # (m, M, 3), NaN beyond the last one
     count = np.sum(~np.isnan(points[..., 0]), axis=1)
-    moves = max(points.shape[1] - 1, 1)  # a platform that stands still moves to where it is
+    moves = max(points.shape[1] - 1, 1)  # a platform at rest moves to its own pose
     reached = np.minimum(np.arange(moves + 1), count[:, None] - 1)
     points = np.take_along_axis(points, reached[..., None], axis=1)
     is_move = np.arange(moves) < count[:, None] - 1
@@ -248,19 +248,19 @@ def _parameters(fields: Fields, law: Law) -> dict[str, np.ndarray]:
 
 
 def law_parameters(study: Study, law: Law) -> dict[str, np.ndarray]:
-    """Fields of a law's own as a study has them, whichever law it chooses, (3,) each."""
+    """A law's own fields in a study, whichever law the study selects, (3,) each."""
     return {name: x[0] for name, x in _parameters(Fields(study), law).items()}
 
 
 def powered(ratio: Any, exponent: Any) -> np.ndarray:
-    """|ratio|^exponent with the ratio's sign; a mode that is off (ratio 0) stays off."""
+    """|ratio|^exponent with the ratio's sign; a disabled mode (ratio 0) stays disabled."""
     size = np.abs(ratio)
     power = np.where(size > 0, np.where(size > 0, size, 1.0) ** exponent, 0.0)
     return np.where(np.asarray(ratio) < 0, -power, power)
 
 
 def _filled(table: np.ndarray, shape: tuple[int, ...], fill: float) -> np.ndarray:
-    """(m, ...) cut or filled to (m, *shape); NaN is what a list lacks."""
+    """(m, ...) truncated or padded to (m, *shape); NaN marks missing entries."""
     whole = np.full((len(table), *shape), np.nan)
     if table.size:
         kept = tuple(slice(0, min(a, b)) for a, b in zip(table.shape[1:], shape, strict=True))
@@ -272,7 +272,7 @@ def _electronics(fields: Fields, structure: Structure) -> Electronics:
     number = fields.numbers
 
     def extend(field: str) -> np.ndarray:
-        """The last entry goes on."""
+        """Repeat the last entry."""
         values = number(field)
         last = np.maximum(np.sum(~np.isnan(values), axis=1) - 1, 0)
         index = np.minimum(np.arange(structure.n_controlled), last[:, None])

@@ -1,4 +1,4 @@
-"""Fields that are a choice from a table, to which users may add their own."""
+"""Fields whose values are names from a table that users can extend."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-#: What messages add to the names in tables to which users may add.
+#: Note that messages add to the names of extensible tables.
 OWN = "one of your own with studies --with FILE.py"
 
 
 class OneOf:
-    """Annotation of a text field: one of the names that a table has now."""
+    """Annotation of a text field: one of the current names of a table."""
 
     def __init__(self, names: Callable[[], Iterable[str]], note: str = "") -> None:
         """
@@ -25,7 +25,7 @@ class OneOf:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What is allowed."""
+        """Allowed names."""
         return tuple(self._names())
 
     def __get_pydantic_core_schema__(

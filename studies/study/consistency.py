@@ -15,7 +15,7 @@ from studies.errors import field_error, nearest
 if TYPE_CHECKING:
     from studies.study.spec import Study
 
-#: A run of more plant steps than this would not fit into memory with its trajectories.
+#: A run with more plant steps than this would not fit into memory with its trajectories.
 SAMPLE_LIMIT = 2_000_000
 #: Bandwidth of the slowest amplifier [Hz].
 SLOWEST_AMPLIFIER = 1.0
@@ -27,7 +27,7 @@ def each_link(value: Any) -> np.ndarray:
 
 
 def patch_pitch(study: Study) -> np.ndarray:
-    """Room along each link that one patch pair takes, the longer of both [m], (3,)."""
+    """Length of one patch pair along each link, the longer of both patches [m], (3,)."""
     patches = study.patches
     return np.maximum(each_link(patches.sensor_length), each_link(patches.actuator_length))
 
@@ -45,7 +45,7 @@ def patch_centers(study: Study) -> np.ndarray:
 
 
 def check_consistency(study: Study) -> None:
-    """Faults that involve more than one field. Those of poses are found in `studies.engine.runs`.
+    """Check faults that involve more than one field; `studies.engine.runs` checks poses.
 
     Raises:
         StudyError: the first fault.
@@ -77,7 +77,7 @@ def check_consistency(study: Study) -> None:
 
 
 def _check_own_fields(study: Study) -> None:
-    """Fields of laws' own; those of a law that is not chosen may stand there for a sweep."""
+    """Check laws' own fields; a sweep can include those of laws that are not selected."""
     for name, fields in study.control.laws.items():
         path = f"control.laws.{name}"
         if name not in LAWS:
@@ -93,7 +93,7 @@ def _check_own_fields(study: Study) -> None:
 
 
 def _check_patches(study: Study) -> None:
-    """Patches that leave their link, or overlap."""
+    """Reject patches that leave their link, or overlap."""
     patches, link = study.patches, study.link
     pitches, lengths, is_own = patch_pitch(study), each_link(link.length), _differs(link.length)
     sensor = each_link(patches.sensor_length)
@@ -134,7 +134,7 @@ def _differs(value: Any) -> bool:
 
 
 def check_locked(study: Study) -> None:
-    """Locked sliders follow no path; a linearisation does not mind, a run does.
+    """Reject a path with locked sliders, which a run cannot follow; a linearisation can.
 
     Raises:
         StudyError: more than one way-point.
@@ -149,7 +149,7 @@ def check_locked(study: Study) -> None:
 
 
 def _check_coupling(study: Study) -> None:
-    """The ceramic must couple, and less than completely: k31^2 = d31^2 E_p/eps33T in (0, 1)."""
+    """The ceramic must couple, but not completely: k31^2 = d31^2 E_p/eps33T in (0, 1)."""
     patches = study.patches
     permittivity = each_link(patches.relative_permittivity) * VACUUM_PERMITTIVITY
     highest = np.sqrt(permittivity / each_link(patches.youngs_modulus))
@@ -165,7 +165,7 @@ def _check_coupling(study: Study) -> None:
 
 
 def _check_pulses(study: Study) -> None:
-    """A pulse that begins after the run would do nothing, without a word."""
+    """Reject a pulse that starts after the run and would silently do nothing."""
     for name, pulse, start in (
         ("drive.pulse_start", study.drive.pulse_force, study.drive.pulse_start),
         ("load.pulse_start", study.load.pulse, study.load.pulse_start),
@@ -175,7 +175,7 @@ def _check_pulses(study: Study) -> None:
 
 
 def _check_sampling(study: Study) -> None:
-    """What must fit the sample rate."""
+    """Check everything that must fit the sample rate."""
     electronics, rate = study.electronics, study.electronics.sample_rate_hz
     for name in ("antialias_hz", "sensor_highpass_hz"):
         value = getattr(electronics, name)
@@ -207,7 +207,7 @@ def _check_sampling(study: Study) -> None:
 
 
 def _nested(lists: Any) -> tuple[Any, ...]:
-    """A table of three lists; empty where one number or list serves all links."""
+    """A table of three lists; empty if one number or list serves all links."""
     return lists if isinstance(lists, tuple) and lists and isinstance(lists[0], tuple) else ()
 
 

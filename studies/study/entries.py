@@ -1,7 +1,7 @@
 """Metrics by name, whole or in part: `residual_rms`, `residual_rms[link=1]`, `peak_voltage[0]`.
 
 Indices that name their axis count from 1, as the files do; others follow the axes' order and count
-from 0. A whole metric is taken over the links that count: those under control.
+from 0. A whole metric is taken over the links that count: the controlled ones.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ class Entries(NamedTuple):
     """Some entries of a metric."""
 
     metric: str
-    at: tuple[int | None, ...]  # number along each axis after the runs', from 0; None: all
+    at: tuple[int | None, ...]  # index along each axis after the runs', from 0; None: all
 
     def take(self, data: Any, links: tuple[int, ...] | None = None) -> Any:
         """Entries of an array of many runs, (S, n).
 
         Args:
             data: of the metric, (S, ...).
-            links: those that count where no link is named, from 0; None: all.
+            links: those that count if no link is named, from 0; None: all.
         """
         index: list[Any] = [slice(None)] * data.ndim
         for k, (axis, number) in enumerate(zip(self.axes, self.at, strict=True), 1):
@@ -46,7 +46,7 @@ class Entries(NamedTuple):
 
     @property
     def names_a_link(self) -> bool:
-        """Whether it is one link's alone."""
+        """Whether it belongs to a single link."""
         return any(
             axis == "link" and number is not None
             for axis, number in zip(self.axes, self.at, strict=True)
@@ -54,12 +54,12 @@ class Entries(NamedTuple):
 
 
 def parse_entries(name: str, path: str = "", sizes: Mapping[str, int] | None = None) -> Entries:
-    """Entries that a name stands for.
+    """Entries denoted by a name.
 
     Args:
         name: of a metric, perhaps with indices.
-        path: where it was written, for messages.
-        sizes: of axes, to check indices by; those not given have three entries.
+        path: where it is written, for messages.
+        sizes: of axes, for checking indices; those not given have three entries.
 
     Raises:
         StudyError: no such metric, axis or entry.
@@ -88,7 +88,7 @@ def parse_entries(name: str, path: str = "", sizes: Mapping[str, int] | None = N
 
 
 def controlled_links(studies: Iterable[Study]) -> tuple[int, ...]:
-    """Links that any of these studies controls, from 0; all where none does."""
+    """Links that any of these studies controls, from 0; all if none does."""
     found = {
         k
         for study in studies

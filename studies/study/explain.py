@@ -1,4 +1,4 @@
-"""What a field of a study allows, in words: for error messages and for a template's comments."""
+"""What a field of a study allows, in words, for error messages and template comments."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ _SIGNS = (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
 _WORDS = {bool: "true or false", str: "text", float: "a finite number", int: "a whole number"}
 _PLURALS = {bool: "values true or false", float: "finite numbers", str: "texts", dict: "tables"}
 
-#: Sections that make more than a study of a file; commands of the same name read them.
+#: Sections beyond those of a study; commands of the same name read them.
 COMMANDS = ("sweep", "tune")
 
 
 def unit_of(info: FieldInfo) -> str:
-    """Unit of a field, "" where it has none."""
+    """Unit of a field, "" if it has none."""
     extra = info.json_schema_extra
     unit = str(extra.get("unit", "")) if isinstance(extra, dict) else ""
     return "" if unit == "-" else unit
 
 
 def choices_of(annotation: Any, metadata: Iterable[Any] = ()) -> tuple[Any, ...]:
-    """What a field that is a choice may be; () for others."""
+    """Values of a choice field; () for others."""
     tables = [item.names for item in metadata if isinstance(item, OneOf)]
     literal = get_args(annotation) if get_origin(annotation) is Literal else ()
     return tables[0] if tables else literal
@@ -45,7 +45,7 @@ def allowed_values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
         told = " or ".join(filter(None, (", ".join(map(repr, names[:-1])), repr(names[-1]))))
         return "".join([told, *notes])
     for item in metadata:
-        if hasattr(item, "allowed"):  # says it itself
+        if hasattr(item, "allowed"):  # describes itself
             return str(item.allowed)
     origin, arguments = get_origin(annotation), get_args(annotation)
     if hasattr(annotation, "__metadata__"):
@@ -167,7 +167,7 @@ def _bad_value(
     value: Any = data
     for part in name:
         value = value[part]
-    # an entry of a list is named by its index, as far as its type is clear
+    # an entry of a list is named by its index if its type is clear
     for part in entries[:-1] if is_missing else entries:
         if get_origin(annotation) is not tuple or not isinstance(part, int):
             break

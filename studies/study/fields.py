@@ -1,7 +1,7 @@
 """Fields of a study as arrays with a leading case axis, of length 1 where nothing varies.
 
 A *column* holds the values of one field for many cases: numbers, or lists of equal shape, as a
-NumPy array with the cases first; lists of unequal shape as an object array of tuples. A column may
+NumPy array with the cases first; lists of unequal shape as an object array of tuples. A column can
 also be named after an entry of a list, `control.velocity_gain[0]`.
 """
 
@@ -19,7 +19,7 @@ Columns = Mapping[str, np.ndarray]
 
 
 def padded(values: list[Any]) -> np.ndarray:
-    """Numbers, or lists of them of any lengths, as one float array, missing entries NaN."""
+    """Numbers, or lists of any length, as one float array with NaN for missing entries."""
     if not isinstance(values[0], (tuple, list, np.ndarray)):
         return np.array(values, float)
     if all(np.size(np.array(value, object)) == 0 for value in values):
@@ -54,7 +54,7 @@ def _fill(array: np.ndarray, value: Any) -> None:
 
 
 class Fields:
-    """Every field of a study, some of them with one value per case.
+    """All fields of a study, some with one value per case.
 
     study: values of all fields that no column names. columns: the others.
     """
@@ -64,7 +64,7 @@ class Fields:
         self.columns = columns or {}
 
     def raw(self, field: str) -> np.ndarray:
-        """Values as they were written, (m,) or (m, ...), m = 1 or the number of cases."""
+        """Values as written, (m,) or (m, ...), m = 1 or the number of cases."""
         if field in self.columns:
             return self.columns[field]
         value = field_value(self.study, field)
@@ -75,7 +75,7 @@ class Fields:
         return np.array([value])
 
     def numbers(self, field: str) -> np.ndarray:
-        """As floats, entries of lists put in; what ragged lists lack is NaN."""
+        """As floats, with entries of lists filled in; NaN pads ragged lists."""
         raw = self.raw(field)
         if raw.dtype == object:
             is_mixed = is_each_link(field) and any(isinstance(value, tuple) for value in raw)
@@ -93,12 +93,12 @@ class Fields:
         return array
 
     def each_link(self, field: str) -> np.ndarray:
-        """As floats, one for each link where one stands for all, (m, 3)."""
+        """As floats, one for each link even if one stands for all, (m, 3)."""
         array = self.numbers(field)
         return np.repeat(array[:, None], LINKS, axis=1) if array.ndim == 1 else array
 
     def choices(self, field: str, names: tuple[str, ...]) -> np.ndarray:
-        """Position of each text value in `names`, (m,)."""
+        """Index of each text value in `names`, (m,)."""
         raw = self.raw(field)
         distinct, inverse = np.unique(raw.astype(str), return_inverse=True)
         return np.array([names.index(name) for name in distinct])[inverse]

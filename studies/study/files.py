@@ -1,4 +1,4 @@
-"""Files of studies, sweeps and tunings: where they lie, and what TOML makes of them."""
+"""Files of studies, sweeps and tunings: finding and reading them."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Any
 
 from studies.errors import StudyError, nearest
 
-#: Folder of the files that come with the package, which can be had by name.
+#: Folder of the package's ready-made files, available by name.
 READY = Path(__file__).parents[1] / "specs"
 
 
 def find_spec(name: str | Path) -> Path:
-    """A file, or the ready-made one of that name where there is no such file.
+    """A file, or the ready-made one of that name if there is no such file.
 
     Raises:
-        StudyError: neither, but a ready one of nearly that name.
+        StudyError: neither exists, but a ready-made one has nearly that name.
     """
     path = Path(name)
     if path.is_file() or len(path.parts) > 1 or path.suffix not in ("", ".toml"):

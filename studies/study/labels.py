@@ -1,4 +1,4 @@
-"""What codes and numbers of a run are called in files, tables and reports."""
+"""Names of a run's codes and numbers in files, tables and reports."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Gain margins in words, and the bounds of what is looked at."""
+"""Gain margins in words, and the bounds of the search."""
 
 from __future__ import annotations
 
-#: Plant modes that a margin rests on at least: modes that nobody controls limit the gains [1].
+#: Minimum number of plant modes for a margin: uncontrolled modes limit the gains [1].
 MARGIN_MODES = 12
 
 
@@ -10,12 +10,12 @@ MARGIN_MODES = 12
 ENOUGH = 2.0
 
 
-#: Margins beyond this are given as it, and those below the other as 0 [1].
+#: Margins above the first are reported as it, those below the second as 0 [1].
 HIGHEST, LOWEST = 64.0, 1e-6
 
 
 def caution(margin: float) -> str:
-    """What must be said of a gain margin, "" where it is `ENOUGH`, or there is none."""
+    """Warning about a gain margin, "" if it is `ENOUGH` or there is none."""
     if margin == 0:
         return (
             "UNSTABLE LOOP: the linearised sampled loop grows by itself, however small the gains."
@@ -34,5 +34,5 @@ def caution(margin: float) -> str:
 
 
 def margin_text(value: float, digits: int = 4) -> str:
-    """A gain margin in words; beyond `HIGHEST` nobody looks."""
+    """A gain margin in words; the search ends at `HIGHEST`."""
     return f"> {HIGHEST:g}" if value >= HIGHEST else f"{value:.{digits}g}"

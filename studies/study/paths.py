@@ -1,8 +1,8 @@
-"""Fields of a study by name: the one language, the one getter, the one setter.
+"""Fields of a study by name: the only syntax, getter and setter.
 
-A name is a field and, of a list, the indices of an entry: `link.length`, `control.ratios[0][1]`.
-Fields of a control law's own are `control.laws.LAW.FIELD`; where a study does not set one it has
-the law's default.
+A name is a field and, for a list, the indices of an entry: `link.length`, `control.ratios[0][1]`.
+A control law's own fields are `control.laws.LAW.FIELD`; one that a study does not set has the
+law's default.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from studies.study.explain import choices_of, explain, unit_of
 from studies.study.spec import OWN_FIELDS, Study
 
 LINKS = 3
-#: An index that names its axis and counts from 1, as the files do: `residual_rms[link=1]`.
+#: An index that names its axis and counts from 1, as in the files: `residual_rms[link=1]`.
 NAMED_INDEX = re.compile(r"\[(\w+)=(\d{1,6})\]")
 _ENTRY = re.compile(r"(?P<field>[^\s\[\]]+)(?P<indices>(\[(0|[1-9]\d{0,5})\])*)")
-#: Faults in these fields are a status of the case, so that a sweep may run into them.
+#: Faults in these fields become a status of the case, so that they do not stop a sweep.
 JUDGED_BY_STATUS = (
     "patches.",
     "motion.",
@@ -47,7 +47,7 @@ class Entry(NamedTuple):
 
 
 def parse_entry(name: str) -> Entry | None:
-    """Split a name into field and indices; None where it is no such name."""
+    """Split a name into field and indices; None if it is not a valid name."""
     match = _ENTRY.fullmatch(name)
     if match is None:
         return None
@@ -68,7 +68,7 @@ def all_fields() -> list[str]:
 
 
 def own_parameter(field: str) -> Parameter | None:
-    """The law's parameter that a field is, if it is one."""
+    """The law's parameter behind a field, if there is one."""
     if not field.startswith(f"{OWN_FIELDS}."):
         return None
     law, _, leaf = field.removeprefix(f"{OWN_FIELDS}.").partition(".")
@@ -77,7 +77,7 @@ def own_parameter(field: str) -> Parameter | None:
 
 
 def is_each_link(field: str) -> bool:
-    """Whether one number stands for all links, or three for one each."""
+    """Whether a field takes one number for all links, or three."""
     return field in EACH_LINK or field.startswith(f"{OWN_FIELDS}.")
 
 
@@ -106,14 +106,14 @@ def field_unit(field: str) -> str:
 
 
 def field_choices(field: str) -> tuple[str, ...]:
-    """What a field that is a choice may be; () for others."""
+    """Values of a choice field; () for others."""
     section, _, leaf = field.partition(".")
     fields = getattr(Study.model_fields[section].annotation, "model_fields", {})
     return choices_of(fields[leaf].annotation, fields[leaf].metadata) if leaf in fields else ()
 
 
 def as_list(field: str, value: Any) -> Any:
-    """A field's value where its entries are asked for: three, where one stands for all links."""
+    """A field's value as a list of entries: three if one number stands for all links."""
     return (value,) * LINKS if is_each_link(field) and not isinstance(value, tuple) else value
 
 
@@ -123,8 +123,8 @@ def known_field(name: str, study: Study, path: str = "", others: Iterable[str] =
     Args:
         name: of the field or entry.
         study: where to look.
-        path: where the name was written, for messages.
-        others: names that may be meant as well.
+        path: where the name is written, for messages.
+        others: further valid names.
 
     Raises:
         StudyError: no such field or entry, with the nearest name.
@@ -161,7 +161,7 @@ def set_value(study: Study, name: str, value: Any) -> dict[str, Any]:
 
 
 def set_values(study: Study, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The study as a dictionary, with fields or entries of fields replaced, one after the other."""
+    """The study as a dictionary, with fields or entries of fields replaced one by one."""
     data = study.model_dump()
     for name, value in values.items():
         entry = parse_entry(name)
@@ -186,7 +186,7 @@ def replaced(whole: Any, indices: tuple[int, ...], value: Any) -> Any:
 
 
 def checked_value(study: Study, name: str, value: Any, path: str) -> Any:
-    """A value as the field takes it (numbers as floats where it holds floats).
+    """A value as the field stores it (numbers as floats in float fields).
 
     Raises:
         StudyError: not allowed there, alone or with the other fields of the study.

@@ -1,4 +1,4 @@
-"""Numbers printed in the paper that more than one feature compares with."""
+"""Numbers printed in the paper and used by more than one feature."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The study file: every field with unit, default and allowed range; the only place of defaults.
+"""The study file: every field with unit, default and allowed range; the only place for defaults.
 
 `load_study(path)` reads TOML into a frozen `Study`, or raises `StudyError` naming field, value,
 allowed range, unit and the nearest valid name. `studies.study.cases` turns a `Study` into arrays.
@@ -24,7 +24,7 @@ from studies.study.consistency import check_consistency
 from studies.study.explain import explain
 from studies.study.files import READY, read_toml
 
-#: Where fields of laws' own are.
+#: Where laws' own fields are.
 OWN_FIELDS = "control.laws"
 Basis = Annotated[str, OneOf(lambda: BASES)]
 
@@ -48,7 +48,7 @@ EachLink: TypeAlias = Number | tuple[Number, Number, Number]
 
 
 class OwnFields:
-    """Annotation of `control.laws`: says what it may hold."""
+    """Annotation of `control.laws`: describes what it can hold."""
 
     @property
     def allowed(self) -> str:
@@ -71,14 +71,14 @@ class Section(BaseModel):
 
 
 class RunSection(Section):
-    """How long, how finely, and by which model."""
+    """Duration, resolution and model of the run."""
 
     duration: float = described(0.8, "s", "length of the run", gt=0, le=100)
     seed: int = described(0, "1", "of ADC noise and force ripple", ge=0, le=10**9)
     substeps: int = described(0, "1", "plant steps per sample; 0: as many as needed", ge=0, le=200)
     smooth: bool = described(False, "-", "smooth limits, noise instead of rounding (for gradients)")
     model: Literal["coupled", "ked"] = described(
-        "coupled", "-", "ked: rigid motion bends the links, nothing acts back (two passes)"
+        "coupled", "-", "ked: rigid motion bends the links, without feedback (two passes)"
     )
 
 
@@ -90,16 +90,16 @@ class MachineSection(Section):
         (120.0, 240.0, 0.0), "deg", "direction alpha of each guide; the platform is on its left"
     )
     guide_offsets: EachLink[Annotated[float, Field(ge=-10, le=10)]] = described(
-        0.0, "m", "by which a guide lies outside its side of the triangle"
+        0.0, "m", "offset of each guide outwards from its side of the triangle"
     )
     assembly: Literal["inward", "outward"] = described(
         "inward", "-", "which of the paper's two assemblies: joints at 90, 210, 330 deg or opposite"
     )
     joint_angles_deg: tuple[()] | tuple[Degrees, Degrees, Degrees] = described(
-        (), "deg", "of the platform's joints in its own axes; empty: as assembly says"
+        (), "deg", "of the platform's joints in its own axes; empty: according to assembly"
     )
     joint_radius: EachLink[Annotated[float, Field(ge=1e-4, le=5)]] = described(
-        round(0.12 / 3**0.5, 12), "m", "reference point of the platform to its joints"
+        round(0.12 / 3**0.5, 12), "m", "distance of the joints from the platform's reference point"
     )
     platform_mass: float = described(0.25, "kg", "m_p", ge=1e-3, le=1e3)
     platform_inertia: float = described(
@@ -126,13 +126,13 @@ class LinkSection(Section):
     density: EachLink[Annotated[float, Field(ge=1, le=3e4)]] = described(2750.0, "kg/m3", "density")
     youngs_modulus: EachLink[Annotated[float, Field(ge=1e3, le=2e12)]] = described(70e9, "Pa", "E")
     stiffness_factor: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(
-        1.0, "1", "true bending stiffness over the one controller and shaper believe"
+        1.0, "1", "true bending stiffness over the one controller and shaper assume"
     )
     damping_ratio: Zeta | tuple[Zeta, ...] | tuple[tuple[Zeta, ...], ...] = described(
-        0.01, "1", "of mode 1; or by mode as measured, one list for all links, or three"
+        0.01, "1", "of mode 1; or by mode, for example measured: one list for all links, or three"
     )
     damping_law: Literal["constant", "mass", "stiffness"] = described(
-        "constant", "-", "of the modes beyond: same ratio, falling with frequency, or rising"
+        "constant", "-", "of further modes: same ratio, falling with frequency, or rising"
     )
     joint_inertia_b: EachLink[Annotated[float, Field(ge=0, le=1)]] = described(
         0.0, "kg m2", "at the slider joint (basis loaded)"
@@ -195,7 +195,7 @@ class MotionSection(Section):
         max_length=100,
     )
     move_time: Time | tuple[Time, ...] = described(0.1, "s", "t_f of each move, or one per move")
-    dwell: Pause | tuple[Pause, ...] = described(0.0, "s", "rest after each move, or one per move")
+    dwell: Pause | tuple[Pause, ...] = described(0.0, "s", "pause after each move, or one per move")
     profile: Annotated[str, OneOf(lambda: PROFILES)] = described("cycloid", "-", "cycloid is (25)")
 
 
@@ -206,10 +206,10 @@ class ShaperSection(Section):
     frequencies_hz: tuple[Hertz, ...] = described(
         (),
         "Hz",
-        "modes to shape for, in series; empty: mode 1 as the controller believes it",
+        "modes to shape for, in series; empty: mode 1 of the controller's model",
         max_length=3,
     )
-    damping_ratio: float = described(0.01, "1", "zeta the shaper assumes", ge=0, lt=0.9)
+    damping_ratio: float = described(0.01, "1", "zeta assumed by the shaper", ge=0, lt=0.9)
     tolerance: float = described(0.05, "1", "V of the EI family", ge=0, lt=1)
     split: Literal["linear", "exact"] = described("linear", "-", "impulses onto the sample grid")
 
@@ -222,15 +222,15 @@ class ControlSection(Section):
     )
     law: Annotated[str, OneOf(lambda: LAWS, OWN)] = described("imsc", "-", "control law")
     laws: Annotated[dict[str, dict[str, EachLink[float]]], OwnFields()] = described(
-        {}, "-", "fields of laws' own, by law"
+        {}, "-", "laws' own fields, by law"
     )
-    basis: Basis = described("pinned_pinned", "-", "modal basis the controller believes in")
+    basis: Basis = described("pinned_pinned", "-", "modal basis of the controller's model")
     modes: int = described(3, "1", "controlled modes per link", ge=1, le=12)
     frequencies_hz: tuple[Hertz, ...] | tuple[tuple[Hertz, ...], ...] = described(
         (),
         "Hz",
-        "assembled links as measured, by mode; one list for all links, or three; "
-        "modes not given: those of control.basis",
+        "measured frequencies of the assembled links, by mode; one list for all links, or three; "
+        "others as in control.basis",
     )
     links: Flags = described((True, True, True), "-", "controlled links")
     mode_mask: tuple[tuple[bool, ...], ...] = described(
@@ -251,14 +251,14 @@ class ControlSection(Section):
         "EMC ratios k_dj : k_d1 per link (24); missing ones are 0",
     )
     ratio_source: Literal["given", "own_run"] = described(
-        "given", "-", "ratios as given, or by (24) from the same case's uncontrolled run"
+        "given", "-", "ratios as given, or from the same case's uncontrolled run by (24)"
     )
     ratio_exponent: float = described(
         1.0, "1", "exponent on the ratios: 0 makes all gains equal", ge=0, le=10
     )
     gain_factor: float = described(0.5, "1", "f, common factor on all gains", ge=0, le=1e3)
     feedthrough_factor: float = described(
-        0.0, "1", "share of the residual modes' feed-through that is subtracted", ge=0, le=1
+        0.0, "1", "subtracted share of the residual modes' feed-through", ge=0, le=1
     )
 
 
@@ -285,11 +285,11 @@ class ElectronicsSection(Section):
     lowpass_ratio: tuple[Annotated[float, Field(gt=0.1, le=100)], ...] = described(
         (3.0, 2.0, 2.0),
         "1",
-        "kappa_j, low-pass corner over omega_j; the last one goes on",
+        "kappa_j, low-pass corner over omega_j; the last one repeats",
         min_length=1,
     )
     lowpass_zeta: tuple[Annotated[float, Field(gt=0, le=5)], ...] = described(
-        (0.7, 0.7, 0.7), "1", "damping of the low-pass; the last one goes on", min_length=1
+        (0.7, 0.7, 0.7), "1", "damping of the low-pass; the last one repeats", min_length=1
     )
     difference_cutoff_hz: float = described(
         2_000.0, "Hz", "low-pass of the difference", gt=0, le=1e6
@@ -324,7 +324,7 @@ class DriveSection(Section):
 
 
 class LoadSection(Section):
-    """What the platform carries and what acts on it, at its reference point (the pose)."""
+    """Payload of the platform, and loads on it, at its reference point (the pose)."""
 
     mass: float = described(0.0, "kg", "payload, added to m_p", ge=0, le=1e3)
     inertia: float = described(
@@ -345,7 +345,7 @@ class InitialSection(Section):
     """State at t = 0."""
 
     modal: tuple[tuple[Deflection, ...], ...] = described(
-        (), "m", "modal coordinates per link; missing ones 0"
+        (), "m", "modal coordinates per link; missing ones are 0"
     )
     load_station: float = described(0.1, "m", "where a static transverse load acts", gt=0, le=10)
     load_deflection: tuple[Deflection, Deflection, Deflection] = described(
@@ -354,7 +354,7 @@ class InitialSection(Section):
 
 
 class MetricsSection(Section):
-    """How a run is judged."""
+    """Evaluation of a run."""
 
     residual_delay: float = described(
         0.0, "s", "residual window starts this long after the command", ge=0, le=100
@@ -380,14 +380,14 @@ class MetricsSection(Section):
         1e3, "1", "tolerated condition number of filter and synthesizer", ge=1, le=1e6
     )
     stations: tuple[float, ...] = described(
-        (0.05, 0.10, 0.15), "m", "where chord deflection is taken", min_length=1, max_length=20
+        (0.05, 0.10, 0.15), "m", "where chord deflection is evaluated", min_length=1, max_length=20
     )
 
 
 class Study(Section):
     """One study file."""
 
-    title: str = described("study", "-", "what this is", max_length=200, pattern="^[^\0]*$")
+    title: str = described("study", "-", "title of the study", max_length=200, pattern="^[^\0]*$")
     run: RunSection = RunSection()
     machine: MachineSection = MachineSection()
     link: LinkSection = LinkSection()
@@ -438,7 +438,7 @@ def parse_study(data: dict[str, Any]) -> Study:
 
 
 def _plain(value: Any) -> Any:
-    """Lists as tuples and NumPy's numbers as Python's, all the way down."""
+    """Recursively convert lists to tuples and NumPy numbers to Python's."""
     if isinstance(value, (np.ndarray, np.generic)):
         value = value.tolist()
     if isinstance(value, dict):
@@ -450,7 +450,7 @@ def load_study(path: str | Path) -> Study:
     """Read a study file.
 
     Args:
-        path: TOML file, or the name of a ready one.
+        path: TOML file, or the name of a ready-made one.
 
     Raises:
         StudyError: unreadable, not TOML, or not a valid study.

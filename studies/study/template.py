@@ -31,14 +31,14 @@ def study_template(study: Study | None = None) -> str:
 
 
 def write_study(out: str | Path, study: Study | None = None) -> None:
-    """Write such a file.
+    """Write a complete, commented study file.
 
     Args:
         out: a new file.
-        study: what it is to read back as; None: all defaults.
+        study: the study it reads back as; None: all defaults.
 
     Raises:
-        StudyError: there is such a file, or it cannot be written.
+        StudyError: the file exists, or cannot be written.
     """
     out = Path(out)
     check_target(out)
@@ -57,11 +57,11 @@ def _field(section: BaseModel, name: str) -> list[str]:
 
 
 def toml_text(data: Mapping[str, Any], path: tuple[str, ...] = ()) -> str:
-    """A dictionary as a TOML file that reads back as it, such as the file of a sweep.
+    """A dictionary as a TOML file that reads back the same, such as the file of a sweep.
 
     Args:
-        data: as read from a file; what is nested deeper than [a.b] is written on one line.
-        path: of the section that it is; () for the whole file.
+        data: as read from a file; anything nested deeper than [a.b] is written on one line.
+        path: of the section; () for the whole file.
     """
     tables = [key for key, value in data.items() if isinstance(value, Mapping) and len(path) < 2]
     lines = [f"[{'.'.join(map(_key, path))}]"] if path else []
@@ -78,7 +78,7 @@ def toml_value(value: Any) -> str:
     """A Python value as TOML."""
     if isinstance(value, bool):
         return "true" if value else "false"
-    if isinstance(value, str):  # JSON escapes all that TOML wants escaped but one
+    if isinstance(value, str):  # JSON escapes everything TOML needs escaped, except one character
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, (tuple, list)):
         return "[" + ", ".join(toml_value(entry) for entry in value) + "]"

@@ -22,24 +22,22 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command()
     def sweep(
-        spec: Annotated[Path, typer.Argument(help="sweep file (TOML), or the name of a ready one")],
+        spec: Annotated[Path, typer.Argument(help="sweep file (TOML) or name of a ready-made one")],
         out: Annotated[Path | None, typer.Option(help="folder for the results")] = None,
         resume: Annotated[
-            bool, typer.Option("--resume", help="go on with the sweep that is there, or extend it")
+            bool, typer.Option("--resume", help="continue the sweep in this folder, or extend it")
         ] = False,
         dry_run: Annotated[
-            bool, typer.Option("--dry-run", help="say what would be run, and how long it takes")
+            bool, typer.Option("--dry-run", help="show what would run, and how long it would take")
         ] = False,
-        quiet: Annotated[bool, typer.Option("--quiet", help="no progress")] = False,
-        report: Annotated[
-            bool, typer.Option("--report", help="write report.html of the results, too")
-        ] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
+        report: Annotated[bool, typer.Option("--report", help="also write report.html")] = False,
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
         scheduler: Scheduler = None,
         local_workers: LocalWorkers = None,
         worker_timeout: WorkerTimeout = 600.0,
     ) -> None:
-        """Run thousands of cases from one file; finished ones survive whatever happens."""
+        """Run thousands of cases from one file; finished cases survive any interruption."""
         workers = Workers(scheduler, local_workers, worker_timeout)
         start(precision, cpu_only=workers.are_named)
         from studies.engine.sweep import make_plan, run_sweep
@@ -48,9 +46,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         asked = load_sweep(spec)
         if dry_run and workers.are_named:
-            raise StudyError("--dry-run: plans for this process; leave the workers out")
+            raise StudyError("--dry-run: plans for this process only; leave the workers out")
         if dry_run and report:
-            raise StudyError("--report: a --dry-run has no results; leave one of them out")
+            raise StudyError("--report: --dry-run produces no results; leave one of them out")
         if dry_run:
             print_plan(make_plan(asked, out if resume else None), console)
             return
@@ -65,14 +63,14 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             done = run_sweep(asked, out, resume, console, quiet, runner)
         if len(done.lost):
             print(
-                f"studies: {len(done.lost)} of {len(done.table)} cases are left out, see above; "
-                f"try them again with --resume --out {out}",
+                f"studies: {len(done.lost)} of {len(done.table)} cases were left out, see above; "
+                f"retry them with --resume --out {out}",
                 file=sys.stderr,
             )
         if done.is_interrupted:
             print(
-                f"studies: interrupted; {done.n_done} of {len(done.table)} cases are safe; go on "
-                f"with: studies sweep {spec} --out {out} --resume{workers.options}",
+                f"studies: interrupted; {done.n_done} of {len(done.table)} cases are safe; "
+                f"continue with: studies sweep {spec} --out {out} --resume{workers.options}",
                 file=sys.stderr,
             )
             sys.exit(130)
@@ -96,7 +94,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         folder: Folder,
         failed: Annotated[bool, typer.Option("--failed", help="list failed cases")] = False,
     ) -> None:
-        """Overview of a sweep: statuses, best cases; or its failed cases."""
+        """Show statuses and best cases of a sweep, or its failed cases."""
         from studies.engine.results import load
         from studies.sweeps.show import print_causes
         from studies.sweeps.show import show as show_sweep
@@ -108,11 +106,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     @app.command()
     def best(
         folder: Folder,
-        by: Annotated[str, typer.Option(help="metric to make small; -metric: to make large")],
+        by: Annotated[str, typer.Option(help="metric to minimise; -metric: to maximise")],
         subject_to: Annotated[str, typer.Option(help="condition on metrics and axes")] = "",
-        count: Annotated[int, typer.Option(min=1, help="how many")] = 10,
+        count: Annotated[int, typer.Option(min=1, help="number of cases")] = 10,
     ) -> None:
-        """Best cases of a sweep by a metric."""
+        """List the best cases of a sweep by a metric."""
         from studies.engine.results import load
         from studies.sweeps.show import best_cases, print_cases, tell_left_out
 
@@ -124,13 +122,15 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     def plot(
         folder: Folder,
         y: Annotated[
-            str | None, typer.Option(help="metric or axis; none: what the sweep ranks by")
+            str | None, typer.Option(help="metric or axis; default: the ranking metric")
         ] = None,
-        x: Annotated[str | None, typer.Option(help="axis or metric; none: all axes")] = None,
+        x: Annotated[str | None, typer.Option(help="axis or metric; default: all axes")] = None,
         hue: Annotated[str | None, typer.Option(help="axis or metric for the colour")] = None,
-        out: Annotated[Path | None, typer.Option(help="PNG, PDF or SVG; default: folder")] = None,
+        out: Annotated[
+            Path | None, typer.Option(help="PNG, PDF or SVG; default: in FOLDER")
+        ] = None,
     ) -> None:
-        """One figure of a sweep; its kind follows from the axes."""
+        """Plot a sweep; the axes determine the kind of figure."""
         from studies.engine.columns import variable_name
         from studies.engine.results import load
         from studies.sweeps.plots import plot as draw
@@ -150,7 +150,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         folder: Folder,
         by: Annotated[str, typer.Option(help="metric")] = "residual_rms",
     ) -> None:
-        """Which parameters matter: from a sweep with a method made for it (morris, saltelli)."""
+        """Show which parameters matter, from a sweep with method morris or saltelli."""
         from studies.engine.results import load
         from studies.sweeps.sensitivity import analyse
         from studies.sweeps.show import label

@@ -1,4 +1,4 @@
-"""What a sweep would take, before it runs."""
+"""The plan and estimated time of a sweep, before it runs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from studies.sweeps.show import Rows, print_rows, short_value
 
 
 def print_plan(plan: Plan, console: Console) -> None:
-    """What a sweep would run, a sample case, and the time it takes, after a short calibration."""
+    """Print what a sweep would run, a sample case, and the estimated time."""
     table = plan.table
     console.print(
         f"{len(table)} cases ({table.n_dropped} left out by where, {table.n_double} doubles, "
@@ -52,7 +52,7 @@ def print_plan(plan: Plan, console: Console) -> None:
 
 
 def axis_rows(table: CaseTable) -> Rows:
-    """How many values each column of a sweep takes, and between which ends."""
+    """Number of values of each column of a sweep, and their range."""
     rows = []
     for name, column in table.columns.items():
         entry = parse_entry(name)

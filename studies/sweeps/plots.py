@@ -1,7 +1,7 @@
-"""`studies plot`: one figure of a sweep, whose kind follows from its axes.
+"""`studies plot`: one figure of a sweep; the axes determine its kind.
 
 No x: parallel coordinates of all axes, or the best placements where patches move. x and hue on a
-numeric grid: heat map. x of few values: lines, one per hue. Else points, coloured by hue.
+numeric grid: heat map. x with few values: lines, one per hue. Otherwise points, coloured by hue.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def plot(data: SweepData, x: str | None, y: str, hue: str | None = None) -> Figu
 
 
 def front(data: SweepData, y: str) -> Figure:
-    """A metric over the gain margin, coloured by peak voltage; black: nothing better in both.
+    """A metric over the gain margin, coloured by peak voltage; black: the Pareto front.
 
     Args:
         data: with cases of status ok that have a gain margin.
@@ -143,7 +143,7 @@ def front(data: SweepData, y: str) -> Figure:
 
 
 def not_beaten(margin: np.ndarray, value: np.ndarray) -> list[int]:
-    """Cases that no other has at least the margin of with a smaller value."""
+    """Cases on the Pareto front: none has a smaller value at the same or a larger margin."""
     found: list[int] = []
     lowest = np.inf
     for k in np.lexsort((value, -margin)):
@@ -171,7 +171,7 @@ def is_log(data: SweepData, name: str) -> bool:
 
 
 def _scale_ordinate(ax: Axes, value: np.ndarray) -> None:
-    """Logarithmic for wide values; limits that a few outliers do not set."""
+    """Logarithmic for a wide range; limits ignore a few outliers."""
     is_wide = _is_wide(value)
     if is_wide:
         figures.log_scale(ax, "y")
@@ -202,10 +202,10 @@ def _say_left_out(figure: Figure, data: SweepData, chosen: np.ndarray) -> None:
 
 
 def save_plot(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, PDF or SVG, by the ending of its name.
+    """Write a figure as PNG, PDF or SVG, by its file extension.
 
     Raises:
-        StudyError: another ending, or it cannot be written there.
+        StudyError: another extension, or the file cannot be written.
     """
     if path.suffix not in (".png", ".pdf", ".svg"):
         raise StudyError(f"--out {path}; allowed: endings .png, .pdf, .svg")
@@ -246,7 +246,7 @@ def _heat_map(
 
 
 def _edges(middles: np.ndarray) -> np.ndarray:
-    """Borders of cells around sorted numbers, on the scale they are drawn on."""
+    """Borders of cells around sorted numbers, on the axis' scale."""
     if _is_geometric(middles):
         return np.exp(_edges(np.log(middles)))
     inner = (middles[1:] + middles[:-1]) / 2
@@ -255,12 +255,12 @@ def _edges(middles: np.ndarray) -> np.ndarray:
 
 
 def _is_wide(value: np.ndarray) -> bool:
-    """Whether numbers call for a logarithmic scale."""
+    """Whether numbers need a logarithmic scale."""
     return bool(np.all(value > 0) and value.max() > 30 * value.min())
 
 
 def _is_geometric(values: np.ndarray) -> bool:
-    """Whether sorted numbers follow one another by a factor, over more than a decade."""
+    """Whether sorted numbers grow by a constant factor, over more than a decade."""
     if values.dtype.kind != "f" or len(values) < 4 or values[0] <= 0:
         return False
     ratios = values[1:] / values[:-1]
@@ -309,7 +309,7 @@ def _lines(
 
 
 def _distinct(values: np.ndarray) -> list[Any]:
-    """Different values: numbers sorted, texts in the order of their first appearance."""
+    """Distinct values: numbers sorted, texts in order of first appearance."""
     found, first = np.unique(values, return_index=True)
     return list(found if values.dtype.kind in "fi" else values[np.sort(first)])
 
@@ -355,13 +355,13 @@ def _points(
 
 
 def _best_text(data: SweepData, count: int) -> str:
-    """Which cases `recommended` gives, in words."""
+    """Which cases `recommended` returns, in words."""
     has_margin = MARGIN in data.variables and bool(np.any(data[MARGIN] >= ENOUGH))
     return f"{count} smallest" + (f" with a gain margin of {ENOUGH:g} or more" * has_margin)
 
 
 def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
-    """Every axis a vertical line, every case a polyline, coloured by rank; the best stand out."""
+    """Each axis a vertical line, each case a polyline coloured by rank; the best stand out."""
     names = [name for name in swept_names(data) if data[name].ndim == 1]
     if not names:
         raise StudyError("--x: needed here, no axis of this sweep is a single number or text")
@@ -407,7 +407,7 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
 
 
 def _placements(data: SweepData, y: str) -> Figure:
-    """The best placements on the link, one below the other, over all cases by each patch."""
+    """The best placements on the link, one below another, above all cases by each patch."""
     centers, value = data["patches_centers"], shown_metric(data, y)
     patches, length = data.spec.study.patches, each_link(data.spec.study.link.length).max()
     chosen = recommended(data, y, N_PLACEMENTS)

@@ -1,4 +1,4 @@
-"""The report of a sweep: what varied, how its cases ended, the best, and what failed and why."""
+"""The report of a sweep: what varied, how cases ended, the best ones, what failed and why."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ from studies.sweeps.show import (
 )
 
 REPORT, FIGURE, FRONT, MACHINE = "report.html", "cases.png", "front.png", "machine.png"
-#: Metrics to ask as well.
+#: Other metrics to check.
 OTHERS = ("settling_time", "peak_voltage")
-#: The best cases are as good as one where they differ by less than this share.
+#: The best cases count as equal if they differ by less than this share.
 ALIKE = 0.02
 
 
@@ -61,14 +61,14 @@ class Rival(NamedTuple):
 
 
 class BestCase(NamedTuple):
-    """What a report says of the best cases; values of the metric have their unit."""
+    """What a report says about the best cases; values of the metric include their unit."""
 
     case: int  # the first of them
     value: str  # of the metric there
     setting: str  # what varies, and its values there
-    margin: float | None  # gain margin there, None where it is not known
+    margin: float | None  # gain margin there, None if unknown
     median: str  # of the metric, over all cases of status ok
-    spread: float | None  # of the metric among them as a share, None where it tells them apart
+    spread: float | None  # relative spread of the metric among them, None if it distinguishes them
     warning: str  # of small gain margins among them
     is_safe: bool  # their gain margins are `ENOUGH`
     rival: Rival | None
@@ -114,12 +114,12 @@ def _front(data: SweepData, metric: str) -> Figure:
 
 
 def _margins(data: SweepData) -> np.ndarray:
-    """Gain margins, nan where they are not known, (n,)."""
+    """Gain margins, nan if unknown, (n,)."""
     return data[MARGIN] if MARGIN in data.variables else np.full(data.n_cases, np.nan)
 
 
 def _best_study(data: SweepData, metric: str) -> Study:
-    """Of the best case; of the sweep itself where no case is ok."""
+    """Study of the best case; of the sweep itself if no case is ok."""
     try:
         return case_study(data.table, int(recommended(data, metric, 1)[0]))
     except StudyError:
@@ -131,8 +131,8 @@ def report(data: SweepData, metric: str, drawn: list[str]) -> str:
 
     Args:
         data: the sweep.
-        metric: what the best cases are ranked by.
-        drawn: figures that there are, of `FIGURE`, `FRONT` and `MACHINE`.
+        metric: ranks the cases.
+        drawn: existing figures among `FIGURE`, `FRONT` and `MACHINE`.
     """
     endings = status_rows(data)
     return render(
@@ -159,7 +159,7 @@ def report(data: SweepData, metric: str, drawn: list[str]) -> str:
 
 
 def _best(data: SweepData, metric: str) -> BestCase | None:
-    """The best cases; None where no case of status ok has the metric."""
+    """The best cases; None if no case of status ok has the metric."""
     value, margin = metric_values(data, metric), _margins(data)
     is_known = (data["status"] == status.OK) & np.isfinite(value)
     if not is_known.any():
@@ -211,7 +211,7 @@ def _blocks(node: BlockNode, depth: int = 0) -> list[tuple[int, str, list[tuple[
 
 
 def _values(written: Any) -> Mapping[str, Any] | list[str]:
-    """Values of an axis: a range as it is written, or each in words."""
+    """Values of an axis: a range as written, or each value in words."""
     if isinstance(written, str):
         return [written]
     if isinstance(written, list):
@@ -220,5 +220,5 @@ def _values(written: Any) -> Mapping[str, Any] | list[str]:
 
 
 def _literal(found: Rows) -> Rows:
-    """A table whose cells Markdown shows unchanged."""
+    """A table with its cells escaped for Markdown."""
     return Rows(found.heads, [list(map(literal, row)) for row in found.rows])

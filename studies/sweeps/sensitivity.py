@@ -26,7 +26,7 @@ class Cause(NamedTuple):
 
 
 def failure_causes(data: SweepData) -> list[Cause]:
-    """Which parameters cause the failures, strongest first; [] where none or all failed.
+    """Which parameters cause the failures, strongest first; [] if none or all failed.
 
     Args:
         data: the sweep.
@@ -85,7 +85,7 @@ def _cause_of_choice(name: str, value: np.ndarray, is_failed: np.ndarray) -> Cau
 
 
 def _scalar_columns(data: SweepData) -> list[tuple[str, np.ndarray]]:
-    """Axes one number, or one text, at a time."""
+    """Axes as columns of single numbers or texts."""
     found = []
     for name in swept_names(data):
         array = data[name]
@@ -103,11 +103,11 @@ def _scalar_columns(data: SweepData) -> list[tuple[str, np.ndarray]]:
 
 
 def analyse(data: SweepData, metric: str) -> Analysis:
-    """What a sweep's design tells about its factors.
+    """Analyse the factors of a sweep's design.
 
     Args:
         data: of a method with an analysis.
-        metric: to look at.
+        metric: to analyse.
 
     Raises:
         StudyError: no such design or metric, or too many cases failed.
@@ -122,7 +122,7 @@ def factor_names(data: SweepData) -> list[str]:
     """Names of the dimensions of a sampled sweep's unit cube.
 
     Raises:
-        StudyError: not a design made for an analysis, or one with cases left out.
+        StudyError: not a design made for an analysis, or one with excluded cases.
     """
     sweep = data.spec.sweep
     if METHODS[sweep.method].analysis is None:
@@ -140,7 +140,7 @@ def factor_names(data: SweepData) -> list[str]:
 
 
 def design_values(data: SweepData, metric: str) -> np.ndarray:
-    """A metric at all rows of a design, NaN where the case failed or has not been run.
+    """A metric at all rows of a design, NaN if the case failed or has not run.
 
     Raises:
         StudyError: unknown metric.

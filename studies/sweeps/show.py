@@ -1,4 +1,4 @@
-"""What `studies show`, `studies best` and `studies sweep --dry-run` print, and tables of it."""
+"""Output of `studies show`, `studies best` and `studies sweep --dry-run`, and its tables."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from studies.study.entries import links_text
 from studies.study.margin import ENOUGH, margin_text
 from studies.sweeps.sensitivity import failure_causes
 
-#: Stands beside every metric of a case that has it.
+#: Shown next to every metric of a case that has it.
 MARGIN = "gain_margin"
 
 
@@ -42,7 +42,7 @@ SHARES = (
 
 
 class Rows(NamedTuple):
-    """A table to be printed, or written into a report."""
+    """A table to print, or to write into a report."""
 
     heads: list[str]
     rows: list[list[str]]
@@ -74,11 +74,11 @@ def select(data: SweepData, subject_to: str) -> np.ndarray:
 
 
 def best_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) -> np.ndarray:
-    """Numbers of the cases with the smallest metric, best first; of `WANTED_LARGE` the largest.
+    """Numbers of the cases with the smallest metric, best first; for `WANTED_LARGE`, the largest.
 
     Args:
         data: the sweep.
-        by: metric or entry of one; "-" before it: the other way round.
+        by: metric or entry of one; with "-" in front, in reverse order.
         subject_to: condition on metrics and axes.
         count: how many.
 
@@ -114,7 +114,7 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
 
 
 def status_rows(data: SweepData) -> Rows:
-    """How many cases ended in which way."""
+    """Number of cases by status."""
     counts = Counter(data["status"].tolist()).most_common()
     rows = [[reason(code), str(n), f"{100 * n / data.n_cases:.1f}"] for code, n in counts]
     return Rows(["status", "cases", "share [%]"], rows)
@@ -129,7 +129,7 @@ def _print_failed(data: SweepData, codes: np.ndarray, console: Console) -> None:
     rows = []
     for k in failed[:LONGEST_TABLE]:
         cells = [shown_value(data, name, int(k)) for name in names]
-        is_whole = codes[k] in status.FINISHED  # it ran to its end
+        is_whole = codes[k] in status.FINISHED  # the case finished
         time = "" if is_whole else f"{data['bad_time'][k]:.4g}"
         rows.append([str(k), short_id(data, int(k)), reason(int(codes[k])), time, *cells])
     print_rows(Rows(["case", "id", "status", "from [s]", *names], rows), console)
@@ -140,7 +140,7 @@ def _print_failed(data: SweepData, codes: np.ndarray, console: Console) -> None:
 
 
 def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console: Console) -> None:
-    """Print `case_rows`, and what must be said of them."""
+    """Print `case_rows`, and any warnings."""
     print_rows(case_rows(data, cases, metrics), console)
     warning = margin_warning(data, cases)
     if warning:
@@ -148,7 +148,7 @@ def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console:
 
 
 def margin_warning(data: SweepData, cases: np.ndarray) -> str:
-    """What is said where cases have a gain margin below `ENOUGH`, "" where none has."""
+    """Warning if cases have a gain margin below `ENOUGH`, "" if none has."""
     margin = data[MARGIN][cases] if MARGIN in data.variables else np.full(len(cases), np.nan)
     low = int(np.sum(margin < ENOUGH))
     if not low:
@@ -195,12 +195,12 @@ def written_name(data: SweepData, name: str) -> str:
 
 
 def short_id(data: SweepData, case: int) -> str:
-    """Enough of a case's id to name it by; unlike its number it is the same in any sweep."""
+    """Start of a case's id that identifies it; unlike its number, it is the same in any sweep."""
     return str(data["case_id"][case])[:ID_DIGITS]
 
 
 def tell_left_out(data: SweepData, console: Console) -> None:
-    """Say how many cases are not ok, and so take no part."""
+    """Report how many cases are not ok and hence left out."""
     codes = data["status"]
     counts = Counter(codes[codes != status.OK].tolist())
     if counts:
@@ -209,7 +209,7 @@ def tell_left_out(data: SweepData, console: Console) -> None:
 
 
 def label(data: SweepData, name: str) -> str:
-    """A name with the unit that it is shown in, a metric's in µm or ms, an axis' as written."""
+    """A name with its displayed unit: a metric's in µm or ms, an axis' as written."""
     unit = unit_of_metric(data, name)
     if is_metric(name):
         return headed(name, unit)
@@ -217,13 +217,13 @@ def label(data: SweepData, name: str) -> str:
 
 
 def ranking(data: SweepData) -> str:
-    """What cases are ranked by: as the sweep says, or the first metric that it keeps."""
+    """What ranks the cases: the sweep's choice, or the first metric it keeps."""
     by = data.spec.sweep.by
     return by if by.partition("[")[0] in data.variables else kept_metrics(data.spec)[0]
 
 
 def counted_text(data: SweepData, by: str) -> str:
-    """Over what a metric's largest value is taken, in words."""
+    """What a metric's largest value is taken over, in words."""
     metric = by.partition("[")[0]
     axes = list(data.variables[metric].dims[1:])
     told = []
@@ -247,7 +247,7 @@ def shown_metric(data: SweepData, name: str) -> np.ndarray:
 
 
 def recommended(data: SweepData, by: str, count: int = 10) -> np.ndarray:
-    """The best cases with a gain margin of `ENOUGH`, or of any margin where none has that.
+    """The best cases with a gain margin of `ENOUGH`, or with any margin if none has that.
 
     Arguments and errors as `best_cases`.
     """
@@ -260,7 +260,7 @@ def recommended(data: SweepData, by: str, count: int = 10) -> np.ndarray:
 
 
 def shown_value(data: SweepData, name: str, case: int) -> str:
-    """A value of one case, short."""
+    """A value of one case, shortened."""
     return short_value(data[name][case])
 
 
@@ -273,14 +273,14 @@ def short_value(value: Any) -> str:
 
 
 def unit_of_metric(data: SweepData, name: str) -> str:
-    """Unit of a metric or axis, "" where it has none."""
+    """Unit of a metric or axis, "" if it has none."""
     key = variable_name(name)
     variable = data.variables.get(key) or data.variables.get(variable_name(name.split("[")[0]))
     return "" if variable is None or variable.units == "1" else variable.units
 
 
 def print_causes(data: SweepData, console: Console) -> None:
-    """Print which parameters go with the failures, if any do."""
+    """Print which parameters correlate with the failures, if any do."""
     found = cause_rows(data)
     if found.rows:
         console.print(f"what the failures depend on ({SHARES}):", soft_wrap=True)
@@ -288,7 +288,7 @@ def print_causes(data: SweepData, console: Console) -> None:
 
 
 def cause_rows(data: SweepData) -> Rows:
-    """Which parameters go with the failures; no rows where none or all failed."""
+    """Which parameters correlate with the failures; no rows if none or all failed."""
     rows = []
     for cause in failure_causes(data)[:8]:
         low, high = (f"{100 * rate:.0f} % ({at})" for rate, at in (cause.low, cause.high))

@@ -1,10 +1,10 @@
-"""Tuning by gradient: free numbers of a study, moved until an objective is as small as it gets.
+"""Tuning by gradient: minimise an objective over free numbers of a study.
 
-- What is asked: `spec` reads the file, `free` puts free numbers into cases, `scenarios` makes the
-  machines and moves, `merit` says what a design is worth.
-- The way down: `evaluate` runs designs and differentiates them, `linear_fidelity` does the same
-  for the linearised loop, `descent` steps (L-BFGS, Adam), `optimise` leads all starts.
-- What came out: `check` runs it on fresh machines with the real converters, `audit` compares
-  derivatives with differences, `report`, `plots` and `results` tell.
-- `run` leads from the file to the results, `folder` keeps what is done and goes on with it.
+- Problem: `spec` reads the file, `free` puts free numbers into cases, `scenarios` makes the
+  machines and moves, `merit` rates a design.
+- Descent: `evaluate` runs designs and differentiates them, `linear_fidelity` does the same for
+  the linearised loop, `descent` steps (L-BFGS, Adam), `optimise` drives all starts.
+- Results: `check` runs them on fresh machines with the real converters, `audit` compares
+  derivatives with finite differences, `report`, `plots` and `results` present them.
+- `run` leads from the file to the results, `folder` saves and resumes progress.
 """

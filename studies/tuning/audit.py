@@ -1,4 +1,4 @@
-"""Derivatives of objective and limits against central differences."""
+"""Check derivatives of objective and limits against central differences."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ from studies.tuning.linear_fidelity import LinearFidelity
 from studies.tuning.optimise import start_families
 from studies.tuning.spec import TuneSpec
 
-#: Steps between the bounds, 0 to 1, of differences of fourth order. Rounding spoils the short one,
-#: and the long one may reach over a corner: an impulse of the shaper that passes a sampling
-#: instant, another sample or link that has the largest voltage, another slowest motion.
-#: Where a corner is nearer still, the differences to one side of it, of second order, are right.
-#: The nearest of the four counts.
+#: Steps of fourth-order differences, as shares of the bounds. Rounding spoils the short step, and
+#: the long one can cross a corner: an impulse of the shaper passes a sampling instant, another
+#: sample or link gets the largest voltage, another motion becomes the slowest. If a corner is even
+#: closer, second-order one-sided differences are right. The closest of the four counts.
 STEPS = (1e-3, 1e-4)
-#: Way from the study towards another point of the first place looked at. At the study itself every
-#: limit "own" is reached in all scenarios at once: a corner by construction.
+#: Distance of the first design from the study, as a share of the way to another point. At the study
+#: itself, every limit "own" is reached in all scenarios at once: a corner by construction.
 BESIDE = 1 / 16
-#: More disagreement than this fails the audit.
+#: Largest allowed disagreement.
 ALLOWED = 1e-4
 #: Smaller derivatives than this share of the largest one count as if they had its size: what a
 #: difference can resolve.
@@ -29,9 +28,9 @@ SMALLEST = 1e-3
 #: And where even that is smaller, they count as if they changed a figure, which is a share of the
 #: study's own, by this much from bound to bound: derivatives near zero are judged absolutely.
 NEAR_ZERO = 1e-3
-#: How many designs are looked at where none are named.
+#: Number of designs to check by default.
 DESIGNS = 3
-#: What a disagreement is, for a reader.
+#: Explanation of a disagreement for the reader.
 MEANING = (
     "Derivatives along the way from bound to bound. A disagreement is a share of the larger of the "
     f"two, or of {SMALLEST:g} of the figure's largest derivative where both are smaller, and of "
@@ -40,11 +39,11 @@ MEANING = (
 
 
 class Disagreement(NamedTuple):
-    """Of the derivatives by one free number, the worst of all points."""
+    """The worst disagreement of the derivatives by one free number."""
 
     name: str
     family: str
-    place: int  # which of the designs that were looked at
+    place: int  # index of the design
     figure: str  # "objective", or the limit
     derivative: float  # as a share of the bounds
     difference: float
@@ -52,18 +51,18 @@ class Disagreement(NamedTuple):
 
 
 def audit(spec: TuneSpec, places: np.ndarray | None = None) -> list[Disagreement]:
-    """Compare derivatives with differences; one entry for each free number.
+    """Compare derivatives with finite differences; one entry per free number.
 
-    Each number is looked at in the family that moves most of them of those that move it.
+    Each number is checked in the family with the most free numbers among those that move it.
 
     Args:
         spec: of the tuning.
-        places: designs to look at, between the bounds, (n, p); None: `audit_places`.
+        places: designs to check, as shares of the bounds, (n, p); None: `audit_places`.
     """
     worst: dict[int, Disagreement] = {}
     places = audit_places(spec) if places is None else places
     for position, numbers in _covering(spec).items():
-        # as many designs as the tuning has starts, so that it needs no program of its own
+        # as many designs as the tuning has starts, to share its program
         evaluator = Evaluator(spec, [spec.moving[position]] * len(start_families(spec)))
         own, exact = [], []
         for place in np.clip(places, 3 * STEPS[0], 1 - 3 * STEPS[0]):
@@ -87,7 +86,7 @@ def audit(spec: TuneSpec, places: np.ndarray | None = None) -> list[Disagreement
 
 
 def _covering(spec: TuneSpec) -> dict[int, list[int]]:
-    """Families by position, with the numbers to look at in each, so that all are."""
+    """Families by position, with the numbers to check in each, so that all are covered."""
     left = np.any([family.is_free for family in spec.moving], axis=0)
     found: dict[int, list[int]] = {}
     while left.any():
@@ -122,7 +121,7 @@ def _compared(
 
 
 def _evaluated(spec: TuneSpec, evaluator: Evaluator, designs: np.ndarray) -> Evaluation:
-    """Designs of one family, a batch at a time; derivatives of the first one only."""
+    """Designs of one family, batch by batch; derivatives only of the first one."""
     batch, parts = len(evaluator.families), []
     for first in range(0, len(designs), batch):
         rows = np.minimum(np.arange(first, first + batch), len(designs) - 1)
@@ -132,7 +131,7 @@ def _evaluated(spec: TuneSpec, evaluator: Evaluator, designs: np.ndarray) -> Eva
 
 
 def audit_places(spec: TuneSpec, count: int = DESIGNS) -> np.ndarray:
-    """Beside the study itself and points spread over the bounds, those with the most stable loops.
+    """A design close to the study, and among points spread over the bounds the most stable ones.
 
     Args:
         spec: of the tuning.
@@ -141,7 +140,7 @@ def audit_places(spec: TuneSpec, count: int = DESIGNS) -> np.ndarray:
     own, family = spec.free.places(), spec.families[spec.main]
     points = qmc.Sobol(len(own), rng=spec.tune.seed).random(16)
     way = np.where(family.is_free, points - own, 0.0)
-    points = own + way / 2  # where a tuning goes
+    points = own + way / 2  # where a tuning searches
     values = np.where(family.is_free, spec.free.values(points), np.nan)
     excess, _ = LinearFidelity(spec, [family]).screen(0, values)
     order = np.argsort(np.maximum(excess, 0.0), kind="stable")

@@ -1,4 +1,4 @@
-"""What designs are worth: with the real converters, on machines they were not tuned on."""
+"""Judge designs with the real converters, on machines they were not tuned on."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ from studies.tuning.optimise import excess
 from studies.tuning.scenarios import lane_columns, scenario_columns
 from studies.tuning.spec import Family, TuneSpec
 
-#: Random designs that are run in one chunk.
+#: Random designs per chunk.
 CHUNK = 256
 
 
 class JudgedDesign(NamedTuple):
-    """One design: on fresh scenarios, machine by machine within each move, and as its file says."""
+    """One design: on fresh scenarios, machine by machine within each move, and as in its file."""
 
-    objective: np.ndarray  # nan where a run did not finish, (S,)
+    objective: np.ndarray  # nan if a run did not finish, (S,)
     metrics: dict[str, np.ndarray]  # largest entry of the links that count, (S,)
     status: np.ndarray  # (S,)
     watched: np.ndarray  # from the end of the command to that of the run [s], (S,)
@@ -52,7 +52,7 @@ class JudgedDesign(NamedTuple):
 
 
 class OwnRun(NamedTuple):
-    """A design on the machine and move of its own file: what `studies simulate` gives."""
+    """A design on the machine and move of its own file, as in `studies simulate`."""
 
     objective: float
     metrics: dict[str, float]
@@ -61,9 +61,9 @@ class OwnRun(NamedTuple):
 
 
 class Searched(NamedTuple):
-    """Random designs of the family with most free numbers, on the scenarios of the tuning."""
+    """Random designs of the family with the most free numbers, on the tuning's scenarios."""
 
-    objective: np.ndarray  # nan where a run did not finish, (n,)
+    objective: np.ndarray  # nan if a run did not finish, (n,)
     limits: np.ndarray  # largest value over limit - 1 of the metrics with a limit, (n, m)
     peaks: np.ndarray  # largest values, (n, m)
     beyond_loop: np.ndarray  # largest excess over limits of the loop (see `screen`); inf where
@@ -75,7 +75,7 @@ class Searched(NamedTuple):
 
 
 def tuned_study(spec: TuneSpec, family: Family, values: np.ndarray) -> Study:
-    """The study with what a family sets, and its free numbers.
+    """The study with a family's settings and free numbers.
 
     Args:
         spec: of the tuning.
@@ -112,23 +112,23 @@ def patch_centers(spec: TuneSpec, family: Family, values: np.ndarray) -> np.ndar
 
 
 def _placed(spec: TuneSpec, family: Family, study: Study, values: np.ndarray) -> Case:
-    """What a family's study becomes by those of the free numbers (p,) that it moves."""
+    """A family's study with those of the free numbers (p,) that it moves."""
     case = as_arrays(build_case(study))
     return spec.free.place(case, np.where(family.is_free, values, np.nan))
 
 
 def fresh_columns(spec: TuneSpec) -> dict[str, np.ndarray]:
-    """Scenarios that the tuning has not seen."""
+    """Scenarios not used in the tuning."""
     scenarios = spec.tune.scenarios
     return scenario_columns(spec, scenarios.check, scenarios.seed + 1, is_fresh=True)
 
 
 def judge(spec: TuneSpec, designs: list[Study]) -> list[JudgedDesign]:
-    """Run designs on scenarios that the tuning has not seen, and as their own files say.
+    """Run designs on scenarios not used in the tuning, and as in their own files.
 
     Args:
         spec: of the tuning.
-        designs: studies that differ from the tuning's own in numbers only; its own comes first.
+        designs: studies that differ from the tuning's own only in numbers; its own comes first.
     """
     columns = fresh_columns(spec)
     count, merit, structure = len(columns["run.seed"]), merit_of(spec), shown_structure(spec)
@@ -160,7 +160,7 @@ def judge(spec: TuneSpec, designs: list[Study]) -> list[JudgedDesign]:
 
 
 def _own_run(study: Study) -> Result | None:
-    """The run of a design's own file; None where that refuses to run."""
+    """The run of a design's own file; None if it cannot run."""
     try:
         return run_study(study, has_record=False, has_loop=False).result
     except StudyError:
@@ -168,7 +168,7 @@ def _own_run(study: Study) -> Result | None:
 
 
 def _seen(merit: Merit, run: Result | None, first: Result | None, duration: float) -> OwnRun:
-    """What a run shows, beside that of the study itself."""
+    """Figures of a run, relative to the study's own run."""
     if run is None or first is None:
         nothing = dict.fromkeys(merit.shown, float("nan"))
         return OwnRun(float("nan"), nothing, status.NON_FINITE, float("nan"))
@@ -182,7 +182,7 @@ def _seen(merit: Merit, run: Result | None, first: Result | None, duration: floa
 
 
 def shown_structure(spec: TuneSpec) -> Structure:
-    """Program of the runs that a report shows."""
+    """Program of the runs shown in a report."""
     return tuned_structure(spec)._replace(metrics=merit_of(spec).shown_metrics)
 
 

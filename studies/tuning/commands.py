@@ -28,18 +28,22 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
     @app.command()
     def tune(
-        spec: Annotated[Path, typer.Argument(help="tuning file (TOML), or `tune`, a ready one")],
+        spec: Annotated[
+            Path, typer.Argument(help="tuning file (TOML), or `tune`, a ready-made one")
+        ],
         out: Annotated[Path | None, typer.Option(help="folder for the results")] = None,
-        resume: Annotated[bool, typer.Option("--resume", help="go on with what is there")] = False,
-        audit: Annotated[
-            bool, typer.Option("--audit", help="only compare derivatives with differences")
+        resume: Annotated[
+            bool, typer.Option("--resume", help="continue an interrupted run")
         ] = False,
-        quiet: Annotated[bool, typer.Option("--quiet", help="no progress")] = False,
+        audit: Annotated[
+            bool, typer.Option("--audit", help="only check derivatives against finite differences")
+        ] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
         scheduler: Scheduler = None,
         local_workers: LocalWorkers = None,
         worker_timeout: WorkerTimeout = 600.0,
     ) -> None:
-        """Move free numbers of a study downhill, within limits, for many machines at once."""
+        """Tune free numbers of a study by gradients, within limits, for many machines at once."""
         workers = Workers(scheduler, local_workers, worker_timeout)
         start(cpu_only=workers.are_named)
         from studies.tuning.run import REPORT, run_tuning
@@ -49,7 +53,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         asked = load_tuning(spec)
         if audit and (out or resume or quiet or workers.are_named):
             raise StudyError(
-                "--audit: writes nothing, here; leave --out, --resume, --quiet and workers out"
+                "--audit: writes no files; leave --out, --resume, --quiet and workers out"
             )
         if audit:
             _audit(asked, console)
@@ -63,13 +67,13 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         with evaluator_for(asked, workers, tell) as evaluator:
             run_tuning(asked, out, resume, console, quiet, evaluator)
-        console.print(f"report: {out / REPORT}; tuned studies beside it", soft_wrap=True)
+        console.print(f"report: {out / REPORT}; tuned studies in the same folder", soft_wrap=True)
 
 
 def _audit(spec: TuneSpec, console: Console) -> None:
     from studies.tuning.audit import ALLOWED, DESIGNS, MEANING, audit
 
-    console.print(f"comparing derivatives with differences at {DESIGNS} designs")
+    console.print(f"comparing derivatives with finite differences at {DESIGNS} designs")
     names = "free number", "family", "worst for", "at", "derivative", "difference", "disagreement"
     table, found = Table(*names), audit(spec)
     for one in found:
@@ -83,7 +87,7 @@ def _audit(spec: TuneSpec, console: Console) -> None:
             f"{one.share:.1e}",
         )
     console.print(table)
-    console.print(f"Design 1 lies beside the study. {MEANING}", soft_wrap=True)
+    console.print(f"Design 1 lies close to the study. {MEANING}", soft_wrap=True)
     worst = max(one.share for one in found)
     is_fine = worst <= ALLOWED
     console.print(f"worst: {worst:.1e}, {'below' if is_fine else 'above'} {ALLOWED:g}")

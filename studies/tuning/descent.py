@@ -1,9 +1,9 @@
-"""How starts go downhill: Adam, or L-BFGS with a line search of its own for each start.
+"""Descent methods: Adam, or L-BFGS with a separate line search for each start.
 
-All starts are evaluated in one batch, so a line search cannot ask for values of one of them. It
-runs across iterations instead: a start whose trial is not good enough tries a shorter step in the
-next iteration, while the others go on. Places lie between 0 and 1; a step that would leave ends at
-the bound.
+All starts are evaluated in one batch, so a line search cannot request values for just one of them.
+It runs across iterations instead: a start whose trial is not good enough tries a shorter step in
+the next iteration, while the others continue. Places lie between 0 and 1; a step beyond a bound
+ends there.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import optax
 FIRST_STEP, LAST_STEP = 0.05, 0.002
 #: Longest step of L-BFGS in any number, and the one along the steepest slope.
 LONGEST, STEEPEST = 0.15, 0.05
-#: Share of the slope's promise that a step must keep (Armijo); how much a refused step shrinks.
+#: Share of the predicted decrease that a step must achieve (Armijo); factor of a rejected step.
 PROMISE, SHRINK = 1e-4, 0.35
-#: Steps below this share of the first one start anew along the slope.
+#: Steps below this share of the first one restart along the slope.
 SHORTEST = 0.02
 #: Steps that L-BFGS remembers.
 MEMORY = 8
@@ -31,18 +31,18 @@ _update = jax.jit(_LBFGS.update)
 
 
 class Trial(NamedTuple):
-    """Designs that were evaluated, and where they came from; starts first."""
+    """Evaluated designs, and where they came from; starts first."""
 
     base: np.ndarray  # last accepted place, (B, p)
     place: np.ndarray  # of the trial, (B, p)
     base_merit: np.ndarray  # (B,); inf before the first
-    merit: np.ndarray  # nan where it did not finish, (B,)
+    merit: np.ndarray  # nan if it did not finish, (B,)
     base_slope: np.ndarray  # (B, p)
     slope: np.ndarray  # (B, p)
 
 
 class Descent(Protocol):
-    """A way downhill. States are tuples of arrays, starts first, so that they can be kept."""
+    """A descent method. States are tuples of arrays, starts first, so that they can be saved."""
 
     def begin(self, place: np.ndarray) -> tuple[np.ndarray, ...]:
         """State before the first trial."""
@@ -51,7 +51,7 @@ class Descent(Protocol):
     def step(
         self, state: tuple[np.ndarray, ...], trial: Trial
     ) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
-        """(next state, which trials are accepted (B,), next places (B, p))."""
+        """Return (next state, which trials are accepted (B,), next places (B, p))."""
         ...
 
 
@@ -71,7 +71,7 @@ class Adam:
         tree = jax.tree.structure(self._optimiser.init(trial.place))
         steps, after = self._optimiser.update(slope, jax.tree.unflatten(tree, state))
         moved = np.clip(trial.place + np.asarray(steps), 0.0, 1.0)
-        # where no run finishes: half the way back
+        # if no run finishes: half the way back
         return _arrays(after), is_fine, np.where(is_fine[:, None], moved, _between(trial, 0.5))
 
 
@@ -107,7 +107,7 @@ class Lbfgs:
         """(slopes turned into steps by what optax remembers, (B, p), the new memory)."""
         ahead, memory = trial.slope.copy(), [np.array(x) for x in memory]
         tree = jax.tree.structure(_LBFGS.init(trial.place[0]))
-        # one start after the other: XLA's CPU compiler aborts on the batch of them (jax 0.10)
+        # one start after another: XLA's CPU compiler aborts on a batch of them (jax 0.10)
         for k in np.flatnonzero(is_taken):
             state = jax.tree.unflatten(tree, [x[k] for x in memory])
             ahead[k], after = _update(trial.slope[k], state, trial.place[k])
@@ -127,7 +127,7 @@ def _between(trial: Trial, share: float) -> np.ndarray:
 
 
 def _inward(place: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Without what would leave the bounds."""
+    """The direction without components that leave the bounds."""
     leaves = ((place <= 0) & (direction < 0)) | ((place >= 1) & (direction > 0))
     return np.where(leaves | ~np.isfinite(direction), 0.0, direction)
 

@@ -1,8 +1,8 @@
 """Designs under all scenarios: objective, limits, and their derivatives by the free numbers.
 
 Runs are differentiated forward (`studies.engine.gradients`), all scenarios of all designs in one
-batch, with limits and rounding made smooth (`Structure.is_smooth`). The study itself is in every
-batch: everything is measured against it.
+batch, with limits and rounding made smooth (`Structure.is_smooth`). Every batch includes the study
+itself as the reference.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from studies.tuning.spec import OWN, Family, TuneSpec
 
 
 class Evaluation(NamedTuple):
-    """Designs and how they change; NumPy arrays."""
+    """Designs and their derivatives; NumPy arrays."""
 
-    objective: np.ndarray  # (designs,), nan where a scenario did not finish
-    slope: np.ndarray  # by the free numbers, 0 by those that do not move, (designs, p)
+    objective: np.ndarray  # (designs,), nan if a scenario did not finish
+    slope: np.ndarray  # by the free numbers, 0 for those that do not move, (designs, p)
     limits: np.ndarray  # value over limit - 1, positive where violated, (designs, m)
     limit_slope: np.ndarray  # (designs, m, p)
     peaks: np.ndarray  # largest values of the limited metrics, nan for the loop's, (designs, m)
@@ -53,7 +53,7 @@ class Evaluator:
     def __init__(self, spec: TuneSpec, families: list[Family]) -> None:
         """
         Args:
-            spec: what is free and what for.
+            spec: of the tuning.
             families: of each design of a batch.
 
         Raises:
@@ -73,7 +73,7 @@ class Evaluator:
         padded = {name: column[rows] for name, column in whole.items()}
         self._cases = in_working_precision(build_cases(study, padded, self._structure))
         self._rows = rows // self.scenarios  # design of every lane, the study itself first
-        self.run_time = float("nan")  # what one of the last batch took [s]
+        self.run_time = float("nan")  # time per run of the last batch [s]
         self._gradients = make_gradients(self._structure, self._layout, spec.free.place)
 
     def evaluate(self, values: np.ndarray, has_slope: np.ndarray | bool = True) -> Evaluation:
@@ -81,8 +81,8 @@ class Evaluator:
 
         Args:
             values: of the free numbers in the study's units, (designs, p); those that a design's
-                family does not move are not looked at.
-            has_slope: designs whose derivatives are wanted; others may have any, (designs,).
+                family does not move are ignored.
+            has_slope: designs that need derivatives; others can have any, (designs,).
         """
         values = np.where(self.is_free, values, np.nan)
         own = np.full((1, values.shape[1]), np.nan)
@@ -149,7 +149,7 @@ class Evaluator:
 
 
 def _layout(lanes: int) -> Layout:
-    """Small blocks: each is differentiated by what its own designs move only."""
+    """Small blocks: each is differentiated only by what its own designs move."""
     if processor() != "cpu":
         return even_layout(lanes)
     whole = even_layout(lanes)
@@ -158,7 +158,7 @@ def _layout(lanes: int) -> Layout:
 
 
 def first_residual(merit: Merit, metrics: Any) -> np.ndarray:
-    """Residual rms of the first scenario [m], (designs,); nan if not there.
+    """Residual rms of the first scenario [m], (designs,); nan if missing.
 
     Root of the mean square of all stations of the links that count.
     """
@@ -168,7 +168,7 @@ def first_residual(merit: Merit, metrics: Any) -> np.ndarray:
 
 
 def tuned_structure(spec: TuneSpec) -> Structure:
-    """Program of all families and scenarios; whatever may be free is there."""
+    """Program of all families and scenarios, with everything that can be free."""
     found = [check_run(nominal(spec, family))[0] for family in (None, *spec.families)]
     return build_structure(spec.study)._replace(
         metrics=merit_of(spec).metrics,

@@ -1,4 +1,4 @@
-"""The folder of a tuning: what was asked for (`tune.json`) and where it stands (`progress.npz`)."""
+"""The folder of a tuning: its request (`tune.json`) and progress (`progress.npz`)."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from studies.store import check_target, replacing
 from studies.tuning.optimise import Progress
 
 MANIFEST, PROGRESS, RESULTS = TUNING, "progress.npz", "tune.h5"
-#: Entries of the manifest that a resumed tuning must share, to go on bit by bit.
+#: Entries of the manifest that a resumed tuning must share to continue bit by bit.
 CHECKED = {"spec": "tuning file", "code": "program", "jaxlib": "jaxlib", "precision": "precision"}
 _LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.tmp")
 
 
 @contextmanager
 def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterator[Progress | None]:
-    """Make or check the folder and lock it; gives where an interrupted tuning stands.
+    """Create or check the folder and lock it; yields the progress of an interrupted tuning.
 
     Raises:
-        StudyError: not writable, in use, holds something else or a tuning that does not fit.
+        StudyError: not writable, in use, holds something else or a different tuning.
     """
     with locked_folder(out, "tuning"):
         path = out / MANIFEST
@@ -52,7 +52,7 @@ def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterat
         else:
             refuse_others(out, _LEFTOVER)
             before = None
-        for left in out.iterdir():  # not before it is known whose they are
+        for left in out.iterdir():  # only once their owner is known
             if _LEFTOVER.fullmatch(left.name) and left.is_file():
                 left.unlink()
         check_target(out / RESULTS)
@@ -61,13 +61,13 @@ def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterat
         try:
             yield before
         except StudyError:
-            if not (out / PROGRESS).exists():  # nothing to go on with, so a mended file may start
+            if not (out / PROGRESS).exists():  # nothing to continue, so a corrected file can start
                 path.unlink(missing_ok=True)
             raise
 
 
 def _settled(part: Any) -> Any:
-    """What must not change: all but the number of iterations, which Adam's steps depend on."""
+    """What must not change: everything but the number of iterations, unless Adam uses it."""
     part = copy.deepcopy(part)
     tune = part.get("tune") if isinstance(part, dict) else None
     if isinstance(tune, dict) and tune.get("method", "lbfgs") == "lbfgs":
@@ -76,7 +76,7 @@ def _settled(part: Any) -> Any:
 
 
 def save_progress(path: Path, at: Progress) -> None:
-    """Write where a tuning stands, whole or not at all."""
+    """Save the progress of a tuning, whole or not at all."""
     arrays = {f"descent_{k}": leaf for k, leaf in enumerate(at.descent)}
     arrays |= {name: getattr(at, name) for name in at._fields if name != "descent"}
     with replacing(path) as temporary, temporary.open("wb") as file:
@@ -84,7 +84,7 @@ def save_progress(path: Path, at: Progress) -> None:
 
 
 def load_progress(path: Path) -> Progress | None:
-    """Where a tuning stood; None where nothing is kept.
+    """Saved progress of a tuning; None if there is none.
 
     Raises:
         StudyError: damaged.

@@ -5,7 +5,7 @@ then free by itself. Ready-made ones stand for several numbers:
 
 - `poles.decay` [1/s] and `poles.frequency_hz` [Hz], three entries each: alpha-bar and beta-bar of
   mode 1 of each link, which become its gains by (22)-(23); they need `control.gain_unit = "1/s"`;
-- `placement`: patch centres on the link and without overlap, whatever the numbers in [0, 1] are.
+- `placement`: patch centres on the link and without overlap, for any numbers in [0, 1].
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TWO_PI = 2 * np.pi
 
 
 class FieldPlace(NamedTuple):
-    """Where a field of the study lies in a Case."""
+    """Where a field of the study is in a Case."""
 
     path: str
     factor: float = 1.0  # the Case's unit in the study's
@@ -43,7 +43,7 @@ def _same(section: str, inside: str, *names: str) -> dict[str, FieldPlace]:
     return {f"{section}.{name}": FieldPlace(f"{inside}.{name}") for name in names}
 
 
-#: Fields that may be free.
+#: Fields that can be free.
 LEAVES: dict[str, FieldPlace] = {
     **_same(
         "control", "control", "velocity_gain", "position_gain", "gain_factor", "feedthrough_factor"
@@ -68,7 +68,7 @@ LEAVES: dict[str, FieldPlace] = {
 POLES = ("poles.decay", "poles.frequency_hz")
 PLACEMENT = "placement"
 PLACEMENTS = ("same", "per_link")
-#: Fields that a ready-made free number decides, or takes for granted.
+#: Fields that a ready-made free number sets or relies on.
 _GAINS = ("control.velocity_gain", "control.position_gain")
 DECIDED = {PLACEMENT: ("patches.", "link.length"), POLES[0]: _GAINS, POLES[1]: _GAINS}
 
@@ -78,8 +78,8 @@ class Free(NamedTuple):
 
     name: str  # with its index in a list
     span: Range
-    start: float  # what the study has, nan where it has no such number
-    key: str  # under which it stands in the file
+    start: float  # the study's value, nan if it has no such number
+    key: str  # its name in the file
 
 
 class Setter(NamedTuple):
@@ -94,12 +94,12 @@ class FreeNumbers(NamedTuple):
     """All free numbers of a design, in the order of the parameter vector."""
 
     numbers: tuple[Free, ...]
-    #: Puts values (p,) in the study's units into a case; what is nan stays as it is there.
+    #: Puts values (p,) in the study's units into a case; nan leaves the case's value.
     place: Callable[[Case, Array], Case]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the numbers, in order."""
+        """Names of the numbers, in order."""
         return tuple(number.name for number in self.numbers)
 
     def values(self, u: np.ndarray) -> np.ndarray:
@@ -117,7 +117,7 @@ class FreeNumbers(NamedTuple):
         return np.stack(found, axis=-1)
 
     def places(self) -> np.ndarray:
-        """Where the study itself lies between the bounds, 0 to 1; 1/2 where it does not say."""
+        """Where the study itself lies between the bounds, 0 to 1; 1/2 if undefined."""
         found = []
         for _, span, start, _ in self.numbers:
             if span.is_log:
@@ -129,7 +129,7 @@ class FreeNumbers(NamedTuple):
 
 
 def writes(number: Free) -> tuple[str, ...]:
-    """Fields of the study that a free number decides."""
+    """Fields of the study that a free number sets."""
     if number.key in POLES:
         return "control.velocity_gain", "control.position_gain"
     return ("patches.centers",) if number.key == PLACEMENT else (number.name,)
@@ -140,7 +140,7 @@ def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
 
     Args:
         written: ranges by name, from `[tune.free]`.
-        study: the design to begin with.
+        study: the initial design.
 
     Raises:
         StudyError: nothing free, unknown name, bad bounds, a start outside them.
@@ -167,7 +167,7 @@ def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
 
 
 def _check_twice(numbers: list[Free]) -> None:
-    """Nothing may be moved by two, nor what a ready-made one takes for granted."""
+    """No field can be moved by two numbers, nor one that a ready-made number relies on."""
     names = [number.name for number in numbers]
     ready = [key for key in DECIDED if any(number.key == key for number in numbers)]
     for k, (name, _, _, own_key) in enumerate(numbers):
@@ -231,7 +231,7 @@ def _plain(
 
 
 def _own_leaves(study: Study) -> dict[str, FieldPlace]:
-    """Fields of the study's law's own."""
+    """The own fields of the study's law."""
     law = LAWS[study.control.law]
     return {
         f"{OWN_FIELDS}.{law.name}.{x.name}": FieldPlace(f"control.parameters.{x.name}")
@@ -240,7 +240,7 @@ def _own_leaves(study: Study) -> dict[str, FieldPlace]:
 
 
 def _check_field(field: str, study: Study, path: str) -> None:
-    """What a free field asks of others."""
+    """Check what a free field requires of others."""
     if field == "control.ratios" and study.control.ratio_exponent != 1:
         raise field_error(
             "control.ratio_exponent", study.control.ratio_exponent, f"1 where {path} is free", "1"
@@ -274,7 +274,7 @@ def _set(setters: tuple[Setter, ...], case: Case, values: Array) -> Case:
 def _replaced(tree: Any, path: list[str], indices: tuple[int, ...], value: Array) -> Any:
     """A tree of named tuples and dictionaries with one number replaced.
 
-    Too few indices mean all that follow.
+    Fewer indices than axes select everything below.
     """
     if not path:
         whole = jnp.asarray(tree, value.dtype)
@@ -292,7 +292,7 @@ def _widened(indices: tuple[int, ...], depth: int) -> Any:
 
 
 def _safe(value: Array) -> Array:
-    """Without nan, whose derivatives would spoil those of what is chosen instead."""
+    """Replace nan, whose derivatives would spoil those of the selected alternative."""
     return jnp.where(jnp.isnan(value), 1.0, value)
 
 
@@ -302,7 +302,7 @@ def _safe(value: Array) -> Array:
 def _poles(written: dict[str, Any], study: Study) -> tuple[list[Free], Callable[..., Any]]:
     for one, other in (POLES, POLES[::-1]):
         if one in written and other not in written:
-            raise StudyError(f"tune.free.{one}: needs {other} beside it, (22)-(23) take both")
+            raise StudyError(f"tune.free.{one}: needs {other} too, (22)-(23) use both")
     if study.control.gain_unit != "1/s":
         raise field_error(
             "control.gain_unit",
@@ -336,7 +336,7 @@ def _placement(bounds: Any, study: Study, path: str) -> tuple[list[Free], Callab
         raise field_error(path, bounds, "{kind = 'same'} or {kind = 'per_link'}")
     centers, pitch, length = patch_centers(study), patch_pitch(study), each_link(study.link.length)
     links, count = (1 if bounds["kind"] == "same" else 3), centers.shape[1]
-    if links == 1:  # where all links have room
+    if links == 1:  # room on all links
         pitch, length = pitch.max(keepdims=True), length.min(keepdims=True)
     free = length - count * pitch
     if np.any(free <= 0):
@@ -353,7 +353,7 @@ def _placement(bounds: Any, study: Study, path: str) -> tuple[list[Free], Callab
 
 
 def _shares(gaps: np.ndarray) -> np.ndarray:
-    """Numbers whose `_place_patches` leaves these gaps, as shares of all that is free."""
+    """Numbers for which `_place_patches` leaves these gaps, as shares of the free length."""
     left, found = 1.0, []
     for k, gap in enumerate(gaps):
         kept = np.clip(1 - gap / left, 0.0, 1.0) if left > 0 else 1.0
@@ -363,7 +363,7 @@ def _shares(gaps: np.ndarray) -> np.ndarray:
 
 
 def _place_patches(links: int, pitches: tuple[float, ...], case: Case, values: Array) -> Case:
-    """Patches one after the other, each after a gap that is its share of what is still free.
+    """Place patches one by one, each after a gap that is its share of the remaining free length.
 
     Of k gaps to come, a number v takes 1 - (1 - v)^(1/k): equal numbers are drawn evenly from all
     placements.
@@ -375,7 +375,7 @@ def _place_patches(links: int, pitches: tuple[float, ...], case: Case, values: A
     begin, centers = jnp.zeros((links,), values.dtype), []
     is_kept, shares = jnp.isnan(jnp.sum(values)), jnp.reshape(_safe(values), (links, count))
     for k in range(count):
-        # the root has no slope at 0, where all that is free is used up
+        # the root has no slope at 0, where no free length is left
         kept = jnp.maximum(1 - shares[:, k], 1e-12) ** (1 / (count - k))
         begin, left = begin + left * (1 - kept), left * kept
         centers.append(begin + pitch * (k + 0.5))

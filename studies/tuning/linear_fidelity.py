@@ -1,8 +1,7 @@
-"""What the linearised sampled loop says of designs: margins, spillover, residual vibration.
+"""Figures of designs from the linearised sampled loop: margins, spillover, residual vibration.
 
 No eigenvalues and no runs: repeated squaring and doubling (`jaxmodel.sampled_loop`), so it works in
-batches on any device. The plant has 12 modes or more, because modes that nobody controls limit the
-gains.
+batches on any device. The plant has at least 12 modes, because uncontrolled modes limit the gains.
 """
 
 from __future__ import annotations
@@ -29,17 +28,17 @@ from studies.study.spec import Study
 from studies.tuning.scenarios import nominal
 from studies.tuning.spec import OWN, Family, TuneSpec
 
-#: Decay rate that violations of `gain_margin` are measured in, and which counts as stable where
-#: no limit of the loop is set [1/s].
+#: Unit of violations of `gain_margin`, and the decay rate that counts as stable if no limit of the
+#: loop is set [1/s].
 STABLE = 10.0
-#: Points of each straight move at which its distance from singularities is looked at.
+#: Points of each straight move at which its distance from singularities is evaluated.
 PATH_POINTS = 17
-#: Designs that are looked at in one call; each core takes one call after the other.
+#: Designs per call; each core takes one call after another.
 BATCH = 16
 
 
 class LoopFigures(NamedTuple):
-    """Of a design on the host."""
+    """Figures of a design, on the host."""
 
     gain_margin: float  # largest factor on all gains with every smaller one stable [1]
     slowest_decay: float  # [1/s]
@@ -48,18 +47,18 @@ class LoopFigures(NamedTuple):
 
 
 def with_margin_modes(study: Study) -> Study:
-    """The study with as many plant modes as its loop is judged with."""
+    """The study with the number of plant modes used to judge its loop."""
     return study.change(link__modes=max(MARGIN_MODES, study.link.modes))
 
 
 class LinearFidelity:
-    """Looks at designs of some families."""
+    """Evaluates designs of some families."""
 
     def __init__(self, spec: TuneSpec, families: list[Family]) -> None:
         """
         Args:
             spec: of the tuning.
-            families: of each design, in the order that they are given in.
+            families: of each design, in the order given.
         """
         self._spec, self.names, self._links = spec, spec.loop_limits, spec.counted_links
         own = nominal(spec, None)
@@ -87,7 +86,7 @@ class LinearFidelity:
         return float(getattr(self._own, name))
 
     def limits(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far designs are beyond the limits of their loop, with derivatives.
+        """How far designs exceed the limits of their loop, with derivatives.
 
         Args:
             values: one design for each family given at the start, (designs, p).
@@ -110,10 +109,10 @@ class LinearFidelity:
         return np.asarray(found[0]), np.asarray(found[1])
 
     def screen(self, position: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A quick look at designs of one family.
+        """A quick evaluation of designs of one family.
 
         Args:
-            position: of a design of that family in what was given at the start.
+            position: index of a design of that family among those given at the start.
             values: (n, p), any number of them.
 
         Returns:
@@ -148,7 +147,7 @@ class LinearFidelity:
 
     @property
     def _plain(self) -> Structure:
-        # what the matrices do not depend on must not cost a compilation
+        # drop what the matrices do not depend on, to avoid a compilation
         return self._structure._replace(n_steps=1, substeps=1)
 
 

@@ -1,4 +1,4 @@
-"""What a design is worth: objective and limits from the metrics of its runs."""
+"""Rating of a design: objective and limits from the metrics of its runs."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from jaxmodel.parameters import Array
 from studies.study.entries import parse_entries
 from studies.tuning.spec import OWN, Family, TuneSpec
 
-#: What a report shows of every design, whatever it is tuned for.
+#: Metrics that a report always shows.
 SHOWN = ("residual_rms", "settling_time", "peak_voltage")
 
 
 class Merit(NamedTuple):
-    """What designs are judged by; hashable."""
+    """Criteria for judging designs; hashable."""
 
-    objective: tuple[tuple[str, float], ...]  # metric and weight, 1 in all
+    objective: tuple[tuple[str, float], ...]  # metric and weight, sum 1
     limits: tuple[str, ...]  # metrics with a limit
     tail: float  # share of worst scenarios that count
-    links: tuple[int, ...]  # those that count where a name says no link, from 0
+    links: tuple[int, ...]  # those that count if a name gives no link, from 0
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        """Fields of `Metrics` that this takes."""
+        """Fields of `Metrics` that it needs."""
         return _fields((*dict(self.objective), *self.limits))
 
     @property
     def shown(self) -> tuple[str, ...]:
-        """Names of what reports show: what is asked for, and `SHOWN`."""
+        """Names that reports show: those requested, and `SHOWN`."""
         return tuple(dict.fromkeys((*dict(self.objective), *self.limits, *SHOWN)))
 
     @property
     def shown_metrics(self) -> tuple[str, ...]:
-        """Fields of `Metrics` that those take."""
+        """Fields of `Metrics` that those need."""
         return _fields(self.shown)
 
 
@@ -47,7 +47,7 @@ def _fields(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def merit_of(spec: TuneSpec) -> Merit:
-    """Of a tuning."""
+    """Criteria of a tuning."""
     total = sum(map(float, spec.tune.objective.values()))
     weights = tuple((name, float(weight) / total) for name, weight in spec.tune.objective.items())
     tail = float(spec.tune.scenarios.tail)
@@ -63,7 +63,7 @@ def entries(merit: Merit, metrics: Metrics, name: str) -> Array:
 def size(merit: Merit, metrics: Metrics, name: str) -> Array:
     """Root of the mean square of the entries, (S,)."""
     square = jnp.mean(entries(merit, metrics, name) ** 2, axis=1)
-    # the root has no slope at 0; what is no number stays none
+    # the root has no slope at 0; NaN stays NaN
     return jnp.where(square == 0, 0.0, jnp.sqrt(jnp.where(square == 0, 1.0, square)))
 
 
@@ -79,7 +79,7 @@ def tail_weights(count: int, tail: float) -> np.ndarray:
 
 
 def objectives(merit: Merit, metrics: Metrics, own: Metrics) -> Array:
-    """Objective in each scenario, (S,); 1 is what the study itself has.
+    """Objective in each scenario, (S,); the study's own is 1.
 
     Args:
         merit: weights.
@@ -98,7 +98,7 @@ def judged(
     """Judge a design.
 
     Args:
-        merit: what by.
+        merit: criteria.
         metrics: (S, ...).
         own: of the study itself, (S, ...).
         allowed: limits in each scenario, (S, m).
@@ -139,7 +139,7 @@ def judged_slopes(
     """Judge designs and differentiate.
 
     Args:
-        merit: what by.
+        merit: criteria.
         metrics: (designs, S, ...).
         slopes: derivatives, (designs, S, p, ...).
         own: of the study itself, (S, ...).
@@ -166,7 +166,7 @@ def judged_slopes(
 
 
 def own_limits(merit: Merit, own: Metrics) -> np.ndarray:
-    """What the study itself reaches, (S, m)."""
+    """The study's own values, (S, m)."""
     columns = [np.asarray(largest(merit, own, name)) for name in merit.limits]
     count = len(jax.tree.leaves(own)[0])
     return np.stack(columns, axis=1) if columns else np.zeros((count, 0))

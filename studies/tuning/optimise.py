@@ -1,7 +1,7 @@
-"""Many starts of many families at once, each downhill, limits by an augmented Lagrangian.
+"""Descent of many starts of many families at once, limits by an augmented Lagrangian.
 
 A start whose trial does not finish tries a shorter step; one that has never finished is frozen.
-Neither spoils another. On a front, families hand good designs on to their neighbours.
+Neither affects the others. On a front, families pass good designs on to their neighbours.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from studies.tuning.descent import Adam, Descent, Lbfgs, Trial
 from studies.tuning.evaluate import Evaluation, Evaluator
 from studies.tuning.spec import OWN, Family, TuneSpec
 
-#: Iterations between two updates of the multipliers.
+#: Iterations between updates of the multipliers.
 ROUND = 5
-#: A limit counts as kept up to this share of it.
+#: A limit counts as kept if exceeded by at most this share.
 KEPT = 1e-3
-#: Sobol points that are looked at for each start, by the linearised loop alone.
+#: Sobol points screened for each start, by the linearised loop alone.
 LOOKED_AT = 8
-#: A tuning ends when no start has gained this share on its own best within so many iterations.
+#: A tuning ends when no start has improved on its best by this share within this many iterations.
 GAIN, PATIENCE = 1e-3, 12
-#: Penalty of the limits to begin with; the objective counts as 1.
+#: Initial penalty of the limits; the objective counts as 1.
 PENALTY = 10.0
 
 
 class Progress(NamedTuple):
-    """Where a tuning stands; NumPy arrays, starts first. What is saved and resumed."""
+    """Progress of a tuning, saved and resumed; NumPy arrays, starts first."""
 
     iteration: np.ndarray  # done, ()
     family: np.ndarray  # of each start, position in `spec.moving`, (B,)
@@ -48,8 +48,8 @@ class Progress(NamedTuple):
     best_objective: np.ndarray  # inf before the first, (B,)
     best_limits: np.ndarray  # values over limits - 1, (B, m)
     best_peaks: np.ndarray  # values of the limited metrics, (B, m)
-    least: np.ndarray  # smallest value of each limit that any design of a family had, (F, m)
-    gained: np.ndarray  # iteration at which a start of each family last gained, (F,)
+    least: np.ndarray  # smallest value of each limit among all designs of a family, (F, m)
+    gained: np.ndarray  # iteration at which a start of each family last improved, (F,)
     history: np.ndarray  # objective, violation, largest one first; nan where not run, (n, B, 2)
     descent: tuple[np.ndarray, ...]  # state of the method
 
@@ -60,7 +60,7 @@ class Progress(NamedTuple):
         return int(members[order[0]])
 
     def beyond(self, start: int) -> float:
-        """By how much a start's best design violates its limits beyond what counts as kept."""
+        """How far a start's best design exceeds its limits, beyond what counts as kept."""
         return float(excess(self.best_limits[[start]])[0])
 
 
@@ -76,10 +76,10 @@ def start_families(spec: TuneSpec) -> np.ndarray:
 
 
 def first_places(spec: TuneSpec, evaluator: Evaluator) -> np.ndarray:
-    """Where the starts begin: in each family the study itself, then Sobol points.
+    """Initial designs: in each family the study itself, then Sobol points.
 
-    Of those the ones whose linearised loop keeps the limits come first, the least residual
-    vibration of the linear machine leading.
+    Points whose linearised loop keeps the limits come first, in order of the linear machine's
+    residual vibration.
 
     Returns:
         (B, p) between 0 and 1.
@@ -101,12 +101,12 @@ def first_places(spec: TuneSpec, evaluator: Evaluator) -> np.ndarray:
 
 
 def begin(spec: TuneSpec, evaluator: Evaluator) -> Progress:
-    """Before the first iteration."""
+    """State before the first iteration."""
     return _untried(spec, first_places(spec, evaluator))
 
 
 def _untried(spec: TuneSpec, place: np.ndarray) -> Progress:
-    """Starts at places between the bounds (B, p), of which nothing is known."""
+    """Unevaluated starts at places between the bounds (B, p)."""
     starts, p = place.shape
     m = len(spec.limit_names)
     return Progress(
@@ -134,20 +134,20 @@ def _untried(spec: TuneSpec, place: np.ndarray) -> Progress:
 
 
 def method(spec: TuneSpec) -> Descent:
-    """The way downhill that was asked for."""
+    """The requested descent method."""
     return Adam(spec.tune.iterations) if spec.tune.method == "adam" else Lbfgs()
 
 
 def advance(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> Progress:
-    """One iteration: evaluate the trials, keep the best, move all downhill.
+    """One iteration: evaluate the trials, keep the best, step downhill.
 
     Args:
         spec: of the tuning.
         evaluator: of it.
-        at: where it stands.
+        at: current progress.
 
     Raises:
-        StudyError: in the first iteration, a free number on which nothing depends.
+        StudyError: in the first iteration, a free number without any effect.
     """
     k = int(at.iteration)
     found = evaluator.evaluate(spec.free.values(at.place))
@@ -204,7 +204,7 @@ def _check_dependence(spec: TuneSpec, at: Progress, found: Evaluation) -> None:
 
 
 def _kept(at: Progress, found: Evaluation, is_fine: np.ndarray) -> Progress:
-    """With what this iteration found written down."""
+    """Progress with this iteration's findings recorded."""
     k = int(at.iteration)
     violation = found.limits.max(axis=1, initial=-np.inf)
     history = at.history.copy()
@@ -244,7 +244,7 @@ def _lagrangian(
 
 
 def _updated(at: Progress) -> Progress:
-    """New multipliers; a larger penalty where the violation has not halved."""
+    """New multipliers; a larger penalty if the violation has not halved."""
     is_known = np.isfinite(at.base_objective)
     multiplier = np.maximum(at.multiplier + at.penalty[:, None] * at.base_limits, 0.0)
     worst = np.maximum(at.base_limits.max(axis=1, initial=0.0), 0.0)
@@ -257,9 +257,10 @@ def _updated(at: Progress) -> Progress:
 
 
 def _handed_on(spec: TuneSpec, at: Progress) -> Progress:
-    """The worst start of a family takes another family's design that is better, and goes on there.
+    """Move the worst start of a family to another family's better design, and continue there.
 
-    Others are those that move no more of the same study, also with another limit along a front.
+    Eligible families move no additional numbers of the same study; their limit on a front can
+    differ.
     """
     for k, family in enumerate(spec.moving):
         members = np.flatnonzero(at.family == k)
@@ -280,7 +281,7 @@ def _handed_on(spec: TuneSpec, at: Progress) -> Progress:
 
 
 def _can_take(spec: TuneSpec, family: Family, other: Family) -> bool:
-    """Whether designs of another family are such of this one, but for the limit along a front."""
+    """Whether another family's designs are valid in this one, except for the limit on a front."""
     is_part = bool((family.is_free | ~other.is_free).all())
     is_same_study = repr(family.columns) == repr(other.columns)
     differing = {name for name, x in family.limits.items() if other.limits[name] != x}
@@ -291,7 +292,7 @@ def _can_take(spec: TuneSpec, family: Family, other: Family) -> bool:
 
 
 def _limits_there(spec: TuneSpec, at: Progress, start: int, family: Family) -> np.ndarray:
-    """What the best design of a start has of another family's limits, (m,)."""
+    """Violation of another family's limits by a start's best design, (m,)."""
     limits, along = at.best_limits[start].copy(), spec.tune.pareto.get("limit")
     if along in spec.limit_names and family.limits[along] != OWN:
         k = spec.limit_names.index(along)
@@ -300,7 +301,7 @@ def _limits_there(spec: TuneSpec, at: Progress, start: int, family: Family) -> n
 
 
 def _moved(spec: TuneSpec, at: Progress, start: int, to: int, limits: np.ndarray) -> Progress:
-    """A start put to the best place of another, whose limits its family sees like this."""
+    """Progress with a start moved to another's best place, with its limits in the new family."""
     place, base = at.place.copy(), at.base_objective.copy()
     place[start], base[start] = at.best_place[to], np.nan
     best = {
@@ -326,12 +327,12 @@ def optimise(
     at: Progress | None,
     keep: Callable[[Progress], None],
 ) -> Progress:
-    """Iterate to the end, or until nothing is gained any more.
+    """Iterate to the end, or until nothing improves any more.
 
     Args:
         spec: of the tuning.
         evaluator: for the families of `start_families`.
-        at: where an interrupted one stands; None for a new one.
+        at: progress of an interrupted tuning; None for a new one.
         keep: called after each iteration.
     """
     at = begin(spec, evaluator) if at is None else _with_room(at, spec.tune.iterations)
@@ -342,7 +343,7 @@ def optimise(
 
 
 def fits(spec: TuneSpec, at: Progress) -> bool:
-    """Whether a kept tuning has the shapes of this one; iterations may differ."""
+    """Whether saved progress has the shapes of this tuning; iterations can differ."""
 
     def shapes(one: Progress) -> list[tuple[int, ...]]:
         *arrays, history, descent = one
@@ -353,13 +354,13 @@ def fits(spec: TuneSpec, at: Progress) -> bool:
 
 
 def _with_room(at: Progress, iterations: int) -> Progress:
-    """For another number of iterations than it was begun with."""
+    """Progress adapted to a different number of iterations."""
     history = np.full((max(iterations, int(at.iteration)), *at.history.shape[1:]), np.nan)
     history[: int(at.iteration)] = at.history[: int(at.iteration)]
     return at._replace(history=history)
 
 
 def is_settled(spec: TuneSpec, at: Progress) -> bool:
-    """Whether going on is of no use; Adam's steps are planned to the end."""
+    """Whether further iterations are useless; Adam's steps are planned to the end."""
     has_waited = spec.tune.method == "lbfgs" and (at.iteration - at.gained > PATIENCE).all()
     return bool(at.is_frozen.all() or has_waited)

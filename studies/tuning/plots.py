@@ -1,4 +1,4 @@
-"""Figures of a tuning: the way down, what it gives on each move, and the front."""
+"""Figures of a tuning: the descent, the gain on each move, and the front."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report of a tuning: what was gained, on which machines, and what limits it."""
+"""The report of a tuning: what improved, on which machines, and what limits it."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
 from studies.tuning.scenarios import move_label
 from studies.tuning.spec import LOOP_LIMITS, OWN, Family, TuneSpec, label
 
-#: Limits that hold from below.
+#: Lower limits.
 LOWER = ("gain_margin", "slowest_decay", "singularity_distance")
-#: A limit nearer than this share counts as active.
+#: A limit closer than this share counts as active.
 NEAR = 0.02
 #: Starts that end within this share of the best one count as equally good.
 ALIKE = 0.01
-#: Fewer designs, or such with less between the smallest and the largest, have no rank to speak of.
+#: With fewer designs, or a smaller spread between them, ranks are meaningless.
 FEW, NARROW = 8, 0.05
-#: Heads the row of what everything is measured against.
+#: Heading of the reference row.
 ITSELF = "the study itself"
 
 
@@ -56,12 +56,12 @@ class BestFamily(NamedTuple):
     file: str  # of its study
     gains: list[tuple[str, str, str]]  # figure, its value, that of the study itself with unit
     objective: np.ndarray  # on the fresh machines
-    caution: str  # of its gain margin, "" where there is none
+    caution: str  # warning about its gain margin, "" if there is none
     is_violated: bool  # a limit
 
 
 class Limit(NamedTuple):
-    """How the best design of a family keeps a limit."""
+    """How well the best design of a family keeps a limit."""
 
     name: str
     value: float | str  # as the tuning file gives it
@@ -76,7 +76,7 @@ class Fidelity(NamedTuple):
     low: float  # 90 % of the ratios lie from here
     median: float
     high: float  # to here
-    case: str  # ranked, or why the order of designs tells nothing: few, alike
+    case: str  # ranked, or why the order of designs is meaningless: few, alike
     spread: float  # of the runs' residual vibration, as a share of the least
     rank: float  # coefficient of correlation
 
@@ -157,7 +157,7 @@ def _best(spec: TuneSpec, found: TuneFindings) -> BestFamily:
 
 
 def best_family(spec: TuneSpec, found: TuneFindings) -> int:
-    """Position of the family to recommend: limits kept first, then the least objective."""
+    """Index of the family to recommend: limits kept first, then the least objective."""
 
     def rank(k: int) -> tuple[bool, bool, float]:
         is_moving = k < len(spec.moving)
@@ -169,14 +169,14 @@ def best_family(spec: TuneSpec, found: TuneFindings) -> int:
 
 
 def file_name(spec: TuneSpec, family: Family) -> str:
-    """Of the study that a family gives."""
+    """File name of a family's study."""
     if len(spec.moving) == 1:
         return "tuned.toml"
     return f"tuned_{label(family.name)}.toml"
 
 
 def summary(spec: TuneSpec, found: TuneFindings) -> list[str]:
-    """What was gained, a line for each family."""
+    """What improved, one line per family."""
     machines = count_text(spec.tune.scenarios.check, "fresh machine")
     lines = []
     for k, (family, one) in enumerate(zip(spec.families, found.judged, strict=True)):
@@ -280,7 +280,7 @@ def _loop_margin(found: TuneFindings, k: int, name: str, limit: float | str) -> 
 
 
 def _state(beyond: float, left: float) -> str:
-    """How a limit stands, from its violation and from what is left of it, nan if not known."""
+    """State of a limit, from its violation and its remaining margin, nan if unknown."""
     if beyond > KEPT:
         return "violated"
     if np.isnan(left):
@@ -307,7 +307,7 @@ def _numbers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
 
 
 def _centers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
-    """Row of each design: its patches [mm], which shares of the free room do not tell."""
+    """Row of each design: its patch centres [mm], which the free numbers do not show."""
     at, unmoved = found.at, np.full(len(spec.free.numbers), np.nan)
     designs = [(ITSELF, spec.moving[0]._replace(columns={}), unmoved)]
     for k, family in enumerate(spec.moving):
@@ -321,7 +321,7 @@ def _centers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
 
 
 def _alike(at: Progress, family: int) -> np.ndarray:
-    """Starts of a family that end as good as its best one, or nearly."""
+    """Starts of a family that end about as well as its best one."""
     best = at.winner(family)
     is_near = at.best_objective <= (1 + ALIKE) * at.best_objective[best]
     is_kept = excess(at.best_limits) <= at.beyond(best)
@@ -335,7 +335,7 @@ def is_kept(spec: TuneSpec, seen: Searched) -> np.ndarray:
 
 
 def _fidelity(spec: TuneSpec, found: TuneFindings) -> Fidelity | None:
-    """Linear residual vibration beside that of runs; None where there is too little of it."""
+    """Linear residual vibration compared with that of runs; None if there are too few."""
     kept = excess(found.at.best_limits) == 0
     linear, residual = found.linear[kept], found.residual[kept]
     if found.searched is not None:
@@ -373,7 +373,7 @@ def _codes(judged: JudgedDesign) -> str:
 
 
 def unkept(spec: TuneSpec, at: Progress) -> list[str]:
-    """What no start of a family keeps, one line for each family; empty where all is well."""
+    """Limits that no start of a family keeps, one line per family; empty if all are kept."""
     lines = []
     for k, family in enumerate(spec.moving):
         if at.beyond(at.winner(k)) == 0:

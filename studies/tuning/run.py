@@ -1,7 +1,6 @@
-"""A tuning in its folder: `tune.json` (what was asked for), `progress.npz` (where it stands),
-`tune.h5` (every start), `study.toml` (what everything is measured against), `tuned.toml` (the study
-with the best numbers, one file for each family), the report (`report.md`, `report.html`) and its
-figures.
+"""A tuning in its folder: `tune.json` (the request), `progress.npz` (progress), `tune.h5` (every
+start), `study.toml` (the reference), `tuned.toml` (the study with the best numbers, one file per
+family), the report (`report.md`, `report.html`) and its figures.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ from studies.tuning.spec import TuneSpec
 
 REPORT = "report.html"
 
-#: Modules that decide the numbers of a tuning, with all that they import.
+#: Modules that determine the numbers of a tuning, with everything they import.
 DECISIVE = ("studies.tuning.check", "studies.tuning.evaluate", "studies.tuning.optimise")
 
 
@@ -63,11 +62,11 @@ def run_tuning(
     """Tune, check the result on fresh scenarios, and write it.
 
     Args:
-        spec: what is free and what for.
+        spec: of the tuning.
         out: folder.
-        is_resumed: go on with the tuning that is there.
+        is_resumed: continue the existing tuning.
         console: where progress goes; default: standard output.
-        is_quiet: no progress.
+        is_quiet: hide progress.
         evaluator: what evaluates all starts; default: this process, as `make_evaluator`.
 
     Returns:
@@ -75,7 +74,7 @@ def run_tuning(
 
     Raises:
         StudyError: the folder holds something else or cannot be written to; a fault of the study;
-            limits that contradict one another (everything is written all the same).
+            contradictory limits (everything is written nevertheless).
     """
     config.require_configured()
     out = Path(out)
@@ -120,13 +119,13 @@ def run_tuning(
 
 
 class _Clock:
-    """Time that the iterations of this session take; the first one compiles."""
+    """Duration of this session's iterations; the first one compiles."""
 
     def __init__(self) -> None:
         self._seen: list[float] = []
 
     def left(self, spec: TuneSpec, at: Progress) -> str:
-        """How much is left after an iteration, "" after the first or last one."""
+        """Time left after an iteration, "" after the first or last one."""
         self._seen.append(time.monotonic())
         count = spec.tune.iterations - int(at.iteration)
         if len(self._seen) < 2 or count <= 0:
@@ -154,7 +153,7 @@ def _told(spec: TuneSpec, at: Progress) -> str:
 
 
 def find(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> TuneFindings:
-    """Judge where a tuning ended."""
+    """Judge the result of a tuning."""
     values = spec.free.values(at.best_place)
     winners = [at.winner(k) for k in range(len(spec.moving))]
     designs = [spec.study] + [
@@ -173,7 +172,7 @@ def find(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> TuneFindings:
         ]
     )
     last = evaluator.evaluate(values)
-    if np.isnan(evaluator.run_time):  # that one has compiled
+    if np.isnan(evaluator.run_time):  # the last batch compiled
         evaluator.evaluate(values)
     searched = None
     if spec.tune.samples:

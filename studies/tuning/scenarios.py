@@ -1,4 +1,4 @@
-"""Machines and moves that designs must suit, as columns of a table of cases."""
+"""Machines and moves that designs must handle, as columns of a table of cases."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def scenario_columns(
         spec: of the tuning.
         count: machines.
         seed: of their shifts and of their noise.
-        is_fresh: all machines differ from the study's own, else it is the first one.
+        is_fresh: all machines differ from the study's own; otherwise it is the first.
 
     Returns:
         Columns of `count` rows for each move.
@@ -45,7 +45,7 @@ def scenario_columns(
 
 
 def move_label(move: dict[str, Any]) -> str:
-    """Name of a move, "" where there is only one."""
+    """Name of a move, "" if there is only one."""
     return ", ".join(f"{name} = {value}" for name, value in move.items())
 
 
@@ -54,7 +54,7 @@ def lane_columns(
 ) -> Columns:
     """Columns for designs times scenarios, design by design.
 
-    Those that say what the study says anyway are left out: what all runs share is prepared once.
+    Columns equal to the study's own values are omitted: what all runs share is prepared once.
 
     Args:
         spec: of the tuning.
@@ -88,7 +88,7 @@ def _is_everywhere(column: np.ndarray, value: Any) -> bool:
 
 
 def nominal(spec: TuneSpec, family: Family | None) -> Study:
-    """The study's own machine on the first move, with what a family sets."""
+    """The study's own machine on the first move, with a family's settings."""
     study = family.study(spec.study) if family else spec.study
     for name, value in spec.moves[0].items():
         study = parse_study(set_value(study, name, value))

@@ -1,11 +1,11 @@
-"""The file of a tuning: a study plus `[tune]`, which says what is free and what it is for.
+"""The file of a tuning: a study plus `[tune]`, which defines free numbers and objective.
 
 Everything is measured against the study itself, machine by machine and move by move:
 
 - objective: sum of weight times the size of a metric (root of the mean square of its entries) over
   its size in the study's own run of that scenario; of the scenarios, the mean of the worst share;
-- limits: the largest entry of a metric, in no scenario above the limit; "own" stands for what the
-  study itself reaches there. `gain_margin` and `slowest_decay` are lower limits and `spillover` an
+- limits: the largest entry of a metric must not exceed the limit in any scenario; "own" stands for
+  the study's own value there. `gain_margin` and `slowest_decay` are lower limits and `spillover` an
   upper one of the linearised sampled loop at the first way-point; `singularity_distance` is a lower
   limit on the distance of all link angles from 0 and 90 deg.
 """
@@ -39,36 +39,36 @@ OF_LOOP = ("gain_margin", "slowest_decay", "spillover")
 LOOP_LIMITS = (*OF_LOOP, "singularity_distance")
 #: Runs in one batch.
 MOST_RUNS = 50_000
-#: Limit that stands for what the study itself reaches.
+#: Limit that stands for the study's own value.
 OWN = "own"
 
 
 class Scenarios(Section):
-    """Machines and moves that one design must suit."""
+    """Machines and moves that one design must handle."""
 
     count: int = described(1, "1", "machines; the first is the study's own", ge=1, le=1000)
-    check: int = described(16, "1", "fresh ones, for the result", ge=1, le=10_000)
+    check: int = described(16, "1", "fresh machines, to judge the result", ge=1, le=10_000)
     seed: int = described(0, "1", "of the machines", ge=0, le=10**9)
     spread: dict[str, Any] = described({}, "-", "field = +-percent of its value")
-    each: dict[str, Any] = described({}, "-", "field = values; every machine runs with each")
-    tail: float = described(1.0, "1", "share of worst ones that count", ge=0, le=1)
+    each: dict[str, Any] = described({}, "-", "field = values; all machines run with each")
+    tail: float = described(1.0, "1", "share of worst scenarios that count", ge=0, le=1)
 
 
 class Tune(Section):
-    """What is free, and what for."""
+    """Free numbers and objective."""
 
     free: dict[str, Any] = described({}, "-", "field = {from, to, scale}")
     objective: dict[str, Any] = described(
-        {"residual_rms": 1.0}, "-", "metric = weight, of its share in the study's own", min_length=1
+        {"residual_rms": 1.0}, "-", "metric = weight, relative to the study's own", min_length=1
     )
     limits: dict[str, Any] = described({}, "-", "metric or figure of the loop = limit or 'own'")
     scenarios: Scenarios = Scenarios()
-    families: dict[str, Any] = described({}, "-", "name = {free, set}: what moves, what is changed")
+    families: dict[str, Any] = described({}, "-", "name = {free, set}: what moves, what is set")
     pareto: dict[str, Any] = described({}, "-", "{limit, values, family}: a front")
-    method: Literal["lbfgs", "adam"] = described("lbfgs", "-", "how starts go downhill")
-    starts: int = described(8, "1", "designs of each family to begin with", ge=1, le=1024)
+    method: Literal["lbfgs", "adam"] = described("lbfgs", "-", "descent method")
+    starts: int = described(8, "1", "initial designs of each family", ge=1, le=1024)
     iterations: int = described(60, "1", "evaluations of each start", ge=1, le=10_000)
-    samples: int = described(0, "1", "random designs to compare with", ge=0, le=10**6)
+    samples: int = described(0, "1", "random designs for comparison", ge=0, le=10**6)
     seed: int = described(0, "1", "of the starts", ge=0, le=10**9)
 
 
@@ -77,35 +77,35 @@ class Family(NamedTuple):
 
     name: str
     is_free: np.ndarray  # which numbers move, (p,)
-    columns: dict[str, Any]  # fields of the study that are set otherwise
+    columns: dict[str, Any]  # fields of the study that are overridden
     limits: dict[str, float | str]
     front: str  # name of the front it is a point of, "" for none
 
     def study(self, study: Study) -> Study:
-        """The study with what this family sets."""
+        """The study with this family's settings."""
         for name, value in self.columns.items():
             study = parse_study(set_value(study, name, value))
         return study
 
 
 class TuneSpec(NamedTuple):
-    """A tuning as asked for."""
+    """A tuning as requested."""
 
-    study: Study  # what everything is measured against
+    study: Study  # the reference
     tune: Tune
     free: FreeNumbers
     families: tuple[Family, ...]  # those that move something come first
-    moves: tuple[dict[str, Any], ...]  # combinations of `scenarios.each`, {} where there is none
+    moves: tuple[dict[str, Any], ...]  # combinations of `scenarios.each`, {} if there is none
     data: dict[str, Any]  # as read, for the record
 
     @property
     def moving(self) -> tuple[Family, ...]:
-        """Families that have something free."""
+        """Families with free numbers."""
         return tuple(family for family in self.families if family.is_free.any())
 
     @property
     def main(self) -> int:
-        """The family with most free numbers."""
+        """The family with the most free numbers."""
         return int(np.argmax([family.is_free.sum() for family in self.families]))
 
     @property
@@ -120,12 +120,12 @@ class TuneSpec(NamedTuple):
 
     @property
     def counted_links(self) -> tuple[int, ...]:
-        """Links that metrics are taken over where none is named, from 0: those under control."""
+        """Links over which metrics are taken if none is named, from 0: the controlled ones."""
         return controlled_links([self.study, *(one.study(self.study) for one in self.families)])
 
     @property
     def metric_limits(self) -> tuple[str, ...]:
-        """Limits that runs are judged by."""
+        """Limits on metrics of runs."""
         return tuple(name for name in self.tune.limits if name not in LOOP_LIMITS)
 
     @property
@@ -135,12 +135,12 @@ class TuneSpec(NamedTuple):
 
     @property
     def limit_names(self) -> tuple[str, ...]:
-        """All limits, in the order that evaluations have them in."""
+        """All limits, in the order used by evaluations."""
         return (*self.metric_limits, *self.loop_limits)
 
 
 def load_tuning(path: str | Path) -> TuneSpec:
-    """Read a tuning file, or the ready one of that name.
+    """Read a tuning file, or the ready-made one of that name.
 
     Raises:
         StudyError: unreadable, not TOML, or not a valid tuning.
@@ -254,7 +254,7 @@ def _check_metric(name: str, path: str, has_loop: bool, study: Study) -> None:
 
 
 def _moves(tune: Tune, study: Study) -> tuple[dict[str, Any], ...]:
-    """Combinations of the values that every machine runs with."""
+    """Combinations of values with which every machine runs."""
     columns = {}
     for name, values in tune.scenarios.each.items():
         path = f"tune.scenarios.each.{shown_name(name)}"
@@ -266,7 +266,7 @@ def _moves(tune: Tune, study: Study) -> tuple[dict[str, Any], ...]:
 
 
 def _check_clashes(tune: Tune, free: FreeNumbers, families: tuple[Family, ...]) -> None:
-    """No field may be set by two."""
+    """Reject fields that are set twice."""
     asked = tune.scenarios
     for name in asked.spread:
         if name in asked.each:
@@ -287,7 +287,7 @@ def _check_clashes(tune: Tune, free: FreeNumbers, families: tuple[Family, ...]) 
 
 
 def _check_size(tune: Tune, families: tuple[Family, ...], moves: int) -> None:
-    """What a machine of some memory can hold in one batch."""
+    """Check that one batch fits into memory."""
     moving = sum(bool(family.is_free.any()) for family in families)
     for what, designs, machines in (
         (
@@ -333,7 +333,7 @@ def _families(tune: Tune, study: Study, free: FreeNumbers) -> tuple[Family, ...]
 
 
 def label(name: str) -> str:
-    """A family's name as part of a file's, where case may not count; families differ in it."""
+    """A family's name as part of a file name, unique even if case is ignored."""
     return re.sub(r"[^a-z0-9.]+", "_", name.lower()).strip("_.")
 
 
@@ -401,7 +401,7 @@ def _front(tune: Tune, families: list[Family]) -> list[Family]:
 
 
 def _check_family(family: Family, move: dict[str, Any], study: Study) -> None:
-    """What a family sets must run, and by the study's own program."""
+    """Check that a family's settings run, with the study's own program."""
     try:
         changed = family.study(study)
         for name, value in move.items():

@@ -1,4 +1,4 @@
-"""Designs of a tuning on the workers of a cluster: each evaluates and differentiates a part."""
+"""Designs of a tuning on the workers of a cluster: each evaluates a part."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Share(NamedTuple):
 
 
 class ShareDone(NamedTuple):
-    """What a worker has made of its part."""
+    """A worker's result of its part."""
 
     found: Evaluation
     worker: str  # address
@@ -65,7 +65,7 @@ def _evaluator(precision: str, text: str, families: tuple[int, ...]) -> Evaluato
 
 
 class ClusterEvaluator(Evaluator):
-    """The same designs in the same order, evaluated in parts by the workers there are now."""
+    """The same designs in the same order, evaluated in parts by the currently available workers."""
 
     def __init__(
         self, client: Client, spec: TuneSpec, timeout: float, tell: Callable[[str], None]
@@ -74,7 +74,7 @@ class ClusterEvaluator(Evaluator):
         Args:
             client: from `connected`.
             spec: the tuning.
-            timeout: a worker that is busy for longer without an answer is restarted [s].
+            timeout: a worker that stays busy for longer without answering is restarted [s].
             tell: called with what users should know.
         """
         families = start_families(spec)
@@ -122,7 +122,7 @@ class ClusterEvaluator(Evaluator):
                     if isinstance(answers[future], str):
                         raise StudyError(
                             f"a part of the designs cannot be evaluated: {answers[future]}; "
-                            "iterations before are safe, go on with --resume"
+                            "earlier iterations are safe; continue with --resume"
                         )
         finally:
             self._client.cancel(futures)
@@ -132,7 +132,7 @@ class ClusterEvaluator(Evaluator):
 def evaluator_for(
     spec: TuneSpec, workers: Workers, tell: Callable[[str], None]
 ) -> AbstractContextManager[Evaluator | None]:
-    """What evaluates the designs of a tuning on workers, None for this process.
+    """The evaluator of a tuning's designs on workers, None for this process.
 
     Raises:
         StudyError: as `connected`.

@@ -12,7 +12,7 @@
  *
  * Wires: {{ n_patches }} patch pairs per link, link 1 first; on each link from slider to platform.
  * Polarity: a positive voltage at actuator n must raise sensor n.
- * Front end, which the design counts on:
+ * Front end assumed by the design:
  *   - a second-order Butterworth filter at {{ electronics.antialias_hz | short(6) }} Hz;
  *   - a conditioner of gain {{ electronics.conditioner_gain | short(6) }};
  *   - a bias of {{ electronics.conditioner_bias | short(6) }} V at the ADC;
@@ -24,8 +24,8 @@
  * +-{{ electronics.voltage_limit | short(6) }} V at the piezo patch; {{ fixed.dac_rest }} is 0 V.
 {% else %}
  * Sensors: volts at the ADC's input, the code times {{ NAME }}_ADC_STEP; conditioner gain and
- * bias are taken off here. A sensor is faulty if it is no number or out of range, or too long at
- * one end of it.
+ * bias are removed here. A sensor is faulty if it is NaN or out of range, or too long at one end
+ * of it.
  * Actuators: volts at the piezo patch, so divide by the gain of the amplifier.
 {% endif %}
  * Start: amplifiers off, {{ name }}_init, then {{ NAME }}_SETTLE_SAMPLES times {{ name }}_step.
@@ -55,8 +55,8 @@ typedef {{ NAME }}_REAL {{ name }}_real;
 #define {{ NAME }}_N_MODES {{ channels.link | length }} /* controlled {{ kinds }} of all links */
 #define {{ NAME }}_SAMPLE_RATE {{ exact(electronics.sample_rate_hz) }} /* Hz */
 #define {{ NAME }}_RAIL_SAMPLES {{ rail }} /* {{ rail_ms }} ms at one end: a faulty sensor */
-#define {{ NAME }}_SETTLE_SAMPLES {{ settle }} /* until 99.99 % of the start are forgotten */
-#define {{ NAME }}_SHAPER_LENGTH {{ shaper_length }} /* samples that the shaper remembers */
+#define {{ NAME }}_SETTLE_SAMPLES {{ settle }} /* until 99.99 % of the initial transient has decayed */
+#define {{ NAME }}_SHAPER_LENGTH {{ shaper_length }} /* samples stored by the shaper */
 {% if fixed %}
 #define {{ NAME }}_ADC_TOP {{ fixed.adc_top }} /* highest code */
 #define {{ NAME }}_DAC_REST {{ fixed.dac_rest }} /* code of 0 V */
@@ -67,7 +67,7 @@ typedef {{ NAME }}_REAL {{ name }}_real;
 #define {{ NAME }}_LIMIT {{ exact(controller.voltage_limit) }} /* V, of every actuator, +- */
 {% endif %}
 
-/* What the controller remembers from sample to sample. */
+/* State of the controller. */
 typedef struct {
     {{ word }} high[{{ NAME }}_N_MODES]; /* memory of the first section */
     {{ word }} line[{{ NAME }}_N_MODES][2]; /* delay line of the second section */
@@ -78,7 +78,7 @@ typedef struct {
     int fault; /* number of the first faulty sensor, from 1; 0: none */
 } {{ name }}_state;
 
-/* Forget everything, faults too: the state of a machine at rest. */
+/* Reset everything, including faults: the state of a machine at rest. */
 void {{ name }}_init({{ name }}_state *state);
 
 /* One sample: sensors in, values for the actuators of the next sample out.
@@ -90,18 +90,18 @@ void {{ name }}_init({{ name }}_state *state);
  * not a number, out of range or stuck at one end of it.
 {% endif %}
  * From then on all actuators are at rest, whatever the sensors say, until {{ name }}_init. Sensors
- * of links that are not controlled are not looked at; their actuators stay at rest.
+ * of uncontrolled links are ignored; their actuators stay at rest.
  */
 int {{ name }}_step({{ name }}_state *state, const {{ wire }} sensor[{{ NAME }}_N_CHANNELS],
     {{ wire }} actuator[{{ NAME }}_N_CHANNELS]);
 
-/* What the shaper remembers: references of the past, newest at `newest`. */
+/* State of the shaper: past references, newest at `newest`. */
 typedef struct {
     {{ word }} past[{{ NAME }}_SHAPER_LENGTH][3];
     uint32_t newest;
 } {{ name }}_shaper;
 
-/* Begin at rest in a pose. */
+/* Start at rest in a pose. */
 void {{ name }}_shape_init({{ name }}_shaper *shaper, const {{ word }} reference[3]);
 
 /* One sample of the reference pose (x, y, phi): as planned in, shaped out.

@@ -5,13 +5,13 @@
  * {{ line }}
 {% endfor %}
  *
- * Every signal is a 32-bit integer; its unit is in the table of formats. A sum of products is made
- * in 64 bits, which it cannot leave (the coefficients of a row add up to less than 2^31), then
+ * Every signal is a 32-bit integer; its unit is in the table of formats. A sum of products is formed
+ * in 64 bits, without overflow (the coefficients of a row add up to less than 2^31), then
  * shifted right with rounding and limited to 32 bits. So coefficient = integer / 2^shift, and its
  * unit is counts of the result per count of what it multiplies.
  *
  * Formats: value = base * integer / 2^Q. The base is the largest value in the simulated motion; a
- * word has room for `room` times that, and no ADC codes can make more than `reach` times that. A
+ * word has room for `room` times that, and ADC codes can produce at most `reach` times that. A
  * coefficient from signal a to signal b, in SI units, is
  * integer / 2^shift * (base_b / 2^Q_b) / (base_a / 2^Q_a); one ADC code is {{ code | short(9) }} V
  * at a sensor, one DAC code {{ fixed.dac_step | short(9) }} V at an actuator.
@@ -20,7 +20,7 @@
  * {{ line }}
 {% endfor %}
  *
- * Each constant: [unit], and the section or field of the study file that it comes from.
+ * Each constant: [unit], and the section or field of the study file it comes from.
  * {{ cost }}
  */
 #include "{{ name }}.h"
@@ -96,7 +96,7 @@ static const int32_t DIRECT{{ array(direct) }};
 {% endif %}
 {% if has_feedthrough %}
 
-/* [sensor/code] of each actuator of the link, by modes that are not controlled;
+/* [sensor/code] of each actuator of the link, through uncontrolled modes;
  * control.feedthrough_factor */
 static const int32_t FEEDTHROUGH{{ array(feedthrough, patches) }};
 

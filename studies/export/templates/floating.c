@@ -7,7 +7,7 @@
  * {{ line }}
 {% endfor %}
  *
- * Each constant: [unit], and the section or field of the study file that it comes from.
+ * Each constant: [unit], and the section or field of the study file it comes from.
  */
 #include "{{ name }}.h"
 
@@ -72,7 +72,7 @@ static const real DIRECT{{ array(channels.direct) }};
 {% endif %}
 {% if has_feedthrough %}
 
-/* [1] sensor volts per volt of each actuator of the link, by modes that are not controlled;
+/* [1] sensor volts per volt of each actuator of the link, through uncontrolled modes;
  * control.feedthrough_factor */
 static const real FEEDTHROUGH{{ array(feedthrough, patches) }};
 {% endif %}

@@ -19,7 +19,7 @@ static const uint32_t DELAY{{ array(delay) }};
 {%- endmacro %}
 
 {% macro rivals() %}
-/* 1: acts where no other one of its link has more energy; control.law */
+/* 1: acts while no other channel of its link has more energy; control.law */
 static const uint16_t IS_RIVAL{{ array(is_rival) }};
 {%- endmacro %}
 
