@@ -81,10 +81,13 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     code, text, _ = run(
         capsys, "replay", out, "--case", "3", "--out", tmp_path / "run.h5", "--report"
     )
-    assert code == 0 and "largest difference of a metric" in text
+    assert code == 0 and "largest relative difference of a metric" in text
     assert (tmp_path / "run.h5").stat().st_size > 10_000
     page = parsed((tmp_path / "run.html").read_text(encoding="utf-8"))
-    assert len(page.images) == 4 and "sweep: ok; largest difference of a metric" in page.text
+    assert (
+        len(page.images) == 4
+        and "the sweep has: ok; largest relative difference of a metric" in page.text
+    )
     _, text, _ = run(capsys, "best", out, "--by", "residual_rms", "--count", "1")
     number, name = re.search(r"(\d+) +│ ([0-9a-f]{8}) ", text).groups()
     assert load_design(out, f"id:{name}").study == load_design(out, int(number)).study

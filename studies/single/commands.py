@@ -34,9 +34,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         """Run one study and save full trajectories."""
         start(precision)
         from studies.single.run import simulate as simulate_study
-        from studies.study.spec import load_study
 
-        run = simulate_study(load_study(study), out, report)
+        run = simulate_study(study, out, report)
         _print_run(run, console)
         _print_files(out, report, console)
 

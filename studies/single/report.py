@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 
 from jaxmodel import status
 from jaxmodel.axial import euler_force
-from jaxmodel.laws import LAWS
 from studies.engine.runs import (
     Run,
     chord_deflection,
@@ -26,9 +25,9 @@ from studies.show.pages import write_report
 from studies.show.sketch import CAPTION, sketch
 from studies.show.templates import render
 from studies.show.units import number
+from studies.show.words import control_text, motion_text
 from studies.store import check_target, write_store
-from studies.study.margin import ENOUGH, caution
-from studies.study.spec import Study
+from studies.study.margin import ENOUGH, MARGIN_MODES, caution
 
 #: Figures, by the end of the file name.
 FIGURES = ("deflection", "error", "voltage", "machine")
@@ -56,14 +55,17 @@ def check_results(out: Path, has_report: bool) -> None:
         check_target(out.with_name(name))
 
 
-def write_results(out: Path, run: Run, has_report: bool, notes: Sequence[str] = ()) -> None:
+def write_results(
+    out: Path, run: Run, has_report: bool, notes: Sequence[str] = (), name: str = "STUDY"
+) -> None:
     """Write a run to its file and, if requested, its report next to it.
 
     Args:
         out: file of the run.
         run: with trajectories.
         has_report: whether to write the report.
-        notes: sentences added to the report's text on the run's status.
+        notes: sentences that the report adds.
+        name: of the study on the command line, for commands in the report.
 
     Raises:
         StudyError: a file cannot be written.
@@ -73,9 +75,9 @@ def write_results(out: Path, run: Run, has_report: bool, notes: Sequence[str] = 
         return
     twin = uncontrolled_twin(run)
     with figures.styled():
-        for name, figure in {**draw(run, twin), "machine": sketch(run.study)}.items():
-            figures.write_figure(figure, out.with_name(_figure(out, name)))
-    write_report(out.parent, report(out, run, twin, notes), run.study, out.stem)
+        for kind, figure in {**draw(run, twin), "machine": sketch(run.study)}.items():
+            figures.write_figure(figure, out.with_name(_figure(out, kind)))
+    write_report(out.parent, report(out, run, twin, notes, name), run.study, out.stem)
 
 
 def _figure(out: Path, name: str) -> str:
@@ -83,7 +85,7 @@ def _figure(out: Path, name: str) -> str:
     return f"{out.stem}-{name}.png"
 
 
-def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str]) -> str:
+def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str], name: str) -> str:
     """Markdown text; arguments of `write_results`, and the same run without control."""
     result, study = run.result, run.study
     worst = int(np.argmax(np.nan_to_num(result.metrics.residual_rms.max(axis=1), nan=-1.0)))
@@ -97,6 +99,7 @@ def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str]) -> str:
         loop=run.loop,
         planned=run.motion,
         notes=notes,
+        name=name,
         motion=motion_text(study),
         control=control_text(study),
         is_finished=run.status in status.FINISHED,
@@ -110,7 +113,8 @@ def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str]) -> str:
         stations=", ".join(f"{1e3 * x:g}" for x in study.metrics.stations),
         watched=_watched(run),
         command_end=round(float(result.command_end), 9),
-        buckling=np.min(euler_force(run.case.machine.beam)),
+        buckling=np.broadcast_to(euler_force(run.case.machine.beam), (3,)),
+        n_modes=max(MARGIN_MODES, study.link.modes),
         links=_links(run, twin),
         platform=_platform(run),
         modes=_modes(run),
@@ -133,54 +137,13 @@ def _situation(run: Run, twin: Run | None) -> str:
     return "worse" if left > 1.05 * free else "well"
 
 
-def motion_text(study: Study) -> str:
-    """What moves the machine, in words."""
-    motion, load, drive = study.motion, study.load, study.drive
-    points = np.array(motion.waypoints, float)[:, :2]
-    count = len(points) - 1
-    told = "the platform at rest"
-    if count:
-        longest = 1e3 * np.linalg.norm(np.diff(points, axis=0), axis=1).max()
-        times = np.atleast_1d(motion.move_time)
-        span = f"{1e3 * times.min():.4g}" + (
-            f" to {1e3 * times.max():.4g}" if np.ptp(times) else ""
-        )
-        shaper = "no shaper" if study.shaper.kind == "none" else f"shaper {study.shaper.kind}"
-        moves = f"{count} move{'s' if count > 1 else ''} of {'up to ' if count > 1 else ''}"
-        told = f"{moves}{longest:.4g} mm in {span} ms{' each' if count > 1 else ''}, {shaper}"
-    blows = [
-        f"a pulse of {max(map(abs, force)):.4g} {unit} on the {where}"
-        for force, unit, where in (
-            (drive.pulse_force, "N", "sliders"),
-            (load.pulse, "N or N m", "platform"),
-        )
-        if any(force)
-    ]
-    if drive.ripple:
-        blows.append(f"force ripple of {drive.ripple:g} N rms")
-    if any(study.initial.load_deflection) or any(map(any, study.initial.modal)):
-        blows.append("links bent at the start")
-    return ", ".join([told, *blows])
-
-
-def control_text(study: Study) -> str:
-    """What is controlled and how, in words."""
-    control = study.control
-    links = [str(i + 1) for i in range(3) if control.links[i]]
-    if control.feedback == "none" or not links:
-        return "no link controlled"
-    law = LAWS[control.law]
-    what = f"{law.text} of {control.modes} modes" if law.channel == "mode" else law.text
-    return (
-        f"{what} on link{'s' if len(links) > 1 else ''} {', '.join(links)}, "
-        f"{control.feedback} feedback, gain factor {control.gain_factor:g}"
-    )
-
-
 def _links(run: Run, twin: Run | None) -> list[list[str]]:
     """Row of each link."""
     metrics = run.result.metrics
-    lengths = [metrics.residual_rms, metrics.residual_peak, metrics.structural_peak]
+    record = run.result.record
+    assert record is not None
+    largest = np.abs(record.chord_deflection_stations).max(axis=0)
+    lengths = [metrics.residual_rms, metrics.residual_peak, largest]
     if twin is not None:
         lengths.insert(1, twin.result.metrics.residual_rms)
     return [
@@ -208,7 +171,10 @@ def settling_text(run: Run, link: int) -> str:
 def _platform(run: Run) -> list[list[str]]:
     """Row of each coordinate."""
     metrics = run.result.metrics
-    errors = metrics.pose_error_peak, metrics.pose_error_rms, metrics.stretch_error_peak
+    record = run.result.record
+    assert record is not None
+    largest = np.abs(record.pose_error).max(axis=0)
+    errors = largest, metrics.pose_error_rms, metrics.stretch_error_peak
     return [[name, *(number(error[k], "m") for error in errors)] for k, name in enumerate(_POSE)]
 
 

@@ -10,7 +10,7 @@ from studies.engine.runs import Run, run_study
 from studies.errors import StudyError
 from studies.single.report import check_results, write_results
 from studies.study.labels import describe
-from studies.study.spec import Study
+from studies.study.spec import Study, load_study
 
 
 class Replay(NamedTuple):
@@ -28,16 +28,18 @@ class Replay(NamedTuple):
             return []
         which = f" ({self.metric})" if self.metric else ""
         return [
-            f"sweep: {describe(self.stored_status)}; largest difference of a metric "
-            f"{self.difference:.1e} of its size{which}"
+            f"the sweep has: {describe(self.stored_status)}; largest relative difference of a "
+            f"metric: {self.difference:.1e}{which}"
         ]
 
 
-def simulate(study: Study, out: str | Path | None = None, has_report: bool = False) -> Run:
+def simulate(
+    study: Study | str | Path, out: str | Path | None = None, has_report: bool = False
+) -> Run:
     """Run a study with full trajectories, and write the requested files.
 
     Args:
-        study: what to run.
+        study: what to run; or its file, or the name of a ready one.
         out: HDF5 file for trajectories and metrics; None: nothing is written.
         has_report: whether to also write the report next to that file.
 
@@ -45,9 +47,10 @@ def simulate(study: Study, out: str | Path | None = None, has_report: bool = Fal
         StudyError: a fault of the study, or a file that cannot be written.
     """
     file = _checked(out, has_report)
-    run = run_study(study)
+    name = "STUDY" if isinstance(study, Study) else str(study)
+    run = run_study(study if isinstance(study, Study) else load_study(study))
     if file is not None:
-        write_results(file, run, has_report)
+        write_results(file, run, has_report, name=name)
     return run
 
 
@@ -75,7 +78,8 @@ def replay(
     else:
         again = Replay(run, None, 0.0, "")
     if file is not None:
-        write_results(file, run, has_report, again.notes)
+        name = str(design) if case is None else f"{design} --case {case}"
+        write_results(file, run, has_report, again.notes, name)
     return again
 
 

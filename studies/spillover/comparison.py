@@ -68,8 +68,7 @@ def compare_laws(study: Study, margin: float = 2.0, sizes: tuple[int, ...] = ())
     """
     found = fixed_controller(study)
     sizes = plant_sizes(found, sizes)
-    own = min(max(found.study.link.modes, sizes[0]), sizes[-1])
-    plant = PlantVariant(found.study.link.basis, own)
+    plant = PlantVariant(found.study.link.basis, sizes[-1])
     laws = all_laws(found, LoopMaker(found), plant)
     with threadpool_limits(1, "blas"):
         views = [_View(found, law, plant, sizes) for law in laws]

@@ -106,16 +106,24 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     @app.command()
     def best(
         folder: Folder,
-        by: Annotated[str, typer.Option(help="metric to minimise; -metric: to maximise")],
+        by: Annotated[str, typer.Option(help="metric; the best come first, after - the worst")],
         subject_to: Annotated[str, typer.Option(help="condition on metrics and axes")] = "",
         count: Annotated[int, typer.Option(min=1, help="number of cases")] = 10,
     ) -> None:
         """List the best cases of a sweep by a metric."""
         from studies.engine.results import load
-        from studies.sweeps.show import best_cases, print_cases, tell_left_out
+        from studies.sweeps.show import (
+            best_cases,
+            counted_text,
+            direction,
+            print_cases,
+            tell_left_out,
+        )
 
-        data = load(folder)
-        print_cases(data, best_cases(data, by, subject_to, count), [by.lstrip("-")], console)
+        data, name = load(folder), by.removeprefix("-")
+        cases = best_cases(data, by, subject_to, count)
+        console.print(f"by {name}, {direction(by)} first, {counted_text(data, name)}:")
+        print_cases(data, cases, [name], console)
         tell_left_out(data, console)
 
     @app.command()

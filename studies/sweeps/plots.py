@@ -192,11 +192,12 @@ def _scale_ordinate(ax: Axes, value: np.ndarray) -> None:
 def _say_left_out(figure: Figure, data: SweepData, chosen: np.ndarray) -> None:
     n_left, parts = int(np.sum(~chosen)), []
     if n_left:
-        parts.append(f"{n_left} of {len(chosen)} cases not ok, left out")
+        parts.append(f"{n_left:,} of {len(chosen):,} cases failed and are left out")
     if MARGIN in data.variables:
         n_low = int(np.sum(data[MARGIN][chosen] < ENOUGH))
         if n_low:
-            parts.append(f"{n_low} of those shown with a gain margin below {ENOUGH:g}")
+            shown = int(np.sum(chosen))
+            parts.append(f"{n_low:,} of the {shown:,} shown have a gain margin below {ENOUGH:g}")
     if parts:
         figure.suptitle("; ".join(parts), fontsize=7.5, x=0.01, ha="left")
 
@@ -398,7 +399,7 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
         ax.set_xticks(range(len(names) + 1), [*names, label(data, y)], rotation=15, ha="right")
         ax.set_yticks([])
         ax.set_title(
-            f"red: the {_best_text(data, len(best))}; else dark: smallest",
+            f"red: the {_best_text(data, len(best))}; the others: darker is smaller",
             fontsize=7.5,
             loc="right",
         )

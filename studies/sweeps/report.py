@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxmodel import status
-from studies.engine.results import SweepData, load, metric_values, swept_names
+from studies.engine.results import SweepData, counted_links, load, metric_values, swept_names
 from studies.errors import StudyError, shown
 from studies.show.figures import styled
 from studies.show.markdown import literal
@@ -18,6 +18,7 @@ from studies.show.pages import write_report
 from studies.show.sketch import CAPTION, sketch
 from studies.show.templates import render
 from studies.show.units import readable
+from studies.show.words import motion_text
 from studies.space.axes import SHOWN_AS
 from studies.space.methods import METHODS
 from studies.space.spec import BlockNode
@@ -35,6 +36,7 @@ from studies.sweeps.show import (
     case_rows,
     cause_rows,
     counted_text,
+    direction,
     margin_warning,
     ranking,
     recommended,
@@ -72,6 +74,7 @@ class BestCase(NamedTuple):
     warning: str  # of small gain margins among them
     is_safe: bool  # their gain margins are `ENOUGH`
     rival: Rival | None
+    idle: list[tuple[str, str]]  # links that no case controls, and the metric there
     table: Rows
 
 
@@ -99,7 +102,7 @@ def write_sweep_report(folder: str | Path) -> None:
     with styled():
         save_plot(sketch(_best_study(data, metric)), folder / MACHINE)
     files = {"Sweep file": toml_text(spec.data), "Study of all cases": study_template(spec.study)}
-    write_report(folder, report(data, metric, [*drawn, MACHINE]), files)
+    write_report(folder, report(data, metric, [*drawn, MACHINE], str(folder)), files)
 
 
 def _all_axes(data: SweepData, metric: str) -> Figure:
@@ -126,18 +129,23 @@ def _best_study(data: SweepData, metric: str) -> Study:
         return data.spec.study
 
 
-def report(data: SweepData, metric: str, drawn: list[str]) -> str:
+def report(data: SweepData, metric: str, drawn: list[str], folder: str = "DIR") -> str:
     """Markdown text.
 
     Args:
         data: the sweep.
         metric: ranks the cases.
         drawn: existing figures among `FIGURE`, `FRONT` and `MACHINE`.
+        folder: of the sweep, for commands.
     """
     endings = status_rows(data)
     return render(
         "sweeps/report.md",
         title=data.spec.study.title,
+        folder=folder,
+        first=direction(metric),
+        motion=motion_text(data.spec.study),
+        window=data.spec.study.metrics,
         sweep=data.spec.sweep,
         cases=data.table,
         metric=metric,
@@ -187,9 +195,21 @@ def _best(data: SweepData, metric: str) -> BestCase | None:
         spread=spread if len(best) > 3 and spread < ALIKE else None,
         warning=warning,
         is_safe=is_safe,
+        idle=_idle(data, metric, first),
         rival=Rival(free, told(readings[free]), margin[free]) if is_beaten else None,
         table=_literal(case_rows(data, best, [metric])),
     )
+
+
+def _idle(data: SweepData, metric: str, case: int) -> list[tuple[str, str]]:
+    """Links that no case controls, and a metric of theirs, where it is one of links."""
+    dims = data.variables[metric.partition("[")[0]].dims
+    if "link" not in dims or "link=" in metric:
+        return []
+    idle = set(range(3)) - set(np.flatnonzero(counted_links(data)).tolist())
+    unit = readable(unit_of_metric(data, metric))[1]
+    names = [(str(link + 1), f"{metric}[link={link + 1}]") for link in sorted(idle)]
+    return [(k, f"{shown_metric(data, name)[case]:.4g} {unit}".rstrip()) for k, name in names]
 
 
 def _blocks(node: BlockNode, depth: int = 0) -> list[tuple[int, str, list[tuple[str, str, Any]]]]:

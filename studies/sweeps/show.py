@@ -22,8 +22,9 @@ from studies.study.entries import links_text
 from studies.study.margin import ENOUGH, margin_text
 from studies.sweeps.sensitivity import failure_causes
 
-#: Shown next to every metric of a case that has it.
 MARGIN = "gain_margin"
+#: Shown next to every metric of the cases that have them: what a design costs, and how safe it is.
+BESIDE = ("peak_voltage", "damping_ratio[controlled_mode=1]", MARGIN)
 
 
 #: Digits of a case's id that tables show.
@@ -85,8 +86,7 @@ def best_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) 
     Raises:
         StudyError: unknown metric, or no case left.
     """
-    name = by.removeprefix("-")
-    is_large = (name.partition("[")[0] in WANTED_LARGE) != by.startswith("-")
+    name, is_large = by.removeprefix("-"), direction(by) == "largest"
     value = metric_values(data, name)
     if value.dtype.kind not in "fiub":
         raise StudyError(f"--by {by}: a text, not a number")
@@ -94,6 +94,12 @@ def best_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) 
     if len(chosen) == 0:
         raise StudyError(f"--subject-to {subject_to!r}: no case with status ok meets it")
     return chosen[np.argsort(-value[chosen] if is_large else value[chosen], kind="stable")][:count]
+
+
+def direction(by: str) -> str:
+    """Which values of a metric come first: "smallest" or "largest"; - before it turns that round."""
+    is_large = by.removeprefix("-").partition("[")[0] in WANTED_LARGE
+    return "largest" if is_large != by.startswith("-") else "smallest"
 
 
 def show(data: SweepData, console: Console, is_failed: bool) -> None:
@@ -109,7 +115,7 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
         best = recommended(data, by)
         is_safe = not margin_warning(data, best) and MARGIN in data.variables
         safe = f", gain margin {ENOUGH:g} or more" if is_safe else ""
-        console.print(f"best cases by {by}, {counted_text(data, by)}{safe}:")
+        console.print(f"best cases by {by}, {direction(by)} first, {counted_text(data, by)}{safe}:")
         print_cases(data, best, [by], console)
 
 
@@ -161,10 +167,12 @@ def margin_warning(data: SweepData, cases: np.ndarray) -> str:
 
 
 def case_rows(data: SweepData, cases: np.ndarray, metrics: list[str]) -> Rows:
-    """Cases with what varies, some metrics, and their gain margins."""
+    """Cases with what varies, some metrics, and what else to look at before acting on them."""
     names = swept_names(data)
-    if MARGIN not in metrics and MARGIN in data.variables and np.isfinite(data[MARGIN]).any():
-        metrics = [*metrics, MARGIN]
+    metrics = [
+        *metrics,
+        *(name for name in BESIDE if name not in metrics and _is_there(data, name)),
+    ]
     columns = [shown_metric(data, name) for name in metrics]
     rows = []
     for k in cases:
@@ -176,6 +184,12 @@ def case_rows(data: SweepData, cases: np.ndarray, metrics: list[str]) -> Rows:
         rows.append([str(k), short_id(data, k), *cells, *numbers])
     heads = [*(written_name(data, name) for name in names), *(label(data, x) for x in metrics)]
     return Rows(["case", "id", *heads], rows)
+
+
+def _is_there(data: SweepData, name: str) -> bool:
+    """Whether a sweep has kept a metric, and some case has it."""
+    kept = name.partition("[")[0] in data.variables
+    return kept and bool(np.isfinite(metric_values(data, name)).any())
 
 
 def _number_text(data: SweepData, name: str, column: np.ndarray, case: int) -> str:
@@ -293,4 +307,4 @@ def cause_rows(data: SweepData) -> Rows:
     for cause in failure_causes(data)[:8]:
         low, high = (f"{100 * rate:.0f} % ({at})" for rate, at in (cause.low, cause.high))
         rows.append([cause.name, f"{cause.distance:.2f}", f"{cause.p_value:.1g}", low, high])
-    return Rows(["parameter", "distance", "p", "failures at its least", "at its most"], rows)
+    return Rows(["parameter", "distance", "p", "failures, lowest quarter", "highest quarter"], rows)

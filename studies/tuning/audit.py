@@ -32,9 +32,9 @@ NEAR_ZERO = 1e-3
 DESIGNS = 3
 #: Explanation of a disagreement for the reader.
 MEANING = (
-    "Derivatives along the way from bound to bound. A disagreement is a share of the larger of the "
-    f"two, or of {SMALLEST:g} of the figure's largest derivative where both are smaller, and of "
-    f"{NEAR_ZERO:g} at least: figures are shares of the study's own."
+    "Derivatives along the way from bound to bound. Differences are relative to the larger of the "
+    f"two values, or, where both are small, to {100 * SMALLEST:g} % of the figure's largest "
+    f"derivative and at least to {NEAR_ZERO:g}."
 )
 
 

@@ -81,12 +81,13 @@ class Fidelity(NamedTuple):
     rank: float  # coefficient of correlation
 
 
-def report(spec: TuneSpec, found: TuneFindings) -> str:
+def report(spec: TuneSpec, found: TuneFindings, folder: str = "") -> str:
     """Markdown text.
 
     Args:
         spec: of the tuning.
         found: what it found.
+        folder: that holds the tuned studies, for commands.
     """
     at, seen = found.at, found.searched
     names = list(found.own.metrics)
@@ -100,6 +101,7 @@ def report(spec: TuneSpec, found: TuneFindings) -> str:
         names_links=all(parse_entries(name).names_a_link for name in spec.tune.objective),
         lower=LOWER,
         best=_best(spec, found),
+        folder=f"{folder}/" if folder else "",
         heads=[headed(x, METRICS[parse_entries(x).metric].unit) for x in names],
         own=_own_machine(spec, found, names),
         n_modes=max(MARGIN_MODES, spec.study.link.modes),
@@ -146,6 +148,8 @@ def _best(spec: TuneSpec, found: TuneFindings) -> BestFamily:
     if one.loop is not None and own.loop is not None:
         margins = one.loop.gain_margin, own.loop.gain_margin
         gains.append(("gain margin", f"{margins[0]:.3g}", f"{margins[1]:.3g}"))
+        decays = one.loop.slowest_decay, own.loop.slowest_decay
+        gains.append(("slowest decay", f"{decays[0]:.3g}", f"{decays[1]:.3g} 1/s"))
     return BestFamily(
         family=family.name,
         file=file_name(spec, family),

@@ -213,4 +213,4 @@ def _write(spec: TuneSpec, found: TuneFindings, out: Path) -> None:
     for limit in spec.metric_limits[:1]:
         save(plots.front(spec, found, spec.tune.pareto.get("limit", limit)), out, "front")
     files = {"Tuning file": toml_text(spec.data), "Study file": study_template(spec.study)}
-    write_report(out, report(spec, found), files)
+    write_report(out, report(spec, found, str(out)), files)

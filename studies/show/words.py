@@ -1,0 +1,52 @@
+"""A study in words: what moves the machine, and who is controlled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxmodel.laws import LAWS
+from studies.study.spec import Study
+
+
+def motion_text(study: Study) -> str:
+    """What moves the machine, in words."""
+    motion, load, drive = study.motion, study.load, study.drive
+    points = np.array(motion.waypoints, float)[:, :2]
+    count = len(points) - 1
+    told = "the platform at rest"
+    if count:
+        longest = 1e3 * np.linalg.norm(np.diff(points, axis=0), axis=1).max()
+        times = np.atleast_1d(motion.move_time)
+        span = f"{1e3 * times.min():.4g}" + (
+            f" to {1e3 * times.max():.4g}" if np.ptp(times) else ""
+        )
+        shaper = "no shaper" if study.shaper.kind == "none" else f"shaper {study.shaper.kind}"
+        moves = f"{count} move{'s' if count > 1 else ''} of {'up to ' if count > 1 else ''}"
+        told = f"{moves}{longest:.4g} mm in {span} ms{' each' if count > 1 else ''}, {shaper}"
+    blows = [
+        f"a pulse of {', '.join(f'{x:g}' for x in force)} {unit} on the {where}"
+        for force, unit, where in (
+            (drive.pulse_force, "N", "sliders"),
+            (load.pulse, "N or N m", "platform"),
+        )
+        if any(force)
+    ]
+    if drive.ripple:
+        blows.append(f"force ripple of {drive.ripple:g} N rms")
+    if any(study.initial.load_deflection) or any(map(any, study.initial.modal)):
+        blows.append("links bent at the start")
+    return ", ".join([told, *blows])
+
+
+def control_text(study: Study) -> str:
+    """What is controlled and how, in words."""
+    control = study.control
+    links = [str(i + 1) for i in range(3) if control.links[i]]
+    if control.feedback == "none" or not links:
+        return "no link controlled"
+    law = LAWS[control.law]
+    what = f"{law.text} of {control.modes} modes" if law.channel == "mode" else law.text
+    return (
+        f"{what} on link{'s' if len(links) > 1 else ''} {', '.join(links)}, "
+        f"{control.feedback} feedback, gain factor {control.gain_factor:g}"
+    )
