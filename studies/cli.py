@@ -99,14 +99,19 @@ for add_commands in (
 @app.command()
 def init(
     out: Annotated[Path | None, typer.Argument(help="file to write; default: print")] = None,
+    ready: Annotated[
+        str, typer.Option("--from", help="copy the ready-made study, sweep or tuning of this name")
+    ] = "",
 ) -> None:
     """Write a commented study file with every field and its default."""
-    from studies.study.template import study_template, write_study
+    from studies.study.files import ready_text
+    from studies.study.template import study_template, write_text
 
+    text = ready_text(ready) if ready else study_template()
     if out is None:
-        print(study_template(), end="")
+        print(text, end="")
         return
-    write_study(out)
+    write_text(out, text)
     console.print(f"written: {out}", soft_wrap=True)
 
 

@@ -20,6 +20,7 @@ import xarray
 
 import studies
 from studies.cli import app, main
+from studies.study.files import READY
 from tests.pages import TITLE, parsed, rendered
 
 HOME_PHI = math.pi / 6
@@ -334,6 +335,10 @@ def test_init_writes_a_study_once(capsys, tmp_path):
     text = target.read_text()
     assert run(capsys, "init")[1] == text
     assert "exists already; name a new file" in refused(capsys, "init", target)
+    capsys.readouterr()
+    main(["init", "--from", "placement"])
+    assert capsys.readouterr().out == (READY / "placement.toml").read_text()
+    assert "did you mean 'placement'" in refused(capsys, "init", "--from", "placment")
     assert target.read_text() == text
     assert "is not a folder" in refused(capsys, "init", tmp_path / "missing" / "my.toml")
     assert [entry.name for entry in tmp_path.iterdir()] == ["my.toml"]

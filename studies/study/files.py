@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from studies.errors import StudyError, nearest
+from studies.errors import StudyError, field_error, nearest
 
 #: Folder of the package's ready-made files, available by name.
 READY = Path(__file__).parents[1] / "specs"
@@ -26,6 +26,18 @@ def find_spec(name: str | Path) -> Path:
     if path.stem not in ready and hint and not path.exists():
         raise StudyError(f"{path}: cannot be read (no such file); did you mean {hint!r}?")
     return ready.get(path.stem, path)
+
+
+def ready_text(name: str) -> str:
+    """The ready-made file of a name.
+
+    Raises:
+        StudyError: there is none.
+    """
+    ready = {file.stem: file for file in READY.glob("*.toml")}
+    if name not in ready:
+        raise field_error("--from", name, ", ".join(sorted(ready)), hint=nearest(name, ready))
+    return ready[name].read_text(encoding="utf-8")
 
 
 def read_toml(name: str | Path) -> dict[str, Any]:

@@ -124,7 +124,11 @@ class LinkSection(Section):
     thickness: EachLink[Annotated[float, Field(ge=1e-5, le=0.1)]] = described(2e-3, "m", "t_b")
     width: EachLink[Annotated[float, Field(ge=1e-4, le=1)]] = described(10e-3, "m", "width")
     density: EachLink[Annotated[float, Field(ge=1, le=3e4)]] = described(2750.0, "kg/m3", "density")
-    youngs_modulus: EachLink[Annotated[float, Field(ge=1e3, le=2e12)]] = described(70e9, "Pa", "E")
+    youngs_modulus: EachLink[Annotated[float, Field(ge=1e3, le=2e12)]] = described(
+        70e9,
+        "Pa",
+        "E, known to the controller; stiffness_factor is not",
+    )
     stiffness_factor: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(
         1.0, "1", "true bending stiffness over the one controller and shaper assume"
     )

@@ -31,21 +31,26 @@ def study_template(study: Study | None = None) -> str:
 
 
 def write_study(out: str | Path, study: Study | None = None) -> None:
-    """Write a complete, commented study file.
+    """Write such a file.
 
     Args:
         out: a new file.
-        study: the study it reads back as; None: all defaults.
+        study: what it reads back as; None: all defaults.
 
     Raises:
-        StudyError: the file exists, or cannot be written.
+        StudyError: the file exists already, or it cannot be written.
     """
+    write_text(out, study_template(study))
+
+
+def write_text(out: str | Path, text: str) -> None:
+    """Write a new file; arguments and errors as `write_study`."""
     out = Path(out)
     check_target(out)
     if out.exists():
         raise StudyError(f"{out}: exists already; name a new file")
     with replacing(out) as temporary:
-        temporary.write_text(study_template(study), encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _field(section: BaseModel, name: str) -> list[str]:

@@ -341,17 +341,20 @@ def _points(
             ax.scatter(
                 across[part], value[part], s=size, color=color, linewidths=0, label=str(name)
             )
-        ax.legend(fontsize=7, title=hue)
+        ax.plot([], [], " ", label=hue)
     ax.plot(
         across[best],
         value[best],
         "o",
+        label=f"the {len(best)} best" if len(best) else None,
         color="black",
         markerfacecolor="none",
         markersize=5,
         markeredgewidth=0.9,
         zorder=3,
     )
+    if ax.get_legend_handles_labels()[1]:
+        ax.legend(fontsize=7)
     _scale_ordinate(ax, value)
 
 

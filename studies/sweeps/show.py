@@ -97,7 +97,7 @@ def best_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) 
 
 
 def direction(by: str) -> str:
-    """Which values of a metric come first: "smallest" or "largest"; - before it turns that round."""
+    """Which values of a metric come first: "smallest" or "largest"; - in front reverses that."""
     is_large = by.removeprefix("-").partition("[")[0] in WANTED_LARGE
     return "largest" if is_large != by.startswith("-") else "smallest"
 
