@@ -152,7 +152,14 @@ def paper_cases(gain_factor: float) -> list[PaperCase]:
 
 
 #: Cases whose linearised sampled loop is also judged (seconds each).
-JUDGED = ("fast-none-3modes-links123", "paper-ratios", "paper-preset", "difference")
+JUDGED = (
+    "fast-none-3modes-links123",
+    "damped-links123",
+    "paper-gains-own-ratios",
+    "paper-ratios",
+    "paper-preset",
+    "difference",
+)
 
 
 def case_study(base: Study, case: PaperCase, ratio: np.ndarray | None = None) -> Study:

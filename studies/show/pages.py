@@ -95,11 +95,20 @@ def _arranged(tokens: list[Token], images: Mapping[str, bytes]) -> list[Token]:
                 child.content = re.sub(" (?=[%†])", "\N{NO-BREAK SPACE}", child.content)
             if child.type == "image":
                 child.children = [Token("text", "", 0, content=_plain(child.children))]
-                child.attrSet("src", _data_uri(unquote(str(child.attrs["src"])), images))
+                name = unquote(str(child.attrs["src"]))
+                child.attrSet("src", _data_uri(name, images))
+                if _is_wide(images[name]):
+                    child.attrSet("class", "wide")
         arranged.append(token)
         if token.type == "table_close":
             arranged.append(Token("box_close", "div", -1, block=True))
     return arranged
+
+
+def _is_wide(image: bytes) -> bool:
+    """Whether a PNG has panels side by side, too small to read if a narrow screen shrinks them."""
+    width, height = (int.from_bytes(image[k : k + 4], "big") for k in (16, 20))
+    return image.startswith(b"\x89PNG") and width > 1.5 * height
 
 
 def _data_uri(name: str, images: Mapping[str, bytes]) -> str:
