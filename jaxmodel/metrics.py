@@ -188,9 +188,21 @@ def finish(totals: Totals, ending: Ending) -> Metrics:
     )
     for name, value in found.items():
         dims = METRICS[name].dims
+        if not is_real(value):
+            raise PartError(f"metric {name!r}: finish returns {value!r}; expected real numbers")
         if jnp.ndim(value) != len(dims):
             raise PartError(f"metric {name!r}: {jnp.ndim(value)} axes found; its dims are {dims}")
     return found
+
+
+def is_real(value: Any) -> bool:
+    """Whether a value is a real number, or an array of them."""
+    try:
+        return jnp.issubdtype(jnp.result_type(value), jnp.floating) or jnp.issubdtype(
+            jnp.result_type(value), jnp.integer
+        )
+    except (TypeError, ValueError):
+        return False
 
 
 def check_metric(metric: Metric) -> None:

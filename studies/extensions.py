@@ -26,6 +26,8 @@ from jaxmodel.table import PartError, Table
 from studies import sources
 from studies.errors import StudyError
 from studies.space.methods import METHODS, Method
+from studies.study.labels import RESERVED
+from studies.study.spec import Study, paper_study
 
 #: Where child processes find what was loaded, as paths or module names.
 VARIABLE = "FLEXLINK_WITH"
@@ -60,6 +62,8 @@ def extend(
             raise StudyError(f"{module}: {kind} = {own!r}; expected a list")
         for entry in [*own, *given]:
             try:
+                if kind == "metrics":
+                    _check_metric_name(str(getattr(entry, "name", "")))
                 _table(kind).add(entry)
             except PartError as error:
                 raise StudyError(f"{module or 'extend'}: {error}") from None
@@ -97,6 +101,18 @@ def blamed(error: BaseException) -> str:
 
 def _told() -> list[str]:
     return [name for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
+
+
+def _check_metric_name(name: str) -> None:
+    """Raise PartError for a name that a variable of a sweep's file may have."""
+    paper = paper_study()
+    fields = [
+        f"{section}_{field}"
+        for section in Study.model_fields
+        for field in getattr(type(getattr(paper, section)), "model_fields", {})
+    ]
+    if name in (*RESERVED, *fields) or name.startswith(tuple(f"{field}_" for field in fields)):
+        raise PartError(f"metric {name!r}: files use this name for something else; choose another")
 
 
 def _table(kind: str) -> Table[Any]:

@@ -125,17 +125,18 @@ def _dataset(file: h5py.File, name: str, array: np.ndarray | Streamed) -> h5py.D
 
 def _check_room(path: str | Path, arrays: Mapping[str, np.ndarray | Streamed]) -> None:
     """Raise StudyError if the disk has no room for the arrays."""
-    text = 32  # estimated bytes of a short text
+    text, labels = 32, 4096  # estimated bytes of a short text, and of a variable's labels
     needed = sum(
-        float(np.prod(np.array(array.shape, float)))
+        labels
+        + float(np.prod(np.array(array.shape, float)))
         * (text if array.dtype.kind == "O" else array.dtype.itemsize)
         for array in arrays.values()
     )
     free = shutil.disk_usage(Path(os.path.realpath(path)).parent).free
     if free < 1.1 * needed:
         raise StudyError(
-            f"{path}: cannot write it, {needed / 2**20:.0f} MiB are needed and "
-            f"{free / 2**20:.0f} MiB are free"
+            f"{path}: cannot write it, {needed / 2**20:.1f} MiB are needed and "
+            f"{free / 2**20:.1f} MiB are free"
         )
 
 

@@ -19,6 +19,7 @@ from jaxmodel.table import Table
 from studies import sources
 from studies.bench.works import EXECUTORS
 from studies.cli import main
+from studies.engine.columns import PER_CASE
 from studies.engine.margins import judge_loops
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import load
@@ -31,6 +32,7 @@ from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.store import read_store
 from studies.study.cases import build_case, build_structure
+from studies.study.labels import RESERVED
 from studies.study.spec import parse_study
 from studies.study.template import study_template
 
@@ -269,12 +271,20 @@ BEYOND = BETWEEN._replace(default=2.0)
             "'share': default 2; allowed: 0 to 1",
         ),
         ({"metrics": [METRICS["residual_rms"]._replace(name="x", dims=("leg",))]}, "axis 'leg'"),
+        *(
+            ({"metrics": [METRICS["residual_rms"]._replace(name=name)]}, f"metric '{name}': files")
+            for name in ("status", "gain_margin", "control_gain_factor", "link_length_0")
+        ),
     ],
 )
 def test_parts_that_do_not_keep_their_contract_are_refused(part, message):
     with pytest.raises(StudyError, match=re.escape(message)):
         extend(**part)
     assert "x" not in LAWS and "x" not in METRICS
+
+
+def test_names_of_files_are_reserved():
+    assert set(PER_CASE) <= set(RESERVED) and not set(RESERVED) & set(METRICS)
 
 
 WRONG = """
@@ -293,7 +303,11 @@ def asks(structure, case, known):
     if case.control.gain_factor > 0.1:
         raise RuntimeError
 
-laws = [Law(f.__name__, f.__name__, "mode", f) for f in (wide, asks)]
+def turns(structure, case, known):
+    one = jnp.ones((3, structure.n_controlled))
+    return modal_feedback(case, known, 1j * one, one)
+
+laws = [Law(f.__name__, f.__name__, "mode", f) for f in (wide, asks, turns)]
 total = Total("pose_sum", (), lambda totals, at: at.sample.pose_error)
 metrics = [Metric("drift", (), "m", "drift", (total,), lambda totals, ending: totals["pose_sum"])]
 methods = [
@@ -327,6 +341,7 @@ def wrong(tmp_path_factory):
             "simulate",
             "wrong_parts.py, line 14: TracerBool",
         ),
+        ({"control__law": "turns"}, "simulate", "velocity_gain is complex; expected real numbers"),
         ({}, "sweep", "total 'pose_sum': shape (3,) after a sample, () before"),
         ({"sweep": "nowhere"}, "sweep", "sweep.method = 'nowhere': gives float64 of shape (2, 1)"),
         ({"sweep": "none"}, "sweep", "sweep.method = 'none': gives float64 of shape (0, 1)"),

@@ -297,8 +297,12 @@ def test_loops_without_feedback_have_no_limit():
         {"drive__kp": 300.0, "load__wrench": (0.0, 100.0, 0.0), "control__gain_factor": 0.1},
         {"link__damping_ratio": 0.0, "control__links": (True, False, False)},
         {"link__damping_ratio": 1e-6, "control__links": (True, False, False)},
+        {
+            "link__damping_ratio": ((0.01,) * 6, (0.01,) * 6, (0.01,) * 5 + (7e-5,)),
+            "control__gain_factor": 0.59,
+        },
     ],
-    ids=["falls by itself", "no damping", "hardly any"],
+    ids=["falls by itself", "no damping", "hardly any", "one mode of one link hardly any"],
 )
 def test_machines_that_hardly_stand_alone(fields):
     study = STUDY.change(**fields)

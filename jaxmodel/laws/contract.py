@@ -106,6 +106,8 @@ def check_feedback(law: Law, made: Feedback, n_channels: int, n_patches: int) ->
         found = jnp.shape(getattr(made, name))
         if found != shape:
             raise PartError(f"law {law.name!r}: {name} has shape {found}; expected {shape}")
+        if jnp.iscomplexobj(getattr(made, name)):
+            raise PartError(f"law {law.name!r}: {name} is complex; expected real numbers")
 
 
 def on_and_off(case: Case, known: Known) -> Array:

@@ -63,8 +63,11 @@ WALKS = (
 LOWEST_HZ = 5.0
 #: Replaces 0 [rad/s], where the hold would be 0/0.
 STILL = 0.01
-#: Links with less damping [1] have peaks too sharp for a walk; eigenvalues judge their loops.
-LEAST_DAMPED = 3e-5
+#: Links with less damping [1] have peaks too sharp for a walk; eigenvalues judge their loops. So
+#: they do where a mode of one link has this many times the damping of another link's: such modes
+#: stay with their links, and the walk, which takes them for modes of the machine, misses the sharp
+#: one (from 50 times on).
+LEAST_DAMPED, UNEVEN = 5e-4, 20.0
 #: Separates the eigenvalues of idle channels, on the walk and in the second look.
 SPREAD, FINE_SPREAD = 1e-3, 1e-6
 #: Crossings examined again per case, and kept per examined place.
@@ -134,6 +137,7 @@ def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
             return np.concatenate(doubtful)
 
         is_sharp = _least_damping(structure, whole) < LEAST_DAMPED
+        is_sharp |= _unevenness(whole) > UNEVEN
         rows = np.flatnonzero(~is_sharp)
         for way in WALKS:
             if len(rows):
@@ -148,6 +152,13 @@ def _least_damping(structure: Structure, cases: Case) -> np.ndarray:
     damping = cases.machine.damping
     falling = np.minimum(np.asarray(damping.exponent), 0.0)
     return np.min(damping.ratio, axis=(1, 2)) * float(structure.n_modes) ** (2 * falling)
+
+
+def _unevenness(cases: Case) -> np.ndarray:
+    """Largest ratio between the damping of two links in a mode [1], (n,)."""
+    ratio = np.asarray(cases.machine.damping.ratio)
+    with np.errstate(all="ignore"):  # without damping: caught as too little
+        return np.max(np.nan_to_num(ratio.max(axis=1) / ratio.min(axis=1)), axis=1)
 
 
 def _judge_by_eigenvalues(structure: Structure, case: Case, figures: LoopMargins, k: int) -> None:

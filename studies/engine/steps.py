@@ -24,6 +24,7 @@ from studies.engine.program import (
     prepare,
     prepare_shared,
 )
+from studies.errors import StudyError
 from studies.kernels import cpu, llvm
 from studies.kernels.traced import InputLeaf, TracedLoop, trace_loop
 
@@ -75,7 +76,10 @@ def compile_steps(program: Program, split: Split, directions: int = 0) -> Steps:
     if key not in _STEPS:
         while len(_STEPS) >= KEPT_KERNELS:
             del _STEPS[next(iter(_STEPS))]
-        parts, shared, loop = trace_steps(program, split, directions)
+        try:
+            parts, shared, loop = trace_steps(program, split, directions)
+        except NotImplementedError as error:  # of a part of the user's own
+            raise StudyError(f"{error}: kernels do not support it; see docs/own-parts.md") from None
         _STEPS[key] = Steps(parts, shared, cpu.build_kernel(loop), directions)
     return _STEPS[key]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -58,6 +59,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         for note in found.notes:
             console.print(note)
         _print_files(out, report, console)
+        if not found.agrees:
+            sys.exit(1)
 
     @app.command()
     def modes(

@@ -22,14 +22,21 @@ class Replay(NamedTuple):
     metric: str  # which one; "" for none
 
     @property
+    def agrees(self) -> bool:
+        """Whether the status is that of the sweep, if there is one."""
+        return self.stored_status in (None, self.run.status)
+
+    @property
     def notes(self) -> list[str]:
         """The comparison as a sentence; [] if there is nothing to compare with."""
         if self.stored_status is None:
             return []
         which = f" ({self.metric})" if self.metric else ""
+        fault = [] if self.agrees else ["CAUTION: the sweep and this run end differently."]
         return [
+            *fault,
             f"the sweep has: {describe(self.stored_status)}; largest relative difference of a "
-            f"metric: {self.difference:.1e}{which}"
+            f"metric: {self.difference:.1e}{which}",
         ]
 
 

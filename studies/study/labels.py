@@ -15,3 +15,35 @@ STATUS_LABEL = ("1", "how the run ended", status.REASONS)
 def describe(code: int) -> str:
     """A status code in words."""
     return status.REASONS.get(code, f"status {code}")
+
+
+#: Names of variables in files that are no metrics.
+RESERVED = (
+    "actuator_condition",
+    "axes",
+    "bad_time",
+    "breaking_frequency",
+    "breaking_mode",
+    "case",
+    "case_id",
+    "command_end",
+    "controlled_mode",
+    "damping_ratio",
+    "gain_margin",
+    "link",
+    "mode",
+    "patch",
+    "pose_axis",
+    "record",
+    "repeat",
+    "seed",
+    "sensor_condition",
+    "singularity_distance",
+    "slider_axis",
+    "spectrum_point",
+    "station",
+    "status",
+    "status_text",
+    "substeps",
+    "time",
+)

@@ -68,9 +68,18 @@ def select(data: SweepData, subject_to: str) -> np.ndarray:
         StudyError: not a condition, or unknown names in it.
     """
     chosen = data["status"] == status.OK
+    is_known = np.ones_like(chosen)  # a missing number meets no condition, "not x < 2" included
+
+    def lookup(name: str) -> np.ndarray:
+        nonlocal is_known
+        values = metric_values(data, name)
+        if values.dtype.kind == "f":
+            is_known = is_known & ~np.isnan(values)
+        return values
+
     if subject_to:
-        truth = evaluate(subject_to, lambda name: metric_values(data, name), "--subject-to")
-        chosen = chosen & np.broadcast_to(truth, chosen.shape)
+        truth = evaluate(subject_to, lookup, "--subject-to")
+        chosen = chosen & np.broadcast_to(truth, chosen.shape) & is_known
     return chosen
 
 
@@ -91,8 +100,10 @@ def best_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) 
     if value.dtype.kind not in "fiub":
         raise StudyError(f"--by {by}: a text, not a number")
     chosen = np.flatnonzero(select(data, subject_to) & np.isfinite(value))
-    if len(chosen) == 0:
+    if len(chosen) == 0 and subject_to:
         raise StudyError(f"--subject-to {subject_to!r}: no case with status ok meets it")
+    if len(chosen) == 0:
+        raise StudyError(f"--by {by}: no case with status ok has this metric")
     return chosen[np.argsort(-value[chosen] if is_large else value[chosen], kind="stable")][:count]
 
 
@@ -110,6 +121,8 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
         return
     console.print(f"{data.spec.study.title}: {data.n_cases} cases, {', '.join(swept_names(data))}")
     print_rows(status_rows(data), console)
+    if not (codes != NOT_RUN).any():
+        return
     by = ranking(data)
     if np.isfinite(metric_values(data, by)[codes == status.OK]).any():
         best = recommended(data, by)
