@@ -275,7 +275,8 @@ def _judged(
     value, omega = np.where(is_more, at_end, value), np.where(is_more, where, omega)
     breaks = value > least
     margin = np.where(breaks, 1 / (weaker * np.where(breaks, value, 1.0)), HIGHEST)
-    falls = modes.growth * response.period > RADIUS_TOLERANCE  # even without control
+    # even without control: the machine, or a filter of a mode too close to the sample rate
+    falls = (modes.growth * response.period > RADIUS_TOLERANCE) | _filters_grow(response)
     margin = np.where(falls | (margin < LOWEST), 0.0, margin)
     breaks, omega = breaks | falls, np.where(falls, 0.0, np.where(breaks, omega, np.nan))
     apart = np.abs(_folded(modes.omega, top) - np.abs(omega))
@@ -293,6 +294,17 @@ def _judged(
         ratio,
     )
     return figures, is_doubtful & is_finite
+
+
+def _filters_grow(response: LoopResponse) -> np.ndarray:
+    """Whether the filter of a channel that acts is unstable by itself, (lanes,)."""
+    first, (a1, a2) = response.estimator.first[2], response.estimator.denominator
+    edge = 1 + RADIUS_TOLERANCE
+    is_calm = (np.abs(first) < edge) & (np.abs(a2) < edge) & (np.abs(a1) < edge + a2)
+    acts = response.velocity_gain != 0
+    if response.position_gain is not None:
+        acts = acts | (response.position_gain != 0)
+    return np.any(~is_calm & acts, axis=(0, 1))
 
 
 def _with_gains(response: LoopResponse, factor: np.ndarray) -> LoopResponse:
