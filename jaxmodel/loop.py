@@ -196,7 +196,7 @@ def plant_step(
     e, f = coefficients.half, coefficients.half_force
     start, middle, end = references
 
-    rates = partial(plant_rates, structure, loop)
+    rates = jax.jit(partial(plant_rates, structure, loop))  # traced once, called four times
 
     def stage(
         origin: PlantState, x: tuple[Any, ...], slope: tuple[Any, ...], length: Array, push: Array

@@ -113,6 +113,7 @@ def info() -> dict[str, Any]:
         PACKAGE: _version(PACKAGE),
         "python": platform.python_version(),
         **{name: _version(name) for name in ("jax", "jaxlib", "numpy", "h5py")},
+        "processor": processor_text(),
         "devices": ", ".join(f"{kinds.count(kind)} x {kind}" for kind in sorted(set(kinds))),
         "precision": "float64" if _settings().jax_enable_x64 else "float32",
         "cache": folder or "none",
@@ -144,6 +145,18 @@ def processor() -> str:
     device = jax.local_devices()[0]
     is_cuda = "cuda" in getattr(device.client, "platform_version", "").lower()
     return "cuda" if device.platform == "gpu" and is_cuda else str(device.platform)
+
+
+def processor_text() -> str:
+    """Name of this machine's processor and number of cores, as results of a benchmark need them."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        text = ""
+    found = re.search(r"^model name\s*: (.+)$", text, re.MULTILINE)
+    name = found[1].strip() if found else platform.processor() or platform.machine()
+    widest = next((x for x in ("avx512f", "avx2", "asimd") if re.search(rf"\b{x}\b", text)), "")
+    return f"{usable_cores()} x {name}" + (f" ({widest})" if widest else "")
 
 
 def require_configured() -> None:

@@ -32,7 +32,7 @@ def test_hand_written_c_agrees(work):
     compiler = shutil.which("gcc") or shutil.which("clang")
     if not compiler:
         pytest.skip("neither gcc nor clang is installed")
-    check_agreement(peers.by_c(work, compiler)(), work)
+    check_agreement(peers.by_c(work, compiler, 4)(), work)
 
 
 def test_adaptive_steps_agree(work):

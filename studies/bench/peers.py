@@ -11,6 +11,7 @@ import ctypes
 import shutil
 import subprocess
 import tempfile
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -30,6 +31,7 @@ from jaxmodel.simulate import Start, begin
 from studies import config
 from studies.bench import reference
 from studies.bench.works import build_work, make_layout, timed
+from studies.config import processor_text
 from studies.engine.kernel_executor import KernelExecutor
 from studies.engine.plan import Layout
 from studies.engine.scan import ScanExecutor
@@ -45,6 +47,9 @@ REPEATS = 3
 FINER = 8
 #: Tolerances of `solve_ivp` that make it as accurate as the others, relative and absolute [m].
 TOLERANCES = (1e-7, 1e-11)
+
+
+KERNEL, C = "this program, traced kernel", "hand-written C"
 
 
 class Work(NamedTuple):
@@ -114,16 +119,49 @@ def bench_peers(
     finer = work.structure._replace(substeps=FINER)
     exact = ScanExecutor(finer, work.layout, False).start(work.cases).wait().metrics.residual_rms
     rows: list[PeerRow] = []
-    for peer in find_peers(work, report):
+    peers = find_peers(work, report)
+    for peer in peers:
         report(f"{peer.name}: {peer.n_cases} cases")
         found, timing = timed(peer.finish, repeats)
         right = exact[: peer.n_cases]
         error = float(np.max(np.abs(found - right)) / np.max(right))
         speed = peer.n_cases / timing.seconds
         rows.append(PeerRow(peer.name, speed, error, 1.0))
+    found_by = {peer.name: peer.finish for peer in peers}
+    if KERNEL in found_by and any(name.startswith(C) for name in found_by):
+        c = next(run for name, run in found_by.items() if name.startswith(C))
+        wall, processor = speed_ratio(found_by[KERNEL], c, repeats)
+        report(
+            f"kernel over C, alternated {repeats} times on {processor_text()}: {wall:.2f} by time, "
+            f"{processor:.2f} by processor time"
+        )
     rows.sort(key=lambda row: -row.configs_per_s)
     best = rows[0].configs_per_s
     return [row._replace(times_slower=best / row.configs_per_s) for row in rows]
+
+
+def speed_ratio(
+    one: Callable[[], Any], other: Callable[[], Any], rounds: int
+) -> tuple[float, float]:
+    """How much faster one is than the other: medians over rounds of both, back to back.
+
+    Args:
+        one, other: to run.
+        rounds: of each.
+
+    Returns:
+        (by time, by processor time).
+    """
+    found = []
+    for _ in range(rounds):
+        times = []
+        for run in (other, one):
+            wall, processor = time.perf_counter(), time.process_time()
+            run()
+            times.append((time.perf_counter() - wall, time.process_time() - processor))
+        found.append([a / b for a, b in zip(*times, strict=True)])
+    wall_ratio, processor_ratio = np.median(found, axis=0)
+    return float(wall_ratio), float(processor_ratio)
 
 
 def find_peers(work: Work, report: Callable[[str], None]) -> list[Peer]:
@@ -140,7 +178,7 @@ def find_peers(work: Work, report: Callable[[str], None]) -> list[Peer]:
         Peer("autodiff Lagrangian, RK4 in a scan, vmap", 8, by_lagrangian(work, 8)),
     ]
     if is_available():
-        peers.append(Peer("this program, traced kernel", size, own(KernelExecutor)))
+        peers.append(Peer(KERNEL, size, own(KernelExecutor)))
     else:
         report("no traced kernel: install flexlink-studies[fast]")
     try:
@@ -149,7 +187,8 @@ def find_peers(work: Work, report: Callable[[str], None]) -> list[Peer]:
         report("no diffrax: install flexlink-studies[peers]")
     compiler = shutil.which("gcc") or shutil.which("clang")
     if compiler:
-        peers.append(Peer("hand-written C, RK4, vectors of 8", size, by_c(work, compiler)))
+        width, run = best_c(work, compiler)
+        peers.append(Peer(f"{C}, RK4, vectors of {width}", size, run))
     else:
         report("no hand-written C: needs gcc or clang")
     return peers
@@ -283,8 +322,20 @@ def by_lagrangian(work: Work, n: int) -> Callable[[], Any]:
 # --- C --------------------------------------------------------------------------------------------
 
 
-def by_c(work: Work, compiler: str) -> Callable[[], Any]:
-    """`w0.c`, one thread per device."""
+#: Cases in a vector of the C program: what registers of 16, 32 and 64 bytes hold.
+WIDTHS = (2, 4, 8)
+
+
+def best_c(work: Work, compiler: str) -> tuple[int, Callable[[], Any]]:
+    """The C program with the vectors that suit this processor best, and their width."""
+    runs = {width: by_c(work, compiler, width) for width in WIDTHS}
+    seconds = {width: timed(run, 1)[1].seconds for width, run in runs.items()}
+    width = min(seconds, key=lambda width: seconds[width])
+    return width, runs[width]
+
+
+def by_c(work: Work, compiler: str, width: int) -> Callable[[], Any]:
+    """`w0.c` with vectors of so many cases, a thread for every device."""
     structure = work.structure
     each = jax.jit(jax.vmap(partial(_ideal, structure)))(work.first(work.layout.size))
     start = jax.jit(begin, static_argnums=0)(structure, jax.tree.map(lambda x: x[0], work.first(1)))
@@ -318,15 +369,15 @@ def by_c(work: Work, compiler: str) -> Callable[[], Any]:
     weight = np.asarray(start.inputs.window.is_residual)
     pose = np.asarray(start.state.plant.pose)
     home = np.array([*pose, pose[2], np.sin(pose[2]), np.cos(pose[2])])
-    gains = [_aligned(g.reshape(8, -1).T) for g in np.asarray(each).reshape(-1, 8, 27)]
-    function = _compiled(compiler)
+    gains = [_aligned(g.T) for g in np.asarray(each).reshape(-1, width, 27)]
+    function = _compiled(compiler, width)
     pool = ThreadPoolExecutor(len(jax.local_devices()))
 
     def group(gain: np.ndarray) -> np.ndarray:
-        square = _aligned(np.zeros((9, 8)))
+        square = _aligned(np.zeros((9, width)))
         arrays = (wanted, weight, home, gain, square)
         function(machine.ctypes.data, n, ctypes.c_double(PERIOD), *(x.ctypes.data for x in arrays))
-        return square.T.reshape(8, 3, 3)
+        return square.T.reshape(width, 3, 3)
 
     def run() -> Any:
         return np.sqrt(np.concatenate(list(pool.map(group, gains))) / weight.sum())
@@ -350,7 +401,7 @@ def _aligned(array: np.ndarray) -> np.ndarray:
     return copy
 
 
-def _compiled(compiler: str) -> Any:
+def _compiled(compiler: str, width: int) -> Any:
     """The function `run` of `w0.c`."""
     source = Path(__file__).with_name("w0.c")
     with tempfile.TemporaryDirectory() as folder:
@@ -360,7 +411,9 @@ def _compiled(compiler: str) -> Any:
                 compiler,
                 "-O3",
                 "-march=native",
+                f"-DWIDTH={width}",
                 "-ffp-contract=fast",
+                "-fno-math-errno",
                 "-Wno-psabi",
                 "-shared",
                 "-fPIC",

@@ -169,7 +169,7 @@ def _run_block(
     ]
     last = kernel(leaves)
     state = jax.tree.unflatten(jax.tree.structure(start.state), last)
-    few = cpu.VECTOR_BYTES // last[0].dtype.itemsize
+    few = cpu.LANE_BYTES // last[0].dtype.itemsize
     return CaseBlock(
         conclude_all(start.outline, start.state.status, state),
         [x[..., :few] for x in leaves],

@@ -16,7 +16,7 @@ from jaxmodel.prepare import STIFFNESS_LIMIT, drive_rate
 from studies.config import processor
 from studies.engine.runs import SUBSTEP_LIMIT, mechanics_at, step_counts
 from studies.errors import StudyError
-from studies.kernels.cpu import VECTOR_BYTES
+from studies.kernels.cpu import LANE_BYTES
 from studies.kernels.gpu import BLOCK
 from studies.space.table import CaseTable, loose_study
 from studies.study.cases import build_cases, build_structure, in_working_precision
@@ -285,7 +285,7 @@ def lane_unit() -> int:
     """Lanes come in multiples of this: one vector of the processor, one block of threads."""
     if processor() != "cpu":
         return BLOCK
-    return int(VECTOR_BYTES // jax.dtypes.canonicalize_dtype(np.float64).itemsize)
+    return int(LANE_BYTES // jax.dtypes.canonicalize_dtype(np.float64).itemsize)
 
 
 def memory_budget() -> int:

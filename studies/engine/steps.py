@@ -72,19 +72,23 @@ def compile_steps(program: Program, split: Split, directions: int = 0) -> Steps:
     """
     numbers = tuple((leaf.shape, leaf.tobytes()) for leaf in split.shared)
     shapes = tuple(leaf.shape for leaf in split.varying)
-    key = (program, shapes, numbers, _real(), directions)
+    key = (program, shapes, numbers, _real(), directions, cpu.this_processor())
     if key not in _STEPS:
         while len(_STEPS) >= KEPT_KERNELS:
             del _STEPS[next(iter(_STEPS))]
+        # where instructions take numbers from memory only, small code is fast
+        has_routines = not cpu.this_processor().has_masks
         try:
-            parts, shared, loop = trace_steps(program, split, directions)
+            parts, shared, loop = trace_steps(program, split, directions, has_routines)
         except NotImplementedError as error:  # of a part of the user's own
             raise StudyError(f"{error}: kernels do not support it; see docs/own-parts.md") from None
         _STEPS[key] = Steps(parts, shared, cpu.build_kernel(loop), directions)
     return _STEPS[key]
 
 
-def trace_steps(program: Program, split: Split, directions: int = 0) -> Traced:
+def trace_steps(
+    program: Program, split: Split, directions: int = 0, has_routines: bool = False
+) -> Traced:
     """Trace the steps of a group.
 
     Args:
@@ -95,7 +99,7 @@ def trace_steps(program: Program, split: Split, directions: int = 0) -> Traced:
     found = prepare_shared(program, parts, one, split.shared)
     shared = [np.asarray(leaf, order="C") for leaf in found]
     TRACES.append(program.structure)
-    return Traced(parts, shared, _trace(program.structure, parts, shared, directions))
+    return Traced(parts, shared, _trace(program.structure, parts, shared, directions, has_routines))
 
 
 def _real() -> Any:
@@ -103,7 +107,11 @@ def _real() -> Any:
 
 
 def _trace(
-    structure: Structure, parts: StartParts, shared: list[np.ndarray], directions: int
+    structure: Structure,
+    parts: StartParts,
+    shared: list[np.ndarray],
+    directions: int,
+    has_routines: bool,
 ) -> TracedLoop:
     """The loop of a structure, with shared numbers embedded."""
     kinds = zip(parts.shapes, parts.is_varying, parts.is_moving, strict=True)
@@ -129,6 +137,7 @@ def _trace(
         [leaf._replace(is_varying=True) for leaf in state],
         _real(),
         directions,
+        has_routines,
     )
 
 

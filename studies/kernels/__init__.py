@@ -1,7 +1,8 @@
 """The step as our own compiled loop, where XLA's would be slow (docs/performance.md).
 
 - `traced`: one sample of the step, as operations on scalars and the arrays they come from; it
-  builds on `graph` (from JAX's equations), `fusion` (fewer, better ordered) and `tangents`.
-- `cpu`: that loop for this processor's vectors, written by `llvm`; needs the extra `fast`.
+  builds on `graph` (from JAX's equations), `fusion` (fewer, better ordered) and `tangents`;
+  `routines` keeps functions that are called more than once.
+- `cpu`: that loop for this processor, written by `llvm` and `vectors`; needs the extra `fast`.
 - `gpu`: the same loop for GPUs, as PTX.
 """

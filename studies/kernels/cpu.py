@@ -13,19 +13,19 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from studies import sources
 from studies.kernels.compilation import ObjectCache, compiling
-from studies.kernels.graph import is_known
-from studies.kernels.llvm import Arguments, Writer, binding, ir
-from studies.kernels.traced import Change, TracedLoop
+from studies.kernels.llvm import binding
+from studies.kernels.traced import TracedLoop
+from studies.kernels.vectors import ALIGNMENT, CalledWriter, MaskedWriter, VectorWriter
 
-#: Bytes per vector: one register of the widest common instruction set.
-VECTOR_BYTES = 64
+#: Lanes come in multiples of this many bytes, which the vectors of every processor divide.
+LANE_BYTES = ALIGNMENT
 #: Optimisation level of XLA's code generator in XLA_FLAGS; the kernels use the same.
 _LEVEL = re.compile(r"--xla_backend_optimization_level=([0-3])")
 
@@ -64,21 +64,39 @@ class Kernel:
             self._function(addresses, n_steps, lanes, first)
 
 
-def build_kernel(loop: TracedLoop) -> Kernel:
+def build_kernel(loop: TracedLoop, processor: Processor | None = None) -> Kernel:
     """Compile a loop.
 
     Args:
         loop: from `trace_loop`.
+        processor: what for; default: this one.
     """
-    return _build(loop)[0]
+    return _build(loop, processor or this_processor())[0]
 
 
-def _build(loop: TracedLoop) -> tuple[Kernel, bytes]:
+def _build(loop: TracedLoop, processor: Processor) -> tuple[Kernel, bytes]:
     """The kernel, and its machine code."""
-    writer = _VectorWriter(loop)
-    engine, code = _compile(str(writer.write()))
-    numbers = np.array(writer.numbers, loop.dtype)
+    writer = write_loop(loop, processor)
+    engine, code = _compile(str(writer.module), processor)
+    numbers = _aligned(writer.numbers, loop.dtype)
     return Kernel(engine, writer.width, numbers, loop.operations()), code
+
+
+def write_loop(loop: TracedLoop, processor: Processor) -> VectorWriter:
+    """The loop as LLVM's instructions, in the way that suits a processor."""
+    kind = MaskedWriter if processor.has_masks else CalledWriter
+    writer = kind(loop, processor.vector_bytes // loop.dtype.itemsize, processor.triple)
+    writer.write()
+    return writer
+
+
+def _aligned(numbers: Sequence[float], dtype: Any) -> np.ndarray:
+    """A copy at an address that any vector may have."""
+    size = np.dtype(dtype).itemsize
+    room = np.empty(len(numbers) + ALIGNMENT // size, dtype)
+    first = -room.ctypes.data % ALIGNMENT // size
+    room[first : first + len(numbers)] = numbers
+    return room[first : first + len(numbers)]
 
 
 def kept_kernel(name: str, make: Callable[[], TracedLoop]) -> Kernel:
@@ -90,99 +108,28 @@ def kept_kernel(name: str, make: Callable[[], TracedLoop]) -> Kernel:
         name: of the loop, with all sizes.
         make: traces it.
     """
-    kept = ObjectCache("loop", name, _code(), jax.__version__, *_target())
+    processor = this_processor()
+    kept = ObjectCache("loop", name, _code(), jax.__version__, *_names(processor))
     found = kept.take(None)
     if found is None:
-        kernel, code = _build(make())
+        kernel, code = _build(make(), processor)
         facts = [kernel.width, kernel.numbers.tolist(), kernel.operations]
         kept.keep(None, json.dumps(facts).encode() + b"\n" + code)
         return kernel
     head, code = found.split(b"\n", 1)
     width, numbers, operations = json.loads(head)
     initialise()
-    engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine())
+    engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine(processor))
     engine.add_object_file(binding.ObjectFileRef.from_data(code))
     engine.finalize_object()
-    dtype = np.dtype(f"f{VECTOR_BYTES // width}")
-    return Kernel(engine, width, np.array(numbers, dtype), Counter(operations))
+    dtype = np.dtype(f"f{processor.vector_bytes // width}")
+    return Kernel(engine, width, _aligned(numbers, dtype), Counter(operations))
 
 
 @cache
 def _code() -> str:
     """Hash of the code that a traced loop comes from."""
     return sources.digest(__name__, "jaxmodel")
-
-
-class _VectorWriter(Writer):
-    """Writes `run(leaves, n_steps, lanes, first)`; the first leaf holds the known numbers."""
-
-    def __init__(self, loop: TracedLoop) -> None:
-        super().__init__(loop, VECTOR_BYTES // loop.dtype.itemsize)
-        self.numbers: list[float] = [0.0]  # known ones, in the order of their use
-
-    def open(self) -> Arguments:
-        pointer = ir.PointerType()
-        signature = ir.FunctionType(ir.VoidType(), [pointer, self.index, self.index, self.index])
-        function = ir.Function(self.module, signature, "run")
-        function.attributes.add("nounwind")
-        leaves, n_steps, lanes, first = function.args
-        self.builder = ir.IRBuilder(function.append_basic_block("entry"))
-        self._rounding = self._flush_to_zero()
-        self._table = self._base(leaves, 0)
-        bases, k = {}, 1
-        for kind, part in self.loop.leaves.items():
-            bases[kind] = [self._base(leaves, k + n) for n in range(len(part))]
-            k += len(part)
-        return Arguments({**bases, "result": bases["state"]}, n_steps, lanes, first)
-
-    def close(self) -> None:
-        if self._rounding is not None:
-            self._control("ldmxcsr", self._rounding)
-        super().close()
-
-    def _base(self, leaves: Any, k: int) -> Any:
-        place = self.builder.gep(
-            leaves, [ir.Constant(self.index, k)], source_etype=ir.PointerType()
-        )
-        return self.builder.load(place, typ=ir.PointerType())
-
-    def _flush_to_zero(self) -> Any:
-        """Flush subnormal numbers to 0; returns where the processor's old mode is kept.
-
-        Arithmetic with them is a hundred times slower, and sums in single precision produce them.
-        """
-        if not binding.get_default_triple().startswith("x86_64"):
-            return None
-        word = ir.IntType(32)
-        old, new = self.builder.alloca(word), self.builder.alloca(word)
-        self._control("stmxcsr", old)
-        mode = self.builder.or_(self.builder.load(old, typ=word), ir.Constant(word, 0x8040))
-        self.builder.store(mode, new)
-        self._control("ldmxcsr", new)
-        return old
-
-    def _control(self, name: str, place: Any) -> None:
-        self._call(f"llvm.x86.sse.{name}", ir.VoidType(), place)
-
-    def _store(self, change: Change, slot: Any) -> None:
-        if is_known(change.mask):
-            super()._store(change, slot)
-            return
-        name = f"llvm.masked.store.v{self.width}f{8 * self.bytes}.p0"
-        alignment = ir.Constant(ir.IntType(32), VECTOR_BYTES)
-        value, mask = self._widened(change.value), self._widened(change.mask)
-        self._call(name, ir.VoidType(), value, slot, alignment, mask)
-
-    def _number(self, x: float) -> Any:
-        """A known number, reloaded at each use.
-
-        LLVM would keep each one as a full vector on the stack, more than the cache holds. A scalar
-        in memory costs nothing extra: it is broadcast over the vector as it is read.
-        """
-        place = ir.Constant(self.index, len(self.numbers))
-        self.numbers.append(x)
-        place = self.builder.gep(self._table, [place], source_etype=self.scalar)
-        return self.builder.load(place, align=self.bytes, typ=self.scalar)
 
 
 @cache
@@ -198,30 +145,55 @@ def _effort() -> int:
     return int(found[1]) if found else 3
 
 
-def _target() -> tuple[str, ...]:
+class Processor(NamedTuple):
+    """What machine code is for."""
+
+    name: str
+    features: str  # as LLVM writes them: "+avx2,-avx512f,..."
+    triple: str
+
+    @property
+    def vector_bytes(self) -> int:
+        """Size of a register: 64 with AVX-512, 32 with AVX2, 16 otherwise."""
+        return 64 if self.has_masks else 32 if self._has("avx2") else 16
+
+    @property
+    def has_masks(self) -> bool:
+        """Whether stores may leave lanes out and instructions spread numbers as they read them."""
+        return self._has("avx512f")
+
+    def without(self, *prefixes: str) -> Processor:
+        """The same processor with fewer features, as older ones are."""
+        features = self.features.split(",")
+        kept = [f"-{x[1:]}" if x[1:].startswith(prefixes) else x for x in features]
+        return self._replace(features=",".join(kept))
+
+    def _has(self, feature: str) -> bool:
+        return f"+{feature}" in self.features.split(",")
+
+
+@cache
+def this_processor() -> Processor:
+    """The one that this program runs on."""
+    features = binding.get_host_cpu_features().flatten()
+    return Processor(binding.get_host_cpu_name(), features, binding.get_default_triple())
+
+
+def _names(processor: Processor) -> tuple[str, ...]:
     """What machine code depends on besides its source."""
-    features, version = binding.get_host_cpu_features().flatten(), binding.llvm_version_info
-    triple = binding.get_default_triple()
-    return (
-        binding.get_host_cpu_name(),
-        features,
-        triple,
-        ".".join(map(str, version)),
-        str(_effort()),
+    return (*processor, ".".join(map(str, binding.llvm_version_info)), str(_effort()))
+
+
+def _machine(processor: Processor) -> Any:
+    return binding.Target.from_triple(processor.triple).create_target_machine(
+        cpu=processor.name, features=processor.features, opt=_effort(), jit=True
     )
 
 
-def _machine() -> Any:
-    cpu, features, *_ = _target()
-    return binding.Target.from_default_triple().create_target_machine(
-        cpu=cpu, features=features, opt=_effort(), jit=True
-    )
-
-
-def _compile(text: str) -> tuple[Any, bytes]:
+def _compile(text: str, processor: Processor) -> tuple[Any, bytes]:
     """The engine with the machine code of a module, and that code."""
     initialise()
-    kept, code = ObjectCache(text, *_target()), []
+    kept, code = ObjectCache(text, *_names(processor)), []
 
     def keep(module: Any, made: bytes) -> None:
         code.append(made)
@@ -234,7 +206,7 @@ def _compile(text: str) -> tuple[Any, bytes]:
         return found
 
     with compiling():
-        engine = binding.create_mcjit_compiler(binding.parse_assembly(text), _machine())
+        engine = binding.create_mcjit_compiler(binding.parse_assembly(text), _machine(processor))
         engine.set_object_cache(keep, take)
         engine.finalize_object()
     return engine, code[-1]

@@ -61,13 +61,14 @@ def fused(results: Sequence[Any]) -> list[Any]:
                     plain.append((sign, new(x)))
             made[id(node)] = _chain(products, plain)
         elif not (node.operation == "mul" and is_inner(node)):
-            made[id(node)] = _like(node.operation, *map(new, node.args), is_truth=node.is_truth)
+            args = tuple(map(new, node.args))
+            made[id(node)] = Node(node.operation, args, node.is_varying, node.is_truth, node.place)
     return [new(x) for x in results]
 
 
-def _like(operation: str, *args: Any, is_truth: bool = False) -> Node:
+def _like(operation: str, *args: Any) -> Node:
     is_varying = any(not is_known(x) and x.is_varying for x in args)
-    return Node(operation, args, is_varying, is_truth)
+    return Node(operation, args, is_varying, False)
 
 
 def _chain(products: list[tuple[int, Any, Any]], plain: list[tuple[int, Any]]) -> Node:

@@ -83,12 +83,16 @@ class Graph:
             if equation.primitive.name == "scan":
                 results = self._unrolled(equation.params, arguments)
             elif inner is not None:
-                body, own = (inner.jaxpr, inner.consts) if hasattr(inner, "consts") else (inner, ())
-                results = self._evaluate(body, own, arguments)
+                results = self._inlined(inner, arguments)
             else:
                 results = [self._apply(equation, arguments)]
             known |= dict(zip(equation.outvars, results, strict=True))
         return [value(atom) for atom in jaxpr.outvars]
+
+    def _inlined(self, inner: Any, given: list[np.ndarray]) -> list[Any]:
+        """A function that is called."""
+        body, own = (inner.jaxpr, inner.consts) if hasattr(inner, "consts") else (inner, ())
+        return self._evaluate(body, own, given)
 
     def _unrolled(self, params: Any, given: list[np.ndarray]) -> list[np.ndarray]:
         """A scan, unrolled."""

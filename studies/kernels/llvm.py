@@ -200,10 +200,10 @@ class Writer:
         return self._intrinsic({"abs": "fabs", "round": "rint"}.get(name, name), *args)
 
     def _fma(self, node: Node, *args: Any) -> Any:
-        return self._intrinsic("fma", *args)
+        return self._intrinsic("fmuladd", *args)
 
     def _fnma(self, node: Node, a: Any, b: Any, c: Any) -> Any:
-        return self._intrinsic("fma", self.builder.fneg(a), b, c)
+        return self._intrinsic("fmuladd", self.builder.fneg(a), b, c)
 
     def _reciprocal(self, node: Node, a: Any) -> Any:
         one = self._widened(1.0) if node.is_varying else self._narrow(1.0)

@@ -14,7 +14,7 @@ from studies.kernels.fusion import in_order
 from studies.kernels.graph import Graph, is_known
 
 #: Operations whose results do not change under small changes.
-_FLAT = ("read", "round", "lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not")
+_FLAT = ("read", "call", "round", "lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not")
 
 
 def push_forward(graph: Graph, results: Sequence[Any], seeds: dict[int, Any]) -> list[Any]:
@@ -26,24 +26,24 @@ def push_forward(graph: Graph, results: Sequence[Any], seeds: dict[int, Any]) ->
         graph: makes the new nodes.
         results: nodes and numbers.
         seeds: tangent of a read, node or number, by the identity of its node; 0 for the others.
+            Takes in what is found.
 
     Returns:
         One node or number for every result.
     """
-    found = dict(seeds)
 
     def tangent(x: Any) -> Any:
-        return 0.0 if is_known(x) else found[id(x)]
+        return 0.0 if is_known(x) else seeds[id(x)]
 
     for node in in_order(results):
-        if id(node) in found:
+        if id(node) in seeds:
             continue
         changes = [tangent(x) for x in node.args]
         is_still = all(is_known(x) and x == 0 for x in changes)
         if node.operation in _FLAT or is_still:
-            found[id(node)] = 0.0
+            seeds[id(node)] = 0.0
         else:
-            found[id(node)] = _RULES[node.operation](graph.operation, node, *changes)
+            seeds[id(node)] = _RULES[node.operation](graph.operation, node, *changes)
     return [tangent(x) for x in results]
 
 

@@ -7,13 +7,14 @@ constants stay, inputs change with the sample.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from studies.kernels.fusion import count_operations, fused, in_order
 from studies.kernels.graph import Graph, Node, is_known, objects
+from studies.kernels.routines import Routine, RoutineGraph
 from studies.kernels.tangents import push_forward
 
 
@@ -38,6 +39,15 @@ class Change(NamedTuple):
     value: Any
 
 
+class Body(NamedTuple):
+    """A routine that is still to be written as code."""
+
+    results: dict[int, Any]  # those that are wanted, by their numbers
+    order: list[Node]  # what they need; a read's place: ("parameter" or "fixed", number)
+    fixed: list[Any]  # nodes of the loop that it reads, the same at every sample
+    n_parameters: int
+
+
 class TracedLoop(NamedTuple):
     """A loop over samples, ready to be written as code."""
 
@@ -47,6 +57,7 @@ class TracedLoop(NamedTuple):
     changes: list[Change]  # the numbers of the state that change
     order: list[Node]  # what they need, each after its arguments; a read's place: (kind, number)
     dtype: np.dtype  # of all arrays
+    bodies: dict[int, Body]  # of the calls among the nodes, by the identity of their place
 
     def fixed(self) -> dict[int, bool]:
         """Which nodes stay the same from sample to sample, by identity."""
@@ -54,13 +65,19 @@ class TracedLoop(NamedTuple):
         for node in self.order:
             if node.operation == "read":
                 found[id(node)] = node.place[0] == "constant"
+            elif node.operation == "call":
+                found[id(node)] = False
             else:
                 found[id(node)] = all(found[id(x)] for x in node.args if not is_known(x))
         return found
 
     def operations(self) -> Counter[str]:
         """Operations of one sample by kind."""
-        return count_operations(self.order)
+        total = count_operations(self.order)
+        for node in self.order:
+            if node.operation == "call":
+                total += count_operations(self.bodies[id(node.place)].results.values())
+        return total
 
 
 def trace_loop(
@@ -70,6 +87,7 @@ def trace_loop(
     state: Sequence[InputLeaf],
     dtype: Any,
     directions: int = 0,
+    has_routines: bool = False,
 ) -> TracedLoop:
     """Trace a loop over `step(constants, inputs, state) -> state`, all lists of arrays.
 
@@ -84,11 +102,14 @@ def trace_loop(
         state: arrays carried from sample to sample; always varying.
         dtype: float64 or float32, of all arrays.
         directions: tangents of each number.
+        has_routines: keep functions that are called more than once.
 
     Raises:
         NotImplementedError: an operation of the step that a graph does not support.
     """
-    real, graph = np.dtype(dtype), Graph()
+    real = np.dtype(dtype)
+    seeds: list[dict[int, Any]] = [{} for _ in range(directions)]
+    graph = RoutineGraph(seeds) if has_routines else Graph()
     read = [leaf for leaf in constants if isinstance(leaf, InputLeaf)]
     state = [leaf._replace(is_moving=directions > 0) for leaf in state]
     stored = {
@@ -110,14 +131,18 @@ def trace_loop(
         [array(kind, leaf) for leaf in leaves]
         for kind, leaves in enumerate((constants, inputs, state))
     ]
+    for kind, leaves in enumerate((constants, inputs, state)):
+        for leaf, given in zip(leaves, arguments[kind], strict=True):
+            if getattr(leaf, "is_moving", False):
+                for seed in seeds:
+                    seed.update((id(x), next(rest[kind])) for x in given.flat)
     results = [x for part in graph.trace(step, arguments, real) for x in part.flat]
-    moving = [
-        [array for leaf, array in zip(leaves, part, strict=True) if getattr(leaf, "is_moving", 0)]
-        for leaves, part in zip((constants, inputs, state), arguments, strict=True)
-    ]
-    changes = _changes(fused([*results, *_tangents(graph, results, moving, rest, directions)]))
-    order = in_order(x for change in changes for x in (change.mask, change.value))
-    return TracedLoop(stored, changes, order, real)
+    results += _tangents(graph, results, [leaf.size for leaf in state], seeds)
+    results, bodies = closed(graph, results)
+    changes = _changes(results)
+    fixed = [x for body in bodies.values() for x in body.fixed]
+    order = in_order([*(x for change in changes for x in (change.mask, change.value)), *fixed])
+    return TracedLoop(stored, changes, order, real, bodies)
 
 
 def _tangent(leaf: InputLeaf, directions: int) -> InputLeaf:
@@ -126,32 +151,21 @@ def _tangent(leaf: InputLeaf, directions: int) -> InputLeaf:
 
 
 def _tangents(
-    graph: Graph,
-    results: list[Any],
-    moving: list[list[Any]],
-    rest: list[Iterator[Any]],
-    directions: int,
+    graph: Graph, results: list[Any], sizes: list[int], seeds: list[dict[int, Any]]
 ) -> list[Any]:
     """Tangents of the results in the order of the state's tangent leaves.
 
     Args:
         graph: of the results.
         results: the new state, leaf by leaf and number by number.
-        moving: arrays of nodes of the moving leaves, for constants, inputs and state.
-        rest: the nodes that their tangents are read from, in the same order.
-        directions: how many.
+        sizes: numbers of each leaf.
+        seeds: tangents of what moves, for each direction.
     """
-    seeds: list[dict[int, Any]] = [{} for _ in range(directions)]
-    for arrays, nodes in zip(moving, rest, strict=True):
-        for array in arrays:
-            for seed in seeds:
-                seed.update((id(x), next(nodes)) for x in array.flat)
     pushed = [push_forward(graph, results, seed) for seed in seeds]
     found, first = [], 0
-    for array in moving[-1]:
-        span = slice(first, first + array.size)
-        found += [x for along in pushed for x in along[span]]
-        first += array.size
+    for size in sizes:
+        found += [x for along in pushed for x in along[first : first + size]]
+        first += size
     return found
 
 
@@ -173,3 +187,77 @@ def _changes(results: Sequence[Any]) -> list[Change]:
 
 def _is_state(x: Any, k: int) -> bool:
     return not is_known(x) and x.place == ("state", k)
+
+
+def closed(graph: Graph, results: list[Any]) -> tuple[list[Any], dict[int, Body]]:
+    """Results with fused sums, and the bodies of the routines that they call.
+
+    What nobody wants of a routine is left out, and so are parameters that the rest does not read.
+    """
+    if not isinstance(graph, RoutineGraph):
+        return fused(results), {}
+    calls: dict[int, list[Node]] = {}
+    wanted: dict[int, set[int]] = {}
+    routines: dict[int, Routine] = {}
+
+    def look() -> int:
+        calls.clear()
+        wanted.clear()
+        for node in in_order(results):
+            if node.operation == "result":
+                wanted.setdefault(id(node.args[0].place), set()).add(node.place)
+            elif node.operation == "call":
+                routines[id(node.place)] = node.place
+                calls.setdefault(id(node.place), []).append(node)
+        return sum(map(len, wanted.values()))
+
+    count, before = look(), -1
+    while count != before:
+        for name, numbers in wanted.items():
+            needed = {
+                node.place[1]
+                for node in in_order([routines[name].results[k] for k in numbers])
+                if node.operation == "read" and node.place[0] == "parameter"
+            }
+            for call in calls[name]:
+                # a number that is not read is a known one; so places stay
+                call.args = tuple(x if k in needed else 0.0 for k, x in enumerate(call.args))
+        before, count = count, look()
+    bodies, fixed = {}, []
+    for name, numbers in wanted.items():
+        body, own = _cut(graph, [routines[name].results[k] for k in sorted(numbers)])
+        body = fused(body)
+        found = dict(zip(sorted(numbers), body, strict=True))
+        n_parameters = len(routines[name].parameters)
+        bodies[name] = Body(found, in_order(body), own, n_parameters)
+        fixed += own
+    whole = fused([*results, *fixed])
+    rest = iter(whole[len(results) :])
+    bodies = {name: b._replace(fixed=[next(rest) for _ in b.fixed]) for name, b in bodies.items()}
+    return whole[: len(results)], bodies
+
+
+def _cut(graph: RoutineGraph, results: list[Any]) -> tuple[list[Any], list[Node]]:
+    """Results with reads in place of what is the same at every sample, and the latter."""
+    made: dict[int, Node] = {}
+    fixed: list[Node] = []
+
+    def is_outer(x: Node) -> bool:
+        return graph.is_fixed(x) and not x.is_truth
+
+    def new(x: Any) -> Any:
+        if is_known(x):
+            return x
+        if is_outer(x) and id(x) not in made:
+            made[id(x)] = Node("read", (), True, False, ("fixed", len(fixed)))
+            fixed.append(x)
+        return made[id(x)]
+
+    for node in in_order(results):
+        if node.operation == "read" and not is_outer(node):
+            made[id(node)] = node
+        elif not is_outer(node):
+            args = tuple(map(new, node.args))
+            is_varying = any(not is_known(x) and x.is_varying for x in args)
+            made[id(node)] = Node(node.operation, args, is_varying, node.is_truth, node.place)
+    return [new(x) for x in results], fixed

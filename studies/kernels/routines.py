@@ -1,0 +1,199 @@
+"""Functions that a step calls more than once, kept as routines instead of written at each call.
+
+Code that is written once stays in the processor's instruction cache: the plant is evaluated four
+times in a sample.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from studies.kernels.fusion import in_order
+from studies.kernels.graph import Graph, Node, is_known, objects
+from studies.kernels.tangents import push_forward
+
+#: Functions of fewer equations are written at every call.
+SHORTEST = 40
+
+
+class Routine:
+    """One function under `jax.jit`, as operations on its parameters.
+
+    Numbers that differ between the calls are its parameters, reads of ("parameter", k). What all
+    calls share and no sample changes is used as it is. With directions, the tangents of those
+    parameters that move follow the parameters, and tangents of the results the results.
+    """
+
+    def __init__(self) -> None:
+        self.positions: list[int] = []  # of the parameters among the numbers of a call
+        self.moving: list[int] = []  # parameters that have tangents
+        self.parameters: list[Node] = []
+        self.results: list[Any] = []
+        self.size = 0  # how many results without tangents
+
+
+class RoutineGraph(Graph):
+    """A graph with operations "call" (its place: a `Routine`) and "result" (its place: which)."""
+
+    def __init__(self, seeds: Sequence[dict[int, Any]] = ()) -> None:
+        """
+        Args:
+            seeds: for each direction the tangents of what moves, as `push_forward` takes them.
+        """
+        super().__init__()
+        self._seeds = seeds
+        self._asked: dict[int, list[list[Any]]] | None = None  # numbers of all calls, by function
+        self._routines: dict[int, Routine] = {}
+        self._is_fixed: dict[int, bool] = {}
+        self._moves: dict[int, bool] = {}
+        self._alive: list[Any] = []  # what is known by its identity
+
+    def trace(
+        self, function: Callable[..., Any], arguments: Sequence[Any], dtype: Any
+    ) -> list[np.ndarray]:
+        shapes = [[jax.ShapeDtypeStruct(x.shape, dtype) for x in part] for part in arguments]
+        closed = jax.make_jaxpr(function)(*shapes)
+        given = [x for part in arguments for x in part]
+        found = _repeated(closed.jaxpr)
+        self._alive += found.values()
+        # what the calls are given, their results still unknown
+        self._asked = {name: [] for name in found}
+        self._evaluate(closed.jaxpr, closed.consts, given)
+        asked, self._asked = self._asked, None
+        for name, calls in asked.items():
+            self._routines[name] = self._routine(found[name], calls)
+        return self._evaluate(closed.jaxpr, closed.consts, given)
+
+    def _inlined(self, inner: Any, given: list[np.ndarray]) -> list[Any]:
+        numbers = [x for array in given for x in array.flat]
+        if self._asked is not None and id(inner) in self._asked:
+            self._asked[id(inner)].append(numbers)
+            call = self._new("call", (), None)
+            count = sum(int(np.prod(x.aval.shape)) for x in inner.jaxpr.outvars)
+            results = [self._new("result", (call,), k) for k in range(count)]
+        elif id(inner) in self._routines:
+            results = self._called(self._routines[id(inner)], numbers)
+        else:
+            return super()._inlined(inner, given)
+        return _arrays(results, inner.jaxpr.outvars)
+
+    def _new(self, operation: str, args: tuple[Any, ...], place: Any) -> Node:
+        node = Node(operation, args, True, False, place)
+        self._alive.append(node)
+        return node
+
+    def _routine(self, inner: Any, calls: list[list[Any]]) -> Routine:
+        """The routine of a function.
+
+        Args:
+            inner: its equations.
+            calls: what each call is given.
+        """
+        routine, given = Routine(), []
+        self._classify([x for numbers in calls for x in numbers])
+        for position, column in enumerate(zip(*calls, strict=True)):
+            if self.is_fixed(column[0]) and all(_is_same(x, column[0]) for x in column):
+                given.append(column[0])
+                continue
+            if self._seeds and any(not is_known(x) and self._moves[id(x)] for x in column):
+                routine.moving.append(len(routine.parameters))
+            routine.positions.append(position)
+            routine.parameters.append(self._parameter(routine))
+            given.append(routine.parameters[-1])
+        found = super()._inlined(inner, _arrays(given, inner.jaxpr.invars))
+        routine.results = [x for array in found for x in array.flat]
+        routine.size = len(routine.results)
+        own, primal = list(routine.parameters), list(routine.results)
+        for seed in self._seeds:
+            for k, node in enumerate(own):
+                seed[id(node)] = 0.0
+                if k in routine.moving:
+                    seed[id(node)] = self._parameter(routine)
+                    routine.parameters.append(seed[id(node)])
+            routine.results += push_forward(self, primal, seed)
+        self._classify(routine.results)
+        return routine
+
+    def _parameter(self, routine: Routine) -> Node:
+        return self._new("read", (), ("parameter", len(routine.parameters)))
+
+    def _called(self, routine: Routine, numbers: list[Any]) -> list[Any]:
+        """Results of a call without their tangents, which the seeds take in."""
+        values = [numbers[k] for k in routine.positions]
+        moving = [values[k] for k in routine.moving]
+        for seed in self._seeds:
+            values += push_forward(self, moving, seed)
+        call = self._new("call", tuple(values), routine)
+        given = {id(x): value for x, value in zip(routine.parameters, values, strict=True)}
+
+        def result(k: int, x: Any) -> Any:
+            if self.is_fixed(x):
+                return x
+            return given[id(x)] if id(x) in given else self._new("result", (call,), k)
+
+        found = [result(k, x) for k, x in enumerate(routine.results)]
+        primal = found[: routine.size]
+        for n, seed in enumerate(self._seeds, 1):
+            along = found[n * routine.size : (n + 1) * routine.size]
+            for x, tangent in zip(primal, along, strict=True):
+                if not is_known(x) and x.operation == "result":
+                    seed[id(x)] = tangent
+        return primal
+
+    def _classify(self, numbers: Sequence[Any]) -> None:
+        """Find out which numbers are the same at every sample, and which may have tangents."""
+        for node in in_order(numbers):
+            if id(node) in self._is_fixed:
+                continue
+            name, args = node.operation, [id(x) for x in node.args if not is_known(x)]
+            if name == "read":
+                self._is_fixed[id(node)] = node.place[0] == "constant"
+                self._moves[id(node)] = any(id(node) in seed for seed in self._seeds[:1])
+            else:
+                is_call = name in ("call", "result")
+                self._is_fixed[id(node)] = not is_call and all(self._is_fixed[x] for x in args)
+                self._moves[id(node)] = is_call or any(self._moves[x] for x in args)
+
+    def is_fixed(self, x: Any) -> bool:
+        """Whether a number that has been classified is the same at every sample."""
+        return is_known(x) or self._is_fixed[id(x)]
+
+
+def _repeated(jaxpr: Any) -> dict[int, Any]:
+    """Functions of some length that are called more than once, by identity."""
+    count: Counter[int] = Counter()
+    found = {}
+
+    def look(jaxpr: Any, times: int) -> None:
+        for equation in jaxpr.eqns:
+            inner = equation.params.get("jaxpr")
+            if equation.primitive.name == "scan":
+                look(inner.jaxpr, times * equation.params["length"])
+            elif hasattr(inner, "consts") and len(inner.jaxpr.eqns) >= SHORTEST:
+                count[id(inner)] += times
+                found[id(inner)] = inner
+
+    look(jaxpr, 1)
+    return {name: inner for name, inner in found.items() if count[name] > 1 and _is_real(inner)}
+
+
+def _is_real(inner: Any) -> bool:
+    return all(np.issubdtype(x.aval.dtype, np.floating) for x in inner.jaxpr.outvars)
+
+
+def _arrays(numbers: Sequence[Any], variables: Sequence[Any]) -> list[np.ndarray]:
+    """Numbers in the shapes of some variables."""
+    rest: Iterator[Any] = iter(numbers)
+    shapes = [x.aval.shape for x in variables]
+    return [objects([next(rest) for _ in range(int(np.prod(shape)))], shape) for shape in shapes]
+
+
+def _is_same(x: Any, y: Any) -> bool:
+    if is_known(x) and is_known(y):
+        return type(x) is type(y) and x == y
+    return x is y
