@@ -142,7 +142,7 @@ def trace_loop(
     changes = _changes(results)
     fixed = [x for body in bodies.values() for x in body.fixed]
     order = in_order([*(x for change in changes for x in (change.mask, change.value)), *fixed])
-    return TracedLoop(stored, changes, order, real, bodies)
+    return TracedLoop(leaves=stored, changes=changes, order=order, dtype=real, bodies=bodies)
 
 
 def _tangent(leaf: InputLeaf, directions: int) -> InputLeaf:
