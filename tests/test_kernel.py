@@ -257,9 +257,21 @@ def four_times(constants, row, state):
     (x,) = state
     one, low = rate(x, row[0])
     two, _ = rate(x + 0.1 * one, row[0])
-    three, _ = rate(x + 0.1 * two, 2 * row[0])
+    three, _ = rate(x + 0.1 * two, jnp.zeros(()))  # a known 0, which other calls do not have
     four, _ = rate(x + 0.2 * three, row[0])
     return [x + 0.01 * (one + 2 * two + 2 * three + four) + 1e-3 * low]
+
+
+def leave_nothing_but_nan_on_the_stack(lanes):
+    """So that what a kernel reads before it is written shows."""
+    loop = trace_loop(
+        lambda constants, row, state: [state[0] * row[0]],
+        [],
+        [InputLeaf((), False)],
+        [InputLeaf((400,), True)],
+        np.float64,
+    )
+    cpu.build_kernel(loop).run([np.ones(1), np.full((400, lanes), np.nan)], 1, lanes)
 
 
 @pytest.mark.parametrize("directions", [0, 2])
@@ -289,6 +301,7 @@ def test_routines_are_what_they_replace(processor, directions):
             kernel = cpu.Kernel(engine, 8, numbers, loop.operations())
         else:
             kernel = cpu.build_kernel(loop)
+        leave_nothing_but_nan_on_the_stack(lanes)
         kernel.run([given[1], row, *own], 5, lanes)
         found.append(own)
     for one, other in zip(*found, strict=True):

@@ -220,8 +220,8 @@ def closed(graph: Graph, results: list[Any]) -> tuple[list[Any], dict[int, Body]
                 if node.operation == "read" and node.place[0] == "parameter"
             }
             for call in calls[name]:
-                # a number that is not read is a known one; so places stay
-                call.args = tuple(x if k in needed else 0.0 for k, x in enumerate(call.args))
+                # None where nothing is read, so that places stay
+                call.args = tuple(x if k in needed else None for k, x in enumerate(call.args))
         before, count = count, look()
     bodies, fixed = {}, []
     for name, numbers in wanted.items():

@@ -306,7 +306,7 @@ class CalledWriter(VectorWriter):
         if node.operation == "call":
             frame = self._slot(work, self._frame_at[id(node)])
             for k, x in enumerate(node.args):
-                if not is_known(x) or x != 0:
+                if x is not None:
                     self._keep(self._widened(x), self._slot(frame, k))
             self.builder.call(self._routines[id(node.place)], [frame, work, self._table])
         elif node.operation == "result":
