@@ -27,7 +27,7 @@ from studies import sources
 from studies.errors import StudyError
 from studies.space.methods import METHODS, Method
 from studies.study.labels import RESERVED
-from studies.study.spec import Study, paper_study
+from studies.study.spec import Study
 
 #: Where child processes find what was loaded, as paths or module names.
 VARIABLE = "FLEXLINK_WITH"
@@ -105,11 +105,10 @@ def _told() -> list[str]:
 
 def _check_metric_name(name: str) -> None:
     """Raise PartError for a name that a variable of a sweep's file may have."""
-    paper = paper_study()
     fields = [
         f"{section}_{field}"
-        for section in Study.model_fields
-        for field in getattr(type(getattr(paper, section)), "model_fields", {})
+        for section, info in Study.model_fields.items()
+        for field in getattr(info.annotation, "model_fields", {})
     ]
     if name in (*RESERVED, *fields) or name.startswith(tuple(f"{field}_" for field in fields)):
         raise PartError(f"metric {name!r}: files use this name for something else; choose another")

@@ -14,7 +14,7 @@ import pytest
 
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law, Parameter, modal_feedback, on_and_off
-from jaxmodel.metrics import METRICS, Metric
+from jaxmodel.metrics import METRICS, Metric, is_real
 from jaxmodel.table import Table
 from studies import sources
 from studies.bench.works import EXECUTORS
@@ -281,6 +281,11 @@ def test_parts_that_do_not_keep_their_contract_are_refused(part, message):
     with pytest.raises(StudyError, match=re.escape(message)):
         extend(**part)
     assert "x" not in LAWS and "x" not in METRICS
+
+
+@pytest.mark.parametrize("value", [None, "a", 1j, np.array(["a"]), np.ones(2) * 1j])
+def test_metrics_are_real_numbers(value):
+    assert not is_real(value) and is_real(1) and is_real(0.5) and is_real(np.ones(2))
 
 
 def test_names_of_files_are_reserved():

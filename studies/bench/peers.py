@@ -31,7 +31,6 @@ from jaxmodel.simulate import Start, begin
 from studies import config
 from studies.bench import reference
 from studies.bench.works import build_work, make_layout, timed
-from studies.config import processor_text
 from studies.engine.kernel_executor import KernelExecutor
 from studies.engine.plan import Layout
 from studies.engine.scan import ScanExecutor
@@ -127,13 +126,12 @@ def bench_peers(
         error = float(np.max(np.abs(found - right)) / np.max(right))
         speed = peer.n_cases / timing.seconds
         rows.append(PeerRow(peer.name, speed, error, 1.0))
-    found_by = {peer.name: peer.finish for peer in peers}
-    if KERNEL in found_by and any(name.startswith(C) for name in found_by):
-        c = next(run for name, run in found_by.items() if name.startswith(C))
-        wall, processor = speed_ratio(found_by[KERNEL], c, repeats)
+    kernel, c = (next((p for p in peers if p.name.startswith(x)), None) for x in (KERNEL, C))
+    if kernel and c:
+        wall, processor = speed_ratio(kernel.finish, c.finish, repeats)
         report(
-            f"kernel over C, alternated {repeats} times on {processor_text()}: {wall:.2f} by time, "
-            f"{processor:.2f} by processor time"
+            f"kernel over C, alternated {repeats} times on {config.processor_text()}: {wall:.2f} "
+            f"by time, {processor:.2f} by processor time"
         )
     rows.sort(key=lambda row: -row.configs_per_s)
     best = rows[0].configs_per_s

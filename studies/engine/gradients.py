@@ -103,6 +103,17 @@ def _split(cases: Case, parameters: np.ndarray, layout: Layout, structure: Struc
     return split._replace(varying=[*split.varying, np.asarray(parameters, real)])
 
 
+def _program(made: KernelGradients | ScanGradients, split: Split) -> Program:
+    """What gradients are taken of."""
+    return Program(
+        structure=made.structure,
+        layout=made.layout,
+        tree=split.tree,
+        is_varying=split.is_varying,
+        place=made.place,
+    )
+
+
 class KernelGradients:
     """Blocks of lanes on a pool of threads, each stepped once for every few directions."""
 
@@ -118,13 +129,7 @@ class KernelGradients:
         self, cases: Case, parameters: np.ndarray, is_used: np.ndarray | None = None
     ) -> ChunkSlopes:
         split = _split(cases, parameters, self.layout, self.structure)
-        program = Program(
-            structure=self.structure,
-            layout=self.layout,
-            tree=split.tree,
-            is_varying=split.is_varying,
-            place=self.place,
-        )
+        program = _program(self, split)
         blocks = lane_blocks(split, self.layout)
         if self._steps is None:
             started = time.perf_counter()
@@ -261,13 +266,7 @@ class ScanGradients:
         split = _split(cases, parameters, self.layout, self.structure)
         *own, parameters = split.varying
         if self._compiled is None:
-            program = Program(
-                structure=self.structure,
-                layout=self.layout,
-                tree=split.tree,
-                is_varying=split.is_varying,
-                place=self.place,
-            )
+            program = _program(self, split)
             started = time.perf_counter()
             self._compiled = _forward.lower(program, own, parameters, split.shared).compile()
             self.compile_time = time.perf_counter() - started

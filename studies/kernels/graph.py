@@ -62,7 +62,12 @@ class Graph:
         """
         shapes = [[jax.ShapeDtypeStruct(x.shape, dtype) for x in part] for part in arguments]
         closed = jax.make_jaxpr(function)(*shapes)
-        return self._evaluate(closed.jaxpr, closed.consts, [x for part in arguments for x in part])
+        given = [x for part in arguments for x in part]
+        self._survey(closed, given)
+        return self._evaluate(closed.jaxpr, closed.consts, given)
+
+    def _survey(self, closed: Any, given: list[np.ndarray]) -> None:
+        """What is to be known of a function before its equations are carried out; here nothing."""
 
     # --- equations --------------------------------------------------------------------------------
 

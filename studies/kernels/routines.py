@@ -7,10 +7,9 @@ times in a sample.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
 from studies.kernels.fusion import in_order
@@ -53,12 +52,8 @@ class RoutineGraph(Graph):
         self._moves: dict[int, bool] = {}
         self._alive: list[Any] = []  # what is known by its identity
 
-    def trace(
-        self, function: Callable[..., Any], arguments: Sequence[Any], dtype: Any
-    ) -> list[np.ndarray]:
-        shapes = [[jax.ShapeDtypeStruct(x.shape, dtype) for x in part] for part in arguments]
-        closed = jax.make_jaxpr(function)(*shapes)
-        given = [x for part in arguments for x in part]
+    def _survey(self, closed: Any, given: list[np.ndarray]) -> None:
+        """Find the routines."""
         found = _repeated(closed.jaxpr)
         self._alive += found.values()
         # what the calls are given, their results still unknown
@@ -67,7 +62,6 @@ class RoutineGraph(Graph):
         asked, self._asked = self._asked, None
         for name, calls in asked.items():
             self._routines[name] = self._routine(found[name], calls)
-        return self._evaluate(closed.jaxpr, closed.consts, given)
 
     def _inlined(self, inner: Any, given: list[np.ndarray]) -> list[Any]:
         numbers = [x for array in given for x in array.flat]
