@@ -35,6 +35,7 @@ class Structure(NamedTuple):
     has_friction: bool = False  # Coulomb friction on the sliders
     has_position_gain: bool = True  # feedback of modal positions, not of velocities alone
     metrics: tuple[str, ...] = ()  # to accumulate; (): all of them
+    is_linear: bool = False  # mechanics to first order about rest at the last way-point
     is_smooth: bool = False  # for gradients: noise instead of rounding, limits with round corners
 
 

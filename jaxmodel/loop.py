@@ -21,7 +21,7 @@ from jaxmodel.controller import (
     soft_limit,
 )
 from jaxmodel.drive import Reference, motor_force, slider_force
-from jaxmodel.dynamics import Accelerations, accelerations, modal_chain
+from jaxmodel.dynamics import Accelerations, accelerations, modal_chain, shortening_row
 from jaxmodel.electronics import Amplifier
 from jaxmodel.integrator import Exponential
 from jaxmodel.kinematics import Chain, chain_status, close_chain
@@ -55,6 +55,14 @@ class Loop(NamedTuple):
     drive: Drive
     axial_compliance: Array  # L/(E A) of the links [m/N], (3,)
     settling_band: Array  # [m], ()
+    rest: Rest | None = None  # about which the linear model is taken; None: the full model
+
+
+class Rest(NamedTuple):
+    """The machine at rest."""
+
+    pose: Array  # [m, m, rad], (3,)
+    reference: Reference  # what holds it there
 
 
 class PlantState(NamedTuple):
@@ -162,6 +170,34 @@ def plant_rates(
     return Rates(chain, rates)
 
 
+def linear_rates(
+    structure: Structure, loop: Loop, state: PlantState, reference: Reference, voltage: Array
+) -> Rates:
+    """`plant_rates` to first order about `loop.rest`, and axial forces that stiffen the links.
+
+    That product of force and bending is kept because fast moves make it the largest one: without it
+    the controlled residual vibration of 10 mm in 0.03 s is 18 % off, with it 1 to 2 %. There are no
+    limits, and nothing else is quadratic.
+    """
+    rest = loop.rest
+    assert rest is not None
+    zero = jax.tree.map(jnp.zeros_like, (state, voltage))
+    still = zero[0]._replace(pose=jnp.broadcast_to(rest.pose, state.pose.shape))
+    held = jax.tree.map(lambda x, at: jnp.broadcast_to(at, x.shape), reference, rest.reference)
+    away = jax.tree.map(jnp.subtract, (state, reference), (still, held))
+    value, change = jax.jvp(
+        partial(plant_rates, structure, loop), (still, held, zero[1]), (*away, voltage)
+    )
+    rates: Rates = jax.tree.map(jnp.add, value, change)
+    if loop.plant.shortening is None:
+        return rates
+    force = change.acceleration.axial / loop.plant.modal_mass
+    stiffer = shortening_row(loop.plant, state.q) * force[:, None]
+    found = rates.acceleration
+    found = found._replace(coupling=found.coupling - stiffer, modal=found.modal - stiffer)
+    return rates._replace(acceleration=found)
+
+
 def ideal_voltage(structure: Structure, loop: Loop, q: Array, q_rate: Array) -> Array:
     """Actuator voltages [V] of continuous feedback (20) from noise-free sensors, (3, K)."""
     assert loop.ideal is not None
@@ -196,7 +232,8 @@ def plant_step(
     e, f = coefficients.half, coefficients.half_force
     start, middle, end = references
 
-    rates = jax.jit(partial(plant_rates, structure, loop))  # traced once, called four times
+    model = plant_rates if loop.rest is None else linear_rates
+    rates = jax.jit(partial(model, structure, loop))  # traced once, called four times
 
     def stage(
         origin: PlantState, x: tuple[Any, ...], slope: tuple[Any, ...], length: Array, push: Array
@@ -441,7 +478,9 @@ def _freeze_if_bad(
     total = total + jnp.sum(jnp.sum(plant.q + plant.q_rate, axis=1), axis=0)
     total = total + jnp.sum(jnp.sum(new.controller.voltage, axis=1), axis=0)
     is_finite = jnp.abs(total) < jnp.inf  # false for NaN too
-    code = chain_status(loop.plant, chain)
+    # a linear machine's reach has no end
+    is_linear = loop.rest is not None
+    code = jnp.zeros_like(old.status) if is_linear else chain_status(loop.plant, chain)
     code = jnp.where((code == status.OK) & is_wild, float(status.DIVERGED), code)
     code = jnp.where(is_finite, code, float(status.NON_FINITE)).astype(old.status.dtype)
     is_first = (old.status == status.OK) & (code != status.OK)

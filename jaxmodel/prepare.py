@@ -11,16 +11,19 @@ from jaxmodel.bases import Bases, find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.control import active_modes, condition_number, left_inverse
 from jaxmodel.controller import Controller
+from jaxmodel.drive import Reference
+from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.electronics import design_amplifier
 from jaxmodel.estimator import KINDS
 from jaxmodel.integrator import exponential_step
+from jaxmodel.kinematics import close_chain
 from jaxmodel.laws import LAWS, is_modal, n_channels
 from jaxmodel.laws.contract import Known, check_feedback
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.loop import Loop
+from jaxmodel.loop import Loop, Rest
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import actuator_constant, placement_faults, sensor_constant
-from jaxmodel.plant import build_plant
+from jaxmodel.plant import Plant, build_plant
 
 #: Frequencies of the spectra lie within this fraction of the modal frequency [1].
 SPECTRUM_SPAN = 0.1
@@ -103,6 +106,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         ),
         axial_compliance=axial_compliance(machine.beam),
         settling_band=jnp.asarray(case.windows.settling_band),
+        rest=_rest(structure, case, plant) if structure.is_linear else None,
     )
     return Prepared(
         loop=loop,
@@ -113,6 +117,24 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         actuator_condition=design.actuator_condition,
         status=_static_status(structure, case, bases, design, omega * step, zeta),
     )
+
+
+def _rest(structure: Structure, case: Case, plant: Plant) -> Rest:
+    """The machine at the last way-point, where it rings, held against the steady load."""
+    pose = jnp.asarray(case.path.waypoints[-1])
+    still = jnp.zeros_like(pose)
+    wrench = jnp.asarray(case.load.wrench) if structure.has_wrench else None
+    force = None
+    if structure.has_feedforward or structure.has_wrench:
+        force = inverse_dynamics(plant, pose, still, still, wrench)
+    held = Reference(
+        rho=close_chain(plant, pose, still).rho,
+        rho_rate=still,
+        feedforward=force,
+        disturbance=still,
+        wrench=wrench,
+    )
+    return Rest(pose, held)
 
 
 def _ideal(controller: Controller, sensor: Array) -> tuple[Array, Array | None]:

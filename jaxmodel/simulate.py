@@ -64,12 +64,16 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
     period, plant = case.electronics.period, prepared.loop.plant
     grid = n * per_sample + 1
     wanted = shape_path(case.path, prepared.taps, grid, per_sample, period / per_sample)
-    rho, rho_rate = inverse_kinematics(plant, wanted.position, wanted.velocity)
+    rest = prepared.loop.rest
     wrench = case.load.wrench if structure.has_wrench else None
+    sliders: Callable[..., Any] = partial(inverse_kinematics, plant)
+    torque: Callable[..., Any] = partial(inverse_dynamics, plant, wrench=wrench)
+    if rest is not None:
+        sliders, torque = _about(sliders, rest.pose), _about(torque, rest.pose)
+    rho, rho_rate = sliders(wanted.position, wanted.velocity)
     forward = None
     if structure.has_feedforward:
-        each = jax.vmap(inverse_dynamics, (None, 0, 0, 0, None))
-        forward = _points(each(plant, *wanted, wrench), n)
+        forward = _points(jax.vmap(torque)(*wanted), n)
     elif structure.has_wrench:  # the settled output of the drive's integrators
         still = jnp.zeros_like(wanted.position[0])
         held = inverse_dynamics(plant, wanted.position[0], still, still, wrench)
@@ -110,6 +114,18 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
         bad_time=bad_time,
         singularity_distance=distance,
     )
+
+
+def _about(function: Callable[..., Any], pose: Array) -> Callable[..., Any]:
+    """A function of pose and rates to first order about rest at a pose."""
+
+    def linear(*given: Array) -> Any:
+        rest = [jnp.zeros_like(x) for x in given]
+        rest[0] = jnp.broadcast_to(pose, given[0].shape)
+        value, change = jax.jvp(function, rest, [x - at for x, at in zip(given, rest, strict=True)])
+        return jax.tree.map(jnp.add, value, change)
+
+    return linear
 
 
 def steady_load(structure: Structure, case: Case, plant: Plant) -> Array:

@@ -20,6 +20,7 @@ from studies import sources
 from studies.bench.works import EXECUTORS
 from studies.cli import main
 from studies.engine.columns import PER_CASE
+from studies.engine.folder import DECISIVE
 from studies.engine.margins import judge_loops
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import load
@@ -378,13 +379,14 @@ def test_every_source_of_a_number_is_in_the_digest(tmp_path):
         shutil.copytree(
             sources.TOP / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__")
         )
-    sweeps = ("studies.engine.chunks", "studies.space.table")
+    sweeps = DECISIVE
     workers = ("studies.cluster.worker", "studies.tuning.workers")
     before = {roots: sources.digest(*roots, top=tmp_path) for roots in (sweeps, workers)}
     for name, roots in (
         ("jaxmodel/laws/ppf.py", sweeps),
         ("jaxmodel/laws/__init__.py", sweeps),
         ("studies/engine/runs.py", sweeps),
+        ("studies/engine/screen.py", sweeps),
         ("studies/study/consistency.py", sweeps),
         ("studies/kernels/tangents.py", sweeps),
         ("studies/engine/gradients.py", workers),

@@ -109,7 +109,7 @@ def by_difference(n_modes):
         "electronics__antialias_hz": 1_000.0,
         "electronics__difference_cutoff_hz": 1e5,
     }
-    return loop_report(*arrays(link__modes=n_modes, **changes), HOME_POSE)
+    return loop_report(*arrays(link__modes=n_modes, **changes), HOME_POSE, n_modes=n_modes)
 
 
 def test_difference_destabilises_the_paper_gains_with_eight_modes():

@@ -124,6 +124,7 @@ class ClusterRunner:
             spec=self._spec,
             structure=group.structure,
             has_own_ratio=flight.has_own_ratio,
+            is_judged=group.is_judged,
             size=group.layout.size,
             rows=flight.chunk.rows,
         )

@@ -12,7 +12,7 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.simulate import Result
 from studies.engine.executor import make_executor, own_ratios
-from studies.engine.margins import LoopMargins, judge_loops
+from studies.engine.margins import LoopMargins, judge_loops, no_margins
 from studies.engine.plan import Chunk, Group, Layout, chunk_cases, local_layout
 from studies.engine.program import Executor
 from studies.engine.progress import Reporter
@@ -88,7 +88,7 @@ class Here:
             for chunk in group.chunks():
                 is_first = executor.compile_time == 0
                 cases = chunk_cases(table, chunk.rows, group.structure, group.layout.size)
-                started = start_chunk(executor, table, chunk.rows, cases, has_own)
+                started = start_chunk(executor, table, chunk.rows, cases, has_own, group.is_judged)
                 if is_first:
                     reporter.compiled(executor.name, executor.compile_time)
                 # the device computes this chunk while the previous one is written
@@ -116,7 +116,12 @@ def has_own_ratio(table: CaseTable, group: Group) -> bool:
 
 
 def start_chunk(
-    executor: Executor, table: CaseTable, rows: np.ndarray, cases: Case, has_own_ratio: bool
+    executor: Executor,
+    table: CaseTable,
+    rows: np.ndarray,
+    cases: Case,
+    has_own_ratio: bool,
+    is_judged: bool = True,
 ) -> Started:
     """Judge the loops of a chunk and start its runs.
 
@@ -128,6 +133,7 @@ def start_chunk(
         rows: those of the chunk.
         cases: from `chunk_cases`.
         has_own_ratio: whether such a pass is needed.
+        is_judged: whether the loops are judged; otherwise their margins are NaN.
     """
     is_first = executor.compile_time == 0
     if has_own_ratio:
@@ -138,7 +144,8 @@ def start_chunk(
         own = powered(own_ratios(executor, cases), exponent)
         cases = with_ratio(cases, np.where(is_own[:, None, None], own, cases.control.ratio))
     before = compiler_time()
-    margins = judge_loops(executor.structure, cases)
+    judge = judge_loops if is_judged else no_margins
+    margins = judge(executor.structure, cases)
     spent = compiler_time() - before
     running = executor.start(cases)
     if is_first:

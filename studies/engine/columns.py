@@ -16,8 +16,8 @@ from studies.study.labels import DISTANCE_TEXT, STATUS_LABEL
 from studies.study.margin import HIGHEST, MARGIN_MODES
 from studies.study.paths import field_unit, field_value, parse_entry
 
-#: Status of a case that has not run.
-NOT_RUN = -1
+#: Status of a case that has not run, and of one that its screen left out.
+NOT_RUN, LEFT_OUT = -1, -2
 
 
 #: Names of the axes of fields that are lists, outermost first.
@@ -40,7 +40,11 @@ _LIST_AXES = {
 
 #: Variables of every case, finished or not: axes after `case`, unit, long name and any flags.
 PER_CASE: dict[str, tuple[Any, ...]] = {
-    "status": ((), *STATUS_LABEL[:2], {NOT_RUN: "not run", **STATUS_LABEL[2]}),
+    "status": (
+        (),
+        *STATUS_LABEL[:2],
+        {LEFT_OUT: "left out by the screen", NOT_RUN: "not run", **STATUS_LABEL[2]},
+    ),
     "bad_time": ((), "s", "when the status appeared, 0 if ok"),
     "command_end": ((), "s", "end of the shaped command"),
     "substeps": ((), "1", "plant steps per sample"),
@@ -65,6 +69,13 @@ PER_CASE: dict[str, tuple[Any, ...]] = {
         "least damping ratio of the modes of each order, among the most damped "
         "ones, one per controlled link",
     ),
+}
+
+
+#: Variables of every case of a screened sweep: what the linear model found.
+SCREENED: dict[str, tuple[Any, ...]] = {
+    "screen_status": ((), STATUS_LABEL[0], "how the linear run ended", PER_CASE["status"][-1]),
+    "screen_value": ((), "1", "what the screen ranks by, from the linear model, in its SI unit"),
 }
 
 
@@ -127,7 +138,7 @@ def axis_variables(table: CaseTable, sizes: Mapping[str, int]) -> dict[str, Vari
 
 def label_of(name: str) -> tuple[Any, ...]:
     """Axes after `case`, unit, long name and any flags of what a chunk holds."""
-    if name in PER_CASE:
-        return PER_CASE[name]
+    if name in PER_CASE or name in SCREENED:
+        return (PER_CASE | SCREENED)[name]
     metric = METRICS[name]
     return metric.dims, metric.unit, metric.text

@@ -9,7 +9,6 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
-from studies.engine.columns import NOT_RUN
 from studies.engine.folder import MANIFEST, TUNING, read_manifest
 from studies.engine.results import SweepData, load
 from studies.engine.runs import Run, metric_variables
@@ -52,7 +51,8 @@ def load_design(path: str | Path, case: int | str | None = None) -> Design:
         return Design(load_study(_tuned(path, case)), {})
     data = load(path)
     number = _number(data, None if case is None else str(case), path)
-    table = build_table(parse_sweep(read_manifest(path)["spec"]))
+    spec = parse_sweep(read_manifest(path)["spec"])
+    table = build_table(spec)
     code = int(data["status"][number])
     try:
         study = case_study(table, number)
@@ -64,7 +64,7 @@ def load_design(path: str | Path, case: int | str | None = None) -> Design:
     if steps > 0:
         study = study.change(run__substeps=steps)
     case_id = str(data["case_id"][number])
-    if code == NOT_RUN:
+    if code < 0 or spec.sweep.fidelity == "linear":  # nothing that the full model would repeat
         return Design(study, {}, case_id)
     names = ["status", *(name for name in METRICS if name in data.variables)]
     return Design(study, {name: data[name][number] for name in names}, case_id)

@@ -27,6 +27,8 @@ from studies.errors import StudyError
 from studies.store import Variable, replacing, write_store
 
 RESULTS, MANIFEST, CHUNKS, LOCK = "results.h5", "sweep.json", "chunks", ".lock"
+#: Where the chunks of the linear model are, if there is a screen.
+SCREEN = "screen"
 #: Key in the manifest that lists chunks that were given up.
 GIVEN_UP = "given_up"
 #: The corresponding file in a tuning's folder.
@@ -58,25 +60,26 @@ class SweepFolder:
     def results(self) -> Path:
         return self.path / RESULTS
 
-    @property
-    def chunks(self) -> Path:
-        return self.path / CHUNKS
-
-    def write_chunk(self, variables: Mapping[str, Variable]) -> None:
+    def write_chunk(self, variables: Mapping[str, Variable], place: str = CHUNKS) -> None:
         """Save a finished chunk: write to a temporary file, flush, rename.
+
+        Args:
+            variables: contents.
+            place: `CHUNKS` or `SCREEN`.
 
         Raises:
             StudyError: the disk is full or not writable; nothing half-written remains.
         """
-        temporary = self.chunks / "unfinished.tmp"
+        folder = self.path / place
+        temporary = folder / "unfinished.tmp"
         try:
-            self.chunks.mkdir(exist_ok=True)
+            folder.mkdir(exist_ok=True)
             write_store(temporary, variables, {})
-            number = 1 + max((n for n, _ in _chunk_files(self.chunks)), default=-1)
-            os.replace(temporary, self.chunks / f"{number:06d}-{file_hash(temporary)}.h5")
-            _sync(self.chunks)
+            number = 1 + max((n for n, _ in _chunk_files(folder)), default=-1)
+            os.replace(temporary, folder / f"{number:06d}-{file_hash(temporary)}.h5")
+            _sync(folder)
         except OSError as error:
-            raise StudyError(f"{self.chunks}: cannot write a chunk ({error})") from error
+            raise StudyError(f"{folder}: cannot write a chunk ({error})") from error
         finally:
             temporary.unlink(missing_ok=True)
 
@@ -107,7 +110,8 @@ class SweepFolder:
             self._write_manifest(manifest)
             os.replace(joined, self.results)
             _sync(self.path)
-            self._remove_chunks()
+            for place in (CHUNKS, SCREEN):
+                _remove_chunks(self.path / place)
         except OSError as error:
             raise StudyError(f"{self.results}: cannot write it ({error})") from error
 
@@ -117,11 +121,12 @@ class SweepFolder:
             with replacing(path) as temporary:
                 temporary.write_text(text, encoding="utf-8")
 
-    def _remove_chunks(self) -> None:
-        for _, path in _chunk_files(self.chunks):
-            path.unlink()
-        if self.chunks.is_dir() and not any(self.chunks.iterdir()):
-            self.chunks.rmdir()
+
+def _remove_chunks(folder: Path) -> None:
+    for _, path in _chunk_files(folder):
+        path.unlink()
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
 
 
 @contextmanager
@@ -139,7 +144,8 @@ def open_folder(path: Path, manifest: dict[str, Any], is_resumed: bool) -> Itera
     with locked_folder(path, "sweep"):
         folder = SweepFolder(path)
         _check_content(folder, manifest, is_resumed)
-        for left in (*path.iterdir(), *path.glob(f"{CHUNKS}/*.tmp")):
+        unfinished = (x for place in (CHUNKS, SCREEN) for x in path.glob(f"{place}/*.tmp"))
+        for left in (*path.iterdir(), *unfinished):
             if left.is_file() and (left.parent != path or _LEFTOVER.fullmatch(left.name)):
                 left.unlink()
         yield folder
@@ -172,7 +178,7 @@ def locked_folder(path: Path, what: str) -> Iterator[None]:
 
 
 #: Modules that determine the numbers of a sweep, with everything they import.
-DECISIVE = ("studies.engine.chunks", "studies.space.table")
+DECISIVE = ("studies.engine.screen", "studies.space.table")
 
 
 def make_manifest(data: dict[str, Any], modules: Iterable[str] = DECISIVE) -> dict[str, Any]:
@@ -237,11 +243,18 @@ def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bo
             "extend it, or name a new folder"
         )
     old = read_manifest(folder.path)
-    kept, wanted = (m["spec"]["sweep"].get("metrics", []) for m in (old, manifest))
-    if kept != wanted:
+    for name, default in (("metrics", []), ("fidelity", "full")):
+        kept, wanted = (m["spec"]["sweep"].get(name, default) for m in (old, manifest))
+        if kept != wanted:
+            raise StudyError(
+                f"--resume: {folder.path} has sweep.{name} = {kept!r}, now {wanted!r}; a resumed "
+                "sweep keeps the same"
+            )
+    rank_before, rank = (m["spec"]["sweep"].get("screen", {}).get("by") for m in (old, manifest))
+    if rank_before != rank and rank_before is not None:
         raise StudyError(
-            f"--resume: {folder.path} keeps sweep.metrics = {kept}, now {wanted}; a resumed sweep "
-            "keeps the same"
+            f"--resume: {folder.path} has sweep.screen.by = {rank_before!r}, now {rank!r}; a "
+            "resumed sweep keeps the same"
         )
     for key, what in (
         ("code", "code"),
@@ -255,16 +268,18 @@ def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bo
             )
 
 
-def finished_cases(path: Path, tell: Any = None) -> Finished:
+def finished_cases(path: Path, tell: Any = None, place: str = CHUNKS) -> Finished:
     """Finished cases, each once; damaged chunks are set aside and reported.
 
     Args:
         path: the sweep's folder.
         tell: called with a message for every damaged file; None: leave it in place.
+        place: `CHUNKS`, or `SCREEN` for those that the linear model has finished.
     """
+    code = "status" if place == CHUNKS else "screen_status"
     check_results(path)
     files = [path / RESULTS] if (path / RESULTS).is_file() else []
-    for _, chunk in _chunk_files(path / CHUNKS):
+    for _, chunk in _chunk_files(path / place):
         if file_hash(chunk) == _CHUNK.fullmatch(chunk.name)[2]:  # type: ignore[index]
             files.append(chunk)
         elif tell is not None:
@@ -275,7 +290,9 @@ def finished_cases(path: Path, tell: Any = None) -> Finished:
     for file in files:
         try:
             with h5py.File(file, "r") as store:
-                status, names = store["status"][()], store["case_id"][()]
+                if code not in store and file.name == RESULTS:
+                    continue  # of a sweep without screen
+                status, names = store[code][()], store["case_id"][()]
         except (OSError, RuntimeError, KeyError) as error:
             if file.name == RESULTS:
                 raise StudyError(

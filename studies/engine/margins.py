@@ -111,17 +111,16 @@ def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
         structure: of their runs.
         cases: leaves with a leading axis, all cases or 1.
     """
-    count = max(len(leaf) for leaf in jax.tree.leaves(cases))
     if structure.feedback != "sampled":
-        return _nothing(count, structure)
+        return no_margins(structure, cases)
     if LAWS[structure.law].is_switching:
         return _judge_one_by_one(structure, cases)
+    count, figures = _count(cases), no_margins(structure, cases)
     structure, cases = with_margin_modes(structure, cases)
     whole = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
     # idle links cost nothing; one number for all cases, since each number has its own programs
     most = max(1, int(np.sum(whole.control.link_mask > 0, axis=1).max()))
     threads = len(jax.local_devices())
-    figures = _nothing(count, structure)
     with ThreadPoolExecutor(threads) as pool:
 
         def judge(rows: np.ndarray, way: Walk) -> np.ndarray:
@@ -197,7 +196,13 @@ def _judge_one_by_one(structure: Structure, cases: Case) -> LoopMargins:
     )
 
 
-def _nothing(count: int, structure: Structure) -> LoopMargins:
+def _count(cases: Case) -> int:
+    return max(len(leaf) for leaf in jax.tree.leaves(cases))
+
+
+def no_margins(structure: Structure, cases: Case) -> LoopMargins:
+    """NaN for every case; arguments as `judge_loops`."""
+    count = _count(cases)
     one, two, three = np.full((3, count), np.nan)
     return LoopMargins(one, two, three, np.full((count, structure.n_controlled), np.nan))
 

@@ -83,6 +83,7 @@ class Group(NamedTuple):
     rows: np.ndarray  # of the table, (m,)
     is_too_stiff: np.ndarray  # drive or ideal feedback too stiff for any allowed step, (m,)
     layout: Layout
+    is_judged: bool = True  # gain margins and damping of every loop
 
     def chunks(self) -> list[Chunk]:
         """All of them, chunk by chunk."""
@@ -98,6 +99,8 @@ def plan_groups(
     rows: np.ndarray,
     lay_out: Callable[[int, Structure], Layout],
     metrics: tuple[str, ...] = (),
+    is_linear: bool = False,
+    is_judged: bool = True,
 ) -> list[Group]:
     """Group cases by program and lay out their chunks.
 
@@ -106,6 +109,8 @@ def plan_groups(
         rows: those to run.
         lay_out: shape of the chunks for this many cases of a structure.
         metrics: those to keep; () for all.
+        is_linear: run the linear model.
+        is_judged: judge the loops.
 
     Raises:
         StudyError: too many programs.
@@ -126,7 +131,9 @@ def plan_groups(
     groups = []
     for key in distinct:
         members = np.flatnonzero(keys == key)
-        structure = _structure(table, members)._replace(metrics=_accumulated(table, metrics))
+        structure = _structure(table, members)._replace(
+            metrics=_accumulated(table, metrics), is_linear=is_linear
+        )
         wanted = rows[np.isin(rows, members)]
         if len(wanted) == 0:
             continue
@@ -136,7 +143,14 @@ def plan_groups(
             chosen = counts[place] == count
             stepped = structure._replace(substeps=int(count))
             layout = lay_out(int(chosen.sum()), stepped)
-            groups.append(Group(stepped, wanted[chosen], is_too_stiff[place][chosen], layout))
+            group = Group(
+                structure=stepped,
+                rows=wanted[chosen],
+                is_too_stiff=is_too_stiff[place][chosen],
+                layout=layout,
+                is_judged=is_judged,
+            )
+            groups.append(group)
     return groups
 
 

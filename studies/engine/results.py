@@ -14,8 +14,8 @@ from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.engine.columns import (
     LEAST,
-    NOT_RUN,
     PER_CASE,
+    WANTED_LARGE,
     axis_variables,
     case_variables,
     variable_name,
@@ -30,6 +30,7 @@ from studies.engine.folder import (
 from studies.engine.stored import axis_sizes, gather
 from studies.errors import StudyError, nearest
 from studies.space.axes import LABELS, SHOWN_AS
+from studies.space.condition import evaluate
 from studies.space.spec import SweepSpec, parse_sweep
 from studies.space.table import CaseTable, build_table
 from studies.store import Variable, read_store, variable_labels
@@ -44,6 +45,7 @@ class SweepData:
     variables: dict[str, Variable]
     attributes: dict[str, Any]
     spec: SweepSpec
+    cases: CaseTable | None = None  # where they are at hand, or not all of the sweep's
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.variables[name].data
@@ -51,11 +53,11 @@ class SweepData:
     @cached_property
     def table(self) -> CaseTable:
         """Its cases, built once."""
-        return build_table(self.spec)
+        return build_table(self.spec) if self.cases is None else self.cases
 
     @property
     def n_cases(self) -> int:
-        return len(self.variables["case"].data)
+        return len(self.variables["status"].data)
 
     @property
     def is_finished(self) -> np.ndarray:
@@ -63,7 +65,7 @@ class SweepData:
         return np.isin(self["status"], status.FINISHED)
 
     def __repr__(self) -> str:
-        done = int(np.sum(self["status"] != NOT_RUN))
+        done = int(np.sum(self["status"] >= 0))
         return (
             f"<sweep {self.spec.study.title!r}: {done} of {self.n_cases} cases, axes "
             f"{', '.join(swept_names(self))}; {len(self.variables)} variables>"
@@ -92,11 +94,12 @@ def swept_names(data: SweepData) -> list[str]:
     return [variable_name(name) for name in columns if name not in labelled]
 
 
-def load(path: str | Path) -> SweepData:
+def load(path: str | Path, cases: CaseTable | None = None) -> SweepData:
     """Read a sweep, finished or not; cases that have not run have status -1 and NaN.
 
     Args:
         path: the sweep's folder.
+        cases: its table, if it is at hand.
 
     Raises:
         StudyError: no sweep there, or a damaged file.
@@ -108,15 +111,15 @@ def load(path: str | Path) -> SweepData:
         check_results(folder)
         variables, attributes = read_store(folder / RESULTS)
         if json.loads(attributes["spec"]) == written:  # otherwise an extension has started
-            return SweepData(variables, attributes, spec)
-    table = build_table(spec)
+            return SweepData(variables, attributes, spec, cases)
+    table = build_table(spec) if cases is None else cases
     gathered = gather(table, finished_cases(folder))
     sizes = axis_sizes(gathered)
     variables = case_variables(table) | gathered | axis_variables(table, sizes)
     for axis, size in (axis_sizes(variables)).items():
         if axis not in variables:
             variables[axis] = Variable(np.arange(1, size + 1), (axis,), "1", f"number of {axis}")
-    return SweepData(variables, {"title": spec.study.title}, spec)
+    return SweepData(variables, {"title": spec.study.title}, spec, table)
 
 
 def metric_values(data: SweepData, name: str) -> np.ndarray:
@@ -153,9 +156,43 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
     known = [n for n, v in variables.items() if v.dims[:1] == ("case",)]
     close = nearest(key, known) or _turned(key, known)
     hint = f"did you mean {close!r}?" if close else f"known: {', '.join(known)}"
+    if key in METRICS and key in (data.spec.sweep.metrics or METRICS):
+        raise StudyError(f"{name!r}: no case has finished, so none has it")
     if any(np.any(data[n] == key) for n in known if data[n].dtype.kind in "OSUT"):
         hint = f"a text stands in quotes: '{key}'"
     raise StudyError(f"{name!r}: unknown metric or axis; {hint}")
+
+
+def meets(data: SweepData, condition: str, field: str) -> np.ndarray:
+    """Cases for which a condition on metrics and axes holds; a missing number meets none, (n,).
+
+    Args:
+        data: the sweep.
+        condition: "" for all cases.
+        field: where the condition is written, for messages.
+
+    Raises:
+        StudyError: not a condition, or unknown names in it.
+    """
+    is_known = np.ones(data.n_cases, bool)
+    if not condition:
+        return is_known
+
+    def lookup(name: str) -> np.ndarray:
+        nonlocal is_known
+        values = metric_values(data, name)
+        if values.dtype.kind == "f":
+            is_known = is_known & ~np.isnan(values)  # so that "not x < 2" does not hold either
+        return values
+
+    truth = evaluate(condition, lookup, field)
+    return np.broadcast_to(truth, is_known.shape) & is_known
+
+
+def direction(by: str) -> str:
+    """Which values of a metric come first: "smallest" or "largest"; - in front reverses that."""
+    is_large = by.removeprefix("-").partition("[")[0] in WANTED_LARGE
+    return "largest" if is_large != by.startswith("-") else "smallest"
 
 
 def _of_axes(data: SweepData, name: str, named: list[tuple[str, str]]) -> np.ndarray:

@@ -49,6 +49,7 @@ def with_margin_modes(
         n_modes=n_modes,
         n_steps=1,
         substeps=1,
+        is_linear=False,
         n_frequencies=1,
         has_noise=False,
         metrics=(),

@@ -16,8 +16,10 @@ from jaxmodel.lazy import jax
 from jaxmodel.metrics import METRICS
 from studies.engine.columns import (
     LEAST,
+    LEFT_OUT,
     NOT_RUN,
     PER_CASE,
+    SCREENED,
     axis_variables,
     case_variables,
     forget,
@@ -125,10 +127,10 @@ def gather(table: CaseTable, finished: Finished) -> dict[str, Variable]:
     Returns:
         Variables with the axis `case`; NaN and status -1 for missing cases.
     """
-    target, is_known = _positions(table, finished)
+    target, is_known = positions(table, finished)
     variables: dict[str, Variable] = {}
     n = len(table)
-    largest = _largest(finished.files)
+    largest = _largest(finished.files, (*PER_CASE, *METRICS))
     for number, file in enumerate(finished.files):
         chosen = is_known & (finished.file == number)
         if not chosen.any():
@@ -139,7 +141,7 @@ def gather(table: CaseTable, finished: Finished) -> dict[str, Variable]:
                     continue
                 data = dataset[()]
                 if name not in variables:
-                    shape = (n, *largest[name][1:])
+                    shape = (n, *largest[name][0][1:])
                     empty = np.full(shape, -1 if data.dtype.kind == "i" else np.nan)
                     dims, *label = label_of(name)
                     filled = empty.astype(data.dtype)
@@ -160,7 +162,13 @@ def manifest_attributes(manifest: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def merge(folder: Path, table: CaseTable, finished: Finished, attributes: dict[str, Any]) -> None:
+def merge(
+    folder: Path,
+    table: CaseTable,
+    finished: Finished,
+    attributes: dict[str, Any],
+    screened: Finished | None = None,
+) -> None:
     """Join all finished cases in one file, file by file to save memory.
 
     Args:
@@ -168,37 +176,88 @@ def merge(folder: Path, table: CaseTable, finished: Finished, attributes: dict[s
         table: all cases, in the order of the file.
         finished: from `finished_cases`.
         attributes: global ones.
+        screened: the same for the screen, if there is one.
 
     Raises:
         StudyError: the disk is full or not writable.
     """
-    target, is_known = _positions(table, finished)
+    variables = case_variables(table)
+    rest = np.full(len(table), NOT_RUN)
+    if screened is not None:
+        target, is_known = positions(table, screened)
+        code = joined(screened, "screen_status")
+        # what no run can start with is a fault in either model
+        left = np.where(np.isin(code, status.FINISHED), LEFT_OUT, code)
+        rest[target[is_known]] = left[is_known]
+        variables |= _streamed(table, screened, tuple(SCREENED), np.full(len(table), NOT_RUN))
+    found = _streamed(table, finished, (*PER_CASE, *METRICS), rest)
+    variables |= found or {"status": Variable(rest, ("case",), *PER_CASE["status"][1:])}
+    variables |= axis_variables(table, axis_sizes(variables))
+    write_store(folder / JOINED, variables, attributes)
+
+
+#: Bytes of a variable that are joined at once.
+BLOCK_BYTES = 2**25
+
+
+def joined(finished: Finished, name: str) -> np.ndarray:
+    """Values of a number of each finished case, (n,).
+
+    Args:
+        finished: from `finished_cases`.
+        name: of the number.
+    """
+    found = np.empty(len(finished.case_id))
+    for number, path in enumerate(finished.files):
+        chosen = finished.file == number
+        with h5py.File(path, "r") as store:
+            found[chosen] = store[name][()][finished.row[chosen]]
+    return found
+
+
+def _streamed(
+    table: CaseTable, finished: Finished, names: tuple[str, ...], rest: np.ndarray
+) -> dict[str, Variable]:
+    """Variables of these names, read from the files that hold them as they are written.
+
+    Args:
+        table: all cases.
+        finished: where they are.
+        names: of the variables, as far as they exist.
+        rest: codes of cases that are in no file, (n,).
+    """
+    target, is_known = positions(table, finished)
     places = []
     for number, path in enumerate(finished.files):
         chosen = np.flatnonzero(is_known & (finished.file == number))
         chosen = chosen[np.argsort(target[chosen])]
         places.append((path, target[chosen], finished.row[chosen]))
 
-    def parts(name: str) -> Iterator[tuple[int, np.ndarray]]:
-        for path, target, row in places:
-            with h5py.File(path, "r") as store:
-                data = _fitted(store[name][()], largest[name][1:])
-            breaks = np.flatnonzero(np.diff(target) != 1) + 1
-            runs = zip(np.split(target, breaks), np.split(row, breaks), strict=True)
-            yield from ((int(at[0]), data[rows]) for at, rows in runs if len(at))
+    def parts(name: str, shape: tuple[int, ...], dtype: np.dtype) -> Iterator[Any]:
+        size = max(1, BLOCK_BYTES // (dtype.itemsize * int(np.prod(shape[1:]))))
+        for start in range(0, shape[0], size):
+            count = min(size, shape[0] - start)
+            whole = np.full((count, *shape[1:]), np.nan if dtype.kind == "f" else NOT_RUN, dtype)
+            if name == "status":
+                whole[:] = rest[start : start + count]
+            for path, at, row in places:
+                here = slice(*np.searchsorted(at, (start, start + count)))
+                if here.start < here.stop:
+                    with h5py.File(path, "r") as store:
+                        data = _fitted(store[name][()], shape[1:])
+                    whole[at[here] - start] = data[row[here]]
+            yield start, whole
 
-    largest = _largest(finished.files)
-    variables = case_variables(table)
-    with h5py.File(finished.files[-1], "r") as store:
-        for name, shape in largest.items():
-            dims, *label = label_of(name)
-            streamed = Streamed((len(table), *shape[1:]), store[name].dtype, partial(parts, name))
-            variables[name] = Variable(streamed, ("case", *dims), *label)
-    variables |= axis_variables(table, axis_sizes(variables))
-    write_store(folder / JOINED, variables, attributes)
+    variables = {}
+    for name, (shape, dtype) in _largest(finished.files, names).items():
+        dims, *label = label_of(name)
+        whole = (len(table), *shape[1:])
+        streamed = Streamed(whole, dtype, partial(parts, name, whole, dtype))
+        variables[name] = Variable(streamed, ("case", *dims), *label)
+    return variables
 
 
-def _positions(table: CaseTable, finished: Finished) -> tuple[np.ndarray, np.ndarray]:
+def positions(table: CaseTable, finished: Finished) -> tuple[np.ndarray, np.ndarray]:
     """Number of each finished case in the table, and whether it is one of its cases."""
     order = np.argsort(table.case_id)
     at = np.searchsorted(table.case_id[order], finished.case_id)
@@ -206,15 +265,17 @@ def _positions(table: CaseTable, finished: Finished) -> tuple[np.ndarray, np.nda
     return target, table.case_id[target] == finished.case_id
 
 
-def _largest(files: list[Path]) -> dict[str, tuple[int, ...]]:
-    """Largest shape of each variable: programs of one sweep can have different mode counts."""
-    largest: dict[str, tuple[int, ...]] = {}
+def _largest(
+    files: list[Path], names: tuple[str, ...]
+) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+    """Largest shape of each variable, and its type: programs can have different mode counts."""
+    largest: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
     for file in files:
         with h5py.File(file, "r") as store:
             for name, dataset in store.items():
-                if name in PER_CASE or name in METRICS:
-                    old = largest.get(name, dataset.shape)
-                    largest[name] = tuple(map(max, old, dataset.shape))
+                if name in names:
+                    shape = largest[name][0] if name in largest else dataset.shape
+                    largest[name] = tuple(map(max, shape, dataset.shape)), dataset.dtype
     return largest
 
 

@@ -6,25 +6,40 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
 
+from jaxmodel.case import Structure
 from studies import config
 from studies.engine.chunks import Done, Here, Lost, Runner, has_own_ratio, start_chunk
 from studies.engine.executor import make_executor
 from studies.engine.folder import (
+    SCREEN,
+    Finished,
     SweepFolder,
     finished_cases,
     make_manifest,
     open_folder,
 )
-from studies.engine.plan import Group, chunk_cases, local_layout, plan_groups
+from studies.engine.plan import Group, Layout, chunk_cases, local_layout, plan_groups
 from studies.engine.progress import Reporter
+from studies.engine.screen import (
+    Round,
+    check_condition,
+    first_round,
+    next_round,
+    ranked,
+    screen_groups,
+    screen_variables,
+    screened_cases,
+    wanted,
+)
 from studies.engine.stored import chunk_variables, kept_metrics, manifest_attributes, merge
 from studies.errors import StudyError
 from studies.space.spec import SweepSpec
@@ -48,7 +63,7 @@ class Plan(NamedTuple):
     """What a sweep would do."""
 
     table: CaseTable
-    groups: list[Group]
+    groups: list[Group]  # those of a screen first
     n_before: int  # cases already done
 
 
@@ -59,17 +74,26 @@ def make_plan(spec: SweepSpec, out: Path | None = None) -> Plan:
         spec: the sweep.
         out: folder with some of them done, if the sweep is to be resumed.
 
+    Returns:
+        Plan; of a screened sweep, as if the first cases passed the screen.
+
     Raises:
         StudyError: a fault of the sweep, or a folder with a different sweep.
     """
     config.require_configured()
     kept_metrics(spec)
-    table = build_table(spec)
+    table, sweep = build_table(spec), spec.sweep
+    check_condition(spec, table)
     rows = np.arange(len(table))
     if out is not None:
         rows = _rows_left(table, finished_cases(out).case_id, out)
-    groups = plan_groups(table, rows, local_layout, spec.sweep.metrics)
-    return Plan(table, groups, len(table) - len(rows))
+    n_before, groups = len(table) - len(rows), []
+    if spec.screen is not None:
+        groups = screen_groups(table, rows, local_layout, spec.screen)
+        rows = rows[: wanted(len(table), spec.screen)]
+    is_linear = sweep.fidelity == "linear"
+    groups += plan_groups(table, rows, local_layout, sweep.metrics, is_linear)
+    return Plan(table, groups, n_before)
 
 
 def run_sweep(
@@ -98,38 +122,154 @@ def run_sweep(
     """
     config.require_configured()
     runner, out = runner or Here(), Path(out)
-    kept = kept_metrics(spec)
+    kept_metrics(spec)
     table = build_table(spec)
+    check_condition(spec, table)
     console = console or Console(highlight=False, markup=False)
+    tell = partial(console.print, soft_wrap=True)
     manifest = make_manifest(spec.data)
-    with open_folder(out, manifest, is_resumed) as folder:
-        finished = finished_cases(out, lambda text: console.print(text, soft_wrap=True))
-        rows = _rows_left(table, finished.case_id, out)
+    with open_folder(out, manifest, is_resumed) as folder, _interrupts() as stop:
+        before = finished_cases(out, tell).case_id
+        _rows_left(table, before, out)  # refuses another sweep
         folder.begin(manifest)
-        groups = plan_groups(table, rows, runner.layout, spec.sweep.metrics)
-        n_before = len(table) - len(rows)
-        with Reporter(console, len(table), n_before, is_quiet) as reporter, _interrupts() as stop:
-            reporter.say(_headline(table, groups, n_before))
-            with closing(runner.run(table, groups, reporter, stop)) as chunks:
-                lost = _run_chunks(chunks, table, kept, folder, reporter)
-            is_interrupted = stop.is_set() and reporter.done + len(lost) < reporter.total
-            if not is_interrupted:
-                finished = finished_cases(out)
-                _check_whole(table, np.union1d(finished.case_id, table.case_id[lost]), out)
-                attributes = {"title": spec.study.title, **manifest_attributes(manifest)}
-                timings = {"compile_time": reporter.compile_time, "run_time": reporter.run_time}
-                merge(out, table, finished, attributes | timings)
-                folder.publish()
+        run = _Run(spec, table, folder, runner, console, is_quiet, stop)
+        if spec.screen is None:
+            rows, screened = run.full(np.arange(len(table)), _headline), None
+        else:
+            screened_cases(out, tell)
+            rows, screened = run.screened()
+        if rows is not None:
+            finished = finished_cases(out)
+            _check_whole(table, rows, np.union1d(finished.case_id, table.case_id[run.lost]), out)
+            attributes = {"title": spec.study.title, **manifest_attributes(manifest)}
+            timings = {"compile_time": run.compile_time, "run_time": run.run_time}
+            merge(out, table, finished, attributes | timings, screened)
+            folder.publish()
         return Outcome(
             table=table,
-            n_done=reporter.done,
-            n_run=reporter.n_run,
-            compile_time=reporter.compile_time,
-            run_time=reporter.run_time,
-            is_interrupted=is_interrupted,
-            executor=reporter.executor,
-            lost=lost,
+            n_done=len(before) + run.n_run,
+            n_run=run.n_run,
+            compile_time=run.compile_time,
+            run_time=run.run_time,
+            is_interrupted=rows is None,
+            executor=run.executor,
+            lost=run.lost,
         )
+
+
+class _Run:
+    """The chunks of one call, and what they took."""
+
+    def __init__(
+        self,
+        spec: SweepSpec,
+        table: CaseTable,
+        folder: SweepFolder,
+        runner: Runner,
+        console: Console,
+        is_quiet: bool,
+        stop: threading.Event,
+    ) -> None:
+        """
+        Args:
+            spec, console, is_quiet, runner: as in `run_sweep`.
+            table: all cases.
+            folder: open.
+            stop: set to end after the chunks under way.
+        """
+        self.spec, self.table, self.folder, self.runner = spec, table, folder, runner
+        self.console, self.is_quiet, self.stop = console, is_quiet, stop
+        self.lost = np.empty(0, int)  # rows that were given up
+        self.n_run, self.compile_time, self.run_time, self.executor = 0, 0.0, 0.0, ""
+        self._layouts: dict[Structure, Layout] = {}
+
+    def full(self, rows: np.ndarray, headline: Headline) -> np.ndarray | None:
+        """Run what is left of these rows; returns them, None if interrupted."""
+        sweep, kept = self.spec.sweep, kept_metrics(self.spec)
+        left = self._left(rows, finished_cases(self.folder.path))
+        is_linear = sweep.fidelity == "linear"
+        groups = plan_groups(self.table, left, self._layout, sweep.metrics, is_linear)
+
+        def save(done: Done) -> np.ndarray:
+            chunk = done.chunk
+            variables = chunk_variables(
+                self.table, chunk.rows, done.judged, chunk.is_too_stiff, done.substeps, kept
+            )
+            self.folder.write_chunk(variables)
+            self.n_run += len(chunk.rows)
+            return variables["status"].data
+
+        n_before = len(rows) - len(left)
+        text = headline(self.table, groups, n_before)
+        return rows if self._chunks(groups, len(rows), n_before, text, save) else None
+
+    def screened(self) -> tuple[np.ndarray | None, Finished]:
+        """Screen all cases and run the best; returns their rows, None if interrupted."""
+        screen, table, path = self.spec.screen, self.table, self.folder.path
+        assert screen is not None
+        left = self._left(np.arange(len(table)), screened_cases(path))
+        groups = screen_groups(table, left, self.runner.layout, screen)
+
+        def save(done: Done) -> np.ndarray:
+            variables = screen_variables(self.spec, table, done)
+            self.folder.write_chunk(variables, SCREEN)
+            return variables["screen_status"].data
+
+        n_before = len(table) - len(left)
+        text = f"screen by the linear model: {_headline(table, groups, n_before)}"
+        is_whole = self._chunks(groups, len(table), n_before, text, save)
+        found = screened_cases(path)
+        if not is_whole:
+            return None, found
+        order = ranked(table, found, screen)
+        wanted: Round | None = first_round(table, order, self.spec)
+        while wanted is not None:
+            this, rows = wanted, self.full(wanted.rows, _kept_headline)
+            if rows is None:
+                return None, found
+            wanted = next_round(table, order, self.spec, this, path)
+        return rows, found
+
+    def _left(self, rows: np.ndarray, finished: Finished) -> np.ndarray:
+        """Those of some rows that are neither finished nor given up."""
+        is_done = np.isin(self.table.case_id[rows], finished.case_id)
+        return rows[~is_done & ~np.isin(rows, self.lost)]
+
+    def _layout(self, n: int, structure: Structure) -> Layout:
+        """One layout for all rounds of a screen, since each compiles its own program."""
+        if structure not in self._layouts:
+            self._layouts[structure] = self.runner.layout(n, structure)
+        return self._layouts[structure]
+
+    def _chunks(
+        self,
+        groups: list[Group],
+        total: int,
+        n_before: int,
+        headline: str,
+        save: Callable[[Done], np.ndarray],
+    ) -> bool:
+        """Run and save chunks; returns whether all of them were run."""
+        with Reporter(self.console, total, n_before, self.is_quiet) as reporter:
+            reporter.say(headline)
+            n_lost = len(self.lost)
+            with closing(self.runner.run(self.table, groups, reporter, self.stop)) as chunks:
+                for one in chunks:
+                    if isinstance(one, Lost):
+                        self.lost = np.concatenate([self.lost, one.chunk.rows])
+                        self.folder.give_up(one.chunk.rows, one.reason)
+                        reporter.lost(one.chunk.rows, one.reason)
+                    else:
+                        reporter.chunk(save(one))
+            n_lost = len(self.lost) - n_lost
+        self.compile_time += reporter.compile_time
+        self.run_time += reporter.run_time
+        self.executor = reporter.executor or self.executor
+        return not (self.stop.is_set() and reporter.done + n_lost < total)
+
+
+#: First line of a run: of the table, the groups that are run, and how many cases were done before.
+Headline = Callable[[CaseTable, list[Group], int], str]
 
 
 def _headline(table: CaseTable, groups: list[Group], n_before: int) -> str:
@@ -142,6 +282,12 @@ def _headline(table: CaseTable, groups: list[Group], n_before: int) -> str:
         text += f", {n_before} of them done before"
     chunks = sum(len(group.chunks()) for group in groups)
     return f"{text}; chunks: {chunks}, programs to compile: {len(groups)}"
+
+
+def _kept_headline(table: CaseTable, groups: list[Group], n_before: int) -> str:
+    count = sum(len(group.rows) for group in groups)
+    text = f"{count} of {len(table)} cases pass the screen or check it"
+    return f"{text}, {n_before} more done before" if n_before else text
 
 
 def _rows_left(table: CaseTable, done: np.ndarray, out: Path) -> np.ndarray:
@@ -161,38 +307,14 @@ def _rows_left(table: CaseTable, done: np.ndarray, out: Path) -> np.ndarray:
     return np.flatnonzero(~np.isin(table.case_id, done))
 
 
-def _check_whole(table: CaseTable, done: np.ndarray, out: Path) -> None:
+def _check_whole(table: CaseTable, rows: np.ndarray, done: np.ndarray, out: Path) -> None:
     """Check that no chunks were removed while the sweep ran."""
-    lost = int(np.sum(~np.isin(table.case_id, done)))
+    lost = int(np.sum(~np.isin(table.case_id[rows], done)))
     if lost:
         raise StudyError(
-            f"{out}: chunks with {lost} of {len(table)} cases disappeared while the sweep ran; "
+            f"{out}: chunks with {lost} of {len(rows)} cases disappeared while the sweep ran; "
             "run them again with --resume"
         )
-
-
-def _run_chunks(
-    done: Iterator[Done | Lost],
-    table: CaseTable,
-    kept: list[str],
-    folder: SweepFolder,
-    reporter: Reporter,
-) -> np.ndarray:
-    """Save the results of chunks; returns the rows of the table that were given up."""
-    lost = [np.empty(0, int)]
-    for one in done:
-        if isinstance(one, Lost):
-            lost.append(one.chunk.rows)
-            folder.give_up(one.chunk.rows, one.reason)
-            reporter.lost(one.chunk.rows, one.reason)
-            continue
-        chunk = one.chunk
-        variables = chunk_variables(
-            table, chunk.rows, one.judged, chunk.is_too_stiff, one.substeps, kept
-        )
-        folder.write_chunk(variables)
-        reporter.chunk(variables["status"].data)
-    return np.concatenate(lost)
 
 
 @contextmanager
@@ -218,26 +340,41 @@ def _interrupts() -> Iterator[threading.Event]:
 class Estimate(NamedTuple):
     """Estimated time of a sweep."""
 
-    compile_time: float  # of the first program [s]
-    chunk_time: float  # of one of its chunks [s]
+    compile_time: float  # of all programs [s]
+    chunk_time: float  # of a chunk of the last one [s]
     total: float  # compiling and running everything [s]
 
 
 def calibrate(plan: Plan) -> Estimate:
-    """Compile the first program and time one chunk of it."""
-    group = plan.groups[0]
-    has_own = has_own_ratio(plan.table, group)
+    """Compile the first program, and that of a screen, and time one chunk of each."""
+    compiling = running = chunk_time = 0.0
+    for is_linear in (True, False):
+        groups = [g for g in plan.groups if g.structure.is_linear == is_linear]
+        if not groups:
+            continue
+        compile_time, chunk_time = _timed(plan.table, groups[0])
+        per_step = chunk_time / _steps(groups[0])
+        running += sum(len(g.chunks()) * _steps(g) * per_step for g in groups)
+        compiling += len(groups) * compile_time
+    return Estimate(compiling, chunk_time, compiling + running)
+
+
+def _steps(group: Group) -> int:
+    """Plant steps of a chunk."""
+    return group.layout.size * group.structure.n_steps * group.structure.substeps
+
+
+def _timed(table: CaseTable, group: Group) -> tuple[float, float]:
+    """Times to compile a program, and to run a chunk of it [s]."""
+    has_own = has_own_ratio(table, group)
     executor = make_executor(group.structure, group.layout, has_own)
     rows = group.chunks()[0].rows
-    cases = chunk_cases(plan.table, rows, group.structure, group.layout.size)
-    start_chunk(executor, plan.table, rows, cases, has_own).wait()
-    began = time.perf_counter()
-    start_chunk(executor, plan.table, rows, cases, has_own).wait()
-    chunk_time = time.perf_counter() - began
-    per_step = chunk_time / (group.layout.size * group.structure.n_steps * group.structure.substeps)
-    running = sum(
-        len(g.chunks()) * g.layout.size * g.structure.n_steps * g.structure.substeps * per_step
-        for g in plan.groups
-    )
-    total = running + len(plan.groups) * executor.compile_time
-    return Estimate(executor.compile_time, chunk_time, total)
+    cases = chunk_cases(table, rows, group.structure, group.layout.size)
+
+    def run() -> float:
+        began = time.perf_counter()
+        start_chunk(executor, table, rows, cases, has_own, group.is_judged).wait()
+        return time.perf_counter() - began
+
+    run()
+    return executor.compile_time, run()

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import ValidationError
 
@@ -41,6 +41,16 @@ class Block(Section):
     levels: int = described(4, "1", "levels of a Morris grid", ge=2, le=100)
 
 
+class Screen(Section):
+    """All cases by the linear model, and only the best of them by the whole one."""
+
+    by: str = described("residual_rms", "-", "metric, or entry of one, that the screen ranks by")
+    keep: float = described(0.05, "1", "share of the cases that are run", gt=0, le=1)
+    subject_to: str = described(
+        "", "-", "cases are run, in the screen's order, until that share meets this condition"
+    )
+
+
 class Sweep(Block):
     """What varies, and what is kept."""
 
@@ -49,6 +59,10 @@ class Sweep(Block):
     seed: int = described(0, "1", "of the sampling methods", ge=0, le=10**9)
     metrics: tuple[str, ...] = described((), "-", "metrics to keep; empty: all")
     by: str = described("residual_rms", "-", "metric, or entry of one, that cases are ranked by")
+    fidelity: Literal["full", "linear"] = described(
+        "full", "-", "model of the runs; linear: mechanics linearised at the last way-point"
+    )
+    screen: dict[str, Any] = described({}, "-", "run only the best cases of the linear model")
 
 
 class BlockNode(NamedTuple):
@@ -65,6 +79,7 @@ class SweepSpec(NamedTuple):
     study: Study  # values of all fields that do not vary
     sweep: Sweep
     root: BlockNode  # the tree of blocks; its block is `sweep`
+    screen: Screen | None  # None: every case runs
     data: dict[str, Any]  # as read, for the record
 
 
@@ -93,7 +108,26 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
     ranking = parse_entries(sweep.by, "sweep.by").metric
     if "by" in data["sweep"] and sweep.metrics and ranking not in sweep.metrics:
         raise field_error("sweep.by", sweep.by, f"one of sweep.metrics = {list(sweep.metrics)}")
-    return SweepSpec(study, sweep, _node(sweep, "sweep"), data)
+    screen = _parse_screen(sweep) if sweep.screen else None
+    return SweepSpec(study=study, sweep=sweep, root=_node(sweep, "sweep"), screen=screen, data=data)
+
+
+def _parse_screen(sweep: Sweep) -> Screen:
+    try:
+        screen = Screen.model_validate(sweep.screen)
+    except ValidationError as error:
+        raise explain(error, Screen, sweep.screen, inside="sweep.screen") from None
+    ranking = parse_entries(screen.by.removeprefix("-"), "sweep.screen.by").metric
+    if sweep.metrics and ranking not in sweep.metrics:
+        allowed = f"one of sweep.metrics = {list(sweep.metrics)}"
+        raise field_error("sweep.screen.by", screen.by, allowed)
+    if sweep.fidelity == "linear":
+        raise field_error("sweep.screen", "a table", "no screen with sweep.fidelity = 'linear'")
+    if METHODS[sweep.method].analysis is not None:
+        raise field_error(
+            "sweep.screen", "a table", f"none with method {sweep.method}, which needs every case"
+        )
+    return screen
 
 
 def _check_depth(data: Any, depth: int = 0) -> None:

@@ -80,6 +80,12 @@ def add_commands(app: typer.Typer, console: Console) -> None:
                 f"compiling; results: {out / 'results.h5'}",
                 soft_wrap=True,
             )
+        if asked.screen is not None and not quiet:
+            from studies.engine.results import load
+            from studies.sweeps.screening import check_screen
+
+            checked = check_screen(load(out, done.table))
+            console.print("" if checked is None else checked.text, soft_wrap=True)
         if report:
             from studies.sweeps.report import REPORT, write_sweep_report
 
@@ -111,11 +117,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         count: Annotated[int, typer.Option(min=1, help="number of cases")] = 10,
     ) -> None:
         """List the best cases of a sweep by a metric."""
-        from studies.engine.results import load
+        from studies.engine.results import direction, load
         from studies.sweeps.show import (
             best_cases,
             counted_text,
-            direction,
             print_cases,
             tell_left_out,
         )

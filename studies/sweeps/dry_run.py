@@ -25,7 +25,8 @@ def print_plan(plan: Plan, console: Console) -> None:
     for group in plan.groups:
         layout, structure = group.layout, group.structure
         console.print(
-            f"program: law {structure.law}, {structure.basis}, "
+            f"program: {'linear model, ' if structure.is_linear else ''}law {structure.law}, "
+            f"{structure.basis}, "
             f"{count_text(structure.n_modes, 'mode')}, {structure.feedback} feedback, "
             f"{count_text(structure.n_steps, 'sample')} of "
             f"{count_text(structure.substeps, 'plant step')}: "
@@ -45,7 +46,7 @@ def print_plan(plan: Plan, console: Console) -> None:
         return
     found = calibrate(plan)
     console.print(
-        f"estimate: {found.total:.0f} s, of which {found.compile_time * len(plan.groups):.0f} s "
+        f"estimate: {found.total:.0f} s, of which {found.compile_time:.0f} s "
         f"compiling; {found.chunk_time:.2g} s a chunk; memory so far "
         f"{peak_memory() / 2**20:.0f} MiB"
     )

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxmodel import status
-from studies.engine.columns import variable_name
+from studies.engine.columns import LEFT_OUT, variable_name
 from studies.engine.results import SweepData, metric_values, swept_names
 from studies.errors import StudyError
 from studies.show import figures
@@ -190,7 +190,10 @@ def _scale_ordinate(ax: Axes, value: np.ndarray) -> None:
 
 
 def _say_left_out(figure: Figure, data: SweepData, chosen: np.ndarray) -> None:
-    n_left, parts = int(np.sum(~chosen)), []
+    n_screened = int(np.sum(data["status"] == LEFT_OUT))
+    n_left, parts = int(np.sum(~chosen)) - n_screened, []
+    if n_screened:
+        parts.append(f"the screen left out {n_screened:,} of {len(chosen):,} cases")
     if n_left:
         parts.append(f"{n_left:,} of {len(chosen):,} cases failed and are left out")
     if MARGIN in data.variables:

@@ -10,7 +10,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxmodel import status
-from studies.engine.results import SweepData, counted_links, load, metric_values, swept_names
+from studies.engine.results import (
+    SweepData,
+    counted_links,
+    direction,
+    load,
+    metric_values,
+    swept_names,
+)
 from studies.errors import StudyError, shown
 from studies.show.figures import styled
 from studies.show.markdown import literal
@@ -28,6 +35,7 @@ from studies.study.spec import Study
 from studies.study.template import study_template, toml_text, toml_value
 from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.plots import front, plot, save_plot
+from studies.sweeps.screening import check_screen, draw_screen
 from studies.sweeps.show import (
     MARGIN,
     SHARES,
@@ -36,7 +44,6 @@ from studies.sweeps.show import (
     case_rows,
     cause_rows,
     counted_text,
-    direction,
     margin_warning,
     ranking,
     recommended,
@@ -48,6 +55,7 @@ from studies.sweeps.show import (
 )
 
 REPORT, FIGURE, FRONT, MACHINE = "report.html", "cases.png", "front.png", "machine.png"
+SCREEN = "screen.png"
 #: Other metrics to check.
 OTHERS = ("settling_time", "peak_voltage")
 #: The best cases count as equal if they differ by less than this share.
@@ -92,7 +100,7 @@ def write_sweep_report(folder: str | Path) -> None:
     spec = data.spec
     metric = ranking(data)
     drawn = []
-    for name, draw in ((FIGURE, _all_axes), (FRONT, _front)):
+    for name, draw in ((FIGURE, _all_axes), (FRONT, _front), (SCREEN, _screen)):
         try:
             figure = draw(data, metric)
         except StudyError:  # no case is ok, or nothing to draw over
@@ -107,6 +115,10 @@ def write_sweep_report(folder: str | Path) -> None:
 
 def _all_axes(data: SweepData, metric: str) -> Figure:
     return plot(data, None, metric, None)
+
+
+def _screen(data: SweepData, metric: str) -> Figure:
+    return draw_screen(data)
 
 
 def _front(data: SweepData, metric: str) -> Figure:
@@ -135,7 +147,7 @@ def report(data: SweepData, metric: str, drawn: list[str], folder: str = "DIR") 
     Args:
         data: the sweep.
         metric: ranks the cases.
-        drawn: existing figures among `FIGURE`, `FRONT` and `MACHINE`.
+        drawn: existing figures among `FIGURE`, `FRONT`, `SCREEN` and `MACHINE`.
         folder: of the sweep, for commands.
     """
     endings = status_rows(data)
@@ -156,6 +168,7 @@ def report(data: SweepData, metric: str, drawn: list[str], folder: str = "DIR") 
         failures=[f"{count}: {name}" for name, count, _ in endings.rows if name != "ok"][:3],
         endings=_literal(endings),
         best=_best(data, metric),
+        screen=check_screen(data),
         enough=ENOUGH,
         blocks=_blocks(data.spec.root),
         columns=_literal(axis_rows(data.table)),
@@ -168,6 +181,8 @@ def report(data: SweepData, metric: str, drawn: list[str], folder: str = "DIR") 
 
 def _best(data: SweepData, metric: str) -> BestCase | None:
     """The best cases; None if no case of status ok has the metric."""
+    if metric.partition("[")[0] not in data.variables:
+        return None
     value, margin = metric_values(data, metric), _margins(data)
     is_known = (data["status"] == status.OK) & np.isfinite(value)
     if not is_known.any():

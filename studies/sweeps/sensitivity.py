@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel import status
-from studies.engine.columns import NOT_RUN
 from studies.engine.results import SweepData, metric_values, swept_names
 from studies.errors import StudyError
 from studies.space.axes import build_axis
@@ -34,7 +33,7 @@ def failure_causes(data: SweepData) -> list[Cause]:
     from scipy.stats import ks_2samp  # takes a third of a second
 
     codes = data["status"]
-    is_run = codes != NOT_RUN
+    is_run = codes >= 0
     is_failed = (codes != status.OK)[is_run]
     if not is_failed.any() or is_failed.all():
         return []

@@ -12,12 +12,18 @@ from rich.table import Table as RichTable
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
-from studies.engine.columns import NOT_RUN, WANTED_LARGE, variable_name
-from studies.engine.results import SweepData, counted_links, metric_values, swept_names
+from studies.engine.columns import LEFT_OUT, NOT_RUN, variable_name
+from studies.engine.results import (
+    SweepData,
+    counted_links,
+    direction,
+    meets,
+    metric_values,
+    swept_names,
+)
 from studies.engine.stored import kept_metrics
 from studies.errors import StudyError
 from studies.show.units import headed, readable, settling_text
-from studies.space.condition import evaluate
 from studies.study.entries import links_text
 from studies.study.margin import ENOUGH, margin_text
 from studies.sweeps.sensitivity import failure_causes
@@ -58,7 +64,8 @@ def print_rows(found: Rows, console: Console) -> None:
 
 def reason(code: int) -> str:
     """A status in words."""
-    return "not run yet" if code == NOT_RUN else status.REASONS.get(code, f"status {code}")
+    others = {NOT_RUN: "not run yet", LEFT_OUT: "left out by the screen"}
+    return (others | status.REASONS).get(code, f"status {code}")
 
 
 def select(data: SweepData, subject_to: str) -> np.ndarray:
@@ -67,20 +74,7 @@ def select(data: SweepData, subject_to: str) -> np.ndarray:
     Raises:
         StudyError: not a condition, or unknown names in it.
     """
-    chosen = data["status"] == status.OK
-    is_known = np.ones_like(chosen)  # a missing number meets no condition, "not x < 2" included
-
-    def lookup(name: str) -> np.ndarray:
-        nonlocal is_known
-        values = metric_values(data, name)
-        if values.dtype.kind == "f":
-            is_known = is_known & ~np.isnan(values)
-        return values
-
-    if subject_to:
-        truth = evaluate(subject_to, lookup, "--subject-to")
-        chosen = chosen & np.broadcast_to(truth, chosen.shape) & is_known
-    return chosen
+    return (data["status"] == status.OK) & meets(data, subject_to, "--subject-to")
 
 
 def best_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) -> np.ndarray:
@@ -107,12 +101,6 @@ def best_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) 
     return chosen[np.argsort(-value[chosen] if is_large else value[chosen], kind="stable")][:count]
 
 
-def direction(by: str) -> str:
-    """Which values of a metric come first: "smallest" or "largest"; - in front reverses that."""
-    is_large = by.removeprefix("-").partition("[")[0] in WANTED_LARGE
-    return "largest" if is_large != by.startswith("-") else "smallest"
-
-
 def show(data: SweepData, console: Console, is_failed: bool) -> None:
     """Print an overview, or the failed cases one by one."""
     codes = data["status"]
@@ -121,9 +109,11 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
         return
     console.print(f"{data.spec.study.title}: {data.n_cases} cases, {', '.join(swept_names(data))}")
     print_rows(status_rows(data), console)
-    if not (codes != NOT_RUN).any():
+    if not (codes >= 0).any():
         return
     by = ranking(data)
+    if by.partition("[")[0] not in data.variables:  # no run has finished
+        return
     if np.isfinite(metric_values(data, by)[codes == status.OK]).any():
         best = recommended(data, by)
         is_safe = not margin_warning(data, best) and MARGIN in data.variables
@@ -140,7 +130,7 @@ def status_rows(data: SweepData) -> Rows:
 
 
 def _print_failed(data: SweepData, codes: np.ndarray, console: Console) -> None:
-    failed = np.flatnonzero((codes != status.OK) & (codes != NOT_RUN))
+    failed = np.flatnonzero((codes != status.OK) & (codes >= 0))
     if len(failed) == 0:
         console.print("no failed case")
         return
@@ -252,6 +242,8 @@ def ranking(data: SweepData) -> str:
 def counted_text(data: SweepData, by: str) -> str:
     """What a metric's largest value is taken over, in words."""
     metric = by.partition("[")[0]
+    if metric not in data.variables:
+        return "of no case"
     axes = list(data.variables[metric].dims[1:])
     told = []
     if "link" in axes and "link=" not in by:

@@ -1,0 +1,204 @@
+"""Screens: every case by the linear model, and only the best of them by the whole one.
+
+The screen ranks all cases by a metric of the linear model and runs them in that order until the
+wanted share has been run, or meets the screen's condition. Some random cases run too, to show what
+the screen lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxmodel import status
+from jaxmodel.case import Structure
+from studies.engine.chunks import Done
+from studies.engine.columns import NOT_RUN, PER_CASE, SCREENED
+from studies.engine.folder import SCREEN, Finished, finished_cases
+from studies.engine.plan import Group, Layout, plan_groups
+from studies.engine.results import SweepData, direction, meets, metric_values
+from studies.engine.stored import chunk_variables, gather, joined, kept_metrics, positions
+from studies.errors import StudyError, nearest
+from studies.space.condition import evaluate
+from studies.space.spec import Screen, SweepSpec
+from studies.space.table import CaseTable
+from studies.store import Variable
+from studies.study.paths import NAMED_INDEX
+
+#: Most random cases that show what the screen lost.
+AUDIT = 2000
+#: Each round goes at most this many times as far down the ranking as the one before.
+FURTHER = 4
+
+
+class Round(NamedTuple):
+    """Which cases are to be run."""
+
+    first: np.ndarray  # the best ones by the screen, best first
+    audit: np.ndarray  # random ones
+
+    @property
+    def rows(self) -> np.ndarray:
+        """All of them, ascending."""
+        return np.union1d(self.first, self.audit)
+
+
+def metric_of(screen: Screen) -> str:
+    """The metric that a screen ranks by, without its entry or direction."""
+    return screen.by.removeprefix("-").partition("[")[0]
+
+
+def check_condition(spec: SweepSpec, table: CaseTable) -> None:
+    """Reject a screen's condition with unknown names before anything runs.
+
+    Raises:
+        StudyError: so it is.
+    """
+    known = (*kept_metrics(spec), *PER_CASE)
+
+    def lookup(name: str) -> np.ndarray:
+        key = NAMED_INDEX.sub("", name).partition("[")[0]
+        if key in known:
+            return np.ones(1)
+        close = nearest(key, known)
+        if close:
+            raise StudyError(f"sweep.screen.subject_to: unknown {name!r}; did you mean {close!r}?")
+        return table.values(name)[:1]
+
+    if spec.screen is not None and spec.screen.subject_to:
+        evaluate(spec.screen.subject_to, lookup, "sweep.screen.subject_to")
+
+
+def screen_groups(
+    table: CaseTable,
+    rows: np.ndarray,
+    lay_out: Callable[[int, Structure], Layout],
+    screen: Screen,
+) -> list[Group]:
+    """Groups of the linear model: one metric, no judgement; arguments as `plan_groups`."""
+    metrics = (metric_of(screen),)
+    return plan_groups(table, rows, lay_out, metrics, is_linear=True, is_judged=False)
+
+
+def screen_variables(spec: SweepSpec, table: CaseTable, done: Done) -> dict[str, Variable]:
+    """Contents of a file of the screen: ids, status and value of its cases.
+
+    Args:
+        spec: the sweep, with a screen.
+        table: all cases.
+        done: a chunk of the linear model.
+    """
+    assert spec.screen is not None
+    by, chunk = spec.screen.by.removeprefix("-"), done.chunk
+    found = chunk_variables(
+        table,
+        chunk.rows,
+        done.judged,
+        chunk.is_too_stiff,
+        done.substeps,
+        [metric_of(spec.screen)],
+    )
+    value = metric_values(SweepData(found, {}, spec, table), by)
+    code, value = found["status"].data, np.asarray(value, float)
+    data = {"screen_status": code, "screen_value": value}
+    return {
+        "case_id": found["case_id"],
+        **{name: Variable(data[name], ("case",), *about) for name, (_, *about) in SCREENED.items()},
+    }
+
+
+def ranked(table: CaseTable, screened: Finished, screen: Screen) -> np.ndarray:
+    """Rows of the cases that end well in the linear model, best first.
+
+    Args:
+        table: all cases.
+        screened: from `screened_cases`.
+        screen: of the sweep.
+    """
+    target, is_known = positions(table, screened)
+    value, code = np.full(len(table), np.nan), np.full(len(table), NOT_RUN)
+    for whole, name in ((code, "screen_status"), (value, "screen_value")):
+        whole[target[is_known]] = joined(screened, name)[is_known]
+    return in_order(code, value, table.case_id, screen)
+
+
+def in_order(
+    code: np.ndarray, value: np.ndarray, case_id: np.ndarray, screen: Screen
+) -> np.ndarray:
+    """Cases of status ok in the linear model, best first; ties by their ids.
+
+    Args:
+        code: how the linear runs ended, (n,).
+        value: what they are ranked by, (n,).
+        case_id: as bytes, (n,).
+        screen: of the sweep.
+    """
+    is_fine = (code == status.OK) & np.isfinite(value)
+    sign = -1 if direction(screen.by) == "largest" else 1
+    order = np.lexsort((case_id, sign * np.where(is_fine, value, 0.0), ~is_fine))
+    return order[: int(is_fine.sum())]
+
+
+def audited(n_cases: int, order: np.ndarray, spec: SweepSpec) -> np.ndarray:
+    """Random cases that run whatever their rank, no more than the screen keeps.
+
+    Args:
+        n_cases: of the sweep.
+        order: from `in_order`.
+        spec: the sweep.
+    """
+    assert spec.screen is not None
+    count = min(AUDIT, wanted(n_cases, spec.screen))
+    return np.random.default_rng(spec.sweep.seed).permutation(np.sort(order))[:count]
+
+
+def first_round(table: CaseTable, order: np.ndarray, spec: SweepSpec) -> Round:
+    """The cases to run first.
+
+    Args:
+        table: all cases.
+        order: from `ranked`.
+        spec: the sweep.
+    """
+    assert spec.screen is not None
+    count = wanted(len(table), spec.screen)
+    return Round(order[:count], audited(len(table), order, spec))
+
+
+def wanted(n_cases: int, screen: Screen) -> int:
+    """How many of these cases a screen keeps."""
+    return max(1, round(screen.keep * n_cases))
+
+
+def next_round(
+    table: CaseTable, order: np.ndarray, spec: SweepSpec, last: Round, folder: Path
+) -> Round | None:
+    """Further cases, if too few of those run meet the screen's condition; None: enough.
+
+    Args:
+        table, order, spec: as in `first_round`.
+        last: round, all of it run.
+        folder: of the sweep.
+    """
+    screen = spec.screen
+    assert screen is not None
+    so_far, count = len(last.first), wanted(len(table), screen)
+    if not screen.subject_to or so_far == len(order):
+        return None
+    rows = np.sort(last.first)
+    part = table.rows(rows)
+    data = SweepData(gather(part, finished_cases(folder)), {}, spec, part)
+    is_fine = data["status"] == status.OK
+    n_met = int(np.sum(meets(data, screen.subject_to, "sweep.screen.subject_to") & is_fine))
+    if n_met >= count:
+        return None
+    needed = int(np.ceil(1.25 * count * so_far / max(n_met, 1)))
+    return last._replace(first=order[: min(needed, FURTHER * so_far)])
+
+
+def screened_cases(folder: Path, tell: Any = None) -> Finished:
+    """Where the results of the linear model are; arguments as `finished_cases`."""
+    return finished_cases(folder, tell, SCREEN)
