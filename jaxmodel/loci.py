@@ -10,6 +10,7 @@ samples; eigenvalues are carried from frequency to frequency by the iteration of
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 from jaxmodel.lazy import jax, jnp
@@ -100,13 +101,16 @@ def _growth(response: LoopResponse) -> Array:
 def _iterated(turn: Turn, values: Pair) -> Pair:
     """Eigenvalues improved one by one, each using the newest of the others (Durand, Kerner)."""
 
-    def improve(values: Pair, _: None) -> tuple[Pair, None]:
+    @jax.jit  # kernels write it once
+    def better(values: Pair) -> Pair:
         x = values[0]
         apart = x - values[1]
         for k in range(2, values.re.shape[0]):
             apart = apart * (x - values[k])
-        x = x - spectrum_polynomial(turn, x) * apart.inverse()
-        join = jnp.concatenate
+        return x - spectrum_polynomial(turn, x) * apart.inverse()
+
+    def improve(values: Pair, _: None) -> tuple[Pair, None]:
+        x, join = better(values), jnp.concatenate
         return Pair(join([values.re[1:], x.re[None]]), join([values.im[1:], x.im[None]])), None
 
     return jax.lax.scan(improve, values, None, length=ITERATIONS * values.re.shape[0])[0]
@@ -159,17 +163,17 @@ def approach(response: LoopResponse, known: FoundMeeting, meeting: Meeting) -> M
     omega, value, zero = meeting.omega, meeting.value, jnp.zeros_like(meeting.omega)
     one = jnp.ones_like(zero)
     shift = Pair(meeting.cosine, -meeting.sine) * (1 - RADIUS_TOLERANCE)
-    none = Pair(zero, zero)
 
-    def wanted(s: Pair, shift: Pair, x: Array) -> Pair:
-        found = spectrum_polynomial(go_round(response, s, shift), Pair(x, jnp.zeros_like(x)))
-        away = known.by_omega * (s.im - known.omega) + known.by_value * (x - known.value)
+    def wanted(turn: Turn, omega: Array, x: Array) -> Pair:
+        found = spectrum_polynomial(turn, Pair(x, jnp.zeros_like(x)))
+        away = known.by_omega * (omega - known.omega) + known.by_value * (x - known.value)
         return found * (away * known.is_there + (1 - known.is_there)).inverse()
 
-    at = (Pair(zero + _growth(response), omega), shift, value)
+    at = (Pair(zero + _growth(response), omega), shift)
     turning = shift * Pair(zero, -response.period * one)  # d/d omega of exp(-j omega T)
-    found, by_omega = jax.jvp(wanted, at, (Pair(zero, one), turning, zero))
-    _, by_value = jax.jvp(wanted, at, (none, none, one))
+    turn, turned = jax.jvp(partial(go_round, response), at, (Pair(zero, one), turning))
+    found, by_omega = jax.jvp(partial(wanted, x=value), (turn, omega), (turned, one))
+    _, by_value = jax.jvp(partial(wanted, turn, omega), (value,), (one,))
     area = by_omega.re * by_value.im - by_omega.im * by_value.re
     over = 1 / jnp.where(area == 0, one, area)
     d_omega = (found.im * by_value.re - found.re * by_value.im) * over
@@ -181,10 +185,10 @@ def approach(response: LoopResponse, known: FoundMeeting, meeting: Meeting) -> M
     share = 1 / jnp.maximum(step, 1.0)
     d_omega, d_value = share * d_omega, share * d_value
     angle = Pair(zero, -response.period * d_omega)
-    turn = angle * (1 / _TERMS) + 1.0
+    ahead = angle * (1 / _TERMS) + 1.0
     for n in range(_TERMS - 1, 0, -1):
-        turn = turn * angle * (1 / n) + 1.0
-    after = shift * turn * (1 / (1 - RADIUS_TOLERANCE))
+        ahead = ahead * angle * (1 / n) + 1.0
+    after = shift * ahead * (1 / (1 - RADIUS_TOLERANCE))
     return Meeting(
         omega=omega + d_omega,
         value=value + d_value,

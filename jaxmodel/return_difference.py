@@ -9,6 +9,7 @@ from 3x3 matrices. docs/theory.md, "Gain margins of a batch". Shapes: structure 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -301,8 +302,53 @@ def go_round(response: LoopResponse, s: Pair, shift: Pair, spread: Array | None 
         spread: subtracted from the diagonal of L, so that channels without gains have distinct
             eigenvalues [1], (n, C); None: nothing.
     """
+    n = response.observe.shape[0]
+    own: list[list[Pair]] = []
+    joint: list[list[Pair]] = []
+    links = None
+    round_once, pass_by = (
+        jax.jit(_round_of_link),
+        jax.jit(_share_in_pose),
+    )  # kernels write them once
+    for i in range(response.square.shape[0]):
+        link = _one_link(response, i, i < n)
+        if i < n:
+            apart = None if spread is None else spread[i : i + 1]
+            one, through, share = round_once(link, s, shift, apart)
+            own.append(one)
+            joint.append(through)
+        else:
+            share = pass_by(link, s)
+        links = share if links is None else links + share
+    assert links is not None
+    s2 = s * s
+    pose = s2 * response.mass + s * response.damping + response.stiffness - links * (s2 * s2)
+    return Turn(
+        [_side_by_side(parts) for parts in zip(*own, strict=True)],
+        [_side_by_side(parts) for parts in zip(*joint, strict=True)],
+        pose,
+        determinant(pose).inverse(),
+    )
+
+
+def _one_link(response: LoopResponse, i: int, has_channels: bool) -> LoopResponse:
+    """The part of one link, without what belongs to the pose."""
+    one = slice(i, i + 1)
+    fields = (*_LINK_FIELDS, *(_CHANNEL_FIELDS if has_channels else ()))
+    parts = {x: jax.tree.map(lambda leaf: leaf[one], getattr(response, x)) for x in fields}
+    return response._replace(mass=None, damping=None, stiffness=None, **parts)
+
+
+def _side_by_side(parts: Sequence[Pair]) -> Pair:
+    """Pairs of the links joined along their first axis."""
+    return Pair(jnp.concatenate([x.re for x in parts]), jnp.concatenate([x.im for x in parts]))
+
+
+def _round_of_link(
+    response: LoopResponse, s: Pair, shift: Pair, spread: Array | None
+) -> tuple[list[Pair], list[Pair], Pair]:
+    """`own` and `joint` of a `Turn`, and what the modes take from the pose's stiffness, (3, 3)."""
     observe, act = response.observe, response.act
-    n = observe.shape[0]
     turn = 2 * np.pi / response.period
     held = -shift + 1.0
     seen = None
@@ -312,25 +358,23 @@ def go_round(response: LoopResponse, s: Pair, shift: Pair, spread: Array | None 
         chain = _electronics(response, at, at2, held)
         inertia = 1.0 if image == 0 else response.lightness
         inverse = (at2 * inertia + at * response.decay + response.square).inverse()
-        own = inverse[:n]
-        part = _through(observe, act, own) * chain
+        part = _through(observe, act, inverse) * chain
         seen = part if seen is None else seen + part
         if image == 0:
-            leaving = _through(observe, response.leave[:n], own) * (at2 * chain)
-            entering = _through(response.enter[:n], act, own) * at2
+            leaving = _through(observe, response.leave, inverse) * (at2 * chain)
+            entering = _through(response.enter, act, inverse) * at2
             links = _through(response.enter, response.leave, inverse).sum(0)
-            pose = (
-                at2 * response.mass
-                + at * response.damping
-                + response.stiffness
-                - links * (at2 * at2)
-            )
     channel = _channel(response, shift)[:, :, None]
     loop, leaving = (seen - response.feedthrough) * channel, leaving * channel
     if spread is not None:
         loop = _plus_diagonal(loop, Pair(-spread, jnp.zeros_like(spread)))
-    own, joint = _by_link(loop, leaving, entering)
-    return Turn(own, joint, pose, determinant(pose).inverse())
+    return *_by_link(loop, leaving, entering), links
+
+
+def _share_in_pose(response: LoopResponse, s: Pair) -> Pair:
+    """What the modes of a link without channels take from the pose's stiffness, (3, 3)."""
+    inverse = (s * s + s * response.decay + response.square).inverse()
+    return _through(response.enter, response.leave, inverse).sum(0)
 
 
 def _through(one: Array, other: Array, inverse: Pair) -> Pair:

@@ -21,7 +21,7 @@ from studies.engine.executor import make_executor
 from studies.engine.kernel_executor import GpuExecutor, KernelExecutor
 from studies.engine.plan import Layout
 from studies.engine.scan import ScanExecutor
-from studies.kernels import cpu, gpu, llvm
+from studies.kernels import gpu, llvm, native
 from studies.kernels.traced import InputLeaf, trace_loop
 from studies.study.cases import build_cases, build_structure
 from studies.study.spec import paper_study
@@ -32,7 +32,7 @@ LAYOUT = Layout(devices=1, blocks=2, lanes=gpu.BLOCK)
 
 def rehearsed(loop, n_steps, lanes):
     """Stands in for `gpu.build_kernel`: the same code, one case after the other on this CPU."""
-    cpu.initialise()
+    native.initialise()
     module = gpu.ThreadWriter(loop, n_steps, lanes).write()
     target = llvm.binding.Target.from_default_triple().create_target_machine(jit=True, opt=3)
     parsed = llvm.binding.parse_assembly(str(module))

@@ -13,10 +13,9 @@ from studies.engine.kernel_executor import KernelExecutor
 from studies.engine.plan import Layout, chunk_cases, local_layout, plan_groups
 from studies.engine.program import TRACES
 from studies.engine.scan import ScanExecutor
-from studies.kernels import compilation, cpu, llvm
+from studies.kernels import compilation, cpu, llvm, native
 from studies.kernels.compilation import ObjectCache
 from studies.kernels.traced import InputLeaf, trace_loop
-from studies.kernels.vectors import CalledWriter
 from studies.space.table import build_table
 from studies.study.cases import build_cases, build_structure
 from studies.study.spec import paper_study
@@ -204,10 +203,10 @@ WITHOUT = {64: (), 32: ("avx512",), 16: ("avx", "fma", "f16c", "vaes", "vpclmul"
 @pytest.fixture(params=WITHOUT)
 def processor(request, monkeypatch):
     """Code for vectors of 64, 32 and 16 bytes, as far as this processor runs it."""
-    found = cpu.this_processor().without(*WITHOUT[request.param])
+    found = native.this_processor().without(*WITHOUT[request.param])
     if found.vector_bytes != request.param:
         pytest.skip(f"needs vectors of {request.param} bytes")
-    monkeypatch.setattr(cpu, "this_processor", lambda: found)
+    monkeypatch.setattr(native, "this_processor", lambda: found)
     return found
 
 
@@ -293,14 +292,7 @@ def test_routines_are_what_they_replace(processor, directions):
     row, found = rng.normal(size=(5, lanes)), []
     for loop in (plain, called):
         own = [x.copy(), *(part.copy() for part in along)]
-        if processor.has_masks and loop is called:  # this one writes routines, whatever for
-            writer = CalledWriter(loop, 8, processor.triple)
-            writer.write()
-            engine, _ = cpu._compile(str(writer.module), processor)
-            numbers = cpu._aligned(writer.numbers, np.float64)
-            kernel = cpu.Kernel(engine, 8, numbers, loop.operations())
-        else:
-            kernel = cpu.build_kernel(loop)
+        kernel = cpu.build_kernel(loop)
         leave_nothing_but_nan_on_the_stack(lanes)
         kernel.run([given[1], row, *own], 5, lanes)
         found.append(own)
@@ -322,7 +314,7 @@ def test_code_for_arm():
         [leaf],
         np.float64,
     )
-    processor = cpu.Processor("generic", "+neon", "aarch64-unknown-linux-gnu")
+    processor = native.Processor("generic", "+neon", "aarch64-unknown-linux-gnu")
     writer = cpu.write_loop(loop, processor)
     assert writer.width == 2
     machine = binding.Target.from_triple(processor.triple).create_target_machine(opt=3)
@@ -363,3 +355,76 @@ def test_a_sample_takes_no_more_operations_than_it_should(work):
     # four evaluations of the plant: a root and two reciprocals per link, three in the solution
     # and, where all metrics are accumulated, one per link for `ringing_time`, one for the stretch
     assert found["sqrt"] == 12 and found["reciprocal"] == {"W0": 36, "W1": 40}[work]
+
+
+# --- quick code first, fast code later ------------------------------------------------------------
+
+
+def test_a_kernel_is_upgraded_and_gives_the_same_numbers(tmp_path, monkeypatch):
+    """Once it has run for a while, by a process of its own; both versions are kept."""
+    monkeypatch.setattr(compilation, "cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(cpu, "_effort", lambda: 3)
+    loop = trace_loop(
+        lambda constants, row, state: [state[0] * 0.9 + jnp.sqrt(row[0]) / (1 + state[0] ** 2)],
+        [],
+        [InputLeaf((), True)],
+        [InputLeaf((3,), True)],
+        np.float64,
+    )
+    row, found = np.linspace(0.1, 2.0, 80).reshape(5, 16), []
+    kernel = cpu.build_kernel(loop)
+    assert not kernel.is_best and len(list(tmp_path.glob("kernel-*"))) == 1
+    for after in (1e9, 0.0, 0.0):
+        monkeypatch.setattr(cpu, "UPGRADE_AFTER", after)
+        found.append(np.linspace(-1, 1, 48).reshape(3, 16))
+        kernel.run([row, found[-1]], 5, 16)
+        if after == 0.0:
+            cpu._UPGRADES._thread.join(60.0)
+    assert kernel.is_best and len(kernel._engines) == 2
+    np.testing.assert_array_equal(found[0], found[2])
+    assert len(list(tmp_path.glob("kernel-*"))) == 2
+    assert cpu.build_kernel(loop).is_best  # found in the cache
+    with cpu.full_effort():
+        assert cpu.build_kernel(loop).is_best
+
+
+def test_a_failed_upgrade_leaves_the_first_version(monkeypatch):
+    monkeypatch.setattr(native.sys, "executable", "/nothing/there")
+    assert native.machine_code_apart("", native.this_processor(), 3) is None
+    monkeypatch.undo()
+    assert native.machine_code_apart("no module", native.this_processor(), 3) is None
+
+
+def test_numbers_that_all_calls_share_are_written_once(processor):
+    """Also where they come from another routine; tangents are left to `test_tangents`."""
+
+    def step(constants, row, state):
+        wide = jax.jit(lambda x: polynomial(x, 30))
+        twice = jax.jit(lambda x, y: polynomial(x, 30) * y + jnp.sum(y * y))
+        same = wide(row[0]) + wide(row[0] * 0.5)  # of this sample, the same in all calls below
+        first = twice(state[0], same * jnp.ones(3))
+        return [0.1 * twice(0.1 * first, same * jnp.ones(3)) + constants[0]]
+
+    def polynomial(x, terms):
+        total = 1.0 + 0 * x
+        for n in range(terms, 0, -1):
+            total = total * x * (0.3 / n) + 1.0
+        return total
+
+    leaves = [InputLeaf((), True)], [InputLeaf((), True)], [InputLeaf((3,), True)], np.float64
+    loops = [trace_loop(step, *leaves, has_routines=x) for x in (False, True)]
+    assert len(loops[1].bodies) == 2 and not loops[0].bodies
+    assert any(
+        node.place[0] == "shared"
+        for body in loops[1].bodies.values()
+        for node in body.order
+        if node.operation == "read"
+    )
+    rng, found = np.random.default_rng(3), []
+    constant, row, x = rng.normal(size=16), rng.normal(size=(4, 16)), rng.normal(size=(3, 16))
+    for loop in loops:
+        found.append(x.copy())
+        leave_nothing_but_nan_on_the_stack(16)
+        cpu.build_kernel(loop).run([constant, row, found[-1]], 4, 16)
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-12)
+    assert np.abs(found[0] - x).max() > 1e-3

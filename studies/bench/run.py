@@ -10,6 +10,7 @@ from studies.bench.gradients import bench_gradients
 from studies.bench.peers import bench_peers
 from studies.bench.works import bench_runs, bench_sweep
 from studies.errors import StudyError, field_error
+from studies.kernels.cpu import full_effort
 
 #: Cases of the work `sweep`.
 SWEEP_CASES = 100_000
@@ -43,13 +44,14 @@ def run_bench(
         raise field_error("bench", what, "'runs' or 'peers'")
     _check(what, work, executor, batch, cases)
     console = console or Console(stderr=True, highlight=False, markup=False)
-    if what == "peers":
-        return [row._asdict() for row in bench_peers(console.print)]
     if work == "sweep":
         return bench_sweep(cases or SWEEP_CASES, console)
-    if work == "grad":
-        return bench_gradients(executor, batch)
-    return bench_runs(work or "W1", executor, batch)
+    with full_effort():
+        if what == "peers":
+            return [row._asdict() for row in bench_peers(console.print)]
+        if work == "grad":
+            return bench_gradients(executor, batch)
+        return bench_runs(work or "W1", executor, batch)
 
 
 def _check(what: str, work: str, executor: str, batch: int, cases: int) -> None:

@@ -98,6 +98,7 @@ def _runner(
                 [InputLeaf((), is_wide) for is_wide in varies],
                 [InputLeaf(shape, True) for shape in state],
                 real,
+                has_routines=True,  # compiles in a third of the time
             )
 
         name = f"{step.__name__} {real} {trees[0]} {constants} {varies} {state}"

@@ -25,7 +25,7 @@ from studies.engine.program import (
     prepare_shared,
 )
 from studies.errors import StudyError
-from studies.kernels import cpu, llvm
+from studies.kernels import cpu, llvm, native
 from studies.kernels.traced import InputLeaf, TracedLoop, trace_loop
 
 #: More plant steps per sample than this would make the kernel's code too long.
@@ -72,12 +72,12 @@ def compile_steps(program: Program, split: Split, directions: int = 0) -> Steps:
     """
     numbers = tuple((leaf.shape, leaf.tobytes()) for leaf in split.shared)
     shapes = tuple(leaf.shape for leaf in split.varying)
-    key = (program, shapes, numbers, _real(), directions, cpu.this_processor())
+    key = (program, shapes, numbers, _real(), directions, native.this_processor())
     if key not in _STEPS:
         while len(_STEPS) >= KEPT_KERNELS:
             del _STEPS[next(iter(_STEPS))]
         # where instructions take numbers from memory only, small code is fast
-        has_routines = not cpu.this_processor().has_masks
+        has_routines = not native.this_processor().has_masks
         try:
             parts, shared, loop = trace_steps(program, split, directions, has_routines)
         except NotImplementedError as error:  # of a part of the user's own
@@ -96,7 +96,8 @@ def trace_steps(
     """
     one = [leaf[0] for leaf in split.varying]
     parts = find_parts(program, one, split.shared)
-    found = prepare_shared(program, parts, one, split.shared)
+    with PREPARING:
+        found = prepare_shared(program, parts, one, split.shared)
     shared = [np.asarray(leaf, order="C") for leaf in found]
     TRACES.append(program.structure)
     return Traced(parts, shared, _trace(program.structure, parts, shared, directions, has_routines))

@@ -49,7 +49,7 @@ def _listen() -> None:
 
 
 class ObjectCache:
-    """Machine code of one module; `take` and `keep` are llvmlite's cache interface."""
+    """Machine code of one module."""
 
     def __init__(self, *names: str) -> None:
         """
@@ -60,7 +60,7 @@ class ObjectCache:
         name = hashlib.sha256("\0".join(names).encode()).hexdigest()
         self._path = Path(folder) / f"kernel-{name}" if folder else None
 
-    def take(self, module: Any) -> bytes | None:
+    def take(self) -> bytes | None:
         """The code, None if it is not there or damaged."""
         try:
             digest, code = self._path.read_bytes().split(b"\n", 1) if self._path else (b"", b"")
@@ -68,7 +68,7 @@ class ObjectCache:
             return None
         return code if digest and digest == _digest(code) else None
 
-    def keep(self, module: Any, code: bytes) -> None:
+    def keep(self, code: bytes) -> None:
         """Write it; the cache only saves time, so an unwritable folder is not an error."""
         if self._path is None:
             return

@@ -10,17 +10,28 @@ import ctypes
 import json
 import os
 import re
+import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from functools import cache
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache, partial
+from threading import Lock, Thread
+from typing import Any
+from weakref import WeakSet
 
 import jax
 import numpy as np
 
 from studies import sources
+from studies.kernels import native
 from studies.kernels.compilation import ObjectCache, compiling
-from studies.kernels.llvm import binding
+from studies.kernels.native import (
+    Processor,
+    binding,
+    load_code,
+    machine_code,
+    machine_code_apart,
+)
 from studies.kernels.traced import TracedLoop
 from studies.kernels.vectors import ALIGNMENT, CalledWriter, MaskedWriter, VectorWriter
 
@@ -30,19 +41,63 @@ LANE_BYTES = ALIGNMENT
 _LEVEL = re.compile(r"--xla_backend_optimization_level=([0-3])")
 
 
+#: Effort of a first version, which compiles six times as fast and runs half as fast.
+QUICK = 0
+#: Run time of all kernels after which they deserve all the effort [s].
+UPGRADE_AFTER = 3.0
+_patience = [0]
+
+
+@contextmanager
+def full_effort() -> Iterator[None]:
+    """Compile kernels with all effort at once, and upgrade those that are used."""
+    _patience[0] += 1
+    try:
+        yield
+    finally:
+        _patience[0] -= 1
+
+
 class Kernel:
-    """A compiled loop. Call it with arrays; it releases Python's lock."""
+    """A compiled loop. Call it with arrays; it releases Python's lock.
+
+    The first version compiles quickly. Once kernels have run for a while, another process makes
+    faster ones, which replace them; both give the same numbers.
+    """
 
     def __init__(
-        self, code: Any, width: int, numbers: np.ndarray, operations: Counter[str]
+        self,
+        engine: Any,
+        width: int,
+        numbers: np.ndarray,
+        operations: Counter[str],
+        better: Callable[[bool], bytes | None] | None = None,
     ) -> None:
-        self._code = code  # keeps the machine code alive
+        """
+        Args:
+            engine: holds the machine code.
+            width: cases in a vector.
+            numbers: known ones, the first leaf.
+            operations: of one sample by kind.
+            better: machine code with all effort, None if that failed; made in a process of its own
+                if its argument is true. None: there is no better one.
+        """
+        self._engines: list[Any] = []  # keeps the machine code alive, for threads that still run it
+        self._use(engine)
+        self.width, self.numbers, self.operations = width, numbers, operations
+        self._better, self.spent = better, 0.0
+        _UPGRADES.add(self)
+
+    def _use(self, engine: Any) -> None:
+        self._engines.append(engine)
         pointers = ctypes.POINTER(ctypes.c_void_p)
         prototype = ctypes.CFUNCTYPE(None, pointers, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
-        self._function = prototype(code.get_function_address("run"))
-        self.width, self.numbers = width, numbers
-        #: operations of one sample by kind
-        self.operations = operations
+        self._function = prototype(engine.get_function_address("run"))
+
+    @property
+    def is_best(self) -> bool:
+        """Whether no upgrade is to come."""
+        return self._better is None
 
     def run(self, leaves: Sequence[np.ndarray], n_steps: int, lanes: int) -> None:
         """Step all lanes from start to end; the state's arrays are changed in place.
@@ -58,10 +113,52 @@ class Kernel:
         """
         if lanes % self.width:
             raise ValueError(f"lanes = {lanes}; allowed: multiples of {self.width}")
+        if self._better is not None and _patience[0]:
+            self.upgrade(False)
         arrays = [self.numbers, *leaves]
         addresses = (ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays))
+        began = time.perf_counter()
         for first in range(0, lanes, self.width):
             self._function(addresses, n_steps, lanes, first)
+        self.spent += time.perf_counter() - began
+        if self._better is not None:
+            _UPGRADES.consider()
+
+    def upgrade(self, is_apart: bool) -> None:
+        """Replace the machine code by better one, made here or in a process of its own."""
+        better, self._better = self._better, None
+        code = better(is_apart) if better is not None else None
+        if code is not None:
+            self._use(load_code(code, native.this_processor()))
+
+
+class _Upgrades:
+    """All kernels in use, which one thread upgrades when they have run long enough."""
+
+    def __init__(self) -> None:
+        self._kernels: WeakSet[Kernel] = WeakSet()
+        self._lock, self._thread = Lock(), Thread()
+
+    def add(self, kernel: Kernel) -> None:
+        with self._lock:
+            self._kernels.add(kernel)
+
+    def consider(self) -> None:
+        """Start the upgrades if they are due."""
+        with self._lock:
+            is_due = sum(kernel.spent for kernel in self._kernels) > UPGRADE_AFTER
+            if is_due and not self._thread.is_alive():
+                self._thread = Thread(target=self._upgrade, daemon=True)
+                self._thread.start()
+
+    def _upgrade(self) -> None:
+        with self._lock:
+            waiting = [kernel for kernel in self._kernels if not kernel.is_best]
+        for kernel in sorted(waiting, key=lambda x: -x.spent):
+            kernel.upgrade(is_apart=True)
+
+
+_UPGRADES = _Upgrades()
 
 
 def build_kernel(loop: TracedLoop, processor: Processor | None = None) -> Kernel:
@@ -71,20 +168,19 @@ def build_kernel(loop: TracedLoop, processor: Processor | None = None) -> Kernel
         loop: from `trace_loop`.
         processor: what for; default: this one.
     """
-    return _build(loop, processor or this_processor())[0]
-
-
-def _build(loop: TracedLoop, processor: Processor) -> tuple[Kernel, bytes]:
-    """The kernel, and its machine code."""
+    processor = processor or native.this_processor()
     writer = write_loop(loop, processor)
-    engine, code = _compile(str(writer.module), processor)
-    numbers = _aligned(writer.numbers, loop.dtype)
-    return Kernel(engine, writer.width, numbers, loop.operations()), code
+    text, numbers = str(writer.module), _aligned(writer.numbers, loop.dtype)
+    code, is_best = _compiled(text, processor)
+    better = None if is_best else partial(_best_code, text, processor)
+    return Kernel(
+        load_code(code, processor), writer.width, numbers, loop.operations(), better=better
+    )
 
 
 def write_loop(loop: TracedLoop, processor: Processor) -> VectorWriter:
     """The loop as LLVM's instructions, in the way that suits a processor."""
-    kind = MaskedWriter if processor.has_masks else CalledWriter
+    kind = MaskedWriter if processor.has_masks and not loop.bodies else CalledWriter
     writer = kind(loop, processor.vector_bytes // loop.dtype.itemsize, processor.triple)
     writer.write()
     return writer
@@ -108,22 +204,38 @@ def kept_kernel(name: str, make: Callable[[], TracedLoop]) -> Kernel:
         name: of the loop, with all sizes.
         make: traces it.
     """
-    processor = this_processor()
-    kept = ObjectCache("loop", name, _code(), jax.__version__, *_names(processor))
-    found = kept.take(None)
-    if found is None:
-        kernel, code = _build(make(), processor)
-        facts = [kernel.width, kernel.numbers.tolist(), kernel.operations]
-        kept.keep(None, json.dumps(facts).encode() + b"\n" + code)
-        return kernel
-    head, code = found.split(b"\n", 1)
-    width, numbers, operations = json.loads(head)
-    initialise()
-    engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine(processor))
-    engine.add_object_file(binding.ObjectFileRef.from_data(code))
-    engine.finalize_object()
+    processor = native.this_processor()
+
+    def kept(effort: int) -> ObjectCache:
+        return ObjectCache("loop", name, _code(), jax.__version__, *_names(processor, effort))
+
+    def better(is_apart: bool) -> bytes | None:
+        loop = make()
+        text = str(write_loop(loop, processor).module)
+        return _best_code(text, processor, is_apart)
+
+    for effort in _efforts():
+        found = kept(effort).take()
+        if found is not None:
+            head, code = found.split(b"\n", 1)
+            width, numbers, operations = json.loads(head)
+            break
+    else:
+        loop, effort = make(), _efforts()[-1]
+        writer = write_loop(loop, processor)
+        width, numbers, operations = writer.width, writer.numbers, loop.operations()
+        code, is_best = _compiled(str(writer.module), processor)
+        effort = _effort() if is_best else effort
+        head = json.dumps([width, numbers, operations]).encode()
+        kept(effort).keep(head + b"\n" + code)
     dtype = np.dtype(f"f{processor.vector_bytes // width}")
-    return Kernel(engine, width, _aligned(numbers, dtype), Counter(operations))
+    return Kernel(
+        load_code(code, processor),
+        width,
+        _aligned(numbers, dtype),
+        Counter(operations),
+        better=None if effort == _effort() else better,
+    )
 
 
 @cache
@@ -132,81 +244,47 @@ def _code() -> str:
     return sources.digest(__name__, "jaxmodel")
 
 
-@cache
-def initialise() -> None:
-    """Prepare LLVM for this processor."""
-    for part in ("initialize_native_target", "initialize_native_asmprinter"):
-        getattr(binding, part)()
-
-
 def _effort() -> int:
     """LLVM's optimisation level; 0 compiles six times as fast as 3, and runs half as fast."""
     found = _LEVEL.search(os.environ.get("XLA_FLAGS", ""))
     return int(found[1]) if found else 3
 
 
-class Processor(NamedTuple):
-    """What machine code is for."""
-
-    name: str
-    features: str  # as LLVM writes them: "+avx2,-avx512f,..."
-    triple: str
-
-    @property
-    def vector_bytes(self) -> int:
-        """Size of a register: 64 with AVX-512, 32 with AVX2, 16 otherwise."""
-        return 64 if self.has_masks else 32 if self._has("avx2") else 16
-
-    @property
-    def has_masks(self) -> bool:
-        """Whether stores may leave lanes out and instructions spread numbers as they read them."""
-        return self._has("avx512f")
-
-    def without(self, *prefixes: str) -> Processor:
-        """The same processor with fewer features, as older ones are."""
-        features = self.features.split(",")
-        kept = [f"-{x[1:]}" if x[1:].startswith(prefixes) else x for x in features]
-        return self._replace(features=",".join(kept))
-
-    def _has(self, feature: str) -> bool:
-        return f"+{feature}" in self.features.split(",")
+def _efforts() -> list[int]:
+    """Efforts in the order of preference; the last one is what is compiled."""
+    best = _effort()
+    return [best] if _patience[0] or best == QUICK else [best, QUICK]
 
 
-@cache
-def this_processor() -> Processor:
-    """The one that this program runs on."""
-    features = binding.get_host_cpu_features().flatten()
-    return Processor(binding.get_host_cpu_name(), features, binding.get_default_triple())
-
-
-def _names(processor: Processor) -> tuple[str, ...]:
+def _names(processor: Processor, effort: int) -> tuple[str, ...]:
     """What machine code depends on besides its source."""
-    return (*processor, ".".join(map(str, binding.llvm_version_info)), str(_effort()))
+    return (*processor, ".".join(map(str, binding.llvm_version_info)), str(effort))
 
 
-def _machine(processor: Processor) -> Any:
-    return binding.Target.from_triple(processor.triple).create_target_machine(
-        cpu=processor.name, features=processor.features, opt=_effort(), jit=True
-    )
-
-
-def _compile(text: str, processor: Processor) -> tuple[Any, bytes]:
-    """The engine with the machine code of a module, and that code."""
-    initialise()
-    kept, code = ObjectCache(text, *_names(processor)), []
-
-    def keep(module: Any, made: bytes) -> None:
-        code.append(made)
-        kept.keep(module, made)
-
-    def take(module: Any) -> bytes | None:
-        found = kept.take(module)
+def _compiled(text: str, processor: Processor) -> tuple[bytes, bool]:
+    """Machine code of a module, and whether there is no better one."""
+    efforts = _efforts()
+    for effort in efforts:
+        found = ObjectCache(text, *_names(processor, effort)).take()
         if found is not None:
-            code.append(found)
-        return found
-
+            return found, effort == _effort()
+    effort = efforts[-1]
     with compiling():
-        engine = binding.create_mcjit_compiler(binding.parse_assembly(text), _machine(processor))
-        engine.set_object_cache(keep, take)
-        engine.finalize_object()
-    return engine, code[-1]
+        code = machine_code(text, processor, effort)
+    ObjectCache(text, *_names(processor, effort)).keep(code)
+    return code, effort == _effort()
+
+
+def _best_code(text: str, processor: Processor, is_apart: bool) -> bytes | None:
+    """Machine code with all effort, None if its process failed."""
+    kept = ObjectCache(text, *_names(processor, _effort()))
+    code = kept.take()
+    if code is None:
+        if is_apart:
+            code = machine_code_apart(text, processor, _effort())
+        else:
+            with compiling():
+                code = machine_code(text, processor, _effort())
+        if code is not None:
+            kept.keep(code)
+    return code

@@ -24,14 +24,16 @@ class Routine:
     """One function under `jax.jit`, as operations on its parameters.
 
     Numbers that differ between the calls are its parameters, reads of ("parameter", k). What all
-    calls share and no sample changes is used as it is. With directions, the tangents of those
-    parameters that move follow the parameters, and tangents of the results the results.
+    calls share is used as it is: what no sample changes, and `shared` numbers. With directions, the
+    tangents of those parameters that move follow the parameters, and tangents of the results the
+    results; nothing is `shared` then.
     """
 
     def __init__(self) -> None:
         self.positions: list[int] = []  # of the parameters among the numbers of a call
         self.moving: list[int] = []  # parameters that have tangents
         self.parameters: list[Node] = []
+        self.shared: dict[int, Node] = {}  # numbers of a sample, by identity
         self.results: list[Any] = []
         self.size = 0  # how many results without tangents
 
@@ -48,6 +50,7 @@ class RoutineGraph(Graph):
         self._seeds = seeds
         self._asked: dict[int, list[list[Any]]] | None = None  # numbers of all calls, by function
         self._routines: dict[int, Routine] = {}
+        self._calls: dict[tuple[Any, ...], list[Any]] = {}  # results of each call
         self._is_fixed: dict[int, bool] = {}
         self._moves: dict[int, bool] = {}
         self._alive: list[Any] = []  # what is known by its identity
@@ -56,12 +59,13 @@ class RoutineGraph(Graph):
         """Find the routines."""
         found = _repeated(closed.jaxpr)
         self._alive += found.values()
-        # what the calls are given, their results still unknown
-        self._asked = {name: [] for name in found}
-        self._evaluate(closed.jaxpr, closed.consts, given)
-        asked, self._asked = self._asked, None
-        for name, calls in asked.items():
-            self._routines[name] = self._routine(found[name], calls)
+        # in the order of their first calls, so that each is given what the others before it return
+        for name, inner in found.items():
+            # what the calls are given, while the results of further routines are still unknown
+            self._asked = {x: [] for x in found if x not in self._routines}
+            self._evaluate(closed.jaxpr, closed.consts, given)
+            calls, self._asked = self._asked[name], None
+            self._routines[name] = self._routine(inner, calls)
 
     def _inlined(self, inner: Any, given: list[np.ndarray]) -> list[Any]:
         numbers = [x for array in given for x in array.flat]
@@ -91,7 +95,7 @@ class RoutineGraph(Graph):
         routine, given = Routine(), []
         self._classify([x for numbers in calls for x in numbers])
         for position, column in enumerate(zip(*calls, strict=True)):
-            if self.is_fixed(column[0]) and all(_is_same(x, column[0]) for x in column):
+            if all(_is_same(x, column[0]) for x in column) and self._is_usable(column[0], routine):
                 given.append(column[0])
                 continue
             if self._seeds and any(not is_known(x) and self._moves[id(x)] for x in column):
@@ -113,20 +117,39 @@ class RoutineGraph(Graph):
         self._classify(routine.results)
         return routine
 
+    def _is_usable(self, x: Any, routine: Routine) -> bool:
+        """Whether a number that all calls are given can be used inside the routine as it is."""
+        if self.is_fixed(x):
+            return True
+        if self._seeds or x.is_truth:
+            return False
+        calls = (node for node in in_order([x]) if node.operation == "call")
+        is_known_yet = all(call.place is not None for call in calls)
+        if is_known_yet:
+            routine.shared[id(x)] = x
+        return is_known_yet
+
     def _parameter(self, routine: Routine) -> Node:
         return self._new("read", (), ("parameter", len(routine.parameters)))
 
     def _called(self, routine: Routine, numbers: list[Any]) -> list[Any]:
         """Results of a call without their tangents, which the seeds take in."""
+        key = (id(routine), *((type(x), x) if is_known(x) else id(x) for x in numbers))
+        if key not in self._calls:
+            self._alive += numbers
+            self._calls[key] = self._call(routine, numbers)
+        return self._calls[key]
+
+    def _call(self, routine: Routine, numbers: list[Any]) -> list[Any]:
         values = [numbers[k] for k in routine.positions]
         moving = [values[k] for k in routine.moving]
         for seed in self._seeds:
             values += push_forward(self, moving, seed)
-        call = self._new("call", tuple(values), routine)
+        call = self._new("call", (*values, *routine.shared.values()), routine)
         given = {id(x): value for x, value in zip(routine.parameters, values, strict=True)}
 
         def result(k: int, x: Any) -> Any:
-            if self.is_fixed(x):
+            if self.is_fixed(x) or id(x) in routine.shared:
                 return x
             return given[id(x)] if id(x) in given else self._new("result", (call,), k)
 

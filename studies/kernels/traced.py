@@ -43,9 +43,9 @@ class Body(NamedTuple):
     """A routine that is still to be written as code."""
 
     results: dict[int, Any]  # those that are wanted, by their numbers
-    order: list[Node]  # what they need; a read's place: ("parameter" or "fixed", number)
-    fixed: list[Any]  # nodes of the loop that it reads, the same at every sample
-    n_parameters: int
+    order: list[Node]  # what they need; a read's place: (its kind, number)
+    fixed: list[Any]  # nodes of the loop that it reads as "fixed", the same at every sample
+    n_parameters: int  # first arguments of a call, read as "parameter"; all calls share the others
 
 
 class TracedLoop(NamedTuple):
@@ -218,14 +218,15 @@ def closed(graph: Graph, results: list[Any]) -> tuple[list[Any], dict[int, Body]
                 node.place[1]
                 for node in in_order([routines[name].results[k] for k in numbers])
                 if node.operation == "read" and node.place[0] == "parameter"
-            }
+            } | set(range(len(routines[name].parameters), len(calls[name][0].args)))
             for call in calls[name]:
                 # None where nothing is read, so that places stay
                 call.args = tuple(x if k in needed else None for k, x in enumerate(call.args))
         before, count = count, look()
     bodies, fixed = {}, []
     for name, numbers in wanted.items():
-        body, own = _cut(graph, [routines[name].results[k] for k in sorted(numbers)])
+        wanted_ones = [routines[name].results[k] for k in sorted(numbers)]
+        body, own = _cut(graph, wanted_ones, routines[name])
         body = fused(body)
         found = dict(zip(sorted(numbers), body, strict=True))
         n_parameters = len(routines[name].parameters)
@@ -237,26 +238,39 @@ def closed(graph: Graph, results: list[Any]) -> tuple[list[Any], dict[int, Body]
     return whole[: len(results)], bodies
 
 
-def _cut(graph: RoutineGraph, results: list[Any]) -> tuple[list[Any], list[Node]]:
-    """Results with reads in place of what is the same at every sample, and the latter."""
+def _cut(graph: RoutineGraph, results: list[Any], routine: Routine) -> tuple[list[Any], list[Node]]:
+    """Results with reads in place of what is the same in all calls.
+
+    Returns:
+        (results; of those numbers the ones that are also the same at every sample).
+    """
     made: dict[int, Node] = {}
     fixed: list[Node] = []
+    shared = {name: k for k, name in enumerate(routine.shared)}
 
     def is_outer(x: Node) -> bool:
-        return graph.is_fixed(x) and not x.is_truth
+        return (graph.is_fixed(x) and not x.is_truth) or id(x) in shared
 
     def new(x: Any) -> Any:
         if is_known(x):
             return x
-        if is_outer(x) and id(x) not in made:
+        if id(x) not in made and id(x) in shared:
+            made[id(x)] = Node("read", (), True, False, ("shared", shared[id(x)]))
+        elif id(x) not in made and is_outer(x):
             made[id(x)] = Node("read", (), True, False, ("fixed", len(fixed)))
             fixed.append(x)
         return made[id(x)]
 
+    own, left = set(), [x for x in results if not is_known(x)]
+    while left:  # what leads to an outer number stays outside too
+        x = left.pop()
+        if id(x) not in own and not is_outer(x):
+            own.add(id(x))
+            left += (y for y in x.args if not is_known(y))
     for node in in_order(results):
-        if node.operation == "read" and not is_outer(node):
+        if id(node) in own and node.operation == "read":
             made[id(node)] = node
-        elif not is_outer(node):
+        elif id(node) in own:
             args = tuple(map(new, node.args))
             is_varying = any(not is_known(x) and x.is_varying for x in args)
             made[id(node)] = Node(node.operation, args, is_varying, node.is_truth, node.place)

@@ -139,8 +139,9 @@ class CalledWriter(VectorWriter):
         self._known: dict[float, int] = {}  # place of each known number
         self._memory: dict[int, Any] = {}  # address of a node, by identity, in this function
         self._is_fixed = loop.fixed()
-        self._fixed_at, self._frame_at, self._work_size = self._layout()
+        self._fixed_at, self._shared_at, self._frame_at, self._work_size = self._layout()
         self._routines: dict[int, Any] = {}
+        self._shared: set[int] = set()  # places of what has been written for all calls
 
     @property
     def numbers(self) -> list[float]:
@@ -148,7 +149,7 @@ class CalledWriter(VectorWriter):
 
     def write(self) -> Any:
         for k, (name, body) in enumerate(self.loop.bodies.items()):
-            self._routines[name] = self._routine(f"routine_{k}", body)
+            self._routines[name] = self._routine(k, name, body)
         sample, pointer = self._sample(), ir.PointerType()
         self._forget()
         arguments = self.open()
@@ -193,11 +194,18 @@ class CalledWriter(VectorWriter):
                 self._emit(node)
             if id(node) in self._fixed_at:
                 self._keep(self._widened(node), self._slot(work, self._fixed_at[id(node)]))
+        for node in self.loop.order:
+            if node.operation == "call":
+                self._give(node, work, is_fixed=True)
 
     # --- memory -----------------------------------------------------------------------------------
 
-    def _layout(self) -> tuple[dict[int, int], dict[int, int], int]:
-        """Slots in `work` of what is the same at every sample, of the calls' frames; its size."""
+    def _layout(self) -> tuple[dict[int, int], dict[int, int], dict[int, int], int]:
+        """Slots in `work`, and its size.
+
+        They belong to what is the same at every sample, to what all calls of a routine share (the
+        first one, by the routine), and to the calls' frames.
+        """
         read = [x for body in self.loop.bodies.values() for x in body.fixed]
         read += [x for change in self.loop.changes for x in (change.mask, change.value)]
         for node in self.loop.order:
@@ -207,12 +215,17 @@ class CalledWriter(VectorWriter):
         for x in read:
             if not is_known(x) and self._is_fixed[id(x)] and not x.is_truth:
                 fixed.setdefault(id(x), len(fixed))
+        shared: dict[int, int] = {}
         frames, size = {}, len(fixed)
         for node in self.loop.order:
             if node.operation == "call":
+                body, name = self.loop.bodies[id(node.place)], id(node.place)
+                if name not in shared:
+                    shared[name] = size
+                    size += len(node.args) - body.n_parameters
                 frames[id(node)] = size
-                size += len(node.args) + len(self.loop.bodies[id(node.place)].results)
-        return fixed, frames, size
+                size += body.n_parameters + len(body.results)
+        return fixed, shared, frames, size
 
     def _buffer(self, count: int) -> Any:
         stack = self.builder.alloca(self.vector, ir.Constant(self.index, max(count, 1)))
@@ -250,9 +263,9 @@ class CalledWriter(VectorWriter):
         self._forget()
         return list(function.args)
 
-    def _routine(self, name: str, body: Body) -> Any:
+    def _routine(self, number: int, name: int, body: Body) -> Any:
         """`routine(frame, work, numbers)`: the frame has the parameters, then the results."""
-        frame, work, self._table = self._begin(name, [ir.PointerType()] * 3)
+        frame, work, self._table = self._begin(f"routine_{number}", [ir.PointerType()] * 3)
         due = defaultdict(list)
         for k, x in enumerate(body.results.values(), body.n_parameters):
             due[None if is_known(x) else id(x)].append((k, x))
@@ -262,6 +275,9 @@ class CalledWriter(VectorWriter):
                 self._emit(node)
             elif node.place[0] == "parameter":
                 self._memory[id(node)] = self._slot(frame, node.place[1])
+            elif node.place[0] == "shared":
+                place = self._shared_at[name] + node.place[1]
+                self._memory[id(node)] = self._slot(work, place)
             else:
                 outer = body.fixed[node.place[1]]
                 if is_known(outer):
@@ -304,10 +320,15 @@ class CalledWriter(VectorWriter):
     def _take(self, node: Node, at_input: list[Any], old: Any, work: Any) -> None:
         """One operation of a sample."""
         if node.operation == "call":
+            body = self.loop.bodies[id(node.place)]
+            self._give(node, work, is_fixed=False)
+            for place, x in enumerate(
+                node.args[body.n_parameters :], self._shared_at[id(node.place)]
+            ):
+                if place not in self._shared:
+                    self._shared.add(place)
+                    self._keep(self._widened(x), self._slot(work, place))
             frame = self._slot(work, self._frame_at[id(node)])
-            for k, x in enumerate(node.args):
-                if x is not None:
-                    self._keep(self._widened(x), self._slot(frame, k))
             self.builder.call(self._routines[id(node.place)], [frame, work, self._table])
         elif node.operation == "result":
             call = node.args[0]
@@ -320,6 +341,14 @@ class CalledWriter(VectorWriter):
             self._memory[id(node)] = self._slot(old, node.place[1])
         else:
             self.values[id(node)] = self._load(at_input[node.place[1]], node.is_varying)
+
+    def _give(self, call: Node, work: Any, is_fixed: bool) -> None:
+        """Write the parameters of a call that stay the same at every sample, or the others."""
+        count = self.loop.bodies[id(call.place)].n_parameters
+        for place, x in enumerate(call.args[:count], self._frame_at[id(call)]):
+            stays = is_known(x) or (x is not None and self._is_fixed[id(x)])
+            if x is not None and stays == is_fixed:
+                self._keep(self._widened(x), self._slot(work, place))
 
     def _change(self, changes: Iterable[Change], new: Any) -> None:
         for change in changes:
