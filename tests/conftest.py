@@ -16,6 +16,8 @@ if jaxlib.__version__.startswith(
     "0.10."
 ):  # unknown flags stop XLA, so elsewhere compiling is slower
     FLAGS += " --xla_cpu_use_fusion_emitters=false"
+    # without the threshold for small loops, which takes a sixth of the time to compile
+    FLAGS += " --xla_backend_extra_options=xla_cpu_use_multi_output_fusion"
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FLAGS}"
 configure()
 # tables as wide as they need to be, wherever the tests run
