@@ -15,8 +15,8 @@ from studies.show.figures import styled
 from studies.show.units import readable
 from studies.sweeps.show import label, shown_metric, unit_of_metric
 
-#: The best cases that the screen should not lose: this share of the random ones, but no fewer.
-GOOD, FEWEST = 0.01, 10
+#: The best cases, which the screen should not lose: this share of the random ones.
+GOOD = 0.01
 
 
 class ScreenCheck(NamedTuple):
@@ -37,7 +37,7 @@ class ScreenCheck(NamedTuple):
             f"The screen ran {self.n_passed} of {self.n_cases} cases, the best by the linear "
             f"model's {self.by}. On {self.n_random} random cases the rank correlation with the "
             f"full model is {self.correlation:.2f}, and {self.n_found} of the {self.n_good} best "
-            "of these by the full model passed the screen."
+            "of them by the full model passed the screen."
         )
 
 
@@ -53,7 +53,7 @@ def check_screen(data: SweepData) -> ScreenCheck | None:
     rows = rows[is_fine & (data["status"][rows] == status.OK)]
     value = metric_values(data, screen.by.removeprefix("-"))[rows]
     sign = -1 if direction(screen.by) == "largest" else 1
-    n_good = min(len(rows), max(FEWEST, round(GOOD * len(rows))))
+    n_good = min(len(rows), max(1, round(min(GOOD, screen.keep) * len(rows))))
     good = rows[np.argsort(sign * value, kind="stable")][:n_good]
     return ScreenCheck(
         by=screen.by.removeprefix("-"),
