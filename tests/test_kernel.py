@@ -428,3 +428,21 @@ def test_numbers_that_all_calls_share_are_written_once(processor):
         cpu.build_kernel(loop).run([constant, row, found[-1]], 4, 16)
     np.testing.assert_allclose(found[1], found[0], rtol=1e-12)
     assert np.abs(found[0] - x).max() > 1e-3
+
+
+def test_an_upgraded_kernel_is_found_by_the_next_process(tmp_path, monkeypatch):
+    """Under its name, so that it is neither traced nor run slowly again."""
+    monkeypatch.setattr(compilation, "cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(cpu, "_effort", lambda: 3)
+    made = []
+
+    def make():
+        made.append(1)
+        leaves = [], [], [InputLeaf((2,), True)]
+        return trace_loop(lambda _, row, state: [state[0] * 0.5 + 1.0], *leaves, np.float64)
+
+    kernel = cpu.kept_kernel("halves", make)
+    assert not kernel.is_best and not cpu.kept_kernel("halves", make).is_best
+    kernel.upgrade(is_apart=False)
+    assert cpu.kept_kernel("halves", make).is_best
+    assert len(made) == 1

@@ -171,8 +171,8 @@ def build_kernel(loop: TracedLoop, processor: Processor | None = None) -> Kernel
     processor = processor or native.this_processor()
     writer = write_loop(loop, processor)
     text, numbers = str(writer.module), _aligned(writer.numbers, loop.dtype)
-    code, is_best = _compiled(text, processor)
-    better = None if is_best else partial(_best_code, text, processor)
+    code, effort = _first_code(text, processor)
+    better = None if effort == _effort() else partial(_best_code, text, processor)
     return Kernel(
         load_code(code, processor), writer.width, numbers, loop.operations(), better=better
     )
@@ -209,25 +209,31 @@ def kept_kernel(name: str, make: Callable[[], TracedLoop]) -> Kernel:
     def kept(effort: int) -> ObjectCache:
         return ObjectCache("loop", name, _code(), jax.__version__, *_names(processor, effort))
 
-    def better(is_apart: bool) -> bytes | None:
+    @cache
+    def written() -> tuple[bytes, str]:
+        """What a kernel needs besides its machine code, and the text of that."""
         loop = make()
-        text = str(write_loop(loop, processor).module)
-        return _best_code(text, processor, is_apart)
+        writer = write_loop(loop, processor)
+        facts = [writer.width, writer.numbers, loop.operations()]
+        return json.dumps(facts).encode(), str(writer.module)
+
+    def better(is_apart: bool) -> bytes | None:
+        head, text = written()
+        code = _best_code(text, processor, is_apart)
+        if code is not None:
+            kept(_effort()).keep(head + b"\n" + code)
+        return code
 
     for effort in _efforts():
         found = kept(effort).take()
         if found is not None:
             head, code = found.split(b"\n", 1)
-            width, numbers, operations = json.loads(head)
             break
     else:
-        loop, effort = make(), _efforts()[-1]
-        writer = write_loop(loop, processor)
-        width, numbers, operations = writer.width, writer.numbers, loop.operations()
-        code, is_best = _compiled(str(writer.module), processor)
-        effort = _effort() if is_best else effort
-        head = json.dumps([width, numbers, operations]).encode()
+        head, text = written()
+        code, effort = _first_code(text, processor)
         kept(effort).keep(head + b"\n" + code)
+    width, numbers, operations = json.loads(head)
     dtype = np.dtype(f"f{processor.vector_bytes // width}")
     return Kernel(
         load_code(code, processor),
@@ -261,30 +267,40 @@ def _names(processor: Processor, effort: int) -> tuple[str, ...]:
     return (*processor, ".".join(map(str, binding.llvm_version_info)), str(effort))
 
 
-def _compiled(text: str, processor: Processor) -> tuple[bytes, bool]:
-    """Machine code of a module, and whether there is no better one."""
-    efforts = _efforts()
-    for effort in efforts:
-        found = ObjectCache(text, *_names(processor, effort)).take()
+def _first_code(text: str, processor: Processor) -> tuple[bytes, int]:
+    """Machine code of a module: the best that is kept, otherwise compiled; and its effort."""
+    *better, effort = _efforts()
+    for one in better:
+        found = ObjectCache(text, *_names(processor, one)).take()
         if found is not None:
-            return found, effort == _effort()
-    effort = efforts[-1]
-    with compiling():
-        code = machine_code(text, processor, effort)
-    ObjectCache(text, *_names(processor, effort)).keep(code)
-    return code, effort == _effort()
+            return found, one
+    code = _kept_code(text, processor, effort, _machine_code_here)
+    assert code is not None
+    return code, effort
 
 
 def _best_code(text: str, processor: Processor, is_apart: bool) -> bytes | None:
     """Machine code with all effort, None if its process failed."""
-    kept = ObjectCache(text, *_names(processor, _effort()))
+    make = machine_code_apart if is_apart else _machine_code_here
+    return _kept_code(text, processor, _effort(), make)
+
+
+def _kept_code(
+    text: str,
+    processor: Processor,
+    effort: int,
+    make: Callable[[str, Processor, int], bytes | None],
+) -> bytes | None:
+    """Machine code from the cache folder, otherwise made and kept there."""
+    kept = ObjectCache(text, *_names(processor, effort))
     code = kept.take()
     if code is None:
-        if is_apart:
-            code = machine_code_apart(text, processor, _effort())
-        else:
-            with compiling():
-                code = machine_code(text, processor, _effort())
+        code = make(text, processor, effort)
         if code is not None:
             kept.keep(code)
     return code
+
+
+def _machine_code_here(text: str, processor: Processor, effort: int) -> bytes:
+    with compiling():
+        return machine_code(text, processor, effort)

@@ -1,6 +1,6 @@
 """A traced loop as LLVM instructions, completed by a writer for each processor.
 
-The optional llvmlite is imported only here.
+The optional llvmlite is imported only here and in `native`.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from studies.kernels.graph import Node, is_known
+from studies.kernels.native import binding as binding
 from studies.kernels.traced import Change, InputLeaf, TracedLoop
 
 try:
-    from llvmlite import binding as binding
     from llvmlite import ir as ir
 except ImportError:  # the extra is not installed
-    binding = ir = None
+    ir = None
 
 
 def is_available() -> bool:
