@@ -9,7 +9,6 @@ from 3x3 matrices. docs/theory.md, "Gain margins of a batch". Shapes: structure 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -302,33 +301,23 @@ def go_round(response: LoopResponse, s: Pair, shift: Pair, spread: Array | None 
         spread: subtracted from the diagonal of L, so that channels without gains have distinct
             eigenvalues [1], (n, C); None: nothing.
     """
-    n = response.observe.shape[0]
-    own: list[list[Pair]] = []
-    joint: list[list[Pair]] = []
-    links = None
-    round_once, pass_by = (
-        jax.jit(_round_of_link),
-        jax.jit(_share_in_pose),
-    )  # kernels write them once
+    n, rounds, shares = response.observe.shape[0], [], []
+    # kernels write them once
+    round_once, pass_by = jax.jit(_round_of_link), jax.jit(_share_in_pose)
     for i in range(response.square.shape[0]):
         link = _one_link(response, i, i < n)
         if i < n:
             apart = None if spread is None else spread[i : i + 1]
-            one, through, share = round_once(link, s, shift, apart)
-            own.append(one)
-            joint.append(through)
+            *found, share = round_once(link, s, shift, apart)
+            rounds.append(found)
         else:
             share = pass_by(link, s)
-        links = share if links is None else links + share
-    assert links is not None
+        shares.append(share)
+    own, joint = jax.tree.map(lambda *x: jnp.concatenate(x), *rounds)
+    links = sum(shares[1:], start=shares[0])
     s2 = s * s
     pose = s2 * response.mass + s * response.damping + response.stiffness - links * (s2 * s2)
-    return Turn(
-        [_side_by_side(parts) for parts in zip(*own, strict=True)],
-        [_side_by_side(parts) for parts in zip(*joint, strict=True)],
-        pose,
-        determinant(pose).inverse(),
-    )
+    return Turn(own, joint, pose, determinant(pose).inverse())
 
 
 def _one_link(response: LoopResponse, i: int, has_channels: bool) -> LoopResponse:
@@ -337,11 +326,6 @@ def _one_link(response: LoopResponse, i: int, has_channels: bool) -> LoopRespons
     fields = (*_LINK_FIELDS, *(_CHANNEL_FIELDS if has_channels else ()))
     parts = {x: jax.tree.map(lambda leaf: leaf[one], getattr(response, x)) for x in fields}
     return response._replace(mass=None, damping=None, stiffness=None, **parts)
-
-
-def _side_by_side(parts: Sequence[Pair]) -> Pair:
-    """Pairs of the links joined along their first axis."""
-    return Pair(jnp.concatenate([x.re for x in parts]), jnp.concatenate([x.im for x in parts]))
 
 
 def _round_of_link(

@@ -76,7 +76,7 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
         forward = _points(jax.vmap(torque)(*wanted), n)
     elif structure.has_wrench:  # the settled output of the drive's integrators
         still = jnp.zeros_like(wanted.position[0])
-        held = inverse_dynamics(plant, wanted.position[0], still, still, wrench)
+        held = torque(wanted.position[0], still, still)
         forward = jnp.broadcast_to(held, (n, per_sample + 1, 3))
 
     is_buckled = jnp.any(steady_load(structure, case, plant) >= 1)

@@ -46,11 +46,6 @@ class Round(NamedTuple):
         return np.union1d(self.first, self.audit)
 
 
-def metric_of(screen: Screen) -> str:
-    """The metric that a screen ranks by, without its entry or direction."""
-    return screen.by.removeprefix("-").partition("[")[0]
-
-
 def check_condition(spec: SweepSpec, table: CaseTable) -> None:
     """Reject a screen's condition with unknown names before anything runs.
 
@@ -79,8 +74,7 @@ def screen_groups(
     screen: Screen,
 ) -> list[Group]:
     """Groups of the linear model: one metric, no judgement; arguments as `plan_groups`."""
-    metrics = (metric_of(screen),)
-    return plan_groups(table, rows, lay_out, metrics, is_linear=True, is_judged=False)
+    return plan_groups(table, rows, lay_out, (screen.metric,), is_linear=True, is_judged=False)
 
 
 def screen_variables(spec: SweepSpec, table: CaseTable, done: Done) -> dict[str, Variable]:
@@ -92,16 +86,8 @@ def screen_variables(spec: SweepSpec, table: CaseTable, done: Done) -> dict[str,
         done: a chunk of the linear model.
     """
     assert spec.screen is not None
-    by, chunk = spec.screen.by.removeprefix("-"), done.chunk
-    found = chunk_variables(
-        table,
-        chunk.rows,
-        done.judged,
-        chunk.is_too_stiff,
-        done.substeps,
-        [metric_of(spec.screen)],
-    )
-    value = metric_values(SweepData(found, {}, spec, table), by)
+    found = chunk_variables(table, done, [spec.screen.metric])
+    value = metric_values(SweepData(found, {}, spec, table), spec.screen.entry)
     code, value = found["status"].data, np.asarray(value, float)
     data = {"screen_status": code, "screen_value": value}
     return {

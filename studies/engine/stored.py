@@ -32,7 +32,7 @@ from studies.space.table import CaseTable
 from studies.store import Streamed, Variable, write_store
 
 if TYPE_CHECKING:
-    from studies.engine.chunks import JudgedChunk
+    from studies.engine.chunks import Done
 
 
 def kept_metrics(spec: SweepSpec) -> list[str]:
@@ -59,38 +59,29 @@ def kept_metrics(spec: SweepSpec) -> list[str]:
     return kept
 
 
-def chunk_variables(
-    table: CaseTable,
-    rows: np.ndarray,
-    judged: JudgedChunk,
-    is_too_stiff: np.ndarray,
-    substeps: int,
-    kept: list[str],
-) -> dict[str, Variable]:
+def chunk_variables(table: CaseTable, done: Done, kept: list[str]) -> dict[str, Variable]:
     """Contents of a chunk's file: ids, status, metrics of its cases, without padding.
 
     Args:
         table: all cases.
-        rows: those of the chunk.
-        judged: of the chunk, padded.
-        is_too_stiff: per case of the chunk.
-        substeps: plant steps per sample of its program.
+        done: the chunk.
         kept: metrics to keep.
 
     Returns:
         Variables; NaN for metrics of cases that did not finish, and of modes they do not have.
     """
-    count, result = len(rows), judged.result
-    margins = {name: data[:count] for name, data in judged.margins._asdict().items()}
+    rows, result = done.chunk.rows, done.judged.result
+    count = len(rows)
+    margins = {name: data[:count] for name, data in done.judged.margins._asdict().items()}
     code = np.asarray(result.status)[:count].copy()
-    code[is_too_stiff] = status.TOO_STIFF
+    code[done.chunk.is_too_stiff] = status.TOO_STIFF
     code[np.isin(code, status.FINISHED) & (margins["gain_margin"] < 1)] = status.UNSTABLE
     is_finished = np.isin(code, status.FINISHED)
     modes, controlled = (table.values(name)[rows] for name in ("link.modes", "control.modes"))
     variables = {
         "case_id": Variable(table.case_id[rows].astype(str), ("case",), "1", "hash of the case")
     }
-    known = {"status": code, "substeps": np.full(count, substeps), **margins}
+    known = {"status": code, "substeps": np.full(count, done.substeps), **margins}
     for name, (dims, *about) in PER_CASE.items():
         data = known[name] if name in known else np.asarray(getattr(result, name))[:count]
         if name in LEAST:

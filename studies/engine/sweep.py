@@ -137,8 +137,7 @@ def run_sweep(
         if spec.screen is None:
             rows, screened = run.full(np.arange(len(table)), _headline), None
         else:
-            screened_cases(out, tell)
-            rows, screened = run.screened()
+            rows, screened = run.screened(screened_cases(out, tell))
         if rows is not None:
             finished = finished_cases(out)
             _check_whole(table, rows, np.union1d(finished.case_id, table.case_id[run.lost]), out)
@@ -192,23 +191,27 @@ class _Run:
         groups = plan_groups(self.table, left, self._layout, sweep.metrics, is_linear)
 
         def save(done: Done) -> np.ndarray:
-            chunk = done.chunk
-            variables = chunk_variables(
-                self.table, chunk.rows, done.judged, chunk.is_too_stiff, done.substeps, kept
-            )
+            variables = chunk_variables(self.table, done, kept)
             self.folder.write_chunk(variables)
-            self.n_run += len(chunk.rows)
+            self.n_run += len(done.chunk.rows)
             return variables["status"].data
 
         n_before = len(rows) - len(left)
         text = headline(self.table, groups, n_before)
         return rows if self._chunks(groups, len(rows), n_before, text, save) else None
 
-    def screened(self) -> tuple[np.ndarray | None, Finished]:
-        """Screen all cases and run the best; returns their rows, None if interrupted."""
+    def screened(self, before: Finished) -> tuple[np.ndarray | None, Finished]:
+        """Screen all cases and run the best.
+
+        Args:
+            before: screened by earlier calls.
+
+        Returns:
+            (rows of the best, None if interrupted; where the screen's results are).
+        """
         screen, table, path = self.spec.screen, self.table, self.folder.path
         assert screen is not None
-        left = self._left(np.arange(len(table)), screened_cases(path))
+        left = self._left(np.arange(len(table)), before)
         groups = screen_groups(table, left, self.runner.layout, screen)
 
         def save(done: Done) -> np.ndarray:
@@ -223,12 +226,12 @@ class _Run:
         if not is_whole:
             return None, found
         order = ranked(table, found, screen)
-        wanted: Round | None = first_round(table, order, self.spec)
-        while wanted is not None:
-            this, rows = wanted, self.full(wanted.rows, _kept_headline)
+        this: Round | None = first_round(table, order, self.spec)
+        while this is not None:
+            rows = self.full(this.rows, _kept_headline)
             if rows is None:
                 return None, found
-            wanted = next_round(table, order, self.spec, this, path)
+            this = next_round(table, order, self.spec, this, path)
         return rows, found
 
     def _left(self, rows: np.ndarray, finished: Finished) -> np.ndarray:

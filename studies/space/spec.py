@@ -50,6 +50,16 @@ class Screen(Section):
         "", "-", "cases are run, in the screen's order, until that share meets this condition"
     )
 
+    @property
+    def entry(self) -> str:
+        """What the screen ranks by, without the direction."""
+        return self.by.removeprefix("-")
+
+    @property
+    def metric(self) -> str:
+        """The metric of that entry."""
+        return self.entry.partition("[")[0]
+
 
 class Sweep(Block):
     """What varies, and what is kept."""
@@ -117,7 +127,7 @@ def _parse_screen(sweep: Sweep) -> Screen:
         screen = Screen.model_validate(sweep.screen)
     except ValidationError as error:
         raise explain(error, Screen, sweep.screen, inside="sweep.screen") from None
-    ranking = parse_entries(screen.by.removeprefix("-"), "sweep.screen.by").metric
+    ranking = parse_entries(screen.entry, "sweep.screen.by").metric
     if sweep.metrics and ranking not in sweep.metrics:
         allowed = f"one of sweep.metrics = {list(sweep.metrics)}"
         raise field_error("sweep.screen.by", screen.by, allowed)

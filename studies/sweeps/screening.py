@@ -43,20 +43,20 @@ class ScreenCheck(NamedTuple):
 
 def check_screen(data: SweepData) -> ScreenCheck | None:
     """Compare both models on random cases; None without a screen, or if nothing passed it."""
-    screen, needed = data.spec.screen, ("screen_value", "case_id", "gain_margin")
-    if screen is None or not all(name in data.variables for name in needed):
+    screen = data.spec.screen
+    if screen is None or not {"screen_value", screen.metric} <= set(data.variables):
         return None
     order = _order(data)
     passed = order[: _n_passed(data, order)]
     rows = _random(data, order)
     is_fine = meets(data, screen.subject_to, "sweep.screen.subject_to")[rows]
     rows = rows[is_fine & (data["status"][rows] == status.OK)]
-    value = metric_values(data, screen.by.removeprefix("-"))[rows]
+    value = metric_values(data, screen.entry)[rows]
     sign = -1 if direction(screen.by) == "largest" else 1
     n_good = min(len(rows), max(1, round(min(GOOD, screen.keep) * len(rows))))
     good = rows[np.argsort(sign * value, kind="stable")][:n_good]
     return ScreenCheck(
-        by=screen.by.removeprefix("-"),
+        by=screen.entry,
         n_cases=data.n_cases,
         n_passed=len(passed),
         n_random=len(rows),
@@ -84,7 +84,7 @@ def _random(data: SweepData, order: np.ndarray) -> np.ndarray:
     """The random cases that have a value of the full model."""
     assert data.spec.screen is not None
     rows = audited(data.n_cases, order, data.spec)
-    value = metric_values(data, data.spec.screen.by.removeprefix("-"))
+    value = metric_values(data, data.spec.screen.entry)
     return rows[np.isfinite(value[rows])]
 
 
@@ -105,7 +105,7 @@ def draw_screen(data: SweepData) -> Figure:
     screen = data.spec.screen
     if screen is None or "screen_value" not in data.variables:
         raise StudyError("sweep.screen: none in this sweep")
-    by = screen.by.removeprefix("-")
+    by = screen.entry
     order, value = _order(data), shown_metric(data, by)
     factor = readable(unit_of_metric(data, by))[0]
     linear = factor * data["screen_value"]

@@ -12,7 +12,7 @@ from rich.table import Table as RichTable
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
-from studies.engine.columns import LEFT_OUT, NOT_RUN, variable_name
+from studies.engine.columns import NOT_RUN, PER_CASE, variable_name
 from studies.engine.results import (
     SweepData,
     counted_links,
@@ -64,8 +64,8 @@ def print_rows(found: Rows, console: Console) -> None:
 
 def reason(code: int) -> str:
     """A status in words."""
-    others = {NOT_RUN: "not run yet", LEFT_OUT: "left out by the screen"}
-    return (others | status.REASONS).get(code, f"status {code}")
+    words = PER_CASE["status"][-1] | {NOT_RUN: "not run yet"}
+    return str(words.get(code, f"status {code}"))
 
 
 def select(data: SweepData, subject_to: str) -> np.ndarray:
