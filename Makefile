@@ -4,7 +4,8 @@ PYTHON ?= python3
 # Small eigenvalue problems are slower on several BLAS threads, much slower beside other processes.
 export OPENBLAS_NUM_THREADS ?= 1
 BIN := .venv/bin
-PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+# A test that kills its process ends the run: pytest-xdist may wait forever with a replacement.
+PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 .DEFAULT_GOAL := help
 .PHONY: help study explore test test-long lint check clean venv

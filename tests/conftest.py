@@ -4,9 +4,11 @@ Tests compile much and run little, so the code generators of XLA and of the kern
 optimisations out here: the same programs, compiled in a third of the time.
 """
 
+import gc
 import os
 from pathlib import Path
 
+import jax
 import jaxlib
 
 from studies.config import configure
@@ -45,3 +47,20 @@ def pytest_collection_modifyitems(items):
     """Heavy files first; otherwise as collected."""
     place = {f"test_{name}.py": k for k, name in enumerate(HEAVY)}
     items.sort(key=lambda item: place.get(Path(item.fspath).name, len(HEAVY)))
+
+
+#: Programs that XLA compiled hold some mappings each; Linux ends a process that wants more than
+#: 65,530 of them by a segmentation fault.
+MAPPINGS = 20_000
+
+
+def pytest_runtest_teardown(item, nextitem):
+    """Drop compiled programs between files before they become too many."""
+    if nextitem is not None and nextitem.fspath != item.fspath and _mappings() > MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
+
+
+def _mappings():
+    maps = Path("/proc/self/maps")
+    return maps.read_bytes().count(b"\n") if maps.exists() else 0
