@@ -451,7 +451,7 @@ def write(folder, **changes):
 def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_path, comparison):
     few(monkeypatch, lambda study, margin: comparison)
     design, out = write(tmp_path), tmp_path / "deep" / "out"
-    code, text, _ = run(capsys, "spillover", design, "--out", out)
+    code, text, _ = run(capsys, "spillover", design, "--out", out, "--pdf")
     assert code == 0 and "passed: gain margin 2.5, 2 required" in text
     figures = [
         f"{name}.{kind}"
@@ -460,6 +460,7 @@ def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_
     ]
     files = {"report.md", "report.html", "certificate.json", "spillover.h5", *figures}
     assert {path.name for path in out.iterdir()} == files | {"machine.png"}
+    assert (out / "laws.pdf").read_bytes()[:5] == b"%PDF-"
     report = (out / "report.md").read_text()
     assert report.startswith("# Spillover certificate passed: gain margin 2.5, 2 required")
     assert all(f"({name}.png)" in report for name in ("margins", "damping", "leakage", "laws"))
@@ -490,7 +491,9 @@ def test_a_certificate_is_made_again_in_its_folder(capsys, monkeypatch, tmp_path
     """Also that of a design whose ratios come from its own run and are written as numbers."""
     few(monkeypatch, lambda study, margin: comparison)
     monkeypatch.setattr(
-        spillover_run.figures, "save", lambda _, out, name: (out / f"{name}.png").write_bytes(b"-")
+        spillover_run.figures,
+        "save",
+        lambda _, out, name, __: (out / f"{name}.png").write_bytes(b"-"),
     )
     design, out = write(tmp_path, control__ratio_source="own_run"), tmp_path / "out"
     for _ in range(2):
@@ -504,7 +507,9 @@ def test_command_fails_a_design(capsys, monkeypatch, tmp_path):
 
     few(monkeypatch, refuse)
     monkeypatch.setattr(
-        spillover_run.figures, "save", lambda _, out, name: (out / f"{name}.png").write_bytes(b"-")
+        spillover_run.figures,
+        "save",
+        lambda _, out, name, __: (out / f"{name}.png").write_bytes(b"-"),
     )
     design, out = write(tmp_path, **DIFFERENCE), tmp_path / "out"
     code, text, _ = run(capsys, "spillover", design, "--out", out, "--margin", "1.5")
@@ -521,7 +526,9 @@ def test_command_fails_a_design(capsys, monkeypatch, tmp_path):
 def test_a_certificate_is_written_whole_or_not_at_all(capsys, monkeypatch, tmp_path, comparison):
     few(monkeypatch, lambda study, margin: comparison)
     monkeypatch.setattr(
-        spillover_run.figures, "save", lambda _, out, name: (out / f"{name}.png").write_bytes(b"-")
+        spillover_run.figures,
+        "save",
+        lambda _, out, name, __: (out / f"{name}.png").write_bytes(b"-"),
     )
     design, out = write(tmp_path), tmp_path / "out"
     (out / "report.md").mkdir(parents=True)

@@ -31,6 +31,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         resume: Annotated[
             bool, typer.Option("--resume", help="continue an interrupted run")
         ] = False,
+        pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
     ) -> None:
         """Map all subsets of controlled links and modes, workspace modes and platform error."""
@@ -46,7 +47,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             raise StudyError(f"--case {case}: needs a DESIGN; name one, or leave --case out")
         else:  # as in the paper, every run's ratios come from its own uncontrolled counterpart
             study = paper_study().change(control__ratio_source="own_run")
-        if not run_atlas(study, out, resume, console, quiet):
+        if not run_atlas(study, out, resume, console, quiet, pdf):
             print(
                 f"studies: interrupted; finished runs are safe; continue with --resume --out {out}",
                 file=sys.stderr,

@@ -51,6 +51,7 @@ def run_atlas(
     is_resumed: bool = False,
     console: Console | None = None,
     is_quiet: bool = False,
+    has_pdf: bool = False,
 ) -> bool:
     """Run all subsets of a design, analyse its workspace and platform, and write the report.
 
@@ -60,6 +61,7 @@ def run_atlas(
         is_resumed: continue with existing runs; everything else is computed anew.
         console: where progress goes; default: standard output.
         is_quiet: hide progress.
+        has_pdf: also write the figures as PDF.
 
     Returns:
         Whether it finished (False: interrupted by Ctrl-C; finished runs are kept).
@@ -76,7 +78,8 @@ def run_atlas(
         if run_sweep(spec, out / RUNS_FOLDER, is_resumed, console, is_quiet).is_interrupted:
             return False
         try:
-            _finish(study, out, (lambda text, share: None) if is_quiet else _teller(console))
+            tell = (lambda text, share: None) if is_quiet else _teller(console)
+            _finish(study, out, tell, has_pdf)
         except KeyboardInterrupt:
             return False
     return True
@@ -90,7 +93,7 @@ def _teller(console: Console) -> Tell:
     return tell
 
 
-def _finish(study: Study, out: Path, tell: Tell) -> None:
+def _finish(study: Study, out: Path, tell: Tell, has_pdf: bool) -> None:
     """Everything after the runs of the subsets."""
     subsets, dropped = sound_settings(read_subsets(load(out / RUNS_FOLDER)))
     with threadpool_limits(1, "blas"):  # many small matrices: more threads only slow them down
@@ -101,7 +104,7 @@ def _finish(study: Study, out: Path, tell: Tell) -> None:
             tell("drawing", 0.0)
             with styled():
                 for name, draw in FIGURES.items():
-                    save(draw(found), staging, name)
+                    save(draw(found), staging, name, has_pdf)
                 write_figure(sketch(study), staging / "machine.png")
             write_animation(found, staging)
             write_report(staging, report(found, dropped), study)

@@ -35,10 +35,12 @@ SCALE_DELAY = 0.05
 Pairs = list[tuple[int, int]]
 
 
-def draw_figure(name: str, runs: PaperRuns, measures: Measures, folder: Path) -> None:
-    """Write one of PAPER_FIGURES as PNG and PDF into a folder."""
+def draw_figure(
+    name: str, runs: PaperRuns, measures: Measures, folder: Path, has_pdf: bool
+) -> None:
+    """Write one of PAPER_FIGURES into a folder."""
     with figures.styled():
-        figures.save(PAPER_FIGURES[name](runs, measures), folder, name)
+        figures.save(PAPER_FIGURES[name](runs, measures), folder, name, has_pdf)
 
 
 def _pairs(runs: PaperRuns, links: tuple[bool, ...], modes: int) -> Pairs:

@@ -40,21 +40,28 @@ from studies.study.spec import Study, paper_study
 DATA, REPORT = "paper.h5", "report.html"
 
 
-def run_paper(out: str | Path, console: Console | None = None) -> None:
+def run_paper(out: str | Path, console: Console | None = None, has_pdf: bool = False) -> None:
     """Run the paper's study and write data, figures and report.
 
     Args:
         out: folder, created if missing; files of an earlier run are replaced.
         console: where progress and the outcome go; default: standard output.
+        has_pdf: also write the figures as PDF.
 
     Raises:
         StudyError: the folder cannot be made or written to.
     """
     study, console = paper_study(), console or Console(highlight=False, markup=False)
-    write_paper(Path(out), console, study, paper_cases(study.control.gain_factor))
+    write_paper(Path(out), console, study, paper_cases(study.control.gain_factor), has_pdf)
 
 
-def write_paper(out: Path, console: Console, study: Study, cases: list[PaperCase]) -> None:
+def write_paper(
+    out: Path,
+    console: Console,
+    study: Study,
+    cases: list[PaperCase],
+    has_pdf: bool = False,
+) -> None:
     """`run_paper` for a chosen machine and choice of cases.
 
     Args:
@@ -62,6 +69,7 @@ def write_paper(out: Path, console: Console, study: Study, cases: list[PaperCase
         console: where progress and the outcome go.
         study: the machine.
         cases: from `paper_cases`.
+        has_pdf: also write the figures as PDF.
 
     Raises:
         StudyError: as `run_paper` and `run_cases`.
@@ -78,14 +86,14 @@ def write_paper(out: Path, console: Console, study: Study, cases: list[PaperCase
         runs = run_cases(study, cases, tell)
         measures = measure(runs)
         try:
-            _write(out, runs, measures, tell)
+            _write(out, runs, measures, tell, has_pdf)
         except OSError as error:
             raise StudyError(f"--out {out}: cannot write there ({error})") from error
         progress.update(task, description="done", completed=work)
     _print_outcome(out, console, runs)
 
 
-def _write(out: Path, runs: PaperRuns, measures: Measures, tell: Tell) -> None:
+def _write(out: Path, runs: PaperRuns, measures: Measures, tell: Tell, has_pdf: bool) -> None:
     """Write everything elsewhere first, so that an interruption leaves old files intact."""
     with staged(out) as staging:
         tell("writing data", 0.0)
@@ -93,7 +101,7 @@ def _write(out: Path, runs: PaperRuns, measures: Measures, tell: Tell) -> None:
         tell("writing data", 1.0)
         for name in PAPER_FIGURES:
             tell(f"drawing {name}", 0.25)
-            draw_figure(name, runs, measures, staging)
+            draw_figure(name, runs, measures, staging, has_pdf)
         with styled():
             write_figure(sketch(runs.study), staging / "machine.png")
         write_report(staging, report(runs, measures), runs.study)
@@ -120,7 +128,7 @@ def _print_outcome(out: Path, console: Console, runs: PaperRuns) -> None:
     console.print(table)
     console.print(f"executor: {EXECUTOR}")
     console.print(f"report:  {out / REPORT}")
-    console.print(f"figures: {out}{os.sep}*.png and *.pdf")
+    console.print(f"figures: {out}{os.sep}*.png")
     console.print(f"data:    {out / DATA}")
 
 

@@ -64,11 +64,16 @@ def legend_above(figure: Figure, ax: Axes) -> None:
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
 
 
-def save(figure: Figure, folder: Path, name: str) -> None:
-    """Write the figure as PNG and PDF, each whole or not at all; StudyError if that fails."""
+def save(figure: Figure, folder: Path, name: str, has_pdf: bool = False) -> None:
+    """Write the figure as PNG, and as PDF if wanted, whole or not at all.
+
+    Raises:
+        StudyError: that fails.
+    """
     write_figure(figure, folder / f"{name}.png")
-    figure.set_layout_engine("none")  # keeps the layout, which takes half a second
-    write_figure(figure, folder / f"{name}.pdf")
+    if has_pdf:
+        figure.set_layout_engine("none")  # keeps the layout, which takes half a second
+        write_figure(figure, folder / f"{name}.pdf")
 
 
 def write_figure(figure: Figure, path: Path) -> None:

@@ -28,11 +28,12 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         margin: Annotated[
             float, typer.Option(help="gain margin required on every plant [1]")
         ] = 2.0,
+        pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
     ) -> None:
         """Certify a controller on plants that differ from its model."""
         start()
         from studies.engine.design import load_design
         from studies.spillover.run import spillover_design
 
-        if not spillover_design(load_design(design, case), out, margin, console):
+        if not spillover_design(load_design(design, case), out, margin, console, pdf):
             sys.exit(1)

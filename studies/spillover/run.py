@@ -29,7 +29,11 @@ DOCUMENT, DATA = "certificate.json", "spillover.h5"
 
 
 def spillover_design(
-    design: Design, out: str | Path, margin: float = 2.0, console: Console | None = None
+    design: Design,
+    out: str | Path,
+    margin: float = 2.0,
+    console: Console | None = None,
+    has_pdf: bool = False,
 ) -> bool:
     """Write the certificate of a design, and the comparison of laws on its machine.
 
@@ -38,6 +42,7 @@ def spillover_design(
         out: folder for the files, created if missing.
         margin: gain margin required on every plant [1].
         console: where messages go; default: standard output.
+        has_pdf: also write the figures as PDF.
 
     Returns:
         whether the design passes.
@@ -58,7 +63,7 @@ def spillover_design(
         laws = compare_laws(found.study, margin)
     except StudyError as error:
         found = found._replace(notes=(*found.notes, f"laws are not compared: {error}"))
-    _write(out, found, laws)
+    _write(out, found, laws, has_pdf)
     for note in found.notes:
         console.print(note, soft_wrap=True)
     console.print(
@@ -83,11 +88,11 @@ def _check_whose(out: Path, study: Study) -> None:
         )
 
 
-def _write(out: Path, found: Certificate, laws: Comparison | None) -> None:
+def _write(out: Path, found: Certificate, laws: Comparison | None, has_pdf: bool) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         with staged(out) as staging:  # an interruption leaves the old files intact
-            _draw(staging, found, laws)
+            _draw(staging, found, laws, has_pdf)
             write_store(staging / DATA, variables(found, laws), run_attributes(found.study))
             (staging / DOCUMENT).write_text(document(found, laws), encoding="utf-8")
             write_report(staging, report(found, laws), found.study)
@@ -95,7 +100,7 @@ def _write(out: Path, found: Certificate, laws: Comparison | None) -> None:
         raise StudyError(f"--out {out}: cannot write there ({error})") from error
 
 
-def _draw(folder: Path, found: Certificate, laws: Comparison | None) -> None:
+def _draw(folder: Path, found: Certificate, laws: Comparison | None, has_pdf: bool) -> None:
     drawn: list[tuple[str, Callable[..., Any], Any]] = [
         ("margins", plots.margins, found),
         ("damping", plots.mode_damping, found),
@@ -106,9 +111,9 @@ def _draw(folder: Path, found: Certificate, laws: Comparison | None) -> None:
         for name, plot, data in drawn:
             figure, axes = figures.new_figure(1, 1, 2.65)
             plot(data, axes[0, 0])
-            figures.save(figure, folder, name)
+            figures.save(figure, folder, name, has_pdf)
         if LAWS[found.study.control.law].channel == "mode":
-            figures.save(plots.leakage(found), folder, "leakage")
+            figures.save(plots.leakage(found), folder, "leakage", has_pdf)
         figures.write_figure(sketch(found.study), folder / "machine.png")
 
 
