@@ -117,12 +117,13 @@ def init(
 
 @app.command()
 def info() -> None:
-    """Show versions, devices, precision and compilation cache."""
+    """Show versions, devices, precision, compilation cache, and what sweeps run with."""
     start()
     from studies.config import info as facts
+    from studies.engine.executor import executor_text
 
     table = Table(show_header=False)
-    for name, value in facts().items():
+    for name, value in {**facts(), "sweeps run with": executor_text()}.items():
         table.add_row(name, str(value))
     console.print(table)
 

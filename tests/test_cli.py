@@ -347,7 +347,7 @@ def test_init_writes_a_study_once(capsys, tmp_path):
 def test_info_names_versions_devices_and_precision(capsys):
     code, out, _ = run(capsys, "info")
     assert code == 0
-    for word in ("flexlink-studies", "jax", "devices", "float64", "cache"):
+    for word in ("flexlink-studies", "jax", "devices", "float64", "cache", "traced kernel"):
         assert word in out
 
 

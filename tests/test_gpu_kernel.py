@@ -17,7 +17,7 @@ from jaxmodel import status
 from studies import config
 from studies.bench.works import METRICS, WORKS
 from studies.engine import kernel_executor as kernels
-from studies.engine.executor import make_executor
+from studies.engine.executor import executor_text, make_executor
 from studies.engine.kernel_executor import GpuExecutor, KernelExecutor
 from studies.engine.plan import Layout
 from studies.engine.scan import ScanExecutor
@@ -113,6 +113,25 @@ def test_without_the_call_target_the_scan_runs(monkeypatch):
     executor = GpuExecutor(structure, LAYOUT, False)
     assert executor.start(cases).wait().status[0] == status.OK
     assert executor.name.startswith("XLA scan (the GPU kernel failed: ")
+
+
+def test_with_another_jaxlib_the_scan_runs(monkeypatch):
+    monkeypatch.setattr(kernels, "ScanExecutor", KernelExecutor)
+    monkeypatch.setattr(gpu, "JAXLIB", "0.11.1")
+    structure, cases = work("W1")
+    executor = GpuExecutor(structure, LAYOUT, False)
+    assert executor.start(cases).wait().status[0] == status.OK
+    assert "is known to run with jaxlib 0.10 only, this is 0.11.1" in executor.name
+
+
+def test_what_sweeps_run_with_is_said(monkeypatch):
+    assert "traced kernel, vectors of" in executor_text()
+    monkeypatch.setattr("studies.engine.executor.processor", lambda: "cuda")
+    assert "never run on a device" in executor_text()
+    monkeypatch.setattr("studies.engine.executor.is_known", lambda: False)
+    assert executor_text() == "XLA scan"
+    monkeypatch.setattr("studies.engine.executor.is_available", lambda: False)
+    assert "extra 'fast'" in executor_text()
 
 
 def test_it_is_chosen_on_a_graphics_processor(monkeypatch):

@@ -19,6 +19,9 @@ from studies.engine.program import Executor
 from studies.engine.runs import uncontrolled
 from studies.engine.scan import ScanExecutor
 from studies.engine.steps import fits_kernel
+from studies.kernels import native
+from studies.kernels.gpu import is_known
+from studies.kernels.llvm import is_available
 
 
 def make_executor(structure: Structure, layout: Layout, has_own_ratio: bool) -> Executor:
@@ -32,6 +35,17 @@ def make_executor(structure: Structure, layout: Layout, has_own_ratio: bool) -> 
     kernels: dict[str, type[Executor]] = {"cpu": KernelExecutor, "cuda": GpuExecutor}
     fastest = kernels.get(processor(), ScanExecutor) if fits_kernel(structure) else ScanExecutor
     return fastest(structure, layout, has_own_ratio)
+
+
+def executor_text() -> str:
+    """What sweeps run with here, in words."""
+    if not is_available():
+        return "XLA scan; the traced kernel, several times faster, needs the extra 'fast'"
+    if processor() == "cpu":
+        return f"traced kernel, vectors of {native.this_processor().vector_bytes} bytes"
+    if processor() == "cuda" and is_known():
+        return "GPU kernel; never run on a device so far: a sweep's first cases also run on the CPU"
+    return "XLA scan"
 
 
 def own_ratios(executor: Executor, cases: Case) -> np.ndarray:

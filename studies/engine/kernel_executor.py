@@ -134,6 +134,8 @@ class GpuExecutor:
 
     def _build(self, program: Program, split: Split, block: list[Any]) -> str:
         """Build the program; returns what is wrong with it, "" if nothing."""
+        if not gpu.is_known():
+            return f"is known to run with jaxlib {gpu.KNOWN} only, this is {gpu.JAXLIB}"
         try:
             traced = trace_steps(program, split)
             if traced.loop.operations()["tanh"]:

@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxlib import version as jaxlib_version
 
 from studies.kernels.compilation import compiling
 from studies.kernels.llvm import Arguments, Writer, binding, ir
@@ -24,11 +25,17 @@ from studies.kernels.traced import TracedLoop
 
 #: Cases per thread block: two warps, so that registers are allocated in small portions.
 BLOCK = 64
-#: XLA's name for a call of a PTX program (jaxlib 0.10).
-TARGET = "__gpu$xla.gpu.ptx"
+#: XLA's name for a call of a PTX program, and the versions of jaxlib that are known to have it.
+TARGET, KNOWN = "__gpu$xla.gpu.ptx", "0.10"
+JAXLIB: str = jaxlib_version.__version__
 #: The oldest GPUs the PTX supports; the driver compiles it for the actual one.
 _ARCHITECTURE, _PTX = "sm_70", "+ptx63"
 _TRIPLE = "nvptx64-nvidia-cuda"
+
+
+def is_known() -> bool:
+    """Whether this version of jaxlib calls PTX programs as this module expects."""
+    return JAXLIB.startswith(f"{KNOWN}.")
 
 
 def build_kernel(
