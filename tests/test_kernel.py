@@ -11,8 +11,9 @@ from studies.bench.works import METRICS, WORKS
 from studies.engine.executor import make_executor
 from studies.engine.kernel_executor import KernelExecutor
 from studies.engine.plan import Layout, chunk_cases, local_layout, plan_groups
-from studies.engine.program import TRACES
+from studies.engine.program import TRACES, Program, split_cases
 from studies.engine.scan import ScanExecutor
+from studies.engine.steps import trace_steps
 from studies.kernels import compilation, cpu, llvm, native
 from studies.kernels.compilation import ObjectCache
 from studies.kernels.traced import InputLeaf, trace_loop
@@ -325,12 +326,17 @@ def test_code_for_arm():
 # --- guards against slow code, which tests cannot time --------------------------------------------
 
 
-def operations_of(work):
-    """Operations of one sample of a workload, by kind."""
+def workload(work):
+    """Structure and cases of a workload."""
     study = paper_study().change(**WORKS[work], run__duration=0.3)
     structure = build_structure(study)._replace(metrics=METRICS.get(work, ()))
     gains = np.linspace(0.1, 0.5, LAYOUT.size)
-    cases = build_cases(study, {"control.gain_factor": gains}, structure)
+    return structure, build_cases(study, {"control.gain_factor": gains}, structure)
+
+
+def operations_of(work):
+    """Operations of one sample of a workload, by kind."""
+    structure, cases = workload(work)
     made = KernelExecutor(structure, LAYOUT, False)
     before = len(TRACES)
     made.start(cases).wait()
@@ -355,6 +361,31 @@ def test_a_sample_takes_no_more_operations_than_it_should(work):
     # four evaluations of the plant: a root and two reciprocals per link, three in the solution
     # and, where all metrics are accumulated, one per link for `ringing_time`, one for the stretch
     assert found["sqrt"] == 12 and found["reciprocal"] == {"W0": 36, "W1": 40}[work]
+
+
+#: Kinds of x86 processors with the features that kernels ask for, and the most bytes of a sample's
+#: code, routines included: what exceeds the instruction cache runs at half the speed.
+CODE = {
+    ("x86-64-v4", "+avx2,+fma,+avx512f,+avx512vl,+avx512bw,+avx512dq"): {"W0": 49e3, "W1": 98e3},
+    ("x86-64-v3", "+avx2,+fma"): {"W0": 26e3, "W1": 82e3},
+}
+
+
+@pytest.mark.parametrize("kind", CODE)
+@pytest.mark.parametrize("work", ["W0", pytest.param("W1", marks=pytest.mark.long)])
+def test_code_of_a_sample_is_as_small_as_it_should_be(work, kind):
+    triple = native.this_processor().triple
+    if not triple.startswith("x86_64"):
+        pytest.skip("needs an x86 processor")
+    processor = native.Processor(*kind, triple)
+    structure, cases = workload(work)
+    split = split_cases(cases, LAYOUT, structure, False)
+    program = Program(structure, LAYOUT, split.tree, split.is_varying)
+    traced = trace_steps(program, split, has_routines=not processor.has_masks)
+    code = native.machine_code(str(cpu.write_loop(traced.loop, processor).module), processor, 3)
+    sections = native.binding.ObjectFileRef.from_data(code).sections()
+    size = sum(section.size() for section in sections if section.is_text())
+    assert 0.8 * CODE[kind][work] < size < CODE[kind][work]
 
 
 # --- quick code first, fast code later ------------------------------------------------------------
