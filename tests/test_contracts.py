@@ -388,7 +388,7 @@ def test_every_source_of_a_number_is_in_the_digest(tmp_path):
         ("studies/engine/runs.py", sweeps),
         ("studies/engine/screen.py", sweeps),
         ("studies/study/consistency.py", sweeps),
-        ("studies/kernels/tangents.py", sweeps),
+        ("studies/kernels/derivatives.py", sweeps),
         ("studies/engine/gradients.py", workers),
         ("studies/tuning/merit.py", workers),
     ):

@@ -1,21 +1,25 @@
 """Derivatives by the traced kernel against those by JAX."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from studies.engine import gradients
 from studies.engine.gradients import (
+    KernelAdjoint,
     KernelGradients,
     ScanGradients,
-    is_forward_cheaper,
-    reverse_gradients,
+    make_gradients,
 )
 from studies.engine.plan import Layout
+from studies.kernels import native
+from studies.kernels.adjoint import trace_adjoint
 from studies.kernels.cpu import build_kernel
+from studies.kernels.derivatives import push_forward
 from studies.kernels.graph import Graph, objects
-from studies.kernels.tangents import push_forward
 from studies.kernels.traced import InputLeaf, trace_loop
-from studies.study.cases import as_arrays, build_cases, build_structure
+from studies.study.cases import build_cases, build_structure
 from studies.study.spec import paper_study
 from tests.test_kernel import every_operation, translated
 
@@ -113,25 +117,88 @@ def test_what_does_not_move_has_the_known_tangent_zero():
     assert objects([a], (1,))[0] is a
 
 
-def test_mode_by_rule():
-    """Forward for few parameters, reverse for many."""
-    for name in ("traced kernel", "XLA scan"):
-        assert is_forward_cheaper(1, name) and not is_forward_cheaper(1000, name)
+def weights(metrics, random):
+    """Derivatives of three numbers by the metrics; the second depends on a few cases only."""
+
+    def some(x):
+        found = random.normal(size=(3, *x.shape)) / (np.nanmax(np.abs(x)) or 1.0)
+        found[1, 1:5] = found[1, 7:] = 0.0
+        return found
+
+    return jax.tree.map(some, metrics)
 
 
-@pytest.mark.long
-def test_reverse_mode_agrees_with_forward_mode(chunk):
-    """One number's gradient, by the mode that pays for many parameters."""
+def assert_gradients_agree(chunk, executor, monkeypatch):
     structure, cases, parameters = chunk
-    forward = ScanGradients(structure, LAYOUT, place).evaluate(cases, parameters)
-    whole = jax.tree.map(lambda x: np.repeat(x, LAYOUT.size // len(x), axis=0), cases)
-    value, slope = reverse_gradients(structure, place, control_energy, as_arrays(whole), parameters)
-    good = forward.result.status == 0
-    wanted, change = forward.result.metrics.control_energy, forward.metrics.control_energy
-    np.testing.assert_allclose(value[good], wanted[good], rtol=1e-9)
-    size = np.abs(change[good]).max()
-    np.testing.assert_allclose(slope[good], change[good], atol=1e-9 * size)
+    monkeypatch.setattr(gradients, "RECORD", 2**18)  # several pieces
+    back = KernelAdjoint(structure, LAYOUT, place).evaluate(cases, parameters)
+    ahead = executor(structure, LAYOUT, place).evaluate(cases, parameters)
+    np.testing.assert_array_equal(back.result.status, ahead.result.status)
+    by = weights(ahead.result.metrics, np.random.default_rng(3))
+    found, wanted = back.pull_back(by), ahead.pull_back(by)
+    good = ahead.result.status == 0
+    assert found.shape == wanted.shape == (3, LAYOUT.size, N_PARAMETERS)
+    assert good.sum() == LAYOUT.size - 1 and (found[:, ~good] == 0).all()
+    assert (found[1, 7:] == 0).all() and (found[1, 5:7] != 0).all()
+    size = np.abs(wanted[:, good]).max(axis=(0, 1))
+    assert (np.abs(found - wanted)[:, good] <= 1e-9 * size).all()
 
 
-def control_energy(metrics):
-    return metrics.control_energy
+@pytest.mark.long  # in short: the reverse of a loop below, and gradients of tunings
+@pytest.mark.parametrize("executor", [KernelGradients, ScanGradients])
+def test_reverse_mode_agrees_with_forward_mode(chunk, executor, monkeypatch):
+    assert_gradients_agree(chunk, executor, monkeypatch)
+
+
+def test_mode_by_number_of_parameters(chunk):
+    """Forward for few parameters, reverse for many."""
+    structure = chunk[0]
+    for count, mode in ((1, "forward"), (3, "forward"), (4, "reverse"), (100, "reverse")):
+        assert make_gradients(structure, LAYOUT, place, count).mode == mode
+
+
+@pytest.mark.parametrize("has_masks", [True, False])
+def test_reverse_of_a_loop_gives_the_gradient(has_masks):
+    """Cotangents of a state after many samples, pulled back to all that a loop is given."""
+    processor = native.this_processor()
+    if not has_masks:
+        processor = processor.without("avx512")
+    random, lanes, n = np.random.default_rng(1), 16, 7
+    shape = (3, 4)
+
+    def step(constants, row, state):
+        gain, fixed = constants
+        (given,) = row
+        x, peak = state
+        moved = every_operation(0.3 * x, fixed) * 0.1 + gain * x + given * fixed[0, 0]
+        is_going = x[0, 0] < 3.0  # some lanes freeze on their way
+        return [jnp.where(is_going, moved, x), jnp.maximum(peak, jnp.abs(moved))]
+
+    fixed = random.normal(size=shape)
+    gain = random.uniform(0.8, 1.4, (*shape, lanes))
+    given = random.normal(size=(n, *shape, lanes))
+    start = random.normal(size=(*shape, lanes)), np.zeros((*shape, lanes))
+    moving = InputLeaf(shape, True, True)
+    made = trace_adjoint(step, [moving, fixed], [moving], [InputLeaf(shape, True)] * 2, np.float64)
+    kept = np.empty((n, made.kept, lanes))
+    last = [x.copy() for x in start]
+    build_kernel(made.forward, processor).run([gain, given, *last, kept], n, lanes)
+
+    def ended(gain, given, start):
+        x = list(start)
+        for row in given:
+            x = step([gain, fixed], [row], x)
+        return x
+
+    wanted, back = jax.vjp(jax.vmap(ended, -1, -1), gain, given, start)
+    for a, b in zip(last, wanted, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+    turned = [random.normal(size=x.shape) for x in start]
+    by_gain, by_given, by_start = back([jnp.asarray(x) for x in turned])
+    sums, rows = np.zeros_like(gain), np.empty_like(given)
+    run = build_kernel(made.backward, processor).run
+    run([gain, given, kept, *turned, sums, rows], n, lanes)
+    for a, b in zip([*turned, sums, rows], [*by_start, by_gain, by_given], strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
+    frozen = np.asarray(by_given)[-1, 0, 0] == 0
+    assert frozen.any() and not frozen.all()

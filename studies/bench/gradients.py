@@ -5,15 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaxmodel.case import Case
 from jaxmodel.parameters import Array
 from studies import config
 from studies.bench.works import build_work, check_executor, describe, make_layout, timed
-from studies.engine.gradients import Gradients, KernelGradients, ScanGradients, make_gradients
+from studies.engine.gradients import (
+    Gradients,
+    KernelAdjoint,
+    KernelGradients,
+    ScanGradients,
+    make_gradients,
+)
 
-GRADIENTS: dict[str, Callable[..., Gradients]] = {"kernel": KernelGradients, "scan": ScanGradients}
+GRADIENTS: dict[str, Callable[..., Gradients]] = {
+    "kernel": KernelAdjoint,
+    "forward": KernelGradients,
+    "scan": ScanGradients,
+}
 
 
 def place_gains(case: Case, parameters: Array) -> Case:
@@ -27,7 +38,8 @@ def bench_gradients(executor: str = "", batch: int = 0) -> dict[str, Any]:
     """Gradients per second of the residual rms of W0 by its nine gains.
 
     Args:
-        executor: "kernel", "scan", or "" for the fastest available.
+        executor: "kernel", "forward" (the kernel with tangents), "scan", or "" for the fastest
+            available.
         batch: cases per chunk; 0: two blocks of lanes on every device.
 
     Returns:
@@ -43,13 +55,21 @@ def bench_gradients(executor: str = "", batch: int = 0) -> dict[str, Any]:
     random = np.random.default_rng(1)
     ratio = np.asarray(cases.control.ratio).reshape(1, -1)
     parameters = ratio * random.uniform(0.5, 2.0, (layout.size, ratio.size))
-    make = GRADIENTS[executor] if executor else make_gradients
-    made = make(structure, layout, place_gains)
-    found, timing = timed(lambda: made.evaluate(cases, parameters))
-    gradient = found.metrics.residual_rms.mean((0, 2, 3))
+    if executor:
+        made = GRADIENTS[executor](structure, layout, place_gains)
+    else:
+        made = make_gradients(structure, layout, place_gains, ratio.size)
+
+    def gradients() -> np.ndarray:
+        found = made.evaluate(cases, parameters)
+        by = jax.tree.map(lambda x: np.ones((1, *x.shape)), found.result.metrics)
+        return found.pull_back(by)[0]
+
+    found, timing = timed(gradients)
+    gradient = found.mean(axis=0)
     return {
         "work": "grad",
-        "executor": f"{made.name}, forward",
+        "executor": f"{made.name}, {made.mode}",
         "parameters": ratio.size,
         **describe(layout, structure, timing, gradient.dtype),
         "fingerprint": float(np.linalg.norm(gradient)),

@@ -83,7 +83,7 @@ def check_executor(executor: str, known: Iterable[str] = EXECUTORS) -> None:
     """
     if executor and executor not in known:
         raise field_error("--executor", executor, ", ".join(map(repr, known)))
-    if executor in ("kernel", "gpu") and not is_available():
+    if executor in ("kernel", "forward", "gpu") and not is_available():
         raise StudyError(f"--executor {executor}: needs llvmlite: install flexlink-studies[fast]")
     if executor == "gpu" and config.processor() != "cuda":
         raise StudyError(

@@ -1,18 +1,17 @@
 """Metrics of a chunk and their derivatives by parameters of each case.
 
-Forward mode: tangents are carried along with the state, so all metrics are differentiated in one
-pass, no step is stored, and the kernel of `studies.kernels` can do it.
+Forward mode carries tangents along with the state: derivatives of all metrics, at a cost that grows
+with the parameters. Reverse mode pulls a number that is computed from the metrics back through
+the steps: its gradient, at a cost that does not (docs/performance.md).
 
-- `KernelGradients`: the traced kernel, `DIRECTIONS` tangents at once.
+- `KernelAdjoint`: reverse mode by the traced kernel.
+- `KernelGradients`: forward mode by the traced kernel, `DIRECTIONS` tangents at once.
 - `ScanGradients`: `jax.jvp` of the reference; everywhere.
-- `reverse_gradients`: one number's gradient by reverse mode, whose cost does not grow with the
-  parameters; `is_forward_cheaper` says when it pays off (docs/performance.md).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -21,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmodel import status
 from jaxmodel.case import Case, Structure
 from jaxmodel.metrics import Metrics
 from jaxmodel.parameters import Array
@@ -32,20 +32,55 @@ from studies.engine.program import (
     Place,
     Program,
     Split,
+    conclude_all,
+    conclude_gradients,
     conclude_slopes,
     joined,
     lane_blocks,
     prepare,
+    prepare_gradients,
     prepare_tangents,
     split_cases,
 )
-from studies.engine.steps import Ready, Steps, compile_steps, fits_kernel, start_block
+from studies.engine.steps import (
+    PREPARING,
+    AdjointSteps,
+    Ready,
+    Steps,
+    compile_adjoint,
+    compile_steps,
+    fits_kernel,
+    start_block,
+)
 
 #: Tangents per pass of the kernel. More of them share the state's own arithmetic (1: 31 gradients/s
 #: by 9 numbers on a core, 3: 49) but take longer to compile (3 s, 5 s).
 DIRECTIONS = 3
-#: Number of parameters from which reverse mode costs less than forward mode, by executor.
-REVERSE_FROM = {"traced kernel": 48, "XLA scan": 3}
+#: Number of parameters from which the kernel's reverse mode costs less than its forward mode.
+REVERSE_FROM = 4
+#: Largest record of a block of lanes [bytes]. A run is reversed in pieces whose records stay in the
+#: cache; stepping each piece again costs less than keeping all records in memory.
+RECORD = 2 * 2**20
+
+
+class Differentiated(Protocol):
+    """A chunk, ready for gradients."""
+
+    @property
+    def result(self) -> Result:
+        """Cases first, NumPy arrays."""
+        ...
+
+    def pull_back(self, cotangents: Metrics) -> np.ndarray:
+        """Gradients of some numbers by the parameters, (n, cases, p).
+
+        Args:
+            cotangents: derivatives of the numbers by the metrics, (n, cases, ...).
+
+        Returns:
+            0 for cases whose run did not finish.
+        """
+        ...
 
 
 class ChunkSlopes(NamedTuple):
@@ -54,16 +89,29 @@ class ChunkSlopes(NamedTuple):
     result: Result  # cases first
     metrics: Metrics  # derivatives, (cases, p, ...); 0 if a run did not finish
 
+    def pull_back(self, cotangents: Metrics) -> np.ndarray:
+        """As `Differentiated.pull_back`."""
+
+        def part(slope: np.ndarray, by: np.ndarray) -> np.ndarray:
+            cases, p = slope.shape[:2]
+            return np.einsum(
+                "cpe,nce->ncp", slope.reshape(cases, p, -1), by.reshape(*by.shape[:2], -1)
+            )
+
+        parts = jax.tree.map(lambda x, y: part(x, np.asarray(y)), self.metrics, cotangents)
+        return np.asarray(sum(jax.tree.leaves(parts)))
+
 
 class Gradients(Protocol):
     """Differentiates chunks of one group."""
 
     name: str
+    mode: str  # "forward" or "reverse"
     compile_time: float  # [s], 0 before the first chunk
 
     def evaluate(
         self, cases: Case, parameters: np.ndarray, is_used: np.ndarray | None = None
-    ) -> ChunkSlopes:
+    ) -> Differentiated:
         """Run a chunk.
 
         Args:
@@ -74,27 +122,21 @@ class Gradients(Protocol):
         ...
 
 
-def make_gradients(structure: Structure, layout: Layout, place: Place) -> Gradients:
-    """The fastest way to differentiate a group's metrics by a few parameters.
+def make_gradients(
+    structure: Structure, layout: Layout, place: Place, n_parameters: int
+) -> Gradients:
+    """The fastest way to differentiate a few numbers that are computed from a group's metrics.
 
     Args:
         structure: of the group.
         layout: of its chunks.
         place: puts parameters into a case.
+        n_parameters: how many of them a case has that are used.
     """
-    if processor() == "cpu" and fits_kernel(structure):
-        return KernelGradients(structure, layout, place)
-    return ScanGradients(structure, layout, place)
-
-
-def is_forward_cheaper(n_parameters: int, executor: str) -> bool:
-    """Whether forward mode computes one number's gradient faster than reverse mode.
-
-    Args:
-        n_parameters: p.
-        executor: name of the forward-mode executor.
-    """
-    return n_parameters < REVERSE_FROM[executor]
+    if processor() != "cpu" or not fits_kernel(structure):
+        return ScanGradients(structure, layout, place)
+    mode = KernelAdjoint if n_parameters >= REVERSE_FROM else KernelGradients
+    return mode(structure, layout, place)
 
 
 def _split(cases: Case, parameters: np.ndarray, layout: Layout, structure: Structure) -> Split:
@@ -103,7 +145,7 @@ def _split(cases: Case, parameters: np.ndarray, layout: Layout, structure: Struc
     return split._replace(varying=[*split.varying, np.asarray(parameters, real)])
 
 
-def _program(made: KernelGradients | ScanGradients, split: Split) -> Program:
+def _program(made: KernelAdjoint | KernelGradients | ScanGradients, split: Split) -> Program:
     """What gradients are taken of."""
     return Program(
         structure=made.structure,
@@ -117,7 +159,7 @@ def _program(made: KernelGradients | ScanGradients, split: Split) -> Program:
 class KernelGradients:
     """Blocks of lanes on a pool of threads, each stepped once for every few directions."""
 
-    name = "traced kernel"
+    name, mode = "traced kernel", "forward"
 
     def __init__(self, structure: Structure, layout: Layout, place: Place) -> None:
         self.structure, self.layout, self.place = structure, layout, place
@@ -218,6 +260,190 @@ def _by_sample(tree: Any) -> list[np.ndarray]:
     return [np.asarray(x.swapaxes(0, 1), order="C") for x in _moving(tree)]
 
 
+# --- reverse mode ---------------------------------------------------------------------------------
+
+
+class KernelAdjoint:
+    """Blocks of lanes on a pool of threads, stepped to the end and then back for every number."""
+
+    name, mode = "traced kernel", "reverse"
+
+    def __init__(self, structure: Structure, layout: Layout, place: Place) -> None:
+        self.structure, self.layout, self.place = structure, layout, place
+        self.compile_time = 0.0
+        self._steps: AdjointSteps | None = None
+        self._pool = ThreadPoolExecutor(layout.devices)
+
+    def evaluate(
+        self, cases: Case, parameters: np.ndarray, is_used: np.ndarray | None = None
+    ) -> PulledBack:
+        split = _split(cases, parameters, self.layout, self.structure)
+        program = _program(self, split)
+        if self._steps is None:
+            started = time.perf_counter()
+            self._steps = compile_adjoint(program, split)
+            prepare(program, self._steps.parts, lane_blocks(split, self.layout)[0], split.shared)
+            self.compile_time = time.perf_counter() - started
+        return PulledBack(program, self._steps, split, self._pool)
+
+
+class _Block(NamedTuple):
+    """A block of lanes after its run."""
+
+    varying: list[np.ndarray]
+    ready: Ready
+    states: list[list[np.ndarray]]  # leaves at the start of every piece, and at the end
+
+
+class PulledBack:
+    """A chunk stepped by the kernel, as `Differentiated`."""
+
+    def __init__(
+        self,
+        program: Program,
+        steps: AdjointSteps,
+        split: Split,
+        pool: ThreadPoolExecutor,
+    ) -> None:
+        self._program, self._steps, self._pool = program, steps, pool
+        self._shared, self._lanes = split.shared, program.layout.lanes
+        n, row = program.structure.n_steps, 8 * steps.kept * self._lanes
+        length = max(1, RECORD // max(row, 1))
+        self._bounds = [*range(0, n, length), n]
+        self._blocks = list(pool.map(self._stepped, lane_blocks(split, program.layout)))
+        given = [(b.ready.outline, b.ready.state.status, self._last(b)) for b in self._blocks]
+        whole = jax.tree.map(lambda *x: np.concatenate(x, axis=-1), *given)
+        self.result: Result = jax.tree.map(np.asarray, conclude_all(*whole))
+
+    def pull_back(self, cotangents: Metrics) -> np.ndarray:
+        cotangents = jax.tree.map(np.asarray, cotangents)
+        wanted = [(x != 0).reshape(*x.shape[:2], -1).any(-1) for x in jax.tree.leaves(cotangents)]
+        turns = _turns(np.any(wanted, axis=0) & np.isin(self.result.status, status.FINISHED))
+        starts = range(0, self._program.layout.size, self._lanes)
+        rows = [slice(k, k + self._lanes) for k in starts]
+        done = self._pool.map(
+            lambda block, part: self._gradients(block, turns[:, part], part, cotangents),
+            self._blocks,
+            rows,
+        )
+        return np.concatenate(list(done), axis=1)
+
+    def _last(self, block: _Block) -> Any:
+        return jax.tree.unflatten(jax.tree.structure(block.ready.state), block.states[-1])
+
+    def _stepped(self, varying: list[np.ndarray]) -> _Block:
+        ready = start_block(self._program, self._steps, varying, self._shared)
+        block = _Block(varying, ready, [jax.tree.leaves(ready.state)])
+        room = self._room(block)
+        for piece in range(len(self._bounds) - 1):
+            block.states.append(self._step(block, piece, room)[0])
+        return block
+
+    def _room(self, block: _Block) -> np.ndarray:
+        """For the record of any piece."""
+        samples = self._bounds[1] - self._bounds[0]
+        return np.empty((samples, self._steps.kept, self._lanes), block.states[0][0].dtype)
+
+    def _step(
+        self, block: _Block, piece: int, room: np.ndarray
+    ) -> tuple[list[np.ndarray], np.ndarray]:
+        """State after a piece of a block's run, and its record."""
+        begin, end = self._bounds[piece : piece + 2]
+        state, record = [x.copy() for x in block.states[piece]], room[: end - begin]
+        inputs = [x[begin:end] for x in block.ready.inputs]
+        leaves = [*block.ready.loop, *inputs, *state, record]
+        self._steps.forward.run(leaves, end - begin, self._lanes)
+        return state, record
+
+    def _gradients(
+        self, block: _Block, turns: np.ndarray, part: slice, cotangents: Metrics
+    ) -> np.ndarray:
+        """Gradients of a block's numbers, (n, lanes, p).
+
+        Args:
+            block: of lanes.
+            turns: which number each lane is pulled back from in each turn, -1: none.
+            part: the block's place among the cases.
+            cotangents: of all cases.
+        """
+        found = np.zeros((len(turns), *block.varying[-1].shape))
+        count = int((turns >= 0).any(axis=1).sum())
+        if not count:
+            return found
+        at_end = jax.tree.map(lambda x: _in_turn(turns, x[:, part]), cotangents)
+        given = block.ready.outline, block.ready.state.status, self._last(block), at_end
+        outline, state = map(jax.tree.leaves, conclude_gradients(*given))
+        start = self._at_start(block, outline, state, count)
+        with PREPARING:
+            gradients = np.asarray(
+                prepare_gradients(
+                    self._program, self._steps.parts, block.varying, self._shared, start
+                )
+            )
+        turn, lane = np.nonzero(turns >= 0)
+        found[turns[turn, lane], lane] = gradients[turn, lane]
+        return found
+
+    def _at_start(
+        self, block: _Block, outline: list[Any], state: list[Any], count: int
+    ) -> list[np.ndarray]:
+        """Cotangents of the leaves of a start that move, numbers first.
+
+        Args:
+            block: of lanes.
+            outline, state: cotangents of a block's outline and last state.
+            count: numbers to pull back; further ones are 0.
+        """
+        parts = self._steps.parts
+        state = [np.array(x, order="C") for x in state]
+        leaf: Start = jax.tree.unflatten(parts.tree, range(len(parts.shapes)))
+
+        def moving(tree: Any) -> list[int]:
+            return [k for k in jax.tree.leaves(tree) if parts.is_moving[k]]
+
+        def sums(tree: Any) -> list[np.ndarray]:
+            shapes = (parts.shapes[k] for k in moving(tree))
+            return [np.zeros((len(state[0]), *x, self._lanes), state[0].dtype) for x in shapes]
+
+        loop, rows = sums(leaf.loop), sums(leaf.inputs)
+        room = self._room(block)
+        for piece in reversed(range(len(self._bounds) - 1)):
+            begin, end = self._bounds[piece : piece + 2]
+            inputs = [x[begin:end] for x in block.ready.inputs]
+            record = self._step(block, piece, room)[1]
+            for k in range(count):
+                own = [x[k] for x in (*state, *loop)] + [x[k, begin:end] for x in rows]
+                leaves = [*block.ready.loop, *inputs, record, *own]
+                self._steps.backward.run(leaves, end - begin, self._lanes)
+        ends = dict(
+            zip(jax.tree.leaves((leaf.state, leaf.outline)), [*state, *outline], strict=True)
+        )
+        return [*loop, *rows, *(np.asarray(ends[k]) for k in moving((leaf.state, leaf.outline)))]
+
+
+def _turns(is_wanted: np.ndarray) -> np.ndarray:
+    """The numbers that each case is pulled back from, in turn; -1: none.
+
+    Args:
+        is_wanted: (numbers, cases).
+
+    Returns:
+        (numbers, cases).
+    """
+    turns = np.full(is_wanted.shape, -1)
+    number, case = np.nonzero(is_wanted)
+    turns[(np.cumsum(is_wanted, axis=0) - 1)[number, case], case] = number
+    return turns
+
+
+def _in_turn(turns: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Cotangents (numbers, lanes, ...) in the order of the turns."""
+    found = np.take_along_axis(
+        x, np.maximum(turns, 0).reshape(*turns.shape, *[1] * (x.ndim - 2)), 0
+    )
+    return np.where((turns >= 0).reshape(*turns.shape, *[1] * (x.ndim - 2)), found, 0.0)
+
+
 # --- XLA ------------------------------------------------------------------------------------------
 
 
@@ -253,7 +479,7 @@ def _forward(
 class ScanGradients:
     """Forward mode through the reference, one block of lanes after another."""
 
-    name = "XLA scan"
+    name, mode = "XLA scan", "forward"
 
     def __init__(self, structure: Structure, layout: Layout, place: Place) -> None:
         self.structure, self.layout, self.place = structure, layout, place
@@ -271,30 +497,3 @@ class ScanGradients:
             self._compiled = _forward.lower(program, own, parameters, split.shared).compile()
             self.compile_time = time.perf_counter() - started
         return ChunkSlopes(*jax.tree.map(np.asarray, self._compiled(own, parameters, split.shared)))
-
-
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def reverse_gradients(
-    structure: Structure,
-    place: Place,
-    objective: Callable[..., Any],
-    cases: Case,
-    parameters: Array,
-) -> tuple[Array, Array]:
-    """An objective and its gradients by reverse mode with checkpoints.
-
-    Args:
-        structure: with `is_smooth`, which keeps checkpoints instead of every step.
-        place: puts parameters into a case.
-        objective: number of a case's Metrics; the same object every time.
-        cases: leaves with the cases first.
-        parameters: (cases, p).
-
-    Returns:
-        (objective (cases,), gradient (cases, p)).
-    """
-
-    def value(parameters: Array, case: Case) -> Array:
-        return objective(simulate(structure, place(case, parameters)).metrics)
-
-    return jax.vmap(jax.value_and_grad(value))(parameters, cases)

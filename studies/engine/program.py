@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.metrics import Metrics
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import Outline, Result, Start, begin, conclude
 from studies.engine.plan import Layout
@@ -194,13 +195,42 @@ def prepare_tangents(
         *fixed, parameters = own
 
         def moving(parameters: Array) -> list[Any]:
-            leaves = jax.tree.leaves(begin_case(program, [*fixed, parameters], common))
-            return [x for x, moves in zip(leaves, parts.is_moving, strict=True) if moves]
+            return _moving(program, parts, [*fixed, parameters], common)
 
         along = partial(jax.jvp, moving, (parameters,))
         return jax.vmap(lambda direction: along((direction,))[1])(directions)
 
     return jax.vmap(one, (0, None), -1)(own, common)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def prepare_gradients(
+    program: Program, parts: StartParts, own: list[Any], common: list[Any], cotangents: list[Any]
+) -> Array:
+    """Gradients of some numbers by the parameters, (n, lanes, p).
+
+    Args:
+        program, parts: of the cases.
+        own, common: as in `prepare`.
+        cotangents: of the moving leaves, numbers first and lanes last.
+    """
+
+    def one(own: list[Any], common: list[Any], cotangents: list[Any]) -> Array:
+        *fixed, parameters = own
+
+        def moving(parameters: Array) -> list[Any]:
+            return _moving(program, parts, [*fixed, parameters], common)
+
+        (found,) = jax.vmap(jax.vjp(moving, parameters)[1])(cotangents)
+        return found
+
+    return jax.vmap(one, (0, None, -1), 1)(own, common, cotangents)
+
+
+def _moving(program: Program, parts: StartParts, own: list[Any], common: list[Any]) -> list[Any]:
+    """Leaves of a case's start that depend on the parameters."""
+    leaves = jax.tree.leaves(begin_case(program, own, common))
+    return [x for x, moves in zip(leaves, parts.is_moving, strict=True) if moves]
 
 
 def find_parts(program: Program, own: list[Any], common: list[Any]) -> StartParts:
@@ -257,3 +287,19 @@ def conclude_slopes(outline: Outline, code: Array, state: Any, turn: Outline, sl
         return result, tangent
 
     return jax.vmap(along, out_axes=(None, 0))(turn, slope)
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(-1, -1, -1, 1), out_axes=-1)
+def conclude_gradients(outline: Outline, code: Array, state: Any, cotangents: Metrics) -> Any:
+    """Cotangents of outline and state, numbers first and lanes last.
+
+    Args:
+        outline, code, state: as in `conclude`, lanes last.
+        cotangents: of the metrics, (numbers, cases, ...).
+    """
+
+    def judged(outline: Outline, state: Any) -> Metrics:
+        return conclude(outline, code, state).metrics
+
+    return jax.vmap(jax.vjp(judged, outline, state)[1])(cotangents)

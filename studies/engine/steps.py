@@ -5,6 +5,7 @@ Numbers that all cases of a chunk share are embedded in the code.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -26,6 +27,7 @@ from studies.engine.program import (
 )
 from studies.errors import StudyError
 from studies.kernels import cpu, llvm, native
+from studies.kernels.adjoint import trace_adjoint
 from studies.kernels.traced import InputLeaf, TracedLoop, trace_loop
 
 #: More plant steps per sample than this would make the kernel's code too long.
@@ -54,10 +56,20 @@ class Steps(NamedTuple):
     directions: int  # tangents carried along
 
 
+class AdjointSteps(NamedTuple):
+    """The steps and their reverse, compiled for this processor (`studies.kernels.adjoint`)."""
+
+    parts: StartParts
+    shared: list[np.ndarray]
+    forward: cpu.Kernel
+    backward: cpu.Kernel
+    kept: int  # numbers recorded per sample
+
+
 #: One at a time: of two concurrent runs of a program with an eigenvalue problem (basis loaded),
 #: XLA's CPU client occasionally never finishes one (jax 0.10).
 PREPARING = Lock()
-_STEPS: dict[tuple[Any, ...], Steps] = {}
+_STEPS: dict[tuple[Any, ...], Any] = {}
 #: Kernels kept in memory.
 KEPT_KERNELS = 8
 
@@ -70,19 +82,49 @@ def compile_steps(program: Program, split: Split, directions: int = 0) -> Steps:
         split: their leaves.
         directions: tangents to carry along at once.
     """
+
+    def build() -> Steps:
+        # where instructions take numbers from memory only, small code is fast
+        has_routines = not native.this_processor().has_masks
+        parts, shared, loop = trace_steps(program, split, directions, has_routines)
+        return Steps(parts, shared, cpu.build_kernel(loop), directions)
+
+    found: Steps = _once(program, split, directions, build)
+    return found
+
+
+def compile_adjoint(program: Program, split: Split) -> AdjointSteps:
+    """Compile the steps and their reverse; arguments as `compile_steps`."""
+
+    def build() -> AdjointSteps:
+        parts, shared = _start(program, split)
+        TRACES.append(program.structure)
+        made = trace_adjoint(*_loop(program.structure, parts, shared), _real())
+        forward, backward = map(cpu.build_kernel, made[:2])
+        return AdjointSteps(
+            parts=parts, shared=shared, forward=forward, backward=backward, kept=made.kept
+        )
+
+    found: AdjointSteps = _once(program, split, "adjoint", build)
+    return found
+
+
+def _once(program: Program, split: Split, kind: Any, build: Callable[[], Any]) -> Any:
+    """What was built before for the same program and shared numbers, or is now.
+
+    Raises:
+        StudyError: an own part uses what kernels do not support.
+    """
     numbers = tuple((leaf.shape, leaf.tobytes()) for leaf in split.shared)
     shapes = tuple(leaf.shape for leaf in split.varying)
-    key = (program, shapes, numbers, _real(), directions, native.this_processor())
+    key = (program, shapes, numbers, _real(), kind, native.this_processor())
     if key not in _STEPS:
         while len(_STEPS) >= KEPT_KERNELS:
             del _STEPS[next(iter(_STEPS))]
-        # where instructions take numbers from memory only, small code is fast
-        has_routines = not native.this_processor().has_masks
         try:
-            parts, shared, loop = trace_steps(program, split, directions, has_routines)
+            _STEPS[key] = build()
         except NotImplementedError as error:  # of a part of the user's own
             raise StudyError(f"{error}: kernels do not support it; see docs/own-parts.md") from None
-        _STEPS[key] = Steps(parts, shared, cpu.build_kernel(loop), directions)
     return _STEPS[key]
 
 
@@ -94,27 +136,29 @@ def trace_steps(
     Args:
         program, split, directions: as in `compile_steps`.
     """
+    parts, shared = _start(program, split)
+    TRACES.append(program.structure)
+    given = _loop(program.structure, parts, shared)
+    return Traced(parts, shared, trace_loop(*given, _real(), directions, has_routines))
+
+
+def _start(program: Program, split: Split) -> tuple[StartParts, list[np.ndarray]]:
+    """Parts of a case's start, and the leaves that all cases share."""
     one = [leaf[0] for leaf in split.varying]
     parts = find_parts(program, one, split.shared)
     with PREPARING:
         found = prepare_shared(program, parts, one, split.shared)
-    shared = [np.asarray(leaf, order="C") for leaf in found]
-    TRACES.append(program.structure)
-    return Traced(parts, shared, _trace(program.structure, parts, shared, directions, has_routines))
+    return parts, [np.asarray(leaf, order="C") for leaf in found]
 
 
 def _real() -> Any:
     return jax.dtypes.canonicalize_dtype(np.float64)
 
 
-def _trace(
-    structure: Structure,
-    parts: StartParts,
-    shared: list[np.ndarray],
-    directions: int,
-    has_routines: bool,
-) -> TracedLoop:
-    """The loop of a structure, with shared numbers embedded."""
+def _loop(
+    structure: Structure, parts: StartParts, shared: list[np.ndarray]
+) -> tuple[Callable[..., Any], list[Any], list[InputLeaf], list[InputLeaf]]:
+    """Step, constants, inputs and state of a structure, with shared numbers as known ones."""
     kinds = zip(parts.shapes, parts.is_varying, parts.is_moving, strict=True)
     leaves = [InputLeaf(*kind) for kind in kinds]
     start: Start = jax.tree.unflatten(parts.tree, range(len(leaves)))
@@ -131,14 +175,11 @@ def _trace(
         )
         return jax.tree.leaves(step(structure, at_loop, at_state, at_inputs)[0])
 
-    return trace_loop(
+    return (
         sample,
         loop,
         [leaf._replace(shape=leaf.shape[1:]) for leaf in inputs],
         [leaf._replace(is_varying=True) for leaf in state],
-        _real(),
-        directions,
-        has_routines,
     )
 
 
@@ -152,7 +193,10 @@ class Ready(NamedTuple):
 
 
 def start_block(
-    program: Program, steps: Steps, varying: list[np.ndarray], shared: list[np.ndarray]
+    program: Program,
+    steps: Steps | AdjointSteps,
+    varying: list[np.ndarray],
+    shared: list[np.ndarray],
 ) -> Ready:
     """Prepare a block of lanes.
 

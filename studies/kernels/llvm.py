@@ -86,10 +86,13 @@ class Writer:
         self.builder.position_at_end(loop)
         sample = self.builder.phi(self.index)
         sample.add_incoming(ir.Constant(self.index, 0), entry)
-        at_input = self._places("input", "input", frame, sample)
+        row = self._row(sample, frame.n_steps)
+        at_input = self._places("input", "input", frame, row)
         due = _due(order, is_fixed, changes)
+        records = self._records(frame, row, is_fixed)
         for change in due[None]:
             self._store(change, slots[change.slot])
+        self._record(records[None])
         for node in order:
             if is_fixed[id(node)]:
                 continue
@@ -101,6 +104,7 @@ class Writer:
                 self.values[id(node)] = self._kept(slots[node.place[1]])
             for change in due[id(node)]:
                 self._store(change, slots[change.slot])
+            self._record(records[id(node)])
         following = self.builder.add(sample, ir.Constant(self.index, 1))
         sample.add_incoming(following, self.builder.block)
         again = self.builder.icmp_signed("<", following, frame.n_steps)
@@ -111,6 +115,32 @@ class Writer:
             self.builder.store(self._kept(slot), place, align=self.bytes)
         self.close()
         return self.module
+
+    def _row(self, sample: Any, n_steps: Any) -> Any:
+        """Row of a sample in inputs and records."""
+        if not self.loop.is_reversed:
+            return sample
+        last = self.builder.sub(n_steps, ir.Constant(self.index, 1))
+        return self.builder.sub(last, sample)
+
+    def _records(
+        self, frame: Arguments, row: Any, is_fixed: dict[int, bool]
+    ) -> dict[Any, list[tuple[Any, Any]]]:
+        """Numbers to keep from a sample, and where, by the node after which that can be done.
+
+        None: before all of them.
+        """
+        found: dict[Any, list[tuple[Any, Any]]] = defaultdict(list)
+        if self.loop.records:
+            places = self._places("record", "record", frame, row)
+            for x, place in zip(self.loop.records, places, strict=True):
+                is_early = is_known(x) or is_fixed[id(x)]
+                found[None if is_early else id(x)].append((x, place))
+        return found
+
+    def _record(self, records: list[tuple[Any, Any]]) -> None:
+        for x, place in records:
+            self.builder.store(self._widened(x), place, align=self.bytes)
 
     # --- memory -----------------------------------------------------------------------------------
 

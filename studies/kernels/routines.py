@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from studies.kernels.derivatives import push_forward
 from studies.kernels.fusion import in_order
 from studies.kernels.graph import Graph, Node, is_known, objects
-from studies.kernels.tangents import push_forward
 
 #: Functions of fewer equations are written at every call.
 SHORTEST = 40

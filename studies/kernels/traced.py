@@ -7,15 +7,15 @@ constants stay, inputs change with the sample.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from studies.kernels.derivatives import push_forward
 from studies.kernels.fusion import count_operations, fused, in_order
 from studies.kernels.graph import Graph, Node, is_known, objects
 from studies.kernels.routines import Routine, RoutineGraph
-from studies.kernels.tangents import push_forward
 
 
 class InputLeaf(NamedTuple):
@@ -58,6 +58,8 @@ class TracedLoop(NamedTuple):
     order: list[Node]  # what they need, each after its arguments; a read's place: (kind, number)
     dtype: np.dtype  # of all arrays
     bodies: dict[int, Body]  # of the calls among the nodes, by the identity of their place
+    records: tuple[Any, ...] = ()  # kept from every sample, in the arrays "record"
+    is_reversed: bool = False  # the last row of inputs and records comes first
 
     def fixed(self) -> dict[int, bool]:
         """Which nodes stay the same from sample to sample, by identity."""
@@ -116,33 +118,55 @@ def trace_loop(
         kind: [*leaves, *(_tangent(leaf, directions) for leaf in leaves if leaf.is_moving)]
         for kind, leaves in (("constant", read), ("input", inputs), ("state", state))
     }
-    places = [
-        [graph.read((kind, k), leaf.is_varying) for k, leaf in enumerate(_elements(leaves))]
-        for kind, leaves in stored.items()
-    ]
-    rest = [iter(part) for part in places]
-
-    def array(kind: int, leaf: InputLeaf | np.ndarray) -> np.ndarray:
-        if not isinstance(leaf, InputLeaf):
-            return objects(leaf.ravel().tolist(), leaf.shape)
-        return objects([next(rest[kind]) for _ in range(leaf.size)], leaf.shape)
-
-    arguments = [
-        [array(kind, leaf) for leaf in leaves]
-        for kind, leaves in enumerate((constants, inputs, state))
-    ]
-    for kind, leaves in enumerate((constants, inputs, state)):
-        for leaf, given in zip(leaves, arguments[kind], strict=True):
-            if getattr(leaf, "is_moving", False):
-                for seed in seeds:
-                    seed.update((id(x), next(rest[kind])) for x in given.flat)
+    reads = reads_of(graph, stored)
+    arguments = arguments_of(reads, (constants, inputs, state))
+    for kind, leaves in (("constant", read), ("input", inputs), ("state", state)):
+        own, along = numbers(reads[kind], leaves), iter(reads[kind][sum(x.size for x in leaves) :])
+        for leaf, mine in zip(leaves, own, strict=True):
+            for seed in seeds if leaf.is_moving else ():
+                seed.update((id(x), next(along)) for x in mine)
     results = [x for part in graph.trace(step, arguments, real) for x in part.flat]
     results += _tangents(graph, results, [leaf.size for leaf in state], seeds)
     results, bodies = closed(graph, results)
-    changes = _changes(results)
-    fixed = [x for body in bodies.values() for x in body.fixed]
-    order = in_order([*(x for change in changes for x in (change.mask, change.value)), *fixed])
+    changes = changes_of(results)
+    order = needed_by(changes, (x for body in bodies.values() for x in body.fixed))
     return TracedLoop(leaves=stored, changes=changes, order=order, dtype=real, bodies=bodies)
+
+
+def reads_of(graph: Graph, leaves: dict[str, list[InputLeaf]]) -> dict[str, list[Node]]:
+    """A node for every number of some leaves, by kind."""
+    return {
+        kind: [
+            graph.read((kind, k), is_varying)
+            for k, is_varying in enumerate(
+                leaf.is_varying for leaf in part for _ in range(leaf.size)
+            )
+        ]
+        for kind, part in leaves.items()
+    }
+
+
+def arguments_of(
+    reads: dict[str, list[Node]], leaves: Sequence[Sequence[InputLeaf | np.ndarray]]
+) -> list[list[np.ndarray]]:
+    """What the step is given: arrays of reads, and of known numbers."""
+    found = []
+    for nodes, part in zip(reads.values(), leaves, strict=True):
+        rest = iter(nodes)
+        found.append(
+            [
+                objects([next(rest) for _ in range(leaf.size)], leaf.shape)
+                if isinstance(leaf, InputLeaf)
+                else objects(leaf.ravel().tolist(), leaf.shape)
+                for leaf in part
+            ]
+        )
+    return found
+
+
+def needed_by(changes: Sequence[Change], others: Iterable[Any]) -> list[Node]:
+    """What changes and other numbers need, in order."""
+    return in_order([*(x for change in changes for x in (change.mask, change.value)), *others])
 
 
 def _tangent(leaf: InputLeaf, directions: int) -> InputLeaf:
@@ -169,12 +193,13 @@ def _tangents(
     return found
 
 
-def _elements(leaves: Sequence[InputLeaf]) -> list[InputLeaf]:
-    """The leaf of every number."""
-    return [leaf for leaf in leaves for _ in range(leaf.size)]
+def numbers(nodes: Sequence[Node], leaves: Sequence[InputLeaf]) -> list[list[Node]]:
+    """The nodes of each leaf; there can be more after them."""
+    rest = iter(nodes)
+    return [[next(rest) for _ in range(leaf.size)] for leaf in leaves]
 
 
-def _changes(results: Sequence[Any]) -> list[Change]:
+def changes_of(results: Sequence[Any]) -> list[Change]:
     """The numbers of the state that change; a frozen case keeps its own."""
     changes = []
     for k, x in enumerate(results):

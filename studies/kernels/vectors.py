@@ -168,7 +168,8 @@ class CalledWriter(VectorWriter):
 
         self.builder.position_at_end(loop)
         number, from_, to = (self.builder.phi(kind) for kind in (self.index, pointer, pointer))
-        self.builder.call(sample, [leaves, lanes, first, number, from_, to, work, self._table])
+        row = self._row(number, n_steps)
+        self.builder.call(sample, [leaves, lanes, first, row, from_, to, work, self._table])
         following = self.builder.add(number, ir.Constant(self.index, 1))
         begin = ir.Constant(self.index, 0)
         for phi, start, later in ((number, begin, following), (from_, old, to), (to, new, from_)):
@@ -208,6 +209,7 @@ class CalledWriter(VectorWriter):
         """
         read = [x for body in self.loop.bodies.values() for x in body.fixed]
         read += [x for change in self.loop.changes for x in (change.mask, change.value)]
+        read += self.loop.records
         for node in self.loop.order:
             if not self._is_fixed[id(node)] or node.is_truth:
                 read += node.args
@@ -293,12 +295,12 @@ class CalledWriter(VectorWriter):
             self._keep(self._widened(x), self._slot(frame, k))
 
     def _sample(self) -> Any:
-        """`sample(leaves, lanes, first, number, from, to, work, numbers)`."""
+        """`sample(leaves, lanes, first, row, from, to, work, numbers)`."""
         pointer = ir.PointerType()
         kinds = [pointer, self.index, self.index, self.index, *[pointer] * 4]
-        leaves, lanes, first, number, old, new, work, self._table = self._begin("sample", kinds)
+        leaves, lanes, first, row, old, new, work, self._table = self._begin("sample", kinds)
         arguments = self._arguments(leaves, None, lanes, first)
-        at_input = self._places("input", "input", arguments, number)
+        at_input = self._places("input", "input", arguments, row)
         due = defaultdict(list)
         for change in self.loop.changes:
             x = change.value
@@ -306,13 +308,16 @@ class CalledWriter(VectorWriter):
         for node in self.loop.order:
             if id(node) in self._fixed_at:
                 self._memory[id(node)] = self._slot(work, self._fixed_at[id(node)])
+        records = self._records(arguments, row, self._is_fixed)
         self._change(due[None], new)
+        self._record(records[None])
         for node in self.loop.order:
             if not self._is_fixed[id(node)]:
                 self._take(node, at_input, old, work)
             elif node.is_truth:
                 self._emit(node)
             self._change(due[id(node)], new)
+            self._record(records[id(node)])
         self._repair(old, new)
         self.builder.ret_void()
         return self.builder.function

@@ -1,6 +1,6 @@
 """Designs under all scenarios: objective, limits, and their derivatives by the free numbers.
 
-Runs are differentiated forward (`studies.engine.gradients`), all scenarios of all designs in one
+Runs are differentiated by kernels (`studies.engine.gradients`), all scenarios of all designs in one
 batch, with limits and rounding made smooth (`Structure.is_smooth`). Every batch includes the study
 itself as the reference.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.case import Structure
 from studies.config import processor
-from studies.engine.gradients import make_gradients
+from studies.engine.gradients import Differentiated, make_gradients
 from studies.engine.plan import Layout, even_layout, lane_unit
 from studies.engine.runs import check_run
 from studies.errors import StudyError
@@ -25,7 +25,7 @@ from studies.tuning.linear_fidelity import LinearFidelity
 from studies.tuning.merit import (
     Merit,
     allowed_limits,
-    judged_slopes,
+    judged_designs,
     largest,
     merit_of,
     own_limits,
@@ -74,7 +74,8 @@ class Evaluator:
         self._cases = in_working_precision(build_cases(study, padded, self._structure))
         self._rows = rows // self.scenarios  # design of every lane, the study itself first
         self.run_time = float("nan")  # time per run of the last batch [s]
-        self._gradients = make_gradients(self._structure, self._layout, spec.free.place)
+        most = int(self.is_free.sum(axis=1).max())
+        self._gradients = make_gradients(self._structure, self._layout, spec.free.place, most)
 
     def evaluate(self, values: np.ndarray, has_slope: np.ndarray | bool = True) -> Evaluation:
         """Objective and limits of designs.
@@ -91,39 +92,60 @@ class Evaluator:
         wanted = np.isfinite(values) & np.reshape(has_slope, (-1, 1))
         used = np.concatenate([np.zeros(own.shape, bool), wanted])[self._rows]
         runs = self._gradients.evaluate(self._cases, whole, used)
-        if is_compiled:
-            self.run_time = (time.perf_counter() - started) / self.lanes
         shape = (1 + len(values), self.scenarios)
 
         def split(x: Any) -> np.ndarray:
             return np.asarray(x)[: self.lanes].reshape(shape + np.shape(x)[1:])
 
-        metrics, slopes = (
-            jax.tree.map(split, part) for part in (runs.result.metrics, runs.metrics)
-        )
+        metrics = jax.tree.map(split, runs.result.metrics)
         codes = split(runs.result.status)
         self._check_own(codes[0], jax.tree.map(lambda x: x[0], metrics))
         own_metrics = jax.tree.map(lambda x: x[0], metrics)
         reached = own_limits(self.merit, own_metrics)
         allowed = [allowed_limits(self.merit, family, reached) for family in self.families]
-        found = judged_slopes(
-            self.merit,
-            *(jax.tree.map(lambda x: x[1:], part) for part in (metrics, slopes)),
-            own_metrics,
-            np.stack(allowed),
-        )
+        designs = jax.tree.map(lambda x: x[1:], metrics)
+        found = judged_designs(self.merit, designs, own_metrics, np.stack(allowed))
         found = jax.tree.map(np.asarray, found)
+        slopes = self._slopes(runs, found.cotangents, wanted.any(axis=1))
+        if is_compiled:
+            self.run_time = (time.perf_counter() - started) / self.lanes
         beyond, change = self.linear.limits(values)
-        limit_slope = np.concatenate([found.limit_slope, change], axis=1)
+        limit_slope = np.concatenate([slopes[:, 1:], change], axis=1)
         return Evaluation(
             objective=found.objective,
-            slope=np.where(self.is_free, found.slope, 0.0),
+            slope=np.where(self.is_free, slopes[:, 0], 0.0),
             limits=np.concatenate([found.limits, beyond], axis=1),
             limit_slope=np.where(self.is_free[:, None], limit_slope, 0.0),
             peaks=np.concatenate([found.peaks, np.full(beyond.shape, np.nan)], axis=1),
             status=codes[1:],
             residual=first_residual(self.merit, metrics)[1:],
         )
+
+    def _slopes(self, runs: Differentiated, cotangents: Any, has_slope: np.ndarray) -> np.ndarray:
+        """Derivatives of the designs' objectives and limits by the free numbers.
+
+        Args:
+            runs: all of a batch.
+            cotangents: from `judged_designs`.
+            has_slope: designs that need derivatives, (designs,).
+
+        Returns:
+            (designs, 1 + m, p).
+        """
+
+        def of_runs(x: np.ndarray) -> np.ndarray:
+            """Zeros for the study itself, the designs' runs, zeros up to the batch's size."""
+            count, designs = x.shape[:2]
+            wanted = np.where(has_slope.reshape(-1, *[1] * (x.ndim - 2)), x, 0.0)
+            found = np.zeros((count, len(self._rows), *x.shape[3:]), x.dtype)
+            begin = self.scenarios
+            found[:, begin : begin + designs * begin] = wanted.reshape(count, -1, *x.shape[3:])
+            return found
+
+        slopes = runs.pull_back(jax.tree.map(of_runs, cotangents))
+        slopes = slopes[:, self.scenarios : self.lanes]
+        by_design = slopes.reshape(len(slopes), -1, self.scenarios, slopes.shape[-1])
+        return np.swapaxes(by_design.sum(axis=2), 0, 1)
 
     def _check_own(self, codes: np.ndarray, metrics: Any) -> None:
         is_bad = ~np.isin(codes, status.FINISHED)

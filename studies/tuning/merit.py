@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -122,47 +122,37 @@ def all_judged(
     return jax.vmap(lambda x: judged(merit, x, own, allowed))(metrics)
 
 
-class DesignSlopes(NamedTuple):
-    """Designs judged, with derivatives by the free numbers."""
+class JudgedDesigns(NamedTuple):
+    """Designs judged."""
 
     objective: Array  # (designs,)
-    slope: Array  # (designs, p)
     limits: Array  # largest value over limit - 1, (designs, m)
-    limit_slope: Array  # (designs, m, p)
     peaks: Array  # largest values, (designs, m)
+    cotangents: Metrics  # of objective and limits by the metrics, (1 + m, designs, S, ...)
 
 
 @partial(jax.jit, static_argnums=0)
-def judged_slopes(
-    merit: Merit, metrics: Metrics, slopes: Metrics, own: Metrics, allowed: Array
-) -> DesignSlopes:
-    """Judge designs and differentiate.
+def judged_designs(merit: Merit, metrics: Metrics, own: Metrics, allowed: Array) -> JudgedDesigns:
+    """Judge designs and differentiate by the metrics.
 
     Args:
         merit: criteria.
         metrics: (designs, S, ...).
-        slopes: derivatives, (designs, S, p, ...).
         own: of the study itself, (S, ...).
         allowed: limits in each scenario, (designs, S, m).
     """
 
-    def one(metrics: Metrics, slopes: Metrics, allowed: Array) -> DesignSlopes:
-        def figures(x: Metrics) -> tuple[Array, Array, Array]:
-            return judged(merit, x, own, allowed)
+    def one(metrics: Metrics, allowed: Array) -> JudgedDesigns:
+        def figures(x: Metrics) -> tuple[Array, Array]:
+            objective, limits, peaks = judged(merit, x, own, allowed)
+            return jnp.concatenate([objective[None], limits]), peaks
 
-        along = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), slopes)
-        (objective, limits, peaks), (slope, limit_slope, _) = jax.vmap(
-            lambda x: jax.jvp(figures, (metrics,), (x,)), out_axes=((None, None, None), 0)
-        )(along)
-        return DesignSlopes(
-            objective=objective,
-            slope=slope,
-            limits=limits,
-            limit_slope=jnp.moveaxis(limit_slope, 0, -1),
-            peaks=peaks,
-        )
+        found, back, peaks = jax.vjp(figures, metrics, has_aux=True)
+        (cotangents,) = jax.vmap(back)(jnp.eye(found.size, dtype=found.dtype))
+        return JudgedDesigns(found[0], found[1:], peaks, cotangents)
 
-    return jax.vmap(one)(metrics, slopes, allowed)
+    axes: Any = JudgedDesigns._make((0, 0, 0, 1))
+    return jax.vmap(one, out_axes=axes)(metrics, allowed)
 
 
 def own_limits(merit: Merit, own: Metrics) -> np.ndarray:
