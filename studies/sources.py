@@ -71,5 +71,10 @@ def _imported(node: ast.AST) -> Iterator[str]:
         yield from (alias.name for alias in node.names)
     elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
         yield from (f"{node.module}.{alias.name}" for alias in node.names)
-    for inner in ast.iter_child_nodes(node):
-        yield from _imported(inner)
+    for part in _BLOCKS:  # imports are statements: expressions need not be searched
+        for inner in getattr(node, part, ()):
+            yield from _imported(inner)
+
+
+#: Where a statement keeps further ones.
+_BLOCKS = ("body", "orelse", "handlers", "finalbody", "cases")

@@ -7,7 +7,7 @@ that depends on them has tangents.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -133,7 +133,11 @@ def begin_case(program: Program, own: list[Any], common: list[Any]) -> Start:
         *own, parameters = own
         case = joined(program.tree, program.is_varying, own, common)
         case = program.place(case, parameters)
-    return begin(program.structure, case)
+    return _begin(program.structure, case)
+
+
+#: Traced once for all programs that start a case.
+_begin = jax.jit(begin, static_argnums=0)
 
 
 def chosen(
@@ -246,19 +250,33 @@ def find_parts(program: Program, own: list[Any], common: list[Any]) -> StartPart
     moving = given[-1:] if program.place else []
     return StartParts(
         jax.tree.structure(shapes),
-        _dependence(traced.jaxpr, given),
+        tuple(_dependence(traced.jaxpr, given)),
         sizes,
-        _dependence(traced.jaxpr, moving),
+        tuple(_dependence(traced.jaxpr, moving)),
     )
 
 
-def _dependence(jaxpr: Any, given: list[Any]) -> tuple[bool, ...]:
+def _dependence(jaxpr: Any, given: Iterable[Any]) -> list[bool]:
     """Which results depend on any of the given arguments."""
-    depends: set[Any] = set(given)
+    depends = set(given)
+
+    def is_one(atom: Any) -> bool:
+        return not hasattr(atom, "val") and atom in depends
+
     for equation in jaxpr.eqns:
-        if any(not hasattr(atom, "val") and atom in depends for atom in equation.invars):
-            depends.update(equation.outvars)
-    return tuple(not hasattr(out, "val") and out in depends for out in jaxpr.outvars)
+        touched = [is_one(atom) for atom in equation.invars]
+        inner = equation.params.get("jaxpr")
+        if equation.primitive.name in _CALLS and inner is not None:
+            own = zip(inner.jaxpr.invars, touched, strict=True)
+            found = _dependence(inner.jaxpr, [x for x, yes in own if yes])
+        else:
+            found = [any(touched)] * len(equation.outvars)
+        depends.update(x for x, yes in zip(equation.outvars, found, strict=True) if yes)
+    return [is_one(out) for out in jaxpr.outvars]
+
+
+#: JAX's names for a call of a compiled function.
+_CALLS = ("jit", "pjit")
 
 
 @jax.jit

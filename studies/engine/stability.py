@@ -12,7 +12,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import brentq
 from threadpoolctl import threadpool_limits
 
 from jaxmodel.axial import axial_force
@@ -257,6 +256,8 @@ def gain_margin(
         if low <= LOWEST:
             return 0.0
         high, low = low, low / DESCENT
+    from scipy.optimize import brentq  # takes a quarter of a second
+
     return float(brentq(excess, low, high, xtol=2e-5 * low, rtol=2e-5))
 
 

@@ -14,7 +14,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache, partial
+from functools import cache
 from threading import Lock, Thread
 from typing import Any
 from weakref import WeakSet
@@ -162,20 +162,13 @@ _UPGRADES = _Upgrades()
 
 
 def build_kernel(loop: TracedLoop, processor: Processor | None = None) -> Kernel:
-    """Compile a loop.
+    """Compile a loop, or find it in the cache folder.
 
     Args:
         loop: from `trace_loop`.
         processor: what for; default: this one.
     """
-    processor = processor or native.this_processor()
-    writer = write_loop(loop, processor)
-    text, numbers = str(writer.module), _aligned(writer.numbers, loop.dtype)
-    code, effort = _first_code(text, processor)
-    better = None if effort == _effort() else partial(_best_code, text, processor)
-    return Kernel(
-        load_code(code, processor), writer.width, numbers, loop.operations(), better=better
-    )
+    return kept_kernel(loop.text(), lambda: loop, processor)
 
 
 def write_loop(loop: TracedLoop, processor: Processor) -> VectorWriter:
@@ -195,7 +188,9 @@ def _aligned(numbers: Sequence[float], dtype: Any) -> np.ndarray:
     return room[first : first + len(numbers)]
 
 
-def kept_kernel(name: str, make: Callable[[], TracedLoop]) -> Kernel:
+def kept_kernel(
+    name: str, make: Callable[[], TracedLoop], processor: Processor | None = None
+) -> Kernel:
     """The kernel of a loop that depends only on `name` and the code of model and kernels.
 
     If found in the cache folder, it is not even traced.
@@ -203,26 +198,35 @@ def kept_kernel(name: str, make: Callable[[], TracedLoop]) -> Kernel:
     Args:
         name: of the loop, with all sizes.
         make: traces it.
+        processor: what for; default: this one.
     """
-    processor = native.this_processor()
+    at = processor or native.this_processor()
 
     def kept(effort: int) -> ObjectCache:
-        return ObjectCache("loop", name, _code(), jax.__version__, *_names(processor, effort))
+        return ObjectCache("loop", name, _code(), jax.__version__, *_names(at, effort))
 
     @cache
     def written() -> tuple[bytes, str]:
         """What a kernel needs besides its machine code, and the text of that."""
         loop = make()
-        writer = write_loop(loop, processor)
+        writer = write_loop(loop, at)
         facts = [writer.width, writer.numbers, loop.operations()]
         return json.dumps(facts).encode(), str(writer.module)
 
-    def better(is_apart: bool) -> bytes | None:
+    def compiled(effort: int, is_apart: bool = False) -> tuple[bytes, bytes] | None:
         head, text = written()
-        code = _best_code(text, processor, is_apart)
-        if code is not None:
-            kept(_effort()).keep(head + b"\n" + code)
-        return code
+        code = (machine_code_apart if is_apart else _machine_code_here)(text, at, effort)
+        if code is None:
+            return None
+        kept(effort).keep(head + b"\n" + code)
+        return head, code
+
+    def better(is_apart: bool) -> bytes | None:
+        found = kept(_effort()).take()
+        if found is not None:  # another process was faster
+            return found.split(b"\n", 1)[1]
+        made = compiled(_effort(), is_apart)
+        return None if made is None else made[1]
 
     for effort in _efforts():
         found = kept(effort).take()
@@ -230,13 +234,13 @@ def kept_kernel(name: str, make: Callable[[], TracedLoop]) -> Kernel:
             head, code = found.split(b"\n", 1)
             break
     else:
-        head, text = written()
-        code, effort = _first_code(text, processor)
-        kept(effort).keep(head + b"\n" + code)
+        made = compiled(effort)
+        assert made is not None
+        head, code = made
     width, numbers, operations = json.loads(head)
-    dtype = np.dtype(f"f{processor.vector_bytes // width}")
+    dtype = np.dtype(f"f{at.vector_bytes // width}")
     return Kernel(
-        load_code(code, processor),
+        load_code(code, at),
         width,
         _aligned(numbers, dtype),
         Counter(operations),
@@ -265,40 +269,6 @@ def _efforts() -> list[int]:
 def _names(processor: Processor, effort: int) -> tuple[str, ...]:
     """What machine code depends on besides its source."""
     return (*processor, ".".join(map(str, binding.llvm_version_info)), str(effort))
-
-
-def _first_code(text: str, processor: Processor) -> tuple[bytes, int]:
-    """Machine code of a module: the best that is kept, otherwise compiled; and its effort."""
-    *better, effort = _efforts()
-    for one in better:
-        found = ObjectCache(text, *_names(processor, one)).take()
-        if found is not None:
-            return found, one
-    code = _kept_code(text, processor, effort, _machine_code_here)
-    assert code is not None
-    return code, effort
-
-
-def _best_code(text: str, processor: Processor, is_apart: bool) -> bytes | None:
-    """Machine code with all effort, None if its process failed."""
-    make = machine_code_apart if is_apart else _machine_code_here
-    return _kept_code(text, processor, _effort(), make)
-
-
-def _kept_code(
-    text: str,
-    processor: Processor,
-    effort: int,
-    make: Callable[[str, Processor, int], bytes | None],
-) -> bytes | None:
-    """Machine code from the cache folder, otherwise made and kept there."""
-    kept = ObjectCache(text, *_names(processor, effort))
-    code = kept.take()
-    if code is None:
-        code = make(text, processor, effort)
-        if code is not None:
-            kept.keep(code)
-    return code
 
 
 def _machine_code_here(text: str, processor: Processor, effort: int) -> bytes:

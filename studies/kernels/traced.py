@@ -7,7 +7,7 @@ constants stay, inputs change with the sample.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,6 +72,30 @@ class TracedLoop(NamedTuple):
             else:
                 found[id(node)] = all(found[id(x)] for x in node.args if not is_known(x))
         return found
+
+    def text(self) -> str:
+        """All that the loop's code depends on."""
+        numbers: dict[int, int] = {}
+        routines = {name: k for k, name in enumerate(self.bodies)}
+
+        def named(x: Any) -> str:
+            return repr(x) if x is None or is_known(x) else f"#{numbers[id(x)]}"
+
+        def lines(order: Sequence[Node]) -> Iterator[str]:
+            for node in order:
+                numbers[id(node)] = len(numbers)
+                place = routines[id(node.place)] if node.operation == "call" else node.place
+                kind = node.operation, place, node.is_varying, node.is_truth
+                yield f"{kind} {' '.join(map(named, node.args))}"
+
+        found = [f"{self.leaves} {self.dtype} {self.is_reversed}", *lines(self.order)]
+        found += [f"{c.slot} {named(c.mask)} {named(c.value)}" for c in self.changes]
+        found += map(named, self.records)
+        for body in self.bodies.values():
+            found += [f"routine {body.n_parameters} {' '.join(map(named, body.fixed))}"]
+            found += lines(body.order)
+            found += [f"{k} {named(x)}" for k, x in body.results.items()]
+        return "\n".join(found)
 
     def operations(self) -> Counter[str]:
         """Operations of one sample by kind."""
