@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from studies.atlas.run import run_atlas
     from studies.bench.run import run_bench
     from studies.config import configure, info
+    from studies.engine.batched import batched
     from studies.engine.design import load_design
     from studies.engine.modes import machine_modes
     from studies.engine.results import load
@@ -39,6 +40,7 @@ __all__ = [
     "analyse",
     "as_arrays",
     "audit",
+    "batched",
     "best_cases",
     "build_case",
     "build_structure",
@@ -82,6 +84,7 @@ __getattr__ = lazily(
         "analyse": "studies.sweeps.sensitivity",
         "as_arrays": "studies.study.cases",
         "audit": "studies.tuning.audit",
+        "batched": "studies.engine.batched",
         "best_cases": "studies.sweeps.show",
         "build_case": "studies.study.cases",
         "build_structure": "studies.study.cases",

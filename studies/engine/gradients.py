@@ -52,15 +52,13 @@ from studies.engine.steps import (
     fits_kernel,
     start_block,
 )
+from studies.kernels.adjoint import RECORD
 
 #: Tangents per pass of the kernel. More of them share the state's own arithmetic (1: 31 gradients/s
 #: by 9 numbers on a core, 3: 49) but take longer to compile (3 s, 5 s).
 DIRECTIONS = 3
 #: Number of parameters from which the kernel's reverse mode costs less than its forward mode.
 REVERSE_FROM = 4
-#: Largest record of a block of lanes [bytes]. A run is reversed in pieces whose records stay in the
-#: cache; stepping each piece again costs less than keeping all records in memory.
-RECORD = 2 * 2**20
 
 
 class Differentiated(Protocol):

@@ -97,9 +97,9 @@ def compile_adjoint(program: Program, split: Split) -> AdjointSteps:
     """Compile the steps and their reverse; arguments as `compile_steps`."""
 
     def build() -> AdjointSteps:
-        parts, shared = _start(program, split)
+        parts, shared = start_parts(program, split)
         TRACES.append(program.structure)
-        made = trace_adjoint(*_loop(program.structure, parts, shared), _real())
+        made = trace_adjoint(*given_loop(program.structure, parts, shared), _real())
         forward, backward = map(cpu.build_kernel, made[:2])
         return AdjointSteps(
             parts=parts, shared=shared, forward=forward, backward=backward, kept=made.kept
@@ -136,13 +136,13 @@ def trace_steps(
     Args:
         program, split, directions: as in `compile_steps`.
     """
-    parts, shared = _start(program, split)
+    parts, shared = start_parts(program, split)
     TRACES.append(program.structure)
-    given = _loop(program.structure, parts, shared)
+    given = given_loop(program.structure, parts, shared)
     return Traced(parts, shared, trace_loop(*given, _real(), directions, has_routines))
 
 
-def _start(program: Program, split: Split) -> tuple[StartParts, list[np.ndarray]]:
+def start_parts(program: Program, split: Split) -> tuple[StartParts, list[np.ndarray]]:
     """Parts of a case's start, and the leaves that all cases share."""
     one = [leaf[0] for leaf in split.varying]
     parts = find_parts(program, one, split.shared)
@@ -155,7 +155,7 @@ def _real() -> Any:
     return jax.dtypes.canonicalize_dtype(np.float64)
 
 
-def _loop(
+def given_loop(
     structure: Structure, parts: StartParts, shared: list[np.ndarray]
 ) -> tuple[Callable[..., Any], list[Any], list[InputLeaf], list[InputLeaf]]:
     """Step, constants, inputs and state of a structure, with shared numbers as known ones."""

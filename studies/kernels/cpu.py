@@ -83,6 +83,8 @@ class Kernel:
                 if its argument is true. None: there is no better one.
         """
         self._engines: list[Any] = []  # keeps the machine code alive, for threads that still run it
+        #: Addresses of the machine code and of the known numbers, for callers other than Python.
+        self.cell = (ctypes.c_void_p * 2)(None, numbers.ctypes.data)
         self._use(engine)
         self.width, self.numbers, self.operations = width, numbers, operations
         self._better, self.spent = better, 0.0
@@ -92,7 +94,8 @@ class Kernel:
         self._engines.append(engine)
         pointers = ctypes.POINTER(ctypes.c_void_p)
         prototype = ctypes.CFUNCTYPE(None, pointers, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
-        self._function = prototype(engine.get_function_address("run"))
+        address = engine.get_function_address("run")
+        self._function, self.cell[0] = prototype(address), address
 
     @property
     def is_best(self) -> bool:

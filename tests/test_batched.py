@@ -1,0 +1,140 @@
+"""A study as a JAX function: equal to the scan, usable inside programs, differentiable."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import AxisType, PartitionSpec
+
+from jaxmodel import status
+from studies.engine import batched as module
+from studies.engine.batched import batched
+from studies.kernels import bridge, native
+from studies.study.spec import paper_study
+
+STUDY = paper_study().change(
+    link__modes=2,
+    control__modes=2,
+    run__duration=0.06,
+    motion__waypoints=paper_study().motion.waypoints[:2],
+    motion__move_time=0.03,
+    metrics__residual_length=0.01,
+    metrics__residual_delay=0.002,
+)
+
+
+def place(case, parameters):
+    """Gains, a number of the shaper, which moves the reference, and a blow."""
+    gain, tolerance, blow = parameters
+    control = case.control._replace(velocity_gain=case.control.velocity_gain * gain)
+    drive = case.drive._replace(pulse_force=case.drive.pulse_force + blow)
+    shaping = case.shaping._replace(tolerance=tolerance)
+    return case._replace(control=control, drive=drive, shaping=shaping)
+
+
+@pytest.fixture(scope="module")
+def parameters():
+    found = np.stack([np.linspace(0.5, 1.5, 10), np.linspace(0.03, 0.08, 10), np.zeros(10)], axis=1)
+    found[3, 2] = 1e6  # thrown off its course
+    return found
+
+
+@pytest.fixture(scope="module")
+def rounded():
+    return batched(STUDY, place)
+
+
+@pytest.fixture(scope="module")
+def smooth():
+    return batched(STUDY.change(run__smooth=True), place)
+
+
+def test_it_equals_the_scan(rounded, parameters, monkeypatch):
+    """Within 1e-9, status by status; ten cases do not fill the vectors."""
+    found = jax.jit(rounded)(parameters)
+    monkeypatch.setattr(bridge, "is_available", lambda: False)
+    wanted = jax.jit(batched(STUDY, place))(parameters)
+    np.testing.assert_array_equal(found.status, wanted.status)
+    assert set(np.asarray(found.status)) == {status.OK, status.DIVERGED}
+    good = np.asarray(found.status) == status.OK
+    for name, x in found.metrics.items():
+        size = np.abs(wanted.metrics[name][good]).max()
+        assert np.abs(x - wanted.metrics[name])[good].max() <= 1e-9 * size, name
+        assert np.isnan(x[~good]).all()
+
+
+def test_it_runs_inside_other_programs(rounded, parameters):
+    whole = np.concatenate([parameters[4:8]] * 4)
+
+    def rms(x):
+        return rounded(x).metrics.residual_rms
+
+    alone = np.asarray(rms(whole))
+    assert alone.min() > 0
+    mapped = jax.jit(lambda x: jax.lax.map(rms, x))(whole.reshape(2, 8, 3))
+    np.testing.assert_allclose(mapped.reshape(alone.shape), alone, rtol=1e-12)
+    mesh = jax.make_mesh((2,), ("cases",), axis_types=(AxisType.Auto,))
+    spec = PartitionSpec("cases")
+    shared = jax.shard_map(rms, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+    np.testing.assert_allclose(jax.jit(shared)(whole), alone, rtol=1e-12)
+
+
+def sum_of_squares(function, x):
+    """Of the cases that run to their end."""
+    result = function(x)
+    good = result.status == status.OK
+    rms = jnp.where(good[:, None, None], result.metrics.residual_rms, 0.0)
+    return jnp.sum((1e6 * rms) ** 2)
+
+
+def test_derivatives_in_both_modes(smooth, parameters):
+    """Against differences; a case that is thrown off leaves the others alone."""
+    value = jax.jit(lambda x: sum_of_squares(smooth, x))
+    gradient = np.asarray(jax.jit(jax.grad(value))(parameters))
+    assert np.isfinite(gradient).all() and (gradient[3] == 0).all()
+    step = np.zeros_like(parameters)
+    step[4:, :2] = 1e-5 * parameters[4:, :2]
+    difference = (value(parameters + step) - value(parameters - step)) / 2
+    along = jax.jit(lambda x, dx: jax.jvp(value, (x,), (dx,))[1])(parameters, step)
+    assert difference == pytest.approx(np.sum(gradient * step), rel=1e-6)
+    assert along == pytest.approx(np.sum(gradient * step), rel=1e-9)
+    assert (gradient[4:, :2] != 0).all()
+
+
+@pytest.mark.long
+def test_jacobians_and_rounded_loops(rounded, smooth, parameters, monkeypatch):
+    """Jacobians by both modes; a loop with converters has the derivatives of the scan's."""
+    few = parameters[4:12]
+
+    def rms(x):
+        return smooth(x).metrics.residual_rms[1].ravel()
+
+    forward, reverse = jax.jacfwd(rms)(few), jax.jacrev(rms)(few)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12 * np.abs(forward).max())
+    assert (np.asarray(forward)[:, 1, :2] != 0).all() and (np.asarray(forward)[:, 2:] == 0).all()
+    turned = jax.grad(lambda x: rounded(x).metrics.residual_rms.sum())(few)
+    monkeypatch.setattr(bridge, "is_available", lambda: False)
+    scan = batched(STUDY, place)
+    wanted = jax.grad(lambda x: scan(x).metrics.residual_rms.sum())(few)
+    size = np.abs(wanted).max(axis=0)
+    assert (np.abs(turned - wanted) <= 1e-9 * size).all() and (size[:2] > 0).all()
+
+
+def test_without_kernels_it_is_the_scan(monkeypatch):
+    monkeypatch.setattr(module, "fits_kernel", lambda structure: False)
+    traced = jax.make_jaxpr(batched(STUDY, place))(np.ones((2, 3)))
+    assert "ffi_call" not in str(traced) and "scan" in str(traced)
+
+
+def test_another_version_of_the_interface_is_left_alone(monkeypatch):
+    assert bridge.is_available()
+    monkeypatch.setattr(bridge, "_version", lambda: (1, 0))
+    assert not bridge.is_available()
+
+
+def test_lanes_fill_vectors():
+    with pytest.raises(ValueError, match="lanes = 3; allowed: multiples of"):
+        bridge.as_function(
+            bridge.trace_loop(lambda *x: x[2], [], [], [bridge.InputLeaf((), True)], float), 5, 3
+        )
+    assert native.this_processor().vector_bytes in (16, 32, 64)
