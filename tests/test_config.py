@@ -1,5 +1,6 @@
 """Settings of JAX: in force under the tests, refused when wrong or late, none at import."""
 
+import gc
 import json
 import os
 import subprocess
@@ -9,7 +10,14 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from studies.config import COMPILER_FLAGS, DEVICE_FLAG, configure, info, is_backend_started
+from studies.config import (
+    COMPILER_FLAGS,
+    DEVICE_FLAG,
+    GARBAGE,
+    configure,
+    info,
+    is_backend_started,
+)
 from studies.errors import StudyError
 
 
@@ -30,6 +38,18 @@ def run(code, **environment):
 def test_float64_and_flags_are_in_force():
     assert jnp.zeros(1).dtype == jnp.float64
     assert all(name in os.environ["XLA_FLAGS"] for name in (*COMPILER_FLAGS, DEVICE_FLAG))
+
+
+def test_garbage_is_looked_for_less_often_unless_the_user_has_a_say():
+    before = gc.get_threshold()
+    assert before == GARBAGE
+    try:
+        for given, wanted in (((700, 10, 10), GARBAGE), ((900, 5, 5), (900, 5, 5))):
+            gc.set_threshold(*given)
+            configure()
+            assert gc.get_threshold() == wanted
+    finally:
+        gc.set_threshold(*before)
 
 
 def test_equal_settings_may_be_repeated_after_the_start():

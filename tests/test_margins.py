@@ -98,11 +98,11 @@ def assert_margins(found, wanted):
 
 
 def test_margins_of_random_loops():
-    loops = random_loops(28, 5)
+    loops = random_loops(16, 5)
     wanted = exact_margins(loops)
     assert_margins(judge_loops(*loops).gain_margin, wanted)
     # neither all stable nor all unstable
-    assert 5 < np.sum(wanted > 1) < 23
+    assert 3 < np.sum(wanted > 1) < 13
 
 
 def too_strong(loops, seed, decades):
@@ -115,10 +115,10 @@ def too_strong(loops, seed, decades):
 
 def test_margins_of_loops_much_too_strong():
     """As of a law whose gains have another unit than the study's."""
-    loops = too_strong(random_loops(28, 8), 8, 5)
+    loops = too_strong(random_loops(16, 8), 8, 5)
     wanted = exact_margins(loops)
     assert_margins(judge_loops(*loops).gain_margin, wanted)
-    assert np.sum(wanted < 1e-3) > 5
+    assert np.sum(wanted < 1e-3) > 3
 
 
 @pytest.mark.long
