@@ -1,5 +1,8 @@
 """A study as a JAX function: equal to the scan, usable inside programs, differentiable."""
 
+import re
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +12,7 @@ from jax.sharding import AxisType, PartitionSpec
 from jaxmodel import status
 from studies.engine import batched as module
 from studies.engine.batched import batched
+from studies.errors import StudyError
 from studies.kernels import bridge, native
 from studies.study.spec import paper_study
 
@@ -130,6 +134,64 @@ def test_another_version_of_the_interface_is_left_alone(monkeypatch):
     assert bridge.is_available()
     monkeypatch.setattr(bridge, "_version", lambda: (1, 0))
     assert not bridge.is_available()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        (np.ones(3), r"shape (3,); expected real numbers of shape (cases, parameters)"),
+        (np.ones((0, 3)), "shape (0, 3)"),
+        (np.ones((2, 0)), "shape (2, 0)"),
+        (np.ones((2, 3)) * 1j, "complex128"),
+        ("abc", "not an array of numbers"),
+    ],
+)
+def test_parameters_of_another_shape_are_refused(rounded, parameters, said):
+    with pytest.raises(StudyError, match=re.escape(said)):
+        rounded(parameters)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda case, x: x, "returns a ShapeDtypeStruct; expected the case"),
+        (lambda case, x: None, "returns a NoneType"),
+        (
+            lambda case, x: case._replace(drive=case.drive._replace(kp=x)),
+            "case.drive.kp has shape (3,); expected ()",
+        ),
+    ],
+)
+def test_a_wrong_place_is_refused(wrong, said):
+    with pytest.raises(StudyError, match=re.escape(said)):
+        batched(STUDY, wrong)(np.ones((2, 3)))
+
+
+def test_a_wrong_study_or_place_is_named():
+    with pytest.raises(StudyError, match="study: 'paper'; expected a study"):
+        batched("paper", place)
+    with pytest.raises(StudyError, match="place: None; expected a function"):
+        batched(STUDY, None)
+
+
+def test_first_calls_from_several_threads(rounded, parameters):
+    """XLA takes the name of a kernel once."""
+    with ThreadPoolExecutor(4) as pool:
+        one = list(pool.map(lambda _: np.asarray(rounded(parameters[:5]).status), range(4)))
+    assert all((x == one[0]).all() for x in one)
+
+
+def test_a_number_that_is_none_spoils_no_derivative(smooth, parameters):
+    given = parameters.copy()
+    given[5, 0] = np.nan
+    gradient = np.asarray(jax.jit(jax.grad(lambda x: sum_of_squares(smooth, x)))(given))
+    assert np.isfinite(gradient).all() and (gradient[5] == 0).all() and (gradient[4, :2] != 0).all()
+
+
+def test_second_derivatives_are_refused_in_words(smooth, parameters):
+    twice = jax.grad(lambda x: jnp.sum(jax.grad(lambda y: sum_of_squares(smooth, y))(x)))
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        twice(parameters)
 
 
 def test_lanes_fill_vectors():

@@ -20,7 +20,8 @@ from studies.space.table import build_table
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study
 from studies.sweeps.report import report, write_sweep_report
-from studies.sweeps.screening import check_screen
+from studies.sweeps.screening import _rank_correlation, check_screen
+from studies.sweeps.show import best_cases, recommended
 from tests.sweeps import HOME_PHI, small, small_spec
 from tests.test_kernel import ALL_SORTS, check_equal
 from tests.test_sweeps import killed_until_done, partly_done
@@ -244,6 +245,29 @@ def test_a_condition_sends_the_screen_further_down(tmp_path, folders):
     np.testing.assert_array_equal(found["status"] >= 0, found["screen_status"] == status.OK)
 
 
+def test_what_is_recommended_meets_the_screens_condition(tmp_path, folders):
+    """Also where cases that do not meet it rank better."""
+    limit = float(np.nanmedian(read(folders / "full")["peak_voltage"].max(axis=1)))
+    run(screened(subject_to=f"peak_voltage < {limit}"), tmp_path / "s")
+    found = read(tmp_path / "s")
+    voltage = metric_values(found, "peak_voltage")
+    assert (voltage[recommended(found, "-residual_rms")] < limit).all()
+    assert not (voltage[best_cases(found, "-residual_rms")] < limit).all()
+    write_sweep_report(tmp_path / "s")
+    text = (tmp_path / "s" / "report.md").read_text()
+    assert f'--subject-to "peak_voltage < {limit} and gain_margin >= 2"' in text
+
+
+def test_a_screen_without_fields_has_the_defaults():
+    assert small_spec(SWEEP | {"screen": {}}).screen.keep == 0.05
+
+
+def test_equal_values_have_equal_ranks():
+    ties = np.array([1.0, 1.0, 2.0, 3.0]), np.array([1.0, 2.0, 2.0, 4.0])
+    assert _rank_correlation(*ties) == pytest.approx(0.8333, abs=1e-3)
+    assert np.isnan(_rank_correlation(np.zeros(5), np.zeros(5)))
+
+
 def test_an_interrupted_screen_goes_on_where_it_was(tmp_path, folders, monkeypatch):
     from studies.engine import plan
 
@@ -319,6 +343,9 @@ def test_nothing_may_pass(tmp_path, capsys):
         ({"screen": SCREEN, "method": "morris", "count": 4}, "needs every case"),
         ({"screen": SCREEN | {"subject_to": "gain_margn > 2"}}, "did you mean 'gain_margin'?"),
         ({"screen": SCREEN | {"subject_to": "foo > 2"}}, "foo"),
+        ({"screen": SCREEN | {"subject_to": "peak_voltage[link=7] < 1"}}, "[link=1 to 3]"),
+        ({"screen": SCREEN | {"subject_to": "plant_energy < 1"}}, "sweep.metrics does not keep it"),
+        ({"screen": SCREEN | {"by": "residual_rms[link=4]"}}, "sweep.screen.by: 'residual_rms"),
     ],
 )
 def test_faults_of_a_screen_are_reported_before_any_run(sweep, message):

@@ -22,6 +22,7 @@ from studies.engine.plan import Layout, lane_unit
 from studies.engine.program import Place, Program, begin_block, conclude_all, split_cases
 from studies.engine.runs import check_run
 from studies.engine.steps import fits_kernel, given_loop, read_leaves, start_parts
+from studies.errors import StudyError
 from studies.kernels import bridge
 from studies.study.spec import Study
 
@@ -39,17 +40,22 @@ def batched(study: Study, place: Place) -> Callable[[Array], Result]:
     Returns:
         A function of parameters (n, p) that gives the results of n cases, leaves (n, ...). Its
         derivatives, forward and reverse, are those of the smooth loop: converters without
-        rounding, limits with round corners.
+        rounding, limits with round corners. It raises StudyError for parameters of another shape
+        and for a `place` that does not return such a case.
 
     Raises:
-        StudyError: as `check_run`.
+        StudyError: as `check_run`, or not a study or a function. Call it outside of `jit`.
     """
+    if not isinstance(study, Study):
+        raise StudyError(f"study: {study!r}; expected a study, as load_study returns")
+    if not callable(place):
+        raise StudyError(f"place: {place!r}; expected a function of a case and its parameters")
     structure, case = check_run(study)
     if processor() != "cpu" or not fits_kernel(structure) or not bridge.is_available():
-        return jax.vmap(lambda parameters: simulate(structure, place(case, parameters)))
+        return _checked(case, place, jax.vmap(lambda x: simulate(structure, place(case, x))))
     exact = _by_kernel(structure, case, place)
     if structure.is_smooth:
-        return exact
+        return _checked(case, place, exact)
     smooth = _by_kernel(structure._replace(is_smooth=True), case, place)
     found = jax.custom_jvp(exact)
 
@@ -57,7 +63,43 @@ def batched(study: Study, place: Place) -> Callable[[Array], Result]:
     def rule(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Result, Result]:
         return exact(*primals), jax.jvp(smooth, primals, tangents)[1]
 
-    return found
+    return _checked(case, place, found)
+
+
+def _checked(case: Case, place: Place, run: Callable[[Array], Result]) -> Callable[[Array], Result]:
+    """The same for parameters that are what they should be."""
+
+    def checked(parameters: Array) -> Result:
+        try:
+            given = jnp.asarray(parameters)
+        except (TypeError, ValueError) as error:
+            raise StudyError(f"parameters: not an array of numbers ({error})") from None
+        if given.ndim != 2 or 0 in given.shape or jnp.iscomplexobj(given):
+            raise StudyError(
+                f"parameters: {given.dtype} of shape {given.shape}; expected real numbers of shape "
+                "(cases, parameters), at least one of each"
+            )
+        given = given.astype(jax.dtypes.canonicalize_dtype(float))
+        _check_place(case, place, given)
+        # a number that is none must not spoil the derivatives of the cases beside it
+        return run(jnp.where(jnp.isfinite(given), given, jax.lax.stop_gradient(given)))
+
+    return checked
+
+
+def _check_place(case: Case, place: Place, parameters: Array) -> None:
+    row = jax.ShapeDtypeStruct(parameters.shape[1:], parameters.dtype)
+    found = jax.eval_shape(place, case, row)
+    if not isinstance(found, Case):
+        raise StudyError(f"place: returns a {type(found).__name__}; expected the case it was given")
+    for (path, one), (other, two) in zip(
+        jax.tree_util.tree_leaves_with_path(found),
+        jax.tree_util.tree_leaves_with_path(case),
+        strict=False,
+    ):
+        if path != other or one.shape != np.shape(two):
+            name = jax.tree_util.keystr(other)
+            raise StudyError(f"place: case{name} has shape {one.shape}; expected {np.shape(two)}")
 
 
 def _by_kernel(structure: Structure, case: Case, place: Place) -> Callable[[Array], Result]:
@@ -66,7 +108,6 @@ def _by_kernel(structure: Structure, case: Case, place: Place) -> Callable[[Arra
         return _program(structure, case, place, lanes, count)
 
     def run(parameters: Array) -> Result:
-        parameters = jnp.asarray(parameters, float)
         n, unit = len(parameters), lane_unit()
         rows = np.minimum(np.arange(-(-n // unit) * unit), n - 1)  # whole vectors
         result = compiled(len(rows), parameters.shape[1])(parameters[rows])

@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.case import Structure
+from jaxmodel.metrics import METRICS
 from studies.engine.chunks import Done
 from studies.engine.columns import NOT_RUN, PER_CASE, SCREENED
 from studies.engine.folder import SCREEN, Finished, finished_cases
@@ -26,6 +27,7 @@ from studies.space.condition import evaluate
 from studies.space.spec import Screen, SweepSpec
 from studies.space.table import CaseTable
 from studies.store import Variable
+from studies.study.entries import parse_entries
 from studies.study.paths import NAMED_INDEX
 
 #: Most random cases that show what the screen lost.
@@ -46,24 +48,37 @@ class Round(NamedTuple):
         return np.union1d(self.first, self.audit)
 
 
-def check_condition(spec: SweepSpec, table: CaseTable) -> None:
-    """Reject a screen's condition with unknown names before anything runs.
+def check_screen_names(spec: SweepSpec, table: CaseTable) -> None:
+    """Reject a screen that ranks by or asks for what no case has, before anything runs.
 
     Raises:
-        StudyError: so it is.
+        StudyError: so it does.
     """
-    known = (*kept_metrics(spec), *PER_CASE)
+    if spec.screen is None:
+        return
+    metrics = kept_metrics(spec)
+    sizes = {
+        "station": len(spec.study.metrics.stations),
+        "mode": int(table.values("link.modes").max()),
+        "controlled_mode": int(table.values("control.modes").max()),
+        "spectrum_point": Structure().n_frequencies,
+    }
+    parse_entries(spec.screen.entry, "sweep.screen.by", sizes)
 
     def lookup(name: str) -> np.ndarray:
         key = NAMED_INDEX.sub("", name).partition("[")[0]
-        if key in known:
-            return np.ones(1)
-        close = nearest(key, known)
-        if close:
-            raise StudyError(f"sweep.screen.subject_to: unknown {name!r}; did you mean {close!r}?")
-        return table.values(name)[:1]
+        if key in metrics:
+            parse_entries(name, sizes=sizes)
+        elif key in METRICS:
+            raise StudyError(f"{name!r}: sweep.metrics does not keep it")
+        elif key not in PER_CASE:
+            close = nearest(key, (*metrics, *PER_CASE))
+            if close:
+                raise StudyError(f"unknown {name!r}; did you mean {close!r}?")
+            return table.values(name)[:1]
+        return np.ones(1)
 
-    if spec.screen is not None and spec.screen.subject_to:
+    if spec.screen.subject_to:
         evaluate(spec.screen.subject_to, lookup, "sweep.screen.subject_to")
 
 

@@ -31,7 +31,7 @@ from studies.engine.plan import Group, Layout, chunk_cases, local_layout, plan_g
 from studies.engine.progress import Reporter
 from studies.engine.screen import (
     Round,
-    check_condition,
+    check_screen_names,
     first_round,
     next_round,
     ranked,
@@ -84,7 +84,7 @@ def make_plan(spec: SweepSpec, out: Path | None = None) -> Plan:
     config.require_configured()
     kept_metrics(spec)
     table, sweep = build_table(spec), spec.sweep
-    check_condition(spec, table)
+    check_screen_names(spec, table)
     rows = np.arange(len(table))
     if out is not None:
         rows = _rows_left(table, finished_cases(out).case_id, out)
@@ -125,7 +125,7 @@ def run_sweep(
     runner, out = runner or Here(), Path(out)
     kept_metrics(spec)
     table = build_table(spec)
-    check_condition(spec, table)
+    check_screen_names(spec, table)
     console = console or Console(highlight=False, markup=False)
     tell = partial(console.print, soft_wrap=True)
     manifest = make_manifest(spec.data)

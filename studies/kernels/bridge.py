@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple
 
 import jax
@@ -34,6 +35,8 @@ _EXTENSION, _KIND, _METADATA, _VERSION = 8, 8, 24, 24
 
 #: What keeps a handler alive: its machine code and its kernel, by its name.
 _HANDLERS: dict[str, tuple[Any, Kernel]] = {}
+#: XLA takes a name once.
+_REGISTERING = Lock()
 
 
 def is_available() -> bool:
@@ -174,6 +177,12 @@ def _turned_back(cotangents: list[Any], *args: Any, linear: _Linear) -> list[Any
     return [*[None] * len(leaves), *kept]
 
 
+def _no_second(*_: Any, **__: Any) -> Any:
+    raise NotImplementedError(
+        "kernels have first derivatives only; for second ones, take jaxmodel.simulate"
+    )
+
+
 def _one_by_one(args: Any, axes: Any, *, linear: _Linear) -> Any:
     """Batching: one after the other, as for the kernel itself."""
     wide = [jnp.moveaxis(x, k, 0) for x, k in zip(args, axes, strict=True) if k is not None]
@@ -189,6 +198,7 @@ def _one_by_one(args: Any, axes: Any, *, linear: _Linear) -> Any:
 
 _LINEAR.def_impl(_pushed)
 _LINEAR.def_abstract_eval(_abstract)
+ad.primitive_jvps[_LINEAR] = _no_second
 ad.primitive_transposes[_LINEAR] = _turned_back
 batching.primitive_batchers[_LINEAR] = _one_by_one
 mlir.register_lowering(_LINEAR, mlir.lower_fun(_pushed, multiple_results=True))
@@ -241,19 +251,25 @@ def _registered(loop: TracedLoop, n_steps: int, lanes: int) -> str:
     """Name under which XLA knows the handler of a loop's kernel, the same in every process."""
     key = f"{loop.text()} {n_steps} {lanes} {native.this_processor()}"
     name = f"flexlink_{hashlib.sha256(key.encode()).hexdigest()[:24]}"
-    if name not in _HANDLERS:
-        kernel = build_kernel(loop)
-        if lanes % kernel.width:
-            raise ValueError(f"lanes = {lanes}; allowed: multiples of {kernel.width}")
-        counts = [len(loop.leaves.get(x, ())) for x in ("constant", "input", "state", "record")]
-        text = _handler(kernel, counts[0] + counts[1], counts[2] + counts[3], n_steps, lanes)
-        processor = native.this_processor()
-        engine = native.load_code(native.machine_code(text, processor, 0), processor)
-        pointer = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
-        address = engine.get_function_address("handler")
-        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(pointer(address)), platform="cpu")
-        _HANDLERS[name] = engine, kernel
+    with _REGISTERING:
+        if name not in _HANDLERS:
+            _HANDLERS[name] = _register(name, loop, n_steps, lanes)
     return name
+
+
+def _register(name: str, loop: TracedLoop, n_steps: int, lanes: int) -> tuple[Any, Kernel]:
+    """Make a handler known to XLA; returns what keeps it alive."""
+    kernel = build_kernel(loop)
+    if lanes % kernel.width:
+        raise ValueError(f"lanes = {lanes}; allowed: multiples of {kernel.width}")
+    counts = [len(loop.leaves.get(x, ())) for x in ("constant", "input", "state", "record")]
+    text = _handler(kernel, counts[0] + counts[1], counts[2] + counts[3], n_steps, lanes)
+    processor = native.this_processor()
+    engine = native.load_code(native.machine_code(text, processor, 0), processor)
+    pointer = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
+    address = engine.get_function_address("handler")
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(pointer(address)), platform="cpu")
+    return engine, kernel
 
 
 def _handler(kernel: Kernel, n_given: int, n_results: int, n_steps: int, lanes: int) -> str:

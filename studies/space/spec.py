@@ -118,7 +118,7 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
     ranking = parse_entries(sweep.by, "sweep.by").metric
     if "by" in data["sweep"] and sweep.metrics and ranking not in sweep.metrics:
         raise field_error("sweep.by", sweep.by, f"one of sweep.metrics = {list(sweep.metrics)}")
-    screen = _parse_screen(sweep) if sweep.screen else None
+    screen = _parse_screen(sweep) if "screen" in data["sweep"] else None
     return SweepSpec(study=study, sweep=sweep, root=_node(sweep, "sweep"), screen=screen, data=data)
 
 

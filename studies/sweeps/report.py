@@ -47,6 +47,7 @@ from studies.sweeps.show import (
     margin_warning,
     ranking,
     recommended,
+    requirement,
     shown_metric,
     shown_value,
     status_rows,
@@ -81,6 +82,7 @@ class BestCase(NamedTuple):
     spread: float | None  # relative spread of the metric among them, None if it distinguishes them
     warning: str  # of small gain margins among them
     is_safe: bool  # their gain margins are `ENOUGH`
+    condition: str  # what the best cases meet, "" for nothing
     rival: Rival | None
     idle: list[tuple[str, str]]  # links that no case controls, and the metric there
     table: Rows
@@ -188,7 +190,9 @@ def _best(data: SweepData, metric: str) -> BestCase | None:
     if not is_known.any():
         return None
     best = recommended(data, metric)
-    first, free = int(best[0]), int(best_cases(data, metric, count=1)[0])
+    condition = requirement(data, metric)
+    own = data.spec.screen.subject_to if data.spec.screen and condition else ""
+    first, free = int(best[0]), int(best_cases(data, metric, own, count=1)[0])
     warning = margin_warning(data, best)
     is_safe = not warning and bool(np.isfinite(margin[best]).any())
     is_beaten = is_safe and value[free] < value[first]
@@ -210,6 +214,7 @@ def _best(data: SweepData, metric: str) -> BestCase | None:
         spread=spread if len(best) > 3 and spread < ALIKE else None,
         warning=warning,
         is_safe=is_safe,
+        condition=condition,
         idle=_idle(data, metric, first),
         rival=Rival(free, told(readings[free]), margin[free]) if is_beaten else None,
         table=_literal(case_rows(data, best, [metric])),

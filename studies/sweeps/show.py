@@ -116,9 +116,9 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
         return
     if np.isfinite(metric_values(data, by)[codes == status.OK]).any():
         best = recommended(data, by)
-        is_safe = not margin_warning(data, best) and MARGIN in data.variables
-        safe = f", gain margin {ENOUGH:g} or more" if is_safe else ""
-        console.print(f"best cases by {by}, {direction(by)} first, {counted_text(data, by)}{safe}:")
+        condition = requirement(data, by)
+        met = f", of those with {condition}" if condition else ""
+        console.print(f"best cases by {by}, {direction(by)} first, {counted_text(data, by)}{met}:")
         print_cases(data, best, [by], console)
 
 
@@ -266,16 +266,30 @@ def shown_metric(data: SweepData, name: str) -> np.ndarray:
 
 
 def recommended(data: SweepData, by: str, count: int = 10) -> np.ndarray:
-    """The best cases with a gain margin of `ENOUGH`, or with any margin if none has that.
+    """The best cases that meet `requirement`; arguments and errors as `best_cases`."""
+    return best_cases(data, by, requirement(data, by), count)
 
-    Arguments and errors as `best_cases`.
+
+def requirement(data: SweepData, by: str) -> str:
+    """What a case must meet to be recommended: a gain margin of `ENOUGH`, the screen's condition.
+
+    Returns:
+        As much of that, as a condition, as any case with this metric meets; "" for nothing.
     """
-    if MARGIN in data.variables and np.isfinite(data[MARGIN]).any():
+    own = data.spec.screen.subject_to if data.spec.screen is not None else ""
+    has_margin = MARGIN in data.variables and bool(np.isfinite(data[MARGIN]).any())
+    wanted = [x for x in (own, f"{MARGIN} >= {ENOUGH:g}" if has_margin else "") if x]
+    for condition in dict.fromkeys((" and ".join(map(_bracketed, wanted)), *wanted)):
         try:
-            return best_cases(data, by, f"{MARGIN} >= {ENOUGH:g}", count)
+            best_cases(data, by, condition, 1)
+            return condition
         except StudyError:
             pass
-    return best_cases(data, by, count=count)
+    return ""
+
+
+def _bracketed(condition: str) -> str:
+    return f"({condition})" if " or " in condition else condition
 
 
 def shown_value(data: SweepData, name: str, case: int) -> str:
