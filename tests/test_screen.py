@@ -241,6 +241,9 @@ def test_a_condition_sends_the_screen_further_down(tmp_path, folders):
     is_met = (found["status"] == status.OK) & (metric_values(found, "peak_voltage") < limit)
     assert is_met.sum() >= 8 and (found["status"] >= 0).sum() > 16
     run(screened(subject_to="peak_voltage < 0"), tmp_path / "none")  # runs all there are
+    write_sweep_report(tmp_path / "none")
+    report = (tmp_path / "none" / "report.md").read_text()
+    assert "None of them meets peak_voltage < 0" in report and "Best: case" in report
     found = read(tmp_path / "none")
     np.testing.assert_array_equal(found["status"] >= 0, found["screen_status"] == status.OK)
 

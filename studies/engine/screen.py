@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.case import Structure
-from jaxmodel.metrics import METRICS
+from jaxmodel.metrics import METRICS, Sizes
 from studies.engine.chunks import Done
 from studies.engine.columns import NOT_RUN, PER_CASE, SCREENED
 from studies.engine.folder import SCREEN, Finished, finished_cases
@@ -57,12 +57,12 @@ def check_screen_names(spec: SweepSpec, table: CaseTable) -> None:
     if spec.screen is None:
         return
     metrics = kept_metrics(spec)
-    sizes = {
-        "station": len(spec.study.metrics.stations),
-        "mode": int(table.values("link.modes").max()),
-        "controlled_mode": int(table.values("control.modes").max()),
-        "spectrum_point": Structure().n_frequencies,
-    }
+    sizes = Sizes(
+        n_stations=len(spec.study.metrics.stations),
+        n_modes=int(table.values("link.modes").max()),
+        n_controlled=int(table.values("control.modes").max()),
+        n_frequencies=Structure().n_frequencies,
+    ).axes
     parse_entries(spec.screen.entry, "sweep.screen.by", sizes)
 
     def lookup(name: str) -> np.ndarray:

@@ -30,7 +30,6 @@ from studies.space.axes import SHOWN_AS
 from studies.space.methods import METHODS
 from studies.space.spec import BlockNode
 from studies.space.table import case_study
-from studies.study.margin import ENOUGH
 from studies.study.spec import Study
 from studies.study.template import study_template, toml_text, toml_value
 from studies.sweeps.dry_run import axis_rows
@@ -171,7 +170,6 @@ def report(data: SweepData, metric: str, drawn: list[str], folder: str = "DIR") 
         endings=_literal(endings),
         best=_best(data, metric),
         screen=check_screen(data),
-        enough=ENOUGH,
         blocks=_blocks(data.spec.root),
         columns=_literal(axis_rows(data.table)),
         causes=_literal(cause_rows(data)),
@@ -189,10 +187,10 @@ def _best(data: SweepData, metric: str) -> BestCase | None:
     is_known = (data["status"] == status.OK) & np.isfinite(value)
     if not is_known.any():
         return None
-    best = recommended(data, metric)
     condition = requirement(data, metric)
-    own = data.spec.screen.subject_to if data.spec.screen and condition else ""
-    first, free = int(best[0]), int(best_cases(data, metric, own, count=1)[0])
+    best = best_cases(data, metric, condition)
+    loose = requirement(data, metric, is_safe=False)
+    first, free = int(best[0]), int(best_cases(data, metric, loose, count=1)[0])
     warning = margin_warning(data, best)
     is_safe = not warning and bool(np.isfinite(margin[best]).any())
     is_beaten = is_safe and value[free] < value[first]

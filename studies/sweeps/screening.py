@@ -34,7 +34,7 @@ class ScreenCheck(NamedTuple):
     correlation: float  # Spearman's, of both models' values among them [1]
     n_good: int  # the best random cases by the full model
     n_found: int  # those among them that passed
-    unmet: str  # the screen's condition if no case meets it, otherwise ""
+    is_met: bool  # by any case
 
     @property
     def text(self) -> str:
@@ -47,8 +47,8 @@ class ScreenCheck(NamedTuple):
             "ones. "
         )
         met = f" that meet {self.condition}" if self.condition else ""
-        if self.unmet:
-            said += f"None of them meets {self.unmet}, so nothing can be said of what it lost."
+        if self.condition and not self.is_met:
+            said += f"None of them meets {self.condition}, so nothing can be said of what it lost."
         elif np.isnan(self.correlation):
             said += f"Too few random cases{met} differ to say how well the screen ranks."
         else:
@@ -72,11 +72,12 @@ def check_screen(data: SweepData) -> ScreenCheck | None:
         return None
     order = _order(data)
     passed = order[: _n_passed(data, order)]
-    rows = _random(data, order)
+    random = _random(data, order)
     is_met = meets(data, screen.subject_to, "sweep.screen.subject_to")
     is_met &= data["status"] == status.OK
-    rows = rows[is_met[rows]]
-    value = metric_values(data, screen.entry)[rows]
+    value = metric_values(data, screen.entry)
+    rows = random[is_met[random] & np.isfinite(value[random])]
+    value = value[rows]
     sign = -1 if direction(screen.by) == "largest" else 1
     n_good = min(len(rows), max(1, round(min(GOOD, screen.keep) * len(rows))))
     good = rows[np.argsort(sign * value, kind="stable")][:n_good]
@@ -88,13 +89,13 @@ def check_screen(data: SweepData) -> ScreenCheck | None:
         n_cases=data.n_cases,
         n_aside=int(np.sum(data["screen_status"] != NOT_RUN)) - len(order),
         n_passed=len(passed),
-        n_audited=int(np.sum(data["status"][audited(data.n_cases, order, data.spec)] >= 0)),
+        n_audited=len(random),
         n_random=len(rows),
         difference=float(np.median(error)) if len(rows) else float("nan"),
         correlation=_rank_correlation(linear, value),
         n_good=n_good,
         n_found=int(np.isin(good, passed).sum()),
-        unmet="" if is_met.any() else screen.subject_to,
+        is_met=bool(is_met.any()),
     )
 
 
@@ -113,11 +114,9 @@ def _n_passed(data: SweepData, order: np.ndarray) -> int:
 
 
 def _random(data: SweepData, order: np.ndarray) -> np.ndarray:
-    """The random cases that have a value of the full model."""
-    assert data.spec.screen is not None
+    """The random cases that the full model ran."""
     rows = audited(data.n_cases, order, data.spec)
-    value = metric_values(data, data.spec.screen.entry)
-    return rows[np.isfinite(value[rows])]
+    return rows[data["status"][rows] >= 0]
 
 
 def _rank_correlation(a: np.ndarray, b: np.ndarray) -> float:

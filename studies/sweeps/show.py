@@ -115,8 +115,8 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
     if by.partition("[")[0] not in data.variables:  # no run has finished
         return
     if np.isfinite(metric_values(data, by)[codes == status.OK]).any():
-        best = recommended(data, by)
         condition = requirement(data, by)
+        best = best_cases(data, by, condition)
         met = f", of those with {condition}" if condition else ""
         console.print(f"best cases by {by}, {direction(by)} first, {counted_text(data, by)}{met}:")
         print_cases(data, best, [by], console)
@@ -270,14 +270,19 @@ def recommended(data: SweepData, by: str, count: int = 10) -> np.ndarray:
     return best_cases(data, by, requirement(data, by), count)
 
 
-def requirement(data: SweepData, by: str) -> str:
+def requirement(data: SweepData, by: str, is_safe: bool = True) -> str:
     """What a case must meet to be recommended: a gain margin of `ENOUGH`, the screen's condition.
+
+    Args:
+        data: the sweep.
+        by: metric or entry of one.
+        is_safe: whether the gain margin counts.
 
     Returns:
         As much of that, as a condition, as any case with this metric meets; "" for nothing.
     """
     own = data.spec.screen.subject_to if data.spec.screen is not None else ""
-    has_margin = MARGIN in data.variables and bool(np.isfinite(data[MARGIN]).any())
+    has_margin = is_safe and MARGIN in data.variables and bool(np.isfinite(data[MARGIN]).any())
     wanted = [x for x in (own, f"{MARGIN} >= {ENOUGH:g}" if has_margin else "") if x]
     for condition in dict.fromkeys((" and ".join(map(_bracketed, wanted)), *wanted)):
         try:

@@ -22,7 +22,7 @@ from pydantic import ValidationError
 
 from jaxmodel.case import Structure
 from jaxmodel.laws import LAWS
-from jaxmodel.metrics import METRICS
+from jaxmodel.metrics import METRICS, Sizes
 from studies.engine.runs import check_run
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.study.cases import build_structure
@@ -244,13 +244,13 @@ def _check_metric(name: str, path: str, has_loop: bool, study: Study) -> None:
             f"{path}: {_field(name)} moves in steps and has no derivative"
             + ("; take ringing_time" if _field(name) == "settling_time" else "; limit it instead")
         )
-    sizes = {
-        "station": len(study.metrics.stations),
-        "mode": study.link.modes,
-        "controlled_mode": study.control.modes,
-        "spectrum_point": Structure().n_frequencies,
-    }
-    parse_entries(name, path, sizes)
+    sizes = Sizes(
+        n_stations=len(study.metrics.stations),
+        n_modes=study.link.modes,
+        n_controlled=study.control.modes,
+        n_frequencies=Structure().n_frequencies,
+    )
+    parse_entries(name, path, sizes.axes)
 
 
 def _moves(tune: Tune, study: Study) -> tuple[dict[str, Any], ...]:
