@@ -299,6 +299,7 @@ def test_atlas_goes_on_after_an_interrupt_and_refuses_to_start_over(atlas, tmp_p
     assert Path(folder / "report.md").is_file()
 
 
+@pytest.mark.long  # in short: an interrupted screen, in test_screen
 def test_an_interrupted_drawing_says_how_to_go_on(tmp_path, monkeypatch, capsys):
     def stop(*arguments):
         raise KeyboardInterrupt

@@ -86,7 +86,7 @@ def fast_square(**changes):
     return given[:, 0], (deflection, given[:, 1:4]), (np.asarray(record.pose)[at], given[:, 4:7])
 
 
-@pytest.mark.parametrize("modes", [3, 8])
+@pytest.mark.parametrize("modes", [pytest.param(3, marks=pytest.mark.long), 8])
 def test_fast_moves_equal_finite_elements(modes):
     time, (deflection, wanted), (pose, true_pose) = fast_square(link__modes=modes)
     assert (np.abs(deflection - wanted).max(axis=0) < 1e-3 * np.abs(wanted).max(axis=0)).all()
@@ -219,6 +219,7 @@ def test_ked_has_no_coupled_frequencies():
     assert np.ptp(bending(BARE)[:3]) > 0.4
 
 
+@pytest.mark.long  # in short: what bends links in KED, and where it fails
 def test_ked_leaves_uncontrolled_links_as_they_are():
     """Table 1 would read exactly 0 %: control of link 1 changes links 2 and 3 by nothing."""
     study = paper_study().change(
@@ -348,6 +349,7 @@ def test_spectra_of_the_measured_machine_stand_on_their_peaks():
     np.testing.assert_allclose(held, np.tile([92.7, 240.5], (3, 1)), rtol=1e-3)
 
 
+@pytest.mark.long  # in short: few steps are as good as forty, in test_integrator
 def test_one_step_per_sample_is_enough_for_the_fastest_moves():
     """20 mm in 0.03 s, actuators at their limit, 8 modes: a step against eight."""
     study = paper_study().change(

@@ -245,6 +245,7 @@ def stiff(structure, case, known):
     return modal_feedback(case, known, 0 * known.omega, position)
 
 
+@pytest.mark.long  # in short: margins of position feedback, in test_margins
 def test_position_gains_of_an_own_law_are_fed_back(monkeypatch):
     monkeypatch.setitem(LAWS._entries, "stiff", Law("stiff", "stiff", "mode", stiff))
     study = parse_study(tomllib.loads(SMALL)).change(control__modes=2, control__law="stiff")

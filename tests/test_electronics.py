@@ -111,6 +111,7 @@ def test_sensors_show_what_is_left_of_the_charge():
     assert np.abs(later).max() > 0.9 * np.abs(sensor).max() * 1e-7
 
 
+@pytest.mark.long  # in short: mixed batches, in test_batch
 def test_without_electronics_a_mixed_batch_changes_nothing():
     """Cases with corner and lag 0 among others, the links bent at the start."""
     study = paper_study().change(**RELEASED | {"run__smooth": False, "run__duration": 0.01})

@@ -107,6 +107,7 @@ def fourth_order(f, x, step):
     return (a - 8 * b + 8 * c - d) / (12 * step)
 
 
+@pytest.mark.long  # in short: a case with converters, by kernels, in test_batched
 def test_rounded_loops_have_the_slope_of_the_smooth_loop():
     """The code of the README: values with real converters, derivatives by smooth differences."""
     text = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")

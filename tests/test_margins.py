@@ -76,7 +76,13 @@ def determinant(structure, case, omega, factor):
     return (found.re + 1j * found.im) * factor**n
 
 
-@pytest.mark.parametrize("name", PLANTS)
+#: Plants of the quick tests: all terms of the others are in them.
+QUICK = ("free ends under load", "loaded basis under load", "electronics", "strain rate feedback")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[] if x in QUICK else pytest.mark.long) for x in PLANTS]
+)
 def test_return_difference_is_that_of_the_matrices(name):
     structure, case = looked_at(STUDY.change(**PLANTS[name]))
     loop = jax.tree.map(np.asarray, jax.jit(closed_loop, static_argnums=0)(structure, case, POSE))

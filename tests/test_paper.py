@@ -132,6 +132,7 @@ def test_controlled_cases_take_ratios_of_their_uncontrolled_counterpart(short):
     assert (runs.ratio[two, :, 1] > 0).all() and not runs.ratio[two, :, 2].any()
 
 
+@pytest.mark.long  # in short: a batched case equals its own run
 def test_atlas_has_the_numbers_of_the_paper_s_cases(short, tmp_path):
     """The subsets of the atlas go through the engine of sweeps, the paper's cases do not."""
     study = short.runs.study.change(control__ratio_source="own_run")

@@ -161,6 +161,7 @@ def test_plants_that_do_not_exist_are_left_out():
     assert "locked" in maker.fault(plants[0]) and maker.fault(plants[1]) == ""
 
 
+@pytest.mark.long  # in short: plants with other bases, and what is known to be unstable
 def test_links_that_are_softer_and_joints_with_inertia():
     """As if the study said so, the controller's coefficients staying as they are."""
     true = (Departure(frequency=0.9), Departure(joint_inertia=1.1e-5), Departure(joint_inertia=0.0))
