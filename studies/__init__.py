@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from studies.export.document import import_study
     from studies.export.run import export_design
     from studies.extensions import extend
+    from studies.fitting.run import fit, run_fit
+    from studies.fitting.spec import load_fit
     from studies.paper.run import run_paper
     from studies.single.run import replay, simulate
     from studies.space.spec import load_sweep, parse_sweep
@@ -48,10 +50,12 @@ __all__ = [
     "configure",
     "export_design",
     "extend",
+    "fit",
     "import_study",
     "info",
     "load",
     "load_design",
+    "load_fit",
     "load_study",
     "load_sweep",
     "load_tuning",
@@ -64,6 +68,7 @@ __all__ = [
     "replay",
     "run_atlas",
     "run_bench",
+    "run_fit",
     "run_paper",
     "run_study",
     "run_sweep",
@@ -92,10 +97,12 @@ __getattr__ = lazily(
         "configure": "studies.config",
         "export_design": "studies.export.run",
         "extend": "studies.extensions",
+        "fit": "studies.fitting.run",
         "import_study": "studies.export.document",
         "info": "studies.config",
         "load": "studies.engine.results",
         "load_design": "studies.engine.design",
+        "load_fit": "studies.fitting.spec",
         "load_study": "studies.study.spec",
         "load_sweep": "studies.space.spec",
         "load_tuning": "studies.tuning.spec",
@@ -108,6 +115,7 @@ __getattr__ = lazily(
         "replay": "studies.single.run",
         "run_atlas": "studies.atlas.run",
         "run_bench": "studies.bench.run",
+        "run_fit": "studies.fitting.run",
         "run_paper": "studies.paper.run",
         "run_study": "studies.engine.runs",
         "run_sweep": "studies.engine.sweep",

@@ -17,6 +17,7 @@ from studies.bench.commands import add_commands as add_bench
 from studies.config import configure, start
 from studies.errors import StudyError
 from studies.export.commands import add_commands as add_export
+from studies.fitting.commands import add_commands as add_fit
 from studies.paper.commands import add_commands as add_paper
 from studies.single.commands import add_commands as add_single
 from studies.spillover.commands import add_commands as add_spillover
@@ -88,6 +89,7 @@ for add_commands in (
     add_single,
     add_sweeps,
     add_tuning,
+    add_fit,
     add_export,
     add_atlas,
     add_spillover,

@@ -11,12 +11,12 @@ from jaxmodel.shaper import Impulses, residual_vibration, zv
 from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.space.axes import Range
+from studies.space.free import Free, FreeNumbers
 from studies.study.spec import paper_study
 from studies.tuning import linear_fidelity
 from studies.tuning.check import tuned_study
 from studies.tuning.evaluate import Evaluation
 from studies.tuning.folder import load_progress, save_progress
-from studies.tuning.free import Free, FreeNumbers
 from studies.tuning.linear_fidelity import loop_figures
 from studies.tuning.optimise import advance, begin, optimise, start_families
 from studies.tuning.report import unkept

@@ -17,7 +17,7 @@ _WORDS = {bool: "true or false", str: "text", float: "a finite number", int: "a 
 _PLURALS = {bool: "values true or false", float: "finite numbers", str: "texts", dict: "tables"}
 
 #: Sections beyond those of a study; commands of the same name read them.
-COMMANDS = ("sweep", "tune")
+COMMANDS = ("sweep", "tune", "fit")
 
 
 def unit_of(info: FieldInfo) -> str:

@@ -25,13 +25,14 @@ from jaxmodel.laws import LAWS
 from jaxmodel.metrics import METRICS, Sizes
 from studies.engine.runs import check_run
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
+from studies.space.free import FreeNumbers
 from studies.study.cases import build_structure
 from studies.study.entries import controlled_links, parse_entries
 from studies.study.explain import explain
 from studies.study.files import read_toml
 from studies.study.paths import checked_value, is_each_link, known_field, set_value
 from studies.study.spec import Section, Study, described, parse_study
-from studies.tuning.free import FreeNumbers, free_numbers, writes
+from studies.tuning.free import free_numbers, writes
 
 #: Limits that no run is needed for; all but `spillover` are lower ones. Those of the loop:
 OF_LOOP = ("gain_margin", "slowest_decay", "spillover")

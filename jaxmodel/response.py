@@ -1,0 +1,118 @@
+"""The machine as a test bench sees it: linear about a pose, from what shakes it to what is measured.
+
+Inputs are voltages on the actuators, forces on the sliders, and a hammer on a link; outputs are
+voltages of the sensors, chord deflections, slider positions and the pose. The controller is off,
+the drive holds the pose.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from jaxmodel.beam import build_basis, held_frequency
+from jaxmodel.case import Case, Structure
+from jaxmodel.drive import Reference
+from jaxmodel.kinematics import close_chain
+from jaxmodel.lazy import jax, jnp
+from jaxmodel.linear import flatten, linearise, resting
+from jaxmodel.loop import Loop, PlantState, plant_rates
+from jaxmodel.parameters import Array
+from jaxmodel.plant import damping_ratio
+from jaxmodel.prepare import prepare
+
+
+class BenchPlant(NamedTuple):
+    """x' = A x + B u, y = C x, with x = (X, X', q, q') about rest, (n,)."""
+
+    state: Array  # A [1/s and mixed], (n, n)
+    actuator: Array  # B of the voltages on the actuators, (n, 3 K)
+    slider_force: Array  # B of forces on the sliders, (n, 3)
+    hammer: Array  # B of forces across the links at the stations, (n, 3 S)
+    sensor: Array  # voltages of the sensors [V], (3 K, n)
+    deflection: Array  # chord deflection at the stations [m], (3 S, n)
+    slider: Array  # slider positions [m], (3, n)
+    pose: Array  # [m, m, rad], (3, n)
+
+
+def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
+    """The machine at rest at a pose, held by its drive, without its controller.
+
+    Args:
+        structure: static choices with feedback "none"; basis with both ends on the chord.
+        case: the numbers; stations are where a hammer hits and deflections are taken.
+        pose: (x, y, phi) [m, m, rad], (3,).
+
+    Returns:
+        BenchPlant.
+    """
+    loop = prepare(structure, case).loop
+    pose = jnp.asarray(pose, loop.omega.dtype)
+    plant = linearise(structure, loop, pose, resting(structure, case))
+    still = jnp.zeros_like(pose)
+
+    def rho(at: Array) -> Array:
+        return close_chain(loop.plant, at, still).rho
+
+    r3 = 3 * structure.n_modes
+    return BenchPlant(
+        state=plant.state,
+        actuator=plant.voltage,
+        slider_force=plant.force,
+        hammer=_hammer(structure, loop, case, pose),
+        sensor=plant.sensor,
+        deflection=plant.deflection,
+        slider=jnp.pad(jax.jacfwd(rho)(pose), ((0, 0), (0, 3 + 2 * r3))),
+        pose=jnp.pad(jnp.eye(3), ((0, 0), (0, 3 + 2 * r3))),
+    )
+
+
+def _hammer(structure: Structure, loop: Loop, case: Case, pose: Array) -> Array:
+    """Columns of B of unit forces across the links, (n, 3 S).
+
+    A force at x does work on v_n = x gamma' - sin(gamma) rho' + sum Y_j(x) q_j': it is a wrench on
+    the platform, and a force on each mode.
+    """
+    count = loop.deflection_at.shape[1]
+    stations = jnp.broadcast_to(jnp.asarray(case.windows.stations), (3, count))
+    still, zero = jnp.zeros_like(pose), jnp.zeros_like(loop.omega)
+
+    def across(rate: Array) -> Array:
+        chain = close_chain(loop.plant, pose, rate)
+        return stations * chain.gamma_rate[:, None] - (chain.sine * chain.rho_rate)[:, None]
+
+    to_pose = jax.jacfwd(across)(still)  # (3, S, 3)
+    # forces on modes enter where the actuators' do
+    on_modes = jnp.swapaxes(loop.deflection_at, 1, 2) / loop.plant.modal_mass[:, None, None]
+    pushed = loop._replace(actuator=on_modes)
+    chain = close_chain(loop.plant, pose, still)
+    wanted = Reference(chain.rho, chain.rho_rate, still, still)
+    open_loop = structure._replace(feedback="none")
+
+    def derivative(force: Array) -> Array:
+        wrench = jnp.einsum("is,isp->p", force, to_pose)
+        if structure.has_wrench:
+            wrench = wrench + case.load.wrench
+        at = PlantState(pose, still, zero, zero)
+        rates = plant_rates(open_loop, pushed, at, wanted._replace(wrench=wrench), force)
+        return flatten(PlantState(still, rates.acceleration.pose, zero, rates.acceleration.modal))
+
+    return jnp.reshape(jax.jacfwd(derivative)(jnp.zeros((3, count), pose.dtype)), (-1, 3 * count))
+
+
+def held_modes(structure: Structure, case: Case) -> tuple[Array, Array]:
+    """Modes of the links alone, between held joints.
+
+    Args:
+        structure: static choices.
+        case: the numbers.
+
+    Returns:
+        frequencies [Hz] and damping ratios [1], (3, R) each.
+    """
+    machine = case.machine
+    stations = jnp.asarray(case.windows.stations)
+    basis = build_basis(
+        structure.basis, machine.beam, machine.patches, structure.n_modes, stations
+    )
+    omega = held_frequency(structure.basis, machine.beam, basis)
+    return omega / (2 * jnp.pi), damping_ratio(machine.damping, omega)

@@ -1,0 +1,230 @@
+"""The linear machine at the poses of all measurements, with derivatives by the free numbers.
+
+Matrices and their derivatives come from one compiled program; frequencies and responses follow from
+them by linear algebra, whose derivatives are written out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxmodel.beam import BASES
+from jaxmodel.case import Case, Structure
+from jaxmodel.kinematics import lift, path_status
+from jaxmodel.parameters import Array
+from jaxmodel.prepare import prepare
+from jaxmodel.response import BenchPlant, bench_plant, held_modes
+from studies.engine.runs import check_pose
+from studies.errors import field_error
+from studies.fitting.signals import Signal
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.spec import Study
+
+Pose = tuple[float, float, float]
+Place = Callable[[Case, Array], Case]
+#: Eigenvectors of worse condition are not used [1].
+WORST_CONDITION = 1e10
+
+
+#: A row or column of a plant, (n,), and its derivatives, (n, p).
+Row = tuple[np.ndarray, np.ndarray | None]
+
+
+class Modes(NamedTuple):
+    """Poles of a plant in the upper half plane, ascending, with derivatives."""
+
+    pole: np.ndarray  # [1/s], (m,), complex
+    shape: np.ndarray  # right eigenvectors, (n, m)
+    dual: np.ndarray  # left eigenvectors, dual @ shape = 1, (m, n)
+
+
+class PlantAt(NamedTuple):
+    """A plant at one pose; derivatives by the p free numbers come last, None if not asked for."""
+
+    value: BenchPlant
+    slope: BenchPlant | None
+
+    def output(self, signal: Signal, rows: int) -> Row:
+        """Row of C, (n,), and its derivatives, (n, p)."""
+        return self._at("pose" if signal.kind == "platform" else signal.kind, rows)
+
+    def input(self, signal: Signal, column: int) -> Row:
+        """Column of B, (n,), and its derivatives, (n, p)."""
+        name = {"actuator": "actuator", "hammer": "hammer", "slider": "slider_force"}[signal.kind]
+        value = np.asarray(getattr(self.value, name))[:, column]
+        if self.slope is None:
+            return value, None
+        return value, np.asarray(getattr(self.slope, name))[:, column]
+
+    def _at(self, name: str, row: int) -> Row:
+        value = np.asarray(getattr(self.value, name))[row]
+        return value, None if self.slope is None else np.asarray(getattr(self.slope, name))[row]
+
+
+class Bench:
+    """Plants at all poses that measurements need, kept for the last free numbers."""
+
+    def __init__(self, study: Study, place: Place, poses: Sequence[Pose], places: Sequence[float]):
+        """
+        Args:
+            study: the model.
+            place: puts free numbers into a case.
+            poses: where measurements were taken; checked here.
+            places: positions along the links of hammers and displacement sensors [m].
+
+        Raises:
+            StudyError: a pose out of reach, or hammers with a basis whose ends are off the chord.
+        """
+        if places and not BASES[study.link.basis].is_on_chord:
+            raise field_error("link.basis", study.link.basis, "a basis with both ends on the chord")
+        self.stations = tuple(sorted(set(places))) or study.metrics.stations[:1]
+        self.study = study.change(
+            control__feedback="none",
+            metrics__stations=self.stations,
+            drive__locked=False,
+            shaper__kind="none",
+        )
+        self.structure = build_structure(self.study)
+        self.case = as_arrays(build_case(self.study))
+        self.n_patches = self.structure.n_patches
+        self.place = place
+        self.poses = tuple(dict.fromkeys(poses))
+        for pose in self.poses:
+            self.check(pose)
+        self._kept: dict[tuple[Pose, bool], tuple[bytes, PlantAt]] = {}
+
+    def check(self, pose: Pose) -> None:
+        """Refuse a pose.
+
+        Raises:
+            StudyError: out of reach or singular.
+        """
+        code, lifts = _reach(self.structure, self.case, np.array(pose))
+        check_pose(self.study, "pose", pose, int(code), np.asarray(lifts))
+
+    def plant(self, pose: Pose, values: np.ndarray, has_slopes: bool) -> PlantAt:
+        """The plant at a pose for some values of the free numbers, (p,)."""
+        key = values.tobytes()
+        for slopes in (True, False)[: 1 if has_slopes else 2]:
+            known, plant = self._kept.get((pose, slopes), (b"", None))
+            if known == key and plant is not None:
+                return plant
+        given = self.structure, self.place, self.case, np.array(pose), values
+        value = jax.tree.map(np.asarray, _plant(*given))
+        slope = jax.tree.map(np.asarray, _plant_slopes(*given)) if has_slopes else None
+        found = PlantAt(value, slope)
+        self._kept[pose, has_slopes] = key, found
+        return found
+
+    def many(self, values: np.ndarray) -> list[dict[Pose, PlantAt]]:
+        """Plants at `poses` for many values of the free numbers, (n, p), without derivatives."""
+        found: list[dict[Pose, PlantAt]] = [{} for _ in values]
+        for pose in self.poses:
+            whole = _plant_batch(self.structure, self.place, self.case, np.array(pose), values)
+            whole = jax.tree.map(np.asarray, whole)
+            for k, one in enumerate(found):
+                one[pose] = PlantAt(jax.tree.map(lambda x, k=k: x[k], whole), None)
+        return found
+
+    def keep(self, values: np.ndarray, plants: dict[Pose, PlantAt]) -> None:
+        """Use these plants for some values of the free numbers."""
+        for pose, plant in plants.items():
+            self._kept[pose, False] = values.tobytes(), plant
+
+    def held(self, values: np.ndarray, has_slopes: bool) -> list[np.ndarray]:
+        """Frequencies [Hz] and damping ratios of the links alone, (3, R), and their slopes."""
+        given = self.structure, self.place, self.case, values
+        found = list(_held(*given))
+        return [np.asarray(x) for x in (*found, *(_held_slopes(*given) if has_slopes else ()))]
+
+
+@partial(jax.jit, static_argnums=0)
+def _reach(structure: Structure, case: Case, pose: Array) -> tuple[Array, Array]:
+    plant = prepare(structure, case).loop.plant
+    return path_status(plant, pose[None])[0], lift(plant, pose)
+
+
+def _at(structure: Structure, place: Place, case: Case, pose: Array, values: Array) -> BenchPlant:
+    return bench_plant(structure, place(case, values), pose)
+
+
+def _one_held(structure: Structure, place: Place, case: Case, values: Array) -> tuple[Array, Array]:
+    return held_modes(structure, place(case, values))
+
+
+_plant = jax.jit(_at, static_argnums=(0, 1))
+_plant_slopes = jax.jit(jax.jacfwd(_at, argnums=4), static_argnums=(0, 1))
+_held = jax.jit(_one_held, static_argnums=(0, 1))
+_held_slopes = jax.jit(jax.jacfwd(_one_held, argnums=3), static_argnums=(0, 1))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _plant_batch(
+    structure: Structure, place: Place, case: Case, pose: Array, values: Array
+) -> BenchPlant:
+    return jax.vmap(partial(_at, structure, place, case, pose))(values)
+
+
+def modes_of(state: np.ndarray) -> Modes:
+    """Oscillating modes of x' = A x.
+
+    Raises:
+        numpy.linalg.LinAlgError: eigenvectors that are nearly dependent.
+    """
+    value, right = np.linalg.eig(state)
+    if np.linalg.cond(right) > WORST_CONDITION:
+        raise np.linalg.LinAlgError("nearly dependent eigenvectors")
+    left = np.linalg.inv(right)
+    upper = np.flatnonzero(value.imag > 1e-9 * np.abs(value).max())
+    upper = upper[np.argsort(np.abs(value[upper]))]
+    return Modes(value[upper], right[:, upper], left[upper])
+
+
+class FrequencyResponse(NamedTuple):
+    """A frequency response and its derivatives."""
+
+    value: np.ndarray  # (f,), complex
+    slope: np.ndarray | None  # (f, p)
+
+
+def response(plant: PlantAt, source: Row, output: Row, omega: np.ndarray) -> FrequencyResponse:
+    """C (j omega - A)^-1 B of one input and one output.
+
+    Its differential is dC X + Y dA X + Y dB with X = (j omega - A)^-1 B and Y = C (j omega - A)^-1.
+
+    Args:
+        plant: at the pose.
+        source: `PlantAt.input`.
+        output: `PlantAt.output`.
+        omega: [rad/s], (f,).
+    """
+    state = np.asarray(plant.value.state)
+    value, right = np.linalg.eig(state)
+    if np.linalg.cond(right) > WORST_CONDITION:  # nearly dependent eigenvectors: without them
+        eye = np.eye(len(state))
+        whole = 1j * omega[:, None, None] * eye - state
+        x = np.linalg.solve(whole, np.broadcast_to(source[0][:, None], (*whole.shape[:2], 1)))[
+            ..., 0
+        ]
+        turned = np.swapaxes(whole, 1, 2)
+        y = np.linalg.solve(turned, np.broadcast_to(output[0][:, None], (*whole.shape[:2], 1)))[
+            ..., 0
+        ]
+    else:
+        left = np.linalg.inv(right)
+        resolvent = 1 / (1j * omega[:, None] - value)
+        x = (resolvent * (left @ source[0])) @ right.T
+        y = (resolvent * (output[0] @ right)) @ left
+    found = x @ output[0]
+    if plant.slope is None or source[1] is None or output[1] is None:
+        return FrequencyResponse(found, None)
+    change = np.asarray(plant.slope.state)  # (n, n, p)
+    n, _, p = change.shape
+    turned = (y @ change.reshape(n, n * p)).reshape(len(omega), n, p)
+    slope = np.einsum("fnp,fn->fp", turned, x) + x @ output[1] + y @ source[1]
+    return FrequencyResponse(found, slope)

@@ -1,0 +1,30 @@
+"""The command `studies fit`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from studies.config import start
+
+
+def add_commands(app: typer.Typer, console: Console) -> None:
+    """Add the command to the command line."""
+
+    @app.command()
+    def fit(
+        data: Annotated[
+            Path, typer.Argument(help="file of a fit (TOML), or the name of a ready-made one")
+        ],
+        out: Annotated[Path, typer.Option(help="folder for report, fitted study and figures")],
+        pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
+    ) -> None:
+        """Fit free numbers of a study to measurements, and say how well they are known."""
+        start()
+        from studies.fitting.run import run_fit
+        from studies.fitting.spec import load_fit
+
+        run_fit(load_fit(data), out, console, pdf)

@@ -1,0 +1,65 @@
+"""What every kind of measurement does."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+
+class Residual(NamedTuple):
+    """Model minus measurement, in standard deviations of the measurement."""
+
+    value: np.ndarray  # (m,)
+    slope: np.ndarray | None  # by the free numbers, (m, p); None if not asked for
+
+
+class Curve(NamedTuple):
+    """What a figure shows of one measurement."""
+
+    abscissa: str  # with its unit
+    ordinate: str
+    x: np.ndarray  # (n,)
+    measured: np.ndarray  # (n,)
+    model: np.ndarray  # (n,)
+    is_log: bool  # ordinate
+    labels: tuple[str, ...] = ()  # of single numbers; empty: a line
+
+
+class Noise(NamedTuple):
+    """Standard deviation of measured values: both parts in quadrature."""
+
+    fixed: float  # in the unit of the values
+    share: float  # of the values [1]
+
+    def sigma(self, value: np.ndarray) -> np.ndarray:
+        """Of each value."""
+        return np.hypot(self.fixed, self.share * np.abs(value))
+
+
+class Measurement(Protocol):
+    """One set of measured numbers and its model."""
+
+    name: str
+    kind: str
+    is_checked: bool  # held out: not fitted, only compared
+    is_ordered: bool  # neighbours in `residual` are neighbours in time or frequency
+
+    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
+        """At some values of the free numbers, (p,)."""
+        ...
+
+    def reweigh(self, values: np.ndarray) -> None:
+        """Take noise that is a share of the value from the model's values from now on.
+
+        Of measured values, those that noise made small would count more than the others.
+        """
+        ...
+
+    def curve(self, values: np.ndarray) -> Curve:
+        """For the figures."""
+        ...
+
+    def complaint(self, values: np.ndarray) -> str:
+        """What looks wrong with the data at the first guess, "" if nothing."""
+        ...

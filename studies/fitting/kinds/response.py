@@ -1,0 +1,173 @@
+"""Frequency responses, complex or magnitudes, and power spectra under white forces."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from studies.fitting.bench import Bench, Pose, response
+from studies.fitting.kinds.contract import Curve, Noise, Residual
+from studies.fitting.signals import Signal
+
+TWO_PI = 2 * np.pi
+#: A measured response this many times the model's at the first guess has another unit [1].
+OTHER_UNIT = 100.0
+
+
+class _OfBench:
+    """What responses and spectra share: one input, one output, one pose."""
+
+    kind, is_ordered = "response", True
+
+    def __init__(
+        self,
+        name: str,
+        is_checked: bool,
+        bench: Bench,
+        pose: Pose,
+        signals: tuple[Signal, Signal],
+        order: int,
+        frequency: np.ndarray,
+        measured: np.ndarray,
+        noise: Noise,
+        unit: str,
+    ) -> None:
+        """
+        Args:
+            name, is_checked, bench, pose: of the measurement.
+            signals: input and output.
+            order: derivatives by time that the output has: 0, 1 or 2.
+            frequency: [Hz], (f,).
+            measured: (f,).
+            noise: of the measured values.
+            unit: of the response.
+        """
+        self.name, self.is_checked = name, is_checked
+        self._bench, self._pose, self._signals, self._order = bench, pose, signals, order
+        self.frequency, self.measured, self._unit = frequency, measured, unit
+        self._noise, self.sigma = noise, noise.sigma(measured)
+
+    def predicted(
+        self, values: np.ndarray, has_slopes: bool
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Response, (f,), and its derivatives, (f, p)."""
+        plant = self._bench.plant(self._pose, values, has_slopes)
+        omega = TWO_PI * self.frequency
+        at = [x.row(self._bench.n_patches, self._bench.stations) for x in self._signals]
+        found = response(
+            plant,
+            plant.input(self._signals[0], at[0]),
+            plant.output(self._signals[1], at[1]),
+            omega,
+        )
+        turn = (1j * omega) ** self._order
+        slope = None if found.slope is None else found.slope * turn[:, None]
+        return found.value * turn, slope
+
+    def reweigh(self, values: np.ndarray) -> None:
+        self.sigma = self._noise.sigma(self.predicted(values, False)[0])
+
+    def complaint(self, values: np.ndarray) -> str:
+        model = np.abs(self.predicted(values, False)[0])
+        ratio = float(np.median(np.abs(self.measured)) / max(np.median(model), 1e-300))
+        if 1 / OTHER_UNIT < ratio < OTHER_UNIT:
+            return ""
+        return (
+            f"measured is {ratio:.3g} times the model at the first guess; expected {self._unit} "
+            "and a frequency in Hz: check the units"
+        )
+
+
+class ComplexResponse(_OfBench):
+    """Real and imaginary part."""
+
+    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
+        found, slope = self.predicted(values, has_slopes)
+        away = (found - self.measured) / self.sigma
+        value = np.concatenate([away.real, away.imag])
+        if slope is None:
+            return Residual(value, None)
+        scaled = slope / self.sigma[:, None]
+        return Residual(value, np.concatenate([scaled.real, scaled.imag]))
+
+    def curve(self, values: np.ndarray) -> Curve:
+        found = np.abs(self.predicted(values, False)[0])
+        measured = np.abs(self.measured)
+        label = f"response [{self._unit}]"
+        return Curve(
+            abscissa="frequency [Hz]",
+            ordinate=label,
+            x=self.frequency,
+            measured=measured,
+            model=found,
+            is_log=True,
+        )
+
+
+class Magnitude(_OfBench):
+    """Absolute value alone."""
+
+    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
+        found, slope = self.predicted(values, has_slopes)
+        size = np.abs(found)
+        value = (size - self.measured) / self.sigma
+        if slope is None:
+            return Residual(value, None)
+        unit = np.where(size > 0, found / np.where(size > 0, size, 1.0), 0.0)
+        return Residual(value, (unit.conj()[:, None] * slope).real / self.sigma[:, None])
+
+    def curve(self, values: np.ndarray) -> Curve:
+        found = np.abs(self.predicted(values, False)[0])
+        label = f"magnitude [{self._unit}]"
+        return Curve(
+            abscissa="frequency [Hz]",
+            ordinate=label,
+            x=self.frequency,
+            measured=self.measured,
+            model=found,
+            is_log=True,
+        )
+
+
+class Spectrum(_OfBench):
+    """Power spectrum of the output under a white input of unknown strength.
+
+    Its logarithm is compared, less the mean difference: the strength does not count.
+    """
+
+    kind = "spectrum"
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.sigma = np.full(len(self.measured), self._noise.fixed)  # of the logarithm
+
+    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
+        found, slope = self.predicted(values, has_slopes)
+        away = 2 * np.log(np.abs(found)) - np.log(self.measured)
+        weight = 1 / self.sigma**2
+        weight = weight / weight.sum()
+        value = (away - weight @ away) / self.sigma
+        if slope is None:
+            return Residual(value, None)
+        by = 2 * (slope / found[:, None]).real
+        return Residual(value, (by - weight @ by) / self.sigma[:, None])
+
+    def reweigh(self, values: np.ndarray) -> None:
+        pass  # logarithms have noise of one size
+
+    def curve(self, values: np.ndarray) -> Curve:
+        found = np.abs(self.predicted(values, False)[0]) ** 2
+        level = np.exp(np.mean(np.log(self.measured) - np.log(found)))
+        label = "power spectrum [any unit]"
+        return Curve(
+            abscissa="frequency [Hz]",
+            ordinate=label,
+            x=self.frequency,
+            measured=self.measured,
+            model=level * found,
+            is_log=True,
+        )
+
+    def complaint(self, values: np.ndarray) -> str:
+        return ""  # any strength will do

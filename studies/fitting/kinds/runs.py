@@ -1,0 +1,268 @@
+"""Measurements of whole motions: signals over time, and metrics such as residual vibration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel import status
+from jaxmodel.case import Case, Structure
+from jaxmodel.parameters import Array
+from jaxmodel.simulate import simulate
+from studies.engine.runs import check_run
+from studies.errors import StudyError
+from studies.fitting.kinds.contract import Curve, Noise, Residual
+from studies.fitting.signals import Signal
+from studies.study.entries import Entries
+from studies.study.labels import describe
+from studies.study.spec import Study
+
+Place = Callable[[Case, Array], Case]
+
+
+class Trace:
+    """One signal over time, compared at the times of the measurement."""
+
+    kind, is_ordered = "trace", True
+
+    def __init__(
+        self,
+        name: str,
+        is_checked: bool,
+        study: Study,
+        place: Place,
+        signal: Signal,
+        time: np.ndarray,
+        measured: np.ndarray,
+        noise: Noise,
+        unit: str,
+    ) -> None:
+        """
+        Args:
+            name, is_checked: of the measurement.
+            study: its motion.
+            place: puts free numbers into a case.
+            signal: the output.
+            time: [s], (n,), ascending and within the run.
+            measured: (n,).
+            noise: of the measured values.
+            unit: of the signal.
+        """
+        self.name, self.is_checked, self._unit = name, is_checked, unit
+        self._given, self._signal = (*_smooth(study), place), signal
+        self.time, self.measured = time, measured
+        self._noise, self.sigma = noise, noise.sigma(measured)
+
+    def predicted(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
+        """The signal at the measured times, (n,), and its derivatives, (n, p)."""
+        structure, case, place = self._given
+        run = _traced_slopes if has_slopes else _traced
+        found = run(structure, place, self._signal.kind, case, values)
+        time, value, code, *slope = (np.asarray(x) for x in found)
+        _check_finished(self.name, int(code))
+        at = self._signal
+        column = value[:, at.link] if value.ndim == 2 else value[:, at.link, at.patch]
+        model = np.interp(self.time, time, column)
+        if not has_slopes:
+            return model, None
+        by = slope[0][:, at.link] if value.ndim == 2 else slope[0][:, at.link, at.patch]
+        return model, np.stack([np.interp(self.time, time, x) for x in by.T], axis=1)
+
+    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
+        found, slope = self.predicted(values, has_slopes)
+        value = (found - self.measured) / self.sigma
+        return Residual(value, None if slope is None else slope / self.sigma[:, None])
+
+    def reweigh(self, values: np.ndarray) -> None:
+        self.sigma = self._noise.sigma(self.predicted(values, False)[0])
+
+    def curve(self, values: np.ndarray) -> Curve:
+        found = self.predicted(values, False)[0]
+        label = f"{self._signal.kind} [{self._unit}]"
+        return Curve(
+            abscissa="time [s]",
+            ordinate=label,
+            x=self.time,
+            measured=self.measured,
+            model=found,
+            is_log=False,
+        )
+
+    def complaint(self, values: np.ndarray) -> str:
+        model = self.predicted(values, False)[0]
+        ratio = float(np.ptp(self.measured) / max(np.ptp(model), 1e-300))
+        if 0.01 < ratio < 100:
+            return ""
+        return (
+            f"measured moves {ratio:.3g} times as far as the model at the first guess; expected "
+            f"{self._unit}: check the unit"
+        )
+
+
+def _smooth(study: Study) -> tuple[Structure, Case]:
+    """A study's run with derivatives.
+
+    Raises:
+        StudyError: as `check_run`.
+    """
+    structure, case = check_run(study)
+    return structure._replace(is_smooth=True), case
+
+
+def _recorded(structure: Structure, place: Place, kind: str, case: Case, values: Array) -> Any:
+    result = simulate(structure, place(case, values), has_record=True)
+    record = result.record
+    assert record is not None
+    signals = {
+        "sensor": record.sensor_voltage,
+        "slider": record.slider,
+        "platform": record.pose,
+        "deflection": record.chord_deflection_stations,
+    }
+    return signals[kind], (record.time, result.status)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _traced(structure: Structure, place: Place, kind: str, case: Case, values: Array) -> Any:
+    value, (time, code) = _recorded(structure, place, kind, case, values)
+    return time, value, code
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _traced_slopes(structure: Structure, place: Place, kind: str, case: Case, values: Array) -> Any:
+    run = partial(_recorded, structure, place, kind, case)
+    value, (time, code) = run(values)
+    return time, value, code, jax.jacfwd(lambda x: run(x)[0])(values)
+
+
+def _check_finished(name: str, code: int) -> None:
+    if code not in status.FINISHED:
+        raise StudyError(f"{name}: the run ends with status {describe(code)}")
+
+
+class Compared(NamedTuple):
+    """One number of a run."""
+
+    entries: Entries
+    links: tuple[bool, bool, bool]  # under control
+    is_reduction: bool  # in percent of the same without control
+    measured: float
+    noise: Noise
+    label: str
+
+
+class Figures:
+    """Metrics of runs that differ in which links are controlled."""
+
+    kind, is_ordered = "figures", False
+
+    def __init__(
+        self,
+        name: str,
+        is_checked: bool,
+        study: Study,
+        place: Place,
+        compared: tuple[Compared, ...],
+    ) -> None:
+        self.name, self.is_checked, self._compared = name, is_checked, compared
+        structure, case = _smooth(study)
+        wanted = tuple(sorted({x.entries.metric for x in compared}))
+        self._structure, self._case, self._place = structure._replace(metrics=wanted), case, place
+        off = (False, False, False)
+        needed = [x.links for x in compared] + [off for x in compared if x.is_reduction]
+        self._masks = tuple(dict.fromkeys(needed))
+        self._measured = np.array([x.measured for x in compared])
+        self._sigma = self._deviation(self._measured)
+
+    def predicted(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
+        """Numbers of the model, (m,), and their derivatives, (m, p)."""
+        masks = np.array(self._masks, float)
+        run = _metric_slopes if has_slopes else _metrics
+        given = self._structure, self._place, self._case, masks, values
+        metrics, code, *slopes = jax.tree.map(np.asarray, run(*given))
+        for one in code:
+            _check_finished(self.name, int(one))
+        found = [self._number(x, metrics, *slopes) for x in self._compared]
+        value = np.array([x for x, _ in found])
+        return value, np.array([by for _, by in found]) if has_slopes else None
+
+    def _number(self, one: Compared, metrics: Any, slopes: Any = None) -> tuple[Any, Any]:
+        on, by_on = self._taken(one, one.links, metrics, slopes)
+        if not one.is_reduction:
+            return on, by_on
+        off, by_off = self._taken(one, (False, False, False), metrics, slopes)
+        by = None if slopes is None else 100 * (on * by_off / off**2 - by_on / off)
+        return 100 * (1 - on / off), by
+
+    def _taken(self, one: Compared, links: Any, metrics: Any, slopes: Any) -> tuple[Any, Any]:
+        """Root of the mean square of the entries, and its derivatives."""
+        k, name = self._masks.index(links), one.entries.metric
+        value = one.entries.take(metrics[name][k : k + 1])[0]
+        size = np.sqrt(np.mean(value**2))
+        if len(value) == 1:
+            size = value[0]
+        if slopes is None:
+            return size, None
+        by = np.moveaxis(slopes[name][k : k + 1], -1, 0)  # (p, 1, ...)
+        parts = np.stack([one.entries.take(x)[0] for x in by], axis=-1)  # (entries, p)
+        return size, (value @ parts) / (len(value) * size) if size != 0 else parts.sum(0)
+
+    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
+        found, slope = self.predicted(values, has_slopes)
+        value = (found - self._measured) / self._sigma
+        return Residual(value, None if slope is None else slope / self._sigma[:, None])
+
+    def reweigh(self, values: np.ndarray) -> None:
+        self._sigma = self._deviation(self.predicted(values, False)[0])
+
+    def _deviation(self, value: np.ndarray) -> np.ndarray:
+        pairs = zip(self._compared, value, strict=True)
+        return np.array([float(one.noise.sigma(x)) for one, x in pairs])
+
+    def curve(self, values: np.ndarray) -> Curve:
+        found = self.predicted(values, False)[0]
+        labels = tuple(x.label for x in self._compared)
+        x = np.arange(len(found))
+        return Curve(
+            abscissa="",
+            ordinate="figure of the run",
+            x=x,
+            measured=self._measured,
+            model=found,
+            is_log=False,
+            labels=labels,
+        )
+
+    def complaint(self, values: np.ndarray) -> str:
+        return ""
+
+
+def _run_metrics(
+    structure: Structure, place: Place, case: Case, masks: Array, values: Array
+) -> Any:
+    changed = place(case, values)
+
+    def one(mask: Array) -> Any:
+        control = changed.control._replace(link_mask=changed.control.link_mask * mask)
+        result = simulate(structure, changed._replace(control=control))
+        named = {name: getattr(result.metrics, name) for name in structure.metrics}
+        return named, result.status
+
+    return jax.vmap(one)(jnp.asarray(masks))
+
+
+_metrics = jax.jit(_run_metrics, static_argnums=(0, 1))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _metric_slopes(
+    structure: Structure, place: Place, case: Case, masks: Array, values: Array
+) -> Any:
+    run = partial(_run_metrics, structure, place, case, masks)
+    metrics, code = run(values)
+    return metrics, code, jax.jacfwd(lambda x: run(x)[0])(values)

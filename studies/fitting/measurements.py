@@ -1,0 +1,278 @@
+"""From the entries of a file to measurements with their data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.special import polygamma
+
+from jaxmodel.metrics import METRICS
+from studies.errors import StudyError, field_error
+from studies.fitting.bench import Bench
+from studies.fitting.bench import Pose as At
+from studies.fitting.kinds.contract import Measurement, Noise
+from studies.fitting.kinds.modes import HeldModes, MachineModes, Measured, check_ascending
+from studies.fitting.kinds.response import ComplexResponse, Magnitude, Spectrum
+from studies.fitting.kinds.runs import Compared, Figures, Trace
+from studies.fitting.signals import INPUTS, OUTPUTS, Signal, parse_signal
+from studies.fitting.spec import (
+    AtPose,
+    Common,
+    FiguresEntry,
+    FileEntry,
+    FitSpec,
+    ModesEntry,
+    ResponseEntry,
+    SpectrumEntry,
+    TraceEntry,
+)
+from studies.fitting.tables import column, read_columns
+from studies.study.cases import build_structure
+from studies.study.consistency import each_link
+from studies.study.entries import parse_entries
+
+#: Derivatives of the output by its quantity.
+ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
+OFF = (False, False, False)
+
+
+def make_bench(spec: FitSpec) -> Bench:
+    """Linear machine at the poses of all entries."""
+    poses, places = [], []
+    for k, entry in enumerate(spec.entries):
+        is_held = isinstance(entry, ModesEntry) and entry.ends == "held"
+        if isinstance(entry, AtPose) and not isinstance(entry, TraceEntry) and not is_held:
+            poses.append(_pose(spec, entry))
+        signals = _signals(spec, entry, f"fit.data[{k}]")
+        if not isinstance(entry, TraceEntry):
+            places += [x.place for x in signals if not np.isnan(x.place)]
+    return Bench(spec.study, spec.free.place, poses, places)
+
+
+def make_measurements(spec: FitSpec, bench: Bench) -> list[Measurement]:
+    """Measurements of a fit, with their data.
+
+    Raises:
+        StudyError: a file that cannot be used, data that do not fit the machine.
+    """
+    return [
+        _MAKERS[type(entry)](spec, bench, entry, f"fit.data[{k}]")
+        for k, entry in enumerate(spec.entries)
+    ]
+
+
+def _pose(spec: FitSpec, entry: AtPose) -> At:
+    return entry.pose or spec.study.motion.waypoints[0]
+
+
+def _signals(spec: FitSpec, entry: Common, path: str) -> tuple[Signal, ...]:
+    """Input and output of an entry, or its output."""
+    if not isinstance(entry, FileEntry):
+        return ()
+    given = build_structure(spec.study).n_patches, each_link(spec.study.link.length)
+    output = parse_signal(entry.output, OUTPUTS, *given, f"{path}.output")
+    if not isinstance(entry, (ResponseEntry, SpectrumEntry)):
+        return (output,)
+    return parse_signal(entry.input, INPUTS, *given, f"{path}.input"), output
+
+
+def _each(value: Any, count: int, path: str) -> np.ndarray:
+    """One number for all, or one for each."""
+    if isinstance(value, tuple) and len(value) != count:
+        raise field_error(path, value, f"one number, or {count}")
+    return np.broadcast_to(np.asarray(value, float), (count,)).copy()
+
+
+def _modes(spec: FitSpec, bench: Bench, entry: ModesEntry, path: str) -> Measurement:
+    count = len(entry.frequency_hz)
+    check_ascending(entry.frequency_hz, bool(entry.shapes), path)
+    damping = sigma = shapes = None
+    if entry.damping_ratio:
+        damping = _each(entry.damping_ratio, count, f"{path}.damping_ratio")
+        damping[damping == 0] = np.nan
+        if entry.damping_sigma is None:
+            raise StudyError(f"{path}.damping_sigma: missing beside damping_ratio")
+        sigma = _each(entry.damping_sigma, count, f"{path}.damping_sigma")
+    if entry.shapes:
+        size = 3 * bench.n_patches
+        if len(entry.shapes) != count or any(len(x) != size for x in entry.shapes):
+            raise StudyError(
+                f"{path}.shapes: {len(entry.shapes)} lists; allowed: {count} lists of {size} "
+                "voltages, link by link and patch by patch"
+            )
+        shapes = np.array(entry.shapes, complex)
+        if not np.all(np.linalg.norm(shapes, axis=1) > 0):
+            raise StudyError(f"{path}.shapes: one of them is zero")
+        if entry.ends == "held":
+            raise StudyError(f"{path}.shapes: allowed with ends = 'machine' only")
+    measured = Measured(
+        frequency=np.array(entry.frequency_hz),
+        sigma=_each(entry.sigma_hz, count, f"{path}.sigma_hz"),
+        damping=damping,
+        damping_sigma=sigma,
+        shapes=shapes,
+    )
+    if entry.ends == "held":
+        if count > bench.structure.n_modes:
+            raise field_error(
+                f"{path}.frequency_hz",
+                entry.frequency_hz,
+                f"at most link.modes = {bench.structure.n_modes} frequencies",
+            )
+        return HeldModes(entry.name, entry.check, bench, measured, entry.link - 1)
+    return MachineModes(entry.name, entry.check, bench, measured, _pose(spec, entry))
+
+
+def _read(spec: FitSpec, entry: FileEntry, path: str) -> Callable[[str], np.ndarray]:
+    found = read_columns(entry.file, spec.folder, f"{path}.file")
+    return lambda name: column(found, name, entry.file, path)
+
+
+def _ascending(x: np.ndarray, what: str, path: str, least: int = 3) -> None:
+    if len(x) < least:
+        raise StudyError(f"{path}: {len(x)} points; allowed: {least} or more")
+    if not np.all(np.diff(x) > 0):
+        row = int(np.argmax(np.diff(x) <= 0)) + 2
+        raise StudyError(f"{path}: {what} must ascend; row {row} does not")
+
+
+def _noise(entry: FileEntry | FiguresEntry, value: np.ndarray, path: str) -> Noise:
+    noise = Noise(entry.sigma or 0.0, (entry.sigma_percent or 0.0) / 100)
+    if not np.all(noise.sigma(value) > 0):
+        raise StudyError(f"{path}: sigma_percent of a value that is 0; give sigma too")
+    return noise
+
+
+def _response(spec: FitSpec, bench: Bench, entry: ResponseEntry, path: str) -> Measurement:
+    read, signals = _read(spec, entry, path), _signals(spec, entry, path)
+    frequency = read(entry.frequency).real
+    _ascending(frequency, f"column {entry.frequency!r}", path)
+    _check_frequency(frequency, path)
+    if entry.magnitude:
+        kind: type[Magnitude | ComplexResponse] = Magnitude
+        measured = read(entry.magnitude).real
+        if np.any(measured < 0):
+            raise StudyError(f"{path}: column {entry.magnitude!r} has negative magnitudes; in dB?")
+    else:
+        kind, measured = ComplexResponse, _complex(read, entry)
+    return kind(
+        entry.name,
+        entry.check,
+        bench,
+        _pose(spec, entry),
+        (signals[0], signals[1]),
+        ORDERS[entry.quantity],
+        frequency,
+        measured,
+        _noise(entry, measured, path),
+        _unit(signals, ORDERS[entry.quantity]),
+    )
+
+
+def _complex(read: Callable[[str], np.ndarray], entry: ResponseEntry) -> np.ndarray:
+    if entry.file.lower().partition("::")[0].endswith((".uff", ".unv")):
+        return read("value").astype(complex)
+    return read(entry.real) + 1j * read(entry.imag)
+
+
+def _check_frequency(frequency: np.ndarray, path: str) -> None:
+    if frequency[0] < 0 or frequency[-1] > 1e5:
+        raise StudyError(
+            f"{path}: frequencies from {frequency[0]:g} to {frequency[-1]:g}; allowed: "
+            "0 to 100000 [Hz]"
+        )
+
+
+def _unit(signals: tuple[Signal, ...], order: int) -> str:
+    per = ("", "/s", "/s^2")[order]
+    return f"{OUTPUTS[signals[1].kind][1]}{per}/{INPUTS[signals[0].kind][1]}"
+
+
+def _spectrum(spec: FitSpec, bench: Bench, entry: SpectrumEntry, path: str) -> Measurement:
+    read, signals = _read(spec, entry, path), _signals(spec, entry, path)
+    frequency, density = read(entry.frequency).real, read(entry.density).real
+    keep = frequency > 0
+    frequency, density = frequency[keep], density[keep]
+    _ascending(frequency, f"column {entry.frequency!r}", path)
+    _check_frequency(frequency, path)
+    if np.any(density <= 0):
+        raise StudyError(
+            f"{path}: column {entry.density!r} has values that are not positive; in dB?"
+        )
+    return Spectrum(
+        entry.name,
+        entry.check,
+        bench,
+        _pose(spec, entry),
+        (signals[0], signals[1]),
+        ORDERS[entry.quantity],
+        frequency,
+        density,
+        Noise(float(np.sqrt(polygamma(1, entry.averages))), 0.0),  # of its logarithm
+        "any",
+    )
+
+
+def _trace(spec: FitSpec, bench: Bench, entry: TraceEntry, path: str) -> Measurement:
+    read, (signal,) = _read(spec, entry, path), _signals(spec, entry, path)
+    time, value = read(entry.time).real, read(entry.value).real
+    _ascending(time, f"column {entry.time!r}", path)
+    if time[0] < 0 or time[-1] > spec.study.run.duration:
+        raise StudyError(
+            f"{path}: times from {time[0]:g} to {time[-1]:g} s; allowed: within the run, 0 to "
+            f"{spec.study.run.duration:g} [s] (run.duration)"
+        )
+    study = spec.study
+    if not np.isnan(signal.place):
+        study = study.change(metrics__stations=(signal.place,))
+        signal = signal._replace(patch=0)
+    return Trace(
+        entry.name,
+        entry.check,
+        study,
+        spec.free.place,
+        signal,
+        time,
+        value,
+        _noise(entry, value, path),
+        OUTPUTS[signal.kind][1],
+    )
+
+
+def _figures(spec: FitSpec, bench: Bench, entry: FiguresEntry, path: str) -> Measurement:
+    links = entry.links or spec.study.control.links
+    compared = []
+    for name, value in entry.values.items():
+        entries = parse_entries(name, f"{path}.values")
+        if not METRICS[entries.metric].has_slope:
+            smooth = [x for x in METRICS if METRICS[x].has_slope]
+            raise StudyError(
+                f"{path}.values: {name!r} has no derivative; allowed: {', '.join(smooth)}"
+            )
+        compared.append(
+            Compared(
+                entries=entries,
+                links=OFF if entry.of == "uncontrolled" else links,
+                is_reduction=entry.of == "reduction",
+                measured=value,
+                noise=_noise(entry, np.array([value]), path),
+                label=name,
+            )
+        )
+    return Figures(entry.name, entry.check, spec.study, spec.free.place, tuple(compared))
+
+
+_MAKERS: dict[type[Common], Callable[..., Measurement]] = {
+    ModesEntry: _modes,
+    ResponseEntry: _response,
+    SpectrumEntry: _spectrum,
+    TraceEntry: _trace,
+    FiguresEntry: _figures,
+}
+
+
+def guess(spec: FitSpec) -> np.ndarray:
+    """The study's own values of the free numbers, (p,)."""
+    return np.array([number.start for number in spec.free.numbers])

@@ -1,0 +1,91 @@
+"""Figures of a fit: data beside the model, residuals of correlated numbers, profiles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from studies.fitting.kinds.contract import Curve
+from studies.fitting.statistics import WIDE
+from studies.show.figures import new_figure
+
+if TYPE_CHECKING:
+    from studies.fitting.run import Fitted
+
+#: Measurements in one figure.
+MOST = 8
+BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#999999"
+
+
+def all_figures(found: Fitted) -> Iterator[tuple[str, Figure]]:
+    """Names and figures."""
+    yield "fit", curves(found)
+    if len(found.names) > 1:
+        yield "correlations", correlations(found)
+    if found.profiles:
+        yield "profiles", profiles(found)
+
+
+def curves(found: Fitted) -> Figure:
+    """Data and model of the first measurements."""
+    shown = found.curves[:MOST]
+    figure, axes = new_figure(len(shown), 1, 1.8, has_shared_abscissa=False)
+    for ax, (name, curve) in zip(axes[:, 0], shown, strict=True):
+        _single(ax, curve) if curve.labels else _line(ax, curve)
+        ax.set_title(name, loc="left", fontsize=9)
+    axes[0, 0].legend(loc="best")
+    return figure
+
+
+def _line(ax: Axes, curve: Curve) -> None:
+    ax.plot(curve.x, curve.measured, ".", ms=2, color=GREY, label="measured")
+    ax.plot(curve.x, curve.model, color=BLUE, lw=1, label="model")
+    if curve.is_log:
+        ax.set_yscale("log")
+    ax.set(xlabel=curve.abscissa, ylabel=curve.ordinate)
+
+
+def _single(ax: Axes, curve: Curve) -> None:
+    away = 100 * (curve.model / np.where(curve.measured == 0, np.nan, curve.measured) - 1)
+    ax.bar(curve.x, away, 0.5, color=BLUE, label="model over measured")
+    ax.axhline(0, color="black", lw=0.6)
+    ax.set_xticks(curve.x, curve.labels, fontsize=7)
+    ax.set(ylabel="model over measured [%]")
+
+
+def correlations(found: Fitted) -> Figure:
+    """Correlation of the free numbers."""
+    n = len(found.names)
+    figure, axes = new_figure(1, 1, min(1.2 + 0.28 * n, 7.0))
+    ax = axes[0, 0]
+    ax.grid(False)
+    image = ax.imshow(found.answer.correlation, vmin=-1, vmax=1, cmap="RdBu_r")
+    ax.set_xticks(range(n), found.names, rotation=90, fontsize=7)
+    ax.set_yticks(range(n), found.names, fontsize=7)
+    figure.colorbar(image, ax=ax, label="correlation [1]")
+    return figure
+
+
+def profiles(found: Fitted) -> Figure:
+    """Least misfit over each free number, and what its standard deviation promises."""
+    count = len(found.profiles)
+    figure, axes = new_figure((count + 1) // 2, min(count, 2), 1.9, has_shared_abscissa=False)
+    for ax, one in zip(axes.ravel(), found.profiles, strict=False):
+        k = one.number
+        value, sigma = found.answer.values[k], found.answer.sigma[k]
+        ax.plot(one.values, one.rise, "o-", ms=3, color=BLUE, label="profile")
+        if sigma > 0:
+            x = np.linspace(one.values.min(), one.values.max(), 101)
+            ax.plot(x, ((x - value) / sigma) ** 2, "--", color=ORANGE, lw=1, label="from sigma")
+        ax.axhline(WIDE**2, color=GREY, lw=0.8)
+        ax.set_ylim(0, 12)
+        ax.set_title(found.names[k], loc="left", fontsize=9)
+        ax.set_ylabel("rise of chi square [1]")
+    axes[0, 0].legend(loc="best")
+    for ax in axes.ravel()[count:]:
+        ax.set_visible(False)
+    return figure

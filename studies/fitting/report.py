@@ -1,0 +1,155 @@
+"""The report of a fit: what was found, how well it is known, and what the data cannot tell."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from studies.fitting.statistics import UNKNOWN, Direction, Misfit
+from studies.show.templates import render
+from studies.study.paths import field_unit, parse_entry
+
+if TYPE_CHECKING:
+    from studies.fitting.run import Fitted
+
+#: Experiments in the report.
+SHOWN = 5
+#: Correlations from this size on are named [1].
+STRONG = 0.95
+
+
+def summary(found: Fitted) -> str:
+    """Some lines: the values, and what is wrong with them."""
+    lines = [f"{row[0]} = {row[1]} +- {row[2]} {row[3]}" for row in _rows(found)]
+    lines += sentences(found)
+    return "\n".join(lines)
+
+
+def report(found: Fitted) -> str:
+    """Markdown text."""
+    return render(
+        "fitting/report.md",
+        found=found,
+        spec=found.spec,
+        answer=found.answer,
+        rows=_rows(found),
+        sentences=sentences(found),
+        misfits=[_misfit(x) for x in found.answer.misfits],
+        checks=[_misfit(x) for x in found.checks],
+        others=_others(found),
+        experiments=_experiments(found),
+        more=len(found.curves) - 8,
+    )
+
+
+def _unit(name: str) -> str:
+    entry = parse_entry(name)
+    assert entry is not None
+    return field_unit(entry.field)
+
+
+def _rows(found: Fitted) -> list[list[str]]:
+    """Name, value, standard deviation, unit, 95 % interval, and where the number came to lie."""
+    rows = []
+    u = found.solution.best.u
+    for k, name in enumerate(found.names):
+        value, sigma = found.answer.values[k], found.answer.sigma[k]
+        low, high = found.answer.interval[k]
+        digits = _digits(value, sigma)
+        at = "at its bound" if not 1e-6 < u[k] < 1 - 1e-6 else ""
+        if found.answer.sigma[k] >= 0.99 * UNKNOWN * abs(found.spec.free.slopes(u)[k]):
+            at = "not determined"
+        rows.append(
+            [
+                name,
+                f"{value:.{digits}g}",
+                f"{sigma:.2g}",
+                _unit(name),
+                f"{low:.{digits}g} to {high:.{digits}g}",
+                at,
+            ]
+        )
+    return rows
+
+
+def _digits(value: float, sigma: float) -> int:
+    """Significant digits of a value that show two of its standard deviation."""
+    if sigma <= 0 or value == 0:
+        return 6
+    return int(np.clip(np.floor(np.log10(abs(value) / sigma)) + 3, 2, 10))
+
+
+def sentences(found: Fitted) -> list[str]:
+    """What a reader must know before he uses the values."""
+    answer, told = found.answer, []
+    if not answer.is_explained:
+        worst = max(answer.misfits, key=lambda x: x.square / max(x.size, 1))
+        told.append(
+            f"The model does not explain the data: chi square is {answer.chi_square:.4g} with "
+            f"{answer.freedom} degrees of freedom, worst for {worst.name}. Uncertainties below "
+            "assume a right model and are too small; look at the residuals, at the model's bases "
+            "and modes, and at the stated noise."
+        )
+    told += [_told(x, found.names) for x in answer.undetermined]
+    if not answer.undetermined:
+        told += _correlated(found)
+    if not found.solution.best.is_converged:
+        told.append("The search ended before it converged; raise fit.iterations.")
+    return told
+
+
+def _told(direction: Direction, names: tuple[str, ...]) -> str:
+    parts = direction.named()
+    if len(parts) == 1:
+        return f"{names[parts[0]]} is not determined by these data."
+    sign = [("up" if direction.parts[k] > 0 else "down") for k in parts]
+    moves = ", ".join(f"{names[k]} {s}" for k, s in zip(parts, sign, strict=True))
+    listed = " and ".join([", ".join(names[k] for k in parts[:-1]), names[parts[-1]]])
+    return (
+        f"{listed} cannot be told apart by these data: moved together ({moves}), they change the "
+        "model's answers by less than the noise. Measure something else (see the next experiment), "
+        "fix one, or state what is known of it by mean and sigma."
+    )
+
+
+def _correlated(found: Fitted) -> list[str]:
+    """Pairs that are determined, but hardly apart."""
+    matrix, names = found.answer.correlation, found.names
+    return [
+        f"{names[k]} and {names[i]} are strongly correlated ({matrix[i, k]:.3f}): each is known "
+        "less well than both together."
+        for i in range(len(matrix))
+        for k in range(i)
+        if abs(matrix[i, k]) > STRONG
+    ]
+
+
+def _misfit(one: Misfit) -> list[str]:
+    likeness = "-" if np.isnan(one.likeness) else f"{one.likeness:.2f}"
+    return [
+        one.name,
+        str(one.size),
+        f"{one.square / max(one.size, 1):.3g}",
+        likeness,
+        "yes" if one.is_noise else "**no**",
+    ]
+
+
+def _others(found: Fitted) -> list[list[str]]:
+    """Optima elsewhere, with the rise of their chi square."""
+    least = found.solution.best.cost
+    rows: list[list[str]] = []
+    for one in found.solution.others:
+        values = found.spec.free.values(one.u)
+        rows.append([f"{2 * (one.cost - least):.3g}", *(f"{x:.4g}" for x in values)])
+    return rows
+
+
+def _experiments(found: Fitted) -> list[list[Any]]:
+    before = float(np.sqrt(np.linalg.eigvalsh(found.answer.covariance)[-1]))
+    rows = []
+    for one in found.experiments[:SHOWN]:
+        pose = ", ".join(f"{x:.3g}" for x in one.pose)
+        rows.append([one.text, f"({pose})", f"{before / one.widest:.3g}"])
+    return rows

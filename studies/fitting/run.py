@@ -1,0 +1,231 @@
+"""From the file of a fit to the folder with its answer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+
+from studies.engine.runs import run_attributes
+from studies.errors import StudyError
+from studies.fitting import plots
+from studies.fitting.experiment import Experiment, next_experiments
+from studies.fitting.kinds.contract import Curve
+from studies.fitting.measurements import guess, make_bench, make_measurements
+from studies.fitting.problem import Problem, complaints
+from studies.fitting.report import report, summary
+from studies.fitting.solve import Solution, solve
+from studies.fitting.spec import FitSpec
+from studies.fitting.statistics import (
+    Answer,
+    Misfit,
+    Likelihood,
+    describe_fit,
+    misfit,
+    profile,
+)
+from studies.show import figures
+from studies.show.pages import write_report
+from studies.store import Variable, check_folder, staged, write_store
+from studies.study.paths import set_values
+from studies.study.spec import Study, parse_study
+from studies.study.template import study_template
+
+#: Free numbers up to which likelihoods are profiled.
+PROFILED = 6
+#: Files of the folder.
+STUDY, TUNE, DATA, DOCUMENT = "fitted.toml", "fitted_tune.toml", "fit.h5", "fit.json"
+
+
+class Fitted(NamedTuple):
+    """A finished fit."""
+
+    spec: FitSpec
+    solution: Solution
+    answer: Answer
+    study: Study  # with the fitted numbers
+    curves: tuple[tuple[str, Curve], ...]  # of all measurements by name
+    checks: tuple[Misfit, ...]  # of those held out
+    profiles: tuple[Likelihood, ...]
+    experiments: tuple[Experiment, ...]  # the most telling first
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free numbers."""
+        return self.spec.free.names
+
+
+def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
+    """Fit a model to measurements.
+
+    Args:
+        spec: from `load_fit`.
+        console: where progress goes; default: nowhere.
+
+    Raises:
+        StudyError: data that cannot be used, or no first guess that leads to a fit.
+    """
+    console = console or Console(quiet=True)
+    fit, free = spec.fit, spec.free
+    bench = make_bench(spec)
+    every = make_measurements(spec, bench)
+    complaints(every, guess(spec))
+    kept = tuple(x for x in every if not x.is_checked)
+    problem = Problem(free, spec.priors, kept, tuple(x for x in every if x.is_checked), bench)
+    u = free.places()
+    count = len(problem.residual(u)) - len(spec.priors)
+    _check_enough(count, len(u), len(spec.priors))
+    console.print(f"{count} measured numbers, {len(u)} free; rating {fit.starts} starts")
+    is_robust = fit.loss == "robust"
+    solution = solve(problem, fit.starts, fit.refine, fit.iterations, fit.seed, is_robust)
+    answer = describe_fit(problem, solution.best.u, is_robust)
+    profiles: list[Likelihood] = []
+    if fit.profile and len(u) <= PROFILED:
+        console.print("profiling the likelihood")
+        sigma = np.sqrt(np.diag(answer.covariance))
+        profiles = [profile(problem, solution.best.u, k, sigma[k]) for k in range(len(u))]
+    console.print("looking for the next experiment")
+    study = parse_study(set_values(spec.study, _numbers(spec, answer.values)))
+    experiments = next_experiments(bench, free, solution.best.u, answer.covariance)
+    return Fitted(
+        spec=spec,
+        solution=solution,
+        answer=answer,
+        study=study,
+        curves=tuple((x.name, x.curve(answer.values)) for x in every),
+        checks=tuple(
+            misfit(x.name, x.residual(answer.values, False), x.is_ordered) for x in problem.checks
+        ),
+        profiles=tuple(profiles),
+        experiments=tuple(experiments),
+    )
+
+
+def _check_enough(count: int, numbers: int, priors: int) -> None:
+    if count + priors < numbers:
+        raise StudyError(
+            f"fit: {count} measured numbers and {priors} known beforehand for {numbers} free "
+            "numbers; allowed: as many or more. Fix some, or give mean and sigma of what is known"
+        )
+
+
+def _numbers(spec: FitSpec, values: np.ndarray) -> dict[str, float]:
+    return {x.name: float(v) for x, v in zip(spec.free.numbers, values, strict=True)}
+
+
+def run_fit(
+    spec: FitSpec, out: str | Path, console: Console | None = None, has_pdf: bool = False
+) -> Fitted:
+    """Fit, and write the answer into a folder.
+
+    Args:
+        spec: from `load_fit`.
+        out: folder for the files, created if missing.
+        console: where messages go; default: standard output.
+        has_pdf: also write the figures as PDF.
+
+    Raises:
+        StudyError: as `fit`, or a folder that cannot be written to.
+    """
+    out, console = Path(out), console or Console(highlight=False, markup=False)
+    check_folder(out)
+    found = fit(spec, console)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with staged(out) as staging:
+            _draw(staging, found, has_pdf)
+            (staging / STUDY).write_text(study_template(found.study), encoding="utf-8")
+            (staging / TUNE).write_text(_tuning(found), encoding="utf-8")
+            (staging / DOCUMENT).write_text(document(found), encoding="utf-8")
+            write_store(staging / DATA, variables(found), run_attributes(found.study))
+            write_report(staging, report(found), found.study)
+    except OSError as error:
+        raise StudyError(f"--out {out}: cannot write there ({error})") from error
+    console.print(summary(found), soft_wrap=True)
+    console.print(
+        f"written: {out / 'report.html'}; {STUDY} is the fitted study, {TUNE} a tuning for "
+        "machines like it",
+        soft_wrap=True,
+    )
+    return found
+
+
+def _draw(folder: Path, found: Fitted, has_pdf: bool) -> None:
+    with figures.styled():
+        for name, figure in plots.all_figures(found):
+            figures.save(figure, folder, name, has_pdf)
+
+
+def spread_percent(found: Fitted) -> dict[str, float]:
+    """Half widths of even distributions with the deviations found, in percent of the values."""
+    answer, most = found.answer, 50.0
+    return {
+        name: float(min(most, round(100 * np.sqrt(3) * sigma / abs(value), 4)))
+        for name, value, sigma in zip(found.names, answer.values, answer.sigma, strict=True)
+        if value != 0 and sigma > 0
+    }
+
+
+def _tuning(found: Fitted) -> str:
+    """The fitted study with its spread, ready for `studies tune`."""
+    gain = found.study.control.gain_factor
+    spread = "\n".join(f"{json.dumps(k)} = {v:g}" for k, v in spread_percent(found).items())
+    return (
+        f"{study_template(found.study)}\n"
+        "# What moves, and how far: change it to what you can decide.\n"
+        "[tune]\n[tune.free]\n"
+        f'"control.gain_factor" = {{ from = {0.2 * gain:g}, to = {2 * gain:g} }}\n\n'
+        "# Machines as uncertain as the fit leaves them.\n"
+        f"[tune.scenarios]\ncount = 4\n[tune.scenarios.spread]\n{spread}\n"
+    )
+
+
+def document(found: Fitted) -> str:
+    """JSON text of the answer."""
+    answer = found.answer
+    numbers = [
+        {
+            "name": name,
+            "value": float(answer.values[k]),
+            "sigma": float(answer.sigma[k]),
+            "interval_95": [float(x) for x in answer.interval[k]],
+        }
+        for k, name in enumerate(found.names)
+    ]
+    whole: dict[str, Any] = {
+        "format": "flexlink-fit",
+        "format_version": 1,
+        "title": found.spec.study.title,
+        "is_explained": bool(answer.is_explained),
+        "chi_square": answer.chi_square,
+        "freedom": int(answer.freedom),
+        "numbers": numbers,
+        "undetermined": [
+            {found.names[k]: float(x.parts[k]) for k in x.named()} for x in answer.undetermined
+        ],
+        "correlation": answer.correlation.tolist(),
+    }
+    return json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def variables(found: Fitted) -> dict[str, Variable]:
+    """Labelled numbers of a fit."""
+    answer, axis = found.answer, ("number",)
+    part = {
+        "number": Variable(np.array(found.names), axis, "1", "free number"),
+        "value": Variable(answer.values, axis, "1", "fitted, in the field's unit"),
+        "sigma": Variable(answer.sigma, axis, "1", "standard deviation, in the field's unit"),
+        "interval": Variable(answer.interval, (*axis, "end"), "1", "95 %, in the field's unit"),
+        "correlation": Variable(answer.correlation, (*axis, "other"), "1", "of the numbers"),
+    }
+    for k, (_, curve) in enumerate(found.curves):
+        point = (f"point_{k}",)
+        part |= {
+            f"x_{k}": Variable(curve.x.astype(float), point, "1", curve.abscissa or "index"),
+            f"measured_{k}": Variable(curve.measured, point, "1", curve.ordinate),
+            f"model_{k}": Variable(curve.model, point, "1", curve.ordinate),
+        }
+    return part

@@ -1,0 +1,84 @@
+"""Names of inputs and outputs of a machine: `actuator 1.2`, `deflection 3 at 0.05`."""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+import numpy as np
+
+from studies.errors import field_error
+
+#: Kinds of inputs and outputs, how they are written, and the unit of their numbers.
+INPUTS = {
+    "actuator": ("actuator LINK.PATCH", "V"),
+    "slider": ("slider LINK", "N"),
+    "hammer": ("hammer LINK at X", "N"),
+}
+OUTPUTS = {
+    "sensor": ("sensor LINK.PATCH", "V"),
+    "deflection": ("deflection LINK at X", "m"),
+    "slider": ("slider LINK", "m"),
+    "platform": ("platform x, y or phi", "m"),
+}
+_NUMBERED = re.compile(r"(\w+) ([1-9])(?:\.([1-9]))?(?: at ([0-9.eE+-]+))?")
+_PLATFORM = {"platform x": 0, "platform y": 1, "platform phi": 2}
+
+
+class Signal(NamedTuple):
+    """One input or output."""
+
+    kind: str  # a key of INPUTS or OUTPUTS
+    link: int  # from 0; of the platform: its coordinate
+    patch: int  # from 0
+    place: float  # from the slider's joint along the link [m], nan if it has none
+
+    def row(self, n_patches: int, stations: tuple[float, ...]) -> int:
+        """Its place among all signals of its kind."""
+        if self.kind in ("actuator", "sensor"):
+            return self.link * n_patches + self.patch
+        if self.kind in ("hammer", "deflection"):
+            return self.link * len(stations) + stations.index(self.place)
+        return self.link
+
+
+def parse_signal(
+    text: str, known: dict[str, tuple[str, str]], n_patches: int, length: np.ndarray, path: str
+) -> Signal:
+    """A signal from its name.
+
+    Args:
+        text: as the file writes it.
+        known: INPUTS or OUTPUTS.
+        n_patches: pairs of patches on each link.
+        length: of the links [m], (3,).
+        path: where it is written, for messages.
+
+    Raises:
+        StudyError: no such signal.
+    """
+    allowed = ", ".join(form for form, _ in known.values())
+    if text in _PLATFORM and "platform" in known:
+        return Signal("platform", _PLATFORM[text], 0, np.nan)
+    match = _NUMBERED.fullmatch(text)
+    if match is None or match[1] not in known or match[1] == "platform":
+        raise field_error(path, text, allowed)
+    kind, link = match[1], int(match[2])
+    if link > 3:
+        raise field_error(path, text, "links 1 to 3")
+    if (kind in ("actuator", "sensor")) != (match[3] is not None):
+        raise field_error(path, text, known[kind][0])
+    patch = int(match[3] or 1)
+    if patch > n_patches:
+        raise field_error(path, text, f"patches 1 to {n_patches}")
+    if (kind in ("hammer", "deflection")) != (match[4] is not None):
+        raise field_error(path, text, known[kind][0])
+    place = np.nan
+    if match[4] is not None:
+        try:
+            place = float(match[4])
+        except ValueError:
+            raise field_error(path, text, known[kind][0], "m") from None
+        if not 0 < place < length[link - 1]:
+            raise field_error(path, text, f"between 0 and {length[link - 1]:g}", "m")
+    return Signal(kind, link - 1, patch - 1, place)

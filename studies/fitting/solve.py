@@ -1,0 +1,111 @@
+"""Many first guesses, rated in one batch; the best are followed by SciPy's trust region method."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import qmc
+
+from studies.errors import StudyError
+from studies.fitting.problem import Problem
+
+#: Optima closer than this in the unit cube are the same [1].
+SAME = 1e-3
+#: Distance kept from the bounds by first guesses [1].
+INSIDE = 1e-3
+#: Size of a residual from which the robust loss grows linearly, in standard deviations.
+SOFT = 2.0
+
+
+class Optimum(NamedTuple):
+    """Where one first guess led."""
+
+    u: np.ndarray  # place between the bounds, (p,)
+    cost: float  # half the sum of the loss
+    is_converged: bool
+    evaluations: int
+
+
+class Solution(NamedTuple):
+    """All optima, the best first."""
+
+    optima: tuple[Optimum, ...]
+    rated: int  # first guesses
+    failed: int  # of these, where the model has no answer
+
+    @property
+    def best(self) -> Optimum:
+        """The best one."""
+        return self.optima[0]
+
+    @property
+    def others(self) -> tuple[Optimum, ...]:
+        """Optima elsewhere."""
+        return tuple(x for x in self.optima if np.abs(x.u - self.best.u).max() > SAME)
+
+
+def solve(
+    problem: Problem, starts: int, refine: int, iterations: int, seed: int, is_robust: bool
+) -> Solution:
+    """Fit.
+
+    Args:
+        problem: the residuals.
+        starts: first guesses; the first is the study's own.
+        refine: how many of them are followed.
+        iterations: evaluations of each.
+        seed: of the first guesses.
+        is_robust: whether outliers pull less.
+
+    Raises:
+        StudyError: no first guess has residuals.
+    """
+    own = problem.free.places()
+    sobol = qmc.Sobol(len(own), seed=seed)
+    drawn = sobol.random_base2(max(int(np.ceil(np.log2(max(starts - 1, 1)))), 0))[: starts - 1]
+    first = np.clip(np.vstack([own[None], drawn]), INSIDE, 1 - INSIDE)
+    cost = problem.costs(first)
+    if not np.isfinite(cost).any():
+        raise StudyError("the model fails at every first guess; see the study and the bounds")
+    kept = [0] if np.isfinite(cost[0]) else []
+    kept += [int(k) for k in np.argsort(cost) if np.isfinite(cost[k]) and k != 0]
+    found = []
+    for k in kept[:refine]:
+        with suppress(StudyError, np.linalg.LinAlgError, ValueError):  # leaves where it works
+            found.append(descend(problem, first[k], iterations, is_robust))
+    if not found:
+        raise StudyError("no first guess leads to a fit: each leaves where the model works")
+    best = min(found, key=lambda x: x.cost)
+    for one in problem.measurements:
+        one.reweigh(problem.free.values(best.u))
+    found = [descend(problem, x.u, iterations, is_robust) for x in found]
+    found.sort(key=lambda x: x.cost)
+    return Solution(tuple(found), len(first), int((~np.isfinite(cost)).sum()))
+
+
+def descend(problem: Problem, u: np.ndarray, iterations: int, is_robust: bool) -> Optimum:
+    """The optimum that a first guess leads to; arguments as `solve`.
+
+    Args:
+        problem: the residuals.
+        u: first guess, (p,).
+        iterations: evaluations.
+        is_robust: whether outliers pull less.
+    """
+    options: dict[str, Any] = {"loss": "soft_l1", "f_scale": SOFT} if is_robust else {}
+    done = least_squares(
+        problem.residual,
+        np.clip(u, 1e-12, 1 - 1e-12),
+        problem.jacobian,
+        bounds=(0.0, 1.0),
+        x_scale="jac",
+        max_nfev=iterations,
+        xtol=1e-10,
+        ftol=1e-12,
+        gtol=1e-10,
+        **options,
+    )
+    return Optimum(u=done.x, cost=done.cost, is_converged=done.status > 0, evaluations=done.nfev)

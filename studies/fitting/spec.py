@@ -1,0 +1,268 @@
+"""The file of a fit: a study, the first guess, plus `[fit]`: what is free, and what was measured.
+
+Each entry of `[[fit.data]]` is a measurement of some kind with its own noise level. Numbers are in
+SI units unless their names say otherwise.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+from pydantic import Field, ValidationError
+
+from studies.engine.runs import check_run
+from studies.errors import StudyError, field_error, nearest, shown_name
+from studies.space.free import (
+    DESIGN,
+    MACHINE,
+    FreeNumbers,
+    check_twice,
+    join_numbers,
+    plain_numbers,
+)
+from studies.study.explain import explain
+from studies.study.files import find_spec, read_toml
+from studies.study.spec import Section, Study, described, parse_study
+
+Positive = Annotated[float, Field(gt=0, le=1e12)]
+Percent = Annotated[float, Field(gt=0, le=1000)]
+Coordinate = Annotated[float, Field(ge=-10, le=10)]
+Pose = tuple[Coordinate, Coordinate, Coordinate]
+Flags = tuple[bool, bool, bool]
+
+
+class Common(Section):
+    """Fields of every measurement."""
+
+    kind: str = described(..., "-", "kind of measurement")
+    name: str = described("", "-", "in messages and figures; default: its number", max_length=60)
+    check: bool = described(False, "-", "held out: compared, not fitted")
+
+
+class AtPose(Common):
+    """Fields of measurements at a pose."""
+
+    pose: Pose | None = described(None, "m; m; rad", "of the platform; default: first way-point")
+
+
+class ModesEntry(AtPose):
+    """Natural frequencies and damping ratios."""
+
+    frequency_hz: tuple[Positive, ...] = described(..., "Hz", "measured", min_length=1)
+    sigma_hz: Positive | tuple[Positive, ...] = described(
+        ..., "Hz", "standard deviation, of all or of each"
+    )
+    damping_ratio: tuple[Annotated[float, Field(ge=0, lt=1)], ...] = described(
+        (), "1", "measured; 0: not known"
+    )
+    damping_sigma: Positive | tuple[Positive, ...] | None = described(
+        None, "1", "standard deviation, of all or of each"
+    )
+    shapes: tuple[tuple[float, ...], ...] = described(
+        (), "-", "of each mode, the voltages of all sensors in any scale; they pair the modes"
+    )
+    ends: Literal["machine", "held"] = described(
+        "machine", "-", "the machine at the pose, or one link between held joints"
+    )
+    link: int = described(1, "1", "with ends = 'held'", ge=1, le=3)
+
+
+class FileEntry(AtPose):
+    """Fields of measurements in a file of columns."""
+
+    file: str = described(..., "-", "CSV, HDF5 or UFF, beside this file")
+    output: str = described(..., "-", "what is measured")
+    sigma: Positive | None = described(None, "unit of the output", "standard deviation")
+    sigma_percent: Percent | None = described(None, "%", "standard deviation over the value")
+
+
+class ResponseEntry(FileEntry):
+    """A frequency response."""
+
+    input: str = described(..., "-", "what shakes the machine")
+    quantity: Literal["displacement", "velocity", "acceleration"] = described(
+        "displacement", "-", "of the output: as named, or its derivative"
+    )
+    frequency: str = described("frequency_hz", "-", "column")
+    real: str = described("real", "-", "column")
+    imag: str = described("imag", "-", "column")
+    magnitude: str = described("", "-", "column; instead of real and imaginary part")
+
+
+class SpectrumEntry(FileEntry):
+    """A power spectrum under a white input of unknown strength."""
+
+    input: str = described(..., "-", "where the white force or voltage acts")
+    quantity: Literal["displacement", "velocity", "acceleration"] = described(
+        "displacement", "-", "of the output: as named, or its derivative"
+    )
+    frequency: str = described("frequency_hz", "-", "column")
+    density: str = described("density", "-", "column, unit^2/Hz in any scale")
+    averages: int = described(1, "1", "independent spectra in the mean", ge=1, le=10**6)
+
+
+class TraceEntry(FileEntry):
+    """A signal over time of the study's motion."""
+
+    time: str = described("time", "-", "column [s], from the start of the motion")
+    value: str = described("value", "-", "column")
+
+
+class FiguresEntry(Common):
+    """Metrics of the study's motion, or their reduction by control."""
+
+    values: dict[str, float] = described(..., "-", "metric = value, in its unit or in percent")
+    of: Literal["controlled", "uncontrolled", "reduction"] = described(
+        "controlled", "-", "with control, without, or percent less with it"
+    )
+    links: Flags | None = described(None, "-", "under control; default: those of the study")
+    sigma: Positive | None = described(None, "unit of the metric; %", "standard deviation")
+    sigma_percent: Percent | None = described(None, "%", "standard deviation over the value")
+
+
+#: Fields of each kind.
+ENTRIES: dict[str, type[Common]] = {
+    "modes": ModesEntry,
+    "response": ResponseEntry,
+    "spectrum": SpectrumEntry,
+    "trace": TraceEntry,
+    "figures": FiguresEntry,
+}
+
+
+class Fit(Section):
+    """What is free, and what was measured."""
+
+    free: dict[str, Any] = described(..., "-", "field = {from, to, scale, mean, sigma}")
+    data: tuple[dict[str, Any], ...] = described(..., "-", "measurements", min_length=1)
+    loss: Literal["squares", "robust"] = described(
+        "squares", "-", "of residuals; robust: outliers pull less"
+    )
+    starts: int = described(32, "1", "first guesses, the study's own first", ge=1, le=10_000)
+    refine: int = described(4, "1", "best of them that are followed to the end", ge=1, le=100)
+    iterations: int = described(60, "1", "evaluations of each", ge=1, le=10_000)
+    profile: bool = described(True, "-", "profile the likelihood of up to six free numbers")
+    seed: int = described(0, "1", "of the first guesses", ge=0, le=10**9)
+
+
+class Prior(NamedTuple):
+    """What is known of a free number beforehand: mean and standard deviation."""
+
+    number: int  # among the free ones
+    mean: float
+    sigma: float
+
+
+class FitSpec(NamedTuple):
+    """A fit as requested."""
+
+    study: Study  # the first guess
+    fit: Fit
+    free: FreeNumbers
+    priors: tuple[Prior, ...]
+    entries: tuple[Common, ...]
+    folder: Path  # where the files of the data are
+    data: dict[str, Any]  # as read, for the record
+
+
+def load_fit(path: str | Path) -> FitSpec:
+    """Read a file of a fit, or the ready-made one of that name.
+
+    Raises:
+        StudyError: unreadable, not TOML, or not a valid fit.
+    """
+    return parse_fit(read_toml(path), find_spec(path).parent)
+
+
+def parse_fit(data: dict[str, Any], folder: str | Path = ".") -> FitSpec:
+    """Validate a dictionary as a fit.
+
+    Args:
+        data: sections of a study and `fit`.
+        folder: where the files of the data are.
+
+    Raises:
+        StudyError: first fault found, with field, value, allowed range and unit.
+    """
+    if "fit" not in data:
+        raise StudyError("fit: missing; a fit is a study file with a section [fit]")
+    study = parse_study({name: value for name, value in data.items() if name != "fit"})
+    try:
+        fit = Fit.model_validate(_tuples(data["fit"]))
+    except ValidationError as error:
+        raise explain(error, Fit, data["fit"], inside="fit") from None
+    check_run(study)
+    free, priors = _free(fit, study)
+    entries = tuple(_entry(written, k) for k, written in enumerate(fit.data))
+    if all(entry.check for entry in entries):
+        raise StudyError("fit.data: every entry is held out by check = true; leave one or more in")
+    return FitSpec(
+        study=study,
+        fit=fit,
+        free=free,
+        priors=priors,
+        entries=entries,
+        folder=Path(folder),
+        data=data,
+    )
+
+
+def _free(fit: Fit, study: Study) -> tuple[FreeNumbers, tuple[Prior, ...]]:
+    if not fit.free:
+        raise field_error("fit.free", {}, "one free field or more")
+    parts, known = [], []
+    for name, written in fit.free.items():
+        path = f"fit.free.{shown_name(name)}"
+        prior = {}
+        if isinstance(written, dict):
+            prior = {k: written[k] for k in ("mean", "sigma") if k in written}
+            written = {k: v for k, v in written.items() if k not in prior}
+        parts.append(plain_numbers(name, written, study, path, DESIGN | MACHINE))
+        known += [(prior, path)] * len(parts[-1][0])
+    free = join_numbers(parts)
+    check_twice(free.numbers, "fit.free")
+    priors = []
+    for k, (prior, path) in enumerate(known):
+        if prior:
+            priors.append(_prior(prior, k, path))
+    return free, tuple(priors)
+
+
+def _prior(written: dict[str, Any], k: int, path: str) -> Prior:
+    for name in ("mean", "sigma"):
+        value = written.get(name)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e150:
+            raise field_error(f"{path}.{name}", value, "a finite number, beside mean or sigma")
+    if written["sigma"] <= 0:
+        raise field_error(f"{path}.sigma", written["sigma"], "more than 0")
+    return Prior(k, float(written["mean"]), float(written["sigma"]))
+
+
+def _entry(written: dict[str, Any], k: int) -> Common:
+    path = f"fit.data[{k}]"
+    kind = written.get("kind")
+    if not isinstance(kind, str) or kind not in ENTRIES:
+        hint = nearest(kind, ENTRIES) if isinstance(kind, str) else ""
+        raise field_error(f"{path}.kind", kind, ", ".join(ENTRIES), hint=hint)
+    model = ENTRIES[kind]
+    try:
+        entry = model.model_validate(_tuples(written))
+    except ValidationError as error:
+        raise explain(error, model, written, inside=path) from None
+    is_bare = isinstance(entry, (ResponseEntry, TraceEntry, FiguresEntry)) and (
+        entry.sigma is None and entry.sigma_percent is None
+    )
+    if is_bare:
+        raise StudyError(
+            f"{path}: sigma or sigma_percent is missing; without it the data say nothing about "
+            "uncertainty"
+        )
+    return entry if entry.name else entry.model_copy(update={"name": f"{kind} {k + 1}"})
+
+
+def _tuples(value: Any) -> Any:
+    """Lists as tuples, and whole numbers as they are."""
+    if isinstance(value, dict):
+        return {name: _tuples(x) for name, x in value.items()}
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value

@@ -1,0 +1,225 @@
+"""What the data say about the free numbers: uncertainty, correlations, and what they cannot tell.
+
+All in the unit cube of the free numbers, in which a number that may be anywhere between its bounds
+has the standard deviation 1/sqrt(12).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from studies.errors import StudyError
+from studies.fitting.kinds.contract import Residual
+from studies.fitting.problem import Problem
+from studies.fitting.solve import SOFT
+
+#: Standard deviation of a number of which only the bounds are known [1].
+UNKNOWN = 1 / np.sqrt(12)
+#: Numbers with at least this part in a direction are named [1].
+NAMED = 0.25
+#: Probability below which residuals are not noise [1].
+UNLIKELY = 1e-3
+#: Of a normal distribution, 95 % lie within this many standard deviations.
+WIDE = 1.959964
+
+
+class Direction(NamedTuple):
+    """A combination of free numbers."""
+
+    sigma: float  # standard deviation along it, between the bounds [1]; inf: no information
+    parts: np.ndarray  # (p,)
+
+    def named(self) -> list[int]:
+        """Numbers with a part worth naming, the largest first."""
+        size = np.abs(self.parts)
+        return [int(k) for k in np.argsort(-size) if size[k] >= NAMED * size.max()]
+
+
+class Misfit(NamedTuple):
+    """How well one measurement is met."""
+
+    name: str
+    size: int  # residuals
+    square: float  # their sum of squares
+    likeness: float  # of neighbours: correlation [1]; 0 for noise, nan if they have no order
+    is_noise: bool  # whether the residuals look like the stated noise
+
+
+class Answer(NamedTuple):
+    """Values and what is known of them, at an optimum."""
+
+    values: np.ndarray  # in the study's units, (p,)
+    sigma: np.ndarray  # standard deviations, (p,); at most that of the bounds
+    interval: np.ndarray  # 95 %, within the bounds, (p, 2)
+    correlation: np.ndarray  # (p, p)
+    covariance: np.ndarray  # between the bounds [1], (p, p)
+    directions: tuple[Direction, ...]  # the widest first
+    misfits: tuple[Misfit, ...]
+    chi_square: float
+    freedom: int  # residuals minus determined directions
+    probability: float  # of a larger chi square, if the model is right
+
+    @property
+    def undetermined(self) -> tuple[Direction, ...]:
+        """Directions of which the data say less than the bounds."""
+        return tuple(x for x in self.directions if x.sigma > UNKNOWN)
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether the residuals look like the stated noise."""
+        return self.probability >= UNLIKELY and all(x.is_noise for x in self.misfits)
+
+
+def describe_fit(problem: Problem, u: np.ndarray, is_robust: bool) -> Answer:
+    """Statistics at an optimum.
+
+    Args:
+        problem: what was fitted.
+        u: the optimum, (p,).
+        is_robust: weigh residuals as the robust loss does.
+    """
+    values = problem.free.values(u)
+    parts = problem.parts(values, True)
+    residual = np.concatenate([x.value for x in parts])
+    jacobian = np.concatenate([x.slope for x in parts if x.slope is not None])
+    jacobian = jacobian * problem.free.slopes(u)
+    if is_robust:
+        jacobian = jacobian * (1 + (residual / SOFT) ** 2)[:, None] ** -0.25
+    covariance, directions = spread(jacobian)
+    sigma_u = np.sqrt(np.diag(covariance))
+    slopes = np.abs(problem.free.slopes(u))
+    low, high = (problem.free.values(np.clip(u + k * WIDE * sigma_u, 0, 1)) for k in (-1, 1))
+    n_prior = len(problem.priors)
+    of_data = residual[: len(residual) - n_prior] if n_prior else residual
+    determined = sum(x.sigma <= UNKNOWN for x in directions)
+    freedom = max(len(residual) - determined, 0)
+    square = float(np.sum(residual**2))
+    assert len(of_data)
+    return Answer(
+        values=values,
+        sigma=np.minimum(sigma_u, UNKNOWN) * slopes,
+        interval=np.stack([low, high], axis=1),
+        correlation=covariance / np.outer(sigma_u, sigma_u),
+        covariance=covariance,
+        directions=directions,
+        misfits=tuple(
+            misfit(x.name, part, x.is_ordered)
+            for x, part in zip(problem.measurements, parts, strict=False)
+        ),
+        chi_square=square,
+        freedom=freedom,
+        probability=float(chi2.sf(square, freedom)) if freedom else 1.0,
+    )
+
+
+def spread(jacobian: np.ndarray) -> tuple[np.ndarray, tuple[Direction, ...]]:
+    """Covariance of the places between the bounds, and its directions, the widest first.
+
+    The bounds count as weak knowledge, so that a direction without information has a finite
+    covariance.
+
+    Args:
+        jacobian: of the normalised residuals by the places, (m, p).
+    """
+    p = jacobian.shape[1]
+    square = np.zeros((max(len(jacobian), p), p))
+    square[: len(jacobian)] = jacobian
+    _, size, rows = np.linalg.svd(np.linalg.qr(square, mode="r"))
+    with np.errstate(divide="ignore"):
+        sigma = 1 / np.maximum(size, 1e-300)
+    covariance = (rows.T / (size**2 + 1 / (10 * UNKNOWN) ** 2)) @ rows
+    order = np.argsort(-sigma)
+    return covariance, tuple(Direction(float(sigma[k]), _signed(rows[k])) for k in order)
+
+
+def _signed(parts: np.ndarray) -> np.ndarray:
+    return parts * np.sign(parts[np.argmax(np.abs(parts))])
+
+
+def misfit(name: str, part: Residual, is_ordered: bool) -> Misfit:
+    """How well one measurement is met."""
+    r = part.value
+    square, n = float(np.sum(r**2)), len(r)
+    likeness = np.nan
+    if is_ordered and n > 10 and square > 0:
+        likeness = float(np.sum(r[1:] * r[:-1]) / square)
+    is_white = np.isnan(likeness) or abs(likeness) < 4 / np.sqrt(n)
+    is_small = chi2.sf(square, n) >= UNLIKELY / 10
+    return Misfit(
+        name=name,
+        size=n,
+        square=square,
+        likeness=likeness,
+        is_noise=bool(is_white and is_small),
+    )
+
+
+class Likelihood(NamedTuple):
+    """Least misfit for fixed values of one free number."""
+
+    number: int
+    values: np.ndarray  # (n,)
+    rise: np.ndarray  # of chi square above its least, (n,)
+
+
+def profile(
+    problem: Problem, u: np.ndarray, number: int, sigma: float, points: int = 9
+) -> Likelihood:
+    """Likelihood the likelihood of one free number over 3 standard deviations each way.
+
+    Args:
+        problem: what was fitted.
+        u: the optimum, (p,).
+        number: which free number.
+        sigma: its standard deviation between the bounds [1].
+        points: values, odd.
+    """
+    others = np.delete(np.arange(len(u)), number)
+    reach = min(3 * sigma, 0.5)
+    least = float(np.sum(problem.residual(u) ** 2))
+    found = np.full((points, 2), np.nan)
+    for way in (1, -1):
+        at = u.copy()
+        for k in range(points // 2 + 1):
+            at[number] = u[number] + way * k * reach / (points // 2)
+            if not 0 <= at[number] <= 1:
+                break
+            if len(others) and k:
+                try:
+                    at = _refit(problem, at, others)
+                except (StudyError, np.linalg.LinAlgError, ValueError):
+                    break
+            square = float(np.sum(problem.residual(at) ** 2))
+            found[points // 2 + way * k] = at[number], square - least
+    kept = found[~np.isnan(found[:, 0])]
+    values = [problem.free.values(_with(u, number, x))[number] for x in kept[:, 0]]
+    return Likelihood(number, np.array(values), kept[:, 1])
+
+
+def _with(u: np.ndarray, number: int, x: float) -> np.ndarray:
+    changed = u.copy()
+    changed[number] = x
+    return changed
+
+
+def _refit(problem: Problem, at: np.ndarray, others: np.ndarray) -> np.ndarray:
+    def whole(x: np.ndarray) -> np.ndarray:
+        changed = at.copy()
+        changed[others] = x
+        return changed
+
+    done = least_squares(
+        lambda x: problem.residual(whole(x)),
+        np.clip(at[others], 1e-9, 1 - 1e-9),
+        lambda x: problem.jacobian(whole(x))[:, others],
+        bounds=(0.0, 1.0),
+        x_scale="jac",
+        max_nfev=15,
+        xtol=1e-6,
+        ftol=1e-8,
+    )
+    return whole(done.x)

@@ -1,0 +1,115 @@
+"""Files of measurements: columns of numbers from CSV, HDF5 or UFF (type 58)."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from studies.errors import StudyError, field_error, nearest
+
+#: Endings of the formats.
+FORMATS = (".csv", ".txt", ".h5", ".hdf5", ".uff", ".unv")
+#: Columns that a function of a UFF file becomes, by its abscissa: 18 frequency [Hz], else time [s].
+_FREQUENCY = 18
+
+
+def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
+    """Columns of a file by name, complex ones as they are.
+
+    Args:
+        file: name, relative to `folder`; of HDF5 and UFF perhaps `file::group` or `file::number`.
+        folder: where the file that names it is.
+        path: where it is written, for messages.
+
+    Raises:
+        StudyError: unreadable, unknown format, columns of unequal length, entries that are none.
+    """
+    name, _, inside = file.partition("::")
+    where = folder / name
+    if where.suffix.lower() not in FORMATS:
+        raise field_error(path, file, f"a file {', '.join(FORMATS)}")
+    if not where.is_file():
+        raise StudyError(f"{path}: {where} cannot be read (no such file)")
+    try:
+        if where.suffix.lower() in (".h5", ".hdf5"):
+            found = _from_hdf5(where, inside)
+        elif where.suffix.lower() in (".uff", ".unv"):
+            found = _from_uff(where, inside, path)
+        else:
+            found = _from_csv(where)
+    except (OSError, ValueError, KeyError) as error:
+        raise StudyError(f"{path}: {where} cannot be read ({error})") from None
+    _check(found, where, path)
+    return found
+
+
+def _check(found: dict[str, np.ndarray], where: Path, path: str) -> None:
+    sizes = {len(x) for x in found.values()}
+    if len(sizes) != 1:
+        raise StudyError(f"{path}: {where} has columns of unequal length, or none")
+    for name, x in found.items():
+        bad = np.flatnonzero(~np.isfinite(x))
+        if bad.size:
+            raise StudyError(
+                f"{path}: {where}, column {name!r}: {bad.size} of {len(x)} entries are no finite "
+                f"numbers, the first in row {bad[0] + 1}; delete these rows"
+            )
+
+
+def column(found: dict[str, np.ndarray], name: str, file: str, path: str) -> np.ndarray:
+    """One column.
+
+    Raises:
+        StudyError: there is none of that name.
+    """
+    if name not in found:
+        hint = nearest(name, found)
+        told = f"; did you mean {hint!r}?" if hint else ""
+        raise StudyError(
+            f"{path}: {file} has no column {name!r}; it has {', '.join(map(repr, found))}{told}"
+        )
+    return found[name]
+
+
+def _from_csv(where: Path) -> dict[str, np.ndarray]:
+    with where.open(encoding="utf-8-sig", newline="") as file:
+        rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
+    if len(rows) < 2:
+        raise ValueError("needs a row of names and one of numbers or more")
+    names = [name.strip() for name in rows[0]]
+    width = len(names)
+    for k, row in enumerate(rows[1:], 2):
+        if len(row) != width:
+            raise ValueError(f"row {k} has {len(row)} entries instead of {width}")
+    numbers = np.array([[float(x or "nan") for x in row] for row in rows[1:]])
+    return dict(zip(names, numbers.T, strict=True))
+
+
+def _from_hdf5(where: Path, group: str) -> dict[str, np.ndarray]:
+    with h5py.File(where) as file:
+        at = file[group] if group else file
+        return {
+            name: np.asarray(x)
+            for name, x in at.items()
+            if isinstance(x, h5py.Dataset) and x.ndim == 1
+        }
+
+
+def _from_uff(where: Path, number: str, path: str) -> dict[str, np.ndarray]:
+    try:
+        import pyuff
+    except ImportError:
+        raise StudyError(f"{path}: reading {where} needs pyuff; install the extra 'uff'") from None
+    sets = pyuff.UFF(str(where))
+    functions = np.flatnonzero(sets.get_set_types() == 58)
+    if not functions.size:
+        raise ValueError("has no function (type 58)")
+    index = int(number or 1) - 1
+    if not 0 <= index < functions.size:
+        raise ValueError(f"has functions 1 to {functions.size}")
+    found = sets.read_sets(int(functions[index]))
+    abscissa = "frequency_hz" if found["abscissa_spec_data_type"] == _FREQUENCY else "time"
+    return {abscissa: np.asarray(found["x"]), "value": np.asarray(found["data"])}
