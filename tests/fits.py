@@ -39,13 +39,6 @@ RESPONSE = {
     "sigma_percent": 3.0,
     "sigma": 1e-5,
 }
-MAGNITUDE = RESPONSE | {
-    "input": "hammer 2 at 0.07",
-    "output": "deflection 3 at 0.1",
-    "quantity": "acceleration",
-    "magnitude": "real",
-    "sigma": 0.02,
-}
 SPECTRUM = {
     "kind": "spectrum",
     "pose": ASKEW,
@@ -60,7 +53,21 @@ FIGURES = {
     "values": {"residual_rms": 1e-6, "residual_rms[link=1]": 1e-6, "peak_voltage": 10.0},
     "sigma_percent": 5.0,
 }
-REDUCTION = FIGURES | {"of": "reduction", "values": {"residual_rms": 50.0}}
+REDUCTION = FIGURES | {
+    "of": "reduction",
+    "values": {"spectral_density[link=1][controlled_mode=1]": 50.0},
+    "amplitude": True,
+    "take": "largest",
+    "links": [True, True, False],
+    "modes": 1,
+}
+HAMMER = RESPONSE | {
+    "input": "hammer 2 at 0.07",
+    "output": "deflection 3 at 0.1",
+    "quantity": "acceleration",
+    "sigma": 0.02,
+}
+MAGNITUDE = HAMMER | {"magnitude": "real"}
 FREQUENCY = np.linspace(60.0, 500.0, 200)
 TIME = np.linspace(0.01, 0.059, 180)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import polygamma
@@ -15,7 +15,7 @@ from studies.fitting.bench import Pose as At
 from studies.fitting.kinds.contract import Measurement, Noise
 from studies.fitting.kinds.modes import HeldModes, MachineModes, Measured, check_ascending
 from studies.fitting.kinds.response import ComplexResponse, Magnitude, Spectrum
-from studies.fitting.kinds.runs import Compared, Figures, Trace
+from studies.fitting.kinds.runs import OFF, Compared, Figures, Runs, Switch, Trace
 from studies.fitting.signals import INPUTS, OUTPUTS, Signal, parse_signal
 from studies.fitting.spec import (
     AtPose,
@@ -35,7 +35,13 @@ from studies.study.entries import parse_entries
 
 #: Derivatives of the output by its quantity.
 ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
-OFF = (False, False, False)
+
+
+class Models(NamedTuple):
+    """What measurements are predicted with."""
+
+    bench: Bench
+    runs: Runs
 
 
 def make_bench(spec: FitSpec) -> Bench:
@@ -57,8 +63,9 @@ def make_measurements(spec: FitSpec, bench: Bench) -> list[Measurement]:
     Raises:
         StudyError: a file that cannot be used, data that do not fit the machine.
     """
+    models = Models(bench, Runs(spec.study, spec.free.place))
     return [
-        _MAKERS[type(entry)](spec, bench, entry, f"fit.data[{k}]")
+        _MAKERS[type(entry)](spec, models, entry, f"fit.data[{k}]")
         for k, entry in enumerate(spec.entries)
     ]
 
@@ -85,7 +92,7 @@ def _each(value: Any, count: int, path: str) -> np.ndarray:
     return np.broadcast_to(np.asarray(value, float), (count,)).copy()
 
 
-def _modes(spec: FitSpec, bench: Bench, entry: ModesEntry, path: str) -> Measurement:
+def _modes(spec: FitSpec, models: Models, entry: ModesEntry, path: str) -> Measurement:
     count = len(entry.frequency_hz)
     check_ascending(entry.frequency_hz, bool(entry.shapes), path)
     damping = sigma = shapes = None
@@ -96,7 +103,7 @@ def _modes(spec: FitSpec, bench: Bench, entry: ModesEntry, path: str) -> Measure
             raise StudyError(f"{path}.damping_sigma: missing beside damping_ratio")
         sigma = _each(entry.damping_sigma, count, f"{path}.damping_sigma")
     if entry.shapes:
-        size = 3 * bench.n_patches
+        size = 3 * models.bench.n_patches
         if len(entry.shapes) != count or any(len(x) != size for x in entry.shapes):
             raise StudyError(
                 f"{path}.shapes: {len(entry.shapes)} lists; allowed: {count} lists of {size} "
@@ -115,14 +122,14 @@ def _modes(spec: FitSpec, bench: Bench, entry: ModesEntry, path: str) -> Measure
         shapes=shapes,
     )
     if entry.ends == "held":
-        if count > bench.structure.n_modes:
+        if count > models.bench.structure.n_modes:
             raise field_error(
                 f"{path}.frequency_hz",
                 entry.frequency_hz,
-                f"at most link.modes = {bench.structure.n_modes} frequencies",
+                f"at most link.modes = {models.bench.structure.n_modes} frequencies",
             )
-        return HeldModes(entry.name, entry.check, bench, measured, entry.link - 1)
-    return MachineModes(entry.name, entry.check, bench, measured, _pose(spec, entry))
+        return HeldModes(entry.name, entry.check, models.bench, measured, entry.link - 1)
+    return MachineModes(entry.name, entry.check, models.bench, measured, _pose(spec, entry))
 
 
 def _read(spec: FitSpec, entry: FileEntry, path: str) -> Callable[[str], np.ndarray]:
@@ -145,7 +152,7 @@ def _noise(entry: FileEntry | FiguresEntry, value: np.ndarray, path: str) -> Noi
     return noise
 
 
-def _response(spec: FitSpec, bench: Bench, entry: ResponseEntry, path: str) -> Measurement:
+def _response(spec: FitSpec, models: Models, entry: ResponseEntry, path: str) -> Measurement:
     read, signals = _read(spec, entry, path), _signals(spec, entry, path)
     frequency = read(entry.frequency).real
     _ascending(frequency, f"column {entry.frequency!r}", path)
@@ -160,7 +167,7 @@ def _response(spec: FitSpec, bench: Bench, entry: ResponseEntry, path: str) -> M
     return kind(
         entry.name,
         entry.check,
-        bench,
+        models.bench,
         _pose(spec, entry),
         (signals[0], signals[1]),
         ORDERS[entry.quantity],
@@ -190,7 +197,7 @@ def _unit(signals: tuple[Signal, ...], order: int) -> str:
     return f"{OUTPUTS[signals[1].kind][1]}{per}/{INPUTS[signals[0].kind][1]}"
 
 
-def _spectrum(spec: FitSpec, bench: Bench, entry: SpectrumEntry, path: str) -> Measurement:
+def _spectrum(spec: FitSpec, models: Models, entry: SpectrumEntry, path: str) -> Measurement:
     read, signals = _read(spec, entry, path), _signals(spec, entry, path)
     frequency, density = read(entry.frequency).real, read(entry.density).real
     keep = frequency > 0
@@ -204,7 +211,7 @@ def _spectrum(spec: FitSpec, bench: Bench, entry: SpectrumEntry, path: str) -> M
     return Spectrum(
         entry.name,
         entry.check,
-        bench,
+        models.bench,
         _pose(spec, entry),
         (signals[0], signals[1]),
         ORDERS[entry.quantity],
@@ -215,7 +222,7 @@ def _spectrum(spec: FitSpec, bench: Bench, entry: SpectrumEntry, path: str) -> M
     )
 
 
-def _trace(spec: FitSpec, bench: Bench, entry: TraceEntry, path: str) -> Measurement:
+def _trace(spec: FitSpec, models: Models, entry: TraceEntry, path: str) -> Measurement:
     read, (signal,) = _read(spec, entry, path), _signals(spec, entry, path)
     time, value = read(entry.time).real, read(entry.value).real
     _ascending(time, f"column {entry.time!r}", path)
@@ -241,8 +248,12 @@ def _trace(spec: FitSpec, bench: Bench, entry: TraceEntry, path: str) -> Measure
     )
 
 
-def _figures(spec: FitSpec, bench: Bench, entry: FiguresEntry, path: str) -> Measurement:
-    links = entry.links or spec.study.control.links
+def _figures(spec: FitSpec, models: Models, entry: FiguresEntry, path: str) -> Measurement:
+    links, modes = entry.links or spec.study.control.links, entry.modes or spec.study.control.modes
+    if modes > spec.study.control.modes:
+        raise field_error(
+            f"{path}.modes", modes, f"1 to control.modes = {spec.study.control.modes}"
+        )
     compared = []
     for name, value in entry.values.items():
         entries = parse_entries(name, f"{path}.values")
@@ -254,14 +265,16 @@ def _figures(spec: FitSpec, bench: Bench, entry: FiguresEntry, path: str) -> Mea
         compared.append(
             Compared(
                 entries=entries,
-                links=OFF if entry.of == "uncontrolled" else links,
+                switch=Switch(OFF if entry.of == "uncontrolled" else links, modes),
                 is_reduction=entry.of == "reduction",
+                is_amplitude=entry.amplitude,
+                is_largest=entry.take == "largest",
                 measured=value,
-                noise=_noise(entry, np.array([value]), path),
+                sigma=float(_noise(entry, np.array([value]), path).sigma(np.array([value]))[0]),
                 label=name,
             )
         )
-    return Figures(entry.name, entry.check, spec.study, spec.free.place, tuple(compared))
+    return Figures(entry.name, entry.check, models.runs, tuple(compared))
 
 
 _MAKERS: dict[type[Common], Callable[..., Measurement]] = {

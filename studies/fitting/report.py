@@ -82,24 +82,25 @@ def _digits(value: float, sigma: float) -> int:
 
 def sentences(found: Fitted) -> list[str]:
     """What a reader must know before he uses the values."""
-    answer, told = found.answer, []
+    answer, lines = found.answer, []
     if not answer.is_explained:
         worst = max(answer.misfits, key=lambda x: x.square / max(x.size, 1))
-        told.append(
+        lines.append(
             f"The model does not explain the data: chi square is {answer.chi_square:.4g} with "
             f"{answer.freedom} degrees of freedom, worst for {worst.name}. Uncertainties below "
             "assume a right model and are too small; look at the residuals, at the model's bases "
             "and modes, and at the stated noise."
         )
-    told += [_told(x, found.names) for x in answer.undetermined]
+    lines += [told(x, found.names) for x in answer.undetermined]
     if not answer.undetermined:
-        told += _correlated(found)
+        lines += _correlated(found)
     if not found.solution.best.is_converged:
-        told.append("The search ended before it converged; raise fit.iterations.")
-    return told
+        lines.append("The search ended before it converged; raise fit.iterations.")
+    return lines
 
 
-def _told(direction: Direction, names: tuple[str, ...]) -> str:
+def told(direction: Direction, names: tuple[str, ...]) -> str:
+    """What the data do not tell."""
     parts = direction.named()
     if len(parts) == 1:
         return f"{names[parts[0]]} is not determined by these data."

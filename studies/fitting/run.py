@@ -21,8 +21,8 @@ from studies.fitting.solve import Solution, solve
 from studies.fitting.spec import FitSpec
 from studies.fitting.statistics import (
     Answer,
-    Misfit,
     Likelihood,
+    Misfit,
     describe_fit,
     misfit,
     profile,
@@ -74,7 +74,13 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
     every = make_measurements(spec, bench)
     complaints(every, guess(spec))
     kept = tuple(x for x in every if not x.is_checked)
-    problem = Problem(free, spec.priors, kept, tuple(x for x in every if x.is_checked), bench)
+    problem = Problem(
+        free=free,
+        priors=spec.priors,
+        measurements=kept,
+        checks=tuple(x for x in every if x.is_checked),
+        bench=bench,
+    )
     u = free.places()
     count = len(problem.residual(u)) - len(spec.priors)
     _check_enough(count, len(u), len(spec.priors))
@@ -87,6 +93,7 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
         console.print("profiling the likelihood")
         sigma = np.sqrt(np.diag(answer.covariance))
         profiles = [profile(problem, solution.best.u, k, sigma[k]) for k in range(len(u))]
+        answer = answer._replace(interval=np.array([x.interval() for x in profiles]))
     console.print("looking for the next experiment")
     study = parse_study(set_values(spec.study, _numbers(spec, answer.values)))
     experiments = next_experiments(bench, free, solution.best.u, answer.covariance)

@@ -16,6 +16,8 @@ from studies.fitting.problem import Problem
 SAME = 1e-3
 #: Distance kept from the bounds by first guesses [1].
 INSIDE = 1e-3
+#: Distance from the bounds at which optima are looked for once more [1].
+AWAY = 0.02
 #: Size of a residual from which the robust loss grows linearly, in standard deviations.
 SOFT = 2.0
 
@@ -81,7 +83,9 @@ def solve(
     best = min(found, key=lambda x: x.cost)
     for one in problem.measurements:
         one.reweigh(problem.free.values(best.u))
-    found = [descend(problem, x.u, iterations, is_robust) for x in found]
+    # away from the bounds, along which the method may have crept
+    inner = [np.clip(x.u, AWAY, 1 - AWAY) for x in found]
+    found = [descend(problem, u, iterations, is_robust) for u in inner]
     found.sort(key=lambda x: x.cost)
     return Solution(tuple(found), len(first), int((~np.isfinite(cost)).sum()))
 

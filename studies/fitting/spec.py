@@ -116,6 +116,13 @@ class FiguresEntry(Common):
     of: Literal["controlled", "uncontrolled", "reduction"] = described(
         "controlled", "-", "with control, without, or percent less with it"
     )
+    amplitude: bool = described(
+        False, "-", "of the square root of the metric: an amplitude where it is a power"
+    )
+    take: Literal["rms", "largest"] = described("rms", "-", "of several entries of a metric")
+    modes: int | None = described(
+        None, "1", "controlled modes; default: those of the study", ge=1, le=12
+    )
     links: Flags | None = described(None, "-", "under control; default: those of the study")
     sigma: Positive | None = described(None, "unit of the metric; %", "standard deviation")
     sigma_percent: Percent | None = described(None, "%", "standard deviation over the value")

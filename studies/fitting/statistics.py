@@ -23,6 +23,8 @@ UNKNOWN = 1 / np.sqrt(12)
 NAMED = 0.25
 #: Probability below which residuals are not noise [1].
 UNLIKELY = 1e-3
+#: Profiles go on by this many standard deviations, at most so many times, until so large a rise.
+STRIDE, STEPS, ENOUGH = 0.7, 14, 6.0
 #: Of a normal distribution, 95 % lie within this many standard deviations.
 WIDE = 1.959964
 
@@ -162,42 +164,51 @@ class Likelihood(NamedTuple):
     """Least misfit for fixed values of one free number."""
 
     number: int
-    values: np.ndarray  # (n,)
+    values: np.ndarray  # ascending, (n,)
     rise: np.ndarray  # of chi square above its least, (n,)
 
+    def interval(self) -> tuple[float, float]:
+        """Where the rise is that of 95 %, or the last values that were tried."""
+        middle, ends = int(np.argmin(self.rise)), []
+        for part in (slice(middle, None, -1), slice(middle, None)):
+            value, size = self.values[part], np.sqrt(np.maximum(self.rise[part], 0.0))
+            beyond = np.flatnonzero(size > WIDE)
+            if not beyond.size:
+                ends.append(float(value[-1]))
+                continue
+            k = int(beyond[0])
+            ends.append(float(np.interp(WIDE, size[k - 1 : k + 1], value[k - 1 : k + 1])))
+        return ends[0], ends[1]
 
-def profile(
-    problem: Problem, u: np.ndarray, number: int, sigma: float, points: int = 9
-) -> Likelihood:
-    """Likelihood the likelihood of one free number over 3 standard deviations each way.
+
+def profile(problem: Problem, u: np.ndarray, number: int, sigma: float) -> Likelihood:
+    """Profile the likelihood of one free number, to 95 % or the bounds.
 
     Args:
         problem: what was fitted.
         u: the optimum, (p,).
         number: which free number.
         sigma: its standard deviation between the bounds [1].
-        points: values, odd.
     """
     others = np.delete(np.arange(len(u)), number)
-    reach = min(3 * sigma, 0.5)
     least = float(np.sum(problem.residual(u) ** 2))
-    found = np.full((points, 2), np.nan)
+    found = [(float(u[number]), 0.0)]
     for way in (1, -1):
         at = u.copy()
-        for k in range(points // 2 + 1):
-            at[number] = u[number] + way * k * reach / (points // 2)
-            if not 0 <= at[number] <= 1:
+        for k in range(1, STEPS + 1):
+            at = at.copy()
+            at[number] = np.clip(u[number] + way * k * STRIDE * sigma, 0.0, 1.0)
+            try:
+                at = _refit(problem, at, others) if len(others) else at
+                rise = float(np.sum(problem.residual(at) ** 2)) - least
+            except (StudyError, np.linalg.LinAlgError, ValueError):
+                break  # out of where the model works
+            found.append((float(at[number]), rise))
+            if rise > ENOUGH or not 0 < at[number] < 1:
                 break
-            if len(others) and k:
-                try:
-                    at = _refit(problem, at, others)
-                except (StudyError, np.linalg.LinAlgError, ValueError):
-                    break
-            square = float(np.sum(problem.residual(at) ** 2))
-            found[points // 2 + way * k] = at[number], square - least
-    kept = found[~np.isnan(found[:, 0])]
-    values = [problem.free.values(_with(u, number, x))[number] for x in kept[:, 0]]
-    return Likelihood(number, np.array(values), kept[:, 1])
+    found.sort()
+    values = [problem.free.values(_with(u, number, x))[number] for x, _ in found]
+    return Likelihood(number, np.array(values), np.array([x for _, x in found]))
 
 
 def _with(u: np.ndarray, number: int, x: float) -> np.ndarray:

@@ -145,15 +145,77 @@ def _check_finished(name: str, code: int) -> None:
         raise StudyError(f"{name}: the run ends with status {describe(code)}")
 
 
+#: No link under control.
+OFF = (False, False, False)
+
+
+class Switch(NamedTuple):
+    """What is under control."""
+
+    links: tuple[bool, bool, bool]
+    modes: int  # of each of these links
+
+
 class Compared(NamedTuple):
     """One number of a run."""
 
     entries: Entries
-    links: tuple[bool, bool, bool]  # under control
+    switch: Switch
     is_reduction: bool  # in percent of the same without control
+    is_amplitude: bool  # square root of the metric
+    is_largest: bool  # of several entries; otherwise root of the mean square
     measured: float
-    noise: Noise
+    sigma: float
     label: str
+
+
+class Runs:
+    """Runs of one study with different links under control, kept for the last free numbers.
+
+    All figures share them: one program runs every combination that any of them needs.
+    """
+
+    def __init__(self, study: Study, place: Place) -> None:
+        """Arguments: what all runs share, and what puts free numbers into a case.
+
+        Raises:
+            StudyError: as `check_run`.
+        """
+        self._structure, self._case = _smooth(study)
+        self._place = place
+        self._metrics: set[str] = set()
+        self._switches: list[Switch] = []
+        self._kept: tuple[bytes, bool, Any] = b"", False, None
+
+    def add(self, compared: tuple[Compared, ...]) -> None:
+        """Run what these figures need, too."""
+        self._metrics |= {x.entries.metric for x in compared}
+        needed = [x.switch for x in compared] + [_off(x) for x in compared if x.is_reduction]
+        self._switches += [x for x in dict.fromkeys(needed) if x not in self._switches]
+
+    def find(self, values: np.ndarray, has_slopes: bool) -> Any:
+        """Metrics of all runs and, perhaps, their derivatives.
+
+        Raises:
+            StudyError: a run that does not reach its end.
+        """
+        key, slopes, found = self._kept
+        if key != values.tobytes() or (has_slopes and not slopes):
+            masks = np.array([x.links for x in self._switches], float)
+            modes = np.array([x.modes for x in self._switches])
+            structure = self._structure._replace(metrics=tuple(sorted(self._metrics)))
+            run = _metric_slopes if has_slopes else _metrics
+            given = structure, self._place, self._case, masks, modes, values
+            found = jax.tree.map(np.asarray, run(*given))
+            self._kept = values.tobytes(), has_slopes, found
+        metrics, code, *by = found
+        for one in code:
+            _check_finished("figures", int(one))
+        return metrics, *by[: int(has_slopes)]
+
+    def at(self, switch: Switch) -> int:
+        """Place of a run among all of them."""
+        return self._switches.index(switch)
 
 
 class Figures:
@@ -162,98 +224,84 @@ class Figures:
     kind, is_ordered = "figures", False
 
     def __init__(
-        self,
-        name: str,
-        is_checked: bool,
-        study: Study,
-        place: Place,
-        compared: tuple[Compared, ...],
+        self, name: str, is_checked: bool, runs: Runs, compared: tuple[Compared, ...]
     ) -> None:
-        self.name, self.is_checked, self._compared = name, is_checked, compared
-        structure, case = _smooth(study)
-        wanted = tuple(sorted({x.entries.metric for x in compared}))
-        self._structure, self._case, self._place = structure._replace(metrics=wanted), case, place
-        off = (False, False, False)
-        needed = [x.links for x in compared] + [off for x in compared if x.is_reduction]
-        self._masks = tuple(dict.fromkeys(needed))
-        self._measured = np.array([x.measured for x in compared])
-        self._sigma = self._deviation(self._measured)
+        self.name, self.is_checked, self._runs, self._compared = name, is_checked, runs, compared
+        runs.add(compared)
+        self.measured = np.array([x.measured for x in compared])
+        self.sigma = np.array([x.sigma for x in compared])
 
     def predicted(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
         """Numbers of the model, (m,), and their derivatives, (m, p)."""
-        masks = np.array(self._masks, float)
-        run = _metric_slopes if has_slopes else _metrics
-        given = self._structure, self._place, self._case, masks, values
-        metrics, code, *slopes = jax.tree.map(np.asarray, run(*given))
-        for one in code:
-            _check_finished(self.name, int(one))
-        found = [self._number(x, metrics, *slopes) for x in self._compared]
+        found = [self._number(x, *self._runs.find(values, has_slopes)) for x in self._compared]
         value = np.array([x for x, _ in found])
         return value, np.array([by for _, by in found]) if has_slopes else None
 
     def _number(self, one: Compared, metrics: Any, slopes: Any = None) -> tuple[Any, Any]:
-        on, by_on = self._taken(one, one.links, metrics, slopes)
+        on, by_on = self._taken(one, one.switch, metrics, slopes)
         if not one.is_reduction:
             return on, by_on
-        off, by_off = self._taken(one, (False, False, False), metrics, slopes)
+        off, by_off = self._taken(one, _off(one), metrics, slopes)
         by = None if slopes is None else 100 * (on * by_off / off**2 - by_on / off)
         return 100 * (1 - on / off), by
 
-    def _taken(self, one: Compared, links: Any, metrics: Any, slopes: Any) -> tuple[Any, Any]:
-        """Root of the mean square of the entries, and its derivatives."""
-        k, name = self._masks.index(links), one.entries.metric
+    def _taken(self, one: Compared, switch: Switch, metrics: Any, slopes: Any) -> tuple[Any, Any]:
+        """The metric of a run, and its derivatives."""
+        k, name = self._runs.at(switch), one.entries.metric
         value = one.entries.take(metrics[name][k : k + 1])[0]
-        size = np.sqrt(np.mean(value**2))
-        if len(value) == 1:
-            size = value[0]
+        kept = [int(np.argmax(value))] if one.is_largest else slice(None)
+        value = value[kept]
+        size = float(np.sqrt(np.mean(value**2))) if len(value) > 1 else float(value[0])
+        root = np.sqrt(size) if one.is_amplitude else size
         if slopes is None:
-            return size, None
+            return root, None
         by = np.moveaxis(slopes[name][k : k + 1], -1, 0)  # (p, 1, ...)
-        parts = np.stack([one.entries.take(x)[0] for x in by], axis=-1)  # (entries, p)
-        return size, (value @ parts) / (len(value) * size) if size != 0 else parts.sum(0)
+        parts = np.stack([one.entries.take(x)[0][kept] for x in by], axis=-1)  # (entries, p)
+        slope = (value @ parts) / (len(value) * size) if size != 0 else parts.sum(0)
+        return root, slope / (2 * root) if one.is_amplitude and root > 0 else slope
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
         found, slope = self.predicted(values, has_slopes)
-        value = (found - self._measured) / self._sigma
-        return Residual(value, None if slope is None else slope / self._sigma[:, None])
+        value = (found - self.measured) / self.sigma
+        return Residual(value, None if slope is None else slope / self.sigma[:, None])
 
     def reweigh(self, values: np.ndarray) -> None:
-        self._sigma = self._deviation(self.predicted(values, False)[0])
-
-    def _deviation(self, value: np.ndarray) -> np.ndarray:
-        pairs = zip(self._compared, value, strict=True)
-        return np.array([float(one.noise.sigma(x)) for one, x in pairs])
+        pass  # few numbers, whose noise is a share of what was measured
 
     def curve(self, values: np.ndarray) -> Curve:
         found = self.predicted(values, False)[0]
-        labels = tuple(x.label for x in self._compared)
-        x = np.arange(len(found))
         return Curve(
             abscissa="",
             ordinate="figure of the run",
-            x=x,
-            measured=self._measured,
+            x=np.arange(len(found)),
+            measured=self.measured,
             model=found,
             is_log=False,
-            labels=labels,
+            labels=tuple(x.label for x in self._compared),
         )
 
     def complaint(self, values: np.ndarray) -> str:
         return ""
 
 
+def _off(one: Compared) -> Switch:
+    return one.switch._replace(links=OFF)
+
+
 def _run_metrics(
-    structure: Structure, place: Place, case: Case, masks: Array, values: Array
+    structure: Structure, place: Place, case: Case, masks: Array, modes: Array, values: Array
 ) -> Any:
     changed = place(case, values)
 
-    def one(mask: Array) -> Any:
-        control = changed.control._replace(link_mask=changed.control.link_mask * mask)
+    def one(mask: Array, count: Array) -> Any:
+        control = changed.control._replace(
+            link_mask=jnp.ones_like(changed.control.link_mask) * mask, n_active=count
+        )
         result = simulate(structure, changed._replace(control=control))
         named = {name: getattr(result.metrics, name) for name in structure.metrics}
         return named, result.status
 
-    return jax.vmap(one)(jnp.asarray(masks))
+    return jax.vmap(one)(jnp.asarray(masks), jnp.asarray(modes))
 
 
 _metrics = jax.jit(_run_metrics, static_argnums=(0, 1))
@@ -261,8 +309,8 @@ _metrics = jax.jit(_run_metrics, static_argnums=(0, 1))
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _metric_slopes(
-    structure: Structure, place: Place, case: Case, masks: Array, values: Array
+    structure: Structure, place: Place, case: Case, masks: Array, modes: Array, values: Array
 ) -> Any:
-    run = partial(_run_metrics, structure, place, case, masks)
+    run = partial(_run_metrics, structure, place, case, masks, modes)
     metrics, code = run(values)
     return metrics, code, jax.jacfwd(lambda x: run(x)[0])(values)
