@@ -38,6 +38,7 @@ def report(found: Fitted) -> str:
         misfits=[_misfit(x) for x in found.answer.misfits],
         checks=[_misfit(x) for x in found.checks],
         others=_others(found),
+        single=_single(found),
         experiments=_experiments(found),
         more=len(found.curves) - 8,
     )
@@ -84,12 +85,14 @@ def sentences(found: Fitted) -> list[str]:
     """What a reader must know before he uses the values."""
     answer, lines = found.answer, []
     if not answer.is_explained:
-        worst = max(answer.misfits, key=lambda x: x.square / max(x.size, 1))
+        bad = [x for x in answer.misfits if not x.is_noise]
+        bad.sort(key=lambda x: -x.square / max(x.size, 1))
+        which = f" Not met: {'; '.join(x.name for x in bad)}." if bad else ""
         lines.append(
             f"The model does not explain the data: chi square is {answer.chi_square:.4g} with "
-            f"{answer.freedom} degrees of freedom, worst for {worst.name}. Uncertainties below "
-            "assume a right model and are too small; look at the residuals, at the model's bases "
-            "and modes, and at the stated noise."
+            f"{answer.freedom} degrees of freedom.{which} Uncertainties assume a right model and "
+            "are too small here; look at the residuals, at the model's bases and modes, and at "
+            "the stated noise."
         )
     lines += [told(x, found.names) for x in answer.undetermined]
     if not answer.undetermined:
@@ -135,6 +138,15 @@ def _misfit(one: Misfit) -> list[str]:
         likeness,
         "yes" if one.is_noise else "**no**",
     ]
+
+
+def _single(found: Fitted) -> list[list[str]]:
+    """Measured numbers that stand alone, and the model's."""
+    rows = []
+    for name, curve in found.curves:
+        for label, measured, model in zip(curve.labels, curve.measured, curve.model, strict=False):
+            rows.append([name, label, f"{measured:.4g}", f"{model:.4g}"])
+    return rows
 
 
 def _others(found: Fitted) -> list[list[str]]:
