@@ -80,13 +80,18 @@ class Bench:
         Raises:
             StudyError: a pose out of reach, or hammers with a basis whose ends are off the chord.
         """
+        if study.drive.locked:
+            raise field_error("drive.locked", True, "false where modes or responses are fitted")
+        if not np.all(np.asarray(study.drive.kp) > 0):
+            raise field_error(
+                "drive.kp", study.drive.kp, "more than 0: the drive holds the machine", "N/m"
+            )
         if places and not BASES[study.link.basis].is_on_chord:
             raise field_error("link.basis", study.link.basis, "a basis with both ends on the chord")
         self.stations = tuple(sorted(set(places))) or study.metrics.stations[:1]
         self.study = study.change(
             control__feedback="none",
             metrics__stations=self.stations,
-            drive__locked=False,
             shaper__kind="none",
         )
         self.structure = build_structure(self.study)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from studies.errors import StudyError
-from studies.fitting.bench import Bench, Pose, modes_of, response
+from studies.fitting.bench import Bench, Pose, response
 from studies.fitting.signals import Signal
 from studies.space.free import FreeNumbers
 
@@ -113,6 +113,7 @@ def _pairs(bench: Bench) -> list[tuple[Signal, Signal]]:
 
 def _about_modes(state: np.ndarray) -> np.ndarray:
     """Frequencies [Hz] that are dense about the first modes."""
-    modes = np.abs(modes_of(state).pole)[:COVERED] / (2 * np.pi)
+    pole = np.linalg.eigvals(state)
+    modes = np.sort(np.abs(pole[pole.imag > 1e-9 * np.abs(pole).max()]))[:COVERED] / (2 * np.pi)
     each = np.concatenate([f * np.linspace(0.85, 1.15, POINTS // len(modes)) for f in modes])
     return np.unique(each)

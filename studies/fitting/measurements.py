@@ -24,6 +24,7 @@ from studies.fitting.spec import (
     FileEntry,
     FitSpec,
     ModesEntry,
+    Noisy,
     ResponseEntry,
     SpectrumEntry,
     TraceEntry,
@@ -94,6 +95,12 @@ def _each(value: Any, count: int, path: str) -> np.ndarray:
 
 def _modes(spec: FitSpec, models: Models, entry: ModesEntry, path: str) -> Measurement:
     count = len(entry.frequency_hz)
+    given = entry.model_fields_set
+    for name, ends in (("link", "machine"), ("pose", "held")):
+        if name in given and entry.ends == ends:
+            raise StudyError(f"{path}.{name}: has no meaning with ends = {ends!r}")
+    if "damping_sigma" in given and not entry.damping_ratio:
+        raise StudyError(f"{path}.damping_sigma: has no meaning without damping_ratio")
     check_ascending(entry.frequency_hz, bool(entry.shapes), path)
     damping = sigma = shapes = None
     if entry.damping_ratio:
@@ -104,6 +111,8 @@ def _modes(spec: FitSpec, models: Models, entry: ModesEntry, path: str) -> Measu
         sigma = _each(entry.damping_sigma, count, f"{path}.damping_sigma")
     if entry.shapes:
         size = 3 * models.bench.n_patches
+        if entry.ends == "held":
+            raise StudyError(f"{path}.shapes: allowed with ends = 'machine' only")
         if len(entry.shapes) != count or any(len(x) != size for x in entry.shapes):
             raise StudyError(
                 f"{path}.shapes: {len(entry.shapes)} lists; allowed: {count} lists of {size} "
@@ -112,8 +121,6 @@ def _modes(spec: FitSpec, models: Models, entry: ModesEntry, path: str) -> Measu
         shapes = np.array(entry.shapes, complex)
         if not np.all(np.linalg.norm(shapes, axis=1) > 0):
             raise StudyError(f"{path}.shapes: one of them is zero")
-        if entry.ends == "held":
-            raise StudyError(f"{path}.shapes: allowed with ends = 'machine' only")
     measured = Measured(
         frequency=np.array(entry.frequency_hz),
         sigma=_each(entry.sigma_hz, count, f"{path}.sigma_hz"),
@@ -137,6 +144,12 @@ def _read(spec: FitSpec, entry: FileEntry, path: str) -> Callable[[str], np.ndar
     return lambda name: column(found, name, entry.file, path)
 
 
+def _real(x: np.ndarray, name: str, path: str) -> np.ndarray:
+    if np.iscomplexobj(x):
+        raise StudyError(f"{path}: column {name!r} is complex; expected real numbers")
+    return x
+
+
 def _ascending(x: np.ndarray, what: str, path: str, least: int = 3) -> None:
     if len(x) < least:
         raise StudyError(f"{path}: {len(x)} points; allowed: {least} or more")
@@ -145,7 +158,7 @@ def _ascending(x: np.ndarray, what: str, path: str, least: int = 3) -> None:
         raise StudyError(f"{path}: {what} must ascend; row {row} does not")
 
 
-def _noise(entry: FileEntry | FiguresEntry, value: np.ndarray, path: str) -> Noise:
+def _noise(entry: Noisy, value: np.ndarray, path: str) -> Noise:
     noise = Noise(entry.sigma or 0.0, (entry.sigma_percent or 0.0) / 100)
     if not np.all(noise.sigma(value) > 0):
         raise StudyError(f"{path}: sigma_percent of a value that is 0; give sigma too")
@@ -159,11 +172,11 @@ def _response(spec: FitSpec, models: Models, entry: ResponseEntry, path: str) ->
     _check_frequency(frequency, path)
     if entry.magnitude:
         kind: type[Magnitude | ComplexResponse] = Magnitude
-        measured = read(entry.magnitude).real
+        measured = _real(read(entry.magnitude), entry.magnitude, path)
         if np.any(measured < 0):
             raise StudyError(f"{path}: column {entry.magnitude!r} has negative magnitudes; in dB?")
     else:
-        kind, measured = ComplexResponse, _complex(read, entry)
+        kind, measured = ComplexResponse, _complex(read, entry, path)
     return kind(
         entry.name,
         entry.check,
@@ -178,10 +191,13 @@ def _response(spec: FitSpec, models: Models, entry: ResponseEntry, path: str) ->
     )
 
 
-def _complex(read: Callable[[str], np.ndarray], entry: ResponseEntry) -> np.ndarray:
+def _complex(read: Callable[[str], np.ndarray], entry: ResponseEntry, path: str) -> np.ndarray:
     if entry.file.lower().partition("::")[0].endswith((".uff", ".unv")):
         return read("value").astype(complex)
-    return read(entry.real) + 1j * read(entry.imag)
+    real = read(entry.real)
+    if np.iscomplexobj(real):
+        return real
+    return real + 1j * _real(read(entry.imag), entry.imag, path)
 
 
 def _check_frequency(frequency: np.ndarray, path: str) -> None:
@@ -199,7 +215,7 @@ def _unit(signals: tuple[Signal, ...], order: int) -> str:
 
 def _spectrum(spec: FitSpec, models: Models, entry: SpectrumEntry, path: str) -> Measurement:
     read, signals = _read(spec, entry, path), _signals(spec, entry, path)
-    frequency, density = read(entry.frequency).real, read(entry.density).real
+    frequency, density = read(entry.frequency).real, _real(read(entry.density), entry.density, path)
     keep = frequency > 0
     frequency, density = frequency[keep], density[keep]
     _ascending(frequency, f"column {entry.frequency!r}", path)
@@ -250,6 +266,9 @@ def _trace(spec: FitSpec, models: Models, entry: TraceEntry, path: str) -> Measu
 
 def _figures(spec: FitSpec, models: Models, entry: FiguresEntry, path: str) -> Measurement:
     links, modes = entry.links or spec.study.control.links, entry.modes or spec.study.control.modes
+    is_on = spec.study.control.feedback != "none" and any(links)
+    if entry.of == "reduction" and not is_on:
+        raise StudyError(f"{path}.of = 'reduction': no link is under control in this study")
     if modes > spec.study.control.modes:
         raise field_error(
             f"{path}.modes", modes, f"1 to control.modes = {spec.study.control.modes}"

@@ -16,6 +16,8 @@ from studies.show.figures import new_figure
 if TYPE_CHECKING:
     from studies.fitting.run import Fitted
 
+#: All figures there can be.
+NAMES = ("fit", "correlations", "profiles")
 #: Measurements in one figure.
 MOST = 8
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#999999"

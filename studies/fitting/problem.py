@@ -13,8 +13,8 @@ from studies.fitting.kinds.contract import Measurement, Residual
 from studies.fitting.spec import Prior
 from studies.space.free import FreeNumbers
 
-#: Residual of a design that cannot run, in standard deviations.
-FAILED = 1e3
+#: Size of a residual from which the robust loss grows linearly, in standard deviations.
+SOFT = 2.0
 
 
 class Problem(NamedTuple):
@@ -25,6 +25,7 @@ class Problem(NamedTuple):
     measurements: tuple[Measurement, ...]  # those that count
     checks: tuple[Measurement, ...]  # those held out
     bench: Bench
+    is_robust: bool = False  # residuals beyond SOFT grow as their root
 
     def parts(self, values: np.ndarray, has_slopes: bool) -> list[Residual]:
         """Residuals of each measurement, and of the priors at the end if there are any."""
@@ -39,12 +40,15 @@ class Problem(NamedTuple):
 
     def residual(self, u: np.ndarray) -> np.ndarray:
         """All residuals, (m,), at places between the bounds, (p,)."""
-        return np.concatenate([x.value for x in self.parts(self.free.values(u), False)])
+        value = np.concatenate([x.value for x in self.parts(self.free.values(u), False)])
+        return softened(value)[0] if self.is_robust else value
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
         """Derivatives by the places, (m, p)."""
-        values = self.free.values(u)
-        by = np.concatenate([x.slope for x in self.parts(values, True) if x.slope is not None])
+        parts = self.parts(self.free.values(u), True)
+        by = np.concatenate([x.slope for x in parts if x.slope is not None])
+        if self.is_robust:
+            by = by * softened(np.concatenate([x.value for x in parts]))[1][:, None]
         return by * self.free.slopes(u)
 
     def costs(self, u: np.ndarray) -> np.ndarray:
@@ -59,6 +63,16 @@ class Problem(NamedTuple):
                 cost = np.inf
             found.append(cost if np.isfinite(cost) else np.inf)
         return np.array(found)
+
+
+def softened(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals whose squares are the loss 2 C^2 (sqrt(1 + (r/C)^2) - 1), and their derivatives."""
+    root = np.sqrt(1 + (r / SOFT) ** 2)
+    # sqrt(1 + x) - 1 without cancellation
+    value = r * np.sqrt(2 / (root + 1))
+    is_small = np.abs(r) < 1e-8
+    slope = np.where(is_small, 1.0, r / (np.where(is_small, 1.0, value) * root))
+    return value, slope
 
 
 def complaints(measurements: Sequence[Measurement], values: np.ndarray) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from studies.fitting.statistics import UNKNOWN, Direction, Misfit
+from studies.show.markdown import literal
 from studies.show.templates import render
 from studies.study.paths import field_unit, parse_entry
 
@@ -87,18 +88,48 @@ def sentences(found: Fitted) -> list[str]:
     if not answer.is_explained:
         bad = [x for x in answer.misfits if not x.is_noise]
         bad.sort(key=lambda x: -x.square / max(x.size, 1))
-        which = f" Not met: {'; '.join(x.name for x in bad)}." if bad else ""
+        which = f" Not met: {'; '.join(cell(x.name) for x in bad)}." if bad else ""
         lines.append(
             f"The model does not explain the data: chi square is {answer.chi_square:.4g} with "
             f"{answer.freedom} degrees of freedom.{which} Uncertainties assume a right model and "
             "are too small here; look at the residuals, at the model's bases and modes, and at "
             "the stated noise."
         )
-    lines += [told(x, found.names) for x in answer.undetermined]
+    if answer.is_too_close:
+        lines.append(
+            f"The data are met more closely than their noise allows: chi square is "
+            f"{answer.chi_square:.3g} with {answer.freedom} degrees of freedom. The stated noise "
+            "is too large, and so are the uncertainties."
+        )
+    lines += undetermined(found)
     if not answer.undetermined:
         lines += _correlated(found)
     if not found.solution.best.is_converged:
         lines.append("The search ended before it converged; raise fit.iterations.")
+    return lines
+
+
+def undetermined(found: Fitted) -> list[str]:
+    """Sentences on numbers that cannot be told apart; directions that share some are one group."""
+    groups: list[tuple[set[int], list[Direction]]] = []
+    for one in found.answer.undetermined:
+        names, members = set(one.named()), [one]
+        for other in [x for x in groups if x[0] & names]:
+            names, members = names | other[0], [*other[1], *members]
+            groups.remove(other)
+        groups.append((names, members))
+    lines = []
+    for names, members in groups:
+        if len(members) == 1 or len(names) == len(members):
+            lines += [told(x, found.names) for x in members]
+            continue
+        listed = [found.names[k] for k in sorted(names)]
+        count = len(names) - len(members)
+        lines.append(
+            f"{', '.join(listed[:-1])} and {listed[-1]} cannot be told apart by these data, which "
+            f"determine {count} combination{'s' if count > 1 else ''} of these {len(names)} "
+            f"numbers. Fix {len(members)} of them, or state what is known by mean and sigma."
+        )
     return lines
 
 
@@ -129,10 +160,15 @@ def _correlated(found: Fitted) -> list[str]:
     ]
 
 
+def cell(name: str) -> str:
+    """A user's name as text of a table."""
+    return literal(" ".join(name.replace("|", "/").split()))
+
+
 def _misfit(one: Misfit) -> list[str]:
     likeness = "-" if np.isnan(one.likeness) else f"{one.likeness:.2f}"
     return [
-        one.name,
+        cell(one.name),
         str(one.size),
         f"{one.square / max(one.size, 1):.3g}",
         likeness,
@@ -145,7 +181,7 @@ def _single(found: Fitted) -> list[list[str]]:
     rows = []
     for name, curve in found.curves:
         for label, measured, model in zip(curve.labels, curve.measured, curve.model, strict=False):
-            rows.append([name, label, f"{measured:.4g}", f"{model:.4g}"])
+            rows.append([cell(name), label, f"{measured:.4g}", f"{model:.4g}"])
     return rows
 
 

@@ -80,20 +80,23 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
         measurements=kept,
         checks=tuple(x for x in every if x.is_checked),
         bench=bench,
+        is_robust=fit.loss == "robust",
     )
     u = free.places()
     count = len(problem.residual(u)) - len(spec.priors)
     _check_enough(count, len(u), len(spec.priors))
     console.print(f"{count} measured numbers, {len(u)} free; rating {fit.starts} starts")
-    is_robust = fit.loss == "robust"
-    solution = solve(problem, fit.starts, fit.refine, fit.iterations, fit.seed, is_robust)
-    answer = describe_fit(problem, solution.best.u, is_robust)
+    solution = solve(problem, fit.starts, fit.refine, fit.iterations, fit.seed)
+    answer = describe_fit(problem, solution.best.u)
+    for one in problem.checks:
+        one.reweigh(answer.values)
     profiles: list[Likelihood] = []
     if fit.profile and len(u) <= PROFILED:
         console.print("profiling the likelihood")
         sigma = np.sqrt(np.diag(answer.covariance))
         profiles = [profile(problem, solution.best.u, k, sigma[k]) for k in range(len(u))]
-        answer = answer._replace(interval=np.array([x.interval() for x in profiles]))
+        found = [x.interval() if len(x.values) > 2 else answer.interval[x.number] for x in profiles]
+        answer = answer._replace(interval=np.array(found))
     console.print("looking for the next experiment")
     study = parse_study(set_values(spec.study, _numbers(spec, answer.values)))
     experiments = next_experiments(bench, free, solution.best.u, answer.covariance)
@@ -143,6 +146,8 @@ def run_fit(
     try:
         out.mkdir(parents=True, exist_ok=True)
         with staged(out) as staging:
+            for name in plots.NAMES:  # of an earlier fit
+                (out / f"{name}.png").unlink(missing_ok=True)
             _draw(staging, found, has_pdf)
             (staging / STUDY).write_text(study_template(found.study), encoding="utf-8")
             (staging / TUNE).write_text(_tuning(found), encoding="utf-8")
@@ -169,16 +174,17 @@ def _draw(folder: Path, found: Fitted, has_pdf: bool) -> None:
 def spread_percent(found: Fitted) -> dict[str, float]:
     """Half widths of even distributions with the deviations found, in percent of the values."""
     answer, most = found.answer, 50.0
-    return {
+    percent = {
         name: float(min(most, round(100 * np.sqrt(3) * sigma / abs(value), 4)))
         for name, value, sigma in zip(found.names, answer.values, answer.sigma, strict=True)
-        if value != 0 and sigma > 0
+        if value != 0 and not name.startswith("control.")  # which is free below
     }
+    return {name: x for name, x in percent.items() if x > 0}
 
 
 def _tuning(found: Fitted) -> str:
     """The fitted study with its spread, ready for `studies tune`."""
-    gain = found.study.control.gain_factor
+    gain = found.study.control.gain_factor or 0.5
     spread = "\n".join(f"{json.dumps(k)} = {v:g}" for k, v in spread_percent(found).items())
     return (
         f"{study_template(found.study)}\n"

@@ -79,6 +79,7 @@ def parse_signal(
             place = float(match[4])
         except ValueError:
             raise field_error(path, text, known[kind][0], "m") from None
-        if not 0 < place < length[link - 1]:
-            raise field_error(path, text, f"between 0 and {length[link - 1]:g}", "m")
+        shortest = float(np.min(length))  # places are common to all links
+        if not 0 < place < shortest:
+            raise field_error(path, text, f"between 0 and {shortest:g}", "m")
     return Signal(kind, link - 1, patch - 1, place)

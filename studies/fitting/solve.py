@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -18,8 +18,6 @@ SAME = 1e-3
 INSIDE = 1e-3
 #: Distance from the bounds at which optima are looked for once more [1].
 AWAY = 0.02
-#: Size of a residual from which the robust loss grows linearly, in standard deviations.
-SOFT = 2.0
 
 
 class Optimum(NamedTuple):
@@ -49,9 +47,7 @@ class Solution(NamedTuple):
         return tuple(x for x in self.optima if np.abs(x.u - self.best.u).max() > SAME)
 
 
-def solve(
-    problem: Problem, starts: int, refine: int, iterations: int, seed: int, is_robust: bool
-) -> Solution:
+def solve(problem: Problem, starts: int, refine: int, iterations: int, seed: int) -> Solution:
     """Fit.
 
     Args:
@@ -60,7 +56,6 @@ def solve(
         refine: how many of them are followed.
         iterations: evaluations of each.
         seed: of the first guesses.
-        is_robust: whether outliers pull less.
 
     Raises:
         StudyError: no first guess has residuals.
@@ -77,7 +72,7 @@ def solve(
     found = []
     for k in kept[:refine]:
         with suppress(StudyError, np.linalg.LinAlgError, ValueError):  # leaves where it works
-            found.append(descend(problem, first[k], iterations, is_robust))
+            found.append(descend(problem, first[k], iterations))
     if not found:
         raise StudyError("no first guess leads to a fit: each leaves where the model works")
     best = min(found, key=lambda x: x.cost)
@@ -85,21 +80,23 @@ def solve(
         one.reweigh(problem.free.values(best.u))
     # away from the bounds, along which the method may have crept
     inner = [np.clip(x.u, AWAY, 1 - AWAY) for x in found]
-    found = [descend(problem, u, iterations, is_robust) for u in inner]
+    followed, found = found, []
+    for u in inner:
+        with suppress(StudyError, np.linalg.LinAlgError, ValueError):
+            found.append(descend(problem, u, iterations))
+    found = found or followed
     found.sort(key=lambda x: x.cost)
     return Solution(tuple(found), len(first), int((~np.isfinite(cost)).sum()))
 
 
-def descend(problem: Problem, u: np.ndarray, iterations: int, is_robust: bool) -> Optimum:
+def descend(problem: Problem, u: np.ndarray, iterations: int) -> Optimum:
     """The optimum that a first guess leads to; arguments as `solve`.
 
     Args:
         problem: the residuals.
         u: first guess, (p,).
         iterations: evaluations.
-        is_robust: whether outliers pull less.
     """
-    options: dict[str, Any] = {"loss": "soft_l1", "f_scale": SOFT} if is_robust else {}
     done = least_squares(
         problem.residual,
         np.clip(u, 1e-12, 1 - 1e-12),
@@ -110,6 +107,5 @@ def descend(problem: Problem, u: np.ndarray, iterations: int, is_robust: bool) -
         xtol=1e-10,
         ftol=1e-12,
         gtol=1e-10,
-        **options,
     )
     return Optimum(u=done.x, cost=done.cost, is_converged=done.status > 0, evaluations=done.nfev)

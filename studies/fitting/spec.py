@@ -13,6 +13,7 @@ from pydantic import Field, ValidationError
 
 from studies.engine.runs import check_run
 from studies.errors import StudyError, field_error, nearest, shown_name
+from studies.space.axes import Range
 from studies.space.free import (
     DESIGN,
     MACHINE,
@@ -68,16 +69,21 @@ class ModesEntry(AtPose):
     link: int = described(1, "1", "with ends = 'held'", ge=1, le=3)
 
 
-class FileEntry(AtPose):
+class FileEntry(Common):
     """Fields of measurements in a file of columns."""
 
     file: str = described(..., "-", "CSV, HDF5 or UFF, beside this file")
     output: str = described(..., "-", "what is measured")
+
+
+class Noisy(Section):
+    """Standard deviation of the values; both parts in quadrature."""
+
     sigma: Positive | None = described(None, "unit of the output", "standard deviation")
     sigma_percent: Percent | None = described(None, "%", "standard deviation over the value")
 
 
-class ResponseEntry(FileEntry):
+class ResponseEntry(FileEntry, AtPose, Noisy):
     """A frequency response."""
 
     input: str = described(..., "-", "what shakes the machine")
@@ -90,7 +96,7 @@ class ResponseEntry(FileEntry):
     magnitude: str = described("", "-", "column; instead of real and imaginary part")
 
 
-class SpectrumEntry(FileEntry):
+class SpectrumEntry(FileEntry, AtPose):
     """A power spectrum under a white input of unknown strength."""
 
     input: str = described(..., "-", "where the white force or voltage acts")
@@ -102,17 +108,19 @@ class SpectrumEntry(FileEntry):
     averages: int = described(1, "1", "independent spectra in the mean", ge=1, le=10**6)
 
 
-class TraceEntry(FileEntry):
+class TraceEntry(FileEntry, Noisy):
     """A signal over time of the study's motion."""
 
     time: str = described("time", "-", "column [s], from the start of the motion")
     value: str = described("value", "-", "column")
 
 
-class FiguresEntry(Common):
+class FiguresEntry(Common, Noisy):
     """Metrics of the study's motion, or their reduction by control."""
 
-    values: dict[str, float] = described(..., "-", "metric = value, in its unit or in percent")
+    values: dict[str, float] = described(
+        ..., "-", "metric = value, in its unit or in percent", min_length=1
+    )
     of: Literal["controlled", "uncontrolled", "reduction"] = described(
         "controlled", "-", "with control, without, or percent less with it"
     )
@@ -124,8 +132,6 @@ class FiguresEntry(Common):
         None, "1", "controlled modes; default: those of the study", ge=1, le=12
     )
     links: Flags | None = described(None, "-", "under control; default: those of the study")
-    sigma: Positive | None = described(None, "unit of the metric; %", "standard deviation")
-    sigma_percent: Percent | None = described(None, "%", "standard deviation over the value")
 
 
 #: Fields of each kind.
@@ -223,6 +229,10 @@ def _free(fit: Fit, study: Study) -> tuple[FreeNumbers, tuple[Prior, ...]]:
         path = f"fit.free.{shown_name(name)}"
         prior = {}
         if isinstance(written, dict):
+            known_keys = ("from", "to", "scale", "mean", "sigma")
+            for key in set(written) - set(known_keys):
+                hint = nearest(key, known_keys)
+                raise field_error(f"{path}.{key}", written[key], ", ".join(known_keys), hint=hint)
             prior = {k: written[k] for k in ("mean", "sigma") if k in written}
             written = {k: v for k, v in written.items() if k not in prior}
         parts.append(plain_numbers(name, written, study, path, DESIGN | MACHINE))
@@ -232,17 +242,20 @@ def _free(fit: Fit, study: Study) -> tuple[FreeNumbers, tuple[Prior, ...]]:
     priors = []
     for k, (prior, path) in enumerate(known):
         if prior:
-            priors.append(_prior(prior, k, path))
+            priors.append(_prior(prior, k, path, free.numbers[k].span))
     return free, tuple(priors)
 
 
-def _prior(written: dict[str, Any], k: int, path: str) -> Prior:
+def _prior(written: dict[str, Any], k: int, path: str, span: Range) -> Prior:
     for name in ("mean", "sigma"):
         value = written.get(name)
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e150:
             raise field_error(f"{path}.{name}", value, "a finite number, beside mean or sigma")
-    if written["sigma"] <= 0:
-        raise field_error(f"{path}.sigma", written["sigma"], "more than 0")
+    mean, least = written["mean"], 1e-9 * (span.high - span.low)
+    if not span.low <= mean <= span.high:
+        raise field_error(f"{path}.mean", mean, f"{span.low:g} to {span.high:g}, its bounds")
+    if written["sigma"] < least:
+        raise field_error(f"{path}.sigma", written["sigma"], f"{least:g} or more")
     return Prior(k, float(written["mean"]), float(written["sigma"]))
 
 
@@ -257,9 +270,7 @@ def _entry(written: dict[str, Any], k: int) -> Common:
         entry = model.model_validate(_tuples(written))
     except ValidationError as error:
         raise explain(error, model, written, inside=path) from None
-    is_bare = isinstance(entry, (ResponseEntry, TraceEntry, FiguresEntry)) and (
-        entry.sigma is None and entry.sigma_percent is None
-    )
+    is_bare = isinstance(entry, Noisy) and entry.sigma is None and entry.sigma_percent is None
     if is_bare:
         raise StudyError(
             f"{path}: sigma or sigma_percent is missing; without it the data say nothing about "

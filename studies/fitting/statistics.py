@@ -15,7 +15,6 @@ from scipy.stats import chi2
 from studies.errors import StudyError
 from studies.fitting.kinds.contract import Residual
 from studies.fitting.problem import Problem
-from studies.fitting.solve import SOFT
 
 #: Standard deviation of a number of which only the bounds are known [1].
 UNKNOWN = 1 / np.sqrt(12)
@@ -54,6 +53,7 @@ class Misfit(NamedTuple):
 class Answer(NamedTuple):
     """Values and what is known of them, at an optimum."""
 
+    place: np.ndarray  # between the bounds [1], (p,)
     values: np.ndarray  # in the study's units, (p,)
     sigma: np.ndarray  # standard deviations, (p,); at most that of the bounds
     interval: np.ndarray  # 95 %, within the bounds, (p, 2)
@@ -71,37 +71,36 @@ class Answer(NamedTuple):
         return tuple(x for x in self.directions if x.sigma > UNKNOWN)
 
     @property
+    def is_too_close(self) -> bool:
+        """Whether the data are met more closely than their noise allows."""
+        return self.freedom > 0 and bool(chi2.cdf(self.chi_square, self.freedom) < UNLIKELY)
+
+    @property
     def is_explained(self) -> bool:
         """Whether the residuals look like the stated noise."""
         return self.probability >= UNLIKELY and all(x.is_noise for x in self.misfits)
 
 
-def describe_fit(problem: Problem, u: np.ndarray, is_robust: bool) -> Answer:
+def describe_fit(problem: Problem, u: np.ndarray) -> Answer:
     """Statistics at an optimum.
 
     Args:
         problem: what was fitted.
         u: the optimum, (p,).
-        is_robust: weigh residuals as the robust loss does.
     """
     values = problem.free.values(u)
     parts = problem.parts(values, True)
-    residual = np.concatenate([x.value for x in parts])
-    jacobian = np.concatenate([x.slope for x in parts if x.slope is not None])
-    jacobian = jacobian * problem.free.slopes(u)
-    if is_robust:
-        jacobian = jacobian * (1 + (residual / SOFT) ** 2)[:, None] ** -0.25
+    residual, jacobian = problem.residual(u), problem.jacobian(u)
     covariance, directions = spread(jacobian)
     sigma_u = np.sqrt(np.diag(covariance))
     slopes = np.abs(problem.free.slopes(u))
     low, high = (problem.free.values(np.clip(u + k * WIDE * sigma_u, 0, 1)) for k in (-1, 1))
-    n_prior = len(problem.priors)
-    of_data = residual[: len(residual) - n_prior] if n_prior else residual
     determined = sum(x.sigma <= UNKNOWN for x in directions)
-    freedom = max(len(residual) - determined, 0)
+    hidden = sum(x.n_hidden for x in problem.measurements)
+    freedom = max(len(residual) - determined - hidden, 0)
     square = float(np.sum(residual**2))
-    assert len(of_data)
     return Answer(
+        place=u,
         values=values,
         sigma=np.minimum(sigma_u, UNKNOWN) * slopes,
         interval=np.stack([low, high], axis=1),
@@ -149,7 +148,7 @@ def misfit(name: str, part: Residual, is_ordered: bool) -> Misfit:
     likeness = np.nan
     if is_ordered and n > 10 and square > 0:
         likeness = float(np.sum(r[1:] * r[:-1]) / square)
-    is_white = np.isnan(likeness) or abs(likeness) < 4 / np.sqrt(n)
+    is_white = np.isnan(likeness) or abs(likeness) < 4 / np.sqrt(n) or square < 0.25 * n
     is_small = chi2.sf(square, n) >= UNLIKELY / 10
     return Misfit(
         name=name,
@@ -169,7 +168,7 @@ class Likelihood(NamedTuple):
 
     def interval(self) -> tuple[float, float]:
         """Where the rise is that of 95 %, or the last values that were tried."""
-        middle, ends = int(np.argmin(self.rise)), []
+        middle, ends = int(np.flatnonzero(self.rise == 0.0)[0]), []
         for part in (slice(middle, None, -1), slice(middle, None)):
             value, size = self.values[part], np.sqrt(np.maximum(self.rise[part], 0.0))
             beyond = np.flatnonzero(size > WIDE)

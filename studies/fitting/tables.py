@@ -31,7 +31,7 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
     where = folder / name
     if where.suffix.lower() not in FORMATS:
         raise field_error(path, file, f"a file {', '.join(FORMATS)}")
-    if not where.is_file():
+    if not _is_file(where):
         raise StudyError(f"{path}: {where} cannot be read (no such file)")
     try:
         if where.suffix.lower() in (".h5", ".hdf5"):
@@ -40,10 +40,17 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
             found = _from_uff(where, inside, path)
         else:
             found = _from_csv(where)
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, csv.Error) as error:
         raise StudyError(f"{path}: {where} cannot be read ({error})") from None
     _check(found, where, path)
     return found
+
+
+def _is_file(where: Path) -> bool:
+    try:
+        return where.is_file()
+    except OSError:  # a name that is too long
+        return False
 
 
 def _check(found: dict[str, np.ndarray], where: Path, path: str) -> None:
@@ -80,6 +87,10 @@ def _from_csv(where: Path) -> dict[str, np.ndarray]:
     if len(rows) < 2:
         raise ValueError("needs a row of names and one of numbers or more")
     names = [name.strip() for name in rows[0]]
+    if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
+        raise ValueError("columns must be separated by commas")
+    if len(set(names)) < len(names):
+        raise ValueError("two columns have one name")
     width = len(names)
     for k, row in enumerate(rows[1:], 2):
         if len(row) != width:
@@ -88,13 +99,20 @@ def _from_csv(where: Path) -> dict[str, np.ndarray]:
     return dict(zip(names, numbers.T, strict=True))
 
 
+def _numbers(x: np.ndarray) -> np.ndarray:
+    return x if np.iscomplexobj(x) else x.astype(float)
+
+
 def _from_hdf5(where: Path, group: str) -> dict[str, np.ndarray]:
     with h5py.File(where) as file:
         at = file[group] if group else file
+        if not isinstance(at, h5py.Group):
+            raise ValueError(f"{group} is no group")
+        columns = {name: x for name, x in at.items() if isinstance(x, h5py.Dataset)}
         return {
-            name: np.asarray(x)
-            for name, x in at.items()
-            if isinstance(x, h5py.Dataset) and x.ndim == 1
+            name: _numbers(np.asarray(x))
+            for name, x in columns.items()
+            if x.ndim == 1 and x.dtype.kind in "iufc"
         }
 
 

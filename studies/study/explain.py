@@ -51,6 +51,9 @@ def allowed_values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
     if hasattr(annotation, "__metadata__"):
         return allowed_values(arguments[0], _limits(annotation))
     if origin in (Union, UnionType):
+        arguments = tuple(x for x in arguments if x is not type(None))  # left out
+        if len(arguments) == 1:
+            return allowed_values(arguments[0], metadata)
         several = get_args(arguments[-1])
         if several == arguments[:1] * len(several):  # one number, or some of the same kind
             inner, limits = get_args(arguments[0])[0], _range(_limits(arguments[0]))

@@ -36,6 +36,11 @@ class Noise(NamedTuple):
         """Of each value."""
         return np.hypot(self.fixed, self.share * np.abs(value))
 
+    def of_model(self, model: np.ndarray, measured: np.ndarray) -> np.ndarray:
+        """The same of a model's values; of measured ones where the model is 0."""
+        found = self.sigma(model)
+        return np.where(found > 0, found, self.sigma(measured))
+
 
 class Measurement(Protocol):
     """One set of measured numbers and its model."""
@@ -44,6 +49,7 @@ class Measurement(Protocol):
     kind: str
     is_checked: bool  # held out: not fitted, only compared
     is_ordered: bool  # neighbours in `residual` are neighbours in time or frequency
+    n_hidden: int  # numbers that it fits by itself
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
         """At some values of the free numbers, (p,)."""

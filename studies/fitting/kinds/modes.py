@@ -37,7 +37,7 @@ class Measured(NamedTuple):
 class HeldModes:
     """Modes of one link between held joints, in their order."""
 
-    kind, is_ordered = "modes", False
+    kind, is_ordered, n_hidden = "modes", False, 0
 
     def __init__(
         self, name: str, is_checked: bool, bench: Bench, measured: Measured, link: int
@@ -74,7 +74,7 @@ class HeldModes:
 class MachineModes:
     """Modes of the machine at a pose, held by its drive."""
 
-    kind, is_ordered = "modes", False
+    kind, is_ordered, n_hidden = "modes", False, 0
 
     def __init__(
         self,

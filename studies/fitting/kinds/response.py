@@ -18,7 +18,7 @@ OTHER_UNIT = 100.0
 class _OfBench:
     """What responses and spectra share: one input, one output, one pose."""
 
-    kind, is_ordered = "response", True
+    kind, is_ordered, n_hidden = "response", True, 0
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class _OfBench:
         return found.value * turn, slope
 
     def reweigh(self, values: np.ndarray) -> None:
-        self.sigma = self._noise.sigma(self.predicted(values, False)[0])
+        self.sigma = self._noise.of_model(self.predicted(values, False)[0], self.measured)
 
     def complaint(self, values: np.ndarray) -> str:
         model = np.abs(self.predicted(values, False)[0])
@@ -136,7 +136,7 @@ class Spectrum(_OfBench):
     Its logarithm is compared, less the mean difference: the strength does not count.
     """
 
-    kind = "spectrum"
+    kind, n_hidden = "spectrum", 1  # the strength of the input
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)

@@ -28,7 +28,7 @@ Place = Callable[[Case, Array], Case]
 class Trace:
     """One signal over time, compared at the times of the measurement."""
 
-    kind, is_ordered = "trace", True
+    kind, is_ordered, n_hidden = "trace", True, 0
 
     def __init__(
         self,
@@ -79,7 +79,7 @@ class Trace:
         return Residual(value, None if slope is None else slope / self.sigma[:, None])
 
     def reweigh(self, values: np.ndarray) -> None:
-        self.sigma = self._noise.sigma(self.predicted(values, False)[0])
+        self.sigma = self._noise.of_model(self.predicted(values, False)[0], self.measured)
 
     def curve(self, values: np.ndarray) -> Curve:
         found = self.predicted(values, False)[0]
@@ -221,7 +221,7 @@ class Runs:
 class Figures:
     """Metrics of runs that differ in which links are controlled."""
 
-    kind, is_ordered = "figures", False
+    kind, is_ordered, n_hidden = "figures", False, 0
 
     def __init__(
         self, name: str, is_checked: bool, runs: Runs, compared: tuple[Compared, ...]
@@ -242,6 +242,8 @@ class Figures:
         if not one.is_reduction:
             return on, by_on
         off, by_off = self._taken(one, _off(one), metrics, slopes)
+        if off == 0:
+            raise StudyError(f"{self.name}: {one.label} is 0 without control: it has no reduction")
         by = None if slopes is None else 100 * (on * by_off / off**2 - by_on / off)
         return 100 * (1 - on / off), by
 
