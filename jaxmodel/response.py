@@ -1,4 +1,4 @@
-"""The machine as a test bench sees it: linear about a pose, from what shakes it to what is measured.
+"""The machine as a test bench sees it: linear about a pose, from inputs to measured outputs.
 
 Inputs are voltages on the actuators, forces on the sliders, and a hammer on a link; outputs are
 voltages of the sensors, chord deflections, slider positions and the pose. The controller is off,
@@ -111,8 +111,6 @@ def held_modes(structure: Structure, case: Case) -> tuple[Array, Array]:
     """
     machine = case.machine
     stations = jnp.asarray(case.windows.stations)
-    basis = build_basis(
-        structure.basis, machine.beam, machine.patches, structure.n_modes, stations
-    )
+    basis = build_basis(structure.basis, machine.beam, machine.patches, structure.n_modes, stations)
     omega = held_frequency(structure.basis, machine.beam, basis)
     return omega / (2 * jnp.pi), damping_ratio(machine.damping, omega)
