@@ -22,7 +22,10 @@ STRONG = 0.95
 
 def summary(found: Fitted) -> str:
     """Some lines: the values, and what is wrong with them."""
-    lines = [f"{row[0]} = {row[1]} +- {row[2]} {row[3]}" for row in _rows(found)]
+    lines = [
+        f"{name} = {value} +- {sigma} {unit} (95 %: {interval})".replace("  ", " ")
+        for name, value, sigma, unit, interval, _ in _rows(found)
+    ]
     lines += sentences(found)
     return "\n".join(lines)
 
@@ -41,6 +44,7 @@ def report(found: Fitted) -> str:
         others=_others(found),
         single=_single(found),
         experiments=_experiments(found),
+        widest=" and ".join(found.names[k] for k in found.answer.directions[0].named()),
         more=len(found.curves) - 8,
     )
 
@@ -59,7 +63,9 @@ def _rows(found: Fitted) -> list[list[str]]:
         value, sigma = found.answer.values[k], found.answer.sigma[k]
         low, high = found.answer.interval[k]
         digits = _digits(value, sigma)
-        at = "at its bound" if not 1e-6 < u[k] < 1 - 1e-6 else ""
+        ends = np.array([found.spec.free.numbers[k].span.low, found.spec.free.numbers[k].span.high])
+        at = "interval ends at a bound" if np.isclose([low, high], ends, rtol=1e-9).any() else ""
+        at = at if 1e-6 < u[k] < 1 - 1e-6 else "at its bound"
         if found.answer.sigma[k] >= 0.99 * UNKNOWN * abs(found.spec.free.slopes(u)[k]):
             at = "not determined"
         rows.append(
@@ -67,7 +73,7 @@ def _rows(found: Fitted) -> list[list[str]]:
                 name,
                 f"{value:.{digits}g}",
                 f"{sigma:.2g}",
-                _unit(name),
+                "" if _unit(name) == "1" else _unit(name),
                 f"{low:.{digits}g} to {high:.{digits}g}",
                 at,
             ]
@@ -94,6 +100,11 @@ def sentences(found: Fitted) -> list[str]:
             f"{answer.freedom} degrees of freedom.{which} Uncertainties assume a right model and "
             "are too small here; look at the residuals, at the model's bases and modes, and at "
             "the stated noise."
+        )
+    if answer.freedom == 0:
+        lines.append(
+            "There are as many unknowns as data: they are met whatever the model, which is not "
+            "tested."
         )
     if answer.is_too_close:
         lines.append(
@@ -152,8 +163,8 @@ def _correlated(found: Fitted) -> list[str]:
     """Pairs that are determined, but hardly apart."""
     matrix, names = found.answer.correlation, found.names
     return [
-        f"{names[k]} and {names[i]} are strongly correlated ({matrix[i, k]:.3f}): each is known "
-        "less well than both together."
+        f"{names[k]} and {names[i]} are strongly correlated ({matrix[i, k]:.3f}): a combination of "
+        "both is known much better than either."
         for i in range(len(matrix))
         for k in range(i)
         if abs(matrix[i, k]) > STRONG
@@ -181,7 +192,7 @@ def _single(found: Fitted) -> list[list[str]]:
     rows = []
     for name, curve in found.curves:
         for label, measured, model in zip(curve.labels, curve.measured, curve.model, strict=False):
-            rows.append([cell(name), label, f"{measured:.4g}", f"{model:.4g}"])
+            rows.append([cell(name), label, f"{measured:.6g}", f"{model:.6g}"])
     return rows
 
 
@@ -200,5 +211,5 @@ def _experiments(found: Fitted) -> list[list[Any]]:
     rows = []
     for one in found.experiments[:SHOWN]:
         pose = ", ".join(f"{x:.3g}" for x in one.pose)
-        rows.append([one.text, f"({pose})", f"{before / one.widest:.3g}"])
+        rows.append([one.text, f"({pose})", f"{before / one.widest:.3g} times"])
     return rows

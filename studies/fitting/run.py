@@ -172,11 +172,17 @@ def _draw(folder: Path, found: Fitted, has_pdf: bool) -> None:
 
 
 def spread_percent(found: Fitted) -> dict[str, float]:
-    """Half widths of even distributions with the deviations found, in percent of the values."""
+    """Half widths of even distributions, in percent of the values.
+
+    Machines are drawn number by number, so each number gets the deviation that it has with the
+    others held: machines then stay within what the data allow, however correlated their numbers.
+    """
     answer, most = found.answer, 50.0
+    held = 1 / np.sqrt(np.diag(np.linalg.inv(answer.covariance)))
+    deviation = held * np.abs(found.spec.free.slopes(answer.place))
     percent = {
         name: float(min(most, round(100 * np.sqrt(3) * sigma / abs(value), 4)))
-        for name, value, sigma in zip(found.names, answer.values, answer.sigma, strict=True)
+        for name, value, sigma in zip(found.names, answer.values, deviation, strict=True)
         if value != 0 and not name.startswith("control.")  # which is free below
     }
     return {name: x for name, x in percent.items() if x > 0}
@@ -191,9 +197,18 @@ def _tuning(found: Fitted) -> str:
         "# What moves, and how far: change it to what you can decide.\n"
         "[tune]\n[tune.free]\n"
         f'"control.gain_factor" = {{ from = {0.2 * gain:g}, to = {2 * gain:g} }}\n\n'
-        "# Machines as uncertain as the fit leaves them.\n"
+        "# How far each number may move with the others held: what data know only together must\n"
+        "# not be spread apart. The controller knows link.youngs_modulus of each machine; spread\n"
+        "# link.stiffness_factor for what it does not know.\n"
+        f"{_warning(found)}"
         f"[tune.scenarios]\ncount = 4\n[tune.scenarios.spread]\n{spread}\n"
     )
+
+
+def _warning(found: Fitted) -> str:
+    if found.answer.is_explained:
+        return ""
+    return "# THE MODEL DOES NOT EXPLAIN THE DATA: these spreads are too small (see report).\n"
 
 
 def document(found: Fitted) -> str:
