@@ -12,7 +12,6 @@ from rich.console import Console
 from scipy.stats import chi2
 
 from studies.errors import StudyError
-from studies.fitting.bench import modes_of
 from studies.fitting.kinds.modes import TWO_PI, pair_modes
 from studies.fitting.problem import Problem
 from studies.fitting.report import told, undetermined
@@ -53,7 +52,7 @@ def folder(tmp_path_factory):
 def measured_modes(bench, one, values):
     """The model's own modes as if they were measured."""
     plant = bench.plant(one._pose, values, False)
-    modes = modes_of(np.asarray(plant.value.state))
+    modes = plant.modes
     frequency = np.abs(modes.pole) / TWO_PI
     bending = np.flatnonzero(frequency > 60)[: len(one._measured.frequency)]
     return one._measured._replace(
@@ -103,7 +102,7 @@ def test_modes_are_paired_by_shape(folder):
     noise = np.random.default_rng(0).normal(size=(6, 9)) * 0.03 * np.abs(truth.shapes).max()
     mixed = truth._replace(frequency=truth.frequency[order], shapes=truth.shapes[order] + noise)
     plant = bench.plant(one._pose, values, False)
-    modes = modes_of(np.asarray(plant.value.state))
+    modes = plant.modes
     pairs = pair_modes(mixed, modes, np.asarray(plant.value.sensor))
     frequency = np.abs(modes.pole[pairs.mode]) / TWO_PI
     np.testing.assert_allclose(frequency, mixed.frequency, rtol=1e-9)
@@ -138,7 +137,7 @@ def repeated(folder, kind, repetitions, seed=0):
     """How many repetitions have the truth in their 95 % region."""
     spec = spec_of(folder, ENTRIES[kind])
     bench, (one,), values = made(spec)
-    problem = Problem(free=spec.free, priors=(), measurements=(one,), checks=(), bench=bench)
+    problem = Problem(free=spec.free, priors=(), measurements=(one,), bench=bench)
     truth, rng, inside = spec.free.places(), np.random.default_rng(seed), 0
     for _ in range(repetitions):
         noisy(one, kind, values, rng)
@@ -172,7 +171,7 @@ def answered(folder, entry, free, study=None, kind="response"):
     spec = spec_of(folder, entry, free=free, study=study)
     bench, (one,), values = made(spec)
     noisy(one, kind, values, np.random.default_rng(3))
-    problem = Problem(free=spec.free, priors=(), measurements=(one,), checks=(), bench=bench)
+    problem = Problem(free=spec.free, priors=(), measurements=(one,), bench=bench)
     found = solve(problem, 8, 2, 60, 0)
     return spec, one, describe_fit(problem, found.best.u)
 
@@ -224,7 +223,6 @@ def test_outliers_pull_less(folder):
             free=spec.free,
             priors=(),
             measurements=(one,),
-            checks=(),
             bench=bench,
             is_robust=is_robust,
         )
@@ -246,7 +244,7 @@ def test_a_wrong_model_is_noticed(folder):
     poor = spec_of(folder, RESPONSE)
     bench, (other,), _ = made(poor)
     other.measured, other.sigma = one.measured, one.sigma
-    problem = Problem(free=poor.free, priors=(), measurements=(other,), checks=(), bench=bench)
+    problem = Problem(free=poor.free, priors=(), measurements=(other,), bench=bench)
     answer = describe_fit(problem, solve(problem, 4, 1, 60, 0).best.u)
     assert not answer.is_explained and not answer.misfits[0].is_noise
 
@@ -394,9 +392,7 @@ def test_twenty_numbers_from_fifteen_responses(tmp_path):
     for one in measurements:
         noisy(one, "response", values, rng)
     started = time.perf_counter()
-    problem = Problem(
-        free=spec.free, priors=(), measurements=tuple(measurements), checks=(), bench=bench
-    )
+    problem = Problem(free=spec.free, priors=(), measurements=tuple(measurements), bench=bench)
     answer = describe_fit(problem, solve(problem, 32, 4, 60, 0).best.u)
     took = time.perf_counter() - started
     truth = spec.free.places()

@@ -7,8 +7,8 @@ them by linear algebra, whose derivatives are written out.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
-from typing import NamedTuple
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -19,6 +19,7 @@ from jaxmodel.kinematics import lift, path_status
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.response import BenchPlant, bench_plant, held_modes
+from studies.engine.program import Place
 from studies.engine.runs import check_pose
 from studies.errors import field_error
 from studies.fitting.signals import Signal
@@ -26,28 +27,60 @@ from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study
 
 Pose = tuple[float, float, float]
-Place = Callable[[Case, Array], Case]
 #: Eigenvectors of worse condition are not used [1].
 WORST_CONDITION = 1e10
-
-
 #: A row or column of a plant, (n,), and its derivatives, (n, p).
 Row = tuple[np.ndarray, np.ndarray | None]
 
 
 class Modes(NamedTuple):
-    """Poles of a plant in the upper half plane, ascending, with derivatives."""
+    """Oscillating modes: poles in the upper half plane, ascending."""
 
     pole: np.ndarray  # [1/s], (m,), complex
     shape: np.ndarray  # right eigenvectors, (n, m)
     dual: np.ndarray  # left eigenvectors, dual @ shape = 1, (m, n)
 
 
-class PlantAt(NamedTuple):
-    """A plant at one pose; derivatives by the p free numbers come last, None if not asked for."""
+class Eigen(NamedTuple):
+    """A = V diag(poles) V^-1."""
 
-    value: BenchPlant
-    slope: BenchPlant | None
+    pole: np.ndarray  # [1/s], (n,), complex
+    right: np.ndarray  # V, (n, n)
+    left: np.ndarray | None  # V^-1; None where eigenvectors are nearly dependent
+
+    @property
+    def upper(self) -> np.ndarray:
+        """Which poles oscillate, one of each pair, ascending."""
+        upper = np.flatnonzero(self.pole.imag > 1e-9 * np.abs(self.pole).max())
+        return upper[np.argsort(np.abs(self.pole[upper]))]
+
+
+class PlantAt:
+    """A plant at one pose, and its derivatives by the p free numbers."""
+
+    def __init__(self, value: BenchPlant, slope: BenchPlant | None) -> None:
+        """Arguments: matrices as NumPy arrays; their derivatives, (..., p), None if not wanted."""
+        self.value, self.slope = value, slope
+
+    @cached_property
+    def eigen(self) -> Eigen:
+        """Poles and eigenvectors, shared by all that is measured at the pose."""
+        pole, right = np.linalg.eig(self.value.state)
+        is_sound = np.linalg.cond(right) <= WORST_CONDITION
+        return Eigen(pole, right, np.linalg.inv(right) if is_sound else None)
+
+    @property
+    def modes(self) -> Modes:
+        """Its oscillating modes.
+
+        Raises:
+            numpy.linalg.LinAlgError: eigenvectors that are nearly dependent.
+        """
+        pole, right, left = self.eigen
+        if left is None:
+            raise np.linalg.LinAlgError("nearly dependent eigenvectors")
+        upper = self.eigen.upper
+        return Modes(pole[upper], right[:, upper], left[upper])
 
     def output(self, signal: Signal, rows: int) -> Row:
         """Row of C, (n,), and its derivatives, (n, p)."""
@@ -56,14 +89,11 @@ class PlantAt(NamedTuple):
     def input(self, signal: Signal, column: int) -> Row:
         """Column of B, (n,), and its derivatives, (n, p)."""
         name = {"actuator": "actuator", "hammer": "hammer", "slider": "slider_force"}[signal.kind]
-        value = np.asarray(getattr(self.value, name))[:, column]
-        if self.slope is None:
-            return value, None
-        return value, np.asarray(getattr(self.slope, name))[:, column]
+        return self._at(name, (slice(None), column))
 
-    def _at(self, name: str, row: int) -> Row:
-        value = np.asarray(getattr(self.value, name))[row]
-        return value, None if self.slope is None else np.asarray(getattr(self.slope, name))[row]
+    def _at(self, name: str, index: Any) -> Row:
+        value = getattr(self.value, name)[index]
+        return value, None if self.slope is None else getattr(self.slope, name)[index]
 
 
 class Bench:
@@ -120,9 +150,8 @@ class Bench:
             if known == key and plant is not None:
                 return plant
         given = self.structure, self.place, self.case, np.array(pose), values
-        value = jax.tree.map(np.asarray, _plant(*given))
-        slope = jax.tree.map(np.asarray, _plant_slopes(*given)) if has_slopes else None
-        found = PlantAt(value, slope)
+        slope, value = _plant_slopes(*given) if has_slopes else (None, _plant(*given))
+        found = PlantAt(*jax.tree.map(np.asarray, (value, slope)))
         self._kept[pose, has_slopes] = key, found
         return found
 
@@ -144,8 +173,26 @@ class Bench:
     def held(self, values: np.ndarray, has_slopes: bool) -> list[np.ndarray]:
         """Frequencies [Hz] and damping ratios of the links alone, (3, R), and their slopes."""
         given = self.structure, self.place, self.case, values
-        found = list(_held(*given))
-        return [np.asarray(x) for x in (*found, *(_held_slopes(*given) if has_slopes else ()))]
+        slope, value = _held_slopes(*given) if has_slopes else ((), _held(*given))
+        return [np.asarray(x) for x in (*value, *slope)]
+
+
+def with_slopes(
+    function: Callable[..., Any], argument: int, is_first: bool = False
+) -> Callable[..., Any]:
+    """A function of the same arguments that returns derivatives by one of them, and the value.
+
+    Args:
+        function: of JAX arrays.
+        argument: by which one.
+        is_first: derivatives of the first part of its value only.
+    """
+
+    def both(*given: Any) -> tuple[Any, Any]:
+        value = function(*given)
+        return value[0] if is_first else value, value
+
+    return jax.jacfwd(both, argnums=argument, has_aux=True)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -163,9 +210,9 @@ def _one_held(structure: Structure, place: Place, case: Case, values: Array) -> 
 
 
 _plant = jax.jit(_at, static_argnums=(0, 1))
-_plant_slopes = jax.jit(jax.jacfwd(_at, argnums=4), static_argnums=(0, 1))
+_plant_slopes = jax.jit(with_slopes(_at, 4), static_argnums=(0, 1))
 _held = jax.jit(_one_held, static_argnums=(0, 1))
-_held_slopes = jax.jit(jax.jacfwd(_one_held, argnums=3), static_argnums=(0, 1))
+_held_slopes = jax.jit(with_slopes(_one_held, 3), static_argnums=(0, 1))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -173,21 +220,6 @@ def _plant_batch(
     structure: Structure, place: Place, case: Case, pose: Array, values: Array
 ) -> BenchPlant:
     return jax.vmap(partial(_at, structure, place, case, pose))(values)
-
-
-def modes_of(state: np.ndarray) -> Modes:
-    """Oscillating modes of x' = A x.
-
-    Raises:
-        numpy.linalg.LinAlgError: eigenvectors that are nearly dependent.
-    """
-    value, right = np.linalg.eig(state)
-    if np.linalg.cond(right) > WORST_CONDITION:
-        raise np.linalg.LinAlgError("nearly dependent eigenvectors")
-    left = np.linalg.inv(right)
-    upper = np.flatnonzero(value.imag > 1e-9 * np.abs(value).max())
-    upper = upper[np.argsort(np.abs(value[upper]))]
-    return Modes(value[upper], right[:, upper], left[upper])
 
 
 class FrequencyResponse(NamedTuple):
@@ -208,28 +240,26 @@ def response(plant: PlantAt, source: Row, output: Row, omega: np.ndarray) -> Fre
         output: `PlantAt.output`.
         omega: [rad/s], (f,).
     """
-    state = np.asarray(plant.value.state)
-    value, right = np.linalg.eig(state)
-    if np.linalg.cond(right) > WORST_CONDITION:  # nearly dependent eigenvectors: without them
-        eye = np.eye(len(state))
-        whole = 1j * omega[:, None, None] * eye - state
-        x = np.linalg.solve(whole, np.broadcast_to(source[0][:, None], (*whole.shape[:2], 1)))[
-            ..., 0
-        ]
-        turned = np.swapaxes(whole, 1, 2)
-        y = np.linalg.solve(turned, np.broadcast_to(output[0][:, None], (*whole.shape[:2], 1)))[
-            ..., 0
-        ]
+    pole, right, left = plant.eigen
+    if left is None:  # without eigenvectors
+        whole = 1j * omega[:, None, None] * np.eye(len(pole)) - plant.value.state
+        x = _solved(whole, source[0])
+        y = _solved(np.swapaxes(whole, 1, 2), output[0])
     else:
-        left = np.linalg.inv(right)
-        resolvent = 1 / (1j * omega[:, None] - value)
+        resolvent = 1 / (1j * omega[:, None] - pole)
         x = (resolvent * (left @ source[0])) @ right.T
         y = (resolvent * (output[0] @ right)) @ left
     found = x @ output[0]
     if plant.slope is None or source[1] is None or output[1] is None:
         return FrequencyResponse(found, None)
-    change = np.asarray(plant.slope.state)  # (n, n, p)
+    change = plant.slope.state  # (n, n, p)
     n, _, p = change.shape
     turned = (y @ change.reshape(n, n * p)).reshape(len(omega), n, p)
     slope = np.einsum("fnp,fn->fp", turned, x) + x @ output[1] + y @ source[1]
     return FrequencyResponse(found, slope)
+
+
+def _solved(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solutions for one right-hand side, (f, n)."""
+    many = np.broadcast_to(right[:, None], (*matrices.shape[:2], 1))
+    return np.linalg.solve(matrices, many)[..., 0]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from studies.errors import StudyError
-from studies.fitting.bench import Bench, Pose, response
+from studies.fitting.bench import Bench, PlantAt, Pose, response
 from studies.fitting.signals import Signal
 from studies.space.free import FreeNumbers
 
@@ -34,7 +34,6 @@ class Experiment(NamedTuple):
     source: Signal
     output: Signal
     widest: float  # standard deviation of the widest direction afterwards, between the bounds [1]
-    sigma: np.ndarray  # of the free numbers afterwards, between the bounds [1], (p,)
 
     @property
     def text(self) -> str:
@@ -63,7 +62,7 @@ def next_experiments(
     found = []
     for pose in _poses(bench):
         plant = bench.plant(pose, values, True)
-        frequency = _about_modes(np.asarray(plant.value.state))
+        frequency = _about_modes(plant)
         for source, output in _pairs(bench):
             one = response(
                 plant,
@@ -77,12 +76,7 @@ def next_experiments(
             by = one.slope * slopes / sigma[:, None]
             after = np.linalg.inv(known + (by.conj().T @ by).real)
             widest = float(np.sqrt(np.linalg.eigvalsh(after)[-1]))
-            sigma_after = np.sqrt(np.maximum(np.diag(after), 0.0))
-            found.append(
-                Experiment(
-                    pose=pose, source=source, output=output, widest=widest, sigma=sigma_after
-                )
-            )
+            found.append(Experiment(pose, source, output, widest))
     return sorted(found, key=lambda x: x.widest)
 
 
@@ -111,9 +105,8 @@ def _pairs(bench: Bench) -> list[tuple[Signal, Signal]]:
     return list(product(sources, outputs))
 
 
-def _about_modes(state: np.ndarray) -> np.ndarray:
+def _about_modes(plant: PlantAt) -> np.ndarray:
     """Frequencies [Hz] that are dense about the first modes."""
-    pole = np.linalg.eigvals(state)
-    modes = np.sort(np.abs(pole[pole.imag > 1e-9 * np.abs(pole).max()]))[:COVERED] / (2 * np.pi)
+    modes = np.abs(plant.eigen.pole[plant.eigen.upper[:COVERED]]) / (2 * np.pi)
     each = np.concatenate([f * np.linspace(0.85, 1.15, POINTS // len(modes)) for f in modes])
     return np.unique(each)

@@ -50,7 +50,7 @@ def make_bench(spec: FitSpec) -> Bench:
     poses, places = [], []
     for k, entry in enumerate(spec.entries):
         is_held = isinstance(entry, ModesEntry) and entry.ends == "held"
-        if isinstance(entry, AtPose) and not isinstance(entry, TraceEntry) and not is_held:
+        if isinstance(entry, AtPose) and not is_held:
             poses.append(_pose(spec, entry))
         signals = _signals(spec, entry, f"fit.data[{k}]")
         if not isinstance(entry, TraceEntry):
@@ -168,8 +168,7 @@ def _noise(entry: Noisy, value: np.ndarray, path: str) -> Noise:
 def _response(spec: FitSpec, models: Models, entry: ResponseEntry, path: str) -> Measurement:
     read, signals = _read(spec, entry, path), _signals(spec, entry, path)
     frequency = read(entry.frequency).real
-    _ascending(frequency, f"column {entry.frequency!r}", path)
-    _check_frequency(frequency, path)
+    _check_frequency(frequency, entry, path)
     if entry.magnitude:
         kind: type[Magnitude | ComplexResponse] = Magnitude
         measured = _real(read(entry.magnitude), entry.magnitude, path)
@@ -200,7 +199,10 @@ def _complex(read: Callable[[str], np.ndarray], entry: ResponseEntry, path: str)
     return real + 1j * _real(read(entry.imag), entry.imag, path)
 
 
-def _check_frequency(frequency: np.ndarray, path: str) -> None:
+def _check_frequency(
+    frequency: np.ndarray, entry: ResponseEntry | SpectrumEntry, path: str
+) -> None:
+    _ascending(frequency, f"column {entry.frequency!r}", path)
     if frequency[0] < 0 or frequency[-1] > 1e5:
         raise StudyError(
             f"{path}: frequencies from {frequency[0]:g} to {frequency[-1]:g}; allowed: "
@@ -218,8 +220,7 @@ def _spectrum(spec: FitSpec, models: Models, entry: SpectrumEntry, path: str) ->
     frequency, density = read(entry.frequency).real, _real(read(entry.density), entry.density, path)
     keep = frequency > 0
     frequency, density = frequency[keep], density[keep]
-    _ascending(frequency, f"column {entry.frequency!r}", path)
-    _check_frequency(frequency, path)
+    _check_frequency(frequency, entry, path)
     if np.any(density <= 0):
         raise StudyError(
             f"{path}: column {entry.density!r} has values that are not positive; in dB?"

@@ -22,8 +22,7 @@ class Problem(NamedTuple):
 
     free: FreeNumbers
     priors: tuple[Prior, ...]
-    measurements: tuple[Measurement, ...]  # those that count
-    checks: tuple[Measurement, ...]  # those held out
+    measurements: tuple[Measurement, ...]  # without those held out
     bench: Bench
     is_robust: bool = False  # residuals beyond SOFT grow as their root
 
@@ -40,12 +39,19 @@ class Problem(NamedTuple):
 
     def residual(self, u: np.ndarray) -> np.ndarray:
         """All residuals, (m,), at places between the bounds, (p,)."""
-        value = np.concatenate([x.value for x in self.parts(self.free.values(u), False)])
-        return softened(value)[0] if self.is_robust else value
+        return self.stacked(self.parts(self.free.values(u), False))
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
         """Derivatives by the places, (m, p)."""
-        parts = self.parts(self.free.values(u), True)
+        return self.stacked_slopes(self.parts(self.free.values(u), True), u)
+
+    def stacked(self, parts: Sequence[Residual]) -> np.ndarray:
+        """`residual` from its parts."""
+        value = np.concatenate([x.value for x in parts])
+        return softened(value)[0] if self.is_robust else value
+
+    def stacked_slopes(self, parts: Sequence[Residual], u: np.ndarray) -> np.ndarray:
+        """`jacobian` from its parts."""
         by = np.concatenate([x.slope for x in parts if x.slope is not None])
         if self.is_robust:
             by = by * softened(np.concatenate([x.value for x in parts]))[1][:, None]

@@ -74,11 +74,11 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
     every = make_measurements(spec, bench)
     complaints(every, guess(spec))
     kept = tuple(x for x in every if not x.is_checked)
+    checks = [x for x in every if x.is_checked]
     problem = Problem(
         free=free,
         priors=spec.priors,
         measurements=kept,
-        checks=tuple(x for x in every if x.is_checked),
         bench=bench,
         is_robust=fit.loss == "robust",
     )
@@ -88,7 +88,7 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
     console.print(f"{count} measured numbers, {len(u)} free; rating {fit.starts} starts")
     solution = solve(problem, fit.starts, fit.refine, fit.iterations, fit.seed)
     answer = describe_fit(problem, solution.best.u)
-    for one in problem.checks:
+    for one in checks:
         one.reweigh(answer.values)
     profiles: list[Likelihood] = []
     if fit.profile and len(u) <= PROFILED:
@@ -107,7 +107,7 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
         study=study,
         curves=tuple((x.name, x.curve(answer.values)) for x in every),
         checks=tuple(
-            misfit(x.name, x.residual(answer.values, False), x.is_ordered) for x in problem.checks
+            misfit(x.name, x.residual(answer.values, False), x.is_ordered) for x in checks
         ),
         profiles=tuple(profiles),
         experiments=tuple(experiments),
@@ -146,14 +146,14 @@ def run_fit(
     try:
         out.mkdir(parents=True, exist_ok=True)
         with staged(out) as staging:
-            for name in plots.NAMES:  # of an earlier fit
-                (out / f"{name}.png").unlink(missing_ok=True)
-            _draw(staging, found, has_pdf)
+            drawn = _draw(staging, found, has_pdf)
             (staging / STUDY).write_text(study_template(found.study), encoding="utf-8")
             (staging / TUNE).write_text(_tuning(found), encoding="utf-8")
             (staging / DOCUMENT).write_text(document(found), encoding="utf-8")
             write_store(staging / DATA, variables(found), run_attributes(found.study))
             write_report(staging, report(found), found.study)
+        for name in set(plots.NAMES) - set(drawn):  # of an earlier fit
+            (out / f"{name}.png").unlink(missing_ok=True)
     except OSError as error:
         raise StudyError(f"--out {out}: cannot write there ({error})") from error
     console.print(summary(found), soft_wrap=True)
@@ -165,10 +165,14 @@ def run_fit(
     return found
 
 
-def _draw(folder: Path, found: Fitted, has_pdf: bool) -> None:
+def _draw(folder: Path, found: Fitted, has_pdf: bool) -> list[str]:
+    """Names of the figures that there are."""
+    drawn = []
     with figures.styled():
         for name, figure in plots.all_figures(found):
             figures.save(figure, folder, name, has_pdf)
+            drawn.append(name)
+    return drawn
 
 
 def spread_percent(found: Fitted) -> dict[str, float]:

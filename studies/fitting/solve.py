@@ -26,7 +26,6 @@ class Optimum(NamedTuple):
     u: np.ndarray  # place between the bounds, (p,)
     cost: float  # half the sum of the loss
     is_converged: bool
-    evaluations: int
 
 
 class Solution(NamedTuple):
@@ -34,7 +33,6 @@ class Solution(NamedTuple):
 
     optima: tuple[Optimum, ...]
     rated: int  # first guesses
-    failed: int  # of these, where the model has no answer
 
     @property
     def best(self) -> Optimum:
@@ -86,7 +84,7 @@ def solve(problem: Problem, starts: int, refine: int, iterations: int, seed: int
             found.append(descend(problem, u, iterations))
     found = found or followed
     found.sort(key=lambda x: x.cost)
-    return Solution(tuple(found), len(first), int((~np.isfinite(cost)).sum()))
+    return Solution(tuple(found), len(first))
 
 
 def descend(problem: Problem, u: np.ndarray, iterations: int) -> Optimum:
@@ -108,4 +106,4 @@ def descend(problem: Problem, u: np.ndarray, iterations: int) -> Optimum:
         ftol=1e-12,
         gtol=1e-10,
     )
-    return Optimum(u=done.x, cost=done.cost, is_converged=done.status > 0, evaluations=done.nfev)
+    return Optimum(done.x, done.cost, done.status > 0)

@@ -90,7 +90,7 @@ def describe_fit(problem: Problem, u: np.ndarray) -> Answer:
     """
     values = problem.free.values(u)
     parts = problem.parts(values, True)
-    residual, jacobian = problem.residual(u), problem.jacobian(u)
+    residual, jacobian = problem.stacked(parts), problem.stacked_slopes(parts, u)
     covariance, directions = spread(jacobian)
     sigma_u = np.sqrt(np.diag(covariance))
     slopes = np.abs(problem.free.slopes(u))

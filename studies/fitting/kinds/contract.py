@@ -14,6 +14,14 @@ class Residual(NamedTuple):
     slope: np.ndarray | None  # by the free numbers, (m, p); None if not asked for
 
 
+def scaled(
+    found: np.ndarray, slope: np.ndarray | None, measured: np.ndarray, sigma: np.ndarray
+) -> Residual:
+    """The residual of real numbers of the model, (m,), with their derivatives, (m, p)."""
+    value = (found - measured) / sigma
+    return Residual(value, None if slope is None else slope / sigma[:, None])
+
+
 class Curve(NamedTuple):
     """What a figure shows of one measurement."""
 

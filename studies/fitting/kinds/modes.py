@@ -12,15 +12,13 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from studies.errors import StudyError, field_error
-from studies.fitting.bench import Bench, Modes, modes_of
+from studies.fitting.bench import Bench, Modes, PlantAt
 from studies.fitting.kinds.contract import Curve, Residual
 
 #: Modes closer than this share one subspace [1].
 NEAR = 0.03
 #: Modes closer than this are one: their shapes are any of a subspace [1].
 EQUAL = 1e-6
-#: A pair of shapes less alike is not a pair [1].
-LEAST_MAC = 0.3
 TWO_PI = 2 * np.pi
 
 
@@ -61,14 +59,13 @@ class HeldModes:
         pass  # its noise is no share
 
     def curve(self, values: np.ndarray) -> Curve:
-        found = self._bench.held(values, False)[0][self._link]
-        return _curve(self._measured, found[: len(self._measured.frequency)])
+        return _curve(self._measured, self._frequencies(values))
 
     def complaint(self, values: np.ndarray) -> str:
-        found = self._bench.held(values, False)[0][self._link]
-        if len(self._measured.frequency) > len(found):
-            return f"has more modes than the model's {len(found)}; raise link.modes"
-        return _scale_complaint(self._measured, found[: len(self._measured.frequency)])
+        return _scale_complaint(self._measured, self._frequencies(values))
+
+    def _frequencies(self, values: np.ndarray) -> np.ndarray:
+        return self._bench.held(values, False)[0][self._link, : len(self._measured.frequency)]
 
 
 class MachineModes:
@@ -88,13 +85,10 @@ class MachineModes:
         self._bench, self._measured, self._pose = bench, measured, pose
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
-        plant = self._bench.plant(self._pose, values, has_slopes)
-        found = modes_of(np.asarray(plant.value.state))
-        pairs = pair_modes(self._measured, found, np.asarray(plant.value.sensor))
-        pole = found.pole[pairs.mode]
+        plant, pole, pairs = self._paired(values, has_slopes)
         slopes: list[np.ndarray | None] = [None, None]
         if plant.slope is not None:
-            turned = np.einsum("kn,nmp->kmp", pairs.dual, np.asarray(plant.slope.state))
+            turned = np.einsum("kn,nmp->kmp", pairs.dual, plant.slope.state)
             by = np.einsum("kmp,mk->kp", turned, pairs.shape)  # of the poles
             size = (pole.real[:, None] * by.real + pole.imag[:, None] * by.imag) / np.abs(pole)[
                 :, None
@@ -109,17 +103,21 @@ class MachineModes:
         pass  # its noise is no share
 
     def curve(self, values: np.ndarray) -> Curve:
-        return _curve(self._measured, self._paired(values))
+        return _curve(self._measured, self._frequencies(values))
 
-    def _paired(self, values: np.ndarray) -> np.ndarray:
-        plant = self._bench.plant(self._pose, values, False)
-        found = modes_of(np.asarray(plant.value.state))
-        pairs = pair_modes(self._measured, found, np.asarray(plant.value.sensor))
-        return np.abs(found.pole[pairs.mode]) / TWO_PI
+    def _paired(self, values: np.ndarray, has_slopes: bool) -> tuple[PlantAt, np.ndarray, Pairs]:
+        """The plant, its poles that belong to the measured modes, and how they were paired."""
+        plant = self._bench.plant(self._pose, values, has_slopes)
+        modes = plant.modes
+        pairs = pair_modes(self._measured, modes, plant.value.sensor)
+        return plant, modes.pole[pairs.mode], pairs
+
+    def _frequencies(self, values: np.ndarray) -> np.ndarray:
+        return np.abs(self._paired(values, False)[1]) / TWO_PI
 
     def complaint(self, values: np.ndarray) -> str:
         try:
-            return _scale_complaint(self._measured, self._paired(values))
+            return _scale_complaint(self._measured, self._frequencies(values))
         except StudyError as error:
             return str(error)
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from studies.fitting.bench import Bench, Pose, response
-from studies.fitting.kinds.contract import Curve, Noise, Residual
+from studies.fitting.kinds.contract import Curve, Noise, Residual, scaled
 from studies.fitting.signals import Signal
 
 TWO_PI = 2 * np.pi
@@ -78,6 +78,16 @@ class _OfBench:
             "and a frequency in Hz: check the units"
         )
 
+    def _line(self, label: str, measured: np.ndarray, model: np.ndarray) -> Curve:
+        return Curve(
+            abscissa="frequency [Hz]",
+            ordinate=label,
+            x=self.frequency,
+            measured=measured,
+            model=model,
+            is_log=True,
+        )
+
 
 class ComplexResponse(_OfBench):
     """Real and imaginary part."""
@@ -95,14 +105,7 @@ class ComplexResponse(_OfBench):
         found = np.abs(self.predicted(values, False)[0])
         measured = np.abs(self.measured)
         label = f"response [{self._unit}]"
-        return Curve(
-            abscissa="frequency [Hz]",
-            ordinate=label,
-            x=self.frequency,
-            measured=measured,
-            model=found,
-            is_log=True,
-        )
+        return self._line(label, measured, found)
 
 
 class Magnitude(_OfBench):
@@ -111,23 +114,16 @@ class Magnitude(_OfBench):
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
         found, slope = self.predicted(values, has_slopes)
         size = np.abs(found)
-        value = (size - self.measured) / self.sigma
-        if slope is None:
-            return Residual(value, None)
-        unit = np.where(size > 0, found / np.where(size > 0, size, 1.0), 0.0)
-        return Residual(value, (unit.conj()[:, None] * slope).real / self.sigma[:, None])
+        by = None
+        if slope is not None:
+            unit = np.where(size > 0, found / np.where(size > 0, size, 1.0), 0.0)
+            by = (unit.conj()[:, None] * slope).real
+        return scaled(size, by, self.measured, self.sigma)
 
     def curve(self, values: np.ndarray) -> Curve:
         found = np.abs(self.predicted(values, False)[0])
         label = f"magnitude [{self._unit}]"
-        return Curve(
-            abscissa="frequency [Hz]",
-            ordinate=label,
-            x=self.frequency,
-            measured=self.measured,
-            model=found,
-            is_log=True,
-        )
+        return self._line(label, self.measured, found)
 
 
 class Spectrum(_OfBench):
@@ -160,14 +156,7 @@ class Spectrum(_OfBench):
         found = np.abs(self.predicted(values, False)[0]) ** 2
         level = np.exp(np.mean(np.log(self.measured) - np.log(found)))
         label = "power spectrum [any unit]"
-        return Curve(
-            abscissa="frequency [Hz]",
-            ordinate=label,
-            x=self.frequency,
-            measured=self.measured,
-            model=level * found,
-            is_log=True,
-        )
+        return self._line(label, self.measured, level * found)
 
     def complaint(self, values: np.ndarray) -> str:
         return ""  # any strength will do

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -14,15 +13,15 @@ from jaxmodel import status
 from jaxmodel.case import Case, Structure
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import simulate
+from studies.engine.program import Place
 from studies.engine.runs import check_run
 from studies.errors import StudyError
-from studies.fitting.kinds.contract import Curve, Noise, Residual
+from studies.fitting.bench import with_slopes
+from studies.fitting.kinds.contract import Curve, Noise, Residual, scaled
 from studies.fitting.signals import Signal
 from studies.study.entries import Entries
 from studies.study.labels import describe
 from studies.study.spec import Study
-
-Place = Callable[[Case, Array], Case]
 
 
 class Trace:
@@ -75,8 +74,7 @@ class Trace:
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
         found, slope = self.predicted(values, has_slopes)
-        value = (found - self.measured) / self.sigma
-        return Residual(value, None if slope is None else slope / self.sigma[:, None])
+        return scaled(found, slope, self.measured, self.sigma)
 
     def reweigh(self, values: np.ndarray) -> None:
         self.sigma = self._noise.of_model(self.predicted(values, False)[0], self.measured)
@@ -135,9 +133,9 @@ def _traced(structure: Structure, place: Place, kind: str, case: Case, values: A
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _traced_slopes(structure: Structure, place: Place, kind: str, case: Case, values: Array) -> Any:
-    run = partial(_recorded, structure, place, kind, case)
-    value, (time, code) = run(values)
-    return time, value, code, jax.jacfwd(lambda x: run(x)[0])(values)
+    run = with_slopes(_recorded, 4, is_first=True)
+    slope, (value, (time, code)) = run(structure, place, kind, case, values)
+    return time, value, code, slope
 
 
 def _check_finished(name: str, code: int) -> None:
@@ -264,8 +262,7 @@ class Figures:
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
         found, slope = self.predicted(values, has_slopes)
-        value = (found - self.measured) / self.sigma
-        return Residual(value, None if slope is None else slope / self.sigma[:, None])
+        return scaled(found, slope, self.measured, self.sigma)
 
     def reweigh(self, values: np.ndarray) -> None:
         pass  # few numbers, whose noise is a share of what was measured
@@ -313,6 +310,6 @@ _metrics = jax.jit(_run_metrics, static_argnums=(0, 1))
 def _metric_slopes(
     structure: Structure, place: Place, case: Case, masks: Array, modes: Array, values: Array
 ) -> Any:
-    run = partial(_run_metrics, structure, place, case, masks, modes)
-    metrics, code = run(values)
-    return metrics, code, jax.jacfwd(lambda x: run(x)[0])(values)
+    run = with_slopes(_run_metrics, 5, is_first=True)
+    slopes, (metrics, code) = run(structure, place, case, masks, modes, values)
+    return metrics, code, slopes
