@@ -48,6 +48,13 @@ SPECTRUM = {
     "averages": 64,
 }
 TRACE = {"kind": "trace", "output": "sensor 1.2", "file": "trace.csv", "sigma": 1e-3}
+SETTLING = {
+    "kind": "settling",
+    "output": "sensor 1.2",
+    "time_s": 0.02,
+    "sigma_s": 0.002,
+    "band_percent": 30.0,
+}
 FIGURES = {
     "kind": "figures",
     "values": {"residual_rms": 1e-6, "residual_rms[link=1]": 1e-6, "peak_voltage": 10.0},

@@ -13,11 +13,13 @@ from scipy.stats import chi2
 
 from studies.errors import StudyError
 from studies.fitting.kinds.modes import TWO_PI, pair_modes
+from studies.fitting.posterior import sample, shape
 from studies.fitting.problem import Problem
+from studies.fitting.profiles import profile
 from studies.fitting.report import told, undetermined
 from studies.fitting.run import fit, run_fit
 from studies.fitting.solve import descend, solve
-from studies.fitting.statistics import describe_fit, profile
+from studies.fitting.statistics import describe_fit
 from studies.fitting.tables import read_columns
 from studies.study.spec import load_study
 from studies.tuning.spec import load_tuning
@@ -29,6 +31,7 @@ from tests.fits import (
     MODES,
     REDUCTION,
     RESPONSE,
+    SETTLING,
     SHORT,
     SPECTRUM,
     TIME,
@@ -75,6 +78,7 @@ ENTRIES = {
     "magnitude": MAGNITUDE,
     "spectrum": SPECTRUM,
     "trace": TRACE,
+    "settling": SETTLING,
     "figures": FIGURES,
     "reduction": REDUCTION,
 }
@@ -266,14 +270,75 @@ def test_the_paper_s_frequencies_from_modulus_and_joint(tmp_path):
     assert 0 < answer.sigma[0] < 5e9 and abs(answer.correlation[0, 1]) > 0.9
     given = load_study(tmp_path / "out" / "fitted.toml")
     assert given.link.youngs_modulus == pytest.approx(answer.values[0], rel=1e-12)
-    spread = load_tuning(tmp_path / "out" / "fitted_tune.toml").tune.scenarios.spread
-    assert set(spread) == set(free) and spread["link.youngs_modulus"] < 1.0  # with J held
+    machines = load_tuning(tmp_path / "out" / "fitted_tune.toml").tune.scenarios.machines
+    assert set(machines) == set(free)
+    drawn = np.corrcoef(list(machines.values()))[0, 1]  # drawn together, not number by number
+    assert abs(drawn) > 0.8 and np.sign(drawn) == np.sign(answer.correlation[0, 1])
     text = (tmp_path / "out" / "report.md").read_text()
     assert "strongly correlated" in text and "## Next experiment" in text
     assert found.experiments[0].widest < 0.5 * np.sqrt(np.linalg.eigvalsh(answer.covariance)[-1])
 
 
+PAIR = {
+    "link.youngs_modulus": {"from": 60e9, "to": 80e9},
+    "link.damping_ratio": {"from": 0.005, "to": 0.02},
+}
+#: The second number has a wide, skewed posterior, cut off by its upper bound.
+ONE_MODE = {
+    "kind": "modes",
+    "ends": "held",
+    "frequency_hz": [101.0],
+    "sigma_hz": 1.5,
+    "damping_ratio": [0.014],
+    "damping_sigma": 0.004,
+}
+
+
+def integrated(problem, size=61):
+    """Mean and standard deviation of places between the bounds, from a grid of densities."""
+    axis = (np.arange(size) + 0.5) / size
+    grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    weight = np.exp(-0.5 * np.array([np.sum(problem.residual(u) ** 2) for u in grid]))
+    weight /= weight.sum()
+    mean = weight @ grid
+    return mean, np.sqrt(weight @ (grid - mean) ** 2)
+
+
+def sampled(folder, count):
+    """A posterior of two numbers, and its mean and deviation by integration."""
+    spec = spec_of(folder, ONE_MODE, free=PAIR)
+    bench, measurements, _ = made(spec)
+    problem = Problem(free=spec.free, priors=(), measurements=measurements, bench=bench)
+    answer = describe_fit(problem, solve(problem, 4, 1, 60, 0).best.u)
+    return sample(problem, shape(answer), count, 1), *integrated(problem)
+
+
+def test_samples_have_the_posterior_s_mean_and_deviation(folder):
+    found, mean, deviation = sampled(folder, 120)
+    assert found.values.shape == (120, 2) and found.effective.max() <= 2 * 120
+    assert np.all(np.abs(found.places.mean(axis=0) - mean) < deviation)
+    assert np.all((found.places >= 0) & (found.places <= 1))
+
+
+@pytest.mark.long
+def test_many_samples_have_the_posterior_s_mean_and_deviation(folder):
+    found, mean, deviation = sampled(folder, 1600)
+    assert found.is_settled
+    error = deviation / np.sqrt(found.effective)
+    assert np.all(np.abs(found.places.mean(axis=0) - mean) < 4 * error)
+    np.testing.assert_allclose(found.places.std(axis=0), deviation, rtol=0.1)
+
+
 FAULTS = {
+    "no time": (
+        {"kind": "settling", "output": "sensor 1.1", "sigma_s": 0.1},
+        {},
+        "fit.data[0].time_s: missing; allowed: a finite number >= 0",
+    ),
+    "no frequency": ({"kind": "modes", "sigma_hz": 1.0}, {}, "frequency_hz: missing"),
+    "two bands": (SETTLING | {"band": 1.0}, {}, "give band [unit of the output] or band_percent"),
+    "never settles": (SETTLING | {"band_percent": 0.01}, {}, "does not settle to"),
+    "settles elsewhere": (SETTLING | {"output": "slider 1"}, {}, "which settle about 0"),
     "not a number": (RESPONSE, {"real": np.nan}, "column 'real': 1 of 200 entries are no finite"),
     "another unit": (RESPONSE, {"scale": 1e3}, "times the model at the first guess; expected V/V"),
     "kilohertz": (RESPONSE, {"frequency": 1e-3}, "check the units"),
@@ -292,7 +357,16 @@ FAULTS = {
         "ascending frequencies",
     ),
     "too few": ({"kind": "modes", "frequency_hz": [92.5], "sigma_hz": 1.0}, {}, "as many or more"),
-    "far away": (MODES | {"pose": [0.5, 0.0, 0.0]}, {}, "pose"),
+    "far away": (MODES | {"pose": [0.5, 0.0, 0.0]}, {}, "fit.data[0].pose = [0.5, 0.0, 0.0]"),
+    "shapes of nothing": (
+        {k: v for k, v in MODES.items() if not k.startswith("damping")}
+        | {
+            "frequency_hz": [90.0, 95.0, 98.0],
+            "shapes": [[0.7, 1.0, 0.7, 1.0, 0.0, -1.0, 0.8, -0.9, 0.8]] * 3,
+        },
+        {},
+        "alike to any of the model's",
+    ),
     "no kind": (MODES | {"kind": "mode"}, {}, "did you mean 'modes'"),
     "no field": (MODES | {"frequencies": 1}, {}, "did you mean 'fit.data[0].frequency_hz'"),
     "no derivative": (FIGURES | {"values": {"settling_time": 0.1}}, {}, "has no derivative"),

@@ -196,6 +196,24 @@ def deep(n):
         ),
         ({"free": GAIN, "scenarios": {"spread": {"run.duration": 5.0}}}, "for the machine and its"),
         (
+            {"free": GAIN, "scenarios": {"machines": {"link.density": [2700.0]}}},
+            "allowed: a list of 16 values or more",
+        ),
+        (
+            {"free": GAIN, "scenarios": {"machines": {"link.density": [-1.0] * 16}}},
+            r"link.density\[0\]: link.density = -1.0",
+        ),
+        (
+            {
+                "free": GAIN,
+                "scenarios": {
+                    "spread": {"link.density": 1.0},
+                    "machines": {"link.density": [2700.0] * 16},
+                },
+            },
+            "both in spread and in machines",
+        ),
+        (
             {
                 "free": GAIN,
                 "scenarios": {

@@ -6,8 +6,8 @@ experiment.
 - Problem: `spec` reads the file, `tables` the files of its data, `signals` names inputs and
   outputs, `measurements` puts them together; `kinds` are the kinds of measurements, `bench` is the
   linear machine they are predicted with.
-- Answer: `problem` stacks the residuals, `solve` finds the least, `statistics` says what is known,
-  `experiment` what to measure next.
+- Answer: `problem` stacks the residuals, `solve` finds the least, `statistics`, `profiles` and
+  `posterior` say what is known, `experiment` what to measure next.
 - `run` leads from the file to the folder, `report` and `plots` present it, `commands` is
   `studies fit`.
 

@@ -104,11 +104,11 @@ class Bench:
         Args:
             study: the model.
             place: puts free numbers into a case.
-            poses: where measurements were taken; checked here.
+            poses: where measurements were taken.
             places: positions along the links of hammers and displacement sensors [m].
 
         Raises:
-            StudyError: a pose out of reach, or hammers with a basis whose ends are off the chord.
+            StudyError: hammers with a basis whose ends are off the chord.
         """
         if study.drive.locked:
             raise field_error("drive.locked", True, "false where modes or responses are fitted")
@@ -129,18 +129,16 @@ class Bench:
         self.n_patches = self.structure.n_patches
         self.place = place
         self.poses = tuple(dict.fromkeys(poses))
-        for pose in self.poses:
-            self.check(pose)
         self._kept: dict[tuple[Pose, bool], tuple[bytes, PlantAt]] = {}
 
-    def check(self, pose: Pose) -> None:
-        """Refuse a pose.
+    def check(self, pose: Pose, path: str) -> None:
+        """Refuse a pose; path: where it is written, for messages.
 
         Raises:
             StudyError: out of reach or singular.
         """
         code, lifts = _reach(self.structure, self.case, np.array(pose))
-        check_pose(self.study, "pose", pose, int(code), np.asarray(lifts))
+        check_pose(self.study, path, pose, int(code), np.asarray(lifts))
 
     def plant(self, pose: Pose, values: np.ndarray, has_slopes: bool) -> PlantAt:
         """The plant at a pose for some values of the free numbers, (p,)."""

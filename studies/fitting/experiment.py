@@ -1,49 +1,45 @@
-"""The next experiment: which response, taken next, would tell most about what is still open.
+"""The next experiment: which measurement, taken next, would tell most about what is still open.
 
-A frequency response has a Jacobian before it is measured, so that its information can be added to
-what the data say already. Candidates are responses from every actuator and slider to every sensor
-at poses around home.
+A measurement has a Jacobian before it is taken, so that its information can be added to what the
+data say already. Candidates are the frequencies and damping ratios of the first modes, and
+responses from every actuator, slider and hammer to every sensor and deflection, at poses around
+home.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
+from jaxmodel.beam import BASES
 from studies.errors import StudyError
 from studies.fitting.bench import Bench, PlantAt, Pose, response
-from studies.fitting.signals import Signal
+from studies.fitting.kinds.modes import frequency_slopes
+from studies.fitting.signals import Signal, signal_name
 from studies.space.free import FreeNumbers
 
 #: Noise of the responses: share of the value, and of the largest value.
 RELATIVE, FLOOR = 0.02, 0.002
+#: Noise of the modes: share of the frequency, and of the damping ratio.
+FREQUENCY, DAMPING = 0.003, 0.1
 #: Frequencies of a candidate, spread about the model's modes.
 POINTS = 120
 #: How far from home candidates are taken [m; rad].
 SHIFT, TURN = 0.02, 0.15
-#: Modes that responses cover.
+#: Modes that a measurement covers.
 COVERED = 9
 
 
 class Experiment(NamedTuple):
-    """One response that could be measured."""
+    """One measurement that could be taken."""
 
     pose: Pose
-    source: Signal
-    output: Signal
+    text: str
     widest: float  # standard deviation of the widest direction afterwards, between the bounds [1]
-
-    @property
-    def text(self) -> str:
-        """In words."""
-        return f"{_name(self.source)} to {_name(self.output)}"
-
-
-def _name(signal: Signal) -> str:
-    patch = f".{signal.patch + 1}" if signal.kind in ("actuator", "sensor") else ""
-    return f"{signal.kind} {signal.link + 1}{patch}"
 
 
 def next_experiments(
@@ -61,23 +57,38 @@ def next_experiments(
     values, slopes = free.values(u), free.slopes(u)
     found = []
     for pose in _poses(bench):
-        plant = bench.plant(pose, values, True)
-        frequency = _about_modes(plant)
-        for source, output in _pairs(bench):
-            one = response(
-                plant,
-                plant.input(source, source.row(bench.n_patches, bench.stations)),
-                plant.output(output, output.row(bench.n_patches, bench.stations)),
-                2 * np.pi * frequency,
-            )
-            assert one.slope is not None
-            size = np.abs(one.value)
-            sigma = np.hypot(RELATIVE * size, FLOOR * size.max())
-            by = one.slope * slopes / sigma[:, None]
+        for text, slope in _candidates(bench, bench.plant(pose, values, True)):
+            by = slope * slopes
             after = np.linalg.inv(known + (by.conj().T @ by).real)
-            widest = float(np.sqrt(np.linalg.eigvalsh(after)[-1]))
-            found.append(Experiment(pose, source, output, widest))
+            found.append(Experiment(pose, text, float(np.sqrt(np.linalg.eigvalsh(after)[-1]))))
     return sorted(found, key=lambda x: x.widest)
+
+
+def _candidates(bench: Bench, plant: PlantAt) -> Iterator[tuple[str, np.ndarray]]:
+    """What could be measured at a pose, and derivatives over the noise, (n, p)."""
+    assert plant.slope is not None
+    with suppress(np.linalg.LinAlgError):
+        modes = plant.modes
+        pole = modes.pole[:COVERED]
+        turned = np.einsum("kn,nmp->kmp", modes.dual[:COVERED], plant.slope.state)
+        by = np.einsum("kmp,mk->kp", turned, modes.shape[:, :COVERED])
+        by_frequency, by_damping = frequency_slopes(pole, by)
+        size, ratio = np.abs(pole) / (2 * np.pi), -pole.real / np.abs(pole)
+        noise = FREQUENCY * size, DAMPING * np.maximum(ratio, 1e-4)
+        slopes = [by_frequency / noise[0][:, None], by_damping / noise[1][:, None]]
+        yield f"frequencies and damping of {len(pole)} modes", np.concatenate(slopes)
+    frequency = _about_modes(plant)
+    for source, output in _pairs(bench):
+        one = response(
+            plant,
+            plant.input(source, source.row(bench.n_patches, bench.stations)),
+            plant.output(output, output.row(bench.n_patches, bench.stations)),
+            2 * np.pi * frequency,
+        )
+        assert one.slope is not None
+        size = np.abs(one.value)
+        sigma = np.hypot(RELATIVE * size, FLOOR * size.max())
+        yield f"{signal_name(source)} to {signal_name(output)}", one.slope / sigma[:, None]
 
 
 def _poses(bench: Bench) -> list[Pose]:
@@ -89,7 +100,7 @@ def _poses(bench: Bench) -> list[Pose]:
     for dx, dy, turn in shifts:
         pose = (x + dx, y + dy, phi + turn)
         try:
-            bench.check(pose)
+            bench.check(pose, "pose")
         except StudyError:
             continue
         kept.append(pose)
@@ -102,6 +113,10 @@ def _pairs(bench: Bench) -> list[tuple[Signal, Signal]]:
     sources = [Signal("actuator", i, k, np.nan) for i, k in product(links, patches)]
     sources += [Signal("slider", i, 0, np.nan) for i in links]
     outputs = [Signal("sensor", i, k, np.nan) for i, k in product(links, patches)]
+    if BASES[bench.study.link.basis].is_on_chord:
+        place = bench.stations[len(bench.stations) // 2]
+        sources += [Signal("hammer", i, 0, place) for i in links]
+        outputs += [Signal("deflection", i, 0, place) for i in links]
     return list(product(sources, outputs))
 
 

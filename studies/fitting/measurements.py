@@ -13,9 +13,11 @@ from studies.errors import StudyError, field_error
 from studies.fitting.bench import Bench
 from studies.fitting.bench import Pose as At
 from studies.fitting.kinds.contract import Measurement, Noise
+from studies.fitting.kinds.figures import Compared, Figures, Runs, Switch
 from studies.fitting.kinds.modes import HeldModes, MachineModes, Measured, check_ascending
+from studies.fitting.kinds.motions import OFF, Motions
 from studies.fitting.kinds.response import ComplexResponse, Magnitude, Spectrum
-from studies.fitting.kinds.runs import OFF, Compared, Figures, Runs, Switch, Trace
+from studies.fitting.kinds.traces import Band, Settling, Trace
 from studies.fitting.signals import INPUTS, OUTPUTS, Signal, parse_signal
 from studies.fitting.spec import (
     AtPose,
@@ -26,6 +28,8 @@ from studies.fitting.spec import (
     ModesEntry,
     Noisy,
     ResponseEntry,
+    Seen,
+    SettlingEntry,
     SpectrumEntry,
     TraceEntry,
 )
@@ -43,19 +47,23 @@ class Models(NamedTuple):
 
     bench: Bench
     runs: Runs
+    motions: Motions
 
 
 def make_bench(spec: FitSpec) -> Bench:
     """Linear machine at the poses of all entries."""
-    poses, places = [], []
+    poses: dict[At, str] = {}
+    places: list[float] = []
     for k, entry in enumerate(spec.entries):
         is_held = isinstance(entry, ModesEntry) and entry.ends == "held"
         if isinstance(entry, AtPose) and not is_held:
-            poses.append(_pose(spec, entry))
-        signals = _signals(spec, entry, f"fit.data[{k}]")
-        if not isinstance(entry, TraceEntry):
-            places += [x.place for x in signals if not np.isnan(x.place)]
-    return Bench(spec.study, spec.free.place, poses, places)
+            poses.setdefault(_pose(spec, entry), f"fit.data[{k}].pose")
+        if not isinstance(entry, (TraceEntry, SettlingEntry)):
+            places += _places(_signals(spec, entry, f"fit.data[{k}]"))
+    bench = Bench(spec.study, spec.free.place, tuple(poses), places)
+    for pose, path in poses.items():
+        bench.check(pose, path)
+    return bench
 
 
 def make_measurements(spec: FitSpec, bench: Bench) -> list[Measurement]:
@@ -64,7 +72,16 @@ def make_measurements(spec: FitSpec, bench: Bench) -> list[Measurement]:
     Raises:
         StudyError: a file that cannot be used, data that do not fit the machine.
     """
-    models = Models(bench, Runs(spec.study, spec.free.place))
+    given = spec.study, spec.free.place
+    places = sorted(
+        {
+            place
+            for k, entry in enumerate(spec.entries)
+            if isinstance(entry, (TraceEntry, SettlingEntry))
+            for place in _places(_signals(spec, entry, f"fit.data[{k}]"))
+        }
+    )
+    models = Models(bench, Runs(*given), Motions(*given, tuple(places)))
     return [
         _MAKERS[type(entry)](spec, models, entry, f"fit.data[{k}]")
         for k, entry in enumerate(spec.entries)
@@ -77,13 +94,18 @@ def _pose(spec: FitSpec, entry: AtPose) -> At:
 
 def _signals(spec: FitSpec, entry: Common, path: str) -> tuple[Signal, ...]:
     """Input and output of an entry, or its output."""
-    if not isinstance(entry, FileEntry):
+    if not isinstance(entry, Seen):
         return ()
     given = build_structure(spec.study).n_patches, each_link(spec.study.link.length)
     output = parse_signal(entry.output, OUTPUTS, *given, f"{path}.output")
     if not isinstance(entry, (ResponseEntry, SpectrumEntry)):
         return (output,)
     return parse_signal(entry.input, INPUTS, *given, f"{path}.input"), output
+
+
+def _places(signals: tuple[Signal, ...]) -> list[float]:
+    """Where along the links they are, of those that are there."""
+    return [x.place for x in signals if not np.isnan(x.place)]
 
 
 def _each(value: Any, count: int, path: str) -> np.ndarray:
@@ -248,21 +270,32 @@ def _trace(spec: FitSpec, models: Models, entry: TraceEntry, path: str) -> Measu
             f"{path}: times from {time[0]:g} to {time[-1]:g} s; allowed: within the run, 0 to "
             f"{spec.study.run.duration:g} [s] (run.duration)"
         )
-    study = spec.study
-    if not np.isnan(signal.place):
-        study = study.change(metrics__stations=(signal.place,))
-        signal = signal._replace(patch=0)
     return Trace(
         entry.name,
         entry.check,
-        study,
-        spec.free.place,
+        models.motions.of(None),
         signal,
         time,
         value,
         _noise(entry, value, path),
         OUTPUTS[signal.kind][1],
     )
+
+
+def _settling(spec: FitSpec, models: Models, entry: SettlingEntry, path: str) -> Measurement:
+    if (entry.band is None) == (entry.band_percent is None):
+        raise StudyError(f"{path}: give band [unit of the output] or band_percent [%], one of them")
+    (signal,) = _signals(spec, entry, path)
+    if signal.kind in ("slider", "platform"):
+        forms = ", ".join(OUTPUTS[x][0] for x in ("sensor", "deflection"))
+        raise field_error(f"{path}.output", entry.output, f"{forms}, which settle about 0")
+    share = entry.band_percent
+    band = Band(entry.band or 0.0, None)
+    if share is not None:
+        band = Band(share / 100, models.motions.of(OFF))
+    motion = models.motions.of(entry.links)
+    given = motion, signal, band, entry.time_s, entry.sigma_s
+    return Settling(entry.name, entry.check, *given)
 
 
 def _figures(spec: FitSpec, models: Models, entry: FiguresEntry, path: str) -> Measurement:
@@ -279,8 +312,9 @@ def _figures(spec: FitSpec, models: Models, entry: FiguresEntry, path: str) -> M
         entries = parse_entries(name, f"{path}.values")
         if not METRICS[entries.metric].has_slope:
             smooth = [x for x in METRICS if METRICS[x].has_slope]
+            hint = "; take kind = 'settling'" if entries.metric == "settling_time" else ""
             raise StudyError(
-                f"{path}.values: {name!r} has no derivative; allowed: {', '.join(smooth)}"
+                f"{path}.values: {name!r} has no derivative{hint}; allowed: {', '.join(smooth)}"
             )
         compared.append(
             Compared(
@@ -302,6 +336,7 @@ _MAKERS: dict[type[Common], Callable[..., Measurement]] = {
     ResponseEntry: _response,
     SpectrumEntry: _spectrum,
     TraceEntry: _trace,
+    SettlingEntry: _settling,
     FiguresEntry: _figures,
 }
 

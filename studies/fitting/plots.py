@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.fitting.kinds.contract import Curve
+from studies.fitting.kinds.contract import Line, Numbers
 from studies.fitting.statistics import WIDE
 from studies.show.figures import new_figure
 
@@ -17,46 +16,63 @@ if TYPE_CHECKING:
     from studies.fitting.run import Fitted
 
 #: All figures there can be.
-NAMES = ("fit", "correlations", "profiles")
-#: Measurements in one figure.
-MOST = 8
+NAMES = ("fit", "numbers", "correlations", "profiles")
+#: Measurements in one figure, and single numbers.
+MOST, MOST_NUMBERS = 8, 40
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#999999"
 
 
 def all_figures(found: Fitted) -> Iterator[tuple[str, Figure]]:
     """Names and figures."""
-    yield "fit", curves(found)
+    lines = [(name, x) for name, x in found.comparisons if isinstance(x, Line)]
+    single = [(name, x) for name, x in found.comparisons if isinstance(x, Numbers)]
+    if lines:
+        yield "fit", curves(lines[:MOST])
+    if single:
+        yield "numbers", numbers(single)
     if len(found.names) > 1:
         yield "correlations", correlations(found)
     if found.profiles:
         yield "profiles", profiles(found)
 
 
-def curves(found: Fitted) -> Figure:
-    """Data and model of the first measurements."""
-    shown = found.curves[:MOST]
+def curves(shown: Sequence[tuple[str, Line]]) -> Figure:
+    """Data and model of measurements with their names."""
     figure, axes = new_figure(len(shown), 1, 1.8, has_shared_abscissa=False)
     for ax, (name, curve) in zip(axes[:, 0], shown, strict=True):
-        _single(ax, curve) if curve.labels else _line(ax, curve)
+        ax.plot(curve.x, curve.measured, ".", ms=2, color=GREY, label="measured")
+        ax.plot(curve.x, curve.model, color=BLUE, lw=1, label="model")
+        if curve.is_log:
+            ax.set_yscale("log")
+        ax.set(xlabel=curve.abscissa, ylabel=curve.ordinate)
         ax.set_title(name, loc="left", fontsize=9)
     axes[0, 0].legend(loc="best")
     return figure
 
 
-def _line(ax: Axes, curve: Curve) -> None:
-    ax.plot(curve.x, curve.measured, ".", ms=2, color=GREY, label="measured")
-    ax.plot(curve.x, curve.model, color=BLUE, lw=1, label="model")
-    if curve.is_log:
-        ax.set_yscale("log")
-    ax.set(xlabel=curve.abscissa, ylabel=curve.ordinate)
-
-
-def _single(ax: Axes, curve: Curve) -> None:
-    away = 100 * (curve.model / np.where(curve.measured == 0, np.nan, curve.measured) - 1)
-    ax.bar(curve.x, away, 0.5, color=BLUE, label="model over measured")
-    ax.axhline(0, color="black", lw=0.6)
-    ax.set_xticks(curve.x, curve.labels, fontsize=7)
-    ax.set(ylabel="model over measured [%]")
+def numbers(shown: Sequence[tuple[str, Numbers]]) -> Figure:
+    """How far the model is from single measured numbers, in their standard deviations."""
+    labels: list[str] = []
+    rows: list[int] = []
+    away: list[float] = []
+    for name, part in shown:
+        if len(labels) + len(part.labels) >= MOST_NUMBERS and rows:
+            break
+        rows += list(range(len(labels) + 1, len(labels) + 1 + len(part.labels)))
+        labels += [f"{name}:", *part.labels]
+        away += list(part.away)
+    figure, axes = new_figure(1, 1, 0.2 * len(labels))
+    ax = axes[0, 0]
+    ax.barh(rows, away, 0.6, color=BLUE)
+    ax.axvline(0, color="black", lw=0.6)
+    ax.axvspan(-2, 2, color=GREY, alpha=0.2, lw=0, label="2 standard deviations")
+    far = max(3.0, 1.1 * float(np.abs(away).max()))
+    ax.set(xlim=(-far, far), ylim=(len(labels) - 0.3, -0.7))
+    ax.set_yticks(range(len(labels)), labels, fontsize=7)
+    ax.grid(visible=False, axis="y")
+    ax.set_xlabel("model minus measured [standard deviations]")
+    ax.legend(loc="best")
+    return figure
 
 
 def correlations(found: Fitted) -> Figure:
@@ -79,7 +95,8 @@ def profiles(found: Fitted) -> Figure:
     for ax, one in zip(axes.ravel(), found.profiles, strict=False):
         k = one.number
         value, sigma = found.answer.values[k], found.answer.sigma[k]
-        ax.plot(one.values, one.rise, "o-", ms=3, color=BLUE, label="profile")
+        ax.plot(*one.smooth(), color=BLUE, label="profile")
+        ax.plot(one.values, one.rise, "o", ms=3, color=BLUE)
         if sigma > 0:
             x = np.linspace(one.values.min(), one.values.max(), 101)
             ax.plot(x, ((x - value) / sigma) ** 2, "--", color=ORANGE, lw=1, label="from sigma")

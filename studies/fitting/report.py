@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from studies.fitting.kinds.contract import Line
+from studies.fitting.plots import MOST
 from studies.fitting.statistics import UNKNOWN, Direction, Misfit
 from studies.show.markdown import literal
 from studies.show.templates import render
@@ -42,10 +44,12 @@ def report(found: Fitted) -> str:
         misfits=[_misfit(x) for x in found.answer.misfits],
         checks=[_misfit(x) for x in found.checks],
         others=_others(found),
+        posterior=_posterior(found),
         single=_single(found),
         experiments=_experiments(found),
         widest=" and ".join(found.names[k] for k in found.answer.directions[0].named()),
-        more=len(found.curves) - 8,
+        lines=sum(isinstance(x, Line) for _, x in found.comparisons),
+        most=MOST,
     )
 
 
@@ -115,6 +119,8 @@ def sentences(found: Fitted) -> list[str]:
     lines += undetermined(found)
     if not answer.undetermined:
         lines += _correlated(found)
+    if found.posterior is not None and not found.posterior.is_settled:
+        lines.append("The chains of samples do not agree yet; raise fit.samples.")
     if not found.solution.best.is_converged:
         lines.append("The search ended before it converged; raise fit.iterations.")
     return lines
@@ -190,9 +196,14 @@ def _misfit(one: Misfit) -> list[str]:
 def _single(found: Fitted) -> list[list[str]]:
     """Measured numbers that stand alone, and the model's."""
     rows = []
-    for name, curve in found.curves:
-        for label, measured, model in zip(curve.labels, curve.measured, curve.model, strict=False):
-            rows.append([cell(name), label, f"{measured:.6g}", f"{model:.6g}"])
+    for name, part in found.comparisons:
+        if isinstance(part, Line):
+            continue
+        notes = part.notes or ("",) * len(part.labels)
+        given = zip(*part[:4], part.away, notes, strict=True)
+        for label, measured, model, sigma, far, note in given:
+            text = f"{measured:.6g}", f"{sigma:.2g}", f"{model:.6g}", f"{far:+.1f}"
+            rows.append([cell(name), label, *text, note])
     return rows
 
 
@@ -203,6 +214,19 @@ def _others(found: Fitted) -> list[list[str]]:
     for one in found.solution.others:
         values = found.spec.free.values(one.u)
         rows.append([f"{2 * (one.cost - least):.3g}", *(f"{x:.4g}" for x in values)])
+    return rows
+
+
+def _posterior(found: Fitted) -> list[list[str]]:
+    """Quantiles of the samples, and what they are worth."""
+    if found.posterior is None:
+        return []
+    rows, samples = [], found.posterior
+    for k, name in enumerate(found.names):
+        digits = _digits(found.answer.values[k], found.answer.sigma[k])
+        quantiles = np.quantile(samples.values[:, k], [0.025, 0.5, 0.975])
+        text = [f"{x:.{digits}g}" for x in quantiles]
+        rows.append([name, *text, f"{samples.effective[k]:.0f}", f"{samples.reduction[k]:.3f}"])
     return rows
 
 

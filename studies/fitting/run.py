@@ -13,20 +13,15 @@ from studies.engine.runs import run_attributes
 from studies.errors import StudyError
 from studies.fitting import plots
 from studies.fitting.experiment import Experiment, next_experiments
-from studies.fitting.kinds.contract import Curve
+from studies.fitting.kinds.contract import Line, Numbers
 from studies.fitting.measurements import guess, make_bench, make_measurements
+from studies.fitting.posterior import Posterior, check_installed, sample, shape
 from studies.fitting.problem import Problem, complaints
+from studies.fitting.profiles import Likelihood, profile
 from studies.fitting.report import report, summary
 from studies.fitting.solve import Solution, solve
 from studies.fitting.spec import FitSpec
-from studies.fitting.statistics import (
-    Answer,
-    Likelihood,
-    Misfit,
-    describe_fit,
-    misfit,
-    profile,
-)
+from studies.fitting.statistics import Answer, Misfit, describe_fit, misfit
 from studies.show import figures
 from studies.show.pages import write_report
 from studies.store import Variable, check_folder, staged, write_store
@@ -36,6 +31,10 @@ from studies.study.template import study_template
 
 #: Free numbers up to which likelihoods are profiled.
 PROFILED = 6
+#: Machines in the file of a tuning.
+MACHINES = 64
+#: Least gain margin of that tuning [1].
+MARGIN = 2.0
 #: Files of the folder.
 STUDY, TUNE, DATA, DOCUMENT = "fitted.toml", "fitted_tune.toml", "fit.h5", "fit.json"
 
@@ -47,9 +46,10 @@ class Fitted(NamedTuple):
     solution: Solution
     answer: Answer
     study: Study  # with the fitted numbers
-    curves: tuple[tuple[str, Curve], ...]  # of all measurements by name
+    comparisons: tuple[tuple[str, Line | Numbers], ...]  # of all measurements by name
     checks: tuple[Misfit, ...]  # of those held out
     profiles: tuple[Likelihood, ...]
+    posterior: Posterior | None  # if samples were asked for
     experiments: tuple[Experiment, ...]  # the most telling first
 
     @property
@@ -70,6 +70,8 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
     """
     console = console or Console(quiet=True)
     fit, free = spec.fit, spec.free
+    if fit.samples:
+        check_installed()
     bench = make_bench(spec)
     every = make_measurements(spec, bench)
     complaints(every, guess(spec))
@@ -97,6 +99,10 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
         profiles = [profile(problem, solution.best.u, k, sigma[k]) for k in range(len(u))]
         found = [x.interval() if len(x.values) > 2 else answer.interval[x.number] for x in profiles]
         answer = answer._replace(interval=np.array(found))
+    posterior = None
+    if fit.samples:
+        console.print(f"drawing {fit.samples} samples")
+        posterior = sample(problem, shape(answer), fit.samples, fit.seed)
     console.print("looking for the next experiment")
     study = parse_study(set_values(spec.study, _numbers(spec, answer.values)))
     experiments = next_experiments(bench, free, solution.best.u, answer.covariance)
@@ -105,11 +111,12 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
         solution=solution,
         answer=answer,
         study=study,
-        curves=tuple((x.name, x.curve(answer.values)) for x in every),
+        comparisons=tuple((x.name, x.comparison(answer.values)) for x in every),
         checks=tuple(
             misfit(x.name, x.residual(answer.values, False), x.is_ordered) for x in checks
         ),
         profiles=tuple(profiles),
+        posterior=posterior,
         experiments=tuple(experiments),
     )
 
@@ -175,44 +182,47 @@ def _draw(folder: Path, found: Fitted, has_pdf: bool) -> list[str]:
     return drawn
 
 
-def spread_percent(found: Fitted) -> dict[str, float]:
-    """Half widths of even distributions, in percent of the values.
-
-    Machines are drawn number by number, so each number gets the deviation that it has with the
-    others held: machines then stay within what the data allow, however correlated their numbers.
-    """
-    answer, most = found.answer, 50.0
-    held = 1 / np.sqrt(np.diag(np.linalg.inv(answer.covariance)))
-    deviation = held * np.abs(found.spec.free.slopes(answer.place))
-    percent = {
-        name: float(min(most, round(100 * np.sqrt(3) * sigma / abs(value), 4)))
-        for name, value, sigma in zip(found.names, answer.values, deviation, strict=True)
-        if value != 0 and not name.startswith("control.")  # which is free below
+def machines(found: Fitted) -> dict[str, list[float]]:
+    """Machines as the data leave them possible: by free number, its value on each of them."""
+    answer, free = found.answer, found.spec.free
+    if found.posterior is not None:
+        at = np.linspace(0, len(found.posterior.values) - 1, MACHINES).astype(int)
+        values = found.posterior.values[at]
+    else:
+        values = free.values(shape(answer).draw(MACHINES, found.spec.fit.seed))
+    return {
+        name: [float(f"{x:.6g}") for x in column]
+        for name, column in zip(found.names, values.T, strict=True)
+        if not name.startswith("control.")  # which is free below
     }
-    return {name: x for name, x in percent.items() if x > 0}
 
 
 def _tuning(found: Fitted) -> str:
-    """The fitted study with its spread, ready for `studies tune`."""
+    """The fitted study with machines like it, ready for `studies tune`."""
     gain = found.study.control.gain_factor or 0.5
-    spread = "\n".join(f"{json.dumps(k)} = {v:g}" for k, v in spread_percent(found).items())
+    rows = "\n".join(f"{json.dumps(k)} = {v}" for k, v in machines(found).items())
+    is_sampled = found.study.control.feedback == "sampled"
+    limits = f"[tune.limits]\ngain_margin = {MARGIN}\n" if is_sampled else ""
     return (
         f"{study_template(found.study)}\n"
         "# What moves, and how far: change it to what you can decide.\n"
         "[tune]\n[tune.free]\n"
-        f'"control.gain_factor" = {{ from = {0.2 * gain:g}, to = {2 * gain:g} }}\n\n'
-        "# How far each number may move with the others held: what data know only together must\n"
-        "# not be spread apart. The controller knows link.youngs_modulus of each machine; spread\n"
-        "# link.stiffness_factor for what it does not know.\n"
+        f'"control.gain_factor" = {{ from = {0.2 * gain:g}, to = {2 * gain:g} }}\n'
+        f"{limits}\n"
+        "# Machines that the data leave possible, drawn with all correlations. The controller\n"
+        "# knows link.youngs_modulus of each machine; fit link.stiffness_factor for what it does\n"
+        "# not know.\n"
         f"{_warning(found)}"
-        f"[tune.scenarios]\ncount = 4\n[tune.scenarios.spread]\n{spread}\n"
+        f"[tune.scenarios]\ncount = 4\n[tune.scenarios.machines]\n{rows}\n"
     )
 
 
 def _warning(found: Fitted) -> str:
     if found.answer.is_explained:
         return ""
-    return "# THE MODEL DOES NOT EXPLAIN THE DATA: these spreads are too small (see report).\n"
+    return (
+        "# THE MODEL DOES NOT EXPLAIN THE DATA: these machines are too much alike (see report).\n"
+    )
 
 
 def document(found: Fitted) -> str:
@@ -253,11 +263,19 @@ def variables(found: Fitted) -> dict[str, Variable]:
         "interval": Variable(answer.interval, (*axis, "end"), "1", "95 %, in the field's unit"),
         "correlation": Variable(answer.correlation, (*axis, "other"), "1", "of the numbers"),
     }
-    for k, (_, curve) in enumerate(found.curves):
+    if found.posterior is not None:
+        part["sample"] = Variable(
+            found.posterior.values, ("draw", *axis), "1", "posterior, in the field's unit"
+        )
+    for k, (name, one) in enumerate(found.comparisons):
         point = (f"point_{k}",)
+        if isinstance(one, Line):
+            x, unit = Variable(one.x, point, "1", one.abscissa), one.ordinate
+        else:
+            x, unit = Variable(np.array(one.labels), point, "1", "number"), "in its unit"
         part |= {
-            f"x_{k}": Variable(curve.x.astype(float), point, "1", curve.abscissa or "index"),
-            f"measured_{k}": Variable(curve.measured, point, "1", curve.ordinate),
-            f"model_{k}": Variable(curve.model, point, "1", curve.ordinate),
+            f"x_{k}": x,
+            f"measured_{k}": Variable(one.measured, point, "1", f"{name}: {unit}"),
+            f"model_{k}": Variable(one.model, point, "1", f"{name}: {unit}"),
         }
     return part

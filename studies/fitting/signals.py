@@ -83,3 +83,11 @@ def parse_signal(
         if not 0 < place < shortest:
             raise field_error(path, text, f"between 0 and {shortest:g}", "m")
     return Signal(kind, link - 1, patch - 1, place)
+
+
+def signal_name(signal: Signal) -> str:
+    """Its name as files write it; not of the platform."""
+    name = f"{signal.kind} {signal.link + 1}"
+    if signal.kind in ("actuator", "sensor"):
+        return f"{name}.{signal.patch + 1}"
+    return name if np.isnan(signal.place) else f"{name} at {signal.place:g}"

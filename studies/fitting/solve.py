@@ -6,7 +6,7 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import qmc
 
 from studies.errors import StudyError
@@ -88,22 +88,62 @@ def solve(problem: Problem, starts: int, refine: int, iterations: int, seed: int
 
 
 def descend(problem: Problem, u: np.ndarray, iterations: int) -> Optimum:
-    """The optimum that a first guess leads to; arguments as `solve`.
+    """The optimum that a first guess leads to.
 
     Args:
         problem: the residuals.
         u: first guess, (p,).
         iterations: evaluations.
+
+    Raises:
+        StudyError: the model fails at the first guess.
     """
-    done = least_squares(
-        problem.residual,
-        np.clip(u, 1e-12, 1 - 1e-12),
-        problem.jacobian,
+    done = follow(problem, u, np.arange(len(u)), iterations, 1e-10)
+    return Optimum(done.x, done.cost, done.status > 0)
+
+
+def follow(
+    problem: Problem, u: np.ndarray, moving: np.ndarray, iterations: int, tolerance: float
+) -> OptimizeResult:
+    """Move some of the numbers to where the residuals are least.
+
+    Steps to where the model fails are taken back.
+
+    Args:
+        problem: the residuals.
+        u: first guess, (p,).
+        moving: which numbers move, (k,).
+        iterations: evaluations.
+        tolerance: of the cost, the step and the slope.
+
+    Returns:
+        SciPy's result; its `x` are the moving numbers.
+
+    Raises:
+        StudyError: the model fails at the first guess.
+    """
+
+    def whole(x: np.ndarray) -> np.ndarray:
+        changed = u.copy()
+        changed[moving] = x
+        return changed
+
+    start = np.clip(u[moving], 1e-12, 1 - 1e-12)
+    failed = np.full_like(problem.residual(whole(start)), np.inf)
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        with suppress(StudyError, np.linalg.LinAlgError):
+            return problem.residual(whole(x))
+        return failed
+
+    return least_squares(
+        residual,
+        start,
+        lambda x: problem.jacobian(whole(x))[:, moving],
         bounds=(0.0, 1.0),
         x_scale="jac",
         max_nfev=iterations,
-        xtol=1e-10,
-        ftol=1e-12,
-        gtol=1e-10,
+        xtol=tolerance,
+        ftol=tolerance / 100,
+        gtol=tolerance,
     )
-    return Optimum(done.x, done.cost, done.status > 0)

@@ -69,11 +69,16 @@ class ModesEntry(AtPose):
     link: int = described(1, "1", "with ends = 'held'", ge=1, le=3)
 
 
-class FileEntry(Common):
+class Seen(Common):
+    """Fields of measurements of one output."""
+
+    output: str = described(..., "-", "what is measured")
+
+
+class FileEntry(Seen):
     """Fields of measurements in a file of columns."""
 
     file: str = described(..., "-", "CSV, HDF5 or UFF, beside this file")
-    output: str = described(..., "-", "what is measured")
 
 
 class Noisy(Section):
@@ -115,6 +120,20 @@ class TraceEntry(FileEntry, Noisy):
     value: str = described("value", "-", "column")
 
 
+class SettlingEntry(Seen):
+    """How long a signal takes to settle after the study's motion."""
+
+    time_s: float = described(
+        ..., "s", "from the end of the command until it stays within the band", ge=0, le=1e4
+    )
+    sigma_s: Positive = described(..., "s", "standard deviation")
+    band: Positive | None = described(None, "unit of the output", "to each side of 0")
+    band_percent: Percent | None = described(
+        None, "%", "the same, over the largest value after the command without control"
+    )
+    links: Flags | None = described(None, "-", "under control; default: those of the study")
+
+
 class FiguresEntry(Common, Noisy):
     """Metrics of the study's motion, or their reduction by control."""
 
@@ -140,6 +159,7 @@ ENTRIES: dict[str, type[Common]] = {
     "response": ResponseEntry,
     "spectrum": SpectrumEntry,
     "trace": TraceEntry,
+    "settling": SettlingEntry,
     "figures": FiguresEntry,
 }
 
@@ -156,7 +176,10 @@ class Fit(Section):
     refine: int = described(4, "1", "best of them that are followed to the end", ge=1, le=100)
     iterations: int = described(60, "1", "evaluations of each", ge=1, le=10_000)
     profile: bool = described(True, "-", "profile the likelihood of up to six free numbers")
-    seed: int = described(0, "1", "of the first guesses", ge=0, le=10**9)
+    samples: int = described(
+        0, "1", "posterior samples, with the extra 'posterior'; 0: none", ge=0, le=10**6
+    )
+    seed: int = described(0, "1", "of the first guesses and samples", ge=0, le=10**9)
 
 
 class Prior(NamedTuple):

@@ -9,10 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from studies.errors import StudyError
 from studies.fitting.kinds.contract import Residual
 from studies.fitting.problem import Problem
 
@@ -22,8 +20,6 @@ UNKNOWN = 1 / np.sqrt(12)
 NAMED = 0.25
 #: Probability below which residuals are not noise [1].
 UNLIKELY = 1e-3
-#: Profiles go on by this many standard deviations, at most so many times, until so large a rise.
-STRIDE, STEPS, ENOUGH = 0.7, 14, 6.0
 #: Of a normal distribution, 95 % lie within this many standard deviations.
 WIDE = 1.959964
 
@@ -59,6 +55,8 @@ class Answer(NamedTuple):
     interval: np.ndarray  # 95 %, within the bounds, (p, 2)
     correlation: np.ndarray  # (p, p)
     covariance: np.ndarray  # between the bounds [1], (p, p)
+    information: np.ndarray  # J^T J of the residuals by the places, (p, p)
+    push: np.ndarray  # J^T r: slope of half chi square, 0 but for numbers at a bound, (p,)
     directions: tuple[Direction, ...]  # the widest first
     misfits: tuple[Misfit, ...]
     chi_square: float
@@ -106,6 +104,8 @@ def describe_fit(problem: Problem, u: np.ndarray) -> Answer:
         interval=np.stack([low, high], axis=1),
         correlation=covariance / np.outer(sigma_u, sigma_u),
         covariance=covariance,
+        information=jacobian.T @ jacobian,
+        push=jacobian.T @ residual,
         directions=directions,
         misfits=tuple(
             misfit(x.name, part, x.is_ordered)
@@ -157,79 +157,3 @@ def misfit(name: str, part: Residual, is_ordered: bool) -> Misfit:
         likeness=likeness,
         is_noise=bool(is_white and is_small),
     )
-
-
-class Likelihood(NamedTuple):
-    """Least misfit for fixed values of one free number."""
-
-    number: int
-    values: np.ndarray  # ascending, (n,)
-    rise: np.ndarray  # of chi square above its least, (n,)
-
-    def interval(self) -> tuple[float, float]:
-        """Where the rise is that of 95 %, or the last values that were tried."""
-        middle, ends = int(np.flatnonzero(self.rise == 0.0)[0]), []
-        for part in (slice(middle, None, -1), slice(middle, None)):
-            value, size = self.values[part], np.sqrt(np.maximum(self.rise[part], 0.0))
-            beyond = np.flatnonzero(size > WIDE)
-            if not beyond.size:
-                ends.append(float(value[-1]))
-                continue
-            k = int(beyond[0])
-            ends.append(float(np.interp(WIDE, size[k - 1 : k + 1], value[k - 1 : k + 1])))
-        return ends[0], ends[1]
-
-
-def profile(problem: Problem, u: np.ndarray, number: int, sigma: float) -> Likelihood:
-    """Profile the likelihood of one free number, to 95 % or the bounds.
-
-    Args:
-        problem: what was fitted.
-        u: the optimum, (p,).
-        number: which free number.
-        sigma: its standard deviation between the bounds [1].
-    """
-    others = np.delete(np.arange(len(u)), number)
-    least = float(np.sum(problem.residual(u) ** 2))
-    found = [(float(u[number]), 0.0)]
-    for way in (1, -1):
-        at = u.copy()
-        for k in range(1, STEPS + 1):
-            at = at.copy()
-            at[number] = np.clip(u[number] + way * k * STRIDE * sigma, 0.0, 1.0)
-            try:
-                at = _refit(problem, at, others) if len(others) else at
-                rise = float(np.sum(problem.residual(at) ** 2)) - least
-            except (StudyError, np.linalg.LinAlgError, ValueError):
-                break  # out of where the model works
-            found.append((float(at[number]), rise))
-            if rise > ENOUGH or not 0 < at[number] < 1:
-                break
-    found.sort()
-    values = [problem.free.values(_with(u, number, x))[number] for x, _ in found]
-    return Likelihood(number, np.array(values), np.array([x for _, x in found]))
-
-
-def _with(u: np.ndarray, number: int, x: float) -> np.ndarray:
-    changed = u.copy()
-    changed[number] = x
-    return changed
-
-
-def _refit(problem: Problem, at: np.ndarray, others: np.ndarray) -> np.ndarray:
-    def whole(x: np.ndarray) -> np.ndarray:
-        changed = at.copy()
-        changed[others] = x
-        return changed
-
-    done = least_squares(
-        lambda x: problem.residual(whole(x)),
-        np.clip(at[others], 1e-9, 1 - 1e-9),
-        lambda x: problem.jacobian(whole(x))[:, others],
-        bounds=(0.0, 1.0),
-        x_scale="jac",
-        max_nfev=15,
-        xtol=1e-6,
-        ftol=1e-8,
-    )
-    return whole(done.x)

@@ -92,11 +92,23 @@ def _from_csv(where: Path) -> dict[str, np.ndarray]:
     if len(set(names)) < len(names):
         raise ValueError("two columns have one name")
     width = len(names)
-    for k, row in enumerate(rows[1:], 2):
+    for k, row in enumerate(rows[1:], 1):
         if len(row) != width:
             raise ValueError(f"row {k} has {len(row)} entries instead of {width}")
-    numbers = np.array([[float(x or "nan") for x in row] for row in rows[1:]])
+    numbers = np.array(
+        [
+            [_cell(x, k, name) for x, name in zip(row, names, strict=True)]
+            for k, row in enumerate(rows[1:], 1)
+        ]
+    )
     return dict(zip(names, numbers.T, strict=True))
+
+
+def _cell(text: str, row: int, name: str) -> float:
+    try:
+        return float(text or "nan")
+    except ValueError:
+        raise ValueError(f"row {row}, column {name!r}: {text!r} is no number") from None
 
 
 def _numbers(x: np.ndarray) -> np.ndarray:

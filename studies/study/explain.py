@@ -167,6 +167,11 @@ def _bad_value(
     inside: str,
 ) -> StudyError:
     annotation, metadata = info.annotation, list(info.metadata)
+    if is_missing and not entries:
+        field = ".".join(str(part) for part in [inside, *name] if part != "")
+        unit = unit_of(info)
+        told = f"{field}: missing; allowed: {allowed_values(annotation, metadata)}"
+        return StudyError(f"{told} [{unit}]" if unit else told)
     value: Any = data
     for part in name:
         value = value[part]

@@ -38,6 +38,9 @@ def scenario_columns(
         for k, (name, percent) in enumerate(spread.items()):
             share = 1 + percent / 100 * shift[:, k]
             machines[name] = np.multiply.outer(share, known_field(name, spec.study))
+    for name, values in spec.tune.scenarios.machines.items():
+        others = values[-count:] if is_fresh else [known_field(name, spec.study), *values][:count]
+        machines[name] = column_of(others)
     columns = {name: _repeated(column, moves) for name, column in machines.items()}
     for name in spec.tune.scenarios.each:
         columns[name] = np.repeat(column_of([move[name] for move in spec.moves]), count, axis=0)

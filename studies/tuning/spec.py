@@ -13,7 +13,7 @@ Everything is measured against the study itself, machine by machine and move by 
 from __future__ import annotations
 
 import re
-from itertools import product
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -51,8 +51,16 @@ class Scenarios(Section):
     check: int = described(16, "1", "fresh machines, to judge the result", ge=1, le=10_000)
     seed: int = described(0, "1", "of the machines", ge=0, le=10**9)
     spread: dict[str, Any] = described({}, "-", "field = +-percent of its value")
+    machines: dict[str, Any] = described(
+        {}, "-", "field = its value on each other machine; first those to tune, last those to check"
+    )
     each: dict[str, Any] = described({}, "-", "field = values; all machines run with each")
     tail: float = described(1.0, "1", "share of worst scenarios that count", ge=0, le=1)
+
+    @property
+    def has_others(self) -> bool:
+        """Whether machines differ from the study's own."""
+        return bool(self.spread or self.machines)
 
 
 class Tune(Section):
@@ -164,6 +172,7 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
         raise explain(error, Tune, data["tune"], inside="tune") from None
     _check_figures(tune, study)
     _check_spread(tune, study)
+    _check_machines(tune.scenarios, study)
     _check_feedback(tune, study)
     free = free_numbers(tune.free, study)
     moves = _moves(tune, study)
@@ -208,6 +217,29 @@ def _check_spread(tune: Tune, study: Study) -> None:
             raise field_error(path, percent, "for the machine and its control; each takes others")
         for share in (1 - percent / 100, 1 + percent / 100):
             checked_value(study, name, (np.array(value) * share).tolist(), path)
+
+
+def _check_machines(asked: Scenarios, study: Study) -> None:
+    needed = max(asked.count - 1, 0) + asked.check
+    for name, values in asked.machines.items():
+        path = f"tune.scenarios.machines.{shown_name(name)}"
+        known_field(name, study, "tune.scenarios.machines")
+        if name.partition(".")[0] in ("run", "metrics", "motion"):
+            raise field_error(path, "its values", "the machine and its control; each takes others")
+        if not isinstance(values, list) or len(values) < needed:
+            raise field_error(
+                path,
+                f"{len(values)} values" if isinstance(values, list) else values,
+                f"a list of {needed} values or more: tune.scenarios.count = {asked.count} less the "
+                f"study's own, and tune.scenarios.check = {asked.check}",
+            )
+        for k, value in enumerate(values):
+            checked_value(study, name, value, f"{path}[{k}]")
+    sizes = {name: len(values) for name, values in asked.machines.items()}
+    if len(set(sizes.values())) > 1:
+        raise field_error(
+            "tune.scenarios.machines", sizes, "lists of one length, a value for each machine"
+        )
 
 
 def _check_feedback(tune: Tune, study: Study) -> None:
@@ -269,21 +301,22 @@ def _moves(tune: Tune, study: Study) -> tuple[dict[str, Any], ...]:
 def _check_clashes(tune: Tune, free: FreeNumbers, families: tuple[Family, ...]) -> None:
     """Reject fields that are set twice."""
     asked = tune.scenarios
-    for name in asked.spread:
-        if name in asked.each:
-            raise StudyError(f"tune.scenarios: {name} is both in spread and in each")
+    parts = {"spread": asked.spread, "machines": asked.machines, "each": asked.each}
+    for one, other in combinations(parts, 2):
+        for name in parts[one]:
+            if name in parts[other]:
+                raise StudyError(f"tune.scenarios: {name} is both in {one} and in {other}")
     for family in families:
         numbers = zip(free.numbers, family.is_free, strict=True)
         moved = {_field(x) for number, is_free in numbers if is_free for x in writes(number)}
         for where, names in (
-            ("tune.scenarios.spread", asked.spread),
-            ("tune.scenarios.each", asked.each),
+            *((f"tune.scenarios.{part}", names) for part, names in parts.items()),
             (f"tune.families.{shown_name(family.name)}.set", family.columns),
         ):
             for name in names:
                 if _field(name) in moved:
                     raise StudyError(f"{where}: {name} is free in family {family.name!r}")
-                if names is family.columns and name in {**asked.spread, **asked.each}:
+                if names is family.columns and any(name in x for x in parts.values()):
                     raise StudyError(f"{where}: {name} is in tune.scenarios too")
 
 

@@ -22,8 +22,8 @@ def scaled(
     return Residual(value, None if slope is None else slope / sigma[:, None])
 
 
-class Curve(NamedTuple):
-    """What a figure shows of one measurement."""
+class Line(NamedTuple):
+    """One measurement over frequency or time."""
 
     abscissa: str  # with its unit
     ordinate: str
@@ -31,7 +31,21 @@ class Curve(NamedTuple):
     measured: np.ndarray  # (n,)
     model: np.ndarray  # (n,)
     is_log: bool  # ordinate
-    labels: tuple[str, ...] = ()  # of single numbers; empty: a line
+
+
+class Numbers(NamedTuple):
+    """Measured numbers that stand alone."""
+
+    labels: tuple[str, ...]  # with their units
+    measured: np.ndarray  # (n,)
+    model: np.ndarray  # (n,)
+    sigma: np.ndarray  # of the measured ones, (n,)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def away(self) -> np.ndarray:
+        """Model minus measurement, in standard deviations, (n,)."""
+        return (self.model - self.measured) / self.sigma
 
 
 class Noise(NamedTuple):
@@ -70,8 +84,8 @@ class Measurement(Protocol):
         """
         ...
 
-    def curve(self, values: np.ndarray) -> Curve:
-        """For the figures."""
+    def comparison(self, values: np.ndarray) -> Line | Numbers:
+        """For figures and tables."""
         ...
 
     def complaint(self, values: np.ndarray) -> str:

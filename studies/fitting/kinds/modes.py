@@ -12,11 +12,13 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from studies.errors import StudyError, field_error
-from studies.fitting.bench import Bench, Modes, PlantAt
-from studies.fitting.kinds.contract import Curve, Residual
+from studies.fitting.bench import Bench, Modes
+from studies.fitting.kinds.contract import Numbers, Residual, scaled
 
 #: Modes closer than this share one subspace [1].
 NEAR = 0.03
+#: Measured shapes less alike than this to any of the model's are refused (subspace MAC) [1].
+ALIKE = 0.5
 #: Modes closer than this are one: their shapes are any of a subspace [1].
 EQUAL = 1e-6
 TWO_PI = 2 * np.pi
@@ -32,46 +34,108 @@ class Measured(NamedTuple):
     shapes: np.ndarray | None  # voltages of the sensors, (k, 3 K)
 
 
-class HeldModes:
-    """Modes of one link between held joints, in their order."""
+class _Predicted(NamedTuple):
+    """The model's modes that belong to the measured ones, and derivatives if asked for."""
+
+    frequency: np.ndarray  # [Hz], (k,)
+    damping: np.ndarray  # [1], (k,)
+    by_frequency: np.ndarray | None  # (k, p)
+    by_damping: np.ndarray | None  # (k, p)
+    likeness: np.ndarray | None  # subspace MAC [1], (k,); None without shapes
+
+
+class _Modes:
+    """What measured modes share, however they are predicted."""
 
     kind, is_ordered, n_hidden = "modes", False, 0
 
-    def __init__(
-        self, name: str, is_checked: bool, bench: Bench, measured: Measured, link: int
-    ) -> None:
+    def __init__(self, name: str, is_checked: bool, bench: Bench, measured: Measured) -> None:
         self.name, self.is_checked = name, is_checked
-        self._bench, self._measured, self._link = bench, measured, link
+        self._bench, self._measured = bench, measured
+
+    def predicted(self, values: np.ndarray, has_slopes: bool) -> _Predicted:
+        """The model's modes at some values of the free numbers, (p,)."""
+        raise NotImplementedError
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
-        frequency, damping, *slopes = self._bench.held(values, has_slopes)
-        n = len(self._measured.frequency)
-        first = [x[self._link, :n] for x in slopes]
-        return _residual(
-            self._measured,
-            frequency[self._link, :n],
-            damping[self._link, :n],
-            first[0] if has_slopes else None,
-            first[1] if has_slopes else None,
-        )
+        measured, found = self._measured, self.predicted(values, has_slopes)
+        parts = [scaled(found.frequency, found.by_frequency, measured.frequency, measured.sigma)]
+        if measured.damping is not None and measured.damping_sigma is not None:
+            at = np.isfinite(measured.damping)
+            by = None if found.by_damping is None else found.by_damping[at]
+            given = measured.damping[at], measured.damping_sigma[at]
+            parts.append(scaled(found.damping[at], by, *given))
+        slopes = [x.slope for x in parts if x.slope is not None]
+        value = np.concatenate([x.value for x in parts])
+        return Residual(value, np.concatenate(slopes) if slopes else None)
 
     def reweigh(self, values: np.ndarray) -> None:
         pass  # its noise is no share
 
-    def curve(self, values: np.ndarray) -> Curve:
-        return _curve(self._measured, self._frequencies(values))
+    def comparison(self, values: np.ndarray) -> Numbers:
+        measured, found = self._measured, self.predicted(values, False)
+        parts = [(f"mode {k + 1} [Hz]" for k in range(len(found.frequency)))]
+        data, model, sigma = [measured.frequency], [found.frequency], [measured.sigma]
+        if measured.damping is not None and measured.damping_sigma is not None:
+            at = np.isfinite(measured.damping)
+            parts.append(f"damping {k + 1} [1]" for k in np.flatnonzero(at))
+            for whole, x in zip(
+                (data, model, sigma),
+                (measured.damping, found.damping, measured.damping_sigma),
+                strict=True,
+            ):
+                whole.append(x[at])
+        labels = tuple(x for part in parts for x in part)
+        notes = () if found.likeness is None else [f"{x:.3f}" for x in found.likeness]
+        return Numbers(
+            labels=labels,
+            measured=np.concatenate(data),
+            model=np.concatenate(model),
+            sigma=np.concatenate(sigma),
+            notes=tuple(f"shape: {x} of 1" for x in notes) + ("",) * (len(labels) - len(notes)),
+        )
 
     def complaint(self, values: np.ndarray) -> str:
-        return _scale_complaint(self._measured, self._frequencies(values))
+        try:
+            found = self.predicted(values, False)
+        except StudyError as error:
+            return str(error)
+        if found.likeness is not None and found.likeness.min() < ALIKE:
+            k = int(found.likeness.argmin())
+            return (
+                f"the shape of mode {k + 1} ({self._measured.frequency[k]:g} Hz) is only "
+                f"{found.likeness[k]:.2f} alike to any of the model's (1: the same): check order "
+                "and signs of its voltages, link by link and patch by patch"
+            )
+        ratio = float(np.median(found.frequency / self._measured.frequency))
+        if not 0.1 < ratio < 10:
+            return (
+                f"the model's frequencies are {ratio:.3g} times the measured ones at the first "
+                "guess; frequencies are in Hz: check unit and first guess"
+            )
+        return ""
 
-    def _frequencies(self, values: np.ndarray) -> np.ndarray:
-        return self._bench.held(values, False)[0][self._link, : len(self._measured.frequency)]
+
+class HeldModes(_Modes):
+    """Modes of one link between held joints, in their order."""
+
+    def __init__(
+        self, name: str, is_checked: bool, bench: Bench, measured: Measured, link: int
+    ) -> None:
+        super().__init__(name, is_checked, bench, measured)
+        self._link = link
+
+    def predicted(self, values: np.ndarray, has_slopes: bool) -> _Predicted:
+        whole = self._bench.held(values, has_slopes)
+        frequency, damping, *slopes = (
+            x[self._link, : len(self._measured.frequency)] for x in whole
+        )
+        by_frequency, by_damping = slopes or (None, None)
+        return _Predicted(frequency, damping, by_frequency, by_damping, likeness=None)
 
 
-class MachineModes:
+class MachineModes(_Modes):
     """Modes of the machine at a pose, held by its drive."""
-
-    kind, is_ordered, n_hidden = "modes", False, 0
 
     def __init__(
         self,
@@ -81,45 +145,34 @@ class MachineModes:
         measured: Measured,
         pose: tuple[float, float, float],
     ) -> None:
-        self.name, self.is_checked = name, is_checked
-        self._bench, self._measured, self._pose = bench, measured, pose
+        super().__init__(name, is_checked, bench, measured)
+        self._pose = pose
 
-    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
-        plant, pole, pairs = self._paired(values, has_slopes)
-        slopes: list[np.ndarray | None] = [None, None]
+    def predicted(self, values: np.ndarray, has_slopes: bool) -> _Predicted:
+        plant = self._bench.plant(self._pose, values, has_slopes)
+        pairs = pair_modes(self._measured, plant.modes, plant.value.sensor)
+        pole = plant.modes.pole[pairs.mode]
+        size = np.abs(pole)
+        by_frequency = by_damping = None
         if plant.slope is not None:
             turned = np.einsum("kn,nmp->kmp", pairs.dual, plant.slope.state)
             by = np.einsum("kmp,mk->kp", turned, pairs.shape)  # of the poles
-            size = (pole.real[:, None] * by.real + pole.imag[:, None] * by.imag) / np.abs(pole)[
-                :, None
-            ]
-            ratio = (
-                -by.real / np.abs(pole)[:, None] + (pole.real / np.abs(pole) ** 2)[:, None] * size
-            )
-            slopes = [size / TWO_PI, ratio]
-        return _residual(self._measured, np.abs(pole) / TWO_PI, -pole.real / np.abs(pole), *slopes)
+            by_frequency, by_damping = frequency_slopes(pole, by)
+        likeness = None if self._measured.shapes is None else pairs.likeness
+        given = size / TWO_PI, -pole.real / size
+        return _Predicted(*given, by_frequency, by_damping, likeness)
 
-    def reweigh(self, values: np.ndarray) -> None:
-        pass  # its noise is no share
 
-    def curve(self, values: np.ndarray) -> Curve:
-        return _curve(self._measured, self._frequencies(values))
+def frequency_slopes(pole: np.ndarray, by: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of frequencies [Hz] and damping ratios, (k, p), from those of poles.
 
-    def _paired(self, values: np.ndarray, has_slopes: bool) -> tuple[PlantAt, np.ndarray, Pairs]:
-        """The plant, its poles that belong to the measured modes, and how they were paired."""
-        plant = self._bench.plant(self._pose, values, has_slopes)
-        modes = plant.modes
-        pairs = pair_modes(self._measured, modes, plant.value.sensor)
-        return plant, modes.pole[pairs.mode], pairs
-
-    def _frequencies(self, values: np.ndarray) -> np.ndarray:
-        return np.abs(self._paired(values, False)[1]) / TWO_PI
-
-    def complaint(self, values: np.ndarray) -> str:
-        try:
-            return _scale_complaint(self._measured, self._frequencies(values))
-        except StudyError as error:
-            return str(error)
+    Args:
+        pole: [1/s], (k,), complex.
+        by: their derivatives, (k, p).
+    """
+    real, imag, size = pole.real[:, None], pole.imag[:, None], np.abs(pole)[:, None]
+    by_size = (real * by.real + imag * by.imag) / size
+    return by_size / TWO_PI, -by.real / size + real / size**2 * by_size
 
 
 class Pairs(NamedTuple):
@@ -179,48 +232,6 @@ def _share(shape: np.ndarray, span: np.ndarray) -> float:
     """Share of a shape's square that lies in the span of others [1]."""
     q, _ = np.linalg.qr(span)
     return float(np.linalg.norm(q.conj().T @ shape) ** 2 / np.linalg.norm(shape) ** 2)
-
-
-def _residual(
-    measured: Measured,
-    frequency: np.ndarray,
-    damping: np.ndarray,
-    by_frequency: np.ndarray | None,
-    by_damping: np.ndarray | None,
-) -> Residual:
-    value = [(frequency - measured.frequency) / measured.sigma]
-    slope = [] if by_frequency is None else [by_frequency / measured.sigma[:, None]]
-    if measured.damping is not None and measured.damping_sigma is not None:
-        is_known = np.isfinite(measured.damping)
-        sigma = measured.damping_sigma[is_known]
-        value.append((damping - measured.damping)[is_known] / sigma)
-        if by_damping is not None:
-            slope.append(by_damping[is_known] / sigma[:, None])
-    return Residual(np.concatenate(value), np.concatenate(slope) if slope else None)
-
-
-def _curve(measured: Measured, found: np.ndarray) -> Curve:
-    labels = tuple(f"mode {k + 1}" for k in range(len(found)))
-    x = np.arange(1, len(found) + 1)
-    return Curve(
-        abscissa="measured mode",
-        ordinate="frequency [Hz]",
-        x=x,
-        measured=measured.frequency,
-        model=found,
-        is_log=True,
-        labels=labels,
-    )
-
-
-def _scale_complaint(measured: Measured, found: np.ndarray) -> str:
-    ratio = float(np.median(found / measured.frequency))
-    if not 0.1 < ratio < 10:
-        return (
-            f"the model's frequencies are {ratio:.3g} times the measured ones at the first guess; "
-            "frequencies are in Hz: check unit and first guess"
-        )
-    return ""
 
 
 def check_ascending(frequency: tuple[float, ...], has_shapes: bool, path: str) -> None:

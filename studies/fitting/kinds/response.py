@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from studies.fitting.bench import Bench, Pose, response
-from studies.fitting.kinds.contract import Curve, Noise, Residual, scaled
+from studies.fitting.kinds.contract import Line, Noise, Residual, scaled
 from studies.fitting.signals import Signal
 
 TWO_PI = 2 * np.pi
@@ -78,8 +78,8 @@ class _OfBench:
             "and a frequency in Hz: check the units"
         )
 
-    def _line(self, label: str, measured: np.ndarray, model: np.ndarray) -> Curve:
-        return Curve(
+    def _line(self, label: str, measured: np.ndarray, model: np.ndarray) -> Line:
+        return Line(
             abscissa="frequency [Hz]",
             ordinate=label,
             x=self.frequency,
@@ -101,7 +101,7 @@ class ComplexResponse(_OfBench):
         scaled = slope / self.sigma[:, None]
         return Residual(value, np.concatenate([scaled.real, scaled.imag]))
 
-    def curve(self, values: np.ndarray) -> Curve:
+    def comparison(self, values: np.ndarray) -> Line:
         found = np.abs(self.predicted(values, False)[0])
         measured = np.abs(self.measured)
         label = f"response [{self._unit}]"
@@ -120,7 +120,7 @@ class Magnitude(_OfBench):
             by = (unit.conj()[:, None] * slope).real
         return scaled(size, by, self.measured, self.sigma)
 
-    def curve(self, values: np.ndarray) -> Curve:
+    def comparison(self, values: np.ndarray) -> Line:
         found = np.abs(self.predicted(values, False)[0])
         label = f"magnitude [{self._unit}]"
         return self._line(label, self.measured, found)
@@ -152,7 +152,7 @@ class Spectrum(_OfBench):
     def reweigh(self, values: np.ndarray) -> None:
         pass  # logarithms have noise of one size
 
-    def curve(self, values: np.ndarray) -> Curve:
+    def comparison(self, values: np.ndarray) -> Line:
         found = np.abs(self.predicted(values, False)[0]) ** 2
         level = np.exp(np.mean(np.log(self.measured) - np.log(found)))
         label = "power spectrum [any unit]"

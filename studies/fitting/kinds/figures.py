@@ -1,4 +1,4 @@
-"""Measurements of whole motions: signals over time, and metrics such as residual vibration."""
+"""Metrics of whole motions, such as residual vibration, and their reduction by control."""
 
 from __future__ import annotations
 
@@ -9,142 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel import status
 from jaxmodel.case import Case, Structure
+from jaxmodel.metrics import METRICS
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import simulate
 from studies.engine.program import Place
-from studies.engine.runs import check_run
 from studies.errors import StudyError
 from studies.fitting.bench import with_slopes
-from studies.fitting.kinds.contract import Curve, Noise, Residual, scaled
-from studies.fitting.signals import Signal
+from studies.fitting.kinds.contract import Numbers, Residual, scaled
+from studies.fitting.kinds.motions import OFF, check_finished, smooth_run
 from studies.study.entries import Entries
-from studies.study.labels import describe
 from studies.study.spec import Study
-
-
-class Trace:
-    """One signal over time, compared at the times of the measurement."""
-
-    kind, is_ordered, n_hidden = "trace", True, 0
-
-    def __init__(
-        self,
-        name: str,
-        is_checked: bool,
-        study: Study,
-        place: Place,
-        signal: Signal,
-        time: np.ndarray,
-        measured: np.ndarray,
-        noise: Noise,
-        unit: str,
-    ) -> None:
-        """
-        Args:
-            name, is_checked: of the measurement.
-            study: its motion.
-            place: puts free numbers into a case.
-            signal: the output.
-            time: [s], (n,), ascending and within the run.
-            measured: (n,).
-            noise: of the measured values.
-            unit: of the signal.
-        """
-        self.name, self.is_checked, self._unit = name, is_checked, unit
-        self._given, self._signal = (*_smooth(study), place), signal
-        self.time, self.measured = time, measured
-        self._noise, self.sigma = noise, noise.sigma(measured)
-
-    def predicted(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
-        """The signal at the measured times, (n,), and its derivatives, (n, p)."""
-        structure, case, place = self._given
-        run = _traced_slopes if has_slopes else _traced
-        found = run(structure, place, self._signal.kind, case, values)
-        time, value, code, *slope = (np.asarray(x) for x in found)
-        _check_finished(self.name, int(code))
-        at = self._signal
-        column = value[:, at.link] if value.ndim == 2 else value[:, at.link, at.patch]
-        model = np.interp(self.time, time, column)
-        if not has_slopes:
-            return model, None
-        by = slope[0][:, at.link] if value.ndim == 2 else slope[0][:, at.link, at.patch]
-        return model, np.stack([np.interp(self.time, time, x) for x in by.T], axis=1)
-
-    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
-        found, slope = self.predicted(values, has_slopes)
-        return scaled(found, slope, self.measured, self.sigma)
-
-    def reweigh(self, values: np.ndarray) -> None:
-        self.sigma = self._noise.of_model(self.predicted(values, False)[0], self.measured)
-
-    def curve(self, values: np.ndarray) -> Curve:
-        found = self.predicted(values, False)[0]
-        label = f"{self._signal.kind} [{self._unit}]"
-        return Curve(
-            abscissa="time [s]",
-            ordinate=label,
-            x=self.time,
-            measured=self.measured,
-            model=found,
-            is_log=False,
-        )
-
-    def complaint(self, values: np.ndarray) -> str:
-        model = self.predicted(values, False)[0]
-        ratio = float(np.ptp(self.measured) / max(np.ptp(model), 1e-300))
-        if 0.01 < ratio < 100:
-            return ""
-        return (
-            f"measured moves {ratio:.3g} times as far as the model at the first guess; expected "
-            f"{self._unit}: check the unit"
-        )
-
-
-def _smooth(study: Study) -> tuple[Structure, Case]:
-    """A study's run with derivatives.
-
-    Raises:
-        StudyError: as `check_run`.
-    """
-    structure, case = check_run(study)
-    return structure._replace(is_smooth=True), case
-
-
-def _recorded(structure: Structure, place: Place, kind: str, case: Case, values: Array) -> Any:
-    result = simulate(structure, place(case, values), has_record=True)
-    record = result.record
-    assert record is not None
-    signals = {
-        "sensor": record.sensor_voltage,
-        "slider": record.slider,
-        "platform": record.pose,
-        "deflection": record.chord_deflection_stations,
-    }
-    return signals[kind], (record.time, result.status)
-
-
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _traced(structure: Structure, place: Place, kind: str, case: Case, values: Array) -> Any:
-    value, (time, code) = _recorded(structure, place, kind, case, values)
-    return time, value, code
-
-
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _traced_slopes(structure: Structure, place: Place, kind: str, case: Case, values: Array) -> Any:
-    run = with_slopes(_recorded, 4, is_first=True)
-    slope, (value, (time, code)) = run(structure, place, kind, case, values)
-    return time, value, code, slope
-
-
-def _check_finished(name: str, code: int) -> None:
-    if code not in status.FINISHED:
-        raise StudyError(f"{name}: the run ends with status {describe(code)}")
-
-
-#: No link under control.
-OFF = (False, False, False)
 
 
 class Switch(NamedTuple):
@@ -166,6 +41,13 @@ class Compared(NamedTuple):
     sigma: float
     label: str
 
+    @property
+    def title(self) -> str:
+        """Its name with its unit, or what it is a reduction of."""
+        unit = "%" if self.is_reduction else METRICS[self.entries.metric].unit
+        root = "root of " if self.is_amplitude else ""
+        return f"{root}{self.label} [{unit}{'^(1/2)' if root and not self.is_reduction else ''}]"
+
 
 class Runs:
     """Runs of one study with different links under control, kept for the last free numbers.
@@ -179,7 +61,7 @@ class Runs:
         Raises:
             StudyError: as `check_run`.
         """
-        self._structure, self._case = _smooth(study)
+        self._structure, self._case = smooth_run(study)
         self._place = place
         self._metrics: set[str] = set()
         self._switches: list[Switch] = []
@@ -208,7 +90,7 @@ class Runs:
             self._kept = values.tobytes(), has_slopes, found
         metrics, code, *by = found
         for one in code:
-            _check_finished("figures", int(one))
+            check_finished("figures", int(one))
         return metrics, *by[: int(has_slopes)]
 
     def at(self, switch: Switch) -> int:
@@ -267,16 +149,12 @@ class Figures:
     def reweigh(self, values: np.ndarray) -> None:
         pass  # few numbers, whose noise is a share of what was measured
 
-    def curve(self, values: np.ndarray) -> Curve:
-        found = self.predicted(values, False)[0]
-        return Curve(
-            abscissa="",
-            ordinate="figure of the run",
-            x=np.arange(len(found)),
+    def comparison(self, values: np.ndarray) -> Numbers:
+        return Numbers(
+            labels=tuple(x.title for x in self._compared),
             measured=self.measured,
-            model=found,
-            is_log=False,
-            labels=tuple(x.label for x in self._compared),
+            model=self.predicted(values, False)[0],
+            sigma=self.sigma,
         )
 
     def complaint(self, values: np.ndarray) -> str:

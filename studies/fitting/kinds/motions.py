@@ -1,0 +1,145 @@
+"""Recorded runs of a study's motion, which all traces and settling times of it share."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxmodel import status
+from jaxmodel.case import Case, Structure
+from jaxmodel.parameters import Array
+from jaxmodel.simulate import simulate
+from studies.engine.program import Place
+from studies.engine.runs import check_run
+from studies.errors import StudyError
+from studies.fitting.bench import with_slopes
+from studies.fitting.signals import Signal
+from studies.study.labels import describe
+from studies.study.spec import Study
+
+#: No link under control.
+OFF = (False, False, False)
+#: What a run records of each kind of output.
+RECORDED = {
+    "sensor": "sensor_voltage",
+    "slider": "slider",
+    "platform": "pose",
+    "deflection": "chord_deflection_stations",
+}
+
+
+class Recording(NamedTuple):
+    """One output of a run."""
+
+    time: np.ndarray  # [s], (n,)
+    command_end: float  # [s]
+    value: np.ndarray  # (n,)
+    slope: np.ndarray | None  # by the free numbers, (n, p)
+
+
+class Motion:
+    """A study's run with some links under control, kept for the last free numbers."""
+
+    def __init__(self, study: Study, place: Place) -> None:
+        """Arguments: the run, and what puts free numbers into a case.
+
+        Raises:
+            StudyError: as `check_run`.
+        """
+        self._structure, self._case = smooth_run(study)
+        self._place, self._stations = place, study.metrics.stations
+        self._kinds: set[str] = set()
+        self._kept: tuple[Any, Any] = None, None
+
+    def add(self, signal: Signal) -> None:
+        """Record what this output needs, too."""
+        self._kinds.add(signal.kind)
+
+    def find(self, name: str, signal: Signal, values: np.ndarray, has_slopes: bool) -> Recording:
+        """One output for some values of the free numbers, (p,).
+
+        Raises:
+            StudyError: naming the measurement `name`; a run that does not reach its end.
+        """
+        kinds = tuple(sorted(self._kinds))
+        key = values.tobytes(), kinds
+        known, found = self._kept
+        if known not in ((*key, True), (*key, has_slopes)):
+            run = _recorded_slopes if has_slopes else _recorded
+            found = run(self._structure, self._place, kinds, self._case, values)
+            found = jax.tree.map(np.asarray, found)
+            self._kept = (*key, has_slopes), found
+        signals, (time, command_end, code), *slopes = found
+        check_finished(name, int(code))
+        at = (slice(None), *self._entry(signal))
+        slope = slopes[0][signal.kind][at] if has_slopes else None
+        return Recording(time, float(command_end), signals[signal.kind][at], slope)
+
+    def _entry(self, signal: Signal) -> tuple[int, ...]:
+        """Where an output lies in what is recorded of its kind."""
+        if signal.kind == "sensor":
+            return signal.link, signal.patch
+        if signal.kind == "deflection":
+            return signal.link, self._stations.index(signal.place)
+        return (signal.link,)
+
+
+class Motions:
+    """Recorded runs of one study, by the links under control."""
+
+    def __init__(self, study: Study, place: Place, places: tuple[float, ...]) -> None:
+        """Arguments: as `Motion`; and where deflections are measured [m]."""
+        self._study = study.change(metrics__stations=places) if places else study
+        self._place = place
+        self._known: dict[tuple[bool, ...] | None, Motion] = {}
+
+    def of(self, links: tuple[bool, ...] | None) -> Motion:
+        """The run with these links under control; None: those of the study."""
+        if links not in self._known:
+            study = self._study if links is None else self._study.change(control__links=links)
+            self._known[links] = Motion(study, self._place)
+        return self._known[links]
+
+
+def smooth_run(study: Study) -> tuple[Structure, Case]:
+    """A study's run with derivatives.
+
+    Raises:
+        StudyError: as `check_run`.
+    """
+    structure, case = check_run(study)
+    return structure._replace(is_smooth=True), case
+
+
+def check_finished(name: str, code: int) -> None:
+    """Refuse a run that did not reach its end.
+
+    Raises:
+        StudyError: it did not.
+    """
+    if code not in status.FINISHED:
+        raise StudyError(f"{name}: the run ends with status {describe(code)}")
+
+
+def _run(
+    structure: Structure, place: Place, kinds: tuple[str, ...], case: Case, values: Array
+) -> Any:
+    result = simulate(structure, place(case, values), has_record=True)
+    record = result.record
+    assert record is not None
+    signals = {kind: getattr(record, RECORDED[kind]) for kind in kinds}
+    return signals, (record.time, result.command_end, result.status)
+
+
+_recorded = jax.jit(_run, static_argnums=(0, 1, 2))
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _recorded_slopes(
+    structure: Structure, place: Place, kinds: tuple[str, ...], case: Case, values: Array
+) -> Any:
+    slopes, found = with_slopes(_run, 4, is_first=True)(structure, place, kinds, case, values)
+    return *found, slopes

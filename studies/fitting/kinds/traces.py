@@ -1,0 +1,235 @@
+"""Signals over the time of the study's motion, and how long they take to settle."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from studies.errors import StudyError
+from studies.fitting.kinds.contract import Line, Noise, Numbers, Residual, scaled
+from studies.fitting.kinds.motions import Motion, Recording
+from studies.fitting.signals import Signal
+
+#: Step of derivatives through complex numbers, exact to rounding [1].
+TINY = 1e-30
+
+
+class Trace:
+    """One signal over time, compared at the times of the measurement."""
+
+    kind, is_ordered, n_hidden = "trace", True, 0
+
+    def __init__(
+        self,
+        name: str,
+        is_checked: bool,
+        motion: Motion,
+        signal: Signal,
+        time: np.ndarray,
+        measured: np.ndarray,
+        noise: Noise,
+        unit: str,
+    ) -> None:
+        """
+        Args:
+            name, is_checked: of the measurement.
+            motion: the run.
+            signal: the output.
+            time: [s], (n,), ascending and within the run.
+            measured: (n,).
+            noise: of the measured values.
+            unit: of the signal.
+        """
+        self.name, self.is_checked, self._unit = name, is_checked, unit
+        self._motion, self._signal = motion, signal
+        self.time, self.measured = time, measured
+        self._noise, self.sigma = noise, noise.sigma(measured)
+        motion.add(signal)
+
+    def predicted(
+        self, values: np.ndarray, has_slopes: bool
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """The signal at the measured times, (n,), and its derivatives, (n, p)."""
+        run = self._motion.find(self.name, self._signal, values, has_slopes)
+        model = np.interp(self.time, run.time, run.value)
+        if run.slope is None:
+            return model, None
+        by = [np.interp(self.time, run.time, x) for x in run.slope.T]
+        return model, np.stack(by, axis=1)
+
+    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
+        found, slope = self.predicted(values, has_slopes)
+        return scaled(found, slope, self.measured, self.sigma)
+
+    def reweigh(self, values: np.ndarray) -> None:
+        self.sigma = self._noise.of_model(self.predicted(values, False)[0], self.measured)
+
+    def comparison(self, values: np.ndarray) -> Line:
+        found = self.predicted(values, False)[0]
+        label = f"{self._signal.kind} [{self._unit}]"
+        return Line(
+            abscissa="time [s]",
+            ordinate=label,
+            x=self.time,
+            measured=self.measured,
+            model=found,
+            is_log=False,
+        )
+
+    def complaint(self, values: np.ndarray) -> str:
+        model = self.predicted(values, False)[0]
+        ratio = float(np.ptp(self.measured) / max(np.ptp(model), 1e-300))
+        if 0.01 < ratio < 100:
+            return ""
+        return (
+            f"measured moves {ratio:.3g} times as far as the model at the first guess; expected "
+            f"{self._unit}: check the unit"
+        )
+
+
+class Band(NamedTuple):
+    """Within which a signal has settled."""
+
+    width: float  # in the unit of the signal, or a share of its largest value without control
+    without: Motion | None  # the run without control, if it is a share
+
+
+class Settling:
+    """Time from the end of the command until a signal stays within a band.
+
+    The signal's envelope counts: from peak to peak it decays exponentially, so that the time and
+    its derivatives are smooth while peaks sink below the band.
+    """
+
+    kind, is_ordered, n_hidden = "settling", False, 0
+
+    def __init__(
+        self,
+        name: str,
+        is_checked: bool,
+        motion: Motion,
+        signal: Signal,
+        band: Band,
+        measured: float,
+        sigma: float,
+    ) -> None:
+        """
+        Args:
+            name, is_checked: of the measurement.
+            motion: the run.
+            signal: the output.
+            band: of the output.
+            measured: [s].
+            sigma: standard deviation [s].
+        """
+        self.name, self.is_checked = name, is_checked
+        self._motion, self._signal, self._band = motion, signal, band
+        self.measured, self.sigma = np.array([measured]), np.array([sigma])
+        for run in (motion, band.without):
+            if run is not None:
+                run.add(signal)
+
+    def predicted(
+        self, values: np.ndarray, has_slopes: bool
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """The model's settling time, (1,), and its derivatives, (1, p)."""
+        run = self._motion.find(self.name, self._signal, values, has_slopes)
+        level, by_level = self._level(values, has_slopes)
+        found = settled(run, level)
+        if found is None:
+            raise StudyError(
+                f"{self.name}: the model does not settle to {level:.3g} within the run; allowed: "
+                "a wider band or a longer run.duration"
+            )
+        time = np.array([found.time])
+        if run.slope is None or by_level is None:
+            return time, None
+        size = np.sign(run.value[found.samples])[:, None] * run.slope[found.samples]
+        return time, (found.by_samples @ size + found.by_level * by_level)[None]
+
+    def _level(self, values: np.ndarray, has_slopes: bool) -> tuple[float, np.ndarray | None]:
+        """The band in the unit of the signal, and its derivatives."""
+        width, without = self._band
+        if without is None:
+            return width, np.zeros(len(values)) if has_slopes else None
+        free = without.find(self.name, self._signal, values, has_slopes)
+        k = int(np.argmax(np.where(free.time > free.command_end, np.abs(free.value), 0.0)))
+        slope = None if free.slope is None else width * np.sign(free.value[k]) * free.slope[k]
+        return width * abs(float(free.value[k])), slope
+
+    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
+        return scaled(*self.predicted(values, has_slopes), self.measured, self.sigma)
+
+    def reweigh(self, values: np.ndarray) -> None:
+        pass  # its noise is no share
+
+    def comparison(self, values: np.ndarray) -> Numbers:
+        return Numbers(
+            labels=("settling time [s]",),
+            measured=self.measured,
+            model=self.predicted(values, False)[0],
+            sigma=self.sigma,
+        )
+
+    def complaint(self, values: np.ndarray) -> str:
+        self.predicted(values, False)  # may not settle
+        return ""
+
+
+class Settled(NamedTuple):
+    """When a signal's envelope enters a band, and how that depends on the signal."""
+
+    time: float  # from the end of the command [s]
+    samples: np.ndarray  # that it depends on, (6,)
+    by_samples: np.ndarray  # derivatives by their sizes, (6,)
+    by_level: float  # derivative by the band
+
+
+def settled(run: Recording, level: float) -> Settled | None:
+    """When the envelope of a recorded signal enters a band for good.
+
+    Args:
+        run: the signal.
+        level: half the width of the band, in the unit of the signal.
+
+    Returns:
+        Time 0 if no peak after the command is larger; None if the last peak still is.
+    """
+    size = np.abs(run.value)
+    inner = (size[1:-1] >= size[:-2]) & (size[1:-1] > size[2:])
+    peak = np.flatnonzero(inner & (run.time[:-2] >= run.command_end)) + 1
+    outside = np.flatnonzero(size[peak] > level)
+    if not outside.size:
+        return Settled(0.0, np.arange(6), np.zeros(6), 0.0)
+    last = int(outside[-1])
+    if last + 1 == len(peak):
+        return None
+    first, second = peak[last], peak[last + 1]
+    samples = np.concatenate([first + np.arange(-1, 2), second + np.arange(-1, 2)])
+    start = run.time[first] - run.command_end, run.time[second] - run.command_end
+    given = start, run.time[1] - run.time[0]
+    x = np.append(size[samples], level)
+    steps = x + 1j * TINY * np.diag(np.maximum(x, 1e-300))
+    by = np.array([_entered(row, *given).imag for row in steps]) / (TINY * np.maximum(x, 1e-300))
+    return Settled(float(_entered(x, *given).real), samples, by[:6], float(by[6]))
+
+
+def _entered(x: np.ndarray, start: tuple[float, float], period: float) -> Any:
+    """Time at which the exponential between two peaks meets a level.
+
+    Args:
+        x: sizes of three samples about each peak, and the level, (7,); may be complex.
+        start: times of the middle samples [s].
+        period: of the samples [s].
+    """
+    (time, peak), (after, lower) = (
+        _vertex(x[k : k + 3], at, period) for k, at in zip((0, 3), start, strict=True)
+    )
+    return time + (after - time) * np.log(peak / x[6]) / np.log(peak / lower)
+
+
+def _vertex(x: np.ndarray, middle: float, period: float) -> tuple[Any, Any]:
+    """Time and height of the parabola through three samples."""
+    slope, bend = (x[2] - x[0]) / 2, x[2] - 2 * x[1] + x[0]
+    return middle - period * slope / bend, x[1] - slope**2 / (2 * bend)

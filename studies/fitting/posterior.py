@@ -1,0 +1,163 @@
+"""Samples of the free numbers, as probable as the data and what is known beforehand make them.
+
+Before the data, every place between the bounds is as likely as any other, on the scale of the
+bounds, unless mean and sigma say more.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit, logit
+
+from studies.errors import StudyError
+from studies.fitting.problem import Problem
+from studies.fitting.statistics import Answer
+
+#: Chains, and the share of their steps that is thrown away while the step adapts.
+CHAINS, WARM_UP = 4, 0.25
+#: Share of steps that are best accepted [1] (Roberts and Rosenthal 1998).
+ACCEPTED = 0.574
+
+
+class Posterior(NamedTuple):
+    """Samples of all chains, one after another."""
+
+    places: np.ndarray  # between the bounds [1], (n, p)
+    values: np.ndarray  # in the study's units, (n, p)
+    reduction: np.ndarray  # by how much longer chains may still shrink their scatter [1], (p,)
+    effective: np.ndarray  # independent samples they are worth, (p,)
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the chains agree."""
+        return bool(np.all(self.reduction < 1.05))
+
+
+class Shape(NamedTuple):
+    """A normal distribution about as wide as the posterior, of the places' logits v.
+
+    In them the bounds are at infinity: u = 1/(1 + exp(-v)).
+    """
+
+    middle: np.ndarray  # (p,)
+    root: np.ndarray  # of the covariance, (p, p)
+
+    def draw(self, count: int, seed: int) -> np.ndarray:
+        """Places between the bounds, (n, p)."""
+        z = np.random.default_rng(seed).normal(size=(count, len(self.middle)))
+        return np.asarray(expit(self.middle + z @ self.root.T))
+
+
+def shape(answer: Answer) -> Shape:
+    """Shape of the posterior, from the model's derivatives at the optimum."""
+
+    def cost(v: np.ndarray) -> tuple[float, np.ndarray]:
+        u = expit(v)
+        away = u - answer.place
+        pull = answer.information @ away
+        value = answer.push @ away + 0.5 * away @ pull - np.sum(_log_width(v))
+        return float(value), (answer.push + pull) * u * (1 - u) - (1 - 2 * u)
+
+    start = logit(np.clip(answer.place, 0.02, 0.98))
+    middle = minimize(cost, start, jac=True, method="BFGS").x
+    width = expit(middle) * expit(-middle)
+    precision = width[:, None] * answer.information * width + np.diag(2 * width)
+    return Shape(middle, np.linalg.cholesky(np.linalg.inv(precision)))
+
+
+def _log_width(v: np.ndarray) -> np.ndarray:
+    """Logarithm of du/dv."""
+    return -np.logaddexp(0, v) - np.logaddexp(0, -v)
+
+
+def sample(problem: Problem, about: Shape, count: int, seed: int) -> Posterior:
+    """Draw from the posterior by BlackJAX's Metropolis-adjusted Langevin algorithm.
+
+    Args:
+        problem: what was fitted.
+        about: where chains start, and how far they step.
+        count: samples, of all chains.
+        seed: of the chains.
+
+    Raises:
+        StudyError: BlackJAX is not installed.
+    """
+    blackjax = _blackjax()
+    import jax
+    import jax.numpy as jnp
+
+    density, kernel = _density(problem, about), blackjax.mala.build_kernel()
+    rng = np.random.default_rng(seed)
+    size, each = len(about.middle), -(-count // CHAINS)
+    warm, chains = int(np.ceil(WARM_UP * each)), []
+    for _ in range(CHAINS):
+        step, found = 0.9 * size ** (-1 / 3), []
+        state = blackjax.mala.init(jnp.asarray(rng.normal(size=size)), density)
+        for k in range(warm + each):
+            key = jax.random.key(int(rng.integers(2**31)))
+            state, info = kernel(key, state, density, step)
+            if k < warm:
+                step *= float(np.exp((float(info.acceptance_rate) - ACCEPTED) / np.sqrt(1 + k)))
+            else:
+                found.append(np.asarray(state.position))
+        chains.append(found)
+    walked = np.array(chains)  # (chains, n, p)
+    places = expit(about.middle + walked.reshape(-1, size) @ about.root.T)[:count]
+    logits = walked @ about.root.T
+    return Posterior(
+        places=places,
+        values=problem.free.values(places),
+        reduction=np.asarray(blackjax.diagnostics.potential_scale_reduction(logits)),
+        effective=np.asarray(blackjax.diagnostics.effective_sample_size(logits)),
+    )
+
+
+def check_installed() -> None:
+    """Refuse samples where they cannot be drawn.
+
+    Raises:
+        StudyError: BlackJAX is not installed.
+    """
+    _blackjax()
+
+
+def _blackjax() -> Any:
+    try:
+        import blackjax
+    except ImportError:
+        raise StudyError(
+            "fit.samples: drawing samples needs blackjax; install the extra 'posterior'"
+        ) from None
+    return blackjax
+
+
+def _density(problem: Problem, about: Shape) -> Any:
+    """Logarithm of the density and its derivatives, as a function that JAX differentiates."""
+    import jax
+    import jax.numpy as jnp
+
+    def both(z: Any) -> tuple[float, np.ndarray]:
+        v = about.middle + about.root @ np.asarray(z)
+        u = expit(v)
+        try:
+            parts = problem.parts(problem.free.values(u), True)
+        except (StudyError, np.linalg.LinAlgError):
+            return -np.inf, np.zeros(len(v))
+        residual = problem.stacked(parts)
+        slope = -residual @ problem.stacked_slopes(parts, u) * u * (1 - u) + 1 - 2 * u
+        value = -0.5 * float(residual @ residual) + float(np.sum(_log_width(v)))
+        return value, slope @ about.root
+
+    @jax.custom_vjp
+    def density(z: Any) -> Any:
+        return jnp.asarray(both(z)[0])
+
+    def forward(z: Any) -> tuple[Any, Any]:
+        value, slope = both(z)
+        return jnp.asarray(value), jnp.asarray(slope)
+
+    density.defvjp(forward, lambda slope, along: (along * slope,))
+    return density
