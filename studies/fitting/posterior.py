@@ -16,8 +16,8 @@ from studies.errors import StudyError
 from studies.fitting.problem import Problem
 from studies.fitting.statistics import Answer
 
-#: Chains, and the share of their steps that is thrown away while the step adapts.
-CHAINS, WARM_UP = 4, 0.25
+#: Chains; steps that are thrown away while their length adapts: this share, and this many at least.
+CHAINS, WARM_UP, WARM_STEPS = 4, 0.25, 50
 #: Share of steps that are best accepted [1] (Roberts and Rosenthal 1998).
 ACCEPTED = 0.574
 
@@ -63,8 +63,11 @@ def shape(answer: Answer) -> Shape:
 
     start = logit(np.clip(answer.place, 0.02, 0.98))
     middle = minimize(cost, start, jac=True, method="BFGS").x
-    width = expit(middle) * expit(-middle)
-    precision = width[:, None] * answer.information * width + np.diag(2 * width)
+    u = expit(middle)
+    width = u * (1 - u)
+    # the second derivatives of u by v, times the slope of the cost by u, which the width balances
+    bend = (1 - 2 * u) ** 2 + 2 * width
+    precision = width[:, None] * answer.information * width + np.diag(bend)
     return Shape(middle, np.linalg.cholesky(np.linalg.inv(precision)))
 
 
@@ -89,10 +92,10 @@ def sample(problem: Problem, about: Shape, count: int, seed: int) -> Posterior:
     import jax
     import jax.numpy as jnp
 
-    density, kernel = _density(problem, about), blackjax.mala.build_kernel()
+    density, kernel = log_density(problem, about), blackjax.mala.build_kernel()
     rng = np.random.default_rng(seed)
     size, each = len(about.middle), -(-count // CHAINS)
-    warm, chains = int(np.ceil(WARM_UP * each)), []
+    warm, chains = max(int(WARM_UP * each), min(WARM_STEPS, 5 * each)), []
     for _ in range(CHAINS):
         step, found = 0.9 * size ** (-1 / 3), []
         state = blackjax.mala.init(jnp.asarray(rng.normal(size=size)), density)
@@ -134,8 +137,11 @@ def _blackjax() -> Any:
     return blackjax
 
 
-def _density(problem: Problem, about: Shape) -> Any:
-    """Logarithm of the density and its derivatives, as a function that JAX differentiates."""
+def log_density(problem: Problem, about: Shape) -> Any:
+    """Logarithm of the posterior, by standard normal numbers (p,) that `about` turns into logits.
+
+    A function that JAX differentiates, but does not compile.
+    """
     import jax
     import jax.numpy as jnp
 

@@ -8,7 +8,7 @@ in his machine.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -93,6 +93,18 @@ class Free(NamedTuple):
     key: str  # its name in the file
 
 
+@dataclass(frozen=True)
+class Placing:
+    """A function with its first arguments given; equal ones share their compiled programs."""
+
+    function: Callable[..., Case]
+    given: tuple[Any, ...]  # hashable
+
+    def __call__(self, case: Case, values: Array) -> Case:
+        """The case with the values put into it."""
+        return self.function(*self.given, case, values)
+
+
 class Setter(NamedTuple):
     """Writes one number into a Case; hashable."""
 
@@ -146,9 +158,9 @@ def join_numbers(
     numbers: list[Free] = []
     places: list[Callable[[Case, Array], Case]] = []
     for added, put in parts:
-        places.append(partial(_part, put, len(numbers), len(numbers) + len(added)))
+        places.append(Placing(_part, (put, len(numbers), len(numbers) + len(added))))
         numbers += added
-    return FreeNumbers(tuple(numbers), partial(_place_all, tuple(places)))
+    return FreeNumbers(tuple(numbers), Placing(_place_all, (tuple(places),)))
 
 
 def check_twice(numbers: Sequence[Free], path: str) -> None:
@@ -227,7 +239,7 @@ def plain_numbers(
         setters.append(Setter(leaf.path, whole, leaf.factor))
     if not numbers:
         raise field_error(name, value, f"one number or more, where {path} is to be free")
-    return numbers, partial(_set, tuple(setters))
+    return numbers, Placing(_set, (tuple(setters),))
 
 
 def _own_leaves(study: Study) -> dict[str, FieldPlace]:

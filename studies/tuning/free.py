@@ -11,7 +11,6 @@ then free by itself. Ready-made ones stand for several numbers:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -27,6 +26,7 @@ from studies.space.free import (
     DESIGN,
     Free,
     FreeNumbers,
+    Placing,
     check_twice,
     join_numbers,
     known,
@@ -112,7 +112,7 @@ def _poles(written: dict[str, Any], study: Study) -> tuple[list[Free], Callable[
         for name, span in zip(POLES, spans, strict=True)
         for k in range(3)
     ]
-    return numbers, partial(_place_poles, build_structure(study))
+    return numbers, Placing(_place_poles, (build_structure(study),))
 
 
 def _place_poles(structure: Structure, case: Case, values: Array) -> Case:
@@ -144,7 +144,7 @@ def _placement(bounds: Any, study: Study, path: str) -> tuple[list[Free], Callab
             Free(f"placement[{i}][{k}]", Range(0.0, 1.0, 0, False), float(starts[k]), PLACEMENT)
             for k in range(count)
         ]
-    return numbers, partial(_place_patches, links, tuple(pitch))
+    return numbers, Placing(_place_patches, (links, tuple(pitch)))
 
 
 def _shares(gaps: np.ndarray) -> np.ndarray:
