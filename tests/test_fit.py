@@ -327,7 +327,9 @@ def test_posterior(folder):
     problem, about = posed(folder, damping_sigma=0.0015)
     mean, deviation = integrated(problem)
     drawn = about.draw(4000, 0)
-    np.testing.assert_allclose(drawn.mean(axis=0), mean, atol=0.1 * deviation.max())
+    assert np.all(
+        np.abs(drawn.mean(axis=0) - mean) < 0.2 * deviation
+    )  # a normal distribution of logits
     np.testing.assert_allclose(drawn.std(axis=0), deviation, rtol=0.1)
     density, at = log_density(problem, about), jnp.array([0.7, -0.4])
     steps = 1e-5 * np.eye(2)
