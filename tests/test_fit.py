@@ -21,8 +21,9 @@ from studies.fitting.profiles import profile
 from studies.fitting.report import told, undetermined
 from studies.fitting.run import fit, run_fit
 from studies.fitting.solve import descend, solve
+from studies.fitting.spec import parse_fit
 from studies.fitting.statistics import describe_fit
-from studies.fitting.tables import read_columns
+from studies.fitting.tables import column, read_columns
 from studies.study.spec import load_study
 from studies.tuning.spec import load_tuning
 from tests.fits import (
@@ -350,7 +351,37 @@ def test_samples_have_the_posterior_s_mean_and_deviation(folder):
     np.testing.assert_allclose(found.places.std(axis=0), deviation, rtol=0.15)
 
 
+def test_an_optimum_at_a_bound(folder, tmp_path):
+    """Profiles to one side, samples of one number, and figures of both."""
+    entry = ONE_MODE | {"frequency_hz": [150.0], "damping_ratio": [], "damping_sigma": None}
+    free = {"link.youngs_modulus": {"from": 60e9, "to": 72e9}}
+    spec = spec_of(folder, {k: v for k, v in entry.items() if v}, free=free)
+    with pytest.raises(StudyError, match="samples = 3; allowed: 0, or 20"):
+        parse_fit(spec.data | {"fit": spec.data["fit"] | {"samples": 3}})
+    spec = spec._replace(fit=spec.fit.model_copy(update={"samples": 20}))
+    found = run_fit(spec, tmp_path / "out", Console(file=io.StringIO()))
+    assert found.answer.values[0] == pytest.approx(72e9, rel=1e-6)
+    assert np.all(np.diff(found.profiles[0].values) > 0)
+    assert found.posterior.effective.shape == (1,) and (tmp_path / "out/profiles.png").is_file()
+
+
 FAULTS = {
+    "late": (SETTLING | {"time_s": 5.0}, {}, "within the run, at most 0.06"),
+    "no third mode": (
+        FIGURES | {"values": {"spectral_density[controlled_mode=3]": 1.0}},
+        {},
+        "controlled_mode=1 to 2",
+    ),
+    "not a figure": (
+        FIGURES | {"values": {"residual_rms": np.nan}},
+        {},
+        "values.residual_rms = nan",
+    ),
+    "negative root": (
+        FIGURES | {"values": {"residual_rms": -5.0}, "amplitude": True},
+        {},
+        "0 or more",
+    ),
     "no time": (
         {"kind": "settling", "output": "sensor 1.1", "sigma_s": 0.1},
         {},
@@ -413,6 +444,21 @@ def test_bad_data_are_answered(tmp_path, fault):
         fit(spec_of(tmp_path, entry))
 
 
+def numbers_of(found):
+    return {name: column(found, name, "a.csv", "file") for name in found}
+
+
+def test_damaged_files_and_columns_nobody_asked_for(tmp_path):
+    (tmp_path / "a.csv").write_text("x,note\n1,ok\n2,\n")
+    found = read_columns("a.csv", tmp_path, "file")
+    assert list(column(found, "x", "a.csv", "file")) == [1.0, 2.0]
+    with pytest.raises(StudyError, match="row 1, column 'note': 'ok' is no number"):
+        column(found, "note", "a.csv", "file")
+    (tmp_path / "b.uff").write_text("    -1\n    58\n garbage\n    -1\n")
+    with pytest.raises(StudyError, match="cannot be read"):
+        read_columns("b.uff", tmp_path, "file")
+
+
 def test_columns_come_from_three_formats(tmp_path):
     f, h = FREQUENCY, np.exp(0.01j * FREQUENCY)
     write(tmp_path, "a.csv", frequency_hz=f, real=h.real, imag=h.imag)
@@ -438,8 +484,8 @@ def test_columns_come_from_three_formats(tmp_path):
         return_full_dict=False,
     )
     pyuff.UFF(str(tmp_path / "a.uff")).write_sets(sets, "add")
-    one = read_columns("a.csv", tmp_path, "file")
-    two = read_columns("a.h5::run 1", tmp_path, "file")
+    one = numbers_of(read_columns("a.csv", tmp_path, "file"))
+    two = numbers_of(read_columns("a.h5::run 1", tmp_path, "file"))
     three = read_columns("a.uff::1", tmp_path, "file")
     assert all(np.array_equal(one[name], two[name]) for name in one)
     np.testing.assert_allclose(three["frequency_hz"], f, rtol=1e-4)

@@ -197,7 +197,7 @@ def deep(n):
         ({"free": GAIN, "scenarios": {"spread": {"run.duration": 5.0}}}, "for the machine and its"),
         (
             {"free": GAIN, "scenarios": {"machines": {"link.density": [2700.0]}}},
-            "allowed: a list of 16 values or more",
+            "1 values; allowed: 16 or more",
         ),
         (
             {"free": GAIN, "scenarios": {"machines": {"link.density": [-1.0] * 16}}},
@@ -212,6 +212,26 @@ def deep(n):
                 },
             },
             "both in spread and in machines",
+        ),
+        (
+            {
+                "free": GAIN,
+                "scenarios": {
+                    "machines": {
+                        "link.youngs_modulus": [7e10] * 16,
+                        "link.youngs_modulus[0]": [7e10] * 16,
+                    }
+                },
+            },
+            "twice in machines",
+        ),
+        (
+            {"free": GAIN, "scenarios": {"machines": {"link.modes": [5] * 16}}},
+            "what runs by the same program",
+        ),
+        (
+            {"free": GAIN, "scenarios": {"machines": {"drive.locked": [True] * 16}}},
+            "drive.locked = true of tune.scenarios",
         ),
         (
             {
@@ -327,6 +347,20 @@ def test_three_values_are_spread_together_on_every_move():
     share = column / own
     np.testing.assert_allclose(share, share[:, :1] * np.ones(3))
     assert 0 < np.abs(share - 1).max() <= 0.05
+
+
+def test_machines_are_given_one_by_one():
+    modulus = [6.9e10, [7.0e10, 7.1e10, 7.2e10], 6.8e10, 6.7e10]
+    machines = {"link.youngs_modulus": modulus, "link.density": [2690.0, 2710.0, 2705.0, 2702.0]}
+    asked = {"count": 2, "check": 3, "machines": machines}
+    spec = parse_tuning({**SMALL, "tune": {"free": GAIN, "scenarios": asked}})
+    tuned, fresh = scenario_columns(spec, 2, 0), scenario_columns(spec, 3, 1, is_fresh=True)
+    own = spec.study.link
+    np.testing.assert_array_equal(tuned["link.density"], [own.density, 2690.0])
+    np.testing.assert_array_equal(tuned["link.youngs_modulus"], [own.youngs_modulus, 6.9e10])
+    np.testing.assert_array_equal(fresh["link.density"], machines["link.density"][1:])
+    wanted = [modulus[1], [6.8e10] * 3, [6.7e10] * 3]
+    np.testing.assert_array_equal(fresh["link.youngs_modulus"], wanted)
 
 
 def test_moves_may_have_unequal_paths():

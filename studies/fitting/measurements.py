@@ -36,7 +36,7 @@ from studies.fitting.spec import (
 from studies.fitting.tables import column, read_columns
 from studies.study.cases import build_structure
 from studies.study.consistency import each_link
-from studies.study.entries import parse_entries
+from studies.study.entries import entry_sizes, parse_entries
 
 #: Derivatives of the output by its quantity.
 ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
@@ -141,8 +141,10 @@ def _modes(spec: FitSpec, models: Models, entry: ModesEntry, path: str) -> Measu
                 "voltages, link by link and patch by patch"
             )
         shapes = np.array(entry.shapes, complex)
-        if not np.all(np.linalg.norm(shapes, axis=1) > 0):
+        largest = np.abs(shapes).max(axis=1, keepdims=True)
+        if not np.all(largest > 0):
             raise StudyError(f"{path}.shapes: one of them is zero")
+        shapes = shapes / largest
     measured = Measured(
         frequency=np.array(entry.frequency_hz),
         sigma=_each(entry.sigma_hz, count, f"{path}.sigma_hz"),
@@ -174,7 +176,7 @@ def _real(x: np.ndarray, name: str, path: str) -> np.ndarray:
 
 def _ascending(x: np.ndarray, what: str, path: str, least: int = 3) -> None:
     if len(x) < least:
-        raise StudyError(f"{path}: {len(x)} points; allowed: {least} or more")
+        raise StudyError(f"{path}: {what} has {len(x)} points; allowed: {least} or more")
     if not np.all(np.diff(x) > 0):
         row = int(np.argmax(np.diff(x) <= 0)) + 2
         raise StudyError(f"{path}: {what} must ascend; row {row} does not")
@@ -189,7 +191,7 @@ def _noise(entry: Noisy, value: np.ndarray, path: str) -> Noise:
 
 def _response(spec: FitSpec, models: Models, entry: ResponseEntry, path: str) -> Measurement:
     read, signals = _read(spec, entry, path), _signals(spec, entry, path)
-    frequency = read(entry.frequency).real
+    frequency = _real(read(entry.frequency), entry.frequency, path)
     _check_frequency(frequency, entry, path)
     if entry.magnitude:
         kind: type[Magnitude | ComplexResponse] = Magnitude
@@ -239,7 +241,7 @@ def _unit(signals: tuple[Signal, ...], order: int) -> str:
 
 def _spectrum(spec: FitSpec, models: Models, entry: SpectrumEntry, path: str) -> Measurement:
     read, signals = _read(spec, entry, path), _signals(spec, entry, path)
-    frequency, density = read(entry.frequency).real, _real(read(entry.density), entry.density, path)
+    frequency, density = (_real(read(x), x, path) for x in (entry.frequency, entry.density))
     keep = frequency > 0
     frequency, density = frequency[keep], density[keep]
     _check_frequency(frequency, entry, path)
@@ -263,7 +265,7 @@ def _spectrum(spec: FitSpec, models: Models, entry: SpectrumEntry, path: str) ->
 
 def _trace(spec: FitSpec, models: Models, entry: TraceEntry, path: str) -> Measurement:
     read, (signal,) = _read(spec, entry, path), _signals(spec, entry, path)
-    time, value = read(entry.time).real, read(entry.value).real
+    time, value = (_real(read(x), x, path) for x in (entry.time, entry.value))
     _ascending(time, f"column {entry.time!r}", path)
     if time[0] < 0 or time[-1] > spec.study.run.duration:
         raise StudyError(
@@ -289,6 +291,13 @@ def _settling(spec: FitSpec, models: Models, entry: SettlingEntry, path: str) ->
     if signal.kind in ("slider", "platform"):
         forms = ", ".join(OUTPUTS[x][0] for x in ("sensor", "deflection"))
         raise field_error(f"{path}.output", entry.output, f"{forms}, which settle about 0")
+    if entry.time_s > spec.study.run.duration:
+        raise field_error(
+            f"{path}.time_s",
+            entry.time_s,
+            f"within the run, at most {spec.study.run.duration:g} (run.duration)",
+            "s",
+        )
     share = entry.band_percent
     band = Band(entry.band or 0.0, None)
     if share is not None:
@@ -309,7 +318,9 @@ def _figures(spec: FitSpec, models: Models, entry: FiguresEntry, path: str) -> M
         )
     compared = []
     for name, value in entry.values.items():
-        entries = parse_entries(name, f"{path}.values")
+        entries = parse_entries(name, f"{path}.values", entry_sizes(spec.study))
+        if entry.amplitude and entry.of != "reduction" and value < 0:
+            raise field_error(f"{path}.values.{name}", value, "0 or more where amplitude = true")
         if not METRICS[entries.metric].has_slope:
             smooth = [x for x in METRICS if METRICS[x].has_slope]
             hint = "; take kind = 'settling'" if entries.metric == "settling_time" else ""

@@ -113,8 +113,9 @@ def sample(problem: Problem, about: Shape, count: int, seed: int) -> Posterior:
     return Posterior(
         places=places,
         values=problem.free.values(places),
-        reduction=np.asarray(blackjax.diagnostics.potential_scale_reduction(logits)),
-        effective=np.asarray(blackjax.diagnostics.effective_sample_size(logits)),
+        # one number comes without its axis
+        reduction=np.reshape(blackjax.diagnostics.potential_scale_reduction(logits), size),
+        effective=np.reshape(blackjax.diagnostics.effective_sample_size(logits), size),
     )
 
 

@@ -14,6 +14,8 @@ from studies.fitting.statistics import WIDE
 
 #: Profiles go on by this many standard deviations, at most so many times, until so large a rise.
 STRIDE, STEPS, ENOUGH = 0.7, 14, 6.0
+#: Places closer than this are one [1].
+NEXT = 1e-9
 
 
 class Likelihood(NamedTuple):
@@ -63,6 +65,8 @@ def profile(problem: Problem, u: np.ndarray, number: int, sigma: float) -> Likel
         for k in range(1, STEPS + 1):
             at = at.copy()
             at[number] = np.clip(u[number] + way * k * STRIDE * sigma, 0.0, 1.0)
+            if min(abs(at[number] - x) for x, _ in found) < NEXT:  # at the bound already
+                break
             try:
                 if len(others):
                     at[others] = follow(problem, at, others, 15, 1e-6).x

@@ -119,6 +119,8 @@ def sentences(found: Fitted) -> list[str]:
     lines += undetermined(found)
     if not answer.undetermined:
         lines += _correlated(found)
+    if found.fault:
+        lines.append(f"The fitted study does not run as it is: {found.fault}.")
     if found.posterior is not None and not found.posterior.is_settled:
         lines.append("The chains of samples do not agree yet; raise fit.samples.")
     if not found.solution.best.is_converged:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.console import Console
 
-from studies.engine.runs import run_attributes
+from studies.engine.runs import check_run, run_attributes
 from studies.errors import StudyError
 from studies.fitting import plots
 from studies.fitting.experiment import Experiment, next_experiments
@@ -50,6 +50,7 @@ class Fitted(NamedTuple):
     checks: tuple[Misfit, ...]  # of those held out
     profiles: tuple[Likelihood, ...]
     posterior: Posterior | None  # if samples were asked for
+    fault: str  # why the fitted study does not run, "" if it does
     experiments: tuple[Experiment, ...]  # the most telling first
 
     @property
@@ -117,8 +118,17 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
         ),
         profiles=tuple(profiles),
         posterior=posterior,
+        fault=_fault(study),
         experiments=tuple(experiments),
     )
+
+
+def _fault(study: Study) -> str:
+    try:
+        check_run(study)
+    except StudyError as error:
+        return str(error)
+    return ""
 
 
 def _check_enough(count: int, numbers: int, priors: int) -> None:

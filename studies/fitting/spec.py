@@ -26,11 +26,16 @@ from studies.study.explain import explain
 from studies.study.files import find_spec, read_toml
 from studies.study.spec import Section, Study, described, parse_study
 
-Positive = Annotated[float, Field(gt=0, le=1e12)]
-Percent = Annotated[float, Field(gt=0, le=1000)]
+Positive = Annotated[float, Field(ge=1e-30, le=1e12)]
+Percent = Annotated[float, Field(ge=1e-6, le=1000)]
+Share = Annotated[float, Field(ge=1e-6, lt=100)]
 Coordinate = Annotated[float, Field(ge=-10, le=10)]
 Pose = tuple[Coordinate, Coordinate, Coordinate]
 Flags = tuple[bool, bool, bool]
+
+
+#: Fewer samples say nothing.
+FEWEST_SAMPLES = 20
 
 
 class Common(Section):
@@ -128,7 +133,7 @@ class SettlingEntry(Seen):
     )
     sigma_s: Positive = described(..., "s", "standard deviation")
     band: Positive | None = described(None, "unit of the output", "to each side of 0")
-    band_percent: Percent | None = described(
+    band_percent: Share | None = described(
         None, "%", "the same, over the largest value after the command without control"
     )
     links: Flags | None = described(None, "-", "under control; default: those of the study")
@@ -229,6 +234,8 @@ def parse_fit(data: dict[str, Any], folder: str | Path = ".") -> FitSpec:
     except ValidationError as error:
         raise explain(error, Fit, data["fit"], inside="fit") from None
     check_run(study)
+    if 0 < fit.samples < FEWEST_SAMPLES:
+        raise field_error("fit.samples", fit.samples, f"0, or {FEWEST_SAMPLES} to 1000000")
     free, priors = _free(fit, study)
     entries = tuple(_entry(written, k) for k, written in enumerate(fit.data))
     if all(entry.check for entry in entries):

@@ -71,7 +71,9 @@ class Answer(NamedTuple):
     @property
     def is_too_close(self) -> bool:
         """Whether the data are met more closely than their noise allows."""
-        return self.freedom > 0 and bool(chi2.cdf(self.chi_square, self.freedom) < UNLIKELY)
+        if self.freedom == 0 or self.undetermined:
+            return False
+        return bool(chi2.cdf(self.chi_square, self.freedom) < UNLIKELY)
 
     @property
     def is_explained(self) -> bool:

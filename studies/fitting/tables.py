@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from studies.errors import StudyError, field_error, nearest
+from studies.errors import StudyError, field_error, nearest, shown
 
 #: Endings of the formats.
 FORMATS = (".csv", ".txt", ".h5", ".hdf5", ".uff", ".unv")
@@ -17,7 +17,7 @@ _FREQUENCY = 18
 
 
 def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
-    """Columns of a file by name, complex ones as they are.
+    """Columns of a file by name, as text from CSV; `column` makes numbers of them.
 
     Args:
         file: name, relative to `folder`; of HDF5 and UFF perhaps `file::group` or `file::number`.
@@ -25,7 +25,7 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
         path: where it is written, for messages.
 
     Raises:
-        StudyError: unreadable, unknown format, columns of unequal length, entries that are none.
+        StudyError: unreadable, unknown format, columns of unequal length.
     """
     name, _, inside = file.partition("::")
     where = folder / name
@@ -42,7 +42,8 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
             found = _from_csv(where)
     except (OSError, ValueError, KeyError, csv.Error) as error:
         raise StudyError(f"{path}: {where} cannot be read ({error})") from None
-    _check(found, where, path)
+    if len({len(x) for x in found.values()}) != 1:
+        raise StudyError(f"{path}: {where} has columns of unequal length, or none")
     return found
 
 
@@ -53,32 +54,41 @@ def _is_file(where: Path) -> bool:
         return False
 
 
-def _check(found: dict[str, np.ndarray], where: Path, path: str) -> None:
-    sizes = {len(x) for x in found.values()}
-    if len(sizes) != 1:
-        raise StudyError(f"{path}: {where} has columns of unequal length, or none")
-    for name, x in found.items():
-        bad = np.flatnonzero(~np.isfinite(x))
-        if bad.size:
-            raise StudyError(
-                f"{path}: {where}, column {name!r}: {bad.size} of {len(x)} entries are no finite "
-                f"numbers, the first in row {bad[0] + 1}; delete these rows"
-            )
-
-
 def column(found: dict[str, np.ndarray], name: str, file: str, path: str) -> np.ndarray:
-    """One column.
+    """One column as numbers; others may hold anything.
 
     Raises:
-        StudyError: there is none of that name.
+        StudyError: there is none of that name, or it has entries that are no finite numbers.
     """
     if name not in found:
         hint = nearest(name, found)
         told = f"; did you mean {hint!r}?" if hint else ""
-        raise StudyError(
-            f"{path}: {file} has no column {name!r}; it has {', '.join(map(repr, found))}{told}"
+        known = ", ".join(shown(x) for x in found)
+        raise StudyError(f"{path}: {shown(file)} has no column {shown(name)}; it has {known}{told}")
+    values = found[name]
+    if values.dtype.kind == "U":
+        values = np.array(
+            [
+                _cell(x, f"{path}: {shown(file)}, row {k}, column {shown(name)}")
+                for k, x in enumerate(values, 1)
+            ]
         )
-    return found[name]
+    bad = np.flatnonzero(~np.isfinite(values))
+    if bad.size:
+        raise StudyError(
+            f"{path}: {shown(file)}, column {name!r}: {bad.size} of {len(values)} entries are no "
+            f"finite numbers, the first in row {bad[0] + 1}; delete these rows"
+        )
+    return values
+
+
+def _cell(text: str, where: str) -> float:
+    try:
+        if "_" not in text:
+            return float(text or "nan")
+    except ValueError:
+        pass
+    raise StudyError(f"{where}: {shown(str(text))} is no number")
 
 
 def _from_csv(where: Path) -> dict[str, np.ndarray]:
@@ -95,20 +105,8 @@ def _from_csv(where: Path) -> dict[str, np.ndarray]:
     for k, row in enumerate(rows[1:], 1):
         if len(row) != width:
             raise ValueError(f"row {k} has {len(row)} entries instead of {width}")
-    numbers = np.array(
-        [
-            [_cell(x, k, name) for x, name in zip(row, names, strict=True)]
-            for k, row in enumerate(rows[1:], 1)
-        ]
-    )
-    return dict(zip(names, numbers.T, strict=True))
-
-
-def _cell(text: str, row: int, name: str) -> float:
-    try:
-        return float(text or "nan")
-    except ValueError:
-        raise ValueError(f"row {row}, column {name!r}: {text!r} is no number") from None
+    columns = zip(*rows[1:], strict=True)
+    return {name: np.array(x, str) for name, x in zip(names, columns, strict=True)}
 
 
 def _numbers(x: np.ndarray) -> np.ndarray:
@@ -133,13 +131,19 @@ def _from_uff(where: Path, number: str, path: str) -> dict[str, np.ndarray]:
         import pyuff
     except ImportError:
         raise StudyError(f"{path}: reading {where} needs pyuff; install the extra 'uff'") from None
-    sets = pyuff.UFF(str(where))
-    functions = np.flatnonzero(sets.get_set_types() == 58)
+    try:
+        sets = pyuff.UFF(str(where))
+        functions = np.flatnonzero(sets.get_set_types() == 58)
+    except Exception as error:  # of any kind, for a damaged file
+        raise ValueError(str(error) or "damaged") from error
     if not functions.size:
         raise ValueError("has no function (type 58)")
     index = int(number or 1) - 1
     if not 0 <= index < functions.size:
         raise ValueError(f"has functions 1 to {functions.size}")
-    found = sets.read_sets(int(functions[index]))
+    try:
+        found = sets.read_sets(int(functions[index]))
+    except Exception as error:
+        raise ValueError(str(error) or "damaged") from error
     abscissa = "frequency_hz" if found["abscissa_spec_data_type"] == _FREQUENCY else "time"
     return {abscissa: np.asarray(found["x"]), "value": np.asarray(found["data"])}

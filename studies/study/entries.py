@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxmodel.metrics import METRICS
+from jaxmodel.case import Structure
+from jaxmodel.metrics import METRICS, Sizes
 from studies.errors import StudyError, nearest
 from studies.study.paths import LINKS, NAMED_INDEX, parse_entry
 from studies.study.spec import Study
@@ -85,6 +86,17 @@ def parse_entries(name: str, path: str = "", sizes: Mapping[str, int] | None = N
         shape = "".join(f"[0 to {n - 1}]" for n in size.values())
         raise StudyError(f"{where}{name!r} has no such entry; allowed: {plain.field}{shape}")
     return Entries(plain.field, tuple(at.get(axis) for axis in axes))
+
+
+def entry_sizes(study: Study) -> dict[str, int]:
+    """Lengths of the axes of a study's metrics."""
+    sizes = Sizes(
+        n_stations=len(study.metrics.stations),
+        n_modes=study.link.modes,
+        n_controlled=study.control.modes,
+        n_frequencies=Structure().n_frequencies,
+    )
+    return sizes.axes
 
 
 def controlled_links(studies: Iterable[Study]) -> tuple[int, ...]:

@@ -177,6 +177,10 @@ def _bad_value(
         value = value[part]
     # an entry of a list is named by its index if its type is clear
     for part in entries[:-1] if is_missing else entries:
+        if get_origin(annotation) is dict and isinstance(part, str):
+            annotation, metadata, value = get_args(annotation)[1], [], value[part]
+            name = [*name, part]
+            continue
         if get_origin(annotation) is not tuple or not isinstance(part, int):
             break
         arguments = get_args(annotation)

@@ -6,10 +6,12 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from studies.errors import StudyError, field_error, nearest
+from studies.errors import StudyError, field_error, nearest, shown
 
 #: Folder of the package's ready-made files, available by name.
 READY = Path(__file__).parents[1] / "specs"
+#: Bytes of a file's name that file systems take.
+LONGEST_NAME = 255
 
 
 def find_spec(name: str | Path) -> Path:
@@ -19,6 +21,8 @@ def find_spec(name: str | Path) -> Path:
         StudyError: neither exists, but a ready-made one has nearly that name.
     """
     path = Path(name)
+    if len(path.name.encode()) > LONGEST_NAME:
+        raise StudyError(f"{shown(str(path))}: cannot be read (name too long)")
     if path.is_file() or len(path.parts) > 1 or path.suffix not in ("", ".toml"):
         return path
     ready = {file.stem: file for file in READY.glob("*.toml")}

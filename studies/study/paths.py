@@ -191,7 +191,7 @@ def checked_value(study: Study, name: str, value: Any, path: str) -> Any:
     Raises:
         StudyError: not allowed there, alone or with the other fields of the study.
     """
-    data = set_value(study, name, _plain(value))
+    data = set_value(study, name, as_tuples(value))
     try:
         changed = Study.model_validate(data)
         if not name.startswith(JUDGED_BY_STATUS):
@@ -203,8 +203,9 @@ def checked_value(study: Study, name: str, value: Any, path: str) -> Any:
     return known_field(name, changed)
 
 
-def _plain(value: Any) -> Any:
-    return tuple(map(_plain, value)) if isinstance(value, (list, tuple)) else value
+def as_tuples(value: Any) -> Any:
+    """Lists as tuples, at any depth."""
+    return tuple(map(as_tuples, value)) if isinstance(value, (list, tuple)) else value
 
 
 def _each_link_fields() -> frozenset[str]:

@@ -9,7 +9,7 @@ from scipy.stats import qmc
 
 from studies.space.axes import column_of
 from studies.study.fields import Columns
-from studies.study.paths import known_field, set_value
+from studies.study.paths import LINKS, as_tuples, known_field, set_value
 from studies.study.spec import Study, parse_study
 from studies.tuning.spec import Family, TuneSpec
 
@@ -39,7 +39,10 @@ def scenario_columns(
             share = 1 + percent / 100 * shift[:, k]
             machines[name] = np.multiply.outer(share, known_field(name, spec.study))
     for name, values in spec.tune.scenarios.machines.items():
-        others = values[-count:] if is_fresh else [known_field(name, spec.study), *values][:count]
+        own = known_field(name, spec.study)
+        others = [as_tuples(x) for x in (values[-count:] if is_fresh else [own, *values][:count])]
+        if any(isinstance(x, tuple) for x in others):  # one number stands for all links
+            others = [x if isinstance(x, tuple) else (x,) * LINKS for x in others]
         machines[name] = column_of(others)
     columns = {name: _repeated(column, moves) for name, column in machines.items()}
     for name in spec.tune.scenarios.each:

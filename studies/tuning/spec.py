@@ -20,14 +20,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
-from jaxmodel.case import Structure
 from jaxmodel.laws import LAWS
-from jaxmodel.metrics import METRICS, Sizes
+from jaxmodel.metrics import METRICS
 from studies.engine.runs import check_run
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.space.free import FreeNumbers
 from studies.study.cases import build_structure
-from studies.study.entries import controlled_links, parse_entries
+from studies.study.entries import controlled_links, entry_sizes, parse_entries
 from studies.study.explain import explain
 from studies.study.files import read_toml
 from studies.study.paths import checked_value, is_each_link, known_field, set_value
@@ -182,6 +181,8 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
     for family in families:
         for move in moves:
             _check_family(family, move, study)
+    for machine in _each_machine(tune.scenarios):
+        _check_family(families[0], moves[0] | machine, study)
     return TuneSpec(study=study, tune=tune, free=free, families=families, moves=moves, data=data)
 
 
@@ -220,26 +221,38 @@ def _check_spread(tune: Tune, study: Study) -> None:
 
 
 def _check_machines(asked: Scenarios, study: Study) -> None:
-    needed = max(asked.count - 1, 0) + asked.check
+    needed = asked.count - 1 + asked.check
     for name, values in asked.machines.items():
         path = f"tune.scenarios.machines.{shown_name(name)}"
         known_field(name, study, "tune.scenarios.machines")
         if name.partition(".")[0] in ("run", "metrics", "motion"):
-            raise field_error(path, "its values", "the machine and its control; each takes others")
-        if not isinstance(values, list) or len(values) < needed:
-            raise field_error(
-                path,
-                f"{len(values)} values" if isinstance(values, list) else values,
-                f"a list of {needed} values or more: tune.scenarios.count = {asked.count} less the "
-                f"study's own, and tune.scenarios.check = {asked.check}",
+            raise StudyError(f"{path}: allowed: the machine and its control; each takes others")
+        if not isinstance(values, list):
+            raise field_error(path, values, "a list with a value for each machine")
+        if len(values) < needed:
+            raise StudyError(
+                f"{path}: {len(values)} values; allowed: {needed} or more, for "
+                f"tune.scenarios.count = {asked.count} without the study's own machine, and for "
+                f"tune.scenarios.check = {asked.check}"
             )
         for k, value in enumerate(values):
             checked_value(study, name, value, f"{path}[{k}]")
     sizes = {name: len(values) for name, values in asked.machines.items()}
     if len(set(sizes.values())) > 1:
-        raise field_error(
-            "tune.scenarios.machines", sizes, "lists of one length, a value for each machine"
+        told = ", ".join(f"{shown_name(name)} {size}" for name, size in sizes.items())
+        raise StudyError(
+            f"tune.scenarios.machines: lists of unequal length ({told}); allowed: one value for "
+            "each machine"
         )
+
+
+def _each_machine(asked: Scenarios) -> list[dict[str, Any]]:
+    """What differs on each machine that is run."""
+    if not asked.machines:
+        return []
+    rows = zip(*asked.machines.values(), strict=True)
+    whole = [dict(zip(asked.machines, row, strict=True)) for row in rows]
+    return whole[: asked.count - 1] + whole[len(whole) - asked.check :]
 
 
 def _check_feedback(tune: Tune, study: Study) -> None:
@@ -277,13 +290,7 @@ def _check_metric(name: str, path: str, has_loop: bool, study: Study) -> None:
             f"{path}: {_field(name)} moves in steps and has no derivative"
             + ("; take ringing_time" if _field(name) == "settling_time" else "; limit it instead")
         )
-    sizes = Sizes(
-        n_stations=len(study.metrics.stations),
-        n_modes=study.link.modes,
-        n_controlled=study.control.modes,
-        n_frequencies=Structure().n_frequencies,
-    )
-    parse_entries(name, path, sizes.axes)
+    parse_entries(name, path, entry_sizes(study))
 
 
 def _moves(tune: Tune, study: Study) -> tuple[dict[str, Any], ...]:
@@ -302,10 +309,12 @@ def _check_clashes(tune: Tune, free: FreeNumbers, families: tuple[Family, ...]) 
     """Reject fields that are set twice."""
     asked = tune.scenarios
     parts = {"spread": asked.spread, "machines": asked.machines, "each": asked.each}
-    for one, other in combinations(parts, 2):
-        for name in parts[one]:
-            if name in parts[other]:
-                raise StudyError(f"tune.scenarios: {name} is both in {one} and in {other}")
+    named = [(part, name) for part, names in parts.items() for name in names]
+    for (one, name), (other, second) in combinations(named, 2):
+        if _is_part(name, second):
+            both = name if name == second else f"{name}, {second}"
+            where = f"both in {one} and in {other}" if one != other else f"twice in {one}"
+            raise StudyError(f"tune.scenarios: {both} is {where}")
     for family in families:
         numbers = zip(free.numbers, family.is_free, strict=True)
         moved = {_field(x) for number, is_free in numbers if is_free for x in writes(number)}
@@ -318,6 +327,11 @@ def _check_clashes(tune: Tune, free: FreeNumbers, families: tuple[Family, ...]) 
                     raise StudyError(f"{where}: {name} is free in family {family.name!r}")
                 if names is family.columns and any(name in x for x in parts.values()):
                     raise StudyError(f"{where}: {name} is in tune.scenarios too")
+
+
+def _is_part(name: str, other: str) -> bool:
+    """Whether one field is the other or an entry of it."""
+    return name == other or name.startswith(f"{other}[") or other.startswith(f"{name}[")
 
 
 def _check_size(tune: Tune, families: tuple[Family, ...], moves: int) -> None:
@@ -436,20 +450,21 @@ def _front(tune: Tune, families: list[Family]) -> list[Family]:
 
 def _check_family(family: Family, move: dict[str, Any], study: Study) -> None:
     """Check that a family's settings run, with the study's own program."""
+    where = [f"tune.families.{shown_name(family.name)}"] if family.columns else []
+    where += [f"{name} = {shown(value)} of tune.scenarios" for name, value in move.items()]
+    told = f"{', '.join(where)}: " if where else ""
     try:
         changed = family.study(study)
         for name, value in move.items():
             changed = parse_study(set_value(changed, name, value))
         check_run(changed)
     except StudyError as error:
-        where = [f"tune.families.{shown_name(family.name)}"] if family.columns else []
-        where += [f"{name} = {shown(value)} of tune.scenarios" for name, value in move.items()]
-        raise StudyError(f"{', '.join(where)}: {error}" if where else str(error)) from None
+        raise StudyError(f"{told}{error}") from None
     one, other = build_structure(study), build_structure(changed)
     kept = {"has_position_gain", "has_noise", "substeps"}
     for field, a, b in zip(one._fields, one, other, strict=True):
         if a != b and field not in kept:
             raise StudyError(
-                f"tune.families.{shown_name(family.name)}: {field} = {shown(b)} where the study "
-                f"has {shown(a)}; allowed: is what runs by the same program"
+                f"{told}{field} = {shown(b)} where the study has {shown(a)}; allowed: what runs by "
+                "the same program"
             )

@@ -11,6 +11,8 @@ from studies.fitting.kinds.contract import Line, Noise, Numbers, Residual, scale
 from studies.fitting.kinds.motions import Motion, Recording
 from studies.fitting.signals import Signal
 
+#: A signal that moves less is at rest [its unit].
+STILL = 1e-15
 #: Step of derivatives through complex numbers, exact to rounding [1].
 TINY = 1e-30
 
@@ -174,6 +176,9 @@ class Settling:
 
     def complaint(self, values: np.ndarray) -> str:
         self.predicted(values, False)  # may not settle
+        run = self._motion.find(self.name, self._signal, values, False)
+        if np.ptp(run.value) < STILL:
+            return f"the signal stays at {run.value[0]:.3g} in the model: nothing settles"
         return ""
 
 
