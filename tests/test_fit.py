@@ -362,6 +362,8 @@ def test_an_optimum_at_a_bound(folder, tmp_path):
     found = run_fit(spec, tmp_path / "out", Console(file=io.StringIO()))
     assert found.answer.values[0] == pytest.approx(72e9, rel=1e-6)
     assert np.all(np.diff(found.profiles[0].values) > 0)
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "link.youngs_modulus ended at its upper bound, 7.2e+10 Pa" in text
     assert found.posterior.effective.shape == (1,) and (tmp_path / "out/profiles.png").is_file()
 
 

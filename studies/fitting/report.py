@@ -119,12 +119,30 @@ def sentences(found: Fitted) -> list[str]:
     lines += undetermined(found)
     if not answer.undetermined:
         lines += _correlated(found)
+    lines += _at_bounds(found)
     if found.fault:
         lines.append(f"The fitted study does not run as it is: {found.fault}.")
     if found.posterior is not None and not found.posterior.is_settled:
         lines.append("The chains of samples do not agree yet; raise fit.samples.")
     if not found.solution.best.is_converged:
         lines.append("The search ended before it converged; raise fit.iterations.")
+    return lines
+
+
+def _at_bounds(found: Fitted) -> list[str]:
+    """Numbers that would go further if they could."""
+    lines = []
+    for name, u, number in zip(
+        found.names, found.solution.best.u, found.spec.free.numbers, strict=True
+    ):
+        if 1e-6 < u < 1 - 1e-6:
+            continue
+        side, end = ("lower", number.span.low) if u < 0.5 else ("upper", number.span.high)
+        unit = "" if _unit(name) == "1" else f" {_unit(name)}"
+        lines.append(
+            f"{name} ended at its {side} bound, {end:g}{unit}: widen fit.free, or take the value as "
+            "a limit."
+        )
     return lines
 
 
