@@ -140,8 +140,8 @@ def _at_bounds(found: Fitted) -> list[str]:
         side, end = ("lower", number.span.low) if u < 0.5 else ("upper", number.span.high)
         unit = "" if _unit(name) == "1" else f" {_unit(name)}"
         lines.append(
-            f"{name} ended at its {side} bound, {end:g}{unit}: widen fit.free, or take the value as "
-            "a limit."
+            f"{name} ended at its {side} bound, {end:g}{unit}: widen fit.free, or take the value "
+            "as a limit."
         )
     return lines
 
