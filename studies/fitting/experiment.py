@@ -17,8 +17,8 @@ import numpy as np
 
 from jaxmodel.beam import BASES
 from studies.errors import StudyError
-from studies.fitting.bench import Bench, PlantAt, Pose, response
-from studies.fitting.kinds.modes import frequency_slopes
+from studies.fitting.bench import Bench, Modes, PlantAt, Pose, response
+from studies.fitting.kinds.modes import mode_slopes
 from studies.fitting.signals import Signal, signal_name
 from studies.space.free import FreeNumbers
 
@@ -68,11 +68,10 @@ def _candidates(bench: Bench, plant: PlantAt) -> Iterator[tuple[str, np.ndarray]
     """What could be measured at a pose, and derivatives over the noise, (n, p)."""
     assert plant.slope is not None
     with suppress(np.linalg.LinAlgError):
-        modes = plant.modes
-        pole = modes.pole[:COVERED]
-        turned = np.einsum("kn,nmp->kmp", modes.dual[:COVERED], plant.slope.state)
-        by = np.einsum("kmp,mk->kp", turned, modes.shape[:, :COVERED])
-        by_frequency, by_damping = frequency_slopes(pole, by)
+        whole = plant.modes
+        pole = whole.pole[:COVERED]
+        first = Modes(pole, whole.shape[:, :COVERED], whole.dual[:COVERED])
+        by_frequency, by_damping = mode_slopes(first, plant.slope.state)
         size, ratio = np.abs(pole) / (2 * np.pi), -pole.real / np.abs(pole)
         noise = FREQUENCY * size, DAMPING * np.maximum(ratio, 1e-4)
         slopes = [by_frequency / noise[0][:, None], by_damping / noise[1][:, None]]

@@ -53,13 +53,11 @@ class Models(NamedTuple):
 def make_bench(spec: FitSpec) -> Bench:
     """Linear machine at the poses of all entries."""
     poses: dict[At, str] = {}
-    places: list[float] = []
     for k, entry in enumerate(spec.entries):
         is_held = isinstance(entry, ModesEntry) and entry.ends == "held"
         if isinstance(entry, AtPose) and not is_held:
             poses.setdefault(_pose(spec, entry), f"fit.data[{k}].pose")
-        if not isinstance(entry, (TraceEntry, SettlingEntry)):
-            places += _places(_signals(spec, entry, f"fit.data[{k}]"))
+    places = _places(spec, (ResponseEntry, SpectrumEntry))
     bench = Bench(spec.study, spec.free.place, tuple(poses), places)
     for pose, path in poses.items():
         bench.check(pose, path)
@@ -73,15 +71,9 @@ def make_measurements(spec: FitSpec, bench: Bench) -> list[Measurement]:
         StudyError: a file that cannot be used, data that do not fit the machine.
     """
     given = spec.study, spec.free.place
-    places = sorted(
-        {
-            place
-            for k, entry in enumerate(spec.entries)
-            if isinstance(entry, (TraceEntry, SettlingEntry))
-            for place in _places(_signals(spec, entry, f"fit.data[{k}]"))
-        }
+    models = Models(
+        bench, Runs(*given), Motions(*given, _places(spec, (TraceEntry, SettlingEntry)))
     )
-    models = Models(bench, Runs(*given), Motions(*given, tuple(places)))
     return [
         _MAKERS[type(entry)](spec, models, entry, f"fit.data[{k}]")
         for k, entry in enumerate(spec.entries)
@@ -103,9 +95,15 @@ def _signals(spec: FitSpec, entry: Common, path: str) -> tuple[Signal, ...]:
     return parse_signal(entry.input, INPUTS, *given, f"{path}.input"), output
 
 
-def _places(signals: tuple[Signal, ...]) -> list[float]:
-    """Where along the links they are, of those that are there."""
-    return [x.place for x in signals if not np.isnan(x.place)]
+def _places(spec: FitSpec, kinds: tuple[type[Seen], ...]) -> tuple[float, ...]:
+    """Where along the links hammers and deflections of some kinds of entries are [m], ascending."""
+    found = {
+        signal.place
+        for k, entry in enumerate(spec.entries)
+        if isinstance(entry, kinds)
+        for signal in _signals(spec, entry, f"fit.data[{k}]")
+    }
+    return tuple(sorted(x for x in found if not np.isnan(x)))
 
 
 def _each(value: Any, count: int, path: str) -> np.ndarray:

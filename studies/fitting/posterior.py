@@ -88,7 +88,7 @@ def sample(problem: Problem, about: Shape, count: int, seed: int) -> Posterior:
     Raises:
         StudyError: BlackJAX is not installed.
     """
-    blackjax = _blackjax()
+    blackjax = load_blackjax()
     import jax
     import jax.numpy as jnp
 
@@ -119,16 +119,12 @@ def sample(problem: Problem, about: Shape, count: int, seed: int) -> Posterior:
     )
 
 
-def check_installed() -> None:
-    """Refuse samples where they cannot be drawn.
+def load_blackjax() -> Any:
+    """BlackJAX, which is an extra.
 
     Raises:
-        StudyError: BlackJAX is not installed.
+        StudyError: it is not installed.
     """
-    _blackjax()
-
-
-def _blackjax() -> Any:
     try:
         import blackjax
     except ImportError:

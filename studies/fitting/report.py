@@ -54,9 +54,15 @@ def report(found: Fitted) -> str:
 
 
 def _unit(name: str) -> str:
+    """Of a free number, "" for 1."""
     entry = parse_entry(name)
     assert entry is not None
-    return field_unit(entry.field)
+    unit = field_unit(entry.field)
+    return "" if unit == "1" else unit
+
+
+def _is_at_bound(place: float) -> bool:
+    return not 1e-6 < place < 1 - 1e-6
 
 
 def _rows(found: Fitted) -> list[list[str]]:
@@ -69,7 +75,7 @@ def _rows(found: Fitted) -> list[list[str]]:
         digits = _digits(value, sigma)
         ends = np.array([found.spec.free.numbers[k].span.low, found.spec.free.numbers[k].span.high])
         at = "interval ends at a bound" if np.isclose([low, high], ends, rtol=1e-9).any() else ""
-        at = at if 1e-6 < u[k] < 1 - 1e-6 else "at its bound"
+        at = "at its bound" if _is_at_bound(u[k]) else at
         if found.answer.sigma[k] >= 0.99 * UNKNOWN * abs(found.spec.free.slopes(u)[k]):
             at = "not determined"
         rows.append(
@@ -77,7 +83,7 @@ def _rows(found: Fitted) -> list[list[str]]:
                 name,
                 f"{value:.{digits}g}",
                 f"{sigma:.2g}",
-                "" if _unit(name) == "1" else _unit(name),
+                _unit(name),
                 f"{low:.{digits}g} to {high:.{digits}g}",
                 at,
             ]
@@ -135,13 +141,13 @@ def _at_bounds(found: Fitted) -> list[str]:
     for name, u, number in zip(
         found.names, found.solution.best.u, found.spec.free.numbers, strict=True
     ):
-        if 1e-6 < u < 1 - 1e-6:
+        if not _is_at_bound(u):
             continue
         side, end = ("lower", number.span.low) if u < 0.5 else ("upper", number.span.high)
-        unit = "" if _unit(name) == "1" else f" {_unit(name)}"
+        value = f"{end:g} {_unit(name)}".rstrip()
         lines.append(
-            f"{name} ended at its {side} bound, {end:g}{unit}: widen fit.free, or take the value "
-            "as a limit."
+            f"{name} ended at its {side} bound, {value}: widen fit.free, or take the value as a "
+            "limit."
         )
     return lines
 
@@ -219,7 +225,7 @@ def _single(found: Fitted) -> list[list[str]]:
     for name, part in found.comparisons:
         if isinstance(part, Line):
             continue
-        notes = part.notes or ("",) * len(part.labels)
+        notes = (*part.notes, *[""] * (len(part.labels) - len(part.notes)))
         given = zip(*part[:4], part.away, notes, strict=True)
         for label, measured, model, sigma, far, note in given:
             text = f"{measured:.6g}", f"{sigma:.2g}", f"{model:.6g}", f"{far:+.1f}"

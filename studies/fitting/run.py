@@ -15,7 +15,7 @@ from studies.fitting import plots
 from studies.fitting.experiment import Experiment, next_experiments
 from studies.fitting.kinds.contract import Line, Numbers
 from studies.fitting.measurements import guess, make_bench, make_measurements
-from studies.fitting.posterior import Posterior, check_installed, sample, shape
+from studies.fitting.posterior import Posterior, load_blackjax, sample, shape
 from studies.fitting.problem import Problem, complaints
 from studies.fitting.profiles import Likelihood, profile
 from studies.fitting.report import report, summary
@@ -72,7 +72,7 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
     console = console or Console(quiet=True)
     fit, free = spec.fit, spec.free
     if fit.samples:
-        check_installed()
+        load_blackjax()
     bench = make_bench(spec)
     every = make_measurements(spec, bench)
     complaints(every, guess(spec))

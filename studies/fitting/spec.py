@@ -24,6 +24,7 @@ from studies.space.free import (
 )
 from studies.study.explain import explain
 from studies.study.files import find_spec, read_toml
+from studies.study.paths import as_tuples
 from studies.study.spec import Section, Study, described, parse_study
 
 Positive = Annotated[float, Field(ge=1e-30, le=1e12)]
@@ -230,7 +231,7 @@ def parse_fit(data: dict[str, Any], folder: str | Path = ".") -> FitSpec:
         raise StudyError("fit: missing; a fit is a study file with a section [fit]")
     study = parse_study({name: value for name, value in data.items() if name != "fit"})
     try:
-        fit = Fit.model_validate(_tuples(data["fit"]))
+        fit = Fit.model_validate(as_tuples(data["fit"]))
     except ValidationError as error:
         raise explain(error, Fit, data["fit"], inside="fit") from None
     check_run(study)
@@ -297,7 +298,7 @@ def _entry(written: dict[str, Any], k: int) -> Common:
         raise field_error(f"{path}.kind", kind, ", ".join(ENTRIES), hint=hint)
     model = ENTRIES[kind]
     try:
-        entry = model.model_validate(_tuples(written))
+        entry = model.model_validate(as_tuples(written))
     except ValidationError as error:
         raise explain(error, model, written, inside=path) from None
     is_bare = isinstance(entry, Noisy) and entry.sigma is None and entry.sigma_percent is None
@@ -307,10 +308,3 @@ def _entry(written: dict[str, Any], k: int) -> Common:
             "uncertainty"
         )
     return entry if entry.name else entry.model_copy(update={"name": f"{kind} {k + 1}"})
-
-
-def _tuples(value: Any) -> Any:
-    """Lists as tuples, and whole numbers as they are."""
-    if isinstance(value, dict):
-        return {name: _tuples(x) for name, x in value.items()}
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value

@@ -134,16 +134,13 @@ def _from_uff(where: Path, number: str, path: str) -> dict[str, np.ndarray]:
     try:
         sets = pyuff.UFF(str(where))
         functions = np.flatnonzero(sets.get_set_types() == 58)
-    except Exception as error:  # of any kind, for a damaged file
-        raise ValueError(str(error) or "damaged") from error
-    if not functions.size:
-        raise ValueError("has no function (type 58)")
-    index = int(number or 1) - 1
-    if not 0 <= index < functions.size:
-        raise ValueError(f"has functions 1 to {functions.size}")
-    try:
+        if not functions.size:
+            raise ValueError("has no function (type 58)")
+        index = int(number or 1) - 1
+        if not 0 <= index < functions.size:
+            raise ValueError(f"has functions 1 to {functions.size}")
         found = sets.read_sets(int(functions[index]))
-    except Exception as error:
+    except Exception as error:  # of any kind, for a damaged file
         raise ValueError(str(error) or "damaged") from error
     abscissa = "frequency_hz" if found["abscissa_spec_data_type"] == _FREQUENCY else "time"
     return {abscissa: np.asarray(found["x"]), "value": np.asarray(found["data"])}

@@ -19,7 +19,7 @@ from jaxmodel.laws import LAWS
 from jaxmodel.parameters import Array
 from studies.errors import StudyError, field_error, nearest
 from studies.space.axes import ALIASES, READY_MADE, Range, parse_range
-from studies.study.paths import checked_value, known_field, parse_entry
+from studies.study.paths import checked_value, known_field, overlaps, parse_entry
 from studies.study.spec import OWN_FIELDS, Study
 
 TWO_PI = 2 * np.pi
@@ -171,9 +171,7 @@ def check_twice(numbers: Sequence[Free], path: str) -> None:
     """
     names = [number.name for number in numbers]
     for k, name in enumerate(names):
-        if name in names[:k] or any(
-            name.startswith(f"{other}[") or other.startswith(f"{name}[") for other in names[:k]
-        ):
+        if any(overlaps(name, other) for other in names[:k]):
             raise StudyError(f"{path}.{name}: free twice")
 
 

@@ -168,9 +168,8 @@ def _bad_value(
 ) -> StudyError:
     annotation, metadata = info.annotation, list(info.metadata)
     if is_missing and not entries:
-        field = ".".join(str(part) for part in [inside, *name] if part != "")
         unit = unit_of(info)
-        told = f"{field}: missing; allowed: {allowed_values(annotation, metadata)}"
+        told = f"{_dotted(inside, name)}: missing; allowed: {allowed_values(annotation, metadata)}"
         return StudyError(f"{told} [{unit}]" if unit else told)
     value: Any = data
     for part in name:
@@ -189,5 +188,9 @@ def _bad_value(
         name = [*name, part]
     choices = choices_of(annotation, metadata)
     hint = nearest(value, choices) if isinstance(value, str) else ""
-    field = ".".join(str(part) for part in [inside, *name] if part != "")
-    return field_error(field, value, allowed_values(annotation, metadata), unit_of(info), hint)
+    allowed = allowed_values(annotation, metadata)
+    return field_error(_dotted(inside, name), value, allowed, unit_of(info), hint)
+
+
+def _dotted(inside: str, name: list[Any]) -> str:
+    return ".".join(str(part) for part in [inside, *name] if part != "")

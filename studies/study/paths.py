@@ -203,8 +203,15 @@ def checked_value(study: Study, name: str, value: Any, path: str) -> Any:
     return known_field(name, changed)
 
 
+def overlaps(name: str, other: str) -> bool:
+    """Whether one field is the other or an entry of it."""
+    return name == other or name.startswith(f"{other}[") or other.startswith(f"{name}[")
+
+
 def as_tuples(value: Any) -> Any:
     """Lists as tuples, at any depth."""
+    if isinstance(value, dict):
+        return {name: as_tuples(x) for name, x in value.items()}
     return tuple(map(as_tuples, value)) if isinstance(value, (list, tuple)) else value
 
 

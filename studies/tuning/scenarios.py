@@ -11,7 +11,7 @@ from studies.space.axes import column_of
 from studies.study.fields import Columns
 from studies.study.paths import LINKS, as_tuples, known_field, set_value
 from studies.study.spec import Study, parse_study
-from studies.tuning.spec import Family, TuneSpec
+from studies.tuning.spec import Family, TuneSpec, others
 
 
 def scenario_columns(
@@ -39,11 +39,11 @@ def scenario_columns(
             share = 1 + percent / 100 * shift[:, k]
             machines[name] = np.multiply.outer(share, known_field(name, spec.study))
     for name, values in spec.tune.scenarios.machines.items():
-        own = known_field(name, spec.study)
-        others = [as_tuples(x) for x in (values[-count:] if is_fresh else [own, *values][:count])]
-        if any(isinstance(x, tuple) for x in others):  # one number stands for all links
-            others = [x if isinstance(x, tuple) else (x,) * LINKS for x in others]
-        machines[name] = column_of(others)
+        own = [] if is_fresh else [known_field(name, spec.study)]
+        column = [as_tuples(x) for x in own + others(values, count, is_fresh)]
+        if any(isinstance(x, tuple) for x in column):  # one number stands for all links
+            column = [x if isinstance(x, tuple) else (x,) * LINKS for x in column]
+        machines[name] = column_of(column)
     columns = {name: _repeated(column, moves) for name, column in machines.items()}
     for name in spec.tune.scenarios.each:
         columns[name] = np.repeat(column_of([move[name] for move in spec.moves]), count, axis=0)

@@ -29,7 +29,7 @@ from studies.study.cases import build_structure
 from studies.study.entries import controlled_links, entry_sizes, parse_entries
 from studies.study.explain import explain
 from studies.study.files import read_toml
-from studies.study.paths import checked_value, is_each_link, known_field, set_value
+from studies.study.paths import checked_value, is_each_link, known_field, overlaps, set_value
 from studies.study.spec import Section, Study, described, parse_study
 from studies.tuning.free import free_numbers, writes
 
@@ -252,7 +252,18 @@ def _each_machine(asked: Scenarios) -> list[dict[str, Any]]:
         return []
     rows = zip(*asked.machines.values(), strict=True)
     whole = [dict(zip(asked.machines, row, strict=True)) for row in rows]
-    return whole[: asked.count - 1] + whole[len(whole) - asked.check :]
+    return others(whole, asked.count, False) + others(whole, asked.check, True)
+
+
+def others(values: list[Any], count: int, is_fresh: bool) -> list[Any]:
+    """Of what is given for each other machine, what `count` machines take.
+
+    Args:
+        values: one for each machine.
+        count: machines that run, the study's own among them unless they are fresh.
+        is_fresh: machines to check the result, not to tune.
+    """
+    return values[-count:] if is_fresh else values[: count - 1]
 
 
 def _check_feedback(tune: Tune, study: Study) -> None:
@@ -311,7 +322,7 @@ def _check_clashes(tune: Tune, free: FreeNumbers, families: tuple[Family, ...]) 
     parts = {"spread": asked.spread, "machines": asked.machines, "each": asked.each}
     named = [(part, name) for part, names in parts.items() for name in names]
     for (one, name), (other, second) in combinations(named, 2):
-        if _is_part(name, second):
+        if overlaps(name, second):
             both = name if name == second else f"{name}, {second}"
             where = f"both in {one} and in {other}" if one != other else f"twice in {one}"
             raise StudyError(f"tune.scenarios: {both} is {where}")
@@ -327,11 +338,6 @@ def _check_clashes(tune: Tune, free: FreeNumbers, families: tuple[Family, ...]) 
                     raise StudyError(f"{where}: {name} is free in family {family.name!r}")
                 if names is family.columns and any(name in x for x in parts.values()):
                     raise StudyError(f"{where}: {name} is in tune.scenarios too")
-
-
-def _is_part(name: str, other: str) -> bool:
-    """Whether one field is the other or an entry of it."""
-    return name == other or name.startswith(f"{other}[") or other.startswith(f"{name}[")
 
 
 def _check_size(tune: Tune, families: tuple[Family, ...], moves: int) -> None:

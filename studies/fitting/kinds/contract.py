@@ -40,7 +40,7 @@ class Numbers(NamedTuple):
     measured: np.ndarray  # (n,)
     model: np.ndarray  # (n,)
     sigma: np.ndarray  # of the measured ones, (n,)
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # on the first of them
 
     @property
     def away(self) -> np.ndarray:

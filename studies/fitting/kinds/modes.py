@@ -86,13 +86,13 @@ class _Modes:
             ):
                 whole.append(x[at])
         labels = tuple(x for part in parts for x in part)
-        notes = () if found.likeness is None else [f"{x:.3f}" for x in found.likeness]
+        likeness = () if found.likeness is None else found.likeness
         return Numbers(
             labels=labels,
             measured=np.concatenate(data),
             model=np.concatenate(model),
             sigma=np.concatenate(sigma),
-            notes=tuple(f"shape: {x} of 1" for x in notes) + ("",) * (len(labels) - len(notes)),
+            notes=tuple(f"shape: {x:.3f} of 1" for x in likeness),
         )
 
     def complaint(self, values: np.ndarray) -> str:
@@ -155,21 +155,22 @@ class MachineModes(_Modes):
         size = np.abs(pole)
         by_frequency = by_damping = None
         if plant.slope is not None:
-            turned = np.einsum("kn,nmp->kmp", pairs.dual, plant.slope.state)
-            by = np.einsum("kmp,mk->kp", turned, pairs.shape)  # of the poles
-            by_frequency, by_damping = frequency_slopes(pole, by)
+            paired = Modes(pole, pairs.shape, pairs.dual)
+            by_frequency, by_damping = mode_slopes(paired, plant.slope.state)
         likeness = None if self._measured.shapes is None else pairs.likeness
         given = size / TWO_PI, -pole.real / size
         return _Predicted(*given, by_frequency, by_damping, likeness)
 
 
-def frequency_slopes(pole: np.ndarray, by: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of frequencies [Hz] and damping ratios, (k, p), from those of poles.
+def mode_slopes(modes: Modes, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of frequencies [Hz] and damping ratios, (k, p).
 
     Args:
-        pole: [1/s], (k,), complex.
-        by: their derivatives, (k, p).
+        modes: k of them.
+        change: derivatives of the matrix A, (n, n, p).
     """
+    pole = modes.pole
+    by = np.einsum("kmp,mk->kp", np.einsum("kn,nmp->kmp", modes.dual, change), modes.shape)
     real, imag, size = pole.real[:, None], pole.imag[:, None], np.abs(pole)[:, None]
     by_size = (real * by.real + imag * by.imag) / size
     return by_size / TWO_PI, -by.real / size + real / size**2 * by_size
