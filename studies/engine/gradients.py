@@ -43,7 +43,6 @@ from studies.engine.program import (
     split_cases,
 )
 from studies.engine.steps import (
-    PREPARING,
     AdjointSteps,
     Ready,
     Steps,
@@ -372,12 +371,8 @@ class PulledBack:
         given = block.ready.outline, block.ready.state.status, self._last(block), at_end
         outline, state = map(jax.tree.leaves, conclude_gradients(*given))
         start = self._at_start(block, outline, state, count)
-        with PREPARING:
-            gradients = np.asarray(
-                prepare_gradients(
-                    self._program, self._steps.parts, block.varying, self._shared, start
-                )
-            )
+        leaves = self._program, self._steps.parts, block.varying, self._shared
+        gradients = prepare_gradients(*leaves, start)
         turn, lane = np.nonzero(turns >= 0)
         found[turns[turn, lane], lane] = gradients[turn, lane]
         return found

@@ -42,8 +42,8 @@ from jaxmodel.return_difference import (
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.engine.damping import damping_ratios, least_controlled
 from studies.engine.lanes import BLOCK, run_steps
+from studies.engine.program import one_at_a_time
 from studies.engine.stability import loop_report, with_margin_modes
-from studies.engine.steps import PREPARING
 from studies.study.margin import HIGHEST, LOWEST
 
 
@@ -223,8 +223,7 @@ def _judge_block(
     n_links = np.sum(mask > 0, axis=0)
     filled = rows[np.minimum(np.arange(BLOCK), len(rows) - 1)]  # one size, one compilation
     block = jax.tree.map(lambda x: x[filled], cases)
-    with PREPARING:
-        found = jax.tree.map(np.asarray, _respond(structure, block))
+    found = _respond(structure, block)
     response, modes, strength = jax.tree.map(lambda x: x[..., : len(rows)], found)
     response = controlled_first(response, mask, most)
     with np.errstate(all="ignore"):  # non-finite values find no crossing
@@ -233,6 +232,7 @@ def _judge_block(
 
 
 # compiled without optimisation: it takes a fiftieth of the time
+@one_at_a_time
 @partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
 def _respond(structure: Structure, cases: Case) -> tuple[LoopResponse, AssembledModes, Any]:
     """The loops, their modes and their strength, lanes last."""

@@ -8,7 +8,8 @@ that depends on them has tangents.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import partial
+from functools import partial, wraps
+from threading import Lock
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -26,6 +27,23 @@ from studies.engine.runs import with_ratio
 TRACES: list[Structure] = []
 #: Puts parameters (p,) into a case; pass the same object every time to avoid recompiling.
 Place = Callable[[Case, Array], Case]
+
+_ALONE = Lock()
+
+
+def one_at_a_time(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A program that runs alone, to its end, and returns NumPy arrays.
+
+    Of two concurrent runs of programs with an eigenvalue problem (basis loaded), XLA's CPU client
+    occasionally never finishes one (jax 0.10), even if nobody waits for the other's results.
+    """
+
+    @wraps(function)
+    def alone(*given: Any) -> Any:
+        with _ALONE:
+            return jax.tree.map(np.asarray, function(*given))
+
+    return alone
 
 
 class Running(NamedTuple):
@@ -174,6 +192,7 @@ def begin_block(program: Program, parts: StartParts, own: list[Any], common: lis
     )
 
 
+@one_at_a_time
 @partial(jax.jit, static_argnums=(0, 1))
 def prepare(program: Program, parts: StartParts, own: list[Any], common: list[Any]) -> list[Any]:
     """The leaves that vary, lanes last."""
@@ -181,6 +200,7 @@ def prepare(program: Program, parts: StartParts, own: list[Any], common: list[An
 
 
 # run once, so compiled without optimisation: saves a quarter of two to four seconds
+@one_at_a_time
 @partial(jax.jit, static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0})
 def prepare_shared(
     program: Program, parts: StartParts, own: list[Any], common: list[Any]
@@ -189,6 +209,7 @@ def prepare_shared(
     return chosen(program, parts, False, own, common)
 
 
+@one_at_a_time
 @partial(jax.jit, static_argnums=(0, 1))
 def prepare_tangents(
     program: Program, parts: StartParts, own: list[Any], common: list[Any], directions: Array
@@ -207,6 +228,7 @@ def prepare_tangents(
     return jax.vmap(one, (0, None), -1)(own, common)
 
 
+@one_at_a_time
 @partial(jax.jit, static_argnums=(0, 1))
 def prepare_gradients(
     program: Program, parts: StartParts, own: list[Any], common: list[Any], cotangents: list[Any]

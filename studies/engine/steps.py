@@ -6,7 +6,6 @@ Numbers that all cases of a chunk share are embedded in the code.
 from __future__ import annotations
 
 from collections.abc import Callable
-from threading import Lock
 from typing import Any, NamedTuple
 
 import jax
@@ -66,9 +65,6 @@ class AdjointSteps(NamedTuple):
     kept: int  # numbers recorded per sample
 
 
-#: One at a time: of two concurrent runs of a program with an eigenvalue problem (basis loaded),
-#: XLA's CPU client occasionally never finishes one (jax 0.10).
-PREPARING = Lock()
 _STEPS: dict[tuple[Any, ...], Any] = {}
 #: Kernels kept in memory.
 KEPT_KERNELS = 8
@@ -146,8 +142,7 @@ def start_parts(program: Program, split: Split) -> tuple[StartParts, list[np.nda
     """Parts of a case's start, and the leaves that all cases share."""
     one = [leaf[0] for leaf in split.varying]
     parts = find_parts(program, one, split.shared)
-    with PREPARING:
-        found = prepare_shared(program, parts, one, split.shared)
+    found = prepare_shared(program, parts, one, split.shared)
     return parts, [np.asarray(leaf, order="C") for leaf in found]
 
 
@@ -206,8 +201,7 @@ def start_block(
         varying, shared: leaves of the block's cases.
     """
     lanes, parts = program.layout.lanes, steps.parts
-    with PREPARING:
-        own = [np.asarray(x, order="C") for x in prepare(program, parts, varying, shared)]
+    own = [np.asarray(x, order="C") for x in prepare(program, parts, varying, shared)]
     start: Start = joined(parts.tree, parts.is_varying, own, steps.shared)
     varies: Start = jax.tree.unflatten(parts.tree, parts.is_varying)
 

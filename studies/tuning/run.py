@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -107,8 +108,7 @@ def run_tuning(
                 "the family sets should be one that does (try studies simulate)"
             )
         say(ended(spec, at))
-        say("comparing derivatives with differences, running the results on fresh machines")
-        found = find(spec, evaluator, at)
+        found = find(spec, evaluator, at, say)
         _write(spec, found, out)
         for line in summary(spec, found):
             say(line)
@@ -152,8 +152,18 @@ def _told(spec: TuneSpec, at: Progress) -> str:
     return f"{int(at.iteration)}/{spec.tune.iterations} best (study: 1): {', '.join(parts)}{lost}"
 
 
-def find(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> TuneFindings:
-    """Judge the result of a tuning."""
+def find(
+    spec: TuneSpec, evaluator: Evaluator, at: Progress, say: Callable[[str], None]
+) -> TuneFindings:
+    """Judge the result of a tuning.
+
+    Args:
+        spec: of the tuning.
+        evaluator: of its starts.
+        at: where the tuning ended.
+        say: called before each stage.
+    """
+    say(f"running the results on {spec.tune.scenarios.check * len(spec.moves)} fresh scenarios")
     values = spec.free.values(at.best_place)
     winners = [at.winner(k) for k in range(len(spec.moving))]
     designs = [spec.study] + [
@@ -176,8 +186,10 @@ def find(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> TuneFindings:
         evaluator.evaluate(values)
     searched = None
     if spec.tune.samples:
+        say(f"running {spec.tune.samples} random designs for comparison")
         searched = search(spec, lambda chosen: evaluator.linear.screen(main, chosen))
     best = at.best_place[at.winner(spec.main)]
+    say("comparing derivatives with differences")
     audited = audit(spec, np.stack([(spec.free.places() + best) / 2, best]))
     return TuneFindings(
         at=at,
