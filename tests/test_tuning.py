@@ -371,10 +371,11 @@ def test_checked_derivatives_of_loaded_links_come_to_an_end():
         from studies.tuning.spec import parse_tuning
 
         spec = parse_tuning({
-            "link": {"basis": "loaded", "damping_ratio": [0.02, 0.01], "joint_inertia_c": 1e-5},
+            "link": {"basis": "loaded", "modes": 6, "joint_inertia_c": 1e-5},
             "run": {"duration": 0.16},
+            "motion": {"move_time": 0.03},
             "metrics": {"residual_length": 0.02},
-            "control": {"basis": "pinned_free", "gain_factor": 0.1},
+            "control": {"modes": 2, "basis": "pinned_free", "gain_factor": 0.1},
             "tune": {
                 "free": {"control.gain_factor": {"from": 0.02, "to": 0.2}},
                 "scenarios": {"count": 4, "spread": {"link.joint_inertia_c": 5}},
