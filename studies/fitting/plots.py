@@ -81,7 +81,7 @@ def correlations(found: Fitted) -> Figure:
     figure, axes = new_figure(1, 1, min(1.2 + 0.28 * n, 7.0))
     ax = axes[0, 0]
     ax.grid(False)
-    image = ax.imshow(found.answer.correlation, vmin=-1, vmax=1, cmap="RdBu_r")
+    image = ax.imshow(found.answer.correlation, vmin=-1, vmax=1, cmap="RdBu_r", aspect="auto")
     ax.set_xticks(range(n), found.names, rotation=90, fontsize=7)
     ax.set_yticks(range(n), found.names, fontsize=7)
     figure.colorbar(image, ax=ax, label="correlation [1]")

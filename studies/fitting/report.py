@@ -257,9 +257,11 @@ def _posterior(found: Fitted) -> list[list[str]]:
 
 
 def _experiments(found: Fitted) -> list[list[Any]]:
+    if not found.answer.is_explained:  # a wrong model does not know what it would learn
+        return []
     before = float(np.sqrt(np.linalg.eigvalsh(found.answer.covariance)[-1]))
     rows = []
     for one in found.experiments[:SHOWN]:
         pose = ", ".join(f"{x:.3g}" for x in one.pose)
-        rows.append([one.text, f"({pose})", f"{before / one.widest:.3g} times"])
+        rows.append([one.text, f"({pose})", f"{one.widest / before:.3g}"])
     return rows

@@ -216,14 +216,20 @@ def _tuning(found: Fitted) -> str:
     return (
         f"{study_template(found.study)}\n"
         "# What moves, and how far: change it to what you can decide.\n"
-        "[tune]\n[tune.free]\n"
+        "[tune]\n"
+        "# objective = { residual_rms = 1.0 }   # metric = weight, relative to this study's own\n"
+        "# starts = 8                           # initial designs\n"
+        "# iterations = 60                      # evaluations of each\n"
+        "[tune.free]\n"
         f'"control.gain_factor" = {{ from = {0.2 * gain:g}, to = {2 * gain:g} }}\n'
         f"{limits}\n"
         "# Machines that the data leave possible, drawn with all correlations. The controller\n"
         "# knows link.youngs_modulus of each machine; fit link.stiffness_factor for what it does\n"
         "# not know.\n"
         f"{_warning(found)}"
-        f"[tune.scenarios]\ncount = 4\n[tune.scenarios.machines]\n{rows}\n"
+        "[tune.scenarios]\ncount = 4   # of them to tune on, with the study's own\n"
+        "check = 16  # others to judge the result\n"
+        f"[tune.scenarios.machines]\n{rows}\n"
     )
 
 
