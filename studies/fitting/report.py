@@ -186,7 +186,7 @@ def told(direction: Direction, names: tuple[str, ...]) -> str:
     listed = " and ".join([", ".join(names[k] for k in parts[:-1]), names[parts[-1]]])
     return (
         f"{listed} cannot be told apart by these data: moved together ({moves}), they change the "
-        "model's answers by less than the noise. Measure something else (see the next experiment), "
+        "model's answers by less than the noise. Measure something else, "
         "fix one, or state what is known of it by mean and sigma."
     )
 
@@ -257,8 +257,6 @@ def _posterior(found: Fitted) -> list[list[str]]:
 
 
 def _experiments(found: Fitted) -> list[list[Any]]:
-    if not found.answer.is_explained:  # a wrong model does not know what it would learn
-        return []
     before = float(np.sqrt(np.linalg.eigvalsh(found.answer.covariance)[-1]))
     rows = []
     for one in found.experiments[:SHOWN]:

@@ -51,7 +51,7 @@ class Fitted(NamedTuple):
     profiles: tuple[Likelihood, ...]
     posterior: Posterior | None  # if samples were asked for
     fault: str  # why the fitted study does not run, "" if it does
-    experiments: tuple[Experiment, ...]  # the most telling first
+    experiments: tuple[Experiment, ...]  # the most telling first; none if the model fails
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -104,9 +104,11 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
     if fit.samples:
         console.print(f"drawing {fit.samples} samples")
         posterior = sample(problem, shape(answer), fit.samples, fit.seed)
-    console.print("looking for the next experiment")
+    experiments: list[Experiment] = []
+    if answer.is_explained:  # a wrong model does not know what it would learn
+        console.print("looking for the next experiment")
+        experiments = next_experiments(bench, free, solution.best.u, answer.covariance)
     study = parse_study(set_values(spec.study, _numbers(spec, answer.values)))
-    experiments = next_experiments(bench, free, solution.best.u, answer.covariance)
     return Fitted(
         spec=spec,
         solution=solution,
