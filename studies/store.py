@@ -187,6 +187,10 @@ def check_folder(out: Path) -> None:
         there = there.parent
     if not there.is_dir():
         raise StudyError(f"--out {out}: {there} is not a folder; name another one")
+    most = os.pathconf(there, "PC_NAME_MAX")
+    longest = max((len(os.fsencode(part)) for part in out.parts), default=0)
+    if longest > most:
+        raise StudyError(f"--out: a name of {longest} bytes; allowed: {most} at most")
     if not os.access(there, os.W_OK | os.X_OK):
         raise StudyError(f"--out {out}: no permission to write in {there}")
 

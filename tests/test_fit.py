@@ -14,7 +14,9 @@ from rich.console import Console
 from scipy.stats import chi2
 
 from studies.errors import StudyError
+from studies.fitting.kinds.contract import Line
 from studies.fitting.kinds.modes import TWO_PI, pair_modes
+from studies.fitting.plots import curves
 from studies.fitting.posterior import log_density, sample, shape
 from studies.fitting.problem import Problem
 from studies.fitting.profiles import profile
@@ -24,6 +26,7 @@ from studies.fitting.solve import descend, solve
 from studies.fitting.spec import parse_fit
 from studies.fitting.statistics import describe_fit
 from studies.fitting.tables import column, read_columns
+from studies.store import check_folder
 from studies.study.spec import load_study
 from studies.tuning.spec import load_tuning
 from tests.fits import (
@@ -272,7 +275,9 @@ def test_the_paper_s_frequencies_from_modulus_and_joint(tmp_path):
     }
     entry = {"kind": "modes", "ends": "held", "frequency_hz": [92.5, 241.3], "sigma_hz": 0.5}
     study = {"link": SHORT["link"] | {"basis": "loaded", "joint_inertia_c": 5e-6}}
-    spec = spec_of(tmp_path, entry, free=free, study=study)
+    held_out = entry | {"name": "second link", "link": 2, "check": True}
+    spec = spec_of(tmp_path, entry, held_out, free=free, study=study)
+    spec = spec._replace(fit=spec.fit.model_copy(update={"samples": 20}))
     found = run_fit(spec, tmp_path / "out", Console(file=io.StringIO()))
     answer = found.answer
     assert answer.chi_square < 1e-6
@@ -287,6 +292,9 @@ def test_the_paper_s_frequencies_from_modulus_and_joint(tmp_path):
     assert abs(drawn) > 0.8 and np.sign(drawn) == np.sign(answer.correlation[0, 1])
     text = (tmp_path / "out" / "report.md").read_text()
     assert "strongly correlated" in text and "## Next experiment" in text
+    assert "from 1 measurement (and 1 held out)" in text
+    assert "| second link (held out) | mode 2 [Hz] | 241.3 |" in text
+    assert "mode 2 of the model" in text and (tmp_path / "out" / "samples.png").is_file()
     assert found.experiments[0].widest < 0.5 * np.sqrt(np.linalg.eigvalsh(answer.covariance)[-1])
 
 
@@ -430,6 +438,14 @@ FAULTS = {
     "a link of the machine": (MODES | {"link": 2}, {}, "has no meaning with ends = 'machine'"),
     "no values": (FIGURES | {"values": {}}, {}, "fit.data[0].values"),
     "out of the run": (TRACE, {"late": True}, "within the run"),
+    "negative frequencies": (SPECTRUM, {"frequency": -1.0}, "must ascend"),
+    "mirrored": (SPECTRUM, {"shift": -100.0}, "frequencies from -40 to 400"),
+    "a share of nothing": (
+        {k: v for k, v in RESPONSE.items() if k != "sigma"},
+        {"scale": 0.0},
+        "value 1 is 0, where sigma_percent alone means no noise",
+    ),
+    "a folder": (RESPONSE | {"file": "folder.csv"}, {}, "cannot be read (a folder)"),
 }
 
 
@@ -439,9 +455,11 @@ def test_bad_data_are_answered(tmp_path, fault):
     real = np.full(200, 1e-3 * change.get("scale", 1.0))
     if "real" in change:
         real[7] = change["real"]
-    frequency = FREQUENCY * change.get("frequency", 1.0)
+    frequency = FREQUENCY * change.get("frequency", 1.0) + change.get("shift", 0.0)
     write(tmp_path, "response.csv", frequency_hz=frequency, real=real, imag=0 * real)
+    write(tmp_path, "spectrum.csv", frequency_hz=frequency, density=1.0 + real**2)
     write(tmp_path, "trace.csv", time=TIME + 1.0, value=TIME)
+    (tmp_path / "folder.csv").mkdir()
     with pytest.raises(StudyError, match=re.escape(said)):
         fit(spec_of(tmp_path, entry))
 
@@ -545,3 +563,26 @@ def test_twenty_numbers_from_fifteen_responses(tmp_path):
     print(f"{len(values)} numbers in {took:.0f} s; truth {away**2:.1f} away, 20 expected")
     assert len(values) == 20 and answer.is_explained
     assert away**2 < chi2.ppf(0.999, 20) and took < 120
+
+
+def test_curves_have_their_residuals_below():
+    """Of complex responses both parts, each in its standard deviations."""
+    x = np.linspace(1.0, 2.0, 5)
+    away = np.arange(10.0)
+    line = Line(
+        abscissa="f [Hz]",
+        ordinate="h [1]",
+        x=x,
+        measured=x,
+        model=x,
+        away=away,
+        is_log=True,
+    )
+    above, below = curves([("tap", line)]).axes
+    assert above.get_title(loc="left") == "tap" and len(above.lines) == 2
+    assert [list(part.get_ydata()) for part in below.lines] == [list(away[:5]), list(away[5:])]
+
+
+def test_folders_that_cannot_be_are_refused_before_the_work(tmp_path):
+    with pytest.raises(StudyError, match="a name of 300 bytes; allowed: 255"):
+        check_folder(tmp_path / ("a" * 300))

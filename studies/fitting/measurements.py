@@ -182,8 +182,12 @@ def _ascending(x: np.ndarray, what: str, path: str, least: int = 3) -> None:
 
 def _noise(entry: Noisy, value: np.ndarray, path: str) -> Noise:
     noise = Noise(entry.sigma or 0.0, (entry.sigma_percent or 0.0) / 100)
-    if not np.all(noise.sigma(value) > 0):
-        raise StudyError(f"{path}: sigma_percent of a value that is 0; give sigma too")
+    without = np.flatnonzero(noise.sigma(value) <= 0)
+    if without.size:
+        raise StudyError(
+            f"{path}: value {without[0] + 1} is 0, where sigma_percent alone means no noise; give "
+            "sigma beside it, the noise of small values in the unit of the output"
+        )
     return noise
 
 
@@ -240,9 +244,9 @@ def _unit(signals: tuple[Signal, ...], order: int) -> str:
 def _spectrum(spec: FitSpec, models: Models, entry: SpectrumEntry, path: str) -> Measurement:
     read, signals = _read(spec, entry, path), _signals(spec, entry, path)
     frequency, density = (_real(read(x), x, path) for x in (entry.frequency, entry.density))
-    keep = frequency > 0
-    frequency, density = frequency[keep], density[keep]
     _check_frequency(frequency, entry, path)
+    keep = frequency > 0  # the mean says nothing about white noise
+    frequency, density = frequency[keep], density[keep]
     if np.any(density <= 0):
         raise StudyError(
             f"{path}: column {entry.density!r} has values that are not positive; in dB?"

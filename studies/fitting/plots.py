@@ -1,4 +1,4 @@
-"""Figures of a fit: data beside the model, residuals of correlated numbers, profiles."""
+"""Figures of a fit: data beside the model with residuals, correlations, profiles, samples."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from studies.fitting.kinds.contract import Line, Numbers
+from studies.fitting.spec import number_unit
 from studies.fitting.statistics import WIDE
 from studies.show.figures import new_figure
 
@@ -16,16 +17,16 @@ if TYPE_CHECKING:
     from studies.fitting.run import Fitted
 
 #: All figures there can be.
-NAMES = ("fit", "numbers", "correlations", "profiles")
-#: Measurements in one figure, and single numbers.
-MOST, MOST_NUMBERS = 8, 40
+NAMES = ("fit", "numbers", "correlations", "profiles", "samples")
+#: Measurements in one figure, single numbers, and numbers whose samples are drawn.
+MOST, MOST_NUMBERS, MOST_SAMPLED = 8, 40, 6
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#999999"
 
 
 def all_figures(found: Fitted) -> Iterator[tuple[str, Figure]]:
     """Names and figures."""
-    lines = [(name, x) for name, x in found.comparisons if isinstance(x, Line)]
-    single = [(name, x) for name, x in found.comparisons if isinstance(x, Numbers)]
+    lines = [(x.title, x.part) for x in found.comparisons if isinstance(x.part, Line)]
+    single = [(x.title, x.part) for x in found.comparisons if isinstance(x.part, Numbers)]
     if lines:
         yield "fit", curves(lines[:MOST])
     if single:
@@ -34,19 +35,32 @@ def all_figures(found: Fitted) -> Iterator[tuple[str, Figure]]:
         yield "correlations", correlations(found)
     if found.profiles:
         yield "profiles", profiles(found)
+    if found.posterior is not None and len(found.names) > 1:
+        yield "samples", samples(found.posterior.values, found.names)
 
 
 def curves(shown: Sequence[tuple[str, Line]]) -> Figure:
-    """Data and model of measurements with their names."""
-    figure, axes = new_figure(len(shown), 1, 1.8, has_shared_abscissa=False)
-    for ax, (name, curve) in zip(axes[:, 0], shown, strict=True):
+    """Data and model of measurements with their titles, and below them their residuals."""
+    figure = Figure(figsize=(7.4, 0.75 + 2.7 * len(shown)), layout="constrained")
+    axes = figure.subplots(
+        2 * len(shown), 1, squeeze=False, gridspec_kw={"height_ratios": [3, 1.2] * len(shown)}
+    )[:, 0]
+    for ax, below, (title, curve) in zip(axes[::2], axes[1::2], shown, strict=True):
+        ax.sharex(below)
+        ax.tick_params(labelbottom=False)
         ax.plot(curve.x, curve.measured, ".", ms=2, color=GREY, label="measured")
         ax.plot(curve.x, curve.model, color=BLUE, lw=1, label="model")
         if curve.is_log:
             ax.set_yscale("log")
-        ax.set(xlabel=curve.abscissa, ylabel=curve.ordinate)
-        ax.set_title(name, loc="left", fontsize=9)
-    axes[0, 0].legend(loc="best")
+        ax.set_ylabel(curve.ordinate, fontsize=8)
+        ax.set_title(title, loc="left", fontsize=9)
+        for part in np.split(curve.away, len(curve.away) // len(curve.x)):
+            below.plot(curve.x, part, ".", ms=2, color=BLUE)
+        below.axhspan(-2, 2, color=GREY, alpha=0.2, lw=0)
+        below.set_xlabel(curve.abscissa)
+        below.set_ylabel("away [sigma]", fontsize=8)
+    figure.align_ylabels()
+    axes[0].legend(loc="best")
     return figure
 
 
@@ -100,11 +114,42 @@ def profiles(found: Fitted) -> Figure:
         if sigma > 0:
             x = np.linspace(one.values.min(), one.values.max(), 101)
             ax.plot(x, ((x - value) / sigma) ** 2, "--", color=ORANGE, lw=1, label="from sigma")
-        ax.axhline(WIDE**2, color=GREY, lw=0.8)
-        ax.set_ylim(0, 12)
+        ax.axhline(WIDE**2, color=GREY, lw=0.8, label="95 %")
+        ax.set_ylim(0, 1.6 * WIDE**2)
+        ax.set(xlabel=f"[{number_unit(found.names[k])}]", ylabel="rise of chi square")
+        ax.locator_params(axis="x", nbins=5)
         ax.set_title(found.names[k], loc="left", fontsize=9)
-        ax.set_ylabel("rise of chi square [1]")
     axes[0, 0].legend(loc="best")
     for ax in axes.ravel()[count:]:
         ax.set_visible(False)
+    return figure
+
+
+def samples(values: np.ndarray, names: Sequence[str]) -> Figure:
+    """Histograms of sampled numbers, and pairs of them.
+
+    Args:
+        values: (n, p).
+        names: of the numbers.
+    """
+    n = min(len(names), MOST_SAMPLED)
+    figure, axes = new_figure(n, n, 7.0 / n, has_shared_abscissa=True)
+    for row in range(n):
+        for column in range(n):
+            ax = axes[row, column]
+            if column > row:
+                ax.set_visible(False)
+                continue
+            if column == row:
+                ax.hist(values[:, row], "auto", color=BLUE)
+                ax.set_yticks([])
+            else:
+                ax.plot(values[:, column], values[:, row], ".", ms=1, color=BLUE, alpha=0.3)
+            ax.tick_params(labelleft=column == 0 and row > 0, labelsize=6)
+            ax.locator_params(axis="x", nbins=4)
+            ax.xaxis.get_offset_text().set_fontsize(6)
+            if row == n - 1:
+                ax.set_xlabel(names[column], fontsize=7)
+            if column == 0 and row > 0:
+                ax.set_ylabel(names[row], fontsize=7)
     return figure

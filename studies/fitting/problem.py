@@ -58,7 +58,11 @@ class Problem(NamedTuple):
         return by * self.free.slopes(u)
 
     def costs(self, u: np.ndarray) -> np.ndarray:
-        """Half the sum of squares at many places, (n, p); infinite where the model fails."""
+        """Half the sum of squares at many places, (n, p); infinite where the model fails.
+
+        Plants come in one batch. Motions run one by one: batched, 16 of them take 1.7 times as
+        long, and six seconds to compile.
+        """
         values = self.free.values(u)
         many, found = self.bench.many(values), []
         for k, row in enumerate(values):

@@ -8,10 +8,10 @@ import numpy as np
 
 from studies.fitting.kinds.contract import Line
 from studies.fitting.plots import MOST
+from studies.fitting.spec import number_unit
 from studies.fitting.statistics import UNKNOWN, Direction, Misfit
 from studies.show.markdown import literal
 from studies.show.templates import render
-from studies.study.paths import field_unit, parse_entry
 
 if TYPE_CHECKING:
     from studies.fitting.run import Fitted
@@ -48,16 +48,17 @@ def report(found: Fitted) -> str:
         single=_single(found),
         experiments=_experiments(found),
         widest=" and ".join(found.names[k] for k in found.answer.directions[0].named()),
-        lines=sum(isinstance(x, Line) for _, x in found.comparisons),
+        lines=sum(isinstance(x.part, Line) for x in found.comparisons),
+        kept=sum(not x.is_checked for x in found.comparisons),
+        is_good=is_good(found),
+        has_entries=any("[" in name for name in found.names),
         most=MOST,
     )
 
 
 def _unit(name: str) -> str:
     """Of a free number, "" for 1."""
-    entry = parse_entry(name)
-    assert entry is not None
-    unit = field_unit(entry.field)
+    unit = number_unit(name)
     return "" if unit == "1" else unit
 
 
@@ -129,10 +130,23 @@ def sentences(found: Fitted) -> list[str]:
     if found.fault:
         lines.append(f"The fitted study does not run as it is: {found.fault}.")
     if found.posterior is not None and not found.posterior.is_settled:
-        lines.append("The chains of samples do not agree yet; raise fit.samples.")
+        worst = int(np.argmax(found.posterior.reduction))
+        lines.append(
+            f"The chains of samples do not agree yet, least on {found.names[worst]} (scatter "
+            f"{found.posterior.reduction[worst]:.2f}, wanted: below 1.05); raise fit.samples."
+        )
     if not found.solution.best.is_converged:
         lines.append("The search ended before it converged; raise fit.iterations.")
     return lines
+
+
+def is_good(found: Fitted) -> bool:
+    """Whether the model explains the data, and they determine all numbers."""
+    answer = found.answer
+    is_tested = answer.freedom > 0 and not answer.is_too_close
+    is_inside = not any(_is_at_bound(u) for u in found.solution.best.u)
+    is_found = found.solution.best.is_converged and is_inside and not answer.undetermined
+    return answer.is_explained and is_tested and is_found
 
 
 def _at_bounds(found: Fitted) -> list[str]:
@@ -222,14 +236,15 @@ def _misfit(one: Misfit) -> list[str]:
 def _single(found: Fitted) -> list[list[str]]:
     """Measured numbers that stand alone, and the model's."""
     rows = []
-    for name, part in found.comparisons:
+    for one in found.comparisons:
+        part = one.part
         if isinstance(part, Line):
             continue
         notes = (*part.notes, *[""] * (len(part.labels) - len(part.notes)))
         given = zip(*part[:4], part.away, notes, strict=True)
         for label, measured, model, sigma, far, note in given:
             text = f"{measured:.6g}", f"{sigma:.2g}", f"{model:.6g}", f"{far:+.1f}"
-            rows.append([cell(name), label, *text, note])
+            rows.append([cell(one.title), label, *text, note])
     return rows
 
 

@@ -13,7 +13,7 @@ from studies.engine.runs import check_run, run_attributes
 from studies.errors import StudyError
 from studies.fitting import plots
 from studies.fitting.experiment import Experiment, next_experiments
-from studies.fitting.kinds.contract import Line, Numbers
+from studies.fitting.kinds.contract import DataAndModel, Line
 from studies.fitting.measurements import guess, make_bench, make_measurements
 from studies.fitting.posterior import Posterior, load_blackjax, sample, shape
 from studies.fitting.problem import Problem, complaints
@@ -46,7 +46,7 @@ class Fitted(NamedTuple):
     solution: Solution
     answer: Answer
     study: Study  # with the fitted numbers
-    comparisons: tuple[tuple[str, Line | Numbers], ...]  # of all measurements by name
+    comparisons: tuple[DataAndModel, ...]  # of all measurements
     checks: tuple[Misfit, ...]  # of those held out
     profiles: tuple[Likelihood, ...]
     posterior: Posterior | None  # if samples were asked for
@@ -114,7 +114,9 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
         solution=solution,
         answer=answer,
         study=study,
-        comparisons=tuple((x.name, x.comparison(answer.values)) for x in every),
+        comparisons=tuple(
+            DataAndModel(x.name, x.is_checked, x.comparison(answer.values)) for x in every
+        ),
         checks=tuple(
             misfit(x.name, x.residual(answer.values, False), x.is_ordered) for x in checks
         ),
@@ -285,7 +287,7 @@ def variables(found: Fitted) -> dict[str, Variable]:
         part["sample"] = Variable(
             found.posterior.values, ("draw", *axis), "1", "posterior, in the field's unit"
         )
-    for k, (name, one) in enumerate(found.comparisons):
+    for k, (name, _, one) in enumerate(found.comparisons):
         point = (f"point_{k}",)
         if isinstance(one, Line):
             x, unit = Variable(one.x, point, "1", one.abscissa), one.ordinate

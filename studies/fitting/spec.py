@@ -24,7 +24,7 @@ from studies.space.free import (
 )
 from studies.study.explain import explain
 from studies.study.files import find_spec, read_toml
-from studies.study.paths import as_tuples
+from studies.study.paths import as_tuples, field_unit, parse_entry
 from studies.study.spec import Section, Study, described, parse_study
 
 Positive = Annotated[float, Field(ge=1e-30, le=1e12)]
@@ -275,6 +275,13 @@ def _free(fit: Fit, study: Study) -> tuple[FreeNumbers, tuple[Prior, ...]]:
         if prior:
             priors.append(_prior(prior, k, path, free.numbers[k].span))
     return free, tuple(priors)
+
+
+def number_unit(name: str) -> str:
+    """Unit of a free number, "1" for none."""
+    entry = parse_entry(name)
+    assert entry is not None
+    return field_unit(entry.field)
 
 
 def _prior(written: dict[str, Any], k: int, path: str, span: Range) -> Prior:

@@ -31,8 +31,9 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
     where = folder / name
     if where.suffix.lower() not in FORMATS:
         raise field_error(path, file, f"a file {', '.join(FORMATS)}")
-    if not _is_file(where):
-        raise StudyError(f"{path}: {where} cannot be read (no such file)")
+    fault = _fault(where)
+    if fault:
+        raise StudyError(f"{path}: {where} cannot be read ({fault})")
     try:
         if where.suffix.lower() in (".h5", ".hdf5"):
             found = _from_hdf5(where, inside)
@@ -47,11 +48,14 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
     return found
 
 
-def _is_file(where: Path) -> bool:
+def _fault(where: Path) -> str:
+    """Why a file cannot be read, "" if it is there."""
     try:
-        return where.is_file()
-    except OSError:  # a name that is too long
-        return False
+        if where.is_dir():
+            return "a folder"
+        return "" if where.is_file() else "no such file"
+    except OSError as error:
+        return str(error.strerror)
 
 
 def column(found: dict[str, np.ndarray], name: str, file: str, path: str) -> np.ndarray:

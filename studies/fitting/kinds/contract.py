@@ -30,6 +30,7 @@ class Line(NamedTuple):
     x: np.ndarray  # (n,)
     measured: np.ndarray  # (n,)
     model: np.ndarray  # (n,)
+    away: np.ndarray  # model minus measurement in standard deviations, (n,), or more parts of it
     is_log: bool  # ordinate
 
 
@@ -40,12 +41,25 @@ class Numbers(NamedTuple):
     measured: np.ndarray  # (n,)
     model: np.ndarray  # (n,)
     sigma: np.ndarray  # of the measured ones, (n,)
-    notes: tuple[str, ...] = ()  # on the first of them
+    notes: tuple[str, ...] = ()  # on the model's, of the first of them
 
     @property
     def away(self) -> np.ndarray:
         """Model minus measurement, in standard deviations, (n,)."""
         return (self.model - self.measured) / self.sigma
+
+
+class DataAndModel(NamedTuple):
+    """A measurement beside the model."""
+
+    name: str
+    is_checked: bool  # held out
+    part: Line | Numbers
+
+    @property
+    def title(self) -> str:
+        """Its name, and whether it was held out."""
+        return f"{self.name} (held out)" if self.is_checked else self.name
 
 
 class Noise(NamedTuple):

@@ -41,6 +41,7 @@ class _Predicted(NamedTuple):
     damping: np.ndarray  # [1], (k,)
     by_frequency: np.ndarray | None  # (k, p)
     by_damping: np.ndarray | None  # (k, p)
+    mode: np.ndarray  # which of the model's, the lowest 0, (k,)
     likeness: np.ndarray | None  # subspace MAC [1], (k,); None without shapes
 
 
@@ -86,13 +87,15 @@ class _Modes:
             ):
                 whole.append(x[at])
         labels = tuple(x for part in parts for x in part)
-        likeness = () if found.likeness is None else found.likeness
+        notes = [f"mode {k + 1} of the model" for k in found.mode]
+        if found.likeness is not None:
+            notes = [f"{x}, shape {y:.3f} of 1" for x, y in zip(notes, found.likeness, strict=True)]
         return Numbers(
             labels=labels,
             measured=np.concatenate(data),
             model=np.concatenate(model),
             sigma=np.concatenate(sigma),
-            notes=tuple(f"shape: {x:.3f} of 1" for x in likeness),
+            notes=tuple(notes),
         )
 
     def complaint(self, values: np.ndarray) -> str:
@@ -131,7 +134,14 @@ class HeldModes(_Modes):
             x[self._link, : len(self._measured.frequency)] for x in whole
         )
         by_frequency, by_damping = slopes or (None, None)
-        return _Predicted(frequency, damping, by_frequency, by_damping, likeness=None)
+        return _Predicted(
+            frequency=frequency,
+            damping=damping,
+            by_frequency=by_frequency,
+            by_damping=by_damping,
+            mode=np.arange(len(frequency)),
+            likeness=None,
+        )
 
 
 class MachineModes(_Modes):
@@ -157,9 +167,15 @@ class MachineModes(_Modes):
         if plant.slope is not None:
             paired = Modes(pole, pairs.shape, pairs.dual)
             by_frequency, by_damping = mode_slopes(paired, plant.slope.state)
-        likeness = None if self._measured.shapes is None else pairs.likeness
-        given = size / TWO_PI, -pole.real / size
-        return _Predicted(*given, by_frequency, by_damping, likeness)
+        order = np.argsort(np.abs(plant.modes.pole), stable=True)
+        return _Predicted(
+            frequency=size / TWO_PI,
+            damping=-pole.real / size,
+            by_frequency=by_frequency,
+            by_damping=by_damping,
+            mode=np.argsort(order)[pairs.mode],
+            likeness=None if self._measured.shapes is None else pairs.likeness,
+        )
 
 
 def mode_slopes(modes: Modes, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -65,6 +65,10 @@ class _OfBench:
         slope = None if found.slope is None else found.slope * turn[:, None]
         return found.value * turn, slope
 
+    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
+        """As of every measurement."""
+        raise NotImplementedError
+
     def reweigh(self, values: np.ndarray) -> None:
         self.sigma = self._noise.of_model(self.predicted(values, False)[0], self.measured)
 
@@ -78,13 +82,16 @@ class _OfBench:
             "and a frequency in Hz: check the units"
         )
 
-    def _line(self, label: str, measured: np.ndarray, model: np.ndarray) -> Line:
+    def _line(
+        self, label: str, measured: np.ndarray, model: np.ndarray, values: np.ndarray
+    ) -> Line:
         return Line(
             abscissa="frequency [Hz]",
             ordinate=label,
             x=self.frequency,
             measured=measured,
             model=model,
+            away=self.residual(values, False).value,
             is_log=True,
         )
 
@@ -105,7 +112,7 @@ class ComplexResponse(_OfBench):
         found = np.abs(self.predicted(values, False)[0])
         measured = np.abs(self.measured)
         label = f"response [{self._unit}]"
-        return self._line(label, measured, found)
+        return self._line(label, measured, found, values)
 
 
 class Magnitude(_OfBench):
@@ -123,7 +130,7 @@ class Magnitude(_OfBench):
     def comparison(self, values: np.ndarray) -> Line:
         found = np.abs(self.predicted(values, False)[0])
         label = f"magnitude [{self._unit}]"
-        return self._line(label, self.measured, found)
+        return self._line(label, self.measured, found, values)
 
 
 class Spectrum(_OfBench):
@@ -156,7 +163,7 @@ class Spectrum(_OfBench):
         found = np.abs(self.predicted(values, False)[0]) ** 2
         level = np.exp(np.mean(np.log(self.measured) - np.log(found)))
         label = "power spectrum [any unit]"
-        return self._line(label, self.measured, level * found)
+        return self._line(label, self.measured, level * found, values)
 
     def complaint(self, values: np.ndarray) -> str:
         return ""  # any strength will do

@@ -70,12 +70,14 @@ class Trace:
     def comparison(self, values: np.ndarray) -> Line:
         found = self.predicted(values, False)[0]
         label = f"{self._signal.kind} [{self._unit}]"
+        away = self.residual(values, False).value
         return Line(
             abscissa="time [s]",
             ordinate=label,
             x=self.time,
             measured=self.measured,
             model=found,
+            away=away,
             is_log=False,
         )
 
