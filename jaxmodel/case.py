@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from jaxmodel.motion import Path
 from jaxmodel.parameters import Array, Machine
+from jaxmodel.state_space import StateSpace
 
 
 class Structure(NamedTuple):
@@ -53,6 +54,7 @@ class Control(NamedTuple):
     is_per_mass: Array  # 1: gains in 1/s and 1/s2, 0: in N s/m and N/m, ()
     feedthrough_factor: Array  # share of the residual modes' feed-through compensated [1], ()
     parameters: dict[str, Array]  # the law's own, by name, (3,) each
+    system: StateSpace | None = None  # controller from a file
 
 
 class Electronics(NamedTuple):

@@ -1,18 +1,20 @@
-"""The sampled controller: ADC, modal filter, estimator, gains, synthesizer, saturation, delay.
+"""The sampled controller: ADC, feedback, saturation, delay.
 
-`controller_step` is what a DSP does once per sample. Shapes: links first, then patches (K) or
-channels (C), then lanes.
+Feedback is modal filter, estimator, gains and synthesizer, channel by channel, or a linear system
+of any order. `controller_step` is what a DSP does once per sample. Shapes: links first, then
+patches (K) or channels (C), then lanes.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxmodel.estimator import Estimator
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
+from jaxmodel.state_space import StateSpace, advance, amplified, at_rest
 
 
 class Controller(NamedTuple):
@@ -33,6 +35,7 @@ class Controller(NamedTuple):
     # [rad/s], (3, C): among a link's channels with a value above 0, only the one of highest modal
     # energy acts (modified IMSC); None: all act
     rival_omega: Array | None = None
+    system: StateSpace | None = None  # instead of channels, of which there are none then
 
 
 class ControllerState(NamedTuple):
@@ -41,6 +44,7 @@ class ControllerState(NamedTuple):
     first: Array  # state of the first-order section, (3, C)
     second: tuple[Array, Array]  # delay line of the second-order section, (3, C) each
     voltage: Array  # command applied during this sample, computed in the last one [V], (3, K)
+    system: Array | None = None  # state of `Controller.system`, (G, N, b)
 
 
 class ControllerInfo(NamedTuple):
@@ -51,10 +55,22 @@ class ControllerInfo(NamedTuple):
     is_clipped: Array  # ADC at the end of its range, 0 or 1 per channel, (3, K)
 
 
-def rest_controller(n_channels: int, n_patches: int, dtype: Any) -> ControllerState:
+def rest_controller(controller: Controller) -> ControllerState:
     """All zeros."""
-    zero = jnp.zeros((3, n_channels), dtype)
-    return ControllerState(zero, (zero, zero), jnp.zeros((3, n_patches), dtype))
+    zero = jnp.zeros_like(jnp.asarray(controller.velocity_gain))
+    voltage = jnp.zeros_like(jnp.asarray(controller.feedthrough)[..., 0])
+    system = None if controller.system is None else at_rest(controller.system)
+    return ControllerState(zero, (zero, zero), voltage, system)
+
+
+def with_gains(controller: Controller, factor: Array) -> Controller:
+    """All gains times a common factor."""
+    position, system = controller.position_gain, controller.system
+    return controller._replace(
+        velocity_gain=factor * controller.velocity_gain,
+        position_gain=None if position is None else factor * position,
+        system=None if system is None else amplified(system, factor),
+    )
 
 
 #: Half-width of a smooth limit's corner, as a share of the limit.
@@ -187,8 +203,26 @@ def controller_step(
     """
     measured, is_clipped = convert(controller, voltage, noise, is_smooth)
     own = jnp.sum(controller.feedthrough * state.voltage[:, None], axis=2)
-    channel = jnp.sum(controller.filter * (measured - own)[:, None], axis=2)
+    find = _from_channels if controller.system is None else _from_system
+    after, wanted = find(controller, state, measured - own)
+    command = soft_limit(wanted, controller.voltage_limit, is_smooth)
+    return after._replace(voltage=command), ControllerInfo(measured, command, is_clipped)
 
+
+def _from_system(
+    controller: Controller, state: ControllerState, voltage: Array
+) -> tuple[ControllerState, Array]:
+    """Next state, and voltages wanted on the actuators [V], (3, K)."""
+    assert controller.system is not None
+    x, wanted = advance(controller.system, state.system, voltage)
+    return state._replace(system=x), wanted
+
+
+def _from_channels(
+    controller: Controller, state: ControllerState, voltage: Array
+) -> tuple[ControllerState, Array]:
+    """As `_from_system`."""
+    channel = jnp.sum(controller.filter * voltage[:, None], axis=2)
     estimator = controller.estimator
     b0, b1, a1 = estimator.first
     high = b0 * channel + state.first
@@ -205,6 +239,5 @@ def controller_step(
         if controller.rival_omega is not None:
             force = force * strongest(controller.rival_omega, value, rate)
     wanted = jnp.sum(controller.synthesizer * force[:, None], axis=2)
-    command = soft_limit(wanted, controller.voltage_limit, is_smooth)
-    after = ControllerState(b1 * channel - a1 * high, (newest, state.second[0]), command)
-    return after, ControllerInfo(measured, command, is_clipped)
+    after = state._replace(first=b1 * channel - a1 * high, second=(newest, state.second[0]))
+    return after, wanted

@@ -25,7 +25,6 @@ from jaxmodel.dynamics import Accelerations, accelerations, modal_chain, shorten
 from jaxmodel.electronics import Amplifier
 from jaxmodel.integrator import Exponential
 from jaxmodel.kinematics import Chain, chain_status, close_chain
-from jaxmodel.laws import n_channels
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.plant import Plant
@@ -512,7 +511,7 @@ def initial_state(
     is_sampled = structure.feedback == "sampled"
     is_drained = is_sampled and structure.has_sensor_highpass
     drained = jnp.where(highpass > 0, q, zero)
-    controller = rest_controller(n_channels(structure), structure.n_patches, q.dtype)
+    controller = rest_controller(loop.controller)
     n_stations = loop.deflection_at.shape[1]
     sizes = metrics.Sizes(
         n_stations, structure.n_modes, structure.n_controlled, structure.n_frequencies

@@ -224,6 +224,7 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         adc_top=jnp.asarray(electronics.adc_levels - 1.0),
         adc_noise=jnp.asarray(electronics.adc_noise),
         rival_omega=feedback.rival_omega,
+        system=feedback.system,
     )
     return ControllerDesign(
         controller=controller,

@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.controller import Controller, ControllerState, controller_step
+from jaxmodel.controller import Controller, controller_step, rest_controller, with_gains
 from jaxmodel.electronics import FASTEST
-from jaxmodel.laws import n_channels
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.linear import LinearPlant, Moment, linearise, resting
 from jaxmodel.parameters import Array
@@ -69,23 +68,19 @@ def closed_loop(
     scale = jnp.concatenate([analogue.size, jnp.full((n_inputs,), 1e6)])
     exact = jax.scipy.linalg.expm(held / scale[:, None] * scale * case.electronics.period)
     exact = (exact * scale[:, None] / scale)[:n]
-    channels, patches = n_channels(structure), structure.n_patches
-    n_sensors = 3 * patches
+    from jax.flatten_util import ravel_pytree
+
+    n_sensors = 3 * structure.n_patches
+    rest, unpack = ravel_pytree(rest_controller(law))
 
     def advance(x: Array, factor: Array) -> Array:
-        line = jnp.reshape(x[n : n + 9 * channels], (3, 3, channels))
-        voltage = jnp.reshape(x[n + 9 * channels :], (3, patches))
-        controller = law._replace(velocity_gain=factor * law.velocity_gain)
-        if controller.position_gain is not None:
-            controller = controller._replace(position_gain=factor * controller.position_gain)
-        before = ControllerState(line[0], (line[1], line[2]), voltage)
-        filtered = jnp.reshape(x[analogue.filtered], (3, patches))
-        after, _ = controller_step(controller, before, filtered, None, True)
-        moved = exact[:, : n + n_sensors] @ jnp.concatenate([x[:n], jnp.ravel(voltage)])
-        parts = (moved, after.first, *after.second, after.voltage)
-        return jnp.concatenate([jnp.ravel(part) for part in parts])
+        before = unpack(x[n:])
+        filtered = jnp.reshape(x[analogue.filtered], before.voltage.shape)
+        after, _ = controller_step(with_gains(law, factor), before, filtered, None, True)
+        moved = exact[:, : n + n_sensors] @ jnp.concatenate([x[:n], jnp.ravel(before.voltage)])
+        return jnp.concatenate([moved, ravel_pytree(after)[0]])
 
-    start = jnp.zeros((n + 9 * channels + n_sensors,), analogue.state.dtype)
+    start = jnp.concatenate([jnp.zeros((n,), analogue.state.dtype), rest])
     jacobian = jax.jacfwd(advance)
     without = jacobian(start, 0.0)
     return LoopMatrices(

@@ -195,6 +195,17 @@ def check_folder(out: Path) -> None:
         raise StudyError(f"--out {out}: no permission to write in {there}")
 
 
+def _is_alive(process: str) -> bool:
+    """Whether a process of that number runs on this machine."""
+    try:
+        os.kill(int(process), 0)
+    except PermissionError:
+        return True
+    except (ValueError, OSError, OverflowError):
+        return False
+    return True
+
+
 @contextmanager
 def staged(out: Path) -> Iterator[Path]:
     """Yield a folder inside `out` whose files move to `out` at the end; on a failure, none does.
@@ -208,8 +219,9 @@ def staged(out: Path) -> Iterator[Path]:
         StudyError: a file cannot be moved there; then none is.
     """
     for left in out.glob(f"{_STAGED}*"):
-        shutil.rmtree(left, ignore_errors=True)
-    with tempfile.TemporaryDirectory(dir=out, prefix=_STAGED) as folder:
+        if not _is_alive(left.name.removeprefix(_STAGED).partition("-")[0]):
+            shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=out, prefix=f"{_STAGED}{os.getpid()}-") as folder:
         yield Path(folder)
         files = sorted(Path(folder).iterdir())
         for file in files:

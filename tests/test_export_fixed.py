@@ -6,7 +6,6 @@ import jax
 import numpy as np
 import pytest
 
-from jaxmodel.laws import n_channels
 from jaxmodel.loop import step
 from studies.engine.channels import fold, unfold
 from studies.engine.controller import fixed_controller
@@ -80,7 +79,7 @@ def kind(request):
 
 def test_floating_arithmetic_is_the_jax_controller(kind):
     found, codes, seen, _ = kind
-    wanted = np.asarray(replay(found.controller, n_channels(found.structure), codes))
+    wanted = np.asarray(replay(found.controller, codes))
     assert np.abs(wanted).max() > 0
     np.testing.assert_allclose(seen.command, wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
 

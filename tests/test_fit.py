@@ -1,6 +1,7 @@
 """Fits to measurements: derivatives, uncertainty, what cannot be told, and bad data."""
 
 import io
+import json
 import re
 import time
 
@@ -445,6 +446,7 @@ FAULTS = {
         {"scale": 0.0},
         "value 1 is 0, where sigma_percent alone means no noise",
     ),
+    "huge": (RESPONSE, {"real": 1e200}, "column 'real', row 8: 1e+200; allowed: up to 1e+30"),
     "a folder": (RESPONSE | {"file": "folder.csv"}, {}, "cannot be read (a folder)"),
 }
 
@@ -457,7 +459,7 @@ def test_bad_data_are_answered(tmp_path, fault):
         real[7] = change["real"]
     frequency = FREQUENCY * change.get("frequency", 1.0) + change.get("shift", 0.0)
     write(tmp_path, "response.csv", frequency_hz=frequency, real=real, imag=0 * real)
-    write(tmp_path, "spectrum.csv", frequency_hz=frequency, density=1.0 + real**2)
+    write(tmp_path, "spectrum.csv", frequency_hz=frequency, density=1.0 + np.abs(real))
     write(tmp_path, "trace.csv", time=TIME + 1.0, value=TIME)
     (tmp_path / "folder.csv").mkdir()
     with pytest.raises(StudyError, match=re.escape(said)):
@@ -586,3 +588,57 @@ def test_curves_have_their_residuals_below():
 def test_folders_that_cannot_be_are_refused_before_the_work(tmp_path):
     with pytest.raises(StudyError, match="a name of 300 bytes; allowed: 255"):
         check_folder(tmp_path / ("a" * 300))
+
+
+def test_poses_out_of_reach_are_no_data(folder):
+    """Kinematics are finite everywhere; a machine that does not reach a pose is not fitted."""
+    free = {"link.length": {"from": 0.15, "to": 0.25}}
+    bench, (one,), values = made(
+        spec_of(folder, RESPONSE | {"pose": [0.0, 0.0, 0.5236]}, free=free)
+    )
+    one.residual(values, True)
+    for has_slopes in (True, False):
+        with pytest.raises(StudyError, match="pose out of reach at .* with the numbers tried"):
+            one.residual(np.array([0.17]), has_slopes)
+    free_numbers = spec_of(folder, RESPONSE, free=free).free
+    problem = Problem(free=free_numbers, priors=(), measurements=(one,), bench=bench)
+    assert list(np.isfinite(problem.costs(np.array([[0.2], [0.5]])))) == [False, True]
+
+
+def test_spectra_of_few_averages_have_the_residuals_of_their_likelihood(folder):
+    """Squares add up to twice the negative log likelihood, up to a constant."""
+    bench, (one,), values = made(spec_of(folder, SPECTRUM | {"averages": 2}))
+    model = np.abs(one.predicted(values, False)[0]) ** 2
+    rng = np.random.default_rng(0)
+    one.measured = 3.0 * model * rng.gamma(2, 0.5, len(model))
+
+    def likelihood(values):
+        model = np.abs(one.predicted(values, False)[0]) ** 2
+        level = np.mean(one.measured / model)
+        return 2 * np.sum(2 * (np.log(level * model) + one.measured / (level * model)))
+
+    other = values * np.array([1.01, 1.2, 0.97])
+    squares = [np.sum(one.residual(x, False).value ** 2) for x in (values, other)]
+    assert squares[1] - squares[0] == pytest.approx(likelihood(other) - likelihood(values))
+    away = [
+        np.mean(one.residual(values, False).value ** 2)
+        for one.measured in model * rng.gamma(2, 0.5, (200, len(model)))
+    ]
+    assert np.mean(away) == pytest.approx(one.mean_square, rel=0.02)
+
+
+def test_what_a_fitted_model_cannot_predict_is_said(folder, tmp_path):
+    """Held-out data do not end a finished fit; names are text, not formulas."""
+    held_out = MODES | {"name": "far", "pose": [0.2, 0.2, 0.5], "check": True}
+    with pytest.raises(StudyError, match="fit.data"):  # unreachable with the first guess: refused
+        fit(spec_of(folder, ONE_MODE, held_out, free=PAIR))
+    name = r"$\frac{a}$"
+    swapped = RESPONSE | {"name": name, "check": True, "file": "huge.csv"}
+    one = np.full(len(FREQUENCY), 1e9)
+    write(folder, "huge.csv", frequency_hz=FREQUENCY, real=one, imag=one)
+    found = run_fit(
+        spec_of(folder, ONE_MODE, swapped, free=PAIR), tmp_path / "out", Console(file=io.StringIO())
+    )
+    assert "check the units" in found.unpredicted[0]
+    document = json.loads((tmp_path / "out" / "fit.json").read_text())
+    assert document["held_out"][0]["is_noise"] is False and document["messages"]

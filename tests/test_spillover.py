@@ -284,7 +284,7 @@ def stepped(law, n_samples=40):
     """Commands of a controller on random sensor voltages, and the states it went through."""
     random = np.random.default_rng(1)
     law = jax.tree.map(np.asarray, law)
-    state, commands, states = rest_controller(3, 3, float), [], []
+    state, commands, states = rest_controller(law), [], []
     step = jax.jit(controller_step, static_argnames="is_smooth")
     for voltage in random.normal(size=(n_samples, 3, 3)):
         states.append(state)
@@ -340,8 +340,8 @@ def test_idle_channels_change_nothing():
         synthesizer=whole.synthesizer[:, :, :2],
     )
     wide = widened(plain, 3)
-    state = rest_controller(2, 3, float)
-    more = rest_controller(3, 3, float)
+    state = rest_controller(plain)
+    more = rest_controller(wide)
     step = jax.jit(controller_step)
     for voltage in np.random.default_rng(2).normal(size=(20, 3, 3)):
         state, info = step(plain, state, voltage)

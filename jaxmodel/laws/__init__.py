@@ -15,16 +15,18 @@ from jaxmodel.laws.lqr import LQR
 from jaxmodel.laws.modified_imsc import MODIFIED_IMSC
 from jaxmodel.laws.ppf import PPF
 from jaxmodel.laws.srf import SRF
+from jaxmodel.laws.state_space import STATE_SPACE
 from jaxmodel.table import Table
 
-LAWS: Table[Law] = Table("law", [IMSC, SRF, LQR, MODIFIED_IMSC, PPF], check_law)
+LAWS: Table[Law] = Table("law", [IMSC, SRF, LQR, MODIFIED_IMSC, PPF, STATE_SPACE], check_law)
 
 
 def is_modal(structure: Structure) -> bool:
-    """Whether channels are modes; patches otherwise."""
+    """Whether channels are modes."""
     return LAWS[structure.law].channel == "mode"
 
 
 def n_channels(structure: Structure) -> int:
     """Number of signals the estimator processes, per link."""
-    return structure.n_controlled if is_modal(structure) else structure.n_patches
+    count = {"mode": structure.n_controlled, "patch": structure.n_patches, "none": 0}
+    return count[LAWS[structure.law].channel]

@@ -2,7 +2,8 @@
 
 A law turns the numbers of a case into coefficients of the one sampled controller
 (`jaxmodel.controller`): channel signals y = `filter` V_s, estimates of their rates and values,
-channel forces, V_a = `synthesizer` f. Per link; shapes (3, C, ...) with C channels.
+channel forces, V_a = `synthesizer` f. Per link; shapes (3, C, ...) with C channels. A law without
+channels returns a linear system from sensors to actuators instead, see `system_feedback`.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ from jaxmodel.control import force_gains
 from jaxmodel.estimator import Estimator, design_estimator
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
+from jaxmodel.state_space import StateSpace, amplified, with_sensors
 from jaxmodel.table import PartError
 
-#: What a channel is: a controlled mode, or a patch pair.
-Channel = Literal["mode", "patch"]
+#: What a channel is: a controlled mode, or a patch pair; "none" for a linear system without them.
+Channel = Literal["mode", "patch", "none"]
 
 
 class Parameter(NamedTuple):
@@ -51,6 +53,7 @@ class Feedback(NamedTuple):
     velocity_gain: Array  # (3, C)
     position_gain: Array  # (3, C)
     rival_omega: Array | None = None  # (3, C)
+    system: StateSpace | None = None  # instead of channels
 
 
 class Law(NamedTuple):
@@ -75,7 +78,7 @@ def check_law(law: Law) -> None:
     """Raise PartError if the description of a law is invalid."""
     place = f"law {law.name!r}"
     if law.channel not in get_args(Channel):
-        raise PartError(f"{place}: channel = {law.channel!r}; allowed: 'mode' or 'patch'")
+        raise PartError(f"{place}: channel = {law.channel!r}; allowed: 'mode', 'patch' or 'none'")
     if not callable(law.design):
         raise PartError(f"{place}: design = {law.design!r}; expected a function")
     seen: set[str] = set()
@@ -108,6 +111,25 @@ def check_feedback(law: Law, made: Feedback, n_channels: int, n_patches: int) ->
             raise PartError(f"law {law.name!r}: {name} has shape {found}; expected {shape}")
         if jnp.iscomplexobj(getattr(made, name)):
             raise PartError(f"law {law.name!r}: {name} is complex; expected real numbers")
+    if (made.system is None) != (law.channel != "none"):
+        raise PartError(f"law {law.name!r}: a system is for channel = 'none', and the reverse")
+    if made.system is not None:
+        _check_system(law, made.system, n_patches)
+
+
+def _check_system(law: Law, system: StateSpace, n_patches: int) -> None:
+    groups, n, b = jnp.shape(system.state)[:3]
+    size = 3 * n_patches // max(groups, 1)
+    wanted = {
+        "state": (groups, n, b, b),
+        "enter": (groups, n, b, size),
+        "leave": (groups, size, n, b),
+        "direct": (groups, size, size),
+    }
+    for name, shape in wanted.items():
+        found = jnp.shape(getattr(system, name))
+        if found != shape or groups not in (1, 3):
+            raise PartError(f"law {law.name!r}: system.{name} has shape {found}; expected {shape}")
 
 
 def on_and_off(case: Case, known: Known) -> Array:
@@ -142,6 +164,32 @@ def as_modal(control: Control, velocity: Array, position: Array) -> Control:
         gain_factor=jnp.ones(()),
         is_per_mass=jnp.zeros(()),
         mode_mask=is_on.astype(velocity.dtype),
+    )
+
+
+def system_feedback(structure: Structure, case: Case, system: StateSpace) -> Feedback:
+    """Feedback by a linear system, of controlled links only, times `gain_factor`."""
+    mask = jnp.asarray(case.control.link_mask)[:, None] * jnp.ones((1, structure.n_patches))
+    system = amplified(with_sensors(system, mask), case.control.gain_factor * mask)
+    return no_channels(system, structure.n_patches)
+
+
+def no_channels(system: StateSpace, n_patches: int) -> Feedback:
+    """Feedback by a system alone."""
+    none = jnp.zeros((3, 0), system.state.dtype)
+    return Feedback(
+        filter=jnp.zeros((3, 0, n_patches), none.dtype),
+        synthesizer=jnp.zeros((3, n_patches, 0), none.dtype),
+        estimator=Estimator(
+            first=(none,) * 3,
+            denominator=(none,) * 2,
+            velocity=(none,) * 3,
+            position=(none,) * 3,
+            direct=none,
+        ),
+        velocity_gain=none,
+        position_gain=none,
+        system=system,
     )
 
 

@@ -10,8 +10,9 @@ import numpy as np
 from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
-from jaxmodel.laws import LAWS, is_modal
+from jaxmodel.laws import LAWS, is_modal, n_channels
 from jaxmodel.shaper import Taps
+from studies.engine.blocks import Blocks, blocks
 from studies.engine.channels import Channels, fold
 from studies.engine.runs import check_run, preflight, resolved_study
 from studies.errors import StudyError, field_error
@@ -25,13 +26,13 @@ class FixedController(NamedTuple):
     structure: Structure
     case: Case
     controller: Controller
-    channels: Channels  # the same, folded
+    channels: Channels | Blocks  # the same as code needs it
     taps: Taps  # shaper on the sample grid, one tap per delay, delays rising
     frequency: np.ndarray  # each channel's velocity estimate is exact there [Hz], (3, C)
 
     @property
     def n_patches(self) -> int:
-        return self.controller.filter.shape[2]
+        return int(self.controller.feedthrough.shape[1])
 
     @property
     def is_modal(self) -> bool:
@@ -53,7 +54,9 @@ def fixed_controller(study: Study) -> FixedController:
     structure, case = check_run(study)
     known = preflight(structure, case)
     controller, taps = known.controller, known.taps
-    if not np.any(controller.velocity_gain) and not _any(controller.position_gain):
+    if not any(
+        map(_any, (controller.velocity_gain, controller.position_gain, *_outputs(controller)))
+    ):
         raise field_error(
             "control.gain_factor",
             study.control.gain_factor,
@@ -67,7 +70,7 @@ def fixed_controller(study: Study) -> FixedController:
         structure=structure,
         case=case,
         controller=controller,
-        channels=fold(controller, LAWS[study.control.law].channel),
+        channels=arrange(controller, study.control.law),
         taps=_merged(taps),
         frequency=_frequencies(structure, case),
     )
@@ -92,6 +95,20 @@ def _check_exportable(study: Study) -> None:
         raise field_error("control.links", control.links, "at least one link that is controlled")
 
 
+def arrange(controller: Controller, law: str) -> Channels | Blocks:
+    """A controller as code needs it.
+
+    Raises:
+        StudyError: a system without a well-conditioned modal form.
+    """
+    return blocks(controller) if controller.system else fold(controller, LAWS[law].channel)
+
+
+def _outputs(controller: Controller) -> tuple[np.ndarray, ...]:
+    system = controller.system
+    return () if system is None else (system.leave, system.direct)
+
+
 def _any(gain: np.ndarray | None) -> bool:
     return gain is not None and bool(np.any(gain))
 
@@ -99,7 +116,7 @@ def _any(gain: np.ndarray | None) -> bool:
 def _frequencies(structure: Structure, case: Case) -> np.ndarray:
     """Where the velocity estimate of each channel is exact [Hz], (3, C)."""
     hertz = np.asarray(find_bases(structure, case).believed_omega) / (2 * np.pi)
-    return hertz if is_modal(structure) else np.repeat(hertz[:, :1], structure.n_patches, axis=1)
+    return hertz if is_modal(structure) else np.repeat(hertz[:, :1], n_channels(structure), axis=1)
 
 
 def _merged(taps: Taps) -> Taps:

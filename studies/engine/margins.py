@@ -137,6 +137,7 @@ def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
 
         is_sharp = _least_damping(structure, whole) < LEAST_DAMPED
         is_sharp |= _unevenness(whole) > UNEVEN
+        is_sharp |= LAWS[structure.law].channel == "none"  # no return difference link by link
         rows = np.flatnonzero(~is_sharp)
         for way in WALKS:
             if len(rows):

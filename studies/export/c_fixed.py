@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
+from studies.engine.blocks import Blocks
+from studies.engine.channels import Channels
 from studies.engine.controller import FixedController
 from studies.export.c_text import Source, source
-from studies.export.fixed import WORD, FixedPoint, Format, IntegerRow, shaper_row
+from studies.export.fixed import WORD, FixedPoint, IntegerRow, shaper_row
+from studies.export.fixed_blocks import FixedBlocks
 
 
 def fixed_source(
     found: FixedController,
-    fixed: FixedPoint,
+    fixed: FixedPoint | FixedBlocks,
     name: str,
     origin: Iterable[str],
     cost: str,
@@ -27,9 +31,7 @@ def fixed_source(
         origin: lines that say where the numbers come from.
         cost: cost of a sample, for the file's header.
     """
-    channels, shaper = found.channels, shaper_row(found.taps)
-    first, memory, numerator = fixed.high_pass, fixed.memory, fixed.numerator.integers
-    each = np.arange(len(channels.link))
+    shaper, wires = shaper_row(found.taps), fixed.wires
     return source(
         "fixed.c",
         found,
@@ -40,19 +42,38 @@ def fixed_source(
         wire="uint16_t",
         formats=format_lines(fixed, found),
         cost=cost,
-        code=fixed.sensor_step * 2.0**fixed.adc_bits,
-        first_mode=np.searchsorted(channels.link, np.arange(4)),
-        high_pass=np.hstack([first.integers, memory.integers]),
-        high_pass_shift=np.stack([first.shift, memory.shift], axis=1),
-        force=numerator[:, :3],
-        direct=numerator[:, 3],
-        synthesizer=fixed.synthesizer.integers[channels.link, :, each],
+        code=wires.sensor_step * 2.0**wires.adc_bits,
         weight=shaper.integers[0],
         weight_shift=shaper.shift[0],
-        energy=_rows(fixed.energy, 4),
-        energy_names=[f"{c}, {what}" for c in channels.names for what in ("velocity", "position")],
-        feedthrough=_rows(fixed.feedthrough, found.n_patches),
+        feedthrough=_rows(wires.feedthrough, found.n_patches),
+        **_constants(found.channels, fixed),
     )
+
+
+def _constants(arranged: Channels | Blocks, fixed: FixedPoint | FixedBlocks) -> dict[str, Any]:
+    if isinstance(fixed, FixedBlocks):
+        advance, leave = fixed.advance, fixed.leave
+        return {
+            "advance": advance.integers.reshape(-1, advance.integers.shape[-1]),
+            "advance_shift": advance.shift.ravel(),
+            "leave": leave.integers.reshape(-1, leave.integers.shape[-1]),
+            "leave_shift": leave.shift.ravel(),
+        }
+    assert isinstance(arranged, Channels)
+    first, memory, numerator = fixed.high_pass, fixed.memory, fixed.numerator.integers
+    each = np.arange(len(arranged.link))
+    return {
+        "first_mode": np.searchsorted(arranged.link, np.arange(4)),
+        "high_pass": np.hstack([first.integers, memory.integers]),
+        "high_pass_shift": np.stack([first.shift, memory.shift], axis=1),
+        "force": numerator[:, :3],
+        "direct": numerator[:, 3],
+        "synthesizer": fixed.synthesizer.integers[arranged.link, :, each],
+        "energy": _rows(fixed.energy, 4),
+        "energy_names": [
+            f"{c}, {what}" for c in arranged.names for what in ("velocity", "position")
+        ],
+    }
 
 
 def _rows(table: IntegerRow | None, length: int) -> np.ndarray | None:
@@ -60,21 +81,15 @@ def _rows(table: IntegerRow | None, length: int) -> np.ndarray | None:
     return None if table is None else table.integers.reshape(-1, length)
 
 
-def format_lines(fixed: FixedPoint, found: FixedController) -> list[str]:
+def format_lines(fixed: FixedPoint | FixedBlocks, found: FixedController) -> list[str]:
     """Table of formats; word range and reach of ADC codes in units of the base."""
-    value, force = ("m", "N") if found.is_modal else ("V", "V")
     lines = [
         f"{'signal':<30}{'Q':>4}{'base':>20}{'room':>9}{'reach':>9}",
-        f"{'sensors':<30}{fixed.adc_bits:>4}{'1 code':>20}",
-    ]
-    parts: list[tuple[str, Format, str]] = [
-        ("signal", fixed.signal, value),
-        ("high-passed", fixed.high, value),
-        ("delay line", fixed.inner, value),
-        ("force", fixed.force, force),
+        f"{'sensors':<30}{fixed.wires.adc_bits:>4}{'1 code':>20}",
     ]
     for m, name in enumerate(found.channels.names):
-        for text, form, unit in parts:
+        for text, form, unit in fixed.formats:
+            unit = unit if found.is_modal else "V"
             lines.append(
                 f"{f'{text}, {name}':<30}{form.bits[m]:>4}{f'{form.base[m]:.9e} {unit}':>20}"
                 f"{2.0 ** (WORD - 1 - form.bits[m]):>9.0f}{form.bound[m] / form.base[m]:>9.1f}"

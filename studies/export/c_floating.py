@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
+from studies.engine.blocks import Blocks
+from studies.engine.channels import Channels
 from studies.engine.controller import FixedController
 from studies.export.c_text import Source, real, source
 
@@ -16,7 +19,6 @@ def floating_source(found: FixedController, name: str, origin: Iterable[str]) ->
         name: prefix of functions and types, and name of the files.
         origin: lines that say where the numbers come from.
     """
-    energy = found.channels.energy
     return source(
         "floating.c",
         found,
@@ -26,10 +28,27 @@ def floating_source(found: FixedController, name: str, origin: Iterable[str]) ->
         word=f"{name}_real",
         wire=f"{name}_real",
         is_modal=found.is_modal,
-        has_rivals=energy is not None,
-        velocity=None if energy is None else energy[:, 0, :3],
-        position=None if energy is None else energy[:, 1],
         feedthrough=found.controller.feedthrough.reshape(-1, found.n_patches),
         weight=found.taps.weight,
         real=real,
+        **_constants(found.channels),
     )
+
+
+def _constants(arranged: Channels | Blocks) -> dict[str, Any]:
+    if isinstance(arranged, Channels):
+        energy = arranged.energy
+        return {
+            "has_rivals": energy is not None,
+            "velocity": None if energy is None else energy[:, 0, :3],
+            "position": None if energy is None else energy[:, 1],
+        }
+    system = arranged.system
+    size = system.direct.shape[1]
+    return {
+        "has_rivals": False,
+        "state_rows": system.state.reshape(-1, 2),
+        "enter_rows": system.enter.reshape(-1, size),
+        "leave_rows": system.leave.reshape(len(system.leave) * size, -1),
+        "direct_rows": system.direct.reshape(-1, size),
+    }

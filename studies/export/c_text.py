@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from studies.engine.blocks import Blocks
+from studies.engine.channels import Channels
 from studies.engine.controller import FixedController
 from studies.export.fixed import rail_samples
 from studies.show.templates import render
@@ -38,24 +40,25 @@ def source(
             sensors and actuators; `fixed`, the controller in integers or None; `weight` of the
             shaper's taps; and what only this code needs.
     """
-    channels, electronics = found.channels, found.study.electronics
+    arranged, electronics = found.channels, found.study.electronics
     rail = rail_samples(electronics.sample_rate_hz)
+    has_feedthrough = bool(np.any(found.controller.feedthrough))
     values |= {
         "name": name,
         "NAME": name.upper(),
         "origin": [plain(line) for line in origin],
         "controller": found.controller,
-        "channels": channels,
+        **_arranged(arranged),
         "electronics": electronics,
         "shaper": found.study.shaper.kind,
         "n_patches": found.n_patches,
-        "is_used": np.isin(np.arange(3), channels.link).astype(int),
-        "is_rival": channels.is_rival.astype(int),
+        "is_used": np.isin(np.arange(3), arranged.link).astype(int),
         "patches": [f"link {i}, patch {k + 1}" for i in (1, 2, 3) for k in range(found.n_patches)],
-        "has_feedthrough": bool(np.any(found.controller.feedthrough)),
+        "has_feedthrough": has_feedthrough,
+        "has_first": has_feedthrough or isinstance(arranged, Channels),
         "rail": rail,
         "rail_ms": f"{1e3 * rail / electronics.sample_rate_hz:.3g}",
-        "settle": channels.memory(1e-4),
+        "settle": arranged.memory(1e-4),
         "delay": found.taps.sample,
         "shaper_length": int(found.taps.sample.max()) + 1,
         "exact": exact,
@@ -63,6 +66,25 @@ def source(
     }
     files = ("controller.h", template)
     return Source(*(render(f"export/templates/{file}", **values) for file in files))
+
+
+def _arranged(arranged: Channels | Blocks) -> dict[str, Any]:
+    """What templates read of channels, or of blocks; the other is None."""
+    if isinstance(arranged, Channels):
+        return {
+            "blocks": None,
+            "channels": arranged,
+            "is_rival": arranged.is_rival.astype(int),
+        }
+    groups, n, _, size = arranged.system.enter.shape
+    ports = [f"system {g + 1}, actuator {k + 1}" for g in range(groups) for k in range(size)]
+    return {
+        "blocks": arranged,
+        "channels": None,
+        "order": 2 * n,
+        "n_ports": size,
+        "port_names": ports,
+    }
 
 
 def exact(value: Any) -> str:

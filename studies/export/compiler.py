@@ -99,7 +99,7 @@ def compiled(
         compiler: command, from `find_compiler`.
         real: NumPy's type of sensors and actuators.
         reference: of the shaper.
-        sizes: channels, modes, and samples stored by the shaper.
+        sizes: patches, channels or states, and samples stored by the shaper.
 
     Raises:
         StudyError: the compiler rejects the code, or does not work.

@@ -8,6 +8,7 @@ import numpy as np
 
 from studies.engine.controller import FixedController
 from studies.export.fixed import FixedPoint
+from studies.export.fixed_blocks import FixedBlocks
 
 
 class Cost(NamedTuple):
@@ -34,21 +35,36 @@ CLOCK = 150e6
 CYCLES = (12, 30, 30, 200)
 
 
-def cost_of(found: FixedController, fixed: FixedPoint) -> Cost:
+def cost_of(found: FixedController, fixed: FixedPoint | FixedBlocks) -> Cost:
     """Multiplications, cycles, load and memory of a sample."""
-    n, k = fixed.filter.integers.shape
-    n_taps, n_channels = len(found.taps.weight), k * len(np.unique(fixed.link))
-    direct = int(np.any(fixed.numerator.integers[:, 3]))
-    # filter, synthesizer, sections; codes to counts; three coordinates of the shaper
-    products = n * (2 * k + 1 + 2 + 3 + 3 + direct) + n_channels + 3 * n_taps
-    roundings = 5 * n + 2 * n_channels + 3
-    words = 2 * 3 * n + 3 * k + 1 + 2 * (3 * (int(found.taps.sample.max()) + 1) + 1)
-    if fixed.energy is not None:
-        products, roundings = products + 10 * n, roundings + 2 * n
-    if fixed.feedthrough is not None:
+    n_taps, k = len(found.taps.weight), found.n_patches
+    n_channels = k * len(np.unique(found.channels.link))
+    count = _of_blocks if isinstance(fixed, FixedBlocks) else _of_channels
+    products, roundings, words = count(fixed)  # type: ignore[arg-type]
+    # codes to counts; three coordinates of the shaper
+    products, roundings = products + n_channels + 3 * n_taps, roundings + 2 * n_channels + 3
+    words += 3 * k + 1 + 2 * (3 * (int(found.taps.sample.max()) + 1) + 1)
+    if fixed.wires.feedthrough is not None:
         products, roundings = products + n_channels * k, roundings + n_channels
         words += 2 * 3 * k
     parts = (products, roundings, n_channels, 1)
     cycles = sum(count * each for count, each in zip(parts, CYCLES, strict=True))
     load = cycles * found.study.electronics.sample_rate_hz / CLOCK
     return Cost(products=products, roundings=roundings, cycles=cycles, load=load, words=words)
+
+
+def _of_channels(fixed: FixedPoint) -> tuple[int, int, int]:
+    """Products, roundings and words of filter, synthesizer and sections."""
+    n, k = fixed.filter.integers.shape
+    direct = int(np.any(fixed.numerator.integers[:, 3]))
+    products, roundings = n * (2 * k + 1 + 2 + 3 + 3 + direct), 5 * n
+    if fixed.energy is not None:
+        products, roundings = products + 10 * n, roundings + 2 * n
+    return products, roundings, 2 * 3 * n
+
+
+def _of_blocks(fixed: FixedBlocks) -> tuple[int, int, int]:
+    """The same of all blocks; every entry counts, also 0."""
+    advance, leave = fixed.advance.integers, fixed.leave.integers
+    states = fixed.state.bits.size
+    return advance.size + leave.size, states + fixed.leave.shift.size, 2 * states

@@ -13,7 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from jaxmodel.controller import Controller
 from jaxmodel.estimator import KINDS, Estimator
 from jaxmodel.laws import LAWS
+from jaxmodel.laws.contract import Feedback, no_channels
 from jaxmodel.shaper import Taps
+from jaxmodel.state_space import StateSpace
 from studies import config
 from studies.engine.controller import FixedController, fixed_controller
 from studies.errors import StudyError, shown
@@ -30,10 +32,15 @@ class DocumentPart(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
+#: A number, or lists of them to any depth in use.
+Three = list[list[list[float]]]
+Nested = float | list[float] | list[list[float]] | Three | list[Three]
+
+
 class Quantity(DocumentPart):
     """Numbers and their meaning; `value` is nested as `axes` says, a single number not at all."""
 
-    value: float | list[float] | list[list[float]] | list[list[list[float]]]
+    value: Nested
     unit: str = Field(description="SI symbol, 1 for none", min_length=1)
     axes: list[str] = Field(description="meaning of each level of nesting")
     meaning: str = Field(description="in words", min_length=1)
@@ -86,6 +93,14 @@ RIVALS = (
     "energy = (rival_frequency * (position + position_direct * signal))^2 + velocity^2; of the "
     "channels of a link with rival_frequency above 0 the force is 0 where another has more energy"
 )
+#: Instead of the steps from `signal` to `command`, for a controller without channels.
+SYSTEMS = (
+    "for each link by itself if there are three systems, with all links together if there is one; "
+    "state and the last command are 0 at the start",
+    "wanted = output_matrix @ state + direct @ sensor; then state = state_matrix @ state + "
+    "input_matrix @ sensor, where state_matrix stands for its blocks on the diagonal",
+    "command = wanted, limited to +-voltage_limit; it goes out at the next sample",
+)
 _LINK, _PATCH = "link", "patch"
 
 
@@ -100,7 +115,6 @@ def document(found: FixedController, case_id: str = "") -> Document:
     study, controller = found.study, found.controller
     facts = config.info()
     kept = (config.PACKAGE, "python", "jax", "jaxlib", "numpy")
-    on = (controller.velocity_gain != 0) | (_position_gain(controller) != 0)
     return Document(
         format="flexlink-controller",
         format_version=1,
@@ -111,11 +125,24 @@ def document(found: FixedController, case_id: str = "") -> Document:
         law=study.control.law,
         estimator=study.electronics.estimator,
         order=ORDER,
-        steps=STEPS if controller.rival_omega is None else [*STEPS[:8], RIVALS, *STEPS[8:]],
-        masks=Masks(links=[bool(x) for x in on.any(axis=1)], modes=on.tolist()),
+        steps=_steps(controller),
+        masks=Masks(
+            links=[k in found.channels.link for k in range(3)], modes=_acting(controller).tolist()
+        ),
         numbers=_numbers(found),
         study=json.loads(json.dumps(study.model_dump(mode="json"))),
     )
+
+
+def _steps(controller: Controller) -> list[str]:
+    if controller.system is not None:
+        return [SYSTEMS[0], *STEPS[1:3], *SYSTEMS[1:], *STEPS[9:]]
+    return STEPS if controller.rival_omega is None else [*STEPS[:8], RIVALS, *STEPS[8:]]
+
+
+def _acting(controller: Controller) -> np.ndarray:
+    """Channels with gains, (3, C)."""
+    return (controller.velocity_gain != 0) | (_position_gain(controller) != 0)
 
 
 def _position_gain(controller: Controller) -> np.ndarray:
@@ -125,6 +152,56 @@ def _position_gain(controller: Controller) -> np.ndarray:
 
 def _numbers(found: FixedController) -> dict[str, Quantity]:
     """Every number of the controller, by name."""
+    controller, electronics = found.controller, found.study.electronics
+    feedback = _of_channels if controller.system is None else _of_system
+    return {
+        "sample_rate": _one(electronics.sample_rate_hz, "Hz", "how often a sample is taken"),
+        "antialias": _one(
+            electronics.antialias_hz,
+            "Hz",
+            "corner of the analogue second-order Butterworth filter before the ADC",
+        ),
+        "adc_bits": _one(float(electronics.adc_bits), "1", "resolution of the ADC"),
+        "adc_step": _one(controller.adc_step, "V", "one code at the ADC's input"),
+        "adc_top": _one(controller.adc_top, "1", "highest code"),
+        "conditioner_gain": _one(controller.adc_gain, "1", "ADC volt per sensor volt"),
+        "conditioner_bias": _one(controller.adc_bias, "V", "at the ADC for a sensor at rest"),
+        "feedthrough": _one(
+            controller.feedthrough,
+            "1",
+            "sensor volts that an actuator volt causes by modes that are not controlled",
+            [_LINK, _PATCH, "actuator"],
+        ),
+        **feedback(found),
+        "voltage_limit": _one(controller.voltage_limit, "V", "of every actuator, +-"),
+        "shaper_weight": _one(found.taps.weight, "1", "of each tap of the input shaper", ["tap"]),
+        "shaper_delay": _one(
+            found.taps.sample.astype(float), "1", "of each tap [samples]", ["tap"]
+        ),
+    }
+
+
+def _one(value: Any, unit: str, meaning: str, axes: list[str] | None = None) -> Quantity:
+    return Quantity(value=np.asarray(value).tolist(), unit=unit, axes=axes or [], meaning=meaning)
+
+
+def _of_system(found: FixedController) -> dict[str, Quantity]:
+    """The systems of a controller without channels."""
+    system = found.controller.system
+    assert system is not None
+    block = ["system", "block"]
+    return {
+        "state_matrix": _one(system.state, "1", "A in blocks", [*block, "to", "from"]),
+        "input_matrix": _one(system.enter, "1", "B, state per volt", [*block, "to", "sensor"]),
+        "output_matrix": _one(
+            system.leave, "1", "C, volts per state", ["system", "actuator", "block", "from"]
+        ),
+        "direct": _one(system.direct, "1", "D", ["system", "actuator", "sensor"]),
+    }
+
+
+def _of_channels(found: FixedController) -> dict[str, Quantity]:
+    """Filters, sections and gains of the channels."""
     controller, electronics = found.controller, found.study.electronics
     estimator = controller.estimator
     to_signal, from_force = ("m/V", "V/N") if found.is_modal else ("1", "1")
@@ -138,33 +215,11 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
     channel = found.channels.kind
     each_axes = [_LINK, channel]
 
-    def one(value: Any, unit: str, meaning: str, axes: list[str] | None = None) -> Quantity:
-        return Quantity(
-            value=np.asarray(value).tolist(), unit=unit, axes=axes or [], meaning=meaning
-        )
-
     def each(value: Any, unit: str, meaning: str) -> Quantity:
-        return one(np.broadcast_to(value, shape), unit, meaning, each_axes)
+        return _one(np.broadcast_to(value, shape), unit, meaning, each_axes)
 
     return {
-        "sample_rate": one(electronics.sample_rate_hz, "Hz", "how often a sample is taken"),
-        "antialias": one(
-            electronics.antialias_hz,
-            "Hz",
-            "corner of the analogue second-order Butterworth filter before the ADC",
-        ),
-        "adc_bits": one(float(electronics.adc_bits), "1", "resolution of the ADC"),
-        "adc_step": one(controller.adc_step, "V", "one code at the ADC's input"),
-        "adc_top": one(controller.adc_top, "1", "highest code"),
-        "conditioner_gain": one(controller.adc_gain, "1", "ADC volt per sensor volt"),
-        "conditioner_bias": one(controller.adc_bias, "V", "at the ADC for a sensor at rest"),
-        "feedthrough": one(
-            controller.feedthrough,
-            "1",
-            "sensor volts that an actuator volt causes by modes that are not controlled",
-            [_LINK, _PATCH, "actuator"],
-        ),
-        "modal_filter": one(
+        "modal_filter": _one(
             controller.filter,
             to_signal,
             "channel signal of each sensor voltage",
@@ -176,13 +231,13 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
         "high_pass_a1": each(estimator.first[2], "1", "first section, denominator of z^-1"),
         "low_pass_a1": each(estimator.denominator[0], "1", "second section, denominator of z^-1"),
         "low_pass_a2": each(estimator.denominator[1], "1", "second section, denominator of z^-2"),
-        "velocity_numerator": one(
+        "velocity_numerator": _one(
             np.stack([np.broadcast_to(x, shape) for x in estimator.velocity], axis=2),
             last,
             "second section, numerator of the velocity",
             [*each_axes, "power of z^-1"],
         ),
-        "position_numerator": one(
+        "position_numerator": _one(
             np.stack([np.broadcast_to(x, shape) for x in estimator.position], axis=2),
             "1",
             "second section, numerator of the position",
@@ -205,37 +260,25 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
                 )
             }
         ),
-        "synthesizer": one(
+        "synthesizer": _one(
             controller.synthesizer,
             from_force,
             "voltages of a channel's force",
             [_LINK, _PATCH, channel],
         ),
-        "voltage_limit": one(controller.voltage_limit, "V", "of every actuator, +-"),
-        "shaper_weight": one(found.taps.weight, "1", "of each tap of the input shaper", ["tap"]),
-        "shaper_delay": one(found.taps.sample.astype(float), "1", "of each tap [samples]", ["tap"]),
     }
 
 
 def controller_of(document: Document) -> tuple[Controller, Taps]:
     """Controller and shaper built only from a document's numbers."""
     number = {name: np.array(entry.value) for name, entry in document.numbers.items()}
-    velocity, position = (
-        tuple(np.moveaxis(number[f"{name}_numerator"], 2, 0)) for name in ("velocity", "position")
-    )
-    estimator = Estimator(
-        first=(number["high_pass_b0"], number["high_pass_b1"], number["high_pass_a1"]),
-        denominator=(number["low_pass_a1"], number["low_pass_a2"]),
-        velocity=velocity,
-        position=position,
-        direct=number["position_direct"],
-    )
+    feedback = _system_of(number) if "state_matrix" in number else _channels_of(number)
     controller = Controller(
-        filter=number["modal_filter"],
-        estimator=estimator,
-        velocity_gain=number["velocity_gain"],
-        position_gain=number["position_gain"],
-        synthesizer=number["synthesizer"],
+        filter=feedback.filter,
+        estimator=feedback.estimator,
+        velocity_gain=feedback.velocity_gain,
+        position_gain=feedback.position_gain,
+        synthesizer=feedback.synthesizer,
         feedthrough=number["feedthrough"],
         voltage_limit=number["voltage_limit"],
         adc_gain=number["conditioner_gain"],
@@ -243,9 +286,40 @@ def controller_of(document: Document) -> tuple[Controller, Taps]:
         adc_step=number["adc_step"],
         adc_top=number["adc_top"],
         adc_noise=np.zeros(()),
-        rival_omega=number.get("rival_frequency"),
+        rival_omega=feedback.rival_omega,
+        system=feedback.system,
     )
     return controller, Taps(number["shaper_weight"], number["shaper_delay"].astype(int))
+
+
+def _system_of(number: dict[str, np.ndarray]) -> Feedback:
+    system = StateSpace(
+        state=number["state_matrix"],
+        enter=number["input_matrix"],
+        leave=number["output_matrix"],
+        direct=number["direct"],
+    )
+    return no_channels(system, number["feedthrough"].shape[1])
+
+
+def _channels_of(number: dict[str, np.ndarray]) -> Feedback:
+    velocity, position = (
+        tuple(np.moveaxis(number[f"{name}_numerator"], 2, 0)) for name in ("velocity", "position")
+    )
+    return Feedback(
+        filter=number["modal_filter"],
+        synthesizer=number["synthesizer"],
+        estimator=Estimator(
+            first=(number["high_pass_b0"], number["high_pass_b1"], number["high_pass_a1"]),
+            denominator=(number["low_pass_a1"], number["low_pass_a2"]),
+            velocity=velocity,
+            position=position,
+            direct=number["position_direct"],
+        ),
+        velocity_gain=number["velocity_gain"],
+        position_gain=number["position_gain"],
+        rival_omega=number.get("rival_frequency"),
+    )
 
 
 def schema() -> dict[str, Any]:

@@ -15,6 +15,7 @@ from scipy.signal import lfilter
 
 from jaxmodel.controller import Controller
 from jaxmodel.shaper import Taps
+from studies.engine.blocks import Blocks
 from studies.engine.channels import Channels
 from studies.engine.controller import FixedController
 from studies.errors import StudyError, field_error
@@ -68,16 +69,23 @@ class IntegerRow(NamedTuple):
         return self.integers / 2.0 ** self.shift[..., None]
 
 
-class FixedPoint(NamedTuple):
-    """A controller in fixed point. Integers unless said otherwise."""
+class Wires(NamedTuple):
+    """Sensors and actuators in fixed point. Integers unless said otherwise."""
 
-    link: np.ndarray  # of each channel, from 0, (M,)
     adc_bits: int  # fraction bits of a sensor signal, whose base is one ADC code
     adc_top: int
     bias: int  # of the conditioner, as a sensor signal
     dac_rest: int  # code of 0 V
     sensor_step: float  # one count of a sensor signal [V]
     dac_step: float  # one code [V]
+    feedthrough: IntegerRow | None  # sensor counts per DAC code, (3, K, K)
+
+
+class FixedPoint(NamedTuple):
+    """A controller with channels in fixed point. Integers unless said otherwise."""
+
+    wires: Wires
+    link: np.ndarray  # of each channel, from 0, (M,)
     signal: Format  # m or V
     high: Format
     inner: Format
@@ -88,10 +96,16 @@ class FixedPoint(NamedTuple):
     low_pass: IntegerRow  # scale, -a1, -a2, (M, 3)
     numerator: IntegerRow  # three taps and the direct share, (M, 4)
     synthesizer: IntegerRow  # 0 for channels of other links, (3, K, M)
-    feedthrough: IntegerRow | None  # sensor counts per DAC code, (3, K, K)
     is_rival: np.ndarray  # channels that act one at a time, (M,)
     energy: IntegerRow | None  # roots of the modal energies of rivals, in one unit, (M, 2, 4)
     error: ErrorBound
+
+    @property
+    def formats(self) -> list[tuple[str, Format, str]]:
+        """Signals, their formats and units; of patches all are in volts."""
+        parts = self.signal, self.high, self.inner, self.force
+        names = "signal", "high-passed", "delay line", "force"
+        return list(zip(names, parts, ("m", "m", "m", "N"), strict=True))
 
 
 class ErrorBound(NamedTuple):
@@ -134,6 +148,7 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
         StudyError: what cannot be represented, with the number and a remedy.
     """
     controller, channels = found.controller, found.channels
+    assert isinstance(channels, Channels)
     check_words(found)
     if channels.energy is not None and np.any(controller.feedthrough):
         raise field_error(
@@ -143,62 +158,79 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
             "what a switch brings back by feed-through has no bound",
             "1",
         )
-    rest = 2 ** (dac_bits - 1)
-    dac_step = float(controller.voltage_limit) / (rest - 1)
+    wires = design_wires(found, dac_bits)
+    step, dac_step = wires.sensor_step, wires.dac_step
     memory = channels.memory(FORGOTTEN)
     gains = peak_gains(channels, memory)
-    code = float(controller.adc_step / controller.adc_gain)  # one ADC code at the sensor [V]
-    sensor = _sensor_bound(controller)  # (3, K)
-    adc_bits = int(_bits(sensor.max() / code))
-    if adc_bits < 0:
-        raise StudyError(
-            f"fixed point: sensor signals can be {sensor.max() / code:.3g} ADC codes; allowed: "
-            f"{2.0 ** (WORD - 1):.3g}; lower control.feedthrough_factor or "
-            "electronics.voltage_limit, or take --target c"
-        )
-    step = code / 2.0**adc_bits
+    sensor = sensor_bound(controller)  # (3, K)
     bound = np.sum(np.abs(channels.filter) * sensor[channels.link], axis=1)
-    signal = _format(seen.signal, bound)
-    high = _format(seen.high, bound * gains.high)
-    inner = _format(seen.inner, bound * gains.inner)
-    force = _format(seen.force, bound * gains.force)
+    signal = find_format(seen.signal, bound)
+    high = find_format(seen.high, bound * gains.high)
+    inner = find_format(seen.inner, bound * gains.inner)
+    force = find_format(seen.force, bound * gains.force)
     b0, b1, a1 = channels.first.T
     one = np.ones_like(b0)
     tap = channels.force * (inner.step / force.step)[:, None]
     back = np.zeros((3, found.n_patches, len(channels.link)))
     back[channels.link, :, np.arange(len(channels.link))] = channels.synthesizer
+    fixed = FixedPoint(
+        wires=wires,
+        link=channels.link,
+        signal=signal,
+        high=high,
+        inner=inner,
+        force=force,
+        filter=find_row(channels.filter * step / signal.step[:, None], "modal filter"),
+        high_pass=find_row((b0 * signal.step / high.step)[:, None], "high-pass"),
+        memory=find_row(np.stack([b1 * signal.step / high.step, -a1], 1), "high-pass"),
+        low_pass=find_row(
+            np.stack([one * high.step / inner.step, *-channels.denominator.T], 1),
+            "low-pass",
+        ),
+        numerator=find_row(
+            np.column_stack([tap, channels.direct * signal.step / force.step]), "gains"
+        ),
+        synthesizer=find_row(back * force.step / dac_step, "synthesizer"),
+        is_rival=channels.is_rival,
+        energy=_energy(channels, bound, inner, signal, memory),
+        error=ErrorBound(*np.zeros((3, 3, found.n_patches))),
+    )
+    error = _error_bound(found, fixed, gains, memory)
+    check_error(found, error, dac_step)
+    return fixed._replace(error=error)
+
+
+def design_wires(found: FixedController, dac_bits: int) -> Wires:
+    """Formats of sensors and actuators.
+
+    Raises:
+        StudyError: sensor signals too large for a word.
+    """
+    controller = found.controller
+    rest = 2 ** (dac_bits - 1)
+    dac_step = float(controller.voltage_limit) / (rest - 1)
+    code = float(controller.adc_step / controller.adc_gain)  # one ADC code at the sensor [V]
+    largest = sensor_bound(controller).max() / code
+    adc_bits = int(_bits(largest))
+    if adc_bits < 0:
+        raise StudyError(
+            f"fixed point: sensor signals can be {largest:.3g} ADC codes; allowed: "
+            f"{2.0 ** (WORD - 1):.3g}; lower control.feedthrough_factor or "
+            "electronics.voltage_limit, or take --target c"
+        )
+    step = code / 2.0**adc_bits
     through = None
     if np.any(controller.feedthrough):
-        through = _row(controller.feedthrough * dac_step / step, "feed-through")
-    fixed = FixedPoint(
-        link=channels.link,
+        through = find_row(controller.feedthrough * dac_step / step, "feed-through")
+    return Wires(
         adc_bits=adc_bits,
         adc_top=int(controller.adc_top),
         bias=round(float(controller.adc_bias) / float(controller.adc_step) * 2**adc_bits),
         dac_rest=rest,
         sensor_step=step,
         dac_step=dac_step,
-        signal=signal,
-        high=high,
-        inner=inner,
-        force=force,
-        filter=_row(channels.filter * step / signal.step[:, None], "modal filter"),
-        high_pass=_row((b0 * signal.step / high.step)[:, None], "high-pass"),
-        memory=_row(np.stack([b1 * signal.step / high.step, -a1], 1), "high-pass"),
-        low_pass=_row(
-            np.stack([one * high.step / inner.step, *-channels.denominator.T], 1),
-            "low-pass",
-        ),
-        numerator=_row(np.column_stack([tap, channels.direct * signal.step / force.step]), "gains"),
-        synthesizer=_row(back * force.step / dac_step, "synthesizer"),
         feedthrough=through,
-        is_rival=channels.is_rival,
-        energy=_energy(channels, bound, inner, signal, memory),
-        error=ErrorBound(*np.zeros((3, 3, found.n_patches))),
     )
-    error = _error_bound(found, fixed, gains, memory)
-    _check_error(found, error, dac_step)
-    return fixed._replace(error=error)
 
 
 def check_words(found: FixedController) -> None:
@@ -216,14 +248,20 @@ def check_words(found: FixedController) -> None:
             "1",
         )
     slowest = 1 + np.log(FORGOTTEN) / LONGEST_MEMORY  # slowest pole that forgets in time
-    if found.channels.slowest_pole > slowest:
+    pole = found.channels.slowest_pole
+    if pole > slowest and isinstance(found.channels, Blocks):
+        raise StudyError(
+            f"fixed point: the controller has a pole of modulus {pole:.12g}; allowed: up to "
+            f"{slowest:.12g}, or it keeps rounding errors for too long (or --target c)"
+        )
+    if pole > slowest:
         rate = electronics.sample_rate_hz
         lowest = -np.log(slowest) * rate / (2 * np.pi)
         raise field_error(
             "electronics.highpass_hz",
             electronics.highpass_hz,
             f"from {lowest:.3g} for fixed point at electronics.sample_rate_hz = {rate:g}: a filter "
-            f"with its pole at {found.channels.slowest_pole:.12g} keeps rounding errors for too "
+            f"with its pole at {pole:.12g} keeps rounding errors for too "
             "long (or --target c)",
             "Hz",
         )
@@ -256,7 +294,7 @@ def _energy(
     step = largest.max() / 2.0 ** (WORD - 3)
     factors = channels.energy * inner.step[:, None, None] / step
     factors[..., 3] = channels.energy[..., 3] * signal.step[:, None] / step
-    return _row(factors, "modal energies")
+    return find_row(factors, "modal energies")
 
 
 def _responses(channels: Channels, m: int, n: int) -> tuple[np.ndarray, ...]:
@@ -283,7 +321,7 @@ def peak_gains(channels: Channels, n: int) -> Gains:
     return Gains(*np.array(rows).T)
 
 
-def _sensor_bound(controller: Controller) -> np.ndarray:
+def sensor_bound(controller: Controller) -> np.ndarray:
     """Largest sensor signals that codes and their own feed-through can produce [V], (3, K)."""
     ends = np.array([0.0, float(controller.adc_top)]) * controller.adc_step - controller.adc_bias
     own = np.abs(controller.feedthrough).sum(axis=2) * controller.voltage_limit
@@ -295,7 +333,7 @@ def _bits(largest: np.ndarray) -> np.ndarray:
     return np.floor(WORD - 1 - np.log2(largest * (1 + 1e-4))).astype(int)
 
 
-def _format(seen: np.ndarray, bound: np.ndarray) -> Format:
+def find_format(seen: np.ndarray, bound: np.ndarray) -> Format:
     """Format of a signal, (M,), from its values over time and its bound."""
     peak = np.abs(seen).max(axis=0)
     # a channel at rest in the simulation has no range
@@ -303,7 +341,7 @@ def _format(seen: np.ndarray, bound: np.ndarray) -> Format:
     return Format(base, _bits(np.maximum(bound, MARGIN * peak) / base), peak, bound)
 
 
-def _row(factors: np.ndarray, name: str) -> IntegerRow:
+def find_row(factors: np.ndarray, name: str) -> IntegerRow:
     """Integers and shifts of rows of factors, (..., n)."""
     total = np.abs(factors).sum(axis=-1)
     safe = np.where(total > 0, total, 1.0)
@@ -324,7 +362,7 @@ def rounded(fixed: FixedPoint, like: Channels) -> Channels:
     numerator = f.numerator.values * f.force.step[:, None]
     own = np.arange(len(f.link))
     return like._replace(
-        filter=f.filter.values * f.signal.step[:, None] / f.sensor_step,
+        filter=f.filter.values * f.signal.step[:, None] / f.wires.sensor_step,
         first=np.stack(
             [
                 f.high_pass.values[:, 0] * f.high.step / f.signal.step,
@@ -336,21 +374,22 @@ def rounded(fixed: FixedPoint, like: Channels) -> Channels:
         denominator=-f.low_pass.values[:, 1:],
         force=numerator[:, :3] * (scale / f.inner.step)[:, None],
         direct=numerator[:, 3] / f.signal.step,
-        synthesizer=f.synthesizer.values[f.link, :, own] * f.dac_step / f.force.step[:, None],
+        synthesizer=f.synthesizer.values[f.link, :, own] * f.wires.dac_step / f.force.step[:, None],
     )
 
 
 def _error_bound(found: FixedController, fixed: FixedPoint, gains: Gains, n: int) -> ErrorBound:
     """Peak errors at the actuators: the sum of every rounding through its peak gain."""
     exact = found.channels
+    assert isinstance(exact, Channels)
     near = rounded(fixed, exact)
     half = 0.5
     # bias and feed-through are rounded once each
-    entering = fixed.sensor_step * np.abs(exact.filter).sum(axis=1) + half * fixed.signal.step
+    entering = fixed.wires.sensor_step * np.abs(exact.filter).sum(axis=1) + half * fixed.signal.step
     force = entering * gains.force + half * fixed.force.step
     force = force + 2 * half * fixed.high.step * gains.force_of_high
     force = force + half * fixed.inner.step * gains.force_of_inner
-    size, volts = np.abs(exact.synthesizer), _sensor_bound(found.controller)[exact.link]
+    size, volts = np.abs(exact.synthesizer), sensor_bound(found.controller)[exact.link]
     change = np.array(
         [
             np.abs(_responses(near, m, n)[2] - _responses(exact, m, n)[2]).sum()
@@ -366,11 +405,11 @@ def _error_bound(found: FixedController, fixed: FixedPoint, gains: Gains, n: int
     rounding, coefficients = np.zeros((2, 3, found.n_patches))
     np.add.at(rounding, exact.link, force[:, None] * size)
     np.add.at(coefficients, exact.link, wrong)
-    inside = rounding + coefficients + half * fixed.dac_step
-    return ErrorBound(rounding, coefficients, _brought_back(found, inside))
+    inside = rounding + coefficients + half * fixed.wires.dac_step
+    return ErrorBound(rounding, coefficients, brought_back(found, inside))
 
 
-def _brought_back(found: FixedController, error: np.ndarray) -> np.ndarray:
+def brought_back(found: FixedController, error: np.ndarray) -> np.ndarray:
     """Errors of commands including their feed-through, (3, K).
 
     An error of a command enters the sensors in the next sample, and so the next command. Uses peak
@@ -395,7 +434,7 @@ def _brought_back(found: FixedController, error: np.ndarray) -> np.ndarray:
     return error + np.einsum("lik,il->ik", gain, error)
 
 
-def _check_error(found: FixedController, error: ErrorBound, dac_step: float) -> None:
+def check_error(found: FixedController, error: ErrorBound, dac_step: float) -> None:
     worst = error.inside
     if worst.max() <= ALLOWED_ERROR * dac_step:
         return
@@ -415,7 +454,7 @@ def shaper_row(taps: Taps) -> IntegerRow:
     Raises:
         StudyError: weights too large for a word.
     """
-    row = _row(np.asarray(taps.weight)[None], "input shaper")
+    row = find_row(np.asarray(taps.weight)[None], "input shaper")
     integers, shift = row.integers[0], int(row.shift[0])
     left = round(float(np.sum(taps.weight)) * 2**shift) - int(integers.sum())
     largest = np.argmax(np.abs(integers))

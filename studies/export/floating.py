@@ -7,7 +7,15 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.controller import Controller, read_back
+from studies.engine.blocks import Blocks
 from studies.engine.channels import Channels, acting
+
+
+class BlockSignals(NamedTuple):
+    """Signals of a controller in blocks over time; leading axes (T, ...)."""
+
+    state: np.ndarray  # [V], (..., G, N, 2)
+    command: np.ndarray  # [V], (..., 3, K)
 
 
 class Signals(NamedTuple):
@@ -20,21 +28,53 @@ class Signals(NamedTuple):
     command: np.ndarray  # [V], (..., 3, K)
 
 
-def respond(channels: Channels, controller: Controller, codes: np.ndarray) -> Signals:
+def respond(
+    arranged: Channels | Blocks, controller: Controller, codes: np.ndarray
+) -> Signals | BlockSignals:
     """Run a controller, from rest, on sequences of ADC codes.
 
     Args:
-        channels: folded controller.
+        arranged: the controller as code needs it.
         controller: the same, for converters, limit and feed-through; NumPy arrays.
         codes: of the sensors, (T, ..., 3, K); sequences side by side.
     """
-    return respond_from(channels, controller, codes, np.zeros(codes.shape[1:]))
+    return respond_from(arranged, controller, codes, np.zeros(codes.shape[1:]))
 
 
 def respond_from(
+    arranged: Channels | Blocks, controller: Controller, codes: np.ndarray, command: np.ndarray
+) -> Signals | BlockSignals:
+    """The same with voltages on the actuators at the beginning [V], (..., 3, K)."""
+    run = _by_blocks if isinstance(arranged, Blocks) else _by_channels
+    return run(arranged, controller, codes, command)  # type: ignore[arg-type]
+
+
+def _sensed(controller: Controller, code: np.ndarray, command: np.ndarray) -> np.ndarray:
+    """Sensor voltages less the feed-through of the last command [V], (..., 3, K)."""
+    own = np.einsum("ikl,...il->...ik", controller.feedthrough, command)
+    return np.asarray(read_back(controller, code)) - own
+
+
+def _by_blocks(
+    blocks: Blocks, controller: Controller, codes: np.ndarray, command: np.ndarray
+) -> BlockSignals:
+    rows, system = [], blocks.system
+    state = np.zeros((*codes.shape[1:-2], *system.state.shape[:3]))
+    limit = float(controller.voltage_limit)
+    for code in codes:
+        volts = blocks.of_groups(_sensed(controller, code, command))
+        wanted = np.einsum("gpnb,...gnb->...gp", system.leave, state)
+        wanted = wanted + np.einsum("gpm,...gm->...gp", system.direct, volts)
+        state = np.einsum("gnbc,...gnc->...gnb", system.state, state)
+        state = state + np.einsum("gnbm,...gm->...gnb", system.enter, volts)
+        command = blocks.of_patches(np.clip(wanted, -limit, limit), codes.shape[-1])
+        rows.append((state, command))
+    return BlockSignals(*map(np.stack, zip(*rows, strict=True)))
+
+
+def _by_channels(
     channels: Channels, controller: Controller, codes: np.ndarray, command: np.ndarray
 ) -> Signals:
-    """The same with voltages on the actuators at the beginning [V], (..., 3, K)."""
     rows = []
     link, many = channels.link, codes.shape[1:-2]
     memory = np.zeros((*many, len(link)))
@@ -46,8 +86,7 @@ def respond_from(
     back = np.zeros((3, *channels.synthesizer.shape))
     back[link, np.arange(len(link))] = channels.synthesizer
     for code in codes:
-        own = np.einsum("ikl,...il->...ik", controller.feedthrough, command)
-        sensor = read_back(controller, code) - own
+        sensor = _sensed(controller, code, command)
         signal = np.einsum("mk,...mk->...m", channels.filter, sensor[..., link, :])
         high = b0 * signal + memory
         memory = b1 * signal - a1 * high

@@ -87,16 +87,15 @@ def _sample(
     return following, record.pose, *_read(loop, inputs, k + 1, following)
 
 
-def jax_law(controller: Controller, n_channels: int, dac_step: float | None = None) -> Law:
+def jax_law(controller: Controller, dac_step: float | None = None) -> Law:
     """The JAX controller as a `Law` with a state.
 
     Args:
         controller: coefficients.
-        n_channels: of each link.
         dac_step: round commands to multiples of it [V]; None: leave them.
     """
     controller = jax.tree.map(jnp.asarray, controller)
-    state = rest_controller(n_channels, controller.filter.shape[2], float)
+    state = rest_controller(controller)
 
     def law(code: np.ndarray) -> np.ndarray:
         nonlocal state
@@ -115,13 +114,12 @@ def _step(controller: Controller, state: Any, code: Any) -> Any:
     return controller_step(controller, state, read_back(controller, code))[0]
 
 
-@partial(jax.jit, static_argnums=1)
-def replay(controller: Controller, n_channels: int, codes: Any) -> Any:
+@jax.jit
+def replay(controller: Controller, codes: Any) -> Any:
     """The JAX controller from rest on a sequence of ADC codes (T, 3, K): voltages (T, 3, K)."""
 
     def body(state: Any, code: Any) -> Any:
         after = _step(controller, state, code)
         return after, after.voltage
 
-    start = rest_controller(n_channels, controller.filter.shape[2], float)
-    return jax.lax.scan(body, start, codes)[1]
+    return jax.lax.scan(body, rest_controller(controller), codes)[1]

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from studies.engine.channels import acting
+from studies.engine.blocks import Blocks
+from studies.engine.channels import Channels, acting
 from studies.export.fixed import FixedPoint, IntegerRow
+from studies.export.fixed_blocks import FixedBlocks
 
 #: Axes of one sequence's numbers.
-SENSORS, CHANNELS = (-2, -1), (-1,)
+SENSORS, CHANNELS, STATES = (-2, -1), (-1,), (-3, -2, -1)
 
 
 class Response(NamedTuple):
@@ -22,34 +24,74 @@ class Response(NamedTuple):
     is_faulty: np.ndarray  # whether actuators are at rest because of a faulty sensor
 
 
-def respond(fixed: FixedPoint, codes: np.ndarray, rail: int) -> Response:
+class _Memory(Protocol):
+    """What the arithmetic remembers between samples."""
+
+    def wanted(self, sensor: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
+        """Counts for the actuators, (..., 3, K), from those of the sensors."""
+        ...
+
+    def forget(self, is_faulty: np.ndarray) -> None:
+        """Begin again in some sequences, (...)."""
+        ...
+
+
+def respond(
+    arranged: Channels | Blocks, fixed: FixedPoint | FixedBlocks, codes: np.ndarray, rail: int
+) -> Response:
     """The exported arithmetic, bit by bit, on sequences of ADC codes from rest.
 
     Args:
+        arranged: the controller, for what belongs to which link.
         fixed: formats and coefficients.
         codes: 16-bit words, (T, ..., 3, K); sequences side by side.
         rail: samples at one end of the range after which a sensor is faulty.
     """
-    many, n = codes.shape[1:-2], len(fixed.link)
-    memory, older, old = np.zeros((3, *many, n), np.int64)
+    many, wires = codes.shape[1:-2], fixed.wires
+    memory: _Memory
+    if isinstance(fixed, FixedBlocks):
+        assert isinstance(arranged, Blocks)
+        memory = _BlockMemory(arranged, fixed, many)
+    else:
+        memory = _ChannelMemory(fixed, many)
     command = np.zeros(codes.shape[1:], np.int64)
     at_end = np.zeros(codes.shape[1:], np.int64)  # samples at the highest code, or minus at 0
     is_faulty = np.zeros(many, bool)
-    is_used = np.isin(np.arange(3), fixed.link)[:, None]
+    is_used = np.isin(np.arange(3), arranged.link)[:, None]
     rows = []
     for code in codes.astype(np.int64):
-        end = (code == fixed.adc_top).astype(np.int64) - (code == 0)
+        end = (code == wires.adc_top).astype(np.int64) - (code == 0)
         at_end = np.where(end * at_end > 0, at_end, 0) + end
-        bad = ((code > fixed.adc_top) | (np.abs(at_end) >= rail)) & is_used
+        bad = ((code > wires.adc_top) | (np.abs(at_end) >= rail)) & is_used
         is_faulty = is_faulty | bad.any(axis=(-2, -1))
         cut: list[np.ndarray] = []  # per sequence, how many were clipped
-        sensor = _limited(code * 2**fixed.adc_bits - fixed.bias, cut, SENSORS)
-        if fixed.feedthrough is not None:
-            own = _products(fixed.feedthrough, command[..., None, :])
+        sensor = _limited(code * 2**wires.adc_bits - wires.bias, cut, SENSORS)
+        if wires.feedthrough is not None:
+            own = _products(wires.feedthrough, command[..., None, :])
             sensor = _limited(sensor - own, cut, SENSORS)
+        wanted = _limited(memory.wanted(sensor, cut), cut, SENSORS)
+        command = np.minimum(np.maximum(wanted, 1 - wires.dac_rest), wires.dac_rest - 1)
+        memory.forget(is_faulty)
+        command = np.where(is_faulty[..., None, None], 0, command)
+        full = np.sum(np.abs(command) == wires.dac_rest - 1, axis=(-2, -1))
+        # a faulty sample ends before the arithmetic
+        n_cut = np.where(is_faulty, 0, np.sum(cut, axis=0))
+        rows.append((command + wires.dac_rest, n_cut, full, is_faulty))
+    return Response(*map(np.stack, zip(*rows, strict=True)))
+
+
+class _ChannelMemory:
+    """Sections of every channel."""
+
+    def __init__(self, fixed: FixedPoint, many: tuple[int, ...]) -> None:
+        self._fixed = fixed
+        self._high, self._older, self._old = np.zeros((3, *many, len(fixed.link)), np.int64)
+
+    def wanted(self, sensor: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
+        fixed, old, older = self._fixed, self._old, self._older
         signal = _limited(_products(fixed.filter, sensor[..., fixed.link, :]), cut)
-        high = _limited(_products(fixed.high_pass, signal[..., None]) + memory, cut)
-        memory = _limited(_products(fixed.memory, np.stack([signal, high], -1)), cut)
+        high = _limited(_products(fixed.high_pass, signal[..., None]) + self._high, cut)
+        self._high = _limited(_products(fixed.memory, np.stack([signal, high], -1)), cut)
         inner = _limited(_products(fixed.low_pass, np.stack([high, old, older], -1)), cut)
         taps = np.stack([inner, old, older, signal], -1)
         force = _limited(_products(fixed.numerator, taps), cut)
@@ -57,17 +99,35 @@ def respond(fixed: FixedPoint, codes: np.ndarray, rail: int) -> Response:
             roots = _limited(_products(fixed.energy, taps[..., None, :]), cut, SENSORS)
             energy = np.sum(roots * roots, axis=-1)
             force = np.where(acting(fixed.link, fixed.is_rival, energy), force, 0)
-        older, old = old, inner
-        wanted = _limited(_products(fixed.synthesizer, force[..., None, None, :]), cut, SENSORS)
-        command = np.minimum(np.maximum(wanted, 1 - fixed.dac_rest), fixed.dac_rest - 1)
-        rest = is_faulty[..., None]
-        memory, old, older = (np.where(rest, 0, x) for x in (memory, old, older))
-        command = np.where(rest[..., None], 0, command)
-        full = np.sum(np.abs(command) == fixed.dac_rest - 1, axis=(-2, -1))
-        # a faulty sample ends before the arithmetic
-        n_cut = np.where(is_faulty, 0, np.sum(cut, axis=0))
-        rows.append((command + fixed.dac_rest, n_cut, full, is_faulty))
-    return Response(*map(np.stack, zip(*rows, strict=True)))
+        self._older, self._old = old, inner
+        return _products(fixed.synthesizer, force[..., None, None, :])
+
+    def forget(self, is_faulty: np.ndarray) -> None:
+        at = is_faulty[..., None]
+        self._high, self._old, self._older = (
+            np.where(at, 0, x) for x in (self._high, self._old, self._older)
+        )
+
+
+class _BlockMemory:
+    """States of every block."""
+
+    def __init__(self, arranged: Blocks, fixed: FixedBlocks, many: tuple[int, ...]) -> None:
+        self._arranged, self._fixed = arranged, fixed
+        self._state = np.zeros((*many, *fixed.state.bits.shape), np.int64)
+
+    def wanted(self, sensor: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
+        fixed, state = self._fixed, self._state
+        volts = self._arranged.of_groups(sensor)  # (..., G, M)
+        flat = state.reshape(*state.shape[:-2], -1)
+        found = _products(fixed.leave, np.concatenate([flat, volts], -1)[..., None, :])
+        entering = np.broadcast_to(volts[..., None, :], (*state.shape[:-1], volts.shape[-1]))
+        read = np.concatenate([state, entering], -1)[..., None, :]
+        self._state = _limited(_products(fixed.advance, read), cut, STATES)
+        return self._arranged.of_patches(found, sensor.shape[-1])
+
+    def forget(self, is_faulty: np.ndarray) -> None:
+        self._state = np.where(is_faulty[..., None, None, None], 0, self._state)
 
 
 def _limited(x: np.ndarray, cut: list[np.ndarray], axes: tuple[int, ...] = CHANNELS) -> np.ndarray:

@@ -10,12 +10,14 @@ import numpy as np
 from rich.console import Console
 
 from jaxmodel import status
+from studies.engine.blocks import Blocks, restored
 from studies.engine.channels import Channels, unfold
 from studies.engine.controller import FixedController
 from studies.engine.stability import LoopReport, loop_report
 from studies.errors import StudyError, field_error
 from studies.export.cost import Cost
 from studies.export.fixed import FixedPoint, rail_samples
+from studies.export.fixed_blocks import FixedBlocks
 from studies.export.in_the_loop import LoopRun
 from studies.export.verify import Verification, reference_run
 from studies.study.labels import describe
@@ -40,14 +42,15 @@ class Made(NamedTuple):
     files: dict[str, str]
     loop: LoopReport  # with the exported coefficients
     verified: Verification | None
-    fixed: FixedPoint | None = None
+    fixed: FixedPoint | FixedBlocks | None = None
     cost: Cost | None = None
 
 
-def judged(found: FixedController, channels: Channels, note: str) -> LoopReport:
+def judged(found: FixedController, arranged: Channels | Blocks, note: str) -> LoopReport:
     """Linearised sampled loop with given coefficients; rejected if unstable."""
     home = np.array(found.study.motion.waypoints[0], float)
-    law = unfold(channels, found.controller)
+    restore = restored if isinstance(arranged, Blocks) else unfold
+    law = restore(arranged, found.controller)  # type: ignore[arg-type]
     law = jax.tree.map(jnp.asarray, law)
     try:
         # not the case's own controller, so its kind must not cost another compilation

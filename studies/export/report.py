@@ -11,6 +11,7 @@ from studies.engine.stability import LoopReport
 from studies.export.c_fixed import format_lines
 from studies.export.cost import Cost
 from studies.export.fixed import MARGIN, FixedPoint
+from studies.export.fixed_blocks import FixedBlocks
 from studies.export.verify import AIM, Verification
 from studies.show.templates import render
 from studies.study.margin import caution
@@ -21,7 +22,7 @@ def report(
     origin: list[str],
     loop: LoopReport,
     verified: Verification,
-    fixed: FixedPoint | None = None,
+    fixed: FixedPoint | FixedBlocks | None = None,
     cost: Cost | None = None,
 ) -> str:
     """Text of the report, in Markdown.
@@ -50,7 +51,7 @@ def report(
         ],
         controllers=_controllers(found, verified),
         code=code,
-        deflection=code * np.abs(controller.filter[:, 0]).max(),
+        deflection=code * np.abs(controller.filter[:, :1]).max(initial=0.0),
         fixed=fixed,
         cost=cost,
         **(_of_fixed(found, fixed, verified) if fixed is not None else {}),
@@ -84,10 +85,12 @@ def _controllers(found: FixedController, verified: Verification) -> list[list[st
     return rows
 
 
-def _of_fixed(found: FixedController, fixed: FixedPoint, verified: Verification) -> dict[str, Any]:
+def _of_fixed(
+    found: FixedController, fixed: FixedPoint | FixedBlocks, verified: Verification
+) -> dict[str, Any]:
     """What the section on fixed point needs."""
     loss, dac_loss = (verified.beside(k).loss for k in ("C, fixed point", "JAX behind the DAC"))
-    forms = (fixed.signal, fixed.high, fixed.inner, fixed.force)
+    forms = [form for _, form, _ in fixed.formats]
     return {
         "loss": loss,
         "dac_loss": dac_loss,

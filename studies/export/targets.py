@@ -11,13 +11,17 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from jaxmodel.table import Table
+from studies.engine.blocks import Blocks
+from studies.engine.channels import Channels
+from studies.engine.controller import FixedController
 from studies.export.c_fixed import fixed_source
 from studies.export.c_floating import floating_source
 from studies.export.c_text import Source
 from studies.export.cost import cost_of
 from studies.export.document import document, schema, to_json
-from studies.export.fixed import check_words, design_fixed, rounded
-from studies.export.floating import respond
+from studies.export.fixed import FixedPoint, check_words, design_fixed, rounded
+from studies.export.fixed_blocks import FixedBlocks, design_blocks, rounded_blocks
+from studies.export.floating import BlockSignals, Signals, respond
 from studies.export.job import Job, Made, judged, reference_motion
 from studies.export.verify import verify_document, verify_fixed, verify_floating
 
@@ -61,8 +65,8 @@ def _as_fixed(job: Job) -> Made:
     judged(found, found.channels, "")
     reference = reference_motion(job)
     seen = respond(found.channels, found.controller, reference.codes)
-    fixed = design_fixed(found, seen, job.dac_bits)
-    loop = judged(found, rounded(fixed, found.channels), ", coefficients rounded to 32 bits")
+    fixed, near = _designed(found, seen, job.dac_bits)
+    loop = judged(found, near, ", coefficients rounded to 32 bits")
     cost = cost_of(found, fixed)
     job.console.print(cost.text)
     source = fixed_source(found, fixed, job.name, job.origin, cost.text)
@@ -72,6 +76,19 @@ def _as_fixed(job: Job) -> Made:
     return Made(
         files=_files(source, job.name), loop=loop, verified=verified, fixed=fixed, cost=cost
     )
+
+
+def _designed(
+    found: FixedController, seen: Signals | BlockSignals, dac_bits: int
+) -> tuple[FixedPoint | FixedBlocks, Channels | Blocks]:
+    """A controller in fixed point, and what its integers represent."""
+    if isinstance(found.channels, Blocks):
+        assert isinstance(seen, BlockSignals)
+        blocks = design_blocks(found, seen, dac_bits)
+        return blocks, rounded_blocks(blocks, found.channels)
+    assert isinstance(seen, Signals)
+    fixed = design_fixed(found, seen, dac_bits)
+    return fixed, rounded(fixed, found.channels)
 
 
 def _files(source: Source, name: str) -> dict[str, str]:

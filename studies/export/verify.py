@@ -9,15 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.laws import LAWS, n_channels
 from jaxmodel.motion import sample_path, shape_path
 from jaxmodel.shaper import Taps
-from studies.engine.channels import fold
-from studies.engine.controller import FixedController
+from studies.engine.controller import FixedController, arrange
 from studies.export.c_text import Source
 from studies.export.compiler import Code, compiled
 from studies.export.document import Document, controller_of
 from studies.export.fixed import FixedPoint, rail_samples, shaper_row
+from studies.export.fixed_blocks import FixedBlocks
 from studies.export.floating import respond as respond_floating
 from studies.export.in_the_loop import LoopRun, jax_law, replay, run_in_the_loop
 from studies.export.integers import Response, shifted
@@ -88,14 +87,14 @@ def vibration(run: LoopRun) -> float:
 
 def reference_run(found: FixedController) -> LoopRun:
     """The case's motion with the JAX controller."""
-    law = jax_law(found.controller, n_channels(found.structure))
+    law = jax_law(found.controller)
     return run_in_the_loop(found.structure, found.case, law)
 
 
 def verify_document(found: FixedController, reference: LoopRun, document: Document) -> Verification:
     """A controller built only from its document, against the JAX controller."""
     controller, taps = controller_of(document)
-    channels = fold(controller, LAWS[document.law].channel)
+    channels = arrange(controller, document.law)
     checks = [
         _compare(
             f"open loop, {name}",
@@ -148,7 +147,7 @@ def verify_floating(
 
 def verify_fixed(
     found: FixedController,
-    fixed: FixedPoint,
+    fixed: FixedPoint | FixedBlocks,
     reference: LoopRun,
     source: Source,
     name: str,
@@ -157,14 +156,14 @@ def verify_fixed(
     """C in fixed point against its integer model, bit by bit, and against the JAX controller."""
     rail = rail_samples(found.study.electronics.sample_rate_hz)
     checks, runs = [], {"JAX": reference}
-    behind_dac = jax_law(found.controller, n_channels(found.structure), fixed.dac_step)
+    behind_dac = jax_law(found.controller, fixed.wires.dac_step)
     runs["JAX behind the DAC"] = run_in_the_loop(found.structure, found.case, behind_dac)
     shape = reference.codes.shape[1:]
     with _loaded(found, source, name, compiler, np.uint16, np.int32) as code:
 
         def in_volts(codes: np.ndarray) -> np.ndarray:
             out = code.step(codes)[0].reshape(shape).astype(float)
-            return (out - fixed.dac_rest) * fixed.dac_step
+            return (out - fixed.wires.dac_rest) * fixed.wires.dac_step
 
         code.begin()
         runs["C, fixed point"] = own = run_in_the_loop(found.structure, found.case, in_volts)
@@ -177,7 +176,7 @@ def verify_fixed(
                 0, 2**16, (50, *shape)
             ),
         }
-        counts = _modelled(fixed, sequences, rail)
+        counts = _modelled(found, fixed, sequences, rail)
         for label, codes in sequences.items():
             given, _ = code.respond(codes)
             differing = int(np.sum(given != counts[label].codes))
@@ -190,8 +189,12 @@ def verify_fixed(
                 )
             )
         # a 16-bit word cannot exceed the highest code of such an ADC
-        bad = {"beyond the range": fixed.adc_top + 1.0} if fixed.adc_top < 2**16 - 1 else {}
-        checks += _faults(found, code, reference, bad, 1.0, float(fixed.dac_rest))
+        bad = (
+            {"beyond the range": fixed.wires.adc_top + 1.0}
+            if fixed.wires.adc_top < 2**16 - 1
+            else {}
+        )
+        checks += _faults(found, code, reference, bad, 1.0, float(fixed.wires.dac_rest))
         checks.append(_check_shaper(found, code))
     checks.append(_check_error(found, fixed, reference, counts["recorded codes"]))
     for label in ("recorded codes", "own run in the loop"):
@@ -205,12 +208,15 @@ def verify_fixed(
 
 
 def _modelled(
-    fixed: FixedPoint, sequences: dict[str, np.ndarray], rail: int
+    found: FixedController,
+    fixed: FixedPoint | FixedBlocks,
+    sequences: dict[str, np.ndarray],
+    rail: int,
 ) -> dict[str, Response]:
     """Response of the integer model to each sequence, all side by side."""
     longest = max(map(len, sequences.values()))
     rows = [np.pad(x, ((0, longest - len(x)), (0, 0), (0, 0)), "edge") for x in sequences.values()]
-    response = respond_fixed(fixed, np.stack(rows, axis=1), rail)
+    response = respond_fixed(found.channels, fixed, np.stack(rows, axis=1), rail)
     return {
         name: Response(*(part[: len(codes), k] for part in response))
         for k, (name, codes) in enumerate(sequences.items())
@@ -225,7 +231,7 @@ def _loaded(
     real: type,
     reference: type,
 ) -> AbstractContextManager[Code]:
-    sizes = (3 * found.n_patches, len(found.channels.link), int(found.taps.sample.max()) + 1)
+    sizes = (3 * found.n_patches, len(found.channels.names), int(found.taps.sample.max()) + 1)
     return compiled(source, name, compiler, real, reference, sizes)
 
 
@@ -236,7 +242,7 @@ def _hard(found: FixedController, reference: LoopRun) -> dict[str, np.ndarray]:
 
 
 def _replayed(found: FixedController, codes: np.ndarray) -> np.ndarray:
-    return np.asarray(replay(found.controller, n_channels(found.structure), codes))
+    return np.asarray(replay(found.controller, codes))
 
 
 def _compare(what: str, found: np.ndarray, wanted: np.ndarray, allowed: float) -> Check:
@@ -346,14 +352,14 @@ def _check_shaper(found: FixedController, code: Code) -> Check:
 
 
 def _check_error(
-    found: FixedController, fixed: FixedPoint, reference: LoopRun, response: Response
+    found: FixedController, fixed: FixedPoint | FixedBlocks, reference: LoopRun, response: Response
 ) -> Check:
     """Fixed point against the JAX controller on the same codes, with the allowed difference.
 
     Where rivals are so close that rounding decides which of them acts, no bound holds; such samples
     are left out and must be few.
     """
-    volts = (response.codes - fixed.dac_rest) * fixed.dac_step
+    volts = (response.codes - fixed.wires.dac_rest) * fixed.wires.dac_step
     each = np.abs(volts - reference.voltage)
     if fixed.energy is not None:
         is_other = np.any(each > fixed.error.total * (1 + 1e-9), axis=(1, 2))
@@ -367,10 +373,10 @@ def _check_error(
     difference = each.max(axis=0)
     bound, reason = fixed.error.total, "rounding of the DAC, and inside"
     peak = np.abs(reference.voltage).max()
-    limit = fixed.dac_step * (fixed.dac_rest - 1)
-    is_bounded = peak < limit * (1 - 1e-9) or fixed.feedthrough is None
+    limit = fixed.wires.dac_step * (fixed.wires.dac_rest - 1)
+    is_bounded = peak < limit * (1 - 1e-9) or fixed.wires.feedthrough is None
     if not is_bounded or not np.all(np.isfinite(bound)):
-        bound = np.full_like(bound, 0.01 * peak + 2 * fixed.dac_step)
+        bound = np.full_like(bound, 0.01 * peak + 2 * fixed.wires.dac_step)
         reason = "1 % and two steps of the DAC: its rounding comes back by feed-through"
     worst = np.unravel_index(np.argmax(difference / bound), bound.shape)
     return Check(

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxmodel import status
 from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
 from jaxmodel.kinematics import lift, path_status
@@ -21,9 +22,10 @@ from jaxmodel.prepare import prepare
 from jaxmodel.response import BenchPlant, bench_plant, held_modes
 from studies.engine.program import Place
 from studies.engine.runs import check_pose
-from studies.errors import field_error
-from studies.fitting.signals import Signal
+from studies.errors import StudyError, field_error
 from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.labels import describe
+from studies.study.signals import Signal
 from studies.study.spec import Study
 
 Pose = tuple[float, float, float]
@@ -141,7 +143,11 @@ class Bench:
         check_pose(self.study, path, pose, int(code), np.asarray(lifts))
 
     def plant(self, pose: Pose, values: np.ndarray, has_slopes: bool) -> PlantAt:
-        """The plant at a pose for some values of the free numbers, (p,)."""
+        """The plant at a pose for some values of the free numbers, (p,).
+
+        Raises:
+            StudyError: the machine with these numbers does not reach it.
+        """
         key = values.tobytes()
         for slopes in (True, False)[: 1 if has_slopes else 2]:
             known, plant = self._kept.get((pose, slopes), (b"", None))
@@ -149,18 +155,24 @@ class Bench:
                 return plant
         given = self.structure, self.place, self.case, np.array(pose), values
         slope, value = _plant_slopes(*given) if has_slopes else (None, _plant(*given))
-        found = PlantAt(*jax.tree.map(np.asarray, (value, slope)))
+        (value, code), slope = jax.tree.map(np.asarray, (value, slope))
+        _check_reached(code, pose)
+        found = PlantAt(value, slope)
         self._kept[pose, has_slopes] = key, found
         return found
 
     def many(self, values: np.ndarray) -> list[dict[Pose, PlantAt]]:
-        """Plants at `poses` for many values of the free numbers, (n, p), without derivatives."""
+        """Plants at `poses` for many values of the free numbers, (n, p), without derivatives.
+
+        Poses out of reach are left out.
+        """
         found: list[dict[Pose, PlantAt]] = [{} for _ in values]
         for pose in self.poses:
             whole = _plant_batch(self.structure, self.place, self.case, np.array(pose), values)
             whole = jax.tree.map(np.asarray, whole)
-            for k, one in enumerate(found):
-                one[pose] = PlantAt(jax.tree.map(lambda x, k=k: x[k], whole), None)
+            whole, codes = whole
+            for k in np.flatnonzero(codes == status.OK):  # the others are refused when needed
+                found[k][pose] = PlantAt(jax.tree.map(lambda x, k=k: x[k], whole), None)
         return found
 
     def keep(self, values: np.ndarray, plants: dict[Pose, PlantAt]) -> None:
@@ -173,6 +185,17 @@ class Bench:
         given = self.structure, self.place, self.case, values
         slope, value = _held_slopes(*given) if has_slopes else ((), _held(*given))
         return [np.asarray(x) for x in (*value, *slope)]
+
+
+def _check_reached(code: np.ndarray, pose: Pose) -> None:
+    """Refuse a plant at a pose that the machine with these numbers does not reach.
+
+    Raises:
+        StudyError: naming the pose.
+    """
+    if int(code) != status.OK:
+        at = ", ".join(f"{x:.6g}" for x in pose)
+        raise StudyError(f"{describe(int(code))} at ({at}) m, m, rad with the numbers tried")
 
 
 def with_slopes(
@@ -199,8 +222,13 @@ def _reach(structure: Structure, case: Case, pose: Array) -> tuple[Array, Array]
     return path_status(plant, pose[None])[0], lift(plant, pose)
 
 
-def _at(structure: Structure, place: Place, case: Case, pose: Array, values: Array) -> BenchPlant:
-    return bench_plant(structure, place(case, values), pose)
+def _at(
+    structure: Structure, place: Place, case: Case, pose: Array, values: Array
+) -> tuple[BenchPlant, Array]:
+    """The plant, and whether the pose is reached: kinematics are finite everywhere."""
+    placed = place(case, values)
+    plant = prepare(structure, placed).loop.plant
+    return bench_plant(structure, placed, pose), path_status(plant, pose[None])[0]
 
 
 def _one_held(structure: Structure, place: Place, case: Case, values: Array) -> tuple[Array, Array]:
@@ -208,7 +236,7 @@ def _one_held(structure: Structure, place: Place, case: Case, values: Array) -> 
 
 
 _plant = jax.jit(_at, static_argnums=(0, 1))
-_plant_slopes = jax.jit(with_slopes(_at, 4), static_argnums=(0, 1))
+_plant_slopes = jax.jit(with_slopes(_at, 4, is_first=True), static_argnums=(0, 1))
 _held = jax.jit(_one_held, static_argnums=(0, 1))
 _held_slopes = jax.jit(with_slopes(_one_held, 3), static_argnums=(0, 1))
 
@@ -216,7 +244,7 @@ _held_slopes = jax.jit(with_slopes(_one_held, 3), static_argnums=(0, 1))
 @partial(jax.jit, static_argnums=(0, 1))
 def _plant_batch(
     structure: Structure, place: Place, case: Case, pose: Array, values: Array
-) -> BenchPlant:
+) -> tuple[BenchPlant, Array]:
     return jax.vmap(partial(_at, structure, place, case, pose))(values)
 
 

@@ -19,8 +19,8 @@ from jaxmodel.beam import BASES
 from studies.errors import StudyError
 from studies.fitting.bench import Bench, Modes, PlantAt, Pose, response
 from studies.fitting.kinds.modes import mode_slopes
-from studies.fitting.signals import Signal, signal_name
 from studies.space.free import FreeNumbers
+from studies.study.signals import Signal, signal_name
 
 #: Noise of the responses: share of the value, and of the largest value.
 RELATIVE, FLOOR = 0.02, 0.002
@@ -57,7 +57,11 @@ def next_experiments(
     values, slopes = free.values(u), free.slopes(u)
     found = []
     for pose in _poses(bench):
-        for text, slope in _candidates(bench, bench.plant(pose, values, True)):
+        try:
+            plant = bench.plant(pose, values, True)
+        except StudyError:  # the fitted machine does not reach it
+            continue
+        for text, slope in _candidates(bench, plant):
             by = slope * slopes
             after = np.linalg.inv(known + (by.conj().T @ by).real)
             found.append(Experiment(pose, text, float(np.sqrt(np.linalg.eigvalsh(after)[-1]))))

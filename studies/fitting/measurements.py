@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import polygamma
 
 from jaxmodel.metrics import METRICS
 from studies.errors import StudyError, field_error
@@ -18,7 +17,6 @@ from studies.fitting.kinds.modes import HeldModes, MachineModes, Measured, check
 from studies.fitting.kinds.motions import OFF, Motions
 from studies.fitting.kinds.response import ComplexResponse, Magnitude, Spectrum
 from studies.fitting.kinds.traces import Band, Settling, Trace
-from studies.fitting.signals import INPUTS, OUTPUTS, Signal, parse_signal
 from studies.fitting.spec import (
     AtPose,
     Common,
@@ -37,7 +35,10 @@ from studies.fitting.tables import column, read_columns
 from studies.study.cases import build_structure
 from studies.study.consistency import each_link
 from studies.study.entries import entry_sizes, parse_entries
+from studies.study.signals import INPUTS, OUTPUTS, Signal, parse_signal
 
+#: Shapes whose largest voltage is below this have no direction [V].
+SMALLEST = 1e-100
 #: Derivatives of the output by its quantity.
 ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 
@@ -140,7 +141,7 @@ def _modes(spec: FitSpec, models: Models, entry: ModesEntry, path: str) -> Measu
             )
         shapes = np.array(entry.shapes, complex)
         largest = np.abs(shapes).max(axis=1, keepdims=True)
-        if not np.all(largest > 0):
+        if not np.all(largest > SMALLEST):
             raise StudyError(f"{path}.shapes: one of them is zero")
         shapes = shapes / largest
     measured = Measured(
@@ -252,6 +253,7 @@ def _spectrum(spec: FitSpec, models: Models, entry: SpectrumEntry, path: str) ->
             f"{path}: column {entry.density!r} has values that are not positive; in dB?"
         )
     return Spectrum(
+        entry.averages,
         entry.name,
         entry.check,
         models.bench,
@@ -260,7 +262,7 @@ def _spectrum(spec: FitSpec, models: Models, entry: SpectrumEntry, path: str) ->
         ORDERS[entry.quantity],
         frequency,
         density,
-        Noise(float(np.sqrt(polygamma(1, entry.averages))), 0.0),  # of its logarithm
+        Noise(0.0, 0.0),
         "any",
     )
 

@@ -25,8 +25,8 @@ BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#999999"
 
 def all_figures(found: Fitted) -> Iterator[tuple[str, Figure]]:
     """Names and figures."""
-    lines = [(x.title, x.part) for x in found.comparisons if isinstance(x.part, Line)]
-    single = [(x.title, x.part) for x in found.comparisons if isinstance(x.part, Numbers)]
+    lines = [(_plain(x.title), x.part) for x in found.comparisons if isinstance(x.part, Line)]
+    single = [(_plain(x.title), x.part) for x in found.comparisons if isinstance(x.part, Numbers)]
     if lines:
         yield "fit", curves(lines[:MOST])
     if single:
@@ -37,6 +37,11 @@ def all_figures(found: Fitted) -> Iterator[tuple[str, Figure]]:
         yield "profiles", profiles(found)
     if found.posterior is not None and len(found.names) > 1:
         yield "samples", samples(found.posterior.values, found.names)
+
+
+def _plain(text: str) -> str:
+    """A user's text, which is no formula."""
+    return "".join(x for x in text.replace("$", r"\$") if x.isprintable())
 
 
 def curves(shown: Sequence[tuple[str, Line]]) -> Figure:

@@ -18,6 +18,8 @@ from studies.fitting.statistics import Answer
 
 #: Chains; steps that are thrown away while their length adapts: this share, and this many at least.
 CHAINS, WARM_UP, WARM_STEPS = 4, 0.25, 50
+#: Least eigenvalue of a precision over its largest [1].
+NARROW = 1e-14
 #: Share of steps that are best accepted [1] (Roberts and Rosenthal 1998).
 ACCEPTED = 0.574
 
@@ -68,7 +70,9 @@ def shape(answer: Answer) -> Shape:
     # the second derivatives of u by v, times the slope of the cost by u, which the width balances
     bend = (1 - 2 * u) ** 2 + 2 * width
     precision = width[:, None] * answer.information * width + np.diag(bend)
-    return Shape(middle, np.linalg.cholesky(np.linalg.inv(precision)))
+    size, axes = np.linalg.eigh(precision)
+    size = np.maximum(size, NARROW * size.max())  # beyond the digits there are
+    return Shape(middle, axes / np.sqrt(size))
 
 
 def _log_width(v: np.ndarray) -> np.ndarray:

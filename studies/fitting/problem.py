@@ -77,7 +77,7 @@ class Problem(NamedTuple):
 
 def softened(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Residuals whose squares are the loss 2 C^2 (sqrt(1 + (r/C)^2) - 1), and their derivatives."""
-    root = np.sqrt(1 + (r / SOFT) ** 2)
+    root = np.hypot(1.0, r / SOFT)
     # sqrt(1 + x) - 1 without cancellation
     value = r * np.sqrt(2 / (root + 1))
     is_small = np.abs(r) < 1e-8

@@ -76,9 +76,13 @@ def profile(problem: Problem, u: np.ndarray, number: int, sigma: float) -> Likel
             found.append((float(at[number]), rise))
             if rise > ENOUGH or not 0 < at[number] < 1:
                 break
-    found.sort()
-    values = [problem.free.values(_with(u, number, x))[number] for x, _ in found]
-    return Likelihood(number, np.array(values), np.array([x for _, x in found]))
+    # bounds may be closer than the values' digits tell apart
+    by_value = {
+        float(problem.free.values(_with(u, number, x))[number]): rise
+        for x, rise in sorted(found, key=lambda one: -abs(one[1]))
+    }
+    values = np.array(sorted(by_value))
+    return Likelihood(number, values, np.array([by_value[x] for x in values]))
 
 
 def _with(u: np.ndarray, number: int, x: float) -> np.ndarray:

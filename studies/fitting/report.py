@@ -127,6 +127,7 @@ def sentences(found: Fitted) -> list[str]:
     if not answer.undetermined:
         lines += _correlated(found)
     lines += _at_bounds(found)
+    lines += [cell(x) + "." for x in found.unpredicted]
     if found.fault:
         lines.append(f"The fitted study does not run as it is: {found.fault}.")
     if found.posterior is not None and not found.posterior.is_settled:
@@ -177,17 +178,25 @@ def undetermined(found: Fitted) -> list[str]:
         groups.append((names, members))
     lines = []
     for names, members in groups:
-        if len(members) == 1 or len(names) == len(members):
-            lines += [told(x, found.names) for x in members]
+        if len(members) == 1:
+            lines.append(told(members[0], found.names))
             continue
-        listed = [found.names[k] for k in sorted(names)]
+        if len(names) == len(members):
+            lines.append(f"{_listed(found, names)} are not determined by these data.")
+            continue
         count = len(names) - len(members)
         lines.append(
-            f"{', '.join(listed[:-1])} and {listed[-1]} cannot be told apart by these data, which "
+            f"{_listed(found, names)} cannot be told apart by these data, which "
             f"determine {count} combination{'s' if count > 1 else ''} of these {len(names)} "
             f"numbers. Fix {len(members)} of them, or state what is known by mean and sigma."
         )
     return lines
+
+
+def _listed(found: Fitted, names: set[int]) -> str:
+    """ "a, b and c"."""
+    every = [found.names[k] for k in sorted(names)]
+    return f"{', '.join(every[:-1])} and {every[-1]}"
 
 
 def told(direction: Direction, names: tuple[str, ...]) -> str:

@@ -13,12 +13,12 @@ from studies.engine.runs import check_run, run_attributes
 from studies.errors import StudyError
 from studies.fitting import plots
 from studies.fitting.experiment import Experiment, next_experiments
-from studies.fitting.kinds.contract import DataAndModel, Line
+from studies.fitting.kinds.contract import DataAndModel, Line, Measurement
 from studies.fitting.measurements import guess, make_bench, make_measurements
 from studies.fitting.posterior import Posterior, load_blackjax, sample, shape
 from studies.fitting.problem import Problem, complaints
 from studies.fitting.profiles import Likelihood, profile
-from studies.fitting.report import report, summary
+from studies.fitting.report import is_good, report, sentences, summary
 from studies.fitting.solve import Solution, solve
 from studies.fitting.spec import FitSpec
 from studies.fitting.statistics import Answer, Misfit, describe_fit, misfit
@@ -48,6 +48,7 @@ class Fitted(NamedTuple):
     study: Study  # with the fitted numbers
     comparisons: tuple[DataAndModel, ...]  # of all measurements
     checks: tuple[Misfit, ...]  # of those held out
+    unpredicted: tuple[str, ...]  # why others held out are not among them
     profiles: tuple[Likelihood, ...]
     posterior: Posterior | None  # if samples were asked for
     fault: str  # why the fitted study does not run, "" if it does
@@ -75,8 +76,8 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
         load_blackjax()
     bench = make_bench(spec)
     every = make_measurements(spec, bench)
-    complaints(every, guess(spec))
     kept = tuple(x for x in every if not x.is_checked)
+    complaints(kept, guess(spec))
     checks = [x for x in every if x.is_checked]
     problem = Problem(
         free=free,
@@ -86,13 +87,18 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
         is_robust=fit.loss == "robust",
     )
     u = free.places()
-    count = len(problem.residual(u)) - len(spec.priors)
+    first = problem.residual(u)
+    if not np.isfinite(np.sum(first**2)):
+        raise StudyError(
+            "fit.data: squared residuals of the first guess overflow; allowed: data and noise "
+            "within many orders of magnitude of the model"
+        )
+    count = len(first) - len(spec.priors)
     _check_enough(count, len(u), len(spec.priors))
     console.print(f"{count} measured numbers, {len(u)} free; rating {fit.starts} starts")
     solution = solve(problem, fit.starts, fit.refine, fit.iterations, fit.seed)
     answer = describe_fit(problem, solution.best.u)
-    for one in checks:
-        one.reweigh(answer.values)
+    checks, unpredicted = _predictable(checks, answer.values)
     profiles: list[Likelihood] = []
     if fit.profile and len(u) <= PROFILED:
         console.print("profiling the likelihood")
@@ -115,16 +121,34 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
         answer=answer,
         study=study,
         comparisons=tuple(
-            DataAndModel(x.name, x.is_checked, x.comparison(answer.values)) for x in every
+            DataAndModel(x.name, x.is_checked, x.comparison(answer.values))
+            for x in (*kept, *checks)
         ),
-        checks=tuple(
-            misfit(x.name, x.residual(answer.values, False), x.is_ordered) for x in checks
-        ),
+        checks=tuple(misfit(x, x.residual(answer.values, False)) for x in checks),
         profiles=tuple(profiles),
+        unpredicted=unpredicted,
         posterior=posterior,
         fault=_fault(study),
         experiments=tuple(experiments),
     )
+
+
+def _predictable(
+    checks: list[Measurement], values: np.ndarray
+) -> tuple[list[Measurement], tuple[str, ...]]:
+    """Held-out measurements that the fitted model predicts, and why it does not the others."""
+    kept, faults = [], []
+    for one in checks:
+        try:
+            fault = one.complaint(values)
+            one.reweigh(values)
+            one.residual(values, False)
+            kept.append(one)
+        except (StudyError, np.linalg.LinAlgError) as error:
+            fault = str(error).removeprefix(f"{one.name}: ")
+        if fault:
+            faults.append(f"{one.name} (held out): {fault}")
+    return kept, tuple(faults)
 
 
 def _fault(study: Study) -> str:
@@ -173,8 +197,11 @@ def run_fit(
             (staging / DOCUMENT).write_text(document(found), encoding="utf-8")
             write_store(staging / DATA, variables(found), run_attributes(found.study))
             write_report(staging, report(found), found.study)
-        for name in set(plots.NAMES) - set(drawn):  # of an earlier fit
-            (out / f"{name}.png").unlink(missing_ok=True)
+        for name in plots.NAMES:  # of an earlier fit
+            if name not in drawn:
+                (out / f"{name}.png").unlink(missing_ok=True)
+            if name not in drawn or not has_pdf:
+                (out / f"{name}.pdf").unlink(missing_ok=True)
     except OSError as error:
         raise StudyError(f"--out {out}: cannot write there ({error})") from error
     console.print(summary(found), soft_wrap=True)
@@ -261,7 +288,10 @@ def document(found: Fitted) -> str:
         "format": "flexlink-fit",
         "format_version": 1,
         "title": found.spec.study.title,
+        "is_good": bool(is_good(found)),
         "is_explained": bool(answer.is_explained),
+        "is_converged": bool(found.solution.best.is_converged),
+        "messages": sentences(found),
         "chi_square": answer.chi_square,
         "freedom": int(answer.freedom),
         "numbers": numbers,
@@ -269,6 +299,10 @@ def document(found: Fitted) -> str:
             {found.names[k]: float(x.parts[k]) for k in x.named()} for x in answer.undetermined
         ],
         "correlation": answer.correlation.tolist(),
+        "held_out": [
+            {"name": x.name, "numbers": x.size, "chi_square": x.square, "is_noise": x.is_noise}
+            for x in found.checks
+        ],
     }
     return json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from studies.fitting.kinds.contract import Residual
+from studies.fitting.kinds.contract import Measurement, Residual
 from studies.fitting.problem import Problem
 
 #: Standard deviation of a number of which only the bounds are known [1].
@@ -98,7 +98,9 @@ def describe_fit(problem: Problem, u: np.ndarray) -> Answer:
     determined = sum(x.sigma <= UNKNOWN for x in directions)
     hidden = sum(x.n_hidden for x in problem.measurements)
     freedom = max(len(residual) - determined - hidden, 0)
-    square = float(np.sum(residual**2))
+    # of the residuals themselves, also where the fit softened them
+    sizes = [*(x.mean_square for x in problem.measurements), 1.0]  # the last of what is known
+    square = float(sum(np.sum(x.value**2) / size for x, size in zip(parts, sizes, strict=False)))
     return Answer(
         place=u,
         values=values,
@@ -110,8 +112,7 @@ def describe_fit(problem: Problem, u: np.ndarray) -> Answer:
         push=jacobian.T @ residual,
         directions=directions,
         misfits=tuple(
-            misfit(x.name, part, x.is_ordered)
-            for x, part in zip(problem.measurements, parts, strict=False)
+            misfit(x, part) for x, part in zip(problem.measurements, parts, strict=False)
         ),
         chi_square=square,
         freedom=freedom,
@@ -143,17 +144,17 @@ def _signed(parts: np.ndarray) -> np.ndarray:
     return parts * np.sign(parts[np.argmax(np.abs(parts))])
 
 
-def misfit(name: str, part: Residual, is_ordered: bool) -> Misfit:
-    """How well one measurement is met."""
-    r = part.value
+def misfit(one: Measurement, part: Residual) -> Misfit:
+    """How well a measurement is met."""
+    r = part.value / np.sqrt(one.mean_square)
     square, n = float(np.sum(r**2)), len(r)
     likeness = np.nan
-    if is_ordered and n > 10 and square > 0:
+    if one.is_ordered and n > 10 and square > 0:
         likeness = float(np.sum(r[1:] * r[:-1]) / square)
     is_white = np.isnan(likeness) or abs(likeness) < 4 / np.sqrt(n) or square < 0.25 * n
     is_small = chi2.sf(square, n) >= UNLIKELY / 10
     return Misfit(
-        name=name,
+        name=one.name,
         size=n,
         square=square,
         likeness=likeness,

@@ -12,6 +12,8 @@ from studies.errors import StudyError, field_error, nearest, shown
 
 #: Endings of the formats.
 FORMATS = (".csv", ".txt", ".h5", ".hdf5", ".uff", ".unv")
+#: Larger numbers are none that an instrument reads.
+LARGEST = 1e30
 #: Columns that a function of a UFF file becomes, by its abscissa: 18 frequency [Hz], else time [s].
 _FREQUENCY = 18
 
@@ -44,7 +46,9 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
     except (OSError, ValueError, KeyError, csv.Error) as error:
         raise StudyError(f"{path}: {where} cannot be read ({error})") from None
     if len({len(x) for x in found.values()}) != 1:
-        raise StudyError(f"{path}: {where} has columns of unequal length, or none")
+        lengths = sorted({len(x) for x in found.values()})
+        told = f"columns of {lengths[0]} to {lengths[-1]} rows" if lengths else "no columns"
+        raise StudyError(f"{path}: {where} has {told}; allowed: columns of one length")
     return found
 
 
@@ -53,7 +57,9 @@ def _fault(where: Path) -> str:
     try:
         if where.is_dir():
             return "a folder"
-        return "" if where.is_file() else "no such file"
+        if where.is_file():
+            return ""
+        return "no plain file" if where.exists() else "no such file"
     except OSError as error:
         return str(error.strerror)
 
@@ -82,6 +88,12 @@ def column(found: dict[str, np.ndarray], name: str, file: str, path: str) -> np.
         raise StudyError(
             f"{path}: {shown(file)}, column {name!r}: {bad.size} of {len(values)} entries are no "
             f"finite numbers, the first in row {bad[0] + 1}; delete these rows"
+        )
+    huge = np.flatnonzero(np.abs(values) > LARGEST)
+    if huge.size:
+        raise StudyError(
+            f"{path}: {shown(file)}, column {name!r}, row {huge[0] + 1}: {values[huge[0]]:g}; "
+            f"allowed: up to {LARGEST:g} in size"
         )
     return values
 
@@ -146,5 +158,8 @@ def _from_uff(where: Path, number: str, path: str) -> dict[str, np.ndarray]:
         found = sets.read_sets(int(functions[index]))
     except Exception as error:  # of any kind, for a damaged file
         raise ValueError(str(error) or "damaged") from error
+    given, read = int(found.get("num_pts", len(found["data"]))), len(found["data"])
+    if given != read:
+        raise ValueError(f"promises {given} points and has {read}")
     abscissa = "frequency_hz" if found["abscissa_spec_data_type"] == _FREQUENCY else "time"
     return {abscissa: np.asarray(found["x"]), "value": np.asarray(found["data"])}

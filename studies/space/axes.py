@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxmodel.laws.state_space import STATE_SPACE
 from studies.errors import field_error, nearest, shown_name
 from studies.study.consistency import each_link, patch_centers, patch_pitch
 from studies.study.fields import Columns
@@ -137,7 +138,7 @@ def column_of(values: list[Any]) -> np.ndarray:
 def _field_axis(name: str, written: Any, study: Study, path: str) -> Axis:
     base = known_field(name, study, path, READY_MADE)
     if written == "all":
-        written = _every_choice(name, base, path)
+        written = _every_choice(name, base, path, study)
     if isinstance(written, dict):
         return _range_axis(name, base, parse_range(written, path), study, path)
     if not isinstance(written, list) or not written:
@@ -151,11 +152,13 @@ def _field_axis(name: str, written: Any, study: Study, path: str) -> Axis:
 _WRITTEN = "a list of values, a range {from = ..., to = ..., count = ..., scale = ...}, or 'all'"
 
 
-def _every_choice(name: str, base: Any, path: str) -> list[Any]:
-    """All values of a choice or a switch."""
-    choices = field_choices(name)
+def _every_choice(name: str, base: Any, path: str, study: Study) -> list[Any]:
+    """All values of a choice or a switch; laws without the file that they need are none."""
+    choices = list(field_choices(name))
+    if name == "control.law" and not study.state_space.c:
+        choices.remove(STATE_SPACE.name)
     if choices:
-        return list(choices)
+        return choices
     if isinstance(base, bool):
         return [False, True]
     raise field_error(path, "all", "'all' for a choice or a switch only; " + _WRITTEN)

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
-from jaxmodel.controller import Controller
+from jaxmodel.controller import Controller, with_gains
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law, as_modal
 from jaxmodel.laws.imsc import IMSC
@@ -37,11 +37,7 @@ class Candidate(NamedTuple):
 
     def at(self, factor: float) -> Controller:
         """All gains times a factor."""
-        law = self.controller
-        assert law.position_gain is not None
-        return law._replace(
-            velocity_gain=factor * law.velocity_gain, position_gain=factor * law.position_gain
-        )
+        return with_gains(self.controller, factor)
 
 
 def all_laws(found: FixedController, maker: LoopMaker, plant: PlantVariant) -> list[Candidate]:
@@ -56,6 +52,12 @@ def all_laws(found: FixedController, maker: LoopMaker, plant: PlantVariant) -> l
         StudyError: velocity gains that do not damp mode 1, so nothing to compare strength by.
     """
     control, given = found.study.control, found.controller
+    own_law = LAWS[control.law]
+    channels = {name: law for name, law in LAWS.items() if law.channel != "none"}
+    if own_law.name not in channels:
+        raise field_error(
+            "control.law", control.law, f"{', '.join(channels)}, to compare laws of equal strength"
+        )
 
     def strength(law: Controller) -> np.ndarray:
         """Damping constant that a law gives mode 1 of each link [N s/m], (3,)."""
@@ -93,7 +95,7 @@ def all_laws(found: FixedController, maker: LoopMaker, plant: PlantVariant) -> l
     own = {control.law: given, IMSC.name: modal}
     return [
         Candidate(law, _even(own[name] if name in own else as_strong(law), found.n_patches))
-        for name, law in LAWS.items()
+        for name, law in channels.items()
     ]
 
 

@@ -26,10 +26,13 @@ from jaxmodel.case import (
 )
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law
+from jaxmodel.laws.state_space import STATE_SPACE
 from jaxmodel.parameters import ASSEMBLIES, Beam, Damping, Geometry, Machine, Masses, Patches
+from jaxmodel.state_space import StateSpace
 from studies.study.consistency import patch_centers
 from studies.study.fields import Columns, Fields
 from studies.study.spec import OWN_FIELDS, Study
+from studies.study.state_space import system_of
 
 TWO_PI = 2 * np.pi
 #: Duration of a move that only pads a path with fewer moves [s].
@@ -239,7 +242,15 @@ def _control(fields: Fields, structure: Structure) -> Control:
         is_per_mass=fields.choices("control.gain_unit", ("N s/m", "1/s")).astype(float),
         feedthrough_factor=number("control.feedthrough_factor"),
         parameters=_parameters(fields, LAWS[structure.law]),
+        system=_system(fields.study, structure),
     )
+
+
+def _system(study: Study, structure: Structure) -> StateSpace | None:
+    if structure.law != STATE_SPACE.name:
+        return None
+    system = system_of(study.state_space, structure.n_patches)
+    return jax.tree.map(lambda x: x[None], system)
 
 
 def _parameters(fields: Fields, law: Law) -> dict[str, np.ndarray]:

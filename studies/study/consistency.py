@@ -11,6 +11,7 @@ from jaxmodel.beam import BASES
 from jaxmodel.laws import LAWS
 from jaxmodel.piezo import VACUUM_PERMITTIVITY
 from studies.errors import field_error, nearest
+from studies.study.state_space import check_system
 
 if TYPE_CHECKING:
     from studies.study.spec import Study
@@ -60,6 +61,11 @@ def check_consistency(study: Study) -> None:
             f"1 to {n_patches}, the number of patch pairs of a link",
             "1",
         )
+    if LAWS[control.law].channel == "none" and control.feedback == "ideal":
+        raise field_error(
+            "control.feedback", "ideal", f"'sampled' or 'none' with control.law = {control.law!r}"
+        )
+    check_system(study, n_patches)
     _check_lists(study)
     _check_own_fields(study)
     _check_basis(study)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from studies.errors import StudyError, field_error, nearest, shown
+from studies.study.state_space import with_matrices
 
 #: Folder of the package's ready-made files, available by name.
 READY = Path(__file__).parents[1] / "specs"
@@ -45,7 +46,7 @@ def ready_text(name: str) -> str:
 
 
 def read_toml(name: str | Path) -> dict[str, Any]:
-    """A TOML file, found by `find_spec`, as a dictionary.
+    """A TOML file, found by `find_spec`, as a dictionary; a controller's file is put in.
 
     Raises:
         StudyError: not found, unreadable or not TOML.
@@ -57,6 +58,7 @@ def read_toml(name: str | Path) -> dict[str, Any]:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise StudyError(f"study file {path}: cannot be read ({reason})") from None
     try:
-        return tomllib.loads(text)
+        data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # ValueError: also a number of 5000 digits
         raise StudyError(f"study file {path}: not valid TOML ({error})") from None
+    return with_matrices(data, path.parent)

@@ -23,6 +23,7 @@ from studies.study.choices import OWN, OneOf
 from studies.study.consistency import check_consistency
 from studies.study.explain import explain
 from studies.study.files import READY, read_toml
+from studies.study.state_space import with_matrices
 
 #: Where laws' own fields are.
 OWN_FIELDS = "control.laws"
@@ -42,6 +43,7 @@ Pause = Annotated[float, Field(ge=0, le=100)]
 Degrees = Annotated[float, Field(ge=-360, le=360)]
 Offset = Annotated[float, Field(ge=-1, le=1)]
 Flags = tuple[bool, bool, bool]
+Matrix = tuple[tuple[float, ...], ...]
 Number = TypeVar("Number")
 #: One number for all links, or one for each.
 EachLink: TypeAlias = Number | tuple[Number, Number, Number]
@@ -266,6 +268,22 @@ class ControlSection(Section):
     )
 
 
+class StateSpaceSection(Section):
+    """Your own controller for control.law = 'state_space': x_(k+1) = A x + B y, u = C x + D y."""
+
+    # y: sensor voltages; u: actuator voltages, which go out one sample later
+    file: str = described("", "-", "JSON, NPZ or MAT with A, B, C, D and dt, beside this file")
+    sample_time: float = described(0.0, "s", "which must be the machine's", ge=0, le=1)
+    a: Matrix = described((), "1", "A; a field replaces the file")
+    b: Matrix = described((), "1/V", "B")
+    c: Matrix = described((), "V", "C")
+    d: Matrix = described((), "1", "D; empty: 0")
+    inputs: tuple[str, ...] = described(
+        (), "-", "sensors, 'sensor LINK.PATCH'; empty: all, or those of a link for each link"
+    )
+    outputs: tuple[str, ...] = described((), "-", "actuators, 'actuator LINK.PATCH'; the same")
+
+
 class ElectronicsSection(Section):
     """Sampling, converters, velocity estimate."""
 
@@ -399,6 +417,7 @@ class Study(Section):
     motion: MotionSection = MotionSection()
     shaper: ShaperSection = ShaperSection()
     control: ControlSection = ControlSection()
+    state_space: StateSpaceSection = StateSpaceSection()
     electronics: ElectronicsSection = ElectronicsSection()
     drive: DriveSection = DriveSection()
     load: LoadSection = LoadSection()
@@ -432,7 +451,7 @@ def parse_study(data: dict[str, Any]) -> Study:
     """
     if not isinstance(data, dict):
         raise field_error("study", data, "a table of sections")
-    data = {name: _plain(value) for name, value in data.items()}
+    data = with_matrices({name: _plain(value) for name, value in data.items()}, Path())
     try:
         study = Study.model_validate(data)
     except ValidationError as error:

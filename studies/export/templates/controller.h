@@ -1,4 +1,4 @@
-{% set kinds = "patches" if channels.kind == "patch" else "modes" %}
+{% set kinds = "patches" if channels and channels.kind == "patch" else "modes" %}
 /* Vibration controller of a planar 3-PRR robot with flexible links.
  *
 {% for line in origin %}
@@ -18,10 +18,10 @@
  *   - a bias of {{ electronics.conditioner_bias | short(6) }} V at the ADC;
  *   - an ADC of {{ electronics.adc_bits }} bits for 0 to {{ electronics.adc_range | short(6) }} V.
 {% if fixed %}
- * Sensors: codes of the ADC, 0 to {{ fixed.adc_top }}. A sensor is faulty if its code is too
+ * Sensors: codes of the ADC, 0 to {{ fixed.wires.adc_top }}. A sensor is faulty if its code is too
  * high, or too long at one end of the range.
- * Actuators: codes of the DAC, 1 to {{ 2 * fixed.dac_rest - 1 }}, which span
- * +-{{ electronics.voltage_limit | short(6) }} V at the piezo patch; {{ fixed.dac_rest }} is 0 V.
+ * Actuators: codes of the DAC, 1 to {{ 2 * fixed.wires.dac_rest - 1 }}, which span
+ * +-{{ electronics.voltage_limit | short(6) }} V at the piezo patch; {{ fixed.wires.dac_rest }} is 0 V.
 {% else %}
  * Sensors: volts at the ADC's input, the code times {{ NAME }}_ADC_STEP; conditioner gain and
  * bias are removed here. A sensor is faulty if it is NaN or out of range, or too long at one end
@@ -52,15 +52,19 @@ typedef {{ NAME }}_REAL {{ name }}_real;
 #define {{ NAME }}_N_LINKS 3
 #define {{ NAME }}_N_PATCHES {{ n_patches }}
 #define {{ NAME }}_N_CHANNELS {{ 3 * n_patches }}
+{% if blocks %}
+#define {{ NAME }}_N_STATES {{ blocks.names | length }} /* of all systems */
+{% else %}
 #define {{ NAME }}_N_MODES {{ channels.link | length }} /* controlled {{ kinds }} of all links */
+{% endif %}
 #define {{ NAME }}_SAMPLE_RATE {{ exact(electronics.sample_rate_hz) }} /* Hz */
 #define {{ NAME }}_RAIL_SAMPLES {{ rail }} /* {{ rail_ms }} ms at one end: a faulty sensor */
 #define {{ NAME }}_SETTLE_SAMPLES {{ settle }} /* until 99.99 % of the initial transient has decayed */
 #define {{ NAME }}_SHAPER_LENGTH {{ shaper_length }} /* samples stored by the shaper */
 {% if fixed %}
-#define {{ NAME }}_ADC_TOP {{ fixed.adc_top }} /* highest code */
-#define {{ NAME }}_DAC_REST {{ fixed.dac_rest }} /* code of 0 V */
-#define {{ NAME }}_DAC_STEP {{ exact(fixed.dac_step) }} /* V per code at the patch */
+#define {{ NAME }}_ADC_TOP {{ fixed.wires.adc_top }} /* highest code */
+#define {{ NAME }}_DAC_REST {{ fixed.wires.dac_rest }} /* code of 0 V */
+#define {{ NAME }}_DAC_STEP {{ exact(fixed.wires.dac_step) }} /* V per code at the patch */
 {% else %}
 #define {{ NAME }}_ADC_TOP {{ controller.adc_top | int }} /* highest code */
 #define {{ NAME }}_ADC_STEP {{ exact(controller.adc_step) }} /* V per code */
@@ -69,8 +73,12 @@ typedef {{ NAME }}_REAL {{ name }}_real;
 
 /* State of the controller. */
 typedef struct {
+    {% if blocks %}
+    {{ word }} x[{{ NAME }}_N_STATES]; /* pairs that turn together */
+    {% else %}
     {{ word }} high[{{ NAME }}_N_MODES]; /* memory of the first section */
     {{ word }} line[{{ NAME }}_N_MODES][2]; /* delay line of the second section */
+    {% endif %}
     {% if has_feedthrough %}
     {{ word }} command[{{ NAME }}_N_CHANNELS]; /* on the actuators now */
     {% endif %}

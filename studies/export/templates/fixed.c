@@ -14,7 +14,7 @@
  * word has room for `room` times that, and ADC codes can produce at most `reach` times that. A
  * coefficient from signal a to signal b, in SI units, is
  * integer / 2^shift * (base_b / 2^Q_b) / (base_a / 2^Q_a); one ADC code is {{ code | short(9) }} V
- * at a sensor, one DAC code {{ fixed.dac_step | short(9) }} V at an actuator.
+ * at a sensor, one DAC code {{ fixed.wires.dac_step | short(9) }} V at an actuator.
  *
 {% for line in formats %}
  * {{ line }}
@@ -27,21 +27,36 @@
 
 {{ shared.structure() }}
 
+{% if not blocks %}
 /* first mode of each link, and the end; control */
 static const uint16_t FIRST_MODE{{ array(first_mode) }};
 
+{% endif %}
 /* [code] highest one; adc_bits */
-static const uint16_t ADC_TOP = {{ fixed.adc_top }};
+static const uint16_t ADC_TOP = {{ fixed.wires.adc_top }};
 
 /* [count] of a sensor per code; adc_bits */
-static const int32_t ADC_UNIT = {{ 2 ** fixed.adc_bits }};
+static const int32_t ADC_UNIT = {{ 2 ** fixed.wires.adc_bits }};
 
 /* [count] sensor at rest; conditioner_bias */
-static const int64_t BIAS = {{ fixed.bias }};
+static const int64_t BIAS = {{ fixed.wires.bias }};
 
 /* [code] of 0 V at an actuator; the DAC's bits */
-static const int32_t DAC_REST = {{ fixed.dac_rest }};
+static const int32_t DAC_REST = {{ fixed.wires.dac_rest }};
 
+{% if blocks %}
+/* [state/state] two of the pair, then [state/sensor] of the system's sensors; control.law */
+static const int32_t ADVANCE{{ array(advance, blocks.names) }};
+
+/* [bit] of each row */
+static const uint16_t ADVANCE_SHIFT{{ array(advance_shift) }};
+
+/* [code/state] of the system's states, then [code/sensor] of its sensors, for each actuator */
+static const int32_t LEAVE{{ array(leave, port_names) }};
+
+/* [bit] of each row */
+static const uint16_t LEAVE_SHIFT{{ array(leave_shift) }};
+{% else %}
 /* [signal/sensor] modal filter pinv(lambda_s Phi_s^t); control.basis, patches */
 static const int32_t FILTER{{ array(fixed.filter.integers, channels.names) }};
 
@@ -74,6 +89,7 @@ static const int32_t SYNTHESIZER{{ array(synthesizer, channels.names) }};
 
 /* [bit] of each actuator */
 static const uint16_t SYNTHESIZER_SHIFT{{ array(fixed.synthesizer.shift.ravel()) }};
+{% endif %}
 
 {{ shared.taps("int32_t", weight) }}
 
@@ -89,7 +105,7 @@ static const int32_t ENERGY{{ array(energy, energy_names) }};
 /* [bit] of each row */
 static const uint16_t ENERGY_SHIFT{{ array(fixed.energy.shift.ravel()) }};
 {% endif %}
-{% if channels.has_direct %}
+{% if not blocks and channels.has_direct %}
 
 /* [force/signal] force past the filters, shifted as FORCE; control.position_gain */
 static const int32_t DIRECT{{ array(direct) }};
@@ -101,7 +117,7 @@ static const int32_t DIRECT{{ array(direct) }};
 static const int32_t FEEDTHROUGH{{ array(feedthrough, patches) }};
 
 /* [bit] of each row */
-static const uint16_t FEEDTHROUGH_SHIFT{{ array(fixed.feedthrough.shift.ravel()) }};
+static const uint16_t FEEDTHROUGH_SHIFT{{ array(fixed.wires.feedthrough.shift.ravel()) }};
 {% endif %}
 
 static int32_t limited(int64_t x)
@@ -149,12 +165,16 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
     uint16_t actuator[{{ NAME }}_N_CHANNELS])
 {
     int32_t sensed[{{ NAME }}_N_CHANNELS]; /* sensor signals */
+    {% if blocks %}
+    int64_t wanted[{{ NAME }}_N_CHANNELS]; /* codes, without limits */
+    {% else %}
     int32_t force[{{ NAME }}_N_MODES]; /* channel forces */
+    {% endif %}
     {% if fixed.energy %}
     int64_t energy[{{ NAME }}_N_MODES]; /* of the channels */
     {% endif %}
     int64_t sum;
-    int k, m, first;
+    int k, m{{ ", s" if blocks }}{{ ", first" if has_first }};
 
     if (!state->fault) {
         state->fault = check(state, sensor);
@@ -183,6 +203,47 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
         }
     }
     {% endif %}
+    {% if blocks %}
+    for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
+        wanted[k] = 0;
+        if (!IS_USED[k / {{ NAME }}_N_PATCHES]) {
+            sensed[k] = 0;
+        }
+    }
+    for (s = 0; s < N_SYSTEMS; s++) {
+        const int32_t *in = sensed + FIRST[s];
+        int32_t *x = state->x + s * ORDER;
+
+        for (k = 0; k < N_PORTS; k++) {
+            const int row = s * N_PORTS + k;
+
+            sum = 0;
+            for (m = 0; m < ORDER; m++) {
+                sum += (int64_t)LEAVE[row][m] * x[m];
+            }
+            for (m = 0; m < N_PORTS; m++) {
+                sum += (int64_t)LEAVE[row][ORDER + m] * in[m];
+            }
+            wanted[FIRST[s] + k] = shifted(sum, LEAVE_SHIFT[row]);
+        }
+        for (m = 0; m < ORDER; m += 2) {
+            int32_t next[2];
+
+            for (k = 0; k < 2; k++) {
+                const int row = s * ORDER + m + k;
+                int port;
+
+                sum = (int64_t)ADVANCE[row][0] * x[m] + (int64_t)ADVANCE[row][1] * x[m + 1];
+                for (port = 0; port < N_PORTS; port++) {
+                    sum += (int64_t)ADVANCE[row][2 + port] * in[port];
+                }
+                next[k] = limited(shifted(sum, ADVANCE_SHIFT[row]));
+            }
+            x[m] = next[0];
+            x[m + 1] = next[1];
+        }
+    }
+    {% else %}
     for (m = 0; m < {{ NAME }}_N_MODES; m++) {
         int32_t signal, high, inner;
         int32_t *line = state->line[m];
@@ -229,14 +290,19 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
         }
     }
     {% endif %}
+    {% endif %}
     for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
         int32_t command;
 
+        {% if blocks %}
+        command = limited(wanted[k]);
+        {% else %}
         sum = 0;
         for (m = FIRST_MODE[k / {{ NAME }}_N_PATCHES]; m < FIRST_MODE[k / {{ NAME }}_N_PATCHES + 1]; m++) {
             sum += (int64_t)SYNTHESIZER[m][k % {{ NAME }}_N_PATCHES] * force[m];
         }
         command = limited(shifted(sum, SYNTHESIZER_SHIFT[k]));
+        {% endif %}
         if (command > DAC_REST - 1) {
             command = DAC_REST - 1;
         } else if (command < 1 - DAC_REST) {

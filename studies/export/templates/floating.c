@@ -35,6 +35,19 @@ static const real CONDITIONER_GAIN = {{ real(controller.adc_gain) }};
 /* [V] of every actuator, +-; voltage_limit */
 static const real LIMIT = {{ real(controller.voltage_limit) }};
 
+{% if blocks %}
+/* [1] of the pair's two states, row by row; control.law */
+static const real STATE{{ array(state_rows, blocks.names) }};
+
+/* [1] of the system's sensors, per volt */
+static const real ENTER{{ array(enter_rows, blocks.names) }};
+
+/* [1] of the system's states, for each of its actuators */
+static const real LEAVE{{ array(leave_rows, port_names) }};
+
+/* [1] of the system's sensors, for each of its actuators */
+static const real DIRECT{{ array(direct_rows, port_names) }};
+{% else %}
 /* [{{ "m/V" if is_modal else "1" }}] modal filter pinv(lambda_s Phi_s^t): signal per volt of each
  * sensor of the link; control.basis, patches */
 static const real FILTER{{ array(channels.filter, channels.names) }};
@@ -53,6 +66,7 @@ static const real FORCE{{ array(channels.force, channels.names) }};
 /* [{{ "V/N" if is_modal else "1" }}] voltage of each actuator of the link per force,
  * pinv(lambda_a Phi_a); control.basis, patches */
 static const real SYNTHESIZER{{ array(channels.synthesizer, channels.names) }};
+{% endif %}
 
 {{ shared.taps("real", weight) }}
 {% if has_rivals %}
@@ -65,7 +79,7 @@ static const real RATE{{ array(velocity, channels.names) }};
 /* [1/s] omega times modal position */
 static const real PLACE{{ array(position, channels.names) }};
 {% endif %}
-{% if channels.has_direct %}
+{% if not blocks and channels.has_direct %}
 
 /* [{{ force_unit }}] force past the filters; control.position_gain */
 static const real DIRECT{{ array(channels.direct) }};
@@ -115,7 +129,7 @@ int {{ name }}_step({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHAN
     {% if has_rivals %}
     real forces[{{ NAME }}_N_MODES], energy[{{ NAME }}_N_MODES]; /* of the channels */
     {% endif %}
-    int k, m, first;
+    int k, m{{ ", s" if blocks }}{{ ", first" if has_first }};
 
     if (!state->fault) {
         state->fault = check(state, sensor);
@@ -139,6 +153,39 @@ int {{ name }}_step({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHAN
         }
     }
     {% endif %}
+    {% if blocks %}
+    for (s = 0; s < N_SYSTEMS; s++) {
+        const real *in = volt + FIRST[s];
+        real *x = state->x + s * ORDER;
+
+        for (k = 0; k < N_PORTS; k++) {
+            real sum = 0;
+
+            for (m = 0; m < ORDER; m++) {
+                sum += LEAVE[s * N_PORTS + k][m] * x[m];
+            }
+            for (m = 0; m < N_PORTS; m++) {
+                sum += DIRECT[s * N_PORTS + k][m] * in[m];
+            }
+            wanted[FIRST[s] + k] = sum;
+        }
+        for (m = 0; m < ORDER; m += 2) {
+            real next[2];
+
+            for (k = 0; k < 2; k++) {
+                const int row = s * ORDER + m + k;
+                int port;
+
+                next[k] = STATE[row][0] * x[m] + STATE[row][1] * x[m + 1];
+                for (port = 0; port < N_PORTS; port++) {
+                    next[k] += ENTER[row][port] * in[port];
+                }
+            }
+            x[m] = next[0];
+            x[m + 1] = next[1];
+        }
+    }
+    {% else %}
     for (m = 0; m < {{ NAME }}_N_MODES; m++) {
         real signal = 0, high, inner, force{% if has_rivals %}, rate, place{% endif %};
         real *line = state->line[m];
@@ -183,6 +230,7 @@ int {{ name }}_step({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHAN
             wanted[first + k] += SYNTHESIZER[m][k] * forces[m];
         }
     }
+    {% endif %}
     {% endif %}
     for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
         if (wanted[k] > LIMIT) {

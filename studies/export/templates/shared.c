@@ -3,8 +3,18 @@
 /* 1: link is controlled; control.links */
 static const uint16_t IS_USED{{ array(is_used) }};
 
+{% if blocks %}
+/* systems, states of each, sensors and actuators of each; control.links */
+#define N_SYSTEMS {{ blocks.first | length }}
+#define ORDER {{ order }}
+#define N_PORTS {{ n_ports }}
+
+/* first sensor and actuator of each system */
+static const uint16_t FIRST{{ array(blocks.first) }};
+{%- else %}
 /* link of each controlled mode, from 0; control */
 static const uint16_t LINK{{ array(channels.link) }};
+{%- endif %}
 {%- endmacro %}
 
 {% macro taps(type, weight) %}
@@ -44,11 +54,17 @@ static void forget({{ name }}_state *state)
 {
     int k;
 
+    {% if blocks %}
+    for (k = 0; k < {{ NAME }}_N_STATES; k++) {
+        state->x[k] = 0;
+    }
+    {% else %}
     for (k = 0; k < {{ NAME }}_N_MODES; k++) {
         state->high[k] = 0;
         state->line[k][0] = 0;
         state->line[k][1] = 0;
     }
+    {% endif %}
     for (k = 0; k < {{ NAME }}_N_CHANNELS; k++) {
         {% if has_feedthrough %}
         state->command[k] = 0;

@@ -86,6 +86,7 @@ class Measurement(Protocol):
     is_checked: bool  # held out: not fitted, only compared
     is_ordered: bool  # neighbours in `residual` are neighbours in time or frequency
     n_hidden: int  # numbers that it fits by itself
+    mean_square: float  # of residuals that are noise [1]
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
         """At some values of the free numbers, (p,)."""

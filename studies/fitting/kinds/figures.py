@@ -102,6 +102,7 @@ class Figures:
     """Metrics of runs that differ in which links are controlled."""
 
     kind, is_ordered, n_hidden = "figures", False, 0
+    mean_square = 1.0
 
     def __init__(
         self, name: str, is_checked: bool, runs: Runs, compared: tuple[Compared, ...]

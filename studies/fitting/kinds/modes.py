@@ -49,6 +49,7 @@ class _Modes:
     """What measured modes share, however they are predicted."""
 
     kind, is_ordered, n_hidden = "modes", False, 0
+    mean_square = 1.0
 
     def __init__(self, name: str, is_checked: bool, bench: Bench, measured: Measured) -> None:
         self.name, self.is_checked = name, is_checked

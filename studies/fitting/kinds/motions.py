@@ -16,8 +16,8 @@ from studies.engine.program import Place
 from studies.engine.runs import check_run
 from studies.errors import StudyError
 from studies.fitting.bench import with_slopes
-from studies.fitting.signals import Signal
 from studies.study.labels import describe
+from studies.study.signals import Signal
 from studies.study.spec import Study
 
 #: No link under control.

@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.special import digamma
 
 from studies.fitting.bench import Bench, Pose, response
 from studies.fitting.kinds.contract import Line, Noise, Residual, scaled
-from studies.fitting.signals import Signal
+from studies.study.signals import Signal
 
 TWO_PI = 2 * np.pi
 #: A measured response this many times the model's at the first guess has another unit [1].
@@ -19,6 +20,7 @@ class _OfBench:
     """What responses and spectra share: one input, one output, one pose."""
 
     kind, is_ordered, n_hidden = "response", True, 0
+    mean_square = 1.0
 
     def __init__(
         self,
@@ -136,34 +138,50 @@ class Magnitude(_OfBench):
 class Spectrum(_OfBench):
     """Power spectrum of the output under a white input of unknown strength.
 
-    Its logarithm is compared, less the mean difference: the strength does not count.
+    The mean of n periodograms is gamma distributed about the model's. Half the squared residuals
+    add up to its negative log likelihood (Whittle): r = sign(x - 1) sqrt(2 n (x - 1 - ln x)) with
+    x = measured/(strength model), the strength being the likeliest, mean(measured/model).
     """
 
     kind, n_hidden = "spectrum", 1  # the strength of the input
 
-    def __init__(self, *arguments: Any) -> None:
+    def __init__(self, averages: int, *arguments: Any) -> None:
+        """Arguments: n; and those of a response, with any noise."""
         super().__init__(*arguments)
-        self.sigma = np.full(len(self.measured), self._noise.fixed)  # of the logarithm
+        self._averages = averages
+        self.mean_square = float(2 * averages * (np.log(averages) - digamma(averages)))
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
         found, slope = self.predicted(values, has_slopes)
-        away = 2 * np.log(np.abs(found)) - np.log(self.measured)
-        weight = 1 / self.sigma**2
-        weight = weight / weight.sum()
-        value = (away - weight @ away) / self.sigma
+        weight, away = self._shares(np.abs(found) ** 2)
+        root = np.sqrt(self._averages) * _half_deviance(away)  # over x - 1
         if slope is None:
-            return Residual(value, None)
+            return Residual(-away * root, None)
         by = 2 * (slope / found[:, None]).real
-        return Residual(value, (by - weight @ by) / self.sigma[:, None])
+        return Residual(-away * root, (self._averages / root)[:, None] * (by - weight @ by))
+
+    def _shares(self, model: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of each frequency in the strength, and x - 1, (f,)."""
+        ratio = self.measured / model
+        return ratio / ratio.sum(), ratio / ratio.mean() - 1
 
     def reweigh(self, values: np.ndarray) -> None:
-        pass  # logarithms have noise of one size
+        pass  # its noise follows from the averages
 
     def comparison(self, values: np.ndarray) -> Line:
         found = np.abs(self.predicted(values, False)[0]) ** 2
-        level = np.exp(np.mean(np.log(self.measured) - np.log(found)))
+        level = np.mean(self.measured / found)
         label = "power spectrum [any unit]"
         return self._line(label, self.measured, level * found, values)
 
     def complaint(self, values: np.ndarray) -> str:
         return ""  # any strength will do
+
+
+def _half_deviance(e: np.ndarray) -> np.ndarray:
+    """sqrt(2 (e - ln(1 + e)))/|e|, 1 at 0."""
+    is_small = np.abs(e) < 1e-3
+    large = np.where(is_small, 1.0, e)
+    series = 1 - 2 * e / 3 + e**2 / 2 - 2 * e**3 / 5
+    whole = 2 * (large - np.log1p(large)) / large**2
+    return np.sqrt(np.where(is_small, series, whole))

@@ -9,7 +9,7 @@ import numpy as np
 from studies.errors import StudyError
 from studies.fitting.kinds.contract import Line, Noise, Numbers, Residual, scaled
 from studies.fitting.kinds.motions import Motion, Recording
-from studies.fitting.signals import Signal
+from studies.study.signals import Signal
 
 #: A signal that moves less is at rest [its unit].
 STILL = 1e-15
@@ -21,6 +21,7 @@ class Trace:
     """One signal over time, compared at the times of the measurement."""
 
     kind, is_ordered, n_hidden = "trace", True, 0
+    mean_square = 1.0
 
     def __init__(
         self,
@@ -107,6 +108,7 @@ class Settling:
     """
 
     kind, is_ordered, n_hidden = "settling", False, 0
+    mean_square = 1.0
 
     def __init__(
         self,

@@ -1,0 +1,15 @@
+"""A controller from a file: any linear system from sensors to actuators."""
+
+from __future__ import annotations
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.laws.contract import Feedback, Known, Law, system_feedback
+
+
+def design(structure: Structure, case: Case, known: Known) -> Feedback:
+    """The given system."""
+    assert case.control.system is not None
+    return system_feedback(structure, case, case.control.system)
+
+
+STATE_SPACE = Law("state_space", "controller from a file", "none", design, has_position=False)

@@ -1,0 +1,164 @@
+"""Linear controllers of any order: x_(k+1) = A x_k + B y_k, u_k = C x_k + D y_k, A in blocks.
+
+One system for all links together, or one for each link. With blocks of 2x2, the real modal form
+(`modal_form`), a sample costs O(order x channels). Shapes: structure first, lanes last.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxmodel.lazy import jnp
+from jaxmodel.parameters import Array
+
+#: Condition number of the largest similarity that keeps enough digits [1].
+WORST_CONDITION = 1e7
+
+
+class StateSpace(NamedTuple):
+    """G systems, 1 or 3: each has M = 3 K/G sensors, as many actuators and N blocks of b states."""
+
+    state: Array  # A, (G, N, b, b)
+    enter: Array  # B, state per sensor volt, (G, N, b, M)
+    leave: Array  # C, actuator volts per state, (G, M, N, b)
+    direct: Array  # D [1], (G, M, M)
+
+
+class IllConditionedError(ValueError):
+    """No well-conditioned modal form."""
+
+
+def at_rest(system: StateSpace) -> Array:
+    """State zero, (G, N, b)."""
+    return jnp.zeros_like(jnp.asarray(system.state)[..., 0])
+
+
+def advance(system: StateSpace, x: Array, voltage: Array) -> tuple[Array, Array]:
+    """One sample.
+
+    Args:
+        system: coefficients.
+        x: state, (G, N, b).
+        voltage: of the sensors [V], (3, K).
+
+    Returns:
+        (next state, voltages wanted on the actuators [V], (3, K)).
+    """
+    groups = x.shape[0]
+    y = jnp.reshape(voltage, (groups, -1, *voltage.shape[2:]))
+    after = jnp.sum(system.state * x[:, :, None], axis=3)
+    after = after + jnp.sum(system.enter * y[:, None, None], axis=3)
+    wanted = jnp.sum(jnp.sum(system.leave * x[:, None], axis=3), axis=2)
+    wanted = wanted + jnp.sum(system.direct * y[:, None], axis=2)
+    return after, jnp.reshape(wanted, voltage.shape)
+
+
+def amplified(system: StateSpace, factor: Array) -> StateSpace:
+    """Outputs times a factor: one for all, or one for each actuator, (3, K)."""
+    groups, size = system.direct.shape[:2]
+    each = jnp.reshape(jnp.broadcast_to(factor, (3, groups * size // 3)), (groups, size))
+    return system._replace(
+        leave=system.leave * each[:, :, None, None], direct=system.direct * each[:, :, None]
+    )
+
+
+def with_sensors(system: StateSpace, factor: Array) -> StateSpace:
+    """Sensor voltages times a factor each, (3, K)."""
+    each = jnp.reshape(factor, (system.direct.shape[0], -1))
+    return system._replace(
+        enter=system.enter * each[:, None, None], direct=system.direct * each[:, None]
+    )
+
+
+def dense(system: StateSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A, B, C, D of all groups as one system from all sensors to all actuators; NumPy arrays."""
+    groups, n, b, _ = system.state.shape
+    size = system.direct.shape[1]
+    order = n * b
+    a = np.zeros((groups * order, groups * order))
+    enter, leave = np.zeros((groups * order, groups * size)), np.zeros((groups * size, len(a)))
+    direct = np.zeros((groups * size, groups * size))
+    for g in range(groups):
+        states, ports = slice(g * order, (g + 1) * order), slice(g * size, (g + 1) * size)
+        for k in range(n):
+            at = slice(g * order + k * b, g * order + (k + 1) * b)
+            a[at, at] = system.state[g, k]
+        enter[states, ports] = np.reshape(system.enter[g], (order, size))
+        leave[ports, states] = np.reshape(system.leave[g], (size, order))
+        direct[ports, ports] = system.direct[g]
+    return a, enter, leave, direct
+
+
+class ModalForm(NamedTuple):
+    """A system in real modal form: blocks of two states, a pair of poles or two real ones."""
+
+    state: np.ndarray  # (N, 2, 2)
+    enter: np.ndarray  # (N, 2, m)
+    leave: np.ndarray  # (m', N, 2)
+    condition: float  # of the similarity, with columns of length 1 [1]
+
+
+def modal_form(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> ModalForm:
+    """Bring x_(k+1) = A x + B y, u = C x to real modal form.
+
+    A complex pair sigma +- j w becomes the block ((sigma, w), (-w, sigma)); real poles share blocks
+    in ascending order, an odd one with a state that stays 0. States are scaled so that the rows of
+    B and the columns of C have one size.
+
+    Args:
+        a, b, c: (n, n), (n, m), (m', n), finite.
+
+    Raises:
+        IllConditionedError: (nearly) equal poles whose eigenvectors are nearly parallel.
+    """
+    if len(a) == 0:  # one state that stays 0
+        a, b, c = np.zeros((1, 1)), np.zeros((1, b.shape[1])), np.zeros((len(c), 1))
+    value, vector = np.linalg.eig(a)
+    condition = float(np.linalg.cond(vector))
+    if not condition <= WORST_CONDITION:
+        i, j = _closest(value)
+        raise IllConditionedError(
+            f"no well-conditioned modal form: its similarity has the condition number "
+            f"{condition:.2g} (allowed: {WORST_CONDITION:g}); poles {value[i]:.6g} and "
+            f"{value[j]:.6g} are too close for their coupling"
+        )
+    upper = np.flatnonzero(value.imag > 0)
+    real = np.flatnonzero(value.imag == 0)
+    real = real[np.argsort(value[real].real)]
+    columns, blocks = [], []
+    for pole, shape in zip(value[upper], vector[:, upper].T, strict=True):
+        columns += [shape.real, shape.imag]
+        blocks.append(np.array([[pole.real, pole.imag], [-pole.imag, pole.real]]))
+    for at in range(0, len(real), 2):
+        pair = real[at : at + 2]
+        columns += list(vector[:, pair].real.T)
+        blocks.append(np.diag([*value[pair].real, 0.0][:2]))
+    basis = np.stack(columns, axis=1) if columns else np.zeros((0, 0))
+    enter, leave = np.linalg.solve(basis, b), c @ basis
+    if len(real) % 2:
+        enter = np.vstack([enter, np.zeros((1, b.shape[1]))])
+        leave = np.hstack([leave, np.zeros((c.shape[0], 1))])
+    n = len(blocks)
+    enter, leave = enter.reshape(n, 2, -1), leave.reshape(len(c), n, 2)
+    size = np.sqrt(
+        _safe(np.linalg.norm(enter, axis=(1, 2))) / _safe(np.linalg.norm(leave, axis=(0, 2)))
+    )
+    return ModalForm(
+        state=np.array(blocks, float).reshape(n, 2, 2),
+        enter=enter / size[:, None, None],
+        leave=leave * size[:, None],
+        condition=condition,
+    )
+
+
+def _safe(x: np.ndarray) -> np.ndarray:
+    return np.where(x > 0, x, 1.0)
+
+
+def _closest(value: np.ndarray) -> tuple[int, int]:
+    """Two poles of least distance."""
+    apart = np.abs(value[:, None] - value[None]) + 1e300 * np.eye(len(value))
+    i, j = np.unravel_index(int(np.argmin(apart)), apart.shape)
+    return int(i), int(j)

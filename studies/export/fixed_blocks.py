@@ -1,0 +1,119 @@
+"""Fixed point of a controller in blocks: formats, integer coefficients, bounds on rounding errors.
+
+As in `studies.export.fixed`: each state is a signal with its own base and fraction bits, each row
+of coefficients has its own shift, and bounds hold for any sequence of ADC codes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxmodel.state_space import StateSpace
+from studies.engine.blocks import Blocks, ImpulseResponses, responses
+from studies.engine.controller import FixedController
+from studies.export.fixed import (
+    FORGOTTEN,
+    ErrorBound,
+    Format,
+    IntegerRow,
+    Wires,
+    brought_back,
+    check_error,
+    check_words,
+    design_wires,
+    find_format,
+    find_row,
+    sensor_bound,
+)
+from studies.export.floating import BlockSignals
+
+
+class FixedBlocks(NamedTuple):
+    """A controller in fixed point; groups first, as in `Blocks`."""
+
+    wires: Wires
+    state: Format  # [V], (G, N, 2)
+    advance: IntegerRow  # two states of the block, then the sensors, (G, N, 2, 2 + M)
+    leave: IntegerRow  # all states of the group, then the sensors, (G, M, 2 N + M)
+    error: ErrorBound
+
+    @property
+    def formats(self) -> list[tuple[str, Format, str]]:
+        """Signals, their formats and units."""
+        flat = Format(*(np.reshape(part, -1) for part in self.state))
+        return [("state", flat, "V")]
+
+    @property
+    def energy(self) -> None:
+        """No blocks are rivals."""
+        return
+
+
+def design_blocks(found: FixedController, seen: BlockSignals, dac_bits: int) -> FixedBlocks:
+    """Formats and coefficients; arguments and errors as `studies.export.fixed.design_fixed`."""
+    arranged = found.channels
+    assert isinstance(arranged, Blocks)
+    check_words(found)
+    wires = design_wires(found, dac_bits)
+    system, memory = arranged.system, arranged.memory(FORGOTTEN)
+    groups, n, _, size = system.enter.shape
+    volts = arranged.of_groups(sensor_bound(found.controller))  # (G, M)
+    each = [responses(system, g, memory) for g in range(groups)]
+    bound = np.stack([np.abs(x.state).sum(axis=3) @ v for x, v in zip(each, volts, strict=True)])
+    state = find_format(seen.state, np.maximum(bound, np.finfo(float).tiny))
+    step, sensor = state.step, wires.sensor_step
+    within = system.state * step[:, :, None, :] / step[..., None]
+    entering = system.enter * sensor / step[..., None]
+    leaving = (system.leave * step[:, None] / wires.dac_step).reshape(groups, size, 2 * n)
+    direct = system.direct * sensor / wires.dac_step
+    fixed = FixedBlocks(
+        wires=wires,
+        state=state,
+        advance=find_row(np.concatenate([within, entering], axis=3), "states"),
+        leave=find_row(np.concatenate([leaving, direct], axis=2), "outputs"),
+        error=ErrorBound(*np.zeros((3, 3, found.n_patches))),
+    )
+    error = _error_bound(found, arranged, fixed, each, memory)
+    check_error(found, error, wires.dac_step)
+    return fixed._replace(error=error)
+
+
+def rounded_blocks(fixed: FixedBlocks, like: Blocks) -> Blocks:
+    """The blocks that the integers represent, in SI units."""
+    step, wires = fixed.state.step, fixed.wires
+    groups, n = step.shape[:2]
+    advance, leave = fixed.advance.values, fixed.leave.values
+    size = leave.shape[1]
+    return like._replace(
+        system=StateSpace(
+            state=advance[..., :2] * step[..., None] / step[:, :, None, :],
+            enter=advance[..., 2:] * step[..., None] / wires.sensor_step,
+            leave=leave[..., : 2 * n].reshape(groups, size, n, 2) * wires.dac_step / step[:, None],
+            direct=leave[..., 2 * n :] * wires.dac_step / wires.sensor_step,
+        )
+    )
+
+
+def _error_bound(
+    found: FixedController,
+    exact: Blocks,
+    fixed: FixedBlocks,
+    each: list[ImpulseResponses],
+    memory: int,
+) -> ErrorBound:
+    """Peak errors at the actuators: the sum of every rounding through its peak gain."""
+    near, half = rounded_blocks(fixed, exact), 0.5
+    volts = exact.of_groups(sensor_bound(found.controller))
+    rounding, coefficients = [], []
+    for g, true in enumerate(each):
+        own = responses(near.system, g, memory)
+        # bias and feed-through are rounded once each
+        entering = fixed.wires.sensor_step * np.abs(true.command).sum(axis=(1, 2))
+        states = np.abs(own.kicked).sum(axis=3)  # (M, N, 2)
+        rounding.append(entering + half * np.sum(states * fixed.state.step[g], axis=(1, 2)))
+        coefficients.append(np.abs(own.command - true.command).sum(axis=2) @ volts[g])
+    parts = [exact.of_patches(np.array(x), found.n_patches) for x in (rounding, coefficients)]
+    inside = parts[0] + parts[1] + half * fixed.wires.dac_step
+    return ErrorBound(parts[0], parts[1], brought_back(found, inside))

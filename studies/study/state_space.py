@@ -1,0 +1,222 @@
+"""A controller of one's own: read from a file, checked, and brought to real modal form."""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxmodel.laws.state_space import STATE_SPACE
+from jaxmodel.state_space import IllConditionedError, StateSpace, modal_form
+from studies.errors import StudyError, field_error, shown
+from studies.study.signals import INPUTS, OUTPUTS, parse_signal
+
+if TYPE_CHECKING:
+    from studies.study.spec import StateSpaceSection, Study
+
+#: Endings of the formats.
+FORMATS = (".json", ".npz", ".mat")
+#: Matrices, and what a file may call the sample time.
+MATRICES, TIMES = ("a", "b", "c", "d"), ("sample_time", "dt", "ts")
+#: A sample time that differs by more than this share is another one [1].
+SAME_TIME = 1e-6
+#: Spectral radius from which a controller is unstable [1].
+UNSTABLE = 1 + 1e-9
+
+
+def with_matrices(data: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """A study as read, with the matrices of the file that it names.
+
+    Args:
+        data: sections.
+        folder: where the file of the study is.
+
+    Raises:
+        StudyError: the file cannot be read.
+    """
+    section = data.get("state_space")
+    if not isinstance(section, dict) or any(name in section for name in MATRICES):
+        return data
+    file = section.get("file", "")
+    if not isinstance(file, str) or not file:
+        return data
+    return {**data, "state_space": {**read_system(folder / file), **section}}
+
+
+def read_system(path: Path) -> dict[str, Any]:
+    """Fields of the section from a file, JSON, NPZ or MAT.
+
+    Raises:
+        StudyError: unreadable, or without A, B or C.
+    """
+    name = "state_space.file"
+    if path.suffix.lower() not in FORMATS:
+        raise field_error(name, str(path), f"a file {', '.join(FORMATS)}")
+    try:
+        found = {key.lower(): value for key, value in _entries(path).items()}
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise StudyError(f"{name}: {path} cannot be read ({reason})") from None
+    except Exception as error:  # of any kind, for a damaged file
+        raise StudyError(f"{name}: {path} cannot be read ({error})") from None
+    missing = [key.upper() for key in MATRICES[:3] if key not in found]
+    if missing:
+        raise StudyError(f"{name}: {path} has no {', '.join(missing)}; expected A, B, C, D and dt")
+    section: dict[str, Any] = {
+        key: _matrix(found[key], f"{name}: {path}: {key.upper()}")
+        for key in MATRICES
+        if key in found
+    }
+    for key in TIMES:
+        if key in found:
+            section["sample_time"] = float(
+                np.ravel(_number(found[key], f"{name}: {path}: {key}"))[0]
+            )
+    for key in ("inputs", "outputs"):
+        if key in found:
+            section[key] = tuple(str(x).strip() for x in np.ravel(np.array(found[key], object)))
+    return section
+
+
+def _entries(path: Path) -> dict[str, Any]:
+    kind = path.suffix.lower()
+    if kind == ".json":
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(found, dict):
+            raise ValueError("expected an object with A, B, C, D and dt")
+        return found
+    if kind == ".npz":
+        with np.load(path, allow_pickle=False) as file:
+            return {key: file[key] for key in file.files}
+    from scipy.io import loadmat
+
+    try:
+        found = loadmat(path, simplify_cells=True)
+    except NotImplementedError:
+        raise ValueError("a file of MATLAB 7.3; save it with -v7") from None
+    return {key: value for key, value in found.items() if not key.startswith("__")}
+
+
+def _number(value: Any, what: str) -> np.ndarray:
+    try:
+        return np.array(value, float)
+    except (TypeError, ValueError):
+        raise StudyError(f"{what} = {shown(str(value))}: expected real numbers") from None
+
+
+def _matrix(value: Any, what: str) -> tuple[tuple[float, ...], ...]:
+    found = _number(value, what)
+    if found.ndim < 2:
+        raise StudyError(f"{what} has {found.ndim} dimensions; expected 2, rows and columns")
+    return tuple(tuple(map(float, row)) for row in found)
+
+
+def check_system(study: Study, n_patches: int) -> None:
+    """Check the section if the study's law needs it.
+
+    Raises:
+        StudyError: missing, wrong sizes or sample time, unstable, no modal form.
+    """
+    if study.control.law != STATE_SPACE.name:
+        return
+    section, period = study.state_space, 1 / study.electronics.sample_rate_hz
+    if not section.c:
+        raise StudyError(
+            "state_space.file: missing; control.law = 'state_space' needs a file with A, B, C, D "
+            "and sample time, or these as fields"
+        )
+    if abs(section.sample_time / period - 1) > SAME_TIME:
+        raise field_error(
+            "state_space.sample_time",
+            section.sample_time,
+            f"{period:.9g}, that of electronics.sample_rate_hz = "
+            f"{study.electronics.sample_rate_hz:g} Hz; convert the controller",
+            "s",
+        )
+    system_of(section, n_patches)
+
+
+@lru_cache(maxsize=8)
+def system_of(section: StateSpaceSection, n_patches: int) -> StateSpace:
+    """The section's controller in real modal form, NumPy arrays.
+
+    Raises:
+        StudyError: wrong sizes or names, unstable, no well-conditioned modal form.
+    """
+    c = np.array(section.c, float)
+    order = c.shape[1]
+    a = _sized(section.a, "a", (order, order))
+    b = _sized(section.b, "b", (order, None))
+    given = (len(c), b.shape[1])
+    d = _sized(section.d, "d", given) if section.d else np.zeros(given)
+    every = 3 * n_patches
+    if not section.inputs and not section.outputs and given == (n_patches, n_patches):
+        groups = 3  # the same controller for each link
+    else:
+        groups = 1
+        inputs, outputs = (
+            _ports(names, count, every, n_patches, kind)
+            for names, count, kind in (
+                (section.inputs, given[1], "inputs"),
+                (section.outputs, given[0], "outputs"),
+            )
+        )
+        columns, rows = np.eye(every)[inputs], np.eye(every)[:, outputs]
+        b, c, d = b @ columns, rows @ c, rows @ d @ columns
+    radius = float(np.abs(np.linalg.eigvals(a)).max()) if order else 0.0
+    if radius > UNSTABLE:
+        raise StudyError(
+            f"state_space.a: an unstable controller, with a pole of modulus {radius:.9g}; allowed: "
+            "1 at most"
+        )
+    try:
+        form = modal_form(a, b, c)
+    except IllConditionedError as error:
+        raise StudyError(f"state_space.a: {error}") from None
+    size = every // groups
+    system = StateSpace(form.state, form.enter, form.leave, d.reshape(size, size))
+    return StateSpace(*(np.repeat(part[None], groups, axis=0) for part in system))
+
+
+def _sized(
+    rows: tuple[tuple[float, ...], ...], name: str, shape: tuple[int, int | None]
+) -> np.ndarray:
+    """A matrix of that many rows and columns; None: any number."""
+    path = f"state_space.{name}"
+    widths = {len(row) for row in rows}
+    if len(widths) > 1:
+        raise StudyError(
+            f"{path}: rows of {min(widths)} to {max(widths)} entries; expected a matrix"
+        )
+    found = np.array(rows, float).reshape(len(rows), max(widths, default=0))
+    wanted = shape[0], found.shape[1] if shape[1] is None else shape[1]
+    if found.shape != wanted:
+        told = " x ".join("any" if x is None else str(x) for x in shape)
+        raise StudyError(
+            f"{path}: {found.shape[0]} x {found.shape[1]}; allowed: {told}, to fit state_space.c"
+        )
+    return found
+
+
+def _ports(names: tuple[str, ...], count: int, every: int, n_patches: int, kind: str) -> list[int]:
+    """Places of a controller's inputs or outputs among all sensors or actuators."""
+    path = f"state_space.{kind}"
+    known = {"sensor": OUTPUTS["sensor"]} if kind == "inputs" else {"actuator": INPUTS["actuator"]}
+    if not names:
+        if count != every:
+            matrix = "b has columns" if kind == "inputs" else "c has rows"
+            raise StudyError(
+                f"{path}: missing, and state_space.{matrix}: {count}; allowed without names: "
+                f"{every}, link by link, or {n_patches} both ways, the same for each link"
+            )
+        return list(range(every))
+    if len(names) != count:
+        raise field_error(path, names, f"{count} names, one for each of the controller's {kind}")
+    signals = [parse_signal(name, known, n_patches, np.ones(3), path) for name in names]
+    found = [signal.row(n_patches, ()) for signal in signals]
+    if len(set(found)) < len(found):
+        raise field_error(path, names, "different names")
+    return found

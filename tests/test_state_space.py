@@ -1,0 +1,291 @@
+"""Controllers from files: modal form, the loop, margins, sweeps, and what is refused."""
+
+import json
+import re
+
+import jax
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from jaxmodel.controller import read_back
+from jaxmodel.prepare import prepare
+from jaxmodel.state_space import (
+    IllConditionedError,
+    StateSpace,
+    amplified,
+    dense,
+    modal_form,
+    with_sensors,
+)
+from studies.bench.works import EXECUTORS
+from studies.cli import main
+from studies.engine.blocks import responses
+from studies.engine.controller import fixed_controller
+from studies.engine.margins import judge_loops
+from studies.engine.plan import chunk_cases, local_layout, plan_groups
+from studies.engine.runs import check_run, run_study
+from studies.engine.stability import loop_report
+from studies.errors import StudyError
+from studies.export.in_the_loop import replay
+from studies.space.spec import parse_sweep
+from studies.space.table import build_table
+from studies.study.cases import build_case
+from studies.study.spec import load_study, parse_study
+from studies.study.template import study_template
+
+PERIOD = 1e-4
+SHORT = {
+    "run": {"duration": 0.06},
+    "link": {"modes": 3},
+    "motion": {"waypoints": [[0.0, 0.0, 0.5236], [0.0, 0.01, 0.5236]], "move_time": 0.03},
+    "shaper": {"kind": "none"},
+    "metrics": {"residual_length": 0.02, "residual_delay": 0.002},
+}
+
+
+def random_system(order, ports, seed=0, gain=0.01):
+    """A stable controller."""
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(order, order))
+    a *= 0.95 / np.abs(np.linalg.eigvals(a)).max(initial=1e-9)
+    b, c = rng.normal(size=(order, ports)), gain * rng.normal(size=(ports, order))
+    return a, b, c, gain * rng.normal(size=(ports, ports))
+
+
+def study_with(path, **changes):
+    """A short study with a controller from a file."""
+    control = {"law": "state_space", "gain_factor": 1.0} | changes.pop("control", {})
+    section = {"file": str(path)} | changes.pop("state_space", {})
+    return parse_study(SHORT | {"control": control, "state_space": section} | changes)
+
+
+@pytest.fixture(scope="module")
+def thirty(tmp_path_factory):
+    """A controller of order 30 for 9 sensors and 9 actuators: its matrices, file and study."""
+    matrices = random_system(30, 9)
+    path = tmp_path_factory.mktemp("system") / "thirty.npz"
+    np.savez(path, **dict(zip("ABCD", matrices, strict=True)), dt=PERIOD)
+    return matrices, path, study_with(path)
+
+
+def stepped(matrices, volts, limit):
+    """Commands by the matrices themselves, (T, 9)."""
+    a, b, c, d = matrices
+    x, rows = np.zeros(len(a)), []
+    for y in volts:
+        rows.append(np.clip(c @ x + d @ y, -limit, limit))
+        x = a @ x + b @ y
+    return np.array(rows)
+
+
+def controller_of(study):
+    structure, case = check_run(study)
+    made = jax.jit(prepare, static_argnums=0)(structure, case).loop.controller
+    return jax.tree.map(np.asarray, made)
+
+
+@pytest.mark.parametrize("order", [0, 1, 5, 12])
+def test_modal_form_has_the_same_transfer_function(order):
+    a, b, c, _ = random_system(order, 3, seed=order)
+    form = modal_form(a, b, c)
+    system = StateSpace(form.state[None], form.enter[None], form.leave[None], np.zeros((1, 3, 3)))
+    a2, b2, c2, _ = dense(system)
+    z = np.exp(0.7j)
+
+    def transfer(a, b, c):
+        return c @ np.linalg.solve(z * np.eye(len(a)) - a, b)
+
+    np.testing.assert_allclose(transfer(a2, b2, c2), transfer(a, b, c), rtol=1e-11, atol=1e-15)
+
+
+def test_equal_poles_that_are_coupled_have_no_modal_form():
+    a = np.array([[0.5, 1.0], [0.0, 0.5]])
+    with pytest.raises(IllConditionedError, match=r"poles 0\.5.* and 0\.5.* are too close"):
+        modal_form(a, np.ones((2, 1)), np.ones((1, 2)))
+    modal_form(0.5 * np.eye(2), np.ones((2, 1)), np.ones((1, 2)))  # equal, but not coupled
+
+
+def test_impulse_responses_are_those_of_the_matrices():
+    rng = np.random.default_rng(0)
+    shapes = (1, 3, 2, 2), (1, 3, 2, 4), (1, 4, 3, 2), (1, 4, 4)
+    system = StateSpace(*(0.4 * rng.normal(size=shape) for shape in shapes))
+    a, b, c, d = dense(system)
+    found = responses(system, 0, 20)
+    powers = [np.linalg.matrix_power(a, k) for k in range(19)]
+    wanted = np.stack([d, *(c @ p @ b for p in powers)], axis=2)
+    np.testing.assert_allclose(found.command, wanted, atol=1e-13)
+    kicked = np.stack([np.zeros_like(c), *(c @ p for p in powers)], axis=2)
+    np.testing.assert_allclose(found.kicked.reshape(4, 6, 20), kicked, atol=1e-13)
+
+
+def test_order_30_in_the_loop_is_direct_stepping(thirty):
+    """Of 9 sensors and 9 actuators, ADC and limit included, to 1e-11."""
+    matrices, _, study = thirty
+    controller = controller_of(study)
+    codes = np.random.default_rng(1).integers(0, 4096, (3000, 3, 3)).astype(float)
+    found = np.asarray(replay(controller, codes)).reshape(-1, 9)
+    volts = np.asarray(read_back(controller, codes)).reshape(-1, 9)
+    limit = float(controller.voltage_limit)
+    wanted = stepped(matrices, volts, limit)
+    assert 1 < np.abs(wanted).max() <= limit
+    np.testing.assert_allclose(found, wanted, atol=1e-11 * np.abs(wanted).max())
+
+
+def test_links_without_control_neither_see_nor_act(thirty):
+    matrices, path, _ = thirty
+    study = study_with(path, control={"links": [True, False, True], "gain_factor": 0.3})
+    controller = controller_of(study)
+    codes = np.random.default_rng(1).integers(0, 4096, (300, 3, 3)).astype(float)
+    volts = np.asarray(read_back(controller, codes))
+    on = np.array([1.0, 0.0, 1.0])[:, None]
+    wanted = stepped(matrices, (volts * on).reshape(-1, 9), 1e9) * 0.3
+    wanted = wanted.reshape(-1, 3, 3) * on
+    np.testing.assert_allclose(replay(controller, codes), wanted, atol=1e-12)
+
+
+def test_gains_and_sensors_scale_the_system():
+    rng = np.random.default_rng(3)
+    shapes = (3, 2, 2, 2), (3, 2, 2, 3), (3, 3, 2, 2), (3, 3, 3)
+    system = StateSpace(*(0.4 * rng.normal(size=shape) for shape in shapes))
+    left, right = rng.normal(size=(2, 3, 3))
+    a, b, c, d = dense(system)
+    a2, b2, c2, d2 = dense(jax.tree.map(np.asarray, with_sensors(amplified(system, left), right)))
+    rows, columns = np.diag(left.ravel()), np.diag(right.ravel())
+    for found, wanted in ((a2, a), (b2, b @ columns), (c2, rows @ c), (d2, rows @ d @ columns)):
+        np.testing.assert_allclose(found, wanted, atol=1e-14)
+
+
+def test_one_link_s_controller_serves_each_link(tmp_path):
+    """Without names, as many ports as a link has patches; the same as all links written out."""
+    a, b, c, d = random_system(4, 3)
+    np.savez(tmp_path / "one.npz", a=a, b=b, c=c, d=d, dt=PERIOD)
+    whole = {k: np.kron(np.eye(3), x) for k, x in zip("abcd", (a, b, c, d), strict=True)}
+    # poles of three equal links: no eigenvectors of their own, but no coupling either
+    np.savez(tmp_path / "all.npz", **whole, dt=PERIOD)
+    codes = np.random.default_rng(1).integers(0, 4096, (300, 3, 3)).astype(float)
+    one, every = (
+        np.asarray(replay(controller_of(study_with(tmp_path / f"{name}.npz")), codes))
+        for name in ("one", "all")
+    )
+    np.testing.assert_allclose(one, every, atol=1e-11)
+
+
+def test_margins_and_the_sweep(thirty):
+    """Kernel and scan agree to 1e-9; a batch's margins are those of the single run."""
+    study = thirty[2]
+    data = {k: v for k, v in study.model_dump().items() if v}
+    sweep = {"axes": {"gain": [0.3, 1.0]}}
+    table = build_table(parse_sweep(data | {"sweep": sweep}))
+    group = plan_groups(table, np.arange(2), local_layout)[0]
+    structure = group.structure._replace(metrics=("residual_rms", "peak_voltage"))
+    cases = chunk_cases(table, group.rows, structure, group.layout.size)
+    one, other = (
+        EXECUTORS[name](structure, group.layout, False).start(cases).wait()
+        for name in ("kernel", "scan")
+    )
+    np.testing.assert_array_equal(one.status, 0)
+    for name in structure.metrics:
+        np.testing.assert_allclose(other.metrics[name], one.metrics[name], rtol=1e-9)
+    report = loop_report(structure, build_case(study), np.array(study.motion.waypoints[0]))
+    margin = judge_loops(structure, cases).gain_margin[:2]
+    np.testing.assert_allclose(margin, report.gain_margin / np.array([0.3, 1.0]), rtol=1e-3)
+
+
+@pytest.mark.parametrize("target", ["json", "c", "c-fixed"])
+def test_export_is_verified(thirty, tmp_path, target, capsys):
+    """In C to 1e-12, in fixed point bit for bit with its integer model."""
+    _, _, study = thirty
+    (tmp_path / "study.toml").write_text(study_template(study))
+    main(["export", str(tmp_path / "study.toml"), "--target", target, "--out", str(tmp_path)])
+    assert "comparisons agree" in capsys.readouterr().out
+    if target == "json":
+        document = json.loads((tmp_path / "flexlink.json").read_text())
+        assert np.shape(document["numbers"]["state_matrix"]["value"]) == (1, 15, 2, 2)
+
+
+def test_export_of_some_links_with_feedthrough(tmp_path, capsys):
+    a, b, c, d = random_system(4, 3)
+    np.savez(tmp_path / "one.npz", a=a, b=b, c=c, d=d, dt=PERIOD)
+    control = {"links": [False, True, True], "feedthrough_factor": 0.5}
+    study = study_with(tmp_path / "one.npz", control=control)
+    assert list(fixed_controller(study).channels.link) == [1, 2]
+    (tmp_path / "study.toml").write_text(study_template(study))
+    for target in ("c", "c-fixed"):
+        main(["export", str(tmp_path / "study.toml"), "--target", target, "--out", str(tmp_path)])
+        assert "comparisons agree" in capsys.readouterr().out
+
+
+def test_formats_and_names(tmp_path):
+    """JSON, NPZ and MAT say the same; names say where ports are; a written study needs no file."""
+    a, b, c, d = random_system(3, 2)
+    ports = {"inputs": ["sensor 2.1", "sensor 1.3"], "outputs": ["actuator 3.2", "actuator 1.1"]}
+    fields = {"A": a, "B": b, "C": c, "D": d, "dt": PERIOD}
+    as_lists = {k: np.asarray(x).tolist() for k, x in fields.items()}
+    (tmp_path / "x.json").write_text(json.dumps(as_lists | ports))
+    np.savez(tmp_path / "x.npz", **fields, **ports)
+    savemat(tmp_path / "x.mat", fields | {k: np.array(x, object) for k, x in ports.items()})
+    found = [study_with(tmp_path / f"x.{end}").state_space for end in ("json", "npz", "mat")]
+    assert found[0].a == found[1].a == found[2].a
+    assert found[0].inputs == found[1].inputs == found[2].inputs == tuple(ports["inputs"])
+    controller = controller_of(study_with(tmp_path / "x.mat"))
+    assert np.abs(dense(controller.system)[3][7, 3]) == pytest.approx(abs(d[0, 0]))
+    text = study_template(study_with(tmp_path / "x.npz"))
+    (tmp_path / "x.npz").unlink()
+    (tmp_path / "study.toml").write_text(text)
+    assert load_study(tmp_path / "study.toml").state_space.a == found[0].a
+
+
+def test_a_single_run_says_its_margin(thirty):
+    study = thirty[2]
+    found = run_study(study, has_record=False)
+    assert found.loop.is_stable and found.loop.gain_margin > 1
+
+
+REFUSED = {
+    "unstable": ({"a": 1.2 * np.eye(4)}, {}, "an unstable controller, with a pole of modulus 1.2"),
+    "wrong size": ({"b": np.ones((3, 3))}, {}, "state_space.b: 3 x 3; allowed: 4 x any"),
+    "not square": ({"a": np.ones((4, 3))}, {}, "state_space.a: 4 x 3; allowed: 4 x 4"),
+    "wrong d": ({"d": np.ones((3, 2))}, {}, "state_space.d: 3 x 2; allowed: 3 x 3"),
+    "another time": ({"dt": 2e-4}, {}, "state_space.sample_time = 0.0002; allowed: 0.0001, that"),
+    "no time": ({"dt": None}, {}, "state_space.sample_time = 0.0; allowed: 0.0001"),
+    "nan": ({"c": np.full((3, 4), np.nan)}, {}, "state_space.c"),
+    "text": ({"a": [["x"]]}, {}, "expected real numbers"),
+    "no output": ({"c": None}, {}, "has no C; expected A, B, C, D and dt"),
+    "coupled": ({"a": np.eye(4, k=1) + 0.5 * np.eye(4)}, {}, "no well-conditioned modal form"),
+    "odd ports": (
+        {"b": np.ones((4, 5)), "d": np.ones((3, 5))},
+        {},
+        "state_space.inputs: missing, and state_space.b has columns: 5",
+    ),
+    "no sensor": ({"inputs": ["sensor 1.1", "sensor 1.2", "sensor 4.1"]}, {}, "links 1 to 3"),
+    "twice": ({"inputs": ["sensor 1.1"] * 3}, {}, "different names"),
+    "no file": (None, {"file": "none.json"}, "none.json cannot be read (No such file"),
+    "no format": (None, {"file": "x.csv"}, "allowed: a file .json, .npz, .mat"),
+    "nothing": (None, {"file": ""}, "state_space.file: missing"),
+}
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_bad_controllers_are_answered(tmp_path, fault):
+    changed, section, said = REFUSED[fault]
+    a, b, c, d = random_system(4, 3)
+    fields = {"a": a, "b": b, "c": c, "d": d, "dt": PERIOD} | (changed or {})
+    fields = {k: np.asarray(x).tolist() for k, x in fields.items() if x is not None}
+    if "inputs" in fields:
+        fields["outputs"] = ["actuator 1.1", "actuator 1.2", "actuator 1.3"]
+    (tmp_path / "x.json").write_text(json.dumps(fields))
+    with pytest.raises(StudyError, match=re.escape(said)):
+        study_with(tmp_path / "x.json", state_space=section)
+
+
+def test_a_damaged_file_is_named(tmp_path):
+    for name in ("x.json", "x.npz", "x.mat"):
+        (tmp_path / name).write_bytes(b"\x00garbage")
+        with pytest.raises(StudyError, match=f"state_space.file: .*{name} cannot be read"):
+            study_with(tmp_path / name)
+
+
+def test_ideal_feedback_has_no_controller_of_this_kind(thirty):
+    with pytest.raises(StudyError, match="control.feedback = 'ideal'; allowed: 'sampled' or"):
+        study_with(thirty[1], control={"feedback": "ideal"})
