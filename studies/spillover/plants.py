@@ -222,8 +222,10 @@ def widened(law: Controller, n_channels: int) -> Controller:
 
     Args:
         law: NumPy arrays.
-        n_channels: of each link.
+        n_channels: of each link; a controller without any stays as it is.
     """
+    if law.system is not None:
+        return law
     shape = law.velocity_gain.shape
     more = n_channels - shape[1]
 

@@ -111,7 +111,7 @@ class Leak(NamedTuple):
 def _leakage(found: Certificate) -> dict[str, Any] | None:
     """Uncontrolled modes in the estimates, and forces on them; None: no such modes."""
     first, last = found.n_controlled, found.observation.shape[4]
-    if first == last:
+    if first == last or found.observation.shape[3] == 0:
         return None
     seen = found.observation[..., first:]
     size = np.nan_to_num(np.abs(seen)).max(axis=(1, 2))
