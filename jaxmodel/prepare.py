@@ -201,6 +201,8 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
     known = Known(
         observer=observer,
         synthesizer=synthesizer,
+        sensor=seen,
+        actuator=actuator[:, :n],
         omega=assembled,
         modal_mass=model.mass[:, :n],
         mask=mask,

@@ -88,9 +88,9 @@ def test_fixed_point_stays_within_its_bound(kind):
     found, codes, seen, fixed = kind
     inside, total = fixed.error.inside, fixed.error.total
     used = np.isin(np.arange(3), found.channels.link)
-    assert np.all((inside > 0) == used[:, None]) and inside.max() < 0.5 * fixed.dac_step
-    assert np.all(total >= 0.5 * fixed.dac_step + inside) and np.all(np.isfinite(total))
-    volts = (respond(fixed, codes, RAIL).codes - fixed.dac_rest) * fixed.dac_step
+    assert np.all((inside > 0) == used[:, None]) and inside.max() < 0.5 * fixed.wires.dac_step
+    assert np.all(total >= 0.5 * fixed.wires.dac_step + inside) and np.all(np.isfinite(total))
+    volts = (respond(fixed, codes, RAIL).codes - fixed.wires.dac_rest) * fixed.wires.dac_step
     difference = np.abs(volts - seen.command).max(axis=0)
     assert np.all(difference <= total * (1 + 1e-9))
 
@@ -115,22 +115,27 @@ def worst_codes(found, fixed):
     channels, n = found.channels, 400
     response = fixed_point._responses(channels, 0, n)[2]
     sign = np.sign(response[::-1])[:, None] * np.sign(channels.filter[0])
-    codes = np.full((n, 3, found.n_patches), round(fixed.bias / 2**fixed.adc_bits), float)
-    codes[:, channels.link[0]] = np.where(sign > 0, fixed.adc_top, 0)
+    codes = np.full(
+        (n, 3, found.n_patches), round(fixed.wires.bias / 2**fixed.wires.adc_bits), float
+    )
+    codes[:, channels.link[0]] = np.where(sign > 0, fixed.wires.adc_top, 0)
     return codes
 
 
 def test_comes_to_rest_after_any_input(kind):
     found, _, _, fixed = kind
-    top, middle = fixed.adc_top, round(fixed.bias / 2**fixed.adc_bits)
+    top, middle = fixed.wires.adc_top, round(fixed.wires.bias / 2**fixed.wires.adc_bits)
     loud = np.where(np.arange(300)[:, None, None] // 17 % 2, top, 0) * np.ones((1, 3, 3))
     codes = np.concatenate([loud, np.full((3000, 3, 3), middle)])
     out = respond(fixed, codes, RAIL).codes
-    assert np.any(out[:300] != fixed.dac_rest)
+    assert np.any(out[:300] != fixed.wires.dac_rest)
     floating = respond_floating(found.channels, found.controller, codes).command[-1]
     # no limit cycle; what is left is what the bias between two codes leaves in floating point
     assert np.all(out[-500:] == out[-1])
-    assert np.abs((out[-1] - fixed.dac_rest) * fixed.dac_step - floating).max() < fixed.dac_step
+    assert (
+        np.abs((out[-1] - fixed.wires.dac_rest) * fixed.wires.dac_step - floating).max()
+        < fixed.wires.dac_step
+    )
 
 
 def test_formats_leave_the_stated_margin(kind):
@@ -158,7 +163,7 @@ def test_a_coefficient_off_by_little_breaks_the_bound():
     fixed = design_fixed(found, seen, 16)
     integers = fixed.numerator.integers * (1 + 1e-4)
     wrong = fixed._replace(numerator=fixed.numerator._replace(integers=integers.astype(np.int64)))
-    volts = (respond(wrong, codes, RAIL).codes - fixed.dac_rest) * fixed.dac_step
+    volts = (respond(wrong, codes, RAIL).codes - fixed.wires.dac_rest) * fixed.wires.dac_step
     assert np.abs(volts - seen.command).max() > fixed.error.total.max()
 
 
@@ -168,15 +173,17 @@ def test_faulty_sensors_are_noticed_where_they_are_used():
     fixed = design_fixed(found, seen, 12)
     for link in range(3):
         bad = codes.copy()
-        bad[100:, link, 1] = fixed.adc_top
+        bad[100:, link, 1] = fixed.wires.adc_top
         response = respond(fixed, bad, RAIL)
         assert response.is_faulty.any() == (link == 1)
         if link == 1:
             assert np.flatnonzero(response.is_faulty)[0] == 100 + RAIL - 1
-            assert np.all(response.codes[100 + RAIL - 1 :] == fixed.dac_rest)
+            assert np.all(response.codes[100 + RAIL - 1 :] == fixed.wires.dac_rest)
     # from end to end is no sensor that is stuck
     bad = codes.copy()
-    bad[100:, 1, 1] = np.where(np.arange(len(codes) - 100) // (RAIL - 1) % 2, fixed.adc_top, 0)
+    bad[100:, 1, 1] = np.where(
+        np.arange(len(codes) - 100) // (RAIL - 1) % 2, fixed.wires.adc_top, 0
+    )
     assert not respond(fixed, bad, RAIL).is_faulty.any()
 
 
@@ -269,9 +276,9 @@ def test_what_does_not_fit_words_is_refused(name):
 
 def test_factors_beyond_a_word_are_refused():
     with pytest.raises(StudyError, match=r"gains: factors add up to 3e\+09 .* allowed: below"):
-        fixed_point._row(np.array([[1e9, 2e9, 0.0]]), "gains")
+        fixed_point.find_row(np.array([[1e9, 2e9, 0.0]]), "gains")
     with pytest.raises(StudyError, match="nan"):
-        fixed_point._row(np.array([[np.nan, 1.0]]), "gains")
+        fixed_point.find_row(np.array([[np.nan, 1.0]]), "gains")
 
 
 def test_unstable_loops_are_refused_with_their_margin():
@@ -336,7 +343,7 @@ def check_random_designs(count, seed):
             assert "allowed" in str(error), (k, error)
             continue
         n_run += 1
-        wild = rng.integers(0, fixed.adc_top + 1, (400, 3, 3)).astype(float)
+        wild = rng.integers(0, fixed.wires.adc_top + 1, (400, 3, 3)).astype(float)
         rail = rail_samples(found.study.electronics.sample_rate_hz)
         sizes = (9, len(found.channels.link), int(found.taps.sample.max()) + 1)
         source = fixed_source(found, fixed, "flexlink", ["random"], "")
@@ -345,7 +352,7 @@ def check_random_designs(count, seed):
                 response = respond(fixed, sequence, rail)
                 np.testing.assert_array_equal(code.respond(sequence)[0], response.codes, str(k))
                 assert response.limited.sum() == 0, k
-        volts = (respond(fixed, codes, rail).codes - fixed.dac_rest) * fixed.dac_step
+        volts = (respond(fixed, codes, rail).codes - fixed.wires.dac_rest) * fixed.wires.dac_step
         off = np.abs(volts - seen.command).max(axis=0)
         assert np.all(off <= fixed.error.total * (1 + 1e-9) + 1e-12), k
         source = floating_source(found, "flexlink", ["random"])

@@ -11,6 +11,7 @@ from __future__ import annotations
 from jaxmodel.case import Structure
 from jaxmodel.laws.contract import Law, check_law
 from jaxmodel.laws.imsc import IMSC
+from jaxmodel.laws.lqg import LQG
 from jaxmodel.laws.lqr import LQR
 from jaxmodel.laws.modified_imsc import MODIFIED_IMSC
 from jaxmodel.laws.ppf import PPF
@@ -18,7 +19,7 @@ from jaxmodel.laws.srf import SRF
 from jaxmodel.laws.state_space import STATE_SPACE
 from jaxmodel.table import Table
 
-LAWS: Table[Law] = Table("law", [IMSC, SRF, LQR, MODIFIED_IMSC, PPF, STATE_SPACE], check_law)
+LAWS: Table[Law] = Table("law", [IMSC, SRF, LQR, MODIFIED_IMSC, PPF, LQG, STATE_SPACE], check_law)
 
 
 def is_modal(structure: Structure) -> bool:

@@ -39,6 +39,8 @@ class Known(NamedTuple):
 
     observer: Array  # modal filter pinv(lambda_s Phi_s^t) of the controlled modes [m/V], (3, C, K)
     synthesizer: Array  # pinv(lambda_a Phi_a), voltages from modal forces [V/N], (3, K, C)
+    sensor: Array  # lambda_s Phi_s^t, voltages of modal coordinates [V/m], (3, K, C)
+    actuator: Array  # lambda_a Phi_a, modal forces of voltages [N/V], (3, C, K)
     omega: Array  # frequencies of the assembled links [rad/s], (3, C)
     modal_mass: Array  # [kg], (3, C)
     mask: Array  # 1 for controlled modes, at most as many as patches, (C,)
@@ -169,8 +171,13 @@ def as_modal(control: Control, velocity: Array, position: Array) -> Control:
 
 def system_feedback(structure: Structure, case: Case, system: StateSpace) -> Feedback:
     """Feedback by a linear system, of controlled links only, times `gain_factor`."""
+    return masked_system(structure, case, amplified(system, case.control.gain_factor))
+
+
+def masked_system(structure: Structure, case: Case, system: StateSpace) -> Feedback:
+    """The same without the factor."""
     mask = jnp.asarray(case.control.link_mask)[:, None] * jnp.ones((1, structure.n_patches))
-    system = amplified(with_sensors(system, mask), case.control.gain_factor * mask)
+    system = amplified(with_sensors(system, mask), mask)
     return no_channels(system, structure.n_patches)
 
 

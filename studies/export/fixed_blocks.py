@@ -34,6 +34,7 @@ class FixedBlocks(NamedTuple):
     """A controller in fixed point; groups first, as in `Blocks`."""
 
     wires: Wires
+    blocks: Blocks  # the same in SI units
     state: Format  # [V], (G, N, 2)
     advance: IntegerRow  # two states of the block, then the sensors, (G, N, 2, 2 + M)
     leave: IntegerRow  # all states of the group, then the sensors, (G, M, 2 N + M)
@@ -44,6 +45,11 @@ class FixedBlocks(NamedTuple):
         """Signals, their formats and units."""
         flat = Format(*(np.reshape(part, -1) for part in self.state))
         return [("state", flat, "V")]
+
+    @property
+    def link(self) -> np.ndarray:
+        """Controlled links, from 0."""
+        return self.blocks.link
 
     @property
     def energy(self) -> None:
@@ -70,6 +76,7 @@ def design_blocks(found: FixedController, seen: BlockSignals, dac_bits: int) -> 
     direct = system.direct * sensor / wires.dac_step
     fixed = FixedBlocks(
         wires=wires,
+        blocks=arranged,
         state=state,
         advance=find_row(np.concatenate([within, entering], axis=3), "states"),
         leave=find_row(np.concatenate([leaving, direct], axis=2), "outputs"),

@@ -6,8 +6,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from studies.engine.blocks import Blocks
-from studies.engine.channels import Channels, acting
+from studies.engine.channels import acting
 from studies.export.fixed import FixedPoint, IntegerRow
 from studies.export.fixed_blocks import FixedBlocks
 
@@ -36,13 +35,10 @@ class _Memory(Protocol):
         ...
 
 
-def respond(
-    arranged: Channels | Blocks, fixed: FixedPoint | FixedBlocks, codes: np.ndarray, rail: int
-) -> Response:
+def respond(fixed: FixedPoint | FixedBlocks, codes: np.ndarray, rail: int) -> Response:
     """The exported arithmetic, bit by bit, on sequences of ADC codes from rest.
 
     Args:
-        arranged: the controller, for what belongs to which link.
         fixed: formats and coefficients.
         codes: 16-bit words, (T, ..., 3, K); sequences side by side.
         rail: samples at one end of the range after which a sensor is faulty.
@@ -50,14 +46,13 @@ def respond(
     many, wires = codes.shape[1:-2], fixed.wires
     memory: _Memory
     if isinstance(fixed, FixedBlocks):
-        assert isinstance(arranged, Blocks)
-        memory = _BlockMemory(arranged, fixed, many)
+        memory = _BlockMemory(fixed, many)
     else:
         memory = _ChannelMemory(fixed, many)
     command = np.zeros(codes.shape[1:], np.int64)
     at_end = np.zeros(codes.shape[1:], np.int64)  # samples at the highest code, or minus at 0
     is_faulty = np.zeros(many, bool)
-    is_used = np.isin(np.arange(3), arranged.link)[:, None]
+    is_used = np.isin(np.arange(3), fixed.link)[:, None]
     rows = []
     for code in codes.astype(np.int64):
         end = (code == wires.adc_top).astype(np.int64) - (code == 0)
@@ -112,19 +107,19 @@ class _ChannelMemory:
 class _BlockMemory:
     """States of every block."""
 
-    def __init__(self, arranged: Blocks, fixed: FixedBlocks, many: tuple[int, ...]) -> None:
-        self._arranged, self._fixed = arranged, fixed
+    def __init__(self, fixed: FixedBlocks, many: tuple[int, ...]) -> None:
+        self._fixed = fixed
         self._state = np.zeros((*many, *fixed.state.bits.shape), np.int64)
 
     def wanted(self, sensor: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
         fixed, state = self._fixed, self._state
-        volts = self._arranged.of_groups(sensor)  # (..., G, M)
+        volts = fixed.blocks.of_groups(sensor)  # (..., G, M)
         flat = state.reshape(*state.shape[:-2], -1)
         found = _products(fixed.leave, np.concatenate([flat, volts], -1)[..., None, :])
         entering = np.broadcast_to(volts[..., None, :], (*state.shape[:-1], volts.shape[-1]))
         read = np.concatenate([state, entering], -1)[..., None, :]
         self._state = _limited(_products(fixed.advance, read), cut, STATES)
-        return self._arranged.of_patches(found, sensor.shape[-1])
+        return fixed.blocks.of_patches(found, sensor.shape[-1])
 
     def forget(self, is_faulty: np.ndarray) -> None:
         self._state = np.where(is_faulty[..., None, None, None], 0, self._state)

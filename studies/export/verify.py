@@ -176,7 +176,7 @@ def verify_fixed(
                 0, 2**16, (50, *shape)
             ),
         }
-        counts = _modelled(found, fixed, sequences, rail)
+        counts = _modelled(fixed, sequences, rail)
         for label, codes in sequences.items():
             given, _ = code.respond(codes)
             differing = int(np.sum(given != counts[label].codes))
@@ -208,15 +208,12 @@ def verify_fixed(
 
 
 def _modelled(
-    found: FixedController,
-    fixed: FixedPoint | FixedBlocks,
-    sequences: dict[str, np.ndarray],
-    rail: int,
+    fixed: FixedPoint | FixedBlocks, sequences: dict[str, np.ndarray], rail: int
 ) -> dict[str, Response]:
     """Response of the integer model to each sequence, all side by side."""
     longest = max(map(len, sequences.values()))
     rows = [np.pad(x, ((0, longest - len(x)), (0, 0), (0, 0)), "edge") for x in sequences.values()]
-    response = respond_fixed(found.channels, fixed, np.stack(rows, axis=1), rail)
+    response = respond_fixed(fixed, np.stack(rows, axis=1), rail)
     return {
         name: Response(*(part[: len(codes), k] for part in response))
         for k, (name, codes) in enumerate(sequences.items())

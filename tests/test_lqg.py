@@ -1,0 +1,167 @@
+"""LQG: Riccati equations, the loop against an independent computation, gradients."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import expm, solve_discrete_are
+
+from jaxmodel.bases import find_bases
+from jaxmodel.prepare import design_controller
+from jaxmodel.riccati import filter_gain, regulator_gain, solve_riccati
+from jaxmodel.sampled_loop import closed_loop
+from jaxmodel.simulate import simulate
+from jaxmodel.state_space import StateSpace, dense
+from studies.engine.runs import check_run
+from studies.engine.stability import loop_report, with_margin_modes
+from studies.study.spec import parse_study
+
+SHORT = {
+    "run": {"duration": 0.06},
+    "link": {"modes": 3},
+    "motion": {"waypoints": [[0.0, 0.0, 0.5236], [0.0, 0.01, 0.5236]], "move_time": 0.03},
+    "shaper": {"kind": "none"},
+    "metrics": {"residual_length": 0.02, "residual_delay": 0.002},
+    "control": {"law": "lqg", "gain_factor": 1.0, "modes": 2},
+}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_riccati_equations_are_solved(seed):
+    """As SciPy solves them, to 1e-9; a slow and a singular plant among them."""
+    rng = np.random.default_rng(seed)
+    n, m = 15, 3
+    a = rng.normal(size=(n, n))
+    a *= (0.9999 if seed else 0.5) / np.abs(np.linalg.eigvals(a)).max()
+    if seed == 1:
+        a[:, 0] = 0.0
+    b, q, r = rng.normal(size=(n, m)), np.diag(rng.uniform(0, 1, n)), 10.0 ** (seed - 2) * np.eye(m)
+    found, wanted = solve_riccati(a, b, q, r), solve_discrete_are(a, b, q, r)
+    np.testing.assert_allclose(found, wanted, atol=1e-9 * np.abs(wanted).max())
+    gain = np.linalg.solve(r + b.T @ wanted @ b, b.T @ wanted @ a)
+    np.testing.assert_allclose(regulator_gain(a, b, q, r), gain, rtol=1e-8, atol=1e-10)
+    both = np.asarray(filter_gain(a.T, b.T, q, r))
+    np.testing.assert_allclose(
+        both, np.linalg.solve(r + b.T @ wanted @ b, b.T @ wanted).T, rtol=1e-8
+    )
+
+
+def compensator(study, known, case, link):
+    """A, B, C, D of one link by SciPy: each mode with its own filter, then hold and delay."""
+    electronics, parameters = case.electronics, case.control.parameters
+    corner, period = float(electronics.antialias), float(electronics.period)
+    omega, mass = np.asarray(known.omega[link]), np.asarray(known.modal_mass[link])
+    sensor, actuator = np.asarray(known.sensor[link]), np.asarray(known.actuator[link])
+    count, patches = len(omega), sensor.shape[0]
+    zeta = parameters["model_damping"][link]
+    a = np.zeros((4 * count, 4 * count))  # q, q', z, z' of one mode after another [m, m/s]
+    b, f = np.zeros((4 * count, patches)), np.zeros((4 * count, count))
+    c = np.zeros((patches, 4 * count))
+    for k in range(count):
+        i = 4 * k
+        a[i, i + 1] = a[i + 2, i + 3] = 1.0
+        a[i + 1, i : i + 2] = -(omega[k] ** 2), -2 * zeta * omega[k]
+        a[i + 3, i], a[i + 3, i + 2] = corner**2, -(corner**2)
+        a[i + 3, i + 3] = -np.sqrt(2) * corner
+        b[i + 1], f[i + 1, k], c[:, i + 2] = actuator[k] / mass[k], 1 / mass[k], sensor[:, k]
+    size = np.tile([1e-6, 1e-3, 1e-6, 1e-2], count)
+    whole = np.zeros((4 * count + patches + count,) * 2)
+    whole[: 4 * count] = np.hstack([a, b, f])
+    scale = np.concatenate([size, np.ones(patches + count)])
+    held = expm(whole * period * scale / scale[:, None]) * scale[:, None] / scale
+    n = 4 * count
+    state = np.block(
+        [[held[:n, :n], held[:n, n : n + patches]], [np.zeros((patches, n + patches))]]
+    )
+    enter = np.vstack([np.zeros((n, patches)), np.eye(patches)])
+    drive = np.vstack([held[:n, n + patches :], np.zeros((patches, count))])
+    look = np.hstack([c, np.zeros((patches, patches))])
+    energy = np.zeros(n + patches)
+    energy[0:n:4], energy[1:n:4] = mass * omega**2, mass
+    eye = np.eye(patches)
+    s = np.concatenate([size, np.ones(patches)])  # SciPy needs numbers of one size
+    a1, b1, l1 = state * s / s[:, None], enter / s[:, None], look * s
+    w1 = drive / s[:, None] * parameters["disturbance"][link]
+    weight, noise = parameters["voltage_weight"][link], parameters["sensor_noise"][link] ** 2
+    x = solve_discrete_are(a1, b1, np.diag(energy * s**2) / weight, eye)
+    gain = np.linalg.solve(eye + b1.T @ x @ b1, b1.T @ x @ a1)
+    p = solve_discrete_are(a1.T, l1.T, w1 @ w1.T / noise, eye)
+    correct = np.linalg.solve(eye + l1 @ p @ l1.T, l1 @ p).T
+    kept = np.eye(len(s)) - correct @ l1
+    after = a1 - b1 @ gain
+    return after @ kept, after @ correct, -gain @ kept, -gain @ correct
+
+
+def known_of(structure, case):
+    return design_controller(structure, case, find_bases(structure, case)).known
+
+
+def controller_of(structure, case):
+    return design_controller(structure, case, find_bases(structure, case)).controller
+
+
+def test_damping_and_margin_are_those_of_an_independent_computation():
+    """Filter and regulator by SciPy in other coordinates, put into the same plant."""
+    study = parse_study(SHORT)
+    structure, case = check_run(study)
+    known = jax.tree.map(np.asarray, jax.jit(known_of, static_argnums=0)(structure, case))
+    parts = [compensator(study, known, case, link) for link in range(3)]
+    a, b, c, d = (np.stack([part[k] for part in parts]) for k in range(4))
+    other = StateSpace(a[:, None], b[:, None], c[:, :, None], d)
+    plain, wide = with_margin_modes(structure, case)
+    pose = np.array(study.motion.waypoints[0])
+
+    def poles(law):
+        found = jax.jit(closed_loop, static_argnums=0)(plain, wide, pose, law)
+        value = np.linalg.eigvals(np.asarray(found.open + found.feedback))
+        return value[np.argsort(-np.abs(value))][:40]
+
+    own = jax.jit(controller_of, static_argnums=0)(plain, wide)
+    given = own._replace(system=jax.tree.map(jnp.asarray, other))
+    mine, theirs = poles(own), poles(given)
+    apart = np.abs(mine[:, None] - theirs[None]).min(axis=1)
+    assert apart.max() < 1e-7
+    report = loop_report(structure, case, pose)
+    wanted = loop_report(structure, case, pose, law=given)
+    assert report.gain_margin == pytest.approx(wanted.gain_margin, rel=1e-3)
+    assert report.gain_margin > 2
+    np.testing.assert_allclose(report.damping_ratio, wanted.damping_ratio, rtol=1e-5)
+    assert report.damping_ratio[0].min() > 5 * study.link.first_damping
+
+
+def test_certainty_equivalence():
+    """On its own model, the loop's poles are those of regulator and filter, and all are stable."""
+    study = parse_study(SHORT | {"link": {"modes": 2}})
+    structure, case = check_run(study)
+    known = jax.tree.map(np.asarray, jax.jit(known_of, static_argnums=0)(structure, case))
+    a, b, c, d = compensator(study, known, case, 0)
+    found = jax.jit(
+        lambda s, k: design_controller(s, k, find_bases(s, k)).controller, static_argnums=0
+    )
+    system = jax.tree.map(np.asarray, found(structure, case).system)
+    mine = dense(StateSpace(*(part[:1] for part in system)))
+    z = np.exp(0.4j)
+
+    def transfer(a, b, c, d):
+        return c @ np.linalg.solve(z * np.eye(len(a)) - a, b) + d
+
+    np.testing.assert_allclose(transfer(*mine), transfer(a, b, c, d), rtol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["voltage_weight", "disturbance", "sensor_noise"])
+def test_gradients_equal_differences(name):
+    """Of residual vibration after the motion, by the logarithm of a weight, to 1e-4."""
+    study = parse_study(SHORT | {"run": {"duration": 0.06, "smooth": True}})
+    structure, case = check_run(study)
+    structure = structure._replace(metrics=("residual_rms",))
+
+    def residual(x):
+        parameters = dict(case.control.parameters)
+        parameters[name] = parameters[name] * jnp.exp(x)
+        control = case.control._replace(parameters=parameters)
+        found = simulate(structure, case._replace(control=control))
+        return jnp.sum(found.metrics.residual_rms**2) * 1e9
+
+    run = jax.jit(residual)
+    slope, step = jax.jit(jax.jacfwd(residual))(0.0), 1e-3
+    assert slope == pytest.approx(float(run(step) - run(-step)) / (2 * step), rel=1e-4)
