@@ -14,12 +14,15 @@ from jaxmodel.laws.imsc import IMSC
 from jaxmodel.laws.lqg import LQG
 from jaxmodel.laws.lqr import LQR
 from jaxmodel.laws.modified_imsc import MODIFIED_IMSC
+from jaxmodel.laws.observer import OBSERVER
 from jaxmodel.laws.ppf import PPF
 from jaxmodel.laws.srf import SRF
 from jaxmodel.laws.state_space import STATE_SPACE
 from jaxmodel.table import Table
 
-LAWS: Table[Law] = Table("law", [IMSC, SRF, LQR, MODIFIED_IMSC, PPF, LQG, STATE_SPACE], check_law)
+LAWS: Table[Law] = Table(
+    "law", [IMSC, SRF, LQR, MODIFIED_IMSC, PPF, OBSERVER, LQG, STATE_SPACE], check_law
+)
 
 
 def is_modal(structure: Structure) -> bool:

@@ -1,4 +1,4 @@
-"""LQG: Riccati equations, the loop against an independent computation, gradients."""
+"""Laws with observers: Riccati equations, LQG against an independent computation, placed poles."""
 
 import jax
 import jax.numpy as jnp
@@ -7,6 +7,8 @@ import pytest
 from scipy.linalg import expm, solve_discrete_are
 
 from jaxmodel.bases import find_bases
+from jaxmodel.laws.link_model import link_model
+from jaxmodel.laws.observer import corrections
 from jaxmodel.prepare import design_controller
 from jaxmodel.riccati import filter_gain, regulator_gain, solve_riccati
 from jaxmodel.sampled_loop import closed_loop
@@ -165,3 +167,43 @@ def test_gradients_equal_differences(name):
     run = jax.jit(residual)
     slope, step = jax.jit(jax.jacfwd(residual))(0.0), 1e-3
     assert slope == pytest.approx(float(run(step) - run(-step)) / (2 * step), rel=1e-4)
+
+
+@pytest.mark.parametrize("highpass", [0.0, 3.0])
+def test_observers_have_the_poles_that_were_placed(highpass):
+    """Of every mode: the given damping at its frequency; those of its filters stay."""
+    control = {"law": "observer", "modes": 2, "laws": {"observer": {"observer_damping": 0.4}}}
+    electronics = {"sensor_highpass_hz": highpass}
+    study = parse_study(SHORT | {"control": control, "electronics": electronics})
+    structure, case = check_run(study)
+
+    def both(case):
+        known = known_of(structure, case)
+        model = link_model(structure, case, known)
+        return known.omega, model.state, corrections(structure, case, known, model.state)
+
+    omega, state, own = map(np.asarray, jax.jit(both)(case))
+    period, corner = float(case.electronics.period), float(case.electronics.antialias)
+    size = own.shape[2]
+    assert size == (5 if highpass else 4)
+    for link, j in np.ndindex(3, 2):
+        at = np.arange(size) * 2 + j
+        f, look = state[link][np.ix_(at, at)], np.eye(size)[2]
+        error = f @ (np.eye(size) - np.outer(own[link, j], look))
+        poles = np.log(np.linalg.eigvals(error)) / period
+        wanted = [omega[link, j] * (-0.4 + 1j * np.sqrt(1 - 0.4**2)), corner * (-1 + 1j) / 2**0.5]
+        wanted = np.concatenate([wanted, np.conj(wanted), [-2 * np.pi * highpass][: size - 4]])
+        apart = np.abs(poles[:, None] - wanted[None]).min(axis=0)
+        assert np.all(apart < 1e-5 * np.abs(wanted))
+
+
+def test_modal_control_by_observers_damps_as_modal_filters_do():
+    """With few modes and slow enough observers, the damping that the gains intend."""
+    found = {}
+    for law in ("imsc", "observer"):
+        control = {"law": law, "gain_factor": 0.2, "modes": 2}
+        structure, case = check_run(parse_study(SHORT | {"control": control}))
+        found[law] = loop_report(structure, case, np.array([0.0, 0.0, 0.5236]))
+        assert found[law].gain_margin > 2
+    damping = [found[law].damping_ratio[0].mean() for law in ("imsc", "observer")]
+    assert damping[1] == pytest.approx(damping[0], rel=0.25) and damping[0] > 0.02

@@ -1,0 +1,125 @@
+"""The sampled plant as a controller with an observer believes it, link by link.
+
+Modes at their assembled frequencies, drained patches, anti-alias filter, amplifiers and hold, exact
+over a sample, and the sample of delay. Each mode is in coordinates whose squares are energies,
+sqrt(m) omega q and sqrt(m) q', and so are its filters. States: all q, all rates, all z, all rates
+of z, all s if patches are drained, voltages if there are amplifiers, commands of the last sample.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.laws.contract import Feedback, Known, Parameter, masked_system
+from jaxmodel.lazy import jax, jnp
+from jaxmodel.parameters import Array
+from jaxmodel.state_space import StateSpace
+
+#: Field of laws with such a model.
+DAMPING = Parameter(
+    "model_damping", 0.01, "1", "damping ratio of the modes in the model", 1e-4, 0.5
+)
+
+
+class LinkModel(NamedTuple):
+    """One link over a sample: x_(k+1) = F x + G u + W f, y = C x; x ends with the last command."""
+
+    state: Array  # F, (n, n)
+    enter: Array  # G, (n, K)
+    drive: Array  # W, state per modal force held over the sample [sqrt(J)/N], (n, C)
+    sensor: Array  # C [V/sqrt(J)], (K, n)
+    energy: Array  # diagonal of the modes' energy, 1 for their two states, (n,)
+
+
+def link_model(structure: Structure, case: Case, known: Known) -> LinkModel:
+    """The model of each link; leading axis 3.
+
+    Args:
+        structure: static choices; electronics that exist are part of the model.
+        case: the numbers.
+        known: what the controller knows.
+    """
+    on = known.mask * case.control.mode_mask
+    zeta = jnp.asarray(case.control.parameters["model_damping"])
+    given = known.omega, jnp.sqrt(known.modal_mass), known.sensor, known.actuator, on, zeta
+
+    def one(*of_link: Array) -> LinkModel:
+        return _one_link(structure, case, *of_link)
+
+    return jax.vmap(one)(*given)
+
+
+def _one_link(
+    structure: Structure,
+    case: Case,
+    omega: Array,
+    root_mass: Array,
+    sensor: Array,
+    actuator: Array,
+    on: Array,
+    zeta: Array,
+) -> LinkModel:
+    electronics, n_modes, n_patches = case.electronics, omega.size, actuator.shape[1]
+    names = ["q", "rate", "z", "z_rate"]
+    names += ["s"] if structure.has_sensor_highpass else []
+    sizes = [n_modes] * len(names) + ([n_patches] if structure.has_amplifier else [])
+    names += ["volts"] if structure.has_amplifier else []
+    begin = [sum(sizes[:k]) for k in range(len(sizes) + 1)]
+    at = {name: slice(begin[k], begin[k + 1]) for k, name in enumerate(names)}
+    n, eye, corner = begin[-1], jnp.eye(n_modes), electronics.antialias
+    a = jnp.zeros((n, n), omega.dtype)
+    a = a.at[at["q"], at["rate"]].set(jnp.diag(omega)).at[at["rate"], at["q"]].set(-jnp.diag(omega))
+    a = a.at[at["rate"], at["rate"]].set(-2 * zeta * jnp.diag(omega))
+    a = a.at[at["z"], at["z_rate"]].set(corner * eye).at[at["z_rate"], at["z"]].set(-corner * eye)
+    a = a.at[at["z_rate"], at["q"]].set(corner * eye)
+    a = a.at[at["z_rate"], at["z_rate"]].set(-jnp.sqrt(2.0) * corner * eye)
+    if "s" in at:
+        a = a.at[at["z_rate"], at["s"]].set(-corner * eye)
+        a = a.at[at["s"], at["q"]].set(electronics.sensor_highpass * eye)
+        a = a.at[at["s"], at["s"]].set(-electronics.sensor_highpass * eye)
+    bend = (on / root_mass)[:, None] * actuator
+    enter = jnp.zeros((n, n_patches), omega.dtype)
+    if "volts" in at:
+        lag = jnp.maximum(electronics.amplifier_lag, electronics.period / 100)
+        a = a.at[at["rate"], at["volts"]].set(bend)
+        a = a.at[at["volts"], at["volts"]].set(-jnp.eye(n_patches) / lag)
+        enter = enter.at[at["volts"]].set(jnp.eye(n_patches) / lag)
+    else:
+        enter = enter.at[at["rate"]].set(bend)
+    drive = jnp.zeros((n, n_modes), omega.dtype).at[at["rate"]].set(jnp.diag(on / root_mass))
+    held = jnp.concatenate([a, enter, drive], axis=1)
+    held = jnp.pad(held, ((0, held.shape[1] - n), (0, 0)))
+    exact = jax.scipy.linalg.expm(held * electronics.period)[:n]
+    seen = jnp.zeros((n_patches, n), omega.dtype)
+    seen = seen.at[:, at["z"]].set(sensor * on / (omega * root_mass))
+    last = ((0, n_patches), (0, 0))
+    return LinkModel(
+        state=jnp.pad(exact[:, : n + n_patches], last),
+        enter=jnp.concatenate([jnp.zeros_like(enter), jnp.eye(n_patches)]),
+        drive=jnp.pad(exact[:, n + n_patches :], last),
+        sensor=jnp.pad(seen, ((0, 0), (0, n_patches))),
+        energy=jnp.pad(jnp.tile(on, 2), (0, n + n_patches - 2 * n_modes)),
+    )
+
+
+def compensated(
+    structure: Structure, case: Case, model: LinkModel, gain: Array, correct: Array
+) -> Feedback:
+    """u = -K x of an observer's state x, corrected with the sample at hand.
+
+    Args:
+        structure, case: of the law.
+        model: of each link, leading axis 3.
+        gain: K, (3, K, n).
+        correct: M of x + M (y - C x), (3, n, K).
+    """
+    kept = jnp.eye(model.state.shape[1]) - correct @ model.sensor
+    after = model.state - model.enter @ gain
+    system = StateSpace(
+        state=(after @ kept)[:, None],
+        enter=(after @ correct)[:, None],
+        leave=-(gain @ kept)[:, :, None],
+        direct=-(gain @ correct),
+    )
+    return masked_system(structure, case, system)
