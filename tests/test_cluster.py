@@ -230,7 +230,7 @@ def check_kills(cluster, local, out, kills, seed):
 
 
 def test_killed_workers_lose_nothing(cluster, local, tmp_path):
-    check_kills(cluster, local, tmp_path / "out", 2, 0)
+    check_kills(cluster, local, tmp_path / "out", 1, 0)
 
 
 @pytest.mark.long

@@ -27,8 +27,7 @@ REFUSED = [
     ('"" = 1', " = 1: unknown field; allowed: at the top: title, run, machine"),
     (
         '[control]\nlaw = "imcs"',
-        "or 'state_space', or one of your own with studies --with FILE.py; did you mean "
-        "'imsc'?",
+        "or 'state_space', or one of your own with studies --with FILE.py; did you mean 'imsc'?",
     ),
     ('[shaper]\nkind = "EI"', "'ei2' or 'ei3'; did you mean 'ei'?"),
     # wrong type

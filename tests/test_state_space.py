@@ -195,16 +195,13 @@ def test_margins_and_the_sweep(thirty):
     np.testing.assert_allclose(margin, report.gain_margin / np.array([0.3, 1.0]), rtol=1e-3)
 
 
-@pytest.mark.parametrize("target", ["json", "c", "c-fixed"])
+@pytest.mark.parametrize("target", ["c", "c-fixed"])
 def test_export_is_verified(thirty, tmp_path, target, capsys):
     """In C to 1e-12, in fixed point bit for bit with its integer model."""
     _, _, study = thirty
     (tmp_path / "study.toml").write_text(study_template(study))
     main(["export", str(tmp_path / "study.toml"), "--target", target, "--out", str(tmp_path)])
     assert "comparisons agree" in capsys.readouterr().out
-    if target == "json":
-        document = json.loads((tmp_path / "flexlink.json").read_text())
-        assert np.shape(document["numbers"]["state_matrix"]["value"]) == (1, 15, 2, 2)
 
 
 def test_export_of_some_links_with_feedthrough(tmp_path, capsys):
@@ -214,9 +211,11 @@ def test_export_of_some_links_with_feedthrough(tmp_path, capsys):
     study = study_with(tmp_path / "one.npz", control=control)
     assert list(fixed_controller(study).channels.link) == [1, 2]
     (tmp_path / "study.toml").write_text(study_template(study))
-    for target in ("c", "c-fixed"):
+    for target in ("json", "c-fixed"):
         main(["export", str(tmp_path / "study.toml"), "--target", target, "--out", str(tmp_path)])
         assert "comparisons agree" in capsys.readouterr().out
+    document = json.loads((tmp_path / "flexlink.json").read_text())
+    assert np.shape(document["numbers"]["state_matrix"]["value"]) == (3, 2, 2, 2)
 
 
 def test_formats_and_names(tmp_path):
