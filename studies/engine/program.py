@@ -22,6 +22,7 @@ from jaxmodel.parameters import Array
 from jaxmodel.simulate import Outline, Result, Start, begin, conclude
 from studies.engine.plan import Layout
 from studies.engine.runs import with_ratio
+from studies.kernels.equations import Function, call_of, literal, trace
 
 #: How often a program was traced in this process; tests use it to count compilations.
 TRACES: list[Structure] = []
@@ -266,39 +267,34 @@ def find_parts(program: Program, own: list[Any], common: list[Any]) -> StartPart
         program: what to trace.
         own, common: leaves of one case that vary, and that do not.
     """
-    traced, shapes = jax.make_jaxpr(partial(begin_case, program), return_shape=True)(own, common)
-    given = traced.jaxpr.invars[: len(own)]
-    sizes = tuple(out.aval.shape for out in traced.jaxpr.outvars)
+    traced, shapes = trace(partial(begin_case, program), own, common)
+    given = traced.inputs[: len(own)]
     moving = given[-1:] if program.place else []
     return StartParts(
         jax.tree.structure(shapes),
-        tuple(_dependence(traced.jaxpr, given)),
-        sizes,
-        tuple(_dependence(traced.jaxpr, moving)),
+        tuple(_dependence(traced, given)),
+        tuple(traced.shapes),
+        tuple(_dependence(traced, moving)),
     )
 
 
-def _dependence(jaxpr: Any, given: Iterable[Any]) -> list[bool]:
-    """Which results depend on any of the given arguments."""
+def _dependence(function: Function, given: Iterable[Any]) -> list[bool]:
+    """Which results depend on any of the given inputs."""
     depends = set(given)
 
     def is_one(atom: Any) -> bool:
-        return not hasattr(atom, "val") and atom in depends
+        return literal(atom) is None and atom in depends
 
-    for equation in jaxpr.eqns:
+    for equation in function.equations:
         touched = [is_one(atom) for atom in equation.invars]
-        inner = equation.params.get("jaxpr")
-        if equation.primitive.name in _CALLS and inner is not None:
-            own = zip(inner.jaxpr.invars, touched, strict=True)
-            found = _dependence(inner.jaxpr, [x for x, yes in own if yes])
+        inner = call_of(equation)
+        if inner is not None:
+            own = zip(inner.inputs, touched, strict=True)
+            found = _dependence(inner, [x for x, yes in own if yes])
         else:
             found = [any(touched)] * len(equation.outvars)
         depends.update(x for x, yes in zip(equation.outvars, found, strict=True) if yes)
-    return [is_one(out) for out in jaxpr.outvars]
-
-
-#: JAX's names for a call of a compiled function.
-_CALLS = ("jit", "pjit")
+    return [is_one(out) for out in function.outputs]
 
 
 @jax.jit

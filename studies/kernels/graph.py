@@ -1,6 +1,6 @@
 """A traced function as a graph of scalar operations, simplified while it is built.
 
-`trace` executes the equations of a jaxpr on arrays of nodes. A node is a number of one case:
+`Graph.trace` executes a function's equations on arrays of nodes. A node is a number of one case:
 *known* (a Python number, folded immediately), *shared* (the same for all cases) or *varying*. Equal
 operations on equal nodes are one node, and unused results are never visited, so the graph holds
 only the necessary arithmetic.
@@ -14,6 +14,8 @@ from typing import Any
 
 import jax
 import numpy as np
+
+from studies.kernels.equations import Function, Scan, call_of, literal, scan_of, trace
 
 
 class Node:
@@ -61,55 +63,56 @@ class Graph:
             NotImplementedError: an operation that a graph does not support.
         """
         shapes = [[jax.ShapeDtypeStruct(x.shape, dtype) for x in part] for part in arguments]
-        closed = jax.make_jaxpr(function)(*shapes)
+        traced, _ = trace(function, *shapes)
         given = [x for part in arguments for x in part]
-        self._survey(closed, given)
-        return self._evaluate(closed.jaxpr, closed.consts, given)
+        self._survey(traced, given)
+        return self._evaluate(traced, given)
 
-    def _survey(self, closed: Any, given: list[np.ndarray]) -> None:
+    def _survey(self, traced: Function, given: list[np.ndarray]) -> None:
         """What is to be known of a function before its equations are carried out; here nothing."""
 
     # --- equations --------------------------------------------------------------------------------
 
-    def _evaluate(self, jaxpr: Any, consts: Sequence[Any], given: list[np.ndarray]) -> list[Any]:
+    def _evaluate(self, function: Function, given: list[np.ndarray]) -> list[Any]:
         known: dict[Any, np.ndarray] = {}
 
         def value(atom: Any) -> np.ndarray:
-            if hasattr(atom, "val"):
-                return objects(np.asarray(atom.val).ravel().tolist(), np.shape(atom.val))
-            return known[atom]
+            number = literal(atom)
+            return known[atom] if number is None else _numbers(number)
 
-        for variable, constant in zip(jaxpr.constvars, consts, strict=True):
-            known[variable] = objects(np.asarray(constant).ravel().tolist(), np.shape(constant))
-        known |= dict(zip(jaxpr.invars, given, strict=True))
-        for equation in jaxpr.eqns:
+        known |= {variable: _numbers(x) for variable, x in function.constants}
+        known |= dict(zip(function.inputs, given, strict=True))
+        for equation in function.equations:
             arguments = [value(atom) for atom in equation.invars]
-            inner = equation.params.get("jaxpr") or equation.params.get("call_jaxpr")
-            if equation.primitive.name == "scan":
-                results = self._unrolled(equation.params, arguments)
+            scan, inner = scan_of(equation), call_of(equation)
+            if scan is not None:
+                results = self._unrolled(scan, arguments)
             elif inner is not None:
                 results = self._inlined(inner, arguments)
             else:
                 results = [self._apply(equation, arguments)]
             known |= dict(zip(equation.outvars, results, strict=True))
-        return [value(atom) for atom in jaxpr.outvars]
+        return [value(atom) for atom in function.outputs]
 
-    def _inlined(self, inner: Any, given: list[np.ndarray]) -> list[Any]:
+    def _inlined(self, inner: Function, given: list[np.ndarray]) -> list[Any]:
         """A function that is called."""
-        body, own = (inner.jaxpr, inner.consts) if hasattr(inner, "consts") else (inner, ())
-        return self._evaluate(body, own, given)
+        return self._evaluate(inner, given)
 
-    def _unrolled(self, params: Any, given: list[np.ndarray]) -> list[np.ndarray]:
-        """A scan, unrolled."""
-        body, n_consts, n_carry = params["jaxpr"], params["num_consts"], params["num_carry"]
-        constants, carry = given[:n_consts], given[n_consts : n_consts + n_carry]
-        stacked = given[n_consts + n_carry :]
+    def _unrolled(self, scan: Scan, given: list[np.ndarray]) -> list[np.ndarray]:
+        first = scan.n_constants + scan.n_carry
+        constants, carry, stacked = (
+            given[: scan.n_constants],
+            given[scan.n_constants : first],
+            given[first:],
+        )
         kept = []
-        for k in range(params["length"]):
+        order = range(scan.length)[:: -1 if scan.is_reversed else 1]
+        for k in order:
             rows = [x[k : k + 1].reshape(x.shape[1:]) for x in stacked]
-            results = self._evaluate(body.jaxpr, body.consts, [*constants, *carry, *rows])
-            carry = results[:n_carry]
-            kept.append(results[n_carry:])
+            results = self._evaluate(scan.body, [*constants, *carry, *rows])
+            carry = results[: scan.n_carry]
+            kept.append(results[scan.n_carry :])
+        kept = kept[:: order.step]
         return [*carry, *(np.stack(parts) for parts in zip(*kept, strict=True))]
 
     def _apply(self, equation: Any, given: list[np.ndarray]) -> np.ndarray:
@@ -293,6 +296,10 @@ def objects(values: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
     array = np.empty(len(values), object)
     array[:] = values
     return array.reshape(shape)
+
+
+def _numbers(array: np.ndarray) -> np.ndarray:
+    return objects(array.ravel().tolist(), array.shape)
 
 
 def is_known(value: Any) -> bool:

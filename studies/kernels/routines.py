@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from studies.kernels.derivatives import push_forward
+from studies.kernels.equations import Function, call_of, scan_of
 from studies.kernels.fusion import in_order
 from studies.kernels.graph import Graph, Node, is_known, objects
 
@@ -55,37 +56,38 @@ class RoutineGraph(Graph):
         self._moves: dict[int, bool] = {}
         self._alive: list[Any] = []  # what is known by its identity
 
-    def _survey(self, closed: Any, given: list[np.ndarray]) -> None:
+    def _survey(self, traced: Function, given: list[np.ndarray]) -> None:
         """Find the routines."""
-        found = _repeated(closed.jaxpr)
+        found = _repeated(traced)
         self._alive += found.values()
         # in the order of their first calls, so that each is given what the others before it return
         for name, inner in found.items():
             # what the calls are given, while the results of further routines are still unknown
             self._asked = {x: [] for x in found if x not in self._routines}
-            self._evaluate(closed.jaxpr, closed.consts, given)
+            self._evaluate(traced, given)
             calls, self._asked = self._asked[name], None
             self._routines[name] = self._routine(inner, calls)
 
-    def _inlined(self, inner: Any, given: list[np.ndarray]) -> list[Any]:
+    def _inlined(self, inner: Function, given: list[np.ndarray]) -> list[Any]:
+        name = id(inner.source)
         numbers = [x for array in given for x in array.flat]
-        if self._asked is not None and id(inner) in self._asked:
-            self._asked[id(inner)].append(numbers)
+        if self._asked is not None and name in self._asked:
+            self._asked[name].append(numbers)
             call = self._new("call", (), None)
-            count = sum(int(np.prod(x.aval.shape)) for x in inner.jaxpr.outvars)
+            count = sum(int(np.prod(shape)) for shape in inner.shapes)
             results = [self._new("result", (call,), k) for k in range(count)]
-        elif id(inner) in self._routines:
-            results = self._called(self._routines[id(inner)], numbers)
+        elif name in self._routines:
+            results = self._called(self._routines[name], numbers)
         else:
             return super()._inlined(inner, given)
-        return _arrays(results, inner.jaxpr.outvars)
+        return _arrays(results, inner.shapes)
 
     def _new(self, operation: str, args: tuple[Any, ...], place: Any) -> Node:
         node = Node(operation, args, True, False, place)
         self._alive.append(node)
         return node
 
-    def _routine(self, inner: Any, calls: list[list[Any]]) -> Routine:
+    def _routine(self, inner: Function, calls: list[list[Any]]) -> Routine:
         """The routine of a function.
 
         Args:
@@ -103,7 +105,7 @@ class RoutineGraph(Graph):
             routine.positions.append(position)
             routine.parameters.append(self._parameter(routine))
             given.append(routine.parameters[-1])
-        found = super()._inlined(inner, _arrays(given, inner.jaxpr.invars))
+        found = super()._inlined(inner, _arrays(given, [x.aval.shape for x in inner.inputs]))
         routine.results = [x for array in found for x in array.flat]
         routine.size = len(routine.results)
         own, primal = list(routine.parameters), list(routine.results)
@@ -181,32 +183,27 @@ class RoutineGraph(Graph):
         return is_known(x) or self._is_fixed[id(x)]
 
 
-def _repeated(jaxpr: Any) -> dict[int, Any]:
-    """Functions of some length that are called more than once, by identity."""
+def _repeated(traced: Function) -> dict[int, Function]:
+    """Functions of some length that are called more than once, by the identity of their source."""
     count: Counter[int] = Counter()
     found = {}
 
-    def look(jaxpr: Any, times: int) -> None:
-        for equation in jaxpr.eqns:
-            inner = equation.params.get("jaxpr")
-            if equation.primitive.name == "scan":
-                look(inner.jaxpr, times * equation.params["length"])
-            elif hasattr(inner, "consts") and len(inner.jaxpr.eqns) >= SHORTEST:
-                count[id(inner)] += times
-                found[id(inner)] = inner
+    def look(function: Function, times: int) -> None:
+        for equation in function.equations:
+            scan, inner = scan_of(equation), call_of(equation)
+            if scan is not None:
+                look(scan.body, times * scan.length)
+            elif inner is not None and len(inner.equations) >= SHORTEST:
+                count[id(inner.source)] += times
+                found[id(inner.source)] = inner
 
-    look(jaxpr, 1)
-    return {name: inner for name, inner in found.items() if count[name] > 1 and _is_real(inner)}
-
-
-def _is_real(inner: Any) -> bool:
-    return all(np.issubdtype(x.aval.dtype, np.floating) for x in inner.jaxpr.outvars)
+    look(traced, 1)
+    return {name: inner for name, inner in found.items() if count[name] > 1 and inner.is_real}
 
 
-def _arrays(numbers: Sequence[Any], variables: Sequence[Any]) -> list[np.ndarray]:
-    """Numbers in the shapes of some variables."""
+def _arrays(numbers: Sequence[Any], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
+    """Numbers in arrays of some shapes."""
     rest: Iterator[Any] = iter(numbers)
-    shapes = [x.aval.shape for x in variables]
     return [objects([next(rest) for _ in range(int(np.prod(shape)))], shape) for shape in shapes]
 
 
