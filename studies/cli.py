@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -15,7 +16,7 @@ from typer.exceptions import Abort, TyperException
 from studies.atlas.commands import add_commands as add_atlas
 from studies.bench.commands import add_commands as add_bench
 from studies.config import configure, start
-from studies.errors import StudyError
+from studies.errors import NoKernelWarning, StudyError
 from studies.export.commands import add_commands as add_export
 from studies.fitting.commands import add_commands as add_fit
 from studies.paper.commands import add_commands as add_paper
@@ -45,8 +46,10 @@ INTERRUPTED = 130
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `studies` command."""
     try:
-        if app(args=arguments, standalone_mode=False) == INTERRUPTED:
-            raise KeyboardInterrupt
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            if app(args=arguments, standalone_mode=False) == INTERRUPTED:
+                raise KeyboardInterrupt
     except (StudyError, TyperException) as error:
         text = error.format_message() if isinstance(error, TyperException) else str(error)
         if text:  # empty if help was printed because no command was given
@@ -62,6 +65,21 @@ def main(arguments: list[str] | None = None) -> None:
             raise
         print(f"studies: {reason}", file=sys.stderr)
         sys.exit(2)
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: Any = None,
+    line: str | None = None,
+) -> None:
+    """The program's own warnings as one line; others with their place in the code."""
+    if issubclass(category, NoKernelWarning):
+        print(f"studies: {message}", file=sys.stderr)
+    else:
+        print(warnings.formatwarning(message, category, filename, lineno), file=sys.stderr, end="")
 
 
 @app.callback()

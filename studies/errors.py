@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from difflib import get_close_matches
 
@@ -11,6 +12,20 @@ LONGEST = 120
 
 class StudyError(Exception):
     """A mistake in the user's request; its text is one complete message for the user."""
+
+
+class NoKernelError(StudyError):
+    """A loop that cannot become a traced kernel; XLA's scan runs it instead."""
+
+
+class NoKernelWarning(UserWarning):
+    """XLA's scan runs a loop for which there is no traced kernel."""
+
+
+def warn_of_scan(error: NoKernelError) -> None:
+    """Say that XLA's scan replaces a kernel, and why."""
+    text = f"{error}; XLA's scan runs instead, several times slower"
+    warnings.warn(text, NoKernelWarning, stacklevel=3)
 
 
 def field_error(

@@ -14,15 +14,13 @@ import jaxlib
 from studies.config import configure
 
 FLAGS = "--xla_backend_optimization_level=0"
-if jaxlib.__version__.startswith(
-    "0.10."
-):  # unknown flags stop XLA, so elsewhere compiling is slower
+# without the threshold for small loops, which takes a sixth of the time to compile
+FLAGS += " --xla_backend_extra_options=xla_cpu_use_multi_output_fusion"
+# nor passes over loops, nor modules split for threads that have no processor: another sixth
+FLAGS += " --xla_cpu_parallel_codegen_split_count=1 --xla_disable_hlo_passes="
+FLAGS += "simplify-while-loops,while-loop-invariant-code-motion,while-loop-constant-sinking"
+if jaxlib.__version__.startswith("0.10."):  # unknown flags stop XLA
     FLAGS += " --xla_cpu_use_fusion_emitters=false"
-    # without the threshold for small loops, which takes a sixth of the time to compile
-    FLAGS += " --xla_backend_extra_options=xla_cpu_use_multi_output_fusion"
-    # nor passes over loops, nor modules split for threads that have no processor: another sixth
-    FLAGS += " --xla_cpu_parallel_codegen_split_count=1 --xla_disable_hlo_passes="
-    FLAGS += "simplify-while-loops,while-loop-invariant-code-motion,while-loop-constant-sinking"
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FLAGS}"
 configure()
 # tables as wide as they need to be, wherever the tests run

@@ -16,8 +16,8 @@ import pytest
 from jaxmodel import status
 from studies import config
 from studies.bench.works import METRICS, WORKS
-from studies.engine import kernel_executor as kernels
-from studies.engine.executor import executor_text, make_executor
+from studies.engine import executor as executors
+from studies.engine.executor import KernelOrScan, executor_text, make_executor
 from studies.engine.kernel_executor import GpuExecutor, KernelExecutor
 from studies.engine.plan import Layout
 from studies.engine.scan import ScanExecutor
@@ -96,30 +96,31 @@ def test_wrong_results_are_noticed(monkeypatch):
         return lambda arrays: [1.001 * x for x in run(arrays)]
 
     monkeypatch.setattr(gpu, "build_kernel", wrong)
-    monkeypatch.setattr(kernels, "ScanExecutor", KernelExecutor)  # compiled already
+    monkeypatch.setattr(executors, "ScanExecutor", KernelExecutor)  # compiled already
     structure, cases = work("W1")
-    executor = GpuExecutor(structure, LAYOUT, False)
+    executor = KernelOrScan(GpuExecutor, structure, LAYOUT, False)
     found = executor.start(cases).wait()
     assert re.fullmatch(
-        r"XLA scan \(the GPU kernel differs by 0\.001 from the same on the CPU\)", executor.name
+        rf"{KernelExecutor.name} \(the GPU kernel differs by 0\.001 from the same on the CPU\)", executor.name
     )
     assert np.sum(found.status == status.OK) == LAYOUT.size - 1
 
 
 def test_without_the_call_target_the_scan_runs(monkeypatch):
     """Here XLA knows no call of PTX, as an older or newer one might not."""
-    monkeypatch.setattr(kernels, "ScanExecutor", KernelExecutor)
+    monkeypatch.setattr(gpu, "JAXLIB", f"{gpu.KNOWN}.2")
+    monkeypatch.setattr(executors, "ScanExecutor", KernelExecutor)
     structure, cases = work("W1")
-    executor = GpuExecutor(structure, LAYOUT, False)
+    executor = KernelOrScan(GpuExecutor, structure, LAYOUT, False)
     assert executor.start(cases).wait().status[0] == status.OK
-    assert executor.name.startswith("XLA scan (the GPU kernel failed: ")
+    assert "(the GPU kernel failed: " in executor.name
 
 
 def test_with_another_jaxlib_the_scan_runs(monkeypatch):
-    monkeypatch.setattr(kernels, "ScanExecutor", KernelExecutor)
+    monkeypatch.setattr(executors, "ScanExecutor", KernelExecutor)
     monkeypatch.setattr(gpu, "JAXLIB", "0.11.1")
     structure, cases = work("W1")
-    executor = GpuExecutor(structure, LAYOUT, False)
+    executor = KernelOrScan(GpuExecutor, structure, LAYOUT, False)
     assert executor.start(cases).wait().status[0] == status.OK
     assert "is known to run with jaxlib 0.10 only, this is 0.11.1" in executor.name
 
@@ -127,6 +128,7 @@ def test_with_another_jaxlib_the_scan_runs(monkeypatch):
 def test_what_sweeps_run_with_is_said(monkeypatch):
     assert "traced kernel, vectors of" in executor_text()
     monkeypatch.setattr("studies.engine.executor.processor", lambda: "cuda")
+    monkeypatch.setattr(gpu, "JAXLIB", f"{gpu.KNOWN}.2")
     assert "never run on a device" in executor_text()
     monkeypatch.setattr("studies.engine.executor.is_known", lambda: False)
     assert executor_text() == "XLA scan"
@@ -137,9 +139,9 @@ def test_what_sweeps_run_with_is_said(monkeypatch):
 def test_it_is_chosen_on_a_graphics_processor(monkeypatch):
     structure, _ = work("W1")
     monkeypatch.setattr("studies.engine.executor.processor", lambda: "cuda")
-    assert isinstance(make_executor(structure, LAYOUT, False), GpuExecutor)
+    assert make_executor(structure, LAYOUT, False).name == GpuExecutor.name
     slow = structure._replace(substeps=100)
-    assert isinstance(make_executor(slow, LAYOUT, False), ScanExecutor)
+    assert make_executor(slow, LAYOUT, False).name == ScanExecutor.name
     assert config.processor() == "cpu"
 
 

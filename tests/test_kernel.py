@@ -14,6 +14,7 @@ from studies.engine.plan import Layout, chunk_cases, local_layout, plan_groups
 from studies.engine.program import TRACES, Program, split_cases
 from studies.engine.scan import ScanExecutor
 from studies.engine.steps import trace_steps
+from studies.errors import NoKernelError
 from studies.kernels import compilation, cpu, llvm, native
 from studies.kernels.compilation import ObjectCache
 from studies.kernels.traced import InputLeaf, trace_loop
@@ -118,9 +119,9 @@ def test_odd_numbers_of_cases_fill_whole_vectors():
 def test_without_llvmlite_the_scan_runs(monkeypatch):
     table = build_table(small_spec(MIXED))
     group = plan_groups(table, np.arange(8), local_layout)[0]
-    assert isinstance(make_executor(group.structure, LAYOUT, False), KernelExecutor)
+    assert make_executor(group.structure, LAYOUT, False).name == KernelExecutor.name
     monkeypatch.setattr(llvm, "binding", None)
-    assert isinstance(make_executor(group.structure, LAYOUT, False), ScanExecutor)
+    assert make_executor(group.structure, LAYOUT, False).name == ScanExecutor.name
 
 
 # --- the translation itself -----------------------------------------------------------------------
@@ -175,7 +176,7 @@ def test_not_a_number_goes_through_limits():
 
 
 def test_unknown_operation_is_named():
-    with pytest.raises(NotImplementedError, match="'cumsum'"):
+    with pytest.raises(NoKernelError, match="'cumsum'"):
         translated(lambda x, c: jnp.cumsum(x), (3,))
 
 

@@ -108,4 +108,6 @@ def test_lanes_last_equals_single(parts):
         one = state._replace(plant=state.plant._replace(q=state.plant.q + 1e-5 * factor[k]))
         single, _ = run(structure, loop, one, inputs)
         for a, b in zip(jax.tree.leaves(wide), jax.tree.leaves(single), strict=True):
-            np.testing.assert_allclose(np.asarray(a)[..., k], b, rtol=1e-12, atol=1e-18)
+            # XLA joins operations in its own ways, so entries round as the largest of a leaf does
+            size = np.max(np.abs(b), initial=0.0)
+            np.testing.assert_allclose(np.asarray(a)[..., k], b, rtol=0, atol=1e-12 * size + 1e-18)

@@ -22,7 +22,7 @@ from studies.engine.plan import Layout, lane_unit
 from studies.engine.program import Place, Program, begin_block, conclude_all, split_cases
 from studies.engine.runs import check_run
 from studies.engine.steps import fits_kernel, given_loop, read_leaves, start_parts
-from studies.errors import StudyError
+from studies.errors import NoKernelError, StudyError, warn_of_scan
 from studies.kernels import bridge
 from studies.study.spec import Study
 
@@ -52,7 +52,7 @@ def batched(study: Study, place: Place) -> Callable[[Array], Result]:
         raise StudyError(f"place: {place!r}; expected a function of a case and its parameters")
     structure, case = check_run(study)
     if processor() != "cpu" or not fits_kernel(structure) or not bridge.is_available():
-        return _checked(case, place, jax.vmap(lambda x: simulate(structure, place(case, x))))
+        return _checked(case, place, _by_scan(structure, case, place))
     exact = _by_kernel(structure, case, place)
     if structure.is_smooth:
         return _checked(case, place, exact)
@@ -102,10 +102,19 @@ def _check_place(case: Case, place: Place, parameters: Array) -> None:
             raise StudyError(f"place: case{name} has shape {one.shape}; expected {np.shape(two)}")
 
 
+def _by_scan(structure: Structure, case: Case, place: Place) -> Callable[[Array], Result]:
+    found: Callable[[Array], Result] = jax.vmap(lambda x: simulate(structure, place(case, x)))
+    return found
+
+
 def _by_kernel(structure: Structure, case: Case, place: Place) -> Callable[[Array], Result]:
     @cache
     def compiled(lanes: int, count: int) -> Callable[[Array], Result]:
-        return _program(structure, case, place, lanes, count)
+        try:
+            return _program(structure, case, place, lanes, count)
+        except NoKernelError as error:
+            warn_of_scan(error)
+            return _by_scan(structure, case, place)
 
     def run(parameters: Array) -> Result:
         n, unit = len(parameters), lane_unit()

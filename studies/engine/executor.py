@@ -9,19 +9,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 
 from jaxmodel.case import Case, Structure
 from studies.config import processor
 from studies.engine.kernel_executor import GpuExecutor, KernelExecutor
 from studies.engine.plan import Layout
-from studies.engine.program import Executor
+from studies.engine.program import Executor, Running
 from studies.engine.runs import uncontrolled
 from studies.engine.scan import ScanExecutor
 from studies.engine.steps import fits_kernel
+from studies.errors import NoKernelError
 from studies.kernels import native
 from studies.kernels.gpu import is_known
 from studies.kernels.llvm import is_available
+
+_Make = Callable[[Structure, Layout, bool], Executor]
 
 
 def make_executor(structure: Structure, layout: Layout, has_own_ratio: bool) -> Executor:
@@ -32,9 +38,47 @@ def make_executor(structure: Structure, layout: Layout, has_own_ratio: bool) -> 
         layout: of its chunks.
         has_own_ratio: gain ratios come from an uncontrolled pass for some cases.
     """
-    kernels: dict[str, type[Executor]] = {"cpu": KernelExecutor, "cuda": GpuExecutor}
-    fastest = kernels.get(processor(), ScanExecutor) if fits_kernel(structure) else ScanExecutor
-    return fastest(structure, layout, has_own_ratio)
+    kernels: dict[str, _Make] = {"cpu": KernelExecutor, "cuda": GpuExecutor}
+    kernel = kernels.get(processor()) if fits_kernel(structure) else None
+    if kernel is None:
+        return ScanExecutor(structure, layout, has_own_ratio)
+    return KernelOrScan(kernel, structure, layout, has_own_ratio)
+
+
+class KernelOrScan:
+    """A kernel; XLA's scan from the first chunk on if the group has none, and `name` says why."""
+
+    def __init__(
+        self, kernel: _Make, structure: Structure, layout: Layout, has_own_ratio: bool
+    ) -> None:
+        """
+        Args:
+            kernel: makes the executor to try.
+            structure, layout, has_own_ratio: as for `make_executor`.
+        """
+        self.structure = structure
+        self._scan = partial(ScanExecutor, structure, layout, has_own_ratio)
+        self._chosen, self._reason = kernel(structure, layout, has_own_ratio), ""
+
+    @property
+    def name(self) -> str:
+        return self._chosen.name + (f" ({self._reason})" if self._reason else "")
+
+    @property
+    def compile_time(self) -> float:
+        return self._chosen.compile_time
+
+    @compile_time.setter
+    def compile_time(self, seconds: float) -> None:
+        self._chosen.compile_time = seconds
+
+    def start(self, cases: Case) -> Running:
+        try:
+            return self._chosen.start(cases)
+        except NoKernelError as error:
+            self._reason = str(error)
+            self._chosen = self._scan()
+            return self._chosen.start(cases)
 
 
 def executor_text() -> str:

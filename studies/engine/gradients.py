@@ -12,6 +12,7 @@ the steps: its gradient, at a cost that does not (docs/performance.md).
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -51,6 +52,7 @@ from studies.engine.steps import (
     fits_kernel,
     start_block,
 )
+from studies.errors import NoKernelError, warn_of_scan
 from studies.kernels.adjoint import RECORD
 
 #: Tangents per pass of the kernel. More of them share the state's own arithmetic (1: 31 gradients/s
@@ -102,9 +104,18 @@ class ChunkSlopes(NamedTuple):
 class Gradients(Protocol):
     """Differentiates chunks of one group."""
 
-    name: str
-    mode: str  # "forward" or "reverse"
-    compile_time: float  # [s], 0 before the first chunk
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def mode(self) -> str:
+        """ "forward" or "reverse"."""
+        ...
+
+    @property
+    def compile_time(self) -> float:
+        """[s], 0 before the first chunk."""
+        ...
 
     def evaluate(
         self, cases: Case, parameters: np.ndarray, is_used: np.ndarray | None = None
@@ -133,7 +144,48 @@ def make_gradients(
     if processor() != "cpu" or not fits_kernel(structure):
         return ScanGradients(structure, layout, place)
     mode = KernelAdjoint if n_parameters >= REVERSE_FROM else KernelGradients
-    return mode(structure, layout, place)
+    return KernelOrScanGradients(mode, structure, layout, place)
+
+
+class KernelOrScanGradients:
+    """Gradients by kernels; by XLA's scan, with a warning, if the group has no kernel."""
+
+    def __init__(
+        self,
+        kernel: Callable[[Structure, Layout, Place], Gradients],
+        structure: Structure,
+        layout: Layout,
+        place: Place,
+    ) -> None:
+        """
+        Args:
+            kernel: makes the gradients to try.
+            structure, layout, place: as for `make_gradients`.
+        """
+        self._scan = partial(ScanGradients, structure, layout, place)
+        self._chosen = kernel(structure, layout, place)
+
+    @property
+    def name(self) -> str:
+        return self._chosen.name
+
+    @property
+    def mode(self) -> str:
+        return self._chosen.mode
+
+    @property
+    def compile_time(self) -> float:
+        return self._chosen.compile_time
+
+    def evaluate(
+        self, cases: Case, parameters: np.ndarray, is_used: np.ndarray | None = None
+    ) -> Differentiated:
+        try:
+            return self._chosen.evaluate(cases, parameters, is_used)
+        except NoKernelError as error:
+            warn_of_scan(error)
+            self._chosen = self._scan()
+            return self._chosen.evaluate(cases, parameters, is_used)
 
 
 def _split(cases: Case, parameters: np.ndarray, layout: Layout, structure: Structure) -> Split:

@@ -24,7 +24,6 @@ from studies.engine.program import (
     lane_blocks,
     split_cases,
 )
-from studies.engine.scan import ScanExecutor
 from studies.engine.steps import (
     Steps,
     Traced,
@@ -33,6 +32,7 @@ from studies.engine.steps import (
     start_block,
     trace_steps,
 )
+from studies.errors import NoKernelError
 from studies.kernels import cpu, gpu
 
 
@@ -97,8 +97,7 @@ TOLERANCE = {8: 1e-6, 4: 1e-2}
 class GpuExecutor:
     """Blocks of lanes on GPUs, one thread per case.
 
-    The first cases of the first chunk also run on the CPU; if they differ, or the kernel cannot be
-    used, XLA's scan does the work and `name` says why.
+    The first cases of the first chunk also run on the CPU; the kernel must give the same.
     """
 
     name = "GPU kernel"
@@ -107,23 +106,14 @@ class GpuExecutor:
         self.structure, self.layout, self.has_own_ratio = structure, layout, has_own_ratio
         self.compile_time = 0.0
         self._run: Any = None
-        self._instead: ScanExecutor | None = None
 
     def start(self, cases: Case) -> Running:
-        if self._instead is not None:
-            return self._instead.start(cases)
         split = split_cases(cases, self.layout, self.structure, self.has_own_ratio)
         blocks = lane_blocks(split, self.layout)
         if self._run is None:
             started = time.perf_counter()
             program = Program(self.structure, self.layout, split.tree, split.is_varying)
-            fault = self._build(program, split, blocks[0])
-            if fault:
-                self.name = f"XLA scan (the GPU kernel {fault})"
-                self._instead = ScanExecutor(self.structure, self.layout, self.has_own_ratio)
-                running = self._instead.start(cases)
-                self.compile_time = time.perf_counter() - started
-                return running
+            self._build(program, split, blocks[0])
             self.compile_time = time.perf_counter() - started
         devices = jax.local_devices()[: self.layout.devices]
         launched = [
@@ -132,24 +122,32 @@ class GpuExecutor:
         ]
         return Running(lambda: _gathered(launched), lambda: None)
 
-    def _build(self, program: Program, split: Split, block: list[Any]) -> str:
-        """Build the program; returns what is wrong with it, "" if nothing."""
+    def _build(self, program: Program, split: Split, block: list[Any]) -> None:
+        """Build the program.
+
+        Raises:
+            NoKernelError: it cannot be used, or its results are wrong.
+        """
         if not gpu.is_known():
-            return f"is known to run with jaxlib {gpu.KNOWN} only, this is {gpu.JAXLIB}"
+            raise NoKernelError(
+                f"the GPU kernel is known to run with jaxlib {gpu.KNOWN} only, this is {gpu.JAXLIB}"
+            )
         try:
             traced = trace_steps(program, split)
             if traced.loop.operations()["tanh"]:
-                return "knows no tanh, which friction needs"
+                raise NoKernelError("the GPU kernel knows no tanh, which friction needs")
             kernel = gpu.build_kernel(traced.loop, program.structure.n_steps, program.layout.lanes)
-            self._run = jax.jit(partial(_run_block, program, traced.parts, kernel))
-            first = self._run(block, split.shared)
+            run = jax.jit(partial(_run_block, program, traced.parts, kernel))
+            first = run(block, split.shared)
             jax.block_until_ready(first)
         except RuntimeError as error:  # from JAX, LLVM or the tracer
-            return f"failed: {str(error).splitlines()[0]}"
+            raise NoKernelError(f"the GPU kernel failed: {str(error).splitlines()[0]}") from error
         difference = _difference(traced, first, program.structure.n_steps)
         if difference > TOLERANCE[traced.loop.dtype.itemsize]:
-            return f"differs by {difference:.1g} from the same on the CPU"
-        return ""
+            raise NoKernelError(
+                f"the GPU kernel differs by {difference:.1g} from the same on the CPU"
+            )
+        self._run = run
 
 
 class CaseBlock(NamedTuple):

@@ -12,6 +12,7 @@ import numpy as np
 
 from studies.config import processor
 from studies.engine.plan import lane_unit
+from studies.errors import NoKernelError, warn_of_scan
 from studies.kernels import cpu
 from studies.kernels.llvm import is_available
 from studies.kernels.traced import InputLeaf, TracedLoop, trace_loop
@@ -102,13 +103,15 @@ def _runner(
             )
 
         name = f"{step.__name__} {real} {trees[0]} {constants} {varies} {state}"
-        kernel = cpu.kept_kernel(name, make)
 
-        def run(leaves: list[Any], n_steps: int, lanes: int) -> list[Any]:
+        def run(kernel: cpu.Kernel, leaves: list[Any], n_steps: int, lanes: int) -> list[Any]:
             kernel.run(leaves, n_steps, lanes)
             return leaves[sizes[0] + sizes[1] :]
 
-        return run
+        try:
+            return partial(run, cpu.kept_kernel(name, make))
+        except NoKernelError as error:
+            warn_of_scan(error)
 
     @partial(jax.jit, static_argnums=3)
     def scanned(

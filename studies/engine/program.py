@@ -57,18 +57,11 @@ class Running(NamedTuple):
 class Executor(Protocol):
     """Runs chunks of one group."""
 
-    name: str
     structure: Structure
     compile_time: float  # [s], 0 before the first chunk
 
-    def __init__(self, structure: Structure, layout: Layout, has_own_ratio: bool) -> None:
-        """
-        Args:
-            structure: of the group.
-            layout: of its chunks.
-            has_own_ratio: EMC ratios come from an uncontrolled pass for some cases.
-        """
-        ...
+    @property
+    def name(self) -> str: ...
 
     def start(self, cases: Case) -> Running:
         """Start a chunk.

@@ -24,7 +24,6 @@ from studies.engine.program import (
     prepare,
     prepare_shared,
 )
-from studies.errors import StudyError
 from studies.kernels import cpu, llvm, native
 from studies.kernels.adjoint import trace_adjoint
 from studies.kernels.traced import InputLeaf, TracedLoop, trace_loop
@@ -109,7 +108,7 @@ def _once(program: Program, split: Split, kind: Any, build: Callable[[], Any]) -
     """What was built before for the same program and shared numbers, or is now.
 
     Raises:
-        StudyError: an own part uses what kernels do not support.
+        NoKernelError: the steps use what kernels do not support.
     """
     numbers = tuple((leaf.shape, leaf.tobytes()) for leaf in split.shared)
     shapes = tuple(leaf.shape for leaf in split.varying)
@@ -117,10 +116,7 @@ def _once(program: Program, split: Split, kind: Any, build: Callable[[], Any]) -
     if key not in _STEPS:
         while len(_STEPS) >= KEPT_KERNELS:
             del _STEPS[next(iter(_STEPS))]
-        try:
-            _STEPS[key] = build()
-        except NotImplementedError as error:  # of a part of the user's own
-            raise StudyError(f"{error}: kernels do not support it; see docs/own-parts.md") from None
+        _STEPS[key] = build()
     return _STEPS[key]
 
 

@@ -90,11 +90,14 @@ def differentiable(
 
     Returns:
         The last state as a function of the arrays: constants without known ones, inputs, state.
+
+    Raises:
+        NoKernelError: the step uses what kernels do not support.
     """
     given = step, constants, inputs, state, dtype
     has_routines = not native.this_processor().has_masks
     still = (step, *map(_still, (constants, inputs, state)), dtype)
-    plain = cache(lambda: outside(trace_loop, *still, 0, has_routines))
+    plain = as_function(outside(trace_loop, *still, 0, has_routines), n_steps, lanes)
     tangent = cache(lambda: outside(trace_loop, *given, 1, has_routines))
     adjoint = cache(lambda: outside(trace_adjoint, *given))
     read = [leaf for leaf in constants if isinstance(leaf, InputLeaf)]
@@ -103,7 +106,7 @@ def differentiable(
 
     @jax.custom_jvp
     def run(leaves: list[Any]) -> list[Any]:
-        return as_function(plain(), n_steps, lanes)(leaves)
+        return plain(leaves)
 
     def push(moving: list[int], leaves: list[Any], tangents: list[Any]) -> list[Any]:
         along = {k: jnp.zeros_like(leaves[k]) for k, leaf in enumerate(kinds) if leaf.is_moving}

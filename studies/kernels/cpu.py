@@ -23,6 +23,7 @@ import jax
 import numpy as np
 
 from studies import sources
+from studies.errors import NoKernelError
 from studies.kernels import native
 from studies.kernels.compilation import ObjectCache, compiling
 from studies.kernels.native import (
@@ -276,4 +277,8 @@ def _names(processor: Processor, effort: int) -> tuple[str, ...]:
 
 def _machine_code_here(text: str, processor: Processor, effort: int) -> bytes:
     with compiling():
-        return machine_code(text, processor, effort)
+        try:
+            return machine_code(text, processor, effort)
+        except RuntimeError as error:
+            reason = (str(error).splitlines() or [""])[0]
+            raise NoKernelError(f"LLVM cannot compile the traced kernel: {reason}") from error

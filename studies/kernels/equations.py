@@ -102,4 +102,10 @@ def _opened(jaxpr: Any) -> Function:
     body = getattr(jaxpr, "jaxpr", jaxpr)
     values = map(np.asarray, getattr(jaxpr, "consts", ()))
     constants = list(zip(body.constvars, values, strict=True))
-    return Function(body.invars, body.outvars, body.eqns, constants, jaxpr)
+    return Function(
+        inputs=body.invars,
+        outputs=body.outvars,
+        equations=body.eqns,
+        constants=constants,
+        source=jaxpr,
+    )

@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from studies.errors import NoKernelError, StudyError
 from studies.kernels.equations import Function, Scan, call_of, literal, scan_of, trace
 
 
@@ -60,8 +61,24 @@ class Graph:
             Arrays of nodes and numbers, flat in the order of the function's result.
 
         Raises:
-            NotImplementedError: an operation that a graph does not support.
+            NoKernelError: the function uses what a graph does not support, or this version of JAX
+                describes it in an unknown way.
         """
+        try:
+            return self._traced(function, arguments, dtype)
+        except (StudyError, MemoryError):
+            raise
+        except NotImplementedError as error:
+            raise NoKernelError(f"the traced kernel does not support {error}") from None
+        except Exception as error:  # a structure of JAX's that is not expected
+            reason = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+            raise NoKernelError(
+                f"JAX {jax.__version__} gives no traced kernel of the step ({reason})"
+            ) from error
+
+    def _traced(
+        self, function: Callable[..., Any], arguments: Sequence[Any], dtype: Any
+    ) -> list[np.ndarray]:
         shapes = [[jax.ShapeDtypeStruct(x.shape, dtype) for x in part] for part in arguments]
         traced, _ = trace(function, *shapes)
         given = [x for part in arguments for x in part]

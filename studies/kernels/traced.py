@@ -131,7 +131,7 @@ def trace_loop(
         has_routines: keep functions that are called more than once.
 
     Raises:
-        NotImplementedError: an operation of the step that a graph does not support.
+        NoKernelError: the step uses what kernels do not support.
     """
     real = np.dtype(dtype)
     seeds: list[dict[int, Any]] = [{} for _ in range(directions)]
