@@ -101,7 +101,8 @@ def test_wrong_results_are_noticed(monkeypatch):
     executor = KernelOrScan(GpuExecutor, structure, LAYOUT, False)
     found = executor.start(cases).wait()
     assert re.fullmatch(
-        rf"{KernelExecutor.name} \(the GPU kernel differs by 0\.001 from the same on the CPU\)", executor.name
+        rf"{KernelExecutor.name} \(the GPU kernel differs by 0\.001 from the same on the CPU\)",
+        executor.name,
     )
     assert np.sum(found.status == status.OK) == LAYOUT.size - 1
 
