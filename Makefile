@@ -8,7 +8,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 .DEFAULT_GOAL := help
-.PHONY: help study explore test test-long lint check clean venv
+.PHONY: help study explore test test-long smoke lint check clean venv
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 16
@@ -33,6 +33,9 @@ test: .venv/installed  ## run the tests
 test-long: .venv/installed  ## run the long campaigns
 	$(PYTEST) -m long
 
+smoke: .venv/installed  ## run the main job and the core tests on every other supported Python here
+	$(BIN)/python .ci/smoke.py
+
 lint: .venv/installed  ## lint, check format, types and the contract of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -42,7 +45,7 @@ lint: .venv/installed  ## lint, check format, types and the contract of imports
 check: lint test  ## all of it, as continuous integration does
 
 clean:  ## remove the environment, caches and build products; results stay
-	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf .venv .venv-* build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 .venv/installed: pyproject.toml constraints.txt

@@ -18,6 +18,17 @@ from studies.errors import StudyError, field_error, nearest
 PACKAGE = "flexlink-studies"
 PRECISIONS = ("float64", "float32")
 
+#: Minor versions that the tests have run with, in continuous integration. JAX changes its internals
+#: between them, and kernels read some.
+TESTED = {
+    "python": ("3.11", "3.12", "3.13"),
+    "jax": ("0.10", "0.12"),
+    "jaxlib": ("0.10", "0.12"),
+    "numpy": ("2.4", "2.5"),
+    "h5py": ("3.16",),
+    "llvmlite": ("0.50",),
+}
+
 # Flags of XLA's CPU compiler for a scan over time steps vectorised over cases.
 # XLA aborts on an unknown flag, so each one is tested with every supported JAX.
 COMPILER_FLAGS = {
@@ -125,7 +136,8 @@ def info() -> dict[str, Any]:
     return {
         PACKAGE: _version(PACKAGE),
         "python": platform.python_version(),
-        **{name: _version(name) for name in ("jax", "jaxlib", "numpy", "h5py")},
+        **{name: _version(name) for name in ("jax", "jaxlib", "numpy", "h5py", "llvmlite")},
+        "versions never tested": untested(),
         "processor": processor_text(),
         "devices": ", ".join(f"{kinds.count(kind)} x {kind}" for kind in sorted(set(kinds))),
         "precision": "float64" if _settings().jax_enable_x64 else "float32",
@@ -133,6 +145,17 @@ def info() -> dict[str, Any]:
         "cache_mib": round(_folder_bytes(folder) / 2**20, 1) if folder else 0.0,
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }
+
+
+def untested() -> str:
+    """Installed versions that the tests have never run with, and those they have; or "none"."""
+    present = {name: _version(name) for name in TESTED} | {"python": platform.python_version()}
+    unknown = [
+        f"{name} {version} (tested: {', '.join(TESTED[name])})"
+        for name, version in present.items()
+        if version != _ABSENT and ".".join(version.split(".")[:2]) not in TESTED[name]
+    ]
+    return ", ".join(unknown) or "none"
 
 
 def origin() -> dict[str, str]:
@@ -256,11 +279,14 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
+_ABSENT = "not installed"
+
+
 def _version(package: str) -> str:
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
-        return "not installed"
+        return _ABSENT
 
 
 def _folder_bytes(folder: str) -> int:

@@ -3,13 +3,16 @@
 import gc
 import json
 import os
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import pytest
 
+from studies import config
 from studies.config import (
     COMPILER_FLAGS,
     DEVICE_FLAG,
@@ -17,8 +20,11 @@ from studies.config import (
     configure,
     info,
     is_backend_started,
+    untested,
 )
 from studies.errors import StudyError
+
+TOP = Path(__file__).parents[1]
 
 
 def run(code, **environment):
@@ -149,6 +155,31 @@ def test_info_is_plain_and_complete():
         "xla_flags",
     } <= facts.keys()
     json.dumps(facts)
+
+
+def test_versions_that_were_never_tested_are_named(monkeypatch):
+    assert untested() == "none" == info()["versions never tested"]
+    version = config._version
+    monkeypatch.setattr(config, "_version", lambda x: "0.11.1" if x == "jax" else version(x))
+    assert untested() == "jax 0.11.1 (tested: 0.10, 0.12)"
+    monkeypatch.setattr(config, "_version", lambda _: config._ABSENT)
+    monkeypatch.setattr(config.platform, "python_version", lambda: "3.14.0")
+    assert untested() == "python 3.14.0 (tested: 3.11, 3.12, 3.13)"
+
+
+def test_versions_tested_are_those_that_are_installed():
+    """The constraints install a tested version on every Python, and the bounds admit no newer."""
+    text = (TOP / "constraints.txt").read_text(encoding="utf-8")
+    for name in config.TESTED.keys() - {"python"}:
+        pinned = set(re.findall(rf"^{name}==(\d+\.\d+)", text, re.MULTILINE))
+        assert pinned == set(config.TESTED[name]), name
+    project = (TOP / "pyproject.toml").read_text(encoding="utf-8")
+    for name, bound in (
+        ("python", r'requires-python = ".*<3\.(\d+)"'),
+        ("jax", r'"jax>=.*<0\.(\d+)"'),
+    ):
+        newest = config.TESTED[name][-1]
+        assert int(re.search(bound, project)[1]) == int(newest.split(".")[1]) + 1
 
 
 def test_what_keeps_jax_from_starting_is_said():
