@@ -49,6 +49,10 @@ LEFT_OUT = " and ".join(
         "without_kernels",
         "routines",
         "adam",
+        "optimal_damping",
+        "inside_other_programs",
+        "as_it_should",
+        "than_it_should",
     )
 )
 

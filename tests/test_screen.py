@@ -8,7 +8,6 @@ from jaxmodel import status
 from jaxmodel.sampled_loop import closed_loop
 from jaxmodel.simulate import simulate
 from studies.engine.columns import LEFT_OUT
-from studies.engine.executor import make_executor
 from studies.engine.kernel_executor import KernelExecutor
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import metric_values
@@ -213,7 +212,7 @@ def test_a_linear_sample_takes_far_fewer_operations(folders):
     table, rows = build_table(spec), np.arange(64)
     for is_linear in (False, True):  # as in the folders, so already compiled
         (group,) = plan_groups(table, rows, local_layout, spec.sweep.metrics, is_linear)
-        made = make_executor(group.structure, group.layout, False)
+        made = KernelExecutor(group.structure, group.layout, False)
         made.start(chunk_cases(table, rows, group.structure, group.layout.size)).wait()
         found.append(made.operations)
     full, linear = (sum(x.values()) - x["read"] for x in found)

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from studies.errors import NoKernelError, StudyError
+from studies.errors import NoKernelError
 from studies.kernels.equations import Function, Scan, call_of, literal, scan_of, trace
 
 
@@ -64,10 +64,12 @@ class Graph:
             NoKernelError: the function uses what a graph does not support, or this version of JAX
                 describes it in an unknown way.
         """
+        shapes = [[jax.ShapeDtypeStruct(x.shape, dtype) for x in part] for part in arguments]
+        traced, _ = trace(function, *shapes)  # runs the function: its errors are its own
+        given = [x for part in arguments for x in part]
         try:
-            return self._traced(function, arguments, dtype)
-        except (StudyError, MemoryError):
-            raise
+            self._survey(traced, given)
+            return self._evaluate(traced, given)
         except NotImplementedError as error:
             raise NoKernelError(f"the traced kernel does not support {error}") from None
         except Exception as error:  # a structure of JAX's that is not expected
@@ -75,15 +77,6 @@ class Graph:
             raise NoKernelError(
                 f"JAX {jax.__version__} gives no traced kernel of the step ({reason})"
             ) from error
-
-    def _traced(
-        self, function: Callable[..., Any], arguments: Sequence[Any], dtype: Any
-    ) -> list[np.ndarray]:
-        shapes = [[jax.ShapeDtypeStruct(x.shape, dtype) for x in part] for part in arguments]
-        traced, _ = trace(function, *shapes)
-        given = [x for part in arguments for x in part]
-        self._survey(traced, given)
-        return self._evaluate(traced, given)
 
     def _survey(self, traced: Function, given: list[np.ndarray]) -> None:
         """What is to be known of a function before its equations are carried out; here nothing."""
