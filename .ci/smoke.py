@@ -20,8 +20,10 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from studies.config import TESTED
+
 TOP = Path(__file__).resolve().parents[1]
-SUPPORTED = ("3.11", "3.12", "3.13")
+SUPPORTED = TESTED["python"]
 #: Where version managers keep interpreters, below the home folder or the root.
 PLACES = (
     ".pyenv/versions/*/bin",

@@ -1,4 +1,4 @@
-"""The one exception meant for users, and how its message is built."""
+"""Exceptions and warnings meant for users, and how their messages are built."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from studies.engine.executor import make_executor
 from studies.engine.kernel_executor import KernelExecutor
 from studies.engine.scan import ScanExecutor
 from studies.errors import NoKernelError, NoKernelWarning
-from studies.kernels import cpu, equations, graph
+from studies.kernels import cpu, graph
 from studies.kernels.equations import call_of, literal, scan_of, trace
 from tests import test_batched
 from tests.test_cli import run
@@ -128,13 +128,11 @@ def test_errors_of_a_graph_name_the_version(no_structure):
         translated(lambda x, c: x * c, (3,))
 
 
-def test_a_sweep_runs_by_the_scan_and_says_so(capsys, tmp_path, monkeypatch):
+def test_a_sweep_runs_by_the_scan_and_says_so(capsys, tmp_path, monkeypatch, no_structure):
     monkeypatch.setattr(plan, "LANES", 8)
     monkeypatch.setattr(plan, "LARGEST_CHUNK", 16)
     path = tmp_path / "small.toml"
     path.write_text(text_of("\n[sweep.axes]\ngain = [0.2, 0.4]\n"))
-    monkeypatch.setattr(graph, "scan_of", unknown)
-    monkeypatch.setattr(steps, "_STEPS", {})
     code, text, errors = run(capsys, "sweep", path, "--out", tmp_path / "out")
     assert code == 0 and "2/2 cases" in text and "Traceback" not in text + errors
     (line,) = [x for x in text.splitlines() if x.startswith("executor: ")]
@@ -185,4 +183,3 @@ def test_steps_over_lanes_without_a_kernel(monkeypatch):
         found = lanes.run_steps(halved, *given)
     lanes._runner.cache_clear()
     np.testing.assert_allclose(found, wanted, rtol=1e-15)
-    assert equations.scan_of is scan_of

@@ -90,12 +90,16 @@ def scan_of(equation: Any) -> Scan | None:
 
 
 def call_of(equation: Any) -> Function | None:
-    """The function that an equation calls (jit, custom derivatives, remat); None for others."""
+    """The function that an equation calls (jit, custom derivatives, remat); None for others.
+
+    A call hands its operands to the function as they are; loops and kernels do not.
+    """
     params = equation.params
     inner = params.get("jaxpr") or params.get("call_jaxpr")
     if inner is None or equation.primitive.name == "scan":
         return None
-    return _opened(inner)
+    function = _opened(inner)
+    return function if len(function.inputs) == len(equation.invars) else None
 
 
 def _opened(jaxpr: Any) -> Function:
