@@ -7,7 +7,8 @@ links do not stretch there; `stretch_error` gives how far stretching would move 
 
 from __future__ import annotations
 
-from jaxmodel.dynamics import accelerations, inverse_dynamics
+from jaxmodel.beam import ModalBasis
+from jaxmodel.dynamics import Accelerations, accelerations, inverse_dynamics
 from jaxmodel.kinematics import Chain, close_chain
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array, Beam
@@ -89,20 +90,49 @@ def axial_force(
         pose_acc: (3,).
         wrench: force and moment on the platform [N, N, N m], (3,), or None.
     """
+    chain = close_chain(plant, pose, pose_rate)
+    return _straight(plant, chain, pose, pose_rate, pose_acc, wrench).axial
+
+
+def _straight(
+    plant: Plant,
+    chain: Chain,
+    pose: Array,
+    pose_rate: Array,
+    pose_acc: Array,
+    wrench: Array | None = None,
+) -> Accelerations:
+    """Prescribed motion of straight links."""
     still = jnp.zeros_like(plant.b)
     force = inverse_dynamics(plant, pose, pose_rate, pose_acc, wrench)
-    found = accelerations(
-        plant,
-        close_chain(plant, pose, pose_rate),
-        pose_rate,
-        still,
-        still,
-        force,
-        still,
-        wrench,
-        is_coupled=False,
+    return accelerations(
+        plant, chain, pose_rate, still, still, force, still, wrench, is_coupled=False
     )
-    return found.axial
+
+
+def lumping_error(
+    plant: Plant, basis: ModalBasis, pose: Array, pose_rate: Array, pose_acc: Array
+) -> Array:
+    """Share of a deflection in mode 1 that lumping the axial inertia costs [1], (3,).
+
+    A link bent by q_1 answers to the forces ((P - mu S) rho'' cos gamma - Q gamma'^2) q_1 that the
+    lumped model leaves out by their share of the modal stiffnesses; the largest one.
+
+    Args:
+        plant: the machine, with lumped inertia.
+        basis: its modal basis.
+        pose: (3,) [m, m, rad].
+        pose_rate: (3,).
+        pose_acc: (3,).
+    """
+    if plant.shortening is None or basis.inward is None or basis.centrifugal is None:
+        return jnp.zeros(3)
+    chain = close_chain(plant, pose, pose_rate)
+    slide = chain.cosine * _straight(plant, chain, pose, pose_rate, pose_acc).rho
+    lumped = plant.tip_mass[:, None] * chord_slopes(plant)[:, :, 0]
+    force = (basis.inward[:, :, 0] - lumped) * slide[:, None]
+    force = force - basis.centrifugal[:, :, 0] * chain.gamma_rate[:, None] ** 2
+    return jnp.max(jnp.abs(force) / plant.stiffness, axis=1)
 
 
 def axial_compliance(beam: Beam) -> Array:

@@ -47,11 +47,19 @@ def find_bases(structure: Structure, case: Case) -> Bases:
     is_there = (jnp.arange(structure.n_modes) < case.n_modes).astype(plant.mass.dtype)
     cut = _first_modes(plant, structure.n_modes)
     return Bases(
-        plant=mask_modes(cut._replace(deflection_at=cut.deflection_at[:, :-1]), is_there),
+        plant=mask_modes(_without_load(cut), is_there),
         at_load=cut.deflection_at[:, -1] * is_there,
         plant_omega=held_frequency(both[0], beam, plant)[:, :n],
-        model=model._replace(deflection_at=model.deflection_at[:, :-1]),
+        model=_without_load(model),
         believed_omega=jnp.where(given > 0, given, own),
+    )
+
+
+def _without_load(basis: ModalBasis) -> ModalBasis:
+    """Without the last station, where a static load acts."""
+    return basis._replace(
+        deflection_at=basis.deflection_at[:, :-1],
+        static_deflection=basis.static_deflection[:, :-1],
     )
 
 
@@ -78,13 +86,17 @@ def _first_modes(basis: ModalBasis, n_modes: int) -> ModalBasis:
     def first(x: Array | None) -> Array | None:
         return None if x is None else x[:, :n]
 
-    mixed = basis.mixed_shortening
+    def square(x: Array | None) -> Array | None:
+        return None if x is None else x[:, :n, :n]
+
     return basis._replace(
         mass=basis.mass[:, :n],
         stiffness=basis.stiffness[:, :n],
         tip=first(basis.tip),
         shortening=first(basis.shortening),
-        mixed_shortening=None if mixed is None else mixed[:, :n, :n],
+        mixed_shortening=square(basis.mixed_shortening),
+        inward=square(basis.inward),
+        centrifugal=square(basis.centrifugal),
         b=basis.b[:, :n],
         c=basis.c[:, :n],
         deflection_at=basis.deflection_at[:, :, :n],

@@ -20,7 +20,8 @@ import numpy as np
 
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array, Beam, Patches
-from jaxmodel.piezo import bare_stiffness, one_sided_section, patch_ends, two_sided_section
+from jaxmodel.piezo import bare_stiffness, patch_ends
+from jaxmodel.static import Pieces, link_pieces, section_stiffness, static_bending
 from jaxmodel.table import Table
 
 _Parts = TypeVar("_Parts", Beam, Patches)
@@ -36,6 +37,10 @@ class ModalBasis(NamedTuple):
     # S_jk = int Y_j' Y_k' dx: a bent link's chord is shorter than the link by 1/2 sum S_jk q_j q_k
     shortening: Array | None  # S_jj [1/m], (3, R); None where the ends are not on the chord
     mixed_shortening: Array | None  # S_jk, zero for j = k [1/m], (3, R, R); None where all zero
+    # a point at x moves inwards by 1/2 int_0^x w'^2; with the mass and first moment beyond x,
+    # m_>(x) = int_x^L rhoA and J_>(x) = int_x^L rhoA x:
+    inward: Array | None  # P_jk = int Y_j' Y_k' m_> dx [kg/m], (3, R, R); None as `shortening`
+    centrifugal: Array | None  # Q_jk = int Y_j' Y_k' J_> dx [kg], (3, R, R); None as `shortening`
     b: Array  # int rhoA Y_j [kg], (3, R)
     c: Array  # int rhoA x Y_j (and joint inertia) [kg m], (3, R)
     link_mass: Array  # m_b [kg], (3,)
@@ -44,6 +49,9 @@ class ModalBasis(NamedTuple):
     deflection_at: Array  # Y_j at `stations` minus the chord's (x/L) Y_j(L) [1], (3, S, R)
     sensor_slope: Array  # Phi_s: Y_j' at right minus left sensor end [1/m], (3, R, n_patches)
     actuator_slope: Array  # Phi_a: the same for the actuators [1/m], (3, R, n_patches)
+    # exact static response to moments of the actuators, whatever the modes (`jaxmodel.static`)
+    static_slope: Array  # slope differences over the sensors [rad/(N m)], (3, n_patches, n_patches)
+    static_deflection: Array  # from the chord at `stations` [m/(N m)], (3, S, n_patches)
 
 
 class Basis(NamedTuple):
@@ -104,10 +112,13 @@ def mask_modes(basis: ModalBasis, mode_mask: Array) -> ModalBasis:
     def kept(x: Array | None, mask: Array) -> Array | None:
         return None if x is None else x * mask
 
+    both = mask * mask[:, None]
     return basis._replace(
         tip=kept(basis.tip, mask),
         shortening=kept(basis.shortening, mask),
-        mixed_shortening=kept(basis.mixed_shortening, mask * mask[:, None]),
+        mixed_shortening=kept(basis.mixed_shortening, both),
+        inward=kept(basis.inward, both),
+        centrifugal=kept(basis.centrifugal, both),
         b=basis.b * mask,
         c=basis.c * mask,
         deflection_at=basis.deflection_at * mask,
@@ -163,6 +174,7 @@ def _pinned_pinned(beam: Beam, patches: Patches, n_modes: int, stations: Array) 
     line_mass, mass, moment, inertia = _rigid(beam)
     sign = jnp.where(order % 2 == 1, 1.0, -1.0)  # -cos(j pi)
     stiffness = bare_stiffness(beam) * beam.stiffness_factor * wave**4 * beam.length / 2
+    static = static_bending(beam, patches, stations, has_patches=False)
 
     def slope(x: Array) -> Array:
         return wave[:, None] * jnp.cos(wave[:, None] * x)
@@ -173,6 +185,8 @@ def _pinned_pinned(beam: Beam, patches: Patches, n_modes: int, stations: Array) 
         tip=None,
         shortening=wave**2 * beam.length / 2,
         mixed_shortening=None,
+        inward=wave[:, None] * wave * line_mass / 2 * _cosines(n_modes, beam.length, 0),
+        centrifugal=wave[:, None] * wave * line_mass / 4 * _cosines(n_modes, beam.length, 1),
         b=line_mass * (1 + sign) / wave,
         c=line_mass * beam.length * sign / wave,
         link_mass=mass,
@@ -181,7 +195,23 @@ def _pinned_pinned(beam: Beam, patches: Patches, n_modes: int, stations: Array) 
         deflection_at=jnp.sin(wave * stations[:, None]),
         sensor_slope=_slope_difference(slope, patches, patches.sensor_length),
         actuator_slope=_slope_difference(slope, patches, patches.actuator_length),
+        static_slope=static[0],
+        static_deflection=static[1],
     )
+
+
+def _cosines(n_modes: int, length: Array, power: int) -> Array:
+    """2 int cos(j pi x/L) cos(k pi x/L) f(x) dx, f = L - x [m2] or L^2 - x^2 [m3], (R, R)."""
+    order = jnp.arange(1, n_modes + 1)
+    parts = []
+    for n in (order[:, None] - order, order[:, None] + order):
+        wave = jnp.where(n == 0, 1, n) * np.pi / length
+        sign = jnp.where(n % 2 == 0, 1.0, -1.0)
+        if power == 0:
+            parts.append(jnp.where(n == 0, length**2 / 2, (1 - sign) / wave**2))
+        else:
+            parts.append(jnp.where(n == 0, 2 * length**3 / 3, -2 * length * sign / wave**2))
+    return parts[0] + parts[1]
 
 
 def _pinned_free(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> ModalBasis:
@@ -190,6 +220,7 @@ def _pinned_free(beam: Beam, patches: Patches, n_modes: int, stations: Array) ->
     wave = root / beam.length
     line_mass, mass, moment, inertia = _rigid(beam)
     sine, scale = jnp.sin(root), 1 - jnp.exp(-2 * root)
+    static = static_bending(beam, patches, stations, has_patches=False)
 
     def shape(x: Array) -> Array:
         up, down = jnp.exp(wave * (x - beam.length)), jnp.exp(-wave * (x + beam.length))
@@ -206,6 +237,8 @@ def _pinned_free(beam: Beam, patches: Patches, n_modes: int, stations: Array) ->
         tip=jnp.ones((n_modes,)),
         shortening=None,
         mixed_shortening=None,
+        inward=None,
+        centrifugal=None,
         b=line_mass * (jnp.tan(root / 2) + jnp.tanh(root / 2)) / (2 * wave),
         c=jnp.zeros((n_modes,)) * mass,
         link_mass=mass,
@@ -214,95 +247,147 @@ def _pinned_free(beam: Beam, patches: Patches, n_modes: int, stations: Array) ->
         deflection_at=jax.vmap(shape)(stations) - (stations / beam.length)[:, None],
         sensor_slope=_slope_difference(slope, patches, patches.sensor_length),
         actuator_slope=_slope_difference(slope, patches, patches.actuator_length),
+        static_slope=static[0],
+        static_deflection=static[1],
     )
 
 
-def _ritz(xi: Array, n_sines: int) -> tuple[Array, Array, Array]:
-    """Ritz functions of xi = x/L, their first and second derivatives, (len(xi), n_sines + 2) each.
+class _Shapes(NamedTuple):
+    """Ritz functions at some points, as functions of xi = x/L, (points, functions) each."""
 
-    Sines alone cannot represent an end moment, so two cubics complete them.
-    """
+    value: Array
+    slope: Array
+
+
+def _smooth_shapes(xi: Array, n_sines: int) -> tuple[_Shapes, Array]:
+    """Sines, and two cubics, since sines cannot carry an end moment; and their curvatures."""
     xi = jnp.asarray(xi)[:, None]
     k = jnp.arange(1, n_sines + 1) * np.pi
     sine, cosine = jnp.sin(k * xi), jnp.cos(k * xi)
-    value = [sine, xi * (1 - xi) ** 2, xi**2 * (1 - xi)]
-    slope = [k * cosine, 1 - 4 * xi + 3 * xi**2, 2 * xi - 3 * xi**2]
-    curvature = [-(k**2) * sine, 6 * xi - 4, 2 - 6 * xi]
-    return tuple(jnp.concatenate(part, axis=1) for part in (value, slope, curvature))  # type: ignore[return-value]
+    value = [sine / k**2, xi * (1 - xi) ** 2, xi**2 * (1 - xi)]
+    slope = [cosine / k, 1 - 4 * xi + 3 * xi**2, 2 * xi - 3 * xi**2]
+    curvature = [-sine, 6 * xi - 4, 2 - 6 * xi]
+    shapes = _Shapes(jnp.concatenate(value, axis=1), jnp.concatenate(slope, axis=1))
+    return shapes, jnp.concatenate(curvature, axis=1)
+
+
+class _Bends(NamedTuple):
+    """Ritz functions with constant curvature over a patch, zero elsewhere.
+
+    Two for each pair of patches: over what both cover, and over what only the longer one covers.
+    Smooth functions follow the steps of curvature at the ends of patches slowly: with sines alone a
+    sensor sees mode 1 of the default link 6 % too strongly.
+    """
+
+    left: Array  # of the link's pieces, as a share of its length [1], (n,)
+    right: Array
+    curvature: Array  # of each function on each piece [1], (2 K, n)
+
+
+def _bends(pieces: Pieces, length: Array) -> _Bends:
+    both, either = pieces.has_sensor * pieces.has_actuator, pieces.has_sensor + pieces.has_actuator
+    cover = jnp.concatenate([both, either - 2 * both])
+    left, right = pieces.left / length, pieces.right / length
+    width = jnp.sum(cover * (right - left), axis=1)
+    is_there = width > 1e-6  # patches of equal length have no second one
+    size = jnp.where(is_there, 1 / jnp.sqrt(jnp.where(is_there, width, 1.0)), 0.0)
+    return _Bends(left, right, cover * size[:, None])
+
+
+def _bent_shapes(xi: Array, bends: _Bends) -> _Shapes:
+    p, q, x = bends.left, bends.right, jnp.asarray(xi)[:, None]
+    end = ((1 - p) ** 2 - (1 - q) ** 2) / 2
+    value = (jnp.maximum(x - p, 0.0) ** 2 - jnp.maximum(x - q, 0.0) ** 2) / 2 - x * end
+    slope = jnp.maximum(x - p, 0.0) - jnp.maximum(x - q, 0.0) - end
+    return _Shapes(value @ bends.curvature.T, slope @ bends.curvature.T)
+
+
+#: Added to the diagonal of the Ritz functions' stiffness, so that coinciding patches stay finite.
+_TINY = 1e-10
 
 
 def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> ModalBasis:
     n_sines = max(12, n_modes + 6)
     length = beam.length
-    line_mass, bare_mass, bare_moment, bare_inertia = _rigid(beam)
-    single = one_sided_section(beam, patches).stiffness
-    double = two_sided_section(beam, patches).stiffness
+    pieces = link_pieces(beam, patches)
+    bends = _bends(pieces, length)
+    line_mass = beam.density * beam.width * beam.thickness
     patch_mass = patches.density * patches.width * patches.thickness
+    covers = jnp.sum(pieces.has_sensor + pieces.has_actuator, axis=0)
 
-    # Intervals with extra line mass and stiffness: sensors, actuators, and where both overlap.
-    sensor = patch_ends(patches.center, patches.sensor_length)
-    actuator = patch_ends(patches.center, patches.actuator_length)
-    both = patch_ends(patches.center, jnp.minimum(patches.sensor_length, patches.actuator_length))
-    left = jnp.concatenate([sensor[0], actuator[0], both[0]]) / length
-    right = jnp.concatenate([sensor[1], actuator[1], both[1]]) / length
-    each = jnp.ones_like(patches.center)
-    extra_mass = jnp.concatenate([patch_mass * each, patch_mass * each, 0 * each])
-    extra_stiffness = jnp.concatenate([single * each, single * each, (double - 2 * single) * each])
+    def shapes(xi: Array) -> _Shapes:
+        smooth, bent = _smooth_shapes(xi, n_sines)[0], _bent_shapes(xi, bends)
+        return _Shapes(*(jnp.concatenate(pair, axis=1) for pair in zip(smooth, bent, strict=True)))
 
-    # Gauss-Legendre is exact to rounding here: 2 n_sines half-waves over the link need about
-    # pi n_sines + 20 points, over a patch far fewer.
-    whole_x, whole_w = _gauss(4 * n_sines + 24)
-    patch_x, patch_w = _gauss(2 * n_sines + 8)
-    span = (right - left)[:, None]
-    xi = jnp.concatenate([whole_x, (left[:, None] + span * patch_x).ravel()])
-    weight = length * jnp.concatenate([whole_w, (span * patch_w).ravel()])
-    n_points = patch_x.size
-    mass_w = weight * jnp.concatenate(
-        [line_mass * jnp.ones_like(whole_x), jnp.repeat(extra_mass, n_points)]
-    )
-    bending = bare_stiffness(beam) * jnp.ones_like(whole_x)
-    bending_w = (
-        weight
-        * beam.stiffness_factor
-        * jnp.concatenate([bending, jnp.repeat(extra_stiffness, n_points)])
-    )
+    # Gauss-Legendre piece by piece: products of two sines have up to 2 n_sines half-waves, for
+    # which these points are exact to rounding
+    node, weight = _gauss(2 * n_sines + 16)
+    width = (bends.right - bends.left)[:, None]
+    xi = (bends.left[:, None] + width * node).ravel()
+    weight = length * (width * weight).ravel()
+    mass_w = weight * jnp.repeat(line_mass + patch_mass * covers, node.size)
+    stiffness = section_stiffness(beam, patches, pieces, has_patches=True)
+    stiffness_w = weight * jnp.repeat(stiffness, node.size)
 
-    value, _, curvature = _ritz(xi, n_sines)
-    ends = _ritz(jnp.array([0.0, 1.0]), n_sines)[1] / length
+    value, steepness = shapes(xi)
+    constant = jnp.repeat(bends.curvature, node.size, axis=1).T
+    curvature = jnp.concatenate([_smooth_shapes(xi, n_sines)[1], constant], axis=1)
+    ends = shapes(jnp.array([0.0, 1.0])).slope / length
     joint = jnp.stack([beam.joint_inertia_b, beam.joint_inertia_c])
     mass_matrix = (value.T * mass_w) @ value + (ends.T * joint) @ ends
-    stiffness_matrix = (curvature.T * bending_w) @ curvature / length**4
+    stiffness_matrix = (curvature.T * stiffness_w) @ curvature / length**4
 
-    total_mass = bare_mass + jnp.sum(extra_mass * (right - left)) * length
-    lower = jnp.linalg.cholesky(mass_matrix)
-    half = jax.scipy.linalg.solve_triangular(lower, stiffness_matrix, lower=True)
+    # functions of unit energy; one that is absent gets a unit of its own, no mass and so no mode
+    energy = jnp.diagonal(stiffness_matrix)
+    is_there = energy > 0
+    scale = jnp.where(is_there, 1 / jnp.sqrt(jnp.where(is_there, energy, 1.0)), 0.0)
+    unit = jnp.diag(jnp.where(is_there, _TINY, 1.0))
+    lower = jnp.linalg.cholesky(scale[:, None] * stiffness_matrix * scale + unit)
+    half = jax.scipy.linalg.solve_triangular(
+        lower, scale[:, None] * mass_matrix * scale, lower=True
+    )
     reduced = jax.scipy.linalg.solve_triangular(lower, half.T, lower=True)
-    squared, vector = jnp.linalg.eigh((reduced + reduced.T) / 2)
-    coefficient = jax.scipy.linalg.solve_triangular(lower.T, vector, lower=False)[:, :n_modes]
+    softness, vector = jnp.linalg.eigh((reduced + reduced.T) / 2)  # 1/omega^2, ascending
+    softness, vector = softness[: -n_modes - 1 : -1], vector[:, : -n_modes - 1 : -1]
+    coefficient = jax.scipy.linalg.solve_triangular(lower.T, vector, lower=False)
+    coefficient = scale[:, None] * coefficient
     coefficient = coefficient * jnp.where(ends[0] @ coefficient < 0, -1.0, 1.0)
-    coefficient = coefficient * jnp.sqrt(total_mass / 2)
+    total_mass = jnp.sum(mass_w)
+    coefficient = coefficient * jnp.sqrt(total_mass / 2 / softness)
 
     def slope(x: Array) -> Array:
-        return (_ritz(x / length, n_sines)[1] @ coefficient).T / length
+        return (shapes(x / length).slope @ coefficient).T / length
 
-    steepness = _ritz(whole_x, n_sines)[1] @ coefficient
-    shortening = (steepness.T * whole_w) @ steepness / length
-    x_patches = length * xi[whole_x.size :]
-    patch_w = mass_w[whole_x.size :]
+    steepness = steepness @ coefficient / length
+    shortening = (steepness.T * weight) @ steepness
+    # mass and first moment of what lies beyond a point, piece by piece
+    left, right = pieces.left[:, None], pieces.right[:, None]
+    rest = jnp.clip(xi * length, left, right)
+    line = (line_mass + patch_mass * covers)[:, None]
+    beyond = (
+        jnp.sum(line * (right - rest), axis=0),
+        jnp.sum(line * (right**2 - rest**2) / 2, axis=0),
+    )
+    static = static_bending(beam, patches, stations, has_patches=True)
+    x = xi * length
     return ModalBasis(
         mass=jnp.full((n_modes,), 0.5) * total_mass,
-        stiffness=squared[:n_modes] * total_mass / 2,
+        stiffness=total_mass / 2 / softness,
         tip=None,
         shortening=jnp.diagonal(shortening),
         mixed_shortening=shortening * (1 - jnp.eye(n_modes)),
+        inward=(steepness.T * (weight * beyond[0])) @ steepness,
+        centrifugal=(steepness.T * (weight * beyond[1])) @ steepness,
         b=mass_w @ value @ coefficient,
-        c=(mass_w * xi * length) @ value @ coefficient + joint @ ends @ coefficient,
+        c=(mass_w * x) @ value @ coefficient + joint @ ends @ coefficient,
         link_mass=total_mass,
-        first_moment=bare_moment + patch_w @ x_patches,
-        inertia=bare_inertia + patch_w @ x_patches**2 + jnp.sum(joint),
-        deflection_at=_ritz(stations / length, n_sines)[0] @ coefficient,
+        first_moment=mass_w @ x,
+        inertia=mass_w @ x**2 + jnp.sum(joint),
+        deflection_at=shapes(stations / length).value @ coefficient,
         sensor_slope=_slope_difference(slope, patches, patches.sensor_length),
         actuator_slope=_slope_difference(slope, patches, patches.actuator_length),
+        static_slope=static[0],
+        static_deflection=static[1],
     )
 
 

@@ -23,6 +23,8 @@ class Structure(NamedTuple):
     n_frequencies: int = 9  # points of the power spectral density per controlled mode
     basis: str = "pinned_pinned"  # of the plant
     has_shortening: bool = True  # bent links have shorter chords (none in basis pinned_free)
+    is_distributed: bool = False  # every point of a bent link moves inwards, not half of it with C
+    has_static_correction: bool = True  # static response of the modes that are left out
     is_coupled: bool = True  # False: kineto-elastodynamics, bending does not act back
     has_wrench: bool = False  # force and moment on the platform
     has_payload_offset: bool = False  # the payload's centre of mass is off the reference point

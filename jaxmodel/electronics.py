@@ -66,6 +66,53 @@ def design_amplifier(step: Array, lag: Array) -> Amplifier:
     )
 
 
+#: Rows and columns of `voltage_passage`.
+PASSED = ("z", "z_rate", "s", "remainder", "command")
+_DOUBLINGS, _TERMS = 14, 10  # rates up to 1600/h become below 0.1, where ten terms are exact
+
+
+def voltage_passage(
+    step: Array, antialias: Array, highpass: Array | None, lag: Array | None
+) -> Array:
+    """How actuator voltages pass the patches' drain and the anti-alias filter in one plant step.
+
+    A sensor answers at once to the modes that a model leaves out, so the actuators' voltages v
+    reach the converters through the same analogue path as the modes: v = command + remainder,
+    z'' = omega_f^2 (v - s - z) - sqrt(2) omega_f z', s' = omega_h (v - s), and the remainder of
+    an amplifier's change decays at 1/lag. The exponential of that, exact for held commands.
+
+    Args:
+        step: h [s], ().
+        antialias: omega_f [rad/s], ().
+        highpass: omega_h [rad/s], (); None: patches are not drained, s stays zero.
+        lag: of the amplifiers [s], () (0: none); None: commands are on the actuators at once.
+
+    Returns:
+        Matrix on `PASSED`, (5, 5).
+    """
+    zero, one = jnp.zeros(()), jnp.ones(())
+    drain = zero if highpass is None else zero + highpass
+    is_slow = zero if lag is None else jnp.where(lag > 0, 1.0, 0.0)
+    decay = zero if lag is None else 1 / jnp.maximum(jnp.where(lag > 0, lag, step), step / FASTEST)
+    corner = zero + antialias
+    rows = (
+        (zero, corner, zero, zero, zero),
+        (-corner, -np.sqrt(2.0) * corner, -corner, is_slow * corner, corner),
+        (zero, zero, -drain, is_slow * drain, drain),
+        (zero, zero, zero, -decay, zero),
+        (zero, zero, zero, zero, zero),
+    )
+    x = jnp.stack([jnp.stack(row) for row in rows]) * (step / 2**_DOUBLINGS)
+    identity = jnp.eye(len(rows), dtype=x.dtype)
+    power = identity
+    for n in reversed(range(_TERMS)):
+        power = identity + x @ power / (n + 1)
+    for _ in range(_DOUBLINGS):
+        power = power @ power
+    scale = jnp.stack([one, corner, one, one, one])
+    return power * scale[:, None] / scale
+
+
 def _phi(rate: Array) -> list[Array]:
     """phi_1..phi_3(-rate) with phi_k(x) = sum x^n/(n + k)!, rate > 0."""
     is_small = rate < 1

@@ -22,13 +22,16 @@ from jaxmodel.parameters import Array
 
 
 class LinearPlant(NamedTuple):
-    """x' = A x + B_voltage V_a + B_force F; outputs are rows that multiply x."""
+    """x' = A x + B_voltage V_a + B_force F; outputs are rows that multiply x, or V_a."""
 
     state: Array  # A [1/s and mixed], (n, n), n = 6 + 6 R
     voltage: Array  # B_voltage, (n, 3 K)
     force: Array  # B_force, disturbance on the sliders, (n, 3)
     deflection: Array  # chord deflection at the stations [m], (3 S, n)
     sensor: Array  # voltages of the sensors, open-circuit [V], (3 K, n)
+    # what the actuators' voltages add at once to both, by the modes that are left out
+    direct_deflection: Array  # [m/V], (3 S, 3 K)
+    direct_sensor: Array  # [V/V], (3 K, 3 K)
 
 
 def flatten(state: PlantState) -> Array:
@@ -98,20 +101,31 @@ def linearise(
     a, b_voltage, b_force = jax.jacfwd(derivative, (0, 1, 2))(
         rest, jnp.zeros((n_voltages,), rest.dtype), still
     )
+    direct_deflection = jnp.zeros((3 * loop.deflection_at.shape[1], n_voltages), rest.dtype)
+    direct_sensor = jnp.zeros((3 * loop.sensor.shape[1], n_voltages), rest.dtype)
+    if loop.left_out is not None:
+        direct_deflection = _diagonal(loop.left_out.deflection)
+        direct_sensor = _diagonal(loop.left_out.sensor)
     return LinearPlant(
         state=a,
         voltage=b_voltage,
         force=b_force,
         deflection=_rows(loop.deflection_at, structure.n_modes),
         sensor=_rows(loop.sensor, structure.n_modes),
+        direct_deflection=direct_deflection,
+        direct_sensor=direct_sensor,
     )
 
 
 def _rows(matrix: Array, n_modes: int) -> Array:
     """Per-link outputs of q, (3, m, R), as rows over x."""
-    m = matrix.shape[1]
-    wide = jnp.einsum("imr,il->imlr", matrix, jnp.eye(3)).reshape(3 * m, 3 * n_modes)
-    return jnp.pad(wide, ((0, 0), (6, 3 * n_modes)))
+    return jnp.pad(_diagonal(matrix), ((0, 0), (6, 3 * n_modes)))
+
+
+def _diagonal(matrix: Array) -> Array:
+    """Blocks of the links, (3, m, n), on a diagonal, (3 m, 3 n)."""
+    m, n = matrix.shape[1:]
+    return jnp.einsum("imr,il->imlr", matrix, jnp.eye(3)).reshape(3 * m, 3 * n)
 
 
 def mechanical(plant: LinearPlant) -> Array:

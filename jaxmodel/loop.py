@@ -53,8 +53,17 @@ class Loop(NamedTuple):
     rotation: tuple[Array, Array]  # of the spectra's phasors per sample, (3, C, n_frequencies)
     drive: Drive
     axial_compliance: Array  # L/(E A) of the links [m/N], (3,)
+    left_out: LeftOut | None  # static response of the modes left out; None: truncated model
     settling_band: Array  # [m], ()
     rest: Rest | None = None  # about which the linear model is taken; None: the full model
+
+
+class LeftOut(NamedTuple):
+    """What actuators do at once, by the modes that the plant leaves out (`jaxmodel.static`)."""
+
+    sensor: Array  # D, sensor voltages [V/V], (3, K, K)
+    deflection: Array  # from the chord at the stations [m/V], (3, S, K)
+    passage: Array | None  # of `electronics.voltage_passage`, (5, 5); None: nothing is sampled
 
 
 class Rest(NamedTuple):
@@ -67,7 +76,8 @@ class Rest(NamedTuple):
 class PlantState(NamedTuple):
     """Mechanism, modes and analogue electronics (None if absent).
 
-    All patches and filters are equal, so modal coordinates are filtered instead of voltages.
+    All patches and filters are equal, so modal coordinates are filtered instead of voltages; so
+    are the actuators' voltages, to which sensors answer by the modes that are left out.
     """
 
     pose: Array  # [m, m, rad], (3,)
@@ -78,6 +88,10 @@ class PlantState(NamedTuple):
     z_rate: Array | None = None  # [m/s], (3, R)
     s: Array | None = None  # slow part of q, which the amplifiers' inputs drain [m], (3, R)
     voltage: Array | None = None  # on the actuators, behind their amplifiers [V], (3, K)
+    # the actuators' voltages as modes that are left out show them to the sensors
+    direct_z: Array | None = None  # anti-alias filtered [V], (3, K)
+    direct_z_rate: Array | None = None  # [V/s], (3, K)
+    direct_s: Array | None = None  # drained by the amplifiers' inputs [V], (3, K)
 
 
 class State(NamedTuple):
@@ -281,12 +295,31 @@ def plant_step(
         z_rate=mode(3),
         s=mode(4),
         voltage=last_voltage,
+        **_passed(loop, state, voltage),
     )
     return after, first
 
 
 #: Which of them each of (q, q', z, z', s) reads: electronics do not act back on a mode.
 _READS = ((0, 1), (0, 1), (0, 1, 2, 3, 4), (0, 1, 2, 3, 4), (0, 1, 4))
+
+
+def _passed(loop: Loop, state: PlantState, command: Array) -> dict[str, Array]:
+    """`direct_z`, `direct_z_rate` and `direct_s` at the end of a step with a held command."""
+    if loop.left_out is None or loop.left_out.passage is None:
+        return {}
+    assert state.direct_z is not None and state.direct_z_rate is not None
+    remainder = None if state.voltage is None else state.voltage - command
+    before = (state.direct_z, state.direct_z_rate, state.direct_s, remainder, command)
+    passage, names = loop.left_out.passage, ("direct_z", "direct_z_rate", "direct_s")
+    return {
+        name: sum(
+            (passage[row, k] * x for k, x in enumerate(before) if x is not None),
+            start=jnp.zeros_like(command),
+        )
+        for row, name in enumerate(names)
+        if before[row] is not None
+    }
 
 
 def _amplified(
@@ -334,7 +367,10 @@ def step(structure: Structure, loop: Loop, state: State, inputs: Inputs) -> tupl
 def filtered_voltage(loop: Loop, plant: PlantState) -> Array:
     """Sensor voltages behind the anti-alias filter [V], (3, K)."""
     assert plant.z is not None
-    return jnp.sum(loop.sensor * plant.z[:, None], axis=2)
+    seen = jnp.sum(loop.sensor * plant.z[:, None], axis=2)
+    if plant.direct_z is None or loop.left_out is None:
+        return seen
+    return seen + jnp.sum(loop.left_out.sensor * plant.direct_z[:, None], axis=2)
 
 
 def advance(
@@ -366,10 +402,10 @@ def advance(
     motors = motor_force(
         loop.drive, reference, rates.chain.rho, rates.chain.rho_rate, structure.is_smooth
     )
-    sample = _sample(loop, plant, inputs, voltage, clipped, motors, rates)
+    present = voltage if plant.voltage is None else plant.voltage
+    sample = _sample(loop, plant, inputs, voltage, present, clipped, motors, rates)
     fixed = metrics.Fixed(loop.omega, loop.modal_omega, loop.rotation, loop.settling_band)
     totals = metrics.accumulate(state.totals, metrics.Instant(sample, inputs.window, fixed))
-    seen = plant.q if plant.s is None else plant.q - plant.s
     record = Record(
         time=inputs.window.time,
         pose=plant.pose,
@@ -378,7 +414,7 @@ def advance(
         modal_coordinate=plant.q,
         controlled_coordinate=sample.modal,
         chord_deflection_stations=sample.deflection,
-        sensor_voltage=jnp.sum(loop.sensor * seen[:, None], axis=2),
+        sensor_voltage=_raw_voltage(loop, plant, present),
         actuator_voltage=voltage,
         slider_force=motors,
     )
@@ -390,6 +426,30 @@ def advance(
         bad_time=state.bad_time,
     )
     return _freeze_if_bad(structure, loop, state, proposed, rates.chain, inputs), record
+
+
+def deflection(loop: Loop, q: Array, voltage: Array) -> Array:
+    """Deflection from the chord at the stations [m], (3, S).
+
+    Args:
+        loop: constants of the case.
+        q: modal coordinates [m], (3, R).
+        voltage: on the actuators [V], (3, K).
+    """
+    found = jnp.sum(loop.deflection_at * q[:, None], axis=2)
+    if loop.left_out is None:
+        return found
+    return found + jnp.sum(loop.left_out.deflection * voltage[:, None], axis=2)
+
+
+def _raw_voltage(loop: Loop, plant: PlantState, voltage: Array) -> Array:
+    """Sensor voltages before the anti-alias filter [V], (3, K)."""
+    q = plant.q if plant.s is None else plant.q - plant.s
+    seen = jnp.sum(loop.sensor * q[:, None], axis=2)
+    if loop.left_out is None:
+        return seen
+    held = voltage if plant.direct_s is None else voltage - plant.direct_s
+    return seen + jnp.sum(loop.left_out.sensor * held[:, None], axis=2)
 
 
 def _reference(inputs: Inputs, point: int) -> Reference:
@@ -440,6 +500,7 @@ def _sample(
     plant: PlantState,
     inputs: Inputs,
     voltage: Array,
+    present: Array,
     clipped: Array,
     motors: Array,
     rates: Rates,
@@ -449,7 +510,7 @@ def _sample(
     axial = rates.acceleration.axial
     is_full = jnp.any(jnp.abs(motors) >= loop.drive.force_limit * (1 - 1e-9), axis=0)
     return metrics.Sample(
-        deflection=jnp.sum(loop.deflection_at * plant.q[:, None], axis=2),
+        deflection=deflection(loop, plant.q, present),
         q=plant.q,
         q_rate=plant.q_rate,
         modal=jnp.sum(loop.observer * plant.q[:, None], axis=2),
@@ -512,6 +573,7 @@ def initial_state(
     is_drained = is_sampled and structure.has_sensor_highpass
     drained = jnp.where(highpass > 0, q, zero)
     controller = rest_controller(loop.controller)
+    is_direct = is_sampled and loop.left_out is not None
     n_stations = loop.deflection_at.shape[1]
     sizes = metrics.Sizes(
         n_stations, structure.n_modes, structure.n_controlled, structure.n_frequencies
@@ -527,6 +589,9 @@ def initial_state(
             z_rate=zero if is_sampled else None,
             s=drained if is_drained else None,
             voltage=controller.voltage if is_sampled and structure.has_amplifier else None,
+            direct_z=jnp.zeros_like(controller.voltage) if is_direct else None,
+            direct_z_rate=jnp.zeros_like(controller.voltage) if is_direct else None,
+            direct_s=jnp.zeros_like(controller.voltage) if is_direct and is_drained else None,
         ),
         controller=controller,
         totals=totals,

@@ -41,6 +41,8 @@ class Plant(NamedTuple):
     tip: Array | None  # Y_j(L) [1], (3, R), None where zero
     shortening: Array | None  # S_jj [1/m], (3, R), None where the chord keeps its length
     mixed_shortening: Array | None  # S_jk, zero for j = k [1/m], (3, R, R), None where all zero
+    inward: Array | None  # P_jk [kg/m], (3, R, R), None where lumped at the joints: mu S
+    centrifugal: Array | None  # Q_jk [kg], (3, R, R), None likewise
     b: Array  # [kg], (3, R)
     c: Array  # [kg m], (3, R)
 
@@ -59,7 +61,11 @@ LOCK_MASS = 1e9
 
 
 def build_plant(
-    machine: Machine, basis: ModalBasis, is_locked: Array = False, has_shortening: bool = True
+    machine: Machine,
+    basis: ModalBasis,
+    is_locked: Array = False,
+    has_shortening: bool = True,
+    is_distributed: bool = False,
 ) -> Plant:
     """Collect machine and basis into a `Plant`.
 
@@ -72,6 +78,8 @@ def build_plant(
         basis: modal basis of the links.
         is_locked: hold all sliders, by `LOCK_MASS`.
         has_shortening: bent links have shorter chords (static); False: as in the paper.
+        is_distributed: every point of a bent link moves inwards by its own amount (static); False:
+            half of the link moves in with joint C.
 
     Returns:
         Plant.
@@ -112,6 +120,8 @@ def build_plant(
         tip=basis.tip,
         shortening=basis.shortening if has_shortening else None,
         mixed_shortening=basis.mixed_shortening if has_shortening else None,
+        inward=basis.inward if has_shortening and is_distributed else None,
+        centrifugal=basis.centrifugal if has_shortening and is_distributed else None,
         b=basis.b,
         c=basis.c,
     )

@@ -8,22 +8,24 @@ from typing import NamedTuple
 from jaxmodel import shaper, status
 from jaxmodel.axial import axial_compliance
 from jaxmodel.bases import Bases, find_bases
+from jaxmodel.beam import ModalBasis
 from jaxmodel.case import Case, Structure
 from jaxmodel.control import active_modes, condition_number, left_inverse
 from jaxmodel.controller import Controller
 from jaxmodel.drive import Reference
 from jaxmodel.dynamics import inverse_dynamics
-from jaxmodel.electronics import design_amplifier
+from jaxmodel.electronics import design_amplifier, voltage_passage
 from jaxmodel.estimator import KINDS
 from jaxmodel.integrator import exponential_step
 from jaxmodel.kinematics import close_chain
 from jaxmodel.laws import LAWS, is_modal, n_channels
 from jaxmodel.laws.contract import Known, check_feedback
 from jaxmodel.lazy import jax, jnp
-from jaxmodel.loop import Loop, Rest
+from jaxmodel.loop import LeftOut, Loop, Rest
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import actuator_constant, placement_faults, sensor_constant
 from jaxmodel.plant import Plant, build_plant
+from jaxmodel.static import static_remainder
 
 #: Frequencies of the spectra lie within this fraction of the modal frequency [1].
 SPECTRUM_SPAN = 0.1
@@ -68,7 +70,9 @@ def prepare(structure: Structure, case: Case) -> Prepared:
     machine, electronics = case.machine, case.electronics
     bases = find_bases(structure, case)
     basis = bases.plant
-    plant = build_plant(machine, basis, case.drive.is_locked, structure.has_shortening)
+    plant = build_plant(
+        machine, basis, case.drive.is_locked, structure.has_shortening, structure.is_distributed
+    )
     design = design_controller(structure, case, bases)
     omega = jnp.sqrt(basis.stiffness / basis.mass)
     zeta = plant.damping / (2 * basis.mass * omega)
@@ -106,6 +110,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         ),
         axial_compliance=axial_compliance(machine.beam),
         settling_band=jnp.asarray(case.windows.settling_band),
+        left_out=_left_out(structure, case, basis, step),
         rest=_rest(structure, case, plant) if structure.is_linear else None,
     )
     return Prepared(
@@ -117,6 +122,30 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         actuator_condition=design.actuator_condition,
         status=_static_status(structure, case, bases, design, omega * step, zeta),
     )
+
+
+def _left_out(structure: Structure, case: Case, basis: ModalBasis, step: Array) -> LeftOut | None:
+    """Static response of the modes that the plant leaves out."""
+    if not structure.has_static_correction:
+        return None
+    electronics = case.electronics
+    lambda_s, lambda_a = (x[:, None, None] for x in _constants(case))
+    passage = voltage_passage(
+        step,
+        electronics.antialias,
+        electronics.sensor_highpass if structure.has_sensor_highpass else None,
+        electronics.amplifier_lag if structure.has_amplifier else None,
+    )
+    return LeftOut(
+        sensor=lambda_s * lambda_a * static_remainder(basis).slope,
+        deflection=left_out_deflection(case, basis),
+        passage=passage if structure.feedback == "sampled" else None,
+    )
+
+
+def left_out_deflection(case: Case, basis: ModalBasis) -> Array:
+    """Deflection at the stations that the actuators give modes beyond `basis` [m/V], (3, S, K)."""
+    return _constants(case)[1][:, None, None] * static_remainder(basis).deflection
 
 
 def _rest(structure: Structure, case: Case, plant: Plant) -> Rest:
@@ -188,10 +217,9 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
     """
     control, electronics = case.control, case.electronics
     model, assembled, n = bases.model, bases.believed_omega, structure.n_controlled
-    size = model.mass.shape[1]
     lambda_s, lambda_a = _constants(case)
-    sensor = lambda_s[:, None, None] * jnp.swapaxes(model.sensor_slope, 1, 2)  # (3, K, size)
-    actuator = lambda_a[:, None, None] * model.actuator_slope  # (3, size, K)
+    sensor = lambda_s[:, None, None] * jnp.swapaxes(model.sensor_slope, 1, 2)  # (3, K, modes)
+    actuator = lambda_a[:, None, None] * model.actuator_slope  # (3, modes, K)
     mask = active_modes(control.n_active, n, structure.n_patches)
     seen, driven = sensor[:, :, :n], jnp.swapaxes(actuator[:, :n], 1, 2)
     # in one call: XLA's CPU compiler aborts on two side by side if C = 1 (jax 0.10)
@@ -206,19 +234,18 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         omega=assembled,
         modal_mass=model.mass[:, :n],
         mask=mask,
+        feedthrough=_believed_feedthrough(case, model, mask),
     )
     law = LAWS[structure.law]
     feedback = law.design(structure, case, known)
     check_feedback(law, feedback, n_channels(structure), structure.n_patches)
-    residual = (1.0 - jnp.pad(mask, (0, size - n))) / model.stiffness
-    feedthrough = jnp.einsum("ikr,ir,irl->ikl", sensor, residual, actuator)
     controller = Controller(
         filter=feedback.filter,
         estimator=feedback.estimator,
         velocity_gain=feedback.velocity_gain,
         position_gain=feedback.position_gain if structure.has_position_gain else None,
         synthesizer=feedback.synthesizer,
-        feedthrough=control.feedthrough_factor * feedthrough,
+        feedthrough=control.feedthrough_factor * known.feedthrough,
         voltage_limit=jnp.asarray(electronics.voltage_limit),
         adc_gain=jnp.asarray(electronics.conditioner_gain),
         adc_bias=jnp.asarray(electronics.conditioner_bias),
@@ -235,6 +262,13 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         sensor_condition=condition_number(seen, mask),
         actuator_condition=condition_number(driven, mask),
     )
+
+
+def _believed_feedthrough(case: Case, model: ModalBasis, mask: Array) -> Array:
+    """Sensor volts per actuator volt by all modes but the controlled ones [V/V], (3, K, K)."""
+    lambda_s, lambda_a = (x[:, None, None] for x in _constants(case))
+    is_controlled = jnp.pad(mask, (0, model.mass.shape[1] - mask.size))
+    return lambda_s * lambda_a * static_remainder(model, is_controlled).slope
 
 
 def design_taps(case: Case, bases: Bases) -> shaper.Taps:

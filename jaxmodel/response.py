@@ -22,7 +22,7 @@ from jaxmodel.prepare import prepare
 
 
 class BenchPlant(NamedTuple):
-    """x' = A x + B u, y = C x, with x = (X, X', q, q') about rest, (n,)."""
+    """x' = A x + B u, y = C x + D u, with x = (X, X', q, q') about rest, (n,)."""
 
     state: Array  # A [1/s and mixed], (n, n)
     actuator: Array  # B of the voltages on the actuators, (n, 3 K)
@@ -32,6 +32,9 @@ class BenchPlant(NamedTuple):
     deflection: Array  # chord deflection at the stations [m], (3 S, n)
     slider: Array  # slider positions [m], (3, n)
     pose: Array  # [m, m, rad], (3, n)
+    # D, of the modes that are left out; zero for all other pairs
+    actuator_to_sensor: Array  # [V/V], (3 K, 3 K)
+    actuator_to_deflection: Array  # [m/V], (3 S, 3 K)
 
 
 def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
@@ -63,6 +66,8 @@ def bench_plant(structure: Structure, case: Case, pose: Array) -> BenchPlant:
         deflection=plant.deflection,
         slider=jnp.pad(jax.jacfwd(rho)(pose), ((0, 0), (0, 3 + 2 * r3))),
         pose=jnp.pad(jnp.eye(3), ((0, 0), (0, 3 + 2 * r3))),
+        actuator_to_sensor=plant.direct_sensor,
+        actuator_to_deflection=plant.direct_deflection,
     )
 
 

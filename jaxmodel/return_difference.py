@@ -46,7 +46,8 @@ class LoopResponse(NamedTuple):
     leave: Array  # inertia force on a mode per pose acceleration, (3, 3, R)
     observe: Array  # channels per modal coordinate, (n, C, R)
     act: Array  # on the modes per channel force, (n, C, R)
-    feedthrough: Array  # compensated, channels per channel force, (n, C, C)
+    direct: Array  # by modes that are left out, channels per channel force, (n, C, C)
+    feedthrough: Array  # compensated, the same way, (n, C, C)
     estimator: Estimator
     velocity_gain: Array  # (n, C)
     position_gain: Array | None
@@ -119,6 +120,7 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
     drag = jnp.einsum("ipr,pq,iqr->ir", enter, jnp.linalg.inv(mass), leave)
     if not structure.is_coupled:
         enter, drag = jnp.zeros_like(enter), jnp.zeros_like(drag)
+    through = jnp.zeros_like(law.feedthrough) if loop.left_out is None else loop.left_out.sensor
     return LoopResponse(
         mass=mass,
         damping=jnp.einsum("i,ip,iq->pq", slope, to_rho, to_rho),
@@ -130,6 +132,7 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
         leave=leave,
         observe=observe,
         act=act,
+        direct=jnp.einsum("ick,ikl,ild->icd", law.filter, through, law.synthesizer),
         feedthrough=jnp.einsum("ick,ikl,ild->icd", law.filter, law.feedthrough, law.synthesizer),
         estimator=law.estimator,
         velocity_gain=law.velocity_gain,
@@ -214,7 +217,15 @@ def _size(x: Pair) -> Array:
 
 #: Fields of links, and those that only links with channels need.
 _LINK_FIELDS = ("square", "decay", "lightness", "enter", "leave")
-_CHANNEL_FIELDS = ("observe", "act", "feedthrough", "estimator", "velocity_gain", "position_gain")
+_CHANNEL_FIELDS = (
+    "observe",
+    "act",
+    "direct",
+    "feedthrough",
+    "estimator",
+    "velocity_gain",
+    "position_gain",
+)
 
 
 def controlled_first(response: LoopResponse, link_mask: np.ndarray, count: int) -> LoopResponse:
@@ -342,7 +353,7 @@ def _round_of_link(
         chain = _electronics(response, at, at2, held)
         inertia = 1.0 if image == 0 else response.lightness
         inverse = (at2 * inertia + at * response.decay + response.square).inverse()
-        part = _through(observe, act, inverse) * chain
+        part = (_through(observe, act, inverse) + response.direct) * chain
         seen = part if seen is None else seen + part
         if image == 0:
             leaving = _through(observe, response.leave, inverse) * (at2 * chain)

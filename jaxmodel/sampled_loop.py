@@ -83,12 +83,20 @@ def closed_loop(
     start = jnp.concatenate([jnp.zeros((n,), analogue.state.dtype), rest])
     jacobian = jax.jacfwd(advance)
     without = jacobian(start, 0.0)
+
+    def deflected(x: Array) -> Array:
+        voltage = (
+            jnp.ravel(unpack(x[n:]).voltage) if analogue.voltage is None else x[analogue.voltage]
+        )
+        bent = plant.deflection @ x[: plant.deflection.shape[1]]
+        return bent + plant.direct_deflection @ voltage
+
     return LoopMatrices(
         open=without,
         feedback=jacobian(start, 1.0) - without,
         plant=plant.state,
         force=jnp.pad(exact[:, n + n_sensors :], ((0, start.size - n), (0, 0))),
-        deflection=jnp.pad(plant.deflection, ((0, 0), (0, start.size - plant.deflection.shape[1]))),
+        deflection=jax.jacfwd(deflected)(start),
     )
 
 
@@ -98,6 +106,7 @@ class _Analogue(NamedTuple):
     state: Array  # A, (n, n)
     enters: Array  # B of commands and slider forces, (n, 3 K + 3)
     filtered: slice  # of the state: what the converters see
+    voltage: slice | None  # of the state: on the actuators; None: the command itself
     size: Array  # typical size of each entry of the state, (n,)
 
 
@@ -124,8 +133,8 @@ def _with_electronics(structure: Structure, plant: LinearPlant, case: Case) -> _
     state = state.at[at["z_rate"], :n_plant].set(corner**2 * plant.sensor)
     state = state.at[at["z_rate"], at["z"]].set(-(corner**2) * eye)
     state = state.at[at["z_rate"], at["z_rate"]].set(-jnp.sqrt(2.0) * corner * eye)
+    highpass = electronics.sensor_highpass
     if "s" in at:
-        highpass = electronics.sensor_highpass
         state = state.at[at["z_rate"], at["s"]].set(-(corner**2) * eye)
         state = state.at[at["s"], :n_plant].set(highpass * plant.sensor)
         state = state.at[at["s"], at["s"]].set(-highpass * eye)
@@ -135,14 +144,26 @@ def _with_electronics(structure: Structure, plant: LinearPlant, case: Case) -> _
         shortest = electronics.period / FASTEST
         rate = 1 / jnp.maximum(electronics.amplifier_lag, shortest)
         state = state.at[:n_plant, at["voltage"]].set(plant.voltage)
+        state = state.at[at["z_rate"], at["voltage"]].set(corner**2 * plant.direct_sensor)
+        if "s" in at:
+            state = state.at[at["s"], at["voltage"]].set(highpass * plant.direct_sensor)
         state = state.at[at["voltage"], at["voltage"]].set(-rate * eye)
         commands = commands.at[at["voltage"]].set(rate * eye)
     else:
         commands = commands.at[:n_plant].set(plant.voltage)
+        commands = commands.at[at["z_rate"]].set(corner**2 * plant.direct_sensor)
+        if "s" in at:
+            commands = commands.at[at["s"]].set(highpass * plant.direct_sensor)
     forces = jnp.pad(plant.force, ((0, n - n_plant), (0, 0)))
     sizes += [(size, n_sensors) for size in blocks.values()]
     size = jnp.asarray(np.concatenate([np.full(count, x) for x, count in sizes]), state.dtype)
-    return _Analogue(state, jnp.concatenate([commands, forces], axis=1), at["z"], size)
+    return _Analogue(
+        state=state,
+        enters=jnp.concatenate([commands, forces], axis=1),
+        filtered=at["z"],
+        voltage=at.get("voltage"),
+        size=size,
+    )
 
 
 #: Squarings of `slowest_decay`: motions whose decay per sample differs by 1e-8 are resolved.

@@ -16,7 +16,7 @@ from typer.exceptions import Abort, TyperException
 from studies.atlas.commands import add_commands as add_atlas
 from studies.bench.commands import add_commands as add_bench
 from studies.config import configure, start
-from studies.errors import NoKernelWarning, StudyError
+from studies.errors import OWN_WARNINGS, StudyError
 from studies.export.commands import add_commands as add_export
 from studies.fitting.commands import add_commands as add_fit
 from studies.paper.commands import add_commands as add_paper
@@ -76,7 +76,7 @@ def _show_warning(
     line: str | None = None,
 ) -> None:
     """The program's own warnings as one line; others with their place in the code."""
-    if issubclass(category, NoKernelWarning):
+    if issubclass(category, OWN_WARNINGS):
         print(f"studies: {message}", file=sys.stderr)
     else:
         print(warnings.formatwarning(message, category, filename, lineno), file=sys.stderr, end="")

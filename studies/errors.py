@@ -22,6 +22,19 @@ class NoKernelWarning(UserWarning):
     """XLA's scan runs a loop for which there is no traced kernel."""
 
 
+class ModelWarning(UserWarning):
+    """A simplification of the model that shows in this study."""
+
+
+#: Warnings that the command line prints as one line.
+OWN_WARNINGS = (NoKernelWarning, ModelWarning)
+
+
+def warn_of_model(text: str) -> None:
+    """Say what a simplification of the model costs."""
+    warnings.warn(text, ModelWarning, stacklevel=3)
+
+
 def warn_of_scan(error: NoKernelError) -> None:
     """Say that XLA's scan replaces a kernel, and why."""
     text = f"{error}; XLA's scan runs instead, several times slower"

@@ -19,7 +19,7 @@ LENGTH = BEAM.length
 LINE_MASS = BEAM.density * BEAM.width * BEAM.thickness
 BARE_STIFFNESS = BEAM.youngs_modulus * BEAM.width * BEAM.thickness**3 / 12
 N_MODES = 8
-FACE_STEP = 1e-6  # for differences of shapes [m]
+FACE_STEP = 1e-8  # for differences of shapes, whose curvature jumps there [m]
 
 
 @partial(jax.jit, static_argnums=0)

@@ -23,24 +23,28 @@ N_STATES = 100
 @partial(jax.jit, static_argnums=0)
 def build(kind, machine, mask, stations):
     basis = build_basis(kind, machine.beam, machine.patches, R, stations, mask)
-    return basis, build_plant(machine, basis)
+    return basis, build_plant(machine, basis, is_distributed=True)
 
 
-def make(kind, machine=MACHINE, mask=1.0, stations=(0.1,), has_shortening=True):
+def make(kind, machine=MACHINE, mask=1.0, stations=(0.1,), shortening="lumped"):
     """Basis and plant as plain arrays."""
     made = jax.tree.map(np.asarray, build(kind, machine, mask, np.array(stations)))
-    if has_shortening:
-        return made
-    return tuple(part._replace(shortening=None, mixed_shortening=None) for part in made)
+    if shortening != "distributed":
+        made = tuple(part._replace(inward=None, centrifugal=None) for part in made)
+    if shortening == "none":
+        made = tuple(part._replace(shortening=None, mixed_shortening=None) for part in made)
+    return made
 
 
-#: Bases, and whether a bent link's chord is shorter.
+#: Bases, and how a bent link's mass moves inwards.
 KINDS = [
-    ("pinned_pinned", True),
-    ("pinned_pinned", False),
-    ("pinned_free", False),
-    ("loaded", True),
-    ("loaded", False),
+    ("pinned_pinned", "lumped"),
+    ("pinned_pinned", "distributed"),
+    ("pinned_pinned", "none"),
+    ("pinned_free", "none"),
+    ("loaded", "lumped"),
+    ("loaded", "distributed"),
+    ("loaded", "none"),
 ]
 
 
@@ -83,9 +87,9 @@ def all_forms(basis, plant, motion, loads):
     )
 
 
-@pytest.mark.parametrize(("kind", "has_shortening"), KINDS)
-def test_accelerations_equal_lagrangian_and_multiplier_form(kind, has_shortening, states):
-    basis, plant = make(kind, has_shortening=has_shortening)
+@pytest.mark.parametrize(("kind", "shortening"), KINDS)
+def test_accelerations_equal_lagrangian_and_multiplier_form(kind, shortening, states):
+    basis, plant = make(kind, shortening=shortening)
 
     found, (pose_l, q_l), (pose_m, q_m, rho_m, gamma_m) = all_forms(basis, plant, *states)
     pairs = (
@@ -115,7 +119,7 @@ def test_kinetic_energy_equals_quadrature_over_the_link(kind, states):
     node, weight = np.polynomial.legendre.leggauss(24)
     length = MACHINE.beam.length
     x, share = length * (node + 1) / 2, weight / 2
-    basis, plant = make(kind, stations=x, has_shortening=False)
+    basis, plant = make(kind, stations=x, shortening="none")
     tip = 0.0 if basis.tip is None else basis.tip[0]
     shape = basis.deflection_at[0] + (x / length)[:, None] * tip
     motion, _ = states

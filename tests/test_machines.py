@@ -58,11 +58,11 @@ def states(count):
     )
 
 
-@partial(jax.jit, static_argnums=0)
-@partial(jax.vmap, in_axes=(None, 0, 0, 0))
-def both_ways(kind, machine, motion, loads):
+@partial(jax.jit, static_argnums=(0, 1))
+@partial(jax.vmap, in_axes=(None, None, 0, 0, 0))
+def both_ways(kind, is_distributed, machine, motion, loads):
     basis = build_basis(kind, machine.beam, machine.patches, R, jnp.array([0.1]))
-    plant = build_plant(machine, basis, False, kind != "pinned_free")
+    plant = build_plant(machine, basis, False, kind != "pinned_free", is_distributed)
     chain = dynamics.modal_chain(plant, *motion)
     found = dynamics.accelerations(
         plant,
@@ -73,13 +73,21 @@ def both_ways(kind, machine, motion, loads):
         loads.slider,
         loads.modal / plant.modal_mass[:, None],
     )
-    own = basis._replace(shortening=plant.shortening, mixed_shortening=plant.mixed_shortening)
+    own = basis._replace(
+        shortening=plant.shortening,
+        mixed_shortening=plant.mixed_shortening,
+        inward=plant.inward,
+        centrifugal=plant.centrifugal,
+    )
     return (found.pose, found.modal), reference.by_lagrangian(machine, own, motion, loads)
 
 
-@pytest.mark.parametrize("kind", ["pinned_pinned", "pinned_free", "loaded"])
-def test_ten_machines_accelerate_as_their_lagrangians_say(kind, machines):
-    found, wanted = both_ways(kind, machines, *states(len(SEEDS)))
+@pytest.mark.parametrize(
+    ("kind", "is_distributed"),
+    [("pinned_pinned", False), ("pinned_free", False), ("loaded", False), ("loaded", True)],
+)
+def test_ten_machines_accelerate_as_their_lagrangians_say(kind, is_distributed, machines):
+    found, wanted = both_ways(kind, is_distributed, machines, *states(len(SEEDS)))
     for mine, theirs in zip(found, wanted, strict=True):
         axes = tuple(range(1, theirs.ndim))
         error = np.abs(mine - theirs).max(axis=axes) / np.abs(theirs).max(axis=axes)
@@ -91,8 +99,8 @@ def test_a_payload_off_the_centre_matters_to_the_lagrangian(machines):
     masses = machines.masses._replace(payload_offset=0 * machines.masses.payload_offset)
     at_centre = machines._replace(masses=masses)
     motion, loads = states(len(SEEDS))
-    (one, _), _ = both_ways("pinned_pinned", machines, motion, loads)
-    (other, _), _ = both_ways("pinned_pinned", at_centre, motion, loads)
+    (one, _), _ = both_ways("pinned_pinned", False, machines, motion, loads)
+    (other, _), _ = both_ways("pinned_pinned", False, at_centre, motion, loads)
     assert np.abs(one - other).max(axis=1).min() > 1e-3 * np.abs(one).max()
 
 

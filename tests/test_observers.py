@@ -56,9 +56,9 @@ def compensator(study, known, case, link):
     sensor, actuator = np.asarray(known.sensor[link]), np.asarray(known.actuator[link])
     count, patches = len(omega), sensor.shape[0]
     zeta = parameters["model_damping"][link]
-    a = np.zeros((4 * count, 4 * count))  # q, q', z, z' of one mode after another [m, m/s]
-    b, f = np.zeros((4 * count, patches)), np.zeros((4 * count, count))
-    c = np.zeros((patches, 4 * count))
+    n = 4 * count + 2 * patches  # q, q', z, z' of one mode after another [m, m/s]; z, z' of volts
+    a, b, f = np.zeros((n, n)), np.zeros((n, patches)), np.zeros((n, count))
+    c = np.zeros((patches, n))
     for k in range(count):
         i = 4 * k
         a[i, i + 1] = a[i + 2, i + 3] = 1.0
@@ -66,12 +66,15 @@ def compensator(study, known, case, link):
         a[i + 3, i], a[i + 3, i + 2] = corner**2, -(corner**2)
         a[i + 3, i + 3] = -np.sqrt(2) * corner
         b[i + 1], f[i + 1, k], c[:, i + 2] = actuator[k] / mass[k], 1 / mass[k], sensor[:, k]
-    size = np.tile([1e-6, 1e-3, 1e-6, 1e-2], count)
-    whole = np.zeros((4 * count + patches + count,) * 2)
-    whole[: 4 * count] = np.hstack([a, b, f])
+    for k in range(patches):  # what all other modes show of the commands, filtered as they are
+        i = 4 * count + 2 * k
+        a[i, i + 1], a[i + 1, i : i + 2] = 1.0, (-(corner**2), -np.sqrt(2) * corner)
+        b[i + 1, k], c[:, i] = corner**2, known.feedthrough[link][:, k]
+    size = np.concatenate([np.tile([1e-6, 1e-3, 1e-6, 1e-2], count), np.tile([1.0, 1e4], patches)])
+    whole = np.zeros((n + patches + count,) * 2)
+    whole[:n] = np.hstack([a, b, f])
     scale = np.concatenate([size, np.ones(patches + count)])
     held = expm(whole * period * scale / scale[:, None]) * scale[:, None] / scale
-    n = 4 * count
     state = np.block(
         [[held[:n, :n], held[:n, n : n + patches]], [np.zeros((patches, n + patches))]]
     )
@@ -79,7 +82,7 @@ def compensator(study, known, case, link):
     drive = np.vstack([held[:n, n + patches :], np.zeros((patches, count))])
     look = np.hstack([c, np.zeros((patches, patches))])
     energy = np.zeros(n + patches)
-    energy[0:n:4], energy[1:n:4] = mass * omega**2, mass
+    energy[0 : 4 * count : 4], energy[1 : 4 * count : 4] = mass * omega**2, mass
     eye = np.eye(patches)
     s = np.concatenate([size, np.ones(patches)])  # SciPy needs numbers of one size
     a1, b1, l1 = state * s / s[:, None], enter / s[:, None], look * s

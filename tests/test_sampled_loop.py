@@ -1,13 +1,15 @@
 """The sampled loop: known designs, leakage into the modal filter, and a nonlinear run."""
 
 from functools import partial
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 import scipy.linalg
 
-from jaxmodel.linear import linearise, natural_modes
+from jaxmodel import sampled_loop
+from jaxmodel.linear import LinearPlant, linearise, natural_modes
 from jaxmodel.linear_residual import linear_residual
 from jaxmodel.parameters import HOME
 from jaxmodel.prepare import prepare
@@ -24,6 +26,7 @@ from studies.study.margin import LOWEST
 from studies.study.spec import paper_study
 
 STUDY = paper_study()
+DATA = Path(__file__).parent / "data"
 HOME_POSE = np.array(HOME)
 PER_MODE = {
     "control__gain_factor": 1.0,
@@ -32,12 +35,15 @@ PER_MODE = {
     "electronics__lowpass_ratio": (3.0, 1.5, 1.5),
     "electronics__lowpass_zeta": (0.7, 0.3, 0.15),
 }
+TRUNCATED = {"link__static_correction": False}
 FAST = {
     "control__gain_factor": 1.0,
     "electronics__sample_rate_hz": 20_000.0,
     "electronics__antialias_hz": 4_000.0,
 }
-TABLE = {  # margins at 8 and 12 plant modes [dB], damping ratios of modes 1 to 3 at 8
+#: Of truncated plants, found elsewhere: margins at 8 and 12 modes [dB], damping ratios of three
+#: modes at 8.
+TABLE = {
     "half gain": ({"control__gain_factor": 0.5}, (12.9, 8.6), (0.248, 0.028, 0.011)),
     "paper's gain": ({"control__gain_factor": 1.0}, (6.9, 2.6), (0.177, 0.047, 0.012)),
     "20 kHz": (FAST, (10.5, 6.6), (0.189, 0.047, 0.012)),
@@ -70,9 +76,14 @@ lengthening = jax.jit(spillover, static_argnums=0)
 def reports():
     """Loop reports of the table at eight plant modes."""
     return {
-        name: loop_report(*arrays(**changes), HOME_POSE, n_modes=8)
+        name: loop_report(*arrays(**TRUNCATED, **changes), HOME_POSE, n_modes=8)
         for name, (changes, _, _) in TABLE.items()
     }
+
+
+def margin_of(matrices):
+    opened, feedback = np.asarray(matrices.open), np.asarray(matrices.feedback)
+    return gain_margin(lambda factor: np.linalg.eigvals(opened + factor * feedback))
 
 
 def decibels(factor):
@@ -91,10 +102,56 @@ def test_table_of_designs(reports, name):
 @pytest.mark.parametrize("name", TABLE)
 def test_margins_with_twelve_plant_modes(name):
     changes, (_, margin), _ = TABLE[name]
-    matrices = loop_matrices(*arrays(link__modes=12, **changes), HOME_POSE)
-    opened, feedback = np.asarray(matrices.open), np.asarray(matrices.feedback)
-    found = gain_margin(lambda factor: np.linalg.eigvals(opened + factor * feedback))
-    np.testing.assert_allclose(decibels(found), margin, atol=0.2)
+    matrices = loop_matrices(*arrays(link__modes=12, **TRUNCATED, **changes), HOME_POSE)
+    np.testing.assert_allclose(decibels(margin_of(matrices)), margin, atol=0.2)
+
+
+def finite_element_plant():
+    """The plant at home from independent finite elements, 40 cable elements a link.
+
+    As many of its modes as a plant of 12 modes a link has, and the static rest of the others.
+    """
+    with np.load(DATA / "fe_plant.npz") as given:
+        fe = dict(given)
+    n, unit = 39, np.sqrt(0.0055)  # modes scaled to move as modal coordinates do
+    kept, rest = slice(n), slice(n, None)
+    static = fe["B"][rest] / fe["w2"][rest, None]
+    order = np.r_[0:3, n : n + 3, 3:n, n + 3 : 2 * n]  # of (X, X', q, q')
+    zero = np.zeros((n, n))
+    state = np.block([[zero, np.eye(n)], [-np.diag(fe["w2"][kept]), -fe["D"][kept, kept]]])
+
+    def force(x):
+        return np.vstack([0 * x[kept], x[kept]])[order] / unit
+
+    def output(x):
+        return np.hstack([x[:, kept], 0 * x[:, kept]])[:, order] * unit
+
+    return LinearPlant(
+        state=state[np.ix_(order, order)],
+        voltage=force(fe["B"]),
+        force=force(fe["F"]),
+        deflection=output(fe["W"]),
+        sensor=output(fe["S"]),
+        direct_deflection=fe["wres"] + fe["W"][:, rest] @ static,
+        direct_sensor=fe["res"] + fe["S"][:, rest] @ static,
+    )
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_loops_are_those_of_finite_elements(name, monkeypatch):
+    """The controller around an independent plant; nothing is shared but how it is sampled."""
+    structure, case = arrays(link__modes=12, **TABLE[name][0])
+    found = loop_matrices(structure, case, HOME_POSE)
+    plant = finite_element_plant()
+    monkeypatch.setattr(sampled_loop, "linearise", lambda *_: plant)
+    wanted = jax.jit(partial(closed_loop, structure))(case, HOME_POSE)
+    np.testing.assert_allclose(margin_of(found), margin_of(wanted), rtol=1e-4)
+    # and the poles of the controlled modes
+    mine, true = (np.log(np.linalg.eigvals(x.open + x.feedback)) for x in (found, wanted))
+    highest = 2 * np.pi * 1100 * float(case.electronics.period)
+    mine = mine[(mine.imag > 0.02) & (np.abs(mine) < highest)]
+    near = true[np.abs(mine[:, None] - true).argmin(axis=1)]
+    assert len(mine) >= 12 and (np.abs(mine - near) < 1e-3 * np.abs(near)).all()
 
 
 def test_frequencies_stay_near_the_assembled_ones(reports):

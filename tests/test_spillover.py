@@ -1,6 +1,7 @@
 """Spillover certificates and control laws: known designs, closed forms, and the nonlinear run."""
 
 import json
+import re
 from functools import partial
 
 import jax
@@ -38,12 +39,14 @@ from tests.test_cli import refused, run
 
 #: One move of a small plant: what the run needs; certificates have plants of their own.
 STUDY = paper_study().change(link__modes=3, motion__waypoints=paper_study().motion.waypoints[:2])
-#: The paper's gains with a plain difference for the velocity: known to be unstable.
+#: The paper's gains with a plain difference for the velocity, on truncated plants: known to be
+#: unstable.
 DIFFERENCE = {
     "control__gain_factor": 1.0,
     "electronics__estimator": "difference",
     "electronics__antialias_hz": 1000.0,
     "control__velocity_gain": (3.1, 3.1, 3.1),
+    "link__static_correction": False,
 }
 SAME = {"bases": ("pinned_pinned",), "departures": (Departure(),)}
 #: Where the default design has its smallest margin of all plants.
@@ -75,22 +78,26 @@ def test_the_certificate_fails_what_is_known_to_be_unstable(difference):
 
 
 def test_verdicts_of_the_ladder_of_gains():
-    """A quarter and a half of the paper's gains pass; the whole does not, because of 9 modes."""
+    """A quarter and a half of the paper's gains pass; the whole does not."""
     found = {f: certified({"control__gain_factor": f}, **HARD) for f in (0.25, 0.5, 1.0)}
     assert [one.is_passed for one in found.values()] == [True, True, False]
     worst = [one.margin[one.worst] for one in found.values()]
     # the same loops, so margins go as 1/f
     np.testing.assert_allclose(np.array(worst) * list(found), worst[2], rtol=2e-4)
-    np.testing.assert_allclose(worst[2], 1.249, atol=2e-3)
     paper = found[1.0]
-    assert paper.fails_from == 9 and np.all(paper.radius < 1)
-    assert paper.breaking[paper.worst].startswith("modes 7+9 of link 2 (5605, 9265 Hz)")
-    assert paper.margin[0, 0, 0] > 2
+    assert paper.fails_from == 8 and np.all(paper.radius < 1)
+    # at 1.2 kHz, where the modes above are springs
+    wanted = r"a controller's filter at 1\d\d\d Hz, fed by modes 7\+9 of link 2 \(5605, 9265 Hz\)"
+    assert re.fullmatch(wanted, paper.breaking[paper.worst])
+    # eight modes say nearly what nine do; truncated, they say what was found elsewhere
+    np.testing.assert_allclose(paper.margin[0, 0], 1.441, rtol=0.025)
+    truncated = certified({"control__gain_factor": 1.0, "link__static_correction": False}, **HARD)
+    np.testing.assert_allclose(truncated.margin[truncated.worst], 1.249, atol=2e-3)
 
 
 def test_a_required_margin_decides():
-    strict = certified({}, margin=2.6, **HARD)
-    assert not strict.is_passed and strict.required == 2.6
+    strict = certified({}, margin=3.0, **HARD)
+    assert not strict.is_passed and strict.required == 3.0
     with pytest.raises(StudyError, match="--margin = 1.0; allowed: more than 1"):
         certified({}, margin=1.0, **HARD)
 
@@ -108,20 +115,21 @@ def test_margins_and_damping_are_those_of_the_loop_report():
     ):
         own = np.sort(own[0, 0, 0, :3], axis=1)
         np.testing.assert_allclose(own, np.sort(wanted, axis=1), rtol=1e-6)
-    # and, with eight modes, those computed elsewhere
-    np.testing.assert_allclose(20 * np.log10(one.margin[0, 0, 1]), 12.9, atol=0.1)
-    zeta = one.damping_ratio[0, 0, 1].min(axis=1)
+    # and, truncated with eight modes, those computed elsewhere
+    one = certified({"link__static_correction": False}, sizes=(8,), **SAME)
+    np.testing.assert_allclose(20 * np.log10(one.margin[0, 0, 0]), 12.9, atol=0.1)
+    zeta = one.damping_ratio[0, 0, 0].min(axis=1)
     np.testing.assert_allclose(zeta[:3], [0.248, 0.028, 0.011], atol=1e-3)
     # modes above half the sample rate keep their true frequency
-    np.testing.assert_allclose(one.frequency_hz[0, 0, 1, 7].mean(), 64 * 114.4, rtol=0.01)
+    np.testing.assert_allclose(one.frequency_hz[0, 0, 0, 7].mean(), 64 * 114.4, rtol=0.01)
     np.testing.assert_allclose(zeta[7], 0.01, rtol=0.01)
 
 
-def test_longer_actuators_take_margin_and_give_damping():
+def test_longer_actuators_give_damping():
     lengths = patch_lengths((1.0, 1.25))  # sensors first
     found = certified({}, sizes=(3,), bases=("pinned_pinned",), departures=lengths)
-    margin = found.margin[0, :, 0]
-    assert np.all(margin[1::2] < 0.9 * margin[::2])
+    first = found.damping_ratio[0, :, 0, 0].min(axis=1)
+    assert np.all(first[1::2] > 1.05 * first[::2])
     # the plant sees the true length, the controller divides by what it believes: 1.2 times q^_1
     seen = np.abs(found.observation[0, 0, 0, 0, 0]), np.abs(found.actuation[0, :2, 0, 0, 0])
     np.testing.assert_allclose(seen[0], 1, atol=1e-9)
@@ -370,7 +378,7 @@ def test_factors_keep_the_margin_and_the_designs_damping(comparison):
     np.testing.assert_allclose(comparison.factor[own], 1, atol=1e-9)
     for numbers in (comparison.damping_ratio, comparison.margin, comparison.residual_rms):
         np.testing.assert_allclose(numbers[own], numbers[given], rtol=1e-9)
-    np.testing.assert_allclose(comparison.margin[given], 5.559, atol=2e-3)
+    np.testing.assert_allclose(comparison.margin[given], 3.911, atol=2e-3)
     # optimal gains are nearly alike for all modes, the paper's fall off
     assert np.all(comparison.damping_ratio[names.index("IMSC-LQR"), 1:] > 2 * 0.01)
 
@@ -430,8 +438,10 @@ def test_damping_is_that_of_links_that_control_the_mode():
     zeta = damping(loop, tracked)[1]
     np.testing.assert_allclose(view.damping(1.0)[:2], zeta[:2].max(axis=1), rtol=1e-6)
     assert view.damping(1.0)[0] > 0.2 and view.damping(0.0)[0] < 0.02
-    # as much as the design damps it takes the design's gains
-    np.testing.assert_allclose(view.fair(2.0, view.damping(1.0)[0]), 1, rtol=1e-9)
+    # as much as the design damps, with no larger gains: beyond its peak damping falls again
+    factor = view.fair(2.0, view.damping(1.0)[0])
+    assert 0.9 < factor <= 1
+    np.testing.assert_allclose(view.damping(factor)[0], view.damping(1.0)[0], rtol=1e-2)
     # no gains at all leave every margin
     assert view.margin(0.0) == HIGHEST
 
@@ -453,7 +463,7 @@ def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_
     few(monkeypatch, lambda study, margin: comparison)
     design, out = write(tmp_path), tmp_path / "deep" / "out"
     code, text, _ = run(capsys, "spillover", design, "--out", out, "--pdf")
-    assert code == 0 and "passed: gain margin 2.5, 2 required" in text
+    assert code == 0 and "passed: gain margin 2.88, 2 required" in text
     figures = [
         f"{name}.{kind}"
         for name in ("margins", "damping", "leakage", "laws")
@@ -463,7 +473,7 @@ def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_
     assert {path.name for path in out.iterdir()} == files | {"machine.png"}
     assert (out / "laws.pdf").read_bytes()[:5] == b"%PDF-"
     report = (out / "report.md").read_text()
-    assert report.startswith("# Spillover certificate passed: gain margin 2.5, 2 required")
+    assert report.startswith("# Spillover certificate passed: gain margin 2.88, 2 required")
     assert all(f"({name}.png)" in report for name in ("margins", "damping", "leakage", "laws"))
     assert "| modified IMSC |" in report and "Not covered" in report
     page = parsed((out / "report.html").read_text())

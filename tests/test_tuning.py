@@ -34,7 +34,7 @@ JUDGED = {
     "objective": {"residual_rms": 1.0, "control_energy": 0.1},
     "limits": {
         "peak_voltage": "own",
-        "gain_margin": 3.0,
+        "gain_margin": 4.0,
         "slowest_decay": 20.0,
         "spillover": 1.1,
         "singularity_distance": 0.1,
@@ -134,7 +134,7 @@ def test_limits_of_the_loop_are_those_of_its_figures(evaluated):
     for position, first in ((0, 0), (1, STARTS)):
         study = tuned_study(spec, spec.moving[position], spec.free.values(u))
         loop, limits = loop_figures(study), found[0, 1, 2].limits[first, 1:]
-        assert (limits[0] > 0) == (loop.gain_margin < 3.0) and abs(loop.gain_margin - 3) > 0.01
+        assert (limits[0] > 0) == (loop.gain_margin < 4.0) and abs(loop.gain_margin - 4) > 0.01
         for value, wanted in (
             (limits[1], 1 - loop.slowest_decay / 20.0),
             (limits[2], loop.spillover / 1.1 - 1),

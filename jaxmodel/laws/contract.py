@@ -44,6 +44,7 @@ class Known(NamedTuple):
     omega: Array  # frequencies of the assembled links [rad/s], (3, C)
     modal_mass: Array  # [kg], (3, C)
     mask: Array  # 1 for controlled modes, at most as many as patches, (C,)
+    feedthrough: Array  # sensor volts per actuator volt by all other modes [V/V], (3, K, K)
 
 
 class Feedback(NamedTuple):

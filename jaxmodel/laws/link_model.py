@@ -1,16 +1,18 @@
 """The sampled plant as a controller with an observer believes it, link by link.
 
 Modes at their assembled frequencies, drained patches, anti-alias filter, amplifiers and hold, exact
-over a sample, and the sample of delay. Each mode is in coordinates whose squares are energies,
+over a sample, and the sample of delay. Sensors answer to all other modes at once
+(`jaxmodel.static`). Each mode is in coordinates whose squares are energies,
 sqrt(m) omega q and sqrt(m) q', and so are its filters. States: all q, all rates, all z, all rates
-of z, all s if patches are drained, voltages if there are amplifiers, commands of the last sample.
+of z, all s if patches are drained; of each patch the voltages on their way to the sensors and, if
+there are amplifiers, on the actuators; commands of the last sample.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from jaxmodel.case import Case, Structure
+from jaxmodel.case import Case, Electronics, Structure
 from jaxmodel.laws.contract import Feedback, Known, Parameter, masked_system
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
@@ -42,7 +44,10 @@ def link_model(structure: Structure, case: Case, known: Known) -> LinkModel:
     """
     on = known.mask * case.control.mode_mask
     zeta = jnp.asarray(case.control.parameters["model_damping"])
-    given = known.omega, jnp.sqrt(known.modal_mass), known.sensor, known.actuator, on, zeta
+    off = (known.mask - on) / (known.modal_mass * known.omega**2)
+    direct = known.feedthrough + jnp.einsum("ikc,ic,icl->ikl", known.sensor, off, known.actuator)
+    root_mass = jnp.sqrt(known.modal_mass)
+    given = known.omega, root_mass, known.sensor, known.actuator, direct, on, zeta
 
     def one(*of_link: Array) -> LinkModel:
         return _one_link(structure, case, *of_link)
@@ -57,14 +62,16 @@ def _one_link(
     root_mass: Array,
     sensor: Array,
     actuator: Array,
+    direct: Array,
     on: Array,
     zeta: Array,
 ) -> LinkModel:
     electronics, n_modes, n_patches = case.electronics, omega.size, actuator.shape[1]
-    names = ["q", "rate", "z", "z_rate"]
-    names += ["s"] if structure.has_sensor_highpass else []
-    sizes = [n_modes] * len(names) + ([n_patches] if structure.has_amplifier else [])
-    names += ["volts"] if structure.has_amplifier else []
+    names = ["q", "rate", "z", "z_rate"] + ["s"] * structure.has_sensor_highpass
+    of_patches = ["direct_z", "direct_z_rate"] + ["direct_s"] * structure.has_sensor_highpass
+    of_patches += ["volts"] * structure.has_amplifier
+    sizes = [n_modes] * len(names) + [n_patches] * len(of_patches)
+    names += of_patches
     begin = [sum(sizes[:k]) for k in range(len(sizes) + 1)]
     at = {name: slice(begin[k], begin[k + 1]) for k, name in enumerate(names)}
     n, eye, corner = begin[-1], jnp.eye(n_modes), electronics.antialias
@@ -79,20 +86,22 @@ def _one_link(
         a = a.at[at["s"], at["q"]].set(electronics.sensor_highpass * eye)
         a = a.at[at["s"], at["s"]].set(-electronics.sensor_highpass * eye)
     bend = (on / root_mass)[:, None] * actuator
+    a, shown = _direct_path(a, at, electronics)
     enter = jnp.zeros((n, n_patches), omega.dtype)
     if "volts" in at:
         lag = jnp.maximum(electronics.amplifier_lag, electronics.period / 100)
-        a = a.at[at["rate"], at["volts"]].set(bend)
+        a = a.at[at["rate"], at["volts"]].set(bend).at[:, at["volts"]].add(shown)
         a = a.at[at["volts"], at["volts"]].set(-jnp.eye(n_patches) / lag)
         enter = enter.at[at["volts"]].set(jnp.eye(n_patches) / lag)
     else:
-        enter = enter.at[at["rate"]].set(bend)
+        enter = (enter + shown).at[at["rate"]].set(bend)
     drive = jnp.zeros((n, n_modes), omega.dtype).at[at["rate"]].set(jnp.diag(on / root_mass))
     held = jnp.concatenate([a, enter, drive], axis=1)
     held = jnp.pad(held, ((0, held.shape[1] - n), (0, 0)))
     exact = jax.scipy.linalg.expm(held * electronics.period)[:n]
     seen = jnp.zeros((n_patches, n), omega.dtype)
     seen = seen.at[:, at["z"]].set(sensor * on / (omega * root_mass))
+    seen = seen.at[:, at["direct_z"]].set(direct)
     last = ((0, n_patches), (0, 0))
     return LinkModel(
         state=jnp.pad(exact[:, : n + n_patches], last),
@@ -101,6 +110,21 @@ def _one_link(
         sensor=jnp.pad(seen, ((0, 0), (0, n_patches))),
         energy=jnp.pad(jnp.tile(on, 2), (0, n + n_patches - 2 * n_modes)),
     )
+
+
+def _direct_path(a: Array, at: dict[str, slice], electronics: Electronics) -> tuple[Array, Array]:
+    """The drain and filter that voltages pass on their way to the sensors, and how they enter."""
+    n_patches = at["direct_z"].stop - at["direct_z"].start
+    eye, corner, drain = jnp.eye(n_patches), electronics.antialias, electronics.sensor_highpass
+    z, rate = at["direct_z"], at["direct_z_rate"]
+    a = a.at[z, rate].set(corner * eye).at[rate, z].set(-corner * eye)
+    a = a.at[rate, rate].set(-jnp.sqrt(2.0) * corner * eye)
+    shown = jnp.zeros((a.shape[0], n_patches), a.dtype).at[rate].set(corner * eye)
+    if "direct_s" in at:
+        s = at["direct_s"]
+        a = a.at[rate, s].set(-corner * eye).at[s, s].set(-drain * eye)
+        shown = shown.at[s].set(drain * eye)
+    return a, shown
 
 
 def compensated(

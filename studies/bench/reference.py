@@ -78,6 +78,21 @@ def chord_length(machine: Machine, basis: ModalBasis, q: jax.Array) -> Any:
     return length - jnp.einsum("ij,ijk,ik->i", q, slopes, q) / 2
 
 
+def first_moment(machine: Machine, basis: ModalBasis, q: jax.Array) -> Any:
+    """int rhoA (x - s) dx [kg m], (3,), s(x) the inward motion; lumped, C's share of it alone."""
+    if basis.inward is None:
+        length = jnp.broadcast_to(machine.beam.length, (3,))
+        return basis.first_moment / length * chord_length(machine, basis, q)
+    return basis.first_moment - jnp.einsum("ij,ijk,ik->i", q, basis.inward, q) / 2
+
+
+def moment_of_inertia(basis: ModalBasis, q: jax.Array) -> Any:
+    """int rhoA (x^2 - 2 x s) dx [kg m2], (3,); lumped, that of the straight link."""
+    if basis.centrifugal is None:
+        return basis.inertia
+    return basis.inertia - jnp.einsum("ij,ijk,ik->i", q, basis.centrifugal, q)
+
+
 def link_tips(machine: Machine, basis: ModalBasis, rho: jax.Array, gamma: Any, q: jax.Array) -> Any:
     """Joints C_i [m] from slider and bent link, (3, 2)."""
     corner, u, _ = guides(machine.geometry)
@@ -112,8 +127,7 @@ def kinetic_energy(
 ) -> Any:
     """T [J] from the velocity a + x b + sum_j Y_j(x) c_j of the points of a link.
 
-    The centre of mass moves inwards along the chord by half the chord's shortening; squares of that
-    motion are neglected.
+    Bending moves a point inwards along the chord; squares of that motion's speed are neglected.
     """
     along = jnp.stack([jnp.cos(gamma), jnp.sin(gamma)], axis=1)  # in the guide's frame
     across = jnp.stack([-jnp.sin(gamma), jnp.cos(gamma)], axis=1)
@@ -123,13 +137,11 @@ def kinetic_energy(
     c = q_rate[:, :, None] * across[:, None] - turning[:, :, None] * along[:, None]
     a_dot_c = jnp.einsum("id,ijd->ij", a, c)
     b_dot_c = jnp.einsum("id,ijd->ij", b, c)
-    length = jnp.broadcast_to(machine.beam.length, (3,))
-    chord, shrinking = jax.jvp(lambda q: chord_length(machine, basis, q), (q,), (q_rate,))
-    inward = shrinking[:, None] * along
+    moment, moving = jax.jvp(lambda q: first_moment(machine, basis, q), (q,), (q_rate,))
     links = (
         (basis.link_mass + machine.masses.slider_mass) * jnp.sum(a * a, axis=1)
-        + basis.inertia * jnp.sum(b * b, axis=1)
-        + 2 * basis.first_moment / length * jnp.sum(a * (chord[:, None] * b + inward), axis=1)
+        + moment_of_inertia(basis, q) * jnp.sum(b * b, axis=1)
+        + 2 * jnp.sum(a * (moment[:, None] * b + moving[:, None] * along), axis=1)
         + jnp.sum(basis.mass * jnp.sum(c * c, axis=2), axis=1)
         + 2 * jnp.sum(basis.b * a_dot_c + basis.c * b_dot_c, axis=1)
     )

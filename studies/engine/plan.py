@@ -27,6 +27,8 @@ STATIC = (
     "run.model",
     "link.basis",
     "link.shortening",
+    "link.axial_inertia",
+    "link.static_correction",
     "control.basis",
     "control.feedback",
     "control.law",

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.signal import lfilter
 
 from jaxmodel import status
-from jaxmodel.axial import critical_force
+from jaxmodel.axial import critical_force, lumping_error
 from jaxmodel.bases import find_bases
 from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
@@ -29,6 +30,7 @@ from jaxmodel.prepare import (
     MODE_STEP_LIMIT,
     STIFFNESS_LIMIT,
     drive_rate,
+    left_out_deflection,
     lowpass_corner,
     prepare,
     spectrum_frequencies,
@@ -37,7 +39,7 @@ from jaxmodel.shaper import Taps, last_sample
 from jaxmodel.simulate import Result, simulate, steady_load
 from studies import config
 from studies.engine.stability import LoopReport, MotionReport, loop_report, motion_report
-from studies.errors import field_error
+from studies.errors import field_error, warn_of_model
 from studies.store import Variable
 from studies.study.cases import as_arrays, build_case, build_structure, powered
 from studies.study.consistency import check_locked, each_link
@@ -47,6 +49,8 @@ from studies.study.spec import Study
 
 #: More plant steps per sample than this are rejected.
 SUBSTEP_LIMIT = 200
+#: Most that lumping the axial inertia may cost without a word [1].
+LUMPING_LIMIT = 2e-3
 
 
 _simulate = jax.jit(simulate, static_argnums=(0, 2))
@@ -180,6 +184,7 @@ class Preflight(NamedTuple):
     corner: Any  # highest low-pass corner of the velocity estimate [rad/s], ()
     steady_load: Any  # compression of the links at way-points over their critical force [1], (n, 3)
     critical_force: Any  # [N], (3,)
+    lumping: Any  # what lumping the axial inertia costs along the unshaped path [1], ()
     controller: Controller
     taps: Taps  # of the shaper
 
@@ -198,8 +203,12 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
     each = jax.vmap(lambda pose: (path_status(plant, pose[None])[0], lift(plant, pose)))(points)
     end = end_of_path(case.path)
     time = jnp.linspace(0.0, 1.0, 2001) * end
-    poses = sample_path(case.path, time).position
-    code, index = path_status(plant, poses)
+    wanted = sample_path(case.path, time)
+    code, index = path_status(plant, wanted.position)
+    lumping = jnp.zeros(())
+    if not structure.is_distributed:
+        error = partial(lumping_error, plant, prepared.bases.plant)
+        lumping = jnp.max(jax.vmap(error)(*wanted))
     worst = jnp.maximum(prepared.sensor_condition.max(), prepared.actuator_condition.max())
     corner = lowpass_corner(structure, case, prepared.bases)
     damping = jnp.max(damping_ratio(case.machine.damping, prepared.loop.omega))
@@ -207,7 +216,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
         *each,
         code,
         time[index],
-        poses[index],
+        wanted.position[index],
         end,
         shaper_length,
         worst,
@@ -216,6 +225,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
         corner,
         steady_load(structure, case, plant),
         critical_force(plant),
+        lumping,
         prepared.loop.controller,
         prepared.taps,
     )
@@ -229,6 +239,8 @@ def _without_run(structure: Structure) -> Structure:
         "n_patches",
         "basis",
         "has_shortening",
+        "is_distributed",
+        "has_static_correction",
         "is_coupled",
         "has_wrench",
         "controller_basis",
@@ -261,6 +273,12 @@ def check_run(study: Study) -> tuple[Structure, Case]:
             "m, m, rad",
         )
     _check_load(study, known)
+    if known.lumping > LUMPING_LIMIT:
+        warn_of_model(
+            f"link.axial_inertia = {study.link.axial_inertia!r} moves deflections by about "
+            f"{100 * known.lumping:.2g} % on this path (limit {100 * LUMPING_LIMIT:g} %); "
+            "'distributed' is exact"
+        )
     _check_duration(study, structure, known)
     is_filtered = is_modal(structure) and structure.feedback != "none"
     if is_filtered and known.condition > study.metrics.condition_limit:
@@ -593,12 +611,31 @@ def run_variables(run: Run) -> dict[str, Variable]:
 
 
 def chord_deflection(run: Run) -> np.ndarray:
-    """Mid-span deflection relative to the chord B-C [m], (n_steps, 3), from the plant's modes."""
+    """Mid-span deflection relative to the chord B-C [m], (n_steps, 3).
+
+    From the plant's modes and, for those it leaves out, the voltages on the actuators.
+    """
     machine, structure = run.case.machine, run.structure
     middle = each_link(run.study.link.length)[:, None] / 2
     shape = build_basis(structure.basis, machine.beam, machine.patches, structure.n_modes, middle)
-    at = np.asarray(shape.deflection_at)[:, 0]
-    return np.einsum("tir,ir->ti", run.result.record.modal_coordinate, at)  # type: ignore[union-attr]
+    record = run.result.record
+    assert record is not None
+    bent = np.einsum("tir,ir->ti", record.modal_coordinate, np.asarray(shape.deflection_at)[:, 0])
+    if structure.has_static_correction:
+        per_volt = np.asarray(left_out_deflection(run.case, shape))[:, 0]
+        bent = bent + np.einsum("tik,ik->ti", _applied_voltage(run), per_volt)
+    return bent
+
+
+def _applied_voltage(run: Run) -> np.ndarray:
+    """Behind the amplifiers, at the sampling instants [V], (n_steps, 3, K)."""
+    assert run.result.record is not None
+    command = np.asarray(run.result.record.actuator_voltage)
+    if not run.structure.has_amplifier:
+        return command
+    electronics = run.case.electronics
+    kept = np.exp(-electronics.period / electronics.amplifier_lag)
+    return lfilter([0.0, 1 - kept], [1.0, -kept], command, axis=0)
 
 
 def run_attributes(study: Study) -> dict[str, Any]:

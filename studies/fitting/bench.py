@@ -93,6 +93,12 @@ class PlantAt:
         name = {"actuator": "actuator", "hammer": "hammer", "slider": "slider_force"}[signal.kind]
         return self._at(name, (slice(None), column))
 
+    def direct(self, source: Signal, output: Signal, column: int, row: int) -> Row:
+        """Entry of D, (), and its derivatives, (p,)."""
+        if source.kind == "actuator" and output.kind in ("sensor", "deflection"):
+            return self._at(f"actuator_to_{output.kind}", (row, column))
+        return np.zeros(()), None if self.slope is None else np.zeros(())
+
     def _at(self, name: str, index: Any) -> Row:
         value = getattr(self.value, name)[index]
         return value, None if self.slope is None else getattr(self.slope, name)[index]
@@ -132,6 +138,11 @@ class Bench:
         self.place = place
         self.poses = tuple(dict.fromkeys(poses))
         self._kept: dict[tuple[Pose, bool], tuple[bytes, PlantAt]] = {}
+
+    def places(self, signals: tuple[Signal, Signal]) -> tuple[int, int]:
+        """Of an input and an output among signals of their kinds."""
+        source, output = (signal.row(self.n_patches, self.stations) for signal in signals)
+        return source, output
 
     def check(self, pose: Pose, path: str) -> None:
         """Refuse a pose; path: where it is written, for messages.
@@ -255,17 +266,22 @@ class FrequencyResponse(NamedTuple):
     slope: np.ndarray | None  # (f, p)
 
 
-def response(plant: PlantAt, source: Row, output: Row, omega: np.ndarray) -> FrequencyResponse:
-    """C (j omega - A)^-1 B of one input and one output.
+def response(
+    plant: PlantAt, signals: tuple[Signal, Signal], at: tuple[int, int], omega: np.ndarray
+) -> FrequencyResponse:
+    """C (j omega - A)^-1 B + D of one input and one output.
 
-    Its differential is dC X + Y dA X + Y dB with X = (j omega - A)^-1 B and Y = C (j omega - A)^-1.
+    Its differential is dC X + Y dA X + Y dB + dD with X = (j omega - A)^-1 B and
+    Y = C (j omega - A)^-1.
 
     Args:
         plant: at the pose.
-        source: `PlantAt.input`.
-        output: `PlantAt.output`.
+        signals: input and output.
+        at: their places among signals of their kinds.
         omega: [rad/s], (f,).
     """
+    source, output = plant.input(signals[0], at[0]), plant.output(signals[1], at[1])
+    direct = plant.direct(*signals, *at)
     pole, right, left = plant.eigen
     if left is None:  # without eigenvectors
         whole = 1j * omega[:, None, None] * np.eye(len(pole)) - plant.value.state
@@ -275,13 +291,13 @@ def response(plant: PlantAt, source: Row, output: Row, omega: np.ndarray) -> Fre
         resolvent = 1 / (1j * omega[:, None] - pole)
         x = (resolvent * (left @ source[0])) @ right.T
         y = (resolvent * (output[0] @ right)) @ left
-    found = x @ output[0]
-    if plant.slope is None or source[1] is None or output[1] is None:
+    found = x @ output[0] + direct[0]
+    if plant.slope is None or source[1] is None or output[1] is None or direct[1] is None:
         return FrequencyResponse(found, None)
     change = plant.slope.state  # (n, n, p)
     n, _, p = change.shape
     turned = (y @ change.reshape(n, n * p)).reshape(len(omega), n, p)
-    slope = np.einsum("fnp,fn->fp", turned, x) + x @ output[1] + y @ source[1]
+    slope = np.einsum("fnp,fn->fp", turned, x) + x @ output[1] + y @ source[1] + direct[1]
     return FrequencyResponse(found, slope)
 
 

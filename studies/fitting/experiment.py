@@ -82,12 +82,8 @@ def _candidates(bench: Bench, plant: PlantAt) -> Iterator[tuple[str, np.ndarray]
         yield f"frequencies and damping of {len(pole)} modes", np.concatenate(slopes)
     frequency = _about_modes(plant)
     for source, output in _pairs(bench):
-        one = response(
-            plant,
-            plant.input(source, source.row(bench.n_patches, bench.stations)),
-            plant.output(output, output.row(bench.n_patches, bench.stations)),
-            2 * np.pi * frequency,
-        )
+        signals = source, output
+        one = response(plant, signals, bench.places(signals), 2 * np.pi * frequency)
         assert one.slope is not None
         size = np.abs(one.value)
         sigma = np.hypot(RELATIVE * size, FLOOR * size.max())

@@ -72,6 +72,13 @@ class Certificate(NamedTuple):
         return tuple(int(k) for k in min(near.tolist(), key=lambda at: at[2]))
 
     @property
+    def truncation(self) -> float:
+        """Largest change of a margin by the last plant modes added, as a share of it [1]."""
+        last, before = self.margin[:, :, -1], self.margin[:, :, max(len(self.margin[0, 0]) - 2, 0)]
+        is_there = self.exists[:, :, -1] & (last > 0)
+        return float(np.max(np.abs(before / last - 1)[is_there], initial=0.0))
+
+    @property
     def fails_from(self) -> int:
         """Fewest plant modes per link with which a plant fails, 0 if none does."""
         failing = self.plants[self.exists & ~self.passes]
@@ -94,7 +101,7 @@ def certify(
         study: with sampled feedback.
         margin: gain margin required on every plant [1], above 1.
         bases: modal bases of the plant.
-        sizes: plant modes per link; empty: from the controlled ones to 12.
+        sizes: plant modes per link; empty: the controlled ones, 8 and 12.
         departures: from the controller's model; joints only in a basis that has them.
 
     Raises:

@@ -150,7 +150,9 @@ def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
     text = f"{_listed('mode', modes)} of {_listed('link', moving)} ({own} Hz)"
     if links > filters:
         return text
-    return f"{text}, " + (f"through a filter at {hertz:.0f} Hz" if hertz >= 1 else "statically")
+    if hertz < 1:
+        return f"{text}, statically"
+    return f"a controller's filter at {hertz:.0f} Hz, fed by {text}"
 
 
 def _leading(energy: np.ndarray) -> list[int]:

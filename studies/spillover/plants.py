@@ -29,6 +29,8 @@ from studies.study.margin import MARGIN_MODES
 
 #: Plant modes per link at most.
 LARGEST = MARGIN_MODES
+#: Beyond the controlled modes: margins have converged, and what remains of that is seen.
+SIZES = (8, LARGEST)
 
 
 class Departure(NamedTuple):
@@ -164,6 +166,8 @@ class LoopMaker:
             n_frequencies=1,
             basis=plant.basis,
             has_shortening=known.has_shortening,
+            is_distributed=known.is_distributed,
+            has_static_correction=known.has_static_correction,
             law=SRF.name,  # a channel for each patch, see `widened`
             has_feedforward=known.has_feedforward,
             has_friction=known.has_friction,
@@ -248,7 +252,7 @@ def widened(law: Controller, n_channels: int) -> Controller:
 
 
 def plant_sizes(found: FixedController, sizes: tuple[int, ...] = ()) -> tuple[int, ...]:
-    """Numbers of plant modes per link, rising; default: from the controlled ones to `LARGEST`.
+    """Numbers of plant modes per link, rising; default: the controlled ones, and `SIZES`.
 
     Raises:
         StudyError: fewer than are controlled, or more than `LARGEST`.
@@ -256,7 +260,7 @@ def plant_sizes(found: FixedController, sizes: tuple[int, ...] = ()) -> tuple[in
     smallest = found.structure.n_controlled
     if smallest > LARGEST:
         raise field_error("control.modes", smallest, f"1 to {LARGEST}, the most plant modes")
-    sizes = tuple(sorted(sizes or range(smallest, LARGEST + 1)))
+    sizes = tuple(sorted(sizes or {smallest, *(n for n in SIZES if n > smallest)}))
     if not smallest <= sizes[0] <= sizes[-1] <= LARGEST:
         raise field_error("sizes", sizes, f"{smallest}, as many as are controlled, to {LARGEST}")
     return sizes

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
 from jaxmodel import status
 from studies.show import figures
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import WITHOUT, Comparison
-from studies.spillover.plants import Departure
 from studies.study.labels import describe
 from studies.study.margin import margin_text
 
@@ -36,49 +37,41 @@ def _has_departures(found: Certificate) -> bool:
 
 
 def margins(found: Certificate, ax: Axes | None = None) -> Axes:
-    """Gain margin over the number of plant modes: range of all departures, and without any.
+    """Gain margin for every departure: of the largest plants, and, hollow, of the smallest.
 
     Args:
         found: the certificate.
         ax: where to draw; default: a new figure.
     """
     ax = figures.axes_or_new(ax)
-    for b, color, dash in zip(
-        range(len(found.plants)), figures.SERIES, figures.DASHES, strict=False
-    ):
-        sizes = [plant.n_modes for plant in found.plants[b, 0]]
-        values = np.maximum(found.margin[b], LEAST)
-        if np.all(np.isnan(values)):
+    sizes = [plant.n_modes for plant in found.plants[0, 0]]
+    shown = np.flatnonzero(found.exists.any(axis=(0, 2)))[::-1]  # the first one on top
+    values = np.maximum(found.margin, LEAST)
+    for b, color, marker in zip(range(len(values)), figures.SERIES, "osD", strict=False):
+        if not found.exists[b].any():
             continue
-        low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
-        ax.fill_between(sizes, low, high, color=color, alpha=0.15, linewidth=0)
-        as_believed = [plant.departure == Departure() for plant in found.plants[b, :, 0]]
-        if any(as_believed):
-            line, name = values[as_believed.index(True)], found.plants[b, 0, 0].basis
-            ax.plot(sizes, line, color=color, linestyle=dash, marker="o", markersize=3, label=name)
-    ax.axhline(found.required, color="black", linewidth=0.9, linestyle="--")
-    ax.annotate(
-        "required",
-        (1, found.required),
-        xycoords=("axes fraction", "data"),
-        ha="right",
-        va="bottom",
-        fontsize=8,
-    )
-    ax.axhline(1, color="black", linewidth=0.9)
-    ax.annotate(
-        "unstable below",
-        (1, 1),
-        xycoords=("axes fraction", "data"),
-        ha="right",
-        va="bottom",
-        fontsize=8,
-    )
-    ax.set(xlabel="plant modes per link [1]", ylabel="gain margin [1]", yscale="log")
-    _plain_ticks(ax.yaxis)
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    shaded = " (shaded: departures from belief)" if _has_departures(found) else ""
-    ax.legend(title=f"plant basis{shaded}", loc="best")
+        at = np.arange(len(shown)) + 0.2 * (b - (len(values) - 1) / 2)
+        style: dict[str, Any] = {"color": color, "marker": marker, "linestyle": "none"}
+        ax.plot(values[b, shown, -1], at, markersize=4, label=found.plants[b, 0, 0].basis, **style)
+        if len(sizes) > 1:
+            ax.plot(values[b, shown, 0], at, markersize=7, markerfacecolor="none", **style)
+    for place, text in ((found.required, "required"), (1.0, "unstable")):
+        ax.axvline(place, color="black", linewidth=0.9, linestyle="--" if place > 1 else "-")
+        ax.annotate(
+            text,
+            (place, 1),
+            xycoords=("data", "axes fraction"),
+            xytext=(0, 3),
+            textcoords="offset points",
+            ha="center",
+            fontsize=8,
+        )
+    ax.set_yticks(np.arange(len(shown)), [str(found.plants[0, d, 0].departure) for d in shown])
+    ax.set(xlabel="gain margin [1]", xscale="log", ylim=(-0.6, len(shown) - 0.4))
+    ax.tick_params(axis="y", labelsize=8)
+    _plain_ticks(ax.xaxis)
+    hollow = f"; hollow: {sizes[0]} modes" if len(sizes) > 1 else ""
+    ax.legend(title=f"{sizes[-1]} plant modes{hollow}", loc="best", fontsize=8)
     return ax
 
 

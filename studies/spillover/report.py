@@ -54,6 +54,7 @@ def report(found: Certificate, laws: Comparison | None) -> str:
         good=int(found.passes[found.exists].sum()),
         links="+".join(str(i + 1) for i in range(3) if study.control.links[i]),
         fewest=found.plants[0, 0, 0].n_modes,
+        sizes=[plant.n_modes for plant in found.plants[0, 0]],
         free_damping=_free_damping(found),
         margins=_margins(found),
         leakage=_leakage(found),
@@ -74,26 +75,23 @@ def _free_damping(found: Certificate) -> list[float]:
 
 
 def _margins(found: Certificate) -> list[list[str]]:
-    """Row of each basis and number of modes: the worst of its departures."""
+    """Row of each basis and departure: the largest plant, and the margin of the smallest."""
     rows = []
-    for b, n in np.ndindex(found.plants.shape[0], found.plants.shape[2]):
-        exists = found.exists[b, :, n]
-        if not exists.any():
+    for b, d in np.ndindex(found.plants.shape[:2]):
+        if not found.exists[b, d].any():
             continue
-        margin = np.where(exists, found.margin[b, :, n], np.inf)
-        zeta = np.where(exists, found.least_damping[b, :, n], np.inf)
-        low, weak = int(np.argmin(margin)), int(np.argmin(zeta))
-        plant = found.plants[b, low, n]
+        last = int(np.flatnonzero(found.exists[b, d])[-1])
+        plant = found.plants[b, d, last]
         rows.append(
             [
                 plant.basis,
-                str(plant.n_modes),
-                margin_text(margin[low], 3),
                 str(plant.departure),
-                found.breaking[b, low, n] or "-",
-                f"{zeta[weak]:.3g}",
-                found.weakest[b, weak, n],
-                "yes" if found.passes[b, :, n][exists].all() else "**no**",
+                margin_text(found.margin[b, d, last], 3),
+                margin_text(found.margin[b, d, 0], 3) if found.exists[b, d, 0] else "-",
+                found.breaking[b, d, last] or "-",
+                f"{found.least_damping[b, d, last]:.3g}",
+                found.weakest[b, d, last],
+                "yes" if found.passes[b, d][found.exists[b, d]].all() else "**no**",
             ]
         )
     return rows

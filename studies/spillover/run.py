@@ -109,7 +109,7 @@ def _draw(folder: Path, found: Certificate, laws: Comparison | None, has_pdf: bo
         drawn.append(("laws", plots.law_bars, laws))
     with figures.styled():
         for name, plot, data in drawn:
-            figure, axes = figures.new_figure(1, 1, 2.65)
+            figure, axes = figures.new_figure(1, 1, 3.6 if plot is plots.margins else 2.65)
             plot(data, axes[0, 0])
             figures.save(figure, folder, name, has_pdf)
         if LAWS[found.study.control.law].channel == "mode":

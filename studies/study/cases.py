@@ -57,6 +57,8 @@ def build_structure(study: Study, substeps: int | None = None) -> Structure:
         substeps=study.run.substeps or substeps or 1,
         basis=study.link.basis,
         has_shortening=study.link.shortening,
+        is_distributed=study.link.axial_inertia == "distributed",
+        has_static_correction=study.link.static_correction,
         is_coupled=study.run.model == "coupled",
         has_wrench=any(x != 0 for x in (*study.load.wrench, *study.load.pulse)),
         has_payload_offset=any(x != 0 for x in study.load.offset),

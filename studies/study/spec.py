@@ -122,6 +122,16 @@ class LinkSection(Section):
         "-",
         "a bent link's chord is shorter: axial force acts on bending (not in pinned_free)",
     )
+    axial_inertia: Literal["lumped", "distributed"] = described(
+        "lumped",
+        "-",
+        "mass that bending moves along the link: half of it at the platform joint, or every point",
+    )
+    static_correction: bool = described(
+        True,
+        "-",
+        "modes that are left out answer to the patches at once; false: the paper's truncated model",
+    )
     length: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(0.2, "m", "L")
     thickness: EachLink[Annotated[float, Field(ge=1e-5, le=0.1)]] = described(2e-3, "m", "t_b")
     width: EachLink[Annotated[float, Field(ge=1e-4, le=1)]] = described(10e-3, "m", "width")

@@ -56,13 +56,7 @@ class _OfBench:
         """Response, (f,), and its derivatives, (f, p)."""
         plant = self._bench.plant(self._pose, values, has_slopes)
         omega = TWO_PI * self.frequency
-        at = [x.row(self._bench.n_patches, self._bench.stations) for x in self._signals]
-        found = response(
-            plant,
-            plant.input(self._signals[0], at[0]),
-            plant.output(self._signals[1], at[1]),
-            omega,
-        )
+        found = response(plant, self._signals, self._bench.places(self._signals), omega)
         turn = (1j * omega) ** self._order
         slope = None if found.slope is None else found.slope * turn[:, None]
         return found.value * turn, slope

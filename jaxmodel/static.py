@@ -1,0 +1,121 @@
+"""Static bending of a link by its actuators: exact, and what the modes of a basis leave out of it.
+
+A link between pinned ends is statically determinate: the pair of moments of an actuator bends it
+between its own ends and nowhere else, whatever the stiffness E I(x). So sensor k answers to
+actuator l with lambda_s lambda_a int dx/(E I) over what both cover, and no other sensor answers
+at all. A sum over modes approaches this as 1/R and changes sign on the way; the plant therefore
+carries the difference as a direct term from voltage to voltage and to deflection
+(docs/theory.md, "Static correction").
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from jaxmodel.lazy import jnp
+from jaxmodel.parameters import Array, Beam, Patches
+from jaxmodel.piezo import bare_stiffness, one_sided_section, patch_ends, two_sided_section
+
+if TYPE_CHECKING:
+    from jaxmodel.beam import ModalBasis
+
+
+class Pieces(NamedTuple):
+    """A link in n pieces between the ends of its patches, each of constant section."""
+
+    left: Array  # [m], (n,)
+    right: Array  # [m], (n,)
+    has_sensor: Array  # 1 where sensor k covers it, else 0, (K, n)
+    has_actuator: Array  # 1 where actuator k covers it, else 0, (K, n)
+
+
+def link_pieces(beam: Beam, patches: Patches) -> Pieces:
+    """Cut one link at the ends of its patches, in any order and overlap.
+
+    Args:
+        beam: one link's data, () fields.
+        patches: its patches, () fields and centres (K,) [m].
+    """
+    length = jnp.asarray(beam.length)
+    sensor = patch_ends(patches.center, patches.sensor_length)
+    actuator = patch_ends(patches.center, patches.actuator_length)
+    cuts = jnp.sort(jnp.concatenate([*sensor, *actuator]))
+    cuts = jnp.concatenate([jnp.zeros((1,)), jnp.clip(cuts, 0.0, length), length[None]])
+    middle = (cuts[1:] + cuts[:-1]) / 2
+
+    def covers(ends: tuple[Array, Array]) -> Array:
+        left, right = (end[:, None] for end in ends)
+        return ((left < middle) & (middle < right)).astype(cuts.dtype)
+
+    return Pieces(cuts[:-1], cuts[1:], covers(sensor), covers(actuator))
+
+
+def section_stiffness(beam: Beam, patches: Patches, pieces: Pieces, has_patches: bool) -> Array:
+    """True bending stiffness E I of each piece [N m2], (n,).
+
+    Args:
+        beam, patches: one link's data.
+        pieces: of that link.
+        has_patches: patches stiffen the link (static).
+    """
+    stiffness = bare_stiffness(beam) * jnp.ones_like(pieces.left)
+    if has_patches:
+        single = one_sided_section(beam, patches).stiffness
+        double = two_sided_section(beam, patches).stiffness
+        one, other = pieces.has_sensor, pieces.has_actuator
+        stiffness = stiffness + single * jnp.sum(one + other, axis=0)
+        stiffness = stiffness + (double - 2 * single) * jnp.sum(one * other, axis=0)
+    return stiffness * beam.stiffness_factor
+
+
+def bent_at(pieces: Pieces, length: Array, x: Array) -> Array:
+    """Deflection from the chord under unit curvature of one piece [m/(1/m)], (len(x), n).
+
+    w = (<x - p>^2 - <x - q>^2)/2 - (x/L) ((L - p)^2 - (L - q)^2)/2 for a piece from p to q.
+    """
+    p, q, x = pieces.left, pieces.right, jnp.asarray(x)[:, None]
+    above = jnp.maximum(x - p, 0.0) ** 2 - jnp.maximum(x - q, 0.0) ** 2
+    return (above - x / length * ((length - p) ** 2 - (length - q) ** 2)) / 2
+
+
+def static_bending(
+    beam: Beam, patches: Patches, stations: Array, has_patches: bool
+) -> tuple[Array, Array]:
+    """Static response of one link to moments of its actuators.
+
+    Args:
+        beam, patches: one link's data.
+        stations: where to take the deflection [m], (S,).
+        has_patches: patches stiffen the link (static).
+
+    Returns:
+        slope differences over the sensors [rad/(N m)], (K, K), and deflections from the chord
+        [m/(N m)], (S, K), each per moment of an actuator.
+    """
+    pieces = link_pieces(beam, patches)
+    softness = 1 / section_stiffness(beam, patches, pieces, has_patches)
+    width = (pieces.right - pieces.left) * softness
+    slope = jnp.einsum("kn,ln,n->kl", pieces.has_sensor, pieces.has_actuator, width)
+    bent = bent_at(pieces, beam.length, stations) * softness
+    return slope, jnp.einsum("sn,ln->sl", bent, pieces.has_actuator)
+
+
+class Remainder(NamedTuple):
+    """Static response of all links that modes leave out, per moment of an actuator."""
+
+    slope: Array  # differences over the sensors [rad/(N m)], (3, K, K)
+    deflection: Array  # from the chord at the stations [m/(N m)], (3, S, K)
+
+
+def static_remainder(basis: ModalBasis, mode_mask: Array = 1.0) -> Remainder:
+    """Exact static response less that of the modes, sum_j Phi_s,jk Phi_a,jl/k_j.
+
+    Args:
+        basis: of all links.
+        mode_mask: modes that count, (3, R) or what broadcasts to it; default: all that exist.
+    """
+    driven = basis.actuator_slope * (mode_mask / basis.stiffness)[..., None]
+    return Remainder(
+        basis.static_slope - jnp.einsum("irk,irl->ikl", basis.sensor_slope, driven),
+        basis.static_deflection - jnp.einsum("isr,irl->isl", basis.deflection_at, driven),
+    )
