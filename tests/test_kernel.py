@@ -76,17 +76,30 @@ OTHER_SORTS = {
 }
 
 
+#: What bends moves every point inwards; direct terms pass the amplifier and the high-pass.
+HEAVY = {
+    "link": {"modes": 2, "axial_inertia": "distributed"},
+    "electronics": {"sensor_highpass_hz": 5.0, "amplifier_hz": 2e3},
+}
+STIFFNESSES = {"method": "random", "count": 32, "axes": {"drive.kp": {"from": 1e4, "to": 2e4}}}
+
+
 @pytest.mark.parametrize(
     ("sweep", "sections"),
     [
         (ALL_SORTS, {"metrics": {"residual_length": 0.004}}),
+        (STIFFNESSES, HEAVY),
         pytest.param(
-            {"method": "random", "count": 32, "axes": {"drive.kp": {"from": 1e4, "to": 2e4}}},
+            STIFFNESSES,
             OTHER_SORTS,
             marks=pytest.mark.long,
         ),
     ],
-    ids=["mixed sampled cases", "strain rate, noise, friction, steps"],
+    ids=[
+        "mixed sampled cases",
+        "distributed inertia, amplifier",
+        "strain rate, noise, friction, steps",
+    ],
 )
 def test_kernel_equals_scan(sweep, sections):
     fast, reference = both(small_spec(sweep, **sections))

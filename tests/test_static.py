@@ -14,8 +14,11 @@ from jaxmodel.loop import deflection
 from jaxmodel.piezo import actuator_constant, sensor_constant
 from jaxmodel.prepare import prepare
 from studies.engine.margins import judge_loops
+from studies.engine.runs import chord_deflection, run_study
 from studies.engine.stability import loop_report
+from studies.fitting.bench import Bench, response
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.study.signals import Signal
 from studies.study.spec import paper_study
 
 #: Three different links with unequal patches, two of which overlap on the third link.
@@ -207,3 +210,45 @@ def test_deflections_at_the_stations_have_it():
     np.testing.assert_allclose(deflection(loop, q, volts), wanted, rtol=2e-4)
     alone = np.einsum("isr,ir->is", loop.deflection_at, q)
     assert np.abs(alone / wanted - 1).max() > 5e-3
+
+
+def test_mid_span_of_a_run_is_the_station_there():
+    """Reported afterwards, from modes and commands, behind slow amplifiers."""
+    run = run_study(
+        paper_study().change(
+            link__modes=2,
+            control__modes=2,
+            control__ratios=((1.5, 2.0),) * 3,
+            electronics__amplifier_hz=300.0,
+            run__duration=0.06,
+            motion__waypoints=paper_study().motion.waypoints[:2],
+            motion__move_time=0.02,
+            shaper__kind="none",
+            metrics__stations=(0.1,),
+            metrics__residual_length=0.01,
+            metrics__residual_delay=0.0,
+        ),
+        has_loop=False,
+    )
+    station = np.asarray(run.result.record.chord_deflection_stations)[:, :, 0]
+    size = np.abs(station).max()
+    np.testing.assert_allclose(chord_deflection(run), station, rtol=0, atol=1e-12 * size)
+    per_volt = np.asarray(run.result.record.actuator_voltage)[:, :, 1]
+    assert np.abs(per_volt).max() > 1  # so that there is something to miss
+
+
+def test_bench_responses_have_it():
+    """Of an actuator at low frequency: what statics says, from three modes."""
+    study = paper_study().change(link__modes=3, drive__kp=2e4)
+    pose = study.motion.waypoints[0]
+    bench = Bench(study, lambda case, values: case, (pose,), (0.1,))
+    plant = bench.plant(pose, np.zeros(0), False)
+    volts, bent = by_hand(bench.case._replace(windows=prepared()[1].windows), "pinned_pinned", 0)
+    station = list(prepared()[1].windows.stations).index(0.1)
+    for output, wanted in (
+        (Signal("sensor", 0, 1, np.nan), volts[1, 1]),
+        (Signal("deflection", 0, 0, 0.1), bent[station, 1]),
+    ):
+        signals = Signal("actuator", 0, 1, np.nan), output
+        found = response(plant, signals, bench.places(signals), np.array([1e-3]))
+        np.testing.assert_allclose(found.value, wanted, rtol=1e-6)

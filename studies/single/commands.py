@@ -116,7 +116,7 @@ def _print_run(run: Run, console: Console) -> None:
     """Print status, link metrics and stability."""
     from studies.single.report import settling_text
     from studies.study.labels import describe
-    from studies.study.margin import caution, margin_text
+    from studies.study.margin import MARGIN_MODES, caution, margin_text
 
     metrics = run.result.metrics
     console.print(f"status: {describe(run.status)}")
@@ -131,8 +131,14 @@ def _print_run(run: Run, console: Console) -> None:
     console.print(table)
     if run.loop is None:
         return
-    margin = margin_text(run.loop.gain_margin)
-    console.print(f"gain margin of the linearised sampled loop: {margin}")
+    damping = ", ".join(f"{zeta:.3g}" for zeta in run.loop.damping_ratio.min(axis=1))
+    modes = run.study.link.modes
+    console.print(
+        f"gain margin of the linearised sampled loop: {margin_text(run.loop.gain_margin)}, damping "
+        f"ratios of the controlled modes: {damping} ({max(MARGIN_MODES, modes)} plant modes per "
+        f"link, the run {modes})",
+        soft_wrap=True,
+    )
     if warning := caution(run.loop.gain_margin):
         console.print(f"[bold red]{warning}[/]", soft_wrap=True, markup=True)
 
