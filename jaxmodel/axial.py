@@ -13,7 +13,7 @@ from jaxmodel.kinematics import Chain, close_chain
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array, Beam
 from jaxmodel.piezo import bare_stiffness
-from jaxmodel.plant import Plant
+from jaxmodel.plant import Plant, unlumped
 
 #: Squarings of `critical_force`: eigenvalues that differ by 1 % are resolved.
 SQUARINGS = 12
@@ -125,13 +125,15 @@ def lumping_error(
         pose_rate: (3,).
         pose_acc: (3,).
     """
-    if plant.shortening is None or basis.inward is None or basis.centrifugal is None:
+    left_out = None if plant.shortening is None else unlumped(basis, plant.length)
+    if left_out is None or basis.centrifugal is None:
         return jnp.zeros(3)
     chain = close_chain(plant, pose, pose_rate)
     slide = chain.cosine * _straight(plant, chain, pose, pose_rate, pose_acc).rho
-    lumped = plant.tip_mass[:, None] * chord_slopes(plant)[:, :, 0]
-    force = (basis.inward[:, :, 0] - lumped) * slide[:, None]
-    force = force - basis.centrifugal[:, :, 0] * chain.gamma_rate[:, None] ** 2
+    force = (
+        left_out[:, :, 0] * slide[:, None]
+        - basis.centrifugal[:, :, 0] * chain.gamma_rate[:, None] ** 2
+    )
     return jnp.max(jnp.abs(force) / plant.stiffness, axis=1)
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from jaxmodel.kinematics import Bend, Chain, close_chain
-from jaxmodel.lazy import jax, jnp
+from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 from jaxmodel.plant import Plant
 
@@ -31,8 +31,13 @@ def shortening_row(plant: Plant, q: Array) -> Array:
     """(S q)_j, shortening of the chord per modal coordinate [1], (3, R)."""
     row = plant.shortening * q
     if plant.mixed_shortening is not None:
-        row = row + times(plant.mixed_shortening, q)
+        row = row + _times(plant.mixed_shortening, q)
     return row
+
+
+def _times(matrix: Array, q: Array) -> Array:
+    """Matrices of links (3, R, R) times modal coordinates (3, R)."""
+    return jnp.sum(matrix * q[:, None], axis=2)
 
 
 def modal_chain(plant: Plant, pose: Array, pose_rate: Array, q: Array, q_rate: Array) -> Chain:
@@ -104,25 +109,22 @@ def accelerations(
         Accelerations.
     """
     swing = _swing(plant, chain, q_rate)
-    shape = _shape(plant, q)
-    rate2, mass = chain.gamma_rate * chain.gamma_rate, plant.modal_mass[:, None]
     # modal accelerations without inertia: of piezos and rotation, and of the oscillator itself
-    push = piezo + q * rate2[:, None]
-    if shape.turning is not None:
-        push = push - (shape.turning / mass) * rate2[:, None]
+    mass = plant.modal_mass[:, None]
+    push = piezo + q * (chain.gamma_rate * chain.gamma_rate)[:, None]
+    spread = _spread(plant, q)
+    if spread is not None:
+        push = push - (spread.turning / mass) * (chain.gamma_rate * chain.gamma_rate)[:, None]
     own = (plant.stiffness / mass) * q + (plant.damping / mass) * q_rate
     pull = own - push
     end = None
     if is_coupled:
-        sums = inward = None
-        if shape.row is not None:
-            sums = _sums(plant, shape.row, shape.row, pull)
-            if plant.tip is None:
-                inward = _inward(plant, chain, shape, swing, sums, q, q_rate, pull)
-        link = _link(plant, chain, shape, inward, q, q_rate, pull, slider_force)
+        link = _link(plant, chain, swing, q, q_rate, pull, slider_force)
+        if spread is not None:
+            link = _spread_out(plant, chain, spread, link, q, q_rate, pull)
         joint = _joint(chain, link)
-        if sums is not None:
-            end, joint = _release_end(chain, joint, sums, inward)
+        if not _is_rigid(plant):
+            end, joint = _release_end(plant, chain, joint, q, pull, spread)
     else:
         joint = _joint(chain, _rigid_link(plant, chain, swing, slider_force))
     phi2 = pose_rate[2] * pose_rate[2]
@@ -132,21 +134,21 @@ def accelerations(
     acc_f, acc_g = (a + b for a, b in zip(rates, chain.frame.joint_motion(pose_acc), strict=True))
     force_f = joint.ff * acc_f + joint.fg * acc_g + joint.load_f
     force_g = joint.fg * acc_f + joint.gg * acc_g + joint.load_g
+    coupling = push
     if end is not None:
-        acc_f = end[1] * acc_f + end[2] * acc_g - end[0]
+        reaction = end.force[0] + end.force[1] * acc_f + end.force[2] * acc_g
+        acc_f = end.motion[1] * acc_f + end.motion[2] * acc_g - end.motion[0]
+        coupling = coupling - end.row * (reaction / plant.modal_mass)[:, None]
     rho_acc, gamma_acc = chain.frame.link_motion(acc_f, acc_g)
-    coupling = push + (plant.b / mass) * (chain.sine * rho_acc)[:, None]
+    coupling = coupling + (plant.b / mass) * (chain.sine * rho_acc)[:, None]
     coupling = coupling - (plant.c / mass) * gamma_acc[:, None]
-    slide = chain.cosine * rho_acc
     # the mass between mid-span and C takes its share of the force at C
-    axial = (force_f if chain.bend.tip is None else force_g) - plant.tip_mass * slide
-    if plant.tip is not None and is_coupled:
-        coupling = coupling - shape.row * (force_f / plant.modal_mass)[:, None]
-    elif plant.shortening is not None:
-        pulled = axial if shape.inward is None else force_f
-        coupling = coupling - shape.row * (pulled / plant.modal_mass)[:, None]
-        if shape.inward is not None:
-            coupling = coupling + shape.inward * (slide / plant.modal_mass)[:, None]
+    tension = force_f if chain.bend.tip is None else force_g
+    axial = tension - plant.tip_mass * chain.cosine * rho_acc
+    if not is_coupled and plant.shortening is not None:
+        coupling = coupling - shortening_row(plant, q) * (axial / plant.modal_mass)[:, None]
+    if spread is not None:
+        coupling = coupling + spread.inward * (chain.cosine * rho_acc / plant.modal_mass)[:, None]
     return Accelerations(
         pose=pose_acc,
         modal=coupling - own,
@@ -157,28 +159,9 @@ def accelerations(
     )
 
 
-class _Shape(NamedTuple):
-    """What a bent link does per modal coordinate, (3, R) each."""
-
-    row: Array | None  # moves C along f, sign reversed: S q, or Y_j(L) [1]; None: C stays
-    inward: Array | None  # moves mass inwards along the chord: P q [kg]; None: mu of it, with C
-    turning: Array | None  # takes from the moment of inertia: Q q [kg m]; None: nothing
-
-
-def _shape(plant: Plant, q: Array) -> _Shape:
-    if plant.tip is not None:
-        return _Shape(plant.tip, None, None)
-    if plant.shortening is None:
-        return _Shape(None, None, None)
-    row = shortening_row(plant, q)
-    if plant.inward is None:
-        return _Shape(row, None, None)
-    return _Shape(row, times(plant.inward, q), times(plant.centrifugal, q))
-
-
-def times(matrix: Array, q: Array) -> Array:
-    """Matrices of links (3, R, R) times modal coordinates (3, R)."""
-    return jnp.sum(matrix * q[:, None], axis=2)
+def _is_rigid(plant: Plant) -> bool:
+    """Whether bending leaves the distance between a link's joints unchanged."""
+    return plant.tip is None and plant.shortening is None
 
 
 class _Swing(NamedTuple):
@@ -188,54 +171,6 @@ class _Swing(NamedTuple):
     g: Array
     inward: Array  # gamma'^2 c + e2, along the chord
     across: Array  # 2 gamma' d', of a point moving inwards along the chord
-
-
-class _Sums(NamedTuple):
-    """A row of a link (row, or p = P q) times other rows, summed over the modes."""
-
-    b: Array  # with b/m
-    c: Array  # with c/m
-    row: Array  # with row/m
-    own: Array  # with itself, over m
-    pull: Array
-
-
-def _sums(plant: Plant, row: Array, end: Array, pull: Array) -> _Sums:
-    mass = plant.modal_mass
-    others = plant.b / mass[:, None], plant.c / mass[:, None], end, row, pull
-    b, c, joint, own, pulled = (jnp.sum(row * x, axis=1) for x in others)
-    return _Sums(b=b, c=c, row=joint / mass, own=own / mass, pull=pulled)
-
-
-class _Inward(NamedTuple):
-    """The mass that bending moves inwards. Lumped, P = mu S: the part mu of the link, with C."""
-
-    moment: Array  # e - 1/2 q.P q [kg m], (3,)
-    sums: _Sums  # of p = P q
-    along: Array  # moment gamma'^2 + q'.P q' - p.pull [N]
-    across: Array  # 2 gamma' p.q' [N]
-
-
-def _inward(
-    plant: Plant,
-    chain: Chain,
-    shape: _Shape,
-    swing: _Swing,
-    end: _Sums,
-    q: Array,
-    q_rate: Array,
-    pull: Array,
-) -> _Inward:
-    mu, p, rate = plant.tip_mass, shape.inward, chain.gamma_rate
-    if p is None:
-        sums = jax.tree.map(lambda x: mu * x, end)
-        along, across = mu * (swing.inward - end.pull), mu * swing.across
-        return _Inward(mu * chain.chord, sums._replace(own=mu * sums.own), along, across)
-    sums = _sums(plant, p, shape.row, pull)
-    moment = mu * plant.length - jnp.sum(p * q, axis=1) / 2
-    rates = jnp.sum(times(plant.inward, q_rate) * q_rate, axis=1)
-    along = moment * (rate * rate) + rates - sums.pull
-    return _Inward(moment, sums, along, 2 * rate * jnp.sum(p * q_rate, axis=1))
 
 
 def _swing(plant: Plant, chain: Chain, q_rate: Array) -> _Swing:
@@ -258,8 +193,7 @@ def _swing(plant: Plant, chain: Chain, q_rate: Array) -> _Swing:
 def _link(
     plant: Plant,
     chain: Chain,
-    shape: _Shape,
-    inward: _Inward | None,
+    swing: _Swing,
     q: Array,
     q_rate: Array,
     pull: Array,
@@ -268,31 +202,51 @@ def _link(
     """Slider and link after eliminating q'', except for the effect of the modes on C."""
     sine, cosine, rate, mass = chain.sine, chain.cosine, chain.gamma_rate, plant.modal_mass
     bq, bq_rate = jnp.sum(plant.b * q, axis=1), jnp.sum(plant.b * q_rate, axis=1)
+    # the centre of mass moves inwards by half the shortening
+    across = jnp.sum(plant.b * pull, axis=1) + bq * (rate * rate) + plant.tip_mass * swing.across
+    along = plant.tip_mass * swing.inward + 2 * rate * bq_rate
     bb, bc, cc = (
         jnp.sum(x * y, axis=1) / mass
         for x, y in ((plant.b, plant.b), (plant.b, plant.c), (plant.c, plant.c))
     )
-    spin, spin_rate = mass * jnp.sum(q * q, axis=1), mass * jnp.sum(q * q_rate, axis=1)
-    if shape.turning is not None:
-        spin = spin - jnp.sum(shape.turning * q, axis=1)
-        spin_rate = spin_rate - jnp.sum(shape.turning * q_rate, axis=1)
-    across = jnp.sum(plant.b * pull, axis=1) + bq * (rate * rate)
-    k_rr = plant.slider_link_mass - sine * sine * bb
-    if inward is None:
-        moment = plant.tip_mass * plant.length
-        along, k_rg = moment * (rate * rate), sine * (bc - moment) - cosine * bq
-    else:
-        sums, along = inward.sums, inward.along
-        across = across + inward.across
-        k_rr = k_rr - cosine * (2 * sine * sums.b + cosine * sums.own)
-        k_rg = sine * (bc - inward.moment) + cosine * (sums.c - bq)
-    along = along + 2 * rate * bq_rate
     return _Link(
-        k_rr=k_rr,
-        k_rg=k_rg,
-        k_gg=plant.inertia - cc + spin,
+        k_rr=plant.slider_link_mass - sine * sine * bb,
+        k_rg=sine * (bc - plant.tip_mass * chain.chord) - cosine * bq,
+        k_gg=plant.inertia - cc + mass * jnp.sum(q * q, axis=1),
         load_r=sine * across - cosine * along - slider_force,
-        load_g=2 * rate * spin_rate - jnp.sum(plant.c * pull, axis=1),
+        load_g=2 * rate * (mass * jnp.sum(q * q_rate, axis=1)) - jnp.sum(plant.c * pull, axis=1),
+    )
+
+
+class _Spread(NamedTuple):
+    """What distributed axial inertia adds to the lumped one, per modal coordinate, (3, R) each."""
+
+    inward: Array  # p = (P - mu S) q, momentum along the chord [kg]
+    turning: Array  # Q q, taken from the moment of inertia [kg m]
+
+
+def _spread(plant: Plant, q: Array) -> _Spread | None:
+    if plant.inward is None or plant.centrifugal is None:
+        return None
+    return _Spread(_times(plant.inward, q), _times(plant.centrifugal, q))
+
+
+def _spread_out(
+    plant: Plant, chain: Chain, spread: _Spread, link: _Link, q: Array, q_rate: Array, pull: Array
+) -> _Link:
+    """A link with lumped axial inertia, and what distributing it adds."""
+    p, mass, rate = spread.inward, plant.modal_mass, chain.gamma_rate
+    b, c, own, pulled, rates, moment = (
+        jnp.sum(p * x, axis=1) for x in (plant.b, plant.c, p, pull, q_rate, -q / 2)
+    )
+    inward = jnp.sum(_times(plant.inward, q_rate) * q_rate, axis=1)
+    along = moment * (rate * rate) + inward - pulled
+    return _Link(
+        k_rr=link.k_rr - chain.cosine * (2 * chain.sine * b + chain.cosine * own) / mass,
+        k_rg=link.k_rg - chain.sine * moment + chain.cosine * c / mass,
+        k_gg=link.k_gg - jnp.sum(spread.turning * q, axis=1),
+        load_r=link.load_r + 2 * rate * chain.sine * rates - chain.cosine * along,
+        load_g=link.load_g - 2 * rate * jnp.sum(spread.turning * q_rate, axis=1),
     )
 
 
@@ -321,39 +275,49 @@ def _joint(chain: Chain, link: _Link) -> _Joint:
     return _Joint(ff, fg, gg, *frame.joint_force(link.load_r, link.load_g))
 
 
+class _End(NamedTuple):
+    """Interaction of the modes with the far joint of a link."""
+
+    row: Array  # motion of C along f per modal coordinate, sign reversed [1], (3, R)
+    # C'' along f that slider and link feel: -motion[0] + motion[1] C''_f + motion[2] C''_g
+    motion: tuple[Array, Array, Array]
+    # reaction on row_j of every mode [N]: force[0] + force[1] C''_f + force[2] C''_g
+    force: tuple[Array, Array, Array]
+
+
 def _release_end(
-    chain: Chain, still: _Joint, end: _Sums, inward: _Inward | None
-) -> tuple[tuple[Array, Array, Array], _Joint]:
+    plant: Plant, chain: Chain, still: _Joint, q: Array, pull: Array, spread: _Spread | None
+) -> tuple[_End, _Joint]:
     """Let the modes move C along f: by shortening of the chord (row S q) or by row Y_j(L).
 
-    tau = sum row_j q_j'' adds to C'' along f, and the force N at C along f acts on the modes,
-    -row_j N. With g = T^t (sum row_j (sin gamma b_j + cos gamma p_j), -sum row_j c_j)/m,
-    B = sum row_j^2/m and D = 1 - g_f:
+    tau = sum row_j q_j'' adds to C'' along f, and a reaction N acts on the modes, -row_j N; along
+    the chord it is the axial force. With g = T^t (sum row_j beta_j, -sum row_j c_j)/m,
+    beta = sin gamma b, plus cos gamma p of distributed inertia,
+    B = sum row_j^2/m, mu the mass that moves in with the chord, A = W_ff - 2 mu and D = 1 - g_f:
 
-    D tau = g.C'' - B N - sum row_j pull_j,  D N = (W_ff, W_fg).C'' + W_ff tau + load_f.
-
-    Returns:
-        C'' along f that slider and link feel, -[0] + [1] C''_f + [2] C''_g, and the joint, whose
-        force along f is N.
+    D tau = g.C'' - B N - sum row_j pull_j,  D N = (W_ff - mu, W_fg).C'' + A tau + load_f.
     """
-    slid = chain.sine * end.b
-    if inward is not None:
-        slid = slid + chain.cosine * inward.sums.row
-    g_f, g_g = chain.frame.joint_force(slid, -end.c)
-    lead, stiff, soft = 1 - g_f, still.ff, end.own
+    row, mu = (shortening_row(plant, q), plant.tip_mass) if plant.tip is None else (plant.tip, 0.0)
+    mass = plant.modal_mass[:, None]
+    slid = chain.sine * jnp.sum(row * (plant.b / mass), axis=1)
+    if spread is not None:
+        slid = slid + chain.cosine * jnp.sum(row * (spread.inward / mass), axis=1)
+    g_f, g_g = chain.frame.joint_force(slid, jnp.sum(row * (-plant.c / mass), axis=1))
+    lead, stiff = 1 - g_f, still.ff - 2 * mu
+    soft = jnp.sum(row * row, axis=1) / plant.modal_mass
     scale = 1 / (lead * lead + soft * stiff)
     lead, stiff, soft = lead * scale, stiff * scale, soft * scale
-    pulled, fg, load = end.pull, still.fg, still.load_f
-    motion = lead * pulled + soft * load, lead, lead * g_g - soft * fg
-    force, across = lead * load - stiff * pulled, lead * fg + stiff * g_g
+    pulled, fg, load = jnp.sum(row * pull, axis=1), still.fg, still.load_f
+    motion = lead * pulled + soft * load, lead - mu * soft, lead * g_g - soft * fg
+    force = lead * load - stiff * pulled, stiff + mu * lead, lead * fg + stiff * g_g
     joint = _Joint(
-        ff=stiff,
-        fg=across,
-        gg=still.gg + fg * motion[2] + g_g * across,
-        load_f=force,
-        load_g=still.load_g - fg * motion[0] + g_g * force,
+        ff=mu * motion[1] + force[1],
+        fg=mu * motion[2] + force[2],
+        gg=still.gg + fg * motion[2] + g_g * force[2],
+        load_f=force[0] - mu * motion[0],
+        load_g=still.load_g - fg * motion[0] + g_g * force[0],
     )
-    return motion, joint
+    return _End(row, motion, force), joint
 
 
 class Platform(NamedTuple):
@@ -497,17 +461,16 @@ def kinetic_energy(plant: Plant, chain: Chain, pose_rate: Array, q: Array, q_rat
         q_rate: [m/s], (3, R).
     """
     bq, bq_rate = jnp.sum(plant.b * q, axis=1), jnp.sum(plant.b * q_rate, axis=1)
-    moment = plant.tip_mass * chain.chord
+    swing = plant.tip_mass * chain.chord * chain.sine + chain.cosine * bq
     push = chain.sine * bq_rate
-    rotary = plant.inertia + plant.modal_mass * jnp.sum(q * q, axis=1)
-    if plant.inward is not None:
-        inward = times(plant.inward, q)
-        moment = plant.tip_mass * plant.length - jnp.sum(inward * q, axis=1) / 2
-        push = push + chain.cosine * jnp.sum(inward * q_rate, axis=1)
-        rotary = rotary - jnp.sum(times(plant.centrifugal, q) * q, axis=1)
-    elif chain.bend.shortening_rate is not None:
+    if chain.bend.shortening_rate is not None:
         push = push + plant.tip_mass * chain.cosine * chain.bend.shortening_rate
-    swing = moment * chain.sine + chain.cosine * bq
+    rotary = plant.inertia + plant.modal_mass * jnp.sum(q * q, axis=1)
+    spread = _spread(plant, q)
+    if spread is not None:
+        swing = swing - chain.sine * jnp.sum(spread.inward * q, axis=1) / 2
+        push = push + chain.cosine * jnp.sum(spread.inward * q_rate, axis=1)
+        rotary = rotary - jnp.sum(spread.turning * q, axis=1)
     links = (
         plant.slider_link_mass * chain.rho_rate**2 / 2
         + rotary * chain.gamma_rate**2 / 2

@@ -41,7 +41,7 @@ class Plant(NamedTuple):
     tip: Array | None  # Y_j(L) [1], (3, R), None where zero
     shortening: Array | None  # S_jj [1/m], (3, R), None where the chord keeps its length
     mixed_shortening: Array | None  # S_jk, zero for j = k [1/m], (3, R, R), None where all zero
-    inward: Array | None  # P_jk [kg/m], (3, R, R), None where lumped at the joints: mu S
+    inward: Array | None  # P_jk - mu S_jk [kg/m], (3, R, R), None where lumped at the joints
     centrifugal: Array | None  # Q_jk [kg], (3, R, R), None likewise
     b: Array  # [kg], (3, R)
     c: Array  # [kg m], (3, R)
@@ -91,6 +91,7 @@ def build_plant(
     def link(x: Array) -> Array:
         return jnp.broadcast_to(jnp.asarray(x), (3,))
 
+    length = link(beam.length)
     payload, offset = jnp.asarray(masses.payload_mass), masses.payload_offset
     mass = masses.platform_mass + payload
     inertia = masses.platform_inertia + jnp.asarray(masses.payload_inertia)
@@ -103,11 +104,11 @@ def build_plant(
         joint_sin=link(geometry.joint_radius) * jnp.sin(psi),
         s0=link(geometry.guide_side / 2),
         h0=link(geometry.guide_side / jnp.sqrt(12.0) + geometry.guide_offset),
-        length=link(beam.length),
+        length=length,
         slider_link_mass=link(masses.slider_mass)
         + basis.link_mass
         + LOCK_MASS * jnp.asarray(is_locked, basis.mass.dtype),
-        tip_mass=basis.first_moment / link(beam.length),
+        tip_mass=basis.first_moment / length,
         inertia=basis.inertia,
         platform_mass=mass,
         platform_inertia=inertia,
@@ -120,8 +121,23 @@ def build_plant(
         tip=basis.tip,
         shortening=basis.shortening if has_shortening else None,
         mixed_shortening=basis.mixed_shortening if has_shortening else None,
-        inward=basis.inward if has_shortening and is_distributed else None,
+        inward=unlumped(basis, length) if has_shortening and is_distributed else None,
         centrifugal=basis.centrifugal if has_shortening and is_distributed else None,
         b=basis.b,
         c=basis.c,
     )
+
+
+def unlumped(basis: ModalBasis, length: Array) -> Array | None:
+    """P - mu S [kg/m], (3, R, R), what lumping the axial inertia leaves out; None without S.
+
+    Args:
+        basis: of the links.
+        length: L [m], (3,).
+    """
+    if basis.inward is None or basis.shortening is None:
+        return None
+    slopes = basis.shortening[:, :, None] * jnp.eye(basis.shortening.shape[1])
+    if basis.mixed_shortening is not None:
+        slopes = slopes + basis.mixed_shortening
+    return basis.inward - (basis.first_moment / length)[:, None, None] * slopes

@@ -76,8 +76,8 @@ def both_ways(kind, is_distributed, machine, motion, loads):
     own = basis._replace(
         shortening=plant.shortening,
         mixed_shortening=plant.mixed_shortening,
-        inward=plant.inward,
-        centrifugal=plant.centrifugal,
+        inward=basis.inward if is_distributed else None,
+        centrifugal=basis.centrifugal if is_distributed else None,
     )
     return (found.pose, found.modal), reference.by_lagrangian(machine, own, motion, loads)
 
