@@ -8,12 +8,12 @@ links do not stretch there; `stretch_error` gives how far stretching would move 
 from __future__ import annotations
 
 from jaxmodel.beam import ModalBasis
-from jaxmodel.dynamics import Accelerations, accelerations, inverse_dynamics
+from jaxmodel.dynamics import accelerations, inverse_dynamics, straight_motion
 from jaxmodel.kinematics import Chain, close_chain
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array, Beam
 from jaxmodel.piezo import bare_stiffness
-from jaxmodel.plant import Plant, unlumped
+from jaxmodel.plant import Plant, shortening_matrix, unlumped
 
 #: Squarings of `critical_force`: eigenvalues that differ by 1 % are resolved.
 SQUARINGS = 12
@@ -74,8 +74,7 @@ def chord_slopes(plant: Plant) -> Array:
         return -plant.tip[:, :, None] * plant.tip[:, None] / plant.length[:, None, None]
     if plant.shortening is None:
         return jnp.zeros((*plant.stiffness.shape, plant.stiffness.shape[1]))
-    slopes = plant.shortening[:, :, None] * jnp.eye(plant.shortening.shape[1])
-    return slopes if plant.mixed_shortening is None else slopes + plant.mixed_shortening
+    return shortening_matrix(plant.shortening, plant.mixed_shortening)
 
 
 def axial_force(
@@ -90,24 +89,20 @@ def axial_force(
         pose_acc: (3,).
         wrench: force and moment on the platform [N, N, N m], (3,), or None.
     """
-    chain = close_chain(plant, pose, pose_rate)
-    return _straight(plant, chain, pose, pose_rate, pose_acc, wrench).axial
-
-
-def _straight(
-    plant: Plant,
-    chain: Chain,
-    pose: Array,
-    pose_rate: Array,
-    pose_acc: Array,
-    wrench: Array | None = None,
-) -> Accelerations:
-    """Prescribed motion of straight links."""
     still = jnp.zeros_like(plant.b)
     force = inverse_dynamics(plant, pose, pose_rate, pose_acc, wrench)
-    return accelerations(
-        plant, chain, pose_rate, still, still, force, still, wrench, is_coupled=False
+    found = accelerations(
+        plant,
+        close_chain(plant, pose, pose_rate),
+        pose_rate,
+        still,
+        still,
+        force,
+        still,
+        wrench,
+        is_coupled=False,
     )
+    return found.axial
 
 
 def lumping_error(
@@ -129,7 +124,7 @@ def lumping_error(
     if left_out is None or basis.centrifugal is None:
         return jnp.zeros(3)
     chain = close_chain(plant, pose, pose_rate)
-    slide = chain.cosine * _straight(plant, chain, pose, pose_rate, pose_acc).rho
+    slide = chain.cosine * straight_motion(chain, pose_rate, pose_acc)[0]
     force = (
         left_out[:, :, 0] * slide[:, None]
         - basis.centrifugal[:, :, 0] * chain.gamma_rate[:, None] ** 2

@@ -21,7 +21,7 @@ import numpy as np
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array, Beam, Patches
 from jaxmodel.piezo import bare_stiffness, patch_ends
-from jaxmodel.static import Pieces, link_pieces, section_stiffness, static_bending
+from jaxmodel.static import Pieces, bent_at, link_pieces, section_stiffness, static_bending
 from jaxmodel.table import Table
 
 _Parts = TypeVar("_Parts", Beam, Patches)
@@ -195,8 +195,8 @@ def _pinned_pinned(beam: Beam, patches: Patches, n_modes: int, stations: Array) 
         deflection_at=jnp.sin(wave * stations[:, None]),
         sensor_slope=_slope_difference(slope, patches, patches.sensor_length),
         actuator_slope=_slope_difference(slope, patches, patches.actuator_length),
-        static_slope=static[0],
-        static_deflection=static[1],
+        static_slope=static.slope,
+        static_deflection=static.deflection,
     )
 
 
@@ -247,8 +247,8 @@ def _pinned_free(beam: Beam, patches: Patches, n_modes: int, stations: Array) ->
         deflection_at=jax.vmap(shape)(stations) - (stations / beam.length)[:, None],
         sensor_slope=_slope_difference(slope, patches, patches.sensor_length),
         actuator_slope=_slope_difference(slope, patches, patches.actuator_length),
-        static_slope=static[0],
-        static_deflection=static[1],
+        static_slope=static.slope,
+        static_deflection=static.deflection,
     )
 
 
@@ -279,26 +279,25 @@ class _Bends(NamedTuple):
     sensor sees mode 1 of the default link 6 % too strongly.
     """
 
-    left: Array  # of the link's pieces, as a share of its length [1], (n,)
-    right: Array
+    pieces: Pieces  # their ends as shares of the link's length [1]
     curvature: Array  # of each function on each piece [1], (2 K, n)
 
 
 def _bends(pieces: Pieces, length: Array) -> _Bends:
     both, either = pieces.has_sensor * pieces.has_actuator, pieces.has_sensor + pieces.has_actuator
     cover = jnp.concatenate([both, either - 2 * both])
-    left, right = pieces.left / length, pieces.right / length
-    width = jnp.sum(cover * (right - left), axis=1)
+    pieces = pieces._replace(left=pieces.left / length, right=pieces.right / length)
+    width = jnp.sum(cover * (pieces.right - pieces.left), axis=1)
     is_there = width > 1e-6  # patches of equal length have no second one
     size = jnp.where(is_there, 1 / jnp.sqrt(jnp.where(is_there, width, 1.0)), 0.0)
-    return _Bends(left, right, cover * size[:, None])
+    return _Bends(pieces, cover * size[:, None])
 
 
 def _bent_shapes(xi: Array, bends: _Bends) -> _Shapes:
-    p, q, x = bends.left, bends.right, jnp.asarray(xi)[:, None]
+    p, q, x = bends.pieces.left, bends.pieces.right, jnp.asarray(xi)[:, None]
     end = ((1 - p) ** 2 - (1 - q) ** 2) / 2
-    value = (jnp.maximum(x - p, 0.0) ** 2 - jnp.maximum(x - q, 0.0) ** 2) / 2 - x * end
     slope = jnp.maximum(x - p, 0.0) - jnp.maximum(x - q, 0.0) - end
+    value = bent_at(bends.pieces, jnp.ones(()), xi)
     return _Shapes(value @ bends.curvature.T, slope @ bends.curvature.T)
 
 
@@ -322,8 +321,8 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
     # Gauss-Legendre piece by piece: products of two sines have up to 2 n_sines half-waves, for
     # which these points are exact to rounding
     node, weight = _gauss(2 * n_sines + 16)
-    width = (bends.right - bends.left)[:, None]
-    xi = (bends.left[:, None] + width * node).ravel()
+    width = (bends.pieces.right - bends.pieces.left)[:, None]
+    xi = (bends.pieces.left[:, None] + width * node).ravel()
     weight = length * (width * weight).ravel()
     mass_w = weight * jnp.repeat(line_mass + patch_mass * covers, node.size)
     stiffness = section_stiffness(beam, patches, pieces, has_patches=True)
@@ -386,8 +385,8 @@ def _loaded(beam: Beam, patches: Patches, n_modes: int, stations: Array) -> Moda
         deflection_at=shapes(stations / length).value @ coefficient,
         sensor_slope=_slope_difference(slope, patches, patches.sensor_length),
         actuator_slope=_slope_difference(slope, patches, patches.actuator_length),
-        static_slope=static[0],
-        static_deflection=static[1],
+        static_slope=static.slope,
+        static_deflection=static.deflection,
     )
 
 

@@ -111,10 +111,9 @@ def accelerations(
     swing = _swing(plant, chain, q_rate)
     # modal accelerations without inertia: of piezos and rotation, and of the oscillator itself
     mass = plant.modal_mass[:, None]
-    push = piezo + q * (chain.gamma_rate * chain.gamma_rate)[:, None]
     spread = _spread(plant, q)
-    if spread is not None:
-        push = push - (spread.turning / mass) * (chain.gamma_rate * chain.gamma_rate)[:, None]
+    thrown = q if spread is None else q - spread.turning / mass
+    push = piezo + thrown * (chain.gamma_rate * chain.gamma_rate)[:, None]
     own = (plant.stiffness / mass) * q + (plant.damping / mass) * q_rate
     pull = own - push
     end = None
@@ -412,6 +411,20 @@ def mass_matrix(platform: Platform) -> Array:
     return jnp.stack([jnp.stack([m[j] for j in row]) for row in ((0, 1, 2), (1, 3, 4), (2, 4, 5))])
 
 
+def straight_motion(chain: Chain, pose_rate: Array, pose_acc: Array) -> tuple[Array, Array]:
+    """rho'' [m/s2] and gamma'' [rad/s2] of straight links in a prescribed motion, (3,) each.
+
+    Args:
+        chain: closure of straight links.
+        pose_rate: (3,).
+        pose_acc: (3,).
+    """
+    frame, phi2 = chain.frame, pose_rate[2] ** 2
+    acc_f, acc_g = frame.joint_motion(pose_acc)
+    acc_f = acc_f + chain.chord * chain.gamma_rate**2 - phi2 * frame.c_f
+    return frame.link_motion(acc_f, acc_g - phi2 * frame.c_g)
+
+
 def inverse_dynamics(
     plant: Plant, pose: Array, pose_rate: Array, pose_acc: Array, wrench: Array | None = None
 ) -> Array:
@@ -431,9 +444,7 @@ def inverse_dynamics(
     """
     chain = close_chain(plant, pose, pose_rate)
     frame, rate2, phi2 = chain.frame, chain.gamma_rate**2, pose_rate[2] ** 2
-    acc_f, acc_g = frame.joint_motion(pose_acc)
-    acc_f = acc_f + chain.chord * rate2 - phi2 * frame.c_f
-    rho_acc, gamma_acc = frame.link_motion(acc_f, acc_g - phi2 * frame.c_g)
+    rho_acc, gamma_acc = straight_motion(chain, pose_rate, pose_acc)
     moment = plant.tip_mass * plant.length
     on_rho = plant.slider_link_mass * rho_acc - moment * (
         chain.sine * gamma_acc + chain.cosine * rate2

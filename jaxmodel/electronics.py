@@ -79,7 +79,8 @@ def voltage_passage(
     A sensor answers at once to the modes that a model leaves out, so the actuators' voltages v
     reach the converters through the same analogue path as the modes: v = command + remainder,
     z'' = omega_f^2 (v - s - z) - sqrt(2) omega_f z', s' = omega_h (v - s), and the remainder of
-    an amplifier's change decays at 1/lag. The exponential of that, exact for held commands.
+    an amplifier's change decays at 1/lag. The exponential of that, exact for held commands, by
+    scaling and squaring.
 
     Args:
         step: h [s], ().

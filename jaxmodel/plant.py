@@ -137,7 +137,11 @@ def unlumped(basis: ModalBasis, length: Array) -> Array | None:
     """
     if basis.inward is None or basis.shortening is None:
         return None
-    slopes = basis.shortening[:, :, None] * jnp.eye(basis.shortening.shape[1])
-    if basis.mixed_shortening is not None:
-        slopes = slopes + basis.mixed_shortening
+    slopes = shortening_matrix(basis.shortening, basis.mixed_shortening)
     return basis.inward - (basis.first_moment / length)[:, None, None] * slopes
+
+
+def shortening_matrix(shortening: Array, mixed: Array | None) -> Array:
+    """S [1/m], (3, R, R), from its diagonal and, unless all zero, the rest."""
+    diagonal = shortening[:, :, None] * jnp.eye(shortening.shape[1])
+    return diagonal if mixed is None else diagonal + mixed

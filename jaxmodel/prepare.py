@@ -128,19 +128,25 @@ def _left_out(structure: Structure, case: Case, basis: ModalBasis, step: Array) 
     """Static response of the modes that the plant leaves out."""
     if not structure.has_static_correction:
         return None
-    electronics = case.electronics
-    lambda_s, lambda_a = (x[:, None, None] for x in _constants(case))
-    passage = voltage_passage(
-        step,
-        electronics.antialias,
-        electronics.sensor_highpass if structure.has_sensor_highpass else None,
-        electronics.amplifier_lag if structure.has_amplifier else None,
-    )
+    electronics, passage = case.electronics, None
+    if structure.feedback == "sampled":
+        passage = voltage_passage(
+            step,
+            electronics.antialias,
+            electronics.sensor_highpass if structure.has_sensor_highpass else None,
+            electronics.amplifier_lag if structure.has_amplifier else None,
+        )
     return LeftOut(
-        sensor=lambda_s * lambda_a * static_remainder(basis).slope,
+        sensor=_left_out_voltage(case, basis),
         deflection=left_out_deflection(case, basis),
-        passage=passage if structure.feedback == "sampled" else None,
+        passage=passage,
     )
+
+
+def _left_out_voltage(case: Case, basis: ModalBasis, mode_mask: Array = 1.0) -> Array:
+    """Sensor volts per actuator volt by all but some modes of a basis [V/V], (3, K, K)."""
+    lambda_s, lambda_a = (x[:, None, None] for x in _constants(case))
+    return lambda_s * lambda_a * static_remainder(basis, mode_mask).slope
 
 
 def left_out_deflection(case: Case, basis: ModalBasis) -> Array:
@@ -234,7 +240,7 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         omega=assembled,
         modal_mass=model.mass[:, :n],
         mask=mask,
-        feedthrough=_believed_feedthrough(case, model, mask),
+        feedthrough=_left_out_voltage(case, model, jnp.pad(mask, (0, model.mass.shape[1] - n))),
     )
     law = LAWS[structure.law]
     feedback = law.design(structure, case, known)
@@ -262,13 +268,6 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         sensor_condition=condition_number(seen, mask),
         actuator_condition=condition_number(driven, mask),
     )
-
-
-def _believed_feedthrough(case: Case, model: ModalBasis, mask: Array) -> Array:
-    """Sensor volts per actuator volt by all modes but the controlled ones [V/V], (3, K, K)."""
-    lambda_s, lambda_a = (x[:, None, None] for x in _constants(case))
-    is_controlled = jnp.pad(mask, (0, model.mass.shape[1] - mask.size))
-    return lambda_s * lambda_a * static_remainder(model, is_controlled).slope
 
 
 def design_taps(case: Case, bases: Bases) -> shaper.Taps:

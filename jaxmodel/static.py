@@ -78,44 +78,40 @@ def bent_at(pieces: Pieces, length: Array, x: Array) -> Array:
     return (above - x / length * ((length - p) ** 2 - (length - q) ** 2)) / 2
 
 
+class StaticResponse(NamedTuple):
+    """Response to moments of the actuators, per moment; of all links with a leading axis (3,)."""
+
+    slope: Array  # differences over the sensors [rad/(N m)], (K, K)
+    deflection: Array  # from the chord at the stations [m/(N m)], (S, K)
+
+
 def static_bending(
     beam: Beam, patches: Patches, stations: Array, has_patches: bool
-) -> tuple[Array, Array]:
-    """Static response of one link to moments of its actuators.
+) -> StaticResponse:
+    """Static response of one link.
 
     Args:
         beam, patches: one link's data.
         stations: where to take the deflection [m], (S,).
         has_patches: patches stiffen the link (static).
-
-    Returns:
-        slope differences over the sensors [rad/(N m)], (K, K), and deflections from the chord
-        [m/(N m)], (S, K), each per moment of an actuator.
     """
     pieces = link_pieces(beam, patches)
     softness = 1 / section_stiffness(beam, patches, pieces, has_patches)
     width = (pieces.right - pieces.left) * softness
     slope = jnp.einsum("kn,ln,n->kl", pieces.has_sensor, pieces.has_actuator, width)
     bent = bent_at(pieces, beam.length, stations) * softness
-    return slope, jnp.einsum("sn,ln->sl", bent, pieces.has_actuator)
+    return StaticResponse(slope, jnp.einsum("sn,ln->sl", bent, pieces.has_actuator))
 
 
-class Remainder(NamedTuple):
-    """Static response of all links that modes leave out, per moment of an actuator."""
-
-    slope: Array  # differences over the sensors [rad/(N m)], (3, K, K)
-    deflection: Array  # from the chord at the stations [m/(N m)], (3, S, K)
-
-
-def static_remainder(basis: ModalBasis, mode_mask: Array = 1.0) -> Remainder:
-    """Exact static response less that of the modes, sum_j Phi_s,jk Phi_a,jl/k_j.
+def static_remainder(basis: ModalBasis, mode_mask: Array = 1.0) -> StaticResponse:
+    """Exact static response of all links less that of the modes, sum_j Phi_s,jk Phi_a,jl/k_j.
 
     Args:
         basis: of all links.
         mode_mask: modes that count, (3, R) or what broadcasts to it; default: all that exist.
     """
     driven = basis.actuator_slope * (mode_mask / basis.stiffness)[..., None]
-    return Remainder(
+    return StaticResponse(
         basis.static_slope - jnp.einsum("irk,irl->ikl", basis.sensor_slope, driven),
         basis.static_deflection - jnp.einsum("isr,irl->isl", basis.deflection_at, driven),
     )

@@ -14,7 +14,7 @@ import pytest
 
 from jaxmodel import dynamics
 from jaxmodel.beam import build_basis
-from jaxmodel.parameters import Beam, Damping, Geometry, Masses, paper_machine
+from jaxmodel.parameters import Damping, Geometry, Masses, paper_machine
 from jaxmodel.plant import build_plant
 from studies.bench.reference import rk4_step
 
@@ -34,15 +34,8 @@ MACHINE = paper_machine()._replace(
         guide_offset=THROUGH_ORIGIN,
     ),
     masses=Masses(platform_mass=HEAVY, platform_inertia=HEAVY, slider_mass=0.075552),
-    beam=Beam(
-        length=0.30,
-        thickness=8e-3,
-        width=8e-3,
-        density=7870.0,
-        youngs_modulus=2e11,
-        stiffness_factor=1.0,
-        joint_inertia_b=0.0,
-        joint_inertia_c=0.0,
+    beam=paper_machine().beam._replace(
+        length=0.30, thickness=8e-3, width=8e-3, density=7870.0, youngs_modulus=2e11
     ),
     damping=Damping(ratio=np.zeros((3, 1)), count=np.ones(3, int), exponent=0.0),
 )
