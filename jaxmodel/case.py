@@ -36,6 +36,7 @@ class Structure(NamedTuple):
     has_amplifier: bool = False  # actuators behind amplifiers of finite bandwidth
     has_noise: bool = False  # seeded ADC noise and force ripple
     has_friction: bool = False  # Coulomb friction on the sliders
+    has_poles: bool = False  # gains follow from poles
     has_position_gain: bool = True  # feedback of modal positions, not of velocities alone
     metrics: tuple[str, ...] = ()  # to accumulate; (): all of them
     is_linear: bool = False  # mechanics to first order about rest at the last way-point
@@ -52,7 +53,9 @@ class Control(NamedTuple):
     velocity_gain: Array  # k_d of mode 1 [N s/m] or [1/s], (3,); SRF: [s]
     position_gain: Array  # k_p of mode 1 [N/m] or [1/s2], (3,); SRF: [1]
     ratio: Array  # EMC ratios (24) [1], (3, C)
-    gain_factor: Array  # common factor on all gains [1], ()
+    pole_decay: Array  # alpha-bar asked [1/s]; 0: none asked, (3, C)
+    pole_frequency: Array  # beta-bar asked [rad/s]; 0: the mode's own, (3, C)
+    gain_factor: Array  # factor on the loop gain, whatever the law [1], ()
     is_per_mass: Array  # 1: gains in 1/s and 1/s2, 0: in N s/m and N/m, ()
     feedthrough_factor: Array  # share of the residual modes' feed-through compensated [1], ()
     parameters: dict[str, Array]  # the law's own, by name, (3,) each

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxmodel.estimator import Estimator
+from jaxmodel.estimator import Estimator, FilterState, advance_filters, weighted
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
 from jaxmodel.state_space import StateSpace, advance, amplified, at_rest
@@ -224,20 +224,14 @@ def _from_channels(
     """As `_from_system`."""
     channel = jnp.sum(controller.filter * voltage[:, None], axis=2)
     estimator = controller.estimator
-    b0, b1, a1 = estimator.first
-    high = b0 * channel + state.first
-    newest = high - estimator.denominator[0] * state.second[0]
-    newest = newest - estimator.denominator[1] * state.second[1]
-    line = (newest, state.second[0], state.second[1])
-    rate = sum(n * x for n, x in zip(estimator.velocity, line, strict=True))
+    filters, line = advance_filters(estimator, FilterState(state.first, state.second), channel)
+    rate = weighted(estimator.velocity, line)
     force = -controller.velocity_gain * rate
     if controller.position_gain is not None or controller.rival_omega is not None:
-        value = sum(n * x for n, x in zip(estimator.position, line, strict=True))
-        value = value + estimator.direct * channel
+        value = weighted(estimator.position, line) + estimator.direct * channel
         if controller.position_gain is not None:
             force = force - controller.position_gain * value
         if controller.rival_omega is not None:
             force = force * strongest(controller.rival_omega, value, rate)
     wanted = jnp.sum(controller.synthesizer * force[:, None], axis=2)
-    after = state._replace(first=b1 * channel - a1 * high, second=(newest, state.second[0]))
-    return after, wanted
+    return state._replace(first=filters.first, second=filters.second), wanted

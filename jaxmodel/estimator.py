@@ -80,6 +80,54 @@ def second_order(corner: Array, zeta: Array, period: Array) -> tuple[Array, Arra
     return warp * warp / lead, a1, a2
 
 
+class FilterState(NamedTuple):
+    """What the filters remember from sample to sample, (3, C) each."""
+
+    first: Array  # of the first-order section
+    second: tuple[Array, Array]  # delay line of the second-order section
+
+
+def advance_filters(
+    estimator: Estimator, state: FilterState, channel: Array
+) -> tuple[FilterState, tuple[Array, Array, Array]]:
+    """Filters one sample on, and the delay line of which estimates are sums.
+
+    Args:
+        estimator: coefficients.
+        state: from the last sample.
+        channel: the channels' signals, (3, C).
+    """
+    b0, b1, a1 = estimator.first
+    high = b0 * channel + state.first
+    newest = high - estimator.denominator[0] * state.second[0]
+    newest = newest - estimator.denominator[1] * state.second[1]
+    after = FilterState(b1 * channel - a1 * high, (newest, state.second[0]))
+    return after, (newest, *state.second)
+
+
+def weighted(numerator: tuple[Array, Array, Array], line: tuple[Array, Array, Array]) -> Array:
+    """An estimate from the delay line, (3, C)."""
+    return sum(n * x for n, x in zip(numerator, line, strict=True))
+
+
+def responses(estimator: Estimator, z: Array) -> tuple[Array, Array]:
+    """H_v(z) [1/s] and H_p(z) [1], estimates of rate and value per value.
+
+    Args:
+        estimator: coefficients, (3, C) each.
+        z: complex, (3, C).
+    """
+    back = 1 / z
+    b0, b1, a1 = estimator.first
+    second = 1 + estimator.denominator[0] * back + estimator.denominator[1] * back**2
+    shared = (b0 + b1 * back) / ((1 + a1 * back) * second)
+    rate, value = (
+        shared * (n0 + n1 * back + n2 * back**2)
+        for n0, n1, n2 in (estimator.velocity, estimator.position)
+    )
+    return rate, value + estimator.direct
+
+
 def _modal_phase(omega: Array, electronics: Electronics, kappa: Array, zeta: Array) -> Estimator:
     period = electronics.period
     zeta = jnp.broadcast_to(zeta, omega.shape)

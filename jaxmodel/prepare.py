@@ -11,7 +11,7 @@ from jaxmodel.bases import Bases, find_bases
 from jaxmodel.beam import ModalBasis
 from jaxmodel.case import Case, Structure
 from jaxmodel.control import active_modes, condition_number, left_inverse
-from jaxmodel.controller import Controller
+from jaxmodel.controller import Controller, with_gains
 from jaxmodel.drive import Reference
 from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.electronics import design_amplifier, voltage_passage
@@ -20,11 +20,12 @@ from jaxmodel.integrator import exponential_step
 from jaxmodel.kinematics import close_chain
 from jaxmodel.laws import LAWS, is_modal, n_channels
 from jaxmodel.laws.contract import Known, check_feedback
+from jaxmodel.laws.poles import is_unplaceable
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import LeftOut, Loop, Rest
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import actuator_constant, placement_faults, sensor_constant
-from jaxmodel.plant import Plant, build_plant
+from jaxmodel.plant import Plant, build_plant, damping_ratio
 from jaxmodel.static import static_remainder
 
 #: Frequencies of the spectra lie within this fraction of the modal frequency [1].
@@ -238,6 +239,7 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         sensor=seen,
         actuator=actuator[:, :n],
         omega=assembled,
+        damping_ratio=damping_ratio(case.machine.damping, assembled),
         modal_mass=model.mass[:, :n],
         mask=mask,
         feedthrough=_left_out_voltage(case, model, jnp.pad(mask, (0, model.mass.shape[1] - n))),
@@ -262,7 +264,7 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         system=feedback.system,
     )
     return ControllerDesign(
-        controller=controller,
+        controller=with_gains(controller, control.gain_factor),
         known=known,
         modal_omega=jnp.sqrt(model.stiffness / model.mass)[:, :n],
         sensor_condition=condition_number(seen, mask),
@@ -332,6 +334,7 @@ def _static_status(
             status.TOO_STIFF,
         ),
         (jnp.any(zeta >= 1), status.OVERDAMPED),
+        (_has_unplaceable_poles(structure, case, design), status.UNPLACEABLE),
         (
             ~jnp.all((windows.stations > 0) & (windows.stations < length[:, None])),
             status.STATION_OFF_LINK,
@@ -366,6 +369,12 @@ def _is_ill_conditioned(structure: Structure, case: Case, design: ControllerDesi
     uses_filter = is_modal(structure) and structure.feedback != "none"
     worst = jnp.maximum(jnp.max(design.sensor_condition), jnp.max(design.actuator_condition))
     return (worst > case.windows.condition_limit) & uses_filter
+
+
+def _has_unplaceable_poles(structure: Structure, case: Case, design: ControllerDesign) -> Array:
+    if not structure.has_poles or structure.feedback == "none":
+        return jnp.zeros((), bool)
+    return is_unplaceable(structure, case, design.known)
 
 
 def _is_too_fast(structure: Structure, case: Case, bases: Bases) -> Array:

@@ -27,6 +27,7 @@ NOT_ARRIVED = 19
 NEAR_SINGULAR = 20
 OVERLOADED = 21
 OVERDAMPED = 22
+UNPLACEABLE = 23
 
 #: A case with one of these statuses ran to its end, and its metrics are valid.
 FINISHED = (
@@ -65,4 +66,5 @@ REASONS = {
     NEAR_SINGULAR: "path close to a singular pose",
     OVERLOADED: "a link compressed beyond its critical force on the way",
     OVERDAMPED: "a link mode with a damping ratio of 1 or more",
+    UNPLACEABLE: "poles that cannot be placed: no decay, no vibration, beyond half the sample rate",
 }

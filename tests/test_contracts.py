@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from jaxmodel.laws import LAWS
-from jaxmodel.laws.contract import Law, Parameter, modal_feedback, on_and_off
+from jaxmodel.laws.contract import Law, Parameter, acting_channels, modal_feedback
 from jaxmodel.metrics import METRICS, Metric, is_real
 from jaxmodel.table import Table
 from studies import sources
@@ -245,7 +245,7 @@ def test_names_that_are_none_are_refused(name):
 
 def stiff(structure, case, known):
     """Positions alone."""
-    position = 20.0 * known.modal_mass * known.omega * on_and_off(case, known)
+    position = 20.0 * known.modal_mass * known.omega * acting_channels(case, known)
     return modal_feedback(case, known, 0 * known.omega, position)
 
 

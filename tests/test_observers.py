@@ -206,7 +206,7 @@ def test_modal_control_by_observers_damps_as_modal_filters_do():
     """With few modes and slow enough observers, the damping that the gains intend."""
     found = {}
     for law in ("imsc", "observer"):
-        control = {"law": law, "gain_factor": 0.2, "modes": 2}
+        control = {"law": law, "velocity_gain": (0.6, 0.7, 0.7), "modes": 2}
         structure, case = check_run(parse_study(SHORT | {"control": control}))
         found[law] = loop_report(structure, case, np.array([0.0, 0.0, 0.5236]))
         assert found[law].gain_margin > 2

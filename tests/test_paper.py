@@ -58,7 +58,7 @@ class Short(NamedTuple):
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
     folder = tmp_path_factory.mktemp("paper")
-    cases = [case for case in paper_cases.paper_cases(0.5) if case.name not in LONG]
+    cases = [case for case in paper_cases.paper_cases() if case.name not in LONG]
     kept = {}
 
     def run(*arguments):

@@ -194,7 +194,7 @@ def test_change_takes_numpy_and_refuses_unknown_names():
     )
     assert (study.control.gain_factor, study.run.seed) == (0.25, 3)
     assert study.patches.centers == ((0.04, 0.1, 0.16),) * 3
-    assert Study().control.gain_factor == 0.5
+    assert Study().control.gain_factor == 1.0
     with pytest.raises(StudyError, match="contrl.*did you mean 'control'"):
         study.change(contrl__gain_factor=1.0)
     with pytest.raises(StudyError, match="title is no section"):
@@ -220,7 +220,7 @@ def test_the_template_explains_every_field():
 def test_the_paper_study_is_the_paper_square():
     study = paper_study()
     assert study.link.modes == 8 and study.control.modes == 3
-    assert study.control.velocity_gain == (3.1, 3.5, 3.4)
+    assert study.control.velocity_gain == (1.55, 1.75, 1.7)
     np.testing.assert_allclose(
         np.array(study.motion.waypoints)[:, :2] * 1e3, [[0, 0], [0, 10], [10, 10], [10, 0], [0, 0]]
     )

@@ -79,7 +79,7 @@ def test_the_certificate_fails_what_is_known_to_be_unstable(difference):
 
 def test_verdicts_of_the_ladder_of_gains():
     """A quarter and a half of the paper's gains pass; the whole does not."""
-    found = {f: certified({"control__gain_factor": f}, **HARD) for f in (0.25, 0.5, 1.0)}
+    found = {f: certified({"control__gain_factor": f}, **HARD) for f in (0.5, 1.0, 2.0)}
     assert [one.is_passed for one in found.values()] == [True, True, False]
     worst = [one.margin[one.worst] for one in found.values()]
     # the same loops, so margins go as 1/f
@@ -91,7 +91,7 @@ def test_verdicts_of_the_ladder_of_gains():
     assert re.fullmatch(wanted, paper.breaking[paper.worst])
     # eight modes say nearly what nine do; truncated, they say what was found elsewhere
     np.testing.assert_allclose(paper.margin[0, 0], 1.441, rtol=0.025)
-    truncated = certified({"control__gain_factor": 1.0, "link__static_correction": False}, **HARD)
+    truncated = certified({"control__gain_factor": 2.0, "link__static_correction": False}, **HARD)
     np.testing.assert_allclose(truncated.margin[truncated.worst], 1.249, atol=2e-3)
 
 

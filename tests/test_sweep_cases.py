@@ -72,7 +72,7 @@ def test_sampled_points_fill_their_ranges_and_can_be_continued(method):
     assert set(many.columns["shaper.kind"].tolist()) == {"zv", "ei"}
     study = case_study(many, 5)
     assert study.control.velocity_gain[1] == many.columns["control.velocity_gain[1]"][5]
-    assert study.control.velocity_gain[0] == 3.1
+    assert study.control.velocity_gain[0] == 1.55
 
 
 @pytest.mark.parametrize("kind", ["same", "mirrored", "per_link"])
@@ -131,7 +131,7 @@ def test_id_and_seed_belong_to_the_case_not_to_the_sweep():
         b = int(np.flatnonzero(other.case_id == case_id)[0])
         assert one.seed[a] == other.seed[b]
         assert case_study(one, a) == case_study(other, b)
-    whole = table_of({"axes": {"control.velocity_gain": [[3.1, 9.0, 3.4]]}})
+    whole = table_of({"axes": {"control.velocity_gain": [[1.55, 9.0, 1.7]]}})
     entry = table_of({"axes": {"control.velocity_gain[1]": [9.0]}})
     np.testing.assert_array_equal(whole.case_id, entry.case_id)
     reseeded = table_of({"axes": {"gain": [0.25, 0.5, 1.0]}}, run={"duration": 0.025, "seed": 1})

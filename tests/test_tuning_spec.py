@@ -64,23 +64,23 @@ def test_patches_stay_on_the_link_and_apart(kind):
         assert np.diff(center, axis=1).min() >= pitch - 1e-12
 
 
-def test_poles_become_gains():
-    """(22)-(23): k_d = 2 alpha, k_p = alpha^2 + beta^2 - omega^2 with omega of the bare link."""
-    data = {**SMALL, "control": {**SMALL["control"], "gain_unit": "1/s"}}
+def test_poles_can_be_free():
+    """All entries of what the study has: one number, one a link, or some modes of each link."""
     free = {
-        "poles.decay": {"from": 5.0, "to": 50.0},
-        "poles.frequency_hz": {"from": 80.0, "to": 200.0},
+        "control.pole_decay": {"from": 5.0, "to": 500.0, "scale": "log"},
+        "control.pole_frequency_hz[1][0]": {"from": 80.0, "to": 200.0},
     }
-    spec = parse_tuning({**data, "tune": {"free": free}})
-    values = np.array([10.0, 20.0, 30.0, 100.0, 110.0, 120.0])
-    control = spec.free.place(as_arrays(build_case(spec.study)), values).control
-    np.testing.assert_allclose(control.velocity_gain, 2 * values[:3])
-    link = spec.study.link
-    inertia = link.width * link.thickness**3 / 12
-    mass = link.density * link.width * link.thickness
-    omega = (np.pi / link.length) ** 2 * np.sqrt(link.youngs_modulus * inertia / mass)
-    wanted = values[:3] ** 2 + (2 * np.pi * values[3:]) ** 2 - omega**2
-    np.testing.assert_allclose(control.position_gain, wanted, rtol=1e-9)
+    control = {
+        **SMALL["control"],
+        "pole_decay": [[100.0, 90.0], [110.0], [120.0]],
+        "pole_frequency_hz": [[120.0], [121.0], [122.0]],
+    }
+    spec = parse_tuning({**SMALL, "control": control, "tune": {"free": free}})
+    assert len(spec.free.names) == 5 and spec.has_poles and spec.has_position_gain
+    values = np.array([10.0, 20.0, 30.0, 40.0, 100.0])
+    moved = spec.free.place(as_arrays(build_case(spec.study)), values).control
+    np.testing.assert_array_equal(moved.pole_decay[:, :2], [[10, 20], [30, 0], [40, 0]])
+    np.testing.assert_allclose(moved.pole_frequency[:, 0], 2 * np.pi * np.array([120, 100, 122]))
 
 
 def test_what_is_no_number_stays_as_it_is():
@@ -110,12 +110,12 @@ def deep(n):
         ({"free": {"control.gainfactor": {}}}, "did you mean 'control.gain_factor'"),
         ({"free": {"run.duration": {"from": 0.1, "to": 1.0}}}, "cannot be free; fields that can"),
         (
-            {"free": {"control.gain_factor": {"from": 0.6, "to": 2.0}}},
-            "control.gain_factor = 0.5; allowed: 0.6 to 2, the bounds",
+            {"free": {"control.gain_factor": {"from": 1.5, "to": 2.0}}},
+            "control.gain_factor = 1.0; allowed: 1.5 to 2, the bounds",
         ),
         ({"free": {"control.gain_factor": {"from": -1.0, "to": 2.0}}}, "a finite number >= 0"),
         ({"free": {"control.gain_factor": {"from": 2.0, "to": 1.0}}}, "= 1.0; allowed: more than"),
-        ({"free": {"poles.decay": {"from": 1.0, "to": 2.0}}}, "needs poles.frequency_hz too"),
+        ({"free": {"control.pole_decay": {"from": 1.0, "to": 2.0}}}, "one number or more, where"),
         (
             {
                 "free": {
@@ -259,7 +259,10 @@ def deep(n):
             {"free": GAIN, "objective": {"residual_rms[link=4]": 1.0}},
             r"allowed: \[link=1 to 3\], \[station=1 to 3\]",
         ),
-        ({"free": {"pole.decay": {"from": 5.0, "to": 50.0}}}, "did you mean 'poles.decay'"),
+        (
+            {"free": {"control.pole_decy": {"from": 5.0, "to": 50.0}}},
+            "did you mean 'control.pole",
+        ),
         ({"free": GAIN, "objective": {"qqq": 1.0}}, "unknown metric; allowed: residual_rms, "),
         ({"free": GAIN, "limits": {"peak_voltage": deep(400)}}, "peak_voltage = .* or 'own'"),
         ({"free": GAIN, "families": {"one": {"sets": {}}}}, "allowed: {free = "),

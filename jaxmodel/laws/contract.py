@@ -42,13 +42,14 @@ class Known(NamedTuple):
     sensor: Array  # lambda_s Phi_s^t, voltages of modal coordinates [V/m], (3, K, C)
     actuator: Array  # lambda_a Phi_a, modal forces of voltages [N/V], (3, C, K)
     omega: Array  # frequencies of the assembled links [rad/s], (3, C)
+    damping_ratio: Array  # structural, of the same modes [1], (3, C)
     modal_mass: Array  # [kg], (3, C)
     mask: Array  # 1 for controlled modes, at most as many as patches, (C,)
     feedthrough: Array  # sensor volts per actuator volt by all other modes [V/V], (3, K, K)
 
 
 class Feedback(NamedTuple):
-    """What a law returns; see `jaxmodel.controller.Controller`."""
+    """What a law returns, before `control.gain_factor`; see `jaxmodel.controller.Controller`."""
 
     filter: Array  # (3, C, K)
     synthesizer: Array  # (3, K, C)
@@ -70,6 +71,8 @@ class Law(NamedTuple):
     # position gains count always; False: they are zero, and cost nothing, where
     # `control.position_gain` is
     has_position: bool = True
+    # gains by mode can follow from `control.pole_decay`
+    places_poles: bool = False
     # the channels of a link act one at a time, so each is judged by itself
     is_switching: bool = False
     # settings with which it damps mode 1 as much as modal control does with the case's settings;
@@ -135,16 +138,16 @@ def _check_system(law: Law, system: StateSpace, n_patches: int) -> None:
             raise PartError(f"law {law.name!r}: system.{name} has shape {found}; expected {shape}")
 
 
-def on_and_off(case: Case, known: Known) -> Array:
-    """Gain factor of channels that act, 0 for the others [1], (3, C)."""
+def acting_channels(case: Case, known: Known) -> Array:
+    """1 for channels that act, 0 for the others, (3, C)."""
     control = case.control
-    links = jnp.asarray(control.link_mask)[:, None] * control.gain_factor
+    links = jnp.asarray(control.link_mask)[:, None]
     return links * jnp.asarray(control.mode_mask) * known.mask
 
 
-def modal_gains(case: Case, known: Known) -> tuple[Array, Array]:
+def given_gains(case: Case, known: Known) -> tuple[Array, Array]:
     """The study's velocity [N s/m] and position gains [N/m] by mode, ratios (24), (3, C) each."""
-    control, on = case.control, on_and_off(case, known)
+    control, on = case.control, acting_channels(case, known)
     velocity, position = (
         on * force_gains(first, control.ratio, known.modal_mass, control.is_per_mass)
         for first in (control.velocity_gain, control.position_gain)
@@ -167,16 +170,20 @@ def as_modal(control: Control, velocity: Array, position: Array) -> Control:
         gain_factor=jnp.ones(()),
         is_per_mass=jnp.zeros(()),
         mode_mask=is_on.astype(velocity.dtype),
+        pole_decay=jnp.zeros_like(velocity),
+    )
+
+
+def study_estimator(case: Case, known: Known) -> Estimator:
+    """The study's estimator of modal velocities and positions."""
+    electronics = case.electronics
+    return design_estimator(
+        known.omega, electronics, electronics.lowpass_ratio, electronics.lowpass_zeta
     )
 
 
 def system_feedback(structure: Structure, case: Case, system: StateSpace) -> Feedback:
-    """Feedback by a linear system, of controlled links only, times `gain_factor`."""
-    return masked_system(structure, case, amplified(system, case.control.gain_factor))
-
-
-def masked_system(structure: Structure, case: Case, system: StateSpace) -> Feedback:
-    """The same without the factor."""
+    """Feedback by a linear system, of controlled links only."""
     mask = jnp.asarray(case.control.link_mask)[:, None] * jnp.ones((1, structure.n_patches))
     system = amplified(with_sensors(system, mask), mask)
     return no_channels(system, structure.n_patches)
@@ -219,15 +226,10 @@ def modal_feedback(
         estimator: of modal velocities and positions; None: that of the study.
         rival_omega: see `Controller`.
     """
-    electronics = case.electronics
-    if estimator is None:
-        estimator = design_estimator(
-            known.omega, electronics, electronics.lowpass_ratio, electronics.lowpass_zeta
-        )
     return Feedback(
         filter=known.observer,
         synthesizer=known.synthesizer,
-        estimator=estimator,
+        estimator=study_estimator(case, known) if estimator is None else estimator,
         velocity_gain=velocity,
         position_gain=position,
         rival_omega=rival_omega,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from jaxmodel.case import Case, Control, Structure
-from jaxmodel.laws.contract import Feedback, Known, Law, modal_feedback, modal_gains
+from jaxmodel.laws.contract import Feedback, Known, Law, modal_feedback
+from jaxmodel.laws.poles import modal_gains
 
 
 def design(structure: Structure, case: Case, known: Known) -> Feedback:
     """Gains of mode 1 and ratios (24), by modal filter and synthesizer."""
-    return modal_feedback(case, known, *modal_gains(case, known))
+    return modal_feedback(case, known, *modal_gains(structure, case, known))
 
 
 def same(case: Case, known: Known) -> Control:
@@ -16,4 +17,4 @@ def same(case: Case, known: Known) -> Control:
     return case.control
 
 
-IMSC = Law("imsc", "IMSC", "mode", design, has_position=False, as_strong=same)
+IMSC = Law("imsc", "IMSC", "mode", design, has_position=False, places_poles=True, as_strong=same)

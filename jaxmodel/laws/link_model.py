@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from jaxmodel.case import Case, Electronics, Structure
-from jaxmodel.laws.contract import Feedback, Known, Parameter, masked_system
+from jaxmodel.laws.contract import Feedback, Known, Parameter, system_feedback
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.state_space import StateSpace
@@ -55,6 +55,42 @@ def link_model(structure: Structure, case: Case, known: Known) -> LinkModel:
     return jax.vmap(one)(*given)
 
 
+def mode_models(
+    structure: Structure, case: Case, known: Known, zeta: Array, direct: Array | float = 0.0
+) -> LinkModel:
+    """The nominal link seen through one mode: from modal force [N] to modal coordinate [m].
+
+    Args:
+        structure, case, known: as for `link_model`.
+        zeta: damping ratio of each mode [1], (3, C).
+        direct: what all other modes show in its coordinate at once [m/N], (3, C).
+
+    Returns:
+        LinkModel of every mode, leading axes (3, C), with one patch in place of K.
+    """
+    one = jnp.ones((1, 1))
+
+    def single(omega: Array, root_mass: Array, zeta: Array, direct: Array) -> LinkModel:
+        each = omega[None], root_mass[None], one, one, direct[None, None], jnp.ones((1,)), zeta
+        return _one_link(structure, case, *each)
+
+    shape = known.omega.shape
+    zeta, direct = jnp.broadcast_to(zeta, shape), jnp.broadcast_to(direct, shape)
+    root_mass = jnp.sqrt(known.modal_mass)
+    return jax.vmap(jax.vmap(single))(known.omega, root_mass, zeta, direct)
+
+
+def layout(structure: Structure, n_modes: int, n_patches: int) -> dict[str, slice]:
+    """Where each kind of state is in the model; "last" are the commands of the last sample."""
+    has_drain = structure.has_sensor_highpass
+    of_modes = ["q", "rate", "z", "z_rate"] + ["s"] * has_drain
+    of_patches = ["direct_z", "direct_z_rate"] + ["direct_s"] * has_drain
+    of_patches += ["volts"] * structure.has_amplifier + ["last"]
+    sizes = [n_modes] * len(of_modes) + [n_patches] * len(of_patches)
+    begin = [sum(sizes[:k]) for k in range(len(sizes) + 1)]
+    return {name: slice(*begin[k : k + 2]) for k, name in enumerate(of_modes + of_patches)}
+
+
 def _one_link(
     structure: Structure,
     case: Case,
@@ -67,14 +103,8 @@ def _one_link(
     zeta: Array,
 ) -> LinkModel:
     electronics, n_modes, n_patches = case.electronics, omega.size, actuator.shape[1]
-    names = ["q", "rate", "z", "z_rate"] + ["s"] * structure.has_sensor_highpass
-    of_patches = ["direct_z", "direct_z_rate"] + ["direct_s"] * structure.has_sensor_highpass
-    of_patches += ["volts"] * structure.has_amplifier
-    sizes = [n_modes] * len(names) + [n_patches] * len(of_patches)
-    names += of_patches
-    begin = [sum(sizes[:k]) for k in range(len(sizes) + 1)]
-    at = {name: slice(begin[k], begin[k + 1]) for k, name in enumerate(names)}
-    n, eye, corner = begin[-1], jnp.eye(n_modes), electronics.antialias
+    at = layout(structure, n_modes, n_patches)
+    n, eye, corner = at["last"].start, jnp.eye(n_modes), electronics.antialias
     a = jnp.zeros((n, n), omega.dtype)
     a = a.at[at["q"], at["rate"]].set(jnp.diag(omega)).at[at["rate"], at["q"]].set(-jnp.diag(omega))
     a = a.at[at["rate"], at["rate"]].set(-2 * zeta * jnp.diag(omega))
@@ -146,4 +176,4 @@ def compensated(
         leave=-(gain @ kept)[:, :, None],
         direct=-(gain @ correct),
     )
-    return masked_system(structure, case, system)
+    return system_feedback(structure, case, system)

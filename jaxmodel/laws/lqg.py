@@ -11,7 +11,7 @@ from jaxmodel.riccati import filter_gain, regulator_gain
 
 
 def design(structure: Structure, case: Case, known: Known) -> Feedback:
-    """Regulator and filter of every link; `control.gain_factor` multiplies the regulator's gain."""
+    """Regulator and filter of every link."""
     given = case.control.parameters
     weights = (jnp.asarray(given[x]) for x in ("voltage_weight", "disturbance", "sensor_noise"))
     model = link_model(structure, case, known)
@@ -21,7 +21,7 @@ def design(structure: Structure, case: Case, known: Known) -> Feedback:
         gain = regulator_gain(model.state, model.enter, jnp.diag(model.energy), weight * eye)
         shaken = force * model.drive
         correct = filter_gain(model.state, model.sensor, shaken @ shaken.T, noise**2 * eye)
-        return gain * case.control.gain_factor, correct
+        return gain, correct
 
     gain, correct = jax.vmap(one)(model, *weights)
     return compensated(structure, case, model, gain, correct)

@@ -9,9 +9,9 @@ from jaxmodel.laws.contract import (
     Known,
     Law,
     Parameter,
+    acting_channels,
+    given_gains,
     modal_feedback,
-    modal_gains,
-    on_and_off,
 )
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
@@ -40,7 +40,7 @@ def design(structure: Structure, case: Case, known: Known) -> Feedback:
     """Optimal gains of every controlled mode, one weight for each link."""
     weight = jnp.asarray(case.control.parameters["control_weight"])[:, None]
     gains = optimal_gains(known.omega, weight)
-    scale = on_and_off(case, known) * known.modal_mass
+    scale = acting_channels(case, known) * known.modal_mass
     return modal_feedback(case, known, scale * gains.velocity, scale * gains.position)
 
 
@@ -49,7 +49,7 @@ def as_strong(case: Case, known: Known) -> Control:
 
     From k_d^2 = 2 k_p + 1/R: 1/R = h (h - 2 omega) with h^2 = k_d^2 + 4 omega^2.
     """
-    velocity, _ = modal_gains(case, known)
+    velocity = case.control.gain_factor * given_gains(case, known)[0]
     is_on = velocity != 0
     first = jnp.argmax(jnp.any(is_on, axis=0))
     chosen = is_on[:, first]

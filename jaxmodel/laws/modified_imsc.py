@@ -7,14 +7,15 @@ The mode with the highest modal energy (omega q)^2 + q'^2 is served; it may chan
 from __future__ import annotations
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.laws.contract import Feedback, Known, Law, modal_feedback, modal_gains
+from jaxmodel.laws.contract import Feedback, Known, Law, modal_feedback
 from jaxmodel.laws.imsc import same
+from jaxmodel.laws.poles import modal_gains
 from jaxmodel.lazy import jnp
 
 
 def design(structure: Structure, case: Case, known: Known) -> Feedback:
     """As IMSC; modes with gains are rivals."""
-    velocity, position = modal_gains(case, known)
+    velocity, position = modal_gains(structure, case, known)
     is_on = (velocity != 0) | (position != 0)
     rival_omega = jnp.where(is_on, known.omega, 0.0)
     return modal_feedback(case, known, velocity, position, rival_omega=rival_omega)
@@ -26,6 +27,7 @@ MODIFIED_IMSC = Law(
     "mode",
     design,
     has_position=False,
+    places_poles=True,
     is_switching=True,
     as_strong=same,
 )

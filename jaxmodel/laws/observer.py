@@ -3,7 +3,8 @@
 Every controlled mode has its own observer on the sampled, delayed plant (`link_model`): it predicts
 mode, filters and what the commands do to them, and is corrected by the modal filter's residual. The
 poles of its mode are placed: same frequency, more damping. Those of its filters stay. Feedback is
-the study's modal control, (20)-(24), of the estimates, free of the estimator's lag.
+modal control, (20)-(24), of the state that the command will meet: commands on their way, hold and
+amplifiers are predicted, so that the poles are those of continuous feedback.
 """
 
 from __future__ import annotations
@@ -11,8 +12,16 @@ from __future__ import annotations
 from functools import reduce
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.laws.contract import Feedback, Known, Law, Parameter, modal_gains
-from jaxmodel.laws.link_model import DAMPING, compensated, link_model
+from jaxmodel.laws.contract import Feedback, Known, Law, Parameter, acting_channels
+from jaxmodel.laws.link_model import (
+    DAMPING,
+    LinkModel,
+    compensated,
+    layout,
+    link_model,
+    mode_models,
+)
+from jaxmodel.laws.poles import closed_modes
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 
@@ -55,20 +64,70 @@ def corrections(structure: Structure, case: Case, known: Known, state: Array) ->
     return jax.vmap(jax.vmap(one))(blocks, wanted)
 
 
+def regulator(structure: Structure, case: Case, known: Known, model: LinkModel) -> Array:
+    """K of u_k = -K x_k that places the poles of every mode, (3, K, n).
+
+    u_k acts from sample k+1 on, where x_(k+1) = F x_k is known: it holds all commands on their way.
+    Of each mode, x_(k+1) gives xi = (q, q') and, behind amplifiers, the modal force that still
+    rises. With f = -k xi held over a sample, Ackermann's formula k = e^t (gamma, Phi gamma, ..)^-1
+    p(Phi) puts the poles at exp(s T), where s are those of continuous feedback, (20)-(23);
+    amplifiers keep theirs.
+
+    Args:
+        structure, case, known: of the law.
+        model: of each link, leading axis 3.
+    """
+    period, zeta = case.electronics.period, case.control.parameters["model_damping"]
+    zeta = jnp.asarray(zeta)[:, None]
+    damping, square = closed_modes(structure, case, known, zeta)
+    # exp(s T) of both poles: their sum and product
+    total = 2 * jnp.exp(-damping * period) * _cosine((square - damping**2) * period**2)
+    product = jnp.exp(-2 * damping * period)
+    at = layout(structure, structure.n_controlled, structure.n_patches)
+    each = layout(structure, 1, 1)
+    own = [each[name].start for name in ("q", "rate", "volts") if name in each]
+    single = mode_models(structure, case, known, zeta)
+    phi = single.state[:, :, jnp.array(own)[:, None], jnp.array(own)]
+    gamma = single.state[:, :, jnp.array(own), each["last"].start]
+    gain = jax.vmap(jax.vmap(_ackermann))(phi, gamma, total, product)  # (3, C, 2 or 3)
+    gain = gain * acting_channels(case, known)[..., None]
+    rows = [model.state[:, at["q"]], model.state[:, at["rate"]]]
+    if "volts" in at:
+        rows.append(known.actuator @ model.state[:, at["volts"]])
+    force = jnp.einsum("icr,ricn->icn", gain, jnp.stack(rows))
+    return known.synthesizer @ force
+
+
+def _ackermann(phi: Array, gamma: Array, total: Array, product: Array) -> Array:
+    """k of u = -k x that gives x_(k+1) = phi x_k + gamma u_k two poles by sum and product."""
+    n = gamma.size
+    wanted = phi @ phi - total * phi + product * jnp.eye(n)
+    if n > 2:  # the pole behind the mode stays
+        wanted = wanted @ (phi - phi[2, 2] * jnp.eye(n))
+    reach = [gamma]
+    for _ in range(n - 1):
+        reach.append(phi @ reach[-1])
+    return jnp.linalg.solve(jnp.stack(reach), jnp.eye(n)[-1]) @ wanted
+
+
+def _cosine(square: Array) -> Array:
+    """cos(sqrt(x)), and cosh(sqrt(-x)) where x is negative."""
+    is_ringing = square > 0
+    turned = jnp.cos(jnp.sqrt(jnp.where(is_ringing, square, 1.0)))
+    return jnp.where(is_ringing, turned, jnp.cosh(jnp.sqrt(jnp.where(is_ringing, 1.0, -square))))
+
+
 def design(structure: Structure, case: Case, known: Known) -> Feedback:
-    """Observers of all modes, and the study's modal gains."""
+    """Observers of all modes, and a regulator of what they predict."""
     model = link_model(structure, case, known)
-    count, n = structure.n_controlled, model.state.shape[1]
+    n = model.state.shape[1]
     root = jnp.sqrt(known.modal_mass)
     own = corrections(structure, case, known, model.state)  # (3, C, s)
     seen = (known.omega * root)[..., None] * known.observer  # residual in z~ per volt, (3, C, K)
     parts = [own[:, :, k, None] * seen for k in range(own.shape[2])]
     correct = jnp.concatenate(parts, axis=1)  # (3, s C, K)
     correct = jnp.pad(correct, ((0, 0), (0, n - correct.shape[1]), (0, 0)))
-    velocity, position = modal_gains(case, known)
-    forces = (position / (known.omega * root), velocity / root)
-    gain = jnp.concatenate([known.synthesizer * x[:, None] for x in forces], axis=2)
-    gain = jnp.pad(gain, ((0, 0), (0, 0), (0, n - 2 * count)))
+    gain = regulator(structure, case, known, model)
     return compensated(structure, case, model, gain, correct)
 
 
@@ -77,6 +136,7 @@ OBSERVER = Law(
     "IMSC with observers",
     "none",
     design,
+    places_poles=True,
     parameters=(
         Parameter(
             "observer_damping", 0.3, "1", "damping ratio of the observer's modes", 0.01, 0.99

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from jaxmodel.case import Case, Electronics, Structure
 from jaxmodel.electronics import measurement_chain
 from jaxmodel.estimator import Estimator, second_order
-from jaxmodel.laws.contract import Feedback, Known, Law, Parameter, modal_feedback, modal_gains
+from jaxmodel.laws.contract import Feedback, Known, Law, Parameter, given_gains, modal_feedback
 from jaxmodel.laws.imsc import same
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
@@ -74,7 +74,7 @@ def design(structure: Structure, case: Case, known: Known) -> Feedback:
 
     Modes at which the measurement chain lags too much get no gain.
     """
-    velocity, _ = modal_gains(case, known)
+    velocity, _ = given_gains(case, known)
     zeta = jnp.asarray(case.control.parameters["filter_damping"])[:, None]
     filters = design_position_filter(known.omega, zeta, case.electronics)
     is_fit = filters.damping > 0

@@ -11,7 +11,7 @@ from jaxmodel.lazy import jnp
 def design(structure: Structure, case: Case, known: Known) -> Feedback:
     """Gains of the link [s] and [1]; the estimator is exact at mode 1."""
     control, electronics, n = case.control, case.electronics, structure.n_patches
-    on = jnp.asarray(control.link_mask)[:, None] * control.gain_factor
+    on = jnp.asarray(control.link_mask)[:, None]
     eye = jnp.broadcast_to(jnp.eye(n), (3, n, n))
     return Feedback(
         filter=eye,

@@ -173,6 +173,7 @@ def _structure(table: CaseTable, members: np.ndarray) -> Structure:
     one = build_structure(loose_study(table, int(members[0])))
     noisy = (column("electronics.adc_noise") > 0).any() | (column("drive.ripple") > 0).any()
     fields = Fields(table.study, table.fields)
+    has_poles = bool(np.any(fields.numbers("control.pole_decay") > 0))
     return one._replace(
         n_modes=int(column("link.modes").max()),
         n_controlled=min(int(column("control.modes").max()), one.n_patches),
@@ -180,7 +181,10 @@ def _structure(table: CaseTable, members: np.ndarray) -> Structure:
         has_amplifier=bool((column("electronics.amplifier_hz") > 0).any()),
         has_noise=bool(noisy) or one.is_smooth,
         has_friction=bool((column("drive.coulomb_friction") > 0).any()),
-        has_position_gain=one.has_position_gain or bool(np.any(fields.numbers(_POSITION) != 0)),
+        has_poles=has_poles,
+        has_position_gain=one.has_position_gain
+        or has_poles
+        or bool(np.any(fields.numbers(_POSITION) != 0)),
         has_wrench=any(np.any(fields.numbers(name) != 0) for name in _WRENCH),
         has_payload_offset=bool(np.any(fields.numbers("load.offset") != 0)),
     )

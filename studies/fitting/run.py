@@ -240,7 +240,7 @@ def machines(found: Fitted) -> dict[str, list[float]]:
 
 def _tuning(found: Fitted) -> str:
     """The fitted study with machines like it, ready for `studies tune`."""
-    gain = found.study.control.gain_factor or 0.5
+    gain = found.study.control.gain_factor or 1.0
     rows = "\n".join(f"{json.dumps(k)} = {v}" for k, v in machines(found).items())
     is_sampled = found.study.control.feedback == "sampled"
     limits = f"[tune.limits]\ngain_margin = {MARGIN}\n" if is_sampled else ""

@@ -39,6 +39,10 @@ SHAPERS = ("ei", "none")
 OFF, ALL, TWO, ONE = (False,) * 3, (True,) * 3, (True, True, False), (True, False, False)
 
 
+#: The paper's velocity gains of mode 1 [N s/m].
+PAPER_GAINS = (3.1, 3.5, 3.4)
+
+
 #: The paper's ratios (26), simulation.
 PAPER_RATIOS = ((1.0, 0.345, 0.045), (1.0, 0.304, 0.041), (1.0, 0.321, 0.038))
 
@@ -60,7 +64,7 @@ class PaperCase(NamedTuple):
     modes: int  # modes separated by the modal filter, 3 in section 4, 2 in section 5
     links: Flags = OFF  # controlled
     ratio_from: str = "none"  # "own run", "paper (26)", "mode 1 only", "none"
-    gain_factor: float = 0.5  # f
+    gain_factor: float = 0.5  # on the paper's gains; the default design has half of them
     feedback: str = "sampled"
     estimator: str = "modal_phase"
     damping_ratio: float = 0.01  # of the links
@@ -120,8 +124,8 @@ class PaperRuns(NamedTuple):
         raise KeyError(wanted)
 
 
-def paper_cases(gain_factor: float) -> list[PaperCase]:
-    """All cases, uncontrolled ones first; gain_factor is the default design's f [1]."""
+def paper_cases() -> list[PaperCase]:
+    """All cases, uncontrolled ones first."""
     off, on = [], []
     for move in MOVES:
         for shaper in SHAPERS:
@@ -131,19 +135,14 @@ def paper_cases(gain_factor: float) -> list[PaperCase]:
                 for links, label in ((ALL, "links123"), (TWO, "links12"), (ONE, "links1")):
                     is_comparison = modes == 2 and links != ALL
                     source = "mode 1 only" if is_comparison else "own run"
-                    on.append(PaperCase(f"{stem}-{label}", *same, links, source, gain_factor))
+                    on.append(PaperCase(f"{stem}-{label}", *same, links, source))
     off.append(PaperCase("damped-off", "fast", "none", 3, damping_ratio=HIGH_DAMPING))
     fast = partial(PaperCase, move="fast", shaper="none", modes=3, links=ALL)
     on += [
-        fast(
-            "damped-links123",
-            ratio_from="own run",
-            gain_factor=gain_factor,
-            damping_ratio=HIGH_DAMPING,
-        ),
+        fast("damped-links123", ratio_from="own run", damping_ratio=HIGH_DAMPING),
         fast("weak", ratio_from="own run", gain_factor=0.01),
         fast("paper-gains-own-ratios", ratio_from="own run", gain_factor=1.0),
-        fast("paper-ratios", ratio_from="paper (26)", gain_factor=gain_factor),
+        fast("paper-ratios", ratio_from="paper (26)"),
         fast("paper-preset", ratio_from="paper (26)", gain_factor=1.0),
         fast("difference", ratio_from="paper (26)", gain_factor=1.0, estimator="difference"),
         fast("ideal", ratio_from="paper (26)", gain_factor=1.0, feedback="ideal"),
@@ -172,6 +171,7 @@ def case_study(base: Study, case: PaperCase, ratio: np.ndarray | None = None) ->
         link__damping_ratio=case.damping_ratio,
         control__modes=3,  # upper bound; `build_paper_case` sets how many are separated
         control__links=case.links,
+        control__velocity_gain=PAPER_GAINS,
         control__ratios=rows,
         control__gain_factor=case.gain_factor,
         control__feedback=case.feedback,

@@ -10,7 +10,16 @@ from typing import Any
 import numpy as np
 
 from studies.engine.frame import EARLY_PART
-from studies.paper.cases import ALL, HIGH_DAMPING, MOVES, OFF, PAPER_RATIOS, TWO, PaperRuns
+from studies.paper.cases import (
+    ALL,
+    HIGH_DAMPING,
+    MOVES,
+    OFF,
+    PAPER_GAINS,
+    PAPER_RATIOS,
+    TWO,
+    PaperRuns,
+)
 from studies.paper.context import PLACES, Context, change, move_text, settings
 from studies.paper.figures import PAPER_FIGURES
 from studies.paper.measures import PEAK_SPAN, SETTLED, Measures, middle_station
@@ -59,6 +68,7 @@ def report(runs: PaperRuns, measures: Measures) -> str:
         settled=f"{100 * SETTLED:g}",
         high_damping=HIGH_DAMPING,
         second=np.array([row.ratio[:, 1] for row in runs.energy_ratio]),
+        gains=PAPER_GAINS,
         paper_second=np.array([row[1] for row in (*PAPER_RATIOS, *EXPERIMENT_RATIOS)]),
         ratios=ratio_rows(context),
         table_1=table_1_rows(context),

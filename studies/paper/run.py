@@ -52,7 +52,7 @@ def run_paper(out: str | Path, console: Console | None = None, has_pdf: bool = F
         StudyError: the folder cannot be made or written to.
     """
     study, console = paper_study(), console or Console(highlight=False, markup=False)
-    write_paper(Path(out), console, study, paper_cases(study.control.gain_factor), has_pdf)
+    write_paper(Path(out), console, study, paper_cases(), has_pdf)
 
 
 def write_paper(

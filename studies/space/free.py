@@ -42,6 +42,8 @@ DESIGN: dict[str, FieldPlace] = {
         "control", "control", "velocity_gain", "position_gain", "gain_factor", "feedthrough_factor"
     ),
     "control.ratios": FieldPlace("control.ratio"),
+    "control.pole_decay": FieldPlace("control.pole_decay"),
+    "control.pole_frequency_hz": FieldPlace("control.pole_frequency", TWO_PI),
     "electronics.highpass_hz": FieldPlace("electronics.highpass", TWO_PI),
     "electronics.antialias_hz": FieldPlace("electronics.antialias", TWO_PI),
     "electronics.difference_cutoff_hz": FieldPlace("electronics.difference_cutoff", TWO_PI),

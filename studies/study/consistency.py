@@ -65,6 +65,7 @@ def check_consistency(study: Study) -> None:
         raise field_error(
             "control.feedback", "ideal", f"'sampled' or 'none' with control.law = {control.law!r}"
         )
+    _check_poles(study)
     check_system(study, n_patches)
     _check_lists(study)
     _check_own_fields(study)
@@ -80,6 +81,43 @@ def check_consistency(study: Study) -> None:
     _check_sampling(study)
     _check_pulses(study)
     _check_coupling(study)
+
+
+def _is_nested(value: Any) -> bool:
+    return isinstance(value, tuple) and any(isinstance(row, tuple) for row in value)
+
+
+def _check_poles(study: Study) -> None:
+    """Check that the law places poles, and what their lists hold."""
+    control = study.control
+    decay, frequency = control.pole_decay, control.pole_frequency_hz
+    if frequency != () and decay == ():
+        raise field_error(
+            "control.pole_decay", decay, "given with control.pole_frequency_hz", "1/s"
+        )
+    if decay == ():
+        return
+    if not LAWS[control.law].places_poles:
+        able = ", ".join(name for name, law in LAWS.items() if law.places_poles)
+        raise field_error("control.law", control.law, f"{able}, with control.pole_decay")
+    for name, value, unit in (
+        ("control.pole_decay", decay, "1/s"),
+        ("control.pole_frequency_hz", frequency, "Hz"),
+    ):
+        if not _is_nested(value):
+            continue
+        lengths = [len(row) for row in value]  # type: ignore[union-attr,arg-type]
+        if len(lengths) != 3 or min(lengths) < 1 or max(lengths) > control.modes:
+            allowed = f"three lists of 1 to {control.modes} entries (control.modes)"
+            raise field_error(name, value, allowed, unit)
+    if control.modes > 1 and frequency != () and not _is_nested(frequency):
+        raise field_error(
+            "control.pole_frequency_hz",
+            frequency,
+            "one list a link by mode, where control.modes is more than 1: [[130.0], [120.0], "
+            "[125.0]] moves mode 1 alone",
+            "Hz",
+        )
 
 
 def _check_own_fields(study: Study) -> None:

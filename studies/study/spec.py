@@ -44,9 +44,13 @@ Degrees = Annotated[float, Field(ge=-360, le=360)]
 Offset = Annotated[float, Field(ge=-1, le=1)]
 Flags = tuple[bool, bool, bool]
 Matrix = tuple[tuple[float, ...], ...]
+Decay = Annotated[float, Field(gt=0, le=1e6)]
+OwnOrHertz = Annotated[float, Field(ge=0, le=1e5)]
 Number = TypeVar("Number")
 #: One number for all links, or one for each.
 EachLink: TypeAlias = Number | tuple[Number, Number, Number]
+#: The same, or one list a link by mode; empty: none given.
+EachMode: TypeAlias = EachLink[Number] | tuple[()] | tuple[tuple[Number, ...], ...]
 
 
 class OwnFields:
@@ -253,10 +257,21 @@ class ControlSection(Section):
         (), "-", "on/off per link and controlled mode; empty: all on"
     )
     velocity_gain: tuple[Gain, Gain, Gain] = described(
-        (3.1, 3.5, 3.4), "N s/m or 1/s", "k_d of mode 1 per link (SRF: s)"
+        (1.55, 1.75, 1.7),
+        "N s/m or 1/s",
+        "k_d of mode 1 per link, half of the paper's by default (SRF: s)",
     )
     position_gain: tuple[Gain, Gain, Gain] = described(
         (0.0, 0.0, 0.0), "N/m or 1/s2", "k_p of mode 1 per link (SRF: 1)"
+    )
+    pole_decay: EachMode[Decay] = described(
+        (),
+        "1/s",
+        "alpha of the poles -alpha +- j beta that modes shall have, from which gains follow: one "
+        "number for all modes, one a link, or one list a link by mode, others by (24)",
+    )
+    pole_frequency_hz: EachMode[OwnOrHertz] = described(
+        (), "Hz", "beta/2 pi of these poles, in the same forms; empty or 0: the mode keeps its own"
     )
     gain_unit: Literal["N s/m", "1/s"] = described(
         "N s/m", "-", "modal force or modal acceleration"
@@ -272,7 +287,13 @@ class ControlSection(Section):
     ratio_exponent: float = described(
         1.0, "1", "exponent on the ratios: 0 makes all gains equal", ge=0, le=10
     )
-    gain_factor: float = described(0.5, "1", "f, common factor on all gains", ge=0, le=1e3)
+    gain_factor: float = described(
+        1.0,
+        "1",
+        "factor on the loop gain: on what the finished controller puts out, whatever the law",
+        ge=0,
+        le=1e3,
+    )
     feedthrough_factor: float = described(
         0.0, "1", "subtracted share of the residual modes' feed-through", ge=0, le=1
     )

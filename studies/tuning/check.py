@@ -21,7 +21,7 @@ from studies.study.cases import as_arrays, build_case, build_cases, in_working_p
 from studies.study.paths import set_values
 from studies.study.spec import Study, parse_study
 from studies.tuning.evaluate import first_residual, tuned_structure
-from studies.tuning.free import PLACEMENT, POLES
+from studies.tuning.free import PLACEMENT
 from studies.tuning.linear_fidelity import LoopFigures, loop_figures
 from studies.tuning.merit import (
     Merit,
@@ -88,13 +88,10 @@ def tuned_study(spec: TuneSpec, family: Family, values: np.ndarray) -> Study:
     whole: dict[str, Any] = {}
     if any(name.startswith(PLACEMENT) for name in names):
         whole["patches.centers"] = case.machine.patches.center
-    if any(name.startswith(POLES) for name in names):
-        whole["control.velocity_gain"] = case.control.velocity_gain
-        whole["control.position_gain"] = case.control.position_gain
     whole |= {
         name: value
         for name, value in zip(spec.free.names, values, strict=True)
-        if name in names and not name.startswith((PLACEMENT, *POLES))
+        if name in names and not name.startswith(PLACEMENT)
     }
     return parse_study(set_values(study, {k: np.asarray(x).tolist() for k, x in whole.items()}))
 

@@ -196,5 +196,6 @@ def tuned_structure(spec: TuneSpec) -> Structure:
         metrics=merit_of(spec).metrics,
         substeps=max(one.substeps for one in found),
         has_noise=any(one.has_noise for one in found),
+        has_poles=spec.has_poles,
         has_position_gain=spec.has_position_gain,
     )

@@ -1,11 +1,8 @@
 """Free numbers of a design: their names, bounds and scale, and how they get into a `Case`.
 
 A free field is a number of the study file, an entry of a list, or a list, each of whose entries is
-then free by itself. Ready-made ones stand for several numbers:
-
-- `poles.decay` [1/s] and `poles.frequency_hz` [Hz], three entries each: alpha-bar and beta-bar of
-  mode 1 of each link, which become its gains by (22)-(23); they need `control.gain_unit = "1/s"`;
-- `placement`: patch centres on the link and without overlap, for any numbers in [0, 1].
+then free by itself. `placement` stands for several numbers: patch centres on the link and without
+overlap, for any numbers in [0, 1].
 """
 
 from __future__ import annotations
@@ -16,9 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.bases import find_bases
-from jaxmodel.case import Case, Structure
-from jaxmodel.control import pole_placement
+from jaxmodel.case import Case
 from jaxmodel.parameters import Array
 from studies.errors import StudyError, field_error, shown_name
 from studies.space.axes import Range
@@ -30,29 +25,20 @@ from studies.space.free import (
     check_twice,
     join_numbers,
     known,
-    parse_bounds,
     plain_numbers,
 )
-from studies.study.cases import build_structure
 from studies.study.consistency import each_link, patch_centers, patch_pitch
 from studies.study.spec import Study
 
-TWO_PI = 2 * np.pi
-
-
-#: Free names that stand for several numbers of a Case.
-POLES = ("poles.decay", "poles.frequency_hz")
+#: Free name that stands for several numbers of a Case.
 PLACEMENT = "placement"
 PLACEMENTS = ("same", "per_link")
-#: Fields that a ready-made free number sets or relies on.
-_GAINS = ("control.velocity_gain", "control.position_gain")
-DECIDED = {PLACEMENT: ("patches.", "link.length"), POLES[0]: _GAINS, POLES[1]: _GAINS}
+#: Fields that it sets or relies on.
+DECIDED = ("patches.", "link.length")
 
 
 def writes(number: Free) -> tuple[str, ...]:
     """Fields of the study that a free number sets."""
-    if number.key in POLES:
-        return "control.velocity_gain", "control.position_gain"
     return ("patches.centers",) if number.key == PLACEMENT else (number.name,)
 
 
@@ -73,12 +59,8 @@ def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
         path = f"tune.free.{shown_name(name)}"
         if name == PLACEMENT:
             parts.append(_placement(bounds, study, path))
-        elif name == POLES[1] and POLES[0] in written:
-            continue  # comes with the other one
-        elif name in POLES:
-            parts.append(_poles(written, study))
         else:
-            parts.append(plain_numbers(name, bounds, study, path, DESIGN, (*POLES, PLACEMENT)))
+            parts.append(plain_numbers(name, bounds, study, path, DESIGN, (PLACEMENT,)))
     found = join_numbers(parts)
     check_twice(found.numbers, "tune.free")
     _check_decided(found.numbers)
@@ -86,44 +68,12 @@ def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
 
 
 def _check_decided(numbers: Sequence[Free]) -> None:
-    """No field can be moved that a ready-made number relies on."""
-    ready = [key for key in DECIDED if any(number.key == key for number in numbers)]
+    """No field can be moved on which the placement relies."""
+    if not any(number.key == PLACEMENT for number in numbers):
+        return
     for number in numbers:
-        for key in ready:
-            if number.key not in DECIDED and number.key.startswith(DECIDED[key]):
-                raise StudyError(f"tune.free.{number.key}: {key} is free too and decides it")
-
-
-def _poles(written: dict[str, Any], study: Study) -> tuple[list[Free], Callable[..., Any]]:
-    for one, other in (POLES, POLES[::-1]):
-        if one in written and other not in written:
-            raise StudyError(f"tune.free.{one}: needs {other} too, (22)-(23) use both")
-    if study.control.gain_unit != "1/s":
-        raise field_error(
-            "control.gain_unit",
-            study.control.gain_unit,
-            "'1/s' where tune.free.poles.decay is free",
-        )
-    spans = [parse_bounds(written[name], f"tune.free.{name}") for name in POLES]
-    if spans[1].low <= 0:
-        raise field_error(f"tune.free.{POLES[1]}.from", spans[1].low, "more than 0", "Hz")
-    numbers = [
-        Free(f"{name}[{k}]", span, np.nan, name)
-        for name, span in zip(POLES, spans, strict=True)
-        for k in range(3)
-    ]
-    return numbers, Placing(_place_poles, (build_structure(study),))
-
-
-def _place_poles(structure: Structure, case: Case, values: Array) -> Case:
-    omega = find_bases(structure, case).believed_omega[:, 0]
-    is_kept, values = jnp.isnan(values[:3] + values[3:]), known(values)
-    gains = pole_placement(values[:3], TWO_PI * values[3:], omega)
-    control = case.control._replace(
-        velocity_gain=jnp.where(is_kept, case.control.velocity_gain, gains.velocity),
-        position_gain=jnp.where(is_kept, case.control.position_gain, gains.position),
-    )
-    return case._replace(control=control)
+        if number.key.startswith(DECIDED):
+            raise StudyError(f"tune.free.{number.key}: {PLACEMENT} is free too and decides it")
 
 
 def _placement(bounds: Any, study: Study, path: str) -> tuple[list[Free], Callable[..., Any]]:

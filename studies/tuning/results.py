@@ -12,7 +12,6 @@ from studies.study.entries import links_text, parse_entries
 from studies.study.labels import STATUS_LABEL
 from studies.study.paths import field_unit, parse_entry
 from studies.tuning.check import JudgedDesign, fresh_columns, patch_centers
-from studies.tuning.free import POLES
 from studies.tuning.report import TuneFindings
 from studies.tuning.spec import TuneSpec
 
@@ -22,8 +21,6 @@ LOOP_UNITS = {"gain_margin": "1", "slowest_decay": "s-1", "spillover": "1"}
 
 def free_unit(key: str) -> str:
     """Unit of a free number, by the name it has in the file."""
-    if key in POLES:
-        return ("s-1", "Hz")[POLES.index(key)]
     entry = parse_entry(key)
     return field_unit(entry.field) if entry and "." in entry.field else "1"
 

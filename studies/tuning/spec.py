@@ -117,9 +117,15 @@ class TuneSpec(NamedTuple):
         return int(np.argmax([family.is_free.sum() for family in self.families]))
 
     @property
+    def has_poles(self) -> bool:
+        """Whether the gains of any design follow from poles."""
+        studies = (self.study, *(family.study(self.study) for family in self.families))
+        return any(study.control.pole_decay != () for study in studies)
+
+    @property
     def has_position_gain(self) -> bool:
         """Whether any design feeds back positions."""
-        if LAWS[self.study.control.law].has_position:
+        if LAWS[self.study.control.law].has_position or self.has_poles:
             return True
         if any("position_gain" in x for number in self.free.numbers for x in writes(number)):
             return True
@@ -467,7 +473,7 @@ def _check_family(family: Family, move: dict[str, Any], study: Study) -> None:
     except StudyError as error:
         raise StudyError(f"{told}{error}") from None
     one, other = build_structure(study), build_structure(changed)
-    kept = {"has_position_gain", "has_noise", "substeps"}
+    kept = {"has_poles", "has_position_gain", "has_noise", "substeps"}
     for field, a, b in zip(one._fields, one, other, strict=True):
         if a != b and field not in kept:
             raise StudyError(

@@ -1,0 +1,187 @@
+"""Pole placement (20)-(23): gains of modal control that put each mode's poles where they are asked.
+
+Poles are -alpha +- j beta. With continuous feedback k_d = 2 (alpha - zeta omega) m and
+k_p = (alpha^2 + beta^2 - omega^2) m; (22) is this without structural damping. A sampled loop with
+delay and filters gets other poles from these gains (half of the damping at 10 kHz), so its gains
+are those of the loop that runs: with z = exp(s T), G(z) the pulse transfer of the nominal link from
+modal force to modal coordinate, one sample of delay included, and H_v(z), H_p(z) the estimates of
+rate and value,
+
+    1 + (k_d H_v(z) + k_p H_p(z)) G(z) = 0,
+
+one complex equation for two real gains. Nominal link: each mode by itself at its assembled
+frequency, with its structural damping, and all other modes' static response to its modal force.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.control import pole_placement
+from jaxmodel.estimator import Estimator, responses
+from jaxmodel.laws.contract import Known, acting_channels, given_gains, study_estimator
+from jaxmodel.laws.link_model import LinkModel, mode_models
+from jaxmodel.lazy import jnp
+from jaxmodel.parameters import Array
+
+#: Added decay over omega below which a mode is left alone [1].
+LEAST_SHIFT = 1e-9
+#: Sine of the angle between k_d H_v and k_p H_p below which they cannot be told apart [1].
+LEAST_ANGLE = 1e-4
+
+
+class Poles(NamedTuple):
+    """Poles -decay +- j frequency of the controlled modes."""
+
+    decay: Array  # alpha [1/s], (3, C)
+    frequency: Array  # beta [rad/s], (3, C)
+
+
+def asked_poles(case: Case, known: Known) -> Poles:
+    """Poles that the study asks for.
+
+    A mode without a decay of its own gets more than its structural one by the EMC ratios,
+    alpha_j = zeta_j omega_j + r_j (alpha_1 - zeta_1 omega_1), as (24) shares out k_d. A mode
+    without a frequency keeps its own, alpha^2 + beta^2 = omega^2, so that k_p = 0 in (23).
+
+    Args:
+        case: the numbers.
+        known: what the controller knows.
+    """
+    control, own = case.control, known.damping_ratio * known.omega
+    first = control.pole_decay[:, :1] - own[:, :1]
+    decay = jnp.where(control.pole_decay > 0, control.pole_decay, own + control.ratio * first)
+    kept = jnp.sqrt(jnp.maximum(known.omega**2 - decay**2, (1e-3 * known.omega) ** 2))
+    is_given = control.pole_frequency > 0
+    return Poles(decay, jnp.where(is_given, control.pole_frequency, kept))
+
+
+def continuous_gains(poles: Poles, known: Known) -> tuple[Array, Array]:
+    """Velocity [N s/m] and position gains [N/m] of continuous feedback, (22)-(23), (3, C) each."""
+    gains = pole_placement(poles.decay, poles.frequency, known.omega)
+    structural = 2 * known.damping_ratio * known.omega
+    return known.modal_mass * (gains.velocity - structural), known.modal_mass * gains.position
+
+
+def sampled_gains(
+    structure: Structure, case: Case, known: Known, estimator: Estimator
+) -> tuple[Array, Array]:
+    """Velocity [N s/m] and position gains [N/m] of the loop that runs, (3, C) each."""
+    poles = asked_poles(case, known)
+    is_moved = _is_moved(poles, known)
+    # own poles are poles of G: any others keep the unused alternative finite
+    decay = jnp.where(is_moved, poles.decay, poles.decay + 0.1 * known.omega)
+    z = jnp.exp((-decay + 1j * poles.frequency) * case.electronics.period)
+    rate, value = responses(estimator, z)
+    wanted = -1 / pulse_transfer(structure, case, known, z)
+    area = jnp.imag(jnp.conj(rate) * value)
+    is_placed = is_moved & ~_is_flat(rate, value)
+    area = jnp.where(is_placed, area, 1.0)
+    velocity = jnp.imag(jnp.conj(wanted) * value) / area
+    position = jnp.imag(jnp.conj(rate) * wanted) / area
+    return jnp.where(is_placed, velocity, 0.0), jnp.where(is_placed, position, 0.0)
+
+
+def pulse_transfer(structure: Structure, case: Case, known: Known, z: Array) -> Array:
+    """G(z) of the nominal link [m/N], complex, (3, C).
+
+    Args:
+        structure, case, known: of the law.
+        z: complex, (3, C).
+    """
+    model = nominal_modes(structure, case, known)
+    shifted = z[..., None, None] * jnp.eye(model.state.shape[-1]) - model.state
+    answer = jnp.linalg.solve(shifted, model.enter.astype(shifted.dtype))
+    return (model.sensor.astype(shifted.dtype) @ answer)[..., 0, 0]
+
+
+def nominal_modes(structure: Structure, case: Case, known: Known) -> LinkModel:
+    """The nominal link, mode by mode, as the controller sees it.
+
+    Of the other modes' static response it subtracts a share, that of its last command.
+
+    Args:
+        structure, case, known: of the law.
+
+    Returns:
+        LinkModel with leading axes (3, C), one input [N] and one output [m].
+    """
+    direct = known.observer @ known.feedthrough @ known.synthesizer
+    direct = structure.has_static_correction * jnp.diagonal(direct, axis1=1, axis2=2)
+    model = mode_models(structure, case, known, known.damping_ratio, direct)
+    subtracted = case.control.feedthrough_factor * direct
+    return model._replace(sensor=model.sensor.at[..., 0, -1].add(-subtracted))
+
+
+def _is_moved(poles: Poles, known: Known) -> Array:
+    """Whether a mode's asked poles are not those it has without control."""
+    omega = known.omega
+    own = known.damping_ratio * omega
+    ringing = jnp.sqrt(jnp.maximum(omega**2 - own**2, 0.0))
+    shift = jnp.abs(poles.decay - own) + jnp.abs(poles.frequency - ringing)
+    return shift > LEAST_SHIFT * omega
+
+
+def _is_flat(rate: Array, value: Array) -> Array:
+    """Whether the two estimates are (nearly) in phase, so that they cannot place two poles."""
+    size = jnp.abs(rate) * jnp.abs(value)
+    return jnp.abs(jnp.imag(jnp.conj(rate) * value)) <= LEAST_ANGLE * size
+
+
+def modal_gains(structure: Structure, case: Case, known: Known) -> tuple[Array, Array]:
+    """Velocity [N s/m] and position gains [N/m] by mode, (3, C) each.
+
+    From the poles that the study asks for; of links without, its gains and ratios (24).
+
+    Args:
+        structure, case, known: of the law.
+    """
+    given = given_gains(case, known)
+    if not structure.has_poles:
+        return given
+    if structure.feedback == "ideal":
+        placed = continuous_gains(asked_poles(case, known), known)
+    else:
+        placed = sampled_gains(structure, case, known, study_estimator(case, known))
+    is_asked, on = case.control.pole_decay[:, :1] > 0, acting_channels(case, known)
+    velocity, position = (
+        jnp.where(is_asked, on * x, y) for x, y in zip(placed, given, strict=True)
+    )
+    return velocity, position
+
+
+def closed_modes(
+    structure: Structure, case: Case, known: Known, damping_ratio: Array
+) -> tuple[Array, Array]:
+    """a [1/s] and b [1/s2] of each mode under continuous feedback, s^2 + 2 a s + b = 0, (3, C).
+
+    Args:
+        structure, case, known: of the law.
+        damping_ratio: structural, as the law assumes it [1], (3, 1).
+    """
+    velocity, position = given_gains(case, known)
+    damping = damping_ratio * known.omega + velocity / (2 * known.modal_mass)
+    square = known.omega**2 + position / known.modal_mass
+    if not structure.has_poles:
+        return damping, square
+    poles = asked_poles(case, known)
+    is_asked = case.control.pole_decay[:, :1] > 0
+    size = poles.decay**2 + poles.frequency**2
+    return jnp.where(is_asked, poles.decay, damping), jnp.where(is_asked, size, square)
+
+
+def is_unplaceable(structure: Structure, case: Case, known: Known) -> Array:
+    """Whether asked poles of an acting mode cannot be placed, ().
+
+    No positive decay, a decay beyond the mode's frequency without a frequency of its own, a
+    frequency beyond half the sample rate, or estimates that are in phase at the pole.
+    """
+    poles, period = asked_poles(case, known), case.electronics.period
+    is_fault = (poles.decay <= 0) | (poles.frequency * period >= jnp.pi)
+    is_fault |= (poles.decay >= known.omega) & (case.control.pole_frequency <= 0)
+    if structure.feedback == "sampled":
+        z = jnp.exp((-poles.decay + 1j * poles.frequency) * period)
+        is_fault |= _is_flat(*responses(study_estimator(case, known), z))
+    is_asked = (case.control.pole_decay[:, :1] > 0) & (acting_channels(case, known) > 0)
+    return jnp.any(is_fault & is_asked)

@@ -1,0 +1,65 @@
+"""Closed loop of the nominal link, on which poles are placed: where do they lie there?
+
+Modes are decoupled (`laws.poles.nominal_modes`), so that the loop of each is a matter of its own; a
+law with a model of whole links (`laws.link_model`) closes the loop of that model.
+"""
+
+from __future__ import annotations
+
+from jaxmodel.bases import find_bases
+from jaxmodel.case import Case, Structure
+from jaxmodel.controller import Controller
+from jaxmodel.estimator import FilterState, advance_filters, weighted
+from jaxmodel.laws.contract import Known
+from jaxmodel.laws.link_model import LinkModel, link_model
+from jaxmodel.laws.poles import asked_poles, nominal_modes
+from jaxmodel.lazy import jax, jnp
+from jaxmodel.parameters import Array
+from jaxmodel.prepare import design_controller
+
+
+def nominal_loop(structure: Structure, case: Case) -> tuple[Array, Array]:
+    """Asked poles, and the loop's transition matrices per sample.
+
+    Args:
+        structure: static choices, feedback "sampled", a law that places poles.
+        case: the numbers.
+
+    Returns:
+        asked poles s [1/s], complex, (3, C); matrices, (3, B, n, n): B = C modes, or 1 whole link.
+    """
+    design = design_controller(structure, case, find_bases(structure, case))
+    poles = asked_poles(case, design.known)
+    loop = _of_modes if design.controller.system is None else _of_links
+    matrix = loop(structure, case, design.controller, design.known)
+    return -poles.decay + 1j * poles.frequency, matrix
+
+
+def _of_modes(structure: Structure, case: Case, law: Controller, known: Known) -> Array:
+    model = nominal_modes(structure, case, known)
+    position = 0 * law.velocity_gain if law.position_gain is None else law.position_gain
+    n = model.state.shape[-1]
+
+    def one(model: LinkModel, estimator: Array, velocity: Array, position: Array) -> Array:
+        def advance(x: Array) -> Array:
+            plant, first, second = x[:n], x[n], (x[n + 1], x[n + 2])
+            seen = model.sensor[0] @ plant
+            after, line = advance_filters(estimator, FilterState(first, second), seen)
+            value = weighted(estimator.position, line) + estimator.direct * seen
+            force = -velocity * weighted(estimator.velocity, line) - position * value
+            moved = model.state @ plant + model.enter[:, 0] * force
+            return jnp.concatenate([moved, jnp.stack([after.first, *after.second])])
+
+        return jax.jacfwd(advance)(jnp.zeros((n + 3,), velocity.dtype))
+
+    return jax.vmap(jax.vmap(one))(model, law.estimator, law.velocity_gain, position)
+
+
+def _of_links(structure: Structure, case: Case, law: Controller, known: Known) -> Array:
+    model, system = link_model(structure, case, known), law.system
+    assert system is not None
+    a, b, c, d = system.state[:, 0], system.enter[:, 0], system.leave[:, :, 0], system.direct
+    last = jnp.zeros_like(model.sensor).at[:, :, -structure.n_patches :].set(law.feedthrough)
+    seen = model.sensor - last
+    above = jnp.concatenate([model.state + model.enter @ d @ seen, model.enter @ c], axis=2)
+    return jnp.concatenate([above, jnp.concatenate([b @ seen, a], axis=2)], axis=1)[:, None]
