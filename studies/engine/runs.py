@@ -38,6 +38,7 @@ from jaxmodel.prepare import (
 from jaxmodel.shaper import Taps, last_sample
 from jaxmodel.simulate import Result, simulate, steady_load
 from studies import config
+from studies.engine.poles import PoleReport, pole_report
 from studies.engine.stability import LoopReport, MotionReport, loop_report, motion_report
 from studies.errors import field_error, warn_of_model
 from studies.store import Variable
@@ -66,6 +67,7 @@ class Run(NamedTuple):
     loop: LoopReport | None  # linearised sampled loop, if there is one
     motion: MotionReport | None  # the same with the forces of the motion
     status: int  # code of `jaxmodel.status`; UNSTABLE comes from the linearised loop
+    poles: PoleReport | None = None  # asked and obtained, where the gains follow from poles
 
 
 def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> Run:
@@ -83,10 +85,13 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
     if study.control.ratio_source == "own_run":
         case = with_ratio(case, _own_ratio(study, structure, case, has_record))
     result = jax.tree.map(np.asarray, _simulate(structure, case, has_record))
-    loop, motion, code = None, None, int(result.status)
+    loop, motion, poles, code = None, None, None, int(result.status)
     if has_loop and structure.feedback == "sampled":
         try:
-            loop = loop_report(structure, case, _home(study), min(3, structure.n_modes))
+            tracked = max(3, structure.n_controlled) if structure.has_poles else 3
+            loop = loop_report(structure, case, _home(study), min(tracked, structure.n_modes))
+            if structure.has_poles:
+                poles = pole_report(structure, case, loop)
             motion = motion_report(structure, case)
         except np.linalg.LinAlgError:  # a non-finite entry
             return Run(
@@ -107,6 +112,7 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
         loop=loop,
         motion=motion,
         status=code,
+        poles=poles,
     )
 
 
@@ -586,6 +592,16 @@ def run_variables(run: Run) -> dict[str, Variable]:
                 "their damping ratios",
             ),
         }
+    if run.poles is not None:
+        texts = ("asked for", "of the nominal link's loop", "of the assembled machine's loop")
+        for name, text, pole in zip(PoleReport._fields, texts, run.poles, strict=True):
+            for part, value, unit in (
+                ("decay", -pole.real, "s-1"),
+                ("frequency", np.abs(pole.imag) / (2 * np.pi), "Hz"),
+            ):
+                variables[f"{name}_pole_{part}"] = Variable(
+                    value, ("link", "controlled_mode"), unit, f"{part} of the poles {text}"
+                )
     if run.motion is not None:
         instants = ("instant",)
         variables |= {

@@ -114,6 +114,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
 def _print_run(run: Run, console: Console) -> None:
     """Print status, link metrics and stability."""
+    from studies.engine.poles import HEADER, difference, pole_rows
     from studies.single.report import settling_text
     from studies.study.labels import describe
     from studies.study.margin import MARGIN_MODES, caution, margin_text
@@ -139,6 +140,12 @@ def _print_run(run: Run, console: Console) -> None:
         f"link, the run {modes})",
         soft_wrap=True,
     )
+    if run.poles is not None:
+        poles = Table(*HEADER)
+        for row in pole_rows(run.poles):
+            poles.add_row(*row)
+        console.print(poles)
+        console.print(difference(run.poles), soft_wrap=True)
     if warning := caution(run.loop.gain_margin):
         console.print(f"[bold red]{warning}[/]", soft_wrap=True, markup=True)
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from jaxmodel import status
 from jaxmodel.axial import euler_force
+from studies.engine.poles import HEADER, difference, pole_rows
 from studies.engine.runs import (
     Run,
     chord_deflection,
@@ -118,6 +119,9 @@ def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str], name: st
         links=_links(run, twin),
         platform=_platform(run),
         modes=_modes(run),
+        pole_header=HEADER,
+        pole_rows=pole_rows(run.poles) if run.poles is not None else [],
+        pole_difference=difference(run.poles) if run.poles is not None else "",
         sketch_caption=CAPTION,
         figure=lambda name, caption: picture(_figure(out, name), caption),
     )

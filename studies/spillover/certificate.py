@@ -25,6 +25,18 @@ from studies.spillover.plants import (
 from studies.study.consistency import each_link
 from studies.study.spec import Study
 
+#: Share of its damping that an uncontrolled mode may lose before it is named [1].
+SPILLOVER = 0.1
+
+
+class Spillover(NamedTuple):
+    """An uncontrolled mode that control makes worse."""
+
+    mode: int  # from 1
+    damping_ratio: float  # [1]
+    free_damping: float  # without control [1]
+    plant: PlantVariant
+
 
 class Certificate(NamedTuple):
     """The findings. Axes: B bases, D departures, N numbers of modes.
@@ -64,6 +76,24 @@ class Certificate(NamedTuple):
     def is_passed(self) -> bool:
         """Whether all of them do."""
         return bool(self.passes[self.exists].all())
+
+    @property
+    def spillover(self) -> Spillover | None:
+        """The uncontrolled mode of any plant that control robs of most of its damping, if any."""
+        kept = np.where(
+            self.exists[..., None, None], self.damping_ratio / self.free_damping, np.nan
+        )
+        kept = kept[:, :, :, self.n_controlled :]
+        if np.isnan(kept).all() or np.nanmin(kept) > 1 - SPILLOVER:
+            return None
+        *plant, mode, _ = at = np.unravel_index(np.nanargmin(kept), kept.shape)
+        whole = (*plant, mode + self.n_controlled, at[-1])
+        return Spillover(
+            mode=int(mode) + self.n_controlled + 1,
+            damping_ratio=float(self.damping_ratio[whole]),
+            free_damping=float(self.free_damping[whole]),
+            plant=self.plants[tuple(plant)],
+        )
 
     @property
     def worst(self) -> tuple[int, ...]:

@@ -11,7 +11,7 @@ from jaxmodel.laws import LAWS
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.show.sketch import CAPTION
 from studies.show.templates import render
-from studies.spillover.certificate import Certificate
+from studies.spillover.certificate import Certificate, Spillover
 from studies.spillover.comparison import FAST, GIVEN, SETTLING, SHOWN, WINDOW, WITHOUT, Comparison
 from studies.spillover.plants import PlantVariant
 from studies.study.labels import describe
@@ -32,6 +32,18 @@ def verdict(found: Certificate) -> str:
     return f"failed by {breaking}: {state}gain margin {margin}, {found.required:g} required"
 
 
+def spillover_text(found: Certificate) -> str:
+    """The uncontrolled mode that control makes worst, in a sentence; "" if there is none."""
+    worst = found.spillover
+    if worst is None:
+        return ""
+    return (
+        f"control spillover: mode {worst.mode}, which is not controlled, has a damping ratio of "
+        f"{worst.damping_ratio:.2g} instead of {worst.free_damping:.2g} without control "
+        f"({worst.plant.basis}, {worst.plant.departure})"
+    )
+
+
 def report(found: Certificate, laws: Comparison | None) -> str:
     """Markdown text.
 
@@ -47,6 +59,7 @@ def report(found: Certificate, laws: Comparison | None) -> str:
         law=LAWS[study.control.law],
         laws=laws,
         verdict=verdict(found),
+        spillover=spillover_text(found),
         margin=margin,
         worst=found.plants[found.worst],
         share=margin / found.required,
@@ -163,6 +176,7 @@ def document(found: Certificate, laws: Comparison | None) -> str:
         "format_version": 2,
         "title": found.study.title,
         "is_passed": found.is_passed,
+        "spillover": found.spillover and _spilled(found.spillover),
         "verdict": verdict(found),
         "required_margin": found.required,
         "smallest_margin": float(np.nanmin(found.margin)),
@@ -173,6 +187,17 @@ def document(found: Certificate, laws: Comparison | None) -> str:
         "study": found.study.model_dump(mode="json"),
     }
     return json.dumps(_plain(whole), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _spilled(worst: Spillover) -> dict[str, Any]:
+    return {
+        "mode": worst.mode,
+        "damping_ratio": worst.damping_ratio,
+        "damping_ratio_without_control": worst.free_damping,
+        "basis": worst.plant.basis,
+        "modes": worst.plant.n_modes,
+        "departure": str(worst.plant.departure),
+    }
 
 
 def _plant(found: Certificate, at: tuple[int, ...]) -> dict[str, Any]:

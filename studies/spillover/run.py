@@ -20,7 +20,7 @@ from studies.show.sketch import sketch
 from studies.spillover import plots
 from studies.spillover.certificate import Certificate, certify
 from studies.spillover.comparison import Comparison, compare_laws
-from studies.spillover.report import document, report, verdict
+from studies.spillover.report import document, report, spillover_text, verdict
 from studies.store import Variable, check_folder, staged, write_store
 from studies.study.labels import STATUS_LABEL
 from studies.study.spec import Study
@@ -57,6 +57,8 @@ def spillover_design(
     console.print("judging the controller on plants that differ from what it believes")
     found = certify(study, margin)
     console.print(verdict(found), soft_wrap=True)
+    if text := spillover_text(found):
+        console.print(text, soft_wrap=True)
     console.print("comparing laws")
     laws = None
     try:

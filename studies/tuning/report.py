@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
+from studies.engine.poles import HEADER, difference, pole_rows
 from studies.show.markdown import literal
 from studies.show.sketch import CAPTION
 from studies.show.templates import render
@@ -113,6 +114,12 @@ def report(spec: TuneSpec, found: TuneFindings, folder: str = "") -> str:
         families=[literal(family.name) for family in spec.moving],
         numbers=_numbers(spec, found),
         alike=ALIKE,
+        pole_header=HEADER,
+        poles=[
+            (name, difference(one.poles), pole_rows(one.poles))
+            for name, one in _designs(spec, found)
+            if one.poles is not None
+        ],
         centers=_centers(spec, found) if PLACEMENT in spec.tune.free else [],
         main=spec.families[spec.main].name,
         searched=seen,

@@ -1,0 +1,101 @@
+"""Poles asked and obtained: on the nominal link, for which they are placed, and on the machine."""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import permutations
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.nominal_loop import nominal_loop
+from studies.engine.stability import LoopReport
+
+#: Relative difference of a decay or frequency that is worth a sentence [1].
+NOTABLE = 0.02
+HEADER = ["mode", "link", "asked", "nominal link", "assembled machine"]
+
+
+class PoleReport(NamedTuple):
+    """Poles s = -alpha + j beta of controlled modes [1/s], complex, (3, C); NaN: not controlled."""
+
+    asked: np.ndarray
+    nominal: np.ndarray  # of the nominal link's loop
+    assembled: np.ndarray  # of the three assembled modes of each order, nearest to those asked
+
+
+def pole_report(structure: Structure, case: Case, loop: LoopReport) -> PoleReport:
+    """Where asked poles lie.
+
+    Args:
+        structure: with `has_poles` and feedback "sampled".
+        case: the numbers.
+        loop: its report, with all controlled modes tracked.
+    """
+    poles, matrix = map(np.asarray, jax.jit(partial(nominal_loop, structure))(case))
+    control, period = case.control, float(case.electronics.period)
+    order = np.arange(poles.shape[1]) < control.n_active
+    is_on = (control.link_mask[:, None] > 0) & (control.mode_mask > 0) & order
+    is_on = is_on & (np.asarray(control.pole_decay)[:, :1] > 0)
+    asked = np.where(is_on, poles, np.nan)
+    nominal, assembled = (np.full(asked.shape, np.nan, complex) for _ in range(2))
+    for link, mode in np.argwhere(is_on):
+        block = matrix[link, min(mode, matrix.shape[1] - 1)]
+        z = np.linalg.eigvals(block)
+        near = z[np.argmin(np.abs(z - np.exp(asked[link, mode] * period)))]
+        nominal[link, mode] = np.log(near) / period
+    frequency, zeta = loop.frequency_hz, loop.damping_ratio
+    found = 2 * np.pi * frequency * (-zeta + 1j * np.sqrt(np.maximum(1 - zeta**2, 0)))
+    for mode in np.flatnonzero(is_on.any(axis=0))[: len(found)]:
+        assembled[:, mode] = np.where(is_on[:, mode], _matched(asked[:, mode], found[mode]), np.nan)
+    return PoleReport(asked, nominal, assembled)
+
+
+def _matched(asked: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """The three assembled poles in the order that brings them nearest to those asked."""
+    return min(
+        (found[list(order)] for order in permutations(range(3))),
+        key=lambda poles: float(np.nansum(np.abs(poles - asked))),
+    )
+
+
+def pole_rows(report: PoleReport) -> list[list[str]]:
+    """Row of each controlled mode and link: decay [1/s] and frequency [Hz], by `HEADER`."""
+    return [
+        [str(mode + 1), str(link + 1), *(_shown(poles[link, mode]) for poles in report)]
+        for mode, link in np.argwhere(~np.isnan(report.asked).T)
+    ]
+
+
+def _shown(pole: complex) -> str:
+    if np.isnan(pole):
+        return "-"
+    return f"{-pole.real:.4g} 1/s, {abs(pole.imag) / (2 * np.pi):.4g} Hz"
+
+
+def difference(report: PoleReport) -> str:
+    """Where the machine differs most from what is asked, and why."""
+    sentences = []
+    if np.nanmax(_apart(report.nominal, report.asked)) > NOTABLE:
+        sentences.append(
+            "The nominal link misses them: gains are designed for control.gain_factor = 1."
+        )
+    apart = _apart(report.assembled, report.asked)
+    if np.isnan(apart).all() or np.nanmax(apart) <= NOTABLE:
+        return " ".join([*sentences, "The assembled machine has all of them within 2 %."])
+    at = np.unravel_index(np.nanargmax(apart), apart.shape)
+    sentences.append(
+        f"The assembled machine differs most in mode {at[1] + 1} of link {at[0] + 1}: "
+        f"{_shown(report.assembled[at])} instead of {_shown(report.asked[at])}. Its links are "
+        "coupled by the platform and patches act on all modes (spillover); gains are designed mode "
+        "by mode."
+    )
+    return " ".join(sentences)
+
+
+def _apart(poles: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    """Relative difference of decay or frequency, whichever is larger [1]."""
+    decay = np.abs((poles.real - asked.real) / asked.real)
+    return np.maximum(decay, np.abs((poles.imag - asked.imag) / np.abs(asked)))
