@@ -1,7 +1,7 @@
 """The gain margin is what it is said to be: runs decay just below that gain factor and grow above.
 
-`control.gain_factor` times the printed margin is where the loop becomes unstable, for every law. Here
-runs with the real step, without converters' and actuators' limits, tell where it does.
+`control.gain_factor` times the printed margin is where the loop becomes unstable, for every law.
+Here runs with the real step, without limits of converters and actuators, tell where it does.
 """
 
 from functools import partial
