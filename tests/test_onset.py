@@ -27,7 +27,7 @@ BASE = {
     "link": {"modes": 4},
     "motion": {"waypoints": [HOME]},
     "shaper": {"kind": "none"},
-    "initial": {"load_deflection": 1e-7},
+    "initial": {"load_deflection": (1e-7, 1e-7, -1e-7)},
     "metrics": {"residual_length": 0.1},
     # no limits: what grows goes on growing
     "electronics": {

@@ -420,13 +420,13 @@ def test_what_does_not_fit_is_refused(tmp_path, mixed):
     folder, _ = mixed
     with pytest.raises(StudyError, match="holds a sweep already; add --resume"):
         run(small_spec(), folder)
-    with pytest.raises(StudyError, match="holds no sweep; leave --resume out"):
-        run(small_spec(), tmp_path / "new", is_resumed=True)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tmp").write_text("x")
     with pytest.raises(StudyError, match="holds other files .thesis.tmp."):
         run(small_spec(), tmp_path / "other")
-    assert (tmp_path / "other" / "thesis.tmp").exists()
+    with pytest.raises(StudyError, match="holds other files .thesis.tmp."):
+        run(small_spec(), tmp_path / "other", is_resumed=True)
+    assert [x.name for x in (tmp_path / "other").iterdir()] == ["thesis.tmp"]
     (tmp_path / "file").write_text("x")
     with pytest.raises(StudyError, match="this is a file; name a folder"):
         run(small_spec(), tmp_path / "file")

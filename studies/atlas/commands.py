@@ -29,7 +29,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             typer.Option(help="case of a sweep (number or id:...) or family of a tuning"),
         ] = None,
         resume: Annotated[
-            bool, typer.Option("--resume", help="continue an interrupted run")
+            bool, typer.Option("--resume", help="continue an interrupted run, if there is one")
         ] = False,
         pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,

@@ -155,6 +155,9 @@ def open_folder(path: Path, manifest: dict[str, Any], is_resumed: bool) -> Itera
 def locked_folder(path: Path, what: str) -> Iterator[None]:
     """Reserve a folder for this process, creating it if necessary.
 
+    What is refused leaves no trace: the lock and folders made here go again if a StudyError ends
+    it before anything else is in them.
+
     Args:
         path: the folder.
         what: what is done there, for messages.
@@ -162,6 +165,8 @@ def locked_folder(path: Path, what: str) -> Iterator[None]:
     Raises:
         StudyError: not writable or in use.
     """
+    created = [folder for folder in (path, *path.parents) if not folder.exists()]
+    before = set(path.iterdir()) if path.is_dir() else set()
     try:
         path.mkdir(parents=True, exist_ok=True)
         lock = open(path / LOCK, "a")  # noqa: SIM115 (held as long as the folder is)
@@ -174,7 +179,14 @@ def locked_folder(path: Path, what: str) -> Iterator[None]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise StudyError(f"--out {path}: another process is running a {what} there") from None
-        yield
+        try:
+            yield
+        except StudyError:
+            if set(path.iterdir()) - before == {path / LOCK}:
+                (path / LOCK).unlink()
+                for folder in created:
+                    folder.rmdir()
+            raise
 
 
 #: Modules that determine the numbers of a sweep, with everything they import.
@@ -233,8 +245,6 @@ def refuse_others(path: Path, leftover: re.Pattern[str]) -> None:
 def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bool) -> None:
     """Reject a folder of something else, an existing sweep, other code, other precision."""
     if not (folder.path / MANIFEST).exists():
-        if is_resumed:
-            raise StudyError(f"--resume: {folder.path} holds no sweep; leave --resume out")
         refuse_others(folder.path, _LEFTOVER)
         return
     if not is_resumed:

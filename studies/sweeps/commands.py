@@ -25,7 +25,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         spec: Annotated[Path, typer.Argument(help="sweep file (TOML) or name of a ready-made one")],
         out: Annotated[Path | None, typer.Option(help="folder for the results")] = None,
         resume: Annotated[
-            bool, typer.Option("--resume", help="continue the sweep in this folder, or extend it")
+            bool,
+            typer.Option(
+                "--resume", help="continue the sweep in this folder, or extend it, if there is one"
+            ),
         ] = False,
         dry_run: Annotated[
             bool, typer.Option("--dry-run", help="show what would run, and how long it would take")

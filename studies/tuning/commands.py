@@ -33,7 +33,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         ],
         out: Annotated[Path | None, typer.Option(help="folder for the results")] = None,
         resume: Annotated[
-            bool, typer.Option("--resume", help="continue an interrupted run")
+            bool, typer.Option("--resume", help="continue an interrupted run, if there is one")
         ] = False,
         audit: Annotated[
             bool, typer.Option("--audit", help="only check derivatives against finite differences")

@@ -47,8 +47,6 @@ def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterat
                         f"--out {out}: was begun with another {what}; name a new folder"
                     )
             before = load_progress(out / PROGRESS)
-        elif is_resumed:
-            raise StudyError(f"--out {out}: no tuning to resume there")
         else:
             refuse_others(out, _LEFTOVER)
             before = None
