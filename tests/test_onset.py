@@ -21,7 +21,7 @@ from studies.study.spec import Study, parse_study
 
 HOME = (0.0, 0.0, 0.5235987755982988)
 WITHIN = 0.05  # of the printed margin
-DURATION = 0.6  # [s]
+DURATION = 0.4  # [s]
 BASE = {
     "run": {"duration": DURATION},
     "link": {"modes": 4},
@@ -79,17 +79,15 @@ def study_of(law: str, design: dict) -> Study:
 def _run(structure, case, factor):
     control = case.control._replace(gain_factor=factor)
     found = simulate(structure, case._replace(control=control), has_record=True)
-    return found.record.voltage, found.status
+    return found.record.actuator_voltage
 
 
 def grows(structure, case, factor: float) -> bool:
-    """Whether voltages grow in the second half of a run."""
-    voltage, code = map(np.asarray, _run(structure, case, factor))
-    if (code != 0 and not np.isfinite(voltage).all()) or np.abs(voltage[-1]).max() >= 1e4:
-        return True
-    size = np.sqrt(np.mean(voltage**2, axis=tuple(range(1, voltage.ndim))))
+    """Whether voltages are larger at the end of a run than after its first tenth."""
+    voltage = np.asarray(_run(structure, case, factor))
+    size = np.sqrt(np.mean(voltage**2, axis=(1, 2)))
     tenth = len(size) // 10
-    return size[-tenth:].mean() > size[-4 * tenth : -3 * tenth].mean()
+    return size[-tenth:].mean() > size[tenth : 2 * tenth].mean()
 
 
 def onset_is_at_the_margin(study: Study) -> None:
