@@ -3,17 +3,22 @@
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from jaxmodel.bases import find_bases
 from jaxmodel.case import Case
 from jaxmodel.nominal_loop import nominal_loop
-from jaxmodel.prepare import design_controller
+from jaxmodel.prepare import design_controller, prepare
+from jaxmodel.status import OK, UNPLACEABLE
+from studies.engine.poles import PoleReport, _matched, difference, pole_rows
+from studies.errors import StudyError
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study, parse_study
 
-#: Axes of a batch of poles, all else shared.
+#: Sets of poles.
 N = 200
 
 
@@ -34,7 +39,7 @@ def nearest_poles(asked: np.ndarray, matrix: np.ndarray, period: float) -> np.nd
 
 
 def random_poles(case: Case, rng: np.random.Generator, omega: np.ndarray) -> Case:
-    """Decays from an eighth of structural damping to a third of omega, frequencies within 20 %."""
+    """Decays of 0.002 to 0.3 omega, frequencies of 0.85 to 1.2 omega."""
     decay = omega * np.exp(rng.uniform(np.log(0.002), np.log(0.3), omega.shape))
     frequency = omega * rng.uniform(0.85, 1.2, omega.shape)
     return case._replace(control=case.control._replace(pole_decay=decay, pole_frequency=frequency))
@@ -76,3 +81,195 @@ def _omega(structure, case):
 def _gains(structure, case):
     law = design_controller(structure, case, find_bases(structure, case)).controller
     return law.velocity_gain, law.position_gain
+
+
+@pytest.mark.parametrize("has_static_correction", [True, False])
+def test_gains_agree_with_an_independent_loop(has_static_correction):
+    """Mode, filter, hold, delay and estimates by SciPy's exponential and polynomials, to 1e-8."""
+    study = study_with(
+        decay=[[150.0, 80.0, 90.0], [100.0, 70.0, 80.0], [60.0, 90.0, 200.0]],
+        link={"modes": 3, "static_correction": has_static_correction},
+    )
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    design = jax.jit(partial(_design, structure))(case)
+    law, known = jax.tree.map(np.asarray, (design.controller, design.known))
+    period, corner = float(case.electronics.period), float(case.electronics.antialias)
+    static = known.observer @ known.feedthrough @ known.synthesizer
+    for i, j in np.ndindex(3, 3):
+        omega, mass = known.omega[i, j], known.modal_mass[i, j]
+        shown = static[i, j, j] if has_static_correction else 0.0
+        a = np.zeros((4, 4))  # q, q', z, z' of the filtered coordinate, and force [N]
+        a[0, 1] = a[2, 3] = 1.0
+        a[1, :2] = -(omega**2), -0.02 * omega
+        a[3, [0, 2, 3]] = corner**2, -(corner**2), -np.sqrt(2) * corner
+        b = np.array([0.0, 1 / mass, 0.0, corner**2 * shown])
+        whole = np.zeros((5, 5))
+        whole[:4, :4], whole[:4, 4] = a, b
+        held = expm(whole * period)
+        e = law.estimator
+        first, denominator = e.first, e.denominator
+        top = np.polymul([first[0][i, j], first[1][i, j]], _numerator(law, i, j))
+        low = np.polymul([1.0, first[2][i, j]], [1.0, denominator[0][i, j], denominator[1][i, j]])
+        # controller: force = -top/low seen; next: delayed by a sample
+        size = len(low) - 1
+        companion = np.zeros((size, size))
+        companion[0], companion[1:, :-1] = -low[1:], np.eye(size - 1)
+        out, through = top[1:] - top[0] * low[1:], top[0]
+        loop = np.zeros((5 + size, 5 + size))
+        look = np.zeros(5)
+        look[2] = 1.0
+        loop[:4, :5] = held[:4]
+        loop[4, :5], loop[4, 5:] = -through * look, -out
+        loop[5, :5] = look
+        loop[5:, 5:] = companion
+        poles = np.linalg.eigvals(loop)
+        decay = study.control.pole_decay[i][j]
+        wanted = np.exp((-decay + 1j * np.sqrt(omega**2 - decay**2)) * period)
+        assert np.abs(poles - wanted).min() < 1e-8
+
+
+def _design(structure, case):
+    return design_controller(structure, case, find_bases(structure, case))
+
+
+def _numerator(law, i, j):
+    velocity = np.array([n[i, j] for n in law.estimator.velocity])
+    position = np.array([n[i, j] for n in law.estimator.position])
+    return law.velocity_gain[i, j] * velocity + law.position_gain[i, j] * position
+
+
+def test_modes_without_a_decay_follow_the_ratios():
+    """alpha_j = zeta omega_j + r_j (alpha_1 - zeta omega_1); a ratio of 0 is no gain."""
+    ratios = [[1.0, 0.5, 0.0], [1.0, 0.3, 2.0], [1.0, 0.0, 0.1]]
+    decay = [[150.0], [100.0, 77.0], [60.0]]
+    study = study_with(decay=decay, control={"ratios": ratios})
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    asked, matrix = map(np.asarray, jax.jit(partial(nominal_loop, structure))(case))
+    omega = np.asarray(jax.jit(partial(_omega, structure))(case))
+    first = np.array([150.0, 100.0, 60.0])[:, None] - 0.01 * omega[:, :1]
+    wanted = 0.01 * omega + np.array(ratios) * first
+    wanted[1, 1] = 77.0
+    np.testing.assert_allclose(-asked.real, wanted, rtol=1e-12)
+    np.testing.assert_allclose(np.abs(asked), omega, rtol=1e-12)
+    found = nearest_poles(asked, matrix, float(case.electronics.period))
+    np.testing.assert_allclose(found, asked, rtol=1e-9)
+    velocity, position = map(np.asarray, jax.jit(partial(_gains, structure))(case))
+    assert velocity[0, 2] == position[0, 2] == velocity[2, 1] == 0.0
+    assert np.all(velocity[[0, 1, 1, 2], [1, 1, 2, 2]] != 0)
+
+
+def test_continuous_feedback_has_the_gains_of_the_paper():
+    """(22)-(23), less the structural damping that is there already."""
+    control = {"feedback": "ideal", "pole_frequency_hz": [[120.0, 0.0], [0.0, 470.0], [125.0]]}
+    study = study_with(decay=90.0, control=control)
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    omega = np.asarray(jax.jit(partial(_omega, structure))(case))
+    velocity, position = map(np.asarray, jax.jit(partial(_gains, structure))(case))
+    mass = study.link.density * study.link.width * study.link.thickness * study.link.length / 2
+    beta = np.sqrt(omega**2 - 90.0**2)
+    for at, hertz in (((0, 0), 120.0), ((1, 1), 470.0), ((2, 0), 125.0)):
+        beta[at] = 2 * np.pi * hertz
+    np.testing.assert_allclose(velocity, mass * 2 * (90.0 - 0.01 * omega), rtol=1e-9)
+    wanted = mass * (90.0**2 + beta**2 - omega**2)
+    np.testing.assert_allclose(position, wanted, rtol=1e-9, atol=1e-6)
+
+
+def test_gains_are_differentiable():
+    """By decays and frequencies, forward against differences, 1e-6."""
+    study = study_with(decay=[[150.0, 80.0, 90.0]] * 3)
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    omega = jax.jit(partial(_omega, structure))(case)
+
+    def gains(x):
+        control = case.control._replace(
+            pole_decay=case.control.pole_decay * jnp.exp(x[0]),
+            pole_frequency=omega * jnp.exp(x[1]),
+        )
+        return jnp.stack(_gains(structure, case._replace(control=control)))
+
+    run, h = jax.jit(gains), 1e-5
+    slope = jax.jit(jax.jacfwd(gains))(np.zeros(2))
+    for k in range(2):
+        step = h * np.eye(2)[k]
+        wanted = (run(step) - run(-step)) / (2 * h)
+        scale = np.abs(wanted).max()
+        np.testing.assert_allclose(slope[..., k], wanted, rtol=1e-6, atol=1e-7 * scale)
+
+
+@pytest.mark.parametrize(
+    ("law", "changes", "code"),
+    [
+        ("imsc", {"pole_decay": 100.0}, OK),
+        ("observer", {"pole_decay": 700.0}, OK),
+        ("imsc", {"pole_decay": 800.0}, UNPLACEABLE),  # mode 1 vibrates at 719 rad/s
+        ("observer", {"pole_decay": 800.0}, UNPLACEABLE),
+        ("imsc", {"pole_decay": 800.0, "mode_mask": [[False, True, True]] * 3}, OK),
+        ("imsc", {"pole_decay": 50.0, "pole_frequency_hz": [[5e3]] * 3}, UNPLACEABLE),
+        ("imsc", {"pole_decay": 800.0, "pole_frequency_hz": [[1e-4]] * 3}, UNPLACEABLE),  # in phase
+        ("imsc", {"pole_decay": [[20.0]] * 3, "ratios": [[1.0, -9.0, 1.0]] * 3}, UNPLACEABLE),
+    ],
+)
+def test_what_cannot_be_placed_is_a_status(law, changes, code):
+    study = study_with(law, control=changes)
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    found = jax.jit(lambda c: prepare(structure, c))(case)
+    assert int(found.status) == code
+    gains = found.loop.controller.velocity_gain
+    assert np.isfinite(gains).all() and np.isfinite(found.loop.controller.synthesizer).all()
+
+
+@pytest.mark.parametrize(
+    ("control", "message"),
+    [
+        ({"law": "lqr", "pole_decay": 100.0}, "control.law = 'lqr'; allowed: imsc, modified_imsc,"),
+        ({"pole_decay": -1.0}, "control.pole_decay"),
+        ({"pole_decay": [1.0, 2.0]}, "control.pole_decay"),
+        ({"pole_decay": [[1.0], [2.0]]}, "allowed: three lists of 1 to 3 entries"),
+        ({"pole_decay": [[1.0, 2.0, 3.0, 4.0]] * 3}, "allowed: three lists of 1 to 3 entries"),
+        ({"pole_decay": [[], [1.0], [1.0]]}, "allowed: three lists of 1 to 3 entries"),
+        ({"pole_frequency_hz": [[100.0]] * 3}, "allowed: given with control.pole_frequency_hz"),
+        ({"pole_decay": 9.0, "pole_frequency_hz": 100.0}, "one list a link by mode, where"),
+    ],
+)
+def test_poles_that_make_no_sense_are_refused(control, message):
+    with pytest.raises(StudyError, match=message):
+        parse_study({"control": control})
+
+
+@pytest.mark.parametrize("rate", [4_500.0, 10_000.0, 40_000.0])
+def test_the_observers_loop_has_the_poles_of_continuous_feedback(rate):
+    """From the study's gains, at any sample rate, on the model of the link."""
+    electronics = {"sample_rate_hz": rate, "antialias_hz": 1_500.0, "amplifier_hz": 3_000.0}
+    gains = {"velocity_gain": (1.0, 2.0, 3.0), "position_gain": (0.0, 200.0, -300.0)}
+    study = parse_study({"control": {"law": "observer"} | gains, "electronics": electronics})
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    _, matrix = map(np.asarray, jax.jit(partial(nominal_loop, structure))(case))
+    known = jax.tree.map(np.asarray, jax.jit(partial(_design, structure))(case).known)
+    ratio = np.array(study.control.ratios)
+    velocity = np.array(gains["velocity_gain"])[:, None] * ratio / known.modal_mass
+    position = np.array(gains["position_gain"])[:, None] * ratio / known.modal_mass
+    damping, square = 0.01 * known.omega + velocity / 2, known.omega**2 + position
+    wanted = -damping + 1j * np.sqrt(square - damping**2)
+    found = nearest_poles(wanted, matrix, 1 / rate)
+    np.testing.assert_allclose(found, wanted, rtol=1e-8)
+
+
+def test_assembled_poles_are_matched_to_links_and_differences_are_said():
+    """Reports, rows and sentences, from made-up poles."""
+    asked = np.array([[-160 + 700j, -80 + 2800j], [-100 + 700j, np.nan], [-50 + 700j, np.nan]])
+    zeta = np.array([[0.08, 0.22, 0.15]])
+    poles = 2 * np.pi * 114.0 * (-zeta[0] + 1j * np.sqrt(1 - zeta[0] ** 2))
+    np.testing.assert_array_equal(_matched(asked[:, 0], poles), poles[[1, 2, 0]])
+    assembled = asked * 1.001
+    assembled[1, 0] = -110 + 710j
+    found = PoleReport(asked, asked, assembled)
+    rows = pole_rows(found)
+    assert [row[:2] for row in rows] == [["1", "1"], ["1", "2"], ["1", "3"], ["2", "1"]]
+    assert rows[1][2] == "100 1/s, 111.4 Hz" and rows[1][4] == "110 1/s, 113 Hz"
+    assert "most in mode 1 of link 2: 110 1/s, 113 Hz instead of 100 1/s, 111.4" in difference(
+        found
+    )
+    same = PoleReport(asked, 1.1 * asked, asked)
+    assert difference(same).startswith("The nominal link misses them") and "within 2 %" in (
+        difference(same)
+    )
