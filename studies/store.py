@@ -21,6 +21,7 @@ import h5py
 import numpy as np
 
 from studies.errors import StudyError, field_error
+from studies.reading import open_hdf5
 
 # What netCDF, HDF5 and xarray's attribute access all take as a name.
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -158,10 +159,10 @@ def read_store(path: str | Path) -> tuple[dict[str, Variable], dict[str, Any]]:
     if not Path(path).is_file():
         raise StudyError(f"{path}: no such file")
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(Path(path)) as file:
             variables = {name: _read_variable(dataset) for name, dataset in file.items()}
             attributes = {name: _plain(value) for name, value in file.attrs.items()}
-    except (OSError, RuntimeError, KeyError, AttributeError) as error:
+    except (OSError, RuntimeError, KeyError, AttributeError, TypeError, ValueError) as error:
         raise StudyError(f"{path}: not a store of results ({error})") from error
     return variables, attributes
 

@@ -2,6 +2,8 @@
 
 import json
 import re
+import zipfile
+from io import BytesIO
 
 import jax
 import numpy as np
@@ -250,7 +252,17 @@ REFUSED = {
     "not square": ({"a": np.ones((4, 3))}, {}, "state_space.a: 4 x 3; allowed: 4 x 4"),
     "wrong d": ({"d": np.ones((3, 2))}, {}, "state_space.d: 3 x 2; allowed: 3 x 3"),
     "another time": ({"dt": 2e-4}, {}, "state_space.sample_time = 0.0002; allowed: 0.0001, that"),
-    "no time": ({"dt": None}, {}, "state_space.sample_time = 0.0; allowed: 0.0001"),
+    "no time": ({"dt": None}, {}, "state_space.sample_time: missing (in a file: dt,"),
+    "no entry": ({"dt": []}, {}, "dt has 0 entries; expected 1 [s]"),
+    "three axes": ({"a": np.zeros((4, 4, 4))}, {}, "A has 3 dimensions; expected 2"),
+    "400 digits": ({"b": [[10**400] * 3] * 4}, {}, "state_space.b"),
+    "large": ({"b": np.full((4, 3), 1e308)}, {}, "state_space.b: an entry of size 1e+308; allowed"),
+    "ragged": ({"c": [[1.0], [1.0, 2.0]]}, {}, "expected real numbers"),
+    "too many states": (
+        {"a": np.zeros((501, 501)), "b": np.zeros((501, 3)), "c": np.zeros((3, 501))},
+        {},
+        "state_space.c: 501 states; allowed: up to 500",
+    ),
     "nan": ({"c": np.full((3, 4), np.nan)}, {}, "state_space.c"),
     "text": ({"a": [["x"]]}, {}, "expected real numbers"),
     "no output": ({"c": None}, {}, "has no C; expected A, B, C, D and dt"),
@@ -273,7 +285,7 @@ def test_bad_controllers_are_answered(tmp_path, fault):
     changed, section, said = REFUSED[fault]
     a, b, c, d = random_system(4, 3)
     fields = {"a": a, "b": b, "c": c, "d": d, "dt": PERIOD} | (changed or {})
-    fields = {k: np.asarray(x).tolist() for k, x in fields.items() if x is not None}
+    fields = {k: getattr(x, "tolist", lambda x=x: x)() for k, x in fields.items() if x is not None}
     if "inputs" in fields:
         fields["outputs"] = ["actuator 1.1", "actuator 1.2", "actuator 1.3"]
     (tmp_path / "x.json").write_text(json.dumps(fields))
@@ -286,6 +298,88 @@ def test_a_damaged_file_is_named(tmp_path):
         (tmp_path / name).write_bytes(b"\x00garbage")
         with pytest.raises(StudyError, match=f"state_space.file: .*{name} cannot be read"):
             study_with(tmp_path / name)
+
+
+@pytest.mark.parametrize("end", ["npz", "mat"])
+def test_complex_matrices_are_refused_unless_they_are_real(tmp_path, end):
+    save = savemat if end == "mat" else lambda path, fields: np.savez(path, **fields)
+    fields = dict(zip("abcd", random_system(4, 3), strict=True)) | {"dt": PERIOD}
+    save(tmp_path / f"x.{end}", fields | {"d": fields["d"] * (1 + 0j)})
+    assert study_with(tmp_path / f"x.{end}").state_space.d == tuple(map(tuple, fields["d"]))
+    save(tmp_path / f"x.{end}", fields | {"d": fields["d"] * (1 + 1e-9j)})
+    with pytest.raises(StudyError, match="D = .*expected real numbers"):
+        study_with(tmp_path / f"x.{end}")
+
+
+def test_mat_files_keep_single_inputs_and_outputs(tmp_path):
+    a, b, c, d = random_system(3, 1)
+    fields = {"A": a, "B": b, "C": c, "D": d, "Ts": PERIOD}
+    savemat(tmp_path / "x.mat", fields | {"inputs": "sensor 2.1", "outputs": "actuator 2.3"})
+    section = study_with(tmp_path / "x.mat").state_space
+    assert np.shape(section.b) == (3, 1) and np.shape(section.c) == (1, 3)
+    assert section.inputs == ("sensor 2.1",) and section.outputs == ("actuator 2.3",)
+
+
+def test_a_mat_file_that_crashes_the_reader_is_damaged(tmp_path):
+    """A matrix whose numbers claim to be a matrix: SciPy's reader ends by a segmentation fault."""
+    a, b, c, d = random_system(3, 3)
+    savemat(tmp_path / "x.mat", {"A": a, "B": b, "C": c, "D": d, "dt": PERIOD})
+    content = bytearray((tmp_path / "x.mat").read_bytes())
+    assert content[176] == 9  # miDOUBLE
+    content[176] = 14  # miMATRIX
+    (tmp_path / "x.mat").write_bytes(content)
+    with pytest.raises(StudyError, match=r"state_space.file: .*x.mat cannot be read \(damaged\)"):
+        study_with(tmp_path / "x.mat")
+
+
+def test_packed_files_are_not_unpacked_beyond_their_limit(tmp_path):
+    """By the archive's directory, by its arrays' headers."""
+    with zipfile.ZipFile(tmp_path / "x.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.npy", bytes(2**26 + 1), compresslevel=1)
+    with pytest.raises(StudyError, match="unpacks to more than 64 MiB"):
+        study_with(tmp_path / "x.npz")
+    header = BytesIO()
+    fields = {"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**6)}
+    np.lib.format.write_array_header_1_0(header, fields)
+    with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
+        archive.writestr("a.npy", header.getvalue())
+    with pytest.raises(StudyError, match=r"an array of shape \(1000000, 1000000\) in 0 bytes"):
+        study_with(tmp_path / "x.npz")
+
+
+def test_a_static_gain_is_a_controller(tmp_path):
+    """In every format, with A, B, C of order 0 or D alone; as D on the read-back voltages."""
+    d = 0.1 * np.random.default_rng(0).normal(size=(3, 3))
+    empty = {"A": np.zeros((0, 0)), "B": np.zeros((0, 3)), "C": np.zeros((3, 0))}
+    fields = {"D": d, "dt": PERIOD}
+    np.savez(tmp_path / "x.npz", **fields, **empty)
+    savemat(tmp_path / "x.mat", fields | empty)
+    whole = {"A": [], "B": [], "C": [[], [], []], "D": d.tolist(), "dt": PERIOD}
+    (tmp_path / "x.json").write_text(json.dumps(whole))
+    (tmp_path / "d.json").write_text(json.dumps({"D": d.tolist(), "dt": PERIOD}))
+    names = ("x.npz", "x.mat", "x.json", "d.json")
+    first, *others = (study_with(tmp_path / name).state_space for name in names)
+    assert all(other.model_copy(update={"file": first.file}) == first for other in others)
+    study = parse_study(study_with(tmp_path / "x.json").model_dump())  # as a study keeps it
+    controller = controller_of(study)
+    codes = np.random.default_rng(1).integers(0, 4096, (30, 3, 3)).astype(float)
+    volts = np.asarray(read_back(controller, codes))
+    np.testing.assert_allclose(replay(controller, codes), volts @ d.T, atol=1e-12)
+
+
+def test_a_static_gain_has_a_margin_and_an_export(tmp_path, capsys):
+    d = 0.05 * np.random.default_rng(0).normal(size=(3, 3))
+    (tmp_path / "d.json").write_text(json.dumps({"D": d.tolist(), "dt": PERIOD}))
+    study = study_with(tmp_path / "d.json")
+    pose = np.array(study.motion.waypoints[0])
+    margin, twice = (
+        loop_report(*check_run(study_with(tmp_path / "d.json", control={"gain_factor": f})), pose)
+        for f in (1.0, 2.0)
+    )
+    assert twice.gain_margin == pytest.approx(margin.gain_margin / 2, rel=1e-3)
+    (tmp_path / "study.toml").write_text(study_template(study))
+    main(["export", str(tmp_path / "study.toml"), "--target", "c", "--out", str(tmp_path)])
+    assert "comparisons agree" in capsys.readouterr().out
 
 
 def test_ideal_feedback_has_no_controller_of_this_kind(thirty):

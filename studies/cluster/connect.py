@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import json
 import logging
 import os
 import re
@@ -18,6 +17,7 @@ import typer
 
 from studies.config import usable_cores
 from studies.errors import StudyError, field_error
+from studies.reading import read_json
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -168,7 +168,7 @@ def _joined(scheduler: str) -> Iterator[Client]:
 def _written_address(file: str) -> str:
     """Address in a scheduler's file."""
     try:
-        address = json.loads(Path(file).read_text(encoding="utf-8"))["address"]
+        address = read_json(Path(file))["address"]
     except FileNotFoundError:
         raise StudyError(
             f"--scheduler {file}: no such file; allowed: tcp://HOST:PORT, tls://HOST:PORT, or a "

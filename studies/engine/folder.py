@@ -22,8 +22,11 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
+from jaxmodel.metrics import METRICS
 from studies import config, sources
+from studies.engine.columns import PER_CASE, SCREENED, label_of
 from studies.errors import StudyError
+from studies.reading import open_hdf5, open_regular, read_json
 from studies.store import Variable, replacing, write_store
 
 RESULTS, MANIFEST, CHUNKS, LOCK = "results.h5", "sweep.json", "chunks", ".lock"
@@ -215,12 +218,15 @@ def read_manifest(path: Path) -> dict[str, Any]:
         StudyError: no sweep there.
     """
     try:
-        manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+        manifest = read_json(path / MANIFEST)
         spec = manifest.get("spec") if isinstance(manifest, dict) else None
         if not isinstance(spec, dict) or not isinstance(spec.get("sweep"), dict):
             raise ValueError("no sweep in it")
-    except RecursionError:
-        raise StudyError(f"{path / MANIFEST}: damaged (nested too deeply)") from None
+        for name in ("results", GIVEN_UP):
+            if not isinstance(manifest.get(name, []), list):
+                raise ValueError(f"{name} is no list")
+        if not isinstance(spec["sweep"].get("screen", {}), dict):
+            raise ValueError("sweep.screen is no table")
     except OSError:
         if (path / TUNING).is_file():
             raise StudyError(
@@ -299,18 +305,19 @@ def finished_cases(path: Path, tell: Any = None, place: str = CHUNKS) -> Finishe
     kept: list[Path] = []
     for file in files:
         try:
-            with h5py.File(file, "r") as store:
+            with open_hdf5(file) as store:
                 if code not in store and file.name == RESULTS:
                     continue  # of a sweep without screen
                 status, names = store[code][()], store["case_id"][()]
-        except (OSError, RuntimeError, KeyError) as error:
+                _check_columns(store, len(names))
+                is_run, names = status >= 0, np.array(names, "S16")
+        except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
             if file.name == RESULTS:
                 raise StudyError(
                     f"{file}: damaged ({error}); remove it to run its cases again"
                 ) from None
             continue
-        is_run = status >= 0
-        ids.append(np.array(names, "S16")[is_run])
+        ids.append(names[is_run])
         rows.append(np.flatnonzero(is_run))
         sources.append(np.full(is_run.sum(), len(kept)))
         kept.append(file)
@@ -318,6 +325,16 @@ def finished_cases(path: Path, tell: Any = None, place: str = CHUNKS) -> Finishe
         return Finished(np.empty(0, "S16"), np.empty(0, int), np.empty(0, int), [])
     case_id, first = np.unique(np.concatenate(ids), return_index=True)
     return Finished(case_id, np.concatenate(sources)[first], np.concatenate(rows)[first], kept)
+
+
+def _check_columns(store: h5py.File, count: int) -> None:
+    """Raise ValueError unless what a case has is there as numbers, for each case."""
+    for name, found in store.items():
+        if name in METRICS or name in PER_CASE or name in SCREENED:
+            shape = np.shape(found) if isinstance(found, h5py.Dataset) else ()
+            dims = label_of(name)[0]
+            if shape[:1] != (count,) or len(shape) != 1 + len(dims) or found.dtype.kind not in "if":
+                raise ValueError(f"{name} is no table of numbers for {count} cases")
 
 
 def check_results(path: Path) -> None:
@@ -338,7 +355,7 @@ def ranges(numbers: np.ndarray) -> str:
 
 def file_hash(path: Path) -> str:
     """First 16 digits of a file's SHA-256."""
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         return file_digest(file, "sha256").hexdigest()[:16]
 
 

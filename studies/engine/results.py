@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,12 +22,12 @@ from studies.engine.columns import (
 from studies.engine.folder import (
     CHUNKS,
     RESULTS,
-    check_results,
     finished_cases,
     read_manifest,
 )
 from studies.engine.stored import axis_sizes, gather
 from studies.errors import StudyError, nearest
+from studies.reading import parse_json
 from studies.space.axes import LABELS, SHOWN_AS
 from studies.space.condition import evaluate
 from studies.space.spec import SweepSpec, parse_sweep
@@ -53,7 +52,10 @@ class SweepData:
     @cached_property
     def table(self) -> CaseTable:
         """Its cases, built once."""
-        return build_table(self.spec) if self.cases is None else self.cases
+        table = build_table(self.spec) if self.cases is None else self.cases
+        if len(table) != self.n_cases:
+            raise StudyError(f"{RESULTS}: {self.n_cases} cases; its sweep has {len(table)}")
+        return table
 
     @property
     def n_cases(self) -> int:
@@ -108,9 +110,13 @@ def load(path: str | Path, cases: CaseTable | None = None) -> SweepData:
     written = read_manifest(folder)["spec"]
     spec = parse_sweep(written)
     if (folder / RESULTS).is_file() and not any((folder / CHUNKS).glob("*.h5")):
-        check_results(folder)
+        finished_cases(folder)  # refuses what no sweep has written
         variables, attributes = read_store(folder / RESULTS)
-        if json.loads(attributes["spec"]) == written:  # otherwise an extension has started
+        try:
+            is_whole = parse_json(attributes["spec"]) == written
+        except (KeyError, TypeError, ValueError) as error:
+            raise StudyError(f"{folder / RESULTS}: damaged (spec: {error})") from None
+        if is_whole:  # otherwise an extension has started
             return SweepData(variables, attributes, spec, cases)
     table = build_table(spec) if cases is None else cases
     gathered = gather(table, finished_cases(folder))

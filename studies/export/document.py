@@ -19,6 +19,7 @@ from jaxmodel.state_space import StateSpace
 from studies import config
 from studies.engine.controller import FixedController, fixed_controller
 from studies.errors import StudyError, shown
+from studies.reading import read_json
 from studies.study.choices import OneOf
 from studies.study.spec import Study, parse_study
 
@@ -335,14 +336,6 @@ def to_json(part: Document) -> str:
     return json.dumps(part.model_dump(mode="json"), indent=1, ensure_ascii=False) + "\n"
 
 
-def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    names = [name for name, _ in pairs]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"{name} occurs twice")
-    return dict(pairs)
-
-
 def read_document(path: Path) -> Document:
     """Read what `to_json` wrote.
 
@@ -350,11 +343,10 @@ def read_document(path: Path) -> Document:
         StudyError: unreadable, or not such a document; names the first wrong entry.
     """
     try:
-        text = path.read_bytes().decode("utf-8")
-        data = json.loads(text, object_pairs_hook=_without_doubles)
+        data = read_json(path)
     except OSError as error:
         raise StudyError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise StudyError(f"{path}: not valid JSON ({error})") from None
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise StudyError(f"{path}: no controller; allowed: a file of studies export --target json")

@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 
 from studies.errors import StudyError, field_error, nearest, shown
+from studies.reading import open_hdf5, open_regular, read_text
 
 #: Endings of the formats.
 FORMATS = (".csv", ".txt", ".h5", ".hdf5", ".uff", ".unv")
@@ -33,10 +34,9 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
     where = folder / name
     if where.suffix.lower() not in FORMATS:
         raise field_error(path, file, f"a file {', '.join(FORMATS)}")
-    fault = _fault(where)
-    if fault:
-        raise StudyError(f"{path}: {where} cannot be read ({fault})")
     try:
+        with open_regular(where):  # of any size: pyuff opens its files itself
+            pass
         if where.suffix.lower() in (".h5", ".hdf5"):
             found = _from_hdf5(where, inside)
         elif where.suffix.lower() in (".uff", ".unv"):
@@ -44,24 +44,13 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
         else:
             found = _from_csv(where)
     except (OSError, ValueError, KeyError, csv.Error) as error:
-        raise StudyError(f"{path}: {where} cannot be read ({error})") from None
+        reason = (isinstance(error, OSError) and error.strerror) or error
+        raise StudyError(f"{path}: {where} cannot be read ({reason})") from None
     if len({len(x) for x in found.values()}) != 1:
         lengths = sorted({len(x) for x in found.values()})
         told = f"columns of {lengths[0]} to {lengths[-1]} rows" if lengths else "no columns"
         raise StudyError(f"{path}: {where} has {told}; allowed: columns of one length")
     return found
-
-
-def _fault(where: Path) -> str:
-    """Why a file cannot be read, "" if it is there."""
-    try:
-        if where.is_dir():
-            return "a folder"
-        if where.is_file():
-            return ""
-        return "no plain file" if where.exists() else "no such file"
-    except OSError as error:
-        return str(error.strerror)
 
 
 def column(found: dict[str, np.ndarray], name: str, file: str, path: str) -> np.ndarray:
@@ -108,8 +97,8 @@ def _cell(text: str, where: str) -> float:
 
 
 def _from_csv(where: Path) -> dict[str, np.ndarray]:
-    with where.open(encoding="utf-8-sig", newline="") as file:
-        rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
+    lines = read_text(where, encoding="utf-8-sig").splitlines(keepends=True)
+    rows = [row for row in csv.reader(lines) if row and not row[0].startswith("#")]
     if len(rows) < 2:
         raise ValueError("needs a row of names and one of numbers or more")
     names = [name.strip() for name in rows[0]]
@@ -130,7 +119,7 @@ def _numbers(x: np.ndarray) -> np.ndarray:
 
 
 def _from_hdf5(where: Path, group: str) -> dict[str, np.ndarray]:
-    with h5py.File(where) as file:
+    with open_hdf5(where) as file:
         at = file[group] if group else file
         if not isinstance(at, h5py.Group):
             raise ValueError(f"{group} is no group")

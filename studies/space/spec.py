@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import ValidationError
 
 from studies.errors import StudyError, field_error
+from studies.reading import check_depth
 from studies.space.methods import METHODS
 from studies.study.choices import OWN, OneOf
 from studies.study.entries import parse_entries
@@ -110,8 +111,10 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
     """
     if "sweep" not in data:
         raise StudyError("sweep: missing; a sweep is a study file with a section [sweep]")
-    if isinstance(data["sweep"], (dict, list)):
-        _check_depth(data["sweep"])
+    try:
+        check_depth(data["sweep"])
+    except ValueError as error:
+        raise StudyError(f"sweep: {error}") from None
     study = parse_study({name: value for name, value in data.items() if name != "sweep"})
     sweep = _parse_block(Sweep, data["sweep"], "sweep")
     assert isinstance(sweep, Sweep)
@@ -138,15 +141,6 @@ def _parse_screen(sweep: Sweep) -> Screen:
             "sweep.screen", "a table", f"none with method {sweep.method}, which needs every case"
         )
     return screen
-
-
-def _check_depth(data: Any, depth: int = 0) -> None:
-    """Reject lists and tables nested deeper than any sweep needs."""
-    if depth > 10 * DEEPEST:
-        raise StudyError("sweep: lists or tables nested too deep")
-    for entry in data.values() if isinstance(data, dict) else data:
-        if isinstance(entry, (dict, list, tuple)):
-            _check_depth(entry, depth + 1)
 
 
 def _parse_block(model: type[Block], data: Any, path: str) -> Block:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from jaxmodel.laws import LAWS
 from studies.engine.design import Design
 from studies.engine.runs import resolved_study, run_attributes
 from studies.errors import StudyError
+from studies.reading import read_json
 from studies.show import figures
 from studies.show.pages import write_report
 from studies.show.sketch import sketch
@@ -81,7 +81,7 @@ def _check_whose(out: Path, study: Study) -> None:
         StudyError: there is one.
     """
     try:
-        kept = json.loads((out / DOCUMENT).read_text(encoding="utf-8"))["study"]
+        kept = read_json(out / DOCUMENT)["study"]
     except (OSError, ValueError, KeyError, TypeError):
         return
     if kept != study.model_dump(mode="json"):

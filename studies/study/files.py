@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from studies.errors import StudyError, field_error, nearest, shown
+from studies.reading import check_depth, read_text
 from studies.study.state_space import with_matrices
 
 #: Folder of the package's ready-made files, available by name.
@@ -22,7 +24,7 @@ def find_spec(name: str | Path) -> Path:
         StudyError: neither exists, but a ready-made one has nearly that name.
     """
     path = Path(name)
-    if len(path.name.encode()) > LONGEST_NAME:
+    if len(os.fsencode(path.name)) > LONGEST_NAME:
         raise StudyError(f"{shown(str(path))}: cannot be read (name too long)")
     if path.is_file() or len(path.parts) > 1 or path.suffix not in ("", ".toml"):
         return path
@@ -53,12 +55,13 @@ def read_toml(name: str | Path) -> dict[str, Any]:
     """
     path = find_spec(name)
     try:
-        text = path.read_bytes().decode("utf-8")
+        text = read_text(path)
     except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        reason = error.strerror if isinstance(error, OSError) else error
         raise StudyError(f"study file {path}: cannot be read ({reason})") from None
     try:
         data = tomllib.loads(text)
+        check_depth(data)
     except (ValueError, RecursionError) as error:  # ValueError: also a number of 5000 digits
         raise StudyError(f"study file {path}: not valid TOML ({error})") from None
     return with_matrices(data, path.parent)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,8 @@ import numpy as np
 from jaxmodel.laws.state_space import STATE_SPACE
 from jaxmodel.state_space import IllConditionedError, StateSpace, modal_form
 from studies.errors import StudyError, field_error, shown
+from studies.reading import read_json, read_npz
+from studies.study.matlab import read_mat
 from studies.study.signals import INPUTS, OUTPUTS, parse_signal
 
 if TYPE_CHECKING:
@@ -23,6 +24,8 @@ FORMATS = (".json", ".npz", ".mat")
 MATRICES, TIMES = ("a", "b", "c", "d"), ("sample_time", "dt", "ts")
 #: A sample time that differs by more than this share is another one [1].
 SAME_TIME = 1e-6
+#: Largest entry of a matrix [1], so that no product of a few overflows, and number of states.
+LARGEST, LARGEST_ORDER = 1e30, 500
 #: Spectral radius from which a controller is unstable [1].
 UNSTABLE = 1 + 1e-9
 
@@ -62,19 +65,22 @@ def read_system(path: Path) -> dict[str, Any]:
         raise StudyError(f"{name}: {path} cannot be read ({reason})") from None
     except Exception as error:  # of any kind, for a damaged file
         raise StudyError(f"{name}: {path} cannot be read ({error})") from None
-    missing = [key.upper() for key in MATRICES[:3] if key not in found]
-    if missing:
-        raise StudyError(f"{name}: {path} has no {', '.join(missing)}; expected A, B, C, D and dt")
     section: dict[str, Any] = {
         key: _matrix(found[key], f"{name}: {path}: {key.upper()}")
         for key in MATRICES
         if key in found
     }
+    if section.get("d") and not any(any(section.get(key, ())) for key in MATRICES[:3]):
+        section |= {"a": (), "b": (), "c": ((),) * len(section["d"])}  # a static gain
+    missing = [key.upper() for key in MATRICES[:3] if key not in section]
+    if missing:
+        raise StudyError(f"{name}: {path} has no {', '.join(missing)}; expected A, B, C, D and dt")
     for key in TIMES:
         if key in found:
-            section["sample_time"] = float(
-                np.ravel(_number(found[key], f"{name}: {path}: {key}"))[0]
-            )
+            time = _number(found[key], f"{name}: {path}: {key}")
+            if time.size != 1:
+                raise StudyError(f"{name}: {path}: {key} has {time.size} entries; expected 1 [s]")
+            section["sample_time"] = float(time.item())
     for key in ("inputs", "outputs"):
         if key in found:
             section[key] = tuple(str(x).strip() for x in np.ravel(np.array(found[key], object)))
@@ -84,34 +90,31 @@ def read_system(path: Path) -> dict[str, Any]:
 def _entries(path: Path) -> dict[str, Any]:
     kind = path.suffix.lower()
     if kind == ".json":
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = read_json(path)
         if not isinstance(found, dict):
             raise ValueError("expected an object with A, B, C, D and dt")
         return found
     if kind == ".npz":
-        with np.load(path, allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
-    from scipy.io import loadmat
-
-    try:
-        found = loadmat(path, simplify_cells=True)
-    except NotImplementedError:
-        raise ValueError("a file of MATLAB 7.3; save it with -v7") from None
-    return {key: value for key, value in found.items() if not key.startswith("__")}
+        return dict(read_npz(path))
+    return dict(read_mat(path))
 
 
 def _number(value: Any, what: str) -> np.ndarray:
     try:
-        return np.array(value, float)
-    except (TypeError, ValueError):
-        raise StudyError(f"{what} = {shown(str(value))}: expected real numbers") from None
+        found = np.array(value)
+    except ValueError:  # lists of unequal length
+        found = np.array(None)
+    is_real = found.dtype.kind in "biuf" or (found.dtype.kind == "c" and not found.imag.any())
+    if not is_real:
+        raise StudyError(f"{what} = {shown(str(value))}: expected real numbers")
+    return found.real.astype(float)
 
 
 def _matrix(value: Any, what: str) -> tuple[tuple[float, ...], ...]:
     found = _number(value, what)
-    if found.ndim < 2:
+    if found.ndim != 2 and found.size:
         raise StudyError(f"{what} has {found.ndim} dimensions; expected 2, rows and columns")
-    return tuple(tuple(map(float, row)) for row in found)
+    return tuple(tuple(map(float, row)) for row in found) if found.ndim == 2 else ()
 
 
 def check_system(study: Study, n_patches: int) -> None:
@@ -127,6 +130,11 @@ def check_system(study: Study, n_patches: int) -> None:
         raise StudyError(
             "state_space.file: missing; control.law = 'state_space' needs a file with A, B, C, D "
             "and sample time, or these as fields"
+        )
+    if not section.sample_time:
+        raise StudyError(
+            f"state_space.sample_time: missing (in a file: dt, Ts or sample_time); expected "
+            f"{period:.9g} [s], that of electronics.sample_rate_hz"
         )
     if abs(section.sample_time / period - 1) > SAME_TIME:
         raise field_error(
@@ -146,10 +154,14 @@ def system_of(section: StateSpaceSection, n_patches: int) -> StateSpace:
     Raises:
         StudyError: wrong sizes or names, unstable, no well-conditioned modal form.
     """
-    c = np.array(section.c, float)
+    c = _sized(section.c, "c", (len(section.c), None))
     order = c.shape[1]
+    if order > LARGEST_ORDER:
+        raise StudyError(f"state_space.c: {order} states; allowed: up to {LARGEST_ORDER}")
     a = _sized(section.a, "a", (order, order))
     b = _sized(section.b, "b", (order, None))
+    if not order:  # a static gain: only D says how many inputs it has
+        b = np.zeros((0, max(map(len, section.d), default=0)))
     given = (len(c), b.shape[1])
     d = _sized(section.d, "d", given) if section.d else np.zeros(given)
     every = 3 * n_patches
@@ -166,8 +178,8 @@ def system_of(section: StateSpaceSection, n_patches: int) -> StateSpace:
         )
         columns, rows = np.eye(every)[inputs], np.eye(every)[:, outputs]
         b, c, d = b @ columns, rows @ c, rows @ d @ columns
-    radius = float(np.abs(np.linalg.eigvals(a)).max()) if order else 0.0
-    if radius > UNSTABLE:
+    radius = _radius(a)
+    if not radius <= UNSTABLE:
         raise StudyError(
             f"state_space.a: an unstable controller, with a pole of modulus {radius:.9g}; allowed: "
             "1 at most"
@@ -181,6 +193,14 @@ def system_of(section: StateSpaceSection, n_patches: int) -> StateSpace:
     return StateSpace(*(np.repeat(part[None], groups, axis=0) for part in system))
 
 
+def _radius(a: np.ndarray) -> float:
+    """Largest modulus of the poles, NaN where none are found."""
+    try:
+        return float(np.abs(np.linalg.eigvals(a)).max(initial=0.0))
+    except np.linalg.LinAlgError:
+        return float("nan")
+
+
 def _sized(
     rows: tuple[tuple[float, ...], ...], name: str, shape: tuple[int, int | None]
 ) -> np.ndarray:
@@ -192,6 +212,9 @@ def _sized(
             f"{path}: rows of {min(widths)} to {max(widths)} entries; expected a matrix"
         )
     found = np.array(rows, float).reshape(len(rows), max(widths, default=0))
+    largest = np.abs(found).max(initial=0.0)
+    if not largest <= LARGEST:
+        raise StudyError(f"{path}: an entry of size {largest:g}; allowed: up to {LARGEST:g}")
     wanted = shape[0], found.shape[1] if shape[1] is None else shape[1]
     if found.shape != wanted:
         told = " x ".join("any" if x is None else str(x) for x in shape)

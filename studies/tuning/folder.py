@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 import re
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 
 from studies.engine.folder import TUNING, locked_folder, refuse_others
 from studies.errors import StudyError
+from studies.reading import read_json, read_npz
 from studies.store import check_target, replacing
 from studies.tuning.optimise import Progress
 
@@ -37,8 +37,8 @@ def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterat
             if not is_resumed:
                 raise StudyError(f"--out {out}: holds a tuning already; go on with --resume")
             try:
-                old = json.loads(path.read_text(encoding="utf-8"))
-            except (ValueError, RecursionError):
+                old = read_json(path)
+            except (OSError, ValueError):
                 raise StudyError(f"{path}: damaged; name a new folder") from None
             now = json.loads(json.dumps(manifest))
             for key, what in CHECKED.items():
@@ -90,10 +90,10 @@ def load_progress(path: Path) -> Progress | None:
     if not path.is_file():
         return None
     try:
-        with np.load(path) as data:
-            count = sum(name.startswith("descent_") for name in data.files)
-            state = tuple(data[f"descent_{k}"] for k in range(count))
-            rest = {name: data[name] for name in Progress._fields if name != "descent"}
-            return Progress(**rest, descent=state)
-    except (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile):
+        data = read_npz(path)
+        count = sum(name.startswith("descent_") for name in data)
+        state = tuple(data[f"descent_{k}"] for k in range(count))
+        rest = {name: data[name] for name in Progress._fields if name != "descent"}
+        return Progress(**rest, descent=state)
+    except (OSError, ValueError, TypeError, KeyError):
         raise StudyError(f"{path}: damaged; name a new folder") from None

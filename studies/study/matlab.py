@@ -1,0 +1,42 @@
+"""MAT files (version 4 to 7), read in a process of their own with limits."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from studies.reading import parse_npz, read_bytes
+from studies.study import unpack_mat
+
+#: Time to read a file [s].
+PATIENCE = 60
+
+
+def read_mat(path: Path) -> dict[str, np.ndarray]:
+    """Numbers and texts of a MAT file by name; matrices keep their two dimensions.
+
+    Raises:
+        OSError: not there, not readable, no regular file, too large.
+        ValueError: damaged, or of MATLAB 7.3.
+
+    Example:
+        >>> read_mat(Path("controller.mat"))["A"].shape  # doctest: +SKIP
+        (4, 4)
+    """
+    content = read_bytes(path)
+    command = [sys.executable, "-I", unpack_mat.__file__]
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    try:
+        done = subprocess.run(
+            command, input=content, capture_output=True, timeout=PATIENCE, env=environment
+        )
+    except subprocess.TimeoutExpired:
+        raise ValueError(f"damaged: not read within {PATIENCE} s") from None
+    if done.returncode:
+        lines = done.stderr.decode(errors="replace").splitlines()
+        raise ValueError(lines[-1] if done.returncode == 1 and lines else "damaged")
+    return parse_npz(done.stdout)
