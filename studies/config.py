@@ -10,10 +10,12 @@ import importlib.metadata
 import os
 import platform
 import re
+import stat
+import warnings
 from pathlib import Path
 from typing import Any
 
-from studies.errors import StudyError, field_error, nearest
+from studies.errors import CacheWarning, StudyError, field_error, nearest
 
 PACKAGE = "flexlink-studies"
 PRECISIONS = ("float64", "float32")
@@ -74,7 +76,8 @@ def configure(
     precision: "float64" or "float32", the default floating type.
     devices: number of CPU devices; None: as in XLA_FLAGS, otherwise one per usable core.
     flags: add COMPILER_FLAGS to XLA_FLAGS, except those the environment already sets.
-    cache: keep compiled programs in JAX_COMPILATION_CACHE_DIR or the user's cache folder.
+    cache: keep compiled programs in JAX_COMPILATION_CACHE_DIR or the user's cache folder, unless
+        others can write there (CacheWarning).
 
     Python then looks for cyclic garbage less often, unless `gc.set_threshold` has been used before.
 
@@ -248,7 +251,7 @@ def _set_cache(cache: bool) -> None:
     if not cache:
         return
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(_default_cache_folder())
-    if not _is_usable_folder(folder):
+    if not _is_usable_folder(folder) or _is_exposed(folder):
         # The cache only saves time: an unwritable home folder must not stop a study.
         _settings().update("jax_enable_compilation_cache", False)
         return
@@ -265,6 +268,24 @@ def _is_usable_folder(folder: str) -> bool:
     except OSError:
         return False
     return os.access(folder, os.W_OK | os.X_OK)
+
+
+def _is_exposed(folder: str) -> bool:
+    """Whether others can put programs into the cache; says so."""
+    about = os.stat(folder)
+    if about.st_uid != os.getuid():
+        fault, cure = "belongs to another user", "name one of your own"
+    elif about.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        fault, cure = "can be written by others", f"`chmod go-w {folder}`, or name another one"
+    else:
+        return False
+    warnings.warn(
+        f"compiled programs are not cached: the folder {folder} {fault}, who could run code "
+        f"through it; {cure} in JAX_COMPILATION_CACHE_DIR",
+        CacheWarning,
+        stacklevel=4,
+    )
+    return True
 
 
 def _default_cache_folder() -> Path:

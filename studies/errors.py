@@ -26,8 +26,12 @@ class ModelWarning(UserWarning):
     """A simplification of the model that shows in this study."""
 
 
+class CacheWarning(UserWarning):
+    """Compiled programs are not cached."""
+
+
 #: Warnings that the command line prints as one line.
-OWN_WARNINGS = (NoKernelWarning, ModelWarning)
+OWN_WARNINGS = (NoKernelWarning, ModelWarning, CacheWarning)
 
 
 def warn_of_model(text: str) -> None:

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import jax
@@ -22,7 +23,7 @@ from studies.config import (
     is_backend_started,
     untested,
 )
-from studies.errors import StudyError
+from studies.errors import CacheWarning, StudyError
 
 TOP = Path(__file__).parents[1]
 
@@ -138,6 +139,36 @@ def test_unusable_cache_folder_does_not_stop_a_study(tmp_path):
         JAX_COMPILATION_CACHE_DIR=str(tmp_path / "file" / "cache"),
     )
     assert facts["cache"] == "none" and facts["cache_mib"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("mode", "others", "said"),
+    [
+        (0o777, False, "can be written by others, who could run code through it; `chmod go-w"),
+        (0o770, False, "can be written by others"),
+        (0o755, True, "belongs to another user, who could run code through it; name one of your"),
+        (0o755, False, ""),
+    ],
+)
+def test_a_cache_folder_of_others_is_not_used(tmp_path, monkeypatch, mode, others, said):
+    folder = tmp_path / "cache"
+    folder.mkdir()
+    folder.chmod(mode)
+    if others:
+        monkeypatch.setattr(config.os, "getuid", lambda: folder.stat().st_uid + 1)
+    before = config.cache_folder()
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(folder))
+    try:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            configure()
+        assert config.cache_folder() == ("" if said else str(folder))
+        assert said in "".join(str(x.message) for x in told)
+        assert [x.category for x in told] == ([CacheWarning] if said else [])
+    finally:
+        monkeypatch.undo()
+        configure()
+    assert config.cache_folder() == before
 
 
 def test_info_is_plain_and_complete():

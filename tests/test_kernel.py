@@ -1,5 +1,7 @@
 """The traced kernel against the scan: the same step, the same results."""
 
+import hashlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -207,6 +209,31 @@ def test_code_is_kept_and_damage_is_noticed(tmp_path, monkeypatch):
     np.testing.assert_array_equal(translated(every_operation, (3, 4))[0], first)
     assert [code is not None for code in taken] == [False, True, False]
     assert file.read_bytes() == whole
+
+
+def test_only_the_users_own_code_is_taken_from_the_cache(tmp_path, monkeypatch):
+    """Neither code with a hash of its own, nor another entry, nor one under another key."""
+    monkeypatch.setattr(compilation, "cache_folder", lambda: str(tmp_path))
+    kept = ObjectCache("a")
+    kept.keep(b"code")
+    assert ObjectCache("a").take() == b"code"
+    (entry,) = tmp_path.glob("kernel-*")
+    whole = entry.read_bytes()
+    entry.write_bytes(hashlib.sha256(b"evil").hexdigest().encode() + b"\nevil")
+    assert ObjectCache("a").take() is None
+    ObjectCache("b").keep(b"other")
+    (other,) = set(tmp_path.glob("kernel-*")) - {entry}
+    entry.write_bytes(other.read_bytes())
+    assert ObjectCache("a").take() is None
+    entry.write_bytes(whole)
+    assert ObjectCache("a").take() == b"code"
+    assert (tmp_path / "key").stat().st_mode & 0o777 == 0o600
+    (tmp_path / "key").chmod(0o644)  # a key that others have read is replaced
+    compilation._key.cache_clear()
+    assert ObjectCache("a").take() is None
+    assert (tmp_path / "key").stat().st_mode & 0o777 == 0o600
+    ObjectCache("a").keep(b"code")
+    assert ObjectCache("a").take() == b"code"
 
 
 # --- other processors -----------------------------------------------------------------------------
