@@ -169,6 +169,43 @@ def test_fuzzing_finds_nothing(capsys, designs, folders, name, target, tmp_path)
     fuzz(out, target, tmp_path, 100_000, 1)
 
 
+HELD = """
+#include <math.h>
+#include <stdio.h>
+#include "flexlink.h"
+
+int main(void)
+{
+    flexlink_shaper shaper;
+    double pose[3] = {1, 2, 3}, bad[3] = {1, NAN, 3}, shaped[3];
+    int k;
+
+    flexlink_shape_init(&shaper, pose);
+    pose[0] = 5;
+    flexlink_shape_step(&shaper, pose, shaped);
+    for (k = 0; k < 2 * FLEXLINK_SHAPER_LENGTH; k++) {
+        bad[0] = k % 2 ? INFINITY : 7;
+        flexlink_shape_step(&shaper, bad, shaped);
+    }
+    printf("%.9g %.9g %.9g", shaped[0], shaped[1], shaped[2]);
+    flexlink_shape_init(&shaper, bad);
+    flexlink_shape_step(&shaper, bad, shaped);
+    printf(" %.9g %.9g %.9g", shaped[0], shaped[1], shaped[2]);
+    return 0;
+}
+"""
+
+
+def test_the_shaper_holds_the_last_finite_reference(capsys, designs, folders, tmp_path):
+    """And begins at zero where there is none; without a start, it stays in its memory."""
+    out, _ = exported(capsys, designs, folders, "single", "c")
+    (tmp_path / "held.c").write_text(HELD)
+    command = [*needs_compiler(), "-std=c99", "-I", out, "-o", tmp_path / "held"]
+    subprocess.run([*command, tmp_path / "held.c", out / "flexlink.c"], check=True)
+    done = subprocess.run([tmp_path / "held"], capture_output=True, text=True, check=True)
+    assert done.stdout == "5 2 3 0 0 0"
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("name", DESIGNS)
 @pytest.mark.parametrize("target", ["c", "c-fixed"])

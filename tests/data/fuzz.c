@@ -42,6 +42,12 @@ static reference_t reference(void)
     }
 }
 
+static int is_off(reference_t value)
+{
+    (void)value;
+    return 0;
+}
+
 static int is_bad(uint16_t value)
 {
     return value < 1 || value > 2 * FLEXLINK_DAC_REST - 1;
@@ -68,9 +74,14 @@ static sensor_t sensor(uint64_t kind)
     }
 }
 
+static int is_off(reference_t value)
+{
+    return !(value - value <= 0);
+}
+
 static reference_t reference(void)
 {
-    return (reference_t)((double)(int32_t)(uint32_t)any() * 1e-9);
+    return any() % 8 ? (reference_t)((double)(int32_t)(uint32_t)any() * 1e-9) : bits();
 }
 
 static int is_bad(sensor_t value)
@@ -96,6 +107,7 @@ int main(int count, char **words)
     for (c = 0; c < 3; c++) {
         pose[c] = reference();
     }
+    flexlink_shape_step(&shaper, pose, shaped); /* before init: whatever comes, nothing breaks */
     flexlink_shape_init(&shaper, pose);
     for (k = 0; k < samples; k++) {
         uint64_t phase = (any() >> 20) % 4096; /* 0: anything at all, 1: stuck at an end */
@@ -127,6 +139,12 @@ int main(int count, char **words)
             pose[c] = reference();
         }
         flexlink_shape_step(&shaper, pose, shaped);
+        for (c = 0; c < 3; c++) {
+            if (is_off(shaped[c])) {
+                printf("reference %d is not finite at sample %ld\n", c + 1, k);
+                return 1;
+            }
+        }
     }
     printf("%ld samples, %ld faults\n", samples, faults);
     return 0;

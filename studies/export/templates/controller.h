@@ -109,14 +109,15 @@ typedef struct {
     uint32_t newest;
 } {{ name }}_shaper;
 
-/* Start at rest in a pose. */
+/* Start at rest in a pose{% if not fixed %}; one that is not finite counts as zero{% endif %}. Without it, the result of
+ * {{ name }}_shape_step means nothing, but stays inside the structure. */
 void {{ name }}_shape_init({{ name }}_shaper *shaper, const {{ word }} reference[3]);
 
 /* One sample of the reference pose (x, y, phi): as planned in, shaped out.
 {% if fixed %}
  * In any units that fit 32 bits.
 {% else %}
- * In any units.
+ * In any units. A reference with a coordinate that is not finite is replaced by the last finite one.
 {% endif %}
  */
 void {{ name }}_shape_step({{ name }}_shaper *shaper, const {{ word }} reference[3],

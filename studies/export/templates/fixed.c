@@ -159,7 +159,7 @@ static int check({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_CHA
     return 0;
 }
 
-{{ shared.state() }}
+{{ shared.state("reference[axis]") }}
 
 int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_CHANNELS],
     uint16_t actuator[{{ NAME }}_N_CHANNELS])
@@ -319,10 +319,10 @@ int {{ name }}_step({{ name }}_state *state, const uint16_t sensor[{{ NAME }}_N_
 void {{ name }}_shape_step({{ name }}_shaper *shaper, const int32_t reference[3], int32_t shaped[3])
 {
     int64_t sum[3] = {0, 0, 0};
-    uint32_t at;
+    uint32_t at, last;
     int k, axis;
 
-    shaper->newest = (shaper->newest == 0 ? {{ NAME }}_SHAPER_LENGTH : shaper->newest) - 1;
+    {{ shared.advance() }}
     for (axis = 0; axis < 3; axis++) {
         shaper->past[shaper->newest][axis] = reference[axis];
     }

@@ -119,7 +119,20 @@ static int check({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHANNEL
     return 0;
 }
 
-{{ shared.state() }}
+/* Whether all coordinates are finite. */
+static int is_pose(const real reference[3])
+{
+    int axis;
+
+    for (axis = 0; axis < 3; axis++) {
+        if (!(reference[axis] - reference[axis] <= 0)) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+{{ shared.state("is_pose(reference) ? reference[axis] : 0") }}
 
 int {{ name }}_step({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHANNELS],
     real actuator[{{ NAME }}_N_CHANNELS])
@@ -249,12 +262,13 @@ int {{ name }}_step({{ name }}_state *state, const real sensor[{{ NAME }}_N_CHAN
 void {{ name }}_shape_step({{ name }}_shaper *shaper, const real reference[3], real shaped[3])
 {
     real sum[3] = {0, 0, 0};
-    uint32_t at;
+    const int is_given = is_pose(reference);
+    uint32_t at, last;
     int k, axis;
 
-    shaper->newest = (shaper->newest == 0 ? {{ NAME }}_SHAPER_LENGTH : shaper->newest) - 1;
+    {{ shared.advance() }}
     for (axis = 0; axis < 3; axis++) {
-        shaper->past[shaper->newest][axis] = reference[axis];
+        shaper->past[shaper->newest][axis] = is_given ? reference[axis] : shaper->past[last][axis];
     }
     for (k = 0; k < N_TAPS; k++) {
         at = shaper->newest + DELAY[k];

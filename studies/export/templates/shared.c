@@ -49,7 +49,7 @@ low-pass; electronics.lowpass_ratio, lowpass_zeta, antialias_hz
 {%- endif %}
 {%- endmacro %}
 
-{% macro state() %}
+{% macro state(reference) %}
 static void forget({{ name }}_state *state)
 {
     int k;
@@ -86,9 +86,14 @@ void {{ name }}_shape_init({{ name }}_shaper *shaper, const {{ word }} reference
 
     for (k = 0; k < {{ NAME }}_SHAPER_LENGTH; k++) {
         for (axis = 0; axis < 3; axis++) {
-            shaper->past[k][axis] = reference[axis];
+            shaper->past[k][axis] = {{ reference }};
         }
     }
     shaper->newest = 0;
 }
+{%- endmacro %}
+
+{% macro advance() %}
+last = shaper->newest < {{ NAME }}_SHAPER_LENGTH ? shaper->newest : 0; /* anything, before init */
+    shaper->newest = (last == 0 ? {{ NAME }}_SHAPER_LENGTH : last) - 1;
 {%- endmacro %}
