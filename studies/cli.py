@@ -11,12 +11,13 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 from typer.exceptions import Abort, TyperException
 
 from studies.atlas.commands import add_commands as add_atlas
 from studies.bench.commands import add_commands as add_bench
 from studies.config import configure, start
-from studies.errors import OWN_WARNINGS, StudyError
+from studies.errors import OWN_WARNINGS, StudyError, printable
 from studies.export.commands import add_commands as add_export
 from studies.fitting.commands import add_commands as add_fit
 from studies.paper.commands import add_commands as add_paper
@@ -33,7 +34,16 @@ app = typer.Typer(
 #: Width of tables in redirected output; a terminal uses its own width.
 FILE_WIDTH = 240
 is_watched = sys.stdout.isatty() or "COLUMNS" in os.environ
-console = Console(
+
+
+class SafeConsole(Console):
+    """Prints texts of files, such as titles, without control sequences that they may hold."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(printable(text), **options)
+
+
+console = SafeConsole(
     highlight=False,
     markup=False,  # units in brackets are not markup
     width=None if is_watched else FILE_WIDTH,
@@ -46,6 +56,7 @@ INTERRUPTED = 130
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `studies` command."""
     try:
+        _check_text(sys.argv[1:] if arguments is None else arguments)
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             if app(args=arguments, standalone_mode=False) == INTERRUPTED:
@@ -53,7 +64,7 @@ def main(arguments: list[str] | None = None) -> None:
     except (StudyError, TyperException) as error:
         text = error.format_message() if isinstance(error, TyperException) else str(error)
         if text:  # empty if help was printed because no command was given
-            print(f"studies: {text}", file=sys.stderr)
+            print(f"studies: {printable(text)}", file=sys.stderr)
         sys.exit(2)
     except (KeyboardInterrupt, Abort):
         print("studies: interrupted", file=sys.stderr)
@@ -63,8 +74,18 @@ def main(arguments: list[str] | None = None) -> None:
 
         if not (reason := blamed(error)):
             raise
-        print(f"studies: {reason}", file=sys.stderr)
+        print(f"studies: {printable(reason)}", file=sys.stderr)
         sys.exit(2)
+
+
+def _check_text(arguments: list[str]) -> None:
+    """Raise StudyError for names that are no UTF-8, which no report could print."""
+    for argument in arguments:
+        try:
+            argument.encode()
+        except UnicodeEncodeError:
+            name = ascii(argument)
+            raise StudyError(f"{name}: no UTF-8 text; rename the file or folder") from None
 
 
 def _show_warning(
@@ -77,7 +98,7 @@ def _show_warning(
 ) -> None:
     """The program's own warnings as one line; others with their place in the code."""
     if issubclass(category, OWN_WARNINGS):
-        print(f"studies: {message}", file=sys.stderr)
+        print(f"studies: {printable(str(message))}", file=sys.stderr)
     else:
         print(warnings.formatwarning(message, category, filename, lineno), file=sys.stderr, end="")
 

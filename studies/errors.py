@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -65,6 +66,15 @@ def shown(value: object) -> str:
     """A value as a study file writes it, on one line and shortened to `LONGEST` characters."""
     text = _text(value)
     return text if len(text) <= LONGEST else text[: LONGEST - 4] + " ..."
+
+
+#: Control characters but line feeds and tabs, and what changes the direction of text.
+_CONTROL = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+
+
+def printable(text: str) -> str:
+    """A text without terminal's control sequences: each of their characters as its escape."""
+    return _CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
 def shown_name(name: str) -> str:

@@ -101,6 +101,7 @@ def rendered(html, folder, width):
     if command is None:
         pytest.skip(f"no browser here ({', '.join(BROWSERS)})")
     path = folder / "probed.html"
+    html = re.sub("<meta http-equiv=[^>]*>", "", html)  # it lets no script run
     path.write_text(html.replace("</body>", f"{PROBE}</body>"), encoding="utf-8")
     options = ("--headless", "--disable-gpu", "--no-sandbox", "--dump-dom")
     own = f"--user-data-dir={folder / 'browser'}", f"--window-size={width},800"

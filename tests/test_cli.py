@@ -9,6 +9,7 @@ import inspect
 import io
 import json
 import math
+import os
 import re
 import subprocess
 import sys
@@ -17,10 +18,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from rich.table import Table
 
 import studies
-from studies.cli import app, main
+from studies.cli import app, console, main
 from studies.study.files import READY
+from studies.study.spec import load_study
 from tests.pages import TITLE, parsed, rendered
 
 HOME_PHI = math.pi / 6
@@ -48,6 +51,25 @@ def run(capsys, *arguments):
         code = end.code
     captured = capsys.readouterr()
     return code, captured.out, captured.err
+
+
+def test_titles_and_names_send_no_control_sequences_to_the_terminal(capsys, tmp_path):
+    console.print("title \x1b]0;owned\x07 \x9b31m \u202e", soft_wrap=True)
+    table = Table("head \x1b[2J")
+    table.add_row("cell \x1b[2J")
+    console.print(table)
+    out = capsys.readouterr().out
+    assert "title \\x1b]0;owned\\x07 \\x9b31m \\u202e" in out and "cell \\x1b[2J" in out
+    assert not set(out) & set("\x1b\x07\x9b\u202e")
+    code, _, err = run(capsys, "simulate", tmp_path / "\x1b[2J.toml", "--out", tmp_path / "x.h5")
+    assert code == 2 and "\\x1b[2J.toml" in err and "\x1b" not in err
+
+
+def test_names_that_are_no_utf_8_are_refused(capsys, tmp_path):
+    name = os.fsdecode(os.fsencode(tmp_path) + b"/\xff.toml")
+    Path(name).write_text(SHORT)
+    assert "no UTF-8 text; rename" in refused(capsys, "simulate", name, "--out", tmp_path / "x.h5")
+    assert load_study(name).link.modes == 2
 
 
 def refused(capsys, *arguments):

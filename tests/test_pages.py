@@ -4,6 +4,7 @@ Pages that commands write are tested where the commands are.
 """
 
 import io
+import re
 import tomllib
 from pathlib import Path
 
@@ -45,6 +46,9 @@ def test_a_text_becomes_a_whole_page():
     ):
         assert part in found.text
     assert "<figcaption>Bending of <code>link</code>, <em>all</em></figcaption>" in html
+    policy = re.search('<meta http-equiv="Content-Security-Policy" content="([^"]*)">', html)[1]
+    assert policy.startswith("default-src 'none'; img-src data:; style-src 'unsafe-inline'")
+    assert "script" not in policy
     assert '<div class="table">\n<table>' in html and '<meta charset="utf-8">' in html
 
 

@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterable
 from urllib.parse import quote
 
+from studies.errors import printable
+
 #: What Markdown takes for a mark wherever it stands (not [ alone, or _ inside a word).
 _MARKS = re.compile(
     r"[\\`*|#]|<(?=[A-Za-z/!?])|&(?=[#\w])|\](?=[(\[:])|(?<!\w)_|_(?!\w)",
@@ -16,7 +18,7 @@ _FIRST_MARKS = re.compile(r"^(\d*)([-+.)](?=\s|$)|[>=~]|--)")
 
 def literal(text: str) -> str:
     """A user's text, such as a title, escaped for Markdown, on one line."""
-    line = " ".join(text.split())
+    line = printable(" ".join(text.split()))
     return _FIRST_MARKS.sub(r"\1\\\2", _MARKS.sub(r"\\\g<0>", line))
 
 
