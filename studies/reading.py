@@ -185,13 +185,16 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
 
     Raises:
         OSError: as `open_regular`, or no HDF5.
-        ValueError: a link to elsewhere, or a dataset too large for the file.
+        ValueError: damaged, a link to elsewhere, or a dataset too large for the file.
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
     with h5py.File(path, "r") as found:
-        _check_group(found, _PACKED * size + _SPARE, 0)
-        yield found
+        try:
+            _check_group(found, _PACKED * size + _SPARE, 0)
+            yield found
+        except (RuntimeError, KeyError) as error:  # h5py's, for a damaged or missing part
+            raise ValueError(str(error)) from None
 
 
 def _check_group(group: h5py.Group, most: int, depth: int) -> None:

@@ -340,7 +340,10 @@ def _check_columns(store: h5py.File, count: int) -> None:
 def check_results(path: Path) -> None:
     """Raise StudyError if `results.h5` is not the file this sweep wrote."""
     results = path / RESULTS
-    if results.is_file() and file_hash(results) not in read_manifest(path).get("results", []):
+    if not results.is_file():
+        return
+    found = file_hash(results)
+    if not found or found not in read_manifest(path).get("results", []):
         raise StudyError(
             f"{results}: damaged, or not of this sweep; put the right one back, or remove it "
             "and run its cases again with --resume"
@@ -354,9 +357,12 @@ def ranges(numbers: np.ndarray) -> str:
 
 
 def file_hash(path: Path) -> str:
-    """First 16 digits of a file's SHA-256."""
-    with open_regular(path) as file:
-        return file_digest(file, "sha256").hexdigest()[:16]
+    """First 16 digits of the SHA-256 of an HDF5 file, "" for anything else."""
+    try:
+        with open_regular(path) as file:
+            return file_digest(file, "sha256").hexdigest()[:16] if h5py.is_hdf5(path) else ""
+    except OSError:
+        return ""
 
 
 def _chunk_files(folder: Path) -> list[tuple[int, Path]]:

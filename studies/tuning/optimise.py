@@ -7,7 +7,7 @@ Neither affects the others. On a front, families pass good designs on to their n
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import qmc
@@ -343,14 +343,19 @@ def optimise(
 
 
 def fits(spec: TuneSpec, at: Progress) -> bool:
-    """Whether saved progress has the shapes of this tuning; iterations can differ."""
+    """Whether saved progress has the arrays of this tuning; iterations can differ."""
 
-    def shapes(one: Progress) -> list[tuple[int, ...]]:
+    def forms(one: Progress) -> list[Any]:
         *arrays, history, descent = one
-        return [np.shape(history)[1:], *map(np.shape, (*arrays, *descent))]
+        kinds = [np.asarray(x).dtype.kind for x in (history, *arrays, *descent)]
+        return [*kinds, np.shape(history)[1:], *map(np.shape, (*arrays, *descent))]
 
     wanted = _untried(spec, np.zeros((len(start_families(spec)), len(spec.free.names))))
-    return shapes(at) == shapes(wanted) and len(at.history) >= int(at.iteration)
+    return (
+        forms(at) == forms(wanted)
+        and np.array_equal(at.family, wanted.family)
+        and 0 <= int(at.iteration) <= len(at.history)
+    )
 
 
 def _with_room(at: Progress, iterations: int) -> Progress:

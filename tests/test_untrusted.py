@@ -1,0 +1,235 @@
+"""Files that somebody else made: whatever is in them, a message or a result; no traceback, no hang.
+
+The short campaign reads what needs no compiled program; the long one everything that is shipped.
+"""
+
+import json
+import os
+import shutil
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+from studies.cli import main
+from studies.engine.folder import MANIFEST, RESULTS, file_hash, finished_cases, read_manifest
+from studies.engine.results import load
+from studies.errors import StudyError
+from studies.export.document import read_document
+from studies.reading import DEEPEST, LARGEST, open_hdf5, read_bytes, read_json, read_npz
+from studies.study.spec import load_study
+from tests import mutations
+from tests.mutations import KINDS, Hang, attack, originals
+
+#: Cases of each kind in the short campaign, and in the long one.
+SHORT = {"study": 45, "sweep": 35, "document": 30, "measurement": 25, "controller": 20}
+SHORT |= {"sweep folder": 6, "MATLAB file": 3}
+LONG = {"study": 500, "sweep": 450, "tuning": 400, "fit": 400, "controller": 300, "gains": 200}
+LONG |= {"MATLAB file": 150}
+LONG |= {"measurement": 250, "sweep folder": 300, "tuning folder": 200}
+
+
+def campaign(kind, count, folder, found):
+    """Faults found."""
+    return [fault for seed in range(count) if (fault := attack(kind, found, folder, seed))]
+
+
+def test_the_long_campaign_covers_all_kinds():
+    assert set(LONG) | {"document"} == set(KINDS) and sum(LONG.values()) >= 3000
+    assert sum(SHORT.values()) >= 150
+
+
+@pytest.mark.parametrize("kind", SHORT)
+def test_changed_files_end_in_a_message(tmp_path, kind):
+    found = originals(kind, tmp_path / "originals")
+    assert campaign(kind, SHORT[kind], tmp_path, found) == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", LONG)
+def test_many_changed_files_end_in_a_message(tmp_path, kind):
+    found = originals(kind, tmp_path / "originals")
+    for path in found:  # readable as they are
+        KINDS[kind].read(path)
+    assert campaign(kind, LONG[kind], tmp_path, found) == []
+
+
+def test_the_campaign_notices_tracebacks_and_hangs(tmp_path, monkeypatch):
+    found = originals("study", tmp_path / "originals")
+    monkeypatch.setattr(mutations, "LIMIT", 0.05)
+    for fault, said in ((lambda _: {}["x"], "KeyError: 'x'"), (lambda _: time.sleep(9), "Hang: ")):
+        monkeypatch.setitem(KINDS, "study", KINDS["study"]._replace(read=fault))
+        assert said in attack("study", found, tmp_path / "originals", 0)
+        (tmp_path / "originals" / "study-0").rename(tmp_path / said[:3])
+    assert not issubclass(Hang, Exception)
+
+
+@pytest.mark.parametrize("kind", ["fifo", "device", "folder", "large"])
+def test_only_regular_files_of_bounded_size_are_read(tmp_path, kind):
+    path = tmp_path / "x.toml"
+    if kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        with path.open("wb") as file:
+            file.truncate(LARGEST + 1)
+    with pytest.raises(OSError) as caught:
+        read_bytes(path)
+    assert caught.value.strerror in ("not a regular file", "larger than 64 MiB", "Is a directory")
+    with pytest.raises(StudyError, match=r"x.toml: cannot be read \("):
+        load_study(path)
+
+
+@pytest.mark.parametrize("text", [".".join("a" * 500) + " = 1", f"[{'.'.join('a' * 500)}]"])
+def test_deep_tables_are_refused(tmp_path, text):
+    (tmp_path / "x.toml").write_text(text)
+    with pytest.raises(StudyError, match=f"nested deeper than {DEEPEST} levels"):
+        load_study(tmp_path / "x.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{"a": 1, "a": 2}', "'a' occurs twice"),
+        ("[" * 100 + "]" * 100, "nested deeper"),
+        ("[" * 100_000, "nested deeper"),
+        ('{"\\ud800": 1}', "is no text"),
+        ("{", "Expecting"),
+    ],
+)
+def test_json_that_no_reader_could_use(tmp_path, text, said):
+    (tmp_path / "x.json").write_text(text)
+    with pytest.raises(ValueError, match=said):
+        read_json(tmp_path / "x.json")
+
+
+def test_many_keys_take_no_long_time(tmp_path):
+    names = ",".join(f'"k{k}": {k}' for k in range(60_000))
+    (tmp_path / "x.json").write_text("{" + names + "}")
+    began = time.perf_counter()
+    with pytest.raises(StudyError, match="no controller"):
+        read_document(tmp_path / "x.json")
+    assert time.perf_counter() - began < 5  # by comparing each with each: minutes
+
+
+def test_npz_arrays_are_read_as_they_are(tmp_path):
+    arrays = {"a": np.arange(6.0).reshape(2, 3).T, "b": np.array(["x", "y"]), "c": np.array(1.5)}
+    np.savez_compressed(tmp_path / "x.npz", **arrays, d=np.zeros((0, 3)), e=np.array([b"z"]))
+    found = read_npz(tmp_path / "x.npz")
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(found[name], array)
+    assert found["d"].shape == (0, 3) and found["e"][0] == b"z"
+    np.savez(tmp_path / "x.npz", a=np.array([{}], object))
+    with pytest.raises(ValueError, match="allowed: numbers and text"):
+        read_npz(tmp_path / "x.npz")
+
+
+def elsewhere(file, folder):
+    file["x"] = h5py.ExternalLink(str(folder / "other.h5"), "/x")
+
+
+def virtual(file, folder):
+    layout = h5py.VirtualLayout((3,), "f8")
+    layout[:] = h5py.VirtualSource(str(folder / "other.h5"), "x", (3,))
+    file.create_virtual_dataset("x", layout)
+
+
+def raw(file, folder):
+    file.create_dataset("x", (3,), "f8", external=[(str(folder / "raw"), 0, 24)])
+
+
+def huge(file, _):
+    file.create_dataset("x", (2**40,), "f8", chunks=(2**20,))
+
+
+@pytest.mark.parametrize("make", [elsewhere, virtual, raw, huge])
+def test_hdf5_files_keep_their_data_themselves(tmp_path, make):
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x"] = np.ones(3)
+    (tmp_path / "raw").write_bytes(bytes(24))
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        make(file, tmp_path)
+    refused = pytest.raises(ValueError, match="'x' (is a link|keeps its data|declares more)")
+    with refused, open_hdf5(tmp_path / "x.h5"):
+        pass
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory):
+    return originals("sweep folder", tmp_path_factory.mktemp("sweep") / "x")[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"results": 7}, "damaged (results is no list)"),
+        ({"given_up": {}}, "damaged (given_up is no list)"),
+        ({"spec": {"sweep": {"screen": 3}}}, "damaged (sweep.screen is no table)"),
+        ({"spec": []}, "damaged (no sweep in it)"),
+    ],
+)
+def test_forged_manifests_are_refused(tmp_path, sweep, change, said):
+    manifest = read_manifest(sweep) | change
+    (tmp_path / MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(StudyError) as caught:
+        read_manifest(tmp_path)
+    assert said in str(caught.value)
+
+
+def group(file):
+    del file["status"]
+    file.create_group("status")
+
+
+def short(file):
+    data = file["residual_rms"][:2]
+    del file["residual_rms"]
+    file["residual_rms"] = data
+
+
+def no_spec(file):
+    del file.attrs["spec"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [(group, "damaged"), (short, "residual_rms is no table"), (no_spec, "spec")],
+)
+def test_forged_results_are_refused(tmp_path, sweep, change, said):
+    """Even where the manifest vouches for them."""
+    out = tmp_path / "out"
+    shutil.copytree(sweep, out)
+    with h5py.File(out / RESULTS, "r+") as file:
+        change(file)
+    manifest = read_manifest(out) | {"results": [file_hash(out / RESULTS)]}
+    (out / MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(StudyError, match=said):
+        load(out)
+
+
+def test_cases_that_its_sweep_does_not_have_are_refused(tmp_path, sweep):
+    out = tmp_path / "out"
+    shutil.copytree(sweep, out)
+    manifest = read_manifest(out)
+    manifest["spec"]["sweep"]["axes"]["gain"] = [0.1]
+    with h5py.File(out / RESULTS, "r+") as file:
+        file.attrs["spec"] = json.dumps(manifest["spec"])
+    manifest["results"] = [file_hash(out / RESULTS)]
+    (out / MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(StudyError, match="6 cases; its sweep has 2"):
+        len(load(out).table)
+
+
+def test_results_that_are_no_file_are_no_results(tmp_path, sweep, capsys):
+    out = tmp_path / "out"
+    shutil.copytree(sweep, out)
+    (out / RESULTS).unlink()
+    (out / RESULTS).symlink_to("/dev/zero")
+    assert len(finished_cases(out).case_id) == 0
+    with pytest.raises(SystemExit):
+        main(["show", str(tmp_path / "nothing")])
+    assert "no folder of a sweep" in capsys.readouterr().err
