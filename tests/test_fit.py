@@ -405,7 +405,7 @@ FAULTS = {
     "another unit": (RESPONSE, {"scale": 1e3}, "times the model at the first guess; expected V/V"),
     "kilohertz": (RESPONSE, {"frequency": 1e-3}, "check the units"),
     "no column": (RESPONSE | {"imag": "imaginary"}, {}, "no column 'imaginary'"),
-    "no file": (RESPONSE | {"file": "none.csv"}, {}, "no such file"),
+    "no file": (RESPONSE | {"file": "none.csv"}, {}, "No such file"),
     "no format": (RESPONSE | {"file": "a.xls"}, {}, "allowed: a file .csv"),
     "no signal": (RESPONSE | {"output": "sensor 4.1"}, {}, "allowed: links 1 to 3"),
     "no noise": (
