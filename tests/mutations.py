@@ -272,7 +272,7 @@ KINDS = {
 def change(path, rng):
     """Change a file, or one file of a folder."""
     if path.is_dir():
-        files = sorted(x for x in path.rglob("*") if x.is_file() and x.name != ".lock")
+        files = sorted(x for x in path.rglob("*") if x.is_file())
         change_results(path, rng) if rng.random() < 0.3 else change(rng.choice(files), rng)
         return
     special = {".json": change_json, ".npz": change_npz, ".mat": change_mat, ".h5": change_hdf5}

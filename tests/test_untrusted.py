@@ -13,7 +13,15 @@ import numpy as np
 import pytest
 
 from studies.cli import main
-from studies.engine.folder import MANIFEST, RESULTS, file_hash, finished_cases, read_manifest
+from studies.engine.folder import (
+    LOCK,
+    MANIFEST,
+    RESULTS,
+    file_hash,
+    finished_cases,
+    locked_folder,
+    read_manifest,
+)
 from studies.engine.results import load
 from studies.errors import StudyError
 from studies.export.document import read_document
@@ -224,6 +232,13 @@ def test_cases_that_its_sweep_does_not_have_are_refused(tmp_path, sweep):
     (out / MANIFEST).write_text(json.dumps(manifest))
     with pytest.raises(StudyError, match="6 cases; its sweep has 2"):
         len(load(out).table)
+
+
+def test_a_lock_that_is_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / LOCK)
+    refused = pytest.raises(StudyError, match="cannot write there")
+    with mutations.time_limit(5), refused, locked_folder(tmp_path, "sweep"):
+        pass
 
 
 def test_results_that_are_no_file_are_no_results(tmp_path, sweep, capsys):

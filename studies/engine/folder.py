@@ -154,6 +154,11 @@ def open_folder(path: Path, manifest: dict[str, Any], is_resumed: bool) -> Itera
         yield folder
 
 
+def _at_once(path: str, flags: int) -> int:
+    """Open a file, or fail: a pipe would wait for its reader."""
+    return os.open(path, flags | os.O_NONBLOCK, 0o666)
+
+
 @contextmanager
 def locked_folder(path: Path, what: str) -> Iterator[None]:
     """Reserve a folder for this process, creating it if necessary.
@@ -172,7 +177,7 @@ def locked_folder(path: Path, what: str) -> Iterator[None]:
     before = set(path.iterdir()) if path.is_dir() else set()
     try:
         path.mkdir(parents=True, exist_ok=True)
-        lock = open(path / LOCK, "a")  # noqa: SIM115 (held as long as the folder is)
+        lock = open(path / LOCK, "a", opener=_at_once)  # noqa: SIM115 (held as long as the folder is)
     except FileExistsError:
         raise StudyError(f"--out {path}: this is a file; name a folder") from None
     except OSError as error:

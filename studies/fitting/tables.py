@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 
 from studies.errors import StudyError, field_error, nearest, shown
-from studies.reading import open_hdf5, open_regular, read_text
+from studies.reading import open_hdf5, open_regular, read_bytes, read_text
 
 #: Endings of the formats.
 FORMATS = (".csv", ".txt", ".h5", ".hdf5", ".uff", ".unv")
@@ -136,6 +136,7 @@ def _from_uff(where: Path, number: str, path: str) -> dict[str, np.ndarray]:
         import pyuff
     except ImportError:
         raise StudyError(f"{path}: reading {where} needs pyuff; install the extra 'uff'") from None
+    read_bytes(where)  # not larger than a file may be
     try:
         sets = pyuff.UFF(str(where))
         functions = np.flatnonzero(sets.get_set_types() == 58)
