@@ -358,7 +358,15 @@ def limited():
         is_motor_saturated=np.any(force > limit - 1e-6, axis=1),
         axial_force=axial,
         stretch_error=stretch,
+        controller=loop.controller,
     )
+
+
+def test_converters_of_a_run_are_those_of_its_study(limited):
+    one = limited[1].controller
+    np.testing.assert_allclose(one.adc_step, 2.0 / 4096, rtol=1e-14)
+    assert (one.adc_top, one.adc_gain, one.adc_bias, one.adc_noise) == (4095, 0.3, 1.1, 0)
+    assert one.voltage_limit == 40
 
 
 def test_metrics_of_a_run_are_those_of_its_trajectories(limited):
