@@ -15,13 +15,14 @@ from studies.study.paths import checked_value, known_field
 from studies.study.spec import Study
 
 
-def spread(node: BlockNode, study: Study, seed: int) -> Columns:
+def spread(node: BlockNode, study: Study, seed: int, stride: int = 1000) -> Columns:
     """Expand a block to columns: what varies, one row per case; {} for a block without axes.
 
     Args:
         node: the block.
         study: values of everything else.
         seed: of the sampling methods.
+        stride: between the seeds of its blocks; theirs is larger, so that none has another's seed.
 
     Raises:
         StudyError: a bad axis, a name used twice, too many cases.
@@ -32,7 +33,10 @@ def spread(node: BlockNode, study: Study, seed: int) -> Columns:
     elif method.points is not None:
         own = _sampled(node, study, seed)
     parts = [own] if own is not None else [_grid_of(a, n) for n, a in _axes(node, study).items()]
-    parts += [spread(child, study, seed + 1000 * (k + 1)) for k, child in enumerate(node.children)]
+    parts += [
+        spread(child, study, seed + stride * (k + 1), 1000 * stride)
+        for k, child in enumerate(node.children)
+    ]
     _check_names(parts, node.path)
     if method.combine == "side by side":
         return _paired(parts, node.path)
