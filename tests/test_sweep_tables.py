@@ -271,7 +271,7 @@ FACTORS = {
 
 
 def designed(method, count):
-    """A sweep of a design whose metric is u (1 + w) + 5 v + 3 w (1 + v), and its points."""
+    """A sweep of a design of a curved metric of u, v, w with products u w and v w, and its points."""
     sweep = {"method": method, "count": count, "axes": FACTORS}
     table = build_table(small_spec(sweep))
     names = "drive.kd", "control.gain_factor", "drive.kp"
@@ -280,7 +280,7 @@ def designed(method, count):
         [(table.columns[n] - a) / b for n, a, b in zip(names, low, span, strict=True)], axis=1
     )
     u, v, w = points.T
-    value = u * (1 + w) + 5 * v + 3 * w * (1 + v)
+    value = u * (1 + w) + 6 * (u - 0.5) ** 2 + 5 * v + 3 * w * (1 + v)
     return made_up(sweep, residual_rms=value[:, None, None] * np.ones((1, 3, 3))), points, value
 
 
@@ -303,7 +303,7 @@ def test_indices_of_a_sweep_are_printed_in_order():
             (row[4], wanted.total_interval[k]),
         ):
             assert cell == f"{low:.3f} to {high:.3f}"
-    main = np.array([1.5**2, 6.5**2, 5.0**2]) / 12  # closed form
+    main = np.array([1.5**2 + 12 * 36 / 180, 6.5**2, 5.0**2]) / 12  # closed form
     both = np.array([1, 9, 10]) / 144
     total = (main + both) / (main.sum() + both.sum() / 2)
     np.testing.assert_allclose(wanted.total, total, atol=0.06)
