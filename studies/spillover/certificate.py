@@ -105,7 +105,7 @@ class Certificate(NamedTuple):
     def truncation(self) -> float:
         """Largest change of a margin by the last plant modes added, as a share of it [1]."""
         last, before = self.margin[:, :, -1], self.margin[:, :, -2:][:, :, 0]
-        is_there = self.exists[:, :, -1] & (last > 0)
+        is_there = self.exists[:, :, -2:].all(axis=2) & (last > 0)
         return float(np.max(np.abs(before / last - 1)[is_there], initial=0.0))
 
     @property
