@@ -271,7 +271,7 @@ FACTORS = {
 
 
 def designed(method, count):
-    """A sweep of a design of a curved metric of u, v, w with products u w and v w, and its points."""
+    """A sweep of a design of a curved metric with products u w and v w, and its points."""
     sweep = {"method": method, "count": count, "axes": FACTORS}
     table = build_table(small_spec(sweep))
     names = "drive.kd", "control.gain_factor", "drive.kp"
