@@ -84,10 +84,16 @@ QUICK = ("free ends under load", "loaded basis under load", "electronics", "stra
     "name", [pytest.param(x, marks=[] if x in QUICK else pytest.mark.long) for x in PLANTS]
 )
 def test_return_difference_is_that_of_the_matrices(name):
-    structure, case = looked_at(STUDY.change(**PLANTS[name]))
+    points = ((3.0, 1.0), (114.4, 1.0), (500.0, 2.0), (722.0, 1.0), (4400.0, 0.5))
+    assert_return_difference(STUDY.change(**PLANTS[name]), points)
+
+
+def assert_return_difference(study, points):
+    """At frequencies [Hz] and factors on the gains."""
+    structure, case = looked_at(study)
     loop = jax.tree.map(np.asarray, jax.jit(closed_loop, static_argnums=0)(structure, case, POSE))
     eye, period = np.eye(len(loop.open)), float(case.electronics.period)
-    for hertz, factor in ((3.0, 1.0), (114.4, 1.0), (500.0, 2.0), (722.0, 1.0), (4400.0, 0.5)):
+    for hertz, factor in points:
         z = np.exp(2j * np.pi * hertz * period)
         closed = np.linalg.slogdet(eye * z - loop.open - factor * loop.feedback)
         opened = np.linalg.slogdet(eye * z - loop.open)
@@ -95,6 +101,18 @@ def test_return_difference_is_that_of_the_matrices(name):
         found = determinant(structure, case, 2 * np.pi * hertz, factor)
         # images of the spectrum that are left out
         np.testing.assert_allclose(complex(found), wanted, rtol=3e-4)
+
+
+#: Forces against soft drives: curvature of the constraint beside kp.
+LOADED = {"load__wrench": (30.0, -20.0, 0.5), "link__basis": "loaded", "drive__kp": 1e3}
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_return_difference_has_the_stiffness_of_the_load(sign):
+    """Where it is a large part of the drives' own, with both signs; low frequencies see it."""
+    wrench = tuple(sign * x for x in LOADED["load__wrench"])
+    study = STUDY.change(**(LOADED | {"load__wrench": wrench}))
+    assert_return_difference(study, ((3.0, 8.0), (8.0, 8.0), (14.0, 8.0), (114.4, 1.0)))
 
 
 def assert_margins(found, wanted):
