@@ -194,6 +194,8 @@ def test_a_margin_equal_to_the_required_one_passes(required):
     margin[0, 1, 1] = np.nextafter(required, 0)
     found = certificate(required, margin=margin)
     assert not found.is_passed and found.passes.sum() == 10 and found.fails_from == 5
+    margin[1, 0] = 1.5
+    assert certificate(required, margin=margin).fails_from == 2
 
 
 def test_an_unstable_plant_fails_whatever_its_margin():

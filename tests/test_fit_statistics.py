@@ -104,6 +104,8 @@ def test_a_profile_that_does_not_rise_enough_ends_where_it_was_tried():
     assert low == 0.0 and high == pytest.approx(2 + 0.959964 / 2)
     low, _ = Likelihood(0, values, np.array([3.9, 0.0, 1.0, 9.0])).interval()
     assert 0 < low < 0.05
+    many = Likelihood(0, np.arange(5.0), np.array([2.4**2, 1.8**2, 1.7**2, 0.0, 9.0]))
+    assert many.interval()[0] == pytest.approx(1 - 0.159964 / 0.6)
     x, rise = found.smooth()
     assert (x[0], x[-1], len(x)) == (0, 3, 201)
     np.testing.assert_allclose(np.interp(values, x, rise), found.rise, atol=0.01)
