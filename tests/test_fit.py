@@ -1,4 +1,4 @@
-"""Fits to measurements: derivatives, uncertainty, what cannot be told, and bad data."""
+"""Fits to measurements: derivatives, uncertainty, what is not identifiable, and bad data."""
 
 import io
 import json
@@ -195,7 +195,7 @@ def answered(folder, entry, free, study=None, kind="response"):
     return spec, one, describe_fit(problem, found.best.u)
 
 
-def test_a_pair_that_cannot_be_told_apart_is_named(folder):
+def test_a_pair_that_is_not_identifiable_is_named(folder):
     """Young's modulus and a factor on the stiffness, of which the first counts for nothing else."""
     free = {
         "link.youngs_modulus": {"from": 60e9, "to": 80e9},
@@ -208,7 +208,7 @@ def test_a_pair_that_cannot_be_told_apart_is_named(folder):
     assert direction.parts[0] * direction.parts[1] < 0
     assert answer.is_explained and answer.sigma[2] < 1e-3
     text = told(direction, spec.free.names)
-    assert "cannot be told apart" in text and "link.stiffness_factor" in text
+    assert "are not identifiable" in text and "link.stiffness_factor" in text
 
 
 def test_three_numbers_that_belong_together_are_one_group(folder):
@@ -227,7 +227,7 @@ def test_three_numbers_that_belong_together_are_one_group(folder):
     study = {"link": SHORT["link"] | {"youngs_modulus": 71e9}}
     found = fit(spec_of(folder, entry, free=free, study=study))
     (sentence,) = undetermined(found)
-    assert "determine 1 combination of these 3 numbers" in sentence and "Fix 2" in sentence
+    assert "determine 1 combination of these 3 parameters" in sentence and "Fix 2" in sentence
 
 
 def test_outliers_pull_less(folder):

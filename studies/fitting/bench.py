@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax
@@ -31,6 +32,8 @@ from studies.study.spec import Study
 Pose = tuple[float, float, float]
 #: Eigenvectors of worse condition are not used [1].
 WORST_CONDITION = 1e10
+#: Plants computed at once.
+BATCH = 32
 #: A row or column of a plant, (n,), and its derivatives, (n, p).
 Row = tuple[np.ndarray, np.ndarray | None]
 
@@ -178,12 +181,12 @@ class Bench:
         Poses out of reach are left out.
         """
         found: list[dict[Pose, PlantAt]] = [{} for _ in values]
-        for pose in self.poses:
-            whole = _plant_batch(self.structure, self.place, self.case, np.array(pose), values)
-            whole = jax.tree.map(np.asarray, whole)
-            whole, codes = whole
-            for k in np.flatnonzero(codes == status.OK):  # the others are refused when needed
-                found[k][pose] = PlantAt(jax.tree.map(lambda x, k=k: x[k], whole), None)
+        for pose, first in product(self.poses, range(0, len(values), BATCH)):
+            part = np.arange(first, first + BATCH).clip(max=len(values) - 1)  # of one program
+            given = self.structure, self.place, self.case, np.array(pose), values[part]
+            whole, codes = jax.tree.map(np.asarray, _plant_batch(*given))
+            for i in np.flatnonzero(codes == status.OK):  # the others are refused when needed
+                found[part[i]][pose] = PlantAt(jax.tree.map(lambda x, i=i: x[i], whole), None)
         return found
 
     def keep(self, values: np.ndarray, plants: dict[Pose, PlantAt]) -> None:

@@ -62,7 +62,7 @@ def next_experiments(
         except StudyError:  # the fitted machine does not reach it
             continue
         for text, slope in _candidates(bench, plant):
-            by = slope * slopes
+            by = slope[np.isfinite(slope).all(axis=1)] * slopes
             after = np.linalg.inv(known + (by.conj().T @ by).real)
             found.append(Experiment(pose, text, float(np.sqrt(np.linalg.eigvalsh(after)[-1]))))
     return sorted(found, key=lambda x: x.widest)
@@ -120,7 +120,11 @@ def _pairs(bench: Bench) -> list[tuple[Signal, Signal]]:
 
 
 def _about_modes(plant: PlantAt) -> np.ndarray:
-    """Frequencies [Hz] that are dense about the first modes."""
+    """Frequencies [Hz] that are dense about the first modes, none at a mode itself.
+
+    There, a machine without damping has no response.
+    """
     modes = np.abs(plant.eigen.pole[plant.eigen.upper[:COVERED]]) / (2 * np.pi)
-    each = np.concatenate([f * np.linspace(0.85, 1.15, POINTS // len(modes)) for f in modes])
+    count = POINTS // len(modes) // 2 * 2
+    each = np.concatenate([f * np.linspace(0.85, 1.15, count) for f in modes])
     return np.unique(each)

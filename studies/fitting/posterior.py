@@ -52,6 +52,12 @@ class Shape(NamedTuple):
         z = np.random.default_rng(seed).normal(size=(count, len(self.middle)))
         return np.asarray(expit(self.middle + z @ self.root.T))
 
+    def log_density(self, u: np.ndarray) -> np.ndarray:
+        """Logarithm of the density of places between the bounds, (n, p), up to a constant."""
+        v = logit(u)
+        z = np.linalg.solve(self.root, (v - self.middle).T)
+        return -0.5 * np.sum(z**2, axis=0) - np.sum(_log_width(v), axis=1)
+
 
 def shape(answer: Answer) -> Shape:
     """Shape of the posterior, from the model's derivatives at the optimum."""

@@ -1,4 +1,8 @@
-"""Profile likelihoods: how much worse the fit becomes as one number is held elsewhere."""
+"""Profile likelihoods: how much worse the fit becomes as one parameter is held elsewhere.
+
+They also confirm what is identifiable: where two frequencies coincide, chi square has a kink, and
+its derivatives say nothing about what splits them.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +14,14 @@ from scipy.interpolate import PchipInterpolator
 from studies.errors import StudyError
 from studies.fitting.problem import Problem
 from studies.fitting.solve import follow
-from studies.fitting.statistics import WIDE
+from studies.fitting.statistics import WIDE, Answer, describe_fit
 
 #: Profiles go on by this many standard deviations, at most so many times, until so large a rise.
-STRIDE, STEPS, ENOUGH = 0.7, 14, 6.0
+STRIDE, STEPS, ENOUGH = 0.7, 20, 6.0
+#: A step that rises by more is taken back and shortened.
+FAR = 2 * ENOUGH
+#: Profiles correct derivatives that promise this many times the standard deviation, or more [1].
+WRONG = 1.5
 #: Places closer than this are one [1].
 NEXT = 1e-9
 
@@ -24,6 +32,11 @@ class Likelihood(NamedTuple):
     number: int
     values: np.ndarray  # ascending, (n,)
     rise: np.ndarray  # of chi square above its least, (n,)
+
+    @property
+    def ends(self) -> int:
+        """Sides on which the data end it, 0 to 2."""
+        return int(self.rise[0] >= WIDE**2) + int(self.rise[-1] >= WIDE**2)
 
     def smooth(self) -> tuple[np.ndarray, np.ndarray]:
         """Values and rises between those that were tried, for figures."""
@@ -48,31 +61,75 @@ class Likelihood(NamedTuple):
         return ends[0], ends[1]
 
 
-def profile(problem: Problem, u: np.ndarray, number: int, sigma: float) -> Likelihood:
-    """Profile the likelihood of one free number, to 95 % or the bounds.
+def describe_confirmed(
+    problem: Problem, u: np.ndarray, has_all: bool
+) -> tuple[Answer, tuple[Likelihood, ...]]:
+    """Statistics at an optimum of which profiles agree with what they say is identifiable.
 
     Args:
         problem: what was fitted.
         u: the optimum, (p,).
-        number: which free number.
-        sigma: its standard deviation between the bounds [1].
+        has_all: profile all parameters; otherwise those that lead a direction without information.
+    """
+    answer, known = describe_fit(problem, u), {}
+    found: dict[int, Likelihood] = {}
+    wanted = list(range(len(u))) if has_all else _leading(answer)
+    while wanted:
+        for k in wanted:
+            sigma = float(np.sqrt(answer.covariance[k, k]))
+            found[k] = profile(problem, u, k, sigma)
+            told = _told(found[k], problem, u)
+            if np.isinf(told) or told * WRONG < sigma:
+                known[k] = told
+        answer = describe_fit(problem, u, known)
+        wanted = [k for k in _leading(answer) if k not in found]
+    interval = answer.interval.copy()
+    for k, one in found.items():
+        if len(one.values) > 2:
+            interval[k] = one.interval()
+    return answer._replace(interval=interval), tuple(found[k] for k in sorted(found))
+
+
+def _leading(answer: Answer) -> list[int]:
+    return sorted({x.named()[0] for x in answer.undetermined})
+
+
+def _told(one: Likelihood, problem: Problem, u: np.ndarray) -> float:
+    """Standard deviation between the bounds that a profile says [1]; inf if it has no end."""
+    if not one.ends:
+        return np.inf
+    low, high = one.interval()
+    return (high - low) / (one.ends * WIDE * abs(float(problem.free.slopes(u)[one.number])))
+
+
+def profile(problem: Problem, u: np.ndarray, number: int, sigma: float) -> Likelihood:
+    """Profile the likelihood of one parameter, to 95 % or the bounds.
+
+    Args:
+        problem: what was fitted.
+        u: the optimum, (p,).
+        number: which parameter.
+        sigma: its standard deviation between the bounds [1], the scale of the first step.
     """
     others = np.delete(np.arange(len(u)), number)
     least = float(np.sum(problem.residual(u) ** 2))
     found = [(float(u[number]), 0.0)]
     for way in (1, -1):
-        at = u.copy()
-        for k in range(1, STEPS + 1):
-            at = at.copy()
-            at[number] = np.clip(u[number] + way * k * STRIDE * sigma, 0.0, 1.0)
-            if min(abs(at[number] - x) for x, _ in found) < NEXT:  # at the bound already
+        at, stride = u, way * STRIDE * sigma
+        for _ in range(STEPS):
+            trial = _with(at, number, float(np.clip(at[number] + stride, 0.0, 1.0)))
+            if abs(trial[number] - at[number]) < NEXT:  # at the bound already
                 break
             try:
                 if len(others):
-                    at[others] = follow(problem, at, others, 15, 1e-6).x
-                rise = float(np.sum(problem.residual(at) ** 2)) - least
+                    trial[others] = follow(problem, trial, others, 15, 1e-6).x
+                rise = float(np.sum(problem.residual(trial) ** 2)) - least
             except (StudyError, np.linalg.LinAlgError, ValueError):
                 break  # out of where the model works
+            if rise > FAR:
+                stride = (trial[number] - at[number]) * np.clip(np.sqrt(2 / rise), 0.02, 0.5)
+                continue
+            at = trial
             found.append((float(at[number]), rise))
             if rise > ENOUGH or not 0 < at[number] < 1:
                 break

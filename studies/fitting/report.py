@@ -9,7 +9,7 @@ import numpy as np
 from studies.fitting.kinds.contract import Line
 from studies.fitting.plots import MOST
 from studies.fitting.spec import number_unit
-from studies.fitting.statistics import UNKNOWN, Direction, Misfit
+from studies.fitting.statistics import REGION, UNKNOWN, Answer, Direction, Misfit, region_rise
 from studies.show.markdown import literal
 from studies.show.templates import render
 
@@ -20,16 +20,18 @@ if TYPE_CHECKING:
 SHOWN = 5
 #: Correlations from this size on are named [1].
 STRONG = 0.95
+#: The verdict on a fit without a fault.
+GOOD = "The model explains the data within their noise, and every parameter is identifiable."
 
 
 def summary(found: Fitted) -> str:
-    """Some lines: the values, and what is wrong with them."""
+    """Some lines: the verdict, the values, and what else is to be known of them."""
+    verdict, *others = [GOOD] * is_good(found) + sentences(found)
     lines = [
         f"{name} = {value} +- {sigma} {unit} (95 %: {interval})".replace("  ", " ")
         for name, value, sigma, unit, interval, _ in _rows(found)
     ]
-    lines += sentences(found)
-    return "\n".join(lines)
+    return "\n".join([verdict, *lines, *others])
 
 
 def report(found: Fitted) -> str:
@@ -50,9 +52,11 @@ def report(found: Fitted) -> str:
         widest=" and ".join(found.names[k] for k in found.answer.directions[0].named()),
         lines=sum(isinstance(x.part, Line) for x in found.comparisons),
         kept=sum(not x.is_checked for x in found.comparisons),
-        is_good=is_good(found),
+        verdict=GOOD if is_good(found) else "",
         has_entries=any("[" in name for name in found.names),
         most=MOST,
+        region=REGION,
+        limit=region_rise(len(found.names)),
     )
 
 
@@ -78,7 +82,7 @@ def _rows(found: Fitted) -> list[list[str]]:
         at = "interval ends at a bound" if np.isclose([low, high], ends, rtol=1e-9).any() else ""
         at = "at its bound" if _is_at_bound(u[k]) else at
         if found.answer.sigma[k] >= 0.99 * UNKNOWN * abs(found.spec.free.slopes(u)[k]):
-            at = "not determined"
+            at = "not identifiable"
         rows.append(
             [
                 name,
@@ -100,18 +104,9 @@ def _digits(value: float, sigma: float) -> int:
 
 
 def sentences(found: Fitted) -> list[str]:
-    """What a reader must know before he uses the values."""
-    answer, lines = found.answer, []
-    if not answer.is_explained:
-        bad = [x for x in answer.misfits if not x.is_noise]
-        bad.sort(key=lambda x: -x.square / max(x.size, 1))
-        which = f" Not met: {'; '.join(cell(x.name) for x in bad)}." if bad else ""
-        lines.append(
-            f"The model does not explain the data: chi square is {answer.chi_square:.4g} with "
-            f"{answer.freedom} degrees of freedom.{which} Uncertainties assume a right model and "
-            "are too small here; look at the residuals, at the model's bases and modes, and at "
-            "the stated noise."
-        )
+    """What a reader must know before he uses the values, the gravest first."""
+    answer = found.answer
+    lines = [*_rivals(found), *_unexplained(answer)]
     if answer.freedom == 0:
         lines.append(
             "There are as many unknowns as data: they are met whatever the model, which is not "
@@ -123,10 +118,7 @@ def sentences(found: Fitted) -> list[str]:
             f"{answer.chi_square:.3g} with {answer.freedom} degrees of freedom. The stated noise "
             "is too large, and so are the uncertainties."
         )
-    lines += undetermined(found)
-    if not answer.undetermined:
-        lines += _correlated(found)
-    lines += _at_bounds(found)
+    lines += [*undetermined(found), *_correlated(found), *_at_bounds(found)]
     lines += [cell(x) + "." for x in found.unpredicted]
     if found.fault:
         lines.append(f"The fitted study does not run as it is: {found.fault}.")
@@ -138,16 +130,60 @@ def sentences(found: Fitted) -> list[str]:
         )
     if not found.solution.best.is_converged:
         lines.append("The search ended before it converged; raise fit.iterations.")
+    if found.experiment_fault:
+        lines.append(f"No next experiment was found: {found.experiment_fault}.")
     return lines
 
 
+def _rivals(found: Fitted) -> list[str]:
+    """That other optima are as good, and where the nearest is."""
+    if not found.rivals:
+        return []
+    first, values = found.rivals[0], found.problem.free.values(found.rivals[0].u)
+    low, high = found.answer.interval.T
+    moved = np.flatnonzero((values < low) | (values > high))
+    other = ", ".join(f"{found.names[k]} = {values[k]:.5g}" for k in moved)
+    count = len(found.rivals)
+    optima = f"{count} other optima lie" if count > 1 else "another optimum lies"
+    what = "the best of them with" if count > 1 else "with"
+    samples = " Samples are drawn about the best optimum alone." if found.posterior else ""
+    return [
+        f"Not identifiable: {optima} in the data's region of {100 * REGION:g} %, {what} {other} "
+        f"(chi square rises by {found.solution.rise(first):.2g}; see the other optima). Measure "
+        f"something in which they differ, at another pose or with shapes.{samples}"
+    ]
+
+
+def _unexplained(answer: Answer) -> list[str]:
+    """Measurements whose residuals are not the stated noise."""
+    lines = []
+    bad = [x for x in answer.misfits if not x.is_noise and not x.is_correlated]
+    if bad or not (answer.is_explained or answer.correlated):
+        bad.sort(key=lambda x: -x.square / max(x.size, 1))
+        which = f" Not met: {'; '.join(cell(x.name) for x in bad)}." if bad else ""
+        lines.append(
+            f"The model does not explain the data: chi square is {answer.chi_square:.4g} with "
+            f"{answer.freedom} degrees of freedom.{which} Uncertainties assume a right model and "
+            "are too small here; look at the residuals, at the model's bases and modes, and at "
+            "the stated noise."
+        )
+    return lines + [
+        f"The noise of {cell(one.name)} is correlated from one value to the next "
+        f"({one.likeness:.2f}), as of data sampled faster than their noise changes: the values are "
+        f"not independent, and uncertainties are about {one.understated:.2g} times those given "
+        "here. Take fewer values, further apart."
+        for one in answer.correlated
+    ]
+
+
 def is_good(found: Fitted) -> bool:
-    """Whether the model explains the data, and they determine all numbers."""
+    """Whether the model explains the data, and they identify all parameters."""
     answer = found.answer
     is_tested = answer.freedom > 0 and not answer.is_too_close
     is_inside = not any(_is_at_bound(u) for u in found.solution.best.u)
-    is_found = found.solution.best.is_converged and is_inside and not answer.undetermined
-    return answer.is_explained and is_tested and is_found
+    is_found = found.solution.best.is_converged and is_inside
+    is_identified = not answer.undetermined and not found.rivals
+    return answer.is_explained and is_tested and is_found and is_identified
 
 
 def _at_bounds(found: Fitted) -> list[str]:
@@ -168,29 +204,34 @@ def _at_bounds(found: Fitted) -> list[str]:
 
 
 def undetermined(found: Fitted) -> list[str]:
-    """Sentences on numbers that cannot be told apart; directions that share some are one group."""
+    """Sentences on parameters that are not identifiable, group by group."""
+    lines = []
+    for names, members in _groups(found.answer):
+        if len(members) == 1:
+            lines.append(told(members[0], found.names))
+            continue
+        if len(names) == len(members):
+            lines.append(f"{_listed(found, names)} are not identifiable from these data.")
+            continue
+        count = len(names) - len(members)
+        lines.append(
+            f"{_listed(found, names)} are not identifiable from these data, which determine "
+            f"{count} combination{'s' if count > 1 else ''} of these {len(names)} parameters. Fix "
+            f"{len(members)} of them, or state what is known by mean and sigma."
+        )
+    return lines
+
+
+def _groups(answer: Answer) -> list[tuple[set[int], list[Direction]]]:
+    """Directions that are not identifiable, and their parameters; those that share some are one."""
     groups: list[tuple[set[int], list[Direction]]] = []
-    for one in found.answer.undetermined:
+    for one in answer.undetermined:
         names, members = set(one.named()), [one]
         for other in [x for x in groups if x[0] & names]:
             names, members = names | other[0], [*other[1], *members]
             groups.remove(other)
         groups.append((names, members))
-    lines = []
-    for names, members in groups:
-        if len(members) == 1:
-            lines.append(told(members[0], found.names))
-            continue
-        if len(names) == len(members):
-            lines.append(f"{_listed(found, names)} are not determined by these data.")
-            continue
-        count = len(names) - len(members)
-        lines.append(
-            f"{_listed(found, names)} cannot be told apart by these data, which "
-            f"determine {count} combination{'s' if count > 1 else ''} of these {len(names)} "
-            f"numbers. Fix {len(members)} of them, or state what is known by mean and sigma."
-        )
-    return lines
+    return groups
 
 
 def _listed(found: Fitted, names: set[int]) -> str:
@@ -203,26 +244,27 @@ def told(direction: Direction, names: tuple[str, ...]) -> str:
     """What the data do not tell."""
     parts = direction.named()
     if len(parts) == 1:
-        return f"{names[parts[0]]} is not determined by these data."
+        return f"{names[parts[0]]} is not identifiable from these data."
     sign = [("up" if direction.parts[k] > 0 else "down") for k in parts]
     moves = ", ".join(f"{names[k]} {s}" for k, s in zip(parts, sign, strict=True))
     listed = " and ".join([", ".join(names[k] for k in parts[:-1]), names[parts[-1]]])
     return (
-        f"{listed} cannot be told apart by these data: moved together ({moves}), they change the "
-        "model's answers by less than the noise. Measure something else, "
+        f"{listed} are not identifiable from these data: moved together ({moves}), they change "
+        "the model's answers by less than the noise. Measure something else, "
         "fix one, or state what is known of it by mean and sigma."
     )
 
 
 def _correlated(found: Fitted) -> list[str]:
-    """Pairs that are determined, but hardly apart."""
+    """Pairs that are hardly apart, but for those of one group that is not identifiable."""
     matrix, names = found.answer.correlation, found.names
+    groups = [x for x, _ in _groups(found.answer)]
     return [
         f"{names[k]} and {names[i]} are strongly correlated ({matrix[i, k]:.3f}): a combination of "
         "both is known much better than either."
         for i in range(len(matrix))
         for k in range(i)
-        if abs(matrix[i, k]) > STRONG
+        if abs(matrix[i, k]) > STRONG and not any({i, k} <= x for x in groups)
     ]
 
 
@@ -259,11 +301,10 @@ def _single(found: Fitted) -> list[list[str]]:
 
 def _others(found: Fitted) -> list[list[str]]:
     """Optima elsewhere, with the rise of their chi square."""
-    least = found.solution.best.cost
     rows: list[list[str]] = []
     for one in found.solution.others:
         values = found.spec.free.values(one.u)
-        rows.append([f"{2 * (one.cost - least):.3g}", *(f"{x:.4g}" for x in values)])
+        rows.append([f"{found.solution.rise(one):.3g}", *(f"{x:.4g}" for x in values)])
     return rows
 
 

@@ -12,24 +12,25 @@ from rich.console import Console
 from studies.engine.runs import check_run, run_attributes
 from studies.errors import StudyError
 from studies.fitting import plots
+from studies.fitting.draw import draw_machines
 from studies.fitting.experiment import Experiment, next_experiments
 from studies.fitting.kinds.contract import DataAndModel, Line, Measurement
 from studies.fitting.measurements import guess, make_bench, make_measurements
 from studies.fitting.posterior import Posterior, load_blackjax, sample, shape
 from studies.fitting.problem import Problem, complaints
-from studies.fitting.profiles import Likelihood, profile
+from studies.fitting.profiles import Likelihood, describe_confirmed
 from studies.fitting.report import is_good, report, sentences, summary
-from studies.fitting.solve import Solution, solve
+from studies.fitting.solve import Optimum, Solution, solve
 from studies.fitting.spec import FitSpec
-from studies.fitting.statistics import Answer, Misfit, describe_fit, misfit
+from studies.fitting.statistics import REGION, Answer, Misfit, misfit, rivals
 from studies.show import figures
 from studies.show.pages import write_report
-from studies.store import Variable, check_folder, staged, write_store
+from studies.store import Variable, check_folder, replacing, staged, write_store
 from studies.study.paths import set_values
 from studies.study.spec import Study, parse_study
 from studies.study.template import study_template
 
-#: Free numbers up to which likelihoods are profiled.
+#: Parameters up to which all likelihoods are profiled.
 PROFILED = 6
 #: Machines in the file of a tuning.
 MACHINES = 64
@@ -43,20 +44,24 @@ class Fitted(NamedTuple):
     """A finished fit."""
 
     spec: FitSpec
+    problem: Problem
     solution: Solution
     answer: Answer
-    study: Study  # with the fitted numbers
+    rivals: tuple[Optimum, ...]  # as good as the best one, and elsewhere
+    machines: np.ndarray  # drawn from what the data leave possible, in the study's units, (n, p)
+    study: Study  # with the fitted parameters
     comparisons: tuple[DataAndModel, ...]  # of all measurements
     checks: tuple[Misfit, ...]  # of those held out
     unpredicted: tuple[str, ...]  # why others held out are not among them
     profiles: tuple[Likelihood, ...]
     posterior: Posterior | None  # if samples were asked for
     fault: str  # why the fitted study does not run, "" if it does
-    experiments: tuple[Experiment, ...]  # the most telling first; none if the model fails
+    experiments: tuple[Experiment, ...] = ()  # the most telling first; none if the model fails
+    experiment_fault: str = ""  # why none was found
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the free numbers."""
+        """Names of the parameters."""
         return self.spec.free.names
 
 
@@ -68,69 +73,97 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
         console: where progress goes; default: nowhere.
 
     Raises:
-        StudyError: data that cannot be used, or no first guess that leads to a fit.
+        StudyError: data that cannot be used, or no starting point that leads to a fit.
     """
     console = console or Console(quiet=True)
-    fit, free = spec.fit, spec.free
+    return suggest(estimate(spec, console), console)
+
+
+def estimate(spec: FitSpec, console: Console) -> Fitted:
+    """Fit a model to measurements, without the next experiment.
+
+    Raises:
+        StudyError: as `fit`.
+    """
+    fit = spec.fit
     if fit.samples:
         load_blackjax()
     bench = make_bench(spec)
     every = make_measurements(spec, bench)
     kept = tuple(x for x in every if not x.is_checked)
     complaints(kept, guess(spec))
-    checks = [x for x in every if x.is_checked]
     problem = Problem(
-        free=free,
+        free=spec.free,
         priors=spec.priors,
         measurements=kept,
         bench=bench,
         is_robust=fit.loss == "robust",
     )
-    u = free.places()
-    first = problem.residual(u)
-    if not np.isfinite(np.sum(first**2)):
-        raise StudyError(
-            "fit.data: squared residuals of the first guess overflow; allowed: data and noise "
-            "within many orders of magnitude of the model"
-        )
-    count = len(first) - len(spec.priors)
-    _check_enough(count, len(u), len(spec.priors))
-    console.print(f"{count} measured numbers, {len(u)} free; rating {fit.starts} starts")
+    _check(problem, console, fit.starts)
     solution = solve(problem, fit.starts, fit.refine, fit.iterations, fit.seed)
-    answer = describe_fit(problem, solution.best.u)
-    checks, unpredicted = _predictable(checks, answer.values)
-    profiles: list[Likelihood] = []
-    if fit.profile and len(u) <= PROFILED:
-        console.print("profiling the likelihood")
-        sigma = np.sqrt(np.diag(answer.covariance))
-        profiles = [profile(problem, solution.best.u, k, sigma[k]) for k in range(len(u))]
-        found = [x.interval() if len(x.values) > 2 else answer.interval[x.number] for x in profiles]
-        answer = answer._replace(interval=np.array(found))
+    console.print("profiling the likelihood")
+    has_all = fit.profile and len(spec.free.numbers) <= PROFILED
+    answer, profiles = describe_confirmed(problem, solution.best.u, has_all)
+    console.print(f"drawing {MACHINES} machines")
+    places = draw_machines(problem, solution, MACHINES, fit.seed)
     posterior = None
     if fit.samples:
         console.print(f"drawing {fit.samples} samples")
         posterior = sample(problem, shape(answer), fit.samples, fit.seed)
-    experiments: list[Experiment] = []
-    if answer.is_explained:  # a wrong model does not know what it would learn
-        console.print("looking for the next experiment")
-        experiments = next_experiments(bench, free, solution.best.u, answer.covariance)
+    checks, unpredicted = _predictable([x for x in every if x.is_checked], answer.values)
     study = parse_study(set_values(spec.study, _numbers(spec, answer.values)))
     return Fitted(
         spec=spec,
+        problem=problem,
         solution=solution,
         answer=answer,
+        rivals=rivals(problem, solution, answer),
+        machines=problem.free.values(places),
         study=study,
         comparisons=tuple(
             DataAndModel(x.name, x.is_checked, x.comparison(answer.values))
             for x in (*kept, *checks)
         ),
         checks=tuple(misfit(x, x.residual(answer.values, False)) for x in checks),
-        profiles=tuple(profiles),
         unpredicted=unpredicted,
+        profiles=profiles,
         posterior=posterior,
         fault=_fault(study),
-        experiments=tuple(experiments),
     )
+
+
+def suggest(found: Fitted, console: Console) -> Fitted:
+    """The same with the next experiment, or with the reason why there is none."""
+    if not found.answer.is_explained:  # a wrong model does not know what it would learn
+        return found
+    console.print("looking for the next experiment")
+    given = found.problem.bench, found.problem.free, found.answer.place, found.answer.covariance
+    try:
+        return found._replace(experiments=tuple(next_experiments(*given)))
+    except (StudyError, ArithmeticError, ValueError) as error:  # LinAlgError is a ValueError
+        return found._replace(experiment_fault=str(error))
+
+
+def _check(problem: Problem, console: Console, starts: int) -> None:
+    """Refuse data too large or too few for the parameters.
+
+    Raises:
+        StudyError: naming what is allowed.
+    """
+    first = problem.residual(problem.free.places())
+    if not np.isfinite(np.sum(first**2)):
+        raise StudyError(
+            "fit.data: squared residuals of the first guess overflow; allowed: data and noise "
+            "within many orders of magnitude of the model"
+        )
+    size, priors = len(problem.free.numbers), len(problem.priors)
+    count = len(first) - priors
+    if count + priors < size:
+        raise StudyError(
+            f"fit: {count} measured numbers and {priors} known beforehand for {size} parameters; "
+            "allowed: as many or more. Fix some, or give mean and sigma of what is known"
+        )
+    console.print(f"{count} measured numbers, {size} parameters; {starts} starting points")
 
 
 def _predictable(
@@ -159,14 +192,6 @@ def _fault(study: Study) -> str:
     return ""
 
 
-def _check_enough(count: int, numbers: int, priors: int) -> None:
-    if count + priors < numbers:
-        raise StudyError(
-            f"fit: {count} measured numbers and {priors} known beforehand for {numbers} free "
-            "numbers; allowed: as many or more. Fix some, or give mean and sigma of what is known"
-        )
-
-
 def _numbers(spec: FitSpec, values: np.ndarray) -> dict[str, float]:
     return {x.name: float(v) for x, v in zip(spec.free.numbers, values, strict=True)}
 
@@ -187,21 +212,22 @@ def run_fit(
     """
     out, console = Path(out), console or Console(highlight=False, markup=False)
     check_folder(out)
-    found = fit(spec, console)
+    found = estimate(spec, console)
     try:
         out.mkdir(parents=True, exist_ok=True)
         with staged(out) as staging:
             drawn = _draw(staging, found, has_pdf)
             (staging / STUDY).write_text(study_template(found.study), encoding="utf-8")
             (staging / TUNE).write_text(_tuning(found), encoding="utf-8")
-            (staging / DOCUMENT).write_text(document(found), encoding="utf-8")
             write_store(staging / DATA, variables(found), run_attributes(found.study))
-            write_report(staging, report(found), found.study)
+            _present(staging, found)
         for name in plots.NAMES:  # of an earlier fit
             if name not in drawn:
                 (out / f"{name}.png").unlink(missing_ok=True)
             if name not in drawn or not has_pdf:
                 (out / f"{name}.pdf").unlink(missing_ok=True)
+        found = suggest(found, console)
+        _present(out, found)
     except OSError as error:
         raise StudyError(f"--out {out}: cannot write there ({error})") from error
     console.print(summary(found), soft_wrap=True)
@@ -211,6 +237,13 @@ def run_fit(
         soft_wrap=True,
     )
     return found
+
+
+def _present(folder: Path, found: Fitted) -> None:
+    """Write the answer in words, beside its figures."""
+    with replacing(folder / DOCUMENT) as file:
+        file.write_text(document(found), encoding="utf-8")
+    write_report(folder, report(found), found.study)
 
 
 def _draw(folder: Path, found: Fitted, has_pdf: bool) -> list[str]:
@@ -224,16 +257,10 @@ def _draw(folder: Path, found: Fitted, has_pdf: bool) -> list[str]:
 
 
 def machines(found: Fitted) -> dict[str, list[float]]:
-    """Machines as the data leave them possible: by free number, its value on each of them."""
-    answer, free = found.answer, found.spec.free
-    if found.posterior is not None:
-        at = np.linspace(0, len(found.posterior.values) - 1, MACHINES).astype(int)
-        values = found.posterior.values[at]
-    else:
-        values = free.values(shape(answer).draw(MACHINES, found.spec.fit.seed))
+    """Machines as the data leave them possible: by parameter, its value on each of them."""
     return {
-        name: [float(f"{x:.6g}") for x in column]
-        for name, column in zip(found.names, values.T, strict=True)
+        name: [float(f"{x:.9g}") for x in column]
+        for name, column in zip(found.names, found.machines.T, strict=True)
         if not name.startswith("control.")  # which is free below
     }
 
@@ -254,7 +281,8 @@ def _tuning(found: Fitted) -> str:
         "[tune.free]\n"
         f'"control.gain_factor" = {{ from = {0.2 * gain:g}, to = {2 * gain:g} }}\n'
         f"{limits}\n"
-        "# Machines that the data leave possible, drawn with all correlations. The controller\n"
+        "# Machines that the data leave possible: chi square of each is within their region of\n"
+        f"# {100 * REGION:g} %, about all equally good optima. The controller\n"
         "# knows link.youngs_modulus of each machine; fit link.stiffness_factor for what it does\n"
         "# not know.\n"
         f"{_warning(found)}"
@@ -274,7 +302,7 @@ def _warning(found: Fitted) -> str:
 
 def document(found: Fitted) -> str:
     """JSON text of the answer."""
-    answer = found.answer
+    answer, free = found.answer, found.spec.free
     numbers = [
         {
             "name": name,
@@ -297,6 +325,10 @@ def document(found: Fitted) -> str:
         "numbers": numbers,
         "undetermined": [
             {found.names[k]: float(x.parts[k]) for k in x.named()} for x in answer.undetermined
+        ],
+        "equally_good": [
+            {"rise": found.solution.rise(x), "values": _numbers(found.spec, free.values(x.u))}
+            for x in found.rivals
         ],
         "correlation": answer.correlation.tolist(),
         "held_out": [

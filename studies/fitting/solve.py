@@ -1,9 +1,11 @@
-"""Many first guesses, rated in one batch; the best are followed by SciPy's trust region method."""
+"""Multi-start: rated in one batch, the best are followed by SciPy's trust region method."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from itertools import permutations, product
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
@@ -11,17 +13,21 @@ from scipy.stats import qmc
 
 from studies.errors import StudyError
 from studies.fitting.problem import Problem
+from studies.space.free import Free
+from studies.study.paths import parse_entry
 
 #: Optima closer than this in the unit cube are the same [1].
 SAME = 1e-3
-#: Distance kept from the bounds by first guesses [1].
+#: Exchanges closer than this share of the links' spread are the same [1].
+ALIKE = 0.1
+#: Distance kept from the bounds by starting points [1].
 INSIDE = 1e-3
 #: Distance from the bounds at which optima are looked for once more [1].
 AWAY = 0.02
 
 
 class Optimum(NamedTuple):
-    """Where one first guess led."""
+    """Where one starting point led."""
 
     u: np.ndarray  # place between the bounds, (p,)
     cost: float  # half the sum of the loss
@@ -29,10 +35,10 @@ class Optimum(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """All optima, the best first."""
+    """All optima, the best first; each is another place."""
 
     optima: tuple[Optimum, ...]
-    rated: int  # first guesses
+    rated: int  # starting points
 
     @property
     def best(self) -> Optimum:
@@ -42,21 +48,28 @@ class Solution(NamedTuple):
     @property
     def others(self) -> tuple[Optimum, ...]:
         """Optima elsewhere."""
-        return tuple(x for x in self.optima if np.abs(x.u - self.best.u).max() > SAME)
+        return self.optima[1:]
+
+    def rise(self, one: Optimum) -> float:
+        """Of chi square at an optimum above that at the best one."""
+        return 2 * (one.cost - self.best.cost)
 
 
 def solve(problem: Problem, starts: int, refine: int, iterations: int, seed: int) -> Solution:
-    """Fit.
+    """Fit by multi-start.
+
+    Links that are much alike can be exchanged for one another with hardly a change in the data, so
+    that each optimum's exchanges are starting points, too.
 
     Args:
         problem: the residuals.
-        starts: first guesses; the first is the study's own.
+        starts: starting points; the first is the study's own.
         refine: how many of them are followed.
         iterations: evaluations of each.
-        seed: of the first guesses.
+        seed: of the starting points.
 
     Raises:
-        StudyError: no first guess has residuals.
+        StudyError: no starting point has residuals.
     """
     own = problem.free.places()
     sobol = qmc.Sobol(len(own), seed=seed)
@@ -64,39 +77,82 @@ def solve(problem: Problem, starts: int, refine: int, iterations: int, seed: int
     first = np.clip(np.vstack([own[None], drawn]), INSIDE, 1 - INSIDE)
     cost = problem.costs(first)
     if not np.isfinite(cost).any():
-        raise StudyError("the model fails at every first guess; see the study and the bounds")
+        raise StudyError("the model fails at every starting point; see the study and the bounds")
     kept = [0] if np.isfinite(cost[0]) else []
     kept += [int(k) for k in np.argsort(cost) if np.isfinite(cost[k]) and k != 0]
-    found = []
-    for k in kept[:refine]:
-        with suppress(StudyError, np.linalg.LinAlgError, ValueError):  # leaves where it works
-            found.append(descend(problem, first[k], iterations))
+    found = descend_all(problem, first[kept[:refine]], iterations)
     if not found:
-        raise StudyError("no first guess leads to a fit: each leaves where the model works")
-    best = min(found, key=lambda x: x.cost)
+        raise StudyError("no starting point leads to a fit: each leaves where the model works")
+    found = distinct(found)
+    images = exchanges(problem.free.numbers, [x.u for x in found])
+    found = distinct(found + descend_all(problem, images, iterations))
     for one in problem.measurements:
-        one.reweigh(problem.free.values(best.u))
+        one.reweigh(problem.free.values(found[0].u))
     # away from the bounds, along which the method may have crept
     inner = [np.clip(x.u, AWAY, 1 - AWAY) for x in found]
-    followed, found = found, []
-    for u in inner:
-        with suppress(StudyError, np.linalg.LinAlgError, ValueError):
-            found.append(descend(problem, u, iterations))
-    found = found or followed
-    found.sort(key=lambda x: x.cost)
+    found = distinct(descend_all(problem, inner, iterations) or found)
     return Solution(tuple(found), len(first))
 
 
+def exchanges(numbers: Sequence[Free], places: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Further places, with the links' parameters permuted among the links or mirrored.
+
+    Args:
+        numbers: free ones; those of a field of which all three entries are free within the same
+            bounds are exchanged.
+        places: optima between the bounds, each (p,).
+    """
+    fields: dict[tuple[Any, ...], dict[int, int]] = {}
+    for k, one in enumerate(numbers):
+        entry = parse_entry(one.name)
+        if entry is not None and entry.indices:
+            key = entry.field, entry.indices[1:], one.span
+            fields.setdefault(key, {})[entry.indices[0]] = k
+    links = np.array([[x[i] for i in range(3)] for x in fields.values() if set(x) == {0, 1, 2}])
+    found: list[np.ndarray] = []
+    for u in places if len(links) else ():
+        mirrored = np.clip(2 * u[links].mean(axis=1, keepdims=True) - u[links], 0, 1)
+        near = max(SAME, ALIKE * float(np.ptp(u[links], axis=1).max()))
+        for given, order in product((u[links], mirrored), permutations(range(3))):
+            changed = u.copy()
+            changed[links] = given[:, order]
+            if not _is_among(changed, [*places, *found], near):
+                found.append(changed)
+    return found
+
+
+def distinct(optima: Sequence[Optimum]) -> list[Optimum]:
+    """One optimum of each place, the best first."""
+    found: list[Optimum] = []
+    for one in sorted(optima, key=lambda x: x.cost):
+        if not _is_among(one.u, [x.u for x in found]):
+            found.append(one)
+    return found
+
+
+def _is_among(u: np.ndarray, places: Sequence[np.ndarray], near: float = SAME) -> bool:
+    return any(np.abs(u - x).max() <= near for x in places)
+
+
+def descend_all(problem: Problem, first: Sequence[np.ndarray], iterations: int) -> list[Optimum]:
+    """Optima that starting points lead to, without those that leave where the model works."""
+    found = []
+    for u in first:
+        with suppress(StudyError, np.linalg.LinAlgError, ValueError):
+            found.append(descend(problem, u, iterations))
+    return found
+
+
 def descend(problem: Problem, u: np.ndarray, iterations: int) -> Optimum:
-    """The optimum that a first guess leads to.
+    """The optimum that a starting point leads to.
 
     Args:
         problem: the residuals.
-        u: first guess, (p,).
+        u: starting point, (p,).
         iterations: evaluations.
 
     Raises:
-        StudyError: the model fails at the first guess.
+        StudyError: the model fails at the starting point.
     """
     done = follow(problem, u, np.arange(len(u)), iterations, 1e-10)
     return Optimum(done.x, done.cost, done.status > 0)
@@ -111,7 +167,7 @@ def follow(
 
     Args:
         problem: the residuals.
-        u: first guess, (p,).
+        u: starting point, (p,).
         moving: which numbers move, (k,).
         iterations: evaluations.
         tolerance: of the cost, the step and the slope.
@@ -120,7 +176,7 @@ def follow(
         SciPy's result; its `x` are the moving numbers.
 
     Raises:
-        StudyError: the model fails at the first guess.
+        StudyError: the model fails at the starting point.
     """
 
     def whole(x: np.ndarray) -> np.ndarray:

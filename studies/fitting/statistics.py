@@ -1,11 +1,12 @@
-"""What the data say about the free numbers: uncertainty, correlations, and what they cannot tell.
+"""What the data say about the parameters: uncertainty, correlations, and what is not identifiable.
 
-All in the unit cube of the free numbers, in which a number that may be anywhere between its bounds
-has the standard deviation 1/sqrt(12).
+All in the unit cube of the parameters, in which one that may be anywhere between its bounds has the
+standard deviation 1/sqrt(12).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.stats import chi2
 
 from studies.fitting.kinds.contract import Measurement, Residual
 from studies.fitting.problem import Problem
+from studies.fitting.solve import Optimum, Solution
 
 #: Standard deviation of a number of which only the bounds are known [1].
 UNKNOWN = 1 / np.sqrt(12)
@@ -22,6 +24,13 @@ NAMED = 0.25
 UNLIKELY = 1e-3
 #: Of a normal distribution, 95 % lie within this many standard deviations.
 WIDE = 1.959964
+#: Probability of the region of all parameters together in which a machine is possible [1].
+REGION = 0.99
+
+
+def region_rise(p: int) -> float:
+    """Rise of chi square up to which a machine with p parameters is within the data's region."""
+    return float(chi2.ppf(REGION, p))
 
 
 class Direction(NamedTuple):
@@ -44,6 +53,12 @@ class Misfit(NamedTuple):
     square: float  # their sum of squares
     likeness: float  # of neighbours: correlation [1]; 0 for noise, nan if they have no order
     is_noise: bool  # whether the residuals look like the stated noise
+    is_correlated: bool  # no larger than the stated noise, but neighbours are alike
+
+    @property
+    def understated(self) -> float:
+        """Uncertainties over those quoted, as the noise is correlated [1] (first-order process)."""
+        return correlated_scale(self.square / self.size, self.likeness)
 
 
 class Answer(NamedTuple):
@@ -55,13 +70,18 @@ class Answer(NamedTuple):
     interval: np.ndarray  # 95 %, within the bounds, (p, 2)
     correlation: np.ndarray  # (p, p)
     covariance: np.ndarray  # between the bounds [1], (p, p)
-    information: np.ndarray  # J^T J of the residuals by the places, (p, p)
+    information: np.ndarray  # J^T J of the residuals by the places, and of profiles, (p, p)
     push: np.ndarray  # J^T r: slope of half chi square, 0 but for numbers at a bound, (p,)
     directions: tuple[Direction, ...]  # the widest first
     misfits: tuple[Misfit, ...]
     chi_square: float
     freedom: int  # residuals minus determined directions
     probability: float  # of a larger chi square, if the model is right
+
+    @property
+    def correlated(self) -> tuple[Misfit, ...]:
+        """Measurements whose noise is correlated from one value to the next."""
+        return tuple(x for x in self.misfits if x.is_correlated)
 
     @property
     def undetermined(self) -> tuple[Direction, ...]:
@@ -71,7 +91,7 @@ class Answer(NamedTuple):
     @property
     def is_too_close(self) -> bool:
         """Whether the data are met more closely than their noise allows."""
-        if self.freedom == 0 or self.undetermined:
+        if self.freedom == 0 or self.undetermined or not self.is_explained:
             return False
         return bool(chi2.cdf(self.chi_square, self.freedom) < UNLIKELY)
 
@@ -81,18 +101,28 @@ class Answer(NamedTuple):
         return self.probability >= UNLIKELY and all(x.is_noise for x in self.misfits)
 
 
-def describe_fit(problem: Problem, u: np.ndarray) -> Answer:
+def describe_fit(
+    problem: Problem, u: np.ndarray, profiled: Mapping[int, float] | None = None
+) -> Answer:
     """Statistics at an optimum.
 
     Args:
         problem: what was fitted.
         u: the optimum, (p,).
+        profiled: standard deviations between the bounds of parameters about which profiles say
+            more than derivatives, or inf for those that have no end between the bounds.
     """
+    profiled = profiled or {}
     values = problem.free.values(u)
     parts = problem.parts(values, True)
     residual, jacobian = problem.stacked(parts), problem.stacked_slopes(parts, u)
-    covariance, directions = spread(jacobian)
+    told = np.array([np.eye(len(u))[k] / x for k, x in profiled.items()]).reshape(-1, len(u))
+    known = np.vstack([jacobian, told])
+    covariance, directions = spread(known)
+    directions = (*_open(directions, profiled), *directions)
     sigma_u = np.sqrt(np.diag(covariance))
+    for k, x in profiled.items():
+        sigma_u[k] = min(x, UNKNOWN)
     slopes = np.abs(problem.free.slopes(u))
     low, high = (problem.free.values(np.clip(u + k * WIDE * sigma_u, 0, 1)) for k in (-1, 1))
     determined = sum(x.sigma <= UNKNOWN for x in directions)
@@ -106,9 +136,9 @@ def describe_fit(problem: Problem, u: np.ndarray) -> Answer:
         values=values,
         sigma=np.minimum(sigma_u, UNKNOWN) * slopes,
         interval=np.stack([low, high], axis=1),
-        correlation=covariance / np.outer(sigma_u, sigma_u),
+        correlation=covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance))),
         covariance=covariance,
-        information=jacobian.T @ jacobian,
+        information=known.T @ known,
         push=jacobian.T @ residual,
         directions=directions,
         misfits=tuple(
@@ -117,6 +147,31 @@ def describe_fit(problem: Problem, u: np.ndarray) -> Answer:
         chi_square=square,
         freedom=freedom,
         probability=float(chi2.sf(square, freedom)) if freedom else 1.0,
+    )
+
+
+def rivals(problem: Problem, solution: Solution, answer: Answer) -> tuple[Optimum, ...]:
+    """Other optima in the data's region that the intervals of the best one leave out."""
+    limit, found = region_rise(len(answer.values)), []
+    low, high = answer.interval.T
+    for one in solution.others:
+        values = problem.free.values(one.u)
+        is_elsewhere = np.any((values < low) | (values > high))
+        if solution.rise(one) <= limit and is_elsewhere:
+            found.append(one)
+    return tuple(found)
+
+
+def _open(
+    directions: tuple[Direction, ...], profiled: Mapping[int, float]
+) -> tuple[Direction, ...]:
+    """Parameters that profiles do not end, unless the derivatives say so already."""
+    named = {k for x in directions if x.sigma > UNKNOWN for k in x.named()}
+    size = sum(len(x.parts) for x in directions[:1])
+    return tuple(
+        Direction(np.inf, np.eye(size)[k])
+        for k, x in profiled.items()
+        if np.isinf(x) and k not in named
     )
 
 
@@ -153,10 +208,28 @@ def misfit(one: Measurement, part: Residual) -> Misfit:
         likeness = float(np.sum(r[1:] * r[:-1]) / square)
     is_white = np.isnan(likeness) or abs(likeness) < 4 / np.sqrt(n) or square < 0.25 * n
     is_small = chi2.sf(square, n) >= UNLIKELY / 10
+    is_correlated = False
+    if likeness >= 4 / np.sqrt(n):
+        # as many independent squares as these have the same variance as n correlated ones
+        m = n * (1 - likeness**2) / (1 + likeness**2)
+        is_met = chi2.sf(square * m / n, m) >= UNLIKELY / 10
+        is_telling = square >= 0.25 * n or correlated_scale(square / n, likeness) > 1
+        is_correlated = bool(is_met and is_telling)
     return Misfit(
         name=one.name,
         size=n,
         square=square,
         likeness=likeness,
-        is_noise=bool(is_white and is_small),
+        is_noise=bool(is_white and is_small and not is_correlated),
+        is_correlated=is_correlated,
     )
+
+
+def correlated_scale(mean_square: float, likeness: float) -> float:
+    """Standard deviation of a mean over that of as many independent values of variance 1.
+
+    Args:
+        mean_square: of the values [1].
+        likeness: correlation of neighbours [1].
+    """
+    return float(np.sqrt(mean_square * (1 + likeness) / (1 - likeness)))
