@@ -14,10 +14,10 @@ from scipy.interpolate import PchipInterpolator
 from studies.errors import StudyError
 from studies.fitting.problem import Problem
 from studies.fitting.solve import follow
-from studies.fitting.statistics import WIDE, Answer, describe_fit
+from studies.fitting.statistics import UNKNOWN, WIDE, Answer, describe_fit
 
 #: Profiles go on by this many standard deviations, at most so many times, until so large a rise.
-STRIDE, STEPS, ENOUGH = 0.7, 20, 6.0
+STRIDE, STEPS, ENOUGH = 0.7, 30, 6.0
 #: A step that rises by more is taken back and shortened.
 FAR = 2 * ENOUGH
 #: Profiles correct derivatives that promise this many times the standard deviation, or more [1].
@@ -64,34 +64,41 @@ class Likelihood(NamedTuple):
 def describe_confirmed(
     problem: Problem, u: np.ndarray, has_all: bool
 ) -> tuple[Answer, tuple[Likelihood, ...]]:
-    """Statistics at an optimum of which profiles agree with what they say is identifiable.
+    """Statistics at an optimum that agree with profiles on what is identifiable.
 
     Args:
         problem: what was fitted.
         u: the optimum, (p,).
-        has_all: profile all parameters; otherwise those that lead a direction without information.
+        has_all: profile all parameters; otherwise those of directions without information.
     """
     answer, known = describe_fit(problem, u), {}
     found: dict[int, Likelihood] = {}
-    wanted = list(range(len(u))) if has_all else _leading(answer)
-    while wanted:
-        for k in wanted:
-            sigma = float(np.sqrt(answer.covariance[k, k]))
-            found[k] = profile(problem, u, k, sigma)
-            told = _told(found[k], problem, u)
-            if np.isinf(told) or told * WRONG < sigma:
-                known[k] = told
+    for _ in range(len(u)):
+        sigma = np.sqrt(np.diag(answer.covariance))
+        named = {k for x in answer.undetermined for k in x.named()}
+        for k in (set(range(len(u))) if has_all else named) - found.keys():
+            found[k] = profile(problem, u, k, float(sigma[k]))
+        told = {k: _told(x, problem, u) for k, x in found.items()}
+        confirmed = {
+            k
+            for x in answer.undetermined
+            if any(told[i] > UNKNOWN for i in x.named())
+            for k in x.named()
+        }
+        corrected = {
+            k: x
+            for k, x in told.items()
+            if k not in confirmed and k not in known and (np.isinf(x) or x * WRONG < sigma[k])
+        }
+        if not corrected:
+            break
+        known |= corrected
         answer = describe_fit(problem, u, known)
-        wanted = [k for k in _leading(answer) if k not in found]
     interval = answer.interval.copy()
     for k, one in found.items():
         if len(one.values) > 2:
             interval[k] = one.interval()
     return answer._replace(interval=interval), tuple(found[k] for k in sorted(found))
-
-
-def _leading(answer: Answer) -> list[int]:
-    return sorted({x.named()[0] for x in answer.undetermined})
 
 
 def _told(one: Likelihood, problem: Problem, u: np.ndarray) -> float:
@@ -115,7 +122,7 @@ def profile(problem: Problem, u: np.ndarray, number: int, sigma: float) -> Likel
     least = float(np.sum(problem.residual(u) ** 2))
     found = [(float(u[number]), 0.0)]
     for way in (1, -1):
-        at, stride = u, way * STRIDE * sigma
+        at, stride, last = u, way * STRIDE * sigma, 0.0
         for _ in range(STEPS):
             trial = _with(at, number, float(np.clip(at[number] + stride, 0.0, 1.0)))
             if abs(trial[number] - at[number]) < NEXT:  # at the bound already
@@ -129,7 +136,9 @@ def profile(problem: Problem, u: np.ndarray, number: int, sigma: float) -> Likel
             if rise > FAR:
                 stride = (trial[number] - at[number]) * np.clip(np.sqrt(2 / rise), 0.02, 0.5)
                 continue
-            at = trial
+            if np.sqrt(max(rise, 0.0)) - last < STRIDE / 2:
+                stride *= 2
+            at, last = trial, np.sqrt(max(rise, 0.0))
             found.append((float(at[number]), rise))
             if rise > ENOUGH or not 0 < at[number] < 1:
                 break
