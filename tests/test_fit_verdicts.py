@@ -169,12 +169,10 @@ def test_results_are_written_before_experiments_are_sought(exchanged, tmp_path, 
 
 def test_a_machine_without_damping_has_a_next_experiment(monkeypatch):
     """Its response has no value at its modes."""
-    monkeypatch.setattr("studies.fitting.experiment.SHIFT", 0.5)  # home alone is within reach
-    monkeypatch.setattr("studies.fitting.experiment.TURN", 3.0)
+    monkeypatch.setattr("studies.fitting.experiment._poses", lambda _: [tuple(HOME)])
     spec = CASES["no damping"].spec(1)
     bench, _, _ = made(spec)
     found = next_experiments(bench, spec.free, spec.free.places(), 0.01 * np.eye(3))
-    assert {x.pose for x in found} == {tuple(HOME)}
     assert len(found) > 100 and all(0 < x.widest < 0.1 for x in found)
 
 
@@ -224,9 +222,9 @@ def along_a_curve():
     entry = {
         "kind": "modes",
         "ends": "held",
-        "frequency_hz": [114.4, 457.6, 1029.5],
+        "frequency_hz": [114.39, 457.55, 1029.5],
         "sigma_hz": 0.2,
-        "damping_ratio": [0.012, 0.024, 0.0],
+        "damping_ratio": [0.012, 0.0, 0.0],
         "damping_sigma": 1e-3,
     }
     study = {"link": LINK | {"youngs_modulus": 70e9}}
@@ -273,7 +271,7 @@ def test_correlated_noise_is_said_once(tmp_path):
     """Oversampled: neither a wrong model nor too large a noise."""
     entry = {k: v for k, v in RESPONSE.items() if k != "sigma_percent"} | {"sigma": 1e-3}
     blank(tmp_path)
-    spec = spec_of(tmp_path, entry, free=MODULUS, study=machine())
+    spec = spec_of(tmp_path, entry, free=MODULUS, study=machine(), starts=4, refine=1)
     _, (one,), values = made(spec)
     model, rng = one.predicted(values, False)[0], np.random.default_rng(0)
     real, imag = (x + 0.8e-3 * noise_of(0.9, rng, len(x)) for x in (model.real, model.imag))

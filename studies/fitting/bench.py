@@ -74,7 +74,7 @@ class PlantAt:
         is_sound = np.linalg.cond(right) <= WORST_CONDITION
         return Eigen(pole, right, np.linalg.inv(right) if is_sound else None)
 
-    @property
+    @cached_property
     def modes(self) -> Modes:
         """Its oscillating modes.
 

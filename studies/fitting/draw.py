@@ -17,7 +17,7 @@ HALVINGS = 40
 #: Least share of independent machines for which the normal distribution is taken as it is [1].
 ALIKE = 0.5
 #: Moves of every machine otherwise, and the largest factor of one (Goodman and Weare 2010).
-MOVES, FACTOR = 40, 2.0
+MOVES, FACTOR = 30, 2.0
 #: Rise of chi square at one standard deviation from which derivatives are wrong; they promise 1.
 SURPRISING = 4.0
 #: Length along which derivatives are checked at most, between the bounds [1].

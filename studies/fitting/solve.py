@@ -20,6 +20,8 @@ from studies.study.paths import parse_entry
 SAME = 1e-3
 #: Exchanges closer than this share of the links' spread are the same [1].
 ALIKE = 0.1
+#: Exchanges that are followed, over the starting points that are.
+EXCHANGED = 2
 #: Distance kept from the bounds by starting points [1].
 INSIDE = 1e-3
 #: Distance from the bounds at which optima are looked for once more [1].
@@ -64,7 +66,7 @@ def solve(problem: Problem, starts: int, refine: int, iterations: int, seed: int
     Args:
         problem: the residuals.
         starts: starting points; the first is the study's own.
-        refine: how many of them are followed.
+        refine: how many of them are followed, and half of how many exchanges.
         iterations: evaluations of each.
         seed: of the starting points.
 
@@ -85,11 +87,13 @@ def solve(problem: Problem, starts: int, refine: int, iterations: int, seed: int
         raise StudyError("no starting point leads to a fit: each leaves where the model works")
     found = distinct(found)
     images = exchanges(problem.free.numbers, [x.u for x in found])
-    found = distinct(found + descend_all(problem, images, iterations))
+    rated = np.argsort(problem.costs(np.array(images))) if images else []
+    best = [images[k] for k in rated[: EXCHANGED * refine]]
+    found = distinct(found + descend_all(problem, best, iterations))
     for one in problem.measurements:
         one.reweigh(problem.free.values(found[0].u))
     # away from the bounds, along which the method may have crept
-    inner = [np.clip(x.u, AWAY, 1 - AWAY) for x in found]
+    inner = [np.clip(x.u, AWAY, 1 - AWAY) for x in found[: (1 + EXCHANGED) * refine]]
     found = distinct(descend_all(problem, inner, iterations) or found)
     return Solution(tuple(found), len(first))
 
