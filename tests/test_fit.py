@@ -402,7 +402,7 @@ FAULTS = {
     "never settles": (SETTLING | {"band_percent": 0.01}, {}, "does not settle to"),
     "settles elsewhere": (SETTLING | {"output": "slider 1"}, {}, "which settle about 0"),
     "not a number": (RESPONSE, {"real": np.nan}, "column 'real': 1 of 200 entries are no finite"),
-    "another unit": (RESPONSE, {"scale": 1e3}, "times the model at the first guess; expected V/V"),
+    "another unit": (RESPONSE, {"scale": 1e3}, "the model at the starting point; expected V/V"),
     "kilohertz": (RESPONSE, {"frequency": 1e-3}, "check the units"),
     "no column": (RESPONSE | {"imag": "imaginary"}, {}, "no column 'imaginary'"),
     "no file": (RESPONSE | {"file": "none.csv"}, {}, "No such file"),
@@ -635,7 +635,7 @@ def test_spectra_of_few_averages_have_the_residuals_of_their_likelihood(folder):
 def test_what_a_fitted_model_cannot_predict_is_said(folder, tmp_path):
     """Held-out data do not end a finished fit; names are text, not formulas."""
     held_out = MODES | {"name": "far", "pose": [0.2, 0.2, 0.5], "check": True}
-    with pytest.raises(StudyError, match="fit.data"):  # unreachable with the first guess: refused
+    with pytest.raises(StudyError, match="fit.data"):  # unreachable from the start: refused
         fit(spec_of(folder, ONE_MODE, held_out, free=PAIR))
     name = r"$\frac{a}$"
     swapped = RESPONSE | {"name": name, "check": True, "file": "huge.csv"}

@@ -1,13 +1,14 @@
-"""Fits: free numbers of a study from measurements, with their uncertainty.
+"""Fits: parameters of a study from measurements, with their uncertainty.
 
-In: a study with `[fit]`. Out: values with intervals, what the data cannot tell, and the next
-experiment.
+In: a study with `[fit]`. Out: values with intervals, what is not identifiable, machines that the
+data leave possible, and the next experiment.
 
 - Problem: `spec` reads the file, `tables` the files of its data, `signals` names inputs and
   outputs, `measurements` puts them together; `kinds` are the kinds of measurements, `bench` is the
   linear machine they are predicted with.
-- Answer: `problem` stacks the residuals, `solve` finds the least, `statistics`, `profiles` and
-  `posterior` say what is known, `experiment` what to measure next.
+- Answer: `problem` stacks the residuals, `solve` finds the least by multi-start, `statistics`,
+  `profiles` and `posterior` say what is known, `draw` draws machines, `experiment` says what to
+  measure next.
 - `run` leads from the file to the folder, `report` and `plots` present it, `commands` is
   `studies fit`.
 

@@ -1,4 +1,4 @@
-"""The linear machine at the poses of all measurements, with derivatives by the free numbers.
+"""The linear machine at the poses of all measurements, with derivatives by the parameters.
 
 Matrices and their derivatives come from one compiled program; frequencies and responses follow from
 them by linear algebra, whose derivatives are written out.
@@ -61,7 +61,7 @@ class Eigen(NamedTuple):
 
 
 class PlantAt:
-    """A plant at one pose, and its derivatives by the p free numbers."""
+    """A plant at one pose, and its derivatives by the p parameters."""
 
     def __init__(self, value: BenchPlant, slope: BenchPlant | None) -> None:
         """Arguments: matrices as NumPy arrays; their derivatives, (..., p), None if not wanted."""
@@ -108,13 +108,13 @@ class PlantAt:
 
 
 class Bench:
-    """Plants at all poses that measurements need, kept for the last free numbers."""
+    """Plants at all poses that measurements need, kept for the last parameters."""
 
     def __init__(self, study: Study, place: Place, poses: Sequence[Pose], places: Sequence[float]):
         """
         Args:
             study: the model.
-            place: puts free numbers into a case.
+            place: puts parameters into a case.
             poses: where measurements were taken.
             places: positions along the links of hammers and displacement sensors [m].
 
@@ -157,7 +157,7 @@ class Bench:
         check_pose(self.study, path, pose, int(code), np.asarray(lifts))
 
     def plant(self, pose: Pose, values: np.ndarray, has_slopes: bool) -> PlantAt:
-        """The plant at a pose for some values of the free numbers, (p,).
+        """The plant at a pose for some values of the parameters, (p,).
 
         Raises:
             StudyError: the machine with these numbers does not reach it.
@@ -176,7 +176,7 @@ class Bench:
         return found
 
     def many(self, values: np.ndarray) -> list[dict[Pose, PlantAt]]:
-        """Plants at `poses` for many values of the free numbers, (n, p), without derivatives.
+        """Plants at `poses` for many values of the parameters, (n, p), without derivatives.
 
         Poses out of reach are left out.
         """
@@ -190,7 +190,7 @@ class Bench:
         return found
 
     def keep(self, values: np.ndarray, plants: dict[Pose, PlantAt]) -> None:
-        """Use these plants for some values of the free numbers."""
+        """Use these plants for some values of the parameters."""
         for pose, plant in plants.items():
             self._kept[pose, False] = values.tobytes(), plant
 

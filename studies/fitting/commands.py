@@ -22,7 +22,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         out: Annotated[Path, typer.Option(help="folder for report, fitted study and figures")],
         pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
     ) -> None:
-        """Fit free numbers of a study to measurements, and say how well they are known."""
+        """Fit parameters of a study to measurements, and say how well they are known."""
         start()
         from studies.fitting.run import run_fit
         from studies.fitting.spec import load_fit

@@ -49,7 +49,7 @@ def next_experiments(
 
     Args:
         bench: the model.
-        free: its free numbers.
+        free: its parameters.
         u: the optimum, between the bounds, (p,).
         covariance: there, (p, p).
     """

@@ -95,7 +95,7 @@ def numbers(shown: Sequence[tuple[str, Numbers]]) -> Figure:
 
 
 def correlations(found: Fitted) -> Figure:
-    """Correlation of the free numbers."""
+    """Correlation of the parameters."""
     n = len(found.names)
     figure, axes = new_figure(1, 1, min(1.2 + 0.28 * n, 7.0))
     ax = axes[0, 0]
@@ -108,7 +108,7 @@ def correlations(found: Fitted) -> Figure:
 
 
 def profiles(found: Fitted) -> Figure:
-    """Least misfit over each free number, and what its standard deviation promises."""
+    """Least misfit over each parameter, and what its standard deviation promises."""
     count = len(found.profiles)
     figure, axes = new_figure((count + 1) // 2, min(count, 2), 1.9, has_shared_abscissa=False)
     for ax, one in zip(axes.ravel(), found.profiles, strict=False):

@@ -1,4 +1,4 @@
-"""Samples of the free numbers, as probable as the data and what is known beforehand make them.
+"""Samples of the parameters, as probable as the data and what is known beforehand make them.
 
 Before the data, every place between the bounds is as likely as any other, on the scale of the
 bounds, unless mean and sigma say more.

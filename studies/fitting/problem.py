@@ -1,4 +1,4 @@
-"""Least squares: all residuals of a fit and their derivatives, in the unit cube of free numbers."""
+"""Least squares: all residuals of a fit and their derivatives, in the unit cube of parameters."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ NEXT = 1e-9
 
 
 class Likelihood(NamedTuple):
-    """Least misfit for fixed values of one free number."""
+    """Least misfit for fixed values of one parameter."""
 
     number: int
     values: np.ndarray  # ascending, (n,)
@@ -71,7 +71,8 @@ def describe_confirmed(
         u: the optimum, (p,).
         has_all: profile all parameters; otherwise those of directions without information.
     """
-    answer, known = describe_fit(problem, u), {}
+    answer = describe_fit(problem, u)
+    known: dict[int, float] = {}
     found: dict[int, Likelihood] = {}
     for _ in range(len(u)):
         sigma = np.sqrt(np.diag(answer.covariance))

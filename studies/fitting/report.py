@@ -61,7 +61,7 @@ def report(found: Fitted) -> str:
 
 
 def _unit(name: str) -> str:
-    """Of a free number, "" for 1."""
+    """Of a parameter, "" for 1."""
     unit = number_unit(name)
     return "" if unit == "1" else unit
 

@@ -153,7 +153,7 @@ def _check(problem: Problem, console: Console, starts: int) -> None:
     first = problem.residual(problem.free.places())
     if not np.isfinite(np.sum(first**2)):
         raise StudyError(
-            "fit.data: squared residuals of the first guess overflow; allowed: data and noise "
+            "fit.data: squared residuals of the starting point overflow; allowed: data and noise "
             "within many orders of magnitude of the model"
         )
     size, priors = len(problem.free.numbers), len(problem.priors)
@@ -343,7 +343,7 @@ def variables(found: Fitted) -> dict[str, Variable]:
     """Labelled numbers of a fit."""
     answer, axis = found.answer, ("number",)
     part = {
-        "number": Variable(np.array(found.names), axis, "1", "free number"),
+        "number": Variable(np.array(found.names), axis, "1", "parameter"),
         "value": Variable(answer.values, axis, "1", "fitted, in the field's unit"),
         "sigma": Variable(answer.sigma, axis, "1", "standard deviation, in the field's unit"),
         "interval": Variable(answer.interval, (*axis, "end"), "1", "95 %, in the field's unit"),

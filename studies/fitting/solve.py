@@ -87,8 +87,8 @@ def solve(problem: Problem, starts: int, refine: int, iterations: int, seed: int
         raise StudyError("no starting point leads to a fit: each leaves where the model works")
     found = distinct(found)
     images = exchanges(problem.free.numbers, [x.u for x in found])
-    rated = np.argsort(problem.costs(np.array(images))) if images else []
-    best = [images[k] for k in rated[: EXCHANGED * refine]]
+    order = np.argsort(problem.costs(np.array(images).reshape(-1, len(own))))
+    best = [images[k] for k in order[: EXCHANGED * refine]]
     found = distinct(found + descend_all(problem, best, iterations))
     for one in problem.measurements:
         one.reweigh(problem.free.values(found[0].u))

@@ -1,4 +1,4 @@
-"""The file of a fit: a study, the first guess, plus `[fit]`: what is free, and what was measured.
+"""The file of a fit: a study, the starting point, plus `[fit]`: what is free and was measured.
 
 Each entry of `[[fit.data]]` is a measurement of some kind with its own noise level. Numbers are in
 SI units unless their names say otherwise.
@@ -178,18 +178,24 @@ class Fit(Section):
     loss: Literal["squares", "robust"] = described(
         "squares", "-", "of residuals; robust: outliers pull less"
     )
-    starts: int = described(32, "1", "first guesses, the study's own first", ge=1, le=10_000)
-    refine: int = described(4, "1", "best of them that are followed to the end", ge=1, le=100)
+    starts: int = described(32, "1", "starting points, the study's own first", ge=1, le=10_000)
+    refine: int = described(
+        4,
+        "1",
+        "best of them that are followed; of exchanged links twice as many",
+        ge=1,
+        le=100,
+    )
     iterations: int = described(60, "1", "evaluations of each", ge=1, le=10_000)
-    profile: bool = described(True, "-", "profile the likelihood of up to six free numbers")
+    profile: bool = described(True, "-", "profile the likelihood of up to six parameters")
     samples: int = described(
         0, "1", "posterior samples, with the extra 'posterior'; 0: none", ge=0, le=10**6
     )
-    seed: int = described(0, "1", "of the first guesses and samples", ge=0, le=10**9)
+    seed: int = described(0, "1", "of the starting points and samples", ge=0, le=10**9)
 
 
 class Prior(NamedTuple):
-    """What is known of a free number beforehand: mean and standard deviation."""
+    """What is known of a parameter beforehand: mean and standard deviation."""
 
     number: int  # among the free ones
     mean: float
@@ -199,7 +205,7 @@ class Prior(NamedTuple):
 class FitSpec(NamedTuple):
     """A fit as requested."""
 
-    study: Study  # the first guess
+    study: Study  # the starting point
     fit: Fit
     free: FreeNumbers
     priors: tuple[Prior, ...]
@@ -278,7 +284,7 @@ def _free(fit: Fit, study: Study) -> tuple[FreeNumbers, tuple[Prior, ...]]:
 
 
 def number_unit(name: str) -> str:
-    """Unit of a free number, "1" for none."""
+    """Unit of a parameter, "1" for none."""
     entry = parse_entry(name)
     assert entry is not None
     return field_unit(entry.field)

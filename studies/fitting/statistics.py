@@ -34,7 +34,7 @@ def region_rise(p: int) -> float:
 
 
 class Direction(NamedTuple):
-    """A combination of free numbers."""
+    """A combination of parameters."""
 
     sigma: float  # standard deviation along it, between the bounds [1]; inf: no information
     parts: np.ndarray  # (p,)

@@ -11,7 +11,7 @@ class Residual(NamedTuple):
     """Model minus measurement, in standard deviations of the measurement."""
 
     value: np.ndarray  # (m,)
-    slope: np.ndarray | None  # by the free numbers, (m, p); None if not asked for
+    slope: np.ndarray | None  # by the parameters, (m, p); None if not asked for
 
 
 def scaled(
@@ -89,7 +89,7 @@ class Measurement(Protocol):
     mean_square: float  # of residuals that are noise [1]
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
-        """At some values of the free numbers, (p,)."""
+        """At some values of the parameters, (p,)."""
         ...
 
     def reweigh(self, values: np.ndarray) -> None:
@@ -104,5 +104,5 @@ class Measurement(Protocol):
         ...
 
     def complaint(self, values: np.ndarray) -> str:
-        """What looks wrong with the data at the first guess, "" if nothing."""
+        """What looks wrong with the data at the starting point, "" if nothing."""
         ...

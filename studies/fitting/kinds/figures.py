@@ -50,13 +50,13 @@ class Compared(NamedTuple):
 
 
 class Runs:
-    """Runs of one study with different links under control, kept for the last free numbers.
+    """Runs of one study with different links under control, kept for the last parameters.
 
     All figures share them: one program runs every combination that any of them needs.
     """
 
     def __init__(self, study: Study, place: Place) -> None:
-        """Arguments: what all runs share, and what puts free numbers into a case.
+        """Arguments: what all runs share, and what puts parameters into a case.
 
         Raises:
             StudyError: as `check_run`.

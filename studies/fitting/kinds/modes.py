@@ -56,7 +56,7 @@ class _Modes:
         self._bench, self._measured = bench, measured
 
     def predicted(self, values: np.ndarray, has_slopes: bool) -> _Predicted:
-        """The model's modes at some values of the free numbers, (p,)."""
+        """The model's modes at some values of the parameters, (p,)."""
         raise NotImplementedError
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
@@ -114,8 +114,8 @@ class _Modes:
         ratio = float(np.median(found.frequency / self._measured.frequency))
         if not 0.1 < ratio < 10:
             return (
-                f"the model's frequencies are {ratio:.3g} times the measured ones at the first "
-                "guess; frequencies are in Hz: check unit and first guess"
+                f"the model's frequencies are {ratio:.3g} times the measured ones at the starting "
+                "point; frequencies are in Hz: check unit and starting point"
             )
         return ""
 

@@ -37,14 +37,14 @@ class Recording(NamedTuple):
     time: np.ndarray  # [s], (n,)
     command_end: float  # [s]
     value: np.ndarray  # (n,)
-    slope: np.ndarray | None  # by the free numbers, (n, p)
+    slope: np.ndarray | None  # by the parameters, (n, p)
 
 
 class Motion:
-    """A study's run with some links under control, kept for the last free numbers."""
+    """A study's run with some links under control, kept for the last parameters."""
 
     def __init__(self, study: Study, place: Place) -> None:
-        """Arguments: the run, and what puts free numbers into a case.
+        """Arguments: the run, and what puts parameters into a case.
 
         Raises:
             StudyError: as `check_run`.
@@ -59,7 +59,7 @@ class Motion:
         self._kinds.add(signal.kind)
 
     def find(self, name: str, signal: Signal, values: np.ndarray, has_slopes: bool) -> Recording:
-        """One output for some values of the free numbers, (p,).
+        """One output for some values of the parameters, (p,).
 
         Raises:
             StudyError: naming the measurement `name`; a run that does not reach its end.

@@ -12,7 +12,7 @@ from studies.fitting.kinds.contract import Line, Noise, Residual, scaled
 from studies.study.signals import Signal
 
 TWO_PI = 2 * np.pi
-#: A measured response this many times the model's at the first guess has another unit [1].
+#: A measured response this many times the model's at the starting point has another unit [1].
 OTHER_UNIT = 100.0
 
 
@@ -74,7 +74,7 @@ class _OfBench:
         if 1 / OTHER_UNIT < ratio < OTHER_UNIT:
             return ""
         return (
-            f"measured is {ratio:.3g} times the model at the first guess; expected {self._unit} "
+            f"measured is {ratio:.3g} times the model at the starting point; expected {self._unit} "
             "and a frequency in Hz: check the units"
         )
 

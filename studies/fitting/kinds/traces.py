@@ -88,7 +88,7 @@ class Trace:
         if 0.01 < ratio < 100:
             return ""
         return (
-            f"measured moves {ratio:.3g} times as far as the model at the first guess; expected "
+            f"measured moves {ratio:.3g} times as far as the model at the starting point; expected "
             f"{self._unit}: check the unit"
         )
 
