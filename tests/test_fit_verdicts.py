@@ -10,7 +10,9 @@ from rich.console import Console
 from scipy.stats import chi2
 
 from studies.fitting import run
+from studies.fitting.bench import Modes
 from studies.fitting.experiment import next_experiments
+from studies.fitting.kinds.modes import Measured, pair_modes
 from studies.fitting.report import is_good, sentences, summary
 from studies.fitting.run import estimate, run_fit
 from studies.fitting.solve import SAME, exchanges
@@ -204,6 +206,23 @@ def test_exchanges_are_permutations_and_mirror_images():
     free = {"link.damping_ratio": {"from": 0.002, "to": 0.04}}
     one = spec_of(HERE, {"kind": "modes", "frequency_hz": [90.0], "sigma_hz": 1.0}, free=free)
     assert exchanges(one.free.numbers, [np.array([0.3])]) == []
+
+
+def test_frequencies_without_shapes_are_paired_in_their_order():
+    """Two of the model's above both measured ones are as near crossed, but chi square would jump."""
+    pole = 2j * np.pi * np.array([103.0, 200.0, 102.0])
+    modes = Modes(pole, np.eye(3), np.eye(3))
+    one = np.ones(2)
+    given = Measured(
+        frequency=np.array([100.0, 101.0]),
+        sigma=one,
+        damping=None,
+        damping_sigma=None,
+        shapes=None,
+    )
+    assert list(pair_modes(given, modes, np.zeros((9, 3))).mode) == [2, 0]
+    pole = pole[[2, 1, 0]]
+    assert list(pair_modes(given, modes._replace(pole=pole), np.zeros((9, 3))).mode) == [0, 2]
 
 
 def test_derivatives_at_a_degeneracy_are_confirmed_by_profiles():

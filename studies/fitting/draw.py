@@ -20,6 +20,8 @@ ALIKE = 0.5
 MOVES, FACTOR = 30, 2.0
 #: Rise of chi square at one standard deviation from which derivatives are wrong; they promise 1.
 SURPRISING = 4.0
+#: Rise of chi square that a shortened axis has at least.
+LEAST = 0.25
 #: Length along which derivatives are checked at most, between the bounds [1].
 LONGEST = 0.5
 
@@ -78,18 +80,17 @@ def measured(problem: Problem, answer: Answer, least: float) -> Answer:
         least: the cost there.
     """
     size, axes = np.linalg.eigh(answer.information)
-    length = 1 / np.sqrt(np.maximum(size, 1 / LONGEST**2))
-    wrong = np.arange(len(size))
+    promised = 1 / np.sqrt(np.maximum(size, 1 / LONGEST**2))
+    length, rise, wrong = promised.copy(), np.zeros(len(size)), np.arange(len(size))
     for _ in range(HALVINGS):
         away = length[wrong] * axes[:, wrong]
         ends = np.clip(np.concatenate([answer.place + away.T, answer.place - away.T]), 0, 1)
-        rise = 2 * np.max((problem.costs(ends) - least).reshape(2, -1), axis=0)
-        is_wrong = rise > SURPRISING
-        wrong = wrong[is_wrong]
+        rise[wrong] = 2 * np.max((problem.costs(ends) - least).reshape(2, -1), axis=0)
+        wrong = wrong[rise[wrong] > SURPRISING]
         if not wrong.size:
             break
-        length[wrong] *= np.clip(np.sqrt(2 / rise[is_wrong]), 0.02, 0.5)
-        size[wrong] = 1 / length[wrong] ** 2
+        length[wrong] *= np.clip(np.sqrt(2 / rise[wrong]), 0.02, 0.5)
+    size = np.where(length < promised, np.maximum(rise, LEAST) / length**2, size)
     return answer._replace(information=(axes * size) @ axes.T)
 
 

@@ -22,6 +22,8 @@ SAME = 1e-3
 ALIKE = 0.1
 #: Exchanges that are followed, over the starting points that are.
 EXCHANGED = 2
+#: Half the rise of chi square up to which optima are followed to the end, however many.
+NEAR = 20.0
 #: Distance kept from the bounds by starting points [1].
 INSIDE = 1e-3
 #: Distance from the bounds at which optima are looked for once more [1].
@@ -93,7 +95,8 @@ def solve(problem: Problem, starts: int, refine: int, iterations: int, seed: int
     for one in problem.measurements:
         one.reweigh(problem.free.values(found[0].u))
     # away from the bounds, along which the method may have crept
-    inner = [np.clip(x.u, AWAY, 1 - AWAY) for x in found[: (1 + EXCHANGED) * refine]]
+    near = [x for k, x in enumerate(found) if k < refine or x.cost - found[0].cost < NEAR]
+    inner = [np.clip(x.u, AWAY, 1 - AWAY) for x in near]
     found = distinct(descend_all(problem, inner, iterations) or found)
     return Solution(tuple(found), len(first))
 

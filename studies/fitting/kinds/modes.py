@@ -218,8 +218,9 @@ def pair_modes(measured: Measured, modes: Modes, sensor: np.ndarray) -> Pairs:
         raise StudyError(f"has more modes than the model's {len(frequency)}; raise link.modes")
     apart = np.abs(np.log(frequency[None] / measured.frequency[:, None]))
     if measured.shapes is None:
-        row, mode = linear_sum_assignment(apart)
-        return Pairs(mode, modes.shape[:, mode], modes.dual[mode], np.ones(len(row)))
+        _, mode = linear_sum_assignment(apart)
+        mode = mode[np.argsort(frequency[mode])]  # crossed pairs may be as near, but not as alike
+        return Pairs(mode, modes.shape[:, mode], modes.dual[mode], np.ones(len(mode)))
     seen = sensor @ modes.shape  # (3 K, m)
     likeness = np.array(
         [
