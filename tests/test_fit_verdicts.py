@@ -209,7 +209,7 @@ def test_exchanges_are_permutations_and_mirror_images():
 
 
 def test_frequencies_without_shapes_are_paired_in_their_order():
-    """Two of the model's above both measured ones are as near crossed, but chi square would jump."""
+    """Two of the model's above both measured ones are as near crossed; chi square would jump."""
     pole = 2j * np.pi * np.array([103.0, 200.0, 102.0])
     modes = Modes(pole, np.eye(3), np.eye(3))
     one = np.ones(2)

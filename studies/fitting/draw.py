@@ -16,8 +16,8 @@ from studies.fitting.statistics import Answer, describe_fit, region_rise
 HALVINGS = 40
 #: Least share of independent machines for which the normal distribution is taken as it is [1].
 ALIKE = 0.5
-#: Moves of every machine otherwise, and the largest factor of one (Goodman and Weare 2010).
-MOVES, FACTOR = 30, 2.0
+#: Moves of every machine otherwise, with whole motions, and the largest factor of one.
+MOVES, MOVES_OF_MOTIONS, FACTOR = 30, 5, 2.0
 #: Rise of chi square at one standard deviation from which derivatives are wrong; they promise 1.
 SURPRISING = 4.0
 #: Rise of chi square that a shortened axis has at least.
@@ -110,7 +110,8 @@ def walk(
     """
     place, cost = place.copy(), cost.copy()
     halves = np.arange(0, len(place), 2), np.arange(1, len(place), 2)
-    for move, still in (halves, halves[::-1]) * MOVES:
+    moves = MOVES_OF_MOTIONS if problem.has_motions else MOVES
+    for move, still in (halves, halves[::-1]) * moves:
         z = (1 + (FACTOR - 1) * rng.random(len(move))) ** 2 / FACTOR
         other = place[rng.choice(still, len(move))]
         trial = other + z[:, None] * (place[move] - other)

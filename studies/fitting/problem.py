@@ -15,6 +15,8 @@ from studies.space.free import FreeNumbers
 
 #: Size of a residual from which the robust loss grows linearly, in standard deviations.
 SOFT = 2.0
+#: Kinds of measurements that take a run of the whole motion.
+MOTIONS = ("trace", "settling", "figures")
 
 
 class Problem(NamedTuple):
@@ -25,6 +27,11 @@ class Problem(NamedTuple):
     measurements: tuple[Measurement, ...]  # without those held out
     bench: Bench
     is_robust: bool = False  # residuals beyond SOFT grow as their root
+
+    @property
+    def has_motions(self) -> bool:
+        """Whether whole motions are run, which take a hundred times as long as a plant."""
+        return any(x.kind in MOTIONS for x in self.measurements)
 
     def parts(self, values: np.ndarray, has_slopes: bool) -> list[Residual]:
         """Residuals of each measurement, and of the priors at the end if there are any."""
