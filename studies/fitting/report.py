@@ -183,7 +183,7 @@ def is_good(found: Fitted) -> bool:
     is_inside = not any(_is_at_bound(u) for u in found.solution.best.u)
     is_found = found.solution.best.is_converged and is_inside
     is_identified = not answer.undetermined and not found.rivals
-    return answer.is_explained and is_tested and is_found and is_identified
+    return bool(answer.is_explained and is_tested and is_found and is_identified)
 
 
 def _at_bounds(found: Fitted) -> list[str]:
