@@ -207,6 +207,32 @@ def test_an_unstable_plant_fails_whatever_its_margin():
     assert table["passes"] == ["yes"] * 3 + ["**no**"] + ["yes"] * 2
 
 
+def test_a_certificate_names_the_uncontrolled_mode_that_control_makes_worst():
+    """Of existing plants and modes beyond the controlled ones, in the first lines and in JSON."""
+    found = certificate()
+    assert found.spillover is None and "pillover" not in certificate_report(found, None)[:800]
+    assert json.loads(document(found, None))["spillover"] is None
+    zeta = found.damping_ratio.copy()
+    zeta[0, 2, 1, 3, 1] = 0.8 * found.free_damping[0, 2, 1, 3, 1]
+    zeta[1, 1, 1, 4, 2] = 0.5 * found.free_damping[1, 1, 1, 4, 2]  # the worst
+    zeta[1, 0, 1, 1, 0] = 0.1 * found.free_damping[1, 0, 1, 1, 0]  # controlled
+    worse = found._replace(damping_ratio=zeta)
+    at = worse.spillover
+    assert (at.mode, at.plant) == (5, found.plants[1, 1, 1])
+    assert at.damping_ratio == zeta[1, 1, 1, 4, 2]
+    assert at.free_damping == found.free_damping[1, 1, 1, 4, 2]
+    text = certificate_report(worse, None)
+    sentence = (
+        f"Control spillover: mode 5, which is not controlled, has a damping ratio of "
+        f"{at.damping_ratio:.2g} instead of {at.free_damping:.2g} without control"
+    )
+    assert sentence in text[: text.index("**Next:**")]
+    kept = json.loads(document(worse, None))["spillover"]
+    assert kept["mode"] == 5 and kept["damping_ratio"] == pytest.approx(at.damping_ratio)
+    assert kept["damping_ratio_without_control"] == pytest.approx(at.free_damping)
+    assert (kept["basis"], kept["modes"]) == (at.plant.basis, 5)
+
+
 def test_a_failed_certificate_says_what_would_pass():
     margin = certificate().margin
     margin[1, 1, 0] = 1.5

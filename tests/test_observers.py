@@ -24,7 +24,7 @@ SHORT = {
     "motion": {"waypoints": [[0.0, 0.0, 0.5236], [0.0, 0.01, 0.5236]], "move_time": 0.03},
     "shaper": {"kind": "none"},
     "metrics": {"residual_length": 0.02, "residual_delay": 0.002},
-    "control": {"law": "lqg", "gain_factor": 1.0, "modes": 2},
+    "control": {"law": "lqg", "modes": 2},
 }
 
 

@@ -14,7 +14,12 @@ from jaxmodel.nominal_loop import nominal_loop
 from jaxmodel.prepare import design_controller, prepare
 from jaxmodel.status import OK, UNPLACEABLE
 from studies.engine.poles import PoleReport, _matched, difference, pole_rows
+from studies.engine.results import load
+from studies.engine.runs import run_study
+from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
+from studies.space.spec import parse_sweep
+from studies.space.table import case_study
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study, parse_study
 
@@ -252,6 +257,29 @@ def test_the_observers_loop_has_the_poles_of_continuous_feedback(rate):
     wanted = -damping + 1j * np.sqrt(square - damping**2)
     found = nearest_poles(wanted, matrix, 1 / rate)
     np.testing.assert_allclose(found, wanted, rtol=1e-8)
+
+
+def test_poles_are_axes_of_a_sweep(tmp_path):
+    """One number, lists by mode and entries of them; each case is the run of its own study."""
+    short = {
+        "run": {"duration": 0.04},
+        "link": {"modes": 3},
+        "motion": {"waypoints": [[0.0, 0.0, 0.5236]]},
+        "shaper": {"kind": "none"},
+        "drive": {"pulse_force": [20.0, -10.0, 15.0], "pulse_length": 0.0005},
+        "metrics": {"residual_delay": 0.003, "residual_length": 0.03},
+    }
+    by_mode = [[150.0, 80.0], [100.0], [60.0]]
+    axes = {"control.pole_decay": [50.0, 200.0, by_mode], "control.modes": [2, 3]}
+    spec = parse_sweep({**short, "sweep": {"axes": axes}})
+    run_sweep(spec, tmp_path / "sweep", is_quiet=True)
+    found = load(tmp_path / "sweep")
+    table, rms = found.table, found["residual_modal_rms"]
+    assert len(table) == 6 and np.all(found["status"] == OK)
+    for k in range(6):
+        alone = run_study(case_study(table, k), has_record=False, has_loop=False).result.metrics
+        np.testing.assert_allclose(rms[k], alone.residual_modal_rms, rtol=1e-6, atol=1e-15)
+    assert rms[0].max() > 1.2 * rms[2].max()  # 200 1/s leave less than 50
 
 
 def test_assembled_poles_are_matched_to_links_and_differences_are_said():

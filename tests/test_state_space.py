@@ -60,7 +60,7 @@ def random_system(order, ports, seed=0, gain=0.01):
 
 def study_with(path, **changes):
     """A short study with a controller from a file."""
-    control = {"law": "state_space", "gain_factor": 1.0} | changes.pop("control", {})
+    control = {"law": "state_space"} | changes.pop("control", {})
     section = {"file": str(path)} | changes.pop("state_space", {})
     return parse_study(SHORT | {"control": control, "state_space": section} | changes)
 

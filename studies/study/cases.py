@@ -242,23 +242,14 @@ def _control(fields: Fields, structure: Structure) -> Control:
         velocity_gain=number("control.velocity_gain"),
         position_gain=number("control.position_gain"),
         ratio=powered(ratio, exponent),
-        pole_decay=_by_mode(number("control.pole_decay"), shape),
-        pole_frequency=TWO_PI * _by_mode(number("control.pole_frequency_hz"), shape),
+        pole_decay=fields.spread("control.pole_decay", shape),
+        pole_frequency=TWO_PI * fields.spread("control.pole_frequency_hz", shape),
         gain_factor=number("control.gain_factor"),
         is_per_mass=fields.choices("control.gain_unit", ("N s/m", "1/s")).astype(float),
         feedthrough_factor=number("control.feedthrough_factor"),
         parameters=_parameters(fields, LAWS[structure.law]),
         system=_system(fields.study, structure),
     )
-
-
-def _by_mode(table: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """(m, *shape) from one number for all modes, one a link, or links' modes; 0: none given."""
-    if table.size == 0:
-        return np.zeros((len(table), *shape))
-    if table.ndim < 3:
-        table = np.broadcast_to(table[(...,) + (None,) * (3 - table.ndim)], (len(table), *shape))
-    return _filled(table, shape, 0.0)
 
 
 def _system(study: Study, structure: Structure) -> StateSpace | None:

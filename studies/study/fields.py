@@ -12,16 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from studies.study.paths import LINKS, as_list, field_value, is_each_link, parse_entry
+from studies.study.paths import LINKS, field_value, parse_entry
 from studies.study.spec import Study
 
 Columns = Mapping[str, np.ndarray]
 
 
 def padded(values: list[Any]) -> np.ndarray:
-    """Numbers, or lists of any length, as one float array with NaN for missing entries."""
-    if not isinstance(values[0], (tuple, list, np.ndarray)):
+    """Numbers, or lists of any length, as one float array with NaN for missing entries.
+
+    Beside lists, one number stands for all links.
+    """
+    is_list = [isinstance(value, (tuple, list, np.ndarray)) for value in values]
+    if not any(is_list):
         return np.array(values, float)
+    values = [x if is_it else (x,) * LINKS for x, is_it in zip(values, is_list, strict=True)]
     if all(np.size(np.array(value, object)) == 0 for value in values):
         return np.zeros((len(values), 0))
     depth = _depth(values)
@@ -53,6 +58,14 @@ def _fill(array: np.ndarray, value: Any) -> None:
             array[k] = entry
 
 
+def _spread(array: np.ndarray, value: Any, at: tuple[int, ...] = ()) -> None:
+    if not isinstance(value, (tuple, list, np.ndarray)):
+        array[at] = value
+        return
+    for k, entry in enumerate(value[: array.shape[len(at)]]):
+        _spread(array, entry, (*at, k))
+
+
 class Fields:
     """All fields of a study, some with one value per case.
 
@@ -77,11 +90,19 @@ class Fields:
     def numbers(self, field: str) -> np.ndarray:
         """As floats, with entries of lists filled in; NaN pads ragged lists."""
         raw = self.raw(field)
-        if raw.dtype == object:
-            is_mixed = is_each_link(field) and any(isinstance(value, tuple) for value in raw)
-            array = padded([as_list(field, x) for x in raw] if is_mixed else list(raw))
-        else:
-            array = raw.astype(float)
+        array = padded(list(raw)) if raw.dtype == object else raw.astype(float)
+        return self._with_entries(field, array)
+
+    def spread(self, field: str, shape: tuple[int, ...]) -> np.ndarray:
+        """As floats, (m, *shape): a number stands for all below it; 0 where there is none."""
+        raw = self.raw(field)
+        array = np.zeros((len(raw), *shape))
+        for whole, value in zip(array, raw, strict=True):
+            _spread(whole, value)
+        return self._with_entries(field, array)
+
+    def _with_entries(self, field: str, array: np.ndarray) -> np.ndarray:
+        """With the columns of single entries of its lists."""
         for name, column in self.columns.items():
             entry = parse_entry(name)
             if entry is not None and entry.field == field and entry.indices:

@@ -221,7 +221,7 @@ def _each_link_fields() -> frozenset[str]:
     for section, outer in Study.model_fields.items():
         for leaf, info in getattr(outer.annotation, "model_fields", {}).items():
             one, *others = get_args(info.annotation) or (None,)
-            if [get_args(other) for other in others] == [(one,) * LINKS]:
+            if (one,) * LINKS in [get_args(other) for other in others]:
                 found.add(f"{section}.{leaf}")
     return frozenset(found)
 
