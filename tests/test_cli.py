@@ -294,7 +294,7 @@ TURN = f"[[{X}, {Y}, 0], [{X}, {Y}, {-2 * math.pi / 3}]]"
         ),
         (
             change("[control]", IDEAL + "[1e6, 1, 1]"),
-            "control.gain_factor = 0.5; allowed: gains low enough for 200 plant steps per sample",
+            "control.gain_factor = 1.0; allowed: gains low enough for 200 plant steps per sample",
         ),
         (
             change("[control]", IDEAL + "[1e3, 1, 1]").replace("[run]", "[run]\nsubsteps = 1"),

@@ -52,7 +52,9 @@ kind = "none"
 [metrics]
 residual_length = 0.02
 """
-OWN = SMALL + '[control]\nlaw = "even_damping"\nmodes = 2\nlinks = [true, false, false]\n'
+OWN = SMALL + (
+    '[control]\nlaw = "even_damping"\nmodes = 2\ngain_factor = 0.5\nlinks = [true, false, false]\n'
+)
 SWEEP = (
     OWN
     + """

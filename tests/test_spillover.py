@@ -84,7 +84,7 @@ def test_verdicts_of_the_ladder_of_gains():
     worst = [one.margin[one.worst] for one in found.values()]
     # the same loops, so margins go as 1/f
     np.testing.assert_allclose(np.array(worst) * list(found), worst[2], rtol=2e-4)
-    paper = found[1.0]
+    paper = found[2.0]
     assert paper.fails_from == 8 and np.all(paper.radius < 1)
     # at 1.2 kHz, where the modes above are springs
     wanted = r"a controller's filter at 1\d\d\d Hz, fed by modes 7\+9 of link 2 \(5605, 9265 Hz\)"

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from studies.reading import parse_npz, read_bytes
-from studies.study import unpack_mat
 
+#: The program that reads; not imported, since it needs SciPy.
+READER = Path(__file__).with_name("unpack_mat.py")
 #: Time to read a file [s].
 PATIENCE = 60
 
@@ -28,7 +29,7 @@ def read_mat(path: Path) -> dict[str, np.ndarray]:
         (4, 4)
     """
     content = read_bytes(path)
-    command = [sys.executable, "-I", unpack_mat.__file__]
+    command = [sys.executable, "-I", str(READER)]
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     try:
         done = subprocess.run(
