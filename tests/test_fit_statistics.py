@@ -10,6 +10,7 @@ from studies.fitting.kinds.contract import Residual
 from studies.fitting.problem import Problem
 from studies.fitting.profiles import Likelihood, profile
 from studies.fitting.report import _misfit, _others
+from studies.fitting.solve import Solution
 from studies.fitting.statistics import UNKNOWN, describe_fit, misfit, spread
 
 LOW, SPAN = np.array([10.0, -2.0]), np.array([20.0, 8.0])
@@ -169,9 +170,7 @@ def test_other_optima_have_the_rise_of_chi_square():
     """Twice that of the cost, which is half the sum of squares."""
     other = [SimpleNamespace(u=np.array([u]), cost=cost) for u, cost in ((0.1, 13.5), (0.9, 12.25))]
     best = SimpleNamespace(u=np.array([0.4]), cost=12.0)
-    found = SimpleNamespace(
-        solution=SimpleNamespace(best=best, others=other), spec=SimpleNamespace(free=Free())
-    )
+    found = SimpleNamespace(solution=Solution((best, *other), 3), spec=SimpleNamespace(free=Free()))
     assert _others(found) == [["3", "12"], ["0.5", "28"]]
     one, u, *_ = problem(1)
     costs = one.free.values(u) + np.array([0.0, 0.25])
