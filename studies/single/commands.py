@@ -135,7 +135,8 @@ def _print_run(run: Run, console: Console) -> None:
     damping = ", ".join(f"{zeta:.3g}" for zeta in run.loop.damping_ratio.min(axis=1))
     modes = run.study.link.modes
     console.print(
-        f"gain margin of the linearised sampled loop: {margin_text(run.loop.gain_margin)}, damping "
+        "gain margin of the linearised sampled loop, a factor on control.gain_factor: "
+        f"{margin_text(run.loop.gain_margin)}, damping "
         f"ratios of the controlled modes: {damping} ({max(MARGIN_MODES, modes)} plant modes per "
         f"link, the run {modes})",
         soft_wrap=True,
