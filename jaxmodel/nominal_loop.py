@@ -12,24 +12,25 @@ from jaxmodel.controller import Controller
 from jaxmodel.estimator import FilterState, advance_filters, weighted
 from jaxmodel.laws.contract import Known
 from jaxmodel.laws.link_model import LinkModel, link_model
-from jaxmodel.laws.poles import asked_poles, nominal_modes
+from jaxmodel.laws.poles import nominal_modes, specified_poles
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import design_controller
 
 
 def nominal_loop(structure: Structure, case: Case) -> tuple[Array, Array]:
-    """Asked poles, and the loop's transition matrices per sample.
+    """Specified poles, and the loop's transition matrices per sample.
 
     Args:
         structure: static choices, feedback "sampled", a law that places poles.
         case: the numbers.
 
     Returns:
-        asked poles s [1/s], complex, (3, C); matrices, (3, B, n, n): B = C modes, or 1 whole link.
+        specified poles s [1/s], complex, (3, C); matrices, (3, B, n, n): B = C modes, or 1 for a
+        whole link.
     """
     design = design_controller(structure, case, find_bases(structure, case))
-    poles = asked_poles(case, design.known)
+    poles = specified_poles(case, design.known)
     loop = _of_modes if design.controller.system is None else _of_links
     matrix = loop(structure, case, design.controller, design.known)
     return -poles.decay + 1j * poles.frequency, matrix

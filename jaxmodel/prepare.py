@@ -239,7 +239,7 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         sensor=seen,
         actuator=actuator[:, :n],
         omega=assembled,
-        damping_ratio=damping_ratio(case.machine.damping, assembled),
+        damping_ratio=_believed_damping(case, assembled),
         modal_mass=model.mass[:, :n],
         mask=mask,
         feedthrough=_left_out_voltage(case, model, jnp.pad(mask, (0, model.mass.shape[1] - n))),
@@ -270,6 +270,14 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         sensor_condition=condition_number(seen, mask),
         actuator_condition=condition_number(driven, mask),
     )
+
+
+def _believed_damping(case: Case, omega: Array) -> Array:
+    """Damping ratios of the controller's modes: of its law's model, if it has one, (3, C)."""
+    given = case.control.parameters.get("model_damping")
+    if given is not None:
+        return jnp.broadcast_to(jnp.asarray(given)[:, None], omega.shape)
+    return damping_ratio(case.machine.damping, omega)
 
 
 def design_taps(case: Case, bases: Bases) -> shaper.Taps:

@@ -66,5 +66,6 @@ REASONS = {
     NEAR_SINGULAR: "path close to a singular pose",
     OVERLOADED: "a link compressed beyond its critical force on the way",
     OVERDAMPED: "a link mode with a damping ratio of 1 or more",
-    UNPLACEABLE: "poles that cannot be placed: no decay, no vibration, beyond half the sample rate",
+    UNPLACEABLE: "poles that cannot be placed: no decay, one beyond the mode's frequency without "
+    "a frequency given, beyond half the sample rate, or estimates in phase",
 }

@@ -71,7 +71,7 @@ def read_text(path: Path, most: int = LARGEST, encoding: str = "utf-8") -> str:
     try:
         return read_bytes(path, most).decode(encoding)
     except UnicodeDecodeError:
-        raise ValueError("not UTF-8 text") from None
+        raise ValueError(f"not {encoding.upper()} text") from None
 
 
 def read_json(path: Path) -> Any:
@@ -194,13 +194,13 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
         size = os.fstat(file.fileno()).st_size
     with h5py.File(path, "r") as found:
         try:
-            _check_group(found, _PACKED * size + _SPARE, 0)
+            _check_group(found, _PACKED * size + _SPARE, set(), 0)
             yield found
         except (RuntimeError, KeyError) as error:  # h5py's, for a damaged or missing part
             raise ValueError(str(error)) from None
 
 
-def _check_group(group: h5py.Group, most: int, depth: int) -> None:
+def _check_group(group: h5py.Group, most: int, seen: set[int], depth: int) -> None:
     """Raise ValueError for what leaves the file or takes more than `most` bytes."""
     if depth == DEEPEST:
         raise ValueError(_TOO_DEEP)
@@ -208,8 +208,12 @@ def _check_group(group: h5py.Group, most: int, depth: int) -> None:
         if not isinstance(group.get(name, getlink=True), h5py.HardLink):
             raise ValueError(f"{name!a} is a link to elsewhere")
         inner = group[name]
+        address = h5py.h5o.get_info(inner.id).addr
+        if address in seen:  # groups may hold one another
+            continue
+        seen.add(address)
         if isinstance(inner, h5py.Group):
-            _check_group(inner, most, depth + 1)
+            _check_group(inner, most, seen, depth + 1)
         elif isinstance(inner, h5py.Dataset):
             if inner.external or inner.is_virtual:
                 raise ValueError(f"{name!a} keeps its data elsewhere")

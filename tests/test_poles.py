@@ -13,9 +13,11 @@ from jaxmodel.case import Case
 from jaxmodel.nominal_loop import nominal_loop
 from jaxmodel.prepare import design_controller, prepare
 from jaxmodel.status import OK, UNPLACEABLE
+from studies.engine.controller import fixed_controller
 from studies.engine.poles import PoleReport, _matched, difference, pole_rows
 from studies.engine.results import load
 from studies.engine.runs import run_study
+from studies.engine.stability import loop_report
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.space.spec import parse_sweep
@@ -88,13 +90,9 @@ def _gains(structure, case):
     return law.velocity_gain, law.position_gain
 
 
-@pytest.mark.parametrize("has_static_correction", [True, False])
-def test_gains_agree_with_an_independent_loop(has_static_correction):
+def test_gains_agree_with_an_independent_loop():
     """Mode, filter, hold, delay and estimates by SciPy's exponential and polynomials, to 1e-8."""
-    study = study_with(
-        decay=[[150.0, 80.0, 90.0], [100.0, 70.0, 80.0], [60.0, 90.0, 200.0]],
-        link={"modes": 3, "static_correction": has_static_correction},
-    )
+    study = study_with(decay=[[150.0, 80.0, 90.0], [100.0, 70.0, 80.0], [60.0, 90.0, 200.0]])
     structure, case = build_structure(study), as_arrays(build_case(study))
     design = jax.jit(partial(_design, structure))(case)
     law, known = jax.tree.map(np.asarray, (design.controller, design.known))
@@ -102,12 +100,11 @@ def test_gains_agree_with_an_independent_loop(has_static_correction):
     static = known.observer @ known.feedthrough @ known.synthesizer
     for i, j in np.ndindex(3, 3):
         omega, mass = known.omega[i, j], known.modal_mass[i, j]
-        shown = static[i, j, j] if has_static_correction else 0.0
         a = np.zeros((4, 4))  # q, q', z, z' of the filtered coordinate, and force [N]
         a[0, 1] = a[2, 3] = 1.0
         a[1, :2] = -(omega**2), -0.02 * omega
         a[3, [0, 2, 3]] = corner**2, -(corner**2), -np.sqrt(2) * corner
-        b = np.array([0.0, 1 / mass, 0.0, corner**2 * shown])
+        b = np.array([0.0, 1 / mass, 0.0, corner**2 * static[i, j, j]])
         whole = np.zeros((5, 5))
         whole[:4, :4], whole[:4, 4] = a, b
         held = expm(whole * period)
@@ -232,8 +229,11 @@ def test_what_cannot_be_placed_is_a_status(law, changes, code):
         ({"pole_decay": [[1.0], [2.0]]}, "allowed: three lists of 1 to 3 entries"),
         ({"pole_decay": [[1.0, 2.0, 3.0, 4.0]] * 3}, "allowed: three lists of 1 to 3 entries"),
         ({"pole_decay": [[], [1.0], [1.0]]}, "allowed: three lists of 1 to 3 entries"),
-        ({"pole_frequency_hz": [[100.0]] * 3}, "allowed: given with control.pole_frequency_hz"),
-        ({"pole_decay": 9.0, "pole_frequency_hz": 100.0}, "one list a link by mode, where"),
+        (
+            {"pole_frequency_hz": [[100.0]] * 3},
+            "where control.pole_frequency_hz is given",
+        ),
+        ({"pole_decay": 9.0, "pole_frequency_hz": 100.0}, "three lists, one a link by mode, where"),
     ],
 )
 def test_poles_that_make_no_sense_are_refused(control, message):
@@ -257,6 +257,35 @@ def test_the_observers_loop_has_the_poles_of_continuous_feedback(rate):
     wanted = -damping + 1j * np.sqrt(square - damping**2)
     found = nearest_poles(wanted, matrix, 1 / rate)
     np.testing.assert_allclose(found, wanted, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("law", "electronics"),
+    [
+        ("imsc", {"amplifier_hz": 2_000.0, "sensor_highpass_hz": 5.0}),
+        ("observer", {"amplifier_hz": 2_000.0}),
+        ("observer", {"sensor_highpass_hz": 5.0}),
+    ],
+)
+def test_exports_and_certificates_get_the_controller_that_runs(law, electronics):
+    """With poles, amplifiers and drained patches, which are part of the design."""
+    study = study_with(law, [160.0, 120.0, 90.0], electronics=electronics)
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    runs = jax.jit(partial(_design, structure))(case).controller
+    exported = fixed_controller(study).controller
+    for name in ("velocity_gain", "position_gain", "filter", "synthesizer", "system"):
+        one, other = getattr(exported, name), getattr(runs, name)
+        jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-12), one, other)
+
+
+def test_observers_leave_modes_alone_whatever_the_links_damping():
+    """A ratio of 0 is no gain, where the law's model has more damping than the links."""
+    link = {"modes": 3, "damping_ratio": 0.001}
+    study = study_with("observer", [[160.0]] * 3, link=link, control={"ratios": [[1.0, 0, 0]] * 3})
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    report = loop_report(structure, case, np.array(study.motion.waypoints[0]))
+    assert report.is_stable and report.gain_margin > 2
+    assert np.all((report.damping_ratio[1:] > 0.0009) & (report.damping_ratio[1:] < 0.0015))
 
 
 def test_poles_are_axes_of_a_sweep(tmp_path):
@@ -290,14 +319,18 @@ def test_assembled_poles_are_matched_to_links_and_differences_are_said():
     np.testing.assert_array_equal(_matched(asked[:, 0], poles), poles[[1, 2, 0]])
     assembled = asked * 1.001
     assembled[1, 0] = -110 + 710j
-    found = PoleReport(asked, asked, assembled)
+    found = PoleReport(asked, asked, assembled, 1.0)
     rows = pole_rows(found)
     assert [row[:2] for row in rows] == [["1", "1"], ["1", "2"], ["1", "3"], ["2", "1"]]
     assert rows[1][2] == "100 1/s, 111.4 Hz" and rows[1][4] == "110 1/s, 113 Hz"
     assert "most in mode 1 of link 2: 110 1/s, 113 Hz instead of 100 1/s, 111.4" in difference(
         found
     )
-    same = PoleReport(asked, 1.1 * asked, asked)
-    assert difference(same).startswith("The nominal link misses them") and "within 2 %" in (
-        difference(same)
+    other = PoleReport(asked, 1.1 * asked, 1.1 * asked, 2.0)
+    assert difference(other) == (
+        "Poles are placed for control.gain_factor = 1; with 2, the nominal link has others. The "
+        "assembled machine has all of them as on the nominal link, to 2 %."
     )
+    same = PoleReport(asked, 1.1 * asked, asked, 1.0)
+    assert difference(same).startswith("The nominal link does not have them")
+    assert difference(same).endswith("all of them as specified, to 2 %.")

@@ -182,7 +182,7 @@ def test_what_is_no_toml_names_the_file(tmp_path, content, words):
 def test_missing_file_and_folder_are_refused(tmp_path):
     with pytest.raises(StudyError, match=r"none\.toml: cannot be read \(No such file"):
         load_study(tmp_path / "none.toml")
-    with pytest.raises(StudyError, match=r"cannot be read \(Is a directory"):
+    with pytest.raises(StudyError, match=r"cannot be read \(a folder"):
         load_study(tmp_path)
 
 

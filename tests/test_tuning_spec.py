@@ -83,6 +83,27 @@ def test_poles_can_be_free():
     np.testing.assert_allclose(moved.pole_frequency[:, 0], 2 * np.pi * np.array([120, 100, 122]))
 
 
+def test_gains_that_poles_decide_cannot_be_free():
+    control = {**SMALL["control"], "pole_decay": 100.0}
+    free = {"control.velocity_gain[0]": {"from": 0.5, "to": 5.0}}
+    with pytest.raises(StudyError, match="velocity_gain.*: control.pole_decay decides the gains"):
+        parse_tuning({**SMALL, "control": control, "tune": {"free": free}})
+
+
+def test_numbers_a_link_move_links():
+    """As in the study: entry k of one number a link is link k, whatever is below it."""
+    control = {**SMALL["control"], "pole_decay": [100.0, 110.0, 120.0]}
+    free = {"control.pole_decay": {"from": 5.0, "to": 500.0}}
+    spec = parse_tuning({**SMALL, "control": control, "tune": {"free": free}})
+    case = as_arrays(build_case(spec.study))
+    moved = spec.free.place(case, np.array([10.0, 20.0, 30.0])).control.pole_decay
+    np.testing.assert_array_equal(moved, [[10, 10], [20, 20], [30, 30]])
+    one = {"control.pole_decay[1]": {"from": 5.0, "to": 500.0}}
+    spec = parse_tuning({**SMALL, "control": control, "tune": {"free": one}})
+    moved = spec.free.place(case, np.array([20.0])).control.pole_decay
+    np.testing.assert_array_equal(moved, [[100, 100], [20, 20], [120, 120]])
+
+
 def test_what_is_no_number_stays_as_it_is():
     free = {**EVERY_KIND, "placement": {"kind": "same"}}
     del free["patches.centers[1]"]

@@ -42,7 +42,7 @@ class Known(NamedTuple):
     sensor: Array  # lambda_s Phi_s^t, voltages of modal coordinates [V/m], (3, K, C)
     actuator: Array  # lambda_a Phi_a, modal forces of voltages [N/V], (3, C, K)
     omega: Array  # frequencies of the assembled links [rad/s], (3, C)
-    damping_ratio: Array  # structural, of the same modes [1], (3, C)
+    damping_ratio: Array  # of the same modes without control [1], (3, C)
     modal_mass: Array  # [kg], (3, C)
     mask: Array  # 1 for controlled modes, at most as many as patches, (C,)
     feedthrough: Array  # sensor volts per actuator volt by all other modes [V/V], (3, K, K)

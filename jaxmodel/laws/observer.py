@@ -77,16 +77,15 @@ def regulator(structure: Structure, case: Case, known: Known, model: LinkModel) 
         structure, case, known: of the law.
         model: of each link, leading axis 3.
     """
-    period, zeta = case.electronics.period, case.control.parameters["model_damping"]
-    zeta = jnp.asarray(zeta)[:, None]
-    damping, square = closed_modes(structure, case, known, zeta)
+    period = case.electronics.period
+    damping, square = closed_modes(structure, case, known)
     # exp(s T) of both poles: their sum and product
     total = 2 * jnp.exp(-damping * period) * _cosine((square - damping**2) * period**2)
     product = jnp.exp(-2 * damping * period)
     at = layout(structure, structure.n_controlled, structure.n_patches)
     each = layout(structure, 1, 1)
     own = [each[name].start for name in ("q", "rate", "volts") if name in each]
-    single = mode_models(structure, case, known, zeta)
+    single = mode_models(structure, case, known, known.damping_ratio)
     phi = single.state[:, :, jnp.array(own)[:, None], jnp.array(own)]
     gamma = single.state[:, :, jnp.array(own), each["last"].start]
     gain = jax.vmap(jax.vmap(_ackermann))(phi, gamma, total, product)  # (3, C, 2 or 3)

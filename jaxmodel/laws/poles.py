@@ -1,4 +1,4 @@
-"""Pole placement (20)-(23): gains of modal control that put each mode's poles where they are asked.
+"""Pole placement (20)-(23): gains of modal control that give each mode its specified poles.
 
 Poles are -alpha +- j beta. With continuous feedback k_d = 2 (alpha - zeta omega) m and
 k_p = (alpha^2 + beta^2 - omega^2) m; (22) is this without structural damping. A sampled loop with
@@ -27,7 +27,7 @@ from jaxmodel.parameters import Array
 
 #: Added decay over omega below which a mode is left alone [1].
 LEAST_SHIFT = 1e-9
-#: Sine of the angle between k_d H_v and k_p H_p below which they cannot be told apart [1].
+#: Sine of the angle between k_d H_v and k_p H_p below which they are taken as parallel [1].
 LEAST_ANGLE = 1e-4
 
 
@@ -38,8 +38,8 @@ class Poles(NamedTuple):
     frequency: Array  # beta [rad/s], (3, C)
 
 
-def asked_poles(case: Case, known: Known) -> Poles:
-    """Poles that the study asks for.
+def specified_poles(case: Case, known: Known) -> Poles:
+    """Poles that the study specifies.
 
     A mode without a decay of its own gets more than its structural one by the EMC ratios,
     alpha_j = zeta_j omega_j + r_j (alpha_1 - zeta_1 omega_1), as (24) shares out k_d. A mode
@@ -68,7 +68,7 @@ def sampled_gains(
     structure: Structure, case: Case, known: Known, estimator: Estimator
 ) -> tuple[Array, Array]:
     """Velocity [N s/m] and position gains [N/m] of the loop that runs, (3, C) each."""
-    poles = asked_poles(case, known)
+    poles = specified_poles(case, known)
     is_moved = _is_moved(poles, known)
     # own poles are poles of G: any others keep the unused alternative finite
     decay = jnp.where(is_moved, poles.decay, poles.decay + 0.1 * known.omega)
@@ -108,14 +108,14 @@ def nominal_modes(structure: Structure, case: Case, known: Known) -> LinkModel:
         LinkModel with leading axes (3, C), one input [N] and one output [m].
     """
     direct = known.observer @ known.feedthrough @ known.synthesizer
-    direct = structure.has_static_correction * jnp.diagonal(direct, axis1=1, axis2=2)
+    direct = jnp.diagonal(direct, axis1=1, axis2=2)
     model = mode_models(structure, case, known, known.damping_ratio, direct)
     subtracted = case.control.feedthrough_factor * direct
     return model._replace(sensor=model.sensor.at[..., 0, -1].add(-subtracted))
 
 
 def _is_moved(poles: Poles, known: Known) -> Array:
-    """Whether a mode's asked poles are not those it has without control."""
+    """Whether a mode's specified poles are not those it has without control."""
     omega = known.omega
     own = known.damping_ratio * omega
     ringing = jnp.sqrt(jnp.maximum(omega**2 - own**2, 0.0))
@@ -132,7 +132,7 @@ def _is_flat(rate: Array, value: Array) -> Array:
 def modal_gains(structure: Structure, case: Case, known: Known) -> tuple[Array, Array]:
     """Velocity [N s/m] and position gains [N/m] by mode, (3, C) each.
 
-    From the poles that the study asks for; of links without, its gains and ratios (24).
+    From the poles that the study specifies; of links without, its gains and ratios (24).
 
     Args:
         structure, case, known: of the law.
@@ -141,47 +141,44 @@ def modal_gains(structure: Structure, case: Case, known: Known) -> tuple[Array, 
     if not structure.has_poles:
         return given
     if structure.feedback == "ideal":
-        placed = continuous_gains(asked_poles(case, known), known)
+        placed = continuous_gains(specified_poles(case, known), known)
     else:
         placed = sampled_gains(structure, case, known, study_estimator(case, known))
-    is_asked, on = case.control.pole_decay[:, :1] > 0, acting_channels(case, known)
+    is_specified, on = case.control.pole_decay[:, :1] > 0, acting_channels(case, known)
     velocity, position = (
-        jnp.where(is_asked, on * x, y) for x, y in zip(placed, given, strict=True)
+        jnp.where(is_specified, on * x, y) for x, y in zip(placed, given, strict=True)
     )
     return velocity, position
 
 
-def closed_modes(
-    structure: Structure, case: Case, known: Known, damping_ratio: Array
-) -> tuple[Array, Array]:
+def closed_modes(structure: Structure, case: Case, known: Known) -> tuple[Array, Array]:
     """a [1/s] and b [1/s2] of each mode under continuous feedback, s^2 + 2 a s + b = 0, (3, C).
 
     Args:
         structure, case, known: of the law.
-        damping_ratio: structural, as the law assumes it [1], (3, 1).
     """
     velocity, position = given_gains(case, known)
-    damping = damping_ratio * known.omega + velocity / (2 * known.modal_mass)
+    damping = known.damping_ratio * known.omega + velocity / (2 * known.modal_mass)
     square = known.omega**2 + position / known.modal_mass
     if not structure.has_poles:
         return damping, square
-    poles = asked_poles(case, known)
-    is_asked = case.control.pole_decay[:, :1] > 0
+    poles = specified_poles(case, known)
+    is_specified = case.control.pole_decay[:, :1] > 0
     size = poles.decay**2 + poles.frequency**2
-    return jnp.where(is_asked, poles.decay, damping), jnp.where(is_asked, size, square)
+    return jnp.where(is_specified, poles.decay, damping), jnp.where(is_specified, size, square)
 
 
 def is_unplaceable(structure: Structure, case: Case, known: Known) -> Array:
-    """Whether asked poles of an acting mode cannot be placed, ().
+    """Whether specified poles of an acting mode cannot be placed, ().
 
     No positive decay, a decay beyond the mode's frequency without a frequency of its own, a
     frequency beyond half the sample rate, or estimates that are in phase at the pole.
     """
-    poles, period = asked_poles(case, known), case.electronics.period
+    poles, period = specified_poles(case, known), case.electronics.period
     is_fault = (poles.decay <= 0) | (poles.frequency * period >= jnp.pi)
     is_fault |= (poles.decay >= known.omega) & (case.control.pole_frequency <= 0)
     if structure.feedback == "sampled":
         z = jnp.exp((-poles.decay + 1j * poles.frequency) * period)
         is_fault |= _is_flat(*responses(study_estimator(case, known), z))
-    is_asked = (case.control.pole_decay[:, :1] > 0) & (acting_channels(case, known) > 0)
-    return jnp.any(is_fault & is_asked)
+    is_specified = (case.control.pole_decay[:, :1] > 0) & (acting_channels(case, known) > 0)
+    return jnp.any(is_fault & is_specified)

@@ -14,7 +14,7 @@ import os
 import re
 import subprocess
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from hashlib import file_digest
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -192,8 +192,9 @@ def locked_folder(path: Path, what: str) -> Iterator[None]:
         except StudyError:
             if set(path.iterdir()) - before == {path / LOCK}:
                 (path / LOCK).unlink()
-                for folder in created:
-                    folder.rmdir()
+                with suppress(OSError):  # somebody else has used one meanwhile
+                    for folder in created:
+                        folder.rmdir()
             raise
 
 

@@ -1,4 +1,4 @@
-"""Poles asked and obtained: on the nominal link, for which they are placed, and on the machine."""
+"""Specified and obtained poles: on the nominal link, for which they are placed, and the machine."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from studies.engine.stability import LoopReport
 
 #: Relative difference of a decay or frequency that is worth a sentence [1].
 NOTABLE = 0.02
-HEADER = ["mode", "link", "asked", "nominal link", "assembled machine"]
+HEADER = ["mode", "link", "specified", "nominal link", "assembled machine"]
 
 
 class PoleReport(NamedTuple):
     """Poles s = -alpha + j beta of controlled modes [1/s], complex, (3, C); NaN: not controlled."""
 
-    asked: np.ndarray
+    specified: np.ndarray
     nominal: np.ndarray  # of the nominal link's loop
-    assembled: np.ndarray  # of the three assembled modes of each order, nearest to those asked
+    assembled: np.ndarray  # of the three assembled modes of each order, nearest to the nominal ones
+    gain_factor: float  # control.gain_factor [1]
 
 
-def pole_report(structure: Structure, case: Case, loop: LoopReport) -> PoleReport:
-    """Where asked poles lie.
+def pole_report(structure: Structure, case: Case, loop: LoopReport) -> PoleReport | None:
+    """Where specified poles lie; None if no mode that acts has any.
 
     Args:
         structure: with `has_poles` and feedback "sampled".
@@ -39,33 +40,36 @@ def pole_report(structure: Structure, case: Case, loop: LoopReport) -> PoleRepor
     order = np.arange(poles.shape[1]) < control.n_active
     is_on = (control.link_mask[:, None] > 0) & (control.mode_mask > 0) & order
     is_on = is_on & (np.asarray(control.pole_decay)[:, :1] > 0)
-    asked = np.where(is_on, poles, np.nan)
-    nominal, assembled = (np.full(asked.shape, np.nan, complex) for _ in range(2))
+    if not is_on.any():
+        return None
+    specified = np.where(is_on, poles, np.nan)
+    nominal, assembled = (np.full(specified.shape, np.nan, complex) for _ in range(2))
     for link, mode in np.argwhere(is_on):
         block = matrix[link, min(mode, matrix.shape[1] - 1)]
         z = np.linalg.eigvals(block)
-        near = z[np.argmin(np.abs(z - np.exp(asked[link, mode] * period)))]
+        near = z[np.argmin(np.abs(z - np.exp(specified[link, mode] * period)))]
         nominal[link, mode] = np.log(near) / period
     frequency, zeta = loop.frequency_hz, loop.damping_ratio
     found = 2 * np.pi * frequency * (-zeta + 1j * np.sqrt(np.maximum(1 - zeta**2, 0)))
     for mode in np.flatnonzero(is_on.any(axis=0))[: len(found)]:
-        assembled[:, mode] = np.where(is_on[:, mode], _matched(asked[:, mode], found[mode]), np.nan)
-    return PoleReport(asked, nominal, assembled)
+        matched = _matched(nominal[:, mode], found[mode])
+        assembled[:, mode] = np.where(is_on[:, mode], matched, np.nan)
+    return PoleReport(specified, nominal, assembled, float(control.gain_factor))
 
 
-def _matched(asked: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """The three assembled poles in the order that brings them nearest to those asked."""
+def _matched(nominal: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """The three assembled poles in the order that brings them nearest to the nominal link's."""
     return min(
         (found[list(order)] for order in permutations(range(3))),
-        key=lambda poles: float(np.nansum(np.abs(poles - asked))),
+        key=lambda poles: float(np.nansum(np.abs(poles - nominal))),
     )
 
 
 def pole_rows(report: PoleReport) -> list[list[str]]:
     """Row of each controlled mode and link: decay [1/s] and frequency [Hz], by `HEADER`."""
     return [
-        [str(mode + 1), str(link + 1), *(_shown(poles[link, mode]) for poles in report)]
-        for mode, link in np.argwhere(~np.isnan(report.asked).T)
+        [str(mode + 1), str(link + 1), *(_shown(poles[link, mode]) for poles in report[:3])]
+        for mode, link in np.argwhere(~np.isnan(report.specified).T)
     ]
 
 
@@ -76,26 +80,33 @@ def _shown(pole: complex) -> str:
 
 
 def difference(report: PoleReport) -> str:
-    """Where the machine differs most from what is asked, and why."""
-    sentences = []
-    if np.nanmax(_apart(report.nominal, report.asked)) > NOTABLE:
+    """Where poles differ most from what is specified, and why."""
+    sentences, wanted = [], report.specified
+    if report.gain_factor != 1:
         sentences.append(
-            "The nominal link misses them: gains are designed for control.gain_factor = 1."
+            f"Poles are placed for control.gain_factor = 1; with {report.gain_factor:g}, the "
+            "nominal link has others."
         )
-    apart = _apart(report.assembled, report.asked)
-    if np.isnan(apart).all() or np.nanmax(apart) <= NOTABLE:
-        return " ".join([*sentences, "The assembled machine has all of them within 2 %."])
+        wanted = report.nominal
+    elif np.nanmax(_apart(report.nominal, wanted)) > NOTABLE:
+        sentences.append("The nominal link does not have them: they cannot be placed.")
+    apart = _apart(report.assembled, wanted)
+    than = "specified" if wanted is report.specified else "on the nominal link"
+    if np.isnan(apart).all():
+        return " ".join(sentences)
+    if np.nanmax(apart) <= NOTABLE:
+        return " ".join([*sentences, f"The assembled machine has all of them as {than}, to 2 %."])
     at = np.unravel_index(np.nanargmax(apart), apart.shape)
     sentences.append(
         f"The assembled machine differs most in mode {at[1] + 1} of link {at[0] + 1}: "
-        f"{_shown(report.assembled[at])} instead of {_shown(report.asked[at])}. Its links are "
+        f"{_shown(report.assembled[at])} instead of {_shown(wanted[at])} {than}. Its links are "
         "coupled by the platform and patches act on all modes (spillover); gains are designed mode "
         "by mode."
     )
     return " ".join(sentences)
 
 
-def _apart(poles: np.ndarray, asked: np.ndarray) -> np.ndarray:
+def _apart(poles: np.ndarray, specified: np.ndarray) -> np.ndarray:
     """Relative difference of decay or frequency, whichever is larger [1]."""
-    decay = np.abs((poles.real - asked.real) / asked.real)
-    return np.maximum(decay, np.abs((poles.imag - asked.imag) / np.abs(asked)))
+    decay = np.abs((poles.real - specified.real) / specified.real)
+    return np.maximum(decay, np.abs((poles.imag - specified.imag) / np.abs(specified)))

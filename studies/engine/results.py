@@ -52,7 +52,9 @@ class SweepData:
     @cached_property
     def table(self) -> CaseTable:
         """Its cases, built once."""
-        table = build_table(self.spec) if self.cases is None else self.cases
+        if self.cases is not None:
+            return self.cases
+        table = build_table(self.spec)
         if len(table) != self.n_cases:
             raise StudyError(f"{RESULTS}: {self.n_cases} cases; its sweep has {len(table)}")
         return table

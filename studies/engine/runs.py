@@ -90,7 +90,7 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
         try:
             tracked = max(3, structure.n_controlled) if structure.has_poles else 3
             loop = loop_report(structure, case, _home(study), min(tracked, structure.n_modes))
-            if structure.has_poles:
+            if structure.has_poles and code != status.UNPLACEABLE:
                 poles = pole_report(structure, case, loop)
             motion = motion_report(structure, case)
         except np.linalg.LinAlgError:  # a non-finite entry
@@ -251,6 +251,9 @@ def _without_run(structure: Structure) -> Structure:
         "has_wrench",
         "controller_basis",
         "law",
+        "has_poles",
+        "has_amplifier",
+        "has_sensor_highpass",
     )
     fields = {name: getattr(structure, name) for name in kept}
     return Structure(n_steps=1, feedback="none", **fields)
@@ -593,8 +596,8 @@ def run_variables(run: Run) -> dict[str, Variable]:
             ),
         }
     if run.poles is not None:
-        texts = ("asked for", "of the nominal link's loop", "of the assembled machine's loop")
-        for name, text, pole in zip(PoleReport._fields, texts, run.poles, strict=True):
+        texts = ("specified", "of the nominal link's loop", "of the assembled machine's loop")
+        for name, text, pole in zip(PoleReport._fields, texts, run.poles[:3], strict=False):
             for part, value, unit in (
                 ("decay", -pole.real, "s-1"),
                 ("frequency", np.abs(pole.imag) / (2 * np.pi), "Hz"),

@@ -19,7 +19,7 @@ from jaxmodel.laws import LAWS
 from jaxmodel.parameters import Array
 from studies.errors import StudyError, field_error, nearest
 from studies.space.axes import ALIASES, READY_MADE, Range, parse_range
-from studies.study.paths import checked_value, known_field, overlaps, parse_entry
+from studies.study.paths import checked_value, is_each_link, known_field, overlaps, parse_entry
 from studies.study.spec import OWN_FIELDS, Study
 
 TWO_PI = 2 * np.pi
@@ -111,7 +111,7 @@ class Setter(NamedTuple):
     """Writes one number into a Case; hashable."""
 
     path: str
-    indices: tuple[int, ...]
+    indices: tuple[Any, ...]  # those of links end with an ellipsis: all below
     factor: float
 
 
@@ -236,7 +236,8 @@ def plain_numbers(
         if not span.low <= start <= span.high:
             raise field_error(label, start, f"{span.low:g} to {span.high:g}, the bounds of {path}")
         numbers.append(Free(label, span, float(start), name))
-        setters.append(Setter(leaf.path, whole, leaf.factor))
+        at = (*whole, Ellipsis) if whole and is_each_link(entry.field) else whole
+        setters.append(Setter(leaf.path, at, leaf.factor))
     if not numbers:
         raise field_error(name, value, f"one number or more, where {path} is to be free")
     return numbers, Placing(_set, (tuple(setters),))
@@ -288,7 +289,7 @@ def _set(setters: tuple[Setter, ...], case: Case, values: Array) -> Case:
     return case
 
 
-def _replaced(tree: Any, path: list[str], indices: tuple[int, ...], value: Array) -> Any:
+def _replaced(tree: Any, path: list[str], indices: tuple[Any, ...], value: Array) -> Any:
     """A tree of named tuples and dictionaries with one number replaced.
 
     Fewer indices than axes select everything below.
@@ -303,8 +304,10 @@ def _replaced(tree: Any, path: list[str], indices: tuple[int, ...], value: Array
     return tree._replace(**{first: _replaced(getattr(tree, first), rest, indices, value)})
 
 
-def _widened(indices: tuple[int, ...], depth: int) -> Any:
+def _widened(indices: tuple[Any, ...], depth: int) -> Any:
     """One list of patch centres, or of one number, stands for those of all links."""
+    if Ellipsis in indices:
+        return indices
     return (Ellipsis, *indices) if indices and depth > len(indices) else (indices or Ellipsis)
 
 

@@ -79,7 +79,7 @@ class Certificate(NamedTuple):
 
     @property
     def spillover(self) -> Spillover | None:
-        """The uncontrolled mode of any plant that control robs of most of its damping, if any."""
+        """The uncontrolled mode of any plant that loses most damping, if more than a tenth."""
         kept = np.where(
             self.exists[..., None, None], self.damping_ratio / self.free_damping, np.nan
         )

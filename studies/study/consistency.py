@@ -93,7 +93,10 @@ def _check_poles(study: Study) -> None:
     decay, frequency = control.pole_decay, control.pole_frequency_hz
     if frequency != () and decay == ():
         raise field_error(
-            "control.pole_decay", decay, "given with control.pole_frequency_hz", "1/s"
+            "control.pole_decay",
+            decay,
+            "more than 0, where control.pole_frequency_hz is given",
+            "1/s",
         )
     if decay == ():
         return
@@ -114,8 +117,8 @@ def _check_poles(study: Study) -> None:
         raise field_error(
             "control.pole_frequency_hz",
             frequency,
-            "one list a link by mode, where control.modes is more than 1: [[130.0], [120.0], "
-            "[125.0]] moves mode 1 alone",
+            "three lists, one a link by mode, where control.modes is more than 1: "
+            "[[130.0], [120.0], [125.0]] moves mode 1 alone",
             "Hz",
         )
 

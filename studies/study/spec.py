@@ -267,11 +267,11 @@ class ControlSection(Section):
     pole_decay: EachMode[Decay] = described(
         (),
         "1/s",
-        "alpha of the poles -alpha +- j beta that modes shall have, from which gains follow: one "
+        "alpha of the specified poles -alpha +- j beta, from which the gains follow: one "
         "number for all modes, one a link, or one list a link by mode, others by (24)",
     )
     pole_frequency_hz: EachMode[OwnOrHertz] = described(
-        (), "Hz", "beta/2 pi of these poles, in the same forms; empty or 0: the mode keeps its own"
+        (), "Hz", "beta/2 pi of these poles, by mode; empty or 0: the mode keeps its own"
     )
     gain_unit: Literal["N s/m", "1/s"] = described(
         "N s/m", "-", "modal force or modal acceleration"
