@@ -166,7 +166,7 @@ def test_the_report_of_a_run_is_whole(short_folder, short_run):
     # links, platform, two tracked modes, versions
     assert len(found.images) == 4 and found.rows == [[8] * 4, [4] * 4, [3] * 3, [2] * 8]
     rms = f"{1e6 * float(short_run.residual_rms[1].max()):.4g}"
-    margin = f"gain margin {float(short_run.gain_margin):.4g}, spectral radius"
+    margin = f"gain margin {float(short_run.gain_margin):.4g}, the factor"
     watched = f"the run ends {50 - 1e3 * float(short_run.command_end):.4g} ms after"
     for part in (
         "Status: ok.",
