@@ -12,7 +12,7 @@ from jaxmodel.controller import Controller
 from jaxmodel.estimator import FilterState, advance_filters, weighted
 from jaxmodel.laws.contract import Known
 from jaxmodel.laws.link_model import LinkModel, link_model
-from jaxmodel.laws.poles import nominal_modes, specified_poles
+from jaxmodel.laws.poles import is_placed, nominal_modes, specified_poles
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import design_controller
@@ -26,14 +26,15 @@ def nominal_loop(structure: Structure, case: Case) -> tuple[Array, Array]:
         case: the numbers.
 
     Returns:
-        specified poles s [1/s], complex, (3, C); matrices, (3, B, n, n): B = C modes, or 1 for a
-        whole link.
+        specified poles s [1/s], complex, NaN where a mode has none, (3, C); and
+        matrices, (3, B, n, n): B = C modes, or 1 for a whole link.
     """
     design = design_controller(structure, case, find_bases(structure, case))
     poles = specified_poles(case, design.known)
+    s = -poles.decay + 1j * poles.frequency
     loop = _of_modes if design.controller.system is None else _of_links
     matrix = loop(structure, case, design.controller, design.known)
-    return -poles.decay + 1j * poles.frequency, matrix
+    return jnp.where(is_placed(case, design.known), s, jnp.nan), matrix
 
 
 def _of_modes(structure: Structure, case: Case, law: Controller, known: Known) -> Array:

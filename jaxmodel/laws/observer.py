@@ -51,11 +51,7 @@ def corrections(structure: Structure, case: Case, known: Known, state: Array) ->
             return x @ (f @ f - 2 * jnp.real(z) * f + jnp.real(z * jnp.conj(z)) * eye)
 
         phi = reduce(pair, [mode, *filters], f - last * eye if size == 5 else eye)
-        rows = [eye[2]]
-        for _ in range(size - 1):
-            rows.append(rows[-1] @ f)
-        predictor = phi @ jnp.linalg.solve(jnp.stack(rows), eye[-1])
-        return jnp.linalg.solve(f, predictor)
+        return jnp.linalg.solve(f, _ackermann(f.T, eye[2], phi.T))
 
     own = jnp.arange(size) * count
     blocks = jnp.stack(
@@ -88,7 +84,14 @@ def regulator(structure: Structure, case: Case, known: Known, model: LinkModel) 
     single = mode_models(structure, case, known, known.damping_ratio)
     phi = single.state[:, :, jnp.array(own)[:, None], jnp.array(own)]
     gamma = single.state[:, :, jnp.array(own), each["last"].start]
-    gain = jax.vmap(jax.vmap(_ackermann))(phi, gamma, total, product)  # (3, C, 2 or 3)
+
+    def one(phi: Array, gamma: Array, total: Array, product: Array) -> Array:
+        wanted = phi @ phi - total * phi + product * jnp.eye(len(own))
+        if len(own) > 2:  # the amplifier's pole stays
+            wanted = wanted @ (phi - phi[2, 2] * jnp.eye(len(own)))
+        return _ackermann(phi, gamma, wanted)
+
+    gain = jax.vmap(jax.vmap(one))(phi, gamma, total, product)  # (3, C, 2 or 3)
     gain = gain * acting_channels(case, known)[..., None]
     rows = [model.state[:, at["q"]], model.state[:, at["rate"]]]
     if "volts" in at:
@@ -97,12 +100,12 @@ def regulator(structure: Structure, case: Case, known: Known, model: LinkModel) 
     return known.synthesizer @ force
 
 
-def _ackermann(phi: Array, gamma: Array, total: Array, product: Array) -> Array:
-    """k of u = -k x that gives x_(k+1) = phi x_k + gamma u_k two poles by sum and product."""
+def _ackermann(phi: Array, gamma: Array, wanted: Array) -> Array:
+    """k of u = -k x that gives x_(k+1) = phi x_k + gamma u_k the polynomial p; wanted = p(phi).
+
+    Of the transposed system, the correction of an observer.
+    """
     n = gamma.size
-    wanted = phi @ phi - total * phi + product * jnp.eye(n)
-    if n > 2:  # the pole behind the mode stays
-        wanted = wanted @ (phi - phi[2, 2] * jnp.eye(n))
     reach = [gamma]
     for _ in range(n - 1):
         reach.append(phi @ reach[-1])

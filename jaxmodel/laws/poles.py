@@ -57,6 +57,11 @@ def specified_poles(case: Case, known: Known) -> Poles:
     return Poles(decay, jnp.where(is_given, control.pole_frequency, kept))
 
 
+def is_placed(case: Case, known: Known) -> Array:
+    """Whether a mode acts and its poles are specified, (3, C)."""
+    return (case.control.pole_decay[:, :1] > 0) & (acting_channels(case, known) > 0)
+
+
 def continuous_gains(poles: Poles, known: Known) -> tuple[Array, Array]:
     """Velocity [N s/m] and position gains [N/m] of continuous feedback, (22)-(23), (3, C) each."""
     gains = pole_placement(poles.decay, poles.frequency, known.omega)
@@ -76,11 +81,11 @@ def sampled_gains(
     rate, value = responses(estimator, z)
     wanted = -1 / pulse_transfer(structure, case, known, z)
     area = jnp.imag(jnp.conj(rate) * value)
-    is_placed = is_moved & ~_is_flat(rate, value)
-    area = jnp.where(is_placed, area, 1.0)
+    is_solved = is_moved & ~_is_flat(rate, value)
+    area = jnp.where(is_solved, area, 1.0)
     velocity = jnp.imag(jnp.conj(wanted) * value) / area
     position = jnp.imag(jnp.conj(rate) * wanted) / area
-    return jnp.where(is_placed, velocity, 0.0), jnp.where(is_placed, position, 0.0)
+    return jnp.where(is_solved, velocity, 0.0), jnp.where(is_solved, position, 0.0)
 
 
 def pulse_transfer(structure: Structure, case: Case, known: Known, z: Array) -> Array:
@@ -144,10 +149,8 @@ def modal_gains(structure: Structure, case: Case, known: Known) -> tuple[Array, 
         placed = continuous_gains(specified_poles(case, known), known)
     else:
         placed = sampled_gains(structure, case, known, study_estimator(case, known))
-    is_specified, on = case.control.pole_decay[:, :1] > 0, acting_channels(case, known)
-    velocity, position = (
-        jnp.where(is_specified, on * x, y) for x, y in zip(placed, given, strict=True)
-    )
+    chosen = is_placed(case, known)
+    velocity, position = (jnp.where(chosen, x, y) for x, y in zip(placed, given, strict=True))
     return velocity, position
 
 
@@ -162,10 +165,9 @@ def closed_modes(structure: Structure, case: Case, known: Known) -> tuple[Array,
     square = known.omega**2 + position / known.modal_mass
     if not structure.has_poles:
         return damping, square
-    poles = specified_poles(case, known)
-    is_specified = case.control.pole_decay[:, :1] > 0
+    poles, chosen = specified_poles(case, known), is_placed(case, known)
     size = poles.decay**2 + poles.frequency**2
-    return jnp.where(is_specified, poles.decay, damping), jnp.where(is_specified, size, square)
+    return jnp.where(chosen, poles.decay, damping), jnp.where(chosen, size, square)
 
 
 def is_unplaceable(structure: Structure, case: Case, known: Known) -> Array:
@@ -180,5 +182,4 @@ def is_unplaceable(structure: Structure, case: Case, known: Known) -> Array:
     if structure.feedback == "sampled":
         z = jnp.exp((-poles.decay + 1j * poles.frequency) * period)
         is_fault |= _is_flat(*responses(study_estimator(case, known), z))
-    is_specified = (case.control.pole_decay[:, :1] > 0) & (acting_channels(case, known) > 0)
-    return jnp.any(is_fault & is_specified)
+    return jnp.any(is_fault & is_placed(case, known))

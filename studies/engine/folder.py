@@ -173,9 +173,9 @@ def locked_folder(path: Path, what: str) -> Iterator[None]:
     Raises:
         StudyError: not writable or in use.
     """
-    created = [folder for folder in (path, *path.parents) if not folder.exists()]
-    before = set(path.iterdir()) if path.is_dir() else set()
     try:
+        created = [folder for folder in (path, *path.parents) if not folder.exists()]
+        before = set(path.iterdir()) if path.is_dir() else set()
         path.mkdir(parents=True, exist_ok=True)
         lock = open(path / LOCK, "a", opener=_at_once)  # noqa: SIM115 (held as long as the folder is)
     except FileExistsError:

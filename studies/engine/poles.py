@@ -35,14 +35,10 @@ def pole_report(structure: Structure, case: Case, loop: LoopReport) -> PoleRepor
         case: the numbers.
         loop: its report, with all controlled modes tracked.
     """
-    poles, matrix = map(np.asarray, jax.jit(partial(nominal_loop, structure))(case))
-    control, period = case.control, float(case.electronics.period)
-    order = np.arange(poles.shape[1]) < control.n_active
-    is_on = (control.link_mask[:, None] > 0) & (control.mode_mask > 0) & order
-    is_on = is_on & (np.asarray(control.pole_decay)[:, :1] > 0)
+    specified, matrix = map(np.asarray, jax.jit(partial(nominal_loop, structure))(case))
+    is_on, period = ~np.isnan(specified), float(case.electronics.period)
     if not is_on.any():
         return None
-    specified = np.where(is_on, poles, np.nan)
     nominal, assembled = (np.full(specified.shape, np.nan, complex) for _ in range(2))
     for link, mode in np.argwhere(is_on):
         block = matrix[link, min(mode, matrix.shape[1] - 1)]
@@ -54,7 +50,7 @@ def pole_report(structure: Structure, case: Case, loop: LoopReport) -> PoleRepor
     for mode in np.flatnonzero(is_on.any(axis=0))[: len(found)]:
         matched = _matched(nominal[:, mode], found[mode])
         assembled[:, mode] = np.where(is_on[:, mode], matched, np.nan)
-    return PoleReport(specified, nominal, assembled, float(control.gain_factor))
+    return PoleReport(specified, nominal, assembled, float(case.control.gain_factor))
 
 
 def _matched(nominal: np.ndarray, found: np.ndarray) -> np.ndarray:

@@ -67,7 +67,7 @@ class Run(NamedTuple):
     loop: LoopReport | None  # linearised sampled loop, if there is one
     motion: MotionReport | None  # the same with the forces of the motion
     status: int  # code of `jaxmodel.status`; UNSTABLE comes from the linearised loop
-    poles: PoleReport | None = None  # asked and obtained, where the gains follow from poles
+    poles: PoleReport | None = None  # specified and obtained, where gains follow from poles
 
 
 def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> Run:
@@ -88,10 +88,7 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
     loop, motion, poles, code = None, None, None, int(result.status)
     if has_loop and structure.feedback == "sampled":
         try:
-            tracked = max(3, structure.n_controlled) if structure.has_poles else 3
-            loop = loop_report(structure, case, _home(study), min(tracked, structure.n_modes))
-            if structure.has_poles and code != status.UNPLACEABLE:
-                poles = pole_report(structure, case, loop)
+            loop, poles = loop_and_poles(study, structure, case, code)
             motion = motion_report(structure, case)
         except np.linalg.LinAlgError:  # a non-finite entry
             return Run(
@@ -114,6 +111,25 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
         status=code,
         poles=poles,
     )
+
+
+def loop_and_poles(
+    study: Study, structure: Structure, case: Case, code: int
+) -> tuple[LoopReport, PoleReport | None]:
+    """The linearised sampled loop, and specified and obtained poles, if there are any.
+
+    Args:
+        study, structure, case: the design, as of `check_run`.
+        code: status of its run.
+
+    Raises:
+        LinAlgError: an entry of the loop's matrices is not finite.
+    """
+    tracked = max(3, structure.n_controlled) if structure.has_poles else 3
+    loop = loop_report(structure, case, _home(study), min(tracked, structure.n_modes))
+    if not structure.has_poles or code == status.UNPLACEABLE:
+        return loop, None
+    return loop, pole_report(structure, case, loop)
 
 
 def _own_ratio(study: Study, structure: Structure, case: Case, has_record: bool) -> np.ndarray:

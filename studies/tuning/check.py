@@ -15,9 +15,8 @@ from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import Result
 from studies.engine.executor import make_executor
 from studies.engine.plan import even_layout
-from studies.engine.poles import PoleReport, pole_report
-from studies.engine.runs import check_run, run_study
-from studies.engine.stability import loop_report
+from studies.engine.poles import PoleReport
+from studies.engine.runs import check_run, loop_and_poles, run_study
 from studies.errors import StudyError
 from studies.study.cases import as_arrays, build_case, build_cases, in_working_precision
 from studies.study.paths import set_values
@@ -154,20 +153,17 @@ def judge(spec: TuneSpec, designs: list[Study]) -> list[JudgedDesign]:
                 watched=duration - result.command_end[rows],
                 loop=loop_figures(study) if study.control.feedback == "sampled" else None,
                 own=_seen(merit, own[k], own[0], duration),
-                poles=_poles(study),
+                poles=_poles(study, own[k]),
             )
         )
     return found
 
 
-def _poles(study: Study) -> PoleReport | None:
-    """Asked and obtained poles of a design's own file; None if there are none."""
-    if study.control.pole_decay == () or study.control.feedback != "sampled":
+def _poles(study: Study, run: Result | None) -> PoleReport | None:
+    """Specified and obtained poles of a design's own file; None if it has none or cannot run."""
+    if run is None or study.control.pole_decay == () or study.control.feedback != "sampled":
         return None
-    structure, case = check_run(study)
-    tracked = max(1, min(structure.n_controlled, structure.n_modes))
-    loop = loop_report(structure, case, np.array(study.motion.waypoints[0]), tracked)
-    return pole_report(structure, case, loop)
+    return loop_and_poles(study, *check_run(study), int(run.status))[1]
 
 
 def _own_run(study: Study) -> Result | None:
