@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING
 
 from studies.lazy import lazily
 
+__version__ = "0.1.0"
+
 if TYPE_CHECKING:
     from studies.atlas.run import run_atlas
     from studies.bench.run import run_bench
@@ -39,6 +41,7 @@ __all__ = [
     "Run",
     "Study",
     "StudyError",
+    "__version__",
     "analyse",
     "as_arrays",
     "audit",

@@ -14,9 +14,10 @@ from rich.table import Table
 from rich.text import Text
 from typer.exceptions import Abort, TyperException
 
+from studies import __version__
 from studies.atlas.commands import add_commands as add_atlas
 from studies.bench.commands import add_commands as add_bench
-from studies.config import configure, start
+from studies.config import PACKAGE, configure, start
 from studies.errors import OWN_WARNINGS, StudyError, printable
 from studies.export.commands import add_commands as add_export
 from studies.fitting.commands import add_commands as add_fit
@@ -28,7 +29,6 @@ from studies.tuning.commands import add_commands as add_tuning
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 #: Width of tables in redirected output; a terminal uses its own width.
@@ -103,6 +103,12 @@ def _show_warning(
         print(warnings.formatwarning(message, category, filename, lineno), file=sys.stderr, end="")
 
 
+def _print_version(is_wanted: bool) -> None:
+    if is_wanted:
+        print(f"{PACKAGE} {__version__}")
+        raise typer.Exit()
+
+
 @app.callback()
 def prepare(
     own: Annotated[
@@ -113,6 +119,10 @@ def prepare(
             "targets",
         ),
     ] = None,
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="show the version", callback=_print_version, is_eager=True),
+    ] = False,
 ) -> None:
     """Parameter studies of a planar 3-PRR manipulator with flexible links."""
     if own:

@@ -424,3 +424,7 @@ def test_every_command_has_a_call_in_python():
                 names = [word.arg for word in call.keywords]
                 signature = inspect.signature(getattr(studies, call.func.id))
                 signature.bind(*call.args, **dict.fromkeys(names))
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    assert run(capsys, "--version") == (0, f"flexlink-studies {studies.__version__}\n", "")
