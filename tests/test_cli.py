@@ -38,6 +38,7 @@ modes = 2
 waypoints = [[0, 0, {HOME_PHI}], [0, 0.002, {HOME_PHI}]]
 move_time = 0.02
 [metrics]
+residual_delay = 0.0
 residual_length = 0.02
 """
 

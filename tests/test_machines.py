@@ -110,7 +110,7 @@ SHORT = {
     "motion": {"waypoints": [HOME, (0.0, 0.01, HOME[2])], "move_time": 0.05},
     "shaper": {"kind": "none"},
     "control": {"gain_factor": 0.2},
-    "metrics": {"residual_length": 0.02},
+    "metrics": {"residual_delay": 0.0, "residual_length": 0.02},
 }
 
 

@@ -28,6 +28,7 @@ STUDY = paper_study().change(
     control__position_gain=(10.0, 10.0, 10.0),
     patches__centers=(0.03, 0.08, 0.12, 0.17),
     metrics__stations=(0.03, 0.05, 0.08, 0.1, 0.12, 0.15, 0.17),
+    metrics__residual_delay=0.0,
     metrics__residual_length=0.005,
     motion__move_time=0.002,
     shaper__kind="none",

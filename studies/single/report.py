@@ -95,6 +95,7 @@ def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str], name: st
         "single/report.md",
         run=run,
         study=study,
+        delay=float(run.case.windows.residual_delay),
         twin=twin,
         metrics=result.metrics,
         loop=run.loop,

@@ -31,8 +31,9 @@ from jaxmodel.parameters import ASSEMBLIES, Beam, Damping, Geometry, Machine, Ma
 from jaxmodel.state_space import StateSpace
 from studies.study.consistency import patch_centers
 from studies.study.fields import Columns, Fields
-from studies.study.spec import OWN_FIELDS, Study
+from studies.study.spec import AUTO, OWN_FIELDS, Study
 from studies.study.state_space import system_of
+from studies.study.window import residual_delay
 
 TWO_PI = 2 * np.pi
 #: Duration of a move that only pads a path with fewer moves [s].
@@ -111,7 +112,7 @@ def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
             number("initial.load_deflection"),
         ),
         windows=Windows(
-            residual_delay=number("metrics.residual_delay"),
+            residual_delay=_delay(fields),
             residual_length=number("metrics.residual_length"),
             settling_band=number("metrics.settling_band"),
             saturation_limit=number("metrics.saturation_limit"),
@@ -122,6 +123,13 @@ def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
         ),
         seed=fields.raw("run.seed").astype(int),
     )
+
+
+def _delay(fields: Fields) -> np.ndarray:
+    """Start of the residual window [s], (m,); "auto" is that of the study without columns."""
+    given = fields.raw("metrics.residual_delay")
+    auto = residual_delay(fields.study) if AUTO in given else 0.0
+    return np.array([auto if x == AUTO else float(x) for x in given])
 
 
 def in_working_precision(cases: Case) -> Case:

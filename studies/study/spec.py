@@ -28,6 +28,8 @@ from studies.study.state_space import with_matrices
 #: Where laws' own fields are.
 OWN_FIELDS = "control.laws"
 Basis = Annotated[str, OneOf(lambda: BASES)]
+#: Value of `metrics.residual_delay` that leaves the number to `studies.study.window`.
+AUTO = "auto"
 
 
 # numbers within bounds, as entries of a list
@@ -79,7 +81,7 @@ class Section(BaseModel):
 class RunSection(Section):
     """Duration, resolution and model of the run."""
 
-    duration: float = described(0.8, "s", "length of the run", gt=0, le=100)
+    duration: float = described(0.4, "s", "length of the run", gt=0, le=100)
     seed: int = described(0, "1", "of ADC noise and force ripple", ge=0, le=10**9)
     substeps: int = described(0, "1", "plant steps per sample; 0: as many as needed", ge=0, le=200)
     smooth: bool = described(False, "-", "smooth limits, noise instead of rounding (for gradients)")
@@ -214,7 +216,7 @@ class MotionSection(Section):
         min_length=1,
         max_length=100,
     )
-    move_time: Time | tuple[Time, ...] = described(0.1, "s", "t_f of each move, or one per move")
+    move_time: Time | tuple[Time, ...] = described(0.03, "s", "t_f of each move, or one per move")
     dwell: Pause | tuple[Pause, ...] = described(0.0, "s", "pause after each move, or one per move")
     profile: Annotated[str, OneOf(lambda: PROFILES)] = described("cycloid", "-", "cycloid is (25)")
 
@@ -222,7 +224,7 @@ class MotionSection(Section):
 class ShaperSection(Section):
     """Input shaper on the motion."""
 
-    kind: Annotated[str, OneOf(lambda: SHAPERS)] = described("ei", "-", "ei is the paper's (13)")
+    kind: Annotated[str, OneOf(lambda: SHAPERS)] = described("none", "-", "ei is the paper's (13)")
     frequencies_hz: tuple[Hertz, ...] = described(
         (),
         "Hz",
@@ -409,10 +411,13 @@ class InitialSection(Section):
 class MetricsSection(Section):
     """Evaluation of a run."""
 
-    residual_delay: float = described(
-        0.0, "s", "residual window starts this long after the command", ge=0, le=100
+    residual_delay: Literal["auto"] | Pause = described(
+        AUTO,
+        "s",
+        "residual window starts this long after the command; auto: when the drive has settled to "
+        "2 %, by its poles",
     )
-    residual_length: float = described(0.3, "s", "length of the residual window", gt=0, le=100)
+    residual_length: float = described(0.2, "s", "length of the residual window", gt=0, le=100)
     settling_band: float = described(
         1e-6, "m", "chord deflection that counts as settled", gt=0, le=0.1
     )
