@@ -37,6 +37,8 @@ modes = 2
 [motion]
 waypoints = [[0, 0, {HOME_PHI}], [0, 0.002, {HOME_PHI}]]
 move_time = 0.02
+[shaper]
+kind = "ei"
 [metrics]
 residual_delay = 0.0
 residual_length = 0.02
