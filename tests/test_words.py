@@ -114,9 +114,14 @@ def help_texts(command, name="studies"):
 
 
 def cells(path):
-    """Texts of a notebook: markdown, and the comments and labels of its code."""
+    """Texts of a notebook: markdown, and the comments and strings of its code."""
     for k, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
-        yield f"{path.name}, cell {k}", "".join(cell["source"])
+        text = "".join(cell["source"])
+        if cell["cell_type"] == "code":
+            code = re.sub(r"^%.*", "", text, flags=re.MULTILINE)
+            strings = [found for _, found in prose_of(ast.parse(code))]
+            text = "\n".join([*re.findall(r"#.*", code), *strings])
+        yield f"{path.name}, cell {k}", text
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(TOP)))
