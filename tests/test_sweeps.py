@@ -418,7 +418,7 @@ def test_extended_sweep_runs_only_new_cases(tmp_path):
 
 def test_what_does_not_fit_is_refused(tmp_path, mixed):
     folder, _ = mixed
-    with pytest.raises(StudyError, match="already holds a sweep; add --resume"):
+    with pytest.raises(StudyError, match="holds a sweep already; add --resume"):
         run(small_spec(), folder)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tmp").write_text("x")

@@ -231,7 +231,7 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
     assert read_store(out / "tune.h5")[0]["trial_objective"].data.shape == (4, 8)
     file.write_text(FILE.replace("starts = 2", "starts = 3"))
     for more, message in (
-        ([], "already holds a tuning"),
+        ([], "holds a tuning already"),
         (["--resume"], "another tuning file"),
         (["--audit"], "--audit: writes no files"),
     ):
@@ -293,7 +293,7 @@ def test_a_folder_belongs_to_its_tuning(tmp_path):
     assert opened(tmp_path, True) is None and not list(tmp_path.glob("*.tmp"))
     longer = {"tune": {"iterations": 9}}
     assert opened(tmp_path, True, spec=longer) is None  # more of the same
-    with pytest.raises(StudyError, match="already holds a tuning"):
+    with pytest.raises(StudyError, match="holds a tuning already"):
         opened(tmp_path, False)
     for other, word in (
         ({"spec": {"tune": {"seed": 1}}}, "tuning file"),

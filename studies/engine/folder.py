@@ -261,7 +261,7 @@ def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bo
         return
     if not is_resumed:
         raise StudyError(
-            f"--out {folder.path}: already holds a sweep; add --resume to continue or to "
+            f"--out {folder.path}: holds a sweep already; add --resume to go on with it or to "
             "extend it, or name a new folder"
         )
     old = read_manifest(folder.path)

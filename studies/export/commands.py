@@ -50,7 +50,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         file: Annotated[Path, typer.Argument(help="JSON file written by studies export")],
         out: Annotated[Path, typer.Option(help="study file to write")],
     ) -> None:
-        """Check the coefficients in an exported JSON file and recover its study."""
+        """Check the numbers of an exported JSON file and recover its study."""
         start()
         from studies.export.document import import_study
         from studies.study.template import write_study

@@ -30,7 +30,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         ] = 2.0,
         pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
     ) -> None:
-        """Certify a controller on plants that differ from its nominal model."""
+        """Certify a controller on plants that differ from its model."""
         start()
         from studies.engine.design import load_design
         from studies.spillover.run import spillover_design

@@ -35,7 +35,7 @@ def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterat
         path = out / MANIFEST
         if path.is_file():
             if not is_resumed:
-                raise StudyError(f"--out {out}: already holds a tuning; continue with --resume")
+                raise StudyError(f"--out {out}: holds a tuning already; go on with --resume")
             try:
                 old = read_json(path)
             except (OSError, ValueError):
