@@ -18,7 +18,7 @@ FIRST_BYTES = {
     "data:image/png;base64": b"\x89PNG\r\n\x1a\n",
     "data:image/gif;base64": b"GIF89a",
 }
-VOID = ("img", "meta", "br", "hr")
+VOID = ("img", "meta", "br", "hr", "wbr")
 #: Nothing of a report needs one of these.
 FORBIDDEN = ("script", "link", "iframe", "object", "embed", "base", "form", "svg", "video")
 

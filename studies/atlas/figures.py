@@ -14,7 +14,7 @@ from studies.atlas.drawing import Clip, animate, draw_mode, mode_skeleton, skele
 from studies.atlas.findings import AtlasFindings
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.subsets import TARGETS, link_label, player_labels, setting_label
-from studies.show.figures import SERIES, comparison, legend_above, new_figure
+from studies.show.figures import SERIES, SMALL, comparison, legend_above, new_figure
 from studies.study.consistency import each_link
 
 #: Index of the late window.
@@ -103,7 +103,7 @@ def _shares(found: AtlasFindings) -> Figure:
                 ax.set_title(target)
             if row == len(subsets.setting) - 1:
                 ax.set_xlabel("mode")
-        axes[row, 0].set_ylabel(f"{found.setting(row)}\nlink", fontsize=7)
+        axes[row, 0].set_ylabel(f"{found.setting(row)}\nlink", fontsize=SMALL)
     return figure
 
 
@@ -192,7 +192,7 @@ def _modes(found: AtlasFindings) -> Figure:
         ax.set_title(
             f"{found.modes.frequency[place, k]:.1f} Hz; "
             + (f"links {', '.join(names)}" if share[3] < 0.5 else f"drive {100 * share[3]:.0f} %"),
-            fontsize=8,
+            fontsize=SMALL,
         )
         ax.set_xlabel("")
         ax.set_ylabel("")

@@ -30,7 +30,7 @@ SETTLING = 0.02
 WINDOW = 0.15
 #: Number of modes whose damping is reported.
 SHOWN = 3
-GIVEN, WITHOUT = "design as given", "no control"
+GIVEN, WITHOUT = "baseline", "no control"
 
 
 class Comparison(NamedTuple):

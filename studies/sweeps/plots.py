@@ -186,7 +186,7 @@ def _scale_ordinate(ax: Axes, value: np.ndarray) -> None:
     ax.set_ylim(bottom, top)
     beyond = int(np.sum(value > top))
     if beyond:
-        ax.set_title(f"{beyond} above {top:.3g} not shown", fontsize=7.5, loc="right")
+        ax.set_title(f"{beyond} above {top:.3g} not shown", fontsize=figures.SMALL, loc="right")
 
 
 def _say_left_out(figure: Figure, data: SweepData, chosen: np.ndarray) -> None:
@@ -202,7 +202,7 @@ def _say_left_out(figure: Figure, data: SweepData, chosen: np.ndarray) -> None:
             shown = int(np.sum(chosen))
             parts.append(f"{n_low:,} of the {shown:,} shown have a gain margin below {ENOUGH:g}")
     if parts:
-        figure.suptitle("; ".join(parts), fontsize=7.5, x=0.01, ha="left")
+        figure.suptitle("; ".join(parts), fontsize=figures.SMALL, x=0.01, ha="left")
 
 
 def save_plot(figure: Figure, path: Path) -> None:
@@ -301,11 +301,11 @@ def _lines(
             elif len(groups) <= MOST_BANDS:
                 ax.fill_between(position, low, high, color=style["color"], alpha=0.1, linewidth=0)
             span = ", smallest to largest" if is_text or len(groups) <= MOST_BANDS else ""
-            ax.set_title(f"median{span}", fontsize=7.5, loc="right")
+            ax.set_title(f"median{span}", fontsize=figures.SMALL, loc="right")
         if is_text:
             ax.set_xticks(range(len(wanted)), [str(v) for v in wanted], rotation=30, ha="right")
     if group is not None:
-        ax.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        ax.legend(fontsize=figures.SMALL, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     if _is_wide(value):
         figures.log_scale(ax, "y")
     if _is_geometric(np.unique(across)):
@@ -357,7 +357,7 @@ def _points(
         zorder=3,
     )
     if ax.get_legend_handles_labels()[1]:
-        ax.legend(fontsize=7)
+        ax.legend(fontsize=figures.SMALL)
     _scale_ordinate(ax, value)
 
 
@@ -395,7 +395,13 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
             lines.append((column - low) / max(high - low, 1e-300))
             places = np.linspace(0, 1, len(texts)) if len(texts) > 1 else [0.0]
             for place, text in zip(places, texts, strict=True):
-                ax.annotate(text, (k, place), xytext=(3, 0), textcoords="offset points", fontsize=7)
+                ax.annotate(
+                    text,
+                    (k, place),
+                    xytext=(3, 0),
+                    textcoords="offset points",
+                    fontsize=figures.SMALL,
+                )
         matrix = np.array(lines)
         for case in order[-3000:]:
             color = matplotlib.colormaps[MAP](rank[case])
@@ -406,7 +412,7 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
         ax.set_yticks([])
         ax.set_title(
             f"red: the {_best_text(data, len(best))}; the others: darker is smaller",
-            fontsize=7.5,
+            fontsize=figures.SMALL,
             loc="right",
         )
         _say_left_out(figure, data, chosen)
@@ -440,7 +446,7 @@ def _placements(data: SweepData, y: str) -> Figure:
         top.set_xlim(0, length * unit)
         top.set_ylabel("best placements")
         top.yaxis.tick_right()
-        top.set_yticks(range(len(chosen)), texts, fontsize=7)
+        top.set_yticks(range(len(chosen)), texts, fontsize=figures.SMALL)
         top.tick_params(axis="y", length=0)
         top.grid(False)
         top.set_title(
@@ -474,7 +480,7 @@ def _placements(data: SweepData, y: str) -> Figure:
         _scale_ordinate(bottom, value[is_ok])
         bottom.set_xlabel("centre of the patch pair along the link [mm]")
         bottom.set_ylabel(label(data, y))
-        bottom.set_title("rings: those above", fontsize=7.5, loc="left")
-        bottom.legend(fontsize=7, markerscale=3, loc="upper right")
+        bottom.set_title("rings: those above", fontsize=figures.SMALL, loc="left")
+        bottom.legend(fontsize=figures.SMALL, markerscale=3, loc="upper right")
         _say_left_out(figure, data, is_ok)
     return figure
