@@ -258,8 +258,8 @@ def test_sentences_of_a_run_show_its_numbers(one_run):
         f"Samples with an actuator at its limit: {100 * m.saturated_fraction:.3g} %; with a "
         f"clipped ADC channel: {100 * m.clipped_fraction:.3g} %; with a motor at its limit of 77 "
         f"N: {100 * m.motor_saturated_fraction:.3g} %.",
-        "with 12 plant modes per link (the run has 4): gain margin 3.25 (10.2 dB), the factor by which the "
-        "loop gain (`control.gain_factor`) can still grow; spectral radius 0.987654",
+        "with 12 plant modes per link (the run has 4): gain margin 3.25 (10.2 dB), the factor by "
+        "which the loop gain (`control.gain_factor`) can still grow; spectral radius 0.987654",
         f"({force.min():.3g} to {force.max():.3g} N), the margin goes from "
         f"{planned.min():.4g} ({20 * np.log10(planned.min()):.1f} dB) to {planned.max():.4g} ",
         "a note.",

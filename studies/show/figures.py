@@ -1,8 +1,10 @@
 """Plots of the studies, in one style. Each takes data in SI units and optional axes.
 
-They only convert units. Pages show figures of `WIDTH` as wide as the text, on a phone 40 rem wide in
-a box that scrolls; text of `SMALL` then has 9.6 pixels, so nothing in a figure is smaller. The colours of Okabe and Ito are distinguishable for colour-blind readers;
+They only convert units. The colours of Okabe and Ito are distinguishable for colour-blind readers;
 in greyscale, the two curves of a comparison differ in lightness and width.
+
+A page shows a figure of `WIDTH` at most 60 rem wide, and on a phone 40 rem wide in a box that
+scrolls, where text of `SMALL` has 9.6 pixels: no figure has smaller text or is wider.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ def report(found: Certificate, laws: Comparison | None) -> str:
 
 
 def _residual(laws: Comparison) -> tuple[float, float] | None:
-    """Residual vibration of the design and without control, worst links [m]; None if a run failed."""
+    """Residual of the design and without control, worst links [m]; None if a run failed."""
     with_it, without = (
         float(np.max(laws.residual_rms[laws.names.index(x)])) for x in (GIVEN, WITHOUT)
     )
