@@ -1,4 +1,4 @@
-"""The modal bases of a case: of the real links, and of the links the controller believes in."""
+"""The modal bases of a case: of the real links, and of the controller's nominal model of them."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class Control(NamedTuple):
     n_active: Array  # number of controlled modes, ()
     link_mask: Array  # controlled links, (3,)
     mode_mask: Array  # controlled modes of each link, (3, C)
-    omega: Array  # believed frequencies of the assembled links [rad/s]; 0: its basis's, (3, C)
+    omega: Array  # nominal frequencies of the assembled links [rad/s]; 0: its basis's, (3, C)
     velocity_gain: Array  # k_d of mode 1 [N s/m] or [1/s], (3,); SRF: [s]
     position_gain: Array  # k_p of mode 1 [N/m] or [1/s2], (3,); SRF: [1]
     ratio: Array  # EMC ratios (24) [1], (3, C)
@@ -86,7 +86,7 @@ class Shaping(NamedTuple):
     """Input shaper of the reference, one entry per shaped frequency."""
 
     kind: Array  # position in `shaper.SHAPERS`, ()
-    omega: Array  # [rad/s], 0: mode 1 as the controller believes it, (n,)
+    omega: Array  # [rad/s], 0: mode 1 of the nominal model, (n,)
     zeta: Array  # [1], (n,)
     tolerance: Array  # V of the EI family [1], ()
     is_exact: Array  # 1: impulses split exactly for their mode, 0: linearly, ()

@@ -399,7 +399,7 @@ def test_a_tuning_s_table_of_the_own_machine():
     _, found, tables, _ = tuned()
     (table,) = tables["On the study's own machine"]
     designs = [found.own, *found.judged]
-    assert table["design"] == ["the study itself", "gains", "all"]
+    assert table["design"] == ["baseline", "gains", "all"]
     assert table["file"] == ["`study.toml`", "`tuned_gains.toml`", "`tuned_all.toml`"]
     assert table["objective"] == [f"{x.own.objective:.4f}" for x in designs]
     for name in NAMES:
@@ -482,7 +482,7 @@ def test_a_tuning_s_summary_and_recommendation():
     ):
         assert part in head, part
     assert summary(spec, found) == [
-        f"{name}: {x.objective.mean():.4f} of the study's objective on 3 fresh machines, worst "
+        f"{name}: {x.objective.mean():.4f} of the baseline's objective on 3 fresh machines, worst "
         f"{x.objective.max():.4f}"
         for name, x in zip(("gains", "all"), found.judged, strict=True)
     ]

@@ -33,7 +33,7 @@ from tests.tunings import EACH, EVERY_KIND, GAIN, tuning
 JUDGED = {
     "objective": {"residual_rms": 1.0, "control_energy": 0.1},
     "limits": {
-        "peak_voltage": "own",
+        "peak_voltage": "baseline",
         "gain_margin": 4.0,
         "slowest_decay": 20.0,
         "spillover": 1.1,

@@ -51,7 +51,7 @@ move_time = 0.03
 starts = 2
 iterations = 3
 samples = 20
-limits = { peak_voltage = "own", gain_margin = 1.0 }
+limits = { peak_voltage = "baseline", gain_margin = 1.0 }
 pareto = { limit = "peak_voltage", values = [20.0, 40.0], family = "all" }
 scenarios = { count = 2, check = 3, spread = { "link.youngs_modulus" = 5.0 } }
 
@@ -100,7 +100,7 @@ def check_report(out):
     own = table_of(text, "On the study's own machine")
     fresh = table_of(text, "On fresh machines")
     files = {name: row["file"].strip("`") for name, row in own.items() if row["file"] != "-"}
-    assert list(own) == list(fresh) == ["the study itself", *data["family"].data]
+    assert list(own) == list(fresh) == ["baseline", *data["family"].data]
     assert len(files) == len(own) - 1  # a family that moves nothing has no file
     moduli = data["scenario_link_youngs_modulus"].data
     seeds = data["scenario_run_seed"].data.tolist()
@@ -187,7 +187,7 @@ def test_a_report_says_what_its_numbers_are():
     own = table_of(text, "On the study's own machine")
     assert own["tuned"]["peak_voltage [V]"] == "33" and own["tuned"]["residual_rms [µm]"] == "4"
     fresh = table_of(text, "On fresh machines")
-    assert fresh["the study itself"]["settling_time [ms]"] == "not within 30"
+    assert fresh["baseline"]["settling_time [ms]"] == "not within 30"
     assert fresh["tuned"]["residual_rms [µm]"] == "4.4"
     assert "Of links 1 and 3, the controlled ones, the largest value counts" in text
 
@@ -352,13 +352,13 @@ def test_own_limits_need_something_to_be_a_share_of():
             **silent,
             "tune": {
                 "free": {"drive.kp": {"from": 1e4, "to": 4e4}},
-                "limits": {"peak_voltage": "own"},
+                "limits": {"peak_voltage": "baseline"},
             },
         }
     )
     checked = SimpleNamespace(spec=spec, families=list(spec.families), merit=merit_of(spec))
     metrics = SimpleNamespace(residual_rms=np.ones((1, 3, 3)), peak_voltage=np.zeros((1, 3)))
-    with pytest.raises(StudyError, match="peak_voltage = 'own': the study itself has 0"):
+    with pytest.raises(StudyError, match="peak_voltage = 'baseline': the baseline has 0"):
         Evaluator._check_own(checked, np.array([0]), metrics)
 
 

@@ -167,7 +167,10 @@ def deep(n):
         ),
         ({"free": GAIN, "objective": {"settling_time": 1.0}}, "no derivative; take ringing_time"),
         ({"free": GAIN, "limits": {"gain_margin[0]": 2.0}}, "no such entry; allowed: gain_margin"),
-        ({"free": GAIN, "limits": {"peak_voltage": "mine"}}, "> 0 and <= 1e\\+30 or 'own'"),
+        (
+            {"free": GAIN, "limits": {"peak_voltage": "own"}},
+            "> 0 and <= 1e\\+30 or 'baseline'; did you mean 'baseline'?",
+        ),
         (
             {"free": GAIN, "limits": {"peak_voltage": 40.0, "peak_voltage[1]": 50.0}},
             r"peak_voltage\[1\] = 50 allows more than peak_voltage = 40",
@@ -181,7 +184,7 @@ def deep(n):
             {"free": GAIN, "families": {"one": {"free": ["control.gainfactor"]}}},
             "did you mean 'control.gain_factor'",
         ),
-        ({"free": GAIN, "families": {"one": {"free": []}}}, "one with free numbers or more"),
+        ({"free": GAIN, "families": {"one": {"free": []}}}, "one or more with free parameters"),
         ({"free": GAIN, "families": {"one": {"set": {"link.modes": 3}}}}, "n_modes = 3 where"),
         (
             {"free": GAIN, "families": {"one": {"set": {"motion.move_time": 0.06}}}},
@@ -285,7 +288,7 @@ def deep(n):
             "did you mean 'control.pole",
         ),
         ({"free": GAIN, "objective": {"qqq": 1.0}}, "unknown metric; allowed: residual_rms, "),
-        ({"free": GAIN, "limits": {"peak_voltage": deep(400)}}, "peak_voltage = .* or 'own'"),
+        ({"free": GAIN, "limits": {"peak_voltage": deep(400)}}, "peak_voltage = .* or 'baseline'"),
         ({"free": GAIN, "families": {"one": {"sets": {}}}}, "allowed: {free = "),
         (
             {"free": GAIN, "pareto": {"limit": "peak_voltage", "values": [1.0, 2.0]}},

@@ -188,7 +188,7 @@ def animate(clip: Clip, path: Path) -> None:
 
         def frame(k: int) -> list[Any]:
             label.set_text(
-                f"{1e3 * clip.time[k]:+.0f} ms from the end of the command; bending drawn "
+                f"{1e3 * clip.time[k]:+.0f} ms from the end of the move; bending drawn "
                 f"{clip.exaggeration:.0f} times"
             )
             for parts, (links, sliders, joints, plate) in zip(clip.parts, lines, strict=True):

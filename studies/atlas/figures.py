@@ -253,7 +253,7 @@ def _vibration_after(found: AtlasFindings) -> Figure:
             ax.margins(x=0.01)
             if column == 0:
                 ax.set_ylabel(f"vibration error\n{label}")
-        axes[2, column].set_xlabel("time after the command [s]")
+        axes[2, column].set_xlabel("time after the move [s]")
     legend_above(figure, axes[0, 0])
     return figure
 

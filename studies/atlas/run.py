@@ -173,7 +173,9 @@ def _subset_variables(subsets: Subsets) -> dict[str, Variable]:
             "m2/Hz",
             "largest spectral density near each mode of the controller",
         ),
-        "settling_time": Variable(subsets.settling, per_link, "s", "after the command"),
+        "settling_time": Variable(
+            subsets.settling, per_link, "s", "after the reference trajectory"
+        ),
         "peak_voltage": Variable(subsets.voltage, per_link, "V", "peak actuator voltage"),
         "removed": Variable(
             game,
@@ -239,7 +241,9 @@ def _run_variables(found: AtlasFindings) -> dict[str, Variable]:
         "run": _names([setting_label(s) for s in RUNS], "run", "move, shaper"),
         "run_links": _names(list(LINK_LABELS), "run_links", "controlled links"),
         "time": Variable(runs.time, ("time",), "s", "time"),
-        "command_end": Variable(runs.command_end, ("run",), "s", "end of the shaped command"),
+        "command_end": Variable(
+            runs.command_end, ("run",), "s", "end of the shaped reference trajectory"
+        ),
         "drive_error": Variable(
             runs.drive, ("run", "time", "pose_axis"), "m; m; rad", "pose error with rigid links"
         ),

@@ -46,7 +46,7 @@ PER_CASE: dict[str, tuple[Any, ...]] = {
         {LEFT_OUT: "left out by the screen", NOT_RUN: "not run", **STATUS_LABEL[2]},
     ),
     "bad_time": ((), "s", "when the status appeared, 0 if ok"),
-    "command_end": ((), "s", "end of the shaped command"),
+    "command_end": ((), "s", "end of the shaped reference trajectory"),
     "substeps": ((), "1", "plant steps per sample"),
     "sensor_condition": (("link",), "1", "condition number of the modal filter"),
     "actuator_condition": (("link",), "1", "condition number of the synthesizer"),

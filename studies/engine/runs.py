@@ -532,7 +532,7 @@ def metric_variables(result: Result) -> dict[str, Variable]:
 
 _RECORD_LABELS = {
     "pose": (("time", "pose_axis"), "m; m; rad", "platform pose (x, y, phi)"),
-    "pose_error": (("time", "pose_axis"), "m; m; rad", "pose minus shaped command"),
+    "pose_error": (("time", "pose_axis"), "m; m; rad", "pose minus shaped reference"),
     "slider": (("time", "slider_axis"), "m", "slider position rho"),
     "modal_coordinate": (("time", "link", "mode"), "m", "modal coordinates q of the plant"),
     "controlled_coordinate": (
@@ -572,7 +572,9 @@ def run_variables(run: Run) -> dict[str, Variable]:
         ),
         "status": Variable(np.array(run.status), (), *STATUS_LABEL),
         "bad_time": Variable(run.result.bad_time, (), "s", "when the status appeared, 0 if ok"),
-        "command_end": Variable(run.result.command_end, (), "s", "end of the shaped command"),
+        "command_end": Variable(
+            run.result.command_end, (), "s", "end of the shaped reference trajectory"
+        ),
         "sensor_condition": Variable(
             run.result.sensor_condition, ("link",), "1", "condition number of the modal filter"
         ),

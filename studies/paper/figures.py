@@ -216,7 +216,7 @@ def _shapers(runs: PaperRuns, measures: Measures) -> Figure:
             linewidth=1.5 - 0.5 * k,
             label={"none": "no shaper", "ei": "EI shaper"}[kind],
         )
-    axes[1, 0].set_xlabel("time after the command [s]")
+    axes[1, 0].set_xlabel("time after the move [s]")
     axes[1, 0].set_ylabel("link 1: deflection\nat 150 mm [µm]")
     axes[1, 0].legend()
     return figure

@@ -156,7 +156,9 @@ def paper_variables(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
             np.array([describe(int(k)) for k in runs.status]), per_case, "1", "status in words"
         ),
         "bad_time": Variable(result.bad_time, per_case, "s", "when the status appeared, 0 if ok"),
-        "command_end": Variable(result.command_end, per_case, "s", "end of the shaped command"),
+        "command_end": Variable(
+            result.command_end, per_case, "s", "end of the shaped reference trajectory"
+        ),
         **metrics,
         **_measured(runs, measures),
         **_trajectories(runs),
@@ -247,7 +249,7 @@ def _measured(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
             measures.settling,
             modal[:2],
             "s",
-            "from the command's end to 5 % of the residual peak without control",
+            "from the end of the reference trajectory to 5 % of the residual peak without control",
         ),
     }
 
@@ -279,7 +281,7 @@ def _trajectories(runs: PaperRuns) -> dict[str, Variable]:
             "deflection relative to the chord B-C at the stations",
         ),
         "pose_error": Variable(
-            record.pose_error, (*series, "pose_axis"), "m; m; rad", "pose minus shaped command"
+            record.pose_error, (*series, "pose_axis"), "m; m; rad", "pose minus shaped reference"
         ),
         "controlled_coordinate": Variable(
             modal,

@@ -1,4 +1,4 @@
-"""Free numbers: their names, bounds and scale, and how they get into a `Case`.
+"""Free parameters: their names, bounds and scale, and how they get into a `Case`.
 
 A free field is a number of the study file, an entry of a list, or a list, each of whose entries is
 then free by itself. `DESIGN` are the fields that a designer decides, `MACHINE` those that he finds
@@ -87,7 +87,7 @@ MACHINE: dict[str, FieldPlace] = {
 
 
 class Free(NamedTuple):
-    """One free number."""
+    """One free parameter."""
 
     name: str  # with its index in a list
     span: Range
@@ -116,7 +116,7 @@ class Setter(NamedTuple):
 
 
 class FreeNumbers(NamedTuple):
-    """All free numbers of a design, in the order of the parameter vector."""
+    """All free parameters of a design, in the order of the parameter vector."""
 
     numbers: tuple[Free, ...]
     #: Puts values (p,) in the study's units into a case; nan leaves the case's value.
@@ -142,7 +142,7 @@ class FreeNumbers(NamedTuple):
         return np.stack(found, axis=-1)
 
     def places(self) -> np.ndarray:
-        """Where the study itself lies between the bounds, 0 to 1; 1/2 if undefined."""
+        """Where the baseline lies between the bounds, 0 to 1; 1/2 if undefined."""
         found = []
         for _, span, start, _ in self.numbers:
             if span.is_log:
@@ -156,7 +156,7 @@ class FreeNumbers(NamedTuple):
 def join_numbers(
     parts: Sequence[tuple[list[Free], Callable[[Case, Array], Case]]],
 ) -> FreeNumbers:
-    """All free numbers, from those of each field."""
+    """All free parameters, from those of each field."""
     numbers: list[Free] = []
     places: list[Callable[[Case, Array], Case]] = []
     for added, put in parts:
@@ -265,7 +265,7 @@ def _check_field(field: str, study: Study, path: str) -> None:
 
 
 def parse_bounds(bounds: Any, path: str) -> Range:
-    """Bounds of a free number.
+    """Bounds of a free parameter.
 
     Raises:
         StudyError: not a range, or one with points.

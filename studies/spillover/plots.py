@@ -120,7 +120,7 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
     ax.yaxis.set_minor_locator(NullLocator())
     _plain_ticks(ax.xaxis)
     size = found.plants[0, 0, -1].n_modes
-    which = ", all model mismatches" if _has_departures(found) else ""
+    which = ", all mismatches" if _has_departures(found) else ""
     ax.set(
         xlabel=f"frequency [Hz], plants of {size} modes a link{which}",
         ylabel="damping ratio [1]",

@@ -205,7 +205,7 @@ def _spilled(worst: Spillover) -> dict[str, Any]:
         "damping_ratio_without_control": worst.free_damping,
         "basis": worst.plant.basis,
         "modes": worst.plant.n_modes,
-        "departure": str(worst.plant.departure),
+        "mismatch": str(worst.plant.departure),
     }
 
 

@@ -218,7 +218,7 @@ def _path(fields: Fields) -> motion.Path:
 def _shaping(fields: Fields) -> Shaping:
     given = TWO_PI * fields.numbers("shaper.frequencies_hz")
     if given.shape[1] == 0:
-        given = np.zeros((len(given), 1))  # as the controller believes, see `design_taps`
+        given = np.zeros((len(given), 1))  # as in the nominal model, see `design_taps`
     zeta = fields.numbers("shaper.damping_ratio")
     return Shaping(
         kind=fields.choices("shaper.kind", tuple(shaper.SHAPERS)),

@@ -124,7 +124,8 @@ class LinkSection(Section):
     shortening: bool = described(
         True,
         "-",
-        "a bent link's chord is shorter: axial force acts on bending (not in pinned_free)",
+        "geometric stiffening: bending shortens the chord, axial force acts on bending "
+        "(not in pinned_free)",
     )
     axial_inertia: Literal["lumped", "distributed"] = described(
         "lumped",
@@ -134,7 +135,7 @@ class LinkSection(Section):
     static_correction: bool = described(
         True,
         "-",
-        "modes that are left out answer to the patches at once; false: the paper's truncated model",
+        "static correction for the modes left out; false: the paper's truncated model",
     )
     length: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(0.2, "m", "L")
     thickness: EachLink[Annotated[float, Field(ge=1e-5, le=0.1)]] = described(2e-3, "m", "t_b")
@@ -143,10 +144,12 @@ class LinkSection(Section):
     youngs_modulus: EachLink[Annotated[float, Field(ge=1e3, le=2e12)]] = described(
         70e9,
         "Pa",
-        "E, known to the controller; stiffness_factor is not",
+        "E, also of the nominal model; stiffness_factor is not in it",
     )
     stiffness_factor: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(
-        1.0, "1", "true bending stiffness over the one controller and shaper assume"
+        1.0,
+        "1",
+        "model mismatch: true over nominal bending stiffness, which controller and shaper assume",
     )
     damping_ratio: Zeta | tuple[Zeta, ...] | tuple[tuple[Zeta, ...], ...] = described(
         0.01, "1", "of mode 1; or by mode, for example measured: one list for all links, or three"
@@ -242,7 +245,7 @@ class ControlSection(Section):
     )
     law: Annotated[str, OneOf(lambda: LAWS, OWN)] = described("imsc", "-", "control law")
     laws: Annotated[dict[str, dict[str, EachLink[float]]], OwnFields()] = described(
-        {}, "-", "laws' own fields, by law"
+        {}, "-", "fields of the laws, by law"
     )
     basis: Basis = described("pinned_pinned", "-", "modal basis of the controller's model")
     modes: int = described(3, "1", "controlled modes per link", ge=1, le=12)
@@ -271,7 +274,7 @@ class ControlSection(Section):
         "number for all modes, one a link, or one list a link by mode, others by (24)",
     )
     pole_frequency_hz: EachMode[OwnOrHertz] = described(
-        (), "Hz", "beta/2 pi of these poles, by mode; empty or 0: the mode keeps its own"
+        (), "Hz", "beta/2 pi of these poles, by mode; empty or 0: the mode keeps its frequency"
     )
     gain_unit: Literal["N s/m", "1/s"] = described(
         "N s/m", "-", "modal force or modal acceleration"
@@ -279,7 +282,7 @@ class ControlSection(Section):
     ratios: tuple[tuple[Gain, ...], ...] = described(
         ((1.0, 0.345, 0.045), (1.0, 0.304, 0.041), (1.0, 0.321, 0.038)),
         "1",
-        "EMC ratios k_dj : k_d1 per link (24); missing ones are 0",
+        "efficient modal control (EMC): ratios k_dj : k_d1 per link (24); missing ones are 0",
     )
     ratio_source: Literal["given", "own_run"] = described(
         "given", "-", "ratios as given, or from the same case's uncontrolled run by (24)"
@@ -290,7 +293,7 @@ class ControlSection(Section):
     gain_factor: float = described(
         1.0,
         "1",
-        "factor on the loop gain: on what the finished controller puts out, whatever the law",
+        "factor on the loop gain: it multiplies the controller's output, whatever the law",
         ge=0,
         le=1e3,
     )
@@ -410,7 +413,7 @@ class MetricsSection(Section):
     """Evaluation of a run."""
 
     residual_delay: float = described(
-        0.0, "s", "residual window starts this long after the command", ge=0, le=100
+        0.0, "s", "residual window starts this long after the reference trajectory", ge=0, le=100
     )
     residual_length: float = described(0.3, "s", "length of the residual window", gt=0, le=100)
     settling_band: float = described(

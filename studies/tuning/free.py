@@ -1,4 +1,4 @@
-"""Free numbers of a design: their names, bounds and scale, and how they get into a `Case`.
+"""Free parameters of a design: their names, bounds and scale, and how they get into a `Case`.
 
 A free field is a number of the study file, an entry of a list, or a list, each of whose entries is
 then free by itself. `placement` stands for several numbers: patch centres on the link and without
@@ -38,12 +38,12 @@ DECIDED = ("patches.", "link.length")
 
 
 def writes(number: Free) -> tuple[str, ...]:
-    """Fields of the study that a free number sets."""
+    """Fields of the study that a free parameter sets."""
     return ("patches.centers",) if number.key == PLACEMENT else (number.name,)
 
 
 def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
-    """Free numbers from what the file says.
+    """Free parameters from what the file says.
 
     Args:
         written: ranges by name, from `[tune.free]`.

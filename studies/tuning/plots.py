@@ -15,7 +15,7 @@ from studies.tuning.scenarios import move_label
 from studies.tuning.spec import TuneSpec
 
 GREY = "#999999"
-OBJECTIVE = "objective (the study itself: 1)"
+OBJECTIVE = "objective (baseline: 1)"
 
 
 def descent(spec: TuneSpec, found: TuneFindings) -> Figure:
@@ -113,7 +113,7 @@ def front(spec: TuneSpec, found: TuneFindings, limit: str) -> Figure:
             "x",
             color=figures.SERIES[1],
             markersize=4,
-            label="every start, machines of the tuning",
+            label="every starting point, machines of the tuning",
         )
         points = [(x.metrics[limit].max(), x.objective.mean()) for x in found.judged]
         line = np.array(
@@ -126,11 +126,11 @@ def front(spec: TuneSpec, found: TuneFindings, limit: str) -> Figure:
                 "o-",
                 markersize=4,
                 color=figures.SERIES[2],
-                label="front, on fresh machines",
+                label="Pareto front, on fresh machines",
             )
         marks = iter("^vD*P<>")
         own = found.own.metrics[limit].max(), found.own.objective.mean()
-        ax.plot(*own, "s", color="black", label="the study itself")
+        ax.plot(*own, "s", color="black", label="baseline")
         for point, family in zip(points, spec.families, strict=True):
             if not family.front:
                 ax.plot(

@@ -22,7 +22,7 @@ from studies.tuning.free import PLACEMENT
 from studies.tuning.merit import SHOWN
 from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
 from studies.tuning.scenarios import move_label
-from studies.tuning.spec import LOOP_LIMITS, OWN, Family, TuneSpec, label
+from studies.tuning.spec import BASELINE, LOOP_LIMITS, Family, TuneSpec, label
 
 #: Lower limits.
 LOWER = ("gain_margin", "slowest_decay", "singularity_distance")
@@ -33,16 +33,16 @@ ALIKE = 0.01
 #: With fewer designs, or a smaller spread between them, ranks are meaningless.
 FEW, NARROW = 8, 0.05
 #: Heading of the reference row.
-ITSELF = "the study itself"
+REFERENCE = "baseline"
 
 
 class TuneFindings(NamedTuple):
     """Everything that a tuning found."""
 
     at: Progress
-    own: JudgedDesign  # the study itself
+    own: JudgedDesign  # the baseline
     judged: list[JudgedDesign]  # the best design of every family, in the order of `spec.families`
-    audited: list[Disagreement]  # at the best design of the family with most free numbers
+    audited: list[Disagreement]  # at the best design of the family with most parameters
     linear: np.ndarray  # linear residual vibration of each start's best design [m], (B,)
     residual: np.ndarray  # of its own run on the first scenario [m], (B,); nan if not judged by it
     searched: Searched | None
@@ -55,7 +55,7 @@ class BestFamily(NamedTuple):
 
     family: str
     file: str  # of its study
-    gains: list[tuple[str, str, str]]  # figure, its value, that of the study itself with unit
+    gains: list[tuple[str, str, str]]  # figure, its value, that of the baseline with unit
     objective: np.ndarray  # on the fresh machines
     caution: str  # warning about its gain margin, "" if there is none
     is_violated: bool  # a limit
@@ -194,7 +194,7 @@ def summary(spec: TuneSpec, found: TuneFindings) -> list[str]:
         is_moving = k < len(spec.moving)
         lost = is_moving and found.at.beyond(found.at.winner(k)) > 0
         lines.append(
-            f"{family.name}: {one.objective.mean():.4f} of the study's objective on {machines}"
+            f"{family.name}: {one.objective.mean():.4f} of the baseline's objective on {machines}"
             + (f", worst {one.objective.max():.4f}" if len(one.objective) > 1 else "")
             + ("; a limit is violated" if lost else "")
         )
@@ -202,9 +202,9 @@ def summary(spec: TuneSpec, found: TuneFindings) -> list[str]:
 
 
 def _designs(spec: TuneSpec, found: TuneFindings) -> list[tuple[str, JudgedDesign]]:
-    """The study itself and the best design of every family, by names for Markdown."""
+    """The baseline and the best design of every family, by names for Markdown."""
     names = [literal(family.name) for family in spec.families]
-    return [(ITSELF, found.own), *zip(names, found.judged, strict=True)]
+    return [(REFERENCE, found.own), *zip(names, found.judged, strict=True)]
 
 
 def _value(metric: str, values: Mapping[str, Any], watched: float) -> str:
@@ -285,7 +285,7 @@ def _loop_margin(found: TuneFindings, k: int, name: str, limit: float | str) -> 
     loop, own = found.judged[k].loop, found.own.loop
     if loop is None or own is None:
         return float("nan")
-    allowed = getattr(own, name) if limit == OWN else float(limit)
+    allowed = getattr(own, name) if limit == BASELINE else float(limit)
     margin = getattr(loop, name) / allowed - 1
     return -margin if name == "spillover" else margin
 
@@ -300,7 +300,7 @@ def _state(beyond: float, left: float) -> str:
 
 
 def _numbers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
-    """Row of each free number: its bounds, the study's, and that of every family."""
+    """Row of each free parameter: its bounds, the study's, and that of every family."""
     at, families, rows = found.at, spec.moving, []
     places = [at.best_place[at.winner(k)] for k in range(len(families))]
     alike = [at.best_place[_alike(at, k)] for k in range(len(families))]
@@ -318,9 +318,9 @@ def _numbers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
 
 
 def _centers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
-    """Row of each design: its patch centres [mm], which the free numbers do not show."""
+    """Row of each design: its patch centres [mm], which the free parameters do not show."""
     at, unmoved = found.at, np.full(len(spec.free.numbers), np.nan)
-    designs = [(ITSELF, spec.moving[0]._replace(columns={}), unmoved)]
+    designs = [(REFERENCE, spec.moving[0]._replace(columns={}), unmoved)]
     for k, family in enumerate(spec.moving):
         place = at.best_place[at.winner(k)]
         designs.append((literal(family.name), family, spec.free.values(place)))
