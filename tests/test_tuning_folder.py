@@ -100,8 +100,9 @@ def check_report(out):
     own = table_of(text, "On the study's own machine")
     fresh = table_of(text, "On fresh machines")
     files = {name: row["file"].strip("`") for name, row in own.items() if row["file"] != "-"}
-    assert list(own) == list(fresh) == ["baseline", *data["family"].data]
-    assert len(files) == len(own) - 1  # a family that moves nothing has no file
+    compared = ["without control", "gain_factor alone"]
+    assert list(own) == list(fresh) == ["baseline", *data["family"].data, *compared]
+    assert len(files) == len(own) - 3  # nor has a family that moves nothing a file
     moduli = data["scenario_link_youngs_modulus"].data
     seeds = data["scenario_run_seed"].data.tolist()
     assert load_study(out / "study.toml").link.youngs_modulus not in moduli

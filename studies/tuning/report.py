@@ -21,6 +21,7 @@ from studies.tuning.check import JudgedDesign, Searched, patch_centers
 from studies.tuning.free import PLACEMENT
 from studies.tuning.merit import SHOWN
 from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
+from studies.tuning.references import References, reference_lines, resolution_lines
 from studies.tuning.scenarios import move_label
 from studies.tuning.spec import BASELINE, LOOP_LIMITS, Family, TuneSpec, label
 
@@ -48,6 +49,7 @@ class TuneFindings(NamedTuple):
     searched: Searched | None
     run_time: float  # of a differentiated run [s]
     runs: int  # how many there were
+    references: References = References(None, None, None, None)  # what designs have to beat
 
 
 class BestFamily(NamedTuple):
@@ -102,6 +104,8 @@ def report(spec: TuneSpec, found: TuneFindings, folder: str = "") -> str:
         names_links=all(parse_entries(name).names_a_link for name in spec.tune.objective),
         lower=LOWER,
         best=_best(spec, found),
+        references=reference_lines(spec, found.own, found.references),
+        unmeasured=_unmeasured(spec, found),
         folder=f"{folder}/" if folder else "",
         heads=[headed(x, METRICS[parse_entries(x).metric].unit) for x in names],
         own=_own_machine(spec, found, names),
@@ -198,13 +202,21 @@ def summary(spec: TuneSpec, found: TuneFindings) -> list[str]:
             + (f", worst {one.objective.max():.4f}" if len(one.objective) > 1 else "")
             + ("; a limit is violated" if lost else "")
         )
-    return lines
+    lines += reference_lines(spec, found.own, found.references)
+    return lines + _unmeasured(spec, found)
+
+
+def _unmeasured(spec: TuneSpec, found: TuneFindings) -> list[str]:
+    """Warnings of what is compared though the controller cannot measure it."""
+    designs = [one for _, one in _designs(spec, found)]
+    return resolution_lines(spec, designs, found.references.adc_step)
 
 
 def _designs(spec: TuneSpec, found: TuneFindings) -> list[tuple[str, JudgedDesign]]:
-    """The baseline and the best design of every family, by names for Markdown."""
+    """The baseline, the best design of every family, what they have to beat; by Markdown names."""
     names = [literal(family.name) for family in spec.families]
-    return [(REFERENCE, found.own), *zip(names, found.judged, strict=True)]
+    compared = found.references.designs
+    return [(REFERENCE, found.own), *zip(names, found.judged, strict=True), *compared]
 
 
 def _value(metric: str, values: Mapping[str, Any], watched: float) -> str:
