@@ -397,7 +397,7 @@ FACTOR = {"residual_rms": 1e6, "settling_time": 1e3, "peak_voltage": 1.0}
 
 def test_a_tuning_s_table_of_the_own_machine():
     _, found, tables, _ = tuned()
-    (table,) = tables["On the study's own machine"]
+    (table,) = tables["On the nominal machine"]
     designs = [found.own, *found.judged]
     assert table["design"] == ["baseline", "gains", "all"]
     assert table["file"] == ["`study.toml`", "`tuned_gains.toml`", "`tuned_all.toml`"]
@@ -423,7 +423,7 @@ def test_a_tuning_s_table_of_fresh_machines():
 
 def test_a_tuning_s_table_of_changes_has_each_move_s_own():
     _, found, tables, _ = tuned()
-    (table,) = tables["Change relative to the study itself"]
+    (table,) = tables["Change relative to the baseline"]
     assert table["design"] == ["gains", "gains", "all", "all"]
     assert table["move"] == ["motion.move_time = 0.03", "motion.move_time = 0.035"] * 2
     parts = [slice(0, 3), slice(3, 6)]
@@ -455,10 +455,10 @@ def test_a_tuning_s_limits_and_numbers():
         "Ended after all 20 iterations",
     ):
         assert part in words, part
-    (table,) = tables["Numbers"]
-    assert table["free number"] == ["control.gain_factor", "drive.kp"]
+    (table,) = tables["Parameters"]
+    assert table["parameter"] == ["control.gain_factor", "drive.kp"]
     assert table["bounds"] == ["0.05 to 2", "10000 to 40000"]
-    assert table["study"] == ["1", "2e+04"]
+    assert table["baseline"] == ["1", "2e+04"]
     # a quarter of the way on a logarithmic scale; the middle, and the end of a linear one
     assert table["gains"] == [f"{0.05 * 40**0.25:.4g}", "-"]
     assert table["all"] == [f"{0.05 * 40**0.5:.4g}", "4e+04*"]
@@ -469,14 +469,19 @@ def test_a_tuning_s_summary_and_recommendation():
     head = " ".join(text.split("## ")[0].split())
     one, own = found.judged[1], found.own
     shares = one.objective
+
+    def change(name):
+        return f"{100 * (one.own.metrics[name] / own.own.metrics[name] - 1):+.3g} %"
+
     for part in (
-        f"all: residual_rms {1e6 * one.own.metrics['residual_rms']:.4g} instead of "
-        f"{1e6 * own.own.metrics['residual_rms']:.4g} µm",
-        f"peak_voltage {one.own.metrics['peak_voltage']:.4g} instead of "
-        f"{own.own.metrics['peak_voltage']:.4g} V",
-        "gain margin 2.38 instead of 3.12",
-        "slowest decay 91.8 instead of 71.2 1/s",
-        f"the objective on 3 fresh machines is {100 * shares.mean():.3g} % of the study's own on "
+        f"**Result:** all: residual_rms {change('residual_rms')} "
+        f"({1e6 * one.own.metrics['residual_rms']:.4g} instead of "
+        f"{1e6 * own.own.metrics['residual_rms']:.4g} µm), settling_time {change('settling_time')}",
+        f"peak_voltage {change('peak_voltage')} ({one.own.metrics['peak_voltage']:.4g} instead of "
+        f"{own.own.metrics['peak_voltage']:.4g} V)",
+        "gain margin 2.38 (7.5 dB) instead of 3.12 (9.9 dB)",
+        "slowest decay +28.8 % (91.8 instead of 71.2 1/s)",
+        f"the objective on 3 fresh machines is {100 * shares.mean():.3g} % of the baseline's on "
         f"average, {100 * shares.max():.3g} % at worst.",
         "`studies simulate tuned_all.toml",
     ):
