@@ -7,8 +7,14 @@ from base64 import b64decode
 from html.parser import HTMLParser
 from io import BytesIO
 
+import numpy as np
 import pytest
+from matplotlib.text import Text
 from PIL import Image
+
+from studies.show.figures import STYLE
+from studies.show.pages import WIDE
+from studies.show.templates import render
 
 #: A title that would be more than text, in HTML and in Markdown.
 TITLE = "<script>alert(1)</script> *fast* | 10 mm ![x](http://e.org/x.png) &amp; a_b"
@@ -111,3 +117,27 @@ def rendered(html, folder, width):
     found = re.search(r'data-found="(\d+) (\d+) (-?\d+)"', done.stdout)
     assert found, done.stderr
     return tuple(map(int, found.groups()))
+
+
+#: Height of text in a figure that can be read [px].
+READABLE = 9.0
+_PHONE = 390
+
+
+def _css(pattern):
+    """A length of `page.css` [px], given there in rem."""
+    return 16 * float(re.search(pattern, render("show/page.css"))[1])
+
+
+def smallest_text(figure):
+    """The smallest text of a figure on its page, on a wide screen or on a phone: pixels, text."""
+    inches, dpi = figure.get_figwidth(), STYLE["savefig.dpi"]
+    natural = inches * dpi
+    desk = min(natural, _css(r"figure \{[^}]*max-width: ([\d.]+)rem"))
+    phone = _PHONE - 2 * _css(r"body \{[^}]*padding: 0 ([\d.]+)rem")
+    if natural > WIDE:
+        phone = _css(r"img\.wide \{[^}]*width: ([\d.]+)rem")
+    scale = min(desk, phone, natural) / inches / 72
+    texts = [x for x in figure.findobj(Text) if x.get_visible() and x.get_text().strip()]
+    sizes = [(scale * x.get_fontsize(), x.get_text()) for x in texts]
+    return min(sizes, default=(np.inf, ""))

@@ -11,11 +11,13 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
+import studies
+from studies.show.figures import SMALL, WIDTH, new_figure, styled
 from studies.show.markdown import literal, picture, table
 from studies.show.pages import page, report_files
 from studies.study import spec as spec_module
 from studies.study.template import toml_text
-from tests.pages import TITLE, parsed, rendered
+from tests.pages import READABLE, TITLE, parsed, rendered, smallest_text
 from tests.sweeps import MIXED, small
 
 VERSIONS = {"python": "3", "jax": "<1>"}
@@ -50,6 +52,32 @@ def test_a_text_becomes_a_whole_page():
     assert policy.startswith("default-src 'none'; img-src data:; style-src 'unsafe-inline'")
     assert "script" not in policy
     assert '<div class="table">\n<table>' in html and '<meta charset="utf-8">' in html
+
+
+@pytest.mark.parametrize("path", sorted(Path(studies.__file__).parent.glob("*/report.md")), ids=str)
+def test_a_report_begins_with_its_result(path):
+    """Then come the question and the next steps, in this order."""
+    text = path.read_text(encoding="utf-8")
+    title = text.index("\n# ") if not text.startswith("# ") else 0
+    heads = re.findall(r"\*\*([A-Z][a-z ]+):\*\*", text[title:])
+    assert [x for x in heads if x in ("Result", "Question", "Next steps")] == [
+        "Result",
+        "Question",
+        "Next steps",
+    ]
+    first = text[title:].lstrip("\n").partition("\n\n")[2]
+    assert first.startswith("**Result:**")
+
+
+def test_small_text_in_a_figure_is_found():
+    with styled():
+        figure, axes = new_figure(1, 1)
+        axes[0, 0].set_title("small", fontsize=6)
+        figure.draw_without_rendering()
+        assert smallest_text(figure) == (pytest.approx(40 * 16 / WIDTH * 6 / 72), "small")
+        axes[0, 0].set_title("large", fontsize=SMALL)
+        assert smallest_text(figure)[0] == pytest.approx(40 * 16 / WIDTH * SMALL / 72)
+    assert 40 * 16 / WIDTH * 6 / 72 < READABLE < 40 * 16 / WIDTH * SMALL / 72
 
 
 def test_a_figure_without_its_image_is_a_fault_of_the_program(tmp_path):
@@ -90,7 +118,7 @@ def test_texts_of_users_are_shown_as_they_are(text):
         assert set(found.tags) <= {
             *["html", "head", "meta", "title", "style", "body", "main", "h1", "h2", "p"],
             "div",
-            *["table", "thead", "tbody", "tr", "th", "td", "ul", "li"],
+            *["table", "thead", "tbody", "tr", "th", "td", "ul", "li", "wbr"],
         }
 
 

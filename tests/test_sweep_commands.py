@@ -125,7 +125,9 @@ def check_report(folder):
     count = int(safe.sum())
     assert 10 < count < 40
     value = np.where(safe, np.nanmax(data["residual_rms"], axis=(1, 2)), np.inf)
-    first = f"Best: case {np.argmin(value)} with {1e6 * value.min():.4g} µm"
+    first = (
+        f"**Result:** best by residual_rms: case {np.argmin(value)} with {1e6 * value.min():.4g} µm"
+    )
     head = text.partition("## ")[0]
     assert first in head and "40 cases of control.gain_factor, drive.kp, patches.cent" in head
     best = text.partition("## Best cases by residual_rms")[2].partition("\n## ")[0]

@@ -219,7 +219,7 @@ def _platform(found: AtlasFindings) -> Figure:
                 color=SERIES[k],
                 linewidth=1.0,
                 linestyle=("-", "--")[k],
-                label=name,
+                label=f"drive error {name}",
             )
         for k, label in enumerate(_ERRORS):
             ax = axes[k + 1, column]
@@ -227,9 +227,8 @@ def _platform(found: AtlasFindings) -> Figure:
             comparison(runs.time, error[0], error[-1], f"vibration error\n{label}", ax)
             ax.axvline(runs.command_end[column], color="#888888", linewidth=0.8, linestyle=":")
         axes[3, column].set_xlabel("time [s]")
-        axes[0, column].legend(loc="upper right")
     axes[0, 0].set_ylabel("drive error [µm]")
-    legend_above(figure, axes[1, 0])
+    legend_above(figure, axes[0, 0], axes[1, 0])
     return figure
 
 

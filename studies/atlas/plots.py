@@ -24,8 +24,8 @@ BETTER, WORSE = "#4C3F91", "#D9730D"
 
 
 def length_text(value: float) -> str:
-    """A small length [m] in µm, or in nm below 0.1 µm."""
-    return f"{1e6 * value:.3g} µm" if value >= 1e-7 else f"{1e9 * value:.3g} nm"
+    """A small length [m] in µm."""
+    return f"{1e6 * value:.3g} µm"
 
 
 def _whole(value: float, sign: str = "+") -> str:

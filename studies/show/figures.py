@@ -63,9 +63,10 @@ def new_figure(
     return figure, axes
 
 
-def legend_above(figure: Figure, ax: Axes) -> None:
-    """One legend for the whole figure, with the entries of `ax`."""
-    handles, labels = ax.get_legend_handles_labels()
+def legend_above(figure: Figure, *axes: Axes) -> None:
+    """One legend for the whole figure, with the entries of these axes."""
+    entries = [entry for ax in axes for entry in zip(*ax.get_legend_handles_labels(), strict=True)]
+    handles, labels = ([entry[k] for entry in entries] for k in range(2))
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
 
 

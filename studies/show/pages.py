@@ -27,8 +27,6 @@ from studies.study.template import study_template
 
 _PARSER = MarkdownIt("commonmark", {"html": False, "xhtmlOut": False}).enable("table")
 
-#: Between a number and its sign or unit, which stay on one line.
-_UNIT = re.compile(r" (?=[%†])|(?<=\d) (?=(?:[µnm]?[msV]|N|Hz|dB|[µn]?rad)\b)")
 #: Where a name in a table may go on in the next line.
 _JOINT = re.compile(r"(?<=[A-Za-z][_./])(?=\w)|(?<=\w)(?=\[)")
 #: Images with more pixels than this across keep a readable width on a narrow screen.
@@ -99,8 +97,8 @@ def _arranged(tokens: list[Token], images: Mapping[str, bytes]) -> list[Token]:
             begin, end = (Token(f"caption_{n}", "figcaption", n) for n in (1, -1))
             token.children = [*inside, begin, *(inside[0].children or []), end]
         for child in inside:
-            if child.type == "text":
-                child.content = _UNIT.sub("\N{NO-BREAK SPACE}", child.content)
+            if child.type == "text":  # keep a number and its sign on one line
+                child.content = re.sub(" (?=[%†])", "\N{NO-BREAK SPACE}", child.content)
             if child.type == "image":
                 child.children = [Token("text", "", 0, content=_plain(child.children))]
                 name = unquote(str(child.attrs["src"]))
