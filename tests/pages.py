@@ -93,7 +93,9 @@ addEventListener("load", () => {
   const root = document.documentElement, images = [...document.images];
   const broken = images.filter(image => image.naturalWidth === 0).length;
   const over = root.scrollWidth - root.clientWidth;
-  root.setAttribute("data-found", `${images.length} ${broken} ${over}`);
+  const cut = [...document.querySelectorAll(".table")].filter(x => x.scrollWidth > x.clientWidth);
+  const found = `${images.length} ${broken} ${over} ${cut.length}`;
+  root.setAttribute("data-found", found);
 });
 </script>"""
 
@@ -101,7 +103,8 @@ addEventListener("load", () => {
 def rendered(html, folder, width):
     """What a browser with a window of this width says; skips the test where there is none.
 
-    Returns images, broken ones among them, and pixels by which the page is too wide.
+    Returns images, broken ones among them, pixels by which the page is too wide, and tables of
+    which only a part is seen.
     """
     command = next(filter(None, map(shutil.which, BROWSERS)), None)
     if command is None:
@@ -114,7 +117,7 @@ def rendered(html, folder, width):
     done = subprocess.run(
         [command, *options, *own, path.as_uri()], capture_output=True, text=True, timeout=120
     )
-    found = re.search(r'data-found="(\d+) (\d+) (-?\d+)"', done.stdout)
+    found = re.search(r'data-found="(\d+) (\d+) (-?\d+) (\d+)"', done.stdout)
     assert found, done.stderr
     return tuple(map(int, found.groups()))
 

@@ -15,7 +15,7 @@ from studies.spillover.report import report as certificate_report
 from studies.study.margin import margin_in_db
 from studies.study.spec import paper_study
 from studies.tuning.audit import Disagreement
-from studies.tuning.check import JudgedDesign, OwnRun
+from studies.tuning.check import JudgedDesign, OwnRun, patch_centers
 from studies.tuning.linear_fidelity import LoopFigures
 from studies.tuning.optimise import begin
 from studies.tuning.report import TuneFindings, summary
@@ -462,6 +462,38 @@ def test_a_tuning_s_limits_and_numbers():
     # a quarter of the way on a logarithmic scale; the middle, and the end of a linear one
     assert table["gains"] == [f"{0.05 * 40**0.25:.4g}", "-"]
     assert table["all"] == [f"{0.05 * 40**0.5:.4g}", "4e+04*"]
+
+
+def test_placements_are_shown_in_millimetres_along_each_link():
+    """Not as the numbers from 0 to 1 that the descent moves."""
+    spec = parse_tuning(
+        {**SMALL, "tune": {"free": {"placement": {"kind": "per_link"}}, "starts": 1}}
+    )
+    _, found, *_ = tuned()
+    at, n = begin(spec, SimpleNamespace(linear=None)), len(spec.free.names)
+    place = np.full((1, n), 0.5)
+    at = at._replace(
+        best_objective=np.ones(1),
+        best_limits=np.zeros((1, 0)),
+        best_place=place,
+        best_peaks=np.zeros((1, 0)),
+    )
+    audited = [Disagreement("placement[2][0]", "tuned", 0, "objective", 1.0, 1.0, 0.0)]
+    found = found._replace(
+        at=at,
+        judged=found.judged[:1],
+        audited=audited,
+        linear=np.full(1, np.nan),
+        residual=np.full(1, np.nan),
+    )
+    text = tuning_report(spec, found)
+    (table,) = tables_of(text)["Parameters"]
+    centers = 1e3 * patch_centers(spec, spec.moving[0], place[0])
+    assert table["design"] == ["baseline", "tuned"]
+    for i, row in enumerate(centers):
+        assert table[f"centres on link {i + 1} [mm]"][1] == ", ".join(f"{x:.1f}" for x in row)
+        assert 0 < row.min() < row.max() < 200
+    assert "placement[" not in text and "(of objective by placement," in text
 
 
 def test_a_tuning_s_summary_and_recommendation():

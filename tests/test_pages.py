@@ -54,9 +54,13 @@ def test_a_text_becomes_a_whole_page():
     assert '<div class="table">\n<table>' in html and '<meta charset="utf-8">' in html
 
 
-@pytest.mark.parametrize("path", sorted(Path(studies.__file__).parent.glob("*/report.md")), ids=str)
-def test_a_report_begins_with_its_result(path):
+REPORTS = {x.parent.name: x for x in sorted(Path(studies.__file__).parent.glob("*/report.md"))}
+
+
+@pytest.mark.parametrize("name", REPORTS)
+def test_a_report_begins_with_its_result(name):
     """Then come the question and the next steps, in this order."""
+    path = REPORTS[name]
     text = path.read_text(encoding="utf-8")
     title = text.index("\n# ") if not text.startswith("# ") else 0
     heads = re.findall(r"\*\*([A-Z][a-z ]+):\*\*", text[title:])
@@ -159,13 +163,33 @@ def test_toml_is_read_back():
 @pytest.mark.parametrize("width", [1280, 600])
 def test_a_wide_report_fits_a_browsers_window(tmp_path, width):
     wide = table([f"column {k}" for k in range(30)], [["123456789"] * 30])
-    lines = ["# Title", "", "a" * 300, "", wide, "", picture("a.png", "a figure")]
+    lines = [
+        "# Title `" + "b" * 200 + "`",
+        "",
+        "a" * 300,
+        "",
+        wide,
+        "",
+        picture("a.png", "a figure"),
+    ]
     files = {"Study file": "x = " + "1" * 500}
     html = page("\n".join(lines), {"a.png": png(3000)}, files, VERSIONS)
-    assert rendered(html, tmp_path, width) == (1, 0, 0)
+    assert rendered(html, tmp_path, width) == (1, 0, 0, 1)
+
+
+@pytest.mark.parametrize(("width", "cut"), [(1280, 0), (600, 1)])
+def test_a_table_of_a_sweep_is_seen_whole_on_a_wide_screen(tmp_path, width, cut):
+    """Long names of columns break at their joints; a narrow screen scrolls and says so."""
+    names = ["control.velocity_gain[0]", "electronics.lowpass_ratio[2]", "link.stiffness_factor"]
+    metrics = ["residual_rms [µm]", "peak_voltage [V]", "damping_ratio[controlled_mode=1]"]
+    heads = ["case", "id", *names, *(f"{x}[1]" for x in names), *metrics, "gain_margin"]
+    text = "# Title\n\n" + table(heads, [["1", "efac70d3", *["0.1234"] * 10]])
+    html = page(text, {}, {}, VERSIONS)
+    assert rendered(html, tmp_path, width) == (0, 0, 0, cut)
+    assert ".table:has(th:nth-child(4))::before" in html and "scroll sideways" in html
 
 
 def test_a_browser_finds_faults(tmp_path):
     bad = '<img src="data:image/png;base64,AAAA"><p style="width: 3000px">wide</p>'
-    images, broken, over = rendered(HEAD + bad + "</body></html>", tmp_path, 1280)
+    images, broken, over, _ = rendered(HEAD + bad + "</body></html>", tmp_path, 1280)
     assert (images, broken) == (1, 1) and over > 1000
