@@ -398,9 +398,12 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
                 ax.annotate(
                     text,
                     (k, place),
-                    xytext=(3, 0),
+                    xytext=(4, 0),
                     textcoords="offset points",
+                    va="center",
                     fontsize=figures.SMALL,
+                    bbox={"fc": "white", "ec": "none", "alpha": 0.85, "pad": 1},
+                    zorder=5,
                 )
         matrix = np.array(lines)
         for case in order[-3000:]:
