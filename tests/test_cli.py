@@ -69,7 +69,7 @@ def test_titles_and_names_send_no_control_sequences_to_the_terminal(capsys, tmp_
 def test_names_that_are_no_utf_8_are_refused(capsys, tmp_path):
     name = os.fsdecode(os.fsencode(tmp_path) + b"/\xff.toml")
     Path(name).write_text(SHORT)
-    assert "no UTF-8 text; rename" in refused(capsys, "simulate", name, "--out", tmp_path / "x.h5")
+    assert "not UTF-8 text; rename" in refused(capsys, "simulate", name, "--out", tmp_path / "x.h5")
     assert load_study(name).link.modes == 2
 
 

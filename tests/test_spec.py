@@ -197,7 +197,7 @@ def test_change_takes_numpy_and_refuses_unknown_names():
     assert Study().control.gain_factor == 1.0
     with pytest.raises(StudyError, match="contrl.*did you mean 'control'"):
         study.change(contrl__gain_factor=1.0)
-    with pytest.raises(StudyError, match="title is no section"):
+    with pytest.raises(StudyError, match="title is not a section"):
         study.change(title__x=1.0)
 
 

@@ -177,9 +177,9 @@ def test_quiet_says_nothing(capsys, spec, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("show", "nowhere"), "no folder of a sweep"),
-        (("best", "nowhere", "--by", "x"), "no folder of a sweep"),
-        (("plot", "nowhere"), "no folder of a sweep"),
+        (("show", "nowhere"), "not the folder of a sweep"),
+        (("best", "nowhere", "--by", "x"), "not the folder of a sweep"),
+        (("plot", "nowhere"), "not the folder of a sweep"),
         (("replay", "nowhere.toml"), "cannot be read"),
         (("replay", "nowhere.toml", "--case", "1"), "leave --case out"),
         (("sweep", "nowhere.toml", "--out", "x"), "cannot be read"),

@@ -316,7 +316,10 @@ def test_limits_that_contradict_are_named():
     spec = known_tuning(spans, names, starts=4, iterations=10)
     for limits, message in (
         (lambda v: jax.numpy.stack([v[0] - 0.3, 0.6 - v[0]]), "by some design each, but by none"),
-        (lambda v: jax.numpy.stack([v[0] + 0.1, 0 * v[0] - 1]), "peak_voltage = 1.0 is kept by no"),
+        (
+            lambda v: jax.numpy.stack([v[0] + 0.1, 0 * v[0] - 1]),
+            "peak_voltage = 1.0 is satisfied by no",
+        ),
     ):
         evaluator = Known(spec, lambda v: jax.numpy.sum((v - 0.45) ** 2), limits)
         at = begin(spec, evaluator)

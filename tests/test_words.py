@@ -20,6 +20,7 @@ DOCUMENTS = [
     TOP / "README.md",
     *sorted((TOP / "docs").glob("*.md")),
     *sorted((TOP / "studies").glob("*/report.md")),
+    *sorted((TOP / "studies" / "specs").glob("*.toml")),
 ]
 NOTEBOOKS = sorted((TOP / "notebooks").glob("*.ipynb"))
 #: Pattern of what is not the field's word, what to write, and where the pattern finds it.

@@ -209,7 +209,7 @@ def _check_reached(code: np.ndarray, pose: Pose) -> None:
     """
     if int(code) != status.OK:
         at = ", ".join(f"{x:.6g}" for x in pose)
-        raise StudyError(f"{describe(int(code))} at ({at}) m, m, rad with the numbers tried")
+        raise StudyError(f"{describe(int(code))} at ({at}) m, m, rad with the values tried")
 
 
 def with_slopes(

@@ -138,7 +138,7 @@ def sentences(found: Fitted) -> list[str]:
     if not found.solution.best.is_converged:
         lines.append("The search ended before it converged; raise fit.iterations.")
     if found.experiment_fault:
-        lines.append(f"No next experiment was found: {found.experiment_fault}.")
+        lines.append(f"No next experiment could be computed: {found.experiment_fault}.")
     return lines
 
 

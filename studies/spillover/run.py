@@ -59,7 +59,7 @@ def spillover_design(
     console.print(verdict(found), soft_wrap=True)
     if text := spillover_text(found):
         console.print(text, soft_wrap=True)
-    console.print("comparing laws")
+    console.print("comparing control laws")
     laws = None
     try:
         laws = compare_laws(found.study, margin)

@@ -472,7 +472,7 @@ class Study(Section):
                 target = target.setdefault(section, {})
                 if not isinstance(target, dict):
                     field = name.replace("__", ".")
-                    raise StudyError(f"{field}: {section} is no section of a study")
+                    raise StudyError(f"{field}: {section} is not a section of a study")
             target[leaf] = value
         return parse_study(data)
 

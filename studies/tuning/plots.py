@@ -92,8 +92,8 @@ def front(spec: TuneSpec, found: TuneFindings, limit: str) -> Figure:
         if found.searched is not None:
             seen, kept = found.searched, is_kept(spec, found.searched)
             for chosen, color, label in (
-                (np.isfinite(seen.objective) & ~kept, "#CCCCCC", "random, a limit not kept"),
-                (kept, figures.SERIES[0], "random, all limits kept"),
+                (np.isfinite(seen.objective) & ~kept, "#CCCCCC", "random, a limit violated"),
+                (kept, figures.SERIES[0], "random, all limits satisfied"),
             ):
                 if chosen.any():
                     ax.scatter(

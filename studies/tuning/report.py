@@ -431,10 +431,10 @@ def _contradiction(spec: TuneSpec, family: Family, values: np.ndarray) -> str:
     never = [name for name, value in least.items() if value > KEPT]
     if never:
         return ", ".join(
-            f"{name} = {family.limits[name]} is kept by no design"
+            f"{name} = {family.limits[name]} is satisfied by no design"
             + ("" if name in LOOP_LIMITS else f" (nearest {100 * least[name]:+.1f} %)")
             for name in never
         )
     return " and ".join(f"{name} = {family.limits[name]}" for name in spec.limit_names) + (
-        " are kept by some design each, but by none together"
+        " are each satisfied by some design, but by none together"
     )

@@ -102,8 +102,8 @@ def _starts(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
             at.best_limits,
             ("start", "limit"),
             "1",
-            "negative: kept; value over limit - 1 of a metric, for the loop a smooth figure that "
-            "has the same sign",
+            "negative: satisfied; value over limit - 1 of a metric, for the loop a smooth figure "
+            "that has the same sign",
         )
     return starts
 

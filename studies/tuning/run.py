@@ -91,7 +91,7 @@ def run_tuning(
         if before is not None and not fits(spec, before):
             raise StudyError(f"{out / PROGRESS}: damaged; name a new folder")
         if before is not None:
-            say(f"going on after iteration {int(before.iteration)}")
+            say(f"continuing after iteration {int(before.iteration)}")
         say("compiling, and choosing starting points by the linear loop")
         evaluator = evaluator or make_evaluator(spec)
 
@@ -115,7 +115,7 @@ def run_tuning(
             say(line)
     faults = unkept(spec, at)
     if faults:
-        raise StudyError("tune.limits: not kept together; " + "; ".join(faults))
+        raise StudyError("tune.limits: not satisfied together; " + "; ".join(faults))
     return found
 
 
