@@ -176,7 +176,7 @@ def baseline_id(spec: SweepSpec) -> str:
 def is_worse(values: np.ndarray, uncontrolled: float) -> np.ndarray:
     """Which values of a metric are above that without control by more than rounding, (n,)."""
     with np.errstate(invalid="ignore"):
-        return values > uncontrolled * (1 + ROUNDING)
+        return np.asarray(values > uncontrolled * (1 + ROUNDING))
 
 
 def uncontrolled_value(data: SweepData, name: str) -> float | None:
