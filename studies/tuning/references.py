@@ -136,7 +136,13 @@ def _evaluated(
     """Objective and largest violation of the limits on metrics for gain factors (n,)."""
     merit, nothing = merit_of(spec), np.zeros(len(spec.free.names), bool)
     designs = [
-        Family(ALONE, nothing, {FIELD: float(value)}, dict(spec.tune.limits), "")
+        Family(
+            name=ALONE,
+            is_free=nothing,
+            columns={FIELD: float(value)},
+            limits=dict(spec.tune.limits),
+            front="",
+        )
         for value in values
     ]
     columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)
