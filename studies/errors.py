@@ -31,8 +31,12 @@ class CacheWarning(UserWarning):
     """Compiled programs are not cached."""
 
 
+class ResolutionWarning(UserWarning):
+    """Values are compared that the controller cannot measure."""
+
+
 #: Warnings that the command line prints as one line.
-OWN_WARNINGS = (NoKernelWarning, ModelWarning, CacheWarning)
+OWN_WARNINGS = (NoKernelWarning, ModelWarning, CacheWarning, ResolutionWarning)
 
 
 def warn_of_model(text: str) -> None:

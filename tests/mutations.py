@@ -22,9 +22,9 @@ from jaxmodel.metrics import METRICS
 from studies.engine.columns import PER_CASE, label_of
 from studies.engine.controller import fixed_controller
 from studies.engine.design import load_design
-from studies.engine.folder import MANIFEST, RESULTS, file_hash, make_manifest, open_folder
+from studies.engine.folder import BASELINE, MANIFEST, RESULTS, file_hash, make_manifest, open_folder
 from studies.engine.folder import finished_cases as finished
-from studies.engine.results import load
+from studies.engine.results import baseline_id, load
 from studies.engine.stored import manifest_attributes, merge
 from studies.errors import StudyError
 from studies.export.document import (
@@ -42,7 +42,7 @@ from studies.fitting.spec import FileEntry, load_fit
 from studies.fitting.tables import column, read_columns
 from studies.space.spec import load_sweep, parse_sweep
 from studies.space.table import build_table
-from studies.store import Variable
+from studies.store import Variable, write_store
 from studies.study.files import READY, read_toml
 from studies.study.spec import load_study
 from studies.sweeps.show import best_cases, print_cases, show
@@ -188,6 +188,14 @@ def sweep_folder(folder):
                 attributes = {"title": "small", **manifest_attributes(manifest)}
                 merge(out.path, table, finished(out.path), attributes)
                 out.publish()
+                spec = parse_sweep(data)
+                step = Variable(np.full(3, 1e-7), ("link",), "m", "one ADC step")
+                baseline = {"status": Variable(np.array(0), (), "1", "status"), "adc_step": step}
+                for metric in METRICS:
+                    dims, *label = label_of(metric)
+                    values = rng.uniform(1, 2, tuple(3 for _ in dims))
+                    baseline[metric] = Variable(values, dims, *label)
+                write_store(out.path / BASELINE, baseline, {"case_id": baseline_id(spec)})
     return [folder / "whole", folder / "part"]
 
 
@@ -420,6 +428,8 @@ def change_results(path, rng):
         return
     for _ in range(rng.integers(1, 3)):
         rng.choice([change_hdf5, change_hdf5, change_bytes])(path / RESULTS, rng)
+    if (path / BASELINE).is_file() and rng.random() < 0.5:
+        rng.choice([change_hdf5, change_hdf5, change_bytes])(path / BASELINE, rng)
     manifest = json.loads((path / MANIFEST).read_text())
     (path / MANIFEST).write_text(json.dumps(manifest | {"results": [file_hash(path / RESULTS)]}))
 

@@ -10,7 +10,10 @@ from PIL import Image
 
 from studies.engine import plan
 from studies.engine.design import load_design
+from studies.engine.folder import BASELINE
+from studies.engine.frame import frame_of
 from studies.engine.results import load
+from studies.engine.runs import check_run, run_study
 from studies.errors import StudyError
 from studies.study.template import toml_value
 from studies.sweeps.report import report
@@ -60,6 +63,7 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     assert code == 0 and "40/40 cases" in text and "compiled in" in text and "results.h5" in text
     assert f"report: {out / 'report.html'}\n" in text
     check_report(out)
+    check_uncontrolled(capsys, spec, out)
     code, text, _ = run(capsys, "show", out)
     assert code == 0 and "ok" in text and "best cases by residual_rms" in text
     assert "residual_rms [µm]" in text
@@ -105,6 +109,36 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     assert Image.open(tmp_path / "placement.png").size[0] > 600
 
 
+def check_uncontrolled(capsys, spec, folder):
+    """The baseline without control is a run of its own; resuming keeps it, older sweeps lack it."""
+    data = load(folder)
+    alone = run_study(data.spec.study.change(control__feedback="none"), has_record=False)
+    wanted = alone.result.metrics["residual_rms"]
+    np.testing.assert_allclose(data.baseline["residual_rms"].data, wanted, rtol=1e-9)
+    step = frame_of(*check_run(data.spec.study)).adc_step
+    np.testing.assert_allclose(data.baseline["adc_step"].data, step, rtol=1e-12)
+    told = f"residual_rms of the baseline without control: {1e6 * wanted.max():.4g} µm"
+    value, is_ok = np.nanmax(data["residual_rms"], axis=(1, 2)), data["status"] == 0
+    text = run(capsys, "best", folder, "--by", "residual_rms", "--count", "99")[1]
+    assert told in text
+    worse = is_ok & (value > wanted.max())
+    rows = [int(k) for k in re.findall(r"(?m)^│ (\d+) .* \* +│", text)]
+    assert rows == [k for k in np.argsort(value, kind="stable") if worse[k]]
+    assert told in (folder / "report.md").read_text(encoding="utf-8").partition("## ")[0]
+    file = folder / BASELINE
+    kept = data.baseline["residual_rms"].data
+    before, whole = file.stat().st_mtime_ns, file.read_bytes()
+    assert run(capsys, "sweep", spec, "--out", folder, "--resume", "--quiet") == (0, "", "")
+    assert file.stat().st_mtime_ns == before
+    file.write_bytes(whole[:999])
+    assert "not a store" in refused(capsys, "show", folder)
+    file.unlink()
+    text = run(capsys, "show", folder)[1]
+    assert "best cases by residual_rms" in text and "without control" not in text
+    assert run(capsys, "sweep", spec, "--out", folder, "--resume", "--quiet") == (0, "", "")
+    np.testing.assert_array_equal(load(folder).baseline["residual_rms"].data, kept)
+
+
 def check_report(folder):
     """The report of the sweep against its data; then with other outcomes."""
     html = (folder / "report.html").read_text(encoding="utf-8")
@@ -125,7 +159,9 @@ def check_report(folder):
     count = int(safe.sum())
     assert 10 < count < 40
     value = np.where(safe, np.nanmax(data["residual_rms"], axis=(1, 2)), np.inf)
-    first = f"Best: case {np.argmin(value)} with {1e6 * value.min():.4g} µm"
+    first = (
+        f"**Result:** best by residual_rms: case {np.argmin(value)} with {1e6 * value.min():.4g} µm"
+    )
     head = text.partition("## ")[0]
     assert first in head and "40 cases of control.gain_factor, drive.kp, patches.cent" in head
     best = text.partition("## Best cases by residual_rms")[2].partition("\n## ")[0]

@@ -1,6 +1,8 @@
 """Tables and reports of sweeps on made-up results: every printed number is read back."""
 
 import re
+import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from jaxmodel.metrics import METRICS
 from studies.engine import results
 from studies.engine.columns import axis_variables, case_variables, label_of
 from studies.engine.results import SweepData, metric_values
-from studies.errors import StudyError
+from studies.errors import ResolutionWarning, StudyError
 from studies.space.indices import elementary_effects, sobol_indices
 from studies.space.table import build_table
 from studies.store import Variable
@@ -26,6 +28,7 @@ from studies.sweeps.show import (
     margin_warning,
     requirement,
     status_rows,
+    uncontrolled_text,
 )
 from tests.sweeps import small_spec
 from tests.test_cli import run
@@ -351,6 +354,77 @@ def printed(capsys, monkeypatch):
         return text
 
     return command
+
+
+# --- the baseline without control -----------------------------------------------------------------
+
+
+def with_baseline(data, code=0, step=1e-9):
+    """The same sweep, whose baseline without control has 5.5 µm on link 2, less on the others."""
+    rms = np.outer([5.0, 5.5, 4.0], [0.9, 1.0, 0.8]) * 1e-6
+    baseline = {
+        "status": Variable(np.array(code), (), "1", "status"),
+        "adc_step": Variable(step * np.array([1.0, 1.2, 1.1]), ("link",), "m", "step"),
+    }
+    if code == 0:
+        baseline["residual_rms"] = Variable(rms, ("link", "station"), "m", "rms")
+    return replace(data, baseline=baseline)
+
+
+def test_cases_worse_than_no_control_are_marked(printed):
+    data = with_baseline(usual())
+    cases = best_cases(data, "residual_rms")
+    marked = [row[3] for row in case_rows(data, cases, ["residual_rms"]).rows]
+    assert marked == ["1", "2", "3", "4", "5", "6 *", "7 *", "8 *"]
+    told = "residual_rms of the baseline without control: 5.5 µm"
+    note = "*: worse than the baseline without control, 5.5 µm"
+    text = printed(data, "best", "DIR", "--by", "residual_rms")
+    assert f"{told}\n" in text and f"{note}\n" in text
+    text = printed(data, "best", "DIR", "--by", "residual_rms", "--count", "5")
+    assert f"{told}\n" in text and note not in text
+    assert f"{told}\n" in printed(data, "show", "DIR")
+    text = report(data, "residual_rms", [])
+    assert f"; {told}." in text.partition("## ")[0] and f"\\{note}" in text
+    assert "without control" not in printed(data, "best", "DIR", "--by", "gain_margin")
+    for by, value in (("residual_rms[link=3]", "4 µm"), ("residual_rms[0][2]", "4 µm")):
+        assert f"control: {value}" in uncontrolled_text(data, by)
+    one = with_baseline(usual(codes=[4, 4, 0, 4, 4, 0, 4, 0]))
+    assert uncontrolled_text(one, "residual_rms") == f"{told}; no case is below it"
+    lost = with_baseline(usual(), status.NON_FINITE)
+    assert uncontrolled_text(lost, "residual_rms").endswith(f": {status.REASONS[4]}")
+
+
+def test_equal_to_no_control_is_not_worse():
+    """Another program rounds differently."""
+    rms = of_stations(np.array([5.5e-6 * (1 + 1e-12), *RMS[1:]]))
+    data = with_baseline(usual(residual_rms=rms))
+    found = {row[0]: row[3] for row in case_rows(data, np.arange(8), ["residual_rms"]).rows}
+    assert found["0"] == "5.5" and found["7"] == "6 *"
+
+
+def test_only_controlled_links_count_without_control():
+    control = {"control": {"links": [True, False, True]}}
+    data = made_up({"gain": GAINS}, residual_rms=of_stations(RMS), sections=control)
+    assert "control: 5 µm" in uncontrolled_text(with_baseline(data), "residual_rms")
+
+
+def test_deflections_below_one_adc_step_are_not_ranked_in_silence(printed):
+    data = with_baseline(usual(), step=2.5e-6)
+    text = "residual_rms of 2 of these 8 cases are below one ADC step of 2.5 µm: the controller"
+    with pytest.warns(ResolutionWarning, match=text):
+        best_cases(data, "residual_rms")
+    with pytest.warns(ResolutionWarning, match="of these 8 cases are below one ADC step of 3 µm"):
+        best_cases(data, "residual_rms[link=2]")  # whose step is larger
+    assert text in printed(data, "best", "DIR", "--by", "residual_rms")
+    shown = text.replace("2 of these 8 cases are", "1 of these 7 cases are")  # of the safe ones
+    assert shown in printed(data, "show", "DIR")
+    assert report(data, "residual_rms", []).partition("## ")[0].count(shown) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for by in ("-residual_rms", "gain_margin", "peak_voltage", "settling_time"):
+            best_cases(data, by, count=6)
+        best_cases(with_baseline(usual()), "residual_rms")
+        best_cases(usual(), "residual_rms")
 
 
 def test_show_prints_statuses_and_the_best(printed):

@@ -97,11 +97,12 @@ def same(told, value):
 def check_report(out):
     """Every number of its tables, from the files of the designs, on the machines of the file."""
     text, data = (out / "report.md").read_text(), read_store(out / "tune.h5")[0]
-    own = table_of(text, "On the study's own machine")
+    own = table_of(text, "On the nominal machine")
     fresh = table_of(text, "On fresh machines")
     files = {name: row["file"].strip("`") for name, row in own.items() if row["file"] != "-"}
-    assert list(own) == list(fresh) == ["baseline", *data["family"].data]
-    assert len(files) == len(own) - 1  # a family that moves nothing has no file
+    compared = ["without control", "gain_factor alone"]
+    assert list(own) == list(fresh) == ["baseline", *data["family"].data, *compared]
+    assert len(files) == len(own) - 3  # nor has a family that moves nothing a file
     moduli = data["scenario_link_youngs_modulus"].data
     seeds = data["scenario_run_seed"].data.tolist()
     assert load_study(out / "study.toml").link.youngs_modulus not in moduli
@@ -177,14 +178,14 @@ def test_a_report_says_what_its_numbers_are():
     for words in (
         "the least residual_rms of links 1 and 3 with peak_voltage at most 30",
         "Ended after 14 of 40 iterations: for 12 no family had gained 0.1 %.",
-        "residual_rms 4 instead of 8 µm, settling_time 12 instead of not within 30 ms, "
-        "peak_voltage 33 instead of 33 V, gain margin 1.3 instead of 3",
+        "residual_rms -50 % (4 instead of 8 µm), settling_time 12 instead of not within 30 ms, "
+        "peak_voltage +0 % (33 instead of 33 V), gain margin 1.3 (2.3 dB) instead of 3 (9.5 dB)",
         "**CAUTION: a gain margin of 1.3; below 2 a machine may go unstable.**",
         "**A limit is violated.**",
         "`studies simulate tuned.toml",
     ):
         assert words in head, words
-    own = table_of(text, "On the study's own machine")
+    own = table_of(text, "On the nominal machine")
     assert own["tuned"]["peak_voltage [V]"] == "33" and own["tuned"]["residual_rms [µm]"] == "4"
     fresh = table_of(text, "On fresh machines")
     assert fresh["baseline"]["settling_time [ms]"] == "not within 30"
@@ -199,14 +200,14 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
     cli.main(["tune", str(file), "--out", str(out)])
     text = (out / "report.md").read_text()
     for part in (
-        "**Asked:** the least residual_rms of all links with peak_voltage at most",
+        "which design has the least residual_rms of all links with peak_voltage at most",
         "| gains |",
         "| loud |",
         "| all, peak_voltage 20 |",
         "worst disagreement is",
         "Sobol designs of all",
         "Linear fidelity",
-        "**Next:** `studies simulate",
+        "**Next steps:** `studies simulate",
     ):
         assert part in text
     page = parsed((out / "report.html").read_text())

@@ -14,7 +14,7 @@ from studies.atlas.drawing import Clip, animate, draw_mode, mode_skeleton, skele
 from studies.atlas.findings import AtlasFindings
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.subsets import TARGETS, link_label, player_labels, setting_label
-from studies.show.figures import SERIES, comparison, legend_above, new_figure
+from studies.show.figures import SERIES, SMALL, comparison, legend_above, new_figure
 from studies.study.consistency import each_link
 
 #: The animation: from before the command's end to after it, and its frames [s].
@@ -99,7 +99,7 @@ def _shares(found: AtlasFindings) -> Figure:
                 ax.set_title(target)
             if row == len(subsets.setting) - 1:
                 ax.set_xlabel("mode")
-        axes[row, 0].set_ylabel(f"{found.setting(row)}\nlink", fontsize=7)
+        axes[row, 0].set_ylabel(f"{found.setting(row)}\nlink", fontsize=SMALL)
     return figure
 
 
@@ -188,7 +188,7 @@ def _modes(found: AtlasFindings) -> Figure:
         ax.set_title(
             f"{found.modes.frequency[place, k]:.1f} Hz; "
             + (f"links {', '.join(names)}" if share[3] < 0.5 else f"drive {100 * share[3]:.0f} %"),
-            fontsize=8,
+            fontsize=SMALL,
         )
         ax.set_xlabel("")
         ax.set_ylabel("")
@@ -215,7 +215,7 @@ def _platform(found: AtlasFindings) -> Figure:
                 color=SERIES[k],
                 linewidth=1.0,
                 linestyle=("-", "--")[k],
-                label=name,
+                label=f"drive error {name}",
             )
         for k, label in enumerate(_ERRORS):
             ax = axes[k + 1, column]
@@ -223,9 +223,8 @@ def _platform(found: AtlasFindings) -> Figure:
             comparison(runs.time, error[0], error[-1], f"vibration error\n{label}", ax)
             ax.axvline(runs.command_end[column], color="#888888", linewidth=0.8, linestyle=":")
         axes[3, column].set_xlabel("time [s]")
-        axes[0, column].legend(loc="upper right")
     axes[0, 0].set_ylabel("drive error [µm]")
-    legend_above(figure, axes[1, 0])
+    legend_above(figure, axes[0, 0], axes[1, 0])
     return figure
 
 

@@ -36,10 +36,12 @@ SCREEN = "screen"
 GIVEN_UP = "given_up"
 #: The corresponding file in a tuning's folder.
 TUNING = "tune.json"
+#: The baseline of the sweep without control.
+BASELINE = "baseline.h5"
 #: Temporary name of the results.
 JOINED = ".joined.h5"
 #: What an interrupted run can leave behind.
-_LEFTOVER = re.compile(r"\.joined\.h5|\.(joined\.h5|sweep\.json)\.[0-9a-f]{8}\.tmp")
+_LEFTOVER = re.compile(r"\.joined\.h5|\.(joined\.h5|baseline\.h5|sweep\.json)\.[0-9a-f]{8}\.tmp")
 _CHUNK = re.compile(r"(\d{6,})-([0-9a-f]{16})\.h5")
 _SOURCES = Path(__file__).parents[2]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from studies.engine.columns import (
     variable_name,
 )
 from studies.engine.folder import (
+    BASELINE,
     CHUNKS,
     RESULTS,
     finished_cases,
@@ -31,10 +32,13 @@ from studies.reading import parse_json
 from studies.space.axes import LABELS, SHOWN_AS
 from studies.space.condition import evaluate
 from studies.space.spec import SweepSpec, parse_sweep
-from studies.space.table import CaseTable, build_table
+from studies.space.table import CaseTable, build_table, case_ids
 from studies.store import Variable, read_store, variable_labels
 from studies.study.fields import Fields
 from studies.study.paths import NAMED_INDEX, known_field, parse_entry
+
+#: Relative difference of equal runs of different programs, at most [1].
+ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,7 @@ class SweepData:
     attributes: dict[str, Any]
     spec: SweepSpec
     cases: CaseTable | None = None  # where they are at hand, or not all of the sweep's
+    baseline: dict[str, Variable] = field(default_factory=dict)  # without control; {}: not known
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.variables[name].data
@@ -111,6 +116,7 @@ def load(path: str | Path, cases: CaseTable | None = None) -> SweepData:
     folder = Path(path)
     written = read_manifest(folder)["spec"]
     spec = parse_sweep(written)
+    baseline = read_baseline(folder, spec)
     if (folder / RESULTS).is_file() and not any((folder / CHUNKS).glob("*.h5")):
         finished_cases(folder)  # refuses what no sweep has written
         variables, attributes = read_store(folder / RESULTS)
@@ -119,7 +125,7 @@ def load(path: str | Path, cases: CaseTable | None = None) -> SweepData:
         except (KeyError, TypeError, ValueError) as error:
             raise StudyError(f"{folder / RESULTS}: damaged (spec: {error})") from None
         if is_whole:  # otherwise an extension has started
-            return SweepData(variables, attributes, spec, cases)
+            return SweepData(variables, attributes, spec, cases, baseline)
     table = build_table(spec) if cases is None else cases
     gathered = gather(table, finished_cases(folder))
     sizes = axis_sizes(gathered)
@@ -127,7 +133,65 @@ def load(path: str | Path, cases: CaseTable | None = None) -> SweepData:
     for axis, size in (axis_sizes(variables)).items():
         if axis not in variables:
             variables[axis] = Variable(np.arange(1, size + 1), (axis,), "1", f"number of {axis}")
-    return SweepData(variables, {"title": spec.study.title}, spec, table)
+    return SweepData(variables, {"title": spec.study.title}, spec, table, baseline)
+
+
+#: Axes of what the baseline's file holds beside metrics.
+BASELINE_DIMS: dict[str, tuple[str, ...]] = {"status": (), "adc_step": ("link",)}
+
+
+def read_baseline(folder: Path, spec: SweepSpec) -> dict[str, Variable]:
+    """The baseline of a sweep without control: its status and metrics, and one ADC step.
+
+    Args:
+        folder: of the sweep.
+        spec: the sweep.
+
+    Returns:
+        {} where that is not stored.
+
+    Raises:
+        StudyError: a damaged file.
+    """
+    path = folder / BASELINE
+    if not path.is_file():
+        return {}
+    variables, attributes = read_store(path)
+    for name, found in variables.items():
+        dims = BASELINE_DIMS.get(name, METRICS[name].dims if name in METRICS else None)
+        if dims is None:
+            continue
+        sizes = dict(zip(found.dims, found.data.shape, strict=False))
+        if found.dims != dims or sizes.get("link", 3) != 3 or found.data.dtype.kind not in "if":
+            raise StudyError(f"{path}: damaged ({name}); remove it and go on with --resume")
+    return variables if attributes.get("case_id") == baseline_id(spec) else {}
+
+
+def baseline_id(spec: SweepSpec) -> str:
+    """Hash of all parameters of a sweep's baseline."""
+    found: str = case_ids(spec.study, {}, np.zeros(1, int))[0].decode()
+    return found
+
+
+def is_worse(values: np.ndarray, uncontrolled: float) -> np.ndarray:
+    """Which values of a metric are above that without control by more than rounding, (n,)."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(values > uncontrolled * (1 + ROUNDING))
+
+
+def uncontrolled_value(data: SweepData, name: str) -> float | None:
+    """A metric of the baseline without control, as `metric_values`; None if it is not known."""
+    if name.partition("[")[0] not in set(METRICS) & set(data.baseline):
+        return None
+    variables = {
+        key: Variable(x.data[None], ("case", *x.dims), x.units, x.long_name)
+        for key, x in data.baseline.items()
+    }
+    try:
+        value = metric_values(replace(data, variables=variables, cases=data.table), name)[0]
+    except StudyError:  # an entry that the baseline does not have
+        return None
+    return float(value) if np.isfinite(value) else None
 
 
 def metric_values(data: SweepData, name: str) -> np.ndarray:
@@ -245,11 +309,15 @@ def counted_links(data: SweepData) -> np.ndarray:
 
     The same for all cases; otherwise fewer controlled links would look like less vibration.
     """
-    fields = Fields(data.spec.study, data.table.fields)
-    is_closed = fields.raw("control.feedback") != "none"
-    links = (fields.numbers("control.links") != 0) & is_closed[:, None]
-    found = links.any(axis=0)
+    found = controlled(data.table).any(axis=0)
     return found if found.any() else np.ones(3, bool)
+
+
+def controlled(table: CaseTable) -> np.ndarray:
+    """Which links each case controls, (n, 3), or (1, 3) if they are the same in all."""
+    fields = Fields(table.study, table.fields)
+    is_closed = fields.raw("control.feedback") != "none"
+    return (fields.numbers("control.links") != 0) & is_closed[:, None]
 
 
 def _turned(name: str, known: list[str]) -> str:

@@ -176,6 +176,31 @@ def uncontrolled_twin(run: Run) -> Run | None:
     )
 
 
+def run_uncontrolled(study: Study, is_linear: bool = False) -> Run:
+    """The run of a study with no link controlled, without trajectories.
+
+    Args:
+        study: what to run.
+        is_linear: by the linear model.
+
+    Raises:
+        StudyError: as `run_study`.
+    """
+    study = study.change(control__links=(False,) * 3)
+    structure, case = check_run(study)
+    structure = structure._replace(is_linear=is_linear)
+    result = jax.tree.map(np.asarray, _simulate(structure, case, False))
+    return Run(
+        study=study,
+        structure=structure,
+        case=case,
+        result=result,
+        loop=None,
+        motion=None,
+        status=int(result.status),
+    )
+
+
 def with_ratio(case: Case, ratio: Any) -> Case:
     """The same case, or cases, with other EMC ratios, (..., 3, C)."""
     ratio = jnp.asarray(ratio, jnp.result_type(float))

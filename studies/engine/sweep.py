@@ -17,6 +17,7 @@ from rich.console import Console
 
 from jaxmodel.case import Structure
 from studies import config
+from studies.engine.baseline import keep_baseline
 from studies.engine.chunks import Done, Here, Lost, Runner, has_own_ratio, start_chunk
 from studies.engine.executor import make_executor
 from studies.engine.folder import (
@@ -140,6 +141,7 @@ def run_sweep(
             rows, screened = run.screened(screened_cases(out, tell))
         if rows is not None:
             finished = finished_cases(out)
+            keep_baseline(spec, table, out, (lambda text: None) if is_quiet else tell)
             _check_whole(table, rows, np.union1d(finished.case_id, table.case_id[run.lost]), out)
             attributes = {"title": spec.study.title, **manifest_attributes(manifest)}
             timings = {"compile_time": run.compile_time, "run_time": run.run_time}

@@ -112,4 +112,4 @@ def _path(ax: Axes, study: Study, pose: np.ndarray) -> None:
     ax.plot(*drawn.T, color="#C00000", linewidth=1.2, zorder=5)
     ax.plot(*drawn[0], ".", color="#C00000", zorder=5)
     if factor > 1:
-        ax.set_title(f"path drawn {factor:g} times its size", fontsize=8, loc="left")
+        ax.set_title(f"path drawn {factor:g} times its size", fontsize=figures.SMALL, loc="left")

@@ -29,7 +29,7 @@ FAST = (0.01, 0.03)  # [m], [s]
 WINDOW = 0.15
 #: Number of modes whose damping is reported.
 SHOWN = 3
-GIVEN, WITHOUT = "design as given", "no control"
+GIVEN, WITHOUT = "baseline", "no control"
 
 
 class Comparison(NamedTuple):

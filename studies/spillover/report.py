@@ -59,7 +59,8 @@ def report(found: Certificate, laws: Comparison | None) -> str:
         study=study,
         law=LAWS[study.control.law],
         laws=laws,
-        verdict=verdict(found),
+        breaking=found.breaking[found.worst],
+        residual=_residual(laws) if laws is not None else None,
         spillover=spillover_text(found),
         margin=margin,
         worst=found.plants[found.worst],
@@ -80,6 +81,14 @@ def report(found: Certificate, laws: Comparison | None) -> str:
         law_rows=_laws(laws) if laws is not None else [],
         sketch_caption=CAPTION,
     )
+
+
+def _residual(laws: Comparison) -> tuple[float, float] | None:
+    """Residual of the design and without control, worst links [m]; None if a run failed."""
+    with_it, without = (
+        float(np.max(laws.residual_rms[laws.names.index(x)])) for x in (GIVEN, WITHOUT)
+    )
+    return (with_it, without) if np.isfinite(with_it) and without > 0 else None
 
 
 def _free_damping(found: Certificate) -> list[float]:

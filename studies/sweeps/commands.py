@@ -122,14 +122,16 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         """List the best cases of a sweep by a metric."""
         from studies.engine.results import direction, load
         from studies.sweeps.show import (
-            best_cases,
             counted_text,
             print_cases,
+            print_uncontrolled,
+            ranked_cases,
             tell_left_out,
         )
 
         data, name = load(folder), by.removeprefix("-")
-        cases = best_cases(data, by, subject_to, count)
+        cases = ranked_cases(data, by, subject_to, count)
+        print_uncontrolled(data, name, console)
         console.print(f"by {name}, {direction(by)} first, {counted_text(data, name)}:")
         print_cases(data, cases, [name], console)
         tell_left_out(data, console)

@@ -39,17 +39,20 @@ from studies.sweeps.show import (
     MARGIN,
     SHARES,
     Rows,
-    best_cases,
     case_rows,
     cause_rows,
     counted_text,
     margin_warning,
+    mark_note,
+    ranked_cases,
     ranking,
     recommended,
     requirement,
+    resolution_warning,
     shown_metric,
     shown_value,
     status_rows,
+    uncontrolled_text,
     unit_of_metric,
     written_name,
 )
@@ -85,6 +88,8 @@ class BestCase(NamedTuple):
     rival: Rival | None
     idle: list[tuple[str, str]]  # links that no case controls, and the metric there
     table: Rows
+    note: str  # what marks in the table stand for
+    unmeasured: str  # warning of values that the controller cannot measure
 
 
 def write_sweep_report(folder: str | Path) -> None:
@@ -169,6 +174,7 @@ def report(data: SweepData, metric: str, drawn: list[str], folder: str = "DIR") 
         failures=[f"{count}: {name}" for name, count, _ in endings.rows if name != "ok"][:3],
         endings=_literal(endings),
         best=_best(data, metric),
+        uncontrolled=uncontrolled_text(data, metric),
         screen=check_screen(data),
         blocks=_blocks(data.spec.root),
         columns=_literal(axis_rows(data.table)),
@@ -188,9 +194,9 @@ def _best(data: SweepData, metric: str) -> BestCase | None:
     if not is_known.any():
         return None
     condition = requirement(data, metric)
-    best = best_cases(data, metric, condition)
+    best = ranked_cases(data, metric, condition)
     loose = requirement(data, metric, is_safe=False)
-    first, free = int(best[0]), int(best_cases(data, metric, loose, count=1)[0])
+    first, free = int(best[0]), int(ranked_cases(data, metric, loose, count=1)[0])
     warning = margin_warning(data, best)
     is_safe = not warning and bool(np.isfinite(margin[best]).any())
     is_beaten = is_safe and value[free] < value[first]
@@ -216,6 +222,8 @@ def _best(data: SweepData, metric: str) -> BestCase | None:
         idle=_idle(data, metric, first),
         rival=Rival(free, told(readings[free]), margin[free]) if is_beaten else None,
         table=_literal(case_rows(data, best, [metric])),
+        note=mark_note(data, best, metric),
+        unmeasured=resolution_warning(data, best, metric),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from typing import Any, NamedTuple
 
@@ -14,21 +15,27 @@ from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.engine.columns import NOT_RUN, PER_CASE, variable_name
 from studies.engine.results import (
+    ROUNDING,
     SweepData,
     counted_links,
     direction,
+    is_worse,
     meets,
     metric_values,
     swept_names,
+    uncontrolled_value,
 )
 from studies.engine.stored import kept_metrics
-from studies.errors import StudyError
+from studies.errors import ResolutionWarning, StudyError
 from studies.show.units import headed, readable, settling_text
 from studies.study.entries import links_text
 from studies.study.margin import ENOUGH, margin_text
+from studies.study.resolution import is_deflection, least_step, resolution_text
 from studies.sweeps.sensitivity import failure_causes
 
 MARGIN = "gain_margin"
+#: After a value that is worse than that of the baseline without control.
+MARK = "*"
 #: Shown next to every metric of the cases that have them: what a design costs, and how safe it is.
 BESIDE = ("peak_voltage", "damping_ratio[controlled_mode=1]", MARGIN)
 
@@ -80,6 +87,9 @@ def select(data: SweepData, subject_to: str) -> np.ndarray:
 def best_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) -> np.ndarray:
     """Numbers of the cases with the smallest metric, best first; for `WANTED_LARGE`, the largest.
 
+    Warns (`ResolutionWarning`) of deflections below one ADC step, which the controller cannot
+    measure.
+
     Args:
         data: the sweep.
         by: metric or entry of one; with "-" in front, in reverse order.
@@ -89,6 +99,15 @@ def best_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) 
     Raises:
         StudyError: unknown metric, or no case left.
     """
+    found = ranked_cases(data, by, subject_to, count)
+    text = resolution_warning(data, found, by.removeprefix("-"))
+    if text:
+        warnings.warn(text, ResolutionWarning, stacklevel=2)
+    return found
+
+
+def ranked_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) -> np.ndarray:
+    """As `best_cases`, for tables, which have `resolution_warning` below them."""
     name, is_large = by.removeprefix("-"), direction(by) == "largest"
     value = metric_values(data, name)
     if value.dtype.kind not in "fiub":
@@ -116,7 +135,8 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
         return
     if np.isfinite(metric_values(data, by)[codes == status.OK]).any():
         condition = requirement(data, by)
-        best = best_cases(data, by, condition)
+        best = ranked_cases(data, by, condition)
+        print_uncontrolled(data, by, console)
         met = f", of those with {condition}" if condition else ""
         console.print(f"best cases by {by}, {direction(by)} first, {counted_text(data, by)}{met}:")
         print_cases(data, best, [by], console)
@@ -151,9 +171,57 @@ def _print_failed(data: SweepData, codes: np.ndarray, console: Console) -> None:
 def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console: Console) -> None:
     """Print `case_rows`, and any warnings."""
     print_rows(case_rows(data, cases, metrics), console)
-    warning = margin_warning(data, cases)
-    if warning:
-        console.print(f"[bold red]{escape(warning)}[/]", soft_wrap=True, markup=True)
+    note = mark_note(data, cases, metrics[0])
+    if note:
+        console.print(note, soft_wrap=True)
+    for warning in (margin_warning(data, cases), resolution_warning(data, cases, metrics[0])):
+        if warning:
+            console.print(f"[bold red]{escape(warning)}[/]", soft_wrap=True, markup=True)
+
+
+def print_uncontrolled(data: SweepData, by: str, console: Console) -> None:
+    """Print what the ranking metric is without control, if that is known."""
+    text = uncontrolled_text(data, by)
+    if text:
+        console.print(text, soft_wrap=True)
+
+
+def uncontrolled_text(data: SweepData, by: str) -> str:
+    """The ranking metric of the baseline without control, in a sentence; "" if it is not known."""
+    if "status" in data.baseline and is_metric(by):
+        code = int(data.baseline["status"].data)
+        if code not in status.FINISHED:
+            return f"the baseline without control: {reason(code)}"
+    value = uncontrolled_value(data, by)
+    if value is None:
+        return ""
+    cases = metric_values(data, by)[data["status"] == status.OK]
+    is_beaten = (cases < value * (1 - ROUNDING)).any()
+    text = f"{by} of the baseline without control: {_shown(data, by, value)}"
+    return text if is_beaten else f"{text}; no case is below it"
+
+
+def mark_note(data: SweepData, cases: np.ndarray, metric: str) -> str:
+    """What `MARK` stands for, "" if no case has it."""
+    value = uncontrolled_value(data, metric)
+    if value is None or not is_worse(metric_values(data, metric)[cases], value).any():
+        return ""
+    return f"{MARK}: worse than the baseline without control, {_shown(data, metric, value)}"
+
+
+def _shown(data: SweepData, metric: str, value: float) -> str:
+    """A value of a metric in the unit that reports show."""
+    factor, unit = readable(unit_of_metric(data, metric))
+    return f"{factor * value:.4g} {unit}".rstrip()
+
+
+def resolution_warning(data: SweepData, cases: np.ndarray, metric: str) -> str:
+    """Warning if deflections of cases are below one ADC step of the baseline, "" if none is."""
+    if "adc_step" not in data.baseline or not is_deflection(metric) or not len(cases):
+        return ""
+    links = tuple(np.flatnonzero(counted_links(data)).tolist())
+    step = least_step(metric, data.baseline["adc_step"].data, links)
+    return resolution_text(metric, metric_values(data, metric)[cases], step, "case")
 
 
 def margin_warning(data: SweepData, cases: np.ndarray) -> str:
@@ -177,13 +245,18 @@ def case_rows(data: SweepData, cases: np.ndarray, metrics: list[str]) -> Rows:
         *(name for name in BESIDE if name not in metrics and _is_there(data, name)),
     ]
     columns = [shown_metric(data, name) for name in metrics]
+    free = uncontrolled_value(data, metrics[0])
+    is_marked = np.zeros(data.n_cases, bool)
+    if free is not None:
+        is_marked = is_worse(metric_values(data, metrics[0]), free)
     rows = []
     for k in cases:
         cells = [shown_value(data, name, k) for name in names]
-        numbers = (
+        numbers = [
             _number_text(data, name, column, k)
             for name, column in zip(metrics, columns, strict=True)
-        )
+        ]
+        numbers[0] += f" {MARK}" if is_marked[k] else ""
         rows.append([str(k), short_id(data, k), *cells, *numbers])
     heads = [*(written_name(data, name) for name in names), *(label(data, x) for x in metrics)]
     return Rows(["case", "id", *heads], rows)
@@ -267,7 +340,7 @@ def shown_metric(data: SweepData, name: str) -> np.ndarray:
 
 def recommended(data: SweepData, by: str, count: int = 10) -> np.ndarray:
     """The best cases that meet `requirement`; arguments and errors as `best_cases`."""
-    return best_cases(data, by, requirement(data, by), count)
+    return ranked_cases(data, by, requirement(data, by), count)
 
 
 def requirement(data: SweepData, by: str, is_safe: bool = True) -> str:
@@ -286,7 +359,7 @@ def requirement(data: SweepData, by: str, is_safe: bool = True) -> str:
     wanted = [x for x in (own, f"{MARGIN} >= {ENOUGH:g}" if has_margin else "") if x]
     for condition in dict.fromkeys((" and ".join(map(_bracketed, wanted)), *wanted)):
         try:
-            best_cases(data, by, condition, 1)
+            ranked_cases(data, by, condition, 1)
             return condition
         except StudyError:
             pass

@@ -122,21 +122,46 @@ def fresh_columns(spec: TuneSpec) -> dict[str, np.ndarray]:
     return scenario_columns(spec, scenarios.check, scenarios.seed + 1, is_fresh=True)
 
 
-def judge(spec: TuneSpec, designs: list[Study]) -> list[JudgedDesign]:
+class PlainRuns:
+    """Runs with the real converters, many at a time through one program."""
+
+    def __init__(self, structure: Structure, count: int) -> None:
+        """
+        Args:
+            structure: of all runs.
+            count: of a batch, about.
+        """
+        self.structure = structure
+        self._layout = even_layout(count)
+        self._executor = make_executor(structure, self._layout, False)
+
+    def run(self, cases: Case, count: int) -> Result:
+        """Run cases, leaves (count or 1, ...)."""
+        cases = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
+        parts = []
+        for first in range(0, count, self._layout.size):
+            rows = np.minimum(first + np.arange(self._layout.size), count - 1)
+            part = in_working_precision(jax.tree.map(lambda x, rows=rows: x[rows], cases))
+            parts.append(self._executor.start(part).wait())
+        return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
+
+
+def judge(spec: TuneSpec, designs: list[Study], runs: PlainRuns) -> list[JudgedDesign]:
     """Run designs on scenarios not used in the tuning, and as in their own files.
 
     Args:
         spec: of the tuning.
         designs: studies that differ from the tuning's own only in numbers; its own comes first.
+        runs: of `shown_structure`.
     """
     columns = fresh_columns(spec)
-    count, merit, structure = len(columns["run.seed"]), merit_of(spec), shown_structure(spec)
+    count, merit, structure = len(columns["run.seed"]), merit_of(spec), runs.structure
     parts = [build_cases(study, columns, structure) for study in designs]
 
     def joined(*leaves: np.ndarray) -> np.ndarray:
         return np.concatenate([np.broadcast_to(x, (count, *x.shape[1:])) for x in leaves])
 
-    result = _run(structure, jax.tree.map(joined, *parts), count * len(designs))
+    result = runs.run(jax.tree.map(joined, *parts), count * len(designs))
     each = [_rows(result.metrics, k * count, count) for k in range(len(designs))]
     duration = structure.n_steps / spec.study.electronics.sample_rate_hz
     own, found = [_own_run(study) for study in designs], []
@@ -195,15 +220,6 @@ def shown_structure(spec: TuneSpec) -> Structure:
 
 def _rows(metrics: Metrics, first: int, count: int) -> Metrics:
     return jax.tree.map(lambda x: np.asarray(x)[first : first + count], metrics)
-
-
-def _run(structure: Structure, cases: Case, count: int) -> Result:
-    """Run `count` cases in one chunk with the real converters."""
-    layout = even_layout(count)
-    rows = layout.filled(count)
-    padded = in_working_precision(jax.tree.map(lambda x: x[rows], cases))
-    result = make_executor(structure, layout, False).start(padded).wait()
-    return jax.tree.map(lambda x: np.asarray(x)[:count], result)
 
 
 def search(spec: TuneSpec, screen: Any) -> Searched:

@@ -21,7 +21,7 @@ OBJECTIVE = "objective (baseline: 1)"
 def descent(spec: TuneSpec, found: TuneFindings) -> Figure:
     """Best objective that keeps the limits, over iterations, by family; thin: every start."""
     with figures.styled():
-        figure = Figure(figsize=(7.4, 3.6), layout="constrained")
+        figure = Figure(figsize=(figures.WIDTH, 3.6), layout="constrained")
         ax: Axes = figure.subplots()
         history = found.at.history[: int(found.at.iteration)]
         best = np.fmin.accumulate(np.where(history[..., 1] <= KEPT, history[..., 0], np.nan))
@@ -46,7 +46,7 @@ def gains(spec: TuneSpec, found: TuneFindings) -> Figure:
     """What each family gains on fresh machines, one panel for each move."""
     with figures.styled():
         rows = len(spec.families)
-        figure = Figure(figsize=(7.4, 1.5 + 0.3 * rows), layout="constrained")
+        figure = Figure(figsize=(figures.WIDTH, 1.5 + 0.3 * rows), layout="constrained")
         axes = figure.subplots(1, len(spec.moves), squeeze=False, sharex=True, sharey=True)[0]
         count = spec.tune.scenarios.check
         for k, (ax, move) in enumerate(zip(axes, spec.moves, strict=True)):
@@ -86,7 +86,7 @@ def front(spec: TuneSpec, found: TuneFindings, limit: str) -> Figure:
         limit: metric along the abscissa, one of `spec.metric_limits`.
     """
     with figures.styled():
-        figure = Figure(figsize=(7.4, 4.2), layout="constrained")
+        figure = Figure(figsize=(figures.WIDTH, 4.2), layout="constrained")
         ax: Axes = figure.subplots()
         column = spec.metric_limits.index(limit)
         if found.searched is not None:

@@ -15,12 +15,13 @@ from studies.show.sketch import CAPTION
 from studies.show.templates import render
 from studies.show.units import count_text, headed, number, readable, settling_text
 from studies.study.entries import parse_entries
-from studies.study.margin import MARGIN_MODES, caution, margin_text
+from studies.study.margin import MARGIN_MODES, caution, margin_in_db, margin_text
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
 from studies.tuning.check import JudgedDesign, Searched, patch_centers
 from studies.tuning.free import PLACEMENT
 from studies.tuning.merit import SHOWN
 from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
+from studies.tuning.references import References, reference_lines, resolution_lines
 from studies.tuning.scenarios import move_label
 from studies.tuning.spec import BASELINE, LOOP_LIMITS, Family, TuneSpec, label
 
@@ -48,6 +49,16 @@ class TuneFindings(NamedTuple):
     searched: Searched | None
     run_time: float  # of a differentiated run [s]
     runs: int  # how many there were
+    references: References = References(None, None, None, None)  # what designs have to beat
+
+
+class Gain(NamedTuple):
+    """A figure of the design to recommend, beside the baseline's."""
+
+    figure: str
+    change: str  # relative, "" if not known
+    after: str
+    before: str  # with the unit
 
 
 class BestFamily(NamedTuple):
@@ -55,7 +66,7 @@ class BestFamily(NamedTuple):
 
     family: str
     file: str  # of its study
-    gains: list[tuple[str, str, str]]  # figure, its value, that of the baseline with unit
+    gains: list[Gain]
     objective: np.ndarray  # on the fresh machines
     caution: str  # warning about its gain margin, "" if there is none
     is_violated: bool  # a limit
@@ -91,6 +102,7 @@ def report(spec: TuneSpec, found: TuneFindings, folder: str = "") -> str:
         folder: that holds the tuned studies, for commands.
     """
     at, seen = found.at, found.searched
+    worst = max(found.audited, key=lambda entry: entry.share)
     names = list(found.own.metrics)
     return render(
         "tuning/report.md",
@@ -102,6 +114,8 @@ def report(spec: TuneSpec, found: TuneFindings, folder: str = "") -> str:
         names_links=all(parse_entries(name).names_a_link for name in spec.tune.objective),
         lower=LOWER,
         best=_best(spec, found),
+        references=reference_lines(spec, found.own, found.references),
+        unmeasured=_unmeasured(spec, found),
         folder=f"{folder}/" if folder else "",
         heads=[headed(x, METRICS[parse_entries(x).metric].unit) for x in names],
         own=_own_machine(spec, found, names),
@@ -126,7 +140,8 @@ def report(spec: TuneSpec, found: TuneFindings, folder: str = "") -> str:
         kept=seen.objective[is_kept(spec, seen)] if seen is not None else [],
         tuned=at.best_objective[at.winner(spec.main)],
         fidelity=_fidelity(spec, found),
-        worst=max(found.audited, key=lambda entry: entry.share),
+        worst=worst,
+        worst_name=PLACEMENT if worst.name.startswith(PLACEMENT) else worst.name,
         allowed=ALLOWED,
         meaning=MEANING,
         sketch_caption=CAPTION,
@@ -151,12 +166,15 @@ def _best(spec: TuneSpec, found: TuneFindings) -> BestFamily:
     for metric in dict.fromkeys((*spec.tune.objective, *SHOWN)):
         after, before = (_value(metric, x.own.metrics, x.own.watched) for x in (one, own))
         unit = readable(METRICS[parse_entries(metric).metric].unit)[1]
-        gains.append((metric, after, before if unit == "1" else f"{before} {unit}"))
+        known = not any(text.startswith("not") for text in (after, before))
+        change = _relative(*(float(x.own.metrics[metric]) for x in (own, one))) if known else ""
+        gains.append(Gain(metric, change, after, before if unit == "1" else f"{before} {unit}"))
     if one.loop is not None and own.loop is not None:
-        margins = one.loop.gain_margin, own.loop.gain_margin
-        gains.append(("gain margin", f"{margins[0]:.3g}", f"{margins[1]:.3g}"))
+        margins = (margin_in_db(x.gain_margin, 3) for x in (one.loop, own.loop))
+        gains.append(Gain("gain margin", "", *margins))
         decays = one.loop.slowest_decay, own.loop.slowest_decay
-        gains.append(("slowest decay", f"{decays[0]:.3g}", f"{decays[1]:.3g} 1/s"))
+        change = _relative(decays[1], decays[0])
+        gains.append(Gain("slowest decay", change, f"{decays[0]:.3g}", f"{decays[1]:.3g} 1/s"))
     return BestFamily(
         family=family.name,
         file=file_name(spec, family),
@@ -165,6 +183,11 @@ def _best(spec: TuneSpec, found: TuneFindings) -> BestFamily:
         caution=caution(one.loop.gain_margin) if one.loop is not None else "",
         is_violated=found.at.beyond(found.at.winner(k)) > 0,
     )
+
+
+def _relative(before: float, after: float) -> str:
+    """A relative change in percent, "" if there is nothing to relate to."""
+    return f"{100 * (after / before - 1):+.3g} %" if before else ""
 
 
 def best_family(spec: TuneSpec, found: TuneFindings) -> int:
@@ -198,13 +221,21 @@ def summary(spec: TuneSpec, found: TuneFindings) -> list[str]:
             + (f", worst {one.objective.max():.4f}" if len(one.objective) > 1 else "")
             + ("; a limit is violated" if lost else "")
         )
-    return lines
+    lines += reference_lines(spec, found.own, found.references)
+    return lines + _unmeasured(spec, found)
+
+
+def _unmeasured(spec: TuneSpec, found: TuneFindings) -> list[str]:
+    """Warnings of what is compared though the controller cannot measure it."""
+    designs = [one for _, one in _designs(spec, found)]
+    return resolution_lines(spec, designs, found.references.adc_step)
 
 
 def _designs(spec: TuneSpec, found: TuneFindings) -> list[tuple[str, JudgedDesign]]:
-    """The baseline and the best design of every family, by names for Markdown."""
+    """The baseline, the best design of every family, what they have to beat; by Markdown names."""
     names = [literal(family.name) for family in spec.families]
-    return [(REFERENCE, found.own), *zip(names, found.judged, strict=True)]
+    compared = found.references.designs
+    return [(REFERENCE, found.own), *zip(names, found.judged, strict=True), *compared]
 
 
 def _value(metric: str, values: Mapping[str, Any], watched: float) -> str:
@@ -300,11 +331,13 @@ def _state(beyond: float, left: float) -> str:
 
 
 def _numbers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
-    """Row of each free parameter: its bounds, the study's, and that of every family."""
+    """Row of each free parameter but those of the placement, which `_centers` shows in mm."""
     at, families, rows = found.at, spec.moving, []
     places = [at.best_place[at.winner(k)] for k in range(len(families))]
     alike = [at.best_place[_alike(at, k)] for k in range(len(families))]
     for n, free in enumerate(spec.free.numbers):
+        if free.key == PLACEMENT:
+            continue
         cells = []
         for k, family in enumerate(families):
             value = spec.free.values(places[k])[n]

@@ -12,6 +12,7 @@ from studies.study.entries import links_text, parse_entries
 from studies.study.labels import STATUS_LABEL
 from studies.study.paths import field_unit, parse_entry
 from studies.tuning.check import JudgedDesign, fresh_columns, patch_centers
+from studies.tuning.references import ALONE, WITHOUT
 from studies.tuning.report import TuneFindings
 from studies.tuning.spec import TuneSpec
 
@@ -32,6 +33,7 @@ def variables(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
         **_starts(spec, found),
         **_fresh(spec, found),
         **_random(found),
+        **_references(spec, found),
     }
 
 
@@ -163,3 +165,41 @@ def _random(found: TuneFindings) -> dict[str, Variable]:
             seen.linear, ("sample",), "m", "linear residual vibration of random designs"
         ),
     }
+
+
+def _references(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
+    """No control, and the gain factor alone."""
+    links, told = links_text(spec.counted_links), {}
+    scan, axis = found.references.scan, ("scanned",)
+    designs = found.references.uncontrolled, found.references.gain_alone
+    for label, text, one in zip(
+        ("uncontrolled", "gain_alone"), (WITHOUT, ALONE), designs, strict=True
+    ):
+        if one is None:
+            continue
+        told[f"{label}_objective"] = Variable(
+            one.objective, ("scenario",), "1", f"objective, fresh machines, {text}"
+        )
+        told[f"{label}_status"] = Variable(one.status, ("scenario",), *STATUS_LABEL)
+        for name, values in one.metrics.items():
+            unit = METRICS[name.partition("[")[0]].unit
+            what = name if parse_entries(name).names_a_link else f"{name}, largest of {links}"
+            told[f"{label}_{variable_name(name)}"] = Variable(
+                values, ("scenario",), unit, f"{what}, fresh machines, {text}"
+            )
+            told[f"file_{label}_{variable_name(name)}"] = Variable(
+                np.array(one.own.metrics[name]), (), unit, f"{what}, the baseline's run, {text}"
+            )
+    if scan is not None:
+        best = scan.gain_factor[scan.best] if scan.best >= 0 else np.nan
+        told |= {
+            "gain_alone_factor": Variable(np.array(best), (), "1", f"control.gain_factor, {ALONE}"),
+            "scanned_gain_factor": Variable(scan.gain_factor, axis, "1", "control.gain_factor"),
+            "scanned_objective": Variable(
+                scan.objective, axis, "1", "objective with that gain factor alone"
+            ),
+            "scanned_excess": Variable(
+                scan.excess, axis, "1", "largest excess over limits of metrics then, 0: kept"
+            ),
+        }
+    return told

@@ -25,10 +25,11 @@ from studies.store import replacing, write_store
 from studies.study.template import study_template, toml_text
 from studies.tuning import plots
 from studies.tuning.audit import audit
-from studies.tuning.check import judge, search, tuned_study
+from studies.tuning.check import search, tuned_study
 from studies.tuning.evaluate import Evaluator
 from studies.tuning.folder import PROGRESS, RESULTS, open_tuning, save_progress
 from studies.tuning.optimise import Progress, fits, optimise, start_families
+from studies.tuning.references import compare
 from studies.tuning.report import (
     TuneFindings,
     best_family,
@@ -165,14 +166,13 @@ def find(
         at: where the tuning ended.
         say: called before each stage.
     """
-    say(f"running the results on {spec.tune.scenarios.check * len(spec.moves)} fresh scenarios")
     values = spec.free.values(at.best_place)
     winners = [at.winner(k) for k in range(len(spec.moving))]
     designs = [spec.study] + [
         tuned_study(spec, family, values[winners[k]] if k < len(winners) else values[0])
         for k, family in enumerate(spec.families)
     ]
-    own, *judged = judge(spec, designs)
+    own, judged, references = compare(spec, designs, say)
     main = int(np.flatnonzero(at.family == spec.main)[0])
     linear = np.concatenate(
         [
@@ -203,6 +203,7 @@ def find(
         searched=searched,
         run_time=evaluator.run_time,
         runs=int(at.iteration) * evaluator.lanes,
+        references=references,
     )
 
 

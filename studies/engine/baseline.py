@@ -1,0 +1,60 @@
+"""The baseline of a sweep without control, in its folder (`baseline.h5`), beside one ADC step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from jaxmodel import status
+from studies.engine.folder import BASELINE
+from studies.engine.frame import frame_of
+from studies.engine.results import baseline_id, controlled, read_baseline
+from studies.engine.runs import metric_variables, run_uncontrolled
+from studies.engine.stored import kept_metrics
+from studies.errors import StudyError
+from studies.space.spec import SweepSpec
+from studies.space.table import CaseTable
+from studies.store import Variable, write_store
+from studies.study.labels import STATUS_LABEL
+
+
+def keep_baseline(
+    spec: SweepSpec, table: CaseTable, folder: Path, say: Callable[[str], None]
+) -> None:
+    """Run the baseline of a sweep without control, unless its folder has that run.
+
+    Args:
+        spec: the sweep.
+        table: its cases; if none is controlled, there is nothing to compare them with.
+        folder: of the sweep.
+        say: called before the run, and with the reason if there can be none.
+
+    Raises:
+        StudyError: the file cannot be written.
+    """
+    if not controlled(table).any() or _is_stored(folder, spec):
+        return
+    say("running the baseline without control")
+    try:
+        run = run_uncontrolled(spec.study, is_linear=spec.sweep.fidelity == "linear")
+    except StudyError as error:
+        say(f"the baseline cannot run without control: {error}")
+        return
+    variables = {"status": Variable(np.array(run.status), (), *STATUS_LABEL)}
+    if (table.values("control.feedback") == "sampled").any():
+        step = frame_of(run.structure, run.case).adc_step
+        text = "one ADC step, in the deflection of mode 1"
+        variables["adc_step"] = Variable(step, ("link",), "m", text)
+    if run.status in status.FINISHED:
+        found = metric_variables(run.result)
+        variables |= {name: found[name] for name in kept_metrics(spec)}
+    write_store(folder / BASELINE, variables, {"case_id": baseline_id(spec)})
+
+
+def _is_stored(folder: Path, spec: SweepSpec) -> bool:
+    try:
+        return bool(read_baseline(folder, spec))
+    except StudyError:  # damaged
+        return False

@@ -1,0 +1,246 @@
+"""What a tuned design has to beat: no control at all, and the best `control.gain_factor` alone.
+
+The gain factor is scanned on the scenarios of the tuning, under its limits, by plain runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxmodel import status
+from jaxmodel.metrics import METRICS
+from studies.engine.frame import frame_of
+from studies.engine.runs import check_run
+from studies.show.units import count_text, number, readable
+from studies.study.cases import build_cases
+from studies.study.entries import parse_entries
+from studies.study.resolution import is_deflection, least_step, resolution_text
+from studies.study.spec import Study
+from studies.tuning.check import JudgedDesign, PlainRuns, judge, shown_structure
+from studies.tuning.linear_fidelity import LoopFigures, loop_figures
+from studies.tuning.merit import all_judged, allowed_limits, merit_of, own_limits
+from studies.tuning.optimise import KEPT, excess
+from studies.tuning.scenarios import lane_columns, scenario_columns
+from studies.tuning.spec import BASELINE, Family, TuneSpec
+
+FIELD = "control.gain_factor"
+#: Values that are scanned: this many between these multiples of the baseline's, and that itself.
+COUNT, LOWEST, HIGHEST = 23, 0.05, 8.0
+#: Most that `control.gain_factor` may be [1].
+MOST = 1e3
+#: Headings of the reference designs.
+WITHOUT, ALONE = "without control", "gain_factor alone"
+
+
+class GainScan(NamedTuple):
+    """The gain factor alone, on the scenarios of the tuning."""
+
+    gain_factor: np.ndarray  # ascending [1], (n,)
+    objective: np.ndarray  # nan if a run did not finish, (n,)
+    excess: np.ndarray  # largest violation of the limits on metrics, 0 where kept, (n,)
+    best: int  # the least objective that keeps all limits; -1 if none does
+
+
+class References(NamedTuple):
+    """What a tuned design has to beat; None where it does not apply."""
+
+    uncontrolled: JudgedDesign | None
+    scan: GainScan | None
+    gain_alone: JudgedDesign | None  # the best of the scan
+    adc_step: np.ndarray | None  # of the baseline, in the deflection of mode 1 [m], (3,)
+
+    @property
+    def designs(self) -> list[tuple[str, JudgedDesign]]:
+        """Those there are, by their headings."""
+        pairs = (WITHOUT, self.uncontrolled), (ALONE, self.gain_alone)
+        return [(name, one) for name, one in pairs if one is not None]
+
+
+def compare(
+    spec: TuneSpec, designs: list[Study], say: Callable[[str], None]
+) -> tuple[JudgedDesign, list[JudgedDesign], References]:
+    """Judge designs, and what they have to beat.
+
+    Args:
+        spec: of the tuning.
+        designs: the baseline, then the best design of every family.
+        say: called before each stage.
+
+    Returns:
+        The baseline, the best designs, and what they have to beat.
+    """
+    fresh, is_on = spec.tune.scenarios.check * len(spec.moves), is_controlled(spec.study)
+    runs = PlainRuns(shown_structure(spec), fresh * (len(designs) + 2))
+    if is_on:
+        say(f"scanning {FIELD} alone, for comparison")
+    scan = scan_gain(spec, runs)
+    others = {}
+    if is_on:
+        others[WITHOUT] = uncontrolled_study(spec.study)
+    if scan is not None and scan.best >= 0:
+        others[ALONE] = gain_study(spec, scan.gain_factor[scan.best])
+    say(f"running the results on {fresh} fresh scenarios")
+    own, *judged = judge(spec, [*designs, *others.values()], runs)
+    count = len(designs) - 1
+    found = dict(zip(others, judged[count:], strict=True))
+    if WITHOUT in found:
+        found[WITHOUT] = found[WITHOUT]._replace(loop=None, poles=None)
+    step = frame_of(*check_run(spec.study)).adc_step if is_on else None
+    references = References(found.get(WITHOUT), scan, found.get(ALONE), step)
+    return own, judged[:count], references
+
+
+def is_controlled(study: Study) -> bool:
+    """Whether any link is controlled."""
+    return study.control.feedback != "none" and any(study.control.links)
+
+
+def uncontrolled_study(study: Study) -> Study:
+    """The same study with no link controlled."""
+    return study.change(control__links=(False,) * 3)
+
+
+def scan_gain(spec: TuneSpec, runs: PlainRuns) -> GainScan | None:
+    """Scan the gain factor alone.
+
+    Args:
+        spec: of the tuning.
+        runs: of `shown_structure`.
+
+    Returns:
+        None where it is the only free parameter, or has no effect.
+    """
+    asked, start = spec.tune.scenarios, spec.study.control.gain_factor
+    others = {*asked.spread, *asked.machines, *asked.each}
+    is_tuned_alone = set(spec.free.names) == {FIELD}
+    if not is_controlled(spec.study) or start == 0 or is_tuned_alone or FIELD in others:
+        return None
+    values = start * np.append(np.geomspace(LOWEST, HIGHEST, COUNT), 1.0)
+    values = np.unique(np.minimum(values, MOST))
+    objective, beyond = _evaluated(spec, runs, values)
+    is_known = np.isfinite(objective)
+    if not is_known.any() or np.ptp(objective[is_known]) == 0:
+        return None
+    order = np.argsort(objective, kind="stable")  # nan last
+    kept = (k for k in order if is_known[k] and beyond[k] == 0 and _keeps_loop(spec, values[k]))
+    return GainScan(values, objective, beyond, int(next(kept, -1)))
+
+
+def _evaluated(
+    spec: TuneSpec, runs: PlainRuns, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Objective and largest violation of the limits on metrics for gain factors (n,)."""
+    merit, nothing = merit_of(spec), np.zeros(len(spec.free.names), bool)
+    designs = [
+        Family(
+            name=ALONE,
+            is_free=nothing,
+            columns={FIELD: float(value)},
+            limits=dict(spec.tune.limits),
+            front="",
+        )
+        for value in values
+    ]
+    columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)
+    count = len(columns["run.seed"])
+    cases = build_cases(spec.study, lane_columns(spec, columns, [None, *designs]), runs.structure)
+    result = runs.run(cases, count * (1 + len(values)))
+
+    def split(x: np.ndarray) -> np.ndarray:
+        return x.reshape(1 + len(values), count, *x.shape[1:])
+
+    metrics = jax.tree.map(split, result.metrics)
+    own, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
+    allowed = allowed_limits(merit, designs[0], own_limits(merit, own))
+    objective, limits, _ = map(np.asarray, all_judged(merit, others, own, allowed))
+    is_whole = np.isin(split(result.status)[1:], status.FINISHED).all(axis=1)
+    return np.where(is_whole, objective, np.nan), excess(limits)
+
+
+def gain_study(spec: TuneSpec, value: float) -> Study:
+    """The baseline with another gain factor."""
+    return spec.study.change(control__gain_factor=float(value))
+
+
+def _keeps_loop(spec: TuneSpec, value: float) -> bool:
+    """Whether a gain factor keeps the limits of the linearised loop."""
+    if not spec.loop_limits or spec.study.control.feedback != "sampled":
+        return True
+    found, own = loop_figures(gain_study(spec, value)), None
+    for name in spec.loop_limits:
+        limit = spec.tune.limits[name]
+        if limit == BASELINE:
+            own = own or loop_figures(spec.study)
+        left = _left(name, found, getattr(own, name) if limit == BASELINE else float(limit))
+        if left < -KEPT:
+            return False
+    return True
+
+
+def _left(name: str, found: LoopFigures, allowed: float) -> float:
+    """How far a figure of the loop is from its limit, as a share of it; negative: violated."""
+    share: float = getattr(found, name) / allowed - 1
+    return -share if name == "spillover" else share
+
+
+def reference_lines(spec: TuneSpec, own: JudgedDesign, found: References) -> list[str]:
+    """What no control and the gain factor alone achieve, one sentence each.
+
+    Args:
+        spec: of the tuning.
+        own: the baseline, judged.
+        found: what a tuned design has to beat.
+    """
+    machines = count_text(spec.tune.scenarios.check, "fresh machine")
+    lines = []
+    for name, one in found.designs:
+        which = name
+        if name == ALONE and found.scan is not None:
+            value = found.scan.gain_factor[found.scan.best]
+            which = (
+                f"{name}, {value:.4g} instead of {spec.study.control.gain_factor:.4g} (the best "
+                f"of {len(found.scan.gain_factor)} values on the scenarios of the tuning)"
+            )
+        terms = ", ".join(_term(x, one, own) for x in spec.tune.objective)
+        lines.append(
+            f"{which}: {one.objective.mean():.4f} of the baseline's objective on {machines}; "
+            f"on its own machine {terms}"
+        )
+    if found.scan is not None and found.scan.best < 0:
+        values = found.scan.gain_factor
+        lines.append(
+            f"{ALONE}: none of {len(values)} values from {values[0]:.3g} to {values[-1]:.3g} "
+            "keeps the limits"
+        )
+    return lines
+
+
+def _term(metric: str, one: JudgedDesign, own: JudgedDesign) -> str:
+    """A term of the objective, of a design and of the baseline."""
+    unit = METRICS[parse_entries(metric).metric].unit
+    before, after = (number(x.own.metrics[metric], unit) for x in (own, one))
+    return f"{metric} {after} instead of {before} {readable(unit)[1]}"
+
+
+def resolution_lines(
+    spec: TuneSpec, designs: list[JudgedDesign], adc_step: np.ndarray | None
+) -> list[str]:
+    """Terms of the objective that the controller cannot measure, a warning each.
+
+    Args:
+        spec: of the tuning.
+        designs: those that are compared.
+        adc_step: of the baseline [m], (3,); None: there is no controller.
+    """
+    if adc_step is None:
+        return []
+    found = []
+    for name in filter(is_deflection, spec.tune.objective):
+        step = least_step(name, adc_step, spec.counted_links)
+        values = np.array([one.own.metrics[name] for one in designs])
+        found.append(resolution_text(name, values[np.isfinite(values)], step, "design"))
+    return list(filter(None, found))
