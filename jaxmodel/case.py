@@ -53,6 +53,7 @@ class Control(NamedTuple):
     velocity_gain: Array  # k_d of mode 1 [N s/m] or [1/s], (3,); SRF: [s]
     position_gain: Array  # k_p of mode 1 [N/m] or [1/s2], (3,); SRF: [1]
     ratio: Array  # EMC ratios (24) [1], (3, C)
+    damping: Array  # added damping ratio specified [1]; negative: none, (3, C)
     pole_decay: Array  # alpha-bar asked [1/s]; 0: none asked, (3, C)
     pole_frequency: Array  # beta-bar asked [rad/s]; 0: the mode's own, (3, C)
     gain_factor: Array  # factor on the loop gain, whatever the law [1], ()

@@ -10,7 +10,7 @@ import numpy as np
 from jaxmodel.beam import BASES
 from jaxmodel.laws import LAWS
 from jaxmodel.piezo import VACUUM_PERMITTIVITY
-from studies.errors import field_error, nearest
+from studies.errors import field_error, nearest, shown
 from studies.study.state_space import check_system
 
 if TYPE_CHECKING:
@@ -90,20 +90,24 @@ def _is_nested(value: Any) -> bool:
 def _check_poles(study: Study) -> None:
     """Check that the law places poles, and what their lists hold."""
     control = study.control
-    decay, frequency = control.pole_decay, control.pole_frequency_hz
-    if frequency != () and decay == ():
+    decay, frequency, damping = control.pole_decay, control.pole_frequency_hz, control.damping
+    if damping != ():
+        _check_damping(study)
+    elif frequency != () and decay == ():
         raise field_error(
             "control.pole_decay",
             decay,
             "more than 0, where control.pole_frequency_hz is given",
             "1/s",
         )
-    if decay == ():
+    if not control.has_poles:
         return
     if not LAWS[control.law].places_poles:
         able = ", ".join(name for name, law in LAWS.items() if law.places_poles)
-        raise field_error("control.law", control.law, f"{able}, with control.pole_decay")
+        poles = "damping" if damping != () else "pole_decay"
+        raise field_error("control.law", control.law, f"{able}, with control.{poles}")
     for name, value, unit in (
+        ("control.damping", damping, "1"),
         ("control.pole_decay", decay, "1/s"),
         ("control.pole_frequency_hz", frequency, "Hz"),
     ):
@@ -121,6 +125,26 @@ def _check_poles(study: Study) -> None:
             "[[130.0], [120.0], [125.0]] moves mode 1 alone",
             "Hz",
         )
+
+
+def _check_damping(study: Study) -> None:
+    """Check that nothing else decides poles and gains, and that modes still vibrate."""
+    control = study.control
+    for leaf in ("pole_decay", "pole_frequency_hz", "velocity_gain", "position_gain"):
+        value = getattr(control, leaf)
+        if value != type(control).model_fields[leaf].default:
+            told = shown(control.damping)
+            allowed = f"not given where control.damping = {told} decides the gains"
+            raise field_error(f"control.{leaf}", value, allowed)
+    most = 1 - _largest(study.link.damping_ratio)
+    if _largest(control.damping) >= most:
+        allowed = f"below {most:g}, 1 less link.damping_ratio"
+        raise field_error("control.damping", control.damping, allowed, "1")
+
+
+def _largest(value: Any) -> float:
+    """Largest number of a nested list."""
+    return max(map(_largest, value), default=0.0) if isinstance(value, tuple) else value
 
 
 def _check_own_fields(study: Study) -> None:

@@ -264,6 +264,13 @@ class ControlSection(Section):
     position_gain: tuple[Gain, Gain, Gain] = described(
         (0.0, 0.0, 0.0), "N/m or 1/s2", "k_p of mode 1 per link (SRF: 1)"
     )
+    damping: EachMode[Zeta] = described(
+        (),
+        "1",
+        "added damping ratio, beside link.damping_ratio, from which the gains follow; natural "
+        "frequencies are kept: one number, or one a link, is that of mode 1, others by (24); or "
+        "one list a link by mode; 0: none, empty: gains or decays as below",
+    )
     pole_decay: EachMode[Decay] = described(
         (),
         "1/s",
@@ -297,6 +304,11 @@ class ControlSection(Section):
     feedthrough_factor: float = described(
         0.0, "1", "subtracted share of the residual modes' feed-through", ge=0, le=1
     )
+
+    @property
+    def has_poles(self) -> bool:
+        """Whether the gains follow from specified poles."""
+        return self.damping != () or self.pole_decay != ()
 
 
 class StateSpaceSection(Section):
