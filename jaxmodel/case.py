@@ -136,7 +136,7 @@ class Windows(NamedTuple):
     arrival_tolerance: Array  # tolerated rms error of a joint's place in the window [m], ()
     singularity_margin: Array  # tolerated distance of link angles from 0 and 90 deg [rad], ()
     condition_limit: Array  # tolerated condition number [1], ()
-    stations: Array  # where chord deflection is taken [m], (S,), or (3, S) for each link
+    stations: Array  # where chord deflection is taken, over the links' lengths [1], (S,) or (3, S)
 
 
 class Case(NamedTuple):

@@ -112,7 +112,7 @@ STUDY = paper_study().change(
     link__modes=4,
     link__thickness=(2e-3, 2.1e-3, 1.9e-3),
     control__modes=2,
-    metrics__stations=(0.04, 0.1, 0.175),
+    metrics__stations=(0.2, 0.5, 0.875),
     metrics__residual_length=0.123,
     metrics__residual_delay=0.045,
     metrics__settling_band=2.5e-6,
@@ -238,7 +238,7 @@ def test_sentences_of_a_run_show_its_numbers(one_run):
         f"Link {worst + 1} vibrates most: {1e6 * rms[worst]:.4g} µm rms ({without:.4g} without "
         f"control), settling time {settled} ms; peak voltage {m.peak_voltage.max():.4g} of 91 V.",
         "Gain margin 3.25.",
-        "the largest of the stations at 40, 100, 175 mm.",
+        "the largest of the stations at 20, 50, 87.5 % of the link.",
         "Residual window: 0.123 s, from 0.045 s after the shaped command.",
         "stays within 2.5 µm; the run ends 400 ms after the command.",
         "the end of the shaped command at 0.1 s",

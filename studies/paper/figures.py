@@ -20,7 +20,6 @@ from jaxmodel import shaper
 from studies.paper.cases import ALL, OFF, ONE, TWO, PaperRuns
 from studies.paper.measures import Measures
 from studies.show import figures
-from studies.study.consistency import each_link
 
 COLUMNS = (("paper", "ei"), ("fast", "none"))
 TITLES = (r"paper's move, $t_f$ = 0.1 s, EI shaper", r"faster move, $t_f$ = 0.05 s, no shaper")
@@ -109,8 +108,7 @@ def _deflection(runs: PaperRuns, measures: Measures, links: tuple[bool, ...]) ->
 
 def _station(runs: PaperRuns) -> int:
     """The station nearest to three quarters of the link."""
-    stations = np.array(runs.study.metrics.stations)
-    return int(np.argmin(np.abs(stations - 0.75 * each_link(runs.study.link.length).mean())))
+    return int(np.argmin(np.abs(np.array(runs.study.metrics.stations) - 0.75)))
 
 
 def _modes(runs: PaperRuns, measures: Measures) -> Figure:

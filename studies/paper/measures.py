@@ -9,7 +9,6 @@ from scipy.signal import periodogram
 
 from studies.engine.frame import EARLY_PART
 from studies.paper.cases import PaperRuns
-from studies.study.consistency import each_link
 
 #: The peak of a mode is sought within this fraction of its frequency [1].
 PEAK_SPAN = 0.2
@@ -38,8 +37,7 @@ class Measures(NamedTuple):
 
 def middle_station(runs: PaperRuns) -> int:
     """Index of the station nearest to mid-span."""
-    stations = np.array(runs.study.metrics.stations)
-    return int(np.argmin(np.abs(stations - each_link(runs.study.link.length).mean() / 2)))
+    return int(np.argmin(np.abs(np.array(runs.study.metrics.stations) - 0.5)))
 
 
 def measure(runs: PaperRuns) -> Measures:

@@ -111,7 +111,7 @@ def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str], name: st
         caution=caution(run.loop.gain_margin) if run.loop is not None else "",
         case=_situation(run, twin),
         band=study.metrics.settling_band,
-        stations=", ".join(f"{1e3 * x:g}" for x in study.metrics.stations),
+        stations=", ".join(f"{100 * x:g}" for x in study.metrics.stations),
         watched=_watched(run),
         command_end=round(float(result.command_end), 9),
         buckling=np.broadcast_to(euler_force(run.case.machine.beam), (3,)),

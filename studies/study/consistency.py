@@ -51,7 +51,7 @@ def check_consistency(study: Study) -> None:
     Raises:
         StudyError: the first fault.
     """
-    link, control = study.link, study.control
+    control = study.control
     _check_patches(study)
     n_patches = patch_centers(study).shape[1]
     if LAWS[control.law].channel == "mode" and control.modes > n_patches:
@@ -70,17 +70,21 @@ def check_consistency(study: Study) -> None:
     _check_lists(study)
     _check_own_fields(study)
     _check_basis(study)
-    stations = ("metrics.stations", study.metrics.stations)
-    shortest = each_link(link.length).min()
-    for name, values in (stations, ("initial.load_station", (study.initial.load_station,))):
-        for value in values:
-            if not 0 < value < shortest:
-                raise field_error(
-                    name, value, f"between 0 and link.length = {shortest:g}, exclusive", "m"
-                )
+    _check_stations(study)
     _check_sampling(study)
     _check_pulses(study)
     _check_coupling(study)
+
+
+def _check_stations(study: Study) -> None:
+    for value in study.metrics.stations:
+        if not 0 < value < 1:
+            allowed = "between 0 and 1, exclusive: fractions of each link's length"
+            raise field_error("metrics.stations", value, allowed, "1")
+    shortest, load = each_link(study.link.length).min(), study.initial.load_station
+    if not 0 < load < shortest:
+        allowed = f"between 0 and link.length = {shortest:g}, exclusive"
+        raise field_error("initial.load_station", load, allowed, "m")
 
 
 def _is_nested(value: Any) -> bool:

@@ -445,7 +445,11 @@ class MetricsSection(Section):
         1e3, "1", "tolerated condition number of filter and synthesizer", ge=1, le=1e6
     )
     stations: tuple[float, ...] = described(
-        (0.05, 0.10, 0.15), "m", "where chord deflection is evaluated", min_length=1, max_length=20
+        (0.25, 0.5, 0.75),
+        "1",
+        "where chord deflection is evaluated, as fractions of each link's length",
+        min_length=1,
+        max_length=20,
     )
 
 
