@@ -414,9 +414,14 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
 
 
 def _placements(data: SweepData, y: str) -> Figure:
-    """The best placements on the link, one below another, above all cases by each patch."""
+    """The best placements on the links, one below another, above all cases by each patch.
+
+    Links of different length, or with patches of different length, have a line each.
+    """
     centers, value = data["patches_centers"], shown_metric(data, y)
-    patches, length = data.spec.study.patches, each_link(data.spec.study.link.length).max()
+    study = data.spec.study
+    sizes = (study.link.length, study.patches.actuator_length, study.patches.sensor_length)
+    links = list(dict.fromkeys(zip(*(map(float, each_link(x)) for x in sizes), strict=True)))
     chosen = recommended(data, y, N_PLACEMENTS)
     is_ok = (data["status"] == status.OK) & np.isfinite(value)
     others = [name for name in swept_names(data) if name != "patches_centers"]
@@ -426,18 +431,12 @@ def _placements(data: SweepData, y: str) -> Figure:
         top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.2, 1))
         texts = []
         for row, case in enumerate(chosen):
-            top.plot([0, length * unit], [row, row], color="#AAAAAA", linewidth=1)
-            for center in centers[case]:
-                for size, color, height in (
-                    (each_link(patches.actuator_length).max(), figures.SERIES[0], 0.6),
-                    (each_link(patches.sensor_length).max(), figures.SERIES[1], 0.3),
-                ):
-                    left = (center - size / 2) * unit
-                    top.barh(row, size * unit, height, left, color=color, linewidth=0)
+            for at, link in zip(_lines(row, len(links)), links, strict=True):
+                _draw_placement(top, at, centers[case], link, 0.6 / len(links))
             also = "".join(f", {name} = {shown_value(data, name, case)}" for name in others)
             texts.append(f"case {case}: {value[case]:.4g}{also}")
         top.set_ylim(len(chosen) - 0.4, -0.6)
-        top.set_xlim(0, length * unit)
+        top.set_xlim(0, max(length for length, *_ in links) * unit)
         top.set_ylabel("best placements")
         top.yaxis.tick_right()
         top.set_yticks(range(len(chosen)), texts, fontsize=7)
@@ -478,3 +477,19 @@ def _placements(data: SweepData, y: str) -> Figure:
         bottom.legend(fontsize=7, markerscale=3, loc="upper right")
         _say_left_out(figure, data, is_ok)
     return figure
+
+
+def _lines(row: int, count: int) -> np.ndarray:
+    """Ordinates of `count` links about that of their placement."""
+    return row + 0.8 * ((np.arange(count) + 0.5) / count - 0.5)
+
+
+def _draw_placement(
+    ax: Axes, at: float, centers: np.ndarray, link: tuple[float, ...], height: float
+) -> None:
+    """A link with its patches to one scale; link: its length, an actuator's, a sensor's [m]."""
+    length, actuator, sensor = (1e3 * x for x in link)
+    ax.plot([0, length], [at, at], color="#AAAAAA", linewidth=1)
+    for center in 1e3 * centers:
+        ax.barh(at, actuator, height, center - actuator / 2, color=figures.SERIES[0], linewidth=0)
+        ax.barh(at, sensor, height / 2, center - sensor / 2, color=figures.SERIES[1], linewidth=0)
