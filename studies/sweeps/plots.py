@@ -19,6 +19,7 @@ from studies.engine.columns import LEFT_OUT, variable_name
 from studies.engine.results import SweepData, metric_values, swept_names
 from studies.errors import StudyError
 from studies.show import figures
+from studies.show.sketch import ACTUATOR, SENSOR
 from studies.space.axes import SHOWN_AS
 from studies.space.spec import BlockNode
 from studies.study.consistency import each_link
@@ -431,7 +432,7 @@ def _placements(data: SweepData, y: str) -> Figure:
         top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.2, 1))
         texts = []
         for row, case in enumerate(chosen):
-            for at, link in zip(_lines(row, len(links)), links, strict=True):
+            for at, link in zip(_lanes(row, len(links)), links, strict=True):
                 _draw_placement(top, at, centers[case], link, 0.6 / len(links))
             also = "".join(f", {name} = {shown_value(data, name, case)}" for name in others)
             texts.append(f"case {case}: {value[case]:.4g}{also}")
@@ -443,7 +444,7 @@ def _placements(data: SweepData, y: str) -> Figure:
         top.tick_params(axis="y", length=0)
         top.grid(False)
         top.set_title(
-            f"{label(data, y)}, the {_best_text(data, len(chosen))}; blue: actuator, orange: "
+            f"{label(data, y)}, the {_best_text(data, len(chosen))}; orange: actuator, green: "
             "sensor",
             fontsize=8.5,
             loc="left",
@@ -479,7 +480,7 @@ def _placements(data: SweepData, y: str) -> Figure:
     return figure
 
 
-def _lines(row: int, count: int) -> np.ndarray:
+def _lanes(row: int, count: int) -> np.ndarray:
     """Ordinates of `count` links about that of their placement."""
     return row + 0.8 * ((np.arange(count) + 0.5) / count - 0.5)
 
@@ -491,5 +492,5 @@ def _draw_placement(
     length, actuator, sensor = (1e3 * x for x in link)
     ax.plot([0, length], [at, at], color="#AAAAAA", linewidth=1)
     for center in 1e3 * centers:
-        ax.barh(at, actuator, height, center - actuator / 2, color=figures.SERIES[0], linewidth=0)
-        ax.barh(at, sensor, height / 2, center - sensor / 2, color=figures.SERIES[1], linewidth=0)
+        ax.barh(at, actuator, height, center - actuator / 2, color=ACTUATOR, linewidth=0)
+        ax.barh(at, sensor, height / 2, center - sensor / 2, color=SENSOR, linewidth=0)
