@@ -77,7 +77,7 @@ def fast_square(**changes):
         motion__move_time=0.05,
         shaper__kind="none",
         run__duration=0.3001,
-        metrics__stations=(0.1,),
+        metrics__stations=(0.5,),
         metrics__residual_delay=0.0,
         metrics__residual_length=0.1,
         **changes,
@@ -121,7 +121,7 @@ HEAVY_LINKS = BARE.change(
     run__duration=0.3,
     metrics__residual_delay=0.0,
     metrics__residual_length=0.05,
-    metrics__stations=(0.1,),
+    metrics__stations=(0.5,),
 )
 
 

@@ -22,7 +22,6 @@ from studies.atlas.subsets import link_label, long_enough
 from studies.engine.batches import run_batches
 from studies.engine.runs import check_run, resolved_study, with_ratio
 from studies.study.cases import powered
-from studies.study.consistency import each_link
 from studies.study.spec import Study
 from studies.study.window import residual_delay
 
@@ -148,10 +147,8 @@ def responses(study: Study, frequency: np.ndarray) -> Responses:
     Raises:
         StudyError: as `check_run`.
     """
-    middle = each_link(study.link.length)[:, None] / 2
-    study = resolved_study(study).change(metrics__stations=(float(middle.min()),))
+    study = resolved_study(study).change(metrics__stations=(0.5,))
     structure, case = check_run(study)
-    case = case._replace(windows=case.windows._replace(stations=jnp.asarray(middle)))
     structure = structure._replace(n_steps=1, substeps=1, n_frequencies=1, has_noise=False)
     pose = jnp.asarray(study.motion.waypoints[0], case.electronics.period.dtype)
     value, radius = [], []

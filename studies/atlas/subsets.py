@@ -168,7 +168,7 @@ def _check(study: Study) -> None:
     if len(set(motion.waypoints)) < 2:
         allowed = "a path of two different poses or more"
         raise field_error("motion.waypoints", motion.waypoints, allowed, "m, m, rad")
-    gains = (*control.velocity_gain, *control.position_gain, control.pole_decay != ())
+    gains = (*control.velocity_gain, *control.position_gain, control.has_poles)
     if control.gain_factor == 0 or not any(gains):
         name = "control.gain_factor" if control.gain_factor == 0 else "control.velocity_gain"
         raise field_error(name, 0.0, "gains that do something, whose effect can be shared out")

@@ -44,7 +44,7 @@ from studies.errors import field_error, warn_of_model
 from studies.store import Variable
 from studies.study.cases import as_arrays, build_case, build_structure, powered
 from studies.study.consistency import check_locked, each_link
-from studies.study.labels import DISTANCE_TEXT, STATUS_LABEL
+from studies.study.labels import DISTANCE_TEXT, STATION_TEXT, STATUS_LABEL
 from studies.study.margin import MARGIN_MODES
 from studies.study.spec import AUTO, Study
 from studies.study.window import residual_delay
@@ -596,7 +596,7 @@ def run_variables(run: Run) -> dict[str, Variable]:
     stations = np.array(run.study.metrics.stations)
     frequency = np.asarray(_spectrum_frequencies(run.structure, run.case))
     variables = {
-        "station": Variable(stations, ("station",), "m", "position along the link"),
+        "station": Variable(stations, ("station",), "1", STATION_TEXT),
         "link": Variable(np.arange(1, 4), ("link",), "1", "link number"),
         "pose_axis": Variable(np.array(["x", "y", "phi"]), ("pose_axis",), "1", "pose component"),
         "spectrum_frequency": Variable(

@@ -269,6 +269,13 @@ class ControlSection(Section):
     position_gain: tuple[Gain, Gain, Gain] = described(
         (0.0, 0.0, 0.0), "N/m or 1/s2", "k_p of mode 1 per link (SRF: 1)"
     )
+    damping: EachMode[Zeta] = described(
+        (),
+        "1",
+        "added damping ratio, beside link.damping_ratio, from which the gains follow; natural "
+        "frequencies are kept: one number, or one a link, is that of mode 1, others by (24); or "
+        "one list a link by mode; 0: none, empty: gains or decays as below",
+    )
     pole_decay: EachMode[Decay] = described(
         (),
         "1/s",
@@ -302,6 +309,11 @@ class ControlSection(Section):
     feedthrough_factor: float = described(
         0.0, "1", "subtracted share of the residual modes' feed-through", ge=0, le=1
     )
+
+    @property
+    def has_poles(self) -> bool:
+        """Whether the gains follow from specified poles."""
+        return self.damping != () or self.pole_decay != ()
 
 
 class StateSpaceSection(Section):
@@ -441,7 +453,11 @@ class MetricsSection(Section):
         1e3, "1", "tolerated condition number of filter and synthesizer", ge=1, le=1e6
     )
     stations: tuple[float, ...] = described(
-        (0.05, 0.10, 0.15), "m", "where chord deflection is evaluated", min_length=1, max_length=20
+        (0.25, 0.5, 0.75),
+        "1",
+        "where chord deflection is evaluated, as fractions of each link's length",
+        min_length=1,
+        max_length=20,
     )
 
 

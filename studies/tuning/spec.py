@@ -123,7 +123,7 @@ class TuneSpec(NamedTuple):
     def has_poles(self) -> bool:
         """Whether the gains of any design follow from poles."""
         studies = (self.study, *(family.study(self.study) for family in self.families))
-        return any(study.control.pole_decay != () for study in studies)
+        return any(study.control.has_poles for study in studies)
 
     @property
     def has_position_gain(self) -> bool:
