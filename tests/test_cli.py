@@ -147,6 +147,15 @@ def test_simulate_writes_a_consistent_run(short_run):
     assert float(abs(short_run.actuator_voltage).max()) > 0.1
 
 
+def test_simulate_prints_its_answer_without_a_file(short_folder, short_run, capsys):
+    before = sorted(short_folder.iterdir())
+    code, out, err = run(capsys, "simulate", short_folder / "short.toml")
+    assert (code, err) == (0, "") and out.startswith("status: ok\n")
+    for link in range(3):
+        assert f"{1e6 * float(short_run.residual_rms[link].max()):.4g}" in out
+    assert "written" not in out and sorted(short_folder.iterdir()) == before
+
+
 def test_the_metrics_agree_with_the_trajectories(short_run):
     after = short_run.time > float(short_run.command_end) - 0.5e-4
     within = short_run.time < float(short_run.command_end) + 0.02 - 0.5e-4
@@ -191,7 +200,8 @@ def test_a_browser_shows_all_of_a_report(short_folder, tmp_path, width):
 def test_reports_that_cannot_be_are_refused_before_the_run(capsys, tmp_path):
     study = tmp_path / "short.toml"
     study.write_text(SHORT)
-    assert "name their file with --out" in refused(capsys, "replay", study, "--report")
+    for command in ("simulate", "replay"):
+        assert "name their file with --out" in refused(capsys, command, study, "--report")
     arguments = ("simulate", study, "--report", "--out")
     for name in ("run.html", "run.md"):
         assert "name it *.h5" in refused(capsys, *arguments, tmp_path / name)

@@ -28,11 +28,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     @app.command()
     def simulate(
         study: Annotated[Path, typer.Argument(help="study file (TOML) or ready-made design")],
-        out: Annotated[Path, typer.Option(help="HDF5 file to write")],
+        out: Annotated[Path | None, typer.Option(help="HDF5 file for the trajectories")] = None,
         report: _Report = False,
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
     ) -> None:
-        """Run one study and save full trajectories."""
+        """Run one study and print its metrics; with --out, also save full trajectories."""
         start(precision)
         from studies.single.run import simulate as simulate_study
 
