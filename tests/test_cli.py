@@ -354,7 +354,7 @@ def test_a_bad_precision_or_command_is_refused(capsys, tmp_path):
     arguments = ("simulate", tmp_path / "short.toml", "--out", tmp_path / "run.h5")
     message = refused(capsys, *arguments, "--precision", "float16")
     assert "precision = 'float16'; allowed: float64 or float32; did you mean 'float64'?" in message
-    assert "Missing option '--out'" in refused(capsys, *arguments[:2])
+    assert "Missing option '--out'" in refused(capsys, "spillover", arguments[1])
     assert "No such command 'simulat'" in refused(capsys, "simulat")
     code, out, _ = run(capsys)
     assert code == 2 and "simulate" in out
@@ -366,6 +366,9 @@ def test_init_writes_a_study_once(capsys, tmp_path):
     assert code == 0 and "written" in out
     text = target.read_text()
     assert run(capsys, "init")[1] == text
+    whole = run(capsys, "init", "--all")[1]
+    assert len(whole.splitlines()) > 5 * len(text.splitlines())
+    assert "leave one of them out" in refused(capsys, "init", "--all", "--from", "placement")
     assert "exists already; name a new file" in refused(capsys, "init", target)
     capsys.readouterr()
     main(["init", "--from", "placement"])
