@@ -22,8 +22,9 @@ from rich.table import Table
 
 import studies
 from studies.cli import app, console, main
+from studies.engine.modes import machine_modes
 from studies.study.files import READY
-from studies.study.spec import load_study
+from studies.study.spec import load_study, parse_study
 from tests.pages import TITLE, parsed, rendered
 
 HOME_PHI = math.pi / 6
@@ -214,7 +215,12 @@ def test_modes_as_json_and_as_table(capsys):
     code, out, err = run(capsys, "modes", "--modes", 2, "--json")
     found = json.loads(out)
     assert (code, err) == (0, "")
-    assert list(found) == ["frequencies_hz", "damping_ratios"]
+    assert list(found) == ["frequencies_hz", "damping_ratios", "names"]
+    moves = [f"drive, platform {x}, 100 %" for x in ("translates", "translates", "turns")]
+    assert found["names"] == [
+        *moves,
+        *(f"links 1 2 3, mode {k}, 100 %" for k in (1, 1, 1, 2, 2, 2)),
+    ]
     frequency = np.array(found["frequencies_hz"])
     assert len(frequency) == len(found["damping_ratios"]) == 3 + 3 * 2
     assert np.all(np.diff(frequency) >= 0)
@@ -223,6 +229,43 @@ def test_modes_as_json_and_as_table(capsys):
     assert np.all(np.abs(frequency[3:6] / 114.39 - 1) < 0.01)
     code, out, _ = run(capsys, "modes", "--modes", 2, "--kd", 60, "--damping", 0.01, "--locked")
     assert code == 0 and "damping ratio" in out and "114.388" in out and "0.01000" in out
+    assert "links 1 2 3, mode 2, 100 %" in out
+
+
+UNLIKE = {"link": {"modes": 2, "damping_ratio": 0.0, "thickness": [2e-3, 2.2e-3, 1.7e-3]}}
+
+
+def test_modes_name_their_link():
+    study = parse_study(UNLIKE | {"drive": {"kd": 0.0}, "metrics": {"residual_delay": 0.0}})
+    locked, free = machine_modes(study, locked=True), machine_modes(study)
+    by_thickness = [f"link {i}, mode {j}, 100 %" for j in (1, 2) for i in (3, 1, 2)]
+    assert locked.names == by_thickness
+    np.testing.assert_allclose(locked.link_share.max(axis=(1, 2)), 1.0, rtol=1e-9)
+    assert free.names[3:] == by_thickness and all("drive" in name for name in free.names[:3])
+    assert machine_modes(study, kp=0.0).names == ["rigid motion"] * 3 + by_thickness
+
+
+@pytest.mark.parametrize("thickness", [UNLIKE["link"]["thickness"], 2e-3])
+def test_shares_of_modes_are_what_their_frequencies_gain_from_stiffness(thickness):
+    """d ln f^2 / d ln k is the share of k in the potential energy; in groups of equal frequency."""
+    step, study = 1e-4, parse_study(UNLIKE | {"metrics": {"residual_delay": 0.0}})
+    study = study.change(link__thickness=thickness, drive__kd=0.0, drive__kp=2e4)
+
+    def gained(**change):
+        high, low = (
+            machine_modes(study.change(**{name: f(sign) for name, f in change.items()}))
+            for sign in (step, -step)
+        )
+        return np.log(high.frequency / low.frequency) / step
+
+    found = machine_modes(study)
+    of_link = gained(link__stiffness_factor=lambda x: (1.0, 1.0 + x, 1.0))
+    of_drive = gained(drive__kp=lambda x: 2e4 * (1 + x))
+    kinds = [slice(0, 3), slice(3, 6), slice(6, 9)] if thickness == 2e-3 else np.arange(9)
+    for kind in kinds:
+        share = found.link_share[kind][..., 1, :].sum(axis=-1)
+        np.testing.assert_allclose(np.sum(of_link[kind]), np.sum(share), atol=2e-6)
+        np.testing.assert_allclose(np.sum(of_drive[kind]), found.drive_share[kind].sum(), atol=2e-6)
 
 
 def test_modes_at_another_pose_differ(capsys):

@@ -103,12 +103,14 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             text = {
                 "frequencies_hz": found.frequency.tolist(),
                 "damping_ratios": found.damping_ratio.tolist(),
+                "names": found.names,
             }
             print(json.dumps(text))
             return
-        table = Table("mode", "frequency [Hz]", "damping ratio [1]")
-        for k, (f, z) in enumerate(zip(found.frequency, found.damping_ratio, strict=True)):
-            table.add_row(str(k + 1), f"{f:.4f}", f"{z:.5f}")
+        table = Table("mode", "frequency [Hz]", "damping ratio [1]", "share of its energy")
+        rows = zip(found.frequency, found.damping_ratio, found.names, strict=True)
+        for k, (f, z, name) in enumerate(rows):
+            table.add_row(str(k + 1), f"{f:.4f}", f"{z:.5f}", name)
         console.print(table)
 
 
