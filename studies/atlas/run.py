@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +28,7 @@ from studies.atlas.subsets import (
 )
 from studies.atlas.workspace import PAIRS
 from studies.engine.batches import Tell
-from studies.engine.folder import locked_folder, refuse_others
+from studies.engine.folder import ATLASES, locked_folder, refuse_existing
 from studies.engine.results import load
 from studies.engine.runs import run_attributes
 from studies.engine.sweep import run_sweep
@@ -40,9 +39,7 @@ from studies.show.sketch import sketch
 from studies.store import Variable, staged, write_store
 from studies.study.spec import Study
 
-DATA, RUNS_FOLDER = "atlas.h5", "runs"
-#: What an interrupted run can leave behind.
-_LEFTOVER = re.compile(r"\.unfinished-.*")
+DATA, RUNS_FOLDER = "atlas.h5", ATLASES.mark
 
 
 def run_atlas(
@@ -73,8 +70,7 @@ def run_atlas(
     out, console = Path(out), console or Console(highlight=False, markup=False)
     spec = atlas_sweep(study)
     with locked_folder(out, "atlas"):
-        if not (out / RUNS_FOLDER).is_dir():
-            refuse_others(out, _LEFTOVER)
+        refuse_existing(out, ATLASES, is_resumed)
         if run_sweep(spec, out / RUNS_FOLDER, is_resumed, console, is_quiet).is_interrupted:
             return False
         try:

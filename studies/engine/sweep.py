@@ -123,13 +123,13 @@ def run_sweep(
     """
     config.require_configured()
     runner, out = runner or Here(), Path(out)
-    kept_metrics(spec)
-    table = build_table(spec)
-    check_screen_names(spec, table)
     console = console or Console(highlight=False, markup=False)
     tell = partial(console.print, soft_wrap=True)
     manifest = make_manifest(spec.data)
     with open_folder(out, manifest, is_resumed) as folder, _interrupts() as stop:
+        kept_metrics(spec)
+        table = build_table(spec)
+        check_screen_names(spec, table)
         before = finished_cases(out, tell).case_id
         _rows_left(table, before, out)  # refuses another sweep
         folder.begin(manifest)

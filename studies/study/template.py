@@ -93,13 +93,17 @@ def write_study(out: str | Path, study: Study | None = None) -> None:
     write_text(out, study_template(study))
 
 
+def check_new(out: str | Path) -> None:
+    """Raise StudyError unless a new file can be written at `out`; call it before long work."""
+    check_target(out)
+    if Path(out).exists():
+        raise StudyError(f"{out}: exists already; name a new file")
+
+
 def write_text(out: str | Path, text: str) -> None:
     """Write a new file; arguments and errors as `write_study`."""
-    out = Path(out)
-    check_target(out)
-    if out.exists():
-        raise StudyError(f"{out}: exists already; name a new file")
-    with replacing(out) as temporary:
+    check_new(out)
+    with replacing(Path(out)) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 

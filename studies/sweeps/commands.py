@@ -41,7 +41,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         worker_timeout: WorkerTimeout = 600.0,
     ) -> None:
         """Run thousands of cases from one file; finished cases survive any interruption."""
+        from studies.engine.folder import SWEEPS, refuse_existing
+
         workers = Workers(scheduler, local_workers, worker_timeout)
+        if out is not None and not dry_run:
+            refuse_existing(out, SWEEPS, resume)
         start(precision, cpu_only=workers.are_named)
         from studies.engine.sweep import make_plan, run_sweep
         from studies.space.spec import load_sweep
