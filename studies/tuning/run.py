@@ -108,7 +108,7 @@ def _tuned(
     """Tune, check and write, in an open folder; arguments as in `run_tuning`."""
     if before is not None:
         phases.say(f"going on after iteration {int(before.iteration)}")
-    phases.begin("compile", "and look for starting points by the linear loop")
+    phases.begin("compile", "starting points by the linear loop, and the first iteration")
     evaluator, clock = evaluator or make_evaluator(spec), _Clock()
 
     def keep(at: Progress) -> None:
