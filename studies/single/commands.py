@@ -28,11 +28,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     @app.command()
     def simulate(
         study: Annotated[Path, typer.Argument(help="study file (TOML) or ready-made design")],
-        out: Annotated[Path, typer.Option(help="HDF5 file to write")],
+        out: Annotated[Path | None, typer.Option(help="HDF5 file for the trajectories")] = None,
         report: _Report = False,
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
     ) -> None:
-        """Run one study and save full trajectories."""
+        """Run one study and print its metrics; with --out, also save full trajectories."""
         start(precision)
         from studies.single.run import simulate as simulate_study
 
@@ -103,12 +103,14 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             text = {
                 "frequencies_hz": found.frequency.tolist(),
                 "damping_ratios": found.damping_ratio.tolist(),
+                "names": found.names,
             }
             print(json.dumps(text))
             return
-        table = Table("mode", "frequency [Hz]", "damping ratio [1]")
-        for k, (f, z) in enumerate(zip(found.frequency, found.damping_ratio, strict=True)):
-            table.add_row(str(k + 1), f"{f:.4f}", f"{z:.5f}")
+        table = Table("mode", "frequency [Hz]", "damping ratio [1]", "share of its energy")
+        rows = zip(found.frequency, found.damping_ratio, found.names, strict=True)
+        for k, (f, z, name) in enumerate(rows):
+            table.add_row(str(k + 1), f"{f:.4f}", f"{z:.5f}", name)
         console.print(table)
 
 
