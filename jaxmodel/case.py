@@ -49,10 +49,11 @@ class Control(NamedTuple):
     n_active: Array  # number of controlled modes, ()
     link_mask: Array  # controlled links, (3,)
     mode_mask: Array  # controlled modes of each link, (3, C)
-    omega: Array  # believed frequencies of the assembled links [rad/s]; 0: its basis's, (3, C)
+    omega: Array  # nominal frequencies of the assembled links [rad/s]; 0: its basis's, (3, C)
     velocity_gain: Array  # k_d of mode 1 [N s/m] or [1/s], (3,); SRF: [s]
     position_gain: Array  # k_p of mode 1 [N/m] or [1/s2], (3,); SRF: [1]
     ratio: Array  # EMC ratios (24) [1], (3, C)
+    damping: Array  # added damping ratio specified [1]; negative: none, (3, C)
     pole_decay: Array  # alpha-bar asked [1/s]; 0: none asked, (3, C)
     pole_frequency: Array  # beta-bar asked [rad/s]; 0: the mode's own, (3, C)
     gain_factor: Array  # factor on the loop gain, whatever the law [1], ()
@@ -86,7 +87,7 @@ class Shaping(NamedTuple):
     """Input shaper of the reference, one entry per shaped frequency."""
 
     kind: Array  # position in `shaper.SHAPERS`, ()
-    omega: Array  # [rad/s], 0: mode 1 as the controller believes it, (n,)
+    omega: Array  # [rad/s], 0: mode 1 of the nominal model, (n,)
     zeta: Array  # [1], (n,)
     tolerance: Array  # V of the EI family [1], ()
     is_exact: Array  # 1: impulses split exactly for their mode, 0: linearly, ()
@@ -135,7 +136,7 @@ class Windows(NamedTuple):
     arrival_tolerance: Array  # tolerated rms error of a joint's place in the window [m], ()
     singularity_margin: Array  # tolerated distance of link angles from 0 and 90 deg [rad], ()
     condition_limit: Array  # tolerated condition number [1], ()
-    stations: Array  # where chord deflection is taken [m], (S,), or (3, S) for each link
+    stations: Array  # where chord deflection is taken, over the links' lengths [1], (S,) or (3, S)
 
 
 class Case(NamedTuple):

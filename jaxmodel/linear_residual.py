@@ -1,6 +1,6 @@
 """Residual vibration from the linearised sampled loop: a quick estimate before any run.
 
-The shaped command moves the linear machine of the first way-point; what is left `residual_delay`
+The shaped reference moves the linear machine of the first way-point; what is left `residual_delay`
 after its end decays freely, and its energy until then comes from a Gramian by doubling (H2 norm
 of an initial state). Converters and their limits are ignored.
 """

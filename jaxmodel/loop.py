@@ -122,7 +122,7 @@ class Record(NamedTuple):
 
     time: Array  # [s], ()
     pose: Array  # (3,)
-    pose_error: Array  # against the shaped command, (3,)
+    pose_error: Array  # against the shaped reference, (3,)
     slider: Array  # rho [m], (3,)
     modal_coordinate: Array  # plant q [m], (3, R)
     controlled_coordinate: Array  # controller's modes, noise-free [m], (3, C)

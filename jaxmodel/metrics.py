@@ -3,7 +3,7 @@
 A `Metric` says what it is, which `Total`s it accumulates sample by sample, and how it computes its
 value from them at the end; `METRICS` is the only list of them, and `METRICS.add` adds your own.
 
-Windows: *moving* is from t = 0 to the end of the shaped command, *residual* starts
+Windows: *moving* is from t = 0 to the end of the shaped reference trajectory, *residual* starts
 `residual_delay` after it and lasts `residual_length`. Deflections are chord deflections (relative
 to the line B-C) at the stations, so they do not depend on the basis. Modal coordinates of the
 controller's modes are the output of a noise-free modal filter on the plant's deflection.
@@ -29,7 +29,7 @@ class Sample(NamedTuple):
     q_rate: Array  # [m/s], (3, R)
     modal: Array  # controlled modes as seen by an ideal modal filter [m], (3, C)
     modal_rate: Array  # [m/s], (3, C)
-    pose_error: Array  # against the shaped command [m, m, rad], (3,)
+    pose_error: Array  # against the shaped reference [m, m, rad], (3,)
     voltage: Array  # on the actuators [V], (3, K)
     is_saturated: Array  # share of this sample with an actuator at its limit, 0 or 1, ()
     is_clipped: Array  # 1 where any ADC channel clips, ()
@@ -45,7 +45,7 @@ class Window(NamedTuple):
     time: Array  # t [s]
     is_moving: Array  # 0 or 1
     is_residual: Array  # 0 or 1
-    after_command: Array  # time since the end of the command, 0 before [s]
+    after_command: Array  # time since the end of the reference, 0 before [s]
     taper: Array  # Hann window of the spectra [1]
 
 
@@ -413,7 +413,7 @@ METRICS: Table[Metric] = Table(
             "settling_time",
             ("link",),
             "s",
-            "from the command's end until all stations stay in the band",
+            "from the end of the reference trajectory until all stations stay in the band",
             (Total("settled_at", ("link",), _last_outside),),
             lambda totals, _: totals["settled_at"],
             has_slope=False,
@@ -423,7 +423,7 @@ METRICS: Table[Metric] = Table(
             "ringing_time",
             ("link",),
             "s",
-            "time outside the band after the command, smooth",
+            "time outside the band after the reference trajectory, smooth",
             (_summed("ringing", ("link",), _share_outside),),
             lambda totals, ending: totals["ringing"] * ending.period,
             is_single=False,
@@ -432,7 +432,7 @@ METRICS: Table[Metric] = Table(
             "pose_error_peak",
             ("pose_axis",),
             "m; m; rad",
-            "peak error from the shaped command while moving",
+            "peak error from the shaped reference while moving",
             lambda at: at.window.is_moving * jnp.abs(at.sample.pose_error),
         ),
         _rms(

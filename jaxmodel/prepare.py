@@ -209,7 +209,7 @@ def _constants(case: Case) -> tuple[Array, Array]:
 
 
 def design_controller(structure: Structure, case: Case, bases: Bases) -> ControllerDesign:
-    """Controller of a case from what it believes, `Bases.model`.
+    """Controller of a case from its nominal model, `Bases.model`.
 
     Modal filter pinv(lambda_s Phi_s^t) and synthesizer pinv(lambda_a Phi_a), from which the law
     designs the feedback (`jaxmodel.laws`).
@@ -344,7 +344,7 @@ def _static_status(
         (jnp.any(zeta >= 1), status.OVERDAMPED),
         (_has_unplaceable_poles(structure, case, design), status.UNPLACEABLE),
         (
-            ~jnp.all((windows.stations > 0) & (windows.stations < length[:, None])),
+            ~jnp.all((windows.stations > 0) & (windows.stations < 1)),
             status.STATION_OFF_LINK,
         ),
         (~_is_finite(case), status.NON_FINITE),

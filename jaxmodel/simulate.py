@@ -31,7 +31,7 @@ class Result(NamedTuple):
     metrics: metrics.Metrics
     status: Array  # code of `jaxmodel.status`, integer, ()
     bad_time: Array  # when it appeared [s], 0 if OK or wrong from the start, ()
-    command_end: Array  # end of the shaped command [s], ()
+    command_end: Array  # end of the shaped reference [s], ()
     sensor_condition: Array  # condition number of the modal filter per link [1], (3,)
     actuator_condition: Array  # of the synthesizer [1], (3,)
     singularity_distance: Array  # of the path from poses no slider reaches or holds [rad], ()
@@ -43,7 +43,7 @@ class Command(NamedTuple):
 
     inputs: Inputs  # leading axis (n_steps,)
     start_pose: Array  # (3,)
-    end: Array  # end of the shaped command [s], ()
+    end: Array  # end of the shaped reference [s], ()
     status: Array  # reach, singularity or length fault of the command, as a float, ()
     bad_time: Array  # when it appears [s], ()
     singularity_distance: Array  # of the path from poses no slider reaches or holds [rad], ()
@@ -93,7 +93,7 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
     # free vibration of a platform at rest: the window can end with the run
     is_moving = jnp.any(jnp.diff(case.path.waypoints, axis=0) != 0)
     is_cut = is_moving & (case.windows.residual_length > left + period / 2)
-    is_cut |= case.windows.residual_length < period
+    is_cut |= (case.windows.residual_length < period) | (left < period / 2)
     code = jnp.where((code == status.OK) & is_cut, float(status.WINDOW_TOO_LONG), code)
     adc_noise, disturbance = _disturbance(structure, case, prepared, time)
     inputs = Inputs(

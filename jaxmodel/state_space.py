@@ -120,7 +120,7 @@ def modal_form(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> ModalForm:
     if not condition <= WORST_CONDITION:
         i, j = _closest(value)
         raise IllConditionedError(
-            f"no well-conditioned modal form: its similarity has the condition number "
+            f"no well-conditioned modal form: its transformation has the condition number "
             f"{condition:.2g} (allowed: {WORST_CONDITION:g}); poles {value[i]:.6g} and "
             f"{value[j]:.6g} are too close for their coupling"
         )

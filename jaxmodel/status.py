@@ -62,7 +62,7 @@ REASONS = {
     CLIPPED: "ADC clipped too often",
     BUCKLED: "steady load on a link beyond its critical force",
     MOTORS_SATURATED: "motors saturated too often",
-    NOT_ARRIVED: "platform not where it was sent",
+    NOT_ARRIVED: "platform did not reach its target",
     NEAR_SINGULAR: "path close to a singular pose",
     OVERLOADED: "a link compressed beyond its critical force on the way",
     OVERDAMPED: "a link mode with a damping ratio of 1 or more",

@@ -85,7 +85,7 @@ def _check_text(arguments: list[str]) -> None:
             argument.encode()
         except UnicodeEncodeError:
             name = ascii(argument)
-            raise StudyError(f"{name}: no UTF-8 text; rename the file or folder") from None
+            raise StudyError(f"{name}: not UTF-8 text; rename the file or folder") from None
 
 
 def _show_warning(

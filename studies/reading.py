@@ -117,7 +117,7 @@ def _check_text(text: str) -> None:
     try:
         text.encode()
     except UnicodeEncodeError:
-        raise ValueError(f"{text[:40]!a} is no text") from None
+        raise ValueError(f"{text[:40]!a} is not text") from None
 
 
 def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

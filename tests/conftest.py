@@ -10,6 +10,7 @@ from pathlib import Path
 
 import jax
 import jaxlib
+import pytest
 
 from studies.config import configure
 
@@ -68,3 +69,22 @@ def pytest_runtest_teardown(item, nextitem):
 def _mappings():
     maps = Path("/proc/self/maps")
     return maps.read_bytes().count(b"\n") if maps.exists() else 0
+
+
+@pytest.fixture(scope="session", autouse=True)
+def readable_figures():
+    """Asserts that the text of every figure that any test writes can be read on its page."""
+    from matplotlib.figure import Figure
+
+    from tests.pages import READABLE, smallest_text
+
+    plain = Figure.savefig
+
+    def checked(figure, *args, **options):
+        plain(figure, *args, **options)
+        size, text = smallest_text(figure)
+        assert options.get("format") != "png" or size >= READABLE, f"{text!r}: {size:.1f} px"
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", checked)
+        yield

@@ -7,8 +7,14 @@ from base64 import b64decode
 from html.parser import HTMLParser
 from io import BytesIO
 
+import numpy as np
 import pytest
+from matplotlib.text import Text
 from PIL import Image
+
+from studies.show.figures import STYLE
+from studies.show.pages import WIDE
+from studies.show.templates import render
 
 #: A title that would be more than text, in HTML and in Markdown.
 TITLE = "<script>alert(1)</script> *fast* | 10 mm ![x](http://e.org/x.png) &amp; a_b"
@@ -18,7 +24,7 @@ FIRST_BYTES = {
     "data:image/png;base64": b"\x89PNG\r\n\x1a\n",
     "data:image/gif;base64": b"GIF89a",
 }
-VOID = ("img", "meta", "br", "hr")
+VOID = ("img", "meta", "br", "hr", "wbr")
 #: Nothing of a report needs one of these.
 FORBIDDEN = ("script", "link", "iframe", "object", "embed", "base", "form", "svg", "video")
 
@@ -87,7 +93,9 @@ addEventListener("load", () => {
   const root = document.documentElement, images = [...document.images];
   const broken = images.filter(image => image.naturalWidth === 0).length;
   const over = root.scrollWidth - root.clientWidth;
-  root.setAttribute("data-found", `${images.length} ${broken} ${over}`);
+  const cut = [...document.querySelectorAll(".table")].filter(x => x.scrollWidth > x.clientWidth);
+  const found = `${images.length} ${broken} ${over} ${cut.length}`;
+  root.setAttribute("data-found", found);
 });
 </script>"""
 
@@ -95,7 +103,8 @@ addEventListener("load", () => {
 def rendered(html, folder, width):
     """What a browser with a window of this width says; skips the test where there is none.
 
-    Returns images, broken ones among them, and pixels by which the page is too wide.
+    Returns images, broken ones among them, pixels by which the page is too wide, and tables of
+    which only a part is seen.
     """
     command = next(filter(None, map(shutil.which, BROWSERS)), None)
     if command is None:
@@ -108,6 +117,30 @@ def rendered(html, folder, width):
     done = subprocess.run(
         [command, *options, *own, path.as_uri()], capture_output=True, text=True, timeout=120
     )
-    found = re.search(r'data-found="(\d+) (\d+) (-?\d+)"', done.stdout)
+    found = re.search(r'data-found="(\d+) (\d+) (-?\d+) (\d+)"', done.stdout)
     assert found, done.stderr
     return tuple(map(int, found.groups()))
+
+
+#: Height of text in a figure that can be read [px].
+READABLE = 9.0
+_PHONE = 390
+
+
+def _css(pattern):
+    """A length of `page.css` [px], given there in rem."""
+    return 16 * float(re.search(pattern, render("show/page.css"))[1])
+
+
+def smallest_text(figure):
+    """The smallest text of a figure on its page, on a wide screen or on a phone: pixels, text."""
+    inches, dpi = figure.get_figwidth(), STYLE["savefig.dpi"]
+    natural = inches * dpi
+    desk = min(natural, _css(r"figure \{[^}]*max-width: ([\d.]+)rem"))
+    phone = _PHONE - 2 * _css(r"body \{[^}]*padding: 0 ([\d.]+)rem")
+    if natural > WIDE:
+        phone = _css(r"img\.wide \{[^}]*width: ([\d.]+)rem")
+    scale = min(desk, phone, natural) / inches / 72
+    texts = [x for x in figure.findobj(Text) if x.get_visible() and x.get_text().strip()]
+    sizes = [(scale * x.get_fontsize(), x.get_text()) for x in texts]
+    return min(sizes, default=(np.inf, ""))

@@ -38,6 +38,7 @@ duration = 0.025
 waypoints = [[0, 0, 0.5236], [0, 0.002, 0.5236]]
 move_time = 0.01
 [metrics]
+residual_delay = 0.0
 residual_length = 0.005
 [sweep.axes]
 gain = { from = 0.1, to = 1.0, count = 6 }

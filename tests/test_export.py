@@ -305,7 +305,7 @@ def test_import_refuses_changed_numbers(capsys, designs, folders, name, tmp_path
         (lambda data: data["numbers"]["adc_step"].update(value=[1.0, "x"]), "adc_step"),
         (lambda data: data["numbers"]["adc_step"].update(value=[1.0]), "shape"),
         (lambda data: data.update(format_version=2), "format_version = 2"),
-        (lambda data: data.update(format="other"), "no controller"),
+        (lambda data: data.update(format="other"), "not a controller"),
         (lambda data: data.pop("masks"), "masks"),
         (lambda data: data["masks"].update(links=[False] * 3), "masks = "),
         (lambda data: data.update(law="srf"), "law = 'srf'"),

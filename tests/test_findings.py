@@ -12,9 +12,10 @@ from studies.spillover.comparison import GIVEN, WITHOUT, Comparison
 from studies.spillover.plants import Departure, PlantVariant
 from studies.spillover.report import document, verdict
 from studies.spillover.report import report as certificate_report
+from studies.study.margin import margin_in_db
 from studies.study.spec import paper_study
 from studies.tuning.audit import Disagreement
-from studies.tuning.check import JudgedDesign, OwnRun
+from studies.tuning.check import JudgedDesign, OwnRun, patch_centers
 from studies.tuning.linear_fidelity import LoopFigures
 from studies.tuning.optimise import begin
 from studies.tuning.report import TuneFindings, summary
@@ -91,7 +92,7 @@ def test_a_certificate_s_table_of_plants():
     (table,) = tables_of(certificate_report(found, None))["Margins and damping"]
     assert list(table) == [
         "basis",
-        "departure",
+        "model mismatch",
         "gain margin",
         "with 2 modes",
         "broken by",
@@ -106,7 +107,7 @@ def test_a_certificate_s_table_of_plants():
         "sensors x 1.25, actuators x 0.8",
         "frequencies x 0.9, J_C = 2e-06 kg m2",
     )
-    assert table["departure"] == [words[d] for _, d in order]
+    assert table["model mismatch"] == [words[d] for _, d in order]
     assert_cells(table["gain margin"], found.margin[:, :, 1].ravel(), 3)
     assert_cells(table["with 2 modes"][:5], found.margin[:, :, 0].ravel()[:5], 3)
     assert table["with 2 modes"][5] == "-"  # there is no such plant
@@ -120,7 +121,7 @@ def test_a_certificate_s_table_of_plants():
 def test_a_certificate_s_table_of_leakage():
     found = certificate()
     text = certificate_report(found, None)
-    (table,) = tables_of(text)["Leakage"]
+    (table,) = tables_of(text)["Observation and control spillover"]
     size = np.abs(found.observation).max(axis=(1, 2))
     assert table["basis"] == [BASES[0]] * 2 + [BASES[1]] * 2
     assert table["estimate"] == ["q^1", "q^2"] * 2
@@ -157,8 +158,13 @@ def test_a_certificate_s_table_of_laws():
     assert table["run"] == ["ok", "ok", "actuators saturated too often", "ok"]
     assert len(table) == 12
     words = " ".join(text.split())
-    assert "a gain margin of 2.5 on the design's own plants (pinned_pinned, as modelled)" in words
+    assert "a gain margin of 2.5 on the nominal plant (pinned_pinned, as modelled)" in words
     assert "with 5 plant modes per link. Nonlinear run:" in words
+    left, free = (1e6 * rms[k].max() for k in (1, 0))
+    assert (
+        f"the design leaves {left:.4g} µm rms on its worst link ({free:.4g} without control, "
+        f"{100 * (left / free - 1):+.3g} %)." in words[: words.index("**Question:**")]
+    )
 
 
 def test_a_certificate_s_sentences():
@@ -169,13 +175,14 @@ def test_a_certificate_s_sentences():
     free = found.free_damping
     last = found.margin[:, :, 1]
     change = np.nanmax(np.abs(found.margin[:, :, 0] / last - 1))
+    shown = margin_in_db(margin, 3)
     for part in (
-        f"# Spillover certificate passed: gain margin {margin:.3g}, 2 required",
+        f"# Spillover certificate passed: gain margin {shown}, 2 required",
         "is its controller stable on 11 plants that differ",
-        "11 of 11 plants pass.",
+        f"**Result:** safe on 11 of 11 plants: gain margin {shown} on the worst, 2 required; what "
+        f"goes unstable first: {found.breaking[found.worst]}.",
         "basis pinned_pinned, 2 controlled modes per link on links 1+3, gain factor 0.4;",
-        f"Smallest margin: {margin:.3g}, on {at.basis}, {at.n_modes} modes per link, "
-        f"{at.departure}.",
+        f"Smallest margin: {shown}, on {at.basis}, {at.n_modes} modes per link, {at.departure}.",
         f"Margins with 2 and 5 plant modes per link differ by up to {100 * change:.2g} %.",
         f"(without control: {np.nanmin(free):.3g} to {np.nanmax(free):.3g})",
         "`studies export DESIGN --target c",
@@ -210,7 +217,8 @@ def test_an_unstable_plant_fails_whatever_its_margin():
 def test_a_certificate_names_the_uncontrolled_mode_that_control_makes_worst():
     """Of existing plants and modes beyond the controlled ones, in the first lines and in JSON."""
     found = certificate()
-    assert found.spillover is None and "ontrol spillover" not in certificate_report(found, None)
+    first = certificate_report(found, None).partition("**Question:**")[0]
+    assert found.spillover is None and "ontrol spillover" not in first
     assert json.loads(document(found, None))["spillover"] is None
     zeta = found.damping_ratio.copy()
     zeta[0, 2, 1, 3, 1] = 0.8 * found.free_damping[0, 2, 1, 3, 1]
@@ -226,7 +234,7 @@ def test_a_certificate_names_the_uncontrolled_mode_that_control_makes_worst():
         f"Control spillover: mode 5, which is not controlled, has a damping ratio of "
         f"{at.damping_ratio:.2g} instead of {at.free_damping:.2g} without control"
     )
-    assert sentence in text[: text.index("**Next:**")]
+    assert sentence in text[: text.index("**Question:**")]
     kept = json.loads(document(worse, None))["spillover"]
     assert kept["mode"] == 5 and kept["damping_ratio"] == pytest.approx(at.damping_ratio)
     assert kept["damping_ratio_without_control"] == pytest.approx(at.free_damping)
@@ -240,7 +248,7 @@ def test_a_failed_certificate_says_what_would_pass():
     assert verdict(found) == "failed by breaks 8: gain margin 1.5, 2 required"
     words = " ".join(certificate_report(found, None).split())
     assert "with its gains scaled by 0.75 the controller would pass" in words
-    assert "`control.gain_factor = 0.3`" in words and "10 of 11 plants pass" in words
+    assert "`control.gain_factor = 0.3`" in words and "**not safe** on 10 of 11 plants" in words
     margin[1, 1, 0] = 0
     words = " ".join(certificate_report(certificate(margin=margin), None).split())
     assert "no gain passes: choose another law" in words
@@ -389,9 +397,9 @@ FACTOR = {"residual_rms": 1e6, "settling_time": 1e3, "peak_voltage": 1.0}
 
 def test_a_tuning_s_table_of_the_own_machine():
     _, found, tables, _ = tuned()
-    (table,) = tables["On the study's own machine"]
+    (table,) = tables["On the nominal machine"]
     designs = [found.own, *found.judged]
-    assert table["design"] == ["the study itself", "gains", "all"]
+    assert table["design"] == ["baseline", "gains", "all"]
     assert table["file"] == ["`study.toml`", "`tuned_gains.toml`", "`tuned_all.toml`"]
     assert table["objective"] == [f"{x.own.objective:.4f}" for x in designs]
     for name in NAMES:
@@ -415,7 +423,7 @@ def test_a_tuning_s_table_of_fresh_machines():
 
 def test_a_tuning_s_table_of_changes_has_each_move_s_own():
     _, found, tables, _ = tuned()
-    (table,) = tables["Change relative to the study itself"]
+    (table,) = tables["Change relative to the baseline"]
     assert table["design"] == ["gains", "gains", "all", "all"]
     assert table["move"] == ["motion.move_time = 0.03", "motion.move_time = 0.035"] * 2
     parts = [slice(0, 3), slice(3, 6)]
@@ -447,13 +455,45 @@ def test_a_tuning_s_limits_and_numbers():
         "Ended after all 20 iterations",
     ):
         assert part in words, part
-    (table,) = tables["Numbers"]
-    assert table["free number"] == ["control.gain_factor", "drive.kp"]
+    (table,) = tables["Parameters"]
+    assert table["parameter"] == ["control.gain_factor", "drive.kp"]
     assert table["bounds"] == ["0.05 to 2", "10000 to 40000"]
-    assert table["study"] == ["1", "2e+04"]
+    assert table["baseline"] == ["1", "2e+04"]
     # a quarter of the way on a logarithmic scale; the middle, and the end of a linear one
     assert table["gains"] == [f"{0.05 * 40**0.25:.4g}", "-"]
     assert table["all"] == [f"{0.05 * 40**0.5:.4g}", "4e+04*"]
+
+
+def test_placements_are_shown_in_millimetres_along_each_link():
+    """Not as the numbers from 0 to 1 that the descent moves."""
+    spec = parse_tuning(
+        {**SMALL, "tune": {"free": {"placement": {"kind": "per_link"}}, "starts": 1}}
+    )
+    _, found, *_ = tuned()
+    at, n = begin(spec, SimpleNamespace(linear=None)), len(spec.free.names)
+    place = np.full((1, n), 0.5)
+    at = at._replace(
+        best_objective=np.ones(1),
+        best_limits=np.zeros((1, 0)),
+        best_place=place,
+        best_peaks=np.zeros((1, 0)),
+    )
+    audited = [Disagreement("placement[2][0]", "tuned", 0, "objective", 1.0, 1.0, 0.0)]
+    found = found._replace(
+        at=at,
+        judged=found.judged[:1],
+        audited=audited,
+        linear=np.full(1, np.nan),
+        residual=np.full(1, np.nan),
+    )
+    text = tuning_report(spec, found)
+    (table,) = tables_of(text)["Parameters"]
+    centers = 1e3 * patch_centers(spec, spec.moving[0], place[0])
+    assert table["design"] == ["baseline", "tuned"]
+    for i, row in enumerate(centers):
+        assert table[f"centres on link {i + 1} [mm]"][1] == ", ".join(f"{x:.1f}" for x in row)
+        assert 0 < row.min() < row.max() < 200
+    assert "placement[" not in text and "(of objective by placement," in text
 
 
 def test_a_tuning_s_summary_and_recommendation():
@@ -461,20 +501,25 @@ def test_a_tuning_s_summary_and_recommendation():
     head = " ".join(text.split("## ")[0].split())
     one, own = found.judged[1], found.own
     shares = one.objective
+
+    def change(name):
+        return f"{100 * (one.own.metrics[name] / own.own.metrics[name] - 1):+.3g} %"
+
     for part in (
-        f"all: residual_rms {1e6 * one.own.metrics['residual_rms']:.4g} instead of "
-        f"{1e6 * own.own.metrics['residual_rms']:.4g} µm",
-        f"peak_voltage {one.own.metrics['peak_voltage']:.4g} instead of "
-        f"{own.own.metrics['peak_voltage']:.4g} V",
-        "gain margin 2.38 instead of 3.12",
-        "slowest decay 91.8 instead of 71.2 1/s",
-        f"the objective on 3 fresh machines is {100 * shares.mean():.3g} % of the study's own on "
+        f"**Result:** all: residual_rms {change('residual_rms')} "
+        f"({1e6 * one.own.metrics['residual_rms']:.4g} instead of "
+        f"{1e6 * own.own.metrics['residual_rms']:.4g} µm), settling_time {change('settling_time')}",
+        f"peak_voltage {change('peak_voltage')} ({one.own.metrics['peak_voltage']:.4g} instead of "
+        f"{own.own.metrics['peak_voltage']:.4g} V)",
+        "gain margin 2.38 (7.5 dB) instead of 3.12 (9.9 dB)",
+        "slowest decay +28.8 % (91.8 instead of 71.2 1/s)",
+        f"the objective on 3 fresh machines is {100 * shares.mean():.3g} % of the baseline's on "
         f"average, {100 * shares.max():.3g} % at worst.",
         "`studies simulate tuned_all.toml",
     ):
         assert part in head, part
     assert summary(spec, found) == [
-        f"{name}: {x.objective.mean():.4f} of the study's objective on 3 fresh machines, worst "
+        f"{name}: {x.objective.mean():.4f} of the baseline's objective on 3 fresh machines, worst "
         f"{x.objective.max():.4f}"
         for name, x in zip(("gains", "all"), found.judged, strict=True)
     ]

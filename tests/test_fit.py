@@ -401,7 +401,7 @@ FAULTS = {
     "two bands": (SETTLING | {"band": 1.0}, {}, "give band [unit of the output] or band_percent"),
     "never settles": (SETTLING | {"band_percent": 0.01}, {}, "does not settle to"),
     "settles elsewhere": (SETTLING | {"output": "slider 1"}, {}, "which settle about 0"),
-    "not a number": (RESPONSE, {"real": np.nan}, "column 'real': 1 of 200 entries are no finite"),
+    "not a number": (RESPONSE, {"real": np.nan}, "column 'real': 1 of 200 entries are not finite"),
     "another unit": (RESPONSE, {"scale": 1e3}, "the model at the starting point; expected V/V"),
     "kilohertz": (RESPONSE, {"frequency": 1e-3}, "check the units"),
     "no column": (RESPONSE | {"imag": "imaginary"}, {}, "no column 'imaginary'"),
@@ -473,7 +473,7 @@ def test_damaged_files_and_columns_nobody_asked_for(tmp_path):
     (tmp_path / "a.csv").write_text("x,note\n1,ok\n2,\n")
     found = read_columns("a.csv", tmp_path, "file")
     assert list(column(found, "x", "a.csv", "file")) == [1.0, 2.0]
-    with pytest.raises(StudyError, match="row 1, column 'note': 'ok' is no number"):
+    with pytest.raises(StudyError, match="row 1, column 'note': 'ok' is not a number"):
         column(found, "note", "a.csv", "file")
     (tmp_path / "b.uff").write_text("    -1\n    58\n garbage\n    -1\n")
     with pytest.raises(StudyError, match="cannot be read"):
@@ -603,7 +603,7 @@ def test_poses_out_of_reach_are_no_data(folder):
     )
     one.residual(values, True)
     for has_slopes in (True, False):
-        with pytest.raises(StudyError, match="pose out of reach at .* with the numbers tried"):
+        with pytest.raises(StudyError, match="pose out of reach at .* with the values tried"):
             one.residual(np.array([0.17]), has_slopes)
     free_numbers = spec_of(folder, RESPONSE, free=free).free
     problem = Problem(free=free_numbers, priors=(), measurements=(one,), bench=bench)

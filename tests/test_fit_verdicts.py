@@ -155,7 +155,7 @@ def test_results_outlive_the_next_experiment(exchanged):
     out, found = exchanged
     written = {x.name for x in out.iterdir()}
     assert {"report.html", "fitted.toml", "fitted_tune.toml", "fit.json", "fit.h5"} <= written
-    said = "No next experiment was found: Eigenvalues did not converge."
+    said = "No next experiment could be computed: Eigenvalues did not converge."
     assert found.experiments == () and said in sentences(found)
     assert said in json.loads((out / "fit.json").read_text())["messages"]
 

@@ -11,11 +11,13 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
+import studies
+from studies.show.figures import SMALL, WIDTH, new_figure, styled
 from studies.show.markdown import literal, picture, table
 from studies.show.pages import page, report_files
 from studies.study import spec as spec_module
 from studies.study.template import toml_text
-from tests.pages import TITLE, parsed, rendered
+from tests.pages import READABLE, TITLE, parsed, rendered, smallest_text
 from tests.sweeps import MIXED, small
 
 VERSIONS = {"python": "3", "jax": "<1>"}
@@ -50,6 +52,36 @@ def test_a_text_becomes_a_whole_page():
     assert policy.startswith("default-src 'none'; img-src data:; style-src 'unsafe-inline'")
     assert "script" not in policy
     assert '<div class="table">\n<table>' in html and '<meta charset="utf-8">' in html
+
+
+REPORTS = {x.parent.name: x for x in sorted(Path(studies.__file__).parent.glob("*/report.md"))}
+
+
+@pytest.mark.parametrize("name", REPORTS)
+def test_a_report_begins_with_its_result(name):
+    """Then come the question and the next steps, in this order."""
+    path = REPORTS[name]
+    text = path.read_text(encoding="utf-8")
+    title = text.index("\n# ") if not text.startswith("# ") else 0
+    heads = re.findall(r"\*\*([A-Z][a-z ]+):\*\*", text[title:])
+    assert [x for x in heads if x in ("Result", "Question", "Next steps")] == [
+        "Result",
+        "Question",
+        "Next steps",
+    ]
+    first = text[title:].lstrip("\n").partition("\n\n")[2]
+    assert first.startswith("**Result:**")
+
+
+def test_small_text_in_a_figure_is_found():
+    with styled():
+        figure, axes = new_figure(1, 1)
+        axes[0, 0].set_title("small", fontsize=6)
+        figure.draw_without_rendering()
+        assert smallest_text(figure) == (pytest.approx(40 * 16 / WIDTH * 6 / 72), "small")
+        axes[0, 0].set_title("large", fontsize=SMALL)
+        assert smallest_text(figure)[0] == pytest.approx(40 * 16 / WIDTH * SMALL / 72)
+    assert 40 * 16 / WIDTH * 6 / 72 < READABLE < 40 * 16 / WIDTH * SMALL / 72
 
 
 def test_a_figure_without_its_image_is_a_fault_of_the_program(tmp_path):
@@ -90,7 +122,7 @@ def test_texts_of_users_are_shown_as_they_are(text):
         assert set(found.tags) <= {
             *["html", "head", "meta", "title", "style", "body", "main", "h1", "h2", "p"],
             "div",
-            *["table", "thead", "tbody", "tr", "th", "td", "ul", "li"],
+            *["table", "thead", "tbody", "tr", "th", "td", "ul", "li", "wbr"],
         }
 
 
@@ -131,13 +163,33 @@ def test_toml_is_read_back():
 @pytest.mark.parametrize("width", [1280, 600])
 def test_a_wide_report_fits_a_browsers_window(tmp_path, width):
     wide = table([f"column {k}" for k in range(30)], [["123456789"] * 30])
-    lines = ["# Title", "", "a" * 300, "", wide, "", picture("a.png", "a figure")]
+    lines = [
+        "# Title `" + "b" * 200 + "`",
+        "",
+        "a" * 300,
+        "",
+        wide,
+        "",
+        picture("a.png", "a figure"),
+    ]
     files = {"Study file": "x = " + "1" * 500}
     html = page("\n".join(lines), {"a.png": png(3000)}, files, VERSIONS)
-    assert rendered(html, tmp_path, width) == (1, 0, 0)
+    assert rendered(html, tmp_path, width) == (1, 0, 0, 1)
+
+
+@pytest.mark.parametrize(("width", "cut"), [(1280, 0), (600, 1)])
+def test_a_table_of_a_sweep_is_seen_whole_on_a_wide_screen(tmp_path, width, cut):
+    """Long names of columns break at their joints; a narrow screen scrolls and says so."""
+    names = ["control.velocity_gain[0]", "electronics.lowpass_ratio[2]", "link.stiffness_factor"]
+    metrics = ["residual_rms [µm]", "peak_voltage [V]", "damping_ratio[controlled_mode=1]"]
+    heads = ["case", "id", *names, *(f"{x}[1]" for x in names), *metrics, "gain_margin"]
+    text = "# Title\n\n" + table(heads, [["1", "efac70d3", *["0.1234"] * 10]])
+    html = page(text, {}, {}, VERSIONS)
+    assert rendered(html, tmp_path, width) == (0, 0, 0, cut)
+    assert ".table:has(th:nth-child(4))::before" in html and "scroll sideways" in html
 
 
 def test_a_browser_finds_faults(tmp_path):
     bad = '<img src="data:image/png;base64,AAAA"><p style="width: 3000px">wide</p>'
-    images, broken, over = rendered(HEAD + bad + "</body></html>", tmp_path, 1280)
+    images, broken, over, _ = rendered(HEAD + bad + "</body></html>", tmp_path, 1280)
     assert (images, broken) == (1, 1) and over > 1000

@@ -11,7 +11,6 @@ import xarray
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from jaxmodel.metrics import Metrics
 from studies import load
 from studies.atlas import atlas_sweep, read_subsets
 from studies.cli import main
@@ -24,6 +23,7 @@ from studies.paper import figures as paper_figures
 from studies.paper import report
 from studies.paper import run as paper
 from studies.paper.cases import ALL, MOVES, OFF, ONE, SHAPERS, TWO, run_cases
+from studies.paper.context import Context, Machines
 from studies.paper.measures import measure
 from studies.show.figures import comparison
 from studies.show.units import span
@@ -33,6 +33,7 @@ from studies.study.spec import paper_study
 
 #: Figures that are written; the others are only drawn.
 FIGURES = ("fig03", "shapers")
+REPORTS = ("report.html", "report.md")
 #: Cases left out of the short run: more compilations, or seconds of eigenvalues each.
 LONG = ("ideal", "paper-gains-own-ratios", "paper-ratios", "paper-preset", "difference")
 
@@ -42,28 +43,41 @@ def short_study():
     home = paper_study().motion.waypoints[0]
     return paper_study().change(
         run__duration=0.4,
+        metrics__residual_delay=0.0,
         metrics__residual_length=0.2,
         link__modes=3,
         motion__waypoints=(home, (home[0], 0.01, home[2])),
     )
 
 
+def other_machine():
+    """Stands for the fitted machine: softer, with less gain; the program is the same."""
+    return short_study().change(link__youngs_modulus=6e10, control__gain_factor=0.2)
+
+
 class Short(NamedTuple):
     folder: object
-    runs: paper_cases.PaperRuns
-    measures: object
+    machines: Machines
     printed: str
+
+    @property
+    def runs(self):
+        return self.machines.nominal.runs
+
+    @property
+    def measures(self):
+        return self.machines.nominal.measures
 
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
     folder = tmp_path_factory.mktemp("paper")
     cases = [case for case in paper_cases.paper_cases() if case.name not in LONG]
-    kept = {}
+    kept = []
 
     def run(*arguments):
-        kept["runs"] = run_cases(*arguments)
-        return kept["runs"]
+        kept.append(run_cases(*arguments))
+        return kept[-1]
 
     console = Console(record=True, width=120, file=io.StringIO())
     with pytest.MonkeyPatch.context() as patch:
@@ -72,26 +86,28 @@ def short(tmp_path_factory):
         few = {name: paper_figures.PAPER_FIGURES[name] for name in FIGURES}
         patch.setattr(paper, "PAPER_FIGURES", few)
         patch.setattr(report, "PAPER_FIGURES", few)
-        paper.write_paper(folder, console, short_study(), cases)
-    return Short(folder, kept["runs"], measure(kept["runs"]), console.export_text())
+        paper.write_paper(folder, console, other_machine(), short_study(), cases)
+    names = ("fitted machine", "nominal machine")
+    contexts = (Context(n, runs, measure(runs)) for n, runs in zip(names, kept, strict=True))
+    return Short(folder, Machines(*contexts), console.export_text())
 
 
 def test_folder_holds_whole_files_and_nothing_else(short):
     names = sorted(file.name for file in short.folder.iterdir())
     figures = [f"{name}.png" for name in FIGURES]
-    assert names == sorted([*figures, "machine.png", "paper.h5", "report.html", "report.md"])
+    assert names == sorted([*figures, "machine.png", "fitted.h5", "nominal.h5", *REPORTS])
     assert (short.folder / "fig03.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
 def test_status_of_every_case_is_printed(short):
     for case in short.runs.cases:
         assert case.name in short.printed
-    assert "report.html" in short.printed and "paper.h5" in short.printed
+    assert "report.html" in short.printed and "fitted.h5" in short.printed
 
 
 @pytest.mark.filterwarnings("error")
 def test_data_open_in_xarray_and_agree_with_the_runs(short):
-    with xarray.open_dataset(short.folder / "paper.h5", engine="h5netcdf") as data:
+    with xarray.open_dataset(short.folder / "nominal.h5", engine="h5netcdf") as data:
         assert list(data["case"].values) == [case.name for case in short.runs.cases]
         for name in data.variables:
             assert data[name].attrs["long_name"] and data[name].attrs["units"]
@@ -100,7 +116,7 @@ def test_data_open_in_xarray_and_agree_with_the_runs(short):
         # a case that separates two modes has no third one
         third = one["controlled_coordinate"].sel(controlled_mode=3)
         assert np.isnan(third).all() and not np.isnan(one["chord_deflection"]).any()
-        middle = one["chord_deflection_stations"].sel(station=0.1, method="nearest")
+        middle = one["chord_deflection_stations"].sel(station=0.5, method="nearest")
         np.testing.assert_array_equal(one["chord_deflection"], middle)
 
 
@@ -129,7 +145,29 @@ def test_controlled_cases_take_ratios_of_their_uncontrolled_counterpart(short):
     np.testing.assert_array_equal(runs.ratio[first], [[1, 0, 0]] * 3)
     assert not runs.ratio[off].any()
     two = runs.where(modes=2, links=ALL)
-    assert (runs.ratio[two, :, 1] > 0).all() and not runs.ratio[two, :, 2].any()
+    np.testing.assert_array_equal(runs.ratio[two, :, 1], [0.312, 0.412, 0.355])
+    assert not runs.ratio[two, :, 2].any()
+
+
+def test_cases_scale_the_machine_s_own_gains(short):
+    """A case multiplies the machine's gains, and keeps its damping unless it has its own."""
+    fitted, case = paper_cases.fitted_study(), short.runs.cases[0]
+    study = paper_cases.case_study(fitted, case._replace(gain_factor=2.0))
+    assert study.control.gain_factor == 2 * fitted.control.gain_factor
+    assert study.link.damping_ratio == fitted.link.damping_ratio
+    assert study.control.velocity_gain == fitted.control.velocity_gain
+    damped = paper_cases.case_study(fitted, case._replace(damping_ratio=0.05))
+    assert damped.link.damping_ratio == 0.05
+
+
+def test_fitted_machine_runs_the_compared_cases_alone(short):
+    fitted, nominal = short.machines
+    assert len(fitted.runs.cases) == 8 and all(case.is_compared for case in fitted.runs.cases)
+    assert [case for case in nominal.runs.cases if case.is_compared] == fitted.runs.cases
+    # sqrt(60/70) of the frequencies, and a fifth of the gain
+    np.testing.assert_allclose(fitted.runs.link_hz / nominal.runs.link_hz, (6 / 7) ** 0.5, 1e-6)
+    voltage = [c.runs.result.metrics.peak_voltage[c.compared(2, ALL)] for c in short.machines]
+    assert (voltage[0] < 0.5 * voltage[1]).all()
 
 
 @pytest.mark.long  # in short: a batched case equals its own run
@@ -182,7 +220,7 @@ def test_spectrum_of_a_known_oscillation(short):
     changed = record._replace(controlled_coordinate=coordinate)
     found = measure(runs._replace(result=runs.result._replace(record=changed)))
     expected = amplitude**2 / 2 * 0.4 / 1.5
-    np.testing.assert_allclose(found.spectral_peak[:, :, 0], expected, rtol=1e-6)
+    np.testing.assert_allclose(found.spectral_density[:, :, 0].max(-1), expected, rtol=1e-6)
 
 
 def test_late_window_and_settling_of_a_known_decay(short):
@@ -193,11 +231,7 @@ def test_late_window_and_settling_of_a_known_decay(short):
     tau, peak = 0.03, 1e-6
     shape = record.chord_deflection_stations.shape
     decay = np.broadcast_to((peak * np.exp(-after / tau))[..., None, None], shape)
-    peaks = {"residual_peak": np.full(shape[:1] + shape[2:], peak)}
-    metrics = Metrics(runs.result.metrics | peaks)
-    changed = runs.result._replace(
-        record=record._replace(chord_deflection_stations=decay), metrics=metrics
-    )
+    changed = runs.result._replace(record=record._replace(chord_deflection_stations=decay))
     found = measure(runs._replace(result=changed))
     np.testing.assert_allclose(found.settling, tau * np.log(20), atol=1.1e-4)
     length = runs.study.metrics.residual_length
@@ -208,11 +242,15 @@ def test_late_window_and_settling_of_a_known_decay(short):
 
 def test_report_holds_the_papers_numbers_and_those_of_the_run(short):
     text = (short.folder / "report.md").read_text(encoding="utf-8")
-    for value in ("0.345", "0.412", "36.51 (-44.97 %)", "34.92 (-43.23 %)", "-52.21 %", "0.07 s"):
+    for value in ("0.345", "0.412", "-44.97 %", "-43.23 %", "-52.21 %", "0.07 s", "241.3"):
         assert value in text
-    k = short.runs.where(move="fast", shaper="none", modes=2, links=OFF)
-    peak = f"{short.measures.spectral_peak[k, 0, 0]:.3g}"
-    assert f"| ours, fast move (0.05 s), no shaper: link 1 | {peak} |" in text
+    cells = ["mode 1, first two: link 1", "-43.62 %"]
+    for context in short.machines:
+        density = context.runs.result.metrics.spectral_density[:, 0, 0].max(axis=-1)
+        off, on = (context.compared(2, links) for links in (OFF, TWO))
+        cells.append(f"{100 * ((density[on] / density[off]) ** 0.5 - 1):+.1f} %")
+    assert f"| {' | '.join(cells)} |" in text
+    assert text.splitlines()[2].startswith("**Result:**")
     for name in FIGURES:
         assert f"({name}.png)" in text
     rows = [line for line in text.splitlines() if line.startswith("|")]
@@ -239,11 +277,12 @@ def test_formatting():
 
 def test_every_figure_has_units_on_its_axes(short):
     for draw in paper_figures.PAPER_FIGURES.values():
-        drawn = draw(short.runs, short.measures)
+        drawn = draw(short.machines)
         labels = [ax.get_xlabel() for ax in drawn.axes if ax.get_xlabel()]
         labels += [ax.get_ylabel() for ax in drawn.axes if ax.get_ylabel()]
         # three rows over two columns: three ordinates, two abscissas
         assert len(labels) >= 4 and all("[" in label and "]" in label for label in labels)
+        assert not any("[p" in label for label in labels)
 
 
 def test_plot_functions_take_an_axes_or_make_one():
@@ -274,16 +313,18 @@ def test_failure_while_writing_leaves_old_files_whole(short, tmp_path, monkeypat
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr(paper, "run_cases", lambda *_: short.runs)
+    runs = iter(context.runs for context in short.machines)
+    monkeypatch.setattr(paper, "run_cases", lambda *_: next(runs))
     monkeypatch.setattr(paper, "draw_figure", fail)
     with pytest.raises(StudyError, match="disk full"):
-        paper.write_paper(tmp_path, Console(quiet=True), short.runs.study, short.runs.cases)
+        studies = (context.runs.study for context in short.machines)
+        paper.write_paper(tmp_path, Console(quiet=True), *studies, short.runs.cases)
     assert [file.name for file in tmp_path.iterdir()] == ["report.md"]
     assert (tmp_path / "report.md").read_text() == "old"
 
 
 def test_stored_metrics_are_the_runs(short):
-    stored, attributes = read_store(short.folder / "paper.h5")
+    stored, attributes = read_store(short.folder / "nominal.h5")
     metrics = short.runs.result.metrics
     np.testing.assert_array_equal(stored["residual_rms"].data, metrics.residual_rms)
     assert stored["residual_rms"].dims == ("case", "link", "station")

@@ -16,7 +16,7 @@ from studies.show.markdown import literal
 from studies.show.units import READABLE, headed, number, readable, settling_text
 from studies.single.report import report
 from studies.study.cases import build_case, build_structure
-from studies.study.margin import caution, margin_text
+from studies.study.margin import caution, margin_in_db, margin_text
 from studies.study.spec import paper_study
 
 #: Numbers that no other number of a report equals.
@@ -104,6 +104,14 @@ def test_words_of_a_margin(margin, text, words):
     assert words in caution(margin) and bool(caution(margin)) == bool(words)
 
 
+@pytest.mark.parametrize(
+    ("margin", "text"),
+    [(3.7, "3.7 (11.4 dB)"), (0.5, "0.5 (-6.0 dB)"), (0.0, "0"), (99.0, "> 64 (36.1 dB)")],
+)
+def test_a_margin_as_a_factor_and_in_decibels(margin, text):
+    assert margin_in_db(margin) == text
+
+
 # --- one run --------------------------------------------------------------------------------------
 
 STUDY = paper_study().change(
@@ -112,7 +120,7 @@ STUDY = paper_study().change(
     link__modes=4,
     link__thickness=(2e-3, 2.1e-3, 1.9e-3),
     control__modes=2,
-    metrics__stations=(0.04, 0.1, 0.175),
+    metrics__stations=(0.2, 0.5, 0.875),
     metrics__residual_length=0.123,
     metrics__residual_delay=0.045,
     metrics__settling_band=2.5e-6,
@@ -235,23 +243,25 @@ def test_sentences_of_a_run_show_its_numbers(one_run):
     force, planned = run.motion.axial_force, run.motion.gain_margin
     buckling = np.pi**2 * 70e9 * 0.01 * np.array([2e-3, 2.1e-3, 1.9e-3]) ** 3 / 12 / 0.2**2
     for part in (
-        f"Link {worst + 1} vibrates most: {1e6 * rms[worst]:.4g} µm rms ({without:.4g} without "
-        f"control), settling time {settled} ms; peak voltage {m.peak_voltage.max():.4g} of 91 V.",
-        "Gain margin 3.25.",
-        "the largest of the stations at 40, 100, 175 mm.",
-        "Residual window: 0.123 s, from 0.045 s after the shaped command.",
-        "stays within 2.5 µm; the run ends 400 ms after the command.",
-        "the end of the shaped command at 0.1 s",
+        f"**Result:** residual {1e6 * rms[worst]:.4g} µm rms on link {worst + 1}, the worst "
+        f"({without:.4g} without control, {100 * (1e6 * rms[worst] / without - 1):+.3g} %), gain "
+        "margin 3.25 (10.2 dB): ",
+        f"Settling time {settled} ms ({settled} without control). Peak voltage "
+        f"{m.peak_voltage.max():.4g} of 91 V.",
+        "the largest of the stations at 20, 50, 87.5 % of the link.",
+        "Residual window: 123 ms, from 45 ms after the end of the reference trajectory.",
+        "stays within 2.5 µm. The run ends 400 ms after the reference trajectory.",
+        "the end of the reference trajectory at 100 ms",
         f"Largest tension in a link {m.peak_tension.max():.4g} N, largest compression "
         f"{m.peak_compression.max():.4g} N (a bare link buckles at {buckling[2]:.4g} N, link 3 as "
         "the first one)",
         f"Samples with an actuator at its limit: {100 * m.saturated_fraction:.3g} %; with a "
         f"clipped ADC channel: {100 * m.clipped_fraction:.3g} %; with a motor at its limit of 77 "
         f"N: {100 * m.motor_saturated_fraction:.3g} %.",
-        "with 12 plant modes per link (the run has 4): gain margin 3.25, the factor by which the "
-        "loop gain (`control.gain_factor`) can still grow; spectral radius 0.987654",
+        "with 12 plant modes per link (the run has 4): gain margin 3.25 (10.2 dB), the factor by "
+        "which the loop gain (`control.gain_factor`) can still grow; spectral radius 0.987654",
         f"({force.min():.3g} to {force.max():.3g} N), the margin goes from "
-        f"{planned.min():.4g} to {planned.max():.4g}",
+        f"{planned.min():.4g} ({20 * np.log10(planned.min()):.1f} dB) to {planned.max():.4g} ",
         "a note.",
         "Status: **ok**",
         "`studies spillover mine.toml --out certificate`",
@@ -260,16 +270,16 @@ def test_sentences_of_a_run_show_its_numbers(one_run):
 
 
 @pytest.mark.parametrize(
-    ("run", "twin", "words"),
+    ("run", "twin", "verdict", "words"),
     [
-        ({"margin": 1.75}, 7.0, "lower `control.gain_factor`"),
-        ({"margin": 2.0}, 7.0, "`studies spillover"),
-        ({"size": 7.0}, 0.7, "control leaves more vibration than no control"),
-        ({}, 1e-4, "there is hardly anything to suppress: less than 2.5 µm is left"),
-        ({}, None, "`studies spillover"),
+        ({"margin": 1.75}, 7.0, "too little margin", "lower `control.gain_factor`"),
+        ({"margin": 2.0}, 7.0, "control works", "`studies spillover"),
+        ({"size": 7.0}, 0.7, "**control makes it worse**", "control leaves more vibration than no"),
+        ({}, 1e-4, "hardly anything to suppress", "less than 2.5 µm is left"),
+        ({}, None, "control works", "`studies spillover"),
     ],
 )
-def test_what_is_recommended_next(run, twin, words):
+def test_what_a_run_means_and_what_is_recommended_next(run, twin, verdict, words):
     one = made_up_run(**run)
     other = None if twin is None else made_up_run(twin)
     rms = 1e-5 * np.arange(1.0, 10.0).reshape(3, 3)
@@ -277,10 +287,28 @@ def test_what_is_recommended_next(run, twin, words):
     if other is not None:
         other.result.metrics["residual_rms"] = rms * twin
     text = report(Path("run.h5"), one, other, [], "mine")
-    assert words in text.partition("**Next:**")[2].partition("![")[0]
+    assert f" dB): {verdict}" in text.splitlines()[2]
+    assert words in text.partition("**Next steps:**")[2].partition("![")[0]
     has_twin = "residual rms without control [µm]" in tables_of(text)["Links"][0]
     assert has_twin == (twin is not None)
     assert ("**CAUTION" in text) == ("margin" in run and run["margin"] < 2)
+
+
+@pytest.mark.parametrize(
+    ("before", "words"),
+    [
+        (0.0125, "control works, but the link settles 6 % later than without control."),
+        (0.0132, "control works."),
+    ],
+)
+def test_the_first_line_says_where_control_delays_settling(before, words):
+    rms = 1e-5 * np.ones((3, 3))
+    run, free = (made_up_run(1.0, 3.25, residual_rms=k * rms) for k in (1, 2))
+    run.result.metrics["settling_time"] = np.full(3, 0.01325)
+    free.result.metrics["settling_time"] = np.full(3, before)
+    first = report(Path("run.h5"), run, free, [], "mine").splitlines()[2]
+    assert first.startswith("**Result:** residual 10 µm rms on link 1, the worst (20 without")
+    assert f"control, -50 %), gain margin 3.25 (10.2 dB): {words}" in first
 
 
 def test_a_run_that_stopped_says_when():
@@ -292,6 +320,6 @@ def test_a_run_that_stopped_says_when():
         motion=None,
     )
     text = report(Path("run.h5"), run, None, [], "mine")
-    assert "Status: **diverged: bending beyond a tenth of the link** from 0.1875 s on." in text
-    assert "vibrates most" not in text and "Gain margin" not in text
+    assert "**Result:** the run stopped at 187.5 ms. Status: **diverged: bending beyond a" in text
+    assert "residual 0" not in text and "gain margin" not in text
     assert literal("a|b") == "a\\|b"

@@ -94,7 +94,7 @@ REFUSED = [
     ),
     ("[shaper]\nfrequencies_hz = [1, 2, 3, 4]", "= [1, 2, 3, 4]; allowed: 0 to 3 finite numbers"),
     ("[electronics]\nlowpass_ratio = []", "lowpass_ratio = []; allowed: 1 or more finite numbers"),
-    ("[metrics]\nstations = []", "metrics.stations = []; allowed: 1 to 20 finite numbers [m]"),
+    ("[metrics]\nstations = []", "metrics.stations = []; allowed: 1 to 20 finite numbers [1]"),
     (
         "[patches]\ncenters = []",
         "patches.centers = []; allowed: one list of centres, or three list",
@@ -122,7 +122,10 @@ REFUSED = [
         "link.basis = 'pinned_free'; allowed: pinned_pinned or loaded, where drive.locked is true",
     ),
     ("[link]\njoint_inertia_b = 1e-5", "allowed: loaded, where a joint has rotary inertia"),
-    ("[metrics]\nstations = [0.3]", "metrics.stations = 0.3; allowed: between 0 and link.length"),
+    (
+        "[metrics]\nstations = [1.3]",
+        "= 1.3; allowed: between 0 and 1, exclusive: fractions of each",
+    ),
     (
         "[initial]\nload_station = 0.5",
         "initial.load_station = 0.5; allowed: between 0 and link.len",
@@ -197,7 +200,7 @@ def test_change_takes_numpy_and_refuses_unknown_names():
     assert Study().control.gain_factor == 1.0
     with pytest.raises(StudyError, match="contrl.*did you mean 'control'"):
         study.change(contrl__gain_factor=1.0)
-    with pytest.raises(StudyError, match="title is no section"):
+    with pytest.raises(StudyError, match="title is not a section"):
         study.change(title__x=1.0)
 
 
@@ -267,7 +270,7 @@ STUDIES = st.fixed_dictionaries(
         "control__velocity_gain": st.tuples(*[_numbers(-1e9, 1e9)] * 3),
         "control__ratios": st.lists(st.lists(_numbers(-1, 1), max_size=4), min_size=3, max_size=3),
         "shaper__frequencies_hz": st.lists(_numbers(0.1, 4999), max_size=3),
-        "metrics__stations": st.lists(_numbers(0.001, 0.199), min_size=1, max_size=4),
+        "metrics__stations": st.lists(_numbers(0.001, 0.999), min_size=1, max_size=4),
         "run__seed": st.integers(0, 10**9),
     }
 )

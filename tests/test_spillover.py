@@ -473,7 +473,9 @@ def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_
     assert {path.name for path in out.iterdir()} == files | {"machine.png"}
     assert (out / "laws.pdf").read_bytes()[:5] == b"%PDF-"
     report = (out / "report.md").read_text()
-    assert report.startswith("# Spillover certificate passed: gain margin 2.88, 2 required")
+    assert report.startswith(
+        "# Spillover certificate passed: gain margin 2.88 (9.2 dB), 2 required"
+    )
     assert all(f"({name}.png)" in report for name in ("margins", "damping", "leakage", "laws"))
     assert "| modified IMSC |" in report and "Not covered" in report
     page = parsed((out / "report.html").read_text())

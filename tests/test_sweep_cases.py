@@ -289,7 +289,7 @@ REFUSED = [
         },
         "1e+08 cases; allowed: up to 10000000",
     ),
-    ({"where": "gain >", "axes": {"gain": [1.0]}}, "no condition"),
+    ({"where": "gain >", "axes": {"gain": [1.0]}}, "not a condition"),
     ({"where": "gian > 1", "axes": {"gain": [1.0]}}, "unknown field; did you mean 'gain'?"),
     ({"where": "gain", "axes": {"gain": [1.0]}}, "gives no true or false"),
     ({"where": "gain == 'x'", "axes": {"gain": [1.0]}}, "mixes text and numbers"),

@@ -159,7 +159,9 @@ def check_report(folder):
     count = int(safe.sum())
     assert 10 < count < 40
     value = np.where(safe, np.nanmax(data["residual_rms"], axis=(1, 2)), np.inf)
-    first = f"Best: case {np.argmin(value)} with {1e6 * value.min():.4g} µm"
+    first = (
+        f"**Result:** best by residual_rms: case {np.argmin(value)} with {1e6 * value.min():.4g} µm"
+    )
     head = text.partition("## ")[0]
     assert first in head and "40 cases of control.gain_factor, drive.kp, patches.cent" in head
     best = text.partition("## Best cases by residual_rms")[2].partition("\n## ")[0]
@@ -209,9 +211,9 @@ def test_quiet_says_nothing(capsys, spec, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("show", "nowhere"), "no folder of a sweep"),
-        (("best", "nowhere", "--by", "x"), "no folder of a sweep"),
-        (("plot", "nowhere"), "no folder of a sweep"),
+        (("show", "nowhere"), "not the folder of a sweep"),
+        (("best", "nowhere", "--by", "x"), "not the folder of a sweep"),
+        (("plot", "nowhere"), "not the folder of a sweep"),
         (("replay", "nowhere.toml"), "cannot be read"),
         (("replay", "nowhere.toml", "--case", "1"), "leave --case out"),
         (("sweep", "nowhere.toml", "--out", "x"), "cannot be read"),

@@ -33,7 +33,7 @@ from tests.tunings import EACH, EVERY_KIND, GAIN, tuning
 JUDGED = {
     "objective": {"residual_rms": 1.0, "control_energy": 0.1},
     "limits": {
-        "peak_voltage": "own",
+        "peak_voltage": "baseline",
         "gain_margin": 4.0,
         "slowest_decay": 20.0,
         "spillover": 1.1,
@@ -316,7 +316,10 @@ def test_limits_that_contradict_are_named():
     spec = known_tuning(spans, names, starts=4, iterations=10)
     for limits, message in (
         (lambda v: jax.numpy.stack([v[0] - 0.3, 0.6 - v[0]]), "by some design each, but by none"),
-        (lambda v: jax.numpy.stack([v[0] + 0.1, 0 * v[0] - 1]), "peak_voltage = 1.0 is kept by no"),
+        (
+            lambda v: jax.numpy.stack([v[0] + 0.1, 0 * v[0] - 1]),
+            "peak_voltage = 1.0 is satisfied by no",
+        ),
     ):
         evaluator = Known(spec, lambda v: jax.numpy.sum((v - 0.45) ** 2), limits)
         at = begin(spec, evaluator)
@@ -374,7 +377,7 @@ def test_checked_derivatives_of_loaded_links_come_to_an_end():
             "link": {"basis": "loaded", "modes": 6, "joint_inertia_c": 1e-5},
             "run": {"duration": 0.16},
             "motion": {"move_time": 0.03},
-            "metrics": {"residual_length": 0.02},
+            "metrics": {"residual_delay": 0.0, "residual_length": 0.02},
             "control": {"modes": 2, "basis": "pinned_free", "gain_factor": 0.1},
             "tune": {
                 "free": {"control.gain_factor": {"from": 0.02, "to": 0.2}},

@@ -51,7 +51,7 @@ move_time = 0.03
 starts = 2
 iterations = 3
 samples = 20
-limits = { peak_voltage = "own", gain_margin = 1.0 }
+limits = { peak_voltage = "baseline", gain_margin = 1.0 }
 pareto = { limit = "peak_voltage", values = [20.0, 40.0], family = "all" }
 scenarios = { count = 2, check = 3, spread = { "link.youngs_modulus" = 5.0 } }
 
@@ -97,11 +97,11 @@ def same(told, value):
 def check_report(out):
     """Every number of its tables, from the files of the designs, on the machines of the file."""
     text, data = (out / "report.md").read_text(), read_store(out / "tune.h5")[0]
-    own = table_of(text, "On the study's own machine")
+    own = table_of(text, "On the nominal machine")
     fresh = table_of(text, "On fresh machines")
     files = {name: row["file"].strip("`") for name, row in own.items() if row["file"] != "-"}
     compared = ["without control", "gain_factor alone"]
-    assert list(own) == list(fresh) == ["the study itself", *data["family"].data, *compared]
+    assert list(own) == list(fresh) == ["baseline", *data["family"].data, *compared]
     assert len(files) == len(own) - 3  # nor has a family that moves nothing a file
     moduli = data["scenario_link_youngs_modulus"].data
     seeds = data["scenario_run_seed"].data.tolist()
@@ -178,17 +178,17 @@ def test_a_report_says_what_its_numbers_are():
     for words in (
         "the least residual_rms of links 1 and 3 with peak_voltage at most 30",
         "Ended after 14 of 40 iterations: for 12 no family had gained 0.1 %.",
-        "residual_rms 4 instead of 8 µm, settling_time 12 instead of not within 30 ms, "
-        "peak_voltage 33 instead of 33 V, gain margin 1.3 instead of 3",
+        "residual_rms -50 % (4 instead of 8 µm), settling_time 12 instead of not within 30 ms, "
+        "peak_voltage +0 % (33 instead of 33 V), gain margin 1.3 (2.3 dB) instead of 3 (9.5 dB)",
         "**CAUTION: a gain margin of 1.3; below 2 a machine may go unstable.**",
         "**A limit is violated.**",
         "`studies simulate tuned.toml",
     ):
         assert words in head, words
-    own = table_of(text, "On the study's own machine")
+    own = table_of(text, "On the nominal machine")
     assert own["tuned"]["peak_voltage [V]"] == "33" and own["tuned"]["residual_rms [µm]"] == "4"
     fresh = table_of(text, "On fresh machines")
-    assert fresh["the study itself"]["settling_time [ms]"] == "not within 30"
+    assert fresh["baseline"]["settling_time [ms]"] == "not within 30"
     assert fresh["tuned"]["residual_rms [µm]"] == "4.4"
     assert "Of links 1 and 3, the controlled ones, the largest value counts" in text
 
@@ -200,14 +200,14 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
     cli.main(["tune", str(file), "--out", str(out)])
     text = (out / "report.md").read_text()
     for part in (
-        "**Asked:** the least residual_rms of all links with peak_voltage at most",
+        "which design has the least residual_rms of all links with peak_voltage at most",
         "| gains |",
         "| loud |",
         "| all, peak_voltage 20 |",
         "worst disagreement is",
         "Sobol designs of all",
         "Linear fidelity",
-        "**Next:** `studies simulate",
+        "**Next steps:** `studies simulate",
     ):
         assert part in text
     page = parsed((out / "report.html").read_text())
@@ -353,13 +353,13 @@ def test_own_limits_need_something_to_be_a_share_of():
             **silent,
             "tune": {
                 "free": {"drive.kp": {"from": 1e4, "to": 4e4}},
-                "limits": {"peak_voltage": "own"},
+                "limits": {"peak_voltage": "baseline"},
             },
         }
     )
     checked = SimpleNamespace(spec=spec, families=list(spec.families), merit=merit_of(spec))
     metrics = SimpleNamespace(residual_rms=np.ones((1, 3, 3)), peak_voltage=np.zeros((1, 3)))
-    with pytest.raises(StudyError, match="peak_voltage = 'own': the study itself has 0"):
+    with pytest.raises(StudyError, match="peak_voltage = 'baseline': the baseline has 0"):
         Evaluator._check_own(checked, np.array([0]), metrics)
 
 

@@ -83,6 +83,21 @@ def test_poles_can_be_free():
     np.testing.assert_allclose(moved.pole_frequency[:, 0], 2 * np.pi * np.array([120, 100, 122]))
 
 
+def test_added_damping_can_be_free():
+    """One number, and one a link, are those of mode 1; lists those of their modes."""
+    free = {"control.damping": {"from": 0.0, "to": 0.5}}
+    for damping, values, moved in (
+        (0.2, [0.1], [[0.1, -1]] * 3),
+        ([0.2, 0.3, 0.1], [0.1, 0.0, 0.4], [[0.1, -1], [0, -1], [0.4, -1]]),
+        ([[0.2, 0.05], [0.1], [0.1]], [0.3, 0.1, 0.2, 0.4], [[0.3, 0.1], [0.2, -1], [0.4, -1]]),
+    ):
+        control = {**SMALL["control"], "damping": damping}
+        spec = parse_tuning({**SMALL, "control": control, "tune": {"free": free}})
+        assert spec.has_poles and spec.has_position_gain
+        placed = spec.free.place(as_arrays(build_case(spec.study)), np.array(values)).control
+        np.testing.assert_allclose(placed.damping[:, :2], moved, atol=1e-15)
+
+
 def test_gains_that_poles_decide_cannot_be_free():
     control = {**SMALL["control"], "pole_decay": 100.0}
     free = {"control.velocity_gain[0]": {"from": 0.5, "to": 5.0}}
@@ -167,7 +182,10 @@ def deep(n):
         ),
         ({"free": GAIN, "objective": {"settling_time": 1.0}}, "no derivative; take ringing_time"),
         ({"free": GAIN, "limits": {"gain_margin[0]": 2.0}}, "no such entry; allowed: gain_margin"),
-        ({"free": GAIN, "limits": {"peak_voltage": "mine"}}, "> 0 and <= 1e\\+30 or 'own'"),
+        (
+            {"free": GAIN, "limits": {"peak_voltage": "own"}},
+            "> 0 and <= 1e\\+30 or 'baseline'; did you mean 'baseline'?",
+        ),
         (
             {"free": GAIN, "limits": {"peak_voltage": 40.0, "peak_voltage[1]": 50.0}},
             r"peak_voltage\[1\] = 50 allows more than peak_voltage = 40",
@@ -181,7 +199,7 @@ def deep(n):
             {"free": GAIN, "families": {"one": {"free": ["control.gainfactor"]}}},
             "did you mean 'control.gain_factor'",
         ),
-        ({"free": GAIN, "families": {"one": {"free": []}}}, "one with free numbers or more"),
+        ({"free": GAIN, "families": {"one": {"free": []}}}, "one or more with free parameters"),
         ({"free": GAIN, "families": {"one": {"set": {"link.modes": 3}}}}, "n_modes = 3 where"),
         (
             {"free": GAIN, "families": {"one": {"set": {"motion.move_time": 0.06}}}},
@@ -285,7 +303,7 @@ def deep(n):
             "did you mean 'control.pole",
         ),
         ({"free": GAIN, "objective": {"qqq": 1.0}}, "unknown metric; allowed: residual_rms, "),
-        ({"free": GAIN, "limits": {"peak_voltage": deep(400)}}, "peak_voltage = .* or 'own'"),
+        ({"free": GAIN, "limits": {"peak_voltage": deep(400)}}, "peak_voltage = .* or 'baseline'"),
         ({"free": GAIN, "families": {"one": {"sets": {}}}}, "allowed: {free = "),
         (
             {"free": GAIN, "pareto": {"limit": "peak_voltage", "values": [1.0, 2.0]}},

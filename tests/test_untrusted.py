@@ -107,7 +107,7 @@ def test_deep_tables_are_refused(tmp_path, text):
         ('{"a": 1, "a": 2}', "'a' occurs twice"),
         ("[" * 100 + "]" * 100, "nested deeper"),
         ("[" * 100_000, "nested deeper"),
-        ('{"\\ud800": 1}', "is no text"),
+        ('{"\\ud800": 1}', "is not text"),
         ("{", "Expecting"),
     ],
 )
@@ -121,7 +121,7 @@ def test_many_keys_take_no_long_time(tmp_path):
     names = ",".join(f'"k{k}": {k}' for k in range(60_000))
     (tmp_path / "x.json").write_text("{" + names + "}")
     began = time.perf_counter()
-    with pytest.raises(StudyError, match="no controller"):
+    with pytest.raises(StudyError, match="not a controller"):
         read_document(tmp_path / "x.json")
     assert time.perf_counter() - began < 5  # by comparing each with each: minutes
 
@@ -176,9 +176,9 @@ def sweep(tmp_path_factory):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"results": 7}, "damaged (results is no list)"),
-        ({"given_up": {}}, "damaged (given_up is no list)"),
-        ({"spec": {"sweep": {"screen": 3}}}, "damaged (sweep.screen is no table)"),
+        ({"results": 7}, "damaged (results is not a list)"),
+        ({"given_up": {}}, "damaged (given_up is not a list)"),
+        ({"spec": {"sweep": {"screen": 3}}}, "damaged (sweep.screen is not a table)"),
         ({"spec": []}, "damaged (no sweep in it)"),
     ],
 )
@@ -207,7 +207,7 @@ def no_spec(file):
 
 @pytest.mark.parametrize(
     ("change", "said"),
-    [(group, "damaged"), (short, "residual_rms is no table"), (no_spec, "spec")],
+    [(group, "damaged"), (short, "residual_rms is not a table"), (no_spec, "spec")],
 )
 def test_forged_results_are_refused(tmp_path, sweep, change, said):
     """Even where the manifest vouches for them."""
@@ -249,4 +249,4 @@ def test_results_that_are_no_file_are_no_results(tmp_path, sweep, capsys):
     assert len(finished_cases(out).case_id) == 0
     with pytest.raises(SystemExit):
         main(["show", str(tmp_path / "nothing")])
-    assert "no folder of a sweep" in capsys.readouterr().err
+    assert "not the folder of a sweep" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The sampled plant as a controller with an observer believes it, link by link.
+"""The sampled plant in the nominal model of a controller with an observer, link by link.
 
 Modes at their assembled frequencies, drained patches, anti-alias filter, amplifiers and hold, exact
 over a sample, and the sample of delay. Sensors answer to all other modes at once

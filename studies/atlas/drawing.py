@@ -19,7 +19,7 @@ from jaxmodel.dynamics import modal_chain
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from studies.engine.runs import check_run
-from studies.show.figures import SERIES, axes_or_new, styled
+from studies.show.figures import SERIES, SMALL, WIDTH, axes_or_new, styled
 from studies.show.sketch import guides
 from studies.study.consistency import each_link
 from studies.study.spec import Study
@@ -127,7 +127,7 @@ def number_links(parts: Skeleton, k: int, ax: Axes) -> None:
             1e3 * slider,
             10 * side,
             textcoords="offset points",
-            fontsize=8,
+            fontsize=SMALL,
             ha="center",
             va="center",
         )
@@ -176,7 +176,7 @@ def animate(clip: Clip, path: Path) -> None:
         path: file, whose name ends in .gif.
     """
     with styled():
-        figure = Figure(figsize=(7.4, 3.9), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 3.9), layout="constrained")
         axes = figure.subplots(1, 2)
         label = figure.supxlabel(" ", fontsize=9)
         lines = [_moving(parts, ax) for parts, ax in zip(clip.parts, axes, strict=True)]
@@ -188,7 +188,7 @@ def animate(clip: Clip, path: Path) -> None:
 
         def frame(k: int) -> list[Any]:
             label.set_text(
-                f"{1e3 * clip.time[k]:+.0f} ms from the end of the command; bending drawn "
+                f"{1e3 * clip.time[k]:+.0f} ms from the end of the move; bending drawn "
                 f"{clip.exaggeration:.0f} times"
             )
             for parts, (links, sliders, joints, plate) in zip(clip.parts, lines, strict=True):

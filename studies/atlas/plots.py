@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import TwoSlopeNorm
 
 from studies.atlas.subsets import link_label
-from studies.show.figures import CONTROLLED, SERIES, WITHOUT, axes_or_new
+from studies.show.figures import CONTROLLED, SERIES, SMALL, WITHOUT, axes_or_new
 
 #: Changes: blue is less vibration, orange is more.
 CHANGES = "PuOr_r"
@@ -24,8 +24,8 @@ BETTER, WORSE = "#4C3F91", "#D9730D"
 
 
 def length_text(value: float) -> str:
-    """A small length [m] in µm, or in nm below 0.1 µm."""
-    return f"{1e6 * value:.3g} µm" if value >= 1e-7 else f"{1e9 * value:.3g} nm"
+    """A small length [m] in µm."""
+    return f"{1e6 * value:.3g} µm"
 
 
 def _whole(value: float, sign: str = "+") -> str:
@@ -58,7 +58,7 @@ def change_map(
             _whole(value),
             ha="center",
             va="center",
-            fontsize=7,
+            fontsize=SMALL,
             color="white" if is_dark else "black",
         )
     ax.set_xticks(range(len(columns)), columns)
@@ -103,7 +103,7 @@ def lattice(residual: np.ndarray, ax: Axes | None = None) -> Axes:
             f"{link_label(subset)}\n{length_text(residual[subset])}",
             ha="center",
             va="center",
-            fontsize=8,
+            fontsize=SMALL,
             bbox={"boxstyle": "round", "fc": "white", "ec": "#888888"},
         )
     ax.set_xlim(-0.5, 3.5)
@@ -148,8 +148,8 @@ def interaction_map(
     ax = axes_or_new(ax)
     norm = TwoSlopeNorm(0, -100 * limit, 100 * limit)
     image = ax.imshow(100 * index, cmap=CHANGES.removesuffix("_r"), norm=norm)
-    ax.set_xticks(range(len(labels)), labels, rotation=90, fontsize=7)
-    ax.set_yticks(range(len(labels)), labels, fontsize=7)
+    ax.set_xticks(range(len(labels)), labels, rotation=90, fontsize=SMALL)
+    ax.set_yticks(range(len(labels)), labels, fontsize=SMALL)
     ax.grid(False)
     ax.tick_params(length=0)
     return image
@@ -190,7 +190,7 @@ def workspace_map(
     lines = ax.contour(
         1e3 * x, 1e3 * y, np.degrees(margin), [10, 20], colors="white", linewidths=0.7
     )
-    ax.clabel(lines, fmt="%g°", fontsize=6)
+    ax.clabel(lines, fmt="%g°", fontsize=SMALL)
     if path is not None:
         ax.plot(*(1e3 * path.T), color="black", linewidth=1.2)
     ax.set_aspect("equal")

@@ -19,7 +19,6 @@ from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.report import report
 from studies.atlas.subsets import (
     TARGETS,
-    WINDOWS,
     Subsets,
     atlas_sweep,
     link_label,
@@ -145,11 +144,10 @@ def _names(values: list[str], axis: str, text: str) -> Variable:
 
 def _subset_variables(subsets: Subsets) -> dict[str, Variable]:
     game = subsets.removed()
-    axes = ("setting", "window", "subset")
+    axes = ("setting", "subset")
     per_link = (*axes, "link")
     return {
         "setting": _names([setting_label(s) for s in subsets.setting], "setting", "move, shaper"),
-        "window": _names(list(WINDOWS), "window", "residual window"),
         "subset": Variable(
             np.arange(game.shape[-1]),
             ("subset",),
@@ -173,23 +171,25 @@ def _subset_variables(subsets: Subsets) -> dict[str, Variable]:
             "m2/Hz",
             "largest spectral density near each mode of the controller",
         ),
-        "settling_time": Variable(subsets.settling, per_link, "s", "after the command"),
+        "settling_time": Variable(
+            subsets.settling, per_link, "s", "after the reference trajectory"
+        ),
         "peak_voltage": Variable(subsets.voltage, per_link, "V", "peak actuator voltage"),
         "removed": Variable(
             game,
-            ("setting", "window", "target", "subset"),
+            ("setting", "target", "subset"),
             "1",
             "share of the uncontrolled mean square that control takes away",
         ),
         "shapley_share": Variable(
             shapley(game),
-            ("setting", "window", "target", "player"),
+            ("setting", "target", "player"),
             "1",
             "Shapley share of it",
         ),
         "interaction": Variable(
             interaction(game),
-            ("setting", "window", "target", "player", "other_player"),
+            ("setting", "target", "player", "other_player"),
             "1",
             "Shapley interaction index of pairs",
         ),
@@ -239,7 +239,9 @@ def _run_variables(found: AtlasFindings) -> dict[str, Variable]:
         "run": _names([setting_label(s) for s in RUNS], "run", "move, shaper"),
         "run_links": _names(list(LINK_LABELS), "run_links", "controlled links"),
         "time": Variable(runs.time, ("time",), "s", "time"),
-        "command_end": Variable(runs.command_end, ("run",), "s", "end of the shaped command"),
+        "command_end": Variable(
+            runs.command_end, ("run",), "s", "end of the shaped reference trajectory"
+        ),
         "drive_error": Variable(
             runs.drive, ("run", "time", "pose_axis"), "m; m; rad", "pose error with rigid links"
         ),

@@ -40,7 +40,7 @@ LocalWorkers = Annotated[
 
 
 WorkerTimeout = Annotated[
-    float, typer.Option(help="restart a worker that stays busy for longer without answering [s]")
+    float, typer.Option(help="restart a worker that does not answer for this long [s]")
 ]
 
 

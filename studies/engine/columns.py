@@ -12,7 +12,7 @@ from jaxmodel.metrics import METRICS
 from jaxmodel.prepare import SPECTRUM_SPAN
 from studies.space.table import CaseTable, as_numbers
 from studies.store import Variable
-from studies.study.labels import DISTANCE_TEXT, STATUS_LABEL
+from studies.study.labels import DISTANCE_TEXT, STATION_TEXT, STATUS_LABEL
 from studies.study.margin import HIGHEST, MARGIN_MODES
 from studies.study.paths import field_unit, field_value, parse_entry
 
@@ -46,7 +46,7 @@ PER_CASE: dict[str, tuple[Any, ...]] = {
         {LEFT_OUT: "left out by the screen", NOT_RUN: "not run", **STATUS_LABEL[2]},
     ),
     "bad_time": ((), "s", "when the status appeared, 0 if ok"),
-    "command_end": ((), "s", "end of the shaped command"),
+    "command_end": ((), "s", "end of the shaped reference trajectory"),
     "substeps": ((), "1", "plant steps per sample"),
     "sensor_condition": (("link",), "1", "condition number of the modal filter"),
     "actuator_condition": (("link",), "1", "condition number of the synthesizer"),
@@ -127,7 +127,7 @@ def axis_variables(table: CaseTable, sizes: Mapping[str, int]) -> dict[str, Vari
         found["pose_axis"] = Variable(names, ("pose_axis",), "1", "pose component")
     if "station" in sizes and "metrics.stations" not in table.columns:
         stations = np.array(field_value(table.study, "metrics.stations"))
-        found["station"] = Variable(stations, ("station",), "m", "position along the link")
+        found["station"] = Variable(stations, ("station",), "1", STATION_TEXT)
     if "spectrum_point" in sizes:
         ratio = np.linspace(1 - SPECTRUM_SPAN, 1 + SPECTRUM_SPAN, sizes["spectrum_point"])
         found["spectrum_point"] = Variable(

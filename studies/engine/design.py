@@ -74,7 +74,7 @@ def _tuned(path: Path, case: str | int | None) -> Path:
     """File of the requested tuned study."""
     files = {file.stem.removeprefix("tuned").lstrip("_"): file for file in path.glob("tuned*.toml")}
     if not files:
-        raise StudyError(f"{path}: the tuning is not finished; go on with studies tune --resume")
+        raise StudyError(f"{path}: the tuning is not finished; continue with studies tune --resume")
     if case is None and len(files) == 1:
         return next(iter(files.values()))
     known = f"{', '.join(sorted(filter(None, files)))}, the families of {path}"

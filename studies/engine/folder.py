@@ -232,15 +232,15 @@ def read_manifest(path: Path) -> dict[str, Any]:
             raise ValueError("no sweep in it")
         for name in ("results", GIVEN_UP):
             if not isinstance(manifest.get(name, []), list):
-                raise ValueError(f"{name} is no list")
+                raise ValueError(f"{name} is not a list")
         if not isinstance(spec["sweep"].get("screen", {}), dict):
-            raise ValueError("sweep.screen is no table")
+            raise ValueError("sweep.screen is not a table")
     except OSError:
         if (path / TUNING).is_file():
             raise StudyError(
-                f"{path}: holds a tuning, no sweep; see its report.md, or tune.h5 with xarray"
+                f"{path}: holds a tuning, not a sweep; see its report.md, or tune.h5 with xarray"
             ) from None
-        raise StudyError(f"{path}: no folder of a sweep ({MANIFEST} is missing)") from None
+        raise StudyError(f"{path}: not the folder of a sweep ({MANIFEST} is missing)") from None
     except ValueError as error:
         raise StudyError(f"{path / MANIFEST}: damaged ({error})") from None
     return manifest
@@ -342,7 +342,7 @@ def _check_columns(store: h5py.File, count: int) -> None:
             shape = np.shape(found) if isinstance(found, h5py.Dataset) else ()
             dims = label_of(name)[0]
             if shape[:1] != (count,) or len(shape) != 1 + len(dims) or found.dtype.kind not in "if":
-                raise ValueError(f"{name} is no table of numbers for {count} cases")
+                raise ValueError(f"{name} is not a table of numbers for {count} cases")
 
 
 def check_results(path: Path) -> None:

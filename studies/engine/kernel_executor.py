@@ -135,7 +135,7 @@ class GpuExecutor:
         try:
             traced = trace_steps(program, split)
             if traced.loop.operations()["tanh"]:
-                raise NoKernelError("the GPU kernel knows no tanh, which friction needs")
+                raise NoKernelError("the GPU kernel does not support tanh, which friction needs")
             kernel = gpu.build_kernel(traced.loop, program.structure.n_steps, program.layout.lanes)
             run = jax.jit(partial(_run_block, program, traced.parts, kernel))
             first = run(block, split.shared)

@@ -283,9 +283,9 @@ def _headline(table: CaseTable, groups: list[Group], n_before: int) -> str:
     if table.n_dropped:
         text += f" ({table.n_dropped} left out by where)"
     if table.n_double:
-        text += f" ({table.n_double} doubles left out)"
+        text += f" ({table.n_double} duplicates left out)"
     if n_before:
-        text += f", {n_before} of them done before"
+        text += f", {n_before} of them already computed"
     chunks = sum(len(group.chunks()) for group in groups)
     return f"{text}; chunks: {chunks}, programs to compile: {len(groups)}"
 
@@ -293,7 +293,7 @@ def _headline(table: CaseTable, groups: list[Group], n_before: int) -> str:
 def _kept_headline(table: CaseTable, groups: list[Group], n_before: int) -> str:
     count = sum(len(group.rows) for group in groups)
     text = f"{count} of {len(table)} cases pass the screen or check it"
-    return f"{text}, {n_before} more done before" if n_before else text
+    return f"{text}, {n_before} more already computed" if n_before else text
 
 
 def _rows_left(table: CaseTable, done: np.ndarray, out: Path) -> np.ndarray:

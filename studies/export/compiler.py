@@ -75,7 +75,7 @@ def find_compiler() -> list[str]:
     try:
         given = shlex.split(os.environ.get("CC", ""))
     except ValueError as error:
-        raise StudyError(f"CC = {os.environ['CC']!r}: no command ({error})") from None
+        raise StudyError(f"CC = {os.environ['CC']!r}: not a command ({error})") from None
     for command in [given] if given else [[name] for name in _NAMES]:
         if shutil.which(command[0]):
             return command

@@ -85,8 +85,8 @@ STEPS = [
     "velocity = sum of velocity_numerator * (w, w1, w2); position likewise; then w2 = w1, w1 = w",
     "force = -velocity_gain * velocity - position_gain * (position + position_direct * signal)",
     "command = synthesizer @ force, limited to +-voltage_limit; it goes out at the next sample",
-    "a sensor that is no number, out of range or 10 ms at one end of it: all commands 0, until "
-    "started again",
+    "a sensor that is not a number, is out of range or 10 ms at one end of it: all commands "
+    "0, until started again",
     "reference: shaped pose = sum over taps of shaper_weight * pose shaper_delay samples ago",
 ]
 #: An extra step before the synthesizer if channels of a link act one at a time.
@@ -349,7 +349,9 @@ def read_document(path: Path) -> Document:
     except ValueError as error:
         raise StudyError(f"{path}: not valid JSON ({error})") from None
     if not isinstance(data, dict) or data.get("format") != FORMAT:
-        raise StudyError(f"{path}: no controller; allowed: a file of studies export --target json")
+        raise StudyError(
+            f"{path}: not a controller; allowed: a file of studies export --target json"
+        )
     try:
         return Document.model_validate(data)
     except ValidationError as error:
@@ -402,7 +404,7 @@ def _check_equal(path: Path, name: str, given: Quantity, wanted: Quantity) -> No
     try:
         found, own = np.array(given.value, float), np.array(wanted.value, float)
     except ValueError:  # lists of unequal length
-        raise StudyError(f"{path}: numbers.{name}: no table of numbers") from None
+        raise StudyError(f"{path}: numbers.{name}: not a table of numbers") from None
     if found.shape != own.shape:
         raise StudyError(
             f"{path}: numbers.{name} has shape {found.shape}; allowed: {own.shape}, as its study"

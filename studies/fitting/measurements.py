@@ -357,5 +357,5 @@ _MAKERS: dict[type[Common], Callable[..., Measurement]] = {
 
 
 def guess(spec: FitSpec) -> np.ndarray:
-    """The study's own values of the parameters, (p,)."""
+    """The study's values of the parameters, (p,)."""
     return np.array([number.start for number in spec.free.numbers])

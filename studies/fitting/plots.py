@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from studies.fitting.kinds.contract import Line, Numbers
 from studies.fitting.spec import number_unit
 from studies.fitting.statistics import WIDE
-from studies.show.figures import new_figure
+from studies.show.figures import SMALL, WIDTH, legend_above, new_figure
 
 if TYPE_CHECKING:
     from studies.fitting.run import Fitted
@@ -46,7 +46,7 @@ def _plain(text: str) -> str:
 
 def curves(shown: Sequence[tuple[str, Line]]) -> Figure:
     """Data and model of measurements with their titles, and below them their residuals."""
-    figure = Figure(figsize=(7.4, 0.75 + 2.7 * len(shown)), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 0.75 + 2.7 * len(shown)), layout="constrained")
     axes = figure.subplots(
         2 * len(shown), 1, squeeze=False, gridspec_kw={"height_ratios": [3, 1.2] * len(shown)}
     )[:, 0]
@@ -57,15 +57,15 @@ def curves(shown: Sequence[tuple[str, Line]]) -> Figure:
         ax.plot(curve.x, curve.model, color=BLUE, lw=1, label="model")
         if curve.is_log:
             ax.set_yscale("log")
-        ax.set_ylabel(curve.ordinate, fontsize=8)
+        ax.set_ylabel(curve.ordinate, fontsize=SMALL)
         ax.set_title(title, loc="left", fontsize=9)
         for part in np.split(curve.away, len(curve.away) // len(curve.x)):
             below.plot(curve.x, part, ".", ms=2, color=BLUE)
         below.axhspan(-2, 2, color=GREY, alpha=0.2, lw=0)
         below.set_xlabel(curve.abscissa)
-        below.set_ylabel("away [sigma]", fontsize=8)
+        below.set_ylabel("residual [sigma]", fontsize=SMALL)
     figure.align_ylabels()
-    axes[0].legend(loc="best")
+    legend_above(figure, axes[0])
     return figure
 
 
@@ -87,10 +87,10 @@ def numbers(shown: Sequence[tuple[str, Numbers]]) -> Figure:
     ax.axvspan(-2, 2, color=GREY, alpha=0.2, lw=0, label="2 standard deviations")
     far = max(3.0, 1.1 * float(np.abs(away).max()))
     ax.set(xlim=(-far, far), ylim=(len(labels) - 0.3, -0.7))
-    ax.set_yticks(range(len(labels)), labels, fontsize=7)
+    ax.set_yticks(range(len(labels)), labels, fontsize=SMALL)
     ax.grid(visible=False, axis="y")
     ax.set_xlabel("model minus measured [standard deviations]")
-    ax.legend(loc="best")
+    legend_above(figure, ax)
     return figure
 
 
@@ -101,8 +101,8 @@ def correlations(found: Fitted) -> Figure:
     ax = axes[0, 0]
     ax.grid(False)
     image = ax.imshow(found.answer.correlation, vmin=-1, vmax=1, cmap="RdBu_r", aspect="auto")
-    ax.set_xticks(range(n), found.names, rotation=90, fontsize=7)
-    ax.set_yticks(range(n), found.names, fontsize=7)
+    ax.set_xticks(range(n), found.names, rotation=90, fontsize=SMALL)
+    ax.set_yticks(range(n), found.names, fontsize=SMALL)
     figure.colorbar(image, ax=ax, label="correlation [1]")
     return figure
 
@@ -124,7 +124,7 @@ def profiles(found: Fitted) -> Figure:
         ax.set(xlabel=f"[{number_unit(found.names[k])}]", ylabel="rise of chi square")
         ax.locator_params(axis="x", nbins=5)
         ax.set_title(found.names[k], loc="left", fontsize=9)
-    axes[0, 0].legend(loc="best")
+    legend_above(figure, axes[0, 0])
     for ax in axes.ravel()[count:]:
         ax.set_visible(False)
     return figure
@@ -150,11 +150,11 @@ def samples(values: np.ndarray, names: Sequence[str]) -> Figure:
                 ax.set_yticks([])
             else:
                 ax.plot(values[:, column], values[:, row], ".", ms=1, color=BLUE, alpha=0.3)
-            ax.tick_params(labelleft=column == 0 and row > 0, labelsize=6)
+            ax.tick_params(labelleft=column == 0 and row > 0, labelsize=SMALL)
             ax.locator_params(axis="x", nbins=4)
-            ax.xaxis.get_offset_text().set_fontsize(6)
+            ax.xaxis.get_offset_text().set_fontsize(SMALL)
             if row == n - 1:
-                ax.set_xlabel(names[column], fontsize=7)
+                ax.set_xlabel(names[column], fontsize=SMALL)
             if column == 0 and row > 0:
-                ax.set_ylabel(names[row], fontsize=7)
+                ax.set_ylabel(names[row], fontsize=SMALL)
     return figure

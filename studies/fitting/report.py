@@ -26,7 +26,7 @@ GOOD = "The model explains the data within their noise, and every parameter is i
 
 def summary(found: Fitted) -> str:
     """Some lines: the verdict, the values, and what else is to be known of them."""
-    verdict, *others = [GOOD] * is_good(found) + sentences(found)
+    verdict, *others = _said(found)
     lines = [
         f"{name} = {value} +- {sigma} {unit} (95 %: {interval})".replace("  ", " ")
         for name, value, sigma, unit, interval, _ in _rows(found)
@@ -34,15 +34,23 @@ def summary(found: Fitted) -> str:
     return "\n".join([verdict, *lines, *others])
 
 
+def _said(found: Fitted) -> list[str]:
+    """The verdict, then what else is to be known."""
+    return [GOOD] * is_good(found) + sentences(found)
+
+
 def report(found: Fitted) -> str:
     """Markdown text."""
+    first, *others = _said(found)
     return render(
         "fitting/report.md",
         found=found,
         spec=found.spec,
         answer=found.answer,
         rows=_rows(found),
-        sentences=sentences(found),
+        is_good=is_good(found),
+        first=f"{'good' if is_good(found) else '**not good**'}. {first}",
+        others_said=others,
         misfits=[_misfit(x) for x in found.answer.misfits],
         checks=[_misfit(x) for x in found.checks],
         others=_others(found),
@@ -52,7 +60,6 @@ def report(found: Fitted) -> str:
         widest=" and ".join(found.names[k] for k in found.answer.directions[0].named()),
         lines=sum(isinstance(x.part, Line) for x in found.comparisons),
         kept=sum(not x.is_checked for x in found.comparisons),
-        verdict=GOOD if is_good(found) else "",
         has_entries=any("[" in name for name in found.names),
         most=MOST,
         region=REGION,
@@ -71,7 +78,7 @@ def _is_at_bound(place: float) -> bool:
 
 
 def _rows(found: Fitted) -> list[list[str]]:
-    """Name, value, standard deviation, unit, 95 % interval, and where the number came to lie."""
+    """Name, value, standard deviation, unit, 95 % interval, and where the value came to lie."""
     rows = []
     u = found.solution.best.u
     for k, name in enumerate(found.names):
@@ -131,7 +138,7 @@ def sentences(found: Fitted) -> list[str]:
     if not found.solution.best.is_converged:
         lines.append("The search ended before it converged; raise fit.iterations.")
     if found.experiment_fault:
-        lines.append(f"No next experiment was found: {found.experiment_fault}.")
+        lines.append(f"No next experiment could be computed: {found.experiment_fault}.")
     return lines
 
 

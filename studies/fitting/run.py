@@ -275,9 +275,9 @@ def _tuning(found: Fitted) -> str:
         f"{study_template(found.study)}\n"
         "# What moves, and how far: change it to what you can decide.\n"
         "[tune]\n"
-        "# objective = { residual_rms = 1.0 }   # metric = weight, relative to this study's own\n"
-        "# starts = 8                           # initial designs\n"
-        "# iterations = 60                      # evaluations of each\n"
+        "# objective = { residual_rms = 1.0 }   # metric = weight, relative to this study's\n"
+        "# starts = 8                           # starting points\n"
+        "# iterations = 60                      # evaluations from each\n"
         "[tune.free]\n"
         f'"control.gain_factor" = {{ from = {0.2 * gain:g}, to = {2 * gain:g} }}\n'
         f"{limits}\n"
@@ -286,7 +286,7 @@ def _tuning(found: Fitted) -> str:
         "# knows link.youngs_modulus of each machine; fit link.stiffness_factor for what it does\n"
         "# not know.\n"
         f"{_warning(found)}"
-        "[tune.scenarios]\ncount = 4   # of them to tune on, with the study's own\n"
+        "[tune.scenarios]\ncount = 4   # of them to tune on, with the nominal one\n"
         "check = 16  # others to judge the result\n"
         f"[tune.scenarios.machines]\n{rows}\n"
     )

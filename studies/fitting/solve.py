@@ -67,7 +67,7 @@ def solve(problem: Problem, starts: int, refine: int, iterations: int, seed: int
 
     Args:
         problem: the residuals.
-        starts: starting points; the first is the study's own.
+        starts: starting points; the first is the study.
         refine: how many of them are followed, and half of how many exchanges.
         iterations: evaluations of each.
         seed: of the starting points.

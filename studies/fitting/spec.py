@@ -26,6 +26,7 @@ from studies.study.explain import explain
 from studies.study.files import find_spec, read_toml
 from studies.study.paths import as_tuples, field_unit, parse_entry
 from studies.study.spec import Section, Study, described, parse_study
+from studies.study.window import with_window
 
 Positive = Annotated[float, Field(ge=1e-30, le=1e12)]
 Percent = Annotated[float, Field(ge=1e-6, le=1000)]
@@ -130,12 +131,16 @@ class SettlingEntry(Seen):
     """How long a signal takes to settle after the study's motion."""
 
     time_s: float = described(
-        ..., "s", "from the end of the command until it stays within the band", ge=0, le=1e4
+        ...,
+        "s",
+        "from the end of the reference trajectory until it stays within the band",
+        ge=0,
+        le=1e4,
     )
     sigma_s: Positive = described(..., "s", "standard deviation")
     band: Positive | None = described(None, "unit of the output", "to each side of 0")
     band_percent: Share | None = described(
-        None, "%", "the same, over the largest value after the command without control"
+        None, "%", "the same, over the largest value after the reference trajectory without control"
     )
     links: Flags | None = described(None, "-", "under control; default: those of the study")
 
@@ -178,7 +183,7 @@ class Fit(Section):
     loss: Literal["squares", "robust"] = described(
         "squares", "-", "of residuals; robust: outliers pull less"
     )
-    starts: int = described(32, "1", "starting points, the study's own first", ge=1, le=10_000)
+    starts: int = described(32, "1", "starting points; the first is the study", ge=1, le=10_000)
     refine: int = described(
         4,
         "1",
@@ -186,7 +191,7 @@ class Fit(Section):
         ge=1,
         le=100,
     )
-    iterations: int = described(60, "1", "evaluations of each", ge=1, le=10_000)
+    iterations: int = described(60, "1", "evaluations from each", ge=1, le=10_000)
     profile: bool = described(True, "-", "profile the likelihood of up to six parameters")
     samples: int = described(
         0, "1", "posterior samples, with the extra 'posterior'; 0: none", ge=0, le=10**6
@@ -235,7 +240,7 @@ def parse_fit(data: dict[str, Any], folder: str | Path = ".") -> FitSpec:
     """
     if "fit" not in data:
         raise StudyError("fit: missing; a fit is a study file with a section [fit]")
-    study = parse_study({name: value for name, value in data.items() if name != "fit"})
+    study = with_window(parse_study({name: value for name, value in data.items() if name != "fit"}))
     try:
         fit = Fit.model_validate(as_tuples(data["fit"]))
     except ValidationError as error:

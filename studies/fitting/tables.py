@@ -75,7 +75,7 @@ def column(found: dict[str, np.ndarray], name: str, file: str, path: str) -> np.
     bad = np.flatnonzero(~np.isfinite(values))
     if bad.size:
         raise StudyError(
-            f"{path}: {shown(file)}, column {name!r}: {bad.size} of {len(values)} entries are no "
+            f"{path}: {shown(file)}, column {name!r}: {bad.size} of {len(values)} entries are not "
             f"finite numbers, the first in row {bad[0] + 1}; delete these rows"
         )
     huge = np.flatnonzero(np.abs(values) > LARGEST)
@@ -93,7 +93,7 @@ def _cell(text: str, where: str) -> float:
             return float(text or "nan")
     except ValueError:
         pass
-    raise StudyError(f"{where}: {shown(str(text))} is no number")
+    raise StudyError(f"{where}: {shown(str(text))} is not a number")
 
 
 def _from_csv(where: Path) -> dict[str, np.ndarray]:
@@ -122,7 +122,7 @@ def _from_hdf5(where: Path, group: str) -> dict[str, np.ndarray]:
     with open_hdf5(where) as file:
         at = file[group] if group else file
         if not isinstance(at, h5py.Group):
-            raise ValueError(f"{group} is no group")
+            raise ValueError(f"{group} is not a group")
         columns = {name: x for name, x in at.items() if isinstance(x, h5py.Dataset)}
         return {
             name: _numbers(np.asarray(x))

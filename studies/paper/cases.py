@@ -1,8 +1,9 @@
 """The cases of the paper's sections 4 and 5, and how they run: two passes of one compiled batch.
 
-First pass: no control. Its modal energies give every controlled case the ratios (24) of its own
-uncontrolled counterpart, as in the paper. Second pass: the controlled cases. They differ only in
-numbers, so one program, compiled once for a fixed number of cases, runs them all.
+First pass: no control. Its modal energies give the controlled cases of section 4 the ratios (24) of
+their own uncontrolled counterparts, as in the paper; section 5 takes the ratios that it prints.
+Second pass: the controlled cases. They differ only in numbers, so one program, compiled once for a
+fixed number of cases, runs all cases of a machine.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.loop import Record
 from jaxmodel.simulate import Result
@@ -22,7 +24,8 @@ from studies.engine.batches import BATCH, Tell, run_batches
 from studies.engine.frame import SharedFrame, frame_of
 from studies.engine.runs import check_run, judged_status, run_study
 from studies.engine.stability import LoopReport, loop_report
-from studies.study.spec import Flags, Study
+from studies.study.files import READY
+from studies.study.spec import Flags, Study, load_study
 
 #: Executor. A kernel would take longer to trace than the scan takes for these few cases
 #: (docs/performance.md).
@@ -30,7 +33,11 @@ EXECUTOR = "XLA scan, with trajectories"
 
 
 #: The paper's move and a faster one that leaves vibration to suppress [s].
-MOVES = {"paper": 0.1, "fast": 0.05}
+MOVES = {"paper": 0.1, "fast": 0.04}
+
+
+#: Move and shaper of the cases that are compared with the paper's numbers, on every machine.
+COMPARED = ("fast", "none")
 
 
 SHAPERS = ("ei", "none")
@@ -39,16 +46,24 @@ SHAPERS = ("ei", "none")
 OFF, ALL, TWO, ONE = (False,) * 3, (True,) * 3, (True, True, False), (True, False, False)
 
 
-#: The paper's velocity gains of mode 1 [N s/m].
-PAPER_GAINS = (3.1, 3.5, 3.4)
-
-
 #: The paper's ratios (26), simulation.
 PAPER_RATIOS = ((1.0, 0.345, 0.045), (1.0, 0.304, 0.041), (1.0, 0.321, 0.038))
 
 
+#: The paper's ratios (27), experiment, two modes.
+EXPERIMENT_RATIOS = ((1.0, 0.312, 0.0), (1.0, 0.412, 0.0), (1.0, 0.355, 0.0))
+
+
 #: Ratios that control only mode 1, as in the paper's comparison experiments.
 FIRST_MODE = ((1.0, 0.0, 0.0),) * 3
+
+
+#: Ratios that do not depend on a run.
+GIVEN_RATIOS = {
+    "paper (26)": PAPER_RATIOS,
+    "paper (27)": EXPERIMENT_RATIOS,
+    "mode 1 only": FIRST_MODE,
+}
 
 
 #: Structural damping that would explain the decay the paper sees without control [1].
@@ -63,11 +78,11 @@ class PaperCase(NamedTuple):
     shaper: str
     modes: int  # modes separated by the modal filter, 3 in section 4, 2 in section 5
     links: Flags = OFF  # controlled
-    ratio_from: str = "none"  # "own run", "paper (26)", "mode 1 only", "none"
-    gain_factor: float = 0.5  # on the paper's gains; the default design has half of them
+    ratio_from: str = "none"  # "own run", a key of GIVEN_RATIOS, "none"
+    gain_factor: float = 1.0  # on the machine's gains
     feedback: str = "sampled"
     estimator: str = "modal_phase"
-    damping_ratio: float = 0.01  # of the links
+    damping_ratio: float | None = None  # of the links; None: the machine's
 
     @property
     def counterpart(self) -> tuple[Any, ...]:
@@ -77,6 +92,11 @@ class PaperCase(NamedTuple):
     @property
     def is_controlled(self) -> bool:
         return any(self.links)
+
+    @property
+    def is_compared(self) -> bool:
+        """With the paper's numbers, on every machine."""
+        return (self.move, self.shaper) == COMPARED and not self.is_extra
 
     @property
     def is_extra(self) -> bool:
@@ -89,17 +109,8 @@ class PaperCase(NamedTuple):
         return "+".join(str(i + 1) for i in range(3) if self.links[i]) or "none"
 
 
-class EnergyRatio(NamedTuple):
-    """Ratios (24) of an uncontrolled run, in one basis."""
-
-    move: str
-    shaper: str
-    basis: str
-    ratio: np.ndarray  # (3, C)
-
-
 class PaperRuns(NamedTuple):
-    """Everything the paper's study computed; leading axis of arrays: cases."""
+    """Everything computed for one machine; leading axis of arrays: cases."""
 
     study: Study
     frame: SharedFrame
@@ -108,7 +119,7 @@ class PaperRuns(NamedTuple):
     status: np.ndarray  # codes; UNSTABLE if the linearised sampled loop is, (n,)
     ratio: np.ndarray  # gains of the modes over that of mode 1 [1], (n, 3, C)
     loops: dict[str, LoopReport]  # by case name, if the loop was linearised
-    energy_ratio: list[EnergyRatio]
+    link_hz: np.ndarray  # frequencies of each link between held ends [Hz], (3, C)
 
     @property
     def record(self) -> Record:
@@ -124,6 +135,11 @@ class PaperRuns(NamedTuple):
         raise KeyError(wanted)
 
 
+def fitted_study() -> Study:
+    """The machine fitted to the paper's measurements, `studies/specs/paper_fitted.toml`."""
+    return load_study(READY / "paper_fitted.toml")
+
+
 def paper_cases() -> list[PaperCase]:
     """All cases, uncontrolled ones first."""
     off, on = [], []
@@ -133,19 +149,20 @@ def paper_cases() -> list[PaperCase]:
                 stem, same = f"{move}-{shaper}-{modes}modes", (move, shaper, modes)
                 off.append(PaperCase(f"{stem}-off", *same))
                 for links, label in ((ALL, "links123"), (TWO, "links12"), (ONE, "links1")):
-                    is_comparison = modes == 2 and links != ALL
-                    source = "mode 1 only" if is_comparison else "own run"
+                    experiment = "paper (27)" if links == ALL else "mode 1 only"
+                    source = "own run" if modes == 3 else experiment
                     on.append(PaperCase(f"{stem}-{label}", *same, links, source))
     off.append(PaperCase("damped-off", "fast", "none", 3, damping_ratio=HIGH_DAMPING))
     fast = partial(PaperCase, move="fast", shaper="none", modes=3, links=ALL)
     on += [
         fast("damped-links123", ratio_from="own run", damping_ratio=HIGH_DAMPING),
-        fast("weak", ratio_from="own run", gain_factor=0.01),
-        fast("paper-gains-own-ratios", ratio_from="own run", gain_factor=1.0),
+        fast("weak", ratio_from="own run", gain_factor=0.02),
+        # the paper's gains are twice the nominal machine's
+        fast("paper-gains-own-ratios", ratio_from="own run", gain_factor=2.0),
         fast("paper-ratios", ratio_from="paper (26)"),
-        fast("paper-preset", ratio_from="paper (26)", gain_factor=1.0),
-        fast("difference", ratio_from="paper (26)", gain_factor=1.0, estimator="difference"),
-        fast("ideal", ratio_from="paper (26)", gain_factor=1.0, feedback="ideal"),
+        fast("paper-preset", ratio_from="paper (26)", gain_factor=2.0),
+        fast("difference", ratio_from="paper (26)", gain_factor=2.0, estimator="difference"),
+        fast("ideal", ratio_from="paper (26)", gain_factor=2.0, feedback="ideal"),
     ]
     return off + on
 
@@ -163,17 +180,17 @@ JUDGED = (
 
 def case_study(base: Study, case: PaperCase, ratio: np.ndarray | None = None) -> Study:
     """The study of one case; ratio (3, C) as in (24), or the paper's."""
+    damping = base.link.damping_ratio if case.damping_ratio is None else case.damping_ratio
     rows = PAPER_RATIOS if ratio is None else tuple(tuple(map(float, row)) for row in ratio)
     return base.change(
         title=case.name,
         motion__move_time=MOVES[case.move],
         shaper__kind=case.shaper,
-        link__damping_ratio=case.damping_ratio,
+        link__damping_ratio=damping,
         control__modes=3,  # upper bound; `build_paper_case` sets how many are separated
         control__links=case.links,
-        control__velocity_gain=PAPER_GAINS,
         control__ratios=rows,
-        control__gain_factor=case.gain_factor,
+        control__gain_factor=case.gain_factor * base.control.gain_factor,
         control__feedback=case.feedback,
         electronics__estimator=case.estimator,
     )
@@ -206,9 +223,8 @@ def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:
     off = [case for case in cases if not case.is_controlled]
     on = [case for case in cases if case.is_controlled and case.feedback == "sampled"]
     ideal = [case for case in cases if case.feedback == "ideal"]
-    # separate programs, compiled on the second core while the first one runs the batches
+    # a program of its own, compiled on the second core while the first one runs the batches
     with ThreadPoolExecutor(1) as side:
-        free = side.submit(_pinned_free_ratios, base, off, tell)
         ideal_runs = [side.submit(_run_ideal, base, case, tell) for case in ideal]
         built = [build_paper_case(base, case) for case in off]
         structure = built[0][0]
@@ -221,11 +237,6 @@ def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:
         results += [run_batches(structure, arrays, tell)] if arrays else []
         loops = _judge(structure, {c.name: a for c, a in zip(on, arrays, strict=True)}, base, tell)
         results += [run.result() for run in ideal_runs]
-        rows = [
-            EnergyRatio(case.move, case.shaper, structure.controller_basis, energy_ratio[k])
-            for k, case in enumerate(off)
-            if case.modes == 3 and not case.is_extra
-        ] + free.result()
     result = jax.tree.map(lambda *x: np.concatenate(x), *results)
     ordered = off + on + ideal
     gains = np.array([*(0 * energy_ratio), *ratios, *(np.array(PAPER_RATIOS) for _ in ideal)])
@@ -241,8 +252,13 @@ def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:
         status=codes,
         ratio=gains,
         loops=loops,
-        energy_ratio=rows,
+        link_hz=np.asarray(_link_hz(structure, built[0][1])),
     )
+
+
+@partial(jax.jit, static_argnums=0)
+def _link_hz(structure: Structure, case: Case) -> Any:
+    return find_bases(structure, case).plant_omega / (2 * jnp.pi)
 
 
 def _run_ideal(base: Study, case: PaperCase, tell: Tell) -> Result:
@@ -256,7 +272,7 @@ def _run_ideal(base: Study, case: PaperCase, tell: Tell) -> Result:
 def _ratio(case: PaperCase, by_counterpart: dict[tuple[Any, ...], np.ndarray]) -> np.ndarray:
     if case.ratio_from == "own run":
         return by_counterpart[case.counterpart]
-    return np.array(PAPER_RATIOS if case.ratio_from == "paper (26)" else FIRST_MODE)
+    return np.array(GIVEN_RATIOS[case.ratio_from])
 
 
 def _judge(
@@ -271,27 +287,9 @@ def _judge(
     return loops
 
 
-def _pinned_free_ratios(base: Study, off: list[PaperCase], tell: Tell) -> list[EnergyRatio]:
-    """Ratios (24) of the unshaped uncontrolled runs in the paper's own coordinates."""
-    rows = []
-    study = base.change(control__basis="pinned_free")
-    for case in _unshaped(off):
-        tell("modal energies in pinned-free coordinates", 0.0)
-        run = run_study(case_study(study, case), has_record=False, has_loop=False)
-        rows.append(
-            EnergyRatio(case.move, case.shaper, "pinned_free", run.result.metrics.energy_ratio)
-        )
-        tell("modal energies in pinned-free coordinates", 1.0)
-    return rows
-
-
-def _unshaped(off: list[PaperCase]) -> list[PaperCase]:
-    return [case for case in off if case.shaper == "none" and case.modes == 3 and not case.is_extra]
-
-
 def work_of(cases: list[PaperCase]) -> int:
     """Number of steps that `run_cases` reports for these cases."""
     off = [case for case in cases if not case.is_controlled]
     ideal = sum(case.feedback == "ideal" for case in cases)
     batches = -(-len(off) // BATCH) - (-(len(cases) - len(off) - ideal) // BATCH)
-    return batches + ideal + len(_unshaped(off)) + sum(case.name in JUDGED for case in cases)
+    return batches + ideal + sum(case.name in JUDGED for case in cases)

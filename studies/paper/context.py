@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from studies.paper.cases import ALL, MOVES, OFF, ONE, SHAPERS, TWO, PaperRuns
+import numpy as np
+
+from studies.paper.cases import ALL, COMPARED, MOVES, OFF, ONE, SHAPERS, TWO, PaperRuns
 from studies.paper.measures import Measures
 
 #: Cases of a comparison: controlled links and heading.
@@ -12,17 +14,20 @@ PLACES = ((ALL, "three links"), (TWO, "first two"), (ONE, "first only"))
 
 
 class Context(NamedTuple):
-    """What every section reads."""
+    """The runs of one machine and what was measured in them."""
 
+    name: str
     runs: PaperRuns
     measures: Measures
 
     def find(self, move: str, shaper: str, modes: int, links: tuple[bool, ...]) -> int:
-        """Index of a case at the default structural damping."""
-        damping = self.runs.study.link.first_damping
-        return self.runs.where(
-            move=move, shaper=shaper, modes=modes, links=links, damping_ratio=damping
-        )
+        """Index of a case of the grid, with the machine's own damping."""
+        wanted = {"move": move, "shaper": shaper, "modes": modes, "links": links}
+        return self.runs.where(**wanted, damping_ratio=None)
+
+    def compared(self, modes: int, links: tuple[bool, ...]) -> int:
+        """Index of a case on the move that is compared with the paper's numbers."""
+        return self.find(*COMPARED, modes, links)
 
     def drop(self, k: int, mode: int) -> str:
         """Change of a mode's spectral peak relative to no control, per link."""
@@ -35,12 +40,19 @@ class Context(NamedTuple):
             (self.find(m, s, 3, OFF), self.find(m, s, 3, ALL), move_text(m, s))
             for m, s in settings()
         ]
-        cases, usual = self.runs.cases, self.runs.study.link.first_damping
-        damped = [k for k, case in enumerate(cases) if case.damping_ratio != usual]
+        cases = self.runs.cases
+        damped = [k for k, case in enumerate(cases) if case.damping_ratio is not None]
         if len(damped) == 2:
             zeta = cases[damped[0]].damping_ratio
             found.append((damped[0], damped[1], f"{move_text('fast', 'none')}, damping {zeta:g}"))
         return found
+
+
+class Machines(NamedTuple):
+    """The machines whose numbers stand beside the paper's."""
+
+    fitted: Context  # to the paper's measurements; its runs are the compared cases
+    nominal: Context  # all cases
 
 
 def change(value: float, reference: float) -> str:
@@ -58,8 +70,12 @@ def settings() -> list[tuple[str, str]]:
     return [(move, shaper) for move in MOVES for shaper in SHAPERS]
 
 
-def residual(context: Context, case: int, link: int) -> str:
-    """Late rms deflection of a link [µm], marked if the converter cannot resolve it."""
-    value = context.measures.late_deflection[case, link]
-    mark = " †" if value < context.runs.frame.adc_step[link] else ""
-    return f"{1e6 * value:.3g}{mark}"
+def residual(context: Context, rms: float, link: int) -> str:
+    """Rms deflection of a link [µm]; of what the converter cannot resolve, only its step."""
+    step = context.runs.frame.adc_step[link]
+    return f"{1e6 * rms:.3g}" if rms >= step else f"< {1e6 * step:.2g}"
+
+
+def residuals(context: Context, rms: np.ndarray) -> str:
+    """`residual` of all links, rms (3,)."""
+    return ", ".join(residual(context, x, i) for i, x in enumerate(rms))

@@ -1,7 +1,8 @@
 """The counterparts of the paper's figures, and the data they show.
 
-Left column: the paper's move with its EI shaper. Right column: the faster move without shaper,
-which leaves vibration for the controller.
+Left column: the machine fitted to the paper's measurements, on its own move. Right column: the
+nominal one, on a move as fast. Neither has a shaper: the paper's own move with its shaper leaves
+the nominal machine nothing to see.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -18,146 +19,142 @@ from matplotlib.figure import Figure
 
 from jaxmodel import shaper
 from studies.paper.cases import ALL, OFF, ONE, TWO, PaperRuns
-from studies.paper.measures import Measures
+from studies.paper.context import Machines
 from studies.show import figures
-from studies.study.consistency import each_link
 
-COLUMNS = (("paper", "ei"), ("fast", "none"))
-TITLES = (r"paper's move, $t_f$ = 0.1 s, EI shaper", r"faster move, $t_f$ = 0.05 s, no shaper")
-#: Duration of the magnified views, from the end of the command [s].
+#: Length of the views after the command [s].
 VIEW_LENGTH = 0.2
-#: They are scaled to the vibration this long after the command, when the drive's transient is
-#: over [s].
-SCALE_DELAY = 0.05
+#: Those of the platform's error begin later, when the drives have settled [s].
+DRIVE_SETTLED = 0.04
+#: Shorter amplitudes than this share of a unit are shown in the next smaller one.
+LEAST = 0.1
+#: Units of axes by SI unit, the larger first, with their size.
+UNITS = {
+    "m": (("µm", 1e-6), ("nm", 1e-9)),
+    "rad": (("µrad", 1e-6), ("nrad", 1e-9)),
+    "V": (("V", 1.0), ("mV", 1e-3)),
+}
 
 
-#: (uncontrolled, controlled) case of each column.
-Pairs = list[tuple[int, int]]
+class Row(NamedTuple):
+    """One row of a figure: a signal of both machines, with and without control."""
+
+    name: str
+    unit: str  # key of UNITS
+    signal: Callable[[PaperRuns], np.ndarray]  # (n, T)
+    is_after: bool = True  # only the view after the command, to its own scale
+    delay: float = 0.0  # with which this view begins [s]
 
 
-def draw_figure(
-    name: str, runs: PaperRuns, measures: Measures, folder: Path, has_pdf: bool
-) -> None:
+def draw_figure(name: str, machines: Machines, folder: Path, has_pdf: bool) -> None:
     """Write one of PAPER_FIGURES into a folder."""
     with figures.styled():
-        figures.save(PAPER_FIGURES[name](runs, measures), folder, name, has_pdf)
+        figures.save(PAPER_FIGURES[name](machines), folder, name, has_pdf)
 
 
-def _pairs(runs: PaperRuns, links: tuple[bool, ...], modes: int) -> Pairs:
-    rows = []
-    for move, kind in COLUMNS:
-        wanted: dict[str, Any] = {"move": move, "shaper": kind, "modes": modes}
-        rows.append((runs.where(**wanted, links=OFF), runs.where(**wanted, links=links)))
-    return rows
-
-
-def _responses(
-    runs: PaperRuns, pairs: Pairs, signal: np.ndarray, labels: list[str], unit: float
-) -> tuple[Figure, np.ndarray]:
-    """Rows of comparisons of signal (n, T, rows), in a unit of this many SI units."""
-    figure, axes = figures.new_figure(len(labels), 2)
-    time = runs.record.time[0]
-    for column, (off, on) in enumerate(pairs):
-        title = TITLES[column] + f"\ncontrolled: links {runs.cases[on].links_text}"
-        axes[0, column].set_title(title)
-        axes[-1, column].set_xlabel("time [s]")
-        for row, label in enumerate(labels):
-            figures.comparison(
-                time,
-                signal[off, :, row] / unit,
-                signal[on, :, row] / unit,
-                label if column == 0 else "",
-                axes[row, column],
-            )
+def _responses(machines: Machines, rows: list[Row], links: tuple[bool, ...], modes: int) -> Figure:
+    figure, axes = figures.new_figure(
+        len(rows), 2, 1.9 if len(rows) <= 3 else 1.4, has_shared_abscissa=False
+    )
+    for column, context in enumerate(machines):
+        pair = context.compared(modes, OFF), context.compared(modes, links)
+        text = context.runs.cases[pair[1]].links_text
+        axes[0, column].set_title(f"{context.name}\ncontrolled: links {text}")
+    for k, row in enumerate(rows):
+        _draw_row(machines, row, links, modes, axes[k])
+        if k + 1 == len(rows) or rows[k + 1].is_after != row.is_after:
+            for ax in axes[k]:
+                ax.set_xlabel("time after the command [ms]" if row.is_after else "time [ms]")
     figures.legend_above(figure, axes[0, 0])
-    return figure, axes
-
-
-def _with_views(
-    runs: PaperRuns, pairs: Pairs, signal: np.ndarray, labels: list[str], unit: float
-) -> Figure:
-    """`_responses` with a magnified view after the command in each of the axes."""
-    figure, axes = _responses(runs, pairs, signal, labels, unit)
-    time = runs.record.time[0]
-    for column, (off, on) in enumerate(pairs):
-        begin = float(runs.result.command_end[off])
-        for row in range(len(labels)):
-            limit = 1.5 * _left_over(runs, (off, on), signal[..., row]) / unit
-            figures.magnified(
-                time,
-                signal[off, :, row] / unit,
-                signal[on, :, row] / unit,
-                (begin, begin + VIEW_LENGTH),
-                limit,
-                axes[row, column],
-            )
     return figure
 
 
-def _left_over(runs: PaperRuns, pair: tuple[int, int], signal: np.ndarray) -> float:
-    """Peak of a signal (n, T) of two cases from SCALE_DELAY after the command on."""
-    time = runs.record.time[0]
-    begin = float(runs.result.command_end[pair[0]]) + SCALE_DELAY
-    return max(float(np.abs(signal[case, time >= begin]).max()) for case in pair)
-
-
-def _deflection(runs: PaperRuns, measures: Measures, links: tuple[bool, ...]) -> Figure:
-    signal = runs.record.chord_deflection_stations[..., _station(runs)]
-    labels = [f"link {i}: deflection\nat 150 mm [µm]" for i in (1, 2, 3)]
-    return _with_views(runs, _pairs(runs, links, 3), signal, labels, 1e-6)
+def _draw_row(
+    machines: Machines, row: Row, links: tuple[bool, ...], modes: int, axes: np.ndarray
+) -> None:
+    curves = []
+    for context in machines:
+        runs, off = context.runs, context.compared(modes, OFF)
+        time, end = runs.record.time[0], float(runs.result.command_end[off])
+        signal, zero = row.signal(runs), end if row.is_after else 0.0
+        shown = (time >= zero + row.delay) & (time <= end + VIEW_LENGTH)
+        pair = (off, context.compared(modes, links))
+        curves.append((time[shown] - zero, [signal[k, shown] for k in pair]))
+    largest = max(float(np.abs(pair).max()) for _, pair in curves)
+    large, small = UNITS[row.unit]
+    unit, size = large if largest >= LEAST * large[1] else small
+    for column, (time, (without, controlled)) in enumerate(curves):
+        label = f"{row.name} [{unit}]" if column == 0 else ""
+        figures.comparison(1e3 * time, without / size, controlled / size, label, axes[column])
 
 
 def _station(runs: PaperRuns) -> int:
     """The station nearest to three quarters of the link."""
-    stations = np.array(runs.study.metrics.stations)
-    return int(np.argmin(np.abs(stations - 0.75 * each_link(runs.study.link.length).mean())))
+    return int(np.argmin(np.abs(np.array(runs.study.metrics.stations) - 0.75)))
 
 
-def _modes(runs: PaperRuns, measures: Measures) -> Figure:
-    q = runs.record.controlled_coordinate[:, :, 0]
-    signal = q * runs.frame.mode_shape[0, _station(runs)]
-    labels = [f"mode {j} of link 1\nat 150 mm [µm]" for j in (1, 2, 3)]
-    return _with_views(runs, _pairs(runs, ALL, 3), signal, labels, 1e-6)
+def _deflection(machines: Machines, links: tuple[bool, ...], is_whole: bool = False) -> Figure:
+    """Deflections after the command; before that those of the whole motion."""
+    rows = [
+        Row(
+            f"link {i + 1}: deflection\nat 150 mm",
+            "m",
+            lambda runs, i=i: runs.record.chord_deflection_stations[:, :, i, _station(runs)],
+            is_after,
+        )
+        for is_after in ((False, True) if is_whole else (True,))
+        for i in range(3)
+    ]
+    return _responses(machines, rows, links, 3)
 
 
-_POSE_LABELS = ["x error [µm]", "y error [µm]", "φ error [µrad]"]
+def _modes(machines: Machines) -> Figure:
+    rows = [
+        Row(
+            f"mode {j + 1} of link 1\nat 150 mm",
+            "m",
+            lambda runs, j=j: (
+                runs.record.controlled_coordinate[:, :, 0, j]
+                * runs.frame.mode_shape[0, _station(runs), j]
+            ),
+        )
+        for j in range(3)
+    ]
+    return _responses(machines, rows, ALL, 3)
 
 
-def _pose(runs: PaperRuns, measures: Measures) -> Figure:
-    signal = runs.record.pose_error
-    return _responses(runs, _pairs(runs, ALL, 3), signal, _POSE_LABELS, 1e-6)[0]
+def _pose(machines: Machines, links: tuple[bool, ...], is_after: bool) -> Figure:
+    delay = DRIVE_SETTLED if is_after else 0.0
+    rows = [
+        Row(
+            f"{name} error", unit, lambda runs, k=k: runs.record.pose_error[..., k], is_after, delay
+        )
+        for k, (name, unit) in enumerate((("x", "m"), ("y", "m"), ("φ", "rad")))
+    ]
+    return _responses(machines, rows, links, 3)
 
 
-def _pose_after(runs: PaperRuns, measures: Measures, links: tuple[bool, ...]) -> Figure:
-    """Pose after the command, scaled to the vibration left once the drive has settled."""
-    signal = runs.record.pose_error
-    pairs = _pairs(runs, links, 3)
-    labels = [label.replace("[µ", "[n") for label in _POSE_LABELS]
-    figure, axes = _responses(runs, pairs, signal, labels, 1e-9)
-    for column, pair in enumerate(pairs):
-        begin = float(runs.result.command_end[pair[0]])
-        for row in range(3):
-            top = 1.3 * _left_over(runs, pair, signal[..., row]) / 1e-9
-            axes[row, column].set_ylim(-top, top)
-            axes[row, column].set_xlim(begin, begin + 2 * VIEW_LENGTH)
-    return figure
+def _sensor(machines: Machines) -> Figure:
+    rows = [
+        Row(
+            f"link {i + 1}: sensor\nat 150 mm",
+            "V",
+            lambda runs, i=i: runs.record.sensor_voltage[:, :, i, -1],
+        )
+        for i in range(3)
+    ]
+    return _responses(machines, rows, ALL, 2)
 
 
-def _sensor(runs: PaperRuns, measures: Measures) -> Figure:
-    signal = runs.record.sensor_voltage[..., -1]
-    labels = [f"link {i}: sensor at\n150 mm [V]" for i in (1, 2, 3)]
-    return _with_views(runs, _pairs(runs, ALL, 2), signal, labels, 1.0)
-
-
-def _spectra(
-    runs: PaperRuns, measures: Measures, mode: int, links: tuple[bool, ...] | None
-) -> Figure:
+def _spectra(machines: Machines, mode: int, links: tuple[bool, ...] | None) -> Figure:
     """Spectra of one mode of the three links; links None: without control only."""
     figure, axes = figures.new_figure(3, 2)
     top = 400.0 if mode == 1 else 800.0
-    shown = measures.frequency <= top
-    for column, (off, on) in enumerate(_pairs(runs, links or ALL, 2)):
-        axes[0, column].set_title(TITLES[column])
+    for column, context in enumerate(machines):
+        measures, on = context.measures, context.compared(2, links or ALL)
+        off, shown = context.compared(2, OFF), measures.frequency <= top
+        text = "" if links is None else f"\ncontrolled: links {context.runs.cases[on].links_text}"
+        axes[0, column].set_title(context.name + text)
         axes[-1, column].set_xlabel("frequency [Hz]")
         for i in range(3):
             density = measures.spectral_density[:, i, mode - 1, shown]
@@ -165,7 +162,7 @@ def _spectra(
                 measures.frequency[shown],
                 density[off],
                 None if links is None else density[on],
-                float(runs.frame.modal_omega[i, mode - 1] / (2 * np.pi)),
+                float(context.runs.link_hz[i, mode - 1]),
                 f"link {i + 1}: PSD of\nmode {mode} [m²/Hz]" if column == 0 else "",
                 axes[i, column],
             )
@@ -191,8 +188,9 @@ def _sensitivity(kinds: Any, ratio: Any, omega: Any, zeta: Any, level: Any) -> A
     return jax.vmap(of)(kinds)
 
 
-def _shapers(runs: PaperRuns, measures: Measures) -> Figure:
-    """Sensitivity curves, and the deflection of link 1 after the faster move."""
+def _shapers(machines: Machines) -> Figure:
+    """Sensitivity curves, and the deflection of link 1 of the nominal machine after a fast move."""
+    runs = machines.nominal.runs
     figure, axes = figures.new_figure(2, 1, 2.6, has_shared_abscissa=False)
     omega, zeta = runs.frame.modal_omega[0, 0], runs.study.shaper.damping_ratio
     level = runs.study.shaper.tolerance
@@ -205,33 +203,33 @@ def _shapers(runs: PaperRuns, measures: Measures) -> Figure:
     time = runs.record.time[0]
     station = _station(runs)
     for k, kind in enumerate(("none", "ei")):
-        case = runs.where(move="fast", shaper=kind, modes=3, links=OFF)
+        case = machines.nominal.find("fast", kind, 3, OFF)
         begin = float(runs.result.command_end[case])
         part = (time >= begin) & (time <= begin + VIEW_LENGTH)
         deflection = runs.record.chord_deflection_stations[case, part, 0, station]
         axes[1, 0].plot(
-            time[part] - begin,
+            1e3 * (time[part] - begin),
             deflection / 1e-6,
             color=figures.SERIES[1 - k],
             linewidth=1.5 - 0.5 * k,
             label={"none": "no shaper", "ei": "EI shaper"}[kind],
         )
-    axes[1, 0].set_xlabel("time after the command [s]")
+    axes[1, 0].set_xlabel("time after the move [ms]")
     axes[1, 0].set_ylabel("link 1: deflection\nat 150 mm [µm]")
     axes[1, 0].legend()
     return figure
 
 
 #: Figures by file name; captions are in `report.md`.
-PAPER_FIGURES: dict[str, Callable[[PaperRuns, Measures], Figure]] = {
-    "fig03": partial(_deflection, links=ALL),
+PAPER_FIGURES: dict[str, Callable[[Machines], Figure]] = {
+    "fig03": partial(_deflection, links=ALL, is_whole=True),
     "fig04": _modes,
-    "fig05": _pose,
-    "fig06": partial(_pose_after, links=ALL),
+    "fig05": partial(_pose, links=ALL, is_after=False),
+    "fig06": partial(_pose, links=ALL, is_after=True),
     "fig07": partial(_deflection, links=ONE),
-    "fig08": partial(_pose_after, links=ONE),
+    "fig08": partial(_pose, links=ONE, is_after=True),
     "fig09": partial(_deflection, links=TWO),
-    "fig10": partial(_pose_after, links=TWO),
+    "fig10": partial(_pose, links=TWO, is_after=True),
     "fig12": _sensor,
     "fig13": partial(_spectra, mode=1, links=None),
     "fig14": partial(_spectra, mode=1, links=ALL),

@@ -9,17 +9,13 @@ from scipy.signal import periodogram
 
 from studies.engine.frame import EARLY_PART
 from studies.paper.cases import PaperRuns
-from studies.study.consistency import each_link
-
-#: The peak of a mode is sought within this fraction of its frequency [1].
-PEAK_SPAN = 0.2
-
 
 #: Spectra are kept up to this frequency [Hz].
 TOP_HZ = 1200.0
 
 
-#: A link has settled when it stays below this share of the residual peak without control [1].
+#: A link has settled when its mid-span stays below this share of its largest deflection after the
+#: command without control [1].
 SETTLED = 0.05
 
 
@@ -28,18 +24,17 @@ class Measures(NamedTuple):
 
     frequency: np.ndarray  # [Hz], (F,)
     spectral_density: np.ndarray  # one-sided, Hann periodogram of the run [m2/Hz], (n, 3, C, F)
-    spectral_peak: np.ndarray  # largest value within PEAK_SPAN of the mode [m2/Hz], (n, 3, C)
+    spectral_peak: np.ndarray  # largest of the metric spectral_density [m2/Hz], (n, 3, C)
     late_start: np.ndarray  # of the late window [s], (n,)
     late_deflection: np.ndarray  # rms mid-span deflection in the late window [m], (n, 3)
     late_pose_error: np.ndarray  # rms [m, m, rad], (n, 3)
-    settling: np.ndarray  # from the command's end to SETTLED of the uncontrolled peak [s], (n, 3)
+    settling: np.ndarray  # of mid-span, from the command's end to SETTLED [s], (n, 3)
     counterpart: np.ndarray  # index of the uncontrolled counterpart, (n,)
 
 
 def middle_station(runs: PaperRuns) -> int:
     """Index of the station nearest to mid-span."""
-    stations = np.array(runs.study.metrics.stations)
-    return int(np.argmin(np.abs(stations - each_link(runs.study.link.length).mean() / 2)))
+    return int(np.argmin(np.abs(np.array(runs.study.metrics.stations) - 0.5)))
 
 
 def measure(runs: PaperRuns) -> Measures:
@@ -55,15 +50,17 @@ def measure(runs: PaperRuns) -> Measures:
     is_late = (time >= start[:, None] - 0.5 / rate) & (time < (end + length)[:, None] - 0.5 / rate)
     deflection = record.chord_deflection_stations[:, :, :, middle_station(runs)]
     counterpart = _counterparts(runs)
-    limit = SETTLED * runs.result.metrics.residual_peak.max(axis=-1)[counterpart]
+    size = np.abs(deflection)
+    is_after = (time >= end[:, None])[..., None]
+    limit = SETTLED * np.max(size, axis=1, where=is_after, initial=0.0)[counterpart]
     return Measures(
         frequency=frequency,
         spectral_density=density,
-        spectral_peak=_peaks(runs, frequency, density),
+        spectral_peak=np.asarray(runs.result.metrics.spectral_density).max(axis=-1),
         late_start=start,
         late_deflection=_rms(deflection, is_late),
         late_pose_error=_rms(record.pose_error, is_late),
-        settling=_settling(time, end, np.abs(record.chord_deflection_stations).max(axis=-1), limit),
+        settling=_settling(time, end, size, limit),
         counterpart=counterpart,
     )
 
@@ -71,12 +68,6 @@ def measure(runs: PaperRuns) -> Measures:
 def _counterparts(runs: PaperRuns) -> np.ndarray:
     off = {case.counterpart: k for k, case in enumerate(runs.cases) if not case.is_controlled}
     return np.array([off[case.counterpart] for case in runs.cases])
-
-
-def _peaks(runs: PaperRuns, frequency: np.ndarray, density: np.ndarray) -> np.ndarray:
-    center = runs.frame.modal_omega / (2 * np.pi)
-    is_near = np.abs(frequency / center[..., None] - 1) <= PEAK_SPAN
-    return np.max(np.where(is_near, density, 0.0), axis=-1)
 
 
 def _rms(signal: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The report of the paper's study: its numbers next to ours, and why they differ.
+"""The report of the paper's study: its numbers next to those of two machines, and why they differ.
 
 The text is in `report.md`; the rows of its tables come from `tables`.
 """
@@ -9,25 +9,30 @@ from typing import Any
 
 import numpy as np
 
+from jaxmodel.prepare import SPECTRUM_SPAN
 from studies.engine.frame import EARLY_PART
 from studies.paper.cases import (
     ALL,
+    EXPERIMENT_RATIOS,
     HIGH_DAMPING,
     MOVES,
     OFF,
-    PAPER_GAINS,
     PAPER_RATIOS,
     TWO,
-    PaperRuns,
 )
-from studies.paper.context import PLACES, Context, change, move_text, settings
+from studies.paper.context import Context, Machines, change
 from studies.paper.figures import PAPER_FIGURES
-from studies.paper.measures import PEAK_SPAN, SETTLED, Measures, middle_station
+from studies.paper.measures import SETTLED
 from studies.paper.tables import (
-    EXPERIMENT_RATIOS,
+    COLUMNS,
+    amplitude_change,
     design_rows,
-    mode_2_rows,
+    energy_ratio,
+    frequency_rows,
+    machine_rows,
+    motion_rows,
     platform_rows,
+    printed_changes,
     ratio_rows,
     settling_rows,
     table_1_rows,
@@ -35,56 +40,61 @@ from studies.paper.tables import (
 from studies.show.markdown import picture
 from studies.show.sketch import CAPTION
 from studies.show.templates import render
-from studies.study.consistency import each_link
 
 
-def report(runs: PaperRuns, measures: Measures) -> str:
+def report(machines: Machines) -> str:
     """Markdown text; its figures are PAPER_FIGURES."""
-    context, study = Context(runs, measures), runs.study
+    fitted, nominal = machines
+    runs, study = nominal.runs, nominal.runs.study
     cases = {case.name: k for k, case in enumerate(runs.cases)}
-    free, held = (context.find("fast", "none", 3, links) for links in (OFF, ALL))
-    settling = 1e3 * measures.settling
     return render(
         "paper/report.md",
-        runs=runs,
+        fitted=fitted.runs.study,
         study=study,
+        machines=machine_rows(machines),
         cases=cases,
         moves=MOVES,
-        bad=[c.name for c, code in zip(runs.cases, runs.status, strict=True) if code],
-        # without control: the paper's move with its shaper and without, the fast one; then with it
-        smooth=context.find("paper", "ei", 3, OFF),
-        slow=context.find("paper", "none", 3, OFF),
-        free=free,
-        held=held,
-        late=1e6 * measures.late_deflection,
+        bad=[
+            f"{case.name} ({context.name})"
+            for context in machines
+            for case, code in zip(context.runs.cases, context.runs.status, strict=True)
+            if code
+        ],
+        # of the nominal machine: without control the paper's move with its shaper and without, the
+        # fast one; then with control
+        smooth=nominal.find("paper", "ei", 3, OFF),
+        slow=nominal.find("paper", "none", 3, OFF),
+        free=nominal.compared(3, OFF),
+        held=nominal.compared(3, ALL),
+        late=1e6 * nominal.measures.late_deflection,
         bent=1e6 * runs.result.metrics.structural_peak.max(axis=2),
-        settling=settling,
-        settling_share=100 * settling[held].max() / max(settling[free].max(), 1e-6),
-        modulus=each_link(study.link.youngs_modulus) / 1e9,
+        damping=np.atleast_1d(fitted.runs.study.link.damping_ratio).tolist(),
         adc_step=1e6 * runs.frame.adc_step,
+        fitted_step=1e6 * fitted.runs.frame.adc_step,
         early=EARLY_PART * study.metrics.residual_length,
-        peak_span=PEAK_SPAN,
+        peak_span=SPECTRUM_SPAN,
         band=f"{1e6 * study.metrics.settling_band:g}",
         settled=f"{100 * SETTLED:g}",
         high_damping=HIGH_DAMPING,
-        second=np.array([row.ratio[:, 1] for row in runs.energy_ratio]),
-        gains=PAPER_GAINS,
+        columns=COLUMNS,
+        weak=study.control.velocity_gain[0] * study.control.gain_factor,
         paper_second=np.array([row[1] for row in (*PAPER_RATIOS, *EXPERIMENT_RATIOS)]),
-        ratios=ratio_rows(context),
-        table_1=table_1_rows(context),
-        mode_2=mode_2_rows(context),
-        settling_rows=settling_rows(context),
-        platform=platform_rows(context),
-        designs=design_rows(context),
-        grown=_grown(context),
-        halved=_halved(context),
-        shaped=_shaped(context),
-        difference=_difference(context, cases),
-        drop=lambda name, mode: context.drop(cases[name], mode),
+        frequencies=frequency_rows(machines),
+        ratios=ratio_rows(machines),
+        table_1=table_1_rows(machines),
+        settling_rows=settling_rows(machines),
+        platform=platform_rows(machines),
+        motions=motion_rows(nominal),
+        designs=design_rows(nominal),
+        agreement=_agreement(fitted),
+        nominal=_agreement(nominal),
+        halved=[(context.name, _halved(context)) for context in machines],
+        shaped=_shaped(nominal),
+        difference=_difference(nominal, cases),
+        ideal_factor=_ideal_factor(nominal, cases),
+        drop=lambda name, mode: nominal.drop(cases[name], mode),
         sketch_caption=CAPTION,
         figure=_figure,
-        **_peaks(context),
-        **_platform(context),
     )
 
 
@@ -92,68 +102,47 @@ def _figure(name: str, caption: str) -> str:
     return picture(f"{name}.png", f"`{name}`: {caption}") if name in PAPER_FIGURES else ""
 
 
-def _peaks(context: Context) -> dict[str, Any]:
-    """Spectral peaks of the faster unshaped move, which leaves vibration to reduce."""
-    peak = context.measures.spectral_peak
-    off = context.find("fast", "none", 2, OFF)
-    controlled: list[float] = []
-    uncontrolled: list[float] = []
-    for links, _ in PLACES:
-        on = context.find("fast", "none", 2, links)
-        for i in range(3):
-            changed = 100 * (peak[on, i, 0] / peak[off, i, 0] - 1)
-            (controlled if links[i] else uncontrolled).append(changed)
-    return {
-        "controlled": controlled,
-        "uncontrolled": uncontrolled,
-        "peak_share": peak[off, :, 1] / peak[off, :, 0],
-        "gain_share": context.runs.ratio[context.find("fast", "none", 2, ALL), :, 1],
+def _agreement(context: Context) -> dict[str, Any]:
+    """How far a machine has the paper's numbers."""
+    measures = context.measures
+    settling = [1e3 * measures.settling[context.compared(2, links)] for links in (OFF, ALL)]
+    changes = {
+        is_controlled: [
+            float(found)
+            for _, links, mode, _ in printed_changes()
+            for found, is_on in zip(amplitude_change(context, links, mode), links, strict=True)
+            if is_on == is_controlled
+        ]
+        for is_controlled in (True, False)
     }
-
-
-def _grown(context: Context) -> list[tuple[str, str, str]]:
-    """Where control increases the rms of the whole window: case, its change, that of the late."""
-    late = context.measures.late_deflection
-    whole = context.runs.result.metrics.residual_rms[:, :, middle_station(context.runs)]
-    return [
-        (
-            f"{text}, link {i + 1}",
-            change(whole[on, i], whole[off, i]),
-            change(late[on, i], late[off, i]),
+    apart = {
+        mode: max(
+            float(np.abs(amplitude_change(context, links, mode) - printed).max())
+            for _, links, of, printed in printed_changes()
+            if of == mode
         )
-        for off, on, text in context.pairs()
-        for i in range(3)
-        if whole[on, i] > whole[off, i]
-    ]
-
-
-def _halved(context: Context) -> list[tuple[str, list[str]]]:
-    """Per move, directions in which two controlled links more than halve the late error."""
-    found = []
-    for move, shaper in settings():
-        off, two = (
-            context.measures.late_pose_error[context.find(move, shaper, 3, links)]
-            for links in (OFF, TWO)
-        )
-        axes = [n for n, x, y in zip("xyφ", two, off, strict=True) if x < 0.5 * y]
-        found.append((move_text(move, shaper), axes))
-    return found
-
-
-def _platform(context: Context) -> dict[str, Any]:
-    """Platform errors of the faster unshaped move, without control and with two links."""
-    off, two = (context.find("fast", "none", 3, links) for links in (OFF, TWO))
-    late, whole = context.measures.late_pose_error, context.runs.result.metrics.pose_error_rms
+        for mode in (1, 2)
+    }
     return {
-        "drive_factor": whole[off, 0] / late[off, 0],
-        "drive_change": change(whole[two, 0], whole[off, 0]),
-        "grown_errors": [
-            f"{n} {change(x, y)}"
-            for n, x, y in zip("xyφ", late[two], late[off], strict=True)
-            if x > y
+        "frequency": context.runs.link_hz.T,
+        "apart": apart,
+        "controlled": changes[True],
+        "uncontrolled": changes[False],
+        "free": settling[0],
+        "held": settling[1],
+        "second": energy_ratio(context)[:, 1],
+        "late": [
+            1e6 * measures.late_deflection[context.compared(3, links)].max() for links in (OFF, ALL)
         ],
-        "largest": 1e9 * late[[off, two]].max(axis=0),
     }
+
+
+def _halved(context: Context) -> list[str]:
+    """Directions in which two controlled links more than halve the late error."""
+    off, two = (
+        context.measures.late_pose_error[context.compared(3, links)] for links in (OFF, TWO)
+    )
+    return [f"{n} ({change(x, y)})" for n, x, y in zip("xyφ", two, off, strict=True) if x < 0.5 * y]
 
 
 def _shaped(context: Context) -> list[float]:
@@ -176,3 +165,13 @@ def _difference(context: Context, cases: dict[str, int]) -> dict[str, Any] | Non
         "margin": runs.loops[name].gain_margin,
         "voltage": runs.result.metrics.peak_voltage[cases[name]].max(),
     }
+
+
+def _ideal_factor(context: Context, cases: dict[str, int]) -> float | None:
+    """Late vibration of the sampled loop over that of ideal feedback, None if either is missing."""
+    if not {"ideal", "paper-preset"} <= cases.keys():
+        return None
+    sampled, ideal = (
+        context.measures.late_deflection[cases[name]].max() for name in ("paper-preset", "ideal")
+    )
+    return float(sampled / ideal)

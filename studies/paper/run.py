@@ -1,7 +1,8 @@
 """`studies paper`: the paper's sections 4 and 5 with one command, in one folder.
 
-The folder gets `paper.h5` (all runs), the counterparts of the paper's figures, and the report,
-as Markdown and as a web page.
+Two machines stand beside the paper's numbers: the one fitted to its measurements, and the nominal
+one. The folder gets a file of runs for each, the counterparts of the paper's figures, and the
+report, as Markdown and as a web page.
 """
 
 from __future__ import annotations
@@ -23,10 +24,12 @@ from studies.paper.cases import (
     MOVES,
     PaperCase,
     PaperRuns,
+    fitted_study,
     paper_cases,
     run_cases,
     work_of,
 )
+from studies.paper.context import Context, Machines
 from studies.paper.figures import PAPER_FIGURES, draw_figure
 from studies.paper.measures import Measures, measure, middle_station
 from studies.paper.report import report
@@ -34,10 +37,12 @@ from studies.show.figures import styled, write_figure
 from studies.show.pages import write_report
 from studies.show.sketch import sketch
 from studies.store import Variable, check_target, staged, write_store
-from studies.study.labels import STATUS_LABEL, describe
+from studies.study.labels import STATION_TEXT, STATUS_LABEL, describe
 from studies.study.spec import Study, paper_study
 
-DATA, REPORT = "paper.h5", "report.html"
+REPORT = "report.html"
+#: File of a machine's runs, by its field in `Machines`.
+DATA = {name: f"{name}.h5" for name in Machines._fields}
 
 
 def run_paper(out: str | Path, console: Console | None = None, has_pdf: bool = False) -> None:
@@ -51,23 +56,25 @@ def run_paper(out: str | Path, console: Console | None = None, has_pdf: bool = F
     Raises:
         StudyError: the folder cannot be made or written to.
     """
-    study, console = paper_study(), console or Console(highlight=False, markup=False)
-    write_paper(Path(out), console, study, paper_cases(), has_pdf)
+    console = console or Console(highlight=False, markup=False)
+    write_paper(Path(out), console, fitted_study(), paper_study(), paper_cases(), has_pdf)
 
 
 def write_paper(
     out: Path,
     console: Console,
-    study: Study,
+    fitted: Study,
+    nominal: Study,
     cases: list[PaperCase],
     has_pdf: bool = False,
 ) -> None:
-    """`run_paper` for a chosen machine and choice of cases.
+    """`run_paper` for chosen machines and choice of cases.
 
     Args:
         out: folder.
         console: where progress and the outcome go.
-        study: the machine.
+        fitted: the machine of the measurements, which runs the compared cases.
+        nominal: the machine that runs all cases.
         cases: from `paper_cases`.
         has_pdf: also write the figures as PDF.
 
@@ -77,34 +84,44 @@ def write_paper(
     _open_folder(out)
     columns = (TextColumn("{task.description:<44}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as progress:
-        work = work_of(cases) + 1 + len(PAPER_FIGURES) / 4
+        compared = [case for case in cases if case.is_compared]
+        work = work_of(compared) + work_of(cases) + 1 + len(PAPER_FIGURES) / 4
         task = progress.add_task("starting", total=work)
 
         def tell(text: str, share: float) -> None:
             progress.update(task, description=text, advance=share)
 
-        runs = run_cases(study, cases, tell)
-        measures = measure(runs)
+        machines = Machines(
+            _context("fitted machine", run_cases(fitted, compared, tell)),
+            _context("nominal machine", run_cases(nominal, cases, tell)),
+        )
         try:
-            _write(out, runs, measures, tell, has_pdf)
+            _write(out, machines, tell, has_pdf)
         except OSError as error:
             raise StudyError(f"--out {out}: cannot write there ({error})") from error
         progress.update(task, description="done", completed=work)
-    _print_outcome(out, console, runs)
+    _print_outcome(out, console, machines)
 
 
-def _write(out: Path, runs: PaperRuns, measures: Measures, tell: Tell, has_pdf: bool) -> None:
+def _context(name: str, runs: PaperRuns) -> Context:
+    return Context(name, runs, measure(runs))
+
+
+def _write(out: Path, machines: Machines, tell: Tell, has_pdf: bool) -> None:
     """Write everything elsewhere first, so that an interruption leaves old files intact."""
     with staged(out) as staging:
         tell("writing data", 0.0)
-        write_store(staging / DATA, paper_variables(runs, measures), run_attributes(runs.study))
+        for file, context in zip(DATA.values(), machines, strict=True):
+            variables = paper_variables(context.runs, context.measures)
+            write_store(staging / file, variables, run_attributes(context.runs.study))
         tell("writing data", 1.0)
         for name in PAPER_FIGURES:
             tell(f"drawing {name}", 0.25)
-            draw_figure(name, runs, measures, staging, has_pdf)
+            draw_figure(name, machines, staging, has_pdf)
+        study = machines.nominal.runs.study
         with styled():
-            write_figure(sketch(runs.study), staging / "machine.png")
-        write_report(staging, report(runs, measures), runs.study)
+            write_figure(sketch(study), staging / "machine.png")
+        write_report(staging, report(machines), study)
 
 
 def _open_folder(out: Path) -> None:
@@ -118,22 +135,24 @@ def _open_folder(out: Path) -> None:
             f"--out {out}: cannot make this folder ({error.strerror}); name one in a place "
             "that can be written to"
         ) from None
-    check_target(out / DATA)
+    for file in DATA.values():
+        check_target(out / file)
 
 
-def _print_outcome(out: Path, console: Console, runs: PaperRuns) -> None:
-    table = Table(Column("case", no_wrap=True), "links", "modes", "status")
-    for case, code in zip(runs.cases, runs.status, strict=True):
-        table.add_row(case.name, case.links_text, str(case.modes), describe(int(code)))
+def _print_outcome(out: Path, console: Console, machines: Machines) -> None:
+    table = Table("machine", Column("case", no_wrap=True), "links", "modes", "status")
+    for name, context in zip(Machines._fields, machines, strict=True):
+        for case, code in zip(context.runs.cases, context.runs.status, strict=True):
+            table.add_row(name, case.name, case.links_text, str(case.modes), describe(int(code)))
     console.print(table)
     console.print(f"executor: {EXECUTOR}")
     console.print(f"report:  {out / REPORT}")
     console.print(f"figures: {out}{os.sep}*.png")
-    console.print(f"data:    {out / DATA}")
+    console.print(f"data:    {', '.join(str(out / file) for file in DATA.values())}")
 
 
 def paper_variables(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
-    """All variables of `paper.h5`; the first axis is `case`.
+    """All variables of a machine's file; the first axis is `case`.
 
     Args:
         runs: from `run_cases`.
@@ -150,13 +169,15 @@ def paper_variables(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
     result, per_case = runs.result, ("case",)
     return {
         **_axes(runs, measures),
-        **_case_labels(runs.cases),
+        **_case_labels(runs),
         "status": Variable(runs.status, per_case, *STATUS_LABEL),
         "status_text": Variable(
             np.array([describe(int(k)) for k in runs.status]), per_case, "1", "status in words"
         ),
         "bad_time": Variable(result.bad_time, per_case, "s", "when the status appeared, 0 if ok"),
-        "command_end": Variable(result.command_end, per_case, "s", "end of the shaped command"),
+        "command_end": Variable(
+            result.command_end, per_case, "s", "end of the shaped reference trajectory"
+        ),
         **metrics,
         **_measured(runs, measures),
         **_trajectories(runs),
@@ -171,9 +192,7 @@ def _axes(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
         "case": Variable(names, ("case",), "1", "name of the case"),
         "time": Variable(runs.record.time[0], ("time",), "s", "time"),
         "link": Variable(np.arange(1, 4), ("link",), "1", "link number"),
-        "station": Variable(
-            np.array(runs.study.metrics.stations), ("station",), "m", "position along the link"
-        ),
+        "station": Variable(np.array(runs.study.metrics.stations), ("station",), "1", STATION_TEXT),
         "patch": Variable(np.arange(1, 4), ("patch",), "1", "patch pair, from the slider on"),
         "controlled_mode": Variable(
             np.arange(1, count + 1), ("controlled_mode",), "1", "mode of the controller"
@@ -183,7 +202,9 @@ def _axes(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
     }
 
 
-def _case_labels(cases: list[PaperCase]) -> dict[str, Variable]:
+def _case_labels(runs: PaperRuns) -> dict[str, Variable]:
+    cases = runs.cases
+
     def label(values: list[Any], unit: str, text: str) -> Variable:
         return Variable(np.array(values), ("case",), unit, text)
 
@@ -194,31 +215,22 @@ def _case_labels(cases: list[PaperCase]) -> dict[str, Variable]:
         "controlled_links": label([c.links_text for c in cases], "1", "links under control"),
         "controlled_modes": label([c.modes for c in cases], "1", "modes separated by the filter"),
         "ratio_from": label([c.ratio_from for c in cases], "1", "where the gain ratios come from"),
-        "gain_factor": label([c.gain_factor for c in cases], "1", "factor on the paper's gains"),
+        "gain_factor": label([c.gain_factor for c in cases], "1", "factor on the machine's gains"),
         "feedback": label([c.feedback for c in cases], "1", "sampled or ideal feedback"),
         "estimator": label([c.estimator for c in cases], "1", "velocity estimate"),
-        "damping_ratio": label([c.damping_ratio for c in cases], "1", "structural damping"),
+        "damping_ratio": label(
+            [c.damping_ratio or runs.study.link.first_damping for c in cases],
+            "1",
+            "structural damping of mode 1",
+        ),
     }
 
 
 def _measured(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
     modal = ("case", "link", "controlled_mode")
-    rows = runs.energy_ratio
     return {
         "gain_ratio": Variable(
             runs.ratio, modal, "1", "gain of a mode over that of mode 1 (24); 0 without control"
-        ),
-        "energy_ratio": Variable(
-            np.array([row.ratio for row in rows]),
-            ("energy_run", *modal[1:]),
-            "1",
-            "ratios (24) from the modal energies of an uncontrolled run",
-        ),
-        "energy_run": Variable(
-            np.array([f"{r.move}-{r.shaper}-{r.basis}" for r in rows]),
-            ("energy_run",),
-            "1",
-            "move, shaper and modal coordinates of energy_ratio",
         ),
         "spectral_density": Variable(
             _separated(runs, measures.spectral_density),
@@ -247,7 +259,8 @@ def _measured(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
             measures.settling,
             modal[:2],
             "s",
-            "from the command's end to 5 % of the residual peak without control",
+            "of mid-span from the end of the reference trajectory to 5 % of its peak without "
+            "control",
         ),
     }
 
@@ -279,7 +292,7 @@ def _trajectories(runs: PaperRuns) -> dict[str, Variable]:
             "deflection relative to the chord B-C at the stations",
         ),
         "pose_error": Variable(
-            record.pose_error, (*series, "pose_axis"), "m; m; rad", "pose minus shaped command"
+            record.pose_error, (*series, "pose_axis"), "m; m; rad", "pose minus shaped reference"
         ),
         "controlled_coordinate": Variable(
             modal,

@@ -1,87 +1,215 @@
-"""Rows of the tables in the paper's report: our numbers next to the paper's.
+"""Rows of the tables in the paper's report.
 
-Our numbers come from the runs; the paper's are constants in this file.
+Our numbers come from the runs; the paper's are constants. In the comparing tables, each row is one
+number of the paper, and COLUMNS say whose it is.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 
-from studies.paper.cases import ALL, OFF, PAPER_RATIOS
-from studies.paper.context import PLACES, Context, change, move_text, residual, settings
+from studies.paper.cases import ALL, COMPARED, EXPERIMENT_RATIOS, MOVES, OFF, PAPER_RATIOS
+from studies.paper.context import PLACES, Context, Machines, change, residual, residuals
 from studies.paper.measures import middle_station
+from studies.show.units import count_text
+from studies.study.consistency import each_link
 from studies.study.labels import describe
 from studies.study.printed import TABLE_1
 
-#: (27), experiment, two modes.
-EXPERIMENT_RATIOS = ((1.0, 0.312), (1.0, 0.412), (1.0, 0.355))
+#: Columns of every comparison with the paper.
+COLUMNS = ("", "paper", "fitted machine", "nominal machine")
+
+
+#: Frequencies of a link, measured [Hz].
+FREQUENCIES = (92.5, 241.3)
 
 
 #: Change of the PSD of mode 2 with three links controlled [%].
 MODE_2 = (-48.33, -49.62, -52.21)
 
 
-def ratio_rows(context: Context) -> list[list[str]]:
-    """Gain ratios of efficient modal control, per link."""
-    rows: list[tuple[str, Any]] = [
-        ("paper (26), simulation", PAPER_RATIOS),
-        ("paper (27), experiment", EXPERIMENT_RATIOS),
-        *(
-            (f"ours, {move_text(row.move, row.shaper)}, {row.basis}", row.ratio)
-            for row in context.runs.energy_ratio
-        ),
-    ]
+#: What the paper says of the platform's error after the command, by place.
+PLATFORM = ("damped fast", "by more than -50 %", "limited effect")
+
+
+def _row(name: str, paper: str, machines: Machines, number: Callable[[Context], str]) -> list[str]:
+    return [name, paper, *(number(context) for context in machines)]
+
+
+def machine_rows(machines: Machines) -> list[list[str]]:
+    """What the machines are, and how they move."""
+
+    def cells(context: Context) -> list[str]:
+        study = context.runs.study
+        gains = study.control.gain_factor * np.array(study.control.velocity_gain)
+        n_moves = len(study.motion.waypoints) - 1
+        return [
+            _listed(each_link(study.link.youngs_modulus) / 1e9),
+            f"{study.link.joint_inertia_c:.3g}",
+            _listed(np.atleast_1d(study.link.damping_ratio), ".2g"),
+            f"{study.drive.kp:.3g}, {study.drive.kd:.3g}",
+            f"{study.link.modes}, {study.link.basis}",
+            study.control.basis,
+            _listed(gains, ".2g"),
+            f"{count_text(n_moves, 'move')} of 10 mm in {MOVES[COMPARED[0]]:g} s, no shaper",
+            str(len(context.runs.cases)),
+        ]
+
+    names = (
+        "Young's modulus, links 1, 2, 3 [GPa]",
+        "inertia at the platform's joints [kg m²]",
+        "damping ratio, by mode (the last for all higher ones)",
+        "slider drive, Kp [N/m], Kd [N s/m]",
+        "modes per link, basis",
+        "controller's basis",
+        "gains of mode 1, links 1, 2, 3 [N s/m]",
+        "compared motion",
+        "runs",
+    )
+    return [list(row) for row in zip(names, *(cells(x) for x in machines), strict=True)]
+
+
+def frequency_rows(machines: Machines) -> list[list[str]]:
+    """Frequencies of the links between held ends."""
     return [
-        [name, *(" : ".join(f"{x:.3g}" for x in link) for link in ratio)] for name, ratio in rows
-    ]
-
-
-def table_1_rows(context: Context) -> list[list[str]]:
-    """Spectral peaks of mode 1: without control, with `PLACES`, and the late residual."""
-    rows = [
-        [f"paper, link {i + 1} (no unit)", f"{values[0]:.2f}"]
-        + [f"{v:.2f} ({100 * (v / values[0] - 1):+.2f} %)" for v in values[1:]]
-        + ["not given"]
-        for i, values in enumerate(TABLE_1)
-    ]
-    for move, shaper in settings():
-        off = context.find(move, shaper, 2, OFF)
-        for i in range(3):
-            reference = context.measures.spectral_peak[off, i, 0]
-            row = [f"ours, {move_text(move, shaper)}: link {i + 1}", f"{reference:.3g}"]
-            for links, _ in PLACES:
-                on = context.measures.spectral_peak[context.find(move, shaper, 2, links), i, 0]
-                row.append(f"{on:.3g} ({change(on, reference)})")
-            rows.append([*row, residual(context, off, i)])
-    return rows
-
-
-def mode_2_rows(context: Context) -> list[list[str]]:
-    """Spectral peaks of mode 2, per link."""
-    rows = [["paper, three links", *(f"{value:+.2f} %" for value in MODE_2)]]
-    for move, shaper in settings():
-        off, on = (
-            context.measures.spectral_peak[context.find(move, shaper, 2, links), :, 1]
-            for links in (OFF, ALL)
+        _row(
+            f"mode {mode + 1}, links 1, 2, 3 [Hz]",
+            f"{measured:g}",
+            machines,
+            lambda context, mode=mode: _listed(context.runs.link_hz[:, mode], ".1f"),
         )
-        cells = [f"{a:.3g} → {b:.3g} m²/Hz ({change(b, a)})" for a, b in zip(off, on, strict=True)]
-        rows.append([f"ours, {move_text(move, shaper)}", *cells])
+        for mode, measured in enumerate(FREQUENCIES)
+    ]
+
+
+def ratio_rows(machines: Machines) -> list[list[str]]:
+    """Ratios (24) of modes 2 and 3, links 1, 2, 3."""
+    printed = (
+        ("(26), simulation: mode 2", PAPER_RATIOS, 1),
+        ("(27), experiment: mode 2", EXPERIMENT_RATIOS, 1),
+        ("(26), simulation: mode 3", PAPER_RATIOS, 2),
+    )
+    return [
+        _row(
+            f"{name}, links 1, 2, 3",
+            _listed([link[mode] for link in rows]),
+            machines,
+            lambda context, mode=mode: _listed(energy_ratio(context)[:, mode]),
+        )
+        for name, rows, mode in printed
+    ]
+
+
+def energy_ratio(context: Context) -> np.ndarray:
+    """Ratios (24) of the compared move without control, (3, C)."""
+    off = context.compared(3, OFF)
+    return np.asarray(context.runs.result.metrics.energy_ratio[off])
+
+
+def amplitude_change(context: Context, links: tuple[bool, ...], mode: int) -> np.ndarray:
+    """Change of a mode's spectral peak, as an amplitude, on the compared move [%], (3,)."""
+    peak = context.measures.spectral_peak[:, :, mode - 1]
+    off, on = context.compared(2, OFF), context.compared(2, links)
+    return 100 * (np.sqrt(peak[on] / peak[off]) - 1)
+
+
+def printed_changes() -> list[tuple[str, tuple[bool, ...], int, np.ndarray]]:
+    """Changes that the paper prints [%], (3,): heading, controlled links, mode."""
+    table = np.array(TABLE_1)
+    percent = 100 * (table[:, 1:] / table[:, :1] - 1)
+    table_1 = [
+        (f"mode 1, {text}", links, 1, percent[:, k]) for k, (links, text) in enumerate(PLACES)
+    ]
+    return [*table_1, ("mode 2, three links", ALL, 2, np.array(MODE_2))]
+
+
+def table_1_rows(machines: Machines) -> list[list[str]]:
+    """Changes of the spectral peaks by control, links 1 to 3; last those of mode 2."""
+    return [
+        _row(
+            f"{text}: link {i + 1}",
+            f"{printed[i]:+.2f} %",
+            machines,
+            lambda context, links=links, mode=mode, i=i: (
+                f"{amplitude_change(context, links, mode)[i]:+.1f} %"
+            ),
+        )
+        for text, links, mode, printed in printed_changes()
+        for i in range(3)
+    ]
+
+
+def settling_rows(machines: Machines) -> list[list[str]]:
+    """Settling times and residual vibration of links 1, 2, 3, with and without control."""
+    rows = []
+    for links, control, paper in ((OFF, "no control", "about 140"), (ALL, "three links", "70")):
+        rows.append(
+            _row(
+                f"settling time, {control} [ms]",
+                paper,
+                machines,
+                lambda context, links=links: _listed(
+                    1e3 * context.measures.settling[context.compared(2, links)], ".0f"
+                ),
+            )
+        )
+    for links, control in ((OFF, "no control"), (ALL, "three links")):
+        rows.append(
+            _row(
+                f"late rms, {control} [µm]",
+                "not given",
+                machines,
+                lambda context, links=links: residuals(
+                    context, context.measures.late_deflection[context.compared(2, links)]
+                ),
+            )
+        )
     return rows
 
 
-def settling_rows(context: Context) -> list[list[str]]:
-    """Settling times and residual vibration of each pair, with and without control."""
+def platform_rows(machines: Machines) -> list[list[str]]:
+    """Platform errors of the late window without control, and their change by control."""
+
+    def error(context: Context, links: tuple[bool, ...]) -> np.ndarray:
+        return context.measures.late_pose_error[context.compared(3, links)]
+
+    rows = [
+        _row(
+            "no control: x [nm], y [nm], φ [nrad]",
+            "not given",
+            machines,
+            lambda context: _listed(1e9 * error(context, OFF)),
+        )
+    ]
+    for (links, text), paper in zip(PLACES, PLATFORM, strict=True):
+        rows.append(
+            _row(
+                f"{text}: x, y, φ",
+                paper,
+                machines,
+                lambda context, links=links: ", ".join(
+                    change(x, y)
+                    for x, y in zip(error(context, links), error(context, OFF), strict=True)
+                ),
+            )
+        )
+    return rows
+
+
+def motion_rows(context: Context) -> list[list[str]]:
+    """What each motion of a machine leaves, with and without control, links 1, 2, 3."""
 
     def cells(k: int) -> list[str]:
         metrics = context.runs.result.metrics
         rms = metrics.residual_rms[k][:, middle_station(context.runs)]
         return [
-            ", ".join(f"{1e3 * t:.0f}" for t in metrics.settling_time[k]),
-            ", ".join(f"{1e3 * t:.0f}" for t in context.measures.settling[k]),
-            ", ".join(f"{1e6 * r:.3g}" for r in rms),
-            ", ".join(residual(context, k, i) for i in range(3)),
+            _listed(1e6 * metrics.structural_peak[k].max(axis=-1)),
+            residuals(context, rms),
+            residuals(context, context.measures.late_deflection[k]),
+            _listed(1e3 * metrics.settling_time[k], ".0f"),
+            _listed(1e3 * context.measures.settling[k], ".0f"),
         ]
 
     return [
@@ -89,27 +217,6 @@ def settling_rows(context: Context) -> list[list[str]]:
         for off, on, text in context.pairs()
         for k, control in ((off, "no control"), (on, "three links"))
     ]
-
-
-def platform_rows(context: Context) -> list[list[str]]:
-    """Platform errors of the late window, then of the whole one."""
-    runs, measures = context.runs, context.measures
-    error = np.hstack([measures.late_pose_error, runs.result.metrics.pose_error_rms])
-    rows = []
-    for move, shaper in settings():
-        off = context.find(move, shaper, 3, OFF)
-        is_hidden = np.all(measures.late_deflection[off] < runs.frame.adc_step)
-        rows.append(
-            [f"{move_text(move, shaper)}: no control", *(f"{1e9 * x:.3g}" for x in error[off])]
-        )
-        for links, text in PLACES:
-            on = context.find(move, shaper, 3, links)
-            pairs = zip(error[on], error[off], strict=True)
-            cells = [f"{1e9 * x:.3g} ({change(x, y)})" for x, y in pairs]
-            if is_hidden:
-                cells[:3] = [f"{cell} †" for cell in cells[:3]]
-            rows.append([f"{move_text(move, shaper)}: {text}", *cells])
-    return rows
 
 
 def design_rows(context: Context) -> list[list[str]]:
@@ -134,8 +241,17 @@ def design_rows(context: Context) -> list[list[str]]:
                 margin,
                 zeta,
                 context.drop(k, mode=1),
-                f"{1e6 * context.measures.late_deflection[k].max():.3g}",
+                residual(context, *_worst(context.measures.late_deflection[k])),
                 f"{runs.result.metrics.peak_voltage[k].max():.3g}",
             ]
         )
     return rows
+
+
+def _worst(values: np.ndarray) -> tuple[float, int]:
+    """The largest value and its place."""
+    return float(values.max()), int(values.argmax())
+
+
+def _listed(values: np.ndarray | list[float], digits: str = ".3g") -> str:
+    return ", ".join(f"{value:{digits}}" for value in values)

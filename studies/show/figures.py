@@ -2,6 +2,9 @@
 
 They only convert units. The colours of Okabe and Ito are distinguishable for colour-blind readers;
 in greyscale, the two curves of a comparison differ in lightness and width.
+
+A page shows a figure of `WIDTH` at most 60 rem wide, and on a phone 40 rem wide in a box that
+scrolls, where text of `SMALL` has 9.6 pixels: no figure has smaller text or is wider.
 """
 
 from __future__ import annotations
@@ -20,6 +23,8 @@ from studies.store import replacing
 
 WITHOUT: dict[str, Any] = {"color": "#E69F00", "linewidth": 1.6, "label": "without control"}
 CONTROLLED: dict[str, Any] = {"color": "#0B3C6F", "linewidth": 0.8, "label": "with control"}
+#: Width of a figure [inch], and its smallest text [pt].
+WIDTH, SMALL = 7.4, 8.0
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000")
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)))
 
@@ -34,7 +39,7 @@ STYLE: dict[str, Any] = {
     "grid.color": "#DDDDDD",
     "grid.linewidth": 0.5,
     "legend.frameon": False,
-    "legend.fontsize": 8,
+    "legend.fontsize": SMALL,
     "lines.solid_joinstyle": "round",
     "figure.dpi": 100,
     "savefig.dpi": 150,
@@ -51,17 +56,23 @@ def new_figure(
     rows: int, columns: int, row_height: float = 1.9, has_shared_abscissa: bool = True
 ) -> tuple[Figure, np.ndarray]:
     """Figure of the printed page's width with its axes, (rows, columns); row_height in inches."""
-    figure = Figure(figsize=(7.4, 0.75 + row_height * rows), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 0.75 + row_height * rows), layout="constrained")
     axes = figure.subplots(
         rows, columns, squeeze=False, sharex="col" if has_shared_abscissa else "none"
     )
     return figure, axes
 
 
-def legend_above(figure: Figure, ax: Axes) -> None:
-    """One legend for the whole figure, with the entries of `ax`."""
-    handles, labels = ax.get_legend_handles_labels()
+def legend_above(figure: Figure, *axes: Axes) -> None:
+    """One legend for the whole figure, with the entries of these axes."""
+    entries = [entry for ax in axes for entry in zip(*ax.get_legend_handles_labels(), strict=True)]
+    handles, labels = ([entry[k] for entry in entries] for k in range(2))
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+
+
+def legend_beside(ax: Axes, **style: Any) -> None:
+    """The legend of `ax` to the right of it, where it covers nothing."""
+    ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, **style)
 
 
 def save(figure: Figure, folder: Path, name: str, has_pdf: bool = False) -> None:
@@ -79,7 +90,7 @@ def save(figure: Figure, folder: Path, name: str, has_pdf: bool = False) -> None
 def write_figure(figure: Figure, path: Path) -> None:
     """Write the figure in the format of its file extension; errors as `save`."""
     with replacing(path) as temporary:
-        figure.savefig(temporary, format=path.suffix[1:])
+        figure.savefig(temporary, format=path.suffix[1:], dpi=STYLE["savefig.dpi"])
 
 
 def log_scale(ax: Axes, which: str) -> None:
@@ -170,7 +181,7 @@ def magnified(
     inset.plot(time[part], controlled[part], **CONTROLLED | {"linewidth": 0.6})
     inset.set_xlim(span)
     inset.set_ylim(-limit, limit)
-    inset.tick_params(labelsize=6.5, length=2, pad=1.5)
+    inset.tick_params(labelsize=SMALL, length=2, pad=1.5)
     inset.locator_params(nbins=3, axis="y")
     inset.locator_params(nbins=4, axis="x")
     return inset
@@ -221,5 +232,5 @@ def sensitivity(
         ax.plot(ratio, 100 * curve, color=SERIES[k], linestyle=DASHES[k], linewidth=1.3, label=name)
     ax.set_xlabel("actual over assumed frequency [1]")
     ax.set_ylabel("residual vibration [%]")
-    ax.legend()
+    legend_beside(ax)
     return ax

@@ -27,6 +27,10 @@ from studies.study.template import study_template
 
 _PARSER = MarkdownIt("commonmark", {"html": False, "xhtmlOut": False}).enable("table")
 
+#: Where a name in a table may go on in the next line.
+_JOINT = re.compile(r"(?<=[A-Za-z][_./])(?=\w)|(?<=\w)(?=\[)")
+#: Images with more pixels than this across keep a readable width on a narrow screen.
+WIDE = 550
 #: Heading level of sections.
 HEADING = ("heading_open", "h2")
 
@@ -82,8 +86,10 @@ def _anchor(title: str) -> str:
 def _arranged(tokens: list[Token], images: Mapping[str, bytes]) -> list[Token]:
     """Put tables into scrolling boxes, and turn paragraphs with one image into figures."""
     arranged: list[Token] = []
+    is_table = False
     for k, token in enumerate(tokens):
         if token.type == "table_open":
+            is_table = True
             arranged.append(Token("box_open", "div", 1, {"class": "table"}, block=True))
         inside = token.children or []
         if [child.type for child in inside] == ["image"]:
@@ -100,15 +106,28 @@ def _arranged(tokens: list[Token], images: Mapping[str, bytes]) -> list[Token]:
                 if _is_wide(images[name]):
                     child.attrSet("class", "wide")
         arranged.append(token)
+        if is_table and token.children:
+            token.children = [part for child in token.children for part in _breakable(child)]
         if token.type == "table_close":
+            is_table = False
             arranged.append(Token("box_close", "div", -1, block=True))
     return arranged
 
 
+def _breakable(token: Token) -> list[Token]:
+    """A text with places to break long names, so that a table of many columns fits the page."""
+    if token.type != "text":
+        return [token]
+    parts = [Token("text", "", 0, content=part) for part in _JOINT.split(token.content)]
+    wbr = Token("html_inline", "", 0, content="<wbr>")
+    return [parts[0], *(x for part in parts[1:] for x in (wbr, part))]
+
+
 def _is_wide(image: bytes) -> bool:
-    """Whether a PNG has panels side by side, too small to read if a narrow screen shrinks them."""
-    width, height = (int.from_bytes(image[k : k + 4], "big") for k in (16, 20))
-    return image.startswith(b"\x89PNG") and width > 1.5 * height
+    """Whether an image is as wide as a page: too small to read if a narrow screen shrinks it."""
+    is_png = image.startswith(b"\x89PNG")
+    width = int.from_bytes(image[16:20], "big") if is_png else int.from_bytes(image[6:8], "little")
+    return width > WIDE
 
 
 def _data_uri(name: str, images: Mapping[str, bytes]) -> str:

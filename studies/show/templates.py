@@ -21,7 +21,7 @@ from studies.show.markdown import literal, picture, table
 from studies.show.units import count_text, headed, number, span
 from studies.study.entries import links_text
 from studies.study.labels import describe
-from studies.study.margin import margin_text
+from studies.study.margin import margin_in_db
 
 _ROOT = Path(__file__).parents[1]
 #: Lines of Markdown with these beginnings stand alone.
@@ -38,17 +38,23 @@ def _percent(share: float, digits: int = 3) -> str:
     return f"{100 * share:.{digits}g} %"
 
 
+def _change(after: float, before: float) -> str:
+    """A relative change in percent."""
+    return f"{100 * (after / before - 1):+.3g} %"
+
+
 #: How templates write values: `{{ value | name }}`.
 FILTERS: dict[str, Callable[..., str]] = {
     "short": _short,
     "percent": _percent,
+    "change": _change,
     "number": number,
     "count": count_text,
     "headed": headed,
     "span": span,
     "links": links_text,
     "literal": literal,
-    "margin": margin_text,
+    "margin": margin_in_db,
     "status": describe,
 }
 

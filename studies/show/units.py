@@ -35,7 +35,7 @@ def settling_text(seconds: float, watched: float) -> str:
     """A settling time [ms], or that it was not seen.
 
     Args:
-        seconds: from the end of the command to the last time outside the band.
+        seconds: from the end of the reference trajectory to the last time outside the band.
         watched: from there to the end of the run [s].
     """
     if seconds > 0 and seconds > watched - CALM:

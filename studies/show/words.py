@@ -23,7 +23,7 @@ def motion_text(study: Study) -> str:
         shaper = "no shaper" if study.shaper.kind == "none" else f"shaper {study.shaper.kind}"
         moves = f"{count} move{'s' if count > 1 else ''} of {'up to ' if count > 1 else ''}"
         told = f"{moves}{longest:.4g} mm in {span} ms{' each' if count > 1 else ''}, {shaper}"
-    blows = [
+    disturbances = [
         f"a pulse of {', '.join(f'{x:g}' for x in force)} {unit} on the {where}"
         for force, unit, where in (
             (drive.pulse_force, "N", "sliders"),
@@ -32,10 +32,10 @@ def motion_text(study: Study) -> str:
         if any(force)
     ]
     if drive.ripple:
-        blows.append(f"force ripple of {drive.ripple:g} N rms")
+        disturbances.append(f"force ripple of {drive.ripple:g} N rms")
     if any(study.initial.load_deflection) or any(map(any, study.initial.modal)):
-        blows.append("links bent at the start")
-    return ", ".join([told, *blows])
+        disturbances.append("links bent at the start")
+    return ", ".join([told, *disturbances])
 
 
 def control_text(study: Study) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -32,7 +33,19 @@ from studies.study.margin import ENOUGH, MARGIN_MODES, caution
 
 #: Figures, by the end of the file name.
 FIGURES = ("deflection", "error", "voltage", "machine")
-_FREE = "without control"
+#: What a run means, by its situation.
+VERDICTS = {
+    "stopped": "the run stopped",
+    "margin": "too little margin for a machine",
+    "uncontrolled": "nothing is controlled",
+    "calm": "hardly anything to suppress",
+    "worse": "**control makes it worse**",
+    "well": "control works",
+}
+#: Settling later than without control is pointed out from this share on [1].
+LATER = 0.02
+#: Grey of the residual window and of markers.
+GREY = "#888888"
 _POSE = ("x [µm]", "y [µm]", "φ [µrad]")
 
 
@@ -90,7 +103,7 @@ def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str], name: st
     """Markdown text; arguments of `write_results`, and the same run without control."""
     result, study = run.result, run.study
     worst = int(np.argmax(np.nan_to_num(result.metrics.residual_rms.max(axis=1), nan=-1.0)))
-    has_free = twin is not None and twin.status in status.FINISHED
+    free = twin if twin is not None and twin.status in status.FINISHED else None
     return render(
         "single/report.md",
         run=run,
@@ -106,14 +119,18 @@ def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str], name: st
         is_finished=run.status in status.FINISHED,
         worst=worst,
         rms=result.metrics.residual_rms.max(axis=1),
-        free_rms=twin.result.metrics.residual_rms.max(axis=1) if twin and has_free else None,
+        free_rms=free.result.metrics.residual_rms.max(axis=1) if free else None,
         settled=[settling_text(run, link) for link in range(3)],
+        free_settled=[settling_text(free, link) for link in range(3)] if free else [],
+        later=_later(run, free, worst) if free else "",
+        verdict=VERDICTS,
         caution=caution(run.loop.gain_margin) if run.loop is not None else "",
         case=_situation(run, twin),
         band=study.metrics.settling_band,
-        stations=", ".join(f"{1e3 * x:g}" for x in study.metrics.stations),
+        windows=run.case.windows,
+        stations=", ".join(f"{100 * x:g}" for x in study.metrics.stations),
         watched=_watched(run),
-        command_end=round(float(result.command_end), 9),
+        command_end=float(result.command_end),
         buckling=np.broadcast_to(euler_force(run.case.machine.beam), (3,)),
         n_modes=max(MARGIN_MODES, study.link.modes),
         links=_links(run, twin),
@@ -128,7 +145,9 @@ def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str], name: st
 
 
 def _situation(run: Run, twin: Run | None) -> str:
-    """The situation that determines the recommended next step."""
+    """The situation, one of VERDICTS, that determines the recommended next step."""
+    if run.status not in status.FINISHED:
+        return "stopped"
     if run.loop is not None and run.loop.gain_margin < ENOUGH:
         return "margin"
     if run.study.control.feedback == "none" or not any(run.study.control.links):
@@ -139,6 +158,12 @@ def _situation(run: Run, twin: Run | None) -> str:
     if free < run.study.metrics.settling_band:
         return "calm"
     return "worse" if left > 1.05 * free else "well"
+
+
+def _later(run: Run, free: Run, link: int) -> str:
+    """By how much control delays settling, as a share; "" if it hardly does."""
+    after, before = (float(x.result.metrics.settling_time[link]) for x in (run, free))
+    return f"{100 * (after / before - 1):.3g} %" if after > (1 + LATER) * before > 0 else ""
 
 
 def _links(run: Run, twin: Run | None) -> list[list[str]]:
@@ -194,31 +219,71 @@ def _modes(run: Run) -> list[list[str]]:
 
 
 def draw(run: Run, twin: Run | None = None) -> dict[str, Figure]:
-    """FIGURES of a run, three panels each, in the style of the caller; twin: without control."""
-    record, end = run.result.record, float(run.result.command_end)
+    """FIGURES of a run, three rows each, in the style of the caller; twin: without control."""
+    record = run.result.record
     assert record is not None
     pairs = [f"pair {k + 1}" for k in range(record.actuator_voltage.shape[2])]
-    bent, error, links = 1e6 * chord_deflection(run), 1e6 * record.pose_error, range(3)
-    panels: dict[str, list[tuple[np.ndarray, list[str], str]]] = {
-        "deflection": [(bent[:, [i]], [], f"link {i + 1} [µm]") for i in links],
-        "error": [(error[:, [k]], [], label) for k, label in enumerate(_POSE)],
-        "voltage": [(record.actuator_voltage[:, i], pairs, f"link {i + 1} [V]") for i in links],
+    error = [(label, 1e6 * record.pose_error[:, [k]]) for k, label in enumerate(_POSE)]
+    voltage = [(f"link {i + 1} [V]", record.actuator_voltage[:, i]) for i in range(3)]
+    return {
+        "deflection": _deflection(run, twin),
+        "error": _over_time(run, error, []),
+        "voltage": _over_time(run, voltage, pairs),
     }
-    drawn = {}
-    for name, rows in panels.items():
-        figure, axes = figures.new_figure(3, 1, 1.3)
-        done: list[Axes] = []
-        for ax, (values, names, label) in zip(axes[:, 0], rows, strict=True):
-            if name == "deflection" and twin is not None:
-                figures.traces(record.time, values, ["with control"], label, ax)
-                without = 1e6 * chord_deflection(twin)[:, len(done)]
-                ax.plot(record.time, without, color="#999999", linewidth=0.7, zorder=1, label=_FREE)
-            else:
-                figures.traces(record.time, values, names, label, ax)
-            done.append(ax)
-            ax.axvline(end, color="#888888", linewidth=0.8, linestyle=":")
-        axes[-1, 0].set_xlabel("time [s]")
-        if name == "voltage" or (name == "deflection" and twin is not None):
-            figures.legend_above(figure, axes[0, 0])
-        drawn[name] = figure
-    return drawn
+
+
+def _over_time(run: Run, rows: list[tuple[str, np.ndarray]], names: list[str]) -> Figure:
+    """A panel of each quantity, (T, n) with its label; names: of the n curves, [] for one."""
+    figure, axes = figures.new_figure(len(rows), 1, 1.3)
+    for ax, (label, values) in zip(axes[:, 0], rows, strict=True):
+        figures.traces(1e3 * run.result.record.time, values, names, label, ax)
+        ax.axvline(1e3 * float(run.result.command_end), color=GREY, linewidth=0.8, linestyle=":")
+    axes[-1, 0].set_xlabel("time [ms]")
+    if names:
+        figures.legend_above(figure, axes[0, 0])
+    return figure
+
+
+def _deflection(run: Run, twin: Run | None) -> Figure:
+    """Deflection of each link: the run, and beside it what the reference trajectory leaves."""
+    assert run.result.record is not None
+    time, end = 1e3 * run.result.record.time, 1e3 * float(run.result.command_end)
+    windows = run.case.windows
+    start = end + 1e3 * float(windows.residual_delay)
+    window = (start, start + 1e3 * float(windows.residual_length))
+    bent = [1e6 * chord_deflection(x) for x in (twin, run) if x is not None]
+    has_rest = time[-1] > end
+    figure, axes = figures.new_figure(3, 1 + has_rest, 1.4)
+    for link, row in enumerate(axes):
+        for ax in row:
+            for values, style in zip(bent, _styles(run, twin), strict=True):
+                ax.plot(time, values[:, link], **style)
+            ax.margins(x=0.01)
+        row[0].axvline(end, color=GREY, linewidth=0.8, linestyle=":")
+        row[0].set_ylabel(f"link {link + 1} [µm]")
+        if has_rest:
+            seen = (time >= window[0]) & (time <= window[1])
+            _zoom(row[1], [x[seen, link] for x in bent], (end, time[-1]), window)
+    for ax in axes[-1]:
+        ax.set_xlabel("time [ms]")
+    if twin is not None:
+        figures.legend_above(figure, axes[0, 0])
+    return figure
+
+
+def _styles(run: Run, twin: Run | None) -> list[dict[str, Any]]:
+    """Of the curves without and with control, or of the only one."""
+    if twin is None:
+        return [figures.CONTROLLED if run.study.control.feedback != "none" else figures.WITHOUT]
+    return [figures.WITHOUT, figures.CONTROLLED]
+
+
+def _zoom(
+    ax: Axes, seen: list[np.ndarray], span: tuple[float, float], window: tuple[float, float]
+) -> None:
+    """Limit a panel to a span of time and to the size of what is seen in the residual window."""
+    ax.axvspan(*window, color=GREY, alpha=0.12, linewidth=0)
+    ax.set_xlim(span)
+    size = max((float(np.abs(x).max()) for x in seen if len(x) and np.isfinite(x).all()), default=0)
+    if size > 0:
+        ax.set_ylim(-1.2 * size, 1.2 * size)

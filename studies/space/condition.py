@@ -75,7 +75,7 @@ def evaluate(text: str, lookup: Lookup, field: str) -> np.ndarray:
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         reason = error.msg if isinstance(error, SyntaxError) else str(error)
         raise StudyError(
-            f"{field} = {said}: no condition ({reason}); allowed: {_ALLOWED}"
+            f"{field} = {said}: not a condition ({reason}); allowed: {_ALLOWED}"
         ) from None
     except (TypeError, OverflowError):
         raise StudyError(f"{field} = {said}: mixes text and numbers") from None
@@ -152,4 +152,4 @@ def _name(node: ast.AST) -> str:
             return f"{_name(node.value)}[{node.slice.value}]"
         if isinstance(node.slice.value, str):  # an index with the name of its axis
             return f"{_name(node.value)}[{node.slice.value}]"
-    raise StudyError(f"{ast.unparse(node)!r} is no name of a field")
+    raise StudyError(f"{ast.unparse(node)!r} is not the name of a field")

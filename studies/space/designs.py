@@ -108,7 +108,9 @@ def _listed(node: BlockNode, study: Study) -> Columns:
     for k, case in enumerate(node.block.cases):
         for name in case:
             if name in READY_MADE:
-                raise StudyError(f"{path}.{k}: {name} is no field; write the field it stands for")
+                raise StudyError(
+                    f"{path}.{k}: {name} is not a field; write the field it stands for"
+                )
             known_field(name, study, f"{path}.{k}", READY_MADE)
     names = list(dict.fromkeys(name for case in node.block.cases for name in case))
     columns: dict[str, np.ndarray] = {}

@@ -1,4 +1,4 @@
-"""Free numbers: their names, bounds and scale, and how they get into a `Case`.
+"""Free parameters: their names, bounds and scale, and how they get into a `Case`.
 
 A free field is a number of the study file, an entry of a list, or a list, each of whose entries is
 then free by itself. `DESIGN` are the fields that a designer decides, `MACHINE` those that he finds
@@ -30,6 +30,7 @@ class FieldPlace(NamedTuple):
 
     path: str
     factor: float = 1.0  # the Case's unit in the study's
+    is_of_mode_1: bool = False  # one number, or one a link, is that of mode 1, not of all
 
 
 def _same(section: str, inside: str, *names: str) -> dict[str, FieldPlace]:
@@ -42,6 +43,7 @@ DESIGN: dict[str, FieldPlace] = {
         "control", "control", "velocity_gain", "position_gain", "gain_factor", "feedthrough_factor"
     ),
     "control.ratios": FieldPlace("control.ratio"),
+    "control.damping": FieldPlace("control.damping", is_of_mode_1=True),
     "control.pole_decay": FieldPlace("control.pole_decay"),
     "control.pole_frequency_hz": FieldPlace("control.pole_frequency", TWO_PI),
     "electronics.highpass_hz": FieldPlace("electronics.highpass", TWO_PI),
@@ -87,7 +89,7 @@ MACHINE: dict[str, FieldPlace] = {
 
 
 class Free(NamedTuple):
-    """One free number."""
+    """One free parameter."""
 
     name: str  # with its index in a list
     span: Range
@@ -116,7 +118,7 @@ class Setter(NamedTuple):
 
 
 class FreeNumbers(NamedTuple):
-    """All free numbers of a design, in the order of the parameter vector."""
+    """All free parameters of a design, in the order of the parameter vector."""
 
     numbers: tuple[Free, ...]
     #: Puts values (p,) in the study's units into a case; nan leaves the case's value.
@@ -142,7 +144,7 @@ class FreeNumbers(NamedTuple):
         return np.stack(found, axis=-1)
 
     def places(self) -> np.ndarray:
-        """Where the study itself lies between the bounds, 0 to 1; 1/2 if undefined."""
+        """Where the baseline lies between the bounds, 0 to 1; 1/2 if undefined."""
         found = []
         for _, span, start, _ in self.numbers:
             if span.is_log:
@@ -156,7 +158,7 @@ class FreeNumbers(NamedTuple):
 def join_numbers(
     parts: Sequence[tuple[list[Free], Callable[[Case, Array], Case]]],
 ) -> FreeNumbers:
-    """All free numbers, from those of each field."""
+    """All free parameters, from those of each field."""
     numbers: list[Free] = []
     places: list[Callable[[Case, Array], Case]] = []
     for added, put in parts:
@@ -237,6 +239,8 @@ def plain_numbers(
             raise field_error(label, start, f"{span.low:g} to {span.high:g}, the bounds of {path}")
         numbers.append(Free(label, span, float(start), name))
         at = (*whole, Ellipsis) if whole and is_each_link(entry.field) else whole
+        if leaf.is_of_mode_1 and len(whole) < 2:
+            at = (*(whole or (Ellipsis,)), 0)
         setters.append(Setter(leaf.path, at, leaf.factor))
     if not numbers:
         raise field_error(name, value, f"one number or more, where {path} is to be free")
@@ -265,7 +269,7 @@ def _check_field(field: str, study: Study, path: str) -> None:
 
 
 def parse_bounds(bounds: Any, path: str) -> Range:
-    """Bounds of a free number.
+    """Bounds of a free parameter.
 
     Raises:
         StudyError: not a range, or one with points.

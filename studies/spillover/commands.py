@@ -26,7 +26,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             typer.Option(help="case of a sweep (number or id:...) or family of a tuning"),
         ] = None,
         margin: Annotated[
-            float, typer.Option(help="gain margin required on every plant [1]")
+            float, typer.Option(help="gain margin required on every plant [1]; 2 is 6 dB")
         ] = 2.0,
         pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
     ) -> None:

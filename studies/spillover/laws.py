@@ -131,7 +131,7 @@ def _designed(found: FixedController, law: Law, modal: Controller | None = None)
     Args:
         found: the design.
         law: which one.
-        modal: modal control whose strength it must match; None: the study's own settings.
+        modal: modal control whose strength it must match; None: the study's settings.
     """
     structure = found.structure._replace(
         law=law.name,

@@ -64,14 +64,14 @@ def margins(found: Certificate, ax: Axes | None = None) -> Axes:
             xytext=(0, 3),
             textcoords="offset points",
             ha="center",
-            fontsize=8,
+            fontsize=figures.SMALL,
         )
     ax.set_yticks(np.arange(len(shown)), [str(found.plants[0, d, 0].departure) for d in shown])
     ax.set(xlabel="gain margin [1]", xscale="log", ylim=(-0.6, len(shown) - 0.4))
-    ax.tick_params(axis="y", labelsize=8)
+    ax.tick_params(axis="y", labelsize=figures.SMALL)
     _plain_ticks(ax.xaxis)
-    hollow = f"; hollow: {sizes[0]} modes" if len(sizes) > 1 else ""
-    ax.legend(title=f"{sizes[-1]} plant modes{hollow}", loc="best", fontsize=8)
+    hollow = f"\nhollow: {sizes[0]}" if len(sizes) > 1 else ""
+    figures.legend_beside(ax, title=f"{sizes[-1]} plant modes{hollow}")
     return ax
 
 
@@ -110,7 +110,7 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
     ax.set_ylim(1.3 * min(np.nanmin(zeta), -0.001), 1.3 * np.nanmax(zeta))
     if np.nanmin(zeta) < 0:
         ax.axhline(0, color="black", linewidth=0.9)
-        ax.annotate("unstable", (0.02, 0.02), xycoords="axes fraction", fontsize=8)
+        ax.annotate("unstable", (0.02, 0.02), xycoords="axes fraction", fontsize=figures.SMALL)
         ax.axhspan(ax.get_ylim()[0], 0, color=figures.SERIES[1], alpha=0.1, linewidth=0)
     low, high = ax.get_ylim()
     sizes = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
@@ -120,12 +120,12 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
     ax.yaxis.set_minor_locator(NullLocator())
     _plain_ticks(ax.xaxis)
     size = found.plants[0, 0, -1].n_modes
-    which = ", all departures" if _has_departures(found) else ""
+    which = ", all mismatches" if _has_departures(found) else ""
     ax.set(
         xlabel=f"frequency [Hz], plants of {size} modes a link{which}",
         ylabel="damping ratio [1]",
     )
-    ax.legend(loc="best")
+    figures.legend_beside(ax)
     return ax
 
 
@@ -148,12 +148,13 @@ def leakage_map(
     for (j, r), value in np.ndenumerate(factor):
         text = f"{value:.2g}" if value >= FLOOR else "·"
         color = "white" if value > 10 else "black"
-        ax.text(r + 1, j + 1, text, ha="center", va="center", fontsize=7.5, color=color)
+        ax.text(r + 1, j + 1, text, ha="center", va="center", fontsize=figures.SMALL, color=color)
     ax.axvline(n_controlled + 0.5, color="black", linewidth=1.2)
     ax.grid(False)
     ax.invert_yaxis()
     ax.set_xticks(range(1, modes + 1))
-    ax.set_yticks(range(1, channels + 1), [rf"$\hat q_{{{j + 1}}}$" for j in range(channels)])
+    ax.set_yticks(range(1, channels + 1), [str(j + 1) for j in range(channels)])
+    ax.set_ylabel("estimate")
     ax.set_xlabel("plant mode [1]")
     ax.set_title(title, loc="left")
     return ax
@@ -201,11 +202,11 @@ def law_bars(found: Comparison, ax: Axes | None = None) -> Axes:
         text = text if found.margin[k] > 0 else "no stable gains"
         if found.status[k] != status.OK:
             text += f"; {describe(int(found.status[k]))}"
-        ax.text(end + 0.01 * most, k, text, va="center", fontsize=8)
+        ax.text(end + 0.01 * most, k, text, va="center", fontsize=figures.SMALL)
     ax.set_yticks(rows, found.names)
     ax.invert_yaxis()
     ax.margins(x=0.32)
     ax.grid(axis="y", visible=False)
     ax.set_xlabel("residual rms of the chord deflection, worst station [µm]")
-    ax.legend(loc="lower right")
+    figures.legend_beside(ax)
     return ax

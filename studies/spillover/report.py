@@ -12,10 +12,11 @@ from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.show.sketch import CAPTION
 from studies.show.templates import render
 from studies.spillover.certificate import Certificate, Spillover
-from studies.spillover.comparison import FAST, GIVEN, SETTLING, SHOWN, WINDOW, WITHOUT, Comparison
+from studies.spillover.comparison import FAST, GIVEN, SHOWN, WINDOW, WITHOUT, Comparison
 from studies.spillover.plants import PlantVariant
 from studies.study.labels import describe
 from studies.study.margin import margin_text
+from studies.study.window import residual_delay
 
 #: Leakage below this is rounding [1].
 TINY = 1e-9
@@ -58,7 +59,8 @@ def report(found: Certificate, laws: Comparison | None) -> str:
         study=study,
         law=LAWS[study.control.law],
         laws=laws,
-        verdict=verdict(found),
+        breaking=found.breaking[found.worst],
+        residual=_residual(laws) if laws is not None else None,
         spillover=spillover_text(found),
         margin=margin,
         worst=found.plants[found.worst],
@@ -73,12 +75,20 @@ def report(found: Certificate, laws: Comparison | None) -> str:
         leakage=_leakage(found),
         given=GIVEN,
         fast=FAST,
-        settling=SETTLING,
+        delay=residual_delay(laws.study) if laws is not None else None,
         window=WINDOW,
         law_modes=[f"zeta {j + 1}" for j in range(SHOWN)],
         law_rows=_laws(laws) if laws is not None else [],
         sketch_caption=CAPTION,
     )
+
+
+def _residual(laws: Comparison) -> tuple[float, float] | None:
+    """Residual of the design and without control, worst links [m]; None if a run failed."""
+    with_it, without = (
+        float(np.max(laws.residual_rms[laws.names.index(x)])) for x in (GIVEN, WITHOUT)
+    )
+    return (with_it, without) if np.isfinite(with_it) and without > 0 else None
 
 
 def _free_damping(found: Certificate) -> list[float]:
@@ -196,7 +206,7 @@ def _spilled(worst: Spillover) -> dict[str, Any]:
         "damping_ratio_without_control": worst.free_damping,
         "basis": worst.plant.basis,
         "modes": worst.plant.n_modes,
-        "departure": str(worst.plant.departure),
+        "mismatch": str(worst.plant.departure),
     }
 
 

@@ -54,12 +54,12 @@ def spillover_design(
     check_folder(out)
     study = resolved_study(design.study)
     _check_whose(out, study)
-    console.print("judging the controller on plants that differ from what it believes")
+    console.print("checking the controller on plants that differ from its nominal model")
     found = certify(study, margin)
     console.print(verdict(found), soft_wrap=True)
     if text := spillover_text(found):
         console.print(text, soft_wrap=True)
-    console.print("comparing laws")
+    console.print("comparing control laws")
     laws = None
     try:
         laws = compare_laws(found.study, margin)
@@ -121,7 +121,7 @@ def _draw(folder: Path, found: Certificate, laws: Comparison | None, has_pdf: bo
 
 def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable]:
     """Labelled numbers of a certificate and of the comparison of laws."""
-    plants = ("basis", "departure", "plant_modes")
+    plants = ("basis", "mismatch", "plant_modes")
     modes = (*plants, "link_mode", "pole")
     place, axes = plants[:2], found.plants
     true = [plant.departure for plant in axes[0, :, 0]]
@@ -129,23 +129,23 @@ def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable
         "basis": Variable(
             np.array([p.basis for p in axes[:, 0, 0]]), ("basis",), "1", "of the plant"
         ),
-        "departure": Variable(
+        "mismatch": Variable(
             np.array([str(d) for d in true]),
-            ("departure",),
+            ("mismatch",),
             "1",
-            "from what the controller believes",
+            "mismatch from the nominal model",
         ),
         "sensor_factor": Variable(
-            np.array([d.sensor for d in true]), ("departure",), "1", "true over believed length"
+            np.array([d.sensor for d in true]), ("mismatch",), "1", "true over nominal length"
         ),
         "actuator_factor": Variable(
-            np.array([d.actuator for d in true]), ("departure",), "1", "true over believed length"
+            np.array([d.actuator for d in true]), ("mismatch",), "1", "true over nominal length"
         ),
         "frequency_factor": Variable(
             np.array([d.frequency for d in true]),
-            ("departure",),
+            ("mismatch",),
             "1",
-            "true frequencies of the links over the study's",
+            "true over nominal frequencies of the links",
         ),
         "plant_modes": Variable(
             np.array([p.n_modes for p in axes[0, 0]]), ("plant_modes",), "1", "per link"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from jaxmodel import status
 
+#: Where a station is.
+STATION_TEXT = "position along the link, over its length"
 #: What `singularity_distance` means.
 DISTANCE_TEXT = "of link angles from 0 and 90 deg, and of the links from lines through one point"
 

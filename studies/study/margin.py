@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 #: Minimum number of plant modes for a margin: uncontrolled modes limit the gains [1].
 MARGIN_MODES = 12
 
@@ -36,3 +38,9 @@ def caution(margin: float) -> str:
 def margin_text(value: float, digits: int = 4) -> str:
     """A gain margin in words; the search ends at `HIGHEST`."""
     return f"> {HIGHEST:g}" if value >= HIGHEST else f"{value:.{digits}g}"
+
+
+def margin_in_db(value: float, digits: int = 4) -> str:
+    """A gain margin as a factor and in decibels, for a sentence: "3.7 (11.4 dB)"."""
+    text = margin_text(value, digits)
+    return f"{text} ({20 * math.log10(min(value, HIGHEST)):.1f} dB)" if value > 0 else text

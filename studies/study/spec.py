@@ -28,6 +28,8 @@ from studies.study.state_space import with_matrices
 #: Where laws' own fields are.
 OWN_FIELDS = "control.laws"
 Basis = Annotated[str, OneOf(lambda: BASES)]
+#: Value of `metrics.residual_delay` that leaves the number to `studies.study.window`.
+AUTO = "auto"
 
 
 # numbers within bounds, as entries of a list
@@ -79,7 +81,7 @@ class Section(BaseModel):
 class RunSection(Section):
     """Duration, resolution and model of the run."""
 
-    duration: float = described(0.8, "s", "length of the run", gt=0, le=100)
+    duration: float = described(0.4, "s", "length of the run", gt=0, le=100)
     seed: int = described(0, "1", "of ADC noise and force ripple", ge=0, le=10**9)
     substeps: int = described(0, "1", "plant steps per sample; 0: as many as needed", ge=0, le=200)
     smooth: bool = described(False, "-", "smooth limits, noise instead of rounding (for gradients)")
@@ -124,7 +126,8 @@ class LinkSection(Section):
     shortening: bool = described(
         True,
         "-",
-        "a bent link's chord is shorter: axial force acts on bending (not in pinned_free)",
+        "geometric stiffening: bending shortens the chord, axial force acts on bending "
+        "(not in pinned_free)",
     )
     axial_inertia: Literal["lumped", "distributed"] = described(
         "lumped",
@@ -134,7 +137,7 @@ class LinkSection(Section):
     static_correction: bool = described(
         True,
         "-",
-        "modes that are left out answer to the patches at once; false: the paper's truncated model",
+        "static correction for the modes left out; false: the paper's truncated model",
     )
     length: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(0.2, "m", "L")
     thickness: EachLink[Annotated[float, Field(ge=1e-5, le=0.1)]] = described(2e-3, "m", "t_b")
@@ -143,10 +146,12 @@ class LinkSection(Section):
     youngs_modulus: EachLink[Annotated[float, Field(ge=1e3, le=2e12)]] = described(
         70e9,
         "Pa",
-        "E, known to the controller; stiffness_factor is not",
+        "E, also of the nominal model; stiffness_factor is not in it",
     )
     stiffness_factor: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(
-        1.0, "1", "true bending stiffness over the one controller and shaper assume"
+        1.0,
+        "1",
+        "model mismatch: true over nominal bending stiffness, which controller and shaper assume",
     )
     damping_ratio: Zeta | tuple[Zeta, ...] | tuple[tuple[Zeta, ...], ...] = described(
         0.01, "1", "of mode 1; or by mode, for example measured: one list for all links, or three"
@@ -214,7 +219,7 @@ class MotionSection(Section):
         min_length=1,
         max_length=100,
     )
-    move_time: Time | tuple[Time, ...] = described(0.1, "s", "t_f of each move, or one per move")
+    move_time: Time | tuple[Time, ...] = described(0.03, "s", "t_f of each move, or one per move")
     dwell: Pause | tuple[Pause, ...] = described(0.0, "s", "pause after each move, or one per move")
     profile: Annotated[str, OneOf(lambda: PROFILES)] = described("cycloid", "-", "cycloid is (25)")
 
@@ -222,7 +227,7 @@ class MotionSection(Section):
 class ShaperSection(Section):
     """Input shaper on the motion."""
 
-    kind: Annotated[str, OneOf(lambda: SHAPERS)] = described("ei", "-", "ei is the paper's (13)")
+    kind: Annotated[str, OneOf(lambda: SHAPERS)] = described("none", "-", "ei is the paper's (13)")
     frequencies_hz: tuple[Hertz, ...] = described(
         (),
         "Hz",
@@ -242,7 +247,7 @@ class ControlSection(Section):
     )
     law: Annotated[str, OneOf(lambda: LAWS, OWN)] = described("imsc", "-", "control law")
     laws: Annotated[dict[str, dict[str, EachLink[float]]], OwnFields()] = described(
-        {}, "-", "laws' own fields, by law"
+        {}, "-", "fields of the laws, by law"
     )
     basis: Basis = described("pinned_pinned", "-", "modal basis of the controller's model")
     modes: int = described(3, "1", "controlled modes per link", ge=1, le=12)
@@ -264,6 +269,13 @@ class ControlSection(Section):
     position_gain: tuple[Gain, Gain, Gain] = described(
         (0.0, 0.0, 0.0), "N/m or 1/s2", "k_p of mode 1 per link (SRF: 1)"
     )
+    damping: EachMode[Zeta] = described(
+        (),
+        "1",
+        "added damping ratio, beside link.damping_ratio, from which the gains follow; natural "
+        "frequencies are kept: one number, or one a link, is that of mode 1, others by (24); or "
+        "one list a link by mode; 0: none, empty: gains or decays as below",
+    )
     pole_decay: EachMode[Decay] = described(
         (),
         "1/s",
@@ -271,7 +283,7 @@ class ControlSection(Section):
         "number for all modes, one a link, or one list a link by mode, others by (24)",
     )
     pole_frequency_hz: EachMode[OwnOrHertz] = described(
-        (), "Hz", "beta/2 pi of these poles, by mode; empty or 0: the mode keeps its own"
+        (), "Hz", "beta/2 pi of these poles, by mode; empty or 0: the mode keeps its frequency"
     )
     gain_unit: Literal["N s/m", "1/s"] = described(
         "N s/m", "-", "modal force or modal acceleration"
@@ -279,7 +291,7 @@ class ControlSection(Section):
     ratios: tuple[tuple[Gain, ...], ...] = described(
         ((1.0, 0.345, 0.045), (1.0, 0.304, 0.041), (1.0, 0.321, 0.038)),
         "1",
-        "EMC ratios k_dj : k_d1 per link (24); missing ones are 0",
+        "efficient modal control (EMC): ratios k_dj : k_d1 per link (24); missing ones are 0",
     )
     ratio_source: Literal["given", "own_run"] = described(
         "given", "-", "ratios as given, or from the same case's uncontrolled run by (24)"
@@ -290,13 +302,18 @@ class ControlSection(Section):
     gain_factor: float = described(
         1.0,
         "1",
-        "factor on the loop gain: on what the finished controller puts out, whatever the law",
+        "factor on the loop gain: it multiplies the controller's output, whatever the law",
         ge=0,
         le=1e3,
     )
     feedthrough_factor: float = described(
         0.0, "1", "subtracted share of the residual modes' feed-through", ge=0, le=1
     )
+
+    @property
+    def has_poles(self) -> bool:
+        """Whether the gains follow from specified poles."""
+        return self.damping != () or self.pole_decay != ()
 
 
 class StateSpaceSection(Section):
@@ -409,10 +426,13 @@ class InitialSection(Section):
 class MetricsSection(Section):
     """Evaluation of a run."""
 
-    residual_delay: float = described(
-        0.0, "s", "residual window starts this long after the command", ge=0, le=100
+    residual_delay: Literal["auto"] | Pause = described(
+        AUTO,
+        "s",
+        "residual window starts this long after the reference trajectory; auto: when the drive "
+        "has settled to 2 %, by its poles",
     )
-    residual_length: float = described(0.3, "s", "length of the residual window", gt=0, le=100)
+    residual_length: float = described(0.2, "s", "length of the residual window", gt=0, le=100)
     settling_band: float = described(
         1e-6, "m", "chord deflection that counts as settled", gt=0, le=0.1
     )
@@ -433,7 +453,11 @@ class MetricsSection(Section):
         1e3, "1", "tolerated condition number of filter and synthesizer", ge=1, le=1e6
     )
     stations: tuple[float, ...] = described(
-        (0.05, 0.10, 0.15), "m", "where chord deflection is evaluated", min_length=1, max_length=20
+        (0.25, 0.5, 0.75),
+        "1",
+        "where chord deflection is evaluated, as fractions of each link's length",
+        min_length=1,
+        max_length=20,
     )
 
 
@@ -469,7 +493,7 @@ class Study(Section):
                 target = target.setdefault(section, {})
                 if not isinstance(target, dict):
                     field = name.replace("__", ".")
-                    raise StudyError(f"{field}: {section} is no section of a study")
+                    raise StudyError(f"{field}: {section} is not a section of a study")
             target[leaf] = value
         return parse_study(data)
 

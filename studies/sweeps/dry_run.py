@@ -18,8 +18,8 @@ def print_plan(plan: Plan, console: Console) -> None:
     """Print what a sweep would run, a sample case, and the estimated time."""
     table = plan.table
     console.print(
-        f"{len(table)} cases ({table.n_dropped} left out by where, {table.n_double} doubles, "
-        f"{plan.n_before} done before)"
+        f"{len(table)} cases ({table.n_dropped} left out by where, {table.n_double} duplicates, "
+        f"{plan.n_before} already computed)"
     )
     print_rows(axis_rows(table), console)
     for group in plan.groups:

@@ -19,6 +19,7 @@ from studies.engine.columns import LEFT_OUT, variable_name
 from studies.engine.results import SweepData, metric_values, swept_names
 from studies.errors import StudyError
 from studies.show import figures
+from studies.show.sketch import ACTUATOR, SENSOR
 from studies.space.axes import SHOWN_AS
 from studies.space.spec import BlockNode
 from studies.study.consistency import each_link
@@ -75,7 +76,7 @@ def plot(data: SweepData, x: str | None, y: str, hue: str | None = None) -> Figu
     group = None if hue is None else shown_metric(data, hue)[chosen]
     shown = shown_metric(data, y)[chosen]
     with figures.styled():
-        figure = Figure(figsize=(5.2, 3.6), layout="constrained")
+        figure = Figure(figsize=(figures.WIDTH, 4.2), layout="constrained")
         ax = figure.subplots()
         _say_left_out(figure, data, chosen)
         ax.set_xlabel(label(data, x))
@@ -107,7 +108,7 @@ def front(data: SweepData, y: str) -> Figure:
     chosen = np.flatnonzero((data["status"] == status.OK) & np.isfinite(metric_values(data, y)))
     margin, value = data[MARGIN][chosen], shown_metric(data, y)[chosen]
     with figures.styled():
-        figure = Figure(figsize=(6.2, 3.8), layout="constrained")
+        figure = Figure(figsize=(figures.WIDTH, 4.2), layout="constrained")
         ax = figure.subplots()
         color: Any = figures.SERIES[0]
         if VOLTAGE in data.variables:
@@ -186,7 +187,7 @@ def _scale_ordinate(ax: Axes, value: np.ndarray) -> None:
     ax.set_ylim(bottom, top)
     beyond = int(np.sum(value > top))
     if beyond:
-        ax.set_title(f"{beyond} above {top:.3g} not shown", fontsize=7.5, loc="right")
+        ax.set_title(f"{beyond} above {top:.3g} not shown", fontsize=figures.SMALL, loc="right")
 
 
 def _say_left_out(figure: Figure, data: SweepData, chosen: np.ndarray) -> None:
@@ -202,7 +203,7 @@ def _say_left_out(figure: Figure, data: SweepData, chosen: np.ndarray) -> None:
             shown = int(np.sum(chosen))
             parts.append(f"{n_low:,} of the {shown:,} shown have a gain margin below {ENOUGH:g}")
     if parts:
-        figure.suptitle("; ".join(parts), fontsize=7.5, x=0.01, ha="left")
+        figure.suptitle("; ".join(parts), fontsize=figures.SMALL, x=0.01, ha="left")
 
 
 def save_plot(figure: Figure, path: Path) -> None:
@@ -301,11 +302,11 @@ def _lines(
             elif len(groups) <= MOST_BANDS:
                 ax.fill_between(position, low, high, color=style["color"], alpha=0.1, linewidth=0)
             span = ", smallest to largest" if is_text or len(groups) <= MOST_BANDS else ""
-            ax.set_title(f"median{span}", fontsize=7.5, loc="right")
+            ax.set_title(f"median{span}", fontsize=figures.SMALL, loc="right")
         if is_text:
             ax.set_xticks(range(len(wanted)), [str(v) for v in wanted], rotation=30, ha="right")
     if group is not None:
-        ax.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        figures.legend_beside(ax)
     if _is_wide(value):
         figures.log_scale(ax, "y")
     if _is_geometric(np.unique(across)):
@@ -357,7 +358,7 @@ def _points(
         zorder=3,
     )
     if ax.get_legend_handles_labels()[1]:
-        ax.legend(fontsize=7)
+        figures.legend_above(figure, ax)
     _scale_ordinate(ax, value)
 
 
@@ -378,7 +379,7 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
     rank = np.argsort(np.argsort(value)) / max(len(value) - 1, 1)
     lines = []
     with figures.styled():
-        figure = Figure(figsize=(max(5.0, 1.5 * (len(names) + 1)), 3.6), layout="constrained")
+        figure = Figure(figsize=(figures.WIDTH, 4.2), layout="constrained")
         ax = figure.subplots()
         for k, name in enumerate([*names, y]):
             column = value if k == len(names) else data[name][chosen]
@@ -395,18 +396,27 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
             lines.append((column - low) / max(high - low, 1e-300))
             places = np.linspace(0, 1, len(texts)) if len(texts) > 1 else [0.0]
             for place, text in zip(places, texts, strict=True):
-                ax.annotate(text, (k, place), xytext=(3, 0), textcoords="offset points", fontsize=7)
+                ax.annotate(
+                    text,
+                    (k, place),
+                    xytext=(4, 0),
+                    textcoords="offset points",
+                    va="center",
+                    fontsize=figures.SMALL,
+                    bbox={"fc": "white", "ec": "none", "alpha": 0.85, "pad": 1},
+                    zorder=5,
+                )
         matrix = np.array(lines)
         for case in order[-3000:]:
             color = matplotlib.colormaps[MAP](rank[case])
             ax.plot(matrix[:, case], color=color, linewidth=0.5, alpha=0.4)
         for case in best:
             ax.plot(matrix[:, case], color=BEST, linewidth=1.3)
-        ax.set_xticks(range(len(names) + 1), [*names, label(data, y)], rotation=15, ha="right")
+        ax.set_xticks(range(len(names) + 1), [*names, label(data, y)], rotation=30, ha="right")
         ax.set_yticks([])
         ax.set_title(
             f"red: the {_best_text(data, len(best))}; the others: darker is smaller",
-            fontsize=7.5,
+            fontsize=figures.SMALL,
             loc="right",
         )
         _say_left_out(figure, data, chosen)
@@ -414,38 +424,38 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
 
 
 def _placements(data: SweepData, y: str) -> Figure:
-    """The best placements on the link, one below another, above all cases by each patch."""
+    """The best placements on the links, one below another, above all cases by each patch.
+
+    Links of different length, or with patches of different length, have a line each.
+    """
     centers, value = data["patches_centers"], shown_metric(data, y)
-    patches, length = data.spec.study.patches, each_link(data.spec.study.link.length).max()
+    study = data.spec.study
+    sizes = (study.link.length, study.patches.actuator_length, study.patches.sensor_length)
+    links = list(dict.fromkeys(zip(*(map(float, each_link(x)) for x in sizes), strict=True)))
     chosen = recommended(data, y, N_PLACEMENTS)
     is_ok = (data["status"] == status.OK) & np.isfinite(value)
     others = [name for name in swept_names(data) if name != "patches_centers"]
     unit = 1e3
     with figures.styled():
-        figure = Figure(figsize=(11.0 if others else 7.4, 5.6), layout="constrained")
+        figure = Figure(figsize=(figures.WIDTH, 5.6), layout="constrained")
         top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.2, 1))
         texts = []
         for row, case in enumerate(chosen):
-            top.plot([0, length * unit], [row, row], color="#AAAAAA", linewidth=1)
-            for center in centers[case]:
-                for size, color, height in (
-                    (each_link(patches.actuator_length).max(), figures.SERIES[0], 0.6),
-                    (each_link(patches.sensor_length).max(), figures.SERIES[1], 0.3),
-                ):
-                    left = (center - size / 2) * unit
-                    top.barh(row, size * unit, height, left, color=color, linewidth=0)
-            also = "".join(f", {name} = {shown_value(data, name, case)}" for name in others)
-            texts.append(f"case {case}: {value[case]:.4g}{also}")
+            for at, link in zip(_lanes(row, len(links)), links, strict=True):
+                _draw_placement(top, at, centers[case], link, 0.6 / len(links))
+            also = "".join(f", {shown_value(data, name, case)}" for name in others)
+            texts.append(f"{case}: {value[case]:.4g}{also}")
         top.set_ylim(len(chosen) - 0.4, -0.6)
-        top.set_xlim(0, length * unit)
+        top.set_xlim(0, max(length for length, *_ in links) * unit)
         top.set_ylabel("best placements")
         top.yaxis.tick_right()
-        top.set_yticks(range(len(chosen)), texts, fontsize=7)
+        top.set_yticks(range(len(chosen)), texts, fontsize=figures.SMALL)
         top.tick_params(axis="y", length=0)
         top.grid(False)
         top.set_title(
-            f"{label(data, y)}, the {_best_text(data, len(chosen))}; blue: actuator, orange: "
-            "sensor",
+            f"{label(data, y)}, the {_best_text(data, len(chosen))}\n"
+            "orange: actuator, green: sensor; right: "
+            + ", ".join([f"case: {y.partition('[')[0]}", *others]),
             fontsize=8.5,
             loc="left",
         )
@@ -474,7 +484,23 @@ def _placements(data: SweepData, y: str) -> Figure:
         _scale_ordinate(bottom, value[is_ok])
         bottom.set_xlabel("centre of the patch pair along the link [mm]")
         bottom.set_ylabel(label(data, y))
-        bottom.set_title("rings: those above", fontsize=7.5, loc="left")
-        bottom.legend(fontsize=7, markerscale=3, loc="upper right")
+        bottom.set_title("rings: those above", fontsize=figures.SMALL, loc="left")
+        figures.legend_beside(bottom, markerscale=3)
         _say_left_out(figure, data, is_ok)
     return figure
+
+
+def _lanes(row: int, count: int) -> np.ndarray:
+    """Ordinates of `count` links about that of their placement."""
+    return row + 0.8 * ((np.arange(count) + 0.5) / count - 0.5)
+
+
+def _draw_placement(
+    ax: Axes, at: float, centers: np.ndarray, link: tuple[float, ...], height: float
+) -> None:
+    """A link with its patches to one scale; link: its length, an actuator's, a sensor's [m]."""
+    length, actuator, sensor = (1e3 * x for x in link)
+    ax.plot([0, length], [at, at], color="#AAAAAA", linewidth=1)
+    for center in 1e3 * centers:
+        ax.barh(at, actuator, height, center - actuator / 2, color=ACTUATOR, linewidth=0)
+        ax.barh(at, sensor, height / 2, center - sensor / 2, color=SENSOR, linewidth=0)

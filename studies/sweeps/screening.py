@@ -12,7 +12,7 @@ from studies.engine.columns import NOT_RUN
 from studies.engine.results import SweepData, direction, meets, metric_values
 from studies.engine.screen import audited, in_order
 from studies.errors import StudyError
-from studies.show.figures import styled
+from studies.show import figures
 from studies.show.units import readable
 from studies.sweeps.show import label, shown_metric, unit_of_metric
 
@@ -146,8 +146,8 @@ def draw_screen(data: SweepData) -> Figure:
     groups = [(_random(data, order), "random cases", "C1"), (passed, "passed the screen", "C0")]
     if not is_fine.any():
         raise StudyError("no case of status ok to draw")
-    with styled():
-        figure = Figure(figsize=(5.2, 4.2))
+    with figures.styled():
+        figure = Figure(figsize=(figures.WIDTH, 4.2), layout="constrained")
         axes = figure.subplots()
         for rows, name, colour in groups:
             rows = rows[is_fine[rows]]
@@ -157,5 +157,5 @@ def draw_screen(data: SweepData) -> Figure:
         if min(ends[0], value[is_fine].min()) > 0:
             axes.set(xscale="log", yscale="log")
         axes.set(xlabel=f"linear model: {label(data, by)}", ylabel=f"full model: {label(data, by)}")
-        axes.legend()
+        figures.legend_beside(axes)
     return figure

@@ -26,7 +26,7 @@ ALLOWED = 1e-4
 #: difference can resolve.
 SMALLEST = 1e-3
 #: And where even that is smaller, they count as if they changed a figure, which is a share of the
-#: study's own, by this much from bound to bound: derivatives near zero are judged absolutely.
+#: baseline's, by this much from bound to bound: derivatives near zero are judged absolutely.
 NEAR_ZERO = 1e-3
 #: Number of designs to check by default.
 DESIGNS = 3
@@ -39,7 +39,7 @@ MEANING = (
 
 
 class Disagreement(NamedTuple):
-    """The worst disagreement of the derivatives by one free number."""
+    """The worst disagreement of the derivatives by one free parameter."""
 
     name: str
     family: str
@@ -51,9 +51,9 @@ class Disagreement(NamedTuple):
 
 
 def audit(spec: TuneSpec, places: np.ndarray | None = None) -> list[Disagreement]:
-    """Compare derivatives with finite differences; one entry per free number.
+    """Compare derivatives with finite differences; one entry per free parameter.
 
-    Each number is checked in the family with the most free numbers among those that move it.
+    Each number is checked in the family with the most free parameters among those that move it.
 
     Args:
         spec: of the tuning.

@@ -63,7 +63,7 @@ class OwnRun(NamedTuple):
 
 
 class Searched(NamedTuple):
-    """Random designs of the family with the most free numbers, on the tuning's scenarios."""
+    """Random designs of the family with the most free parameters, on the tuning's scenarios."""
 
     objective: np.ndarray  # nan if a run did not finish, (n,)
     limits: np.ndarray  # largest value over limit - 1 of the metrics with a limit, (n, m)
@@ -77,12 +77,12 @@ class Searched(NamedTuple):
 
 
 def tuned_study(spec: TuneSpec, family: Family, values: np.ndarray) -> Study:
-    """The study with a family's settings and free numbers.
+    """The study with a family's settings and free parameters.
 
     Args:
         spec: of the tuning.
         family: what moves.
-        values: of all free numbers, (p,).
+        values: of all free parameters, (p,).
     """
     study = family.study(spec.study)
     case = _placed(spec, family, study, values)
@@ -104,14 +104,14 @@ def patch_centers(spec: TuneSpec, family: Family, values: np.ndarray) -> np.ndar
     Args:
         spec: of the tuning.
         family: of the design.
-        values: of the free numbers, (p,).
+        values: of the free parameters, (p,).
     """
     placed = _placed(spec, family, family.study(spec.study), values)
     return np.asarray(placed.machine.patches.center)
 
 
 def _placed(spec: TuneSpec, family: Family, study: Study, values: np.ndarray) -> Case:
-    """A family's study with those of the free numbers (p,) that it moves."""
+    """A family's study with those of the free parameters (p,) that it moves."""
     case = as_arrays(build_case(study))
     return spec.free.place(case, np.where(family.is_free, values, np.nan))
 
@@ -186,7 +186,7 @@ def judge(spec: TuneSpec, designs: list[Study], runs: PlainRuns) -> list[JudgedD
 
 def _poles(study: Study, run: Result | None) -> PoleReport | None:
     """Specified and obtained poles of a design's own file; None if it has none or cannot run."""
-    if run is None or study.control.pole_decay == () or study.control.feedback != "sampled":
+    if run is None or not study.control.has_poles or study.control.feedback != "sampled":
         return None
     return loop_and_poles(study, *check_run(study), int(run.status))[1]
 
@@ -200,7 +200,7 @@ def _own_run(study: Study) -> Result | None:
 
 
 def _seen(merit: Merit, run: Result | None, first: Result | None, duration: float) -> OwnRun:
-    """Figures of a run, relative to the study's own run."""
+    """Figures of a run, relative to the baseline's run."""
     if run is None or first is None:
         nothing = dict.fromkeys(merit.shown, float("nan"))
         return OwnRun(float("nan"), nothing, status.NON_FINITE, float("nan"))

@@ -43,7 +43,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         local_workers: LocalWorkers = None,
         worker_timeout: WorkerTimeout = 600.0,
     ) -> None:
-        """Tune free numbers of a study by gradients, within limits, for many machines at once."""
+        """Tune parameters of a study by gradients, within limits, for many machines at once."""
         workers = Workers(scheduler, local_workers, worker_timeout)
         start(cpu_only=workers.are_named)
         from studies.tuning.run import REPORT, run_tuning
@@ -74,7 +74,7 @@ def _audit(spec: TuneSpec, console: Console) -> None:
     from studies.tuning.audit import ALLOWED, DESIGNS, MEANING, audit
 
     console.print(f"comparing derivatives with finite differences at {DESIGNS} designs")
-    names = "free number", "family", "worst for", "at", "derivative", "difference", "disagreement"
+    names = "parameter", "family", "worst for", "at", "derivative", "difference", "disagreement"
     table, found = Table(*names), audit(spec)
     for one in found:
         table.add_row(
@@ -87,7 +87,7 @@ def _audit(spec: TuneSpec, console: Console) -> None:
             f"{one.share:.1e}",
         )
     console.print(table)
-    console.print(f"Design 1 lies close to the study. {MEANING}", soft_wrap=True)
+    console.print(f"Design 1 is close to the baseline. {MEANING}", soft_wrap=True)
     worst = max(one.share for one in found)
     is_fine = worst <= ALLOWED
     console.print(f"worst: {worst:.1e}, {'below' if is_fine else 'above'} {ALLOWED:g}")

@@ -1,4 +1,4 @@
-"""Designs under all scenarios: objective, limits, and their derivatives by the free numbers.
+"""Designs under all scenarios: objective, limits, and their derivatives by the free parameters.
 
 Runs are differentiated by kernels (`studies.engine.gradients`), all scenarios of all designs in one
 batch, with limits and rounding made smooth (`Structure.is_smooth`). Every batch includes the study
@@ -32,14 +32,14 @@ from studies.tuning.merit import (
     size,
 )
 from studies.tuning.scenarios import lane_columns, nominal, scenario_columns
-from studies.tuning.spec import OWN, Family, TuneSpec
+from studies.tuning.spec import BASELINE, Family, TuneSpec
 
 
 class Evaluation(NamedTuple):
     """Designs and their derivatives; NumPy arrays."""
 
     objective: np.ndarray  # (designs,), nan if a scenario did not finish
-    slope: np.ndarray  # by the free numbers, 0 for those that do not move, (designs, p)
+    slope: np.ndarray  # by the free parameters, 0 for those that do not move, (designs, p)
     limits: np.ndarray  # value over limit - 1, positive where violated, (designs, m)
     limit_slope: np.ndarray  # (designs, m, p)
     peaks: np.ndarray  # largest values of the limited metrics, nan for the loop's, (designs, m)
@@ -57,7 +57,7 @@ class Evaluator:
             families: of each design of a batch.
 
         Raises:
-            StudyError: as `check_run`; the study itself does not finish a run.
+            StudyError: as `check_run`; the baseline does not finish a run.
         """
         self.spec, self.families = spec, families
         self.merit, self.linear = merit_of(spec), LinearFidelity(spec, families)
@@ -72,7 +72,7 @@ class Evaluator:
         study = spec.study.change(run__smooth=True)
         padded = {name: column[rows] for name, column in whole.items()}
         self._cases = in_working_precision(build_cases(study, padded, self._structure))
-        self._rows = rows // self.scenarios  # design of every lane, the study itself first
+        self._rows = rows // self.scenarios  # design of every lane, the baseline first
         self.run_time = float("nan")  # time per run of the last batch [s]
         most = int(self.is_free.sum(axis=1).max())
         self._gradients = make_gradients(self._structure, self._layout, spec.free.place, most)
@@ -81,7 +81,7 @@ class Evaluator:
         """Objective and limits of designs.
 
         Args:
-            values: of the free numbers in the study's units, (designs, p); those that a design's
+            values: of the free parameters in the study's units, (designs, p); those that a design's
                 family does not move are ignored.
             has_slope: designs that need derivatives; others can have any, (designs,).
         """
@@ -122,7 +122,7 @@ class Evaluator:
         )
 
     def _slopes(self, runs: Differentiated, cotangents: Any, has_slope: np.ndarray) -> np.ndarray:
-        """Derivatives of the designs' objectives and limits by the free numbers.
+        """Derivatives of the designs' objectives and limits by the free parameters.
 
         Args:
             runs: all of a batch.
@@ -134,7 +134,7 @@ class Evaluator:
         """
 
         def of_runs(x: np.ndarray) -> np.ndarray:
-            """Zeros for the study itself, the designs' runs, zeros up to the batch's size."""
+            """Zeros for the baseline, the designs' runs, zeros up to the batch's size."""
             count, designs = x.shape[:2]
             wanted = np.where(has_slope.reshape(-1, *[1] * (x.ndim - 2)), x, 0.0)
             found = np.zeros((count, len(self._rows), *x.shape[3:]), x.dtype)
@@ -152,21 +152,21 @@ class Evaluator:
         if is_bad.any():
             k = int(np.argmax(is_bad))
             raise StudyError(
-                f"tune: the study itself does not finish a run in scenario {k}: "
-                f"{status.REASONS[int(codes[k])]}; everything is measured against it"
+                f"tune: the baseline does not finish a run in scenario {k}: "
+                f"{status.REASONS[int(codes[k])]}; every design is measured against it"
             )
         for name, _ in self.merit.objective:
             if (np.asarray(size(self.merit, metrics, name)) == 0).any():
                 raise StudyError(
-                    f"tune.objective: {name} is 0 in a run of the study itself, so nothing can be "
+                    f"tune.objective: {name} is 0 in a run of the baseline, so nothing can be "
                     "measured against it; limit it instead"
                 )
-        wanted = {name for one in self.families for name, x in one.limits.items() if x == OWN}
+        wanted = {name for one in self.families for name, x in one.limits.items() if x == BASELINE}
         for name in wanted & set(self.merit.limits):
             if (np.asarray(largest(self.merit, metrics, name)) <= 0).any():
                 raise StudyError(
-                    f"tune.limits.{name} = 'own': the study itself has 0 in a run, of which "
-                    "nothing is a share; give a number"
+                    f"tune.limits.{name} = {BASELINE!r}: the baseline has 0 in a run, which "
+                    "leaves no room; give a number"
                 )
 
 

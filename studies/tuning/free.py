@@ -1,4 +1,4 @@
-"""Free numbers of a design: their names, bounds and scale, and how they get into a `Case`.
+"""Free parameters of a design: their names, bounds and scale, and how they get into a `Case`.
 
 A free field is a number of the study file, an entry of a list, or a list, each of whose entries is
 then free by itself. `placement` stands for several numbers: patch centres on the link and without
@@ -38,12 +38,12 @@ DECIDED = ("patches.", "link.length")
 
 
 def writes(number: Free) -> tuple[str, ...]:
-    """Fields of the study that a free number sets."""
+    """Fields of the study that a free parameter sets."""
     return ("patches.centers",) if number.key == PLACEMENT else (number.name,)
 
 
 def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
-    """Free numbers from what the file says.
+    """Free parameters from what the file says.
 
     Args:
         written: ranges by name, from `[tune.free]`.
@@ -64,10 +64,11 @@ def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
     found = join_numbers(parts)
     check_twice(found.numbers, "tune.free")
     _check_decided(found.numbers)
-    if study.control.pole_decay != ():
+    if study.control.has_poles:
+        poles = "damping" if study.control.damping != () else "pole_decay"
         for number in found.numbers:
             if number.key.startswith(("control.velocity_gain", "control.position_gain")):
-                raise StudyError(f"tune.free.{number.key}: control.pole_decay decides the gains")
+                raise StudyError(f"tune.free.{number.key}: control.{poles} decides the gains")
     return found
 
 

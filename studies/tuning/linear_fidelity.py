@@ -28,7 +28,7 @@ from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.margin import MARGIN_MODES
 from studies.study.spec import Study
 from studies.tuning.scenarios import nominal
-from studies.tuning.spec import OWN, Family, TuneSpec
+from studies.tuning.spec import BASELINE, Family, TuneSpec
 
 #: Unit of violations of `gain_margin`, and the decay rate that counts as stable if no limit of the
 #: loop is set [1/s].
@@ -82,7 +82,7 @@ class LinearFidelity:
 
     def _limit(self, family: Family, name: str) -> float:
         limit = family.limits[name]
-        if limit != OWN:
+        if limit != BASELINE:
             return float(limit)
         self._own = self._own or loop_figures(self._spec.study)
         return float(getattr(self._own, name))

@@ -12,7 +12,7 @@ import numpy as np
 from jaxmodel.metrics import Metrics
 from jaxmodel.parameters import Array
 from studies.study.entries import parse_entries
-from studies.tuning.spec import OWN, Family, TuneSpec
+from studies.tuning.spec import BASELINE, Family, TuneSpec
 
 #: Metrics that a report always shows.
 SHOWN = ("residual_rms", "settling_time", "peak_voltage")
@@ -79,12 +79,12 @@ def tail_weights(count: int, tail: float) -> np.ndarray:
 
 
 def objectives(merit: Merit, metrics: Metrics, own: Metrics) -> Array:
-    """Objective in each scenario, (S,); the study's own is 1.
+    """Objective in each scenario, (S,); the baseline's is 1.
 
     Args:
         merit: weights.
         metrics: of the design, (S, ...).
-        own: of the study itself in the same scenarios, (S, ...).
+        own: of the baseline in the same scenarios, (S, ...).
     """
     shares = [
         weight * size(merit, metrics, x) / size(merit, own, x) for x, weight in merit.objective
@@ -100,7 +100,7 @@ def judged(
     Args:
         merit: criteria.
         metrics: (S, ...).
-        own: of the study itself, (S, ...).
+        own: of the baseline, (S, ...).
         allowed: limits in each scenario, (S, m).
 
     Returns:
@@ -138,7 +138,7 @@ def judged_designs(merit: Merit, metrics: Metrics, own: Metrics, allowed: Array)
     Args:
         merit: criteria.
         metrics: (designs, S, ...).
-        own: of the study itself, (S, ...).
+        own: of the baseline, (S, ...).
         allowed: limits in each scenario, (designs, S, m).
     """
 
@@ -156,7 +156,7 @@ def judged_designs(merit: Merit, metrics: Metrics, own: Metrics, allowed: Array)
 
 
 def own_limits(merit: Merit, own: Metrics) -> np.ndarray:
-    """The study's own values, (S, m)."""
+    """The baseline's values, (S, m)."""
     columns = [np.asarray(largest(merit, own, name)) for name in merit.limits]
     count = len(jax.tree.leaves(own)[0])
     return np.stack(columns, axis=1) if columns else np.zeros((count, 0))
@@ -165,5 +165,7 @@ def own_limits(merit: Merit, own: Metrics) -> np.ndarray:
 def allowed_limits(merit: Merit, family: Family, own: np.ndarray) -> np.ndarray:
     """Limits of a family's runs in each scenario, (S, m); `own` is from `own_limits`."""
     given = [family.limits[name] for name in merit.limits]
-    columns = [own[:, k] if x == OWN else np.full(len(own), float(x)) for k, x in enumerate(given)]
+    columns = [
+        own[:, k] if x == BASELINE else np.full(len(own), float(x)) for k, x in enumerate(given)
+    ]
     return np.stack(columns, axis=1) if columns else own

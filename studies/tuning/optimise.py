@@ -15,7 +15,7 @@ from scipy.stats import qmc
 from studies.errors import StudyError
 from studies.tuning.descent import Adam, Descent, Lbfgs, Trial
 from studies.tuning.evaluate import Evaluation, Evaluator
-from studies.tuning.spec import OWN, Family, TuneSpec
+from studies.tuning.spec import BASELINE, Family, TuneSpec
 
 #: Iterations between updates of the multipliers.
 ROUND = 5
@@ -76,7 +76,7 @@ def start_families(spec: TuneSpec) -> np.ndarray:
 
 
 def first_places(spec: TuneSpec, evaluator: Evaluator) -> np.ndarray:
-    """Initial designs: in each family the study itself, then Sobol points.
+    """Initial designs: in each family the baseline, then Sobol points.
 
     Points whose linearised loop keeps the limits come first, in order of the linear machine's
     residual vibration.
@@ -147,7 +147,7 @@ def advance(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> Progress:
         at: current progress.
 
     Raises:
-        StudyError: in the first iteration, a free number without any effect.
+        StudyError: in the first iteration, a free parameter without any effect.
     """
     k = int(at.iteration)
     found = evaluator.evaluate(spec.free.values(at.place))
@@ -286,7 +286,8 @@ def _can_take(spec: TuneSpec, family: Family, other: Family) -> bool:
     is_same_study = repr(family.columns) == repr(other.columns)
     differing = {name for name, x in family.limits.items() if other.limits[name] != x}
     is_known = all(
-        name == spec.tune.pareto.get("limit") and family.limits[name] != OWN for name in differing
+        name == spec.tune.pareto.get("limit") and family.limits[name] != BASELINE
+        for name in differing
     )
     return other is not family and is_same_study and is_part and is_known
 
@@ -294,7 +295,7 @@ def _can_take(spec: TuneSpec, family: Family, other: Family) -> bool:
 def _limits_there(spec: TuneSpec, at: Progress, start: int, family: Family) -> np.ndarray:
     """Violation of another family's limits by a start's best design, (m,)."""
     limits, along = at.best_limits[start].copy(), spec.tune.pareto.get("limit")
-    if along in spec.limit_names and family.limits[along] != OWN:
+    if along in spec.limit_names and family.limits[along] != BASELINE:
         k = spec.limit_names.index(along)
         limits[k] = at.best_peaks[start, k] / float(family.limits[along]) - 1
     return limits

@@ -15,13 +15,13 @@ from studies.tuning.scenarios import move_label
 from studies.tuning.spec import TuneSpec
 
 GREY = "#999999"
-OBJECTIVE = "objective (the study itself: 1)"
+OBJECTIVE = "objective (baseline: 1)"
 
 
 def descent(spec: TuneSpec, found: TuneFindings) -> Figure:
     """Best objective that keeps the limits, over iterations, by family; thin: every start."""
     with figures.styled():
-        figure = Figure(figsize=(7.4, 3.6), layout="constrained")
+        figure = Figure(figsize=(figures.WIDTH, 3.6), layout="constrained")
         ax: Axes = figure.subplots()
         history = found.at.history[: int(found.at.iteration)]
         best = np.fmin.accumulate(np.where(history[..., 1] <= KEPT, history[..., 0], np.nan))
@@ -46,7 +46,7 @@ def gains(spec: TuneSpec, found: TuneFindings) -> Figure:
     """What each family gains on fresh machines, one panel for each move."""
     with figures.styled():
         rows = len(spec.families)
-        figure = Figure(figsize=(7.4, 1.5 + 0.3 * rows), layout="constrained")
+        figure = Figure(figsize=(figures.WIDTH, 1.5 + 0.3 * rows), layout="constrained")
         axes = figure.subplots(1, len(spec.moves), squeeze=False, sharex=True, sharey=True)[0]
         count = spec.tune.scenarios.check
         for k, (ax, move) in enumerate(zip(axes, spec.moves, strict=True)):
@@ -86,14 +86,14 @@ def front(spec: TuneSpec, found: TuneFindings, limit: str) -> Figure:
         limit: metric along the abscissa, one of `spec.metric_limits`.
     """
     with figures.styled():
-        figure = Figure(figsize=(7.4, 4.2), layout="constrained")
+        figure = Figure(figsize=(figures.WIDTH, 4.2), layout="constrained")
         ax: Axes = figure.subplots()
         column = spec.metric_limits.index(limit)
         if found.searched is not None:
             seen, kept = found.searched, is_kept(spec, found.searched)
             for chosen, color, label in (
-                (np.isfinite(seen.objective) & ~kept, "#CCCCCC", "random, a limit not kept"),
-                (kept, figures.SERIES[0], "random, all limits kept"),
+                (np.isfinite(seen.objective) & ~kept, "#CCCCCC", "random, a limit violated"),
+                (kept, figures.SERIES[0], "random, all limits satisfied"),
             ):
                 if chosen.any():
                     ax.scatter(
@@ -113,7 +113,7 @@ def front(spec: TuneSpec, found: TuneFindings, limit: str) -> Figure:
             "x",
             color=figures.SERIES[1],
             markersize=4,
-            label="every start, machines of the tuning",
+            label="every starting point, machines of the tuning",
         )
         points = [(x.metrics[limit].max(), x.objective.mean()) for x in found.judged]
         line = np.array(
@@ -126,11 +126,11 @@ def front(spec: TuneSpec, found: TuneFindings, limit: str) -> Figure:
                 "o-",
                 markersize=4,
                 color=figures.SERIES[2],
-                label="front, on fresh machines",
+                label="Pareto front, on fresh machines",
             )
         marks = iter("^vD*P<>")
         own = found.own.metrics[limit].max(), found.own.objective.mean()
-        ax.plot(*own, "s", color="black", label="the study itself")
+        ax.plot(*own, "s", color="black", label="baseline")
         for point, family in zip(points, spec.families, strict=True):
             if not family.front:
                 ax.plot(

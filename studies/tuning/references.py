@@ -25,7 +25,7 @@ from studies.tuning.linear_fidelity import LoopFigures, loop_figures
 from studies.tuning.merit import all_judged, allowed_limits, merit_of, own_limits
 from studies.tuning.optimise import KEPT, excess
 from studies.tuning.scenarios import lane_columns, scenario_columns
-from studies.tuning.spec import OWN, Family, TuneSpec
+from studies.tuning.spec import BASELINE, Family, TuneSpec
 
 FIELD = "control.gain_factor"
 #: Values that are scanned: this many between these multiples of the baseline's, and that itself.
@@ -174,9 +174,9 @@ def _keeps_loop(spec: TuneSpec, value: float) -> bool:
     found, own = loop_figures(gain_study(spec, value)), None
     for name in spec.loop_limits:
         limit = spec.tune.limits[name]
-        if limit == OWN:
+        if limit == BASELINE:
             own = own or loop_figures(spec.study)
-        left = _left(name, found, getattr(own, name) if limit == OWN else float(limit))
+        left = _left(name, found, getattr(own, name) if limit == BASELINE else float(limit))
         if left < -KEPT:
             return False
     return True

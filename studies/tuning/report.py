@@ -15,7 +15,7 @@ from studies.show.sketch import CAPTION
 from studies.show.templates import render
 from studies.show.units import count_text, headed, number, readable, settling_text
 from studies.study.entries import parse_entries
-from studies.study.margin import MARGIN_MODES, caution, margin_text
+from studies.study.margin import MARGIN_MODES, caution, margin_in_db, margin_text
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
 from studies.tuning.check import JudgedDesign, Searched, patch_centers
 from studies.tuning.free import PLACEMENT
@@ -23,7 +23,7 @@ from studies.tuning.merit import SHOWN
 from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
 from studies.tuning.references import References, reference_lines, resolution_lines
 from studies.tuning.scenarios import move_label
-from studies.tuning.spec import LOOP_LIMITS, OWN, Family, TuneSpec, label
+from studies.tuning.spec import BASELINE, LOOP_LIMITS, Family, TuneSpec, label
 
 #: Lower limits.
 LOWER = ("gain_margin", "slowest_decay", "singularity_distance")
@@ -34,16 +34,16 @@ ALIKE = 0.01
 #: With fewer designs, or a smaller spread between them, ranks are meaningless.
 FEW, NARROW = 8, 0.05
 #: Heading of the reference row.
-ITSELF = "the study itself"
+REFERENCE = "baseline"
 
 
 class TuneFindings(NamedTuple):
     """Everything that a tuning found."""
 
     at: Progress
-    own: JudgedDesign  # the study itself
+    own: JudgedDesign  # the baseline
     judged: list[JudgedDesign]  # the best design of every family, in the order of `spec.families`
-    audited: list[Disagreement]  # at the best design of the family with most free numbers
+    audited: list[Disagreement]  # at the best design of the family with most parameters
     linear: np.ndarray  # linear residual vibration of each start's best design [m], (B,)
     residual: np.ndarray  # of its own run on the first scenario [m], (B,); nan if not judged by it
     searched: Searched | None
@@ -52,12 +52,21 @@ class TuneFindings(NamedTuple):
     references: References = References(None, None, None, None)  # what designs have to beat
 
 
+class Gain(NamedTuple):
+    """A figure of the design to recommend, beside the baseline's."""
+
+    figure: str
+    change: str  # relative, "" if not known
+    after: str
+    before: str  # with the unit
+
+
 class BestFamily(NamedTuple):
     """The design to recommend."""
 
     family: str
     file: str  # of its study
-    gains: list[tuple[str, str, str]]  # figure, its value, that of the study itself with unit
+    gains: list[Gain]
     objective: np.ndarray  # on the fresh machines
     caution: str  # warning about its gain margin, "" if there is none
     is_violated: bool  # a limit
@@ -93,6 +102,7 @@ def report(spec: TuneSpec, found: TuneFindings, folder: str = "") -> str:
         folder: that holds the tuned studies, for commands.
     """
     at, seen = found.at, found.searched
+    worst = max(found.audited, key=lambda entry: entry.share)
     names = list(found.own.metrics)
     return render(
         "tuning/report.md",
@@ -130,7 +140,8 @@ def report(spec: TuneSpec, found: TuneFindings, folder: str = "") -> str:
         kept=seen.objective[is_kept(spec, seen)] if seen is not None else [],
         tuned=at.best_objective[at.winner(spec.main)],
         fidelity=_fidelity(spec, found),
-        worst=max(found.audited, key=lambda entry: entry.share),
+        worst=worst,
+        worst_name=PLACEMENT if worst.name.startswith(PLACEMENT) else worst.name,
         allowed=ALLOWED,
         meaning=MEANING,
         sketch_caption=CAPTION,
@@ -155,12 +166,15 @@ def _best(spec: TuneSpec, found: TuneFindings) -> BestFamily:
     for metric in dict.fromkeys((*spec.tune.objective, *SHOWN)):
         after, before = (_value(metric, x.own.metrics, x.own.watched) for x in (one, own))
         unit = readable(METRICS[parse_entries(metric).metric].unit)[1]
-        gains.append((metric, after, before if unit == "1" else f"{before} {unit}"))
+        known = not any(text.startswith("not") for text in (after, before))
+        change = _relative(*(float(x.own.metrics[metric]) for x in (own, one))) if known else ""
+        gains.append(Gain(metric, change, after, before if unit == "1" else f"{before} {unit}"))
     if one.loop is not None and own.loop is not None:
-        margins = one.loop.gain_margin, own.loop.gain_margin
-        gains.append(("gain margin", f"{margins[0]:.3g}", f"{margins[1]:.3g}"))
+        margins = (margin_in_db(x.gain_margin, 3) for x in (one.loop, own.loop))
+        gains.append(Gain("gain margin", "", *margins))
         decays = one.loop.slowest_decay, own.loop.slowest_decay
-        gains.append(("slowest decay", f"{decays[0]:.3g}", f"{decays[1]:.3g} 1/s"))
+        change = _relative(decays[1], decays[0])
+        gains.append(Gain("slowest decay", change, f"{decays[0]:.3g}", f"{decays[1]:.3g} 1/s"))
     return BestFamily(
         family=family.name,
         file=file_name(spec, family),
@@ -169,6 +183,11 @@ def _best(spec: TuneSpec, found: TuneFindings) -> BestFamily:
         caution=caution(one.loop.gain_margin) if one.loop is not None else "",
         is_violated=found.at.beyond(found.at.winner(k)) > 0,
     )
+
+
+def _relative(before: float, after: float) -> str:
+    """A relative change in percent, "" if there is nothing to relate to."""
+    return f"{100 * (after / before - 1):+.3g} %" if before else ""
 
 
 def best_family(spec: TuneSpec, found: TuneFindings) -> int:
@@ -198,7 +217,7 @@ def summary(spec: TuneSpec, found: TuneFindings) -> list[str]:
         is_moving = k < len(spec.moving)
         lost = is_moving and found.at.beyond(found.at.winner(k)) > 0
         lines.append(
-            f"{family.name}: {one.objective.mean():.4f} of the study's objective on {machines}"
+            f"{family.name}: {one.objective.mean():.4f} of the baseline's objective on {machines}"
             + (f", worst {one.objective.max():.4f}" if len(one.objective) > 1 else "")
             + ("; a limit is violated" if lost else "")
         )
@@ -216,7 +235,7 @@ def _designs(spec: TuneSpec, found: TuneFindings) -> list[tuple[str, JudgedDesig
     """The baseline, the best design of every family, what they have to beat; by Markdown names."""
     names = [literal(family.name) for family in spec.families]
     compared = found.references.designs
-    return [(ITSELF, found.own), *zip(names, found.judged, strict=True), *compared]
+    return [(REFERENCE, found.own), *zip(names, found.judged, strict=True), *compared]
 
 
 def _value(metric: str, values: Mapping[str, Any], watched: float) -> str:
@@ -297,7 +316,7 @@ def _loop_margin(found: TuneFindings, k: int, name: str, limit: float | str) -> 
     loop, own = found.judged[k].loop, found.own.loop
     if loop is None or own is None:
         return float("nan")
-    allowed = getattr(own, name) if limit == OWN else float(limit)
+    allowed = getattr(own, name) if limit == BASELINE else float(limit)
     margin = getattr(loop, name) / allowed - 1
     return -margin if name == "spillover" else margin
 
@@ -312,11 +331,13 @@ def _state(beyond: float, left: float) -> str:
 
 
 def _numbers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
-    """Row of each free number: its bounds, the study's, and that of every family."""
+    """Row of each free parameter but those of the placement, which `_centers` shows in mm."""
     at, families, rows = found.at, spec.moving, []
     places = [at.best_place[at.winner(k)] for k in range(len(families))]
     alike = [at.best_place[_alike(at, k)] for k in range(len(families))]
     for n, free in enumerate(spec.free.numbers):
+        if free.key == PLACEMENT:
+            continue
         cells = []
         for k, family in enumerate(families):
             value = spec.free.values(places[k])[n]
@@ -330,9 +351,9 @@ def _numbers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
 
 
 def _centers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
-    """Row of each design: its patch centres [mm], which the free numbers do not show."""
+    """Row of each design: its patch centres [mm], which the free parameters do not show."""
     at, unmoved = found.at, np.full(len(spec.free.numbers), np.nan)
-    designs = [(ITSELF, spec.moving[0]._replace(columns={}), unmoved)]
+    designs = [(REFERENCE, spec.moving[0]._replace(columns={}), unmoved)]
     for k, family in enumerate(spec.moving):
         place = at.best_place[at.winner(k)]
         designs.append((literal(family.name), family, spec.free.values(place)))
@@ -410,10 +431,10 @@ def _contradiction(spec: TuneSpec, family: Family, values: np.ndarray) -> str:
     never = [name for name, value in least.items() if value > KEPT]
     if never:
         return ", ".join(
-            f"{name} = {family.limits[name]} is kept by no design"
+            f"{name} = {family.limits[name]} is satisfied by no design"
             + ("" if name in LOOP_LIMITS else f" (nearest {100 * least[name]:+.1f} %)")
             for name in never
         )
     return " and ".join(f"{name} = {family.limits[name]}" for name in spec.limit_names) + (
-        " are kept by some design each, but by none together"
+        " are each satisfied by some design, but by none together"
     )

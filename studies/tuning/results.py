@@ -21,7 +21,7 @@ LOOP_UNITS = {"gain_margin": "1", "slowest_decay": "s-1", "spillover": "1"}
 
 
 def free_unit(key: str) -> str:
-    """Unit of a free number, by the name it has in the file."""
+    """Unit of a free parameter, by the name it has in the file."""
     entry = parse_entry(key)
     return field_unit(entry.field) if entry and "." in entry.field else "1"
 
@@ -48,18 +48,18 @@ def _asked(spec: TuneSpec) -> dict[str, Variable]:
         for x in zip(*((f.span.low, f.span.high, f.start) for f in numbers), strict=True)
     )
     asked = {
-        "free": _text([f.name for f in numbers], "free", "free number"),
-        "free_unit": _text([free_unit(f.key) for f in numbers], "free", "unit of the free number"),
-        "free_low": Variable(low, axis, "1", "lower bound, in the number's unit"),
-        "free_high": Variable(high, axis, "1", "upper bound, in the number's unit"),
-        "free_study": Variable(start, axis, "1", "value of the study itself, in the number's unit"),
+        "free": _text([f.name for f in numbers], "free", "free parameter"),
+        "free_unit": _text([free_unit(f.key) for f in numbers], "free", "its unit"),
+        "free_low": Variable(low, axis, "1", "lower bound, in the parameter's unit"),
+        "free_high": Variable(high, axis, "1", "upper bound, in the parameter's unit"),
+        "free_study": Variable(start, axis, "1", "the baseline's value, in the parameter's unit"),
         "family": _text([family.name for family in spec.families], "family", "family"),
     }
     if spec.limit_names:
         limits = [[str(x.limits[name]) for name in spec.limit_names] for x in spec.families]
         asked["limit"] = _text(list(spec.limit_names), "limit", "what is limited")
         asked["family_limit"] = Variable(
-            np.array(limits), ("family", "limit"), "1", "limit; own: what the study itself reaches"
+            np.array(limits), ("family", "limit"), "1", "limit; baseline: its value"
         )
     return asked
 
@@ -74,15 +74,22 @@ def _starts(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
     is_best[[at.winner(k) for k in range(len(spec.moving))]] = True
     axis, trial = ("start",), ("iteration", "start")
     starts = {
-        "start_family": _text([one.name for one in family], "start", "family of the start"),
-        "is_best": Variable(is_best, axis, "1", "best start of its family"),
+        "start_family": _text(
+            [one.name for one in family], "start", "family of the starting point"
+        ),
+        "is_best": Variable(is_best, axis, "1", "best of its family"),
         "value": Variable(
-            values, ("start", "free"), "1", "best value of each start, in the number's unit"
+            values,
+            ("start", "free"),
+            "1",
+            "best value from each starting point, in the parameter's unit",
         ),
         "patch_center": Variable(
             np.array(centers), ("start", "link", "patch"), "m", "centres of the patches then"
         ),
-        "objective": Variable(at.best_objective, axis, "1", "best objective of each start"),
+        "objective": Variable(
+            at.best_objective, axis, "1", "best objective from each starting point"
+        ),
         "is_frozen": Variable(at.is_frozen, axis, "1", "stopped, a run did not finish"),
         "linear_residual": Variable(
             found.linear, axis, "m", "linear residual vibration of the best design"
@@ -95,8 +102,8 @@ def _starts(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
             at.best_limits,
             ("start", "limit"),
             "1",
-            "negative: kept; value over limit - 1 of a metric, for the loop a smooth figure that "
-            "has the same sign",
+            "negative: satisfied; value over limit - 1 of a metric, for the loop a smooth figure "
+            "that has the same sign",
         )
     return starts
 
@@ -116,27 +123,29 @@ def _fresh(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
 
     fresh["fresh_objective"] = Variable(each("objective"), both, "1", "objective, fresh machines")
     fresh["fresh_status"] = Variable(each("status"), both, *STATUS_LABEL)
-    fresh["own_status"] = Variable(found.own.status, axis, *STATUS_LABEL)
+    fresh["baseline_status"] = Variable(found.own.status, axis, *STATUS_LABEL)
     links = links_text(spec.counted_links)
     for name, own in found.own.metrics.items():
         label, unit = variable_name(name), METRICS[name.partition("[")[0]].unit
         values = np.stack([one.metrics[name] for one in found.judged])
         text = name if parse_entries(name).names_a_link else f"{name}, largest of {links}"
         fresh[f"fresh_{label}"] = Variable(values, both, unit, f"{text}, fresh machines")
-        fresh[f"own_{label}"] = Variable(
-            own, axis, unit, f"{text}, fresh machines, the study itself"
+        fresh[f"baseline_{label}"] = Variable(
+            own, axis, unit, f"{text}, fresh machines, the baseline"
         )
         values = np.array([one.own.metrics[name] for one in found.judged])
         fresh[f"file_{label}"] = Variable(values, ("family",), unit, f"{text}, as the file runs")
         before = np.array(found.own.own.metrics[name])
-        fresh[f"file_own_{label}"] = Variable(before, (), unit, f"{text}, the study as it runs")
+        fresh[f"file_baseline_{label}"] = Variable(
+            before, (), unit, f"{text}, the baseline's file as it runs"
+        )
     if found.own.loop is not None:
         for name, unit in LOOP_UNITS.items():
             what = f"{name.replace('_', ' ')} of the linearised loop"
             values = np.array([_loop_figure(one, name) for one in found.judged])
             fresh[name] = Variable(values, ("family",), unit, what)
             own = np.array(_loop_figure(found.own, name))
-            fresh[f"own_{name}"] = Variable(own, (), unit, f"{what}, the study itself")
+            fresh[f"baseline_{name}"] = Variable(own, (), unit, f"{what}, the baseline")
     return fresh
 
 

@@ -49,7 +49,7 @@ DECISIVE = ("studies.tuning.check", "studies.tuning.evaluate", "studies.tuning.o
 
 
 def make_evaluator(spec: TuneSpec) -> Evaluator:
-    """Evaluator of all starts."""
+    """Evaluator of all starting points."""
     return Evaluator(spec, [spec.moving[k] for k in start_families(spec)])
 
 
@@ -69,7 +69,7 @@ def run_tuning(
         is_resumed: continue the existing tuning.
         console: where progress goes; default: standard output.
         is_quiet: hide progress.
-        evaluator: what evaluates all starts; default: this process, as `make_evaluator`.
+        evaluator: what evaluates all starting points; default: this process, as `make_evaluator`.
 
     Returns:
         What was found.
@@ -91,8 +91,8 @@ def run_tuning(
         if before is not None and not fits(spec, before):
             raise StudyError(f"{out / PROGRESS}: damaged; name a new folder")
         if before is not None:
-            say(f"going on after iteration {int(before.iteration)}")
-        say("compiling, and looking for starts by the linear loop")
+            say(f"continuing after iteration {int(before.iteration)}")
+        say("compiling, and choosing starting points by the linear loop")
         evaluator = evaluator or make_evaluator(spec)
 
         clock = _Clock()
@@ -105,8 +105,8 @@ def run_tuning(
         lost = [f.name for k, f in enumerate(spec.moving) if not _has_finished(at, k)]
         if lost:
             raise StudyError(
-                f"tune.starts: no start of {', '.join(lost)} finished a run; the study with what "
-                "the family sets should be one that does (try studies simulate)"
+                f"tune.starts: no starting point of {', '.join(lost)} finished a run; the study "
+                "with the family's settings should be one that does (try studies simulate)"
             )
         say(ended(spec, at))
         found = find(spec, evaluator, at, say)
@@ -115,7 +115,7 @@ def run_tuning(
             say(line)
     faults = unkept(spec, at)
     if faults:
-        raise StudyError("tune.limits: not kept together; " + "; ".join(faults))
+        raise StudyError("tune.limits: not satisfied together; " + "; ".join(faults))
     return found
 
 
@@ -149,8 +149,10 @@ def _told(spec: TuneSpec, at: Progress) -> str:
         beyond = at.beyond(best)
         mark = f" (limit {100 * beyond:+.1f} %)" if beyond > 0 else ""
         parts.append(f"{family.name} {at.best_objective[best]:.4f}{mark}")
-    lost = f"; {at.is_frozen.sum()} starts frozen" if at.is_frozen.any() else ""
-    return f"{int(at.iteration)}/{spec.tune.iterations} best (study: 1): {', '.join(parts)}{lost}"
+    lost = f"; {at.is_frozen.sum()} starting points frozen" if at.is_frozen.any() else ""
+    return (
+        f"{int(at.iteration)}/{spec.tune.iterations} best (baseline: 1): {', '.join(parts)}{lost}"
+    )
 
 
 def find(
@@ -160,7 +162,7 @@ def find(
 
     Args:
         spec: of the tuning.
-        evaluator: of its starts.
+        evaluator: of its starting points.
         at: where the tuning ended.
         say: called before each stage.
     """

@@ -23,7 +23,7 @@ def scenario_columns(
         spec: of the tuning.
         count: machines.
         seed: of their shifts and of their noise.
-        is_fresh: all machines differ from the study's own; otherwise it is the first.
+        is_fresh: all machines differ from the nominal one; otherwise it is the first.
 
     Returns:
         Columns of `count` rows for each move.
@@ -60,12 +60,12 @@ def lane_columns(
 ) -> Columns:
     """Columns for designs times scenarios, design by design.
 
-    Columns equal to the study's own values are omitted: what all runs share is prepared once.
+    Columns equal to the baseline's values are omitted: what all runs share is prepared once.
 
     Args:
         spec: of the tuning.
         columns: from `scenario_columns`.
-        families: of each design; None is the study itself.
+        families: of each design; None is the baseline.
     """
     count = len(next(iter(columns.values())))
     lanes = {name: _repeated(column, len(families)) for name, column in columns.items()}
@@ -94,7 +94,7 @@ def _is_everywhere(column: np.ndarray, value: Any) -> bool:
 
 
 def nominal(spec: TuneSpec, family: Family | None) -> Study:
-    """The study's own machine on the first move, with a family's settings."""
+    """The nominal machine on the first move, with a family's settings."""
     study = family.study(spec.study) if family else spec.study
     for name, value in spec.moves[0].items():
         study = parse_study(set_value(study, name, value))

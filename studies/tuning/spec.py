@@ -1,13 +1,13 @@
-"""The file of a tuning: a study plus `[tune]`, which defines free numbers and objective.
+"""The file of a tuning: a study plus `[tune]`, which defines free parameters and objective.
 
-Everything is measured against the study itself, machine by machine and move by move:
+Everything is measured against the baseline, machine by machine and move by move:
 
 - objective: sum of weight times the size of a metric (root of the mean square of its entries) over
-  its size in the study's own run of that scenario; of the scenarios, the mean of the worst share;
-- limits: the largest entry of a metric must not exceed the limit in any scenario; "own" stands for
-  the study's own value there. `gain_margin` and `slowest_decay` are lower limits and `spillover` an
-  upper one of the linearised sampled loop at the first way-point; `singularity_distance` is a lower
-  limit on the distance of all link angles from 0 and 90 deg.
+  its size in the baseline's run of that scenario; of the scenarios, the mean of the worst share;
+- limits: the largest entry of a metric must not exceed the limit in any scenario; "baseline"
+  stands for the baseline's value there. `gain_margin` and `slowest_decay` are lower limits and
+  `spillover` an upper one of the linearised sampled loop at the first way-point;
+  `singularity_distance` is a lower limit on the distance of all link angles from 0 and 90 deg.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from studies.study.explain import explain
 from studies.study.files import read_toml
 from studies.study.paths import checked_value, is_each_link, known_field, overlaps, set_value
 from studies.study.spec import Section, Study, described, parse_study
+from studies.study.window import with_window
 from studies.tuning.free import free_numbers, writes
 
 #: Limits that no run is needed for; all but `spillover` are lower ones. Those of the loop:
@@ -39,14 +40,14 @@ OF_LOOP = ("gain_margin", "slowest_decay", "spillover")
 LOOP_LIMITS = (*OF_LOOP, "singularity_distance")
 #: Runs in one batch.
 MOST_RUNS = 50_000
-#: Limit that stands for the study's own value.
-OWN = "own"
+#: Limit that stands for the baseline's value.
+BASELINE = "baseline"
 
 
 class Scenarios(Section):
     """Machines and moves that one design must handle."""
 
-    count: int = described(1, "1", "machines; the first is the study's own", ge=1, le=1000)
+    count: int = described(1, "1", "machines; the first is the nominal one", ge=1, le=1000)
     check: int = described(16, "1", "fresh machines, to judge the result", ge=1, le=10_000)
     seed: int = described(0, "1", "of the machines", ge=0, le=10**9)
     spread: dict[str, Any] = described({}, "-", "field = +-percent of its value")
@@ -58,26 +59,28 @@ class Scenarios(Section):
 
     @property
     def has_others(self) -> bool:
-        """Whether machines differ from the study's own."""
+        """Whether machines differ from the nominal one."""
         return bool(self.spread or self.machines)
 
 
 class Tune(Section):
-    """Free numbers and objective."""
+    """Free parameters and objective."""
 
     free: dict[str, Any] = described({}, "-", "field = {from, to, scale}")
     objective: dict[str, Any] = described(
-        {"residual_rms": 1.0}, "-", "metric = weight, relative to the study's own", min_length=1
+        {"residual_rms": 1.0}, "-", "metric = weight, relative to the baseline", min_length=1
     )
-    limits: dict[str, Any] = described({}, "-", "metric or figure of the loop = limit or 'own'")
+    limits: dict[str, Any] = described(
+        {}, "-", "metric or figure of the loop = limit or 'baseline'"
+    )
     scenarios: Scenarios = Scenarios()
     families: dict[str, Any] = described({}, "-", "name = {free, set}: what moves, what is set")
-    pareto: dict[str, Any] = described({}, "-", "{limit, values, family}: a front")
+    pareto: dict[str, Any] = described({}, "-", "{limit, values, family}: a Pareto front")
     method: Literal["lbfgs", "adam"] = described("lbfgs", "-", "descent method")
-    starts: int = described(8, "1", "initial designs of each family", ge=1, le=1024)
-    iterations: int = described(60, "1", "evaluations of each start", ge=1, le=10_000)
+    starts: int = described(8, "1", "starting points of each family", ge=1, le=1024)
+    iterations: int = described(60, "1", "evaluations from each starting point", ge=1, le=10_000)
     samples: int = described(0, "1", "random designs for comparison", ge=0, le=10**6)
-    seed: int = described(0, "1", "of the starts", ge=0, le=10**9)
+    seed: int = described(0, "1", "of the starting points", ge=0, le=10**9)
 
 
 class Family(NamedTuple):
@@ -108,19 +111,19 @@ class TuneSpec(NamedTuple):
 
     @property
     def moving(self) -> tuple[Family, ...]:
-        """Families with free numbers."""
+        """Families with free parameters."""
         return tuple(family for family in self.families if family.is_free.any())
 
     @property
     def main(self) -> int:
-        """The family with the most free numbers."""
+        """The family with the most free parameters."""
         return int(np.argmax([family.is_free.sum() for family in self.families]))
 
     @property
     def has_poles(self) -> bool:
         """Whether the gains of any design follow from poles."""
         studies = (self.study, *(family.study(self.study) for family in self.families))
-        return any(study.control.pole_decay != () for study in studies)
+        return any(study.control.has_poles for study in studies)
 
     @property
     def has_position_gain(self) -> bool:
@@ -170,7 +173,9 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
     """
     if "tune" not in data:
         raise StudyError("tune: missing; a tuning is a study file with a section [tune]")
-    study = parse_study({name: value for name, value in data.items() if name != "tune"})
+    study = with_window(
+        parse_study({name: value for name, value in data.items() if name != "tune"})
+    )
     try:
         tune = Tune.model_validate(data["tune"])
     except ValidationError as error:
@@ -198,12 +203,13 @@ def _check_figures(tune: Tune, study: Study) -> None:
         _check_positive(weight, 1e30, f"tune.objective.{shown_name(name)}")
     for name, limit in tune.limits.items():
         _check_metric(name, "tune.limits", True, study)
-        if limit != OWN:
-            _check_positive(limit, 1e30, f"tune.limits.{shown_name(name)}", more=" or 'own'")
+        if limit != BASELINE:
+            path, hint = f"tune.limits.{shown_name(name)}", BASELINE * isinstance(limit, str)
+            _check_positive(limit, 1e30, path, more=f" or {BASELINE!r}", hint=hint)
     for name, part in tune.limits.items():
         metric = _field(name)
-        whole = tune.limits.get(metric, OWN)
-        if name != metric and OWN not in (whole, part) and part > whole:
+        whole = tune.limits.get(metric, BASELINE)
+        if name != metric and BASELINE not in (whole, part) and part > whole:
             raise StudyError(
                 f"tune.limits: {name} = {part:g} allows more than {metric} = {whole:g}, "
                 "which holds for all its entries; leave one out"
@@ -238,7 +244,7 @@ def _check_machines(asked: Scenarios, study: Study) -> None:
         if len(values) < needed:
             raise StudyError(
                 f"{path}: {len(values)} values; allowed: {needed} or more, for "
-                f"tune.scenarios.count = {asked.count} without the study's own machine, and for "
+                f"tune.scenarios.count = {asked.count} without the nominal machine, and for "
                 f"tune.scenarios.check = {asked.check}"
             )
         for k, value in enumerate(values):
@@ -284,10 +290,12 @@ def _check_feedback(tune: Tune, study: Study) -> None:
         )
 
 
-def _check_positive(number: Any, most: float, path: str, unit: str = "", more: str = "") -> None:
+def _check_positive(
+    number: Any, most: float, path: str, unit: str = "", more: str = "", hint: str = ""
+) -> None:
     is_number = isinstance(number, (int, float)) and not isinstance(number, bool)
     if not is_number or not 0 < number <= most:
-        raise field_error(path, number, f"a number > 0 and <= {most:g}{more}", unit)
+        raise field_error(path, number, f"a number > 0 and <= {most:g}{more}", unit, hint)
 
 
 def _check_metric(name: str, path: str, has_loop: bool, study: Study) -> None:
@@ -378,7 +386,7 @@ def _families(tune: Tune, study: Study, free: FreeNumbers) -> tuple[Family, ...]
     else:
         found = [_family(name, x, tune, study, free) for name, x in tune.families.items()]
     if not any(family.is_free.any() for family in found):
-        raise field_error("tune.families", list(tune.families), "one with free numbers or more")
+        raise field_error("tune.families", list(tune.families), "one or more with free parameters")
     found += _front(tune, found)
     names = [label(family.name) for family in found]
     for k, name in enumerate(names):
@@ -461,7 +469,7 @@ def _front(tune: Tune, families: list[Family]) -> list[Family]:
 
 
 def _check_family(family: Family, move: dict[str, Any], study: Study) -> None:
-    """Check that a family's settings run, with the study's own program."""
+    """Check that a family's settings run, with the baseline's program."""
     where = [f"tune.families.{shown_name(family.name)}"] if family.columns else []
     where += [f"{name} = {shown(value)} of tune.scenarios" for name, value in move.items()]
     told = f"{', '.join(where)}: " if where else ""

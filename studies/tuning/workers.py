@@ -33,7 +33,7 @@ class Share(NamedTuple):
     precision: str
     spec: str  # the tuning as JSON
     families: tuple[int, ...]  # of the designs, positions in `spec.moving`
-    values: np.ndarray  # of the free numbers, (designs, p)
+    values: np.ndarray  # of the free parameters, (designs, p)
     has_slope: np.ndarray  # (designs,)
 
 
@@ -86,7 +86,8 @@ class ClusterEvaluator(Evaluator):
         self._parts = np.array_split(np.arange(len(families)), count)
         self._families = [tuple(map(int, families[part])) for part in self._parts]
         self._is_compiled = False
-        tell(f"workers: {self._watch.n_workers}, each with {len(self._parts[0])} starts or fewer")
+        most = len(self._parts[0])
+        tell(f"workers: {self._watch.n_workers}, each with {most} starting points or fewer")
 
     def evaluate(self, values: np.ndarray, has_slope: np.ndarray | bool = True) -> Evaluation:
         wanted, started = np.broadcast_to(has_slope, len(values)), time.perf_counter()
