@@ -89,7 +89,8 @@ def compare(
     found = dict(zip(others, judged[count:], strict=True))
     if WITHOUT in found:
         found[WITHOUT] = found[WITHOUT]._replace(loop=None, poles=None)
-    step = frame_of(*check_run(spec.study)).adc_step if is_on else None
+    has_adc = is_on and spec.study.control.feedback == "sampled"
+    step = frame_of(*check_run(spec.study)).adc_step if has_adc else None
     references = References(found.get(WITHOUT), scan, found.get(ALONE), step)
     return own, judged[:count], references
 
