@@ -25,7 +25,7 @@ from studies.show import figures
 #: Length of the views after the command [s].
 VIEW_LENGTH = 0.2
 #: Those of the platform's error begin later, when the drives have settled [s].
-DRIVE_SETTLED = 0.04
+DRIVE_SETTLED = 0.05
 #: Shorter amplitudes than this share of a unit are shown in the next smaller one.
 LEAST = 0.1
 #: Units of axes by SI unit, the larger first, with their size.
