@@ -81,7 +81,7 @@ class Section(BaseModel):
 class RunSection(Section):
     """Duration, resolution and model of the run."""
 
-    duration: float = described(0.4, "s", "length of the run", gt=0, le=100)
+    duration: float = described(0.5, "s", "length of the run", gt=0, le=100)
     seed: int = described(0, "1", "of ADC noise and force ripple", ge=0, le=10**9)
     substeps: int = described(0, "1", "plant steps per sample; 0: as many as needed", ge=0, le=200)
     smooth: bool = described(False, "-", "smooth limits, noise instead of rounding (for gradients)")
