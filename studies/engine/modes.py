@@ -22,7 +22,7 @@ EQUAL = 1e-6
 RIGID = 1e-6
 
 
-class MachineModes(NamedTuple):
+class NamedModes(NamedTuple):
     """Natural modes of the machine at a pose, ascending in frequency.
 
     `link_share` is the strain energy k_ij |q_ij|^2 in modal coordinate j of link i over the mode's
@@ -95,7 +95,7 @@ def modes_study(
     return parse_study(data)
 
 
-def machine_modes(study: Study | None = None, **changes: Any) -> MachineModes:
+def machine_modes(study: Study | None = None, **changes: Any) -> NamedModes:
     """Natural modes of the machine held by its drive at a pose, under the study's steady load.
 
     Args:
@@ -117,7 +117,7 @@ def machine_modes(study: Study | None = None, **changes: Any) -> MachineModes:
     first = 3 if study.drive.locked else 0  # the coordinates held by the sliders are not modes
     frequency, shape = found.frequency[first:], found.shape[:, first:]
     link_share = _link_shares(frequency, shape, stiffness, modal_stiffness)
-    return MachineModes(
+    return NamedModes(
         frequency=frequency,
         damping_ratio=found.damping_ratio[first:],
         shape=shape,
@@ -130,7 +130,7 @@ def machine_modes(study: Study | None = None, **changes: Any) -> MachineModes:
 def _link_shares(
     frequency: np.ndarray, shape: np.ndarray, stiffness: np.ndarray, modal_stiffness: np.ndarray
 ) -> np.ndarray:
-    """`link_share` of `MachineModes`; stiffness in (X, q), k_ij of the links (3, R)."""
+    """`link_share` of `NamedModes`; stiffness in (X, q), k_ij of the links (3, R)."""
     share = np.full((len(frequency), *modal_stiffness.shape), np.nan)
     group = np.cumsum(np.diff(frequency, prepend=frequency[0]) > EQUAL * frequency)
     for members in (group == k for k in np.unique(group)):
@@ -144,7 +144,7 @@ def _link_shares(
 
 
 def _turn_shares(shape: np.ndarray, mass: np.ndarray) -> np.ndarray:
-    """`turn_share` of `MachineModes`; mass in (X, q)."""
+    """`turn_share` of `NamedModes`; mass in (X, q)."""
     part = np.einsum("am,ab,bm->abm", shape[:3].conj(), mass[:3, :3], shape[:3]).real
     turning, translating = part[2, 2], part[:2, :2].sum(axis=(0, 1))
     return turning / np.maximum(turning + translating, np.finfo(float).tiny)
