@@ -33,9 +33,8 @@ def find_bases(structure: Structure, case: Case) -> Bases:
     beam, patches, n = case.machine.beam, case.machine.patches, structure.n_controlled
     belief = beam._replace(stiffness_factor=1.0)
     size = max(structure.n_modes, n)
-    stations = jnp.asarray(case.windows.stations)
-    load = jnp.broadcast_to(case.initial.load_station, (*stations.shape[:-1], 1))
-    stations = jnp.concatenate([stations, load], axis=-1)
+    load = jnp.broadcast_to(case.initial.load_station, (3, 1))
+    stations = jnp.concatenate([station_places(case), load], axis=1)
     both = structure.basis, structure.controller_basis
     if both[0] == both[1]:
         plant, model = _side_by_side(both[0], beam, belief, patches, size, stations)
@@ -53,6 +52,12 @@ def find_bases(structure: Structure, case: Case) -> Bases:
         model=_without_load(model),
         believed_omega=jnp.where(given > 0, given, own),
     )
+
+
+def station_places(case: Case) -> Array:
+    """Where the chord deflection of each link is taken, from the slider joint [m], (3, S)."""
+    length = jnp.broadcast_to(case.machine.beam.length, (3,))
+    return length[:, None] * case.windows.stations
 
 
 def _without_load(basis: ModalBasis) -> ModalBasis:
@@ -75,7 +80,7 @@ def _side_by_side(
     beam = Beam(*(jnp.concatenate([jnp.broadcast_to(x, (3,)) for x in pair]) for pair in pairs))
     twice = (jnp.asarray(x) for x in patches)
     both = Patches(*(jnp.concatenate([x, x]) if x.ndim else x for x in twice))
-    six = build_basis(kind, beam, both, size, jnp.tile(stations, (stations.ndim, 1)))
+    six = build_basis(kind, beam, both, size, jnp.tile(stations, (2, 1)))
     return jax.tree.map(lambda x: x[:3], six), jax.tree.map(lambda x: x[3:], six)
 
 

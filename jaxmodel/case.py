@@ -53,6 +53,7 @@ class Control(NamedTuple):
     velocity_gain: Array  # k_d of mode 1 [N s/m] or [1/s], (3,); SRF: [s]
     position_gain: Array  # k_p of mode 1 [N/m] or [1/s2], (3,); SRF: [1]
     ratio: Array  # EMC ratios (24) [1], (3, C)
+    damping: Array  # added damping ratio specified [1]; negative: none, (3, C)
     pole_decay: Array  # alpha-bar asked [1/s]; 0: none asked, (3, C)
     pole_frequency: Array  # beta-bar asked [rad/s]; 0: the mode's own, (3, C)
     gain_factor: Array  # factor on the loop gain, whatever the law [1], ()
@@ -135,7 +136,7 @@ class Windows(NamedTuple):
     arrival_tolerance: Array  # tolerated rms error of a joint's place in the window [m], ()
     singularity_margin: Array  # tolerated distance of link angles from 0 and 90 deg [rad], ()
     condition_limit: Array  # tolerated condition number [1], ()
-    stations: Array  # where chord deflection is taken [m], (S,), or (3, S) for each link
+    stations: Array  # where chord deflection is taken, over the links' lengths [1], (S,) or (3, S)
 
 
 class Case(NamedTuple):

@@ -344,7 +344,7 @@ def _static_status(
         (jnp.any(zeta >= 1), status.OVERDAMPED),
         (_has_unplaceable_poles(structure, case, design), status.UNPLACEABLE),
         (
-            ~jnp.all((windows.stations > 0) & (windows.stations < length[:, None])),
+            ~jnp.all((windows.stations > 0) & (windows.stations < 1)),
             status.STATION_OFF_LINK,
         ),
         (~_is_finite(case), status.NON_FINITE),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from jaxmodel.bases import station_places
 from jaxmodel.beam import build_basis, held_frequency
 from jaxmodel.case import Case, Structure
 from jaxmodel.drive import Reference
@@ -77,8 +78,7 @@ def _hammer(structure: Structure, loop: Loop, case: Case, pose: Array) -> Array:
     A force at x does work on v_n = x gamma' - sin(gamma) rho' + sum Y_j(x) q_j': it is a wrench on
     the platform, and a force on each mode.
     """
-    count = loop.deflection_at.shape[1]
-    stations = jnp.broadcast_to(jnp.asarray(case.windows.stations), (3, count))
+    stations, count = station_places(case), loop.deflection_at.shape[1]
     still, zero = jnp.zeros_like(pose), jnp.zeros_like(loop.omega)
 
     def across(rate: Array) -> Array:
@@ -114,8 +114,7 @@ def held_modes(structure: Structure, case: Case) -> tuple[Array, Array]:
     Returns:
         frequencies [Hz] and damping ratios [1], (3, R) each.
     """
-    machine = case.machine
-    stations = jnp.asarray(case.windows.stations)
+    machine, stations = case.machine, station_places(case)
     basis = build_basis(structure.basis, machine.beam, machine.patches, structure.n_modes, stations)
     omega = held_frequency(structure.basis, machine.beam, basis)
     return omega / (2 * jnp.pi), damping_ratio(machine.damping, omega)

@@ -93,7 +93,7 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
     # free vibration of a platform at rest: the window can end with the run
     is_moving = jnp.any(jnp.diff(case.path.waypoints, axis=0) != 0)
     is_cut = is_moving & (case.windows.residual_length > left + period / 2)
-    is_cut |= case.windows.residual_length < period
+    is_cut |= (case.windows.residual_length < period) | (left < period / 2)
     code = jnp.where((code == status.OK) & is_cut, float(status.WINDOW_TOO_LONG), code)
     adc_noise, disturbance = _disturbance(structure, case, prepared, time)
     inputs = Inputs(

@@ -14,7 +14,7 @@ _SHORT = {
     "run": {"duration": 0.08},
     "link": {"modes": 4},
     "motion": {"waypoints": [_HOME, [0.0, 0.01, _HOME[2]]], "move_time": 0.02},
-    "metrics": {"residual_length": 0.03},
+    "metrics": {"residual_delay": 0.0, "residual_length": 0.03},
 }
 #: The paper's gains at full strength, three modes on three links.
 PAPER = {**_SHORT, "title": "paper's gains", "control": {"velocity_gain": [3.1, 3.5, 3.4]}}

@@ -14,7 +14,7 @@ BASE = {
     "link": {"modes": 3},
     "motion": {"waypoints": [[0, 0, HOME_PHI], [0, 0.002, HOME_PHI]], "move_time": 0.01},
     "shaper": {"kind": "zv"},
-    "metrics": {"residual_length": 0.01},
+    "metrics": {"residual_delay": 0.0, "residual_length": 0.01},
 }
 MIXED = {
     "method": "grid",

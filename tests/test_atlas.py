@@ -36,6 +36,7 @@ def small_study(**fields):
             control__modes=1,
             control__ratio_source="own_run",
             run__duration=0.18,
+            metrics__residual_delay=0.0,
             metrics__residual_length=0.06,
             motion__move_time=0.05,
             motion__waypoints=(home, (0.0, 0.01, home[2])),

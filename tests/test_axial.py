@@ -77,7 +77,8 @@ def fast_square(**changes):
         motion__move_time=0.05,
         shaper__kind="none",
         run__duration=0.3001,
-        metrics__stations=(0.1,),
+        metrics__stations=(0.5,),
+        metrics__residual_delay=0.0,
         metrics__residual_length=0.1,
         **changes,
     )
@@ -118,8 +119,9 @@ HEAVY_LINKS = BARE.change(
     motion__move_time=0.05,
     shaper__kind="none",
     run__duration=0.3,
+    metrics__residual_delay=0.0,
     metrics__residual_length=0.05,
-    metrics__stations=(0.1,),
+    metrics__stations=(0.5,),
 )
 
 
@@ -193,6 +195,7 @@ def test_a_load_beyond_the_critical_force_is_a_status(share, code):
     moment = -share * N_CR * 5.0 / statics((0.0, 0.0, 5.0))[0]
     study = BARE.change(
         run__duration=0.02,
+        metrics__residual_delay=0.0,
         metrics__residual_length=0.001,
         shaper__kind="none",
         motion__waypoints=(HOME,),
@@ -213,6 +216,7 @@ def test_a_steady_load_is_held_and_a_pulse_moves_the_platform():
     study = BARE.change(
         drive__kd=60.0,
         run__duration=0.1,
+        metrics__residual_delay=0.0,
         metrics__residual_length=0.02,
         shaper__kind="none",
         motion__waypoints=(HOME,),
@@ -289,6 +293,7 @@ def test_ked_bends_links_by_the_rigid_motion_alone():
         motion__move_time=0.1,
         shaper__kind="none",
         run__duration=0.5,
+        metrics__residual_delay=0.0,
         metrics__residual_length=0.05,
         control__feedback="none",
         drive__kp=1e7,
@@ -316,6 +321,7 @@ def test_ked_fails_where_the_drive_rings_with_the_links(kp, peak, residual):
         shaper__kind="none",
         control__feedback="none",
         run__duration=0.2,
+        metrics__residual_delay=0.0,
         metrics__residual_length=0.1,
         drive__kp=kp,
     )
@@ -377,6 +383,7 @@ def test_spectra_of_the_measured_machine_stand_on_their_peaks():
         control__links=(False,) * 3,
         shaper__kind="none",
         run__duration=0.5,
+        metrics__residual_delay=0.0,
         metrics__residual_length=0.1,
     )
     result = jax.jit(simulate, static_argnums=0)(*arrays(study))
@@ -395,6 +402,7 @@ def test_one_step_per_sample_is_enough_for_the_fastest_moves():
         motion__move_time=0.03,
         shaper__kind="none",
         run__duration=0.08,
+        metrics__residual_delay=0.0,
         metrics__residual_length=0.02,
         control__gain_factor=1.0,
         run__smooth=True,

@@ -23,6 +23,7 @@ def short_study(**changes):
         "run__duration": 0.045,
         "motion__waypoints": ((0.0, 0.0, np.pi / 6), (0.0, 0.005, np.pi / 6)),
         "motion__move_time": 0.025,
+        "metrics__residual_delay": 0.0,
         "metrics__residual_length": 0.01,
     }
     return paper_study().change(**(short | changes))

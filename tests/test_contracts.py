@@ -50,6 +50,7 @@ move_time = 0.03
 [shaper]
 kind = "none"
 [metrics]
+residual_delay = 0.0
 residual_length = 0.02
 """
 OWN = SMALL + (

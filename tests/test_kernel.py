@@ -89,7 +89,7 @@ STIFFNESSES = {"method": "random", "count": 32, "axes": {"drive.kp": {"from": 1e
 @pytest.mark.parametrize(
     ("sweep", "sections"),
     [
-        (ALL_SORTS, {"metrics": {"residual_length": 0.004}}),
+        (ALL_SORTS, {"metrics": {"residual_delay": 0.0, "residual_length": 0.004}}),
         (STIFFNESSES, HEAVY),
         pytest.param(
             STIFFNESSES,

@@ -110,7 +110,7 @@ SHORT = {
     "motion": {"waypoints": [HOME, (0.0, 0.01, HOME[2])], "move_time": 0.05},
     "shaper": {"kind": "none"},
     "control": {"gain_factor": 0.2},
-    "metrics": {"residual_length": 0.02},
+    "metrics": {"residual_delay": 0.0, "residual_length": 0.02},
 }
 
 
@@ -319,4 +319,34 @@ def test_a_sketch_stands_where_the_machine_does():
     centre = joint - pose[:2]
     np.testing.assert_allclose(centre, np.stack([chain.cx, chain.cy], axis=1), atol=1e-12)
     with styled():
-        assert len(sketch(study).axes) == 1
+        assert len(sketch(study).axes) == 2
+
+
+def test_a_sketch_draws_each_link_and_patch_to_scale():
+    """Faces in their own length and width, edges in their own thickness times one factor."""
+    study = parse_study(
+        {
+            "link": {"length": [0.2, 0.26, 0.18], "width": [0.01, 0.02, 0.012], "thickness": 3e-3},
+            "patches": {"sensor_length": [0.01, 0.03, 0.02], "thickness": [2e-4, 5e-4, 3e-4]},
+        }
+    )
+    with styled():
+        links = sketch(study).axes[1]
+    drawn = [(x.get_x(), x.get_width(), x.get_height()) for x in links.patches]
+    patches = study.patches
+    wanted = [
+        (0.0, length, width, thickness)
+        for length, width, thickness in zip(
+            study.link.length, study.link.width, (3e-3,) * 3, strict=True
+        )
+    ]
+    for size in (patches.actuator_length, patches.sensor_length):
+        for i, thickness in enumerate(patches.thickness):
+            length = np.broadcast_to(size, (3,))[i]
+            wanted += [(c - length / 2, length, patches.width, thickness) for c in patches.centers]
+    pairs = [
+        (1e3 * start, 1e3 * length, 1e3 * height)
+        for start, length, width, thickness in wanted
+        for height in (width, 5 * thickness)
+    ]
+    np.testing.assert_allclose(sorted(drawn), sorted(pairs), rtol=1e-9, atol=1e-9)

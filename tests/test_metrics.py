@@ -383,7 +383,7 @@ def test_metrics_of_a_run_are_those_of_its_trajectories(limited):
 def test_signals_of_a_run_are_what_their_names_say(limited):
     """Deflections of half-sine modes, rates of coordinates, a filter that sees its own modes."""
     _, run = limited
-    x = np.array(STUDY.metrics.stations) / STUDY.link.length
+    x = np.array(STUDY.metrics.stations)
     bent = np.einsum("tir,rs->tis", run.q, np.sin(np.pi * np.outer([1, 2], x)))
     assert np.abs(bent - run.deflection).max() < 0.02 * np.abs(bent).max()  # and modes left out
     np.testing.assert_allclose(run.modal, run.q, atol=1e-9 * np.abs(run.q).max())

@@ -29,7 +29,7 @@ BASE = {
     "motion": {"waypoints": [HOME]},
     "shaper": {"kind": "none"},
     "initial": {"load_deflection": (1e-5, 1e-5, -1e-5)},
-    "metrics": {"residual_length": 0.1},
+    "metrics": {"residual_delay": 0.0, "residual_length": 0.1},
     # no limits: what grows goes on growing
     "electronics": {
         "adc_bits": 32,

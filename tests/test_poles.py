@@ -14,6 +14,7 @@ from jaxmodel.nominal_loop import nominal_loop
 from jaxmodel.prepare import design_controller, prepare
 from jaxmodel.status import OK, UNPLACEABLE
 from studies.engine.controller import fixed_controller
+from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.poles import PoleReport, _matched, difference, pole_rows
 from studies.engine.results import load
 from studies.engine.runs import run_study
@@ -21,12 +22,14 @@ from studies.engine.stability import loop_report
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.space.spec import parse_sweep
-from studies.space.table import case_study
+from studies.space.table import build_table, case_study
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study, parse_study
 
 #: Sets of poles.
 N = 200
+#: Added damping ratios by mode.
+BY_MODE = [[0.2, 0.03, 0.01], [0.15, 0.02, 0.005], [0.1, 0.0, 0.02]]
 
 
 def study_with(law: str = "imsc", decay: object = 100.0, **changes: object) -> Study:
@@ -234,6 +237,17 @@ def test_what_cannot_be_placed_is_a_status(law, changes, code):
             "where control.pole_frequency_hz is given",
         ),
         ({"pole_decay": 9.0, "pole_frequency_hz": 100.0}, "three lists, one a link by mode, where"),
+        ({"law": "lqr", "damping": 0.1}, "modified_imsc, observer, with control.damping"),
+        ({"damping": -0.1}, "control.damping = -0.1; allowed: a finite number >= 0 and < 1"),
+        ({"damping": 0.99}, "control.damping = 0.99; allowed: below 0.99, 1 less link.damping"),
+        ({"damping": [0.1, 0.2]}, "control.damping"),
+        ({"damping": [[0.1], [0.2]]}, "control.damping.*three lists of 1 to 3 entries"),
+        ({"damping": 0.2, "pole_decay": 9.0}, "pole_decay = 9.0; allowed: not given where control"),
+        ({"damping": 0.2, "pole_frequency_hz": [[99.0]] * 3}, "pole_frequency_hz.*: not given"),
+        (
+            {"damping": 0.2, "velocity_gain": [3.0, 3.0, 3.0]},
+            "velocity_gain = .*: not given where control.damping = 0.2 decides the gains",
+        ),
     ],
 )
 def test_poles_that_make_no_sense_are_refused(control, message):
@@ -257,6 +271,89 @@ def test_the_observers_loop_has_the_poles_of_continuous_feedback(rate):
     wanted = -damping + 1j * np.sqrt(square - damping**2)
     found = nearest_poles(wanted, matrix, 1 / rate)
     np.testing.assert_allclose(found, wanted, rtol=1e-8)
+
+
+#: Three different links with a payload off centre.
+OWN_LINKS = {
+    "link": {
+        "length": [0.20, 0.22, 0.21],
+        "thickness": [2e-3, 2.2e-3, 2e-3],
+        "youngs_modulus": [70e9, 68e9, 72e9],
+    },
+    "patches": {"centers": [[0.05, 0.10, 0.15], [0.055, 0.11, 0.165], [0.05, 0.105, 0.155]]},
+    "load": {"mass": 0.1, "offset": [0.01, 0.005]},
+}
+
+
+def test_added_damping_is_obtained_on_any_machine():
+    """0.2 of mode 1, others by (24): to 1e-9 on the nominal link, 10 % assembled, margin above 2.
+
+    Natural frequencies are kept. By mode, each gets its own.
+    """
+    payload = {"load": {"mass": 0.0, "offset": [0.01, 0.005]}}  # massless: the default machine
+    ratio = np.array(Study().control.ratios)
+    structure = nominal = natural = None
+    for machine, damping in ((payload, 0.2), (OWN_LINKS, 0.2), (OWN_LINKS, BY_MODE)):
+        link = machine.get("link", {}) | {"modes": 3}
+        study = parse_study({**machine, "link": link, "control": {"damping": damping}})
+        if structure is None:
+            structure = build_structure(study)
+            nominal, natural = (jax.jit(partial(f, structure)) for f in (nominal_loop, _omega))
+        case = as_arrays(build_case(study))
+        asked, matrix = map(np.asarray, nominal(case))
+        found, omega = nearest_poles(asked, matrix, float(case.electronics.period)), natural(case)
+        added = 0.2 * ratio * omega[:, :1] / omega if damping == 0.2 else np.array(damping)
+        np.testing.assert_allclose(np.abs(found), omega, rtol=1e-9)
+        np.testing.assert_allclose(-found.real / np.abs(found), 0.01 + added, rtol=1e-9)
+        if damping == 0.2:
+            report = loop_report(structure, case, np.array(study.motion.waypoints[0]))
+            assert report.is_stable and report.gain_margin > 2
+            np.testing.assert_allclose(report.damping_ratio[0], 0.21, rtol=0.1)
+
+
+def test_added_damping_leaves_modes_alone_where_it_is_none():
+    """0 is no gain, whatever the links' own damping; modes beyond a list follow the ratios."""
+    study = parse_study(
+        {
+            "link": {"modes": 3, "damping_ratio": 0.0},
+            "control": {"damping": [[0.2, 0.0], [0.0], [0.1, 0.05, 0.0]]},
+        }
+    )
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    found = jax.jit(lambda c: prepare(structure, c))(case)
+    assert int(found.status) == OK
+    is_on = np.asarray(found.loop.controller.velocity_gain) != 0
+    np.testing.assert_array_equal(is_on, [[True, False, True], [False] * 3, [True, True, False]])
+
+
+def test_added_damping_is_an_axis_of_a_sweep():
+    """One number, one a link, lists by mode and entries of them: each case is its own study's."""
+    two = [row[:2] for row in BY_MODE]
+    axes = {"control.damping": [0.1, [0.1, 0.2, 0.0], two], "control.modes": [2, 3]}
+    _check_cases({"sweep": {"axes": axes}})
+    entry = {"control.damping[1]": [0.0, 0.3]}
+    _check_cases({"control": {"damping": 0.1}, "sweep": {"axes": entry}})
+    entry = {"control.damping[1][1]": [0.0, 0.3]}
+    _check_cases({"control": {"damping": BY_MODE}, "sweep": {"axes": entry}})
+
+
+def _check_cases(data: dict) -> None:
+    table = build_table(parse_sweep(data))
+    (group,) = plan_groups(table, np.arange(len(table)), local_layout)
+    assert group.structure.has_poles and group.structure.has_position_gain
+    together = chunk_cases(table, np.arange(len(table)), group.structure, len(table)).control
+    for k in range(len(table)):
+        alone = build_case(case_study(table, k)).control.damping
+        one = together.damping[k if len(together.damping) > 1 else 0]
+        np.testing.assert_array_equal(one[:, : alone.shape[1]], alone)
+
+
+def test_decays_and_damping_ratios_are_shown_in_their_units():
+    poles = np.full((3, 1), 720 * (-0.21 + 1j * np.sqrt(1 - 0.21**2)))
+    (row, *_) = pole_rows(PoleReport(poles, poles, poles, 1.0, is_by_damping=True))
+    assert row == ["1", "1", *["zeta 0.21, 114.6 Hz"] * 3]
+    (row, *_) = pole_rows(PoleReport(poles, poles, poles, 1.0))
+    assert row == ["1", "1", *["151.2 1/s, 112 Hz"] * 3]
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,7 @@ STUDY = paper_study().change(
     link__modes=4,
     link__thickness=(2e-3, 2.1e-3, 1.9e-3),
     control__modes=2,
-    metrics__stations=(0.04, 0.1, 0.175),
+    metrics__stations=(0.2, 0.5, 0.875),
     metrics__residual_length=0.123,
     metrics__residual_delay=0.045,
     metrics__settling_band=2.5e-6,
@@ -248,7 +248,7 @@ def test_sentences_of_a_run_show_its_numbers(one_run):
         "margin 3.25 (10.2 dB): ",
         f"Settling time {settled} ms ({settled} without control). Peak voltage "
         f"{m.peak_voltage.max():.4g} of 91 V.",
-        "the largest of the stations at 40, 100, 175 mm.",
+        "the largest of the stations at 20, 50, 87.5 % of the link.",
         "Residual window: 123 ms, from 45 ms after the end of the reference trajectory.",
         "stays within 2.5 µm. The run ends 400 ms after the reference trajectory.",
         "the end of the reference trajectory at 100 ms",

@@ -39,7 +39,10 @@ def test_stiff_drive_runs_as_with_many_steps():
     [
         ({"drive__kd": 5000.0, "run__substeps": 1}, "run.substeps = 1; allowed: 2 to 200"),
         ({"drive__coulomb_friction": 1e3}, "drive.coulomb_friction = 1000.0; allowed: small"),
-        ({"metrics__residual_length": 1e-5}, "metrics.residual_length = 1e-05; allowed: 0.0001 to"),
+        (
+            {"metrics__residual_delay": 0.0, "metrics__residual_length": 1e-5},
+            "metrics.residual_length = 1e-05; allowed: 0.0001 to",
+        ),
         ({"drive__locked": True}, "motion.waypoints = "),
         ({"run__duration": 1e-5}, "run.duration"),
     ],

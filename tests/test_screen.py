@@ -98,7 +98,8 @@ def test_the_linear_model_has_the_poles_of_the_loop_matrices():
     """Free vibration sample by sample against powers of the exactly discretised matrix."""
     start = tuple((1e-5, 2e-6) for _ in range(3))
     study = paper_study().change(
-        **SHORT | {"run__duration": 0.03, "metrics__residual_length": 0.02},
+        **SHORT
+        | {"run__duration": 0.03, "metrics__residual_delay": 0.0, "metrics__residual_length": 0.02},
         motion__waypoints=(HOME,),
         initial__modal=start,
         electronics__adc_bits=24,
@@ -194,7 +195,10 @@ def test_kernel_equals_scan_for_the_linear_model(folders, sorts):
     """The few are those of the folders, so that their kernel has been compiled."""
     spec, metrics = small_spec(SWEEP), SWEEP["metrics"]
     if sorts == "all":
-        spec, metrics = small_spec(ALL_SORTS, metrics={"residual_length": 0.004}), ["residual_rms"]
+        spec, metrics = (
+            small_spec(ALL_SORTS, metrics={"residual_delay": 0.0, "residual_length": 0.004}),
+            ["residual_rms"],
+        )
     table = build_table(spec)
     rows = np.arange(len(table))
     group = plan_groups(table, rows, local_layout, tuple(metrics), is_linear=True)[0]
@@ -323,7 +327,9 @@ def test_nothing_may_pass(tmp_path, capsys):
     from studies.cli import main
 
     spec = parse_sweep(
-        small(SWEEP | {"screen": SCREEN}, metrics={"residual_length": 0.024})  # beyond the run
+        small(
+            SWEEP | {"screen": SCREEN}, metrics={"residual_delay": 0.0, "residual_length": 0.024}
+        )  # beyond the run
     )
     run(spec, tmp_path / "s")
     assert set(read(tmp_path / "s")["status"]) == {status.WINDOW_TOO_LONG}

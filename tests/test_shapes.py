@@ -6,11 +6,11 @@ import inspect
 import re
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Shaped, jaxtyped
 
+from jaxmodel.bases import station_places
 from jaxmodel.beam import build_basis
 from jaxmodel.metrics import METRICS, Sizes
 from jaxmodel.prepare import prepare
@@ -27,7 +27,8 @@ STUDY = paper_study().change(
     control__modes=2,
     control__position_gain=(10.0, 10.0, 10.0),
     patches__centers=(0.03, 0.08, 0.12, 0.17),
-    metrics__stations=(0.03, 0.05, 0.08, 0.1, 0.12, 0.15, 0.17),
+    metrics__stations=(0.15, 0.25, 0.4, 0.5, 0.6, 0.75, 0.85),
+    metrics__residual_delay=0.0,
     metrics__residual_length=0.005,
     motion__move_time=0.002,
     shaper__kind="none",
@@ -53,7 +54,7 @@ def made():
     def make(case):
         loop = prepare(structure, case).loop
         response = loop_response(structure, case, loop, case.path.waypoints[0])
-        stations = jnp.asarray(STUDY.metrics.stations)
+        stations = station_places(case)
         basis = build_basis("loaded", case.machine.beam, case.machine.patches, 5, stations)
         result = simulate(structure, case, has_record=True)
         return basis, loop.plant, loop.controller, response, assembled_modes(response), result

@@ -12,7 +12,7 @@ from jaxmodel.prepare import prepare
 from studies import Study, StudyError, load_study, paper_study, parse_study
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.explain import allowed_values
-from studies.study.template import study_template, toml_value
+from studies.study.template import STARTERS, starter_template, study_template, toml_value
 
 REFUSED = [
     # unknown or misspelt
@@ -94,7 +94,7 @@ REFUSED = [
     ),
     ("[shaper]\nfrequencies_hz = [1, 2, 3, 4]", "= [1, 2, 3, 4]; allowed: 0 to 3 finite numbers"),
     ("[electronics]\nlowpass_ratio = []", "lowpass_ratio = []; allowed: 1 or more finite numbers"),
-    ("[metrics]\nstations = []", "metrics.stations = []; allowed: 1 to 20 finite numbers [m]"),
+    ("[metrics]\nstations = []", "metrics.stations = []; allowed: 1 to 20 finite numbers [1]"),
     (
         "[patches]\ncenters = []",
         "patches.centers = []; allowed: one list of centres, or three list",
@@ -122,7 +122,10 @@ REFUSED = [
         "link.basis = 'pinned_free'; allowed: pinned_pinned or loaded, where drive.locked is true",
     ),
     ("[link]\njoint_inertia_b = 1e-5", "allowed: loaded, where a joint has rotary inertia"),
-    ("[metrics]\nstations = [0.3]", "metrics.stations = 0.3; allowed: between 0 and link.length"),
+    (
+        "[metrics]\nstations = [1.3]",
+        "= 1.3; allowed: between 0 and 1, exclusive: fractions of each",
+    ),
     (
         "[initial]\nload_station = 0.5",
         "initial.load_station = 0.5; allowed: between 0 and link.len",
@@ -204,6 +207,22 @@ def test_change_takes_numpy_and_refuses_unknown_names():
 def test_an_empty_file_and_the_template_are_the_default_study():
     assert parse_study({}) == Study()
     assert parse_study(tomllib.loads(study_template())) == Study()
+    assert parse_study(tomllib.loads(starter_template())) == Study()
+
+
+def test_the_file_to_start_from_has_few_fields_each_with_its_unit():
+    text = starter_template()
+    data, lines = tomllib.loads(text), text.splitlines()
+    sections = {k: v for k, v in data.items() if k != "title"}
+    assert ["title", *(f"{k}.{x}" for k, v in sections.items() for x in v)] == list(STARTERS)
+    assert 20 <= sum(bool(line) for line in lines) <= 32
+    for name in STARTERS:
+        k, line = next(
+            (k, x) for k, x in enumerate(lines) if x.startswith(f"{name.split('.')[-1]} =")
+        )
+        note = line.partition("  # ")[2] or lines[k - 1].removeprefix("# ")
+        assert note.endswith("]") or name in ("title", "shaper.kind"), line
+    assert "--all" in lines[-1]
 
 
 def test_the_template_explains_every_field():
@@ -267,7 +286,7 @@ STUDIES = st.fixed_dictionaries(
         "control__velocity_gain": st.tuples(*[_numbers(-1e9, 1e9)] * 3),
         "control__ratios": st.lists(st.lists(_numbers(-1, 1), max_size=4), min_size=3, max_size=3),
         "shaper__frequencies_hz": st.lists(_numbers(0.1, 4999), max_size=3),
-        "metrics__stations": st.lists(_numbers(0.001, 0.199), min_size=1, max_size=4),
+        "metrics__stations": st.lists(_numbers(0.001, 0.999), min_size=1, max_size=4),
         "run__seed": st.integers(0, 10**9),
     }
 )

@@ -1,5 +1,6 @@
 """What the kept modes leave out: exact static bending, and loops that converge with the modes."""
 
+from functools import partial
 from itertools import pairwise
 
 import jax
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from jaxmodel.bases import find_bases, station_places
 from jaxmodel.beam import build_basis
 from jaxmodel.electronics import PASSED, voltage_passage
 from jaxmodel.linear import linearise
@@ -73,7 +75,7 @@ def by_hand(case, basis, link):
     for piece in pairwise(cuts):
         curvature = [lambda_a / stiffness(piece) * inside(piece, a) for a in actuators]
         p, q = piece
-        for k, x in enumerate(np.broadcast_to(case.windows.stations, (3, 3))[link]):
+        for k, x in enumerate(length * np.broadcast_to(case.windows.stations, (3, 3))[link]):
             # w = int (x - s) kappa ds up to x, less the chord's share of the same up to L
             to_x = (max(x - p, 0) ** 2 - max(x - q, 0) ** 2) / 2
             to_end = ((length - p) ** 2 - (length - q) ** 2) / 2
@@ -88,7 +90,7 @@ def by_hand(case, basis, link):
 def test_held_voltages_bend_the_links_as_statics_says(basis, n_modes):
     """A step on each patch, all sensors and stations of the assembled machine, in the long run."""
     fields = UNLIKE if n_modes != 1 else {}
-    fields = {**fields, "control__modes": 1, "metrics__stations": (0.05, 0.1, 0.15)}
+    fields = {**fields, "control__modes": 1, "metrics__stations": (0.25, 0.5, 0.75)}
     structure, case, loop = prepared(link__basis=basis, link__modes=n_modes, **fields)
     if n_modes != 1:
         centers = np.array(case.machine.patches.center)
@@ -199,7 +201,7 @@ def test_compensation_subtracts_what_is_there():
 def test_deflections_at_the_stations_have_it():
     _, case, loop = prepared(link__modes=2)
     basis = build_basis(
-        "pinned_pinned", case.machine.beam, case.machine.patches, 40, case.windows.stations
+        "pinned_pinned", case.machine.beam, case.machine.patches, 40, station_places(case)
     )
     volts = np.zeros((3, 3))
     volts[:, 1] = 30.0
@@ -224,7 +226,7 @@ def test_mid_span_of_a_run_is_the_station_there():
             motion__waypoints=paper_study().motion.waypoints[:2],
             motion__move_time=0.02,
             shaper__kind="none",
-            metrics__stations=(0.1,),
+            metrics__stations=(0.5,),
             metrics__residual_length=0.01,
             metrics__residual_delay=0.0,
         ),
@@ -237,6 +239,26 @@ def test_mid_span_of_a_run_is_the_station_there():
     assert np.abs(per_volt).max() > 1  # so that there is something to miss
 
 
+def test_stations_are_fractions_and_measured_places_metres():
+    """Of links of different length; places stay where they are if a length is a parameter."""
+    study = paper_study().change(
+        link__length=(0.2, 0.25, 0.22), metrics__stations=(0.25, 0.75), link__modes=3
+    )
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    shape = np.asarray(jax.jit(partial(find_bases, structure))(case).plant.deflection_at)
+    wave = np.sin(np.pi * np.outer([0.25, 0.75], [1, 2, 3]))
+    np.testing.assert_allclose(shape, np.broadcast_to(wave, (3, 2, 3)), atol=1e-12)
+    bench = Bench(study, _with_length, study.motion.waypoints[:1], (0.05, 0.1))
+    for length in (0.2, 0.3):
+        places = station_places(bench.place(bench.case, np.array([length])))
+        np.testing.assert_allclose(places, [[0.05, 0.1]] * 3, rtol=1e-12)
+
+
+def _with_length(case, values):
+    beam = case.machine.beam._replace(length=case.machine.beam.length.at[1].set(values[0]))
+    return case._replace(machine=case.machine._replace(beam=beam))
+
+
 def test_bench_responses_have_it():
     """Of an actuator at low frequency: what statics says, from three modes."""
     study = paper_study().change(link__modes=3, drive__kp=2e4)
@@ -244,7 +266,7 @@ def test_bench_responses_have_it():
     bench = Bench(study, lambda case, values: case, (pose,), (0.1,))
     plant = bench.plant(pose, np.zeros(0), False)
     volts, bent = by_hand(bench.case._replace(windows=prepared()[1].windows), "pinned_pinned", 0)
-    station = list(prepared()[1].windows.stations).index(0.1)
+    station = list(prepared()[1].windows.stations).index(0.5)
     for output, wanted in (
         (Signal("sensor", 0, 1, np.nan), volts[1, 1]),
         (Signal("deflection", 0, 0, 0.1), bent[station, 1]),

@@ -545,6 +545,7 @@ basis = "loaded"
 """
     + FAST_MOVE
     + """[metrics]
+residual_delay = 0.0
 residual_length = 0.01
 [[sweep.blocks]]
 method = "random"

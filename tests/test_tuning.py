@@ -377,7 +377,7 @@ def test_checked_derivatives_of_loaded_links_come_to_an_end():
             "link": {"basis": "loaded", "modes": 6, "joint_inertia_c": 1e-5},
             "run": {"duration": 0.16},
             "motion": {"move_time": 0.03},
-            "metrics": {"residual_length": 0.02},
+            "metrics": {"residual_delay": 0.0, "residual_length": 0.02},
             "control": {"modes": 2, "basis": "pinned_free", "gain_factor": 0.1},
             "tune": {
                 "free": {"control.gain_factor": {"from": 0.02, "to": 0.2}},

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from studies.engine.frame import frame_of
+from studies.engine.program import TRACES
 from studies.engine.runs import check_run, run_study
 from studies.tuning import linear_fidelity, references
 from studies.tuning.check import fresh_columns
@@ -48,7 +49,9 @@ def compared():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(references, "COUNT", 7)
         patch.setattr(linear_fidelity, "MARGIN_MODES", 4)  # a third of the time to compile
+        before = len(TRACES)
         found = compare(spec, [spec.study], lambda text: None)
+        assert len(TRACES) == before + 1  # the scan takes the program of the fresh machines
         scan = found[2].scan
         loops = [
             loop_figures(spec.study.change(control__gain_factor=float(g))) for g in scan.gain_factor

@@ -83,6 +83,21 @@ def test_poles_can_be_free():
     np.testing.assert_allclose(moved.pole_frequency[:, 0], 2 * np.pi * np.array([120, 100, 122]))
 
 
+def test_added_damping_can_be_free():
+    """One number, and one a link, are those of mode 1; lists those of their modes."""
+    free = {"control.damping": {"from": 0.0, "to": 0.5}}
+    for damping, values, moved in (
+        (0.2, [0.1], [[0.1, -1]] * 3),
+        ([0.2, 0.3, 0.1], [0.1, 0.0, 0.4], [[0.1, -1], [0, -1], [0.4, -1]]),
+        ([[0.2, 0.05], [0.1], [0.1]], [0.3, 0.1, 0.2, 0.4], [[0.3, 0.1], [0.2, -1], [0.4, -1]]),
+    ):
+        control = {**SMALL["control"], "damping": damping}
+        spec = parse_tuning({**SMALL, "control": control, "tune": {"free": free}})
+        assert spec.has_poles and spec.has_position_gain
+        placed = spec.free.place(as_arrays(build_case(spec.study)), np.array(values)).control
+        np.testing.assert_allclose(placed.damping[:, :2], moved, atol=1e-15)
+
+
 def test_gains_that_poles_decide_cannot_be_free():
     control = {**SMALL["control"], "pole_decay": 100.0}
     free = {"control.velocity_gain[0]": {"from": 0.5, "to": 5.0}}

@@ -71,7 +71,7 @@ class Law(NamedTuple):
     # position gains count always; False: they are zero, and cost nothing, where
     # `control.position_gain` is
     has_position: bool = True
-    # gains by mode can follow from `control.pole_decay`
+    # gains by mode can follow from `control.damping` or `control.pole_decay`
     places_poles: bool = False
     # the channels of a link act one at a time, so each is judged by itself
     is_switching: bool = False
@@ -170,6 +170,7 @@ def as_modal(control: Control, velocity: Array, position: Array) -> Control:
         gain_factor=jnp.ones(()),
         is_per_mass=jnp.zeros(()),
         mode_mask=is_on.astype(velocity.dtype),
+        damping=-jnp.ones_like(velocity),
         pole_decay=jnp.zeros_like(velocity),
     )
 

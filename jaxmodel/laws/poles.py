@@ -39,19 +39,22 @@ class Poles(NamedTuple):
 
 
 def specified_poles(case: Case, known: Known) -> Poles:
-    """Poles that the study specifies.
+    """Poles that the study specifies, by their decays or by added damping ratios.
 
-    A mode without a decay of its own gets more than its structural one by the EMC ratios,
-    alpha_j = zeta_j omega_j + r_j (alpha_1 - zeta_1 omega_1), as (24) shares out k_d. A mode
-    without a frequency keeps its own, alpha^2 + beta^2 = omega^2, so that k_p = 0 in (23).
+    An added damping ratio is a decay alpha_j = (zeta_j + damping_j) omega_j. A mode without either
+    gets more than its structural decay by the EMC ratios, alpha_j = zeta_j omega_j +
+    r_j (alpha_1 - zeta_1 omega_1), as (24) shares out k_d. A mode without a frequency keeps its
+    own, alpha^2 + beta^2 = omega^2, so that k_p = 0 in (23).
 
     Args:
         case: the numbers.
         known: what the controller knows.
     """
     control, own = case.control, known.damping_ratio * known.omega
-    first = control.pole_decay[:, :1] - own[:, :1]
-    decay = jnp.where(control.pole_decay > 0, control.pole_decay, own + control.ratio * first)
+    is_damped = control.damping >= 0
+    given = jnp.where(is_damped, own + control.damping * known.omega, control.pole_decay)
+    shared = own + control.ratio * (given[:, :1] - own[:, :1])
+    decay = jnp.where(is_damped | (given > 0), given, shared)
     kept = jnp.sqrt(jnp.maximum(known.omega**2 - decay**2, (1e-3 * known.omega) ** 2))
     is_given = control.pole_frequency > 0
     return Poles(decay, jnp.where(is_given, control.pole_frequency, kept))
@@ -59,7 +62,9 @@ def specified_poles(case: Case, known: Known) -> Poles:
 
 def is_placed(case: Case, known: Known) -> Array:
     """Whether a mode acts and its poles are specified, (3, C)."""
-    return (case.control.pole_decay[:, :1] > 0) & (acting_channels(case, known) > 0)
+    control = case.control
+    is_specified = (control.damping[:, :1] >= 0) | (control.pole_decay[:, :1] > 0)
+    return is_specified & (acting_channels(case, known) > 0)
 
 
 def continuous_gains(poles: Poles, known: Known) -> tuple[Array, Array]:
@@ -182,4 +187,4 @@ def is_unplaceable(structure: Structure, case: Case, known: Known) -> Array:
     if structure.feedback == "sampled":
         z = jnp.exp((-poles.decay + 1j * poles.frequency) * period)
         is_fault |= _is_flat(*responses(study_estimator(case, known), z))
-    return jnp.any(is_fault & is_placed(case, known))
+    return jnp.any(is_fault & _is_moved(poles, known) & is_placed(case, known))

@@ -34,7 +34,7 @@ def table_1_signs(subsets: Subsets) -> Signs:
     table = np.array(TABLE_1).T
     columns = [_modes_of(subsets, TABLE_1_LINKS[0], 2)]
     columns += [_modes_of(subsets, links, 1) for links in TABLE_1_LINKS[1:]]
-    peak = subsets.peak[:, 0, :, :, 0]
+    peak = subsets.peak[:, :, :, 0]
     on = (np.array(TABLE_1_LINKS)[:, None] >> np.arange(3)) & 1
     return Signs(table[1:] / table[0] - 1, peak[:, columns] / peak[:, :1] - 1, on.astype(bool))
 
@@ -51,11 +51,11 @@ class LinkSteps(NamedTuple):
 
     labels: list[str]  # "1 -> 1+3", (12,)
     is_controlled: np.ndarray  # which links are, after the step, (12, 3)
-    change: np.ndarray  # of the rms by TARGETS [1], (settings, windows, 5, 12)
+    change: np.ndarray  # of the rms by TARGETS [1], (settings, 5, 12)
 
     @property
     def rises(self) -> np.ndarray:
-        """How many of the 12 steps make it worse, (settings, windows, 5)."""
+        """How many of the 12 steps make it worse, (settings, 5)."""
         return np.sum(self.change > NO_CHANGE, axis=-1)
 
 
@@ -73,7 +73,7 @@ class Halved(NamedTuple):
     """Two controlled links: change of the platform's residual error."""
 
     labels: list[str]  # "1+2", (3,)
-    change: np.ndarray  # [1], (settings, windows, 3)
+    change: np.ndarray  # [1], (settings, 3)
 
 
 def two_links(subsets: Subsets) -> Halved:

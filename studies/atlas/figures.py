@@ -17,8 +17,6 @@ from studies.atlas.subsets import TARGETS, link_label, player_labels, setting_la
 from studies.show.figures import SERIES, SMALL, comparison, legend_above, new_figure
 from studies.study.consistency import each_link
 
-#: Index of the late window.
-LATE = -1
 #: The animation: from before the command's end to after it, and its frames [s].
 CLIP = (-0.02, 0.07, 1e-3)
 #: Largest drawn deflection after the command, as a share of a link's length [1].
@@ -48,12 +46,10 @@ def _subsets(found: AtlasFindings) -> Figure:
 
 
 def _link_changes(found: AtlasFindings) -> np.ndarray:
-    """Change of the late residual of links 1 to 3 and platform, (settings, 8, 4)."""
+    """Change of the residual of links 1 to 3 and platform, (settings, 8, 4)."""
     subsets = found.subsets
     chosen = subsets.link_subsets
-    residual = np.concatenate(
-        [subsets.link[:, LATE, chosen], subsets.platform[:, LATE, chosen, None]], axis=-1
-    )
+    residual = np.concatenate([subsets.link[:, chosen], subsets.platform[:, chosen, None]], axis=-1)
     return residual / residual[:, :1] - 1
 
 
@@ -71,7 +67,7 @@ def _panels(found: AtlasFindings, height: float) -> tuple[Figure, np.ndarray]:
 def _lattice(found: AtlasFindings) -> Figure:
     subsets = found.subsets
     figure, axes = _panels(found, 1.9)
-    every = np.sqrt(np.mean(subsets.link[:, LATE, subsets.link_subsets] ** 2, axis=-1))
+    every = np.sqrt(np.mean(subsets.link[:, subsets.link_subsets] ** 2, axis=-1))
     for ax, residual in zip(axes, every, strict=True):
         plots.lattice(residual, ax)
     return figure
@@ -91,7 +87,7 @@ def _helps(found: AtlasFindings) -> Figure:
 
 def _shares(found: AtlasFindings) -> Figure:
     subsets = found.subsets
-    share = shapley(subsets.removed()[:, LATE]).reshape(-1, len(TARGETS), 3, subsets.modes)
+    share = shapley(subsets.removed()).reshape(-1, len(TARGETS), 3, subsets.modes)
     figure, axes = new_figure(len(subsets.setting), len(TARGETS), 1.3, False)
     for row in range(len(subsets.setting)):
         for column, target in enumerate(TARGETS):
@@ -110,7 +106,7 @@ def _shares(found: AtlasFindings) -> Figure:
 def _interactions(found: AtlasFindings) -> Figure:
     subsets = found.subsets
     figure, axes = _panels(found, 2.4)
-    every = interaction(subsets.removed()[:, LATE, TARGETS.index("all links")])
+    every = interaction(subsets.removed()[:, TARGETS.index("all links")])
     limit = float(np.max(np.abs(np.nan_to_num(every)), initial=1e-6))
     for ax, index in zip(axes, every, strict=True):
         image = plots.interaction_map(index, player_labels(subsets.modes), limit, ax)

@@ -36,7 +36,7 @@ class AtlasFindings(NamedTuple):
 
     def setting(self, k: int) -> str:
         """A setting in words, with † if a link's uncontrolled residual is below an ADC step."""
-        is_small = (self.subsets.link[k, -1, 0] < self.adc_step).any()
+        is_small = (self.subsets.link[k, 0] < self.adc_step).any()
         return setting_label(self.subsets.setting[k]) + (" †" if is_small else "")
 
 

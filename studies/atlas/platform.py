@@ -18,12 +18,12 @@ from jaxmodel.kinematics import close_chain
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
-from studies.atlas.subsets import WINDOWS, link_label, long_enough, residual_window
+from studies.atlas.subsets import link_label, long_enough
 from studies.engine.batches import run_batches
 from studies.engine.runs import check_run, resolved_study, with_ratio
 from studies.study.cases import powered
-from studies.study.consistency import each_link
 from studies.study.spec import Study
+from studies.study.window import residual_delay
 
 #: Controlled links of the paper's cases.
 LINK_SETS = ((False, False, False), (True, False, False), (True, True, False), (True, True, True))
@@ -49,16 +49,16 @@ class PlatformError(NamedTuple):
 
     time: np.ndarray  # [s], (T,)
     command_end: np.ndarray  # [s], (s,)
-    window: np.ndarray  # whether a sample is in each of WINDOWS, (s, 2, T)
+    window: np.ndarray  # whether a sample is in the residual window, (s, T)
     drive: np.ndarray  # error with rigid links [m, m, rad], (s, T, 3)
     vibration: np.ndarray  # error beyond that [m, m, rad], (s, 4, T, 3)
     pose: np.ndarray  # of the platform [m, m, rad], (s, 4, T, 3)
     modal: np.ndarray  # modal coordinates of the plant [m], (s, 4, T, 3, R)
 
     def rms(self, error: np.ndarray) -> np.ndarray:
-        """Root mean square of an error (s, ..., T, 3) over each window, (s, ..., 2, 3)."""
-        total = np.einsum("s...ta,swt->s...wa", error**2, self.window)
-        count = self.window.sum(axis=-1).reshape(len(total), *(1,) * (error.ndim - 3), -1, 1)
+        """Root mean square of an error (s, ..., T, 3) over the window, (s, ..., 3)."""
+        total = np.einsum("s...ta,st->s...a", error**2, self.window)
+        count = self.window.sum(axis=-1).reshape(len(total), *(1,) * (error.ndim - 2))
         return np.sqrt(total / count)
 
 
@@ -98,9 +98,8 @@ def platform_error(study: Study, tell: Any = None) -> PlatformError:
     drive, time = quiet.record.pose_error[1::2], quiet.record.time[0]
     end = np.asarray(quiet.command_end[::2])
     tick = 0.5 / study.electronics.sample_rate_hz
-    begin, length = np.array([residual_window(study, name) for name in WINDOWS]).T
-    since = time - end[:, None, None] - begin[:, None]
-    window = (since > -tick) & (since < length[:, None] - tick)
+    since = time - end[:, None] - residual_delay(study)
+    window = (since > -tick) & (since < study.metrics.residual_length - tick)
     return PlatformError(
         time=time,
         command_end=end,
@@ -148,10 +147,8 @@ def responses(study: Study, frequency: np.ndarray) -> Responses:
     Raises:
         StudyError: as `check_run`.
     """
-    middle = each_link(study.link.length)[:, None] / 2
-    study = resolved_study(study).change(metrics__stations=(float(middle.min()),))
+    study = resolved_study(study).change(metrics__stations=(0.5,))
     structure, case = check_run(study)
-    case = case._replace(windows=case.windows._replace(stations=jnp.asarray(middle)))
     structure = structure._replace(n_steps=1, substeps=1, n_frequencies=1, has_noise=False)
     pose = jnp.asarray(study.motion.waypoints[0], case.electronics.period.dtype)
     value, radius = [], []

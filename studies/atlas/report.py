@@ -13,13 +13,13 @@ from studies.atlas.findings import AtlasFindings
 from studies.atlas.platform import LINK_LABELS, OUTPUTS
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.plots import length_text
-from studies.atlas.subsets import TARGETS, WINDOWS, link_label, setting_label
+from studies.atlas.subsets import TARGETS, link_label, setting_label
 from studies.atlas.workspace import MAP_MODES, Map
 from studies.show.sketch import CAPTION
 from studies.show.templates import render
 from studies.show.units import span
+from studies.study.window import residual_delay
 
-LATE = WINDOWS.index("late")
 ALL_LINKS, PLATFORM = TARGETS.index("all links"), TARGETS.index("platform")
 
 
@@ -34,6 +34,7 @@ def report(found: AtlasFindings, dropped: list[str]) -> str:
     return render(
         "atlas/report.md",
         study=found.study,
+        delay=residual_delay(found.study),
         subsets=found.subsets,
         dropped=dropped,
         most=_most_vibration(found),
@@ -74,18 +75,18 @@ def _by_setting(found: AtlasFindings, cells: Iterable[Iterable[str]]) -> list[li
 
 
 def _all_links(found: AtlasFindings) -> np.ndarray:
-    """Residual of the three links by choice of controlled links [m], (settings, windows, 8)."""
-    link = found.subsets.link[:, :, found.subsets.link_subsets]
+    """Residual of the three links by choice of controlled links [m], (settings, 8)."""
+    link = found.subsets.link[:, found.subsets.link_subsets]
     return np.sqrt(np.mean(link**2, axis=-1))
 
 
 def _most_vibration(found: AtlasFindings) -> dict[str, Any]:
-    """The answer for the setting with the most residual vibration, late window."""
-    rms = _all_links(found)[:, LATE]
+    """The answer for the setting with the most residual vibration."""
+    rms = _all_links(found)
     k = int(np.argmax(rms[:, 0]))
     best = min((1, 2, 4), key=lambda subset: rms[k, subset])
-    link = found.subsets.link[k, LATE, found.subsets.link_subsets]  # (8, 3)
-    change = one_more_link(found.subsets).change[k, LATE, ALL_LINKS]
+    link = found.subsets.link[k, found.subsets.link_subsets]  # (8, 3)
+    change = one_more_link(found.subsets).change[k, ALL_LINKS]
     return {
         "setting": found.setting(k),
         "free": length_text(rms[k, 0]),
@@ -99,18 +100,14 @@ def _most_vibration(found: AtlasFindings) -> dict[str, Any]:
     }
 
 
-def _residuals(found: AtlasFindings) -> dict[str, list[list[str]]]:
-    """Rows of each window: residual of the three links for each choice of controlled links."""
-    rms = _all_links(found)
-    return {
-        name: _by_setting(found, (map(length_text, row) for row in rms[:, w]))
-        for w, name in enumerate(WINDOWS)
-    }
+def _residuals(found: AtlasFindings) -> list[list[str]]:
+    """Rows of settings: residual of the three links for each choice of controlled links."""
+    return _by_setting(found, (map(length_text, row) for row in _all_links(found)))
 
 
 def _shares(found: AtlasFindings) -> list[list[str]]:
     """Row of each setting: Shapley shares of links, and of modes beyond the first."""
-    game = found.subsets.removed()[:, LATE, ALL_LINKS]
+    game = found.subsets.removed()[:, ALL_LINKS]
     share = 100 * shapley(game).reshape(len(game), 3, -1)
     cells = (
         [*(f"{x:.2f}" for x in (*one.sum(axis=1), np.abs(one[:, 1:]).sum())), f"{100 * total:.4g}"]
@@ -157,14 +154,13 @@ def _steps(found: AtlasFindings) -> dict[str, Any]:
             return text
         return f"{text} ({steps.labels[worst]}: {_change(change[worst])})"
 
-    columns = [(w, target) for w in range(len(WINDOWS)) for target in (ALL_LINKS, PLATFORM)]
-    single = steps.change[:, LATE, :3] > NO_CHANGE
+    single = steps.change[:, :3] > NO_CHANGE
+    shown = steps.change[:, [ALL_LINKS, PLATFORM]]
     return {
-        "rows": _by_setting(found, ([cell(one[at]) for at in columns] for one in steps.change)),
-        "count": steps.change[:, LATE, ALL_LINKS].size,
-        "links": steps.rises[:, LATE, ALL_LINKS].sum(),
-        "platform": steps.rises[:, LATE, PLATFORM].sum(),
-        "whole": steps.rises[:, 0, ALL_LINKS].sum(),
+        "rows": _by_setting(found, (map(cell, one) for one in shown)),
+        "count": steps.change[:, ALL_LINKS].size,
+        "links": steps.rises[:, ALL_LINKS].sum(),
+        "platform": steps.rises[:, PLATFORM].sum(),
         "single": single.sum(),
         "singles": single.size,
         "left_alone": single[:, ~steps.is_controlled.T].sum(),
@@ -183,19 +179,14 @@ def _at_drive(found: AtlasFindings) -> dict[str, float] | None:
 
 
 def _pairs(found: AtlasFindings) -> dict[str, Any]:
-    """Two links controlled: change of the platform's error [%], by window."""
+    """Two links controlled: change of the platform's error [%]."""
     pairs = two_links(found.subsets)
-    cells = ((" / ".join(map(_change, window)) for window in one) for one in pairs.change)
-
-    def counted(window: int) -> dict[str, Any]:
-        change = pairs.change[:, window]
-        return {"change": 100 * change, "kept": np.sum(change < -0.5), "count": change.size}
-
     return {
-        "labels": ", ".join(pairs.labels),
-        "rows": _by_setting(found, cells),
-        "whole": counted(0),
-        "late": counted(LATE),
+        "labels": [f"links {label}" for label in pairs.labels],
+        "rows": _by_setting(found, (map(_change, one) for one in pairs.change)),
+        "change": 100 * pairs.change,
+        "kept": np.sum(pairs.change < -0.5),
+        "count": pairs.change.size,
     }
 
 
@@ -248,28 +239,26 @@ def _runs(found: AtlasFindings) -> list[dict[str, Any]]:
             "setting": setting_label(setting),
             "drive": _errors(drive[k]),
             "vibration": dict(zip(LINK_LABELS, map(_errors, vibration[k]), strict=True)),
-            "parts": [_part(w, drive[k, w], vibration[k, :, w]) for w in range(len(WINDOWS))],
+            "part": _part(drive[k], vibration[k]),
         }
         for k, setting in enumerate(RUNS)
     ]
 
 
 def _errors(rms: np.ndarray) -> list[str]:
-    """Errors of centre [nm] and turn [nrad] in each window, of (windows, 3)."""
-    return [f"{1e9 * x:.3g}" for x in (*np.hypot(rms[:, 0], rms[:, 1]), *rms[:, 2])]
+    """Errors of centre [nm] and turn [nrad], of (3,)."""
+    return [f"{1e9 * x:.3g}" for x in (np.hypot(rms[0], rms[1]), rms[2])]
 
 
-def _part(window: int, drive: np.ndarray, vibration: np.ndarray) -> dict[str, Any]:
-    """Result of the split in one window.
+def _part(drive: np.ndarray, vibration: np.ndarray) -> dict[str, Any]:
+    """Result of the split.
 
     Args:
-        window: of WINDOWS.
         drive: rms error, (3,).
         vibration: the same by choice of links, (4, 3).
     """
     centre = np.hypot(vibration[:, 0], vibration[:, 1])
     return {
-        "window": WINDOWS[window],
         "is_drive": np.hypot(*drive[:2]) > centre[0],
         "centre": _change(centre[-1] / centre[0] - 1),
         "turn": _change(vibration[-1, 2] / vibration[0, 2] - 1),

@@ -12,18 +12,16 @@ import numpy as np
 
 from jaxmodel.laws import LAWS
 from studies.engine.columns import NOT_RUN
-from studies.engine.frame import EARLY_PART
 from studies.engine.results import SweepData
 from studies.engine.runs import preflight, resolved_study
 from studies.errors import field_error
 from studies.space.spec import SweepSpec, parse_sweep
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study
+from studies.study.window import residual_delay
 
 #: Time of a move [s] and input shaper: the paper's move, and faster ones that leave more vibration.
 SETTINGS = tuple((time, shaper) for time in (0.1, 0.05, 0.03) for shaper in ("ei", "none"))
-#: The design's residual window, and the same without the part in which the drive settles.
-WINDOWS = ("whole", "late")
 #: More controlled modes than this have too many subsets.
 MODE_LIMIT = 3
 _KEPT = (
@@ -36,11 +34,11 @@ _KEPT = (
 
 
 class Subsets(NamedTuple):
-    """Residuals of all subsets; leading axes: setting, window, subset."""
+    """Residuals of all subsets; leading axes: setting, subset."""
 
     setting: tuple[tuple[float, str], ...]  # move time [s], shaper
     modes: int  # C, controlled modes per link
-    status: np.ndarray  # codes of `jaxmodel.status`, (n, 2, 2^(3C))
+    status: np.ndarray  # codes of `jaxmodel.status`, (n, 2^(3C))
     station: np.ndarray  # residual chord deflection, rms [m], (..., 3, S)
     pose: np.ndarray  # residual pose error, rms [m, m, rad], (..., 3)
     peak: np.ndarray  # largest spectral density near each mode [m2/Hz], (..., 3, C)
@@ -100,7 +98,6 @@ def setting_label(setting: tuple[float, str]) -> str:
 def atlas_sweep(
     study: Study,
     settings: tuple[tuple[float, str], ...] = SETTINGS,
-    windows: tuple[str, ...] = WINDOWS,
     has_modes: bool = True,
 ) -> SweepSpec:
     """The sweep of all subsets of a design.
@@ -109,7 +106,6 @@ def atlas_sweep(
         study: the design; its links, masks, move time and shaper are replaced. Where its ratios
             come from its own uncontrolled run, each setting's uncontrolled run is done here.
         settings: time of every move of its path [s], and shaper.
-        windows: of WINDOWS.
         has_modes: all subsets of links and modes; otherwise the 8 of links.
 
     Raises:
@@ -128,17 +124,13 @@ def atlas_sweep(
         moved = study.change(motion__move_time=time, shaper__kind=shaper)
         # the same on every machine, so that a sweep can be resumed
         ratios = np.vectorize(_rounded)(resolved_study(moved).control.ratios)
-        for window in windows:
-            delay, length = residual_window(study, window)
-            cases.append(
-                {
-                    "motion.move_time": time,
-                    "shaper.kind": shaper,
-                    "metrics.residual_delay": delay,
-                    "metrics.residual_length": length,
-                    "control.ratios": ratios.tolist(),
-                }
-            )
+        cases.append(
+            {
+                "motion.move_time": time,
+                "shaper.kind": shaper,
+                "control.ratios": ratios.tolist(),
+            }
+        )
     data = study.model_dump(mode="json")
     data["control"] |= {"ratio_source": "given", "ratio_exponent": 1.0}
     data["sweep"] = {
@@ -153,21 +145,14 @@ def _rounded(x: float) -> float:
     return float(f"{x:.10g}")
 
 
-def residual_window(study: Study, window: str) -> tuple[float, float]:
-    """Start after the command's end and length of one of WINDOWS [s]."""
-    delay, length = study.metrics.residual_delay, study.metrics.residual_length
-    early = EARLY_PART * length if window == "late" else 0.0
-    return delay + early, length - early
-
-
 def long_enough(study: Study, settings: tuple[tuple[float, str], ...]) -> Study:
-    """The study with a run long enough for the slowest setting and its windows."""
+    """The study with a run long enough for the slowest setting and its window."""
     ends = []
     for time, shaper in settings:
         moved = study.change(motion__move_time=time, shaper__kind=shaper)
         known = preflight(build_structure(moved), as_arrays(build_case(moved)))
         ends.append(float(known.motion_end + known.shaper_length))
-    needed = max(ends) + study.metrics.residual_delay + study.metrics.residual_length
+    needed = max(ends) + residual_delay(study) + study.metrics.residual_length
     return study.change(run__duration=max(study.run.duration, float(np.ceil(100 * needed) / 100)))
 
 
@@ -183,7 +168,7 @@ def _check(study: Study) -> None:
     if len(set(motion.waypoints)) < 2:
         allowed = "a path of two different poses or more"
         raise field_error("motion.waypoints", motion.waypoints, allowed, "m, m, rad")
-    gains = (*control.velocity_gain, *control.position_gain, control.pole_decay != ())
+    gains = (*control.velocity_gain, *control.position_gain, control.has_poles)
     if control.gain_factor == 0 or not any(gains):
         name = "control.gain_factor" if control.gain_factor == 0 else "control.velocity_gain"
         raise field_error(name, 0.0, "gains that do something, whose effect can be shared out")
@@ -225,10 +210,9 @@ def read_subsets(data: SweepData) -> Subsets:
         zip(data["motion_move_time"].tolist(), data["shaper_kind"].tolist(), strict=True)
     )
     settings = list(dict.fromkeys(setting))
-    windows, window = np.unique(data["metrics_residual_delay"], return_inverse=True)
     subset = mask.reshape(len(mask), -1) @ 2 ** np.arange(3 * modes)
-    index = (np.array([settings.index(one) for one in setting]), window, subset)
-    shape = (len(settings), len(windows), 2 ** (3 * modes))
+    index = (np.array([settings.index(one) for one in setting]), subset)
+    shape = (len(settings), 2 ** (3 * modes))
 
     def placed(values: np.ndarray, fill: Any = np.nan) -> np.ndarray:
         whole = np.full(shape + values.shape[1:], fill, values.dtype)

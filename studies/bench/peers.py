@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from jaxmodel.bases import station_places
 from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.drive import Reference
@@ -288,7 +289,7 @@ def by_lagrangian(work: Work, n: int) -> Callable[[], Any]:
     def one(case: Case) -> Any:
         start, machine = begin(structure, case), case.machine
         basis = build_basis(
-            structure.basis, machine.beam, machine.patches, structure.n_modes, case.windows.stations
+            structure.basis, machine.beam, machine.patches, structure.n_modes, station_places(case)
         )
         loop = start.loop
         mass, drive = loop.plant.modal_mass[:, None], loop.drive

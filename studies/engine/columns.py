@@ -12,7 +12,7 @@ from jaxmodel.metrics import METRICS
 from jaxmodel.prepare import SPECTRUM_SPAN
 from studies.space.table import CaseTable, as_numbers
 from studies.store import Variable
-from studies.study.labels import DISTANCE_TEXT, STATUS_LABEL
+from studies.study.labels import DISTANCE_TEXT, STATION_TEXT, STATUS_LABEL
 from studies.study.margin import HIGHEST, MARGIN_MODES
 from studies.study.paths import field_unit, field_value, parse_entry
 
@@ -127,7 +127,7 @@ def axis_variables(table: CaseTable, sizes: Mapping[str, int]) -> dict[str, Vari
         found["pose_axis"] = Variable(names, ("pose_axis",), "1", "pose component")
     if "station" in sizes and "metrics.stations" not in table.columns:
         stations = np.array(field_value(table.study, "metrics.stations"))
-        found["station"] = Variable(stations, ("station",), "m", "position along the link")
+        found["station"] = Variable(stations, ("station",), "1", STATION_TEXT)
     if "spectrum_point" in sizes:
         ratio = np.linspace(1 - SPECTRUM_SPAN, 1 + SPECTRUM_SPAN, sizes["spectrum_point"])
         found["spectrum_point"] = Variable(

@@ -61,7 +61,7 @@ def fixed_controller(study: Study) -> FixedController:
             "control.gain_factor",
             study.control.gain_factor,
             "gains of which at least one is not zero (control.links, control.mode_mask, "
-            "control.velocity_gain, control.ratios, control.pole_decay)",
+            "control.velocity_gain, control.ratios, control.damping, control.pole_decay)",
             "1",
         )
     _check_finite(controller, taps)

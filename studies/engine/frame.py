@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmodel.bases import station_places
 from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.prepare import prepare
@@ -30,7 +31,7 @@ def _prepare_frame(structure: Structure, case: Case) -> SharedFrame:
     loop = prepare(structure, case).loop
     machine, n = case.machine, structure.n_controlled
     shape = build_basis(
-        structure.controller_basis, machine.beam, machine.patches, n, case.windows.stations
+        structure.controller_basis, machine.beam, machine.patches, n, station_places(case)
     ).deflection_at
     one_step = loop.controller.adc_step / loop.controller.adc_gain
     largest = jnp.max(jnp.abs(loop.sensor[:, :, 0]), axis=1)

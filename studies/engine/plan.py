@@ -173,7 +173,8 @@ def _structure(table: CaseTable, members: np.ndarray) -> Structure:
     one = build_structure(loose_study(table, int(members[0])))
     noisy = (column("electronics.adc_noise") > 0).any() | (column("drive.ripple") > 0).any()
     fields = Fields(table.study, table.fields)
-    has_poles = bool(np.any(fields.numbers("control.pole_decay") > 0))
+    poles = (fields.numbers(f"control.{name}") for name in ("damping", "pole_decay"))
+    has_poles = any(bool(np.any(given >= 0)) for given in poles)
     return one._replace(
         n_modes=int(column("link.modes").max()),
         n_controlled=min(int(column("control.modes").max()), one.n_patches),

@@ -25,6 +25,7 @@ class PoleReport(NamedTuple):
     nominal: np.ndarray  # of the nominal link's loop
     assembled: np.ndarray  # of the three assembled modes of each order, nearest to the nominal ones
     gain_factor: float  # control.gain_factor [1]
+    is_by_damping: bool = False  # specified as added damping ratios, and shown as such
 
 
 def pole_report(structure: Structure, case: Case, loop: LoopReport) -> PoleReport | None:
@@ -50,7 +51,8 @@ def pole_report(structure: Structure, case: Case, loop: LoopReport) -> PoleRepor
     for mode in np.flatnonzero(is_on.any(axis=0))[: len(found)]:
         matched = _matched(nominal[:, mode], found[mode])
         assembled[:, mode] = np.where(is_on[:, mode], matched, np.nan)
-    return PoleReport(specified, nominal, assembled, float(case.control.gain_factor))
+    is_by_damping = bool(np.any(np.asarray(case.control.damping) >= 0))
+    return PoleReport(specified, nominal, assembled, float(case.control.gain_factor), is_by_damping)
 
 
 def _matched(nominal: np.ndarray, found: np.ndarray) -> np.ndarray:
@@ -62,22 +64,33 @@ def _matched(nominal: np.ndarray, found: np.ndarray) -> np.ndarray:
 
 
 def pole_rows(report: PoleReport) -> list[list[str]]:
-    """Row of each controlled mode and link: decay [1/s] and frequency [Hz], by `HEADER`."""
+    """Row of each controlled mode and link, by `HEADER`.
+
+    Decay [1/s] and frequency [Hz]; of added damping ratios: damping ratio and natural frequency.
+    """
+    shown = _in_ratio if report.is_by_damping else _in_decay
     return [
-        [str(mode + 1), str(link + 1), *(_shown(poles[link, mode]) for poles in report[:3])]
+        [str(mode + 1), str(link + 1), *(shown(poles[link, mode]) for poles in report[:3])]
         for mode, link in np.argwhere(~np.isnan(report.specified).T)
     ]
 
 
-def _shown(pole: complex) -> str:
+def _in_decay(pole: complex) -> str:
     if np.isnan(pole):
         return "-"
     return f"{-pole.real:.4g} 1/s, {abs(pole.imag) / (2 * np.pi):.4g} Hz"
 
 
+def _in_ratio(pole: complex) -> str:
+    if np.isnan(pole):
+        return "-"
+    return f"zeta {-pole.real / abs(pole):.4g}, {abs(pole) / (2 * np.pi):.4g} Hz"
+
+
 def difference(report: PoleReport) -> str:
     """Where poles differ most from what is specified, and why."""
     sentences, wanted = [], report.specified
+    shown = _in_ratio if report.is_by_damping else _in_decay
     if report.gain_factor != 1:
         sentences.append(
             f"Poles are placed for control.gain_factor = 1; with {report.gain_factor:g}, the "
@@ -95,7 +108,7 @@ def difference(report: PoleReport) -> str:
     at = np.unravel_index(np.nanargmax(apart), apart.shape)
     sentences.append(
         f"The assembled machine differs most in mode {at[1] + 1} of link {at[0] + 1}: "
-        f"{_shown(report.assembled[at])} instead of {_shown(wanted[at])} {than}. Its links are "
+        f"{shown(report.assembled[at])} instead of {shown(wanted[at])} {than}. Its links are "
         "coupled by the platform and patches act on all modes (spillover); gains are designed mode "
         "by mode."
     )

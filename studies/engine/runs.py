@@ -44,9 +44,10 @@ from studies.errors import field_error, warn_of_model
 from studies.store import Variable
 from studies.study.cases import as_arrays, build_case, build_structure, powered
 from studies.study.consistency import check_locked, each_link
-from studies.study.labels import DISTANCE_TEXT, STATUS_LABEL
+from studies.study.labels import DISTANCE_TEXT, STATION_TEXT, STATUS_LABEL
 from studies.study.margin import MARGIN_MODES
-from studies.study.spec import Study
+from studies.study.spec import AUTO, Study
+from studies.study.window import residual_delay
 
 #: More plant steps per sample than this are rejected.
 SUBSTEP_LIMIT = 200
@@ -416,18 +417,27 @@ def _check_duration(study: Study, structure: Structure, known: Preflight) -> Non
             f"{known.shaper_length:.4g} s",
             "s",
         )
-    left = duration - end - study.metrics.residual_delay
+    delay = residual_delay(study)
+    left = duration - end - delay
     # free vibration of a platform at rest: the window can end with the run
-    longest = left if len(study.motion.waypoints) > 1 else np.inf
     period = 1 / study.electronics.sample_rate_hz
+    is_free = len(study.motion.waypoints) == 1 and left > period / 2
+    longest = np.inf if is_free else left
     if not period * (1 - 1e-9) <= study.metrics.residual_length <= longest + 1e-9:
         raise field_error(
             "metrics.residual_length",
             study.metrics.residual_length,
             f"{period:g} to {max(left, 0):.6g}, from one sample to what run.duration = "
-            f"{duration:g} leaves after the shaped motion and metrics.residual_delay",
+            f"{duration:g} leaves after the shaped motion of {end:.4g} s and "
+            + _wait_text(study, delay),
             "s",
         )
+
+
+def _wait_text(study: Study, delay: float) -> str:
+    if study.metrics.residual_delay == AUTO:
+        return f"{delay:g} s in which the drive settles (metrics.residual_delay = 'auto')"
+    return f"metrics.residual_delay = {delay:g}"
 
 
 def _check_rates(study: Study, structure: Structure, known: Preflight) -> None:
@@ -586,7 +596,7 @@ def run_variables(run: Run) -> dict[str, Variable]:
     stations = np.array(run.study.metrics.stations)
     frequency = np.asarray(_spectrum_frequencies(run.structure, run.case))
     variables = {
-        "station": Variable(stations, ("station",), "m", "position along the link"),
+        "station": Variable(stations, ("station",), "1", STATION_TEXT),
         "link": Variable(np.arange(1, 4), ("link",), "1", "link number"),
         "pose_axis": Variable(np.array(["x", "y", "phi"]), ("pose_axis",), "1", "pose component"),
         "spectrum_frequency": Variable(

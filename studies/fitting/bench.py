@@ -12,6 +12,7 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel import status
@@ -24,7 +25,9 @@ from jaxmodel.response import BenchPlant, bench_plant, held_modes
 from studies.engine.program import Place
 from studies.engine.runs import check_pose
 from studies.errors import StudyError, field_error
+from studies.space.free import Placing
 from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.consistency import each_link
 from studies.study.labels import describe
 from studies.study.signals import Signal
 from studies.study.spec import Study
@@ -107,6 +110,26 @@ class PlantAt:
         return value, None if self.slope is None else getattr(self.slope, name)[index]
 
 
+def seen_at(study: Study, place: Place, places: tuple[float, ...]) -> tuple[Study, Place]:
+    """A study whose stations are measured places [m], on links of any length.
+
+    Args:
+        study: the model.
+        place: puts parameters into a case.
+        places: from the slider joint on, the same on all links, within the shortest one [m].
+    """
+    longest = float(each_link(study.link.length).max())
+    study = study.change(metrics__stations=tuple(x / longest for x in places))  # as many
+    return study, Placing(_place_and_see, (place, places))
+
+
+def _place_and_see(place: Place, places: tuple[float, ...], case: Case, values: Array) -> Case:
+    case = place(case, values)
+    length = jnp.broadcast_to(case.machine.beam.length, (3,))
+    stations = jnp.asarray(places, length.dtype) / length[:, None]
+    return case._replace(windows=case.windows._replace(stations=stations))
+
+
 class Bench:
     """Plants at all poses that measurements need, kept for the last parameters."""
 
@@ -129,16 +152,14 @@ class Bench:
             )
         if places and not BASES[study.link.basis].is_on_chord:
             raise field_error("link.basis", study.link.basis, "a basis with both ends on the chord")
-        self.stations = tuple(sorted(set(places))) or study.metrics.stations[:1]
-        self.study = study.change(
-            control__feedback="none",
-            metrics__stations=self.stations,
-            shaper__kind="none",
+        self.stations = tuple(sorted(set(places))) or (
+            float(each_link(study.link.length).min()) / 2,
         )
+        study = study.change(control__feedback="none", shaper__kind="none")
+        self.study, self.place = seen_at(study, place, self.stations)
         self.structure = build_structure(self.study)
         self.case = as_arrays(build_case(self.study))
         self.n_patches = self.structure.n_patches
-        self.place = place
         self.poses = tuple(dict.fromkeys(poses))
         self._kept: dict[tuple[Pose, bool], tuple[bytes, PlantAt]] = {}
 

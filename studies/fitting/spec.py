@@ -26,6 +26,7 @@ from studies.study.explain import explain
 from studies.study.files import find_spec, read_toml
 from studies.study.paths import as_tuples, field_unit, parse_entry
 from studies.study.spec import Section, Study, described, parse_study
+from studies.study.window import with_window
 
 Positive = Annotated[float, Field(ge=1e-30, le=1e12)]
 Percent = Annotated[float, Field(ge=1e-6, le=1000)]
@@ -239,7 +240,7 @@ def parse_fit(data: dict[str, Any], folder: str | Path = ".") -> FitSpec:
     """
     if "fit" not in data:
         raise StudyError("fit: missing; a fit is a study file with a section [fit]")
-    study = parse_study({name: value for name, value in data.items() if name != "fit"})
+    study = with_window(parse_study({name: value for name, value in data.items() if name != "fit"}))
     try:
         fit = Fit.model_validate(as_tuples(data["fit"]))
     except ValidationError as error:

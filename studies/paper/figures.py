@@ -21,12 +21,11 @@ from jaxmodel import shaper
 from studies.paper.cases import ALL, OFF, ONE, TWO, PaperRuns
 from studies.paper.context import Machines
 from studies.show import figures
-from studies.study.consistency import each_link
 
 #: Length of the views after the command [s].
 VIEW_LENGTH = 0.2
 #: Those of the platform's error begin later, when the drives have settled [s].
-DRIVE_SETTLED = 0.04
+DRIVE_SETTLED = 0.05
 #: Shorter amplitudes than this share of a unit are shown in the next smaller one.
 LEAST = 0.1
 #: Units of axes by SI unit, the larger first, with their size.
@@ -91,8 +90,7 @@ def _draw_row(
 
 def _station(runs: PaperRuns) -> int:
     """The station nearest to three quarters of the link."""
-    stations = np.array(runs.study.metrics.stations)
-    return int(np.argmin(np.abs(stations - 0.75 * each_link(runs.study.link.length).mean())))
+    return int(np.argmin(np.abs(np.array(runs.study.metrics.stations) - 0.75)))
 
 
 def _deflection(machines: Machines, links: tuple[bool, ...], is_whole: bool = False) -> Figure:

@@ -9,7 +9,6 @@ from scipy.signal import periodogram
 
 from studies.engine.frame import EARLY_PART
 from studies.paper.cases import PaperRuns
-from studies.study.consistency import each_link
 
 #: Spectra are kept up to this frequency [Hz].
 TOP_HZ = 1200.0
@@ -35,8 +34,7 @@ class Measures(NamedTuple):
 
 def middle_station(runs: PaperRuns) -> int:
     """Index of the station nearest to mid-span."""
-    stations = np.array(runs.study.metrics.stations)
-    return int(np.argmin(np.abs(stations - each_link(runs.study.link.length).mean() / 2)))
+    return int(np.argmin(np.abs(np.array(runs.study.metrics.stations) - 0.5)))
 
 
 def measure(runs: PaperRuns) -> Measures:

@@ -37,7 +37,7 @@ from studies.show.figures import styled, write_figure
 from studies.show.pages import write_report
 from studies.show.sketch import sketch
 from studies.store import Variable, check_target, staged, write_store
-from studies.study.labels import STATUS_LABEL, describe
+from studies.study.labels import STATION_TEXT, STATUS_LABEL, describe
 from studies.study.spec import Study, paper_study
 
 REPORT = "report.html"
@@ -192,9 +192,7 @@ def _axes(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
         "case": Variable(names, ("case",), "1", "name of the case"),
         "time": Variable(runs.record.time[0], ("time",), "s", "time"),
         "link": Variable(np.arange(1, 4), ("link",), "1", "link number"),
-        "station": Variable(
-            np.array(runs.study.metrics.stations), ("station",), "m", "position along the link"
-        ),
+        "station": Variable(np.array(runs.study.metrics.stations), ("station",), "1", STATION_TEXT),
         "patch": Variable(np.arange(1, 4), ("patch",), "1", "patch pair, from the slider on"),
         "controlled_mode": Variable(
             np.arange(1, count + 1), ("controlled_mode",), "1", "mode of the controller"

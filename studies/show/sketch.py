@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from jaxmodel.case import Case
 from studies.show import figures
@@ -12,23 +15,29 @@ from studies.study.cases import build_case
 from studies.study.consistency import each_link, patch_centers
 from studies.study.spec import Study
 
-#: Colours of controlled links, other links, and patches.
-ON, OFF, PATCH = figures.SERIES[0], "#888888", figures.SERIES[1]
+#: Colours of controlled links, other links, actuators and sensors.
+ON, OFF, ACTUATOR, SENSOR = figures.SERIES[0], "#888888", figures.SERIES[1], figures.SERIES[2]
 CAPTION = (
-    "The machine at its first way-point; blue: links under control, grey: the others, orange: "
-    "patches, red: the path of the platform's reference point, enlarged where it is short, black "
-    "cross: a payload's centre of mass"
+    "The machine at its first way-point, and its links to scale, each from its face and, below, "
+    "from its edge; blue: links under control, grey: the others, orange: actuators, green: "
+    "sensors, on opposite faces, red: the path of the platform's reference point, enlarged where "
+    "it is short, black cross: a payload's centre of mass"
 )
+#: How far patches stand out of a link of the whole machine, as a share of the guides' side.
+OUTSTANDING = 0.018
+#: Largest thickness drawn, as a share of the longest link, and factors on true thickness.
+THICKEST, FACTORS = 0.1, (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100)
 #: The path is drawn at least this long, as a share of the guides' side.
 SHORTEST_PATH = 0.08
 
 
 def sketch(study: Study) -> Figure:
-    """Guides, sliders, links with their patches, platform and path."""
+    """Guides, sliders, links with their patches, platform and path; links to scale below."""
     case, pose = build_case(study), np.array(study.motion.waypoints[0], float)
     slider, joint = standing(case, pose)
-    figure = Figure(figsize=(3.4, 3.0), layout="constrained")
-    ax: Axes = figure.subplots()
+    figure = Figure(figsize=(3.4, 5.2), layout="constrained")
+    ax: Axes
+    ax, below = figure.subplots(2, 1, height_ratios=(3.0, 2.2))
     _guides(ax, study, case)
     ax.fill(*(1e3 * joint.T), color="#DDDDDD", zorder=1)
     for i, (start, end) in enumerate(zip(slider, joint, strict=True)):
@@ -53,6 +62,7 @@ def sketch(study: Study) -> Figure:
     ax.set_aspect("equal")
     ax.margins(0.14)
     ax.set(xlabel="x [mm]", ylabel="y [mm]")
+    _links_to_scale(below, study)
     return figure
 
 
@@ -86,21 +96,85 @@ def _guides(ax: Axes, study: Study, case: Case) -> None:
 
 
 def _link(ax: Axes, study: Study, i: int, start: np.ndarray, end: np.ndarray) -> None:
-    is_on = study.control.feedback != "none" and study.control.links[i]
     ax.plot(
-        *(1e3 * np.stack([start, end], axis=1)), color=ON if is_on else OFF, linewidth=2, zorder=2
+        *(1e3 * np.stack([start, end], axis=1)), color=_color(study, i), linewidth=1.5, zorder=3
     )
-    length = each_link(study.link.length)[i]
-    for center in patch_centers(study)[i]:
-        half = each_link(study.patches.actuator_length)[i] / 2
-        places = [start + (end - start) * (center + x) / length for x in (-half, half)]
-        ax.plot(
-            *(1e3 * np.stack(places, axis=1)),
-            color=PATCH,
-            linewidth=5,
-            zorder=3,
-            solid_capstyle="butt",
-        )
+    along = (end - start) / np.linalg.norm(end - start)
+    out = OUTSTANDING * study.machine.guide_side * np.array([-along[1], along[0]])
+    patches = study.patches
+    for size, color, side in (
+        (each_link(patches.actuator_length)[i], ACTUATOR, out),
+        (each_link(patches.sensor_length)[i], SENSOR, -out),
+    ):
+        for center in patch_centers(study)[i]:
+            first, last = (start + (center + x) * along for x in (-size / 2, size / 2))
+            corners = np.array([first, last, last + side, first + side])
+            ax.fill(*(1e3 * corners.T), color=color, linewidth=0, zorder=2)
+
+
+def _color(study: Study, i: int) -> str:
+    return ON if study.control.feedback != "none" and study.control.links[i] else OFF
+
+
+class Part(NamedTuple):
+    """A link or a patch on it: its extent along the link and, on its edge, across [m]."""
+
+    color: str
+    start: float
+    length: float
+    width: float
+    bottom: float
+    thickness: float
+
+
+def link_parts(study: Study, i: int) -> list[Part]:
+    """Link i and its patches; the longer ones of a pair come first."""
+    link, patches = study.link, study.patches
+    length, width, thickness = (
+        float(each_link(x)[i]) for x in (link.length, link.width, link.thickness)
+    )
+    across, ceramic = (float(each_link(x)[i]) for x in (patches.width, patches.thickness))
+    kinds = [
+        (float(each_link(patches.actuator_length)[i]), ACTUATOR, thickness / 2),
+        (float(each_link(patches.sensor_length)[i]), SENSOR, -thickness / 2 - ceramic),
+    ]
+    return [
+        Part(_color(study, i), 0.0, length, width, -thickness / 2, thickness),
+        *(
+            Part(color, center - size / 2, size, across, bottom, ceramic)
+            for size, color, bottom in sorted(kinds, reverse=True)
+            for center in map(float, patch_centers(study)[i])
+        ),
+    ]
+
+
+def _links_to_scale(ax: Axes, study: Study) -> None:
+    """Faces and edges of the links, one below another, in millimetres."""
+    links = [link_parts(study, i) for i in range(3)]
+    height = max(parts[0].thickness + 2 * parts[-1].thickness for parts in links)
+    longest = max(parts[0].length for parts in links)
+    factor = max((x for x in FACTORS if x * height <= THICKEST * longest), default=FACTORS[0])
+    gap, half, low, ticks = 20 * longest, 500 * factor * height, 0.0, []
+    for parts in links:
+        face = low - 500 * parts[0].width
+        edge = face - 500 * parts[0].width - gap - half
+        for part in parts:
+            at, size = 1e3 * part.start, 1e3 * part.length
+            for bottom, across in (
+                (face - 500 * part.width, 1e3 * part.width),
+                (edge + 1e3 * factor * part.bottom, 1e3 * factor * part.thickness),
+            ):
+                ax.add_patch(Rectangle((at, bottom), size, across, color=part.color, linewidth=0))
+        ticks.append((face + edge) / 2)
+        low = edge - half - 2 * gap
+    ax.set_xlim(0, 1e3 * longest)
+    ax.set_ylim(low + gap, gap)
+    ax.set_aspect("equal")
+    ax.set_yticks(ticks, ["link 1", "link 2", "link 3"])
+    ax.tick_params(axis="y", length=0)
+    ax.grid(False)
+    ax.set_xlabel("from the slider joint [mm]")
+    ax.set_title(f"edges drawn {factor:g} times as thick", fontsize=8, loc="left")
 
 
 def _path(ax: Axes, study: Study, pose: np.ndarray) -> None:

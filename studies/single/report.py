@@ -128,7 +128,7 @@ def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str], name: st
         case=_situation(run, twin),
         band=study.metrics.settling_band,
         windows=run.case.windows,
-        stations=", ".join(f"{1e3 * x:g}" for x in study.metrics.stations),
+        stations=", ".join(f"{100 * x:g}" for x in study.metrics.stations),
         watched=_watched(run),
         command_end=float(result.command_end),
         buckling=np.broadcast_to(euler_force(run.case.machine.beam), (3,)),

@@ -30,6 +30,7 @@ class FieldPlace(NamedTuple):
 
     path: str
     factor: float = 1.0  # the Case's unit in the study's
+    is_of_mode_1: bool = False  # one number, or one a link, is that of mode 1, not of all
 
 
 def _same(section: str, inside: str, *names: str) -> dict[str, FieldPlace]:
@@ -42,6 +43,7 @@ DESIGN: dict[str, FieldPlace] = {
         "control", "control", "velocity_gain", "position_gain", "gain_factor", "feedthrough_factor"
     ),
     "control.ratios": FieldPlace("control.ratio"),
+    "control.damping": FieldPlace("control.damping", is_of_mode_1=True),
     "control.pole_decay": FieldPlace("control.pole_decay"),
     "control.pole_frequency_hz": FieldPlace("control.pole_frequency", TWO_PI),
     "electronics.highpass_hz": FieldPlace("electronics.highpass", TWO_PI),
@@ -237,6 +239,8 @@ def plain_numbers(
             raise field_error(label, start, f"{span.low:g} to {span.high:g}, the bounds of {path}")
         numbers.append(Free(label, span, float(start), name))
         at = (*whole, Ellipsis) if whole and is_each_link(entry.field) else whole
+        if leaf.is_of_mode_1 and len(whole) < 2:
+            at = (*(whole or (Ellipsis,)), 0)
         setters.append(Setter(leaf.path, at, leaf.factor))
     if not numbers:
         raise field_error(name, value, f"one number or more, where {path} is to be free")

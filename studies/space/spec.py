@@ -24,6 +24,7 @@ from studies.study.entries import parse_entries
 from studies.study.explain import explain
 from studies.study.files import read_toml
 from studies.study.spec import Section, Study, described, parse_study
+from studies.study.window import with_window
 
 
 class Block(Section):
@@ -115,7 +116,9 @@ def parse_sweep(data: dict[str, Any]) -> SweepSpec:
         check_depth(data["sweep"])
     except ValueError as error:
         raise StudyError(f"sweep: {error}") from None
-    study = parse_study({name: value for name, value in data.items() if name != "sweep"})
+    study = with_window(
+        parse_study({name: value for name, value in data.items() if name != "sweep"})
+    )
     sweep = _parse_block(Sweep, data["sweep"], "sweep")
     assert isinstance(sweep, Sweep)
     ranking = parse_entries(sweep.by, "sweep.by").metric

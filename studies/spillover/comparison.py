@@ -21,11 +21,10 @@ from studies.spillover.laws import Candidate, all_laws
 from studies.spillover.plants import LoopMaker, PlantVariant, plant_sizes
 from studies.study.margin import HIGHEST, LOWEST
 from studies.study.spec import Study
+from studies.study.window import residual_delay
 
 #: The fast move has the acceleration of a move of this length in this time.
 FAST = (0.01, 0.03)  # [m], [s]
-#: The drives settle this long after the command; then the residual window begins [s].
-SETTLING = 0.02
 #: Length of the residual window [s].
 WINDOW = 0.15
 #: Number of modes whose damping is reported.
@@ -193,12 +192,11 @@ def _made_fast(study: Study) -> Study:
     if distance > 0:
         time = max(FAST[1] * np.sqrt(distance / FAST[0]), 1e-3)
     moving = time if len(points) > 1 else 0.0
-    return study.change(
+    fast = study.change(
         motion__waypoints=points,
         motion__move_time=float(time),
         motion__dwell=0.0,
         shaper__kind="none",
-        metrics__residual_delay=SETTLING,
         metrics__residual_length=WINDOW,
-        run__duration=moving + SETTLING + WINDOW + 0.01,
     )
+    return fast.change(run__duration=moving + residual_delay(fast) + WINDOW + 0.01)

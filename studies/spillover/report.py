@@ -12,10 +12,11 @@ from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.show.sketch import CAPTION
 from studies.show.templates import render
 from studies.spillover.certificate import Certificate, Spillover
-from studies.spillover.comparison import FAST, GIVEN, SETTLING, SHOWN, WINDOW, WITHOUT, Comparison
+from studies.spillover.comparison import FAST, GIVEN, SHOWN, WINDOW, WITHOUT, Comparison
 from studies.spillover.plants import PlantVariant
 from studies.study.labels import describe
 from studies.study.margin import margin_text
+from studies.study.window import residual_delay
 
 #: Leakage below this is rounding [1].
 TINY = 1e-9
@@ -74,7 +75,7 @@ def report(found: Certificate, laws: Comparison | None) -> str:
         leakage=_leakage(found),
         given=GIVEN,
         fast=FAST,
-        settling=SETTLING,
+        delay=residual_delay(laws.study) if laws is not None else None,
         window=WINDOW,
         law_modes=[f"zeta {j + 1}" for j in range(SHOWN)],
         law_rows=_laws(laws) if laws is not None else [],

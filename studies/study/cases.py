@@ -30,9 +30,10 @@ from jaxmodel.laws.state_space import STATE_SPACE
 from jaxmodel.parameters import ASSEMBLIES, Beam, Damping, Geometry, Machine, Masses, Patches
 from jaxmodel.state_space import StateSpace
 from studies.study.consistency import patch_centers
-from studies.study.fields import Columns, Fields
-from studies.study.spec import OWN_FIELDS, Study
+from studies.study.fields import Columns, Fields, nesting
+from studies.study.spec import AUTO, OWN_FIELDS, Study
 from studies.study.state_space import system_of
+from studies.study.window import residual_delay
 
 TWO_PI = 2 * np.pi
 #: Duration of a move that only pads a path with fewer moves [s].
@@ -70,9 +71,9 @@ def build_structure(study: Study, substeps: int | None = None) -> Structure:
         has_amplifier=study.electronics.amplifier_hz > 0,
         has_noise=noisy,
         has_friction=study.drive.coulomb_friction > 0,
-        has_poles=study.control.pole_decay != (),
+        has_poles=study.control.has_poles,
         has_position_gain=LAWS[study.control.law].has_position
-        or study.control.pole_decay != ()
+        or study.control.has_poles
         or any(gain != 0 for gain in study.control.position_gain),
         is_smooth=study.run.smooth,
     )
@@ -111,7 +112,7 @@ def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
             number("initial.load_deflection"),
         ),
         windows=Windows(
-            residual_delay=number("metrics.residual_delay"),
+            residual_delay=_delay(fields),
             residual_length=number("metrics.residual_length"),
             settling_band=number("metrics.settling_band"),
             saturation_limit=number("metrics.saturation_limit"),
@@ -122,6 +123,13 @@ def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
         ),
         seed=fields.raw("run.seed").astype(int),
     )
+
+
+def _delay(fields: Fields) -> np.ndarray:
+    """Start of the residual window [s], (m,); "auto" is that of the study without columns."""
+    given = fields.raw("metrics.residual_delay")
+    auto = residual_delay(fields.study) if AUTO in given else 0.0
+    return np.array([auto if x == AUTO else float(x) for x in given])
 
 
 def in_working_precision(cases: Case) -> Case:
@@ -242,6 +250,7 @@ def _control(fields: Fields, structure: Structure) -> Control:
         velocity_gain=number("control.velocity_gain"),
         position_gain=number("control.position_gain"),
         ratio=powered(ratio, exponent),
+        damping=_added_damping(fields, shape),
         pole_decay=fields.spread("control.pole_decay", shape),
         pole_frequency=TWO_PI * fields.spread("control.pole_frequency_hz", shape),
         gain_factor=number("control.gain_factor"),
@@ -250,6 +259,13 @@ def _control(fields: Fields, structure: Structure) -> Control:
         parameters=_parameters(fields, LAWS[structure.law]),
         system=_system(fields.study, structure),
     )
+
+
+def _added_damping(fields: Fields, shape: tuple[int, int]) -> np.ndarray:
+    """`control.damping`, (m, 3, C): one number, or one a link, is that of mode 1; -1: none."""
+    is_by_mode = np.array([nesting(value) > 0 for value in fields.raw("control.damping")])
+    found = fields.spread("control.damping", shape, missing=-1.0)
+    return np.where(is_by_mode[:, None, None] | (np.arange(shape[1]) == 0), found, -1.0)
 
 
 def _system(study: Study, structure: Structure) -> StateSpace | None:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxmodel.beam import BASES
 from jaxmodel.laws import LAWS
 from jaxmodel.piezo import VACUUM_PERMITTIVITY
-from studies.errors import field_error, nearest
+from studies.errors import field_error, nearest, shown
 from studies.study.state_space import check_system
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def check_consistency(study: Study) -> None:
     Raises:
         StudyError: the first fault.
     """
-    link, control = study.link, study.control
+    control = study.control
     _check_patches(study)
     n_patches = patch_centers(study).shape[1]
     if LAWS[control.law].channel == "mode" and control.modes > n_patches:
@@ -70,17 +70,21 @@ def check_consistency(study: Study) -> None:
     _check_lists(study)
     _check_own_fields(study)
     _check_basis(study)
-    stations = ("metrics.stations", study.metrics.stations)
-    shortest = each_link(link.length).min()
-    for name, values in (stations, ("initial.load_station", (study.initial.load_station,))):
-        for value in values:
-            if not 0 < value < shortest:
-                raise field_error(
-                    name, value, f"between 0 and link.length = {shortest:g}, exclusive", "m"
-                )
+    _check_stations(study)
     _check_sampling(study)
     _check_pulses(study)
     _check_coupling(study)
+
+
+def _check_stations(study: Study) -> None:
+    for value in study.metrics.stations:
+        if not 0 < value < 1:
+            allowed = "between 0 and 1, exclusive: fractions of each link's length"
+            raise field_error("metrics.stations", value, allowed, "1")
+    shortest, load = each_link(study.link.length).min(), study.initial.load_station
+    if not 0 < load < shortest:
+        allowed = f"between 0 and link.length = {shortest:g}, exclusive"
+        raise field_error("initial.load_station", load, allowed, "m")
 
 
 def _is_nested(value: Any) -> bool:
@@ -90,20 +94,24 @@ def _is_nested(value: Any) -> bool:
 def _check_poles(study: Study) -> None:
     """Check that the law places poles, and what their lists hold."""
     control = study.control
-    decay, frequency = control.pole_decay, control.pole_frequency_hz
-    if frequency != () and decay == ():
+    decay, frequency, damping = control.pole_decay, control.pole_frequency_hz, control.damping
+    if damping != ():
+        _check_damping(study)
+    elif frequency != () and decay == ():
         raise field_error(
             "control.pole_decay",
             decay,
             "more than 0, where control.pole_frequency_hz is given",
             "1/s",
         )
-    if decay == ():
+    if not control.has_poles:
         return
     if not LAWS[control.law].places_poles:
         able = ", ".join(name for name, law in LAWS.items() if law.places_poles)
-        raise field_error("control.law", control.law, f"{able}, with control.pole_decay")
+        poles = "damping" if damping != () else "pole_decay"
+        raise field_error("control.law", control.law, f"{able}, with control.{poles}")
     for name, value, unit in (
+        ("control.damping", damping, "1"),
         ("control.pole_decay", decay, "1/s"),
         ("control.pole_frequency_hz", frequency, "Hz"),
     ):
@@ -121,6 +129,26 @@ def _check_poles(study: Study) -> None:
             "[[130.0], [120.0], [125.0]] moves mode 1 alone",
             "Hz",
         )
+
+
+def _check_damping(study: Study) -> None:
+    """Check that nothing else decides poles and gains, and that modes still vibrate."""
+    control = study.control
+    for leaf in ("pole_decay", "pole_frequency_hz", "velocity_gain", "position_gain"):
+        value = getattr(control, leaf)
+        if value != type(control).model_fields[leaf].default:
+            told = shown(control.damping)
+            allowed = f"not given where control.damping = {told} decides the gains"
+            raise field_error(f"control.{leaf}", value, allowed)
+    most = 1 - _largest(study.link.damping_ratio)
+    if _largest(control.damping) >= most:
+        allowed = f"below {most:g}, 1 less link.damping_ratio"
+        raise field_error("control.damping", control.damping, allowed, "1")
+
+
+def _largest(value: Any) -> float:
+    """Largest number of a nested list."""
+    return max(map(_largest, value), default=0.0) if isinstance(value, tuple) else value
 
 
 def _check_own_fields(study: Study) -> None:

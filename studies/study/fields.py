@@ -29,7 +29,7 @@ def padded(values: list[Any]) -> np.ndarray:
     values = [x if is_it else (x,) * LINKS for x, is_it in zip(values, is_list, strict=True)]
     if all(np.size(np.array(value, object)) == 0 for value in values):
         return np.zeros((len(values), 0))
-    depth = _depth(values)
+    depth = nesting(values)
     shape = [len(values)] + [0] * depth
     _measure(values, shape, 0)
     array = np.full(shape, np.nan)
@@ -37,10 +37,11 @@ def padded(values: list[Any]) -> np.ndarray:
     return array
 
 
-def _depth(value: Any) -> int:
+def nesting(value: Any) -> int:
+    """Levels of lists inside a list; -1: no list."""
     if not isinstance(value, (tuple, list, np.ndarray)):
         return -1
-    return 1 + max((_depth(entry) for entry in value), default=-1)
+    return 1 + max((nesting(entry) for entry in value), default=-1)
 
 
 def _measure(value: Any, shape: list[int], level: int) -> None:
@@ -93,10 +94,10 @@ class Fields:
         array = padded(list(raw)) if raw.dtype == object else raw.astype(float)
         return self._with_entries(field, array)
 
-    def spread(self, field: str, shape: tuple[int, ...]) -> np.ndarray:
-        """As floats, (m, *shape): a number stands for all below it; 0 where there is none."""
+    def spread(self, field: str, shape: tuple[int, ...], missing: float = 0.0) -> np.ndarray:
+        """As floats, (m, *shape): a number stands for all below it; `missing` without any."""
         raw = self.raw(field)
-        array = np.zeros((len(raw), *shape))
+        array = np.full((len(raw), *shape), missing)
         for whole, value in zip(array, raw, strict=True):
             _spread(whole, value)
         return self._with_entries(field, array)

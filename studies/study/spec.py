@@ -28,6 +28,8 @@ from studies.study.state_space import with_matrices
 #: Where laws' own fields are.
 OWN_FIELDS = "control.laws"
 Basis = Annotated[str, OneOf(lambda: BASES)]
+#: Value of `metrics.residual_delay` that leaves the number to `studies.study.window`.
+AUTO = "auto"
 
 
 # numbers within bounds, as entries of a list
@@ -79,7 +81,7 @@ class Section(BaseModel):
 class RunSection(Section):
     """Duration, resolution and model of the run."""
 
-    duration: float = described(0.8, "s", "length of the run", gt=0, le=100)
+    duration: float = described(0.5, "s", "length of the run", gt=0, le=100)
     seed: int = described(0, "1", "of ADC noise and force ripple", ge=0, le=10**9)
     substeps: int = described(0, "1", "plant steps per sample; 0: as many as needed", ge=0, le=200)
     smooth: bool = described(False, "-", "smooth limits, noise instead of rounding (for gradients)")
@@ -107,7 +109,7 @@ class MachineSection(Section):
     joint_radius: EachLink[Annotated[float, Field(ge=1e-4, le=5)]] = described(
         round(0.12 / 3**0.5, 12), "m", "distance of the joints from the platform's reference point"
     )
-    platform_mass: float = described(0.25, "kg", "m_p", ge=1e-3, le=1e3)
+    platform_mass: float = described(0.25, "kg", "mass m_p", ge=1e-3, le=1e3)
     platform_inertia: float = described(
         3.0e-4, "kg m2", "I_p about the reference point", ge=1e-7, le=1e2
     )
@@ -137,8 +139,10 @@ class LinkSection(Section):
         "-",
         "static correction for the modes left out; false: the paper's truncated model",
     )
-    length: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(0.2, "m", "L")
-    thickness: EachLink[Annotated[float, Field(ge=1e-5, le=0.1)]] = described(2e-3, "m", "t_b")
+    length: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(0.2, "m", "length L")
+    thickness: EachLink[Annotated[float, Field(ge=1e-5, le=0.1)]] = described(
+        2e-3, "m", "thickness t_b"
+    )
     width: EachLink[Annotated[float, Field(ge=1e-4, le=1)]] = described(10e-3, "m", "width")
     density: EachLink[Annotated[float, Field(ge=1, le=3e4)]] = described(2750.0, "kg/m3", "density")
     youngs_modulus: EachLink[Annotated[float, Field(ge=1e3, le=2e12)]] = described(
@@ -217,7 +221,7 @@ class MotionSection(Section):
         min_length=1,
         max_length=100,
     )
-    move_time: Time | tuple[Time, ...] = described(0.1, "s", "t_f of each move, or one per move")
+    move_time: Time | tuple[Time, ...] = described(0.03, "s", "t_f of each move, or one per move")
     dwell: Pause | tuple[Pause, ...] = described(0.0, "s", "pause after each move, or one per move")
     profile: Annotated[str, OneOf(lambda: PROFILES)] = described("cycloid", "-", "cycloid is (25)")
 
@@ -225,7 +229,7 @@ class MotionSection(Section):
 class ShaperSection(Section):
     """Input shaper on the motion."""
 
-    kind: Annotated[str, OneOf(lambda: SHAPERS)] = described("ei", "-", "ei is the paper's (13)")
+    kind: Annotated[str, OneOf(lambda: SHAPERS)] = described("none", "-", "ei is the paper's (13)")
     frequencies_hz: tuple[Hertz, ...] = described(
         (),
         "Hz",
@@ -267,6 +271,13 @@ class ControlSection(Section):
     position_gain: tuple[Gain, Gain, Gain] = described(
         (0.0, 0.0, 0.0), "N/m or 1/s2", "k_p of mode 1 per link (SRF: 1)"
     )
+    damping: EachMode[Zeta] = described(
+        (),
+        "1",
+        "added damping ratio, beside link.damping_ratio, from which the gains follow; natural "
+        "frequencies are kept: one number, or one a link, is that of mode 1, others by (24); or "
+        "one list a link by mode; 0: none, empty: gains or decays as below",
+    )
     pole_decay: EachMode[Decay] = described(
         (),
         "1/s",
@@ -300,6 +311,11 @@ class ControlSection(Section):
     feedthrough_factor: float = described(
         0.0, "1", "subtracted share of the residual modes' feed-through", ge=0, le=1
     )
+
+    @property
+    def has_poles(self) -> bool:
+        """Whether the gains follow from specified poles."""
+        return self.damping != () or self.pole_decay != ()
 
 
 class StateSpaceSection(Section):
@@ -362,8 +378,8 @@ class DriveSection(Section):
     """Slider servo and disturbances."""
 
     kind: Literal["pd", "computed_torque"] = described("pd", "-", "PD, or PD with computed torque")
-    kp: float = described(2e4, "N/m", "Kp", ge=0, le=1e8)
-    kd: float = described(60.0, "N s/m", "Kd", ge=0, le=1e5)
+    kp: float = described(2e4, "N/m", "position gain Kp", ge=0, le=1e8)
+    kd: float = described(60.0, "N s/m", "velocity gain Kd", ge=0, le=1e5)
     force_limit: float = described(1e3, "N", "motors, +-", gt=0, le=1e6)
     coulomb_friction: float = described(0.0, "N", "F_c of F_c tanh(v/v_0)", ge=0, le=1e3)
     friction_speed: float = described(1e-3, "m/s", "v_0", gt=0, le=1)
@@ -412,10 +428,13 @@ class InitialSection(Section):
 class MetricsSection(Section):
     """Evaluation of a run."""
 
-    residual_delay: float = described(
-        0.0, "s", "residual window starts this long after the reference trajectory", ge=0, le=100
+    residual_delay: Literal["auto"] | Pause = described(
+        AUTO,
+        "s",
+        "residual window starts this long after the reference trajectory; auto: when the drive "
+        "has settled to 2 %, by its poles",
     )
-    residual_length: float = described(0.3, "s", "length of the residual window", gt=0, le=100)
+    residual_length: float = described(0.2, "s", "length of the residual window", gt=0, le=100)
     settling_band: float = described(
         1e-6, "m", "chord deflection that counts as settled", gt=0, le=0.1
     )
@@ -436,7 +455,11 @@ class MetricsSection(Section):
         1e3, "1", "tolerated condition number of filter and synthesizer", ge=1, le=1e6
     )
     stations: tuple[float, ...] = described(
-        (0.05, 0.10, 0.15), "m", "where chord deflection is evaluated", min_length=1, max_length=20
+        (0.25, 0.5, 0.75),
+        "1",
+        "where chord deflection is evaluated, as fractions of each link's length",
+        min_length=1,
+        max_length=20,
     )
 
 

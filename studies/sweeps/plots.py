@@ -19,6 +19,7 @@ from studies.engine.columns import LEFT_OUT, variable_name
 from studies.engine.results import SweepData, metric_values, swept_names
 from studies.errors import StudyError
 from studies.show import figures
+from studies.show.sketch import ACTUATOR, SENSOR
 from studies.space.axes import SHOWN_AS
 from studies.space.spec import BlockNode
 from studies.study.consistency import each_link
@@ -423,9 +424,14 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
 
 
 def _placements(data: SweepData, y: str) -> Figure:
-    """The best placements on the link, one below another, above all cases by each patch."""
+    """The best placements on the links, one below another, above all cases by each patch.
+
+    Links of different length, or with patches of different length, have a line each.
+    """
     centers, value = data["patches_centers"], shown_metric(data, y)
-    patches, length = data.spec.study.patches, each_link(data.spec.study.link.length).max()
+    study = data.spec.study
+    sizes = (study.link.length, study.patches.actuator_length, study.patches.sensor_length)
+    links = list(dict.fromkeys(zip(*(map(float, each_link(x)) for x in sizes), strict=True)))
     chosen = recommended(data, y, N_PLACEMENTS)
     is_ok = (data["status"] == status.OK) & np.isfinite(value)
     others = [name for name in swept_names(data) if name != "patches_centers"]
@@ -435,18 +441,12 @@ def _placements(data: SweepData, y: str) -> Figure:
         top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.2, 1))
         texts = []
         for row, case in enumerate(chosen):
-            top.plot([0, length * unit], [row, row], color="#AAAAAA", linewidth=1)
-            for center in centers[case]:
-                for size, color, height in (
-                    (each_link(patches.actuator_length).max(), figures.SERIES[0], 0.6),
-                    (each_link(patches.sensor_length).max(), figures.SERIES[1], 0.3),
-                ):
-                    left = (center - size / 2) * unit
-                    top.barh(row, size * unit, height, left, color=color, linewidth=0)
+            for at, link in zip(_lanes(row, len(links)), links, strict=True):
+                _draw_placement(top, at, centers[case], link, 0.6 / len(links))
             also = "".join(f", {shown_value(data, name, case)}" for name in others)
             texts.append(f"{case}: {value[case]:.4g}{also}")
         top.set_ylim(len(chosen) - 0.4, -0.6)
-        top.set_xlim(0, length * unit)
+        top.set_xlim(0, max(length for length, *_ in links) * unit)
         top.set_ylabel("best placements")
         top.yaxis.tick_right()
         top.set_yticks(range(len(chosen)), texts, fontsize=figures.SMALL)
@@ -454,7 +454,7 @@ def _placements(data: SweepData, y: str) -> Figure:
         top.grid(False)
         top.set_title(
             f"{label(data, y)}, the {_best_text(data, len(chosen))}\n"
-            "blue: actuator, orange: sensor; right: "
+            "orange: actuator, green: sensor; right: "
             + ", ".join([f"case: {y.partition('[')[0]}", *others]),
             fontsize=8.5,
             loc="left",
@@ -488,3 +488,19 @@ def _placements(data: SweepData, y: str) -> Figure:
         figures.legend_beside(bottom, markerscale=3)
         _say_left_out(figure, data, is_ok)
     return figure
+
+
+def _lanes(row: int, count: int) -> np.ndarray:
+    """Ordinates of `count` links about that of their placement."""
+    return row + 0.8 * ((np.arange(count) + 0.5) / count - 0.5)
+
+
+def _draw_placement(
+    ax: Axes, at: float, centers: np.ndarray, link: tuple[float, ...], height: float
+) -> None:
+    """A link with its patches to one scale; link: its length, an actuator's, a sensor's [m]."""
+    length, actuator, sensor = (1e3 * x for x in link)
+    ax.plot([0, length], [at, at], color="#AAAAAA", linewidth=1)
+    for center in 1e3 * centers:
+        ax.barh(at, actuator, height, center - actuator / 2, color=ACTUATOR, linewidth=0)
+        ax.barh(at, sensor, height / 2, center - sensor / 2, color=SENSOR, linewidth=0)

@@ -186,7 +186,7 @@ def judge(spec: TuneSpec, designs: list[Study], runs: PlainRuns) -> list[JudgedD
 
 def _poles(study: Study, run: Result | None) -> PoleReport | None:
     """Specified and obtained poles of a design's own file; None if it has none or cannot run."""
-    if run is None or study.control.pole_decay == () or study.control.feedback != "sampled":
+    if run is None or not study.control.has_poles or study.control.feedback != "sampled":
         return None
     return loop_and_poles(study, *check_run(study), int(run.status))[1]
 

@@ -64,10 +64,11 @@ def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
     found = join_numbers(parts)
     check_twice(found.numbers, "tune.free")
     _check_decided(found.numbers)
-    if study.control.pole_decay != ():
+    if study.control.has_poles:
+        poles = "damping" if study.control.damping != () else "pole_decay"
         for number in found.numbers:
             if number.key.startswith(("control.velocity_gain", "control.position_gain")):
-                raise StudyError(f"tune.free.{number.key}: control.pole_decay decides the gains")
+                raise StudyError(f"tune.free.{number.key}: control.{poles} decides the gains")
     return found
 
 

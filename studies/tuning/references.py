@@ -76,20 +76,21 @@ def compare(
     fresh, is_on = spec.tune.scenarios.check * len(spec.moves), is_controlled(spec.study)
     runs = PlainRuns(shown_structure(spec), fresh * (len(designs) + 2))
     if is_on:
-        say(f"scanning {FIELD} alone, for comparison")
+        say(f"{FIELD} alone, for comparison")
     scan = scan_gain(spec, runs)
     others = {}
     if is_on:
         others[WITHOUT] = uncontrolled_study(spec.study)
     if scan is not None and scan.best >= 0:
         others[ALONE] = gain_study(spec, scan.gain_factor[scan.best])
-    say(f"running the results on {fresh} fresh scenarios")
+    say(f"the results on {fresh} fresh scenarios")
     own, *judged = judge(spec, [*designs, *others.values()], runs)
     count = len(designs) - 1
     found = dict(zip(others, judged[count:], strict=True))
     if WITHOUT in found:
         found[WITHOUT] = found[WITHOUT]._replace(loop=None, poles=None)
-    step = frame_of(*check_run(spec.study)).adc_step if is_on else None
+    has_adc = is_on and spec.study.control.feedback == "sampled"
+    step = frame_of(*check_run(spec.study)).adc_step if has_adc else None
     references = References(found.get(WITHOUT), scan, found.get(ALONE), step)
     return own, judged[:count], references
 

@@ -452,5 +452,5 @@ def _contradiction(spec: TuneSpec, family: Family, values: np.ndarray) -> str:
             for name in never
         )
     return " and ".join(f"{name} = {family.limits[name]}" for name in spec.limit_names) + (
-        " are each satisfied by some design, but by none together"
+        " are satisfied by some design each, but by none together"
     )

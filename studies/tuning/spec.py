@@ -31,6 +31,7 @@ from studies.study.explain import explain
 from studies.study.files import read_toml
 from studies.study.paths import checked_value, is_each_link, known_field, overlaps, set_value
 from studies.study.spec import Section, Study, described, parse_study
+from studies.study.window import with_window
 from studies.tuning.free import free_numbers, writes
 
 #: Limits that no run is needed for; all but `spillover` are lower ones. Those of the loop:
@@ -122,7 +123,7 @@ class TuneSpec(NamedTuple):
     def has_poles(self) -> bool:
         """Whether the gains of any design follow from poles."""
         studies = (self.study, *(family.study(self.study) for family in self.families))
-        return any(study.control.pole_decay != () for study in studies)
+        return any(study.control.has_poles for study in studies)
 
     @property
     def has_position_gain(self) -> bool:
@@ -172,7 +173,9 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
     """
     if "tune" not in data:
         raise StudyError("tune: missing; a tuning is a study file with a section [tune]")
-    study = parse_study({name: value for name, value in data.items() if name != "tune"})
+    study = with_window(
+        parse_study({name: value for name, value in data.items() if name != "tune"})
+    )
     try:
         tune = Tune.model_validate(data["tune"])
     except ValidationError as error:

@@ -79,7 +79,7 @@ static const uint16_t LOW_PASS_SHIFT{{ array(fixed.low_pass.shift) }};
 
 /* [force/delay line] its numerator times the gains, -k_d n_v - k_p n_x;
  * control.gain_factor, velocity_gain, position_gain, ratios, gain_unit,
- * or pole_decay, pole_frequency_hz */
+ * or damping, pole_decay, pole_frequency_hz */
 static const int32_t FORCE{{ array(force, channels.names) }};
 
 /* [bit] of each row */

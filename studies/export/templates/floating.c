@@ -61,7 +61,7 @@ static const real LOW_PASS{{ array(channels.denominator, channels.names) }};
 
 /* [{{ force_unit }}] its numerator times the gains, -k_d n_v - k_p n_x;
  * control.gain_factor, velocity_gain, position_gain, ratios, gain_unit,
- * or pole_decay, pole_frequency_hz */
+ * or damping, pole_decay, pole_frequency_hz */
 static const real FORCE{{ array(channels.force, channels.names) }};
 
 /* [{{ "V/N" if is_modal else "1" }}] voltage of each actuator of the link per force,

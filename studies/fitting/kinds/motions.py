@@ -15,7 +15,7 @@ from jaxmodel.simulate import simulate
 from studies.engine.program import Place
 from studies.engine.runs import check_run
 from studies.errors import StudyError
-from studies.fitting.bench import with_slopes
+from studies.fitting.bench import seen_at, with_slopes
 from studies.study.labels import describe
 from studies.study.signals import Signal
 from studies.study.spec import Study
@@ -43,14 +43,14 @@ class Recording(NamedTuple):
 class Motion:
     """A study's run with some links under control, kept for the last parameters."""
 
-    def __init__(self, study: Study, place: Place) -> None:
-        """Arguments: the run, and what puts parameters into a case.
+    def __init__(self, study: Study, place: Place, places: tuple[float, ...]) -> None:
+        """Arguments: the run, what puts parameters into a case, and its stations [m], if any.
 
         Raises:
             StudyError: as `check_run`.
         """
         self._structure, self._case = smooth_run(study)
-        self._place, self._stations = place, study.metrics.stations
+        self._place, self._places = place, places
         self._kinds: set[str] = set()
         self._kept: tuple[Any, Any] = None, None
 
@@ -83,7 +83,7 @@ class Motion:
         if signal.kind == "sensor":
             return signal.link, signal.patch
         if signal.kind == "deflection":
-            return signal.link, self._stations.index(signal.place)
+            return signal.link, self._places.index(signal.place)
         return (signal.link,)
 
 
@@ -92,15 +92,15 @@ class Motions:
 
     def __init__(self, study: Study, place: Place, places: tuple[float, ...]) -> None:
         """Arguments: as `Motion`; and where deflections are measured [m]."""
-        self._study = study.change(metrics__stations=places) if places else study
-        self._place = place
+        self._study, self._place = seen_at(study, place, places) if places else (study, place)
+        self._places = places
         self._known: dict[tuple[bool, ...] | None, Motion] = {}
 
     def of(self, links: tuple[bool, ...] | None) -> Motion:
         """The run with these links under control; None: those of the study."""
         if links not in self._known:
             study = self._study if links is None else self._study.change(control__links=links)
-            self._known[links] = Motion(study, self._place)
+            self._known[links] = Motion(study, self._place, self._places)
         return self._known[links]
 
 

@@ -1,0 +1,156 @@
+"""Where the residual window begins if a study leaves it open: when the slider drive has settled.
+
+A move leaves the drive's own tracking error behind, which bends the links while it settles. That
+vibration says nothing of the links or of their control, so by default the window waits for it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from jaxmodel.parameters import ASSEMBLIES
+from studies.errors import field_error
+from studies.study.consistency import each_link
+from studies.study.spec import AUTO, Study
+
+#: What is left of the drive's slowest motion when it counts as settled [1].
+SETTLED = 0.02
+#: The window begins on a multiple of this [s].
+GRID = 1e-3
+
+
+def residual_delay(study: Study) -> float:
+    """Start of the residual window after the end of the shaped command [s].
+
+    `metrics.residual_delay` as given; for "auto" the time in which the drive settles, counted from
+    the later of the path's end and the disturbances' end, rounded up to a millisecond. 0 where
+    nothing moves the sliders.
+
+    Args:
+        study: validated study.
+
+    Raises:
+        StudyError: "auto" with a drive that never settles.
+
+    Example:
+        >>> residual_delay(Study())
+        0.026
+    """
+    given = study.metrics.residual_delay
+    if given != AUTO:
+        return float(given)
+    moves = len(study.motion.waypoints) - 1
+    ends = _disturbance_ends(study)
+    if study.drive.locked or (moves == 0 and not ends):
+        return 0.0
+    path = sum(_total(x, moves) for x in (study.motion.move_time, study.motion.dwell))
+    wait = max([0.0, *(end - path for end in ends)]) + settling_time(study)
+    return round(math.ceil(wait / GRID - 1e-6) * GRID, 9)
+
+
+def with_window(study: Study) -> Study:
+    """The study with a number for `metrics.residual_delay`.
+
+    What varies a study (a sweep, a tuning, a fit) begins with this, so that all its cases have one
+    window: a case whose drive settles later must not be measured later.
+    """
+    return study.change(metrics__residual_delay=residual_delay(study))
+
+
+def settling_time(study: Study) -> float:
+    """Time in which the drive's slowest motion decays to SETTLED [s].
+
+    The poles are those of the machine with rigid links at the last way-point, its sliders held by
+    k_p and k_d (and viscous friction): with the inertia M of the pose and the sliders' rates J X',
+    each lambda of J^T J v = lambda M v is a mode s^2 + lambda k_d s + lambda k_p = 0.
+
+    Raises:
+        StudyError: a pole without decay.
+    """
+    drive = study.drive
+    stiffness, resistance = drive.kp, drive.kd + drive.viscous_friction
+    inertia, rates = rigid_machine(study)
+    # both are scaled by M^(-1/2), which keeps the problem symmetric
+    half = np.linalg.inv(np.linalg.cholesky(inertia))
+    scale = np.linalg.eigvalsh(half @ rates.T @ rates @ half.T)
+    poles = [np.roots([1.0, s * resistance, s * stiffness]) for s in scale]
+    decay = float(np.min(-np.real(poles)))
+    if not decay > 0:
+        name, value = ("kd", drive.kd) if drive.kp > 0 else ("kp", drive.kp)
+        raise field_error(
+            f"drive.{name}",
+            value,
+            "more than 0 with metrics.residual_delay = 'auto', which waits for the drive to settle "
+            "(or give that in s)",
+            "N s/m" if name == "kd" else "N/m",
+        )
+    return math.log(1 / SETTLED) / decay
+
+
+def rigid_machine(study: Study) -> tuple[np.ndarray, np.ndarray]:
+    """Inertia of the machine with rigid links at its last way-point, and its sliders' rates.
+
+    Args:
+        study: validated study.
+
+    Returns:
+        M of the pose (x, y, phi) [kg, kg m, kg m2], (3, 3); J = d rho / d pose [1, 1, m], (3, 3).
+    """
+    machine, link = study.machine, study.link
+    x, y, phi = study.motion.waypoints[-1]
+    guide = np.radians(machine.guide_angles_deg)
+    along = np.stack([np.cos(guide), np.sin(guide)], axis=1)
+    inwards = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    body = np.radians(machine.joint_angles_deg) if machine.joint_angles_deg else None
+    angle = phi + (np.array(ASSEMBLIES[machine.assembly]) if body is None else body)
+    radius = each_link(machine.joint_radius)
+    arm = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    # rate of each joint C_i by (x, y, phi), (3, 2, 3)
+    joint = np.concatenate(
+        [np.tile(np.eye(2), (3, 1, 1)), np.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None]],
+        axis=2,
+    )
+    length = each_link(link.length)
+    # distance of the guide from the centre of the triangle
+    inradius = machine.guide_side / (2 * np.sqrt(3)) + each_link(machine.guide_offsets)
+    height = np.sum(inwards * (np.array([x, y]) + arm), axis=1) + inradius
+    sine = np.clip(height / length, 0.0, 0.999)  # an unreachable pose has a message of its own
+    cosine = np.sqrt(1 - sine**2)
+    by_height = np.einsum("ij,ijk->ik", inwards, joint)
+    turn = by_height / (length * cosine)[:, None]
+    rates = np.einsum("ij,ijk->ik", along, joint) + (sine / cosine)[:, None] * by_height
+    mass = each_link(link.density) * each_link(link.width) * each_link(link.thickness) * length
+    carried = each_link(machine.slider_mass) + mass
+    coupling = mass * length / 2 * sine
+    inertia = np.einsum("i,ij,ik->jk", carried, rates, rates)
+    inertia += np.einsum("i,ij,ik->jk", mass * length**2 / 3, turn, turn)
+    mixed = np.einsum("i,ij,ik->jk", coupling, rates, turn)
+    inertia += _platform(study, phi) - mixed - mixed.T
+    return inertia, rates
+
+
+def _platform(study: Study, phi: float) -> np.ndarray:
+    """Inertia of platform and payload about the reference point, (3, 3)."""
+    machine, load = study.machine, study.load
+    cosine, sine = np.cos(phi), np.sin(phi)
+    offset = np.array([[cosine, -sine], [sine, cosine]]) @ np.array(load.offset)
+    inertia = np.diag([machine.platform_mass + load.mass] * 2 + [machine.platform_inertia])
+    inertia[2, 2] += load.inertia + load.mass * offset @ offset
+    inertia[:2, 2] = load.mass * np.array([-offset[1], offset[0]])
+    inertia[2, :2] = inertia[:2, 2]
+    return inertia
+
+
+def _disturbance_ends(study: Study) -> list[float]:
+    """When each disturbance ends [s]."""
+    pulses = (
+        (study.drive.pulse_force, study.drive.pulse_start, study.drive.pulse_length),
+        (study.load.pulse, study.load.pulse_start, study.load.pulse_length),
+    )
+    return [start + length for force, start, length in pulses if any(force)]
+
+
+def _total(times: float | tuple[float, ...], count: int) -> float:
+    return sum(times[:count]) if isinstance(times, tuple) else count * times

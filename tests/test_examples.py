@@ -1,0 +1,188 @@
+"""Every example of README, documents, notebooks and ready files shows control that works.
+
+All of them run as one table: the example as written, at half its gains, and without control.
+"""
+
+import ast
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import studies
+from studies.engine.executor import make_executor
+from studies.engine.plan import chunk_cases, even_layout, plan_groups
+from studies.space.table import CaseTable
+from studies.study.files import READY, read_toml
+from studies.study.paths import field_value
+from studies.study.spec import Study, parse_study
+from studies.study.window import residual_delay
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+#: Sections of a file beside those of its study.
+WORK = ("sweep", "tune", "fit")
+#: Examples that are about something else.
+OTHERS = {
+    "difference.toml": "a warning: its loop is unstable",
+    "models.toml": "compares models, without control",
+}
+FACTORS = (1.0, 0.5, 0.0)
+
+
+def study_of(data):
+    return parse_study({name: value for name, value in data.items() if name not in WORK})
+
+
+def blocks(text, language):
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
+def in_toml(text):
+    """Studies of a page's files; fragments that are no files of this program are passed over."""
+    for block in blocks(text, "toml"):
+        data = tomllib.loads(block)
+        is_whole = set(data) <= {*Study.model_fields, *WORK}
+        if is_whole and "file" not in data.get("state_space", {}):  # whose file is the reader's own
+            yield study_of(data)
+
+
+def is_start(node):
+    """Whether an expression is `studies.Study()` or the like."""
+    return (
+        isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Attribute)
+        and node.func.attr in ("Study", "paper_study")
+    )
+
+
+def in_python(code):
+    """Studies that code makes: with `Study().change(...)`, or from a dictionary."""
+    tree = ast.parse("\n".join(x for x in code.splitlines() if not x.startswith(("%", "!"))))
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+            continue
+        if node.func.attr == "change" and is_start(node.func.value):
+            known = {k.arg: literal(k.value) for k in node.keywords}
+            start = getattr(studies, node.func.value.func.attr)()
+            yield start.change(**{name: x for name, x in known.items() if x is not None})
+        elif node.func.attr in ("parse_sweep", "parse_tuning", "parse_study") and node.args:
+            data = literal(node.args[0])
+            if data is not None:
+                yield study_of(data)
+
+
+def literal(node):
+    try:
+        return ast.literal_eval(node)
+    except ValueError:
+        return None
+
+
+def examples():
+    """Name and study of every example."""
+    found = [(path.name, study_of(read_toml(path))) for path in sorted(READY.glob("*.toml"))]
+    found.append(("default", Study()))
+    for path in PAGES:
+        text = path.read_text(encoding="utf-8")
+        found += [(path.name, study) for study in in_toml(text)]
+        for block in blocks(text, "python"):
+            found += [(path.name, study) for study in in_python(block)]
+    for path in NOTEBOOKS:
+        for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+            if cell["cell_type"] == "code":
+                found += [(path.name, study) for study in in_python("".join(cell["source"]))]
+    chosen, seen = [], []
+    for name, study in found:
+        is_controlled = study.control.feedback == "sampled" and any(study.control.links)
+        what = study.model_dump(exclude={"title"})
+        if name in OTHERS or not is_controlled or what in seen:
+            continue
+        seen.append(what)
+        chosen.append((name, study))
+    return chosen
+
+
+EXAMPLES = examples()
+
+
+def columns_of(study):
+    """Fields in which a study differs from the default one, `run.duration` apart."""
+    skipped = {"run.duration"}
+    if study.shaper.kind == "none":
+        skipped.add("shaper.frequencies_hz")
+    fields = {}
+    for section, info in list(Study.model_fields.items())[1:]:
+        for name in info.annotation.model_fields:
+            field = f"{section}.{name}"
+            value = field_value(study, field)
+            if value != field_value(Study(), field) and field not in skipped:
+                fields[field] = value
+    return fields | {"metrics.residual_delay": residual_delay(study)}
+
+
+def column_of(values):
+    """As a table keeps them: an array, or an array of tuples of one depth."""
+    if any(isinstance(x, tuple) for x in values):
+        if any(isinstance(x, tuple) and x and isinstance(x[0], tuple) for x in values):
+            values = [x if x and isinstance(x[0], tuple) else (x,) * 3 for x in values]
+        column = np.empty(len(values), object)
+        column[:] = values
+        return column
+    return np.array(values)
+
+
+def table_of(examples):
+    """The table of these studies, each at FACTORS times its gains."""
+    rows = [
+        columns_of(study) | {"control.gain_factor": factor * study.control.gain_factor}
+        for study in examples
+        for factor in FACTORS
+    ]
+    longest = max(study.run.duration for study in examples)
+    default = Study().change(run__duration=longest)
+    names = sorted({name for row in rows for name in row})
+    columns = {
+        name: column_of([row.get(name, field_value(default, name)) for row in rows])
+        for name in names
+    }
+    n = len(rows)
+    zero = np.zeros(n, int)
+    return CaseTable(default, columns, zero, zero.astype("S16"), zero, 0, np.arange(n))
+
+
+@pytest.fixture(scope="module")
+def residual():
+    """Residual of every example at FACTORS times its gains, rms [m], (n, 3 factors, 3 links)."""
+    table = table_of([study for _, study in EXAMPLES])
+    rms = np.full((len(table), 3), np.nan)
+    groups = plan_groups(
+        table, np.arange(len(table)), lambda n, _: even_layout(n), ("residual_rms",), False, False
+    )
+    for group in groups:
+        executor = make_executor(group.structure, group.layout, False)
+        chunk = chunk_cases(table, group.rows, group.structure, group.layout.size)
+        found = executor.start(chunk).wait().metrics.residual_rms
+        rms[group.rows] = np.asarray(found)[: len(group.rows)].max(axis=-1)
+    return rms.reshape(len(EXAMPLES), len(FACTORS), 3)
+
+
+def test_there_are_examples():
+    names = {name for name, _ in EXAMPLES}
+    assert {"README.md", "default", "tune.toml", "1_first_run.ipynb"} <= names
+    assert {path.name for path in READY.glob("*.toml")} >= OTHERS.keys()
+
+
+@pytest.mark.parametrize("k", range(len(EXAMPLES)), ids=[name for name, _ in EXAMPLES])
+def test_control_beats_no_control(residual, k):
+    study = EXAMPLES[k][1]
+    # of the controlled links, as `best` ranks
+    controlled = residual[k][:, list(study.control.links)]
+    assert np.isfinite(residual[k]).all()
+    left, half, free = controlled.max(axis=1)
+    assert left < 0.9 * free
+    assert half < 0.9 * free
