@@ -196,7 +196,7 @@ def _loop_gains(one: LoopFigures, own: LoopFigures) -> list[Gain]:
     lost = [after < (1 - ALIKE) * before for after, before in (margins, decays)]
     change = _relative(decays[1], decays[0])
     return [
-        Gain("gain margin", "", *(margin_in_db(x, 3) for x in margins), lost[0]),
+        Gain("gain margin", "", margin_in_db(margins[0], 3), margin_in_db(margins[1], 3), lost[0]),
         Gain("slowest decay", change, f"{decays[0]:.3g}", f"{decays[1]:.3g} 1/s", lost[1]),
     ]
 
