@@ -286,7 +286,7 @@ OWN_LINKS = {
 
 
 def test_added_damping_is_obtained_on_any_machine():
-    """0.2 of mode 1, others by (24): to 1e-9 on the nominal link, 10 % assembled, margin above 2.
+    """0.2 of mode 1, others by (24): to 1e-9 on the nominal link, 5 % assembled, margin > 2.
 
     Natural frequencies are kept. By mode, each gets its own.
     """
@@ -308,7 +308,7 @@ def test_added_damping_is_obtained_on_any_machine():
         if damping == 0.2:
             report = loop_report(structure, case, np.array(study.motion.waypoints[0]))
             assert report.is_stable and report.gain_margin > 2
-            np.testing.assert_allclose(report.damping_ratio[0], 0.21, rtol=0.1)
+            np.testing.assert_allclose(report.damping_ratio[0], 0.21, rtol=0.05)
 
 
 def test_added_damping_leaves_modes_alone_where_it_is_none():

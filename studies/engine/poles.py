@@ -52,7 +52,8 @@ def pole_report(structure: Structure, case: Case, loop: LoopReport) -> PoleRepor
         matched = _matched(nominal[:, mode], found[mode])
         assembled[:, mode] = np.where(is_on[:, mode], matched, np.nan)
     is_by_damping = bool(np.any(np.asarray(case.control.damping) >= 0))
-    return PoleReport(specified, nominal, assembled, float(case.control.gain_factor), is_by_damping)
+    factor = float(case.control.gain_factor)
+    return PoleReport(specified, nominal, assembled, factor, is_by_damping=is_by_damping)
 
 
 def _matched(nominal: np.ndarray, found: np.ndarray) -> np.ndarray:

@@ -138,13 +138,25 @@ def link_parts(study: Study, i: int) -> list[Part]:
         (float(each_link(patches.actuator_length)[i]), ACTUATOR, thickness / 2),
         (float(each_link(patches.sensor_length)[i]), SENSOR, -thickness / 2 - ceramic),
     ]
-    return [
-        Part(_color(study, i), 0.0, length, width, -thickness / 2, thickness),
-        *(
-            Part(color, center - size / 2, size, across, bottom, ceramic)
-            for size, color, bottom in sorted(kinds, reverse=True)
-            for center in map(float, patch_centers(study)[i])
-        ),
+    body = Part(
+        color=_color(study, i),
+        start=0.0,
+        length=length,
+        width=width,
+        bottom=-thickness / 2,
+        thickness=thickness,
+    )
+    return [body] + [
+        Part(
+            color=color,
+            start=center - size / 2,
+            length=size,
+            width=across,
+            bottom=bottom,
+            thickness=ceramic,
+        )
+        for size, color, bottom in sorted(kinds, reverse=True)
+        for center in map(float, patch_centers(study)[i])
     ]
 
 
