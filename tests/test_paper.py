@@ -14,13 +14,13 @@ from rich.console import Console
 from studies import load
 from studies.atlas import atlas_sweep, read_subsets
 from studies.cli import main
-from studies.engine.runs import run_study
+from studies.engine.runs import check_run, run_study
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.paper import cases as paper_cases
 from studies.paper import context as report_context
 from studies.paper import figures as paper_figures
-from studies.paper import report
+from studies.paper import report, tables
 from studies.paper import run as paper
 from studies.paper.cases import ALL, MOVES, OFF, ONE, SHAPERS, TWO, run_cases
 from studies.paper.context import Context, Machines
@@ -168,6 +168,28 @@ def test_fitted_machine_runs_the_compared_cases_alone(short):
     np.testing.assert_allclose(fitted.runs.link_hz / nominal.runs.link_hz, (6 / 7) ** 0.5, 1e-6)
     voltage = [c.runs.result.metrics.peak_voltage[c.compared(2, ALL)] for c in short.machines]
     assert (voltage[0] < 0.5 * voltage[1]).all()
+
+
+def test_fitted_machine_has_the_measured_frequencies():
+    """Two of its links; the third is stiffer."""
+    hz = paper_cases.link_hz(*check_run(paper_cases.fitted_study()))[:, :2]
+    apart = np.sort(np.abs(hz - np.array(tables.FREQUENCIES)), axis=0)
+    assert apart[0].max() < 0.2 and apart[1].max() < 0.7
+
+
+@pytest.mark.long  # in short: its frequencies, and Table 1 of another machine in the report
+def test_fitted_machine_has_the_reductions_and_settling_times(monkeypatch):
+    """As docs/paper-measured.md says of runs whose converters round."""
+    monkeypatch.setattr(paper_cases, "JUDGED", ())
+    cases = [case for case in paper_cases.paper_cases() if case.is_compared]
+    runs = run_cases(paper_cases.fitted_study(), cases, lambda *_: None)
+    fitted = Context("fitted machine", runs, measure(runs))
+    for _, links, mode, printed in tables.printed_changes():
+        change = tables.amplitude_change(fitted, links, mode)
+        np.testing.assert_allclose(change, printed, atol={1: 2.5, 2: 4.7}[mode])
+    held, free = (fitted.measures.settling[fitted.compared(2, x)] for x in (ALL, OFF))
+    assert (held > 0.06).all() and (held < 0.09).all() and (held < 0.8 * free).all()
+    assert (free > 0.1).all() and (free < 0.14).all()
 
 
 @pytest.mark.long  # in short: a batched case equals its own run

@@ -252,12 +252,13 @@ def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:
         status=codes,
         ratio=gains,
         loops=loops,
-        link_hz=np.asarray(_link_hz(structure, built[0][1])),
+        link_hz=np.asarray(link_hz(structure, built[0][1])),
     )
 
 
 @partial(jax.jit, static_argnums=0)
-def _link_hz(structure: Structure, case: Case) -> Any:
+def link_hz(structure: Structure, case: Case) -> Any:
+    """Frequencies of each link between held ends [Hz], (3, C)."""
     return find_bases(structure, case).plant_omega / (2 * jnp.pi)
 
 
