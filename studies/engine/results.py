@@ -310,7 +310,7 @@ def counted_links(data: SweepData) -> np.ndarray:
 
     The same for all cases; otherwise fewer controlled links would look like less vibration.
     """
-    found = controlled(data.table).any(axis=0)
+    found: np.ndarray = np.any(controlled(data.table), axis=0)
     return found if found.any() else np.ones(3, bool)
 
 
