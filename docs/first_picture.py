@@ -11,11 +11,9 @@ import studies
 
 
 def main() -> None:
-    """Run the paper's square at 0.03 s a move without shaper, twice, and plot the bending."""
+    """Run the default study twice and plot the bending."""
     studies.configure()
-    fast = studies.paper_study().change(
-        motion__move_time=0.03, shaper__kind="none", run__duration=0.5
-    )
+    fast = studies.Study()
     runs = {
         "without control": studies.run_study(fast.change(control__gain_factor=0.0)),
         "with control": studies.run_study(fast),

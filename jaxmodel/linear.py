@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.drive import Reference, slider_force
-from jaxmodel.dynamics import inverse_dynamics
+from jaxmodel.dynamics import inverse_dynamics, kinetic_energy, modal_chain
 from jaxmodel.kinematics import close_chain
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import Loop, PlantState, plant_rates
@@ -135,6 +135,30 @@ def mechanical(plant: LinearPlant) -> Array:
     velocity = np.r_[3:6, 6 + r3 : 6 + 2 * r3]
     index = np.r_[position, velocity]
     return plant.state[np.ix_(index, index)]
+
+
+def mass_and_stiffness(loop: Loop, pose: Array, plant: LinearPlant) -> tuple[Array, Array]:
+    """Mass and stiffness matrix in (X, q): M x'' + K x = 0 without damping.
+
+    Args:
+        loop: constants of the case.
+        pose: (x, y, phi) [m, m, rad], (3,).
+        plant: of `linearise`, there.
+
+    Returns:
+        (M, K): [kg and mixed] and [N/m and mixed], symmetric, (m, m) with m = 3 + 3 R.
+    """
+    rest = jnp.zeros_like(loop.omega)
+    size = 3 + rest.size
+
+    def energy(rates: Array) -> Array:
+        pose_rate, q_rate = rates[:3], rates[3:].reshape(rest.shape)
+        chain = modal_chain(loop.plant, pose, pose_rate, rest, q_rate)
+        return kinetic_energy(loop.plant, chain, pose_rate, rest, q_rate)
+
+    mass = jax.hessian(energy)(jnp.zeros(size, rest.dtype))
+    stiffness = -mass @ mechanical(plant)[size:, :size]
+    return mass, (stiffness + stiffness.T) / 2
 
 
 class NaturalModes(NamedTuple):

@@ -153,12 +153,17 @@ def init(
     ready: Annotated[
         str, typer.Option("--from", help="copy the ready-made study, sweep or tuning of this name")
     ] = "",
+    is_whole: Annotated[
+        bool, typer.Option("--all", help="write every field with its allowed range")
+    ] = False,
 ) -> None:
-    """Write a commented study file with every field and its default."""
+    """Write a commented study file to start from, with the default of each field."""
     from studies.study.files import ready_text
-    from studies.study.template import study_template, write_text
+    from studies.study.template import starter_template, study_template, write_text
 
-    text = ready_text(ready) if ready else study_template()
+    if ready and is_whole:
+        raise StudyError("--all: --from copies a ready-made file; leave one of them out")
+    text = ready_text(ready) if ready else study_template() if is_whole else starter_template()
     if out is None:
         print(text, end="")
         return

@@ -54,6 +54,10 @@ COMPILER_FLAGS = {
 # Python looks for unreachable cycles after so many new objects. Tracing makes millions that stay:
 # with Python's own numbers, a fifth of a sweep's start went into looking through them.
 GARBAGE, PYTHONS_OWN = (50_000, 50, 50), ((700, 10, 10), (2000, 10, 10))
+# XLA logs a compilation of more than two minutes as an error and asks for a bug report. No flag
+# hides this alarm alone. From this level on, XLA logs only what ends the process; whatever fails
+# still reaches the caller as a Python exception. XLA reads the level while JAX is imported.
+LOG_LEVEL = ("TF_CPP_MIN_LOG_LEVEL", "3")
 # XLA runs a program on one core per device, so a batch uses all cores through one device per core.
 DEVICE_FLAG = "--xla_force_host_platform_device_count"
 
@@ -80,6 +84,8 @@ def configure(
         others can write there (CacheWarning).
 
     Python then looks for cyclic garbage less often, unless `gc.set_threshold` has been used before.
+    If JAX has not been imported yet, XLA's alarm about slow compilations is hidden (LOG_LEVEL),
+    unless the environment sets its own level.
 
     Raises StudyError for a value outside its range, or if JAX has already started without the
     requested flags or devices. Calls with equal settings can be repeated at any time.
@@ -91,6 +97,7 @@ def configure(
         raise field_error("devices", devices, "a whole number from 1")
 
     _look_less_for_garbage()
+    os.environ.setdefault(*LOG_LEVEL)
     old_flags = os.environ.get("XLA_FLAGS", "")
     new_flags = _extended(old_flags, devices, flags)
     if not is_backend_started():
@@ -115,10 +122,9 @@ def start(precision: str = "float64", cpu_only: bool = False) -> None:
 
     Raises StudyError as `configure`, or if JAX cannot start.
     """
-    _look_less_for_garbage()
+    configure(precision)
     import jax
 
-    configure(precision)
     if cpu_only:
         _settings().update("jax_platforms", "cpu")
     try:

@@ -22,9 +22,10 @@ from rich.table import Table
 
 import studies
 from studies.cli import app, console, main
+from studies.engine.modes import machine_modes
 from studies.study.files import READY
 from studies.study.margin import margin_in_db
-from studies.study.spec import load_study
+from studies.study.spec import load_study, parse_study
 from tests.pages import TITLE, parsed, rendered
 
 HOME_PHI = math.pi / 6
@@ -151,6 +152,15 @@ def test_simulate_writes_a_consistent_run(short_run):
     assert float(abs(short_run.actuator_voltage).max()) > 0.1
 
 
+def test_simulate_prints_its_answer_without_a_file(short_folder, short_run, capsys):
+    before = sorted(short_folder.iterdir())
+    code, out, err = run(capsys, "simulate", short_folder / "short.toml")
+    assert (code, err) == (0, "") and out.startswith("status: ok\n")
+    for link in range(3):
+        assert f"{1e6 * float(short_run.residual_rms[link].max()):.4g}" in out
+    assert "written" not in out and sorted(short_folder.iterdir()) == before
+
+
 def test_the_metrics_agree_with_the_trajectories(short_run):
     after = short_run.time > float(short_run.command_end) - 0.5e-4
     within = short_run.time < float(short_run.command_end) + 0.02 - 0.5e-4
@@ -196,7 +206,8 @@ def test_a_browser_shows_all_of_a_report(short_folder, tmp_path, width):
 def test_reports_that_cannot_be_are_refused_before_the_run(capsys, tmp_path):
     study = tmp_path / "short.toml"
     study.write_text(SHORT)
-    assert "name their file with --out" in refused(capsys, "replay", study, "--report")
+    for command in ("simulate", "replay"):
+        assert "name their file with --out" in refused(capsys, command, study, "--report")
     arguments = ("simulate", study, "--report", "--out")
     for name in ("run.html", "run.md"):
         assert "name it *.h5" in refused(capsys, *arguments, tmp_path / name)
@@ -209,7 +220,12 @@ def test_modes_as_json_and_as_table(capsys):
     code, out, err = run(capsys, "modes", "--modes", 2, "--json")
     found = json.loads(out)
     assert (code, err) == (0, "")
-    assert list(found) == ["frequencies_hz", "damping_ratios"]
+    assert list(found) == ["frequencies_hz", "damping_ratios", "names"]
+    moves = [f"drive, platform {x}, 100 %" for x in ("translates", "translates", "turns")]
+    assert found["names"] == [
+        *moves,
+        *(f"links 1 2 3, mode {k}, 100 %" for k in (1, 1, 1, 2, 2, 2)),
+    ]
     frequency = np.array(found["frequencies_hz"])
     assert len(frequency) == len(found["damping_ratios"]) == 3 + 3 * 2
     assert np.all(np.diff(frequency) >= 0)
@@ -218,6 +234,43 @@ def test_modes_as_json_and_as_table(capsys):
     assert np.all(np.abs(frequency[3:6] / 114.39 - 1) < 0.01)
     code, out, _ = run(capsys, "modes", "--modes", 2, "--kd", 60, "--damping", 0.01, "--locked")
     assert code == 0 and "damping ratio" in out and "114.388" in out and "0.01000" in out
+    assert "links 1 2 3, mode 2, 100 %" in out
+
+
+UNLIKE = {"link": {"modes": 2, "damping_ratio": 0.0, "thickness": [2e-3, 2.2e-3, 1.7e-3]}}
+
+
+def test_modes_name_their_link():
+    study = parse_study(UNLIKE | {"drive": {"kd": 0.0}, "metrics": {"residual_delay": 0.0}})
+    locked, free = machine_modes(study, locked=True), machine_modes(study)
+    by_thickness = [f"link {i}, mode {j}, 100 %" for j in (1, 2) for i in (3, 1, 2)]
+    assert locked.names == by_thickness
+    np.testing.assert_allclose(locked.link_share.max(axis=(1, 2)), 1.0, rtol=1e-9)
+    assert free.names[3:] == by_thickness and all("drive" in name for name in free.names[:3])
+    assert machine_modes(study, kp=0.0).names == ["rigid motion"] * 3 + by_thickness
+
+
+@pytest.mark.parametrize("thickness", [UNLIKE["link"]["thickness"], 2e-3])
+def test_shares_of_modes_are_what_their_frequencies_gain_from_stiffness(thickness):
+    """d ln f^2 / d ln k is the share of k in the potential energy; in groups of equal frequency."""
+    step, study = 1e-4, parse_study(UNLIKE | {"metrics": {"residual_delay": 0.0}})
+    study = study.change(link__thickness=thickness, drive__kd=0.0, drive__kp=2e4)
+
+    def gained(**change):
+        high, low = (
+            machine_modes(study.change(**{name: f(sign) for name, f in change.items()}))
+            for sign in (step, -step)
+        )
+        return np.log(high.frequency / low.frequency) / step
+
+    found = machine_modes(study)
+    of_link = gained(link__stiffness_factor=lambda x: (1.0, 1.0 + x, 1.0))
+    of_drive = gained(drive__kp=lambda x: 2e4 * (1 + x))
+    kinds = [slice(0, 3), slice(3, 6), slice(6, 9)] if thickness == 2e-3 else np.arange(9)
+    for kind in kinds:
+        share = found.link_share[kind][..., 1, :].sum(axis=-1)
+        np.testing.assert_allclose(np.sum(of_link[kind]), np.sum(share), atol=2e-6)
+        np.testing.assert_allclose(np.sum(of_drive[kind]), found.drive_share[kind].sum(), atol=2e-6)
 
 
 def test_modes_at_another_pose_differ(capsys):
@@ -349,7 +402,7 @@ def test_a_bad_precision_or_command_is_refused(capsys, tmp_path):
     arguments = ("simulate", tmp_path / "short.toml", "--out", tmp_path / "run.h5")
     message = refused(capsys, *arguments, "--precision", "float16")
     assert "precision = 'float16'; allowed: float64 or float32; did you mean 'float64'?" in message
-    assert "Missing option '--out'" in refused(capsys, *arguments[:2])
+    assert "Missing option '--out'" in refused(capsys, "spillover", arguments[1])
     assert "No such command 'simulat'" in refused(capsys, "simulat")
     code, out, _ = run(capsys)
     assert code == 2 and "simulate" in out
@@ -361,6 +414,9 @@ def test_init_writes_a_study_once(capsys, tmp_path):
     assert code == 0 and "written" in out
     text = target.read_text()
     assert run(capsys, "init")[1] == text
+    whole = run(capsys, "init", "--all")[1]
+    assert len(whole.splitlines()) > 5 * len(text.splitlines())
+    assert "leave one of them out" in refused(capsys, "init", "--all", "--from", "placement")
     assert "exists already; name a new file" in refused(capsys, "init", target)
     capsys.readouterr()
     main(["init", "--from", "placement"])

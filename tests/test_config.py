@@ -130,6 +130,37 @@ def test_import_sets_nothing_and_configure_does(tmp_path):
     assert any((tmp_path / "flexlink-studies").iterdir())
 
 
+#: XLA cannot write there, which it logs as it logs the alarm; JAX's own failures are exceptions.
+LOGGING = """
+import json, sys
+from studies.config import start
+assert "jax" not in sys.modules
+start()
+import jax
+try:
+    jax.jit(lambda x: jax.pure_callback(lambda x: 1 / 0, x, x))(1.0).block_until_ready()
+except jax.errors.JaxRuntimeError as error:
+    print(json.dumps("ZeroDivisionError" in str(error)), flush=True)
+"""
+
+
+@pytest.mark.parametrize(("level", "is_logged"), [(None, False), ("0", True)])
+def test_errors_of_jax_arrive_without_the_log_of_xla(level, is_logged):
+    """The log, in which XLA asks for bug reports, is there for those who ask for it."""
+    names = ("XLA_FLAGS", config.LOG_LEVEL[0])  # importing JAX has set the latter here
+    clean = {name: value for name, value in os.environ.items() if name not in names}
+    clean["XLA_FLAGS"] = "--xla_dump_to=/proc/none"
+    done = subprocess.run(
+        [sys.executable, "-c", LOGGING],
+        env=clean if level is None else clean | {config.LOG_LEVEL[0]: level},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert (done.returncode, done.stdout) == (0, "true\n"), done.stderr
+    assert ("Could not create directory" in done.stderr) == is_logged
+
+
 def test_unusable_cache_folder_does_not_stop_a_study(tmp_path):
     (tmp_path / "file").write_text("")
     facts = run(

@@ -17,7 +17,7 @@ from studies.cluster.worker import ChunkDone
 from studies.engine import sweep as engine_sweep
 from studies.engine.chunks import Done, Lost
 from studies.engine.plan import Layout, plan_groups
-from studies.engine.progress import Reporter
+from studies.engine.progress import Phases, Reporter
 from studies.engine.results import load
 from studies.engine.sweep import Outcome
 from studies.single import run as single_run
@@ -91,7 +91,7 @@ def test_a_sweep_with_lost_cases_fails_and_says_how_to_retry(
     [(0, False, 0), (2, False, 1), (0, True, 130), (2, True, 130)],
 )
 def test_how_a_sweep_ended(capsys, monkeypatch, sweep_file, tmp_path, lost, is_interrupted, wanted):
-    def ended(spec, *_):
+    def ended(spec, *_, **__):
         return Outcome(
             table=build_table(spec),
             n_done=6 - lost,
@@ -161,8 +161,8 @@ def on_cluster(monkeypatch):
         fake = FakeCluster(answers, **options)
         monkeypatch.setattr(cluster_runner, "Watch", lambda *_: fake)
         runner = ClusterRunner(fake, spec, 60.0)
-        with Reporter(SILENT, 20, 0, True) as reporter:
-            found = list(runner.run(table, groups, reporter, threading.Event()))
+        reporter = Reporter(Phases(SILENT, ("compile", "run"), True), "run", 20)
+        found = list(runner.run(table, groups, reporter, threading.Event()))
         return fake, found
 
     return outcome

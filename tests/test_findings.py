@@ -508,16 +508,19 @@ def test_a_tuning_s_summary_and_recommendation():
     for part in (
         f"**Result:** all: residual_rms {change('residual_rms')} "
         f"({1e6 * one.own.metrics['residual_rms']:.4g} instead of "
-        f"{1e6 * own.own.metrics['residual_rms']:.4g} µm), settling_time {change('settling_time')}",
+        f"{1e6 * own.own.metrics['residual_rms']:.4g} µm), ",
+        f"settling_time {change('settling_time')} (",
         f"peak_voltage {change('peak_voltage')} ({one.own.metrics['peak_voltage']:.4g} instead of "
         f"{own.own.metrics['peak_voltage']:.4g} V)",
-        "gain margin 2.38 (7.5 dB) instead of 3.12 (9.9 dB)",
+        "gain margin 2.38 (7.5 dB) instead of 3.12 (9.9 dB) on the nominal machine",
         "slowest decay +28.8 % (91.8 instead of 71.2 1/s)",
         f"the objective on 3 fresh machines is {100 * shares.mean():.3g} % of the baseline's on "
         f"average, {100 * shares.max():.3g} % at worst.",
         "`studies simulate tuned_all.toml",
     ):
         assert part in head, part
+    better, worse = head.partition("**Question:**")[0].split(" but ")  # what is worse comes last
+    assert "residual_rms" in better and "slowest decay" in better and "gain margin" in worse
     assert summary(spec, found) == [
         f"{name}: {x.objective.mean():.4f} of the baseline's objective on 3 fresh machines, worst "
         f"{x.objective.max():.4f}"

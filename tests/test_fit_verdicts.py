@@ -94,7 +94,7 @@ def check(case, found):
 
 @cache
 def estimated(name):
-    return estimate(CASES[name].spec(1), QUIET)
+    return estimate(CASES[name].spec(1))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -106,7 +106,7 @@ def test_no_wrong_assignment_is_good(name):
 @pytest.mark.parametrize("name", CASES)
 def test_no_wrong_assignment_is_good_in_20_repetitions(name):
     case = CASES[name]
-    found = [check(case, estimate(case.spec(seed), QUIET)) for seed in range(1, 21)]
+    found = [check(case, estimate(case.spec(seed))) for seed in range(1, 21)]
     right, good = (sum(x[k] for x in found) for k in (0, 1))
     rise = np.array([x[2] for x in found])
     print(f"{name}: {right} right, {good} good; rises {rise.mean():.2f}, at most {rise.max():.2f}")
@@ -253,7 +253,7 @@ def along_a_curve():
         "damping_sigma": 1e-3,
     }
     study = {"link": LINK | {"youngs_modulus": 70e9}}
-    return estimate(spec_of(HERE, entry, free=free, study=study), QUIET)
+    return estimate(spec_of(HERE, entry, free=free, study=study))
 
 
 def test_what_profiles_do_not_end_is_not_identifiable(along_a_curve):
@@ -301,7 +301,7 @@ def test_correlated_noise_is_said_once(tmp_path):
     model, rng = one.predicted(values, False)[0], np.random.default_rng(0)
     real, imag = (x + 0.8e-3 * noise_of(0.9, rng, len(x)) for x in (model.real, model.imag))
     write(tmp_path, "response.csv", frequency_hz=FREQUENCY, real=real, imag=imag)
-    found = estimate(spec, QUIET)
+    found = estimate(spec)
     text = " ".join(sentences(found))
     assert text.count("The noise of response 1 is correlated") == 1 and not is_good(found)
     assert "too small" not in text and "too large" not in text

@@ -2,9 +2,12 @@
 
 import pytest
 
+import studies.engine.sweep as engine_sweep
+from studies.cli import main
 from studies.engine.folder import locked_folder, make_manifest, open_folder
 from studies.errors import StudyError
 from studies.tuning.folder import open_tuning
+from tests.sweeps import small_spec
 
 MANIFEST = make_manifest({"sweep": {}}, ("studies.engine.folder",))
 
@@ -37,3 +40,57 @@ def test_what_is_refused_leaves_no_folder(tmp_path):
         (out / "results").write_text("x")
         raise StudyError("late")
     assert (out / "results").exists()
+
+
+def forbidden(*_, **__):
+    raise AssertionError("long work before the folder is looked at")
+
+
+@pytest.mark.parametrize(
+    ("command", "package", "mark"),
+    [
+        ("sweep none.toml", "sweeps", "sweep.json"),
+        ("tune none.toml", "tuning", "tune.json"),
+        ("atlas none.toml", "atlas", "runs"),
+    ],
+)
+@pytest.mark.parametrize("is_taken", [False, True])
+def test_folders_are_refused_before_jax_starts(
+    command, package, mark, is_taken, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(f"studies.{package}.commands.start", forbidden)
+    name, words = (
+        (mark, "holds a") if is_taken else ("thesis.tex", "holds other files (thesis.tex)")
+    )
+    (tmp_path / name).write_text("x")
+    with pytest.raises(SystemExit, match="2"):
+        main([*command.split(), "--out", str(tmp_path)])
+    message = capsys.readouterr().err
+    assert words in message and ("already; add --resume" in message) == is_taken
+    assert [x.name for x in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize(
+    ("command", "package", "words"),
+    [
+        ("fit none.toml", "fitting", "is not a folder"),
+        ("spillover none.toml", "spillover", "is not a folder"),
+        ("export none.toml --target c", "export", "is not a folder"),
+        ("import-gains none.json", "export", "exists already"),
+    ],
+)
+def test_files_in_the_way_are_refused_before_jax_starts(
+    command, package, words, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(f"studies.{package}.commands.start", forbidden)
+    (tmp_path / "mine").write_text("x")
+    with pytest.raises(SystemExit, match="2"):
+        main([*command.split(), "--out", str(tmp_path / "mine")])
+    assert words in capsys.readouterr().err and (tmp_path / "mine").read_text() == "x"
+
+
+def test_a_sweep_is_not_expanded_for_a_folder_that_is_taken(tmp_path, monkeypatch):
+    monkeypatch.setattr(engine_sweep, "build_table", forbidden)
+    (tmp_path / "sweep.json").write_text("{}")
+    with pytest.raises(StudyError, match="holds a sweep already; add --resume"):
+        engine_sweep.run_sweep(small_spec(), tmp_path)

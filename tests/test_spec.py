@@ -12,7 +12,7 @@ from jaxmodel.prepare import prepare
 from studies import Study, StudyError, load_study, paper_study, parse_study
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.explain import allowed_values
-from studies.study.template import study_template, toml_value
+from studies.study.template import STARTERS, starter_template, study_template, toml_value
 
 REFUSED = [
     # unknown or misspelt
@@ -207,6 +207,22 @@ def test_change_takes_numpy_and_refuses_unknown_names():
 def test_an_empty_file_and_the_template_are_the_default_study():
     assert parse_study({}) == Study()
     assert parse_study(tomllib.loads(study_template())) == Study()
+    assert parse_study(tomllib.loads(starter_template())) == Study()
+
+
+def test_the_file_to_start_from_has_few_fields_each_with_its_unit():
+    text = starter_template()
+    data, lines = tomllib.loads(text), text.splitlines()
+    sections = {k: v for k, v in data.items() if k != "title"}
+    assert ["title", *(f"{k}.{x}" for k, v in sections.items() for x in v)] == list(STARTERS)
+    assert 20 <= sum(bool(line) for line in lines) <= 32
+    for name in STARTERS:
+        k, line = next(
+            (k, x) for k, x in enumerate(lines) if x.startswith(f"{name.split('.')[-1]} =")
+        )
+        note = line.partition("  # ")[2] or lines[k - 1].removeprefix("# ")
+        assert note.endswith("]") or name in ("title", "shaper.kind"), line
+    assert "--all" in lines[-1]
 
 
 def test_the_template_explains_every_field():

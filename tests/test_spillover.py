@@ -368,7 +368,7 @@ def comparison():
 
 def test_factors_keep_the_margin_and_the_designs_damping(comparison):
     names = comparison.names
-    assert names[:2] == ("no control", "design as given") and len(names) == 7
+    assert names[:2] == ("no control", "baseline") and len(names) == 7
     given, laws = 1, slice(2, None)
     assert np.all(comparison.margin[laws] > 2 - 1e-3)
     zeta = comparison.damping_ratio[:, 0]
@@ -395,7 +395,7 @@ def test_control_reduces_vibration_at_the_price_of_voltage(comparison):
 def test_a_law_given_to_the_run_is_the_law_that_runs(comparison):
     """The design's coefficients handed over, against a run of its study."""
     metrics = run_study(comparison.study, has_record=False, has_loop=False).result.metrics
-    given = comparison.names.index("design as given")
+    given = comparison.names.index("baseline")
     np.testing.assert_allclose(
         comparison.residual_rms[given], metrics.residual_rms.max(axis=1), rtol=1e-9
     )

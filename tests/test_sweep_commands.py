@@ -107,6 +107,14 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
         assert run(capsys, "plot", out, *options, "--out", tmp_path / name)[0] == 0
         assert (tmp_path / name).stat().st_size > 5_000
     assert Image.open(tmp_path / "placement.png").size[0] > 600
+    for command, wrong, name in (
+        (("plot", out, "--x"), "gian", "gain"),
+        (("plot", out, "--x", "gain", "--hue"), "drive.pk", "drive.kp"),
+        (("plot", out, "--y"), "residul_rms", "residual_rms"),
+        (("best", out, "--by"), "placment", "placement"),
+        (("best", out, "--by", "residual_rms", "--subject-to"), "gian > 1", "gain"),
+    ):
+        assert f"did you mean {name!r}?" in refused(capsys, *command, wrong)
 
 
 def check_uncontrolled(capsys, spec, folder):

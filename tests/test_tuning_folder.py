@@ -179,7 +179,8 @@ def test_a_report_says_what_its_numbers_are():
         "the least residual_rms of links 1 and 3 with peak_voltage at most 30",
         "Ended after 14 of 40 iterations: for 12 no family had gained 0.1 %.",
         "residual_rms -50 % (4 instead of 8 µm), settling_time 12 instead of not within 30 ms, "
-        "peak_voltage +0 % (33 instead of 33 V), gain margin 1.3 (2.3 dB) instead of 3 (9.5 dB)",
+        "peak_voltage +0 % (33 instead of 33 V), slowest decay +0 % (70 instead of 70 1/s), "
+        "but gain margin 1.3 (2.3 dB) instead of 3 (9.5 dB) on the nominal machine",
         "**CAUTION: a gain margin of 1.3; below 2 a machine may go unstable.**",
         "**A limit is violated.**",
         "`studies simulate tuned.toml",

@@ -35,6 +35,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
     ) -> None:
         """Map all subsets of controlled links and modes, workspace modes and platform error."""
+        from studies.engine.folder import ATLASES, refuse_existing
+
+        refuse_existing(out, ATLASES, resume)
         start()
         from studies.atlas.run import run_atlas
         from studies.engine.design import load_design

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -27,11 +26,11 @@ from studies.atlas.subsets import (
     setting_label,
 )
 from studies.atlas.workspace import PAIRS
-from studies.engine.batches import Tell
-from studies.engine.folder import locked_folder, refuse_others
+from studies.engine.folder import ATLASES, locked_folder, refuse_existing
+from studies.engine.progress import Phases
 from studies.engine.results import load
 from studies.engine.runs import run_attributes
-from studies.engine.sweep import run_sweep
+from studies.engine.sweep import run_sweep, sweep_phases
 from studies.errors import StudyError
 from studies.show.figures import save, styled, write_figure
 from studies.show.pages import write_report
@@ -39,9 +38,9 @@ from studies.show.sketch import sketch
 from studies.store import Variable, staged, write_store
 from studies.study.spec import Study
 
-DATA, RUNS_FOLDER = "atlas.h5", "runs"
-#: What an interrupted run can leave behind.
-_LEFTOVER = re.compile(r"\.unfinished-.*")
+DATA, RUNS_FOLDER = "atlas.h5", ATLASES.mark
+#: Phases after those of the sweep.
+LATER = ("analyse", "draw")
 
 
 def run_atlas(
@@ -72,35 +71,33 @@ def run_atlas(
     out, console = Path(out), console or Console(highlight=False, markup=False)
     spec = atlas_sweep(study)
     with locked_folder(out, "atlas"):
-        if not (out / RUNS_FOLDER).is_dir():
-            refuse_others(out, _LEFTOVER)
-        if run_sweep(spec, out / RUNS_FOLDER, is_resumed, console, is_quiet).is_interrupted:
-            return False
-        try:
-            tell = (lambda text, share: None) if is_quiet else _teller(console)
-            _finish(study, out, tell, has_pdf)
-        except KeyboardInterrupt:
-            return False
+        refuse_existing(out, ATLASES, is_resumed)
+        with Phases(console, (*sweep_phases(spec), *LATER), is_quiet) as phases:
+            runs = run_sweep(spec, out / RUNS_FOLDER, is_resumed, phases=phases)
+            if runs.is_interrupted:
+                return False
+            try:
+                _finish(study, out, phases, has_pdf)
+            except KeyboardInterrupt:
+                return False
     return True
 
 
-def _teller(console: Console) -> Tell:
+def _finish(study: Study, out: Path, phases: Phases, has_pdf: bool) -> None:
+    """Everything after the runs of the subsets."""
+
     def tell(text: str, share: float) -> None:
         if share == 0:  # the beginning of a step; its end needs no message
-            console.print(text, soft_wrap=True)
+            phases.say(text)
 
-    return tell
-
-
-def _finish(study: Study, out: Path, tell: Tell, has_pdf: bool) -> None:
-    """Everything after the runs of the subsets."""
+    phases.begin("analyse")
     subsets, dropped = sound_settings(read_subsets(load(out / RUNS_FOLDER)))
     with threadpool_limits(1, "blas"):  # many small matrices: more threads only slow them down
         found = look_around(study, subsets, tell)
+    phases.begin("draw")
     try:
         with staged(out) as staging:
             write_store(staging / DATA, variables(found), run_attributes(study))
-            tell("drawing", 0.0)
             with styled():
                 for name, draw in FIGURES.items():
                     save(draw(found), staging, name, has_pdf)

@@ -16,9 +16,8 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.case import Case, Structure
-from jaxmodel.dynamics import kinetic_energy, modal_chain
 from jaxmodel.kinematics import close_chain, lift, link_angle, path_status
-from jaxmodel.linear import linearise, mechanical, resting
+from jaxmodel.linear import linearise, mass_and_stiffness, resting
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from studies.engine.runs import check_pose, check_run
@@ -173,22 +172,12 @@ def _stand(structure: Structure, case: Case, poses: Array) -> tuple[Array, Array
 def _matrices(structure: Structure, case: Case, poses: Array) -> tuple[Array, Array, Array]:
     """Mass and stiffness matrices in (X, q), and k_j of the links, (n, m, m) twice, (3, R)."""
     loop = prepare(structure, case).loop
-    plant, size = loop.plant, 3 + 3 * structure.n_modes
 
     def one(pose: Array) -> tuple[Array, Array]:
-        rest = jnp.zeros((3, structure.n_modes), pose.dtype)
+        plant = linearise(structure, loop, pose, resting(structure, case))
+        return mass_and_stiffness(loop, pose, plant)
 
-        def energy(rates: Array) -> Array:
-            pose_rate, q_rate = rates[:3], rates[3:].reshape(rest.shape)
-            chain = modal_chain(plant, pose, pose_rate, rest, q_rate)
-            return kinetic_energy(plant, chain, pose_rate, rest, q_rate)
-
-        mass = jax.hessian(energy)(jnp.zeros(size, pose.dtype))
-        state = mechanical(linearise(structure, loop, pose, resting(structure, case)))
-        stiffness = -mass @ state[size:, :size]
-        return mass, (stiffness + stiffness.T) / 2
-
-    return *jax.vmap(one)(poses), plant.stiffness
+    return *jax.vmap(one)(poses), loop.plant.stiffness
 
 
 def _solve(structure: Structure, case: Case, poses: np.ndarray) -> PoseModes:

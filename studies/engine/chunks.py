@@ -87,6 +87,8 @@ class Here:
             pending: tuple[Chunk, Started] | None = None
             for chunk in group.chunks():
                 is_first = executor.compile_time == 0
+                if is_first:
+                    reporter.compiling()
                 cases = chunk_cases(table, chunk.rows, group.structure, group.layout.size)
                 started = start_chunk(executor, table, chunk.rows, cases, has_own, group.is_judged)
                 if is_first:

@@ -40,10 +40,25 @@ TUNING = "tune.json"
 BASELINE = "baseline.h5"
 #: Temporary name of the results.
 JOINED = ".joined.h5"
-#: What an interrupted run can leave behind.
-_LEFTOVER = re.compile(r"\.joined\.h5|\.(joined\.h5|baseline\.h5|sweep\.json)\.[0-9a-f]{8}\.tmp")
 _CHUNK = re.compile(r"(\d{6,})-([0-9a-f]{16})\.h5")
 _SOURCES = Path(__file__).parents[2]
+
+
+class Content(NamedTuple):
+    """What a folder of results holds."""
+
+    what: str  # with its article
+    mark: str  # file or folder that is there from the beginning
+    leftover: re.Pattern[str]  # names that an interrupted run can leave behind
+
+
+SWEEPS = Content(
+    "a sweep",
+    MANIFEST,
+    re.compile(r"\.joined\.h5|\.(joined\.h5|baseline\.h5|sweep\.json)\.[0-9a-f]{8}\.tmp"),
+)
+TUNINGS = Content("a tuning", TUNING, re.compile(r"\..+\.[0-9a-f]{8}\.tmp"))
+ATLASES = Content("an atlas", "runs", re.compile(r"\.unfinished-.*"))
 
 
 class Finished(NamedTuple):
@@ -151,7 +166,7 @@ def open_folder(path: Path, manifest: dict[str, Any], is_resumed: bool) -> Itera
         _check_content(folder, manifest, is_resumed)
         unfinished = (x for place in (CHUNKS, SCREEN) for x in path.glob(f"{place}/*.tmp"))
         for left in (*path.iterdir(), *unfinished):
-            if left.is_file() and (left.parent != path or _LEFTOVER.fullmatch(left.name)):
+            if left.is_file() and (left.parent != path or SWEEPS.leftover.fullmatch(left.name)):
                 left.unlink()
         yield folder
 
@@ -246,7 +261,31 @@ def read_manifest(path: Path) -> dict[str, Any]:
     return manifest
 
 
-def refuse_others(path: Path, leftover: re.Pattern[str]) -> None:
+def refuse_existing(path: Path, content: Content, is_resumed: bool) -> None:
+    """Refuse a folder with results or other files; call it before long work.
+
+    Args:
+        path: the folder, which need not exist.
+        content: what it is to hold.
+        is_resumed: whether that may be there already.
+
+    Raises:
+        StudyError: it is, and is not resumed; other files; no access.
+    """
+    try:
+        is_there = (path / content.mark).exists()
+        if not is_there and path.is_dir():
+            _refuse_others(path, content.leftover)
+    except OSError as error:
+        raise StudyError(f"--out {path}: cannot write there ({error.strerror})") from None
+    if is_there and not is_resumed:
+        raise StudyError(
+            f"--out {path}: holds {content.what} already; add --resume to go on with it or to "
+            "extend it, or name a new folder"
+        )
+
+
+def _refuse_others(path: Path, leftover: re.Pattern[str]) -> None:
     """Raise StudyError if a new folder holds anything but its lock and leftovers of a kill."""
     names = [found.name for found in path.iterdir() if found.name != LOCK]
     others = sorted(name for name in names if not leftover.fullmatch(name))
@@ -258,14 +297,9 @@ def refuse_others(path: Path, leftover: re.Pattern[str]) -> None:
 
 def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bool) -> None:
     """Reject a folder of something else, an existing sweep, other code, other precision."""
+    refuse_existing(folder.path, SWEEPS, is_resumed)
     if not (folder.path / MANIFEST).exists():
-        refuse_others(folder.path, _LEFTOVER)
         return
-    if not is_resumed:
-        raise StudyError(
-            f"--out {folder.path}: holds a sweep already; add --resume to go on with it or to "
-            "extend it, or name a new folder"
-        )
     old = read_manifest(folder.path)
     for name, default in (("metrics", []), ("fidelity", "full")):
         kept, wanted = (m["spec"]["sweep"].get(name, default) for m in (old, manifest))

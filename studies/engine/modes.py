@@ -3,18 +3,62 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.kinematics import lift, path_status
-from jaxmodel.linear import NaturalModes, linearise, natural_modes, resting
+from jaxmodel.linear import linearise, mass_and_stiffness, natural_modes, resting
 from jaxmodel.prepare import prepare
 from studies.engine.runs import check_pose
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study, parse_study
+
+#: Relative difference of equal frequencies.
+EQUAL = 1e-6
+#: Frequency, over the highest one, up to which a motion counts as rigid: nothing holds it.
+RIGID = 1e-6
+
+
+class NamedModes(NamedTuple):
+    """Natural modes of the machine at a pose, ascending in frequency.
+
+    `link_share` is the strain energy k_ij |q_ij|^2 in modal coordinate j of link i over the mode's
+    potential energy x* K x, which in the mean over a period equals its kinetic energy;
+    `drive_share` is the rest, in the sliders' springs and in a steady load. Any mixture of modes of
+    equal frequency, as symmetric machines have them, is a mode: such modes have their mean shares,
+    those of K-orthogonal ones. NaN for rigid motion, which nothing holds.
+    """
+
+    frequency: np.ndarray  # |lambda|/2 pi [Hz], (m,)
+    damping_ratio: np.ndarray  # [1], (m,)
+    shape: np.ndarray  # (X, q) part of the eigenvectors, largest entry 1, (n, m), one per column
+    link_share: np.ndarray  # [1], (m, 3, R)
+    drive_share: np.ndarray  # [1], (m,)
+    turn_share: np.ndarray  # of the platform's kinetic energy that is in rotation [1], (m,)
+
+    @property
+    def names(self) -> list[str]:
+        """What each mode is, with its share in the energy: "link 2, mode 1, 96 %"."""
+        return [
+            _name(*shares)
+            for shares in zip(self.link_share, self.drive_share, self.turn_share, strict=True)
+        ]
+
+
+def _name(link_share: np.ndarray, drive_share: float, turn_share: float) -> str:
+    if np.isnan(drive_share):
+        return "rigid motion"
+    if drive_share > 0.5:
+        platform = "turns" if turn_share > 0.5 else "translates"
+        return f"drive, platform {platform}, {100 * drive_share:.0f} %"
+    order = int(link_share.sum(axis=0).argmax())
+    share = link_share[:, order]
+    links = np.flatnonzero(share >= share.max() / 3)  # the others hardly take part
+    which = f"link{'s' * (len(links) > 1)} {' '.join(str(i + 1) for i in links)}"
+    return f"{which}, mode {order + 1}, {100 * share[links].sum():.0f} %"
 
 
 def modes_study(
@@ -43,6 +87,7 @@ def modes_study(
         ("drive", "locked", locked),
         ("control", "feedback", "none"),
         ("shaper", "kind", "none"),
+        ("metrics", "residual_delay", 0.0),  # no window is needed, nor a drive that settles
     )
     for section, name, value in given:
         if value is not None:
@@ -50,7 +95,7 @@ def modes_study(
     return parse_study(data)
 
 
-def machine_modes(study: Study | None = None, **changes: Any) -> NaturalModes:
+def machine_modes(study: Study | None = None, **changes: Any) -> NamedModes:
     """Natural modes of the machine held by its drive at a pose, under the study's steady load.
 
     Args:
@@ -64,16 +109,52 @@ def machine_modes(study: Study | None = None, **changes: Any) -> NaturalModes:
     study = modes_study(study, **changes)
     structure, case = build_structure(study), as_arrays(build_case(study))
     where = study.motion.waypoints[0]
-    code, lifts, plant = _at_pose(structure, case, np.array(where))
-    check_pose(study, "pose", where, int(code), np.asarray(lifts))
+    code, lifts, plant, mass, stiffness, modal_stiffness = jax.tree.map(
+        np.asarray, _at_pose(structure, case, np.array(where))
+    )
+    check_pose(study, "pose", where, int(code), lifts)
     found = natural_modes(plant)
-    if study.drive.locked:  # the three coordinates held by the sliders are not modes
-        found = NaturalModes(found.frequency[3:], found.damping_ratio[3:], found.shape[:, 3:])
-    return found
+    first = 3 if study.drive.locked else 0  # the coordinates held by the sliders are not modes
+    frequency, shape = found.frequency[first:], found.shape[:, first:]
+    link_share = _link_shares(frequency, shape, stiffness, modal_stiffness)
+    return NamedModes(
+        frequency=frequency,
+        damping_ratio=found.damping_ratio[first:],
+        shape=shape,
+        link_share=link_share,
+        drive_share=1 - link_share.sum(axis=(1, 2)),
+        turn_share=_turn_shares(shape, mass),
+    )
+
+
+def _link_shares(
+    frequency: np.ndarray, shape: np.ndarray, stiffness: np.ndarray, modal_stiffness: np.ndarray
+) -> np.ndarray:
+    """`link_share` of `NamedModes`; stiffness in (X, q), k_ij of the links (3, R)."""
+    share = np.full((len(frequency), *modal_stiffness.shape), np.nan)
+    group = np.cumsum(np.diff(frequency, prepend=frequency[0]) > EQUAL * frequency)
+    for members in (group == k for k in np.unique(group)):
+        if frequency[members].max() <= RIGID * frequency.max():
+            continue
+        mode = shape[:, members]
+        energy = mode.conj().T @ stiffness @ mode
+        square = np.diag(mode @ np.linalg.solve(energy, mode.conj().T)).real[3:] / members.sum()
+        share[members] = modal_stiffness * square.reshape(modal_stiffness.shape)
+    return share
+
+
+def _turn_shares(shape: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """`turn_share` of `NamedModes`; mass in (X, q)."""
+    part = np.einsum("am,ab,bm->abm", shape[:3].conj(), mass[:3, :3], shape[:3]).real
+    turning, translating = part[2, 2], part[:2, :2].sum(axis=(0, 1))
+    return turning / np.maximum(turning + translating, np.finfo(float).tiny)
 
 
 @partial(jax.jit, static_argnums=0)
 def _at_pose(structure: Structure, case: Case, pose: np.ndarray) -> Any:
+    """Status, `lift`, linear plant, its mass and stiffness matrices, and k_ij of the links."""
     loop = prepare(structure, case).loop
     code, _ = path_status(loop.plant, pose[None])
-    return code, lift(loop.plant, pose), linearise(structure, loop, pose, resting(structure, case))
+    plant = linearise(structure, loop, pose, resting(structure, case))
+    matrices = mass_and_stiffness(loop, pose, plant)
+    return code, lift(loop.plant, pose), plant, *matrices, loop.plant.stiffness

@@ -227,7 +227,8 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
             raise StudyError(f"{name}: a list; name one entry of it, such as {name}[0]")
         return np.full(data.n_cases, value)
     known = [n for n, v in variables.items() if v.dims[:1] == ("case",)]
-    close = nearest(key, known) or _turned(key, known)
+    ready = [n for n, field in SHOWN_AS.items() if variable_name(field) in known]
+    close = nearest(key, [*ready, *known]) or _turned(key, known)
     hint = f"did you mean {close!r}?" if close else f"known: {', '.join(known)}"
     if key in METRICS and key in (data.spec.sweep.metrics or METRICS):
         raise StudyError(f"{name!r}: no case has finished, so none has it")

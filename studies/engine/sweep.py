@@ -29,7 +29,7 @@ from studies.engine.folder import (
     open_folder,
 )
 from studies.engine.plan import Group, Layout, chunk_cases, local_layout, plan_groups
-from studies.engine.progress import Reporter
+from studies.engine.progress import Phases, Reporter
 from studies.engine.screen import (
     Round,
     check_screen_names,
@@ -46,6 +46,11 @@ from studies.errors import StudyError
 from studies.kernels.cpu import full_effort
 from studies.space.spec import SweepSpec
 from studies.space.table import CaseTable, build_table
+
+
+def sweep_phases(spec: SweepSpec) -> tuple[str, ...]:
+    """Names of the phases of `run_sweep`."""
+    return ("compile", *(() if spec.screen is None else ("screen",)), "run", "join")
 
 
 class Outcome(NamedTuple):
@@ -105,6 +110,7 @@ def run_sweep(
     console: Console | None = None,
     is_quiet: bool = False,
     runner: Runner | None = None,
+    phases: Phases | None = None,
 ) -> Outcome:
     """Run a sweep into a folder.
 
@@ -115,6 +121,7 @@ def run_sweep(
         console: where progress goes; default: standard output.
         is_quiet: hide progress.
         runner: where chunks are run; default: here.
+        phases: of a longer command, with those of `sweep_phases`, in place of console and is_quiet.
 
     Returns:
         Outcome; `results.h5` exists unless the run was interrupted.
@@ -124,24 +131,28 @@ def run_sweep(
     """
     config.require_configured()
     runner, out = runner or Here(), Path(out)
-    kept_metrics(spec)
-    table = build_table(spec)
-    check_screen_names(spec, table)
-    console = console or Console(highlight=False, markup=False)
-    tell = partial(console.print, soft_wrap=True)
+    if phases is None:
+        console = console or Console(highlight=False, markup=False)
+        with Phases(console, sweep_phases(spec), is_quiet) as phases:
+            return run_sweep(spec, out, is_resumed, runner=runner, phases=phases)
+    tell = partial(phases.console.print, soft_wrap=True)
     manifest = make_manifest(spec.data)
     with open_folder(out, manifest, is_resumed) as folder, _interrupts() as stop:
+        kept_metrics(spec)
+        table = build_table(spec)
+        check_screen_names(spec, table)
         before = finished_cases(out, tell).case_id
         _rows_left(table, before, out)  # refuses another sweep
         folder.begin(manifest)
-        run = _Run(spec, table, folder, runner, console, is_quiet, stop)
+        run = _Run(spec, table, folder, runner, phases, stop)
         if spec.screen is None:
             rows, screened = run.full(np.arange(len(table)), _headline), None
         else:
             rows, screened = run.screened(screened_cases(out, tell))
         if rows is not None:
+            phases.begin("join")
             finished = finished_cases(out)
-            keep_baseline(spec, table, out, (lambda text: None) if is_quiet else tell)
+            keep_baseline(spec, table, out, phases.say)
             _check_whole(table, rows, np.union1d(finished.case_id, table.case_id[run.lost]), out)
             attributes = {"title": spec.study.title, **manifest_attributes(manifest)}
             timings = {"compile_time": run.compile_time, "run_time": run.run_time}
@@ -168,19 +179,18 @@ class _Run:
         table: CaseTable,
         folder: SweepFolder,
         runner: Runner,
-        console: Console,
-        is_quiet: bool,
+        phases: Phases,
         stop: threading.Event,
     ) -> None:
         """
         Args:
-            spec, console, is_quiet, runner: as in `run_sweep`.
+            spec, phases, runner: as in `run_sweep`.
             table: all cases.
             folder: open.
             stop: set to end after the chunks under way.
         """
         self.spec, self.table, self.folder, self.runner = spec, table, folder, runner
-        self.console, self.is_quiet, self.stop = console, is_quiet, stop
+        self.phases, self.stop = phases, stop
         self.lost = np.empty(0, int)  # rows that were given up
         self.n_run, self.compile_time, self.run_time, self.executor = 0, 0.0, 0.0, ""
         self._layouts: dict[Structure, Layout] = {}
@@ -200,7 +210,7 @@ class _Run:
 
         n_before = len(rows) - len(left)
         text = headline(self.table, groups, n_before)
-        return rows if self._chunks(groups, len(rows), n_before, text, save) else None
+        return rows if self._chunks("run", groups, len(rows), n_before, text, save) else None
 
     def screened(self, before: Finished) -> tuple[np.ndarray | None, Finished]:
         """Screen all cases and run the best.
@@ -223,7 +233,7 @@ class _Run:
 
         n_before = len(table) - len(left)
         text = f"screen by the linear model: {_headline(table, groups, n_before)}"
-        is_whole = self._chunks(groups, len(table), n_before, text, save)
+        is_whole = self._chunks("screen", groups, len(table), n_before, text, save)
         found = screened_cases(path)
         if not is_whole:
             return None, found
@@ -249,25 +259,26 @@ class _Run:
 
     def _chunks(
         self,
+        name: str,
         groups: list[Group],
         total: int,
         n_before: int,
         headline: str,
         save: Callable[[Done], np.ndarray],
     ) -> bool:
-        """Run and save chunks; returns whether all of them were run."""
-        with Reporter(self.console, total, n_before, self.is_quiet) as reporter:
-            reporter.say(headline)
-            n_lost = len(self.lost)
-            with closing(self.runner.run(self.table, groups, reporter, self.stop)) as chunks:
-                for one in chunks:
-                    if isinstance(one, Lost):
-                        self.lost = np.concatenate([self.lost, one.chunk.rows])
-                        self.folder.give_up(one.chunk.rows, one.reason)
-                        reporter.lost(one.chunk.rows, one.reason)
-                    else:
-                        reporter.chunk(save(one))
-            n_lost = len(self.lost) - n_lost
+        """Run and save chunks in a phase; returns whether all of them were run."""
+        reporter = Reporter(self.phases, name, total, n_before, len(groups))
+        reporter.say(headline)
+        n_lost = len(self.lost)
+        with closing(self.runner.run(self.table, groups, reporter, self.stop)) as chunks:
+            for one in chunks:
+                if isinstance(one, Lost):
+                    self.lost = np.concatenate([self.lost, one.chunk.rows])
+                    self.folder.give_up(one.chunk.rows, one.reason)
+                    reporter.lost(one.chunk.rows, one.reason)
+                else:
+                    reporter.chunk(save(one))
+        n_lost = len(self.lost) - n_lost
         self.compile_time += reporter.compile_time
         self.run_time += reporter.run_time
         self.executor = reporter.executor or self.executor

@@ -37,6 +37,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         ] = None,
     ) -> None:
         """Export the controller of a design to a real-time target, and verify it."""
+        from studies.store import check_folder
+
+        check_folder(out)
         start()
         from studies.engine.design import load_design
         from studies.export.run import export_design
@@ -51,9 +54,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         out: Annotated[Path, typer.Option(help="study file to write")],
     ) -> None:
         """Check the numbers of an exported JSON file and recover its study."""
+        from studies.study.template import check_new, write_study
+
+        check_new(out)
         start()
         from studies.export.document import import_study
-        from studies.study.template import write_study
 
         write_study(out, import_study(file))
         console.print(f"written: {out}", soft_wrap=True)

@@ -23,6 +23,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
     ) -> None:
         """Fit parameters of a study to measurements, and say how well they are known."""
+        from studies.store import check_folder
+
+        check_folder(out)
         start()
         from studies.fitting.run import run_fit
         from studies.fitting.spec import load_fit

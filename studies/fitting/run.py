@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.console import Console
 
+from studies.engine.progress import Phases
 from studies.engine.runs import check_run, run_attributes
 from studies.errors import StudyError
 from studies.fitting import plots
@@ -75,19 +76,30 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
     Raises:
         StudyError: data that cannot be used, or no starting point that leads to a fit.
     """
-    console = console or Console(quiet=True)
-    return suggest(estimate(spec, console), console)
+    with Phases(console or Console(quiet=True), fit_phases(spec)) as phases:
+        return suggest(estimate(spec, phases), phases)
 
 
-def estimate(spec: FitSpec, console: Console) -> Fitted:
+def fit_phases(spec: FitSpec) -> tuple[str, ...]:
+    """Names of the phases of a fit that is written."""
+    samples = ("sample",) if spec.fit.samples else ()
+    return ("fit", "profile", "machines", *samples, "check", "draw", "next experiment")
+
+
+def estimate(spec: FitSpec, phases: Phases | None = None) -> Fitted:
     """Fit a model to measurements, without the next experiment.
+
+    Args:
+        spec: from `load_fit`.
+        phases: with those of `fit_phases`; default: shown nowhere.
 
     Raises:
         StudyError: as `fit`.
     """
-    fit = spec.fit
+    fit, phases = spec.fit, phases or Phases(Console(quiet=True), fit_phases(spec))
     if fit.samples:
         load_blackjax()
+    phases.begin("fit")
     bench = make_bench(spec)
     every = make_measurements(spec, bench)
     kept = tuple(x for x in every if not x.is_checked)
@@ -99,17 +111,18 @@ def estimate(spec: FitSpec, console: Console) -> Fitted:
         bench=bench,
         is_robust=fit.loss == "robust",
     )
-    _check(problem, console, fit.starts)
+    _check(problem, phases, fit.starts)
     solution = solve(problem, fit.starts, fit.refine, fit.iterations, fit.seed)
-    console.print("profiling the likelihood")
+    phases.begin("profile", "the likelihood")
     has_all = fit.profile and len(spec.free.numbers) <= PROFILED
     answer, profiles = describe_confirmed(problem, solution.best.u, has_all)
-    console.print(f"drawing {MACHINES} machines")
+    phases.begin("machines", f"{MACHINES} that the data leave possible")
     places = draw_machines(problem, solution, MACHINES, fit.seed)
     posterior = None
     if fit.samples:
-        console.print(f"drawing {fit.samples} samples")
+        phases.begin("sample", f"{fit.samples} from the posterior")
         posterior = sample(problem, shape(answer), fit.samples, fit.seed)
+    phases.begin("check")
     checks, unpredicted = _predictable([x for x in every if x.is_checked], answer.values)
     study = parse_study(set_values(spec.study, _numbers(spec, answer.values)))
     return Fitted(
@@ -132,11 +145,11 @@ def estimate(spec: FitSpec, console: Console) -> Fitted:
     )
 
 
-def suggest(found: Fitted, console: Console) -> Fitted:
+def suggest(found: Fitted, phases: Phases) -> Fitted:
     """The same with the next experiment, or with the reason why there is none."""
     if not found.answer.is_explained:  # a wrong model does not know what it would learn
         return found
-    console.print("looking for the next experiment")
+    phases.begin("next experiment")
     given = found.problem.bench, found.problem.free, found.answer.place, found.answer.covariance
     try:
         return found._replace(experiments=tuple(next_experiments(*given)))
@@ -144,7 +157,7 @@ def suggest(found: Fitted, console: Console) -> Fitted:
         return found._replace(experiment_fault=str(error))
 
 
-def _check(problem: Problem, console: Console, starts: int) -> None:
+def _check(problem: Problem, phases: Phases, starts: int) -> None:
     """Refuse data too large or too few for the parameters.
 
     Raises:
@@ -163,7 +176,7 @@ def _check(problem: Problem, console: Console, starts: int) -> None:
             f"fit: {count} measured numbers and {priors} known beforehand for {size} parameters; "
             "allowed: as many or more. Fix some, or give mean and sigma of what is known"
         )
-    console.print(f"{count} measured numbers, {size} parameters; {starts} starting points")
+    phases.say(f"{count} measured numbers, {size} parameters; {starts} starting points")
 
 
 def _predictable(
@@ -212,24 +225,26 @@ def run_fit(
     """
     out, console = Path(out), console or Console(highlight=False, markup=False)
     check_folder(out)
-    found = estimate(spec, console)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with staged(out) as staging:
-            drawn = _draw(staging, found, has_pdf)
-            (staging / STUDY).write_text(study_template(found.study), encoding="utf-8")
-            (staging / TUNE).write_text(_tuning(found), encoding="utf-8")
-            write_store(staging / DATA, variables(found), run_attributes(found.study))
-            _present(staging, found)
-        for name in plots.NAMES:  # of an earlier fit
-            if name not in drawn:
-                (out / f"{name}.png").unlink(missing_ok=True)
-            if name not in drawn or not has_pdf:
-                (out / f"{name}.pdf").unlink(missing_ok=True)
-        found = suggest(found, console)
-        _present(out, found)
-    except OSError as error:
-        raise StudyError(f"--out {out}: cannot write there ({error})") from error
+    with Phases(console, fit_phases(spec)) as phases:
+        found = estimate(spec, phases)
+        phases.begin("draw")
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            with staged(out) as staging:
+                drawn = _draw(staging, found, has_pdf)
+                (staging / STUDY).write_text(study_template(found.study), encoding="utf-8")
+                (staging / TUNE).write_text(_tuning(found), encoding="utf-8")
+                write_store(staging / DATA, variables(found), run_attributes(found.study))
+                _present(staging, found)
+            for name in plots.NAMES:  # of an earlier fit
+                if name not in drawn:
+                    (out / f"{name}.png").unlink(missing_ok=True)
+                if name not in drawn or not has_pdf:
+                    (out / f"{name}.pdf").unlink(missing_ok=True)
+            found = suggest(found, phases)
+            _present(out, found)
+        except OSError as error:
+            raise StudyError(f"--out {out}: cannot write there ({error})") from error
     console.print(summary(found), soft_wrap=True)
     console.print(
         f"written: {out / 'report.html'}; {STUDY} is the fitted study, {TUNE} a tuning for "

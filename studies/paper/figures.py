@@ -24,8 +24,10 @@ from studies.show import figures
 
 #: Length of the views after the command [s].
 VIEW_LENGTH = 0.2
-#: Those of the platform's error begin later, when the drives have settled [s].
-DRIVE_SETTLED = 0.04
+#: They begin when the bending by the drives' own transient is over [s],
+LINKS_DELAY = 0.01
+#: and those of the platform's error when the drives have settled [s].
+PLATFORM_DELAY = 0.075
 #: Shorter amplitudes than this share of a unit are shown in the next smaller one.
 LEAST = 0.1
 #: Units of axes by SI unit, the larger first, with their size.
@@ -41,9 +43,9 @@ class Row(NamedTuple):
 
     name: str
     unit: str  # key of UNITS
-    signal: Callable[[PaperRuns], np.ndarray]  # (n, T)
-    is_after: bool = True  # only the view after the command, to its own scale
-    delay: float = 0.0  # with which this view begins [s]
+    signals: Callable[[PaperRuns], np.ndarray]  # (n, T, rows)
+    place: int  # of the row's signal among these
+    delay: float | None = LINKS_DELAY  # of the view after the command [s]; None: whole motion
 
 
 def draw_figure(name: str, machines: Machines, folder: Path, has_pdf: bool) -> None:
@@ -62,9 +64,9 @@ def _responses(machines: Machines, rows: list[Row], links: tuple[bool, ...], mod
         axes[0, column].set_title(f"{context.name}\ncontrolled: links {text}")
     for k, row in enumerate(rows):
         _draw_row(machines, row, links, modes, axes[k])
-        if k + 1 == len(rows) or rows[k + 1].is_after != row.is_after:
+        if k + 1 == len(rows) or rows[k + 1].delay != row.delay:
             for ax in axes[k]:
-                ax.set_xlabel("time after the command [ms]" if row.is_after else "time [ms]")
+                ax.set_xlabel("time [ms]" if row.delay is None else "time after the command [ms]")
     figures.legend_above(figure, axes[0, 0])
     return figure
 
@@ -76,8 +78,9 @@ def _draw_row(
     for context in machines:
         runs, off = context.runs, context.compared(modes, OFF)
         time, end = runs.record.time[0], float(runs.result.command_end[off])
-        signal, zero = row.signal(runs), end if row.is_after else 0.0
-        shown = (time >= zero + row.delay) & (time <= end + VIEW_LENGTH)
+        signal = row.signals(runs)[..., row.place]
+        zero = 0.0 if row.delay is None else end
+        shown = (time >= zero + (row.delay or 0.0)) & (time <= end + VIEW_LENGTH)
         pair = (off, context.compared(modes, links))
         curves.append((time[shown] - zero, [signal[k, shown] for k in pair]))
     largest = max(float(np.abs(pair).max()) for _, pair in curves)
@@ -93,56 +96,50 @@ def _station(runs: PaperRuns) -> int:
     return int(np.argmin(np.abs(np.array(runs.study.metrics.stations) - 0.75)))
 
 
+def _deflections(runs: PaperRuns) -> np.ndarray:
+    return np.asarray(runs.record.chord_deflection_stations[..., _station(runs)])
+
+
 def _deflection(machines: Machines, links: tuple[bool, ...], is_whole: bool = False) -> Figure:
     """Deflections after the command; before that those of the whole motion."""
     rows = [
-        Row(
-            f"link {i + 1}: deflection\nat 150 mm",
-            "m",
-            lambda runs, i=i: runs.record.chord_deflection_stations[:, :, i, _station(runs)],
-            is_after,
-        )
-        for is_after in ((False, True) if is_whole else (True,))
+        Row(f"link {i + 1}: deflection\nat 150 mm", "m", _deflections, i, delay)
+        for delay in ((None, LINKS_DELAY) if is_whole else (LINKS_DELAY,))
         for i in range(3)
     ]
     return _responses(machines, rows, links, 3)
 
 
+def _modes_of_link_1(runs: PaperRuns) -> np.ndarray:
+    return runs.record.controlled_coordinate[:, :, 0] * runs.frame.mode_shape[0, _station(runs)]
+
+
 def _modes(machines: Machines) -> Figure:
-    rows = [
-        Row(
-            f"mode {j + 1} of link 1\nat 150 mm",
-            "m",
-            lambda runs, j=j: (
-                runs.record.controlled_coordinate[:, :, 0, j]
-                * runs.frame.mode_shape[0, _station(runs), j]
-            ),
-        )
-        for j in range(3)
-    ]
+    names = (f"mode {j} of link 1\nat 150 mm" for j in (1, 2, 3))
+    rows = [Row(name, "m", _modes_of_link_1, j) for j, name in enumerate(names)]
     return _responses(machines, rows, ALL, 3)
 
 
-def _pose(machines: Machines, links: tuple[bool, ...], is_after: bool) -> Figure:
-    delay = DRIVE_SETTLED if is_after else 0.0
+def _pose_errors(runs: PaperRuns) -> np.ndarray:
+    return np.asarray(runs.record.pose_error)
+
+
+def _pose(
+    machines: Machines, links: tuple[bool, ...], delay: float | None = PLATFORM_DELAY
+) -> Figure:
     rows = [
-        Row(
-            f"{name} error", unit, lambda runs, k=k: runs.record.pose_error[..., k], is_after, delay
-        )
+        Row(f"{name} error", unit, _pose_errors, k, delay)
         for k, (name, unit) in enumerate((("x", "m"), ("y", "m"), ("φ", "rad")))
     ]
     return _responses(machines, rows, links, 3)
 
 
+def _voltages(runs: PaperRuns) -> np.ndarray:
+    return np.asarray(runs.record.sensor_voltage[..., -1])
+
+
 def _sensor(machines: Machines) -> Figure:
-    rows = [
-        Row(
-            f"link {i + 1}: sensor\nat 150 mm",
-            "V",
-            lambda runs, i=i: runs.record.sensor_voltage[:, :, i, -1],
-        )
-        for i in range(3)
-    ]
+    rows = [Row(f"link {i + 1}: sensor\nat 150 mm", "V", _voltages, i) for i in range(3)]
     return _responses(machines, rows, ALL, 2)
 
 
@@ -224,12 +221,12 @@ def _shapers(machines: Machines) -> Figure:
 PAPER_FIGURES: dict[str, Callable[[Machines], Figure]] = {
     "fig03": partial(_deflection, links=ALL, is_whole=True),
     "fig04": _modes,
-    "fig05": partial(_pose, links=ALL, is_after=False),
-    "fig06": partial(_pose, links=ALL, is_after=True),
+    "fig05": partial(_pose, links=ALL, delay=None),
+    "fig06": partial(_pose, links=ALL),
     "fig07": partial(_deflection, links=ONE),
-    "fig08": partial(_pose, links=ONE, is_after=True),
+    "fig08": partial(_pose, links=ONE),
     "fig09": partial(_deflection, links=TWO),
-    "fig10": partial(_pose, links=TWO, is_after=True),
+    "fig10": partial(_pose, links=TWO),
     "fig12": _sensor,
     "fig13": partial(_spectra, mode=1, links=None),
     "fig14": partial(_spectra, mode=1, links=ALL),

@@ -89,6 +89,7 @@ def report(machines: Machines) -> str:
         agreement=_agreement(fitted),
         nominal=_agreement(nominal),
         halved=[(context.name, _halved(context)) for context in machines],
+        is_halved=any(len(_halved(context)) == 3 for context in machines),
         shaped=_shaped(nominal),
         difference=_difference(nominal, cases),
         ideal_factor=_ideal_factor(nominal, cases),

@@ -7,6 +7,7 @@ number of the paper, and COLUMNS say whose it is.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -34,8 +35,11 @@ MODE_2 = (-48.33, -49.62, -52.21)
 PLATFORM = ("damped fast", "by more than -50 %", "limited effect")
 
 
-def _row(name: str, paper: str, machines: Machines, number: Callable[[Context], str]) -> list[str]:
-    return [name, paper, *(number(context) for context in machines)]
+def _row(
+    name: str, paper: str, machines: Machines, number: Callable[..., str], *given: Any
+) -> list[str]:
+    """A row whose numbers are `number(context, *given)`."""
+    return [name, paper, *(number(context, *given) for context in machines)]
 
 
 def machine_rows(machines: Machines) -> list[list[str]]:
@@ -73,14 +77,13 @@ def machine_rows(machines: Machines) -> list[list[str]]:
 
 def frequency_rows(machines: Machines) -> list[list[str]]:
     """Frequencies of the links between held ends."""
+
+    def number(context: Context, mode: int) -> str:
+        return _listed(context.runs.link_hz[:, mode], ".1f")
+
     return [
-        _row(
-            f"mode {mode + 1}, links 1, 2, 3 [Hz]",
-            f"{measured:g}",
-            machines,
-            lambda context, mode=mode: _listed(context.runs.link_hz[:, mode], ".1f"),
-        )
-        for mode, measured in enumerate(FREQUENCIES)
+        _row(f"mode {k + 1}, links 1, 2, 3 [Hz]", f"{hz:g}", machines, number, k)
+        for k, hz in enumerate(FREQUENCIES)
     ]
 
 
@@ -91,12 +94,13 @@ def ratio_rows(machines: Machines) -> list[list[str]]:
         ("(27), experiment: mode 2", EXPERIMENT_RATIOS, 1),
         ("(26), simulation: mode 3", PAPER_RATIOS, 2),
     )
+
+    def number(context: Context, mode: int) -> str:
+        return _listed(energy_ratio(context)[:, mode])
+
     return [
         _row(
-            f"{name}, links 1, 2, 3",
-            _listed([link[mode] for link in rows]),
-            machines,
-            lambda context, mode=mode: _listed(energy_ratio(context)[:, mode]),
+            f"{name}, links 1, 2, 3", _listed([link[mode] for link in rows]), machines, number, mode
         )
         for name, rows, mode in printed
     ]
@@ -127,15 +131,12 @@ def printed_changes() -> list[tuple[str, tuple[bool, ...], int, np.ndarray]]:
 
 def table_1_rows(machines: Machines) -> list[list[str]]:
     """Changes of the spectral peaks by control, links 1 to 3; last those of mode 2."""
+
+    def number(context: Context, links: tuple[bool, ...], mode: int, link: int) -> str:
+        return f"{amplitude_change(context, links, mode)[link]:+.1f} %"
+
     return [
-        _row(
-            f"{text}: link {i + 1}",
-            f"{printed[i]:+.2f} %",
-            machines,
-            lambda context, links=links, mode=mode, i=i: (
-                f"{amplitude_change(context, links, mode)[i]:+.1f} %"
-            ),
-        )
+        _row(f"{text}: link {i + 1}", f"{printed[i]:+.2f} %", machines, number, links, mode, i)
         for text, links, mode, printed in printed_changes()
         for i in range(3)
     ]
@@ -143,30 +144,19 @@ def table_1_rows(machines: Machines) -> list[list[str]]:
 
 def settling_rows(machines: Machines) -> list[list[str]]:
     """Settling times and residual vibration of links 1, 2, 3, with and without control."""
-    rows = []
-    for links, control, paper in ((OFF, "no control", "about 140"), (ALL, "three links", "70")):
-        rows.append(
-            _row(
-                f"settling time, {control} [ms]",
-                paper,
-                machines,
-                lambda context, links=links: _listed(
-                    1e3 * context.measures.settling[context.compared(2, links)], ".0f"
-                ),
-            )
-        )
-    for links, control in ((OFF, "no control"), (ALL, "three links")):
-        rows.append(
-            _row(
-                f"late rms, {control} [µm]",
-                "not given",
-                machines,
-                lambda context, links=links: residuals(
-                    context, context.measures.late_deflection[context.compared(2, links)]
-                ),
-            )
-        )
-    return rows
+
+    def time(context: Context, links: tuple[bool, ...]) -> str:
+        return _listed(1e3 * context.measures.settling[context.compared(2, links)], ".0f")
+
+    def rms(context: Context, links: tuple[bool, ...]) -> str:
+        return residuals(context, context.measures.late_deflection[context.compared(2, links)])
+
+    return [
+        _row("settling time, no control [ms]", "about 140", machines, time, OFF),
+        _row("settling time, three links [ms]", "70", machines, time, ALL),
+        _row("late rms, no control [µm]", "not given", machines, rms, OFF),
+        _row("late rms, three links [µm]", "not given", machines, rms, ALL),
+    ]
 
 
 def platform_rows(machines: Machines) -> list[list[str]]:
@@ -175,27 +165,20 @@ def platform_rows(machines: Machines) -> list[list[str]]:
     def error(context: Context, links: tuple[bool, ...]) -> np.ndarray:
         return context.measures.late_pose_error[context.compared(3, links)]
 
-    rows = [
-        _row(
-            "no control: x [nm], y [nm], φ [nrad]",
-            "not given",
-            machines,
-            lambda context: _listed(1e9 * error(context, OFF)),
-        )
+    def without(context: Context) -> str:
+        return _listed(1e9 * error(context, OFF))
+
+    def changes(context: Context, links: tuple[bool, ...]) -> str:
+        pairs = zip(error(context, links), error(context, OFF), strict=True)
+        return ", ".join(change(x, y) for x, y in pairs)
+
+    return [
+        _row("no control: x [nm], y [nm], φ [nrad]", "not given", machines, without),
+        *(
+            _row(f"{text}: x, y, φ", paper, machines, changes, links)
+            for (links, text), paper in zip(PLACES, PLATFORM, strict=True)
+        ),
     ]
-    for (links, text), paper in zip(PLACES, PLATFORM, strict=True):
-        rows.append(
-            _row(
-                f"{text}: x, y, φ",
-                paper,
-                machines,
-                lambda context, links=links: ", ".join(
-                    change(x, y)
-                    for x, y in zip(error(context, links), error(context, OFF), strict=True)
-                ),
-            )
-        )
-    return rows
 
 
 def motion_rows(context: Context) -> list[list[str]]:

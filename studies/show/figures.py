@@ -65,8 +65,9 @@ def new_figure(
 
 def legend_above(figure: Figure, *axes: Axes) -> None:
     """One legend for the whole figure, with the entries of these axes."""
-    entries = [entry for ax in axes for entry in zip(*ax.get_legend_handles_labels(), strict=True)]
-    handles, labels = ([entry[k] for entry in entries] for k in range(2))
+    entries = [ax.get_legend_handles_labels() for ax in axes]
+    handles = [handle for some, _ in entries for handle in some]
+    labels = [label for _, some in entries for label in some]
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
 
 

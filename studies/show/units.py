@@ -54,14 +54,6 @@ def count_text(n: int, what: str) -> str:
     return f"{n} {what if n == 1 else many}"
 
 
-def duration_text(seconds: float) -> str:
-    """A duration in words: "40 s", "3 min", "2 h 10 min"."""
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
-
-
 def span(values: Any, digits: str = ".3g") -> str:
     """Smallest and largest number: "1.2 to 3.4"."""
     low, high = (f"{x:{digits}}" for x in (float(np.min(values)), float(np.max(values))))

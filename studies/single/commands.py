@@ -28,16 +28,17 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     @app.command()
     def simulate(
         study: Annotated[Path, typer.Argument(help="study file (TOML) or ready-made design")],
-        out: Annotated[Path, typer.Option(help="HDF5 file to write")],
+        out: Annotated[Path | None, typer.Option(help="HDF5 file for the trajectories")] = None,
         report: _Report = False,
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
     ) -> None:
-        """Run one study and save full trajectories."""
+        """Run one study and print its metrics; with --out, also save full trajectories."""
         start(precision)
+        from studies.engine.runs import uncontrolled_twin
         from studies.single.run import simulate as simulate_study
 
         run = simulate_study(study, out, report)
-        _print_run(run, console)
+        _print_run(run, uncontrolled_twin(run), console)
         _print_files(out, report, console)
 
     @app.command()
@@ -103,40 +104,56 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             text = {
                 "frequencies_hz": found.frequency.tolist(),
                 "damping_ratios": found.damping_ratio.tolist(),
+                "names": found.names,
             }
             print(json.dumps(text))
             return
-        table = Table("mode", "frequency [Hz]", "damping ratio [1]")
-        for k, (f, z) in enumerate(zip(found.frequency, found.damping_ratio, strict=True)):
-            table.add_row(str(k + 1), f"{f:.4f}", f"{z:.5f}")
+        table = Table("mode", "frequency [Hz]", "damping ratio [1]", "share of its energy")
+        rows = zip(found.frequency, found.damping_ratio, found.names, strict=True)
+        for k, (f, z, name) in enumerate(rows):
+            table.add_row(str(k + 1), f"{f:.4f}", f"{z:.5f}", name)
         console.print(table)
 
 
-def _print_run(run: Run, console: Console) -> None:
-    """Print status, link metrics and stability."""
+def _print_run(run: Run, twin: Run | None, console: Console) -> None:
+    """Print status, link metrics and stability; twin: the same run without control."""
     from studies.engine.poles import HEADER, difference, pole_rows
     from studies.single.report import settling_text
-    from studies.study.labels import describe
-    from studies.study.margin import MARGIN_MODES, caution, margin_text
+    from studies.study.labels import describe, remedy
+    from studies.study.margin import MARGIN_MODES, caution, margin_in_db
 
-    metrics = run.result.metrics
+    metrics, windows = run.result.metrics, run.case.windows
     console.print(f"status: {describe(run.status)}")
-    table = Table("link", "residual rms, worst station [um]", "settling [ms]", "peak voltage [V]")
+    if advice := remedy(run.status):
+        console.print(f"next step: {advice}", soft_wrap=True)
+    table = Table("link", "residual rms, worst station [um]")
+    if twin is not None:
+        table.add_column("without control [um]")
+    for heading in ("settling [ms]", "peak voltage [V]"):
+        table.add_column(heading)
     for i in range(3):
+        both = [one.result.metrics.residual_rms[i].max() for one in (run, twin) if one is not None]
         table.add_row(
             str(i + 1),
-            f"{1e6 * metrics.residual_rms[i].max():.4g}",
+            *(f"{1e6 * x:.4g}" for x in both),
             settling_text(run, i),
             f"{metrics.peak_voltage[i]:.4g}",
         )
     console.print(table)
+    settled = run.study.metrics.residual_delay == "auto"
+    console.print(
+        f"residual window: {1e3 * float(windows.residual_length):.4g} ms, from "
+        f"{1e3 * float(windows.residual_delay):.4g} ms after the reference trajectory"
+        + (", when the slider drive has settled to 2 %" if settled else ""),
+        soft_wrap=True,
+    )
     if run.loop is None:
         return
     damping = ", ".join(f"{zeta:.3g}" for zeta in run.loop.damping_ratio.min(axis=1))
     modes = run.study.link.modes
     console.print(
         "gain margin of the linearised sampled loop, a factor on control.gain_factor: "
-        f"{margin_text(run.loop.gain_margin)}, damping "
+        f"{margin_in_db(run.loop.gain_margin)}, damping "
         f"ratios of the controlled modes: {damping} ({max(MARGIN_MODES, modes)} plant modes per "
         f"link, the run {modes})",
         soft_wrap=True,

@@ -234,6 +234,7 @@ def draw(run: Run, twin: Run | None = None) -> dict[str, Figure]:
 
 def _over_time(run: Run, rows: list[tuple[str, np.ndarray]], names: list[str]) -> Figure:
     """A panel of each quantity, (T, n) with its label; names: of the n curves, [] for one."""
+    assert run.result.record is not None
     figure, axes = figures.new_figure(len(rows), 1, 1.3)
     for ax, (label, values) in zip(axes[:, 0], rows, strict=True):
         figures.traces(1e3 * run.result.record.time, values, names, label, ax)

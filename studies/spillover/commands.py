@@ -31,6 +31,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
     ) -> None:
         """Certify a controller on plants that differ from its model."""
+        from studies.store import check_folder
+
+        check_folder(out)
         start()
         from studies.engine.design import load_design
         from studies.spillover.run import spillover_design

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from jaxmodel.laws import LAWS
 from studies.engine.design import Design
+from studies.engine.progress import Phases
 from studies.engine.runs import resolved_study, run_attributes
 from studies.errors import StudyError
 from studies.reading import read_json
@@ -26,6 +27,7 @@ from studies.study.labels import STATUS_LABEL
 from studies.study.spec import Study
 
 DOCUMENT, DATA = "certificate.json", "spillover.h5"
+PHASES = ("judge", "compare laws", "draw")
 
 
 def spillover_design(
@@ -54,18 +56,20 @@ def spillover_design(
     check_folder(out)
     study = resolved_study(design.study)
     _check_whose(out, study)
-    console.print("checking the controller on plants that differ from its nominal model")
-    found = certify(study, margin)
-    console.print(verdict(found), soft_wrap=True)
-    if text := spillover_text(found):
-        console.print(text, soft_wrap=True)
-    console.print("comparing control laws")
-    laws = None
-    try:
-        laws = compare_laws(found.study, margin)
-    except StudyError as error:
-        found = found._replace(notes=(*found.notes, f"laws are not compared: {error}"))
-    _write(out, found, laws, has_pdf)
+    with Phases(console, PHASES) as phases:
+        phases.begin("judge", "the controller on plants that differ from its nominal model")
+        found = certify(study, margin)
+        console.print(verdict(found), soft_wrap=True)
+        if text := spillover_text(found):
+            console.print(text, soft_wrap=True)
+        phases.begin("compare laws")
+        laws = None
+        try:
+            laws = compare_laws(found.study, margin)
+        except StudyError as error:
+            found = found._replace(notes=(*found.notes, f"laws are not compared: {error}"))
+        phases.begin("draw")
+        _write(out, found, laws, has_pdf)
     for note in found.notes:
         console.print(note, soft_wrap=True)
     console.print(

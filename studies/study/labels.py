@@ -49,3 +49,18 @@ RESERVED = (
     "substeps",
     "time",
 )
+
+
+#: What to change where a run ends at a limit of the machine.
+_REMEDIES = {
+    status.CLIPPED: "lower electronics.conditioner_gain, or move more slowly (motion.move_time)",
+    status.SATURATED: "lower control.gain_factor, or move more slowly (motion.move_time)",
+    status.MOTORS_SATURATED: "move more slowly (motion.move_time), or raise drive.force_limit",
+    status.NOT_ARRIVED: "let the run and its window begin later (metrics.residual_delay), or "
+    "stiffen the drive (drive.kp)",
+}
+
+
+def remedy(code: int) -> str:
+    """What to change so that a run does not end with this status; "" if nothing general helps."""
+    return _REMEDIES.get(code, "")

@@ -135,7 +135,7 @@ def known_field(name: str, study: Study, path: str = "", others: Iterable[str] =
     if entry is None or entry.field not in names:
         wanted = entry.field if entry else name
         close = nearest(wanted, [*names, *others]) or _by_leaf(wanted, names)
-        hint = f"did you mean {close!r}?" if close else "see studies init for all fields"
+        hint = f"did you mean {close!r}?" if close else "see studies init --all for all fields"
         raise StudyError(f"{where}{shown(name)}: unknown field; {hint}")
     value = field_value(study, entry.field)
     value = as_list(entry.field, value) if entry.indices else value

@@ -81,7 +81,7 @@ class Section(BaseModel):
 class RunSection(Section):
     """Duration, resolution and model of the run."""
 
-    duration: float = described(0.4, "s", "length of the run", gt=0, le=100)
+    duration: float = described(0.5, "s", "length of the run", gt=0, le=100)
     seed: int = described(0, "1", "of ADC noise and force ripple", ge=0, le=10**9)
     substeps: int = described(0, "1", "plant steps per sample; 0: as many as needed", ge=0, le=200)
     smooth: bool = described(False, "-", "smooth limits, noise instead of rounding (for gradients)")
@@ -109,7 +109,7 @@ class MachineSection(Section):
     joint_radius: EachLink[Annotated[float, Field(ge=1e-4, le=5)]] = described(
         round(0.12 / 3**0.5, 12), "m", "distance of the joints from the platform's reference point"
     )
-    platform_mass: float = described(0.25, "kg", "m_p", ge=1e-3, le=1e3)
+    platform_mass: float = described(0.25, "kg", "mass m_p", ge=1e-3, le=1e3)
     platform_inertia: float = described(
         3.0e-4, "kg m2", "I_p about the reference point", ge=1e-7, le=1e2
     )
@@ -139,8 +139,10 @@ class LinkSection(Section):
         "-",
         "static correction for the modes left out; false: the paper's truncated model",
     )
-    length: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(0.2, "m", "L")
-    thickness: EachLink[Annotated[float, Field(ge=1e-5, le=0.1)]] = described(2e-3, "m", "t_b")
+    length: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(0.2, "m", "length L")
+    thickness: EachLink[Annotated[float, Field(ge=1e-5, le=0.1)]] = described(
+        2e-3, "m", "thickness t_b"
+    )
     width: EachLink[Annotated[float, Field(ge=1e-4, le=1)]] = described(10e-3, "m", "width")
     density: EachLink[Annotated[float, Field(ge=1, le=3e4)]] = described(2750.0, "kg/m3", "density")
     youngs_modulus: EachLink[Annotated[float, Field(ge=1e3, le=2e12)]] = described(
@@ -376,8 +378,8 @@ class DriveSection(Section):
     """Slider servo and disturbances."""
 
     kind: Literal["pd", "computed_torque"] = described("pd", "-", "PD, or PD with computed torque")
-    kp: float = described(2e4, "N/m", "Kp", ge=0, le=1e8)
-    kd: float = described(60.0, "N s/m", "Kd", ge=0, le=1e5)
+    kp: float = described(2e4, "N/m", "position gain Kp", ge=0, le=1e8)
+    kd: float = described(60.0, "N s/m", "velocity gain Kd", ge=0, le=1e5)
     force_limit: float = described(1e3, "N", "motors, +-", gt=0, le=1e6)
     coulomb_friction: float = described(0.0, "N", "F_c of F_c tanh(v/v_0)", ge=0, le=1e3)
     friction_speed: float = described(1e-3, "m/s", "v_0", gt=0, le=1)

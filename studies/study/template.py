@@ -1,4 +1,4 @@
-"""`studies init`: a study file with every field, its unit, its meaning and its default."""
+"""`studies init`: a study file to start from, or one with every field and its default."""
 
 from __future__ import annotations
 
@@ -12,8 +12,58 @@ from pydantic import BaseModel
 
 from studies.errors import StudyError
 from studies.store import check_target, replacing
-from studies.study.explain import allowed_values, unit_of
+from studies.study.explain import allowed_values, choices_of, unit_of
 from studies.study.spec import Study
+
+#: What an engineer changes first: all that `studies init` writes.
+STARTERS = (
+    "title",
+    "machine.joint_radius",
+    "machine.platform_mass",
+    "machine.slider_mass",
+    "link.length",
+    "link.thickness",
+    "link.width",
+    "link.damping_ratio",
+    "patches.centers",
+    "patches.actuator_length",
+    "motion.waypoints",
+    "motion.move_time",
+    "shaper.kind",
+    "control.gain_factor",
+    "drive.kp",
+    "drive.kd",
+    "metrics.residual_length",
+    "metrics.settling_band",
+)
+#: A longer line has its comment above.
+_LONGEST_LINE = 110
+
+
+def starter_template() -> str:
+    """A short commented study file that reads back as the default study."""
+    study = Study()
+    lines = ["# Study file: what one changes first, in SI units unless its name says otherwise."]
+    title = ""
+    for name in STARTERS:
+        *sections, field = name.split(".")
+        section = getattr(study, sections[0]) if sections else study
+        if sections and sections[0] != title:
+            title = sections[0]
+            lines += ["", f"[{title}]  # {_meaning(section)}"]
+        lines += _starter(section, field)
+    return "\n".join([*lines, "", "# `studies init --all` prints every field."]) + "\n"
+
+
+def _starter(section: BaseModel, name: str) -> list[str]:
+    info = type(section).model_fields[name]
+    unit = unit_of(info)
+    note = f"# {info.description}{f' [{unit}]' if unit else ''}"
+    if choices_of(info.annotation, info.metadata):
+        note += f"; {allowed_values(info.annotation, info.metadata)}"
+    line = _assigned(section, name)
+    both = f"{line}  {note}"
+    return [both] if len(both) <= _LONGEST_LINE else [note, line]
 
 
 def study_template(study: Study | None = None) -> str:
@@ -24,7 +74,7 @@ def study_template(study: Study | None = None) -> str:
     for name in Study.model_fields:
         section = getattr(study, name)
         if isinstance(section, BaseModel):
-            lines += ["", f"[{name}]  # {(type(section).__doc__ or '').strip()}"]
+            lines += ["", f"[{name}]  # {_meaning(section)}"]
             for field in type(section).model_fields:
                 lines += _field(section, field)
     return "\n".join(lines) + "\n"
@@ -43,13 +93,17 @@ def write_study(out: str | Path, study: Study | None = None) -> None:
     write_text(out, study_template(study))
 
 
+def check_new(out: str | Path) -> None:
+    """Raise StudyError unless a new file can be written at `out`; call it before long work."""
+    check_target(out)
+    if Path(out).exists():
+        raise StudyError(f"{out}: exists already; name a new file")
+
+
 def write_text(out: str | Path, text: str) -> None:
     """Write a new file; arguments and errors as `write_study`."""
-    out = Path(out)
-    check_target(out)
-    if out.exists():
-        raise StudyError(f"{out}: exists already; name a new file")
-    with replacing(out) as temporary:
+    check_new(out)
+    with replacing(Path(out)) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
@@ -58,7 +112,15 @@ def _field(section: BaseModel, name: str) -> list[str]:
     unit = unit_of(info)
     allowed = allowed_values(info.annotation, info.metadata)
     note = f"{info.description}{f' [{unit}]' if unit else ''}; {allowed}"
-    return [f"# {note}", f"{name} = {toml_value(getattr(section, name))}"]
+    return [f"# {note}", _assigned(section, name)]
+
+
+def _meaning(section: BaseModel) -> str:
+    return (type(section).__doc__ or "").strip()
+
+
+def _assigned(section: BaseModel, name: str) -> str:
+    return f"{name} = {toml_value(getattr(section, name))}"
 
 
 def toml_text(data: Mapping[str, Any], path: tuple[str, ...] = ()) -> str:

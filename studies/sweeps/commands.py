@@ -41,9 +41,14 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         worker_timeout: WorkerTimeout = 600.0,
     ) -> None:
         """Run thousands of cases from one file; finished cases survive any interruption."""
+        from studies.engine.folder import SWEEPS, refuse_existing
+
         workers = Workers(scheduler, local_workers, worker_timeout)
+        if out is not None and not dry_run:
+            refuse_existing(out, SWEEPS, resume)
         start(precision, cpu_only=workers.are_named)
-        from studies.engine.sweep import make_plan, run_sweep
+        from studies.engine.progress import Phases
+        from studies.engine.sweep import make_plan, run_sweep, sweep_phases
         from studies.space.spec import load_sweep
         from studies.sweeps.dry_run import print_plan
 
@@ -58,12 +63,15 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if out is None:
             raise StudyError("--out: name a folder for the results")
 
-        def tell(text: str) -> None:
-            if not quiet:
-                console.print(text, soft_wrap=True)
+        names = (*sweep_phases(asked), *(["report"] if report else []))
+        with Phases(console, names, quiet) as phases:
+            with runner_for(asked, workers, phases.say) as runner:
+                done = run_sweep(asked, out, resume, runner=runner, phases=phases)
+            if report and not done.is_interrupted:
+                from studies.sweeps.report import write_sweep_report
 
-        with runner_for(asked, workers, tell) as runner:
-            done = run_sweep(asked, out, resume, console, quiet, runner)
+                phases.begin("report")
+                write_sweep_report(out)
         if len(done.lost):
             print(
                 f"studies: {len(done.lost)} of {len(done.table)} cases were left out, see above; "
@@ -89,12 +97,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
             checked = check_screen(load(out, done.table))
             console.print("" if checked is None else checked.text, soft_wrap=True)
-        if report:
-            from studies.sweeps.report import REPORT, write_sweep_report
-
-            write_sweep_report(out)
-            if not quiet:
-                console.print(f"report: {out / REPORT}", soft_wrap=True)
+        if report and not quiet:
+            console.print(f"report: {out / 'report.html'}", soft_wrap=True)
         if len(done.lost):
             sys.exit(1)
 

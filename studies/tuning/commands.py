@@ -44,7 +44,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         worker_timeout: WorkerTimeout = 600.0,
     ) -> None:
         """Tune parameters of a study by gradients, within limits, for many machines at once."""
+        from studies.engine.folder import TUNINGS, refuse_existing
+
         workers = Workers(scheduler, local_workers, worker_timeout)
+        if out is not None and not audit:
+            refuse_existing(out, TUNINGS, resume)
         start(cpu_only=workers.are_named)
         from studies.tuning.run import REPORT, run_tuning
         from studies.tuning.spec import load_tuning

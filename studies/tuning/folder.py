@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from studies.engine.folder import TUNING, locked_folder, refuse_others
+from studies.engine.folder import TUNING, TUNINGS, locked_folder, refuse_existing
 from studies.errors import StudyError
 from studies.reading import read_json, read_npz
 from studies.store import check_target, replacing
@@ -21,7 +20,6 @@ from studies.tuning.optimise import Progress
 MANIFEST, PROGRESS, RESULTS = TUNING, "progress.npz", "tune.h5"
 #: Entries of the manifest that a resumed tuning must share to continue bit by bit.
 CHECKED = {"spec": "tuning file", "code": "program", "jaxlib": "jaxlib", "precision": "precision"}
-_LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.tmp")
 
 
 @contextmanager
@@ -32,10 +30,9 @@ def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterat
         StudyError: not writable, in use, holds something else or a different tuning.
     """
     with locked_folder(out, "tuning"):
-        path = out / MANIFEST
+        path, before = out / MANIFEST, None
+        refuse_existing(out, TUNINGS, is_resumed)
         if path.is_file():
-            if not is_resumed:
-                raise StudyError(f"--out {out}: holds a tuning already; go on with --resume")
             try:
                 old = read_json(path)
             except (OSError, ValueError):
@@ -47,11 +44,8 @@ def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterat
                         f"--out {out}: was begun with another {what}; name a new folder"
                     )
             before = load_progress(out / PROGRESS)
-        else:
-            refuse_others(out, _LEFTOVER)
-            before = None
         for left in out.iterdir():  # only once their owner is known
-            if _LEFTOVER.fullmatch(left.name) and left.is_file():
+            if TUNINGS.leftover.fullmatch(left.name) and left.is_file():
                 left.unlink()
         check_target(out / RESULTS)
         with replacing(path) as temporary:

@@ -76,14 +76,14 @@ def compare(
     fresh, is_on = spec.tune.scenarios.check * len(spec.moves), is_controlled(spec.study)
     runs = PlainRuns(shown_structure(spec), fresh * (len(designs) + 2))
     if is_on:
-        say(f"scanning {FIELD} alone, for comparison")
+        say(f"{FIELD} alone, for comparison")
     scan = scan_gain(spec, runs)
     others = {}
     if is_on:
         others[WITHOUT] = uncontrolled_study(spec.study)
     if scan is not None and scan.best >= 0:
         others[ALONE] = gain_study(spec, scan.gain_factor[scan.best])
-    say(f"running the results on {fresh} fresh scenarios")
+    say(f"the results on {fresh} fresh scenarios")
     own, *judged = judge(spec, [*designs, *others.values()], runs)
     count = len(designs) - 1
     found = dict(zip(others, judged[count:], strict=True))

@@ -19,6 +19,7 @@ from studies.study.margin import MARGIN_MODES, caution, margin_in_db, margin_tex
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
 from studies.tuning.check import JudgedDesign, Searched, patch_centers
 from studies.tuning.free import PLACEMENT
+from studies.tuning.linear_fidelity import LoopFigures
 from studies.tuning.merit import SHOWN
 from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
 from studies.tuning.references import References, reference_lines, resolution_lines
@@ -59,6 +60,7 @@ class Gain(NamedTuple):
     change: str  # relative, "" if not known
     after: str
     before: str  # with the unit
+    is_worse: bool  # by more than `ALIKE`
 
 
 class BestFamily(NamedTuple):
@@ -66,7 +68,7 @@ class BestFamily(NamedTuple):
 
     family: str
     file: str  # of its study
-    gains: list[Gain]
+    gains: list[Gain]  # what is worse comes last
     objective: np.ndarray  # on the fresh machines
     caution: str  # warning about its gain margin, "" if there is none
     is_violated: bool  # a limit
@@ -162,27 +164,41 @@ def ended(spec: TuneSpec, at: Progress) -> str:
 def _best(spec: TuneSpec, found: TuneFindings) -> BestFamily:
     k = best_family(spec, found)
     one, own, family = found.judged[k], found.own, spec.families[k]
-    gains = []
-    for metric in dict.fromkeys((*spec.tune.objective, *SHOWN)):
-        after, before = (_value(metric, x.own.metrics, x.own.watched) for x in (one, own))
-        unit = readable(METRICS[parse_entries(metric).metric].unit)[1]
-        known = not any(text.startswith("not") for text in (after, before))
-        change = _relative(*(float(x.own.metrics[metric]) for x in (own, one))) if known else ""
-        gains.append(Gain(metric, change, after, before if unit == "1" else f"{before} {unit}"))
+    gains = [
+        _metric_gain(metric, one, own) for metric in dict.fromkeys((*spec.tune.objective, *SHOWN))
+    ]
     if one.loop is not None and own.loop is not None:
-        margins = (margin_in_db(x.gain_margin, 3) for x in (one.loop, own.loop))
-        gains.append(Gain("gain margin", "", *margins))
-        decays = one.loop.slowest_decay, own.loop.slowest_decay
-        change = _relative(decays[1], decays[0])
-        gains.append(Gain("slowest decay", change, f"{decays[0]:.3g}", f"{decays[1]:.3g} 1/s"))
+        gains += _loop_gains(one.loop, own.loop)
     return BestFamily(
         family=family.name,
         file=file_name(spec, family),
-        gains=gains,
+        gains=sorted(gains, key=lambda gain: gain.is_worse),
         objective=one.objective,
         caution=caution(one.loop.gain_margin) if one.loop is not None else "",
         is_violated=found.at.beyond(found.at.winner(k)) > 0,
     )
+
+
+def _metric_gain(metric: str, one: JudgedDesign, own: JudgedDesign) -> Gain:
+    """A metric, of which less is better."""
+    after, before = (float(x.own.metrics[metric]) for x in (one, own))
+    texts = [_value(metric, x.own.metrics, x.own.watched) for x in (one, own)]
+    unit = readable(METRICS[parse_entries(metric).metric].unit)[1]
+    change = "" if any(text.startswith("not") for text in texts) else _relative(before, after)
+    with_unit = texts[1] if unit == "1" else f"{texts[1]} {unit}"
+    return Gain(metric, change, texts[0], with_unit, after > (1 + ALIKE) * before)
+
+
+def _loop_gains(one: LoopFigures, own: LoopFigures) -> list[Gain]:
+    """Figures of the linearised loop, of which more is better."""
+    margins = [x.gain_margin for x in (one, own)]
+    decays = [x.slowest_decay for x in (one, own)]
+    lost = [after < (1 - ALIKE) * before for after, before in (margins, decays)]
+    change = _relative(decays[1], decays[0])
+    return [
+        Gain("gain margin", "", margin_in_db(margins[0], 3), margin_in_db(margins[1], 3), lost[0]),
+        Gain("slowest decay", change, f"{decays[0]:.3g}", f"{decays[1]:.3g} 1/s", lost[1]),
+    ]
 
 
 def _relative(before: float, after: float) -> str:
@@ -436,5 +452,5 @@ def _contradiction(spec: TuneSpec, family: Family, values: np.ndarray) -> str:
             for name in never
         )
     return " and ".join(f"{name} = {family.limits[name]}" for name in spec.limit_names) + (
-        " are each satisfied by some design, but by none together"
+        " are satisfied by some design each, but by none together"
     )

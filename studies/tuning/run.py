@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +15,12 @@ from rich.console import Console
 
 from studies import config
 from studies.engine.folder import make_manifest
+from studies.engine.progress import Phases, duration_text
 from studies.engine.runs import run_attributes
 from studies.errors import StudyError
 from studies.show.figures import save, styled, write_figure
 from studies.show.pages import write_report
 from studies.show.sketch import sketch
-from studies.show.units import duration_text
 from studies.store import replacing, write_store
 from studies.study.template import study_template, toml_text
 from studies.tuning import plots
@@ -83,39 +83,56 @@ def run_tuning(
     console = console or Console(highlight=False, markup=False)
     manifest = make_manifest(spec.data, DECISIVE)
 
-    def say(text: str) -> None:
-        if not is_quiet:
-            console.print(text, soft_wrap=True)
-
     with open_tuning(out, manifest, is_resumed) as before:
         if before is not None and not fits(spec, before):
             raise StudyError(f"{out / PROGRESS}: damaged; name a new folder")
-        if before is not None:
-            say(f"continuing after iteration {int(before.iteration)}")
-        say("compiling, and choosing starting points by the linear loop")
-        evaluator = evaluator or make_evaluator(spec)
-
-        clock = _Clock()
-
-        def keep(at: Progress) -> None:
-            save_progress(out / PROGRESS, at)
-            say(f"{_told(spec, at)}{clock.left(spec, at)}")
-
-        at = optimise(spec, evaluator, before, keep)
-        lost = [f.name for k, f in enumerate(spec.moving) if not _has_finished(at, k)]
-        if lost:
-            raise StudyError(
-                f"tune.starts: no starting point of {', '.join(lost)} finished a run; the study "
-                "with the family's settings should be one that does (try studies simulate)"
-            )
-        say(ended(spec, at))
-        found = find(spec, evaluator, at, say)
-        _write(spec, found, out)
-        for line in summary(spec, found):
-            say(line)
-    faults = unkept(spec, at)
+        with Phases(console, tune_phases(spec), is_quiet) as phases:
+            found = _tuned(spec, out, before, evaluator, phases)
+    faults = unkept(spec, found.at)
     if faults:
         raise StudyError("tune.limits: not satisfied together; " + "; ".join(faults))
+    return found
+
+
+def tune_phases(spec: TuneSpec) -> tuple[str, ...]:
+    """Names of the phases of a tuning."""
+    random = ("random designs",) if spec.tune.samples else ()
+    return ("compile", "descend", "check", *random, "compare derivatives", "draw")
+
+
+def _tuned(
+    spec: TuneSpec,
+    out: Path,
+    before: Progress | None,
+    evaluator: Evaluator | None,
+    phases: Phases,
+) -> TuneFindings:
+    """Tune, check and write, in an open folder; arguments as in `run_tuning`."""
+    if before is not None:
+        phases.say(f"continuing after iteration {int(before.iteration)}")
+    phases.begin("compile", "starting points by the linear loop, and the first iteration")
+    evaluator, clock = evaluator or make_evaluator(spec), _Clock()
+
+    def keep(at: Progress) -> None:
+        save_progress(out / PROGRESS, at)
+        if phases.present == "compile":  # the first iteration compiles
+            phases.begin("descend")
+        done, total = int(at.iteration), spec.tune.iterations
+        phases.advance(done, total, _told(spec, at), clock.left(total - done))
+
+    at = optimise(spec, evaluator, before, keep)
+    lost = [f.name for k, f in enumerate(spec.moving) if not _has_finished(at, k)]
+    if lost:
+        raise StudyError(
+            f"tune.starts: no starting point of {', '.join(lost)} finished a run; the study "
+            "with the family's settings should be one that does (try studies simulate)"
+        )
+    phases.say(ended(spec, at))
+    found = find(spec, evaluator, at, phases)
+    phases.begin("draw")
+    _write(spec, found, out)
+    for line in summary(spec, found):
+        phases.say(line)
     return found
 
 
@@ -125,14 +142,13 @@ class _Clock:
     def __init__(self) -> None:
         self._seen: list[float] = []
 
-    def left(self, spec: TuneSpec, at: Progress) -> str:
-        """Time left after an iteration, "" after the first or last one."""
+    def left(self, count: int) -> str:
+        """Time that so many iterations take, "" after the first or last one."""
         self._seen.append(time.monotonic())
-        count = spec.tune.iterations - int(at.iteration)
         if len(self._seen) < 2 or count <= 0:
             return ""
         each = (self._seen[-1] - self._seen[0]) / (len(self._seen) - 1)
-        return f"; {duration_text(count * each)} left at most"
+        return f"at most {duration_text(count * each)}"
 
 
 def _has_finished(at: Progress, family: int) -> bool:
@@ -155,16 +171,14 @@ def _told(spec: TuneSpec, at: Progress) -> str:
     )
 
 
-def find(
-    spec: TuneSpec, evaluator: Evaluator, at: Progress, say: Callable[[str], None]
-) -> TuneFindings:
+def find(spec: TuneSpec, evaluator: Evaluator, at: Progress, phases: Phases) -> TuneFindings:
     """Judge the result of a tuning.
 
     Args:
         spec: of the tuning.
         evaluator: of its starting points.
         at: where the tuning ended.
-        say: called before each stage.
+        phases: those of `tune_phases`.
     """
     values = spec.free.values(at.best_place)
     winners = [at.winner(k) for k in range(len(spec.moving))]
@@ -172,7 +186,7 @@ def find(
         tuned_study(spec, family, values[winners[k]] if k < len(winners) else values[0])
         for k, family in enumerate(spec.families)
     ]
-    own, judged, references = compare(spec, designs, say)
+    own, judged, references = compare(spec, designs, partial(phases.begin, "check"))
     main = int(np.flatnonzero(at.family == spec.main)[0])
     linear = np.concatenate(
         [
@@ -188,10 +202,10 @@ def find(
         evaluator.evaluate(values)
     searched = None
     if spec.tune.samples:
-        say(f"running {spec.tune.samples} random designs for comparison")
+        phases.begin("random designs", f"{spec.tune.samples} for comparison")
         searched = search(spec, lambda chosen: evaluator.linear.screen(main, chosen))
     best = at.best_place[at.winner(spec.main)]
-    say("comparing derivatives with differences")
+    phases.begin("compare derivatives", "with differences")
     audited = audit(spec, np.stack([(spec.free.places() + best) / 2, best]))
     return TuneFindings(
         at=at,

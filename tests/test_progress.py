@@ -1,0 +1,93 @@
+"""Progress of long commands: which phase they are in, and what is left of it."""
+
+import io
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from studies.engine import progress
+from studies.engine.progress import Phases, Reporter, duration_text
+
+NAMES = ("compile", "run", "join", "draw")
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that the test sets [s]."""
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: now[0])
+    return now
+
+
+def shown(steps, **options):
+    console = Console(file=io.StringIO(), width=200, **options)
+    with Phases(console, NAMES) as phases:
+        steps(phases)
+    return console.file.getvalue()
+
+
+def test_every_phase_is_named_with_the_time_since_the_start(clock):
+    def steps(phases):
+        phases.begin("compile", "program 1 of 1")
+        clock[0] = 200.0
+        phases.begin("join")
+
+    lines = shown(steps).splitlines()
+    assert lines == [
+        "compile (1 of 4), 0 s since the start: program 1 of 1",
+        "join (3 of 4), 3 min since the start",
+    ]
+
+
+def test_the_time_left_says_which_phases_it_does_not_cover():
+    def steps(phases):
+        for name in ("run", "draw"):
+            phases.begin(name)
+            phases.advance(1, 2, "1/2", "about 5 s")
+            phases.advance(2, 2, "2/2")
+
+    lines = shown(steps).splitlines()
+    assert lines[1:3] == ["1/2; about 5 s left in this phase, then join, draw", "2/2"]
+    assert lines[4:] == ["1/2; about 5 s left", "2/2"]
+
+
+def test_a_terminal_has_one_line_for_all_phases():
+    def steps(phases):
+        phases.begin("compile")
+        phases.begin("run")
+        phases.advance(1, 2, "1/2 cases")
+        phases.say("a line above it")
+
+    text = shown(steps, force_terminal=True)
+    assert "run (2 of 4)" in text and "1/2 cases" in text and "a line above it" in text
+    assert "since the start" not in text and "\x1b[" in text
+
+
+def test_the_time_left_of_a_sweep_includes_programs_that_are_not_compiled_yet(clock):
+    console = Console(file=io.StringIO(), width=200)
+    reporter = Reporter(Phases(console, NAMES), "run", 100, 20, programs=3)
+    reporter.compiling()
+    clock[0] = 30.0
+    reporter.compiled("kernel", 30.0)
+    clock[0] = 40.0
+    reporter.chunk(np.zeros(20, int))  # 2 cases/s: 30 s for the others and 2 x 30 s of compiling
+    text = console.file.getvalue()
+    assert "compile (1 of 4), 0 s since the start: program 1 of 3" in text
+    assert "40/100 cases, 2 cases/s, all ok; about 90 s left in this phase, then join" in text
+    reporter.chunk(np.zeros(60, int))
+    assert "100/100 cases" in console.file.getvalue().splitlines()[-1]
+    assert "left" not in console.file.getvalue().splitlines()[-1]
+
+
+def test_quiet_phases_say_nothing():
+    console = Console(file=io.StringIO(), force_terminal=True)
+    with Phases(console, NAMES, is_quiet=True) as phases:
+        phases.begin("run")
+        phases.advance(1, 2, "1/2", "5 s")
+        phases.say("text")
+    assert console.file.getvalue() == ""
+
+
+def test_durations_in_words():
+    assert [duration_text(x) for x in (40, 180, 7800)] == ["40 s", "3 min", "2 h 10 min"]
