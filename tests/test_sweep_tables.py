@@ -512,10 +512,10 @@ def test_the_head_of_a_report_says_what_the_data_say():
     assert "7 of 8 cases ended ok (1: non-finite number)." in head
     # of 5, 3, 8, 1, 2, 7, 4 um the median is 4 and the mean 4.286
     assert "the median of the ok cases is 4 µm." in head
-    assert "Best: case 4 with 2 µm (control.gain_factor = 0.5), gain margin 5;" in head
+    assert "case 4 with 2 µm (control.gain_factor = 0.5), gain margin 5 (14.0 dB);" in head
     assert '--by "residual_rms" --subject-to "gain_margin >= 2"' in head
     assert "studies replay DIR --case 4 " in head and "studies spillover DIR --case 4 " in head
-    assert "Regardless of the margin, case 3 comes first, with 1 µm at a margin of 1.5." in text
+    assert "Regardless of the margin, case 3 comes first, with 1 µm at a margin of 1.5 (3.5 dB)." in text
     assert "by only" not in head and "CAUTION" not in text
 
 
@@ -540,7 +540,7 @@ def test_a_report_names_what_does_not_tell_cases_apart():
     rms = of_stations(1e-6 * (1 + 1e-3 * np.arange(8)))
     text = report(usual(residual_rms=rms), "residual_rms", [], "DIR")
     # seven cases have a margin of 2, without the fourth
-    assert "**The 7 best differ by only 0.7 %: residual_rms does not tell them apart;" in text
+    assert "**The 7 best differ by only 0.7 %: residual_rms does not distinguish them;" in text
     wide = report(usual(residual_rms=rms**30), "residual_rms", [], "DIR")
     assert "differ by only" not in wide
 
@@ -549,7 +549,7 @@ def test_a_report_warns_where_no_margin_is_enough():
     data = usual(gain_margin=np.linspace(1.1, 1.8, 8))
     text = report(data, "residual_rms", [], "DIR")
     assert "**CAUTION: 8 of these 8 cases have a gain margin below 2 (smallest 1.1);" in text
-    assert "Best: case 3 with 1 µm (control.gain_factor = 0.4), gain margin 1.4;" in text
+    assert "case 3 with 1 µm (control.gain_factor = 0.4), gain margin 1.4 (2.9 dB);" in text
     assert "Regardless" not in text and "Cases of status ok, smallest residual_rms first." in text
 
 
@@ -557,7 +557,7 @@ def test_a_report_names_links_that_no_case_controls():
     rms = np.ones((2, 3, 3)) * 1e-6 * np.array([[[2.0], [5.0], [1.0]], [[1.0], [7.0], [3.0]]])
     data = made_up({"link_subsets": ["1", "1+3"]}, residual_rms=rms)
     head = report(data, "residual_rms", [], "DIR").partition("## ")[0]
-    assert "Best: case 0 with 2 µm (link_subset = 1); link 2, which no case controls: 5 µm;" in head
+    assert "case 0 with 2 µm (link_subset = 1); link 2, which no case controls: 5 µm;" in head
     assert "largest of links 1 and 3 and all stations" in head
 
 

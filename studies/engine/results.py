@@ -176,7 +176,8 @@ def baseline_id(spec: SweepSpec) -> str:
 def is_worse(values: np.ndarray, uncontrolled: float) -> np.ndarray:
     """Which values of a metric are above that without control by more than rounding, (n,)."""
     with np.errstate(invalid="ignore"):
-        return np.asarray(values > uncontrolled * (1 + ROUNDING))
+        found: np.ndarray = np.greater(values, uncontrolled * (1 + ROUNDING))
+    return found
 
 
 def uncontrolled_value(data: SweepData, name: str) -> float | None:
@@ -310,7 +311,7 @@ def counted_links(data: SweepData) -> np.ndarray:
 
     The same for all cases; otherwise fewer controlled links would look like less vibration.
     """
-    found = controlled(data.table).any(axis=0)
+    found: np.ndarray = np.any(controlled(data.table), axis=0)
     return found if found.any() else np.ones(3, bool)
 
 
