@@ -186,7 +186,13 @@ def _metric_gain(metric: str, one: JudgedDesign, own: JudgedDesign) -> Gain:
     unit = readable(METRICS[parse_entries(metric).metric].unit)[1]
     change = "" if any(text.startswith("not") for text in texts) else _relative(before, after)
     with_unit = texts[1] if unit == "1" else f"{texts[1]} {unit}"
-    return Gain(metric, change, texts[0], with_unit, after > (1 + ALIKE) * before)
+    return Gain(
+        figure=metric,
+        change=change,
+        after=texts[0],
+        before=with_unit,
+        is_worse=after > (1 + ALIKE) * before,
+    )
 
 
 def _loop_gains(one: LoopFigures, own: LoopFigures) -> list[Gain]:
@@ -196,8 +202,20 @@ def _loop_gains(one: LoopFigures, own: LoopFigures) -> list[Gain]:
     lost = [after < (1 - ALIKE) * before for after, before in (margins, decays)]
     change = _relative(decays[1], decays[0])
     return [
-        Gain("gain margin", "", margin_in_db(margins[0], 3), margin_in_db(margins[1], 3), lost[0]),
-        Gain("slowest decay", change, f"{decays[0]:.3g}", f"{decays[1]:.3g} 1/s", lost[1]),
+        Gain(
+            figure="gain margin",
+            change="",
+            after=margin_in_db(margins[0], 3),
+            before=margin_in_db(margins[1], 3),
+            is_worse=lost[0],
+        ),
+        Gain(
+            figure="slowest decay",
+            change=change,
+            after=f"{decays[0]:.3g}",
+            before=f"{decays[1]:.3g} 1/s",
+            is_worse=lost[1],
+        ),
     ]
 
 
