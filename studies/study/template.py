@@ -18,23 +18,25 @@ from studies.study.spec import Study
 #: What an engineer changes first: all that `studies init` writes.
 STARTERS = (
     "title",
+    "run.duration",
     "machine.joint_radius",
     "machine.platform_mass",
-    "machine.slider_mass",
     "link.length",
     "link.thickness",
     "link.width",
+    "link.youngs_modulus",
     "link.damping_ratio",
     "patches.centers",
     "patches.actuator_length",
     "motion.waypoints",
     "motion.move_time",
     "shaper.kind",
-    "control.gain_factor",
+    "control.velocity_gain",
+    "control.damping",
     "drive.kp",
     "drive.kd",
+    "load.mass",
     "metrics.residual_length",
-    "metrics.settling_band",
 )
 #: A longer line has its comment above.
 _LONGEST_LINE = 110
