@@ -171,7 +171,7 @@ def test_fitted_machine_runs_the_compared_cases_alone(short):
 
 
 def test_fitted_machine_has_the_measured_frequencies():
-    """Two of its links; the third is stiffer."""
+    """Links 1 and 3 have them; link 2 is stiffer."""
     hz = paper_cases.link_hz(*check_run(paper_cases.fitted_study()))[:, :2]
     apart = np.sort(np.abs(hz - np.array(tables.FREQUENCIES)), axis=0)
     assert apart[0].max() < 0.2 and apart[1].max() < 0.7
