@@ -14,9 +14,6 @@ from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.prepare import prepare
 
-#: The late window is the residual window without this part, in which the drive settles [1].
-EARLY_PART = 1 / 3
-
 
 class SharedFrame(NamedTuple):
     """What all cases share."""

@@ -22,7 +22,7 @@ from studies.paper.cases import ALL, OFF, ONE, TWO, PaperRuns
 from studies.paper.context import Machines
 from studies.show import figures
 
-#: Length of the views after the command [s].
+#: Length of the views after the move [s].
 VIEW_LENGTH = 0.2
 #: They begin when the bending by the drives' own transient is over [s],
 LINKS_DELAY = 0.01
@@ -45,7 +45,7 @@ class Row(NamedTuple):
     unit: str  # key of UNITS
     signals: Callable[[PaperRuns], np.ndarray]  # (n, T, rows)
     place: int  # of the row's signal among these
-    delay: float | None = LINKS_DELAY  # of the view after the command [s]; None: whole motion
+    delay: float | None = LINKS_DELAY  # of the view after the move [s]; None: whole motion
 
 
 def draw_figure(name: str, machines: Machines, folder: Path, has_pdf: bool) -> None:
@@ -66,7 +66,7 @@ def _responses(machines: Machines, rows: list[Row], links: tuple[bool, ...], mod
         _draw_row(machines, row, links, modes, axes[k])
         if k + 1 == len(rows) or rows[k + 1].delay != row.delay:
             for ax in axes[k]:
-                ax.set_xlabel("time [ms]" if row.delay is None else "time after the command [ms]")
+                ax.set_xlabel("time [ms]" if row.delay is None else "time after the move [ms]")
     figures.legend_above(figure, axes[0, 0])
     return figure
 
@@ -101,9 +101,15 @@ def _deflections(runs: PaperRuns) -> np.ndarray:
 
 
 def _deflection(machines: Machines, links: tuple[bool, ...], is_whole: bool = False) -> Figure:
-    """Deflections after the command; before that those of the whole motion."""
+    """Deflections after the move; before that those of the whole motion."""
     rows = [
-        Row(f"link {i + 1}: deflection\nat 150 mm", "m", _deflections, i, delay)
+        Row(
+            name=f"link {i + 1}: deflection\nat 150 mm",
+            unit="m",
+            signals=_deflections,
+            place=i,
+            delay=delay,
+        )
         for delay in ((None, LINKS_DELAY) if is_whole else (LINKS_DELAY,))
         for i in range(3)
     ]
@@ -128,7 +134,7 @@ def _pose(
     machines: Machines, links: tuple[bool, ...], delay: float | None = PLATFORM_DELAY
 ) -> Figure:
     rows = [
-        Row(f"{name} error", unit, _pose_errors, k, delay)
+        Row(name=f"{name} error", unit=unit, signals=_pose_errors, place=k, delay=delay)
         for k, (name, unit) in enumerate((("x", "m"), ("y", "m"), ("φ", "rad")))
     ]
     return _responses(machines, rows, links, 3)

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import periodogram
 
-from studies.engine.frame import EARLY_PART
 from studies.paper.cases import PaperRuns
 
 #: Spectra are kept up to this frequency [Hz].
@@ -25,9 +24,7 @@ class Measures(NamedTuple):
     frequency: np.ndarray  # [Hz], (F,)
     spectral_density: np.ndarray  # one-sided, Hann periodogram of the run [m2/Hz], (n, 3, C, F)
     spectral_peak: np.ndarray  # largest of the metric spectral_density [m2/Hz], (n, 3, C)
-    late_start: np.ndarray  # of the late window [s], (n,)
-    late_deflection: np.ndarray  # rms mid-span deflection in the late window [m], (n, 3)
-    late_pose_error: np.ndarray  # rms [m, m, rad], (n, 3)
+    residual: np.ndarray  # rms mid-span deflection in the residual window [m], (n, 3)
     settling: np.ndarray  # of mid-span, from the command's end to SETTLED [s], (n, 3)
     counterpart: np.ndarray  # index of the uncontrolled counterpart, (n,)
 
@@ -38,17 +35,16 @@ def middle_station(runs: PaperRuns) -> int:
 
 
 def measure(runs: PaperRuns) -> Measures:
-    """Spectra, their peaks, the late window and settling of all runs."""
+    """Spectra, their peaks, the residual and settling of all runs."""
     record, end = runs.result.record, np.asarray(runs.result.command_end)
     assert record is not None
-    rate, length = runs.study.electronics.sample_rate_hz, runs.study.metrics.residual_length
+    rate = runs.study.electronics.sample_rate_hz
     time = record.time[0]
     frequency, density = periodogram(record.controlled_coordinate, rate, window="hann", axis=1)
     keep = frequency <= TOP_HZ
     frequency, density = frequency[keep], np.moveaxis(density[:, keep], 1, -1)
-    start = end + EARLY_PART * length
-    is_late = (time >= start[:, None] - 0.5 / rate) & (time < (end + length)[:, None] - 0.5 / rate)
-    deflection = record.chord_deflection_stations[:, :, :, middle_station(runs)]
+    middle = middle_station(runs)
+    deflection = record.chord_deflection_stations[:, :, :, middle]
     counterpart = _counterparts(runs)
     size = np.abs(deflection)
     is_after = (time >= end[:, None])[..., None]
@@ -57,9 +53,7 @@ def measure(runs: PaperRuns) -> Measures:
         frequency=frequency,
         spectral_density=density,
         spectral_peak=np.asarray(runs.result.metrics.spectral_density).max(axis=-1),
-        late_start=start,
-        late_deflection=_rms(deflection, is_late),
-        late_pose_error=_rms(record.pose_error, is_late),
+        residual=np.asarray(runs.result.metrics.residual_rms)[:, :, middle],
         settling=_settling(time, end, size, limit),
         counterpart=counterpart,
     )
@@ -68,12 +62,6 @@ def measure(runs: PaperRuns) -> Measures:
 def _counterparts(runs: PaperRuns) -> np.ndarray:
     off = {case.counterpart: k for k, case in enumerate(runs.cases) if not case.is_controlled}
     return np.array([off[case.counterpart] for case in runs.cases])
-
-
-def _rms(signal: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Root mean square over time of (n, T, k) where mask (n, T), (n, k)."""
-    total = np.einsum("ntk,nt->nk", signal**2, mask)
-    return np.sqrt(total / np.maximum(mask.sum(axis=1), 1)[:, None])
 
 
 def _settling(time: np.ndarray, end: np.ndarray, size: np.ndarray, limit: np.ndarray) -> np.ndarray:

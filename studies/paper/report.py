@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from jaxmodel.prepare import SPECTRUM_SPAN
-from studies.engine.frame import EARLY_PART
 from studies.paper.cases import (
     ALL,
     EXPERIMENT_RATIOS,
@@ -40,6 +39,7 @@ from studies.paper.tables import (
 from studies.show.markdown import picture
 from studies.show.sketch import CAPTION
 from studies.show.templates import render
+from studies.study.window import residual_delay
 
 
 def report(machines: Machines) -> str:
@@ -66,12 +66,12 @@ def report(machines: Machines) -> str:
         slow=nominal.find("paper", "none", 3, OFF),
         free=nominal.compared(3, OFF),
         held=nominal.compared(3, ALL),
-        late=1e6 * nominal.measures.late_deflection,
+        residual=1e6 * nominal.measures.residual,
         bent=1e6 * runs.result.metrics.structural_peak.max(axis=2),
         damping=np.atleast_1d(fitted.runs.study.link.damping_ratio).tolist(),
         adc_step=1e6 * runs.frame.adc_step,
         fitted_step=1e6 * fitted.runs.frame.adc_step,
-        early=EARLY_PART * study.metrics.residual_length,
+        delays=sorted({1e3 * residual_delay(x.runs.study) for x in (fitted, nominal)}),
         peak_span=SPECTRUM_SPAN,
         band=f"{1e6 * study.metrics.settling_band:g}",
         settled=f"{100 * SETTLED:g}",
@@ -132,25 +132,26 @@ def _agreement(context: Context) -> dict[str, Any]:
         "free": settling[0],
         "held": settling[1],
         "second": energy_ratio(context)[:, 1],
-        "late": [
-            1e6 * measures.late_deflection[context.compared(3, links)].max() for links in (OFF, ALL)
+        "residual": [
+            1e6 * measures.residual[context.compared(3, links)].max() for links in (OFF, ALL)
         ],
     }
 
 
 def _halved(context: Context) -> list[str]:
-    """Directions in which two controlled links more than halve the late error."""
+    """Directions in which two controlled links more than halve the residual error."""
     off, two = (
-        context.measures.late_pose_error[context.compared(3, links)] for links in (OFF, TWO)
+        context.runs.result.metrics.pose_error_rms[context.compared(3, links)]
+        for links in (OFF, TWO)
     )
     return [f"{n} ({change(x, y)})" for n, x, y in zip("xyφ", two, off, strict=True) if x < 0.5 * y]
 
 
 def _shaped(context: Context) -> list[float]:
-    """Factor by which the EI shaper reduces the late vibration, per move."""
-    late = context.measures.late_deflection.max(axis=1)
+    """Factor by which the EI shaper reduces the residual vibration, per move."""
+    left = context.measures.residual.max(axis=1)
     unshaped, shaped = (
-        np.array([late[context.find(move, shaper, 3, OFF)] for move in MOVES])
+        np.array([left[context.find(move, shaper, 3, OFF)] for move in MOVES])
         for shaper in ("none", "ei")
     )
     return (unshaped / shaped).tolist()
@@ -169,10 +170,10 @@ def _difference(context: Context, cases: dict[str, int]) -> dict[str, Any] | Non
 
 
 def _ideal_factor(context: Context, cases: dict[str, int]) -> float | None:
-    """Late vibration of the sampled loop over that of ideal feedback, None if either is missing."""
+    """Residual of the sampled loop over that of ideal feedback, None if either is missing."""
     if not {"ideal", "paper-preset"} <= cases.keys():
         return None
     sampled, ideal = (
-        context.measures.late_deflection[cases[name]].max() for name in ("paper-preset", "ideal")
+        context.measures.residual[cases[name]].max() for name in ("paper-preset", "ideal")
     )
     return float(sampled / ideal)

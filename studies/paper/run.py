@@ -245,16 +245,6 @@ def _measured(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
             "m2/Hz",
             "largest spectral density near the mode's frequency",
         ),
-        "late_start": Variable(measures.late_start, ("case",), "s", "begin of the late window"),
-        "late_deflection_rms": Variable(
-            measures.late_deflection, modal[:2], "m", "rms mid-span deflection in the late window"
-        ),
-        "late_pose_error_rms": Variable(
-            measures.late_pose_error,
-            ("case", "pose_axis"),
-            "m; m; rad",
-            "rms pose error in the late window",
-        ),
         "relative_settling_time": Variable(
             measures.settling,
             modal[:2],

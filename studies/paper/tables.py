@@ -13,7 +13,6 @@ import numpy as np
 
 from studies.paper.cases import ALL, COMPARED, EXPERIMENT_RATIOS, MOVES, OFF, PAPER_RATIOS
 from studies.paper.context import PLACES, Context, Machines, change, residual, residuals
-from studies.paper.measures import middle_station
 from studies.show.units import count_text
 from studies.study.consistency import each_link
 from studies.study.labels import describe
@@ -149,21 +148,21 @@ def settling_rows(machines: Machines) -> list[list[str]]:
         return _listed(1e3 * context.measures.settling[context.compared(2, links)], ".0f")
 
     def rms(context: Context, links: tuple[bool, ...]) -> str:
-        return residuals(context, context.measures.late_deflection[context.compared(2, links)])
+        return residuals(context, context.measures.residual[context.compared(2, links)])
 
     return [
         _row("settling time, no control [ms]", "about 140", machines, time, OFF),
         _row("settling time, three links [ms]", "70", machines, time, ALL),
-        _row("late rms, no control [µm]", "not given", machines, rms, OFF),
-        _row("late rms, three links [µm]", "not given", machines, rms, ALL),
+        _row("residual rms, no control [µm]", "not given", machines, rms, OFF),
+        _row("residual rms, three links [µm]", "not given", machines, rms, ALL),
     ]
 
 
 def platform_rows(machines: Machines) -> list[list[str]]:
-    """Platform errors of the late window without control, and their change by control."""
+    """Platform errors of the residual window without control, and their change by control."""
 
     def error(context: Context, links: tuple[bool, ...]) -> np.ndarray:
-        return context.measures.late_pose_error[context.compared(3, links)]
+        return np.asarray(context.runs.result.metrics.pose_error_rms[context.compared(3, links)])
 
     def without(context: Context) -> str:
         return _listed(1e9 * error(context, OFF))
@@ -186,11 +185,9 @@ def motion_rows(context: Context) -> list[list[str]]:
 
     def cells(k: int) -> list[str]:
         metrics = context.runs.result.metrics
-        rms = metrics.residual_rms[k][:, middle_station(context.runs)]
         return [
             _listed(1e6 * metrics.structural_peak[k].max(axis=-1)),
-            residuals(context, rms),
-            residuals(context, context.measures.late_deflection[k]),
+            residuals(context, context.measures.residual[k]),
             _listed(1e3 * metrics.settling_time[k], ".0f"),
             _listed(1e3 * context.measures.settling[k], ".0f"),
         ]
@@ -224,7 +221,7 @@ def design_rows(context: Context) -> list[list[str]]:
                 margin,
                 zeta,
                 context.drop(k, mode=1),
-                residual(context, *_worst(context.measures.late_deflection[k])),
+                residual(context, *_worst(context.measures.residual[k])),
                 f"{runs.result.metrics.peak_voltage[k].max():.3g}",
             ]
         )
