@@ -171,6 +171,14 @@ def residual():
     return rms.reshape(len(EXAMPLES), len(FACTORS), 3)
 
 
+def test_the_first_example_prints_what_the_readme_shows(tmp_path, monkeypatch, capsys):
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(blocks(text, "python")[0], "README.md", "exec"), {})
+    assert capsys.readouterr().out == blocks(text, "text")[0]
+    assert (tmp_path / "first_run.png").stat().st_size > 1e4
+
+
 def test_there_are_examples():
     names = {name for name, _ in EXAMPLES}
     assert {"README.md", "default", "tune.toml", "1_first_run.ipynb"} <= names

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import studies
 from jaxmodel.bases import find_bases
 from jaxmodel.control import pole_placement
 from jaxmodel.simulate import simulate
@@ -101,27 +102,22 @@ def test_bad_case_leaves_gradients_of_others_alone(reverse, point):
     np.testing.assert_array_equal(after[1], 0.0)
 
 
-def fourth_order(f, x, step):
-    """Central difference."""
-    a, b, c, d = (float(f(x + k * step)) for k in (-2, -1, 1, 2))
-    return (a - 8 * b + 8 * c - d) / (12 * step)
-
-
 @pytest.mark.long  # in short: a case with converters, by kernels, in test_batched
 def test_rounded_loops_have_the_slope_of_the_smooth_loop():
     """The code of the README: values with real converters, derivatives by smooth differences."""
     text = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    (code,) = (x for x in blocks if "value_and_grad" in x)
+    (code,) = (x for x in blocks if "studies.batched" in x)
     names = {}
     exec(code, names)
-    many, value, slope = (np.asarray(names[name]) for name in ("many", "value", "slope"))
+    residual, factors, slopes = (names[name] for name in ("residual", "factors", "slopes"))
+    many = np.asarray(residual(factors))
     assert many.shape == (8,) and np.all(many > 0)
-    assert many[3] < value < many[4]
 
-    names["structure"] = names["structure"]._replace(is_smooth=True)
-    residual = names["residual"]
-    smooth = jax.jit(lambda factor: residual(factor))  # noqa: PLW0108 (traced anew)
-    assert slope == pytest.approx(fourth_order(smooth, 0.5, 1e-3), rel=1e-6)
+    names["run"] = studies.batched(studies.Study().change(run__smooth=True), names["place"])
+    smooth, step, k = jax.jit(lambda x: residual(x)), 1e-3, 4  # noqa: PLW0108 (traced anew)
+    near = [np.asarray(smooth(factors + place * step))[k] for place in (-2, -1, 1, 2)]
+    slope = (near[0] - 8 * near[1] + 8 * near[2] - near[3]) / (12 * step)
+    assert float(slopes[k, 0]) == pytest.approx(slope, rel=1e-6)
     # rounding shows in the value: these are not the same loop
-    assert abs(float(smooth(0.5)) / value - 1) > 1e-6
+    assert abs(float(smooth(factors)[k]) / many[k] - 1) > 1e-6
