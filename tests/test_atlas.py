@@ -132,8 +132,8 @@ def test_a_case_of_the_atlas_is_the_run_of_its_study(atlas):
     )
     metrics = run_study(moved, has_record=False, has_loop=False).result.metrics
     subset = seen.link_subsets[0b101]
-    np.testing.assert_allclose(seen.station[where, 0, subset], metrics.residual_rms, rtol=1e-6)
-    np.testing.assert_allclose(seen.pose[where, 0, subset], metrics.pose_error_rms, rtol=1e-6)
+    np.testing.assert_allclose(seen.station[where, subset], metrics.residual_rms, rtol=1e-6)
+    np.testing.assert_allclose(seen.pose[where, subset], metrics.pose_error_rms, rtol=1e-6)
 
 
 def test_atlas_writes_what_its_report_shows(atlas):
@@ -224,18 +224,17 @@ def test_a_pose_out_of_reach_is_refused():
 
 
 def made_up(link, platform):
-    """Subsets of one controlled mode with given late residuals of 8 choices."""
-    both = np.stack([link, link])[None]
+    """Subsets of one controlled mode with given residuals of 8 choices."""
     pose = np.stack([platform, 0 * platform, 0 * platform], axis=-1)
     return subsets.Subsets(
-        ((0.1, "ei"),),
-        1,
-        np.zeros((1, 2, 8), int),
-        both[..., None],
-        np.stack([pose, pose])[None],
-        both[..., None] ** 2,
-        both,
-        both,
+        setting=((0.1, "ei"),),
+        modes=1,
+        status=np.zeros((1, 8), int),
+        station=link[None, ..., None],
+        pose=pose[None],
+        peak=link[None, ..., None] ** 2,
+        settling=link[None],
+        voltage=link[None],
     )
 
 
@@ -245,9 +244,9 @@ def test_claims_are_counted():
     platform = np.array([1.0, 0.8, 0.8, 0.4, 0.8, 0.45, 0.6, 0.7])  # three worse than two
     seen = made_up(link, platform)
     steps = claims.one_more_link(seen)
-    assert steps.rises[0, 1].tolist() == [0, 0, 0, 0, 3]
-    assert np.argmax(steps.change[0, 1, 4]) == steps.labels.index("1+2 -> 1+2+3")
-    np.testing.assert_allclose(claims.two_links(seen).change[0, 1], [-0.6, -0.55, -0.4])
+    assert steps.rises[0].tolist() == [0, 0, 0, 0, 3]
+    assert np.argmax(steps.change[0, 4]) == steps.labels.index("1+2 -> 1+2+3")
+    np.testing.assert_allclose(claims.two_links(seen).change[0], [-0.6, -0.55, -0.4])
     signs = claims.table_1_signs(seen)
     assert np.all(signs.agree[:, signs.is_controlled])
     np.testing.assert_allclose(signs.ours[0][signs.is_controlled], -0.75)
@@ -275,10 +274,10 @@ def test_settings_with_failed_runs_are_left_out_in_words():
         setting=(*seen.setting, (0.03, "none")),
         **{n: np.concatenate([getattr(seen, n)] * 2) for n in subsets.Subsets._fields[2:]},
     )
-    twice.status[1, 0, 3] = 1
+    twice.status[1, 3] = 1
     kept, dropped = run.sound_settings(twice)
     assert kept.setting == seen.setting and kept.station.shape[0] == 1
-    assert "0.03 s, no shaper: of 16 runs 1 " in dropped[0]
+    assert "0.03 s, no shaper: of 8 runs 1 " in dropped[0]
     twice.status[:] = 1
     with pytest.raises(StudyError, match="no setting"):
         run.sound_settings(twice)

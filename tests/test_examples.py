@@ -4,21 +4,22 @@ All of them run as one table: the example as written, at half its gains, and wit
 """
 
 import ast
+import contextlib
 import json
 import re
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-import studies
 from studies.engine.executor import make_executor
 from studies.engine.plan import chunk_cases, even_layout, plan_groups
 from studies.space.table import CaseTable
 from studies.study.files import READY, read_toml
 from studies.study.paths import field_value
-from studies.study.spec import Study, parse_study
+from studies.study.spec import Study, paper_study, parse_study
 from studies.study.window import residual_delay
 
 ROOT = Path(__file__).parent.parent
@@ -28,7 +29,6 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 WORK = ("sweep", "tune", "fit")
 #: Examples that are about something else.
 OTHERS = {
-    "difference.toml": "a warning: its loop is unstable",
     "models.toml": "compares models, without control",
 }
 FACTORS = (1.0, 0.5, 0.0)
@@ -51,36 +51,39 @@ def in_toml(text):
             yield study_of(data)
 
 
-def is_start(node):
-    """Whether an expression is `studies.Study()` or the like."""
-    return (
-        isinstance(node, ast.Call)
-        and isinstance(node.func, ast.Attribute)
-        and node.func.attr in ("Study", "paper_study")
-    )
+#: Calls that only make studies; nothing else of an example is evaluated.
+MAKERS = (
+    "Study",
+    "paper_study",
+    "change",
+    "parse_study",
+    "parse_sweep",
+    "parse_tuning",
+)
 
 
-def in_python(code):
-    """Studies that code makes: with `Study().change(...)`, or from a dictionary."""
-    tree = ast.parse("\n".join(x for x in code.splitlines() if not x.startswith(("%", "!"))))
-    for node in ast.walk(tree):
-        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+def in_python(code, names):
+    """Studies that code assigns to names; names: those of earlier code, which it adds to."""
+    kept = (line for line in code.splitlines() if not line.startswith(("%", "!")))
+    for node in ast.parse("\n".join(kept)).body:
+        if not isinstance(node, ast.Assign) or not isinstance(node.targets[0], ast.Name):
             continue
-        if node.func.attr == "change" and is_start(node.func.value):
-            known = {k.arg: literal(k.value) for k in node.keywords}
-            start = getattr(studies, node.func.value.func.attr)()
-            yield start.change(**{name: x for name, x in known.items() if x is not None})
-        elif node.func.attr in ("parse_sweep", "parse_tuning", "parse_study") and node.args:
-            data = literal(node.args[0])
-            if data is not None:
-                yield study_of(data)
+        calls = [x.func for x in ast.walk(node.value) if isinstance(x, ast.Call)]
+        if not all(getattr(x, "attr", getattr(x, "id", "")) in MAKERS for x in calls):
+            continue
+        with contextlib.suppress(NameError, AttributeError, TypeError, KeyError):
+            made = eval(compile(ast.Expression(node.value), "example", "eval"), names)
+            names[node.targets[0].id] = made
+            if isinstance(made, Study):
+                yield made
 
 
-def literal(node):
-    try:
-        return ast.literal_eval(node)
-    except ValueError:
-        return None
+def start_names():
+    """What makers are called; a sweep or a tuning is its study here, so that nothing starts JAX."""
+    makers = SimpleNamespace(
+        Study=Study, paper_study=paper_study, parse_sweep=study_of, parse_study=study_of
+    )
+    return {"studies": makers, "parse_tuning": study_of}
 
 
 def examples():
@@ -90,16 +93,21 @@ def examples():
     for path in PAGES:
         text = path.read_text(encoding="utf-8")
         found += [(path.name, study) for study in in_toml(text)]
+        names = start_names()
         for block in blocks(text, "python"):
-            found += [(path.name, study) for study in in_python(block)]
+            found += [(path.name, study) for study in in_python(block, names)]
     for path in NOTEBOOKS:
+        names = start_names()
         for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
             if cell["cell_type"] == "code":
-                found += [(path.name, study) for study in in_python("".join(cell["source"]))]
+                found += [(path.name, study) for study in in_python("".join(cell["source"]), names)]
     chosen, seen = [], []
     for name, study in found:
         is_controlled = study.control.feedback == "sampled" and any(study.control.links)
+        is_controlled &= study.control.gain_factor > 0  # otherwise what an example compares with
         what = study.model_dump(exclude={"title"})
+        # a warning: a difference as the velocity estimate makes the loop unstable
+        is_controlled &= study.electronics.estimator != "difference"
         if name in OTHERS or not is_controlled or what in seen:
             continue
         seen.append(what)
@@ -181,7 +189,7 @@ def test_the_first_example_prints_what_the_readme_shows(tmp_path, monkeypatch, c
 
 def test_there_are_examples():
     names = {name for name, _ in EXAMPLES}
-    assert {"README.md", "default", "tune.toml", "1_first_run.ipynb"} <= names
+    assert {"README.md", "default", "tune.toml", "4_gradient_tuning.ipynb"} <= names
     assert {path.name for path in READY.glob("*.toml")} >= OTHERS.keys()
 
 

@@ -43,7 +43,6 @@ def short_study():
     home = paper_study().motion.waypoints[0]
     return paper_study().change(
         run__duration=0.4,
-        metrics__residual_delay=0.0,
         metrics__residual_length=0.2,
         link__modes=3,
         motion__waypoints=(home, (home[0], 0.01, home[2])),

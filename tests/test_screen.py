@@ -246,7 +246,9 @@ def test_a_condition_sends_the_screen_further_down(tmp_path, folders):
     run(screened(subject_to="peak_voltage < 0"), tmp_path / "none")  # runs all there are
     write_sweep_report(tmp_path / "none")
     report = (tmp_path / "none" / "report.md").read_text()
-    assert "None of them meets peak_voltage < 0" in report and "Best: case" in report
+    assert (
+        "None of them meets peak_voltage < 0" in report and "best by residual_rms: case" in report
+    )
     found = read(tmp_path / "none")
     np.testing.assert_array_equal(found["status"] >= 0, found["screen_status"] == status.OK)
 

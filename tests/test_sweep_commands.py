@@ -194,9 +194,9 @@ def check_report(folder):
 
 def test_a_dry_run_says_why_its_sample_cannot_run(capsys, tmp_path):
     spec = tmp_path / "short.toml"
-    spec.write_text("run.duration = 0.15\n[sweep.axes]\ngain = [0.1, 0.2]\n")
+    spec.write_text("run.duration = 0.1\n[sweep.axes]\ngain = [0.1, 0.2]\n")
     code, text, _ = run(capsys, "sweep", spec, "--dry-run")
-    assert code == 0 and "the sample cannot run: run.duration = 0.15; allowed: at least" in text
+    assert code == 0 and "the sample cannot run: run.duration = 0.1; allowed: at least" in text
 
 
 def test_a_folder_of_other_things_does_not_hide_a_ready_study(tmp_path, monkeypatch):

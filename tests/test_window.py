@@ -67,9 +67,14 @@ def test_the_window_waits_for_disturbances():
 )
 def test_a_drive_that_never_settles_is_refused(drive, words):
     with pytest.raises(StudyError, match=words) as told:
-        build_case(parse_study({"drive": drive}))
+        check_run(parse_study({"drive": drive, "link": {"modes": 1}}))
     assert "metrics.residual_delay = 'auto'" in str(told.value)
-    build_case(parse_study({"drive": drive, "metrics": {"residual_delay": 0.03}}))
+    with pytest.raises(StudyError, match=words):
+        parse_sweep({"drive": drive, "sweep": {"axes": {"drive.kd": [5.0, 60.0]}}})
+    assert np.isinf(build_case(parse_study({"drive": drive})).windows.residual_delay)
+    check_run(
+        parse_study({"drive": drive, "metrics": {"residual_delay": 0.03}, "link": {"modes": 1}})
+    )
 
 
 def test_a_run_without_room_for_it_is_refused_in_words():

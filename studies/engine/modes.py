@@ -87,7 +87,6 @@ def modes_study(
         ("drive", "locked", locked),
         ("control", "feedback", "none"),
         ("shaper", "kind", "none"),
-        ("metrics", "residual_delay", 0.0),  # no window is needed, nor a drive that settles
     )
     for section, name, value in given:
         if value is not None:

@@ -47,7 +47,7 @@ from studies.study.consistency import check_locked, each_link
 from studies.study.labels import DISTANCE_TEXT, STATION_TEXT, STATUS_LABEL
 from studies.study.margin import MARGIN_MODES
 from studies.study.spec import AUTO, Study
-from studies.study.window import residual_delay
+from studies.study.window import never_settles, residual_delay
 
 #: More plant steps per sample than this are rejected.
 SUBSTEP_LIMIT = 200
@@ -418,6 +418,8 @@ def _check_duration(study: Study, structure: Structure, known: Preflight) -> Non
             "s",
         )
     delay = residual_delay(study)
+    if np.isinf(delay):
+        raise never_settles(study)
     left = duration - end - delay
     # free vibration of a platform at rest: the window can end with the run
     period = 1 / study.electronics.sample_rate_hz

@@ -19,15 +19,12 @@ from studies.study.spec import Study
 STARTERS = (
     "title",
     "run.duration",
-    "machine.joint_radius",
     "machine.platform_mass",
     "link.length",
     "link.thickness",
-    "link.width",
     "link.youngs_modulus",
     "link.damping_ratio",
     "patches.centers",
-    "patches.actuator_length",
     "motion.waypoints",
     "motion.move_time",
     "shaper.kind",
@@ -36,7 +33,6 @@ STARTERS = (
     "drive.kp",
     "drive.kd",
     "load.mass",
-    "metrics.residual_length",
 )
 #: A longer line has its comment above.
 _LONGEST_LINE = 110

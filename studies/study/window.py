@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from jaxmodel.parameters import ASSEMBLIES
-from studies.errors import field_error
+from studies.errors import StudyError, field_error
 from studies.study.consistency import each_link
 from studies.study.spec import AUTO, Study
 
@@ -19,6 +19,8 @@ from studies.study.spec import AUTO, Study
 SETTLED = 0.02
 #: The window begins on a multiple of this [s].
 GRID = 1e-3
+#: A drive that takes longer never settles [s].
+LONGEST = 100.0
 
 
 def residual_delay(study: Study) -> float:
@@ -31,8 +33,8 @@ def residual_delay(study: Study) -> float:
     Args:
         study: validated study.
 
-    Raises:
-        StudyError: "auto" with a drive that never settles.
+    Returns:
+        inf for "auto" with a drive that never settles: such a study can be analysed, but not run.
 
     Example:
         >>> residual_delay(Study())
@@ -47,7 +49,7 @@ def residual_delay(study: Study) -> float:
         return 0.0
     path = sum(_total(x, moves) for x in (study.motion.move_time, study.motion.dwell))
     wait = max([0.0, *(end - path for end in ends)]) + settling_time(study)
-    return round(math.ceil(wait / GRID - 1e-6) * GRID, 9)
+    return round(math.ceil(wait / GRID - 1e-6) * GRID, 9) if wait < LONGEST else math.inf
 
 
 def with_window(study: Study) -> Study:
@@ -55,8 +57,27 @@ def with_window(study: Study) -> Study:
 
     What varies a study (a sweep, a tuning, a fit) begins with this, so that all its cases have one
     window: a case whose drive settles later must not be measured later.
+
+    Raises:
+        StudyError: "auto" with a drive that never settles.
     """
-    return study.change(metrics__residual_delay=residual_delay(study))
+    delay = residual_delay(study)
+    if math.isinf(delay):
+        raise never_settles(study)
+    return study.change(metrics__residual_delay=delay)
+
+
+def never_settles(study: Study) -> StudyError:
+    """What to say where the residual window would have to wait for ever."""
+    drive = study.drive
+    name, value, unit = ("kd", drive.kd, "N s/m") if drive.kp > 0 else ("kp", drive.kp, "N/m")
+    return field_error(
+        f"drive.{name}",
+        value,
+        "more than 0 with metrics.residual_delay = 'auto', which waits for the drive to settle "
+        f"within {LONGEST:g} s (or give that in s)",
+        unit,
+    )
 
 
 def settling_time(study: Study) -> float:
@@ -66,8 +87,8 @@ def settling_time(study: Study) -> float:
     k_p and k_d (and viscous friction): with the inertia M of the pose and the sliders' rates J X',
     each lambda of J^T J v = lambda M v is a mode s^2 + lambda k_d s + lambda k_p = 0.
 
-    Raises:
-        StudyError: a pole without decay.
+    Returns:
+        inf if a pole has no decay.
     """
     drive = study.drive
     stiffness, resistance = drive.kp, drive.kd + drive.viscous_friction
@@ -77,16 +98,7 @@ def settling_time(study: Study) -> float:
     scale = np.linalg.eigvalsh(half @ rates.T @ rates @ half.T)
     poles = [np.roots([1.0, s * resistance, s * stiffness]) for s in scale]
     decay = float(np.min(-np.real(poles)))
-    if not decay > 0:
-        name, value = ("kd", drive.kd) if drive.kp > 0 else ("kp", drive.kp)
-        raise field_error(
-            f"drive.{name}",
-            value,
-            "more than 0 with metrics.residual_delay = 'auto', which waits for the drive to settle "
-            "(or give that in s)",
-            "N s/m" if name == "kd" else "N/m",
-        )
-    return math.log(1 / SETTLED) / decay
+    return math.log(1 / SETTLED) / decay if decay > 0 else math.inf
 
 
 def rigid_machine(study: Study) -> tuple[np.ndarray, np.ndarray]:
