@@ -23,11 +23,17 @@ def main() -> None:
         time = 1e3 * (run.result.record.time - run.result.command_end)
         for axis, deflection in zip(axes, 1e6 * studies.chord_deflection(run).T, strict=True):
             axis.plot(time, deflection, color=color, lw=1.2, label=label)
+    windows = runs["with control"].case.windows
+    begin = 1e3 * float(windows.residual_delay)
+    end = begin + 1e3 * float(windows.residual_length)
     for i, axis in enumerate(axes):
+        axis.axvspan(begin, end, color="0.93", zorder=0)
         axis.axvline(0, color="0.3", ls="--", lw=1)
-        axis.set(ylabel=f"link {i + 1} [µm]", xlim=(-20, 200), ylim=(-60, 60))
-    axes[0].legend(loc="upper right")
-    axes[0].set_title("Bending at mid-span; the command ends at 0 (four moves of 10 mm in 30 ms)")
+        axis.set(ylabel=f"link {i + 1} [µm]", xlim=(-20, end), ylim=(-60, 60))
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
+    figure.suptitle(
+        "Bending at mid-span; the motion ends at 0", x=0.1, ha="left", fontsize="medium"
+    )
     axes[-1].set_xlabel("time [ms]")
     figure.savefig(Path(__file__).with_name("first_picture.png"), dpi=110)
 
