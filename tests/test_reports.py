@@ -163,6 +163,7 @@ def made_up_run(size=1.0, margin=3.25, code=status.OK, **changes):
         gain_margin=margin,
         frequency_hz=RNG.uniform(100, 900, (2, 3)),
         damping_ratio=RNG.uniform(0.01, 0.3, (2, 3)),
+        breaking_hz=1199.25,
     )
     motion = MotionReport(
         time=np.array([0.0, 0.1, 0.2]),
@@ -259,7 +260,10 @@ def test_sentences_of_a_run_show_its_numbers(one_run):
         f"clipped ADC channel: {100 * m.clipped_fraction:.3g} %; with a motor at its limit of 77 "
         f"N: {100 * m.motor_saturated_fraction:.3g} %.",
         "with 12 plant modes per link (the run has 4): gain margin 3.25 (10.2 dB), the factor by "
-        "which the loop gain (`control.gain_factor`) can still grow; spectral radius 0.987654",
+        "which the loop gain (`control.gain_factor`) can still grow; beyond it, motion "
+        "at 1199 Hz grows, of a link's mode or of a controller's filter; spectral radius 0.987654",
+        f"CAUTION: {100 * m.clipped_fraction:.2g} % of the samples have an ADC channel clipped; "
+        f"{100 * m.saturated_fraction:.2g} % of the samples have an actuator at its limit; ",
         f"({force.min():.3g} to {force.max():.3g} N), the margin goes from "
         f"{planned.min():.4g} ({20 * np.log10(planned.min()):.1f} dB) to {planned.max():.4g} ",
         "a note.",
@@ -291,7 +295,7 @@ def test_what_a_run_means_and_what_is_recommended_next(run, twin, verdict, words
     assert words in text.partition("**Next steps:**")[2].partition("![")[0]
     has_twin = "residual rms without control [µm]" in tables_of(text)["Links"][0]
     assert has_twin == (twin is not None)
-    assert ("**CAUTION" in text) == ("margin" in run and run["margin"] < 2)
+    assert ("**CAUTION: a gain margin" in text) == ("margin" in run and run["margin"] < 2)
 
 
 @pytest.mark.parametrize(

@@ -127,7 +127,7 @@ REFUSED = [
         "= 1.3; allowed: between 0 and 1, exclusive: fractions of each",
     ),
     (
-        "[initial]\nload_station = 0.5",
+        "[initial]\nload_station = 0.5\nload_deflection = [1e-5, 0.0, 0.0]",
         "initial.load_station = 0.5; allowed: between 0 and link.len",
     ),
     (

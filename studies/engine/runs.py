@@ -422,6 +422,7 @@ def _check_duration(study: Study, structure: Structure, known: Preflight) -> Non
         raise never_settles(study)
     left = duration - end - delay
     # free vibration of a platform at rest: the window can end with the run
+    needed = end + delay + study.metrics.residual_length
     period = 1 / study.electronics.sample_rate_hz
     is_free = len(study.motion.waypoints) == 1 and left > period / 2
     longest = np.inf if is_free else left
@@ -431,9 +432,14 @@ def _check_duration(study: Study, structure: Structure, known: Preflight) -> Non
             study.metrics.residual_length,
             f"{period:g} to {max(left, 0):.6g}, from one sample to what run.duration = "
             f"{duration:g} leaves after the shaped motion of {end:.4g} s and "
-            + _wait_text(study, delay),
+            f"{_wait_text(study, delay)}; run.duration = {_rounded_up(needed):g} would do",
             "s",
         )
+
+
+def _rounded_up(duration: float) -> float:
+    """The next hundredth of a second [s]."""
+    return float(np.ceil(100 * duration - 1e-6) / 100)
 
 
 def _wait_text(study: Study, delay: float) -> str:

@@ -66,6 +66,7 @@ class LoopReport(NamedTuple):
     gain_margin: float  # largest common factor on all gains with every smaller one stable [1]
     frequency_hz: np.ndarray  # of the tracked controlled link modes [Hz], (J, 3)
     damping_ratio: np.ndarray  # [1], (J, 3): three assembled modes per link mode
+    breaking_hz: float  # of the pole that leaves the unit circle at the margin, NaN: none does
 
     @property
     def is_stable(self) -> bool:
@@ -184,11 +185,13 @@ def loop_report(
             _judged(_closed_loop(plain, case, pose, part), period, n_tracked) for _, part in parts
         ]
     chosen = [modes for modes, _ in parts]
+    least = min(reports, key=lambda one: one.gain_margin)
     return LoopReport(
-        max(one.spectral_radius for one in reports),
-        min(one.gain_margin for one in reports),
-        mode_by_mode(chosen, [one.frequency_hz for one in reports]),
-        mode_by_mode(chosen, [one.damping_ratio for one in reports]),
+        spectral_radius=max(one.spectral_radius for one in reports),
+        gain_margin=least.gain_margin,
+        frequency_hz=mode_by_mode(chosen, [one.frequency_hz for one in reports]),
+        damping_ratio=mode_by_mode(chosen, [one.damping_ratio for one in reports]),
+        breaking_hz=least.breaking_hz,
     )
 
 
@@ -217,7 +220,23 @@ def _judged(matrices: LoopMatrices, period: float, n_tracked: int) -> LoopReport
         for x in (np.abs(decay) / (2 * np.pi), -decay.real / np.abs(decay))
     )
     radius = float(np.abs(poles(1.0)).max())
-    return LoopReport(radius, gain_margin(poles, STEPS), frequency, zeta)
+    margin = gain_margin(poles, STEPS)
+    return LoopReport(
+        spectral_radius=radius,
+        gain_margin=margin,
+        frequency_hz=frequency,
+        damping_ratio=zeta,
+        breaking_hz=_breaking_hz(poles, margin, period),
+    )
+
+
+def _breaking_hz(poles: Callable[[float], np.ndarray], margin: float, period: float) -> float:
+    """Frequency of the pole that is unstable just beyond a margin [Hz], NaN if none is."""
+    if margin >= HIGHEST:
+        return np.nan
+    beyond = poles(max(1.001 * margin, LOWEST))
+    pole = beyond[np.argmax(np.abs(beyond))]
+    return float(abs(np.angle(pole)) / (2 * np.pi * period))
 
 
 def gain_margin(

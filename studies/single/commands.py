@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -108,6 +109,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             }
             print(json.dumps(text))
             return
+        if study is None:
+            console.print(
+                "the paper's machine without damping; with it: studies modes paper", soft_wrap=True
+            )
         table = Table("mode", "frequency [Hz]", "damping ratio [1]", "share of its energy")
         rows = zip(found.frequency, found.damping_ratio, found.names, strict=True)
         for k, (f, z, name) in enumerate(rows):
@@ -118,12 +123,14 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 def _print_run(run: Run, twin: Run | None, console: Console) -> None:
     """Print status, link metrics and stability; twin: the same run without control."""
     from studies.engine.poles import HEADER, difference, pole_rows
-    from studies.single.report import settling_text
+    from studies.single.report import limits_text, settling_text
     from studies.study.labels import describe, remedy
     from studies.study.margin import MARGIN_MODES, caution, margin_in_db
 
     metrics, windows = run.result.metrics, run.case.windows
     console.print(f"status: {describe(run.status)}")
+    if text := limits_text(run):
+        console.print(f"[bold red]{text}[/]", soft_wrap=True, markup=True)
     if advice := remedy(run.status):
         console.print(f"next step: {advice}", soft_wrap=True)
     table = Table("link", "residual rms, worst station [um]")
@@ -153,9 +160,9 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
     modes = run.study.link.modes
     console.print(
         "gain margin of the linearised sampled loop, a factor on control.gain_factor: "
-        f"{margin_in_db(run.loop.gain_margin)}, damping "
-        f"ratios of the controlled modes: {damping} ({max(MARGIN_MODES, modes)} plant modes per "
-        f"link, the run {modes})",
+        f"{margin_in_db(run.loop.gain_margin)}; damping "
+        f"ratios of modes 1, 2, ..., the smallest of the links: {damping} "
+        f"({max(MARGIN_MODES, modes)} plant modes per link, the run {modes})",
         soft_wrap=True,
     )
     if run.poles is not None:
@@ -164,6 +171,12 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
             poles.add_row(*row)
         console.print(poles)
         console.print(difference(run.poles), soft_wrap=True)
+    if not math.isnan(run.loop.breaking_hz):
+        console.print(
+            f"beyond that margin, motion at {run.loop.breaking_hz:.4g} Hz grows, of a link's mode "
+            "or of a controller's filter: `studies spillover` names it",
+            soft_wrap=True,
+        )
     if warning := caution(run.loop.gain_margin):
         console.print(f"[bold red]{warning}[/]", soft_wrap=True, markup=True)
 

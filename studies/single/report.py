@@ -125,6 +125,7 @@ def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str], name: st
         later=_later(run, free, worst) if free else "",
         verdict=VERDICTS,
         caution=caution(run.loop.gain_margin) if run.loop is not None else "",
+        at_limit=limits_text(run),
         case=_situation(run, twin),
         band=study.metrics.settling_band,
         windows=run.case.windows,
@@ -142,6 +143,22 @@ def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str], name: st
         sketch_caption=CAPTION,
         figure=lambda name, caption: picture(_figure(out, name), caption),
     )
+
+
+def limits_text(run: Run) -> str:
+    """Warning about converters and actuators at their limits in a run that ended ok, "" if none."""
+    metrics = run.result.metrics
+    shares = {
+        "an ADC channel clipped": float(metrics.clipped_fraction),
+        "an actuator at its limit": float(metrics.saturated_fraction),
+        "a motor at its limit": float(metrics.motor_saturated_fraction),
+    }
+    told = [
+        f"{100 * share:.2g} % of the samples have {what}"
+        for what, share in shares.items()
+        if share > 0
+    ]
+    return f"CAUTION: {'; '.join(told)}." if told and run.status == status.OK else ""
 
 
 def _situation(run: Run, twin: Run | None) -> str:

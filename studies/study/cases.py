@@ -108,7 +108,7 @@ def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
         load=Load(*(number(f"load.{name}") for name in Load._fields)),
         initial=Initial(
             _filled(number("initial.modal"), (3, structure.n_modes), 0.0),
-            number("initial.load_station"),
+            _load_station(fields),
             number("initial.load_deflection"),
         ),
         windows=Windows(
@@ -123,6 +123,12 @@ def build_cases(study: Study, columns: Columns, structure: Structure) -> Case:
         ),
         seed=fields.raw("run.seed").astype(int),
     )
+
+
+def _load_station(fields: Fields) -> np.ndarray:
+    """Where the static load acts [m], (m,); on a link that is shorter it has no deflection."""
+    shortest = fields.each_link("link.length").min(axis=1)
+    return np.minimum(fields.numbers("initial.load_station"), 0.999 * shortest)
 
 
 def _delay(fields: Fields) -> np.ndarray:

@@ -82,7 +82,7 @@ def _check_stations(study: Study) -> None:
             allowed = "between 0 and 1, exclusive: fractions of each link's length"
             raise field_error("metrics.stations", value, allowed, "1")
     shortest, load = each_link(study.link.length).min(), study.initial.load_station
-    if not 0 < load < shortest:
+    if any(study.initial.load_deflection) and not 0 < load < shortest:
         allowed = f"between 0 and link.length = {shortest:g}, exclusive"
         raise field_error("initial.load_station", load, allowed, "m")
 
