@@ -173,7 +173,11 @@ def check_target(path: str | Path) -> None:
     folder = target.parent
     if not folder.is_dir():
         raise StudyError(f"{path}: cannot write there, {folder} is not a folder; create it first")
-    if target.exists() and not target.is_file():
+    try:
+        is_there = target.exists()
+    except OSError as error:  # a name that is too long
+        raise StudyError(f"{path}: cannot write there ({error.strerror})") from None
+    if is_there and not target.is_file():
         raise StudyError(f"{path}: cannot write there, it is a folder or a device; name a file")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise StudyError(f"{path}: cannot write there, no permission for the folder {folder}")

@@ -251,3 +251,8 @@ def test_field_error_names_value_range_unit_and_nearest():
     )
     assert str(field_error("method", "", "rk4")) == "method = ''; allowed: rk4"
     assert nearest("zzz", ["modal_filter"]) == ""
+
+
+def test_a_name_that_no_file_can_have_is_refused(tmp_path):
+    with pytest.raises(StudyError, match="cannot write there"):
+        check_target(tmp_path / ("x" * 300))

@@ -139,7 +139,7 @@ def check_uncontrolled(capsys, spec, folder):
     assert run(capsys, "sweep", spec, "--out", folder, "--resume", "--quiet") == (0, "", "")
     assert file.stat().st_mtime_ns == before
     file.write_bytes(whole[:999])
-    assert "not a store" in refused(capsys, "show", folder)
+    assert "damaged; remove it and go on with --resume" in refused(capsys, "show", folder)
     file.unlink()
     text = run(capsys, "show", folder)[1]
     assert "best cases by residual_rms" in text and "without control" not in text

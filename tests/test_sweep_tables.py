@@ -427,6 +427,22 @@ def test_deflections_below_one_adc_step_are_not_ranked_in_silence(printed):
         best_cases(usual(), "residual_rms")
 
 
+def test_each_case_has_the_step_of_its_own_converter():
+    rms = of_stations(np.array([1e-6, 1e-6]))
+    data = with_baseline(made_up({"electronics.adc_bits": [4, 12]}, residual_rms=rms), step=1e-8)
+    text = "1 of these 2 cases are below one ADC step of 2.56 µm"
+    with pytest.warns(ResolutionWarning, match=text):
+        best_cases(data, "residual_rms")
+
+
+def test_other_windows_are_not_compared_with_the_baseline_s():
+    rms = of_stations(np.array([6e-6, 7e-6]))
+    data = with_baseline(made_up({"metrics.residual_delay": [0.0, 0.01]}, residual_rms=rms))
+    assert uncontrolled_text(data, "residual_rms") == ""
+    rows = case_rows(data, np.arange(2), ["residual_rms"]).rows
+    assert [row[3] for row in rows] == ["6", "7"]
+
+
 def test_show_prints_statuses_and_the_best(printed):
     data = usual(codes=[0, 0, 0, 0, 0, 0, 4, 5])
     text = printed(data, "show", "DIR")

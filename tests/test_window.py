@@ -77,6 +77,14 @@ def test_a_drive_that_never_settles_is_refused(drive, words):
     )
 
 
+def test_a_drive_that_settles_too_late_is_told_its_time():
+    drive = {"kp": 1e-9, "kd": 60.0}
+    with pytest.raises(
+        StudyError, match=r"drive.kd = 60.*settles within 100 s.*it takes [0-9.e+]+ s"
+    ):
+        check_run(parse_study({"drive": drive, "link": {"modes": 1}}))
+
+
 def test_a_run_without_room_for_it_is_refused_in_words():
     with pytest.raises(StudyError, match="0.026 s in which the drive settles"):
         check_run(Study().change(run__duration=0.15, link__modes=1))
@@ -100,8 +108,24 @@ def test_all_cases_have_the_window_of_the_baseline():
     assert tuning.study == with_window(Study())
 
 
-def test_auto_beside_numbers_in_an_axis():
-    spec = parse_sweep({"sweep": {"axes": {"metrics.residual_delay": ["auto", 0.0]}}})
-    table = build_table(spec)
-    case = build_cases(table.study, table.fields, build_structure(table.study))
-    assert case.windows.residual_delay.tolist() == [residual_delay(Study()), 0.0]
+@pytest.mark.parametrize("values", [["auto", 0.0], ["auto"]])
+def test_auto_is_no_value_of_an_axis(values):
+    with pytest.raises(StudyError, match="'auto'; allowed: numbers in an axis"):
+        build_table(parse_sweep({"sweep": {"axes": {"metrics.residual_delay": values}}}))
+
+
+@pytest.mark.parametrize(
+    ("drive", "axis"),
+    [
+        (STRUCK, {"motion.move_time": [0.03, 0.05]}),
+        (STRUCK, {"drive.pulse_start": [0.05, 0.3]}),
+        ({}, {"drive.pulse_force": [[0.0, 0.0, 0.0], [20.0, 0.0, 0.0]]}),
+    ],
+)
+def test_one_window_must_suit_the_disturbances_of_all_cases(drive, axis):
+    data = {"drive": drive, "sweep": {"axes": axis}}
+    with pytest.raises(StudyError, match="a number where .* varies"):
+        build_table(parse_sweep(data))
+    build_table(parse_sweep(data | {"metrics": {"residual_delay": 0.3}}))
+    harmless = {"drive.pulse_force": [[10.0, 0.0, 0.0], [20.0, 0.0, 0.0]], "drive.kp": [1e4, 2e4]}
+    build_table(parse_sweep({"drive": STRUCK, "sweep": {"axes": harmless}}))

@@ -156,7 +156,10 @@ def read_baseline(folder: Path, spec: SweepSpec) -> dict[str, Variable]:
     path = folder / BASELINE
     if not path.is_file():
         return {}
-    variables, attributes = read_store(path)
+    try:
+        variables, attributes = read_store(path)
+    except StudyError:
+        raise StudyError(f"{path}: damaged; remove it and go on with --resume") from None
     for name, found in variables.items():
         dims = BASELINE_DIMS.get(name, METRICS[name].dims if name in METRICS else None)
         if dims is None:
@@ -181,7 +184,12 @@ def is_worse(values: np.ndarray, uncontrolled: float) -> np.ndarray:
 
 
 def uncontrolled_value(data: SweepData, name: str) -> float | None:
-    """A metric of the baseline without control, as `metric_values`; None if it is not known."""
+    """A metric of the baseline without control, as `metric_values`.
+
+    None if it is not known, or if the cases' windows and stations differ from the baseline's.
+    """
+    if any(field.startswith("metrics.") for field in data.table.fields):
+        return None
     if name.partition("[")[0] not in set(METRICS) & set(data.baseline):
         return None
     variables = {

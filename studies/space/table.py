@@ -18,6 +18,7 @@ from studies.space.axes import ALIASES, LIMIT, READY_MADE
 from studies.space.condition import evaluate
 from studies.space.designs import length, spread
 from studies.space.spec import SweepSpec
+from studies.study.cases import DELAY
 from studies.study.consistency import SAMPLE_LIMIT
 from studies.study.fields import Columns, Fields, padded
 from studies.study.paths import (
@@ -28,7 +29,8 @@ from studies.study.paths import (
     replaced,
     set_value,
 )
-from studies.study.spec import Study, parse_study
+from studies.study.spec import AUTO, Study, parse_study
+from studies.study.window import check_varied
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,9 @@ def build_table(spec: SweepSpec) -> CaseTable:
     _check_shapes(columns)
     _check_samples(spec.study, columns)
     _check_moves(spec.study, columns)
+    check_varied(spec.data, spec.study, columns)
+    if np.any(columns.get(DELAY, np.zeros(1)).astype(str) == AUTO):
+        raise field_error(DELAY, AUTO, "numbers in an axis; without the axis, 'auto' holds", "s")
     n = length(columns)
     kept = np.arange(n)
     if spec.sweep.where:

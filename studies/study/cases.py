@@ -31,11 +31,12 @@ from jaxmodel.parameters import ASSEMBLIES, Beam, Damping, Geometry, Machine, Ma
 from jaxmodel.state_space import StateSpace
 from studies.study.consistency import patch_centers
 from studies.study.fields import Columns, Fields, nesting
-from studies.study.spec import AUTO, OWN_FIELDS, Study
+from studies.study.spec import OWN_FIELDS, Study
 from studies.study.state_space import system_of
 from studies.study.window import residual_delay
 
 TWO_PI = 2 * np.pi
+DELAY = "metrics.residual_delay"
 #: Duration of a move that only pads a path with fewer moves [s].
 NO_TIME = 1e-12
 
@@ -133,9 +134,9 @@ def _load_station(fields: Fields) -> np.ndarray:
 
 def _delay(fields: Fields) -> np.ndarray:
     """Start of the residual window [s], (m,); "auto" is that of the study without columns."""
-    given = fields.raw("metrics.residual_delay")
-    auto = residual_delay(fields.study) if AUTO in given else 0.0
-    return np.array([auto if x == AUTO else float(x) for x in given])
+    if DELAY in fields.columns:
+        return fields.numbers(DELAY)
+    return np.array([residual_delay(fields.study)])
 
 
 def in_working_precision(cases: Case) -> Case:

@@ -31,19 +31,21 @@ def least_step(name: str, adc_step: Any, links: tuple[int, ...]) -> float:
     return float(np.min(np.asarray(adc_step)[named or list(links)]))
 
 
-def resolution_text(name: str, values: Any, step: float, what: str) -> str:
+def resolution_text(name: str, values: Any, step: Any, what: str) -> str:
     """Warning that values are below one ADC step, "" if none is.
 
     Args:
         name: of the metric.
         values: of it [m].
-        step: one ADC step in the deflection of mode 1 [m].
+        step: one ADC step in the deflection of mode 1, of all or of each [m].
         what: one value belongs to: "case", "design".
     """
     values = np.asarray(values)
-    low = int(np.sum(values < step))
+    is_low = values < step
+    low = int(np.sum(is_low))
     if not low:
         return ""
+    step = float(np.max(np.broadcast_to(step, values.shape)[is_low]))
     which = f"this {what} is" if len(values) == 1 else f"{low} of these {len(values)} {what}s are"
     return (
         f"{name} of {which} below one ADC step of {1e6 * step:.3g} µm: the controller "

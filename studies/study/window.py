@@ -7,6 +7,8 @@ vibration says nothing of the links or of their control, so by default the windo
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +21,14 @@ from studies.study.spec import AUTO, Study
 SETTLED = 0.02
 #: The window begins on a multiple of this [s].
 GRID = 1e-3
+#: Fields that move the end of the path, or of the disturbances.
+PATH = ("motion.move_time", "motion.dwell", "motion.waypoints")
+PULSE_TIMES = (
+    "drive.pulse_start",
+    "drive.pulse_length",
+    "load.pulse_start",
+    "load.pulse_length",
+)
 #: A drive that takes longer never settles [s].
 LONGEST = 100.0
 
@@ -69,15 +79,49 @@ def with_window(study: Study) -> Study:
 
 def never_settles(study: Study) -> StudyError:
     """What to say where the residual window would have to wait for ever."""
-    drive = study.drive
+    drive, wait = study.drive, settling_time(study)
     name, value, unit = ("kd", drive.kd, "N s/m") if drive.kp > 0 else ("kp", drive.kp, "N/m")
+    found = f"takes {wait:.3g} s" if math.isfinite(wait) else "never does"
     return field_error(
         f"drive.{name}",
         value,
-        "more than 0 with metrics.residual_delay = 'auto', which waits for the drive to settle "
-        f"within {LONGEST:g} s (or give that in s)",
+        f"a drive that settles within {LONGEST:g} s with metrics.residual_delay = 'auto', which "
+        f"waits for it (with drive.kp = {drive.kp:g} N/m, drive.kd = {drive.kd:g} N s/m and this "
+        f"load it {found}); or give metrics.residual_delay in s",
         unit,
     )
+
+
+def check_varied(data: Mapping[str, Any], study: Study, names: Iterable[str]) -> None:
+    """Check that one window suits all cases of what varies a study.
+
+    The baseline's window waits for the baseline's disturbances, not for those of other cases.
+
+    Args:
+        data: sections of the file, as written.
+        study: the baseline.
+        names: fields, or entries of fields, that vary.
+
+    Raises:
+        StudyError: "auto" while the motion moves against a disturbance, or the other way round.
+    """
+    metrics = data.get("metrics", {})
+    if metrics.get("residual_delay", AUTO) != AUTO:
+        return
+    fields = {name.partition("[")[0] for name in names}
+    has_pulse = bool(_disturbance_ends(study))
+    if has_pulse:
+        wrong = fields & {*PATH, *PULSE_TIMES}
+    else:
+        wrong = fields & {"drive.pulse_force", "load.pulse"}
+    if wrong:
+        raise field_error(
+            "metrics.residual_delay",
+            AUTO,
+            f"a number where {', '.join(sorted(wrong))} varies, so that each case has its "
+            "disturbance before the window or within it, as you want",
+            "s",
+        )
 
 
 def settling_time(study: Study) -> float:

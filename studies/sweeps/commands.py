@@ -161,8 +161,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         data = load(folder)
         y = y or ranking(data)
-        names = [variable_name(name) for name in (y, x, hue) if name]
-        path = out or folder / f"{'-over-'.join(names[:2])}{'-by-' + names[2] if hue else ''}.png"
+        parts = (("", y), ("-over-", x), ("-by-", hue))
+        name = "".join(f"{word}{variable_name(one)}" for word, one in parts if one)
+        path = out or folder / f"{name}.png"
         save_plot(draw(data, x, y, hue), path)
         tell_left_out(data, console)
         console.print(f"written: {path}", soft_wrap=True)

@@ -216,12 +216,23 @@ def _shown(data: SweepData, metric: str, value: float) -> str:
 
 
 def resolution_warning(data: SweepData, cases: np.ndarray, metric: str) -> str:
-    """Warning if deflections of cases are below one ADC step of the baseline, "" if none is."""
+    """Warning if deflections of cases are below one step of their ADC, "" if none is."""
     if "adc_step" not in data.baseline or not is_deflection(metric) or not len(cases):
         return ""
     links = tuple(np.flatnonzero(counted_links(data)).tolist())
-    step = least_step(metric, data.baseline["adc_step"].data, links)
+    step = least_step(metric, data.baseline["adc_step"].data, links) * _step_share(data)[cases]
     return resolution_text(metric, metric_values(data, metric)[cases], step, "case")
+
+
+def _step_share(data: SweepData) -> np.ndarray:
+    """One ADC step at the sensor of each case over that of the baseline [1], (n,)."""
+    own = data.spec.study.electronics
+    bits, full, gain = (
+        data.table.values(f"electronics.{name}").astype(float)
+        for name in ("adc_bits", "adc_range", "conditioner_gain")
+    )
+    share = full / own.adc_range * 2.0 ** (own.adc_bits - bits) * own.conditioner_gain / gain
+    return np.asarray(share)
 
 
 def margin_warning(data: SweepData, cases: np.ndarray) -> str:

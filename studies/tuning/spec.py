@@ -31,7 +31,7 @@ from studies.study.explain import explain
 from studies.study.files import read_toml
 from studies.study.paths import checked_value, is_each_link, known_field, overlaps, set_value
 from studies.study.spec import Section, Study, described, parse_study
-from studies.study.window import with_window
+from studies.study.window import check_varied, with_window
 from studies.tuning.free import free_numbers, writes
 
 #: Limits that no run is needed for; all but `spillover` are lower ones. Those of the loop:
@@ -184,6 +184,8 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
     _check_spread(tune, study)
     _check_machines(tune.scenarios, study)
     _check_feedback(tune, study)
+    asked = tune.scenarios
+    check_varied(data, study, (*tune.free, *asked.each, *asked.spread, *asked.machines))
     free = free_numbers(tune.free, study)
     moves = _moves(tune, study)
     families = _families(tune, study, free)
