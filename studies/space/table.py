@@ -18,7 +18,6 @@ from studies.space.axes import ALIASES, LIMIT, READY_MADE
 from studies.space.condition import evaluate
 from studies.space.designs import length, spread
 from studies.space.spec import SweepSpec
-from studies.study.cases import DELAY
 from studies.study.consistency import SAMPLE_LIMIT
 from studies.study.fields import Columns, Fields, padded
 from studies.study.paths import (
@@ -30,7 +29,7 @@ from studies.study.paths import (
     set_value,
 )
 from studies.study.spec import AUTO, Study, parse_study
-from studies.study.window import check_varied
+from studies.study.window import DELAY, check_varied
 
 
 @dataclass(frozen=True)

@@ -33,10 +33,9 @@ from studies.study.consistency import patch_centers
 from studies.study.fields import Columns, Fields, nesting
 from studies.study.spec import OWN_FIELDS, Study
 from studies.study.state_space import system_of
-from studies.study.window import residual_delay
+from studies.study.window import DELAY, residual_delay
 
 TWO_PI = 2 * np.pi
-DELAY = "metrics.residual_delay"
 #: Duration of a move that only pads a path with fewer moves [s].
 NO_TIME = 1e-12
 

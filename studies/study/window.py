@@ -17,6 +17,8 @@ from studies.errors import StudyError, field_error
 from studies.study.consistency import each_link
 from studies.study.spec import AUTO, Study
 
+#: The field.
+DELAY = "metrics.residual_delay"
 #: What is left of the drive's slowest motion when it counts as settled [1].
 SETTLED = 0.02
 #: The window begins on a multiple of this [s].
@@ -116,7 +118,7 @@ def check_varied(data: Mapping[str, Any], study: Study, names: Iterable[str]) ->
         wrong = fields & {"drive.pulse_force", "load.pulse"}
     if wrong:
         raise field_error(
-            "metrics.residual_delay",
+            DELAY,
             AUTO,
             f"a number where {', '.join(sorted(wrong))} varies, so that each case has its "
             "disturbance before the window or within it, as you want",
