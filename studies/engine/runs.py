@@ -161,19 +161,9 @@ def uncontrolled(case: Case) -> Case:
 
 def uncontrolled_twin(run: Run) -> Run | None:
     """The same run with no link controlled, with trajectories; None if none is anyway."""
-    if run.structure.feedback == "none" or not np.any(run.study.control.links):
+    if not is_controlled(run.study):
         return None
-    case = uncontrolled(run.case)
-    result = jax.tree.map(np.asarray, _simulate(run.structure, case, True))
-    return Run(
-        study=run.study,
-        structure=run.structure,
-        case=case,
-        result=result,
-        loop=None,
-        motion=None,
-        status=int(result.status),
-    )
+    return _without_judgement(run.study, run.structure, uncontrolled(run.case), True)
 
 
 def run_uncontrolled(study: Study, is_linear: bool = False) -> Run:
@@ -186,10 +176,24 @@ def run_uncontrolled(study: Study, is_linear: bool = False) -> Run:
     Raises:
         StudyError: as `run_study`.
     """
-    study = study.change(control__links=(False,) * 3)
+    study = uncontrolled_study(study)
     structure, case = check_run(study)
-    structure = structure._replace(is_linear=is_linear)
-    result = jax.tree.map(np.asarray, _simulate(structure, case, False))
+    return _without_judgement(study, structure._replace(is_linear=is_linear), case, False)
+
+
+def is_controlled(study: Study) -> bool:
+    """Whether any link is controlled."""
+    return study.control.feedback != "none" and any(study.control.links)
+
+
+def uncontrolled_study(study: Study) -> Study:
+    """The same study with no link controlled."""
+    return study.change(control__links=(False,) * 3)
+
+
+def _without_judgement(study: Study, structure: Structure, case: Case, has_record: bool) -> Run:
+    """Run a case whose loop is not asked about."""
+    result = jax.tree.map(np.asarray, _simulate(structure, case, has_record))
     return Run(
         study=study,
         structure=structure,

@@ -126,6 +126,7 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
     from studies.single.report import limits_text, settling_text
     from studies.study.labels import describe, remedy
     from studies.study.margin import MARGIN_MODES, caution, margin_in_db
+    from studies.study.spec import AUTO
 
     metrics, windows = run.result.metrics, run.case.windows
     console.print(f"status: {describe(run.status)}")
@@ -147,7 +148,7 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
             f"{metrics.peak_voltage[i]:.4g}",
         )
     console.print(table)
-    settled = run.study.metrics.residual_delay == "auto"
+    settled = run.study.metrics.residual_delay == AUTO
     console.print(
         f"residual window: {1e3 * float(windows.residual_length):.4g} ms, from "
         f"{1e3 * float(windows.residual_delay):.4g} ms after the reference trajectory"

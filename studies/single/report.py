@@ -16,6 +16,7 @@ from studies.engine.poles import HEADER, difference, pole_rows
 from studies.engine.runs import (
     Run,
     chord_deflection,
+    is_controlled,
     run_attributes,
     run_variables,
     uncontrolled_twin,
@@ -167,7 +168,7 @@ def _situation(run: Run, twin: Run | None) -> str:
         return "stopped"
     if run.loop is not None and run.loop.gain_margin < ENOUGH:
         return "margin"
-    if run.study.control.feedback == "none" or not any(run.study.control.links):
+    if not is_controlled(run.study):
         return "uncontrolled"
     if twin is None:
         return "well"

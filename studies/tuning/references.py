@@ -14,7 +14,7 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.engine.frame import frame_of
-from studies.engine.runs import check_run
+from studies.engine.runs import check_run, is_controlled, uncontrolled_study
 from studies.show.units import count_text, number, readable
 from studies.study.cases import build_cases
 from studies.study.entries import parse_entries
@@ -93,16 +93,6 @@ def compare(
     step = frame_of(*check_run(spec.study)).adc_step if has_adc else None
     references = References(found.get(WITHOUT), scan, found.get(ALONE), step)
     return own, judged[:count], references
-
-
-def is_controlled(study: Study) -> bool:
-    """Whether any link is controlled."""
-    return study.control.feedback != "none" and any(study.control.links)
-
-
-def uncontrolled_study(study: Study) -> Study:
-    """The same study with no link controlled."""
-    return study.change(control__links=(False,) * 3)
 
 
 def scan_gain(spec: TuneSpec, runs: PlainRuns) -> GainScan | None:
