@@ -1,6 +1,6 @@
 """Lines of code in `jaxmodel` and `studies`: without blank lines, comments and docstrings.
 
-    python .ci/code_lines.py
+python .ci/code_lines.py
 """
 
 from __future__ import annotations
