@@ -1,7 +1,4 @@
-"""Lines of code in `jaxmodel` and `studies`: without blank lines, comments and docstrings.
-
-python .ci/code_lines.py
-"""
+"""`python .ci/code_lines.py`: lines of code by folder, without blanks, comments and docstrings."""
 
 from __future__ import annotations
 

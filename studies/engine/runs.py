@@ -425,9 +425,9 @@ def _check_duration(study: Study, structure: Structure, known: Preflight) -> Non
     if np.isinf(delay):
         raise never_settles(study)
     left = duration - end - delay
-    # free vibration of a platform at rest: the window can end with the run
     needed = end + delay + study.metrics.residual_length
     period = 1 / study.electronics.sample_rate_hz
+    # free vibration of a platform at rest: the window can end with the run
     is_free = len(study.motion.waypoints) == 1 and left > period / 2
     longest = np.inf if is_free else left
     if not period * (1 - 1e-9) <= study.metrics.residual_length <= longest + 1e-9:
