@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from jaxmodel.lazy import jnp
 from jaxmodel.motion import Path
 from jaxmodel.parameters import Array, Machine
 from jaxmodel.state_space import StateSpace
@@ -153,3 +154,14 @@ class Case(NamedTuple):
     initial: Initial
     windows: Windows
     seed: Array  # of ADC noise and ripple, ()
+
+
+def uncontrolled(case: Case) -> Case:
+    """The same case, or cases, with no link controlled."""
+    return case._replace(control=case.control._replace(link_mask=0 * case.control.link_mask))
+
+
+def with_ratio(case: Case, ratio: Array) -> Case:
+    """The same case, or cases, with other EMC ratios (24) [1], (..., 3, C)."""
+    ratio = jnp.asarray(ratio, jnp.result_type(float))
+    return case._replace(control=case.control._replace(ratio=ratio))

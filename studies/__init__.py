@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from studies.engine.design import load_design
     from studies.engine.modes import machine_modes
     from studies.engine.results import load
-    from studies.engine.runs import Run, chord_deflection, run_study
+    from studies.engine.run_data import chord_deflection
+    from studies.engine.runs import Run, run_study
     from studies.engine.sweep import make_plan, run_sweep
     from studies.errors import StudyError
     from studies.export.document import import_study
@@ -96,7 +97,7 @@ __getattr__ = lazily(
         "best_cases": "studies.sweeps.show",
         "build_case": "studies.study.cases",
         "build_structure": "studies.study.cases",
-        "chord_deflection": "studies.engine.runs",
+        "chord_deflection": "studies.engine.run_data",
         "configure": "studies.config",
         "export_design": "studies.export.run",
         "extend": "studies.extensions",

@@ -17,7 +17,7 @@ from jaxmodel.parameters import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
 from studies.bench import reference
-from studies.engine.runs import check_run
+from studies.engine.preflight import check_run
 from studies.engine.stability import loop_report, motion_report
 from studies.errors import ModelWarning, StudyError
 from studies.study.cases import as_arrays, build_case, build_structure

@@ -14,8 +14,9 @@ from jaxmodel.parameters import HOME
 from jaxmodel.plant import build_plant
 from studies import cli
 from studies.bench import reference
+from studies.engine.preflight import check_run
 from studies.engine.results import load, metric_values
-from studies.engine.runs import check_run, run_study
+from studies.engine.runs import run_study
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.show.figures import styled

@@ -14,7 +14,7 @@ from jaxmodel.riccati import filter_gain, regulator_gain, solve_riccati
 from jaxmodel.sampled_loop import closed_loop
 from jaxmodel.simulate import simulate
 from jaxmodel.state_space import StateSpace, dense
-from studies.engine.runs import check_run
+from studies.engine.preflight import check_run
 from studies.engine.stability import loop_report, with_margin_modes
 from studies.study.spec import parse_study
 

@@ -14,7 +14,7 @@ from jaxmodel.bases import find_bases
 from jaxmodel.prepare import design_controller
 from jaxmodel.simulate import simulate
 from jaxmodel.state_space import dense
-from studies.engine.runs import check_run
+from studies.engine.preflight import check_run
 from studies.engine.stability import loop_report
 from studies.study.cases import as_arrays
 from studies.study.spec import Study, parse_study

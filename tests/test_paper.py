@@ -14,7 +14,8 @@ from rich.console import Console
 from studies import load
 from studies.atlas import atlas_sweep, read_subsets
 from studies.cli import main
-from studies.engine.runs import check_run, run_study
+from studies.engine.preflight import check_run
+from studies.engine.runs import run_study
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.paper import cases as paper_cases

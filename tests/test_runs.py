@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from jaxmodel import status
-from studies.engine.runs import check_run, run_study
+from studies.engine.preflight import check_run
+from studies.engine.runs import run_study
 from studies.errors import StudyError
 from tests.test_batch import short_study
 

@@ -26,7 +26,8 @@ from studies.engine.blocks import responses
 from studies.engine.controller import fixed_controller
 from studies.engine.margins import judge_loops
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
-from studies.engine.runs import check_run, run_study
+from studies.engine.preflight import check_run
+from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.export.in_the_loop import replay

@@ -16,7 +16,8 @@ from jaxmodel.loop import deflection
 from jaxmodel.piezo import actuator_constant, sensor_constant
 from jaxmodel.prepare import prepare
 from studies.engine.margins import judge_loops
-from studies.engine.runs import chord_deflection, run_study
+from studies.engine.run_data import chord_deflection
+from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
 from studies.fitting.bench import Bench, response
 from studies.study.cases import as_arrays, build_case, build_cases, build_structure

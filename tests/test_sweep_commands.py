@@ -12,8 +12,9 @@ from studies.engine import plan
 from studies.engine.design import load_design
 from studies.engine.folder import BASELINE
 from studies.engine.frame import frame_of
+from studies.engine.preflight import check_run
 from studies.engine.results import load
-from studies.engine.runs import check_run, run_study
+from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.study.template import toml_value
 from studies.sweeps.report import report

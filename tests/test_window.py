@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import studies
-from studies.engine.runs import check_run
+from studies.engine.preflight import check_run
 from studies.errors import StudyError
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table

@@ -18,7 +18,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.dynamics import modal_chain
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
-from studies.engine.runs import check_run
+from studies.engine.preflight import check_run
 from studies.show.figures import SERIES, SMALL, WIDTH, axes_or_new, styled
 from studies.show.sketch import guides
 from studies.study.consistency import each_link

@@ -11,7 +11,7 @@ from studies.atlas.subsets import Subsets, setting_label
 from studies.atlas.workspace import Map, PoseModes, map_workspace, natural_modes_at
 from studies.engine.batches import Tell
 from studies.engine.frame import frame_of
-from studies.engine.runs import check_run
+from studies.engine.preflight import check_run
 from studies.study.spec import Study
 
 #: The pose near the border is at least this far from a singularity [rad].

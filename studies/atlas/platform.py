@@ -13,14 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.case import Case, Structure
+from jaxmodel.case import Case, Structure, with_ratio
 from jaxmodel.kinematics import close_chain
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
 from studies.atlas.subsets import link_label, long_enough
 from studies.engine.batches import run_batches
-from studies.engine.runs import check_run, resolved_study, with_ratio
+from studies.engine.preflight import check_run
+from studies.engine.runs import resolved_study
 from studies.study.cases import powered
 from studies.study.spec import Study
 from studies.study.window import residual_delay

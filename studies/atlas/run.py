@@ -29,7 +29,7 @@ from studies.atlas.workspace import PAIRS
 from studies.engine.folder import ATLASES, locked_folder, refuse_existing
 from studies.engine.progress import Phases
 from studies.engine.results import load
-from studies.engine.runs import run_attributes
+from studies.engine.run_data import run_attributes
 from studies.engine.sweep import run_sweep, sweep_phases
 from studies.errors import StudyError
 from studies.show.figures import save, styled, write_figure

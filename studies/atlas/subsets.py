@@ -12,8 +12,9 @@ import numpy as np
 
 from jaxmodel.laws import LAWS
 from studies.engine.columns import NOT_RUN
+from studies.engine.preflight import preflight
 from studies.engine.results import SweepData
-from studies.engine.runs import preflight, resolved_study
+from studies.engine.runs import resolved_study
 from studies.errors import field_error
 from studies.space.spec import SweepSpec, parse_sweep
 from studies.study.cases import as_arrays, build_case, build_structure

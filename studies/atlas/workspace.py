@@ -20,7 +20,7 @@ from jaxmodel.kinematics import close_chain, lift, link_angle, path_status
 from jaxmodel.linear import linearise, mass_and_stiffness, resting
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
-from studies.engine.runs import check_pose, check_run
+from studies.engine.preflight import check_pose, check_run
 from studies.study.spec import Study
 
 #: Modes per link in these matrices; assembled frequencies converge with the first one.

@@ -11,7 +11,8 @@ from jaxmodel import status
 from studies.engine.folder import BASELINE
 from studies.engine.frame import frame_of
 from studies.engine.results import baseline_id, controlled, read_baseline
-from studies.engine.runs import metric_variables, run_uncontrolled
+from studies.engine.run_data import metric_variables
+from studies.engine.runs import run_uncontrolled
 from studies.engine.stored import kept_metrics
 from studies.errors import StudyError
 from studies.space.spec import SweepSpec

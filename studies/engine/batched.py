@@ -19,8 +19,8 @@ from jaxmodel.parameters import Array
 from jaxmodel.simulate import Result, simulate
 from studies.config import processor
 from studies.engine.plan import Layout, lane_unit
+from studies.engine.preflight import check_run
 from studies.engine.program import Place, Program, begin_block, conclude_all, split_cases
-from studies.engine.runs import check_run
 from studies.engine.steps import fits_kernel, given_loop, read_leaves, start_parts
 from studies.errors import NoKernelError, StudyError, warn_of_scan
 from studies.kernels import bridge

@@ -9,14 +9,13 @@ from typing import NamedTuple, Protocol
 import jax
 import numpy as np
 
-from jaxmodel.case import Case, Structure
+from jaxmodel.case import Case, Structure, with_ratio
 from jaxmodel.simulate import Result
 from studies.engine.executor import make_executor, own_ratios
 from studies.engine.margins import LoopMargins, judge_loops, no_margins
 from studies.engine.plan import Chunk, Group, Layout, chunk_cases, local_layout
 from studies.engine.program import Executor
 from studies.engine.progress import Reporter
-from studies.engine.runs import with_ratio
 from studies.kernels.compilation import compiler_time
 from studies.space.table import CaseTable
 from studies.study.cases import powered

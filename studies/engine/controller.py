@@ -14,7 +14,8 @@ from jaxmodel.laws import LAWS, is_modal, n_channels
 from jaxmodel.shaper import Taps
 from studies.engine.blocks import Blocks, blocks
 from studies.engine.channels import Channels, fold
-from studies.engine.runs import check_run, preflight, resolved_study
+from studies.engine.preflight import check_run, preflight
+from studies.engine.runs import resolved_study
 from studies.errors import StudyError, field_error
 from studies.study.spec import Study
 

@@ -11,7 +11,8 @@ from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.engine.folder import MANIFEST, TUNING, read_manifest
 from studies.engine.results import SweepData, load
-from studies.engine.runs import Run, metric_variables
+from studies.engine.run_data import metric_variables
+from studies.engine.runs import Run
 from studies.errors import StudyError, field_error, nearest
 from studies.space.spec import parse_sweep
 from studies.space.table import build_table, case_study

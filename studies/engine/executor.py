@@ -15,12 +15,11 @@ from functools import partial
 
 import numpy as np
 
-from jaxmodel.case import Case, Structure
+from jaxmodel.case import Case, Structure, uncontrolled
 from studies.config import processor
 from studies.engine.kernel_executor import GpuExecutor, KernelExecutor
 from studies.engine.plan import Layout
 from studies.engine.program import Executor, Running
-from studies.engine.runs import uncontrolled
 from studies.engine.scan import ScanExecutor
 from studies.engine.steps import fits_kernel
 from studies.errors import NoKernelError

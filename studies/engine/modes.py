@@ -12,7 +12,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.kinematics import lift, path_status
 from jaxmodel.linear import linearise, mass_and_stiffness, natural_modes, resting
 from jaxmodel.prepare import prepare
-from studies.engine.runs import check_pose
+from studies.engine.preflight import check_pose
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study, parse_study
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.prepare import STIFFNESS_LIMIT, drive_rate
 from studies.config import processor
-from studies.engine.runs import SUBSTEP_LIMIT, mechanics_at, step_counts
+from studies.engine.preflight import SUBSTEP_LIMIT, mechanics_at, step_counts
 from studies.errors import StudyError
 from studies.kernels.cpu import LANE_BYTES
 from studies.kernels.gpu import BLOCK

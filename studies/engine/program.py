@@ -16,12 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.case import Case, Structure
+from jaxmodel.case import Case, Structure, with_ratio
 from jaxmodel.metrics import Metrics
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import Outline, Result, Start, begin, conclude
 from studies.engine.plan import Layout
-from studies.engine.runs import with_ratio
 from studies.kernels.equations import Function, call_of, literal, trace
 
 #: How often a program was traced in this process; tests use it to count compilations.

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.console import Console
 
+from studies.engine.preflight import check_run
 from studies.engine.progress import Phases
-from studies.engine.runs import check_run, run_attributes
+from studies.engine.run_data import run_attributes
 from studies.errors import StudyError
 from studies.fitting import plots
 from studies.fitting.draw import draw_machines

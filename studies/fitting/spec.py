@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, ValidationError
 
-from studies.engine.runs import check_run
+from studies.engine.preflight import check_run
 from studies.errors import StudyError, field_error, nearest, shown_name
 from studies.space.axes import Range
 from studies.space.free import (

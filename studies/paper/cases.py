@@ -22,7 +22,8 @@ from jaxmodel.loop import Record
 from jaxmodel.simulate import Result
 from studies.engine.batches import BATCH, Tell, run_batches
 from studies.engine.frame import SharedFrame, frame_of
-from studies.engine.runs import check_run, judged_status, run_study
+from studies.engine.preflight import check_run
+from studies.engine.runs import judged_status, run_study
 from studies.engine.stability import LoopReport, loop_report
 from studies.study.files import READY
 from studies.study.spec import Flags, Study, load_study

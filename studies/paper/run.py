@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 
 from studies.engine.batches import Tell
-from studies.engine.runs import metric_variables, run_attributes
+from studies.engine.run_data import metric_variables, run_attributes
 from studies.errors import StudyError
 from studies.paper.cases import (
     EXECUTOR,

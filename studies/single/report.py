@@ -13,14 +13,8 @@ from matplotlib.figure import Figure
 from jaxmodel import status
 from jaxmodel.axial import euler_force
 from studies.engine.poles import HEADER, difference, pole_rows
-from studies.engine.runs import (
-    Run,
-    chord_deflection,
-    is_controlled,
-    run_attributes,
-    run_variables,
-    uncontrolled_twin,
-)
+from studies.engine.run_data import chord_deflection, run_attributes, run_variables
+from studies.engine.runs import Run, uncontrolled_twin
 from studies.errors import StudyError
 from studies.show import figures, units
 from studies.show.markdown import picture
@@ -168,7 +162,7 @@ def _situation(run: Run, twin: Run | None) -> str:
         return "stopped"
     if run.loop is not None and run.loop.gain_margin < ENOUGH:
         return "margin"
-    if not is_controlled(run.study):
+    if not run.study.is_controlled:
         return "uncontrolled"
     if twin is None:
         return "well"

@@ -14,7 +14,7 @@ from jaxmodel.controller import Controller, linear_parts
 from jaxmodel.laws.srf import SRF
 from jaxmodel.simulate import Result, simulate
 from studies.engine.controller import FixedController, fixed_controller
-from studies.engine.runs import check_run
+from studies.engine.preflight import check_run
 from studies.engine.stability import gain_margin
 from studies.spillover.judgement import STEPS, breaking_motion, damping, follow
 from studies.spillover.laws import Candidate, all_laws

@@ -12,7 +12,8 @@ from rich.console import Console
 from jaxmodel.laws import LAWS
 from studies.engine.design import Design
 from studies.engine.progress import Phases
-from studies.engine.runs import resolved_study, run_attributes
+from studies.engine.run_data import run_attributes
+from studies.engine.runs import resolved_study
 from studies.errors import StudyError
 from studies.reading import read_json
 from studies.show import figures

@@ -46,7 +46,7 @@ def patch_centers(study: Study) -> np.ndarray:
 
 
 def check_consistency(study: Study) -> None:
-    """Check faults that involve more than one field; `studies.engine.runs` checks poses.
+    """Check faults that involve more than one field; `studies.engine.preflight` checks poses.
 
     Raises:
         StudyError: the first fault.

@@ -499,6 +499,15 @@ class Study(Section):
             target[leaf] = value
         return parse_study(data)
 
+    @property
+    def is_controlled(self) -> bool:
+        """Whether any link is controlled."""
+        return self.control.feedback != "none" and any(self.control.links)
+
+    def uncontrolled(self) -> Study:
+        """The same study with no link controlled."""
+        return self.change(control__links=(False,) * 3)
+
 
 def parse_study(data: dict[str, Any]) -> Study:
     """Validate a dictionary as a study.

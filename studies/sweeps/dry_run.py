@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 
 from studies.engine.plan import peak_memory
-from studies.engine.runs import check_run
+from studies.engine.preflight import check_run
 from studies.engine.sweep import Plan, calibrate
 from studies.errors import StudyError
 from studies.show.units import count_text

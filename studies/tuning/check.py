@@ -16,7 +16,8 @@ from jaxmodel.simulate import Result
 from studies.engine.executor import make_executor
 from studies.engine.plan import even_layout
 from studies.engine.poles import PoleReport
-from studies.engine.runs import check_run, loop_and_poles, run_study
+from studies.engine.preflight import check_run
+from studies.engine.runs import loop_and_poles, run_study
 from studies.errors import StudyError
 from studies.study.cases import as_arrays, build_case, build_cases, in_working_precision
 from studies.study.paths import set_values

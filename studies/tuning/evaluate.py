@@ -18,7 +18,7 @@ from jaxmodel.case import Structure
 from studies.config import processor
 from studies.engine.gradients import Differentiated, make_gradients
 from studies.engine.plan import Layout, even_layout, lane_unit
-from studies.engine.runs import check_run
+from studies.engine.preflight import check_run
 from studies.errors import StudyError
 from studies.study.cases import build_cases, build_structure, in_working_precision
 from studies.tuning.linear_fidelity import LinearFidelity

@@ -14,7 +14,7 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.engine.frame import frame_of
-from studies.engine.runs import check_run, is_controlled, uncontrolled_study
+from studies.engine.preflight import check_run
 from studies.show.units import count_text, number, readable
 from studies.study.cases import build_cases
 from studies.study.entries import parse_entries
@@ -73,14 +73,14 @@ def compare(
     Returns:
         The baseline, the best designs, and what they have to beat.
     """
-    fresh, is_on = spec.tune.scenarios.check * len(spec.moves), is_controlled(spec.study)
+    fresh, is_on = spec.tune.scenarios.check * len(spec.moves), spec.study.is_controlled
     runs = PlainRuns(shown_structure(spec), fresh * (len(designs) + 2))
     if is_on:
         say(f"{FIELD} alone, for comparison")
     scan = scan_gain(spec, runs)
     others = {}
     if is_on:
-        others[WITHOUT] = uncontrolled_study(spec.study)
+        others[WITHOUT] = spec.study.uncontrolled()
     if scan is not None and scan.best >= 0:
         others[ALONE] = gain_study(spec, scan.gain_factor[scan.best])
     say(f"the results on {fresh} fresh scenarios")
@@ -108,7 +108,7 @@ def scan_gain(spec: TuneSpec, runs: PlainRuns) -> GainScan | None:
     asked, start = spec.tune.scenarios, spec.study.control.gain_factor
     others = {*asked.spread, *asked.machines, *asked.each}
     is_tuned_alone = set(spec.free.names) == {FIELD}
-    if not is_controlled(spec.study) or start == 0 or is_tuned_alone or FIELD in others:
+    if not spec.study.is_controlled or start == 0 or is_tuned_alone or FIELD in others:
         return None
     values = start * np.append(np.geomspace(LOWEST, HIGHEST, COUNT), 1.0)
     values = np.unique(np.minimum(values, MOST))

@@ -16,7 +16,7 @@ from rich.console import Console
 from studies import config
 from studies.engine.folder import make_manifest
 from studies.engine.progress import Phases, duration_text
-from studies.engine.runs import run_attributes
+from studies.engine.run_data import run_attributes
 from studies.errors import StudyError
 from studies.show.figures import save, styled, write_figure
 from studies.show.pages import write_report

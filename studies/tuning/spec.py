@@ -22,7 +22,7 @@ from pydantic import ValidationError
 
 from jaxmodel.laws import LAWS
 from jaxmodel.metrics import METRICS
-from studies.engine.runs import check_run
+from studies.engine.preflight import check_run
 from studies.errors import StudyError, field_error, nearest, shown, shown_name
 from studies.space.free import FreeNumbers
 from studies.study.cases import build_structure

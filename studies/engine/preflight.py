@@ -1,0 +1,389 @@
+"""Checks before a run: poses, path, load, durations, rates; the plant steps per sample it needs."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel import status
+from jaxmodel.axial import critical_force, lumping_error
+from jaxmodel.case import Case, Structure
+from jaxmodel.controller import Controller
+from jaxmodel.kinematics import SINGULAR_MARGIN, lift, path_status
+from jaxmodel.laws import is_modal, n_channels
+from jaxmodel.linear import linearise, mechanical, resting
+from jaxmodel.motion import end_of_path, sample_path
+from jaxmodel.plant import damping_ratio
+from jaxmodel.prepare import (
+    MODE_STEP_LIMIT,
+    STIFFNESS_LIMIT,
+    drive_rate,
+    lowpass_corner,
+    prepare,
+)
+from jaxmodel.shaper import Taps, last_sample
+from jaxmodel.simulate import steady_load
+from studies import config
+from studies.errors import field_error, warn_of_model
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.consistency import check_locked, each_link
+from studies.study.spec import AUTO, Study
+from studies.study.window import never_settles, residual_delay
+
+#: More plant steps per sample than this are rejected.
+SUBSTEP_LIMIT = 200
+#: Most that lumping the axial inertia may cost without a word [1].
+LUMPING_LIMIT = 2e-3
+
+
+class Preflight(NamedTuple):
+    """What is known about a case before it runs."""
+
+    pose_status: Any  # of every way-point, (n,)
+    lift: Any  # of the links there, see `jaxmodel.kinematics.lift` [1], (n, 3)
+    path_status: Any  # first fault along the unshaped path, ()
+    path_time: Any  # when [s], ()
+    path_pose: Any  # where, (3,)
+    motion_end: Any  # of the unshaped motion [s], ()
+    shaper_length: Any  # [s], ()
+    condition: Any  # worst condition number of filter and synthesizer [1], ()
+    highest: Any  # frequency of the highest plant mode [rad/s], ()
+    damping: Any  # largest damping ratio of a link mode [1], ()
+    corner: Any  # highest low-pass corner of the velocity estimate [rad/s], ()
+    steady_load: Any  # compression of the links at way-points over their critical force [1], (n, 3)
+    critical_force: Any  # [N], (3,)
+    lumping: Any  # what lumping the axial inertia costs along the unshaped path [1], ()
+    controller: Controller
+    taps: Taps  # of the shaper
+
+
+def preflight(structure: Structure, case: Case) -> Preflight:
+    """What is known about a case before it runs, as NumPy arrays."""
+    return jax.tree.map(np.asarray, _preflight(_without_run(structure), case))
+
+
+@partial(jax.jit, static_argnums=0)
+def _preflight(structure: Structure, case: Case) -> Preflight:
+    prepared = prepare(structure, case)
+    plant = prepared.loop.plant
+    shaper_length = last_sample(prepared.taps) * case.electronics.period
+    points = jnp.asarray(case.path.waypoints)
+    each = jax.vmap(lambda pose: (path_status(plant, pose[None])[0], lift(plant, pose)))(points)
+    end = end_of_path(case.path)
+    time = jnp.linspace(0.0, 1.0, 2001) * end
+    wanted = sample_path(case.path, time)
+    code, index = path_status(plant, wanted.position)
+    lumping = jnp.zeros(())
+    if not structure.is_distributed:
+        error = partial(lumping_error, plant, prepared.bases.plant)
+        lumping = jnp.max(jax.vmap(error)(*wanted))
+    worst = jnp.maximum(prepared.sensor_condition.max(), prepared.actuator_condition.max())
+    corner = lowpass_corner(structure, case, prepared.bases)
+    damping = jnp.max(damping_ratio(case.machine.damping, prepared.loop.omega))
+    return Preflight(
+        *each,
+        code,
+        time[index],
+        wanted.position[index],
+        end,
+        shaper_length,
+        worst,
+        jnp.max(prepared.loop.omega),
+        damping,
+        corner,
+        steady_load(structure, case, plant),
+        critical_force(plant),
+        lumping,
+        prepared.loop.controller,
+        prepared.taps,
+    )
+
+
+def _without_run(structure: Structure) -> Structure:
+    """Only machine and controller, so that runs of any kind share a compilation."""
+    kept = (
+        "n_modes",
+        "n_controlled",
+        "n_patches",
+        "basis",
+        "has_shortening",
+        "is_distributed",
+        "has_static_correction",
+        "is_coupled",
+        "has_wrench",
+        "controller_basis",
+        "law",
+        "has_poles",
+        "has_amplifier",
+        "has_sensor_highpass",
+    )
+    fields = {name: getattr(structure, name) for name in kept}
+    return Structure(n_steps=1, feedback="none", **fields)
+
+
+def check_run(study: Study) -> tuple[Structure, Case]:
+    """Structure and case of a study, checked against its geometry and step size.
+
+    Raises:
+        StudyError: see `run_study`.
+    """
+    config.require_configured()
+    check_locked(study)
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    structure = structure._replace(substeps=_drive_substeps(study, structure, case))
+    known = preflight(structure, case)
+    for k, pose in enumerate(study.motion.waypoints):
+        check_pose(study, f"motion.waypoints.{k}", pose, int(known.pose_status[k]), known.lift[k])
+    if int(known.path_status) != status.OK:
+        x, y, phi = known.path_pose
+        raise field_error(
+            "motion.waypoints",
+            f"path at t = {known.path_time:.4g} s, pose ({x:.4g}, {y:.4g}, {phi:.4g})",
+            "a path on which every link angle gamma stays inside (0, 90) deg "
+            f"(here: {status.REASONS[int(known.path_status)]})",
+            "m, m, rad",
+        )
+    _check_load(study, known)
+    if known.lumping > LUMPING_LIMIT:
+        warn_of_model(
+            f"link.axial_inertia = {study.link.axial_inertia!r} moves deflections by about "
+            f"{100 * known.lumping:.2g} % on this path (limit {100 * LUMPING_LIMIT:g} %); "
+            "'distributed' is exact"
+        )
+    _check_duration(study, structure, known)
+    is_filtered = is_modal(structure) and structure.feedback != "none"
+    if is_filtered and known.condition > study.metrics.condition_limit:
+        raise field_error(
+            "patches.centers",
+            study.patches.centers,
+            f"a placement whose modal filter for control.modes = {study.control.modes} has on each "
+            f"link a condition number up to metrics.condition_limit = "
+            f"{study.metrics.condition_limit:g}; the largest is {known.condition:.3g}",
+            "1",
+        )
+    _check_rates(study, structure, known)
+    if structure.feedback == "ideal":
+        structure = structure._replace(substeps=_ideal_substeps(study, structure, case))
+    return structure, case
+
+
+def check_pose(
+    study: Study, field: str, pose: tuple[float, float, float], code: int, lifts: np.ndarray
+) -> None:
+    """Reject a pose out of reach, or with a link parallel or square to its guide.
+
+    Args:
+        study: supplies the machine.
+        field: name for the message.
+        pose: (x, y, phi) [m, m, rad].
+        code: its status.
+        lifts: of the links there, (3,).
+
+    Raises:
+        StudyError: out of reach or singular.
+    """
+    if code == status.OK:
+        return
+    lengths = each_link(study.link.length)
+    wrong = [
+        f"link {i + 1} is {length:.4g} m long, its joint lies {x * length:.4g} m inside its guide"
+        for i, (x, length) in enumerate(zip(lifts, lengths, strict=True))
+        if not SINGULAR_MARGIN <= x < np.sqrt(1 - SINGULAR_MARGIN**2)
+    ]
+    if not wrong:
+        raise field_error(
+            field,
+            pose,
+            "a pose where the lines of the links do not meet in one point "
+            f"(here: {status.REASONS[code]})",
+            "m, m, rad",
+        )
+    raise field_error(
+        field,
+        pose,
+        "a pose where the joint of each link lies inside its guide by more than 0 and less than "
+        f"link.length, so that gamma is inside (0, 90) deg (here: {status.REASONS[code]}; "
+        f"{wrong[0]}; machine.guide_offsets moves it)",
+        "m, m, rad",
+    )
+
+
+def _check_load(study: Study, known: Preflight) -> None:
+    if np.all(known.steady_load < 1):
+        return
+    at, link = np.unravel_index(np.argmax(known.steady_load), known.steady_load.shape)
+    critical = known.critical_force[link]
+    raise field_error(
+        "load.wrench",
+        study.load.wrench,
+        f"a load that compresses no link by its critical force, {critical:.4g} N (here link "
+        f"{link + 1}: {known.steady_load[at, link] * critical:.4g} N at way-point {at + 1})",
+        "N, N, N m",
+    )
+
+
+def _check_duration(study: Study, structure: Structure, known: Preflight) -> None:
+    duration = structure.n_steps / study.electronics.sample_rate_hz
+    if duration > 1.5 * study.run.duration:
+        raise field_error(
+            "run.duration", study.run.duration, f"at least {duration:g}, one sample", "s"
+        )
+    end = float(known.motion_end + known.shaper_length)
+    if end > duration * (1 + 1e-12):
+        raise field_error(
+            "run.duration",
+            study.run.duration,
+            f"at least {end:.6g}, the end of the motion with its shaper of "
+            f"{known.shaper_length:.4g} s",
+            "s",
+        )
+    delay = residual_delay(study)
+    if np.isinf(delay):
+        raise never_settles(study)
+    left = duration - end - delay
+    needed = end + delay + study.metrics.residual_length
+    period = 1 / study.electronics.sample_rate_hz
+    # free vibration of a platform at rest: the window can end with the run
+    is_free = len(study.motion.waypoints) == 1 and left > period / 2
+    longest = np.inf if is_free else left
+    if not period * (1 - 1e-9) <= study.metrics.residual_length <= longest + 1e-9:
+        raise field_error(
+            "metrics.residual_length",
+            study.metrics.residual_length,
+            f"{period:g} to {max(left, 0):.6g}, from one sample to what run.duration = "
+            f"{duration:g} leaves after the shaped motion of {end:.4g} s and "
+            f"{_wait_text(study, delay)}; run.duration = {_rounded_up(needed):g} would do",
+            "s",
+        )
+
+
+def _rounded_up(duration: float) -> float:
+    """The next hundredth of a second [s]."""
+    return float(np.ceil(100 * duration - 1e-6) / 100)
+
+
+def _wait_text(study: Study, delay: float) -> str:
+    if study.metrics.residual_delay == AUTO:
+        return f"{delay:g} s in which the drive settles (metrics.residual_delay = 'auto')"
+    return f"metrics.residual_delay = {delay:g}"
+
+
+def _check_rates(study: Study, structure: Structure, known: Preflight) -> None:
+    """Check plant modes against the step, and low-passes against the sample rate."""
+    if known.damping >= 1:
+        raise field_error(
+            "link.damping_ratio",
+            study.link.damping_ratio,
+            f"ratios that with link.damping_law = {study.link.damping_law!r} stay below 1 for all "
+            f"link.modes = {study.link.modes} (here up to {known.damping:.3g})",
+            "1",
+        )
+    rate = study.electronics.sample_rate_hz
+    needed = known.highest / MODE_STEP_LIMIT
+    if needed > rate * structure.substeps:
+        raise field_error(
+            "link.modes",
+            study.link.modes,
+            f"modes up to {MODE_STEP_LIMIT * rate * structure.substeps / (2 * np.pi):.4g} Hz at "
+            f"electronics.sample_rate_hz = {rate:g} and run.substeps = {structure.substeps}; the "
+            f"highest one has {known.highest / (2 * np.pi):.4g} Hz",
+            "1",
+        )
+    is_modal_phase = study.electronics.estimator == "modal_phase"
+    corner = known.corner / (2 * np.pi)
+    if structure.feedback == "sampled" and is_modal_phase and corner >= rate / 2:
+        raise field_error(
+            "electronics.lowpass_ratio",
+            study.electronics.lowpass_ratio,
+            f"low-pass corners below half the sample rate, {rate / 2:g} Hz; the highest of the "
+            f"{n_channels(structure)} is at {corner:.5g} Hz (lower it, control.modes or raise "
+            "electronics.sample_rate_hz)",
+            "1",
+        )
+
+
+def pole_decay(structure: Structure, case: Case, pose: Any) -> float:
+    """Fastest decay |Re lambda| [1/s] of the plant with ideal feedback at a pose."""
+    structure = _without_run(structure)._replace(feedback="ideal")
+    poles = np.linalg.eigvals(np.asarray(_mechanics_at(structure, case, pose)))
+    return float(np.abs(poles.real).max())
+
+
+def mechanics_at(structure: Structure, case: Case, pose: Any) -> Any:
+    """State matrix of the plant (with ideal feedback, if the structure has it) at a pose."""
+    loop = prepare(structure, case).loop
+    return mechanical(linearise(structure, loop, pose, resting(structure, case)))
+
+
+_mechanics_at = jax.jit(mechanics_at, static_argnums=0)
+
+
+def step_counts(needed: Any) -> np.ndarray:
+    """Plant steps per sample to use when `needed` suffice: the next power of two.
+
+    Thus a sweep needs few programs, and a case uses the same steps in any sweep.
+    """
+    return 2 ** np.ceil(np.log2(np.maximum(needed, 1))).astype(int)
+
+
+def _drive_substeps(study: Study, structure: Structure, case: Case) -> int:
+    """Plant steps per sample that the sliders' drive and friction need, or as given."""
+    rate = float(drive_rate(case))
+    needed = max(int(np.ceil(rate / study.electronics.sample_rate_hz / STIFFNESS_LIMIT)), 1)
+    given, drive = study.run.substeps, study.drive
+    if needed <= (given or SUBSTEP_LIMIT):
+        return given or int(step_counts(needed))
+    if needed <= SUBSTEP_LIMIT:
+        raise field_error(
+            "run.substeps",
+            given,
+            f"{needed} to {SUBSTEP_LIMIT}, or 0 for as many as needed; drive and friction have a "
+            f"rate of {rate:.3g} 1/s",
+            "1",
+        )
+    slope = drive.coulomb_friction / drive.friction_speed
+    parts = {
+        "drive.kd": drive.kd,
+        "drive.viscous_friction": drive.viscous_friction,
+        "drive.coulomb_friction": slope,
+    }
+    name = max(parts, key=parts.__getitem__)
+    value = drive.coulomb_friction if name == "drive.coulomb_friction" else parts[name]
+    raise field_error(
+        name,
+        value,
+        f"small enough for {SUBSTEP_LIMIT} plant steps per sample with drive.kd, "
+        f"drive.viscous_friction and drive.coulomb_friction/drive.friction_speed = {slope:g} N s/m "
+        f"on machine.slider_mass; {needed} would be needed",
+        "N" if name == "drive.coulomb_friction" else "N s/m",
+    )
+
+
+def _ideal_substeps(study: Study, structure: Structure, case: Case) -> int:
+    """Plant steps per sample for ideal feedback: as the worst way-point needs, or as given."""
+    poses = set(study.motion.waypoints)
+    fastest = max(pole_decay(structure, case, np.array(pose)) for pose in poses)
+    needed = int(np.ceil(fastest / study.electronics.sample_rate_hz / STIFFNESS_LIMIT))
+    needed = max(needed, structure.substeps)  # what the drive needs
+    given = study.run.substeps
+    if given and given < needed <= SUBSTEP_LIMIT:
+        raise field_error(
+            "run.substeps",
+            given,
+            f"{needed} to {SUBSTEP_LIMIT}, or 0 for as many as needed; ideal feedback has a pole "
+            f"at {fastest:.3g} 1/s",
+            "1",
+        )
+    if needed > SUBSTEP_LIMIT:
+        raise field_error(
+            "control.gain_factor",
+            study.control.gain_factor,
+            f"gains low enough for {SUBSTEP_LIMIT} plant steps per sample; ideal feedback has a "
+            f"pole at {fastest:.3g} 1/s, which needs {needed}",
+            "1",
+        )
+    return given or int(step_counts(needed))

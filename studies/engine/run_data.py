@@ -1,0 +1,188 @@
+"""Labelled results of one run: axes, trajectories, metrics and judgement, for its file."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.signal import lfilter
+
+from jaxmodel.bases import find_bases
+from jaxmodel.beam import build_basis
+from jaxmodel.case import Case, Structure
+from jaxmodel.metrics import METRICS
+from jaxmodel.prepare import left_out_deflection, spectrum_frequencies
+from jaxmodel.simulate import Result
+from studies import config
+from studies.engine.poles import PoleReport
+from studies.engine.runs import Run
+from studies.store import Variable
+from studies.study.consistency import each_link
+from studies.study.labels import DISTANCE_TEXT, STATION_TEXT, STATUS_LABEL
+from studies.study.margin import MARGIN_MODES
+from studies.study.spec import Study
+
+
+def metric_variables(result: Result) -> dict[str, Variable]:
+    """Labelled metrics of a run."""
+    return {
+        name: Variable(np.asarray(data), METRICS[name].dims, METRICS[name].unit, METRICS[name].text)
+        for name, data in result.metrics.items()
+    }
+
+
+_RECORD_LABELS = {
+    "pose": (("time", "pose_axis"), "m; m; rad", "platform pose (x, y, phi)"),
+    "pose_error": (("time", "pose_axis"), "m; m; rad", "pose minus shaped reference"),
+    "slider": (("time", "slider_axis"), "m", "slider position rho"),
+    "modal_coordinate": (("time", "link", "mode"), "m", "modal coordinates q of the plant"),
+    "controlled_coordinate": (
+        ("time", "link", "controlled_mode"),
+        "m",
+        "controller's modes seen by an ideal modal filter",
+    ),
+    "chord_deflection_stations": (
+        ("time", "link", "station"),
+        "m",
+        "deflection relative to the chord B-C at the stations",
+    ),
+    "sensor_voltage": (("time", "link", "patch"), "V", "raw sensor voltage"),
+    "actuator_voltage": (("time", "link", "patch"), "V", "actuator voltage"),
+    "slider_force": (("time", "slider_axis"), "N", "motor force"),
+}
+
+
+@partial(jax.jit, static_argnums=0)
+def _spectrum_frequencies(structure: Structure, case: Case) -> Any:
+    return spectrum_frequencies(structure, find_bases(structure, case))
+
+
+def run_variables(run: Run) -> dict[str, Variable]:
+    """Contents of a run's file: axes, trajectories (if kept), metrics, judgement."""
+    stations = np.array(run.study.metrics.stations)
+    frequency = np.asarray(_spectrum_frequencies(run.structure, run.case))
+    variables = {
+        "station": Variable(stations, ("station",), "1", STATION_TEXT),
+        "link": Variable(np.arange(1, 4), ("link",), "1", "link number"),
+        "pose_axis": Variable(np.array(["x", "y", "phi"]), ("pose_axis",), "1", "pose component"),
+        "spectrum_frequency": Variable(
+            frequency,
+            ("link", "controlled_mode", "spectrum_point"),
+            "Hz",
+            "frequency of spectral_density",
+        ),
+        "status": Variable(np.array(run.status), (), *STATUS_LABEL),
+        "bad_time": Variable(run.result.bad_time, (), "s", "when the status appeared, 0 if ok"),
+        "command_end": Variable(
+            run.result.command_end, (), "s", "end of the shaped reference trajectory"
+        ),
+        "sensor_condition": Variable(
+            run.result.sensor_condition, ("link",), "1", "condition number of the modal filter"
+        ),
+        "actuator_condition": Variable(
+            run.result.actuator_condition, ("link",), "1", "condition number of the synthesizer"
+        ),
+        "singularity_distance": Variable(
+            run.result.singularity_distance,
+            (),
+            "rad",
+            DISTANCE_TEXT,
+        ),
+        **metric_variables(run.result),
+    }
+    if run.loop is not None:
+        variables |= {
+            "loop_spectral_radius": Variable(
+                np.array(run.loop.spectral_radius), (), "1", "of the linearised sampled loop"
+            ),
+            "gain_margin": Variable(
+                np.array(run.loop.gain_margin),
+                (),
+                "1",
+                f"common gain factor before instability, {MARGIN_MODES} plant modes or more",
+            ),
+            "loop_frequency": Variable(
+                run.loop.frequency_hz,
+                ("tracked_mode", "tracked_pole"),
+                "Hz",
+                "frequencies of the lowest link modes under control, three of each order",
+            ),
+            "loop_damping_ratio": Variable(
+                run.loop.damping_ratio,
+                ("tracked_mode", "tracked_pole"),
+                "1",
+                "their damping ratios",
+            ),
+        }
+    if run.poles is not None:
+        texts = ("specified", "of the nominal link's loop", "of the assembled machine's loop")
+        for name, text, pole in zip(PoleReport._fields, texts, run.poles[:3], strict=False):
+            for part, value, unit in (
+                ("decay", -pole.real, "s-1"),
+                ("frequency", np.abs(pole.imag) / (2 * np.pi), "Hz"),
+            ):
+                variables[f"{name}_pole_{part}"] = Variable(
+                    value, ("link", "controlled_mode"), unit, f"{part} of the poles {text}"
+                )
+    if run.motion is not None:
+        instants = ("instant",)
+        variables |= {
+            "motion_time": Variable(
+                run.motion.time, instants, "s", "start of the unshaped motion, and extremes of N"
+            ),
+            "motion_axial_force": Variable(
+                run.motion.axial_force, ("instant", "link"), "N", "tension N in the links then"
+            ),
+            "motion_gain_margin": Variable(
+                run.motion.gain_margin, instants, "1", "gain margin as if the instant lasted"
+            ),
+        }
+    if run.result.record is not None:
+        record = run.result.record
+        variables["time"] = Variable(record.time, ("time",), "s", "time")
+        for name, (dims, unit, text) in _RECORD_LABELS.items():
+            variables[name] = Variable(getattr(record, name), dims, unit, text)
+        variables["chord_deflection"] = Variable(
+            chord_deflection(run), ("time", "link"), "m", "mid-span relative to the chord B-C"
+        )
+    return variables
+
+
+def chord_deflection(run: Run) -> np.ndarray:
+    """Mid-span deflection relative to the chord B-C [m], (n_steps, 3).
+
+    From the plant's modes and, for those it leaves out, the voltages on the actuators.
+    """
+    machine, structure = run.case.machine, run.structure
+    middle = each_link(run.study.link.length)[:, None] / 2
+    shape = build_basis(structure.basis, machine.beam, machine.patches, structure.n_modes, middle)
+    record = run.result.record
+    assert record is not None
+    bent = np.einsum("tir,ir->ti", record.modal_coordinate, np.asarray(shape.deflection_at)[:, 0])
+    if structure.has_static_correction:
+        per_volt = np.asarray(left_out_deflection(run.case, shape))[:, 0]
+        bent = bent + np.einsum("tik,ik->ti", _applied_voltage(run), per_volt)
+    return bent
+
+
+def _applied_voltage(run: Run) -> np.ndarray:
+    """Behind the amplifiers, at the sampling instants [V], (n_steps, 3, K)."""
+    assert run.result.record is not None
+    command = np.asarray(run.result.record.actuator_voltage)
+    if not run.structure.has_amplifier:
+        return command
+    electronics = run.case.electronics
+    kept = np.exp(-electronics.period / electronics.amplifier_lag)
+    return lfilter([0.0, 1 - kept], [1.0, -kept], command, axis=0)
+
+
+def run_attributes(study: Study) -> dict[str, Any]:
+    """A file's record of its origin: study, versions, device, precision."""
+    return {
+        "title": study.title,
+        "study": json.dumps(study.model_dump(mode="json")),
+        **{name.replace("-", "_"): fact for name, fact in config.origin().items()},
+    }
