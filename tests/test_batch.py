@@ -10,7 +10,7 @@ import pytest
 from jaxmodel import status
 from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import simulate
-from studies.engine.program import one_at_a_time
+from studies.engine.function import one_at_a_time
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study
 

@@ -125,7 +125,7 @@ def test_jacobians_and_rounded_loops(rounded, smooth, parameters, monkeypatch):
 
 
 def test_without_kernels_it_is_the_scan(monkeypatch):
-    monkeypatch.setattr(module, "fits_kernel", lambda structure: False)
+    monkeypatch.setattr(module, "stepper", lambda structure: "scan")
     traced = jax.make_jaxpr(batched(STUDY, place))(np.ones((2, 3)))
     assert "ffi_call" not in str(traced) and "scan" in str(traced)
 

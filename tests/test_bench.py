@@ -9,7 +9,7 @@ import pytest
 from studies import cli
 from studies.bench import peers
 from studies.bench.works import WORKS
-from studies.engine.kernel_executor import KernelExecutor
+from studies.engine.executor import Executor
 
 KEYS = "work executor configs_per_s compile_s peak_mib device dtype batch steps fingerprint"
 
@@ -22,7 +22,7 @@ def work():
 
 
 def check_agreement(rms, work):
-    own = KernelExecutor(work.structure, work.layout, False).start(work.cases).wait()
+    own = Executor(work.structure, work.layout, kind="kernel").start(work.cases).wait()
     wanted = own.metrics.residual_rms[: len(rms)]
     assert wanted.min() > 1e-9
     np.testing.assert_allclose(rms, wanted, atol=2e-6 * wanted.max())

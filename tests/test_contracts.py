@@ -17,9 +17,9 @@ from jaxmodel.laws.contract import Law, Parameter, acting_channels, modal_feedba
 from jaxmodel.metrics import METRICS, Metric, is_real
 from jaxmodel.table import Table
 from studies import sources
-from studies.bench.works import EXECUTORS
 from studies.cli import main
 from studies.engine.columns import PER_CASE
+from studies.engine.executor import Executor
 from studies.engine.folder import DECISIVE
 from studies.engine.margins import judge_loops
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
@@ -188,9 +188,8 @@ def test_own_parts_on_kernel_and_scan(own):
     structure = group.structure._replace(metrics=("turning", "residual_rms"))
     cases = chunk_cases(table, group.rows, structure, group.layout.size)
     found = {
-        name: make(structure, group.layout, False).start(cases).wait().metrics
-        for name, make in EXECUTORS.items()
-        if name != "gpu"
+        kind: Executor(structure, group.layout, kind=kind).start(cases).wait().metrics
+        for kind in ("kernel", "scan")
     }
     one, *others = found.values()
     for other in others:
@@ -397,7 +396,7 @@ def test_every_source_of_a_number_is_in_the_digest(tmp_path):
         ("studies/engine/screen.py", sweeps),
         ("studies/study/consistency.py", sweeps),
         ("studies/kernels/derivatives.py", sweeps),
-        ("studies/engine/gradients.py", workers),
+        ("studies/engine/function.py", workers),
         ("studies/tuning/merit.py", workers),
     ):
         path = tmp_path / name

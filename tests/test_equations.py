@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from studies.engine import batched as batched_module
-from studies.engine import gradients, lanes, plan, steps
-from studies.engine.executor import make_executor
-from studies.engine.kernel_executor import KernelExecutor
-from studies.engine.scan import ScanExecutor
+from studies.engine import function, lanes, plan
+from studies.engine.executor import Executor
+from studies.engine.function import STEPPERS
 from studies.errors import NoKernelError, NoKernelWarning
 from studies.kernels import cpu, graph
 from studies.kernels.equations import call_of, literal, scan_of, trace
@@ -120,7 +119,7 @@ def unknown(equation):
 def no_structure(monkeypatch):
     """A JAX whose programs cannot be read."""
     monkeypatch.setattr(graph, "scan_of", unknown)
-    monkeypatch.setattr(steps, "_STEPS", {})
+    monkeypatch.setattr(function, "_FUNCTIONS", {})
 
 
 def test_errors_of_a_graph_name_the_version(no_structure):
@@ -141,21 +140,21 @@ def test_a_sweep_runs_by_the_scan_and_says_so(capsys, tmp_path, monkeypatch, no_
 
 def test_the_results_are_those_of_the_kernel(chunk, no_structure, monkeypatch):  # noqa: F811
     structure, cases, _ = chunk
-    executor = make_executor(structure, LAYOUT, False)
+    executor = Executor(structure, LAYOUT)
     found = executor.start(cases).wait()
     assert executor.name.startswith("XLA scan (")
     monkeypatch.undo()
-    wanted = make_executor(structure, LAYOUT, False)
+    wanted = Executor(structure, LAYOUT)
     check_equal(found, wanted.start(cases).wait())
-    assert wanted.name == KernelExecutor.name and ScanExecutor.name in executor.name
+    assert wanted.name == STEPPERS["kernel"] and STEPPERS["scan"] in executor.name
 
 
 def test_gradients_without_a_kernel(chunk, no_structure):  # noqa: F811
     structure, cases, parameters = chunk
-    made = gradients.make_gradients(structure, LAYOUT, place, parameters.shape[1])
+    executor = Executor(structure, LAYOUT, place=place)
     with pytest.warns(NoKernelWarning, match="XLA's scan runs instead"):
-        made.evaluate(cases, parameters)
-    assert (made.name, made.mode) == ("XLA scan", "forward") and made.compile_time > 0
+        executor.differentiate(cases, parameters)
+    assert executor.name.startswith("XLA scan (") and executor.compile_time > 0
 
 
 def test_batched_without_a_kernel(no_structure):

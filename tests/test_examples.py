@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from studies.engine.executor import make_executor
+from studies.engine.executor import Executor
 from studies.engine.plan import chunk_cases, even_layout, plan_groups
 from studies.space.table import CaseTable
 from studies.study.files import READY, read_toml
@@ -172,7 +172,7 @@ def residual():
         table, np.arange(len(table)), lambda n, _: even_layout(n), ("residual_rms",), False, False
     )
     for group in groups:
-        executor = make_executor(group.structure, group.layout, False)
+        executor = Executor(group.structure, group.layout)
         chunk = chunk_cases(table, group.rows, group.structure, group.layout.size)
         found = executor.start(chunk).wait().metrics.residual_rms
         rms[group.rows] = np.asarray(found)[: len(group.rows)].max(axis=-1)

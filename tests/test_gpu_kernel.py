@@ -16,11 +16,10 @@ import pytest
 from jaxmodel import status
 from studies import config
 from studies.bench.works import METRICS, WORKS
-from studies.engine import executor as executors
-from studies.engine.executor import KernelOrScan, executor_text, make_executor
-from studies.engine.kernel_executor import GpuExecutor, KernelExecutor
+from studies.engine import function
+from studies.engine.executor import Executor, executor_text
+from studies.engine.function import STEPPERS, stepper
 from studies.engine.plan import Layout
-from studies.engine.scan import ScanExecutor
 from studies.kernels import gpu, llvm, native
 from studies.kernels.traced import InputLeaf, trace_loop
 from studies.study.cases import build_cases, build_structure
@@ -77,10 +76,10 @@ def work(name, size=LAYOUT.size):
 def test_gpu_executor_equals_the_traced_kernel(name, monkeypatch):
     monkeypatch.setattr(gpu, "build_kernel", rehearsed)
     structure, cases = work(name)
-    executor = GpuExecutor(structure, LAYOUT, False)
+    executor = Executor(structure, LAYOUT, kind="gpu")
     found = executor.start(cases).wait()
     assert executor.name == "GPU kernel" and executor.compile_time > 0
-    wanted = KernelExecutor(structure, LAYOUT, False).start(cases).wait()
+    wanted = Executor(structure, LAYOUT, kind="kernel").start(cases).wait()
     assert set(wanted.status) == {status.OK, status.DIVERGED}
     check_equal(found, wanted)
     rms = wanted.metrics.residual_rms[wanted.status == status.OK]
@@ -96,12 +95,11 @@ def test_wrong_results_are_noticed(monkeypatch):
         return lambda arrays: [1.001 * x for x in run(arrays)]
 
     monkeypatch.setattr(gpu, "build_kernel", wrong)
-    monkeypatch.setattr(executors, "ScanExecutor", KernelExecutor)  # compiled already
     structure, cases = work("W1")
-    executor = KernelOrScan(GpuExecutor, structure, LAYOUT, False)
+    executor = Executor(structure, LAYOUT, kind="gpu")
     found = executor.start(cases).wait()
     assert re.fullmatch(
-        rf"{KernelExecutor.name} \(the GPU kernel differs by 0\.001 from the same on the CPU\)",
+        rf"{STEPPERS['scan']} \(the GPU kernel differs by 0\.001 from the scan\)",
         executor.name,
     )
     assert np.sum(found.status == status.OK) == LAYOUT.size - 1
@@ -110,18 +108,17 @@ def test_wrong_results_are_noticed(monkeypatch):
 def test_without_the_call_target_the_scan_runs(monkeypatch):
     """Here XLA knows no call of PTX, as an older or newer one might not."""
     monkeypatch.setattr(gpu, "JAXLIB", f"{gpu.KNOWN}.2")
-    monkeypatch.setattr(executors, "ScanExecutor", KernelExecutor)
     structure, cases = work("W1")
-    executor = KernelOrScan(GpuExecutor, structure, LAYOUT, False)
+    executor = Executor(structure, LAYOUT, kind="gpu")
     assert executor.start(cases).wait().status[0] == status.OK
     assert "(the GPU kernel failed: " in executor.name
 
 
 def test_with_another_jaxlib_the_scan_runs(monkeypatch):
-    monkeypatch.setattr(executors, "ScanExecutor", KernelExecutor)
     monkeypatch.setattr(gpu, "JAXLIB", "0.11.1")
+    monkeypatch.setattr(function, "_FUNCTIONS", {})
     structure, cases = work("W1")
-    executor = KernelOrScan(GpuExecutor, structure, LAYOUT, False)
+    executor = Executor(structure, LAYOUT, kind="gpu")
     assert executor.start(cases).wait().status[0] == status.OK
     assert "is known to run with jaxlib 0.10 only, this is 0.11.1" in executor.name
 
@@ -139,10 +136,9 @@ def test_what_sweeps_run_with_is_said(monkeypatch):
 
 def test_it_is_chosen_on_a_graphics_processor(monkeypatch):
     structure, _ = work("W1")
-    monkeypatch.setattr("studies.engine.executor.processor", lambda: "cuda")
-    assert make_executor(structure, LAYOUT, False).name == GpuExecutor.name
-    slow = structure._replace(substeps=100)
-    assert make_executor(slow, LAYOUT, False).name == ScanExecutor.name
+    monkeypatch.setattr(function, "processor", lambda: "cuda")
+    assert stepper(structure) == "gpu"
+    assert stepper(structure._replace(substeps=100)) == "scan"
     assert config.processor() == "cpu"
 
 

@@ -10,12 +10,9 @@ import pytest
 from jaxmodel import status
 from jaxmodel.trigonometry import sine_cosine
 from studies.bench.works import METRICS, WORKS
-from studies.engine.executor import make_executor
-from studies.engine.kernel_executor import KernelExecutor
+from studies.engine.executor import CaseLeaves, Executor
+from studies.engine.function import STEPPERS, TRACES, block_function
 from studies.engine.plan import Layout, chunk_cases, local_layout, plan_groups
-from studies.engine.program import TRACES, Program, split_cases
-from studies.engine.scan import ScanExecutor
-from studies.engine.steps import trace_steps
 from studies.errors import NoKernelError
 from studies.kernels import compilation, cpu, llvm, native
 from studies.kernels.compilation import ObjectCache
@@ -51,8 +48,8 @@ def both(spec):
     group = plan_groups(table, np.arange(len(table)), local_layout)[0]
     cases = chunk_cases(table, np.arange(len(table)), group.structure, LAYOUT.size)
     return [
-        executor(group.structure, LAYOUT, False).start(cases).wait()
-        for executor in (KernelExecutor, ScanExecutor)
+        Executor(group.structure, LAYOUT, kind=kind).start(cases).wait()
+        for kind in ("kernel", "scan")
     ]
 
 
@@ -134,9 +131,9 @@ def test_odd_numbers_of_cases_fill_whole_vectors():
 def test_without_llvmlite_the_scan_runs(monkeypatch):
     table = build_table(small_spec(MIXED))
     group = plan_groups(table, np.arange(8), local_layout)[0]
-    assert make_executor(group.structure, LAYOUT, False).name == KernelExecutor.name
+    assert Executor(group.structure, LAYOUT).name == STEPPERS["kernel"]
     monkeypatch.setattr(llvm, "binding", None)
-    assert make_executor(group.structure, LAYOUT, False).name == ScanExecutor.name
+    assert Executor(group.structure, LAYOUT).name == STEPPERS["scan"]
 
 
 # --- the translation itself -----------------------------------------------------------------------
@@ -378,7 +375,7 @@ def workload(work):
 def operations_of(work):
     """Operations of one sample of a workload, by kind."""
     structure, cases = workload(work)
-    made = KernelExecutor(structure, LAYOUT, False)
+    made = Executor(structure, LAYOUT, kind="kernel")
     before = len(TRACES)
     made.start(cases).wait()
     made.start(cases).wait()
@@ -420,10 +417,13 @@ def test_code_of_a_sample_is_as_small_as_it_should_be(work, kind):
         pytest.skip("needs an x86 processor")
     processor = native.Processor(*kind, triple)
     structure, cases = workload(work)
-    split = split_cases(cases, LAYOUT, structure, False)
-    program = Program(structure, LAYOUT, split.tree, split.is_varying)
-    traced = trace_steps(program, split, has_routines=not processor.has_masks)
-    code = native.machine_code(str(cpu.write_loop(traced.loop, processor).module), processor, 3)
+    leaves, tree = jax.tree.flatten(cases)
+    is_own = tuple(len(leaf) > 1 for leaf in leaves)
+    own = [x[: LAYOUT.lanes] for x, yes in zip(leaves, is_own, strict=True) if yes]
+    shared = [x[0] for x, yes in zip(leaves, is_own, strict=True) if not yes]
+    block = block_function(structure, CaseLeaves(tree, is_own), (), own, shared)
+    loop = trace_loop(*block.loop_arguments(), np.float64, 0, not processor.has_masks)
+    code = native.machine_code(str(cpu.write_loop(loop, processor).module), processor, 3)
     sections = native.binding.ObjectFileRef.from_data(code).sections()
     size = sum(section.size() for section in sections if section.is_text())
     assert 0.8 * CODE[kind][work] < size < CODE[kind][work]

@@ -8,10 +8,9 @@ from jaxmodel import status
 from jaxmodel.sampled_loop import closed_loop
 from jaxmodel.simulate import simulate
 from studies.engine.columns import LEFT_OUT
-from studies.engine.kernel_executor import KernelExecutor
+from studies.engine.executor import Executor
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.results import metric_values
-from studies.engine.scan import ScanExecutor
 from studies.engine.sweep import make_plan, run_sweep
 from studies.errors import StudyError
 from studies.space.spec import parse_sweep
@@ -204,8 +203,8 @@ def test_kernel_equals_scan_for_the_linear_model(folders, sorts):
     group = plan_groups(table, rows, local_layout, tuple(metrics), is_linear=True)[0]
     cases = chunk_cases(table, rows, group.structure, group.layout.size)
     fast, reference = (
-        executor(group.structure, group.layout, False).start(cases).wait()
-        for executor in (KernelExecutor, ScanExecutor)
+        Executor(group.structure, group.layout, kind=kind).start(cases).wait()
+        for kind in ("kernel", "scan")
     )
     assert np.sum(reference.status == status.OK) >= 8
     check_equal(fast, reference)
@@ -216,7 +215,7 @@ def test_a_linear_sample_takes_far_fewer_operations(folders):
     table, rows = build_table(spec), np.arange(64)
     for is_linear in (False, True):  # as in the folders, so already compiled
         (group,) = plan_groups(table, rows, local_layout, spec.sweep.metrics, is_linear)
-        made = KernelExecutor(group.structure, group.layout, False)
+        made = Executor(group.structure, group.layout, kind="kernel")
         made.start(chunk_cases(table, rows, group.structure, group.layout.size)).wait()
         found.append(made.operations)
     full, linear = (sum(x.values()) - x["read"] for x in found)

@@ -20,10 +20,10 @@ from jaxmodel.state_space import (
     modal_form,
     with_sensors,
 )
-from studies.bench.works import EXECUTORS
 from studies.cli import main
 from studies.engine.blocks import responses
 from studies.engine.controller import fixed_controller
+from studies.engine.executor import Executor
 from studies.engine.margins import judge_loops
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.preflight import check_run
@@ -187,7 +187,7 @@ def test_margins_and_the_sweep(thirty):
     structure = group.structure._replace(metrics=("residual_rms", "peak_voltage"))
     cases = chunk_cases(table, group.rows, structure, group.layout.size)
     one, other = (
-        EXECUTORS[name](structure, group.layout, False).start(cases).wait()
+        Executor(structure, group.layout, kind=name).start(cases).wait()
         for name in ("kernel", "scan")
     )
     np.testing.assert_array_equal(one.status, 0)

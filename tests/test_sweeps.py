@@ -20,11 +20,11 @@ from rich.console import Console
 
 import studies
 from jaxmodel import status
-from studies.engine import plan, steps
+from studies.engine import function, plan
 from studies.engine import sweep as run_module
 from studies.engine.design import deviation, load_design
 from studies.engine.folder import CHUNKS, finished_cases, make_manifest, open_folder
-from studies.engine.program import TRACES
+from studies.engine.function import TRACES
 from studies.engine.results import load, metric_values
 from studies.engine.runs import run_study
 from studies.engine.sweep import make_plan, run_sweep
@@ -53,7 +53,7 @@ def mixed(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan, "LANES", 8)
         patch.setattr(plan, "LARGEST_CHUNK", 16)
-        patch.setattr(steps, "_STEPS", {})  # other tests of this process may have compiled it
+        patch.setattr(function, "_FUNCTIONS", {})  # of other tests
         before = len(TRACES)
         outcome = run(small_spec(), out)
     assert outcome.n_done == outcome.n_run == 72

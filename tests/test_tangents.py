@@ -5,15 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from studies.engine import gradients
-from studies.engine.gradients import (
-    KernelAdjoint,
-    KernelGradients,
-    ScanGradients,
-    make_gradients,
-)
+from studies.engine import function
+from studies.engine.executor import Executor
 from studies.engine.plan import Layout
-from studies.kernels import native
+from studies.kernels import bridge, native
 from studies.kernels.adjoint import trace_adjoint
 from studies.kernels.cpu import build_kernel
 from studies.kernels.derivatives import push_forward
@@ -64,27 +59,6 @@ def chunk():
     return structure, cases, parameters
 
 
-@pytest.mark.long  # in short: gradients of tunings (test_tuning.py) are those of differences
-def test_kernel_and_scan_agree(chunk):
-    structure, cases, parameters = chunk
-    fast, slow = (
-        executor(structure, LAYOUT, place).evaluate(cases, parameters)
-        for executor in (KernelGradients, ScanGradients)
-    )
-    np.testing.assert_array_equal(fast.result.status, slow.result.status)
-    good = np.flatnonzero(fast.result.status == 0)
-    assert len(good) == LAYOUT.size - 1  # the one that is thrown off spoils no other
-    for name, a in fast.metrics.items():
-        b = slow.metrics[name]
-        assert a.shape[:2] == (LAYOUT.size, N_PARAMETERS)
-        size = np.abs(b[good]).max()
-        assert np.abs(a[good] - b[good]).max() <= 1e-9 * size, name
-    stopped = np.delete(fast.metrics.residual_rms, good, axis=0)
-    assert len(stopped) == 1 and (stopped == 0).all()
-    rms = fast.metrics.residual_rms[good]
-    assert (np.abs(rms).max((0, 2, 3)) > 0).all()  # by every parameter
-
-
 def test_every_operation_is_differentiated():
     """Directions of a state, pushed through one step, against `jax.jvp`."""
     random, shape, lanes, directions = np.random.default_rng(1), (3, 4), 16, 2
@@ -128,33 +102,26 @@ def weights(metrics, random):
     return jax.tree.map(some, metrics)
 
 
-def assert_gradients_agree(chunk, executor, monkeypatch):
+@pytest.mark.long  # in short: the reverse of a loop below, and gradients of tunings
+def test_kernel_and_scan_agree(chunk, monkeypatch):
     structure, cases, parameters = chunk
-    monkeypatch.setattr(gradients, "RECORD", 2**18)  # several pieces
-    back = KernelAdjoint(structure, LAYOUT, place).evaluate(cases, parameters)
-    ahead = executor(structure, LAYOUT, place).evaluate(cases, parameters)
-    np.testing.assert_array_equal(back.result.status, ahead.result.status)
-    by = weights(ahead.result.metrics, np.random.default_rng(3))
-    found, wanted = back.pull_back(by), ahead.pull_back(by)
-    good = ahead.result.status == 0
+    monkeypatch.setattr(bridge, "RECORD", 2**18)  # several pieces, the last one shorter
+    monkeypatch.setattr(function, "_FUNCTIONS", {})
+    fast, slow = (
+        Executor(structure, LAYOUT, place=place, kind=kind).differentiate(cases, parameters)
+        for kind in ("kernel", "scan")
+    )
+    np.testing.assert_array_equal(fast.result.status, slow.result.status)
+    by = weights(slow.result.metrics, np.random.default_rng(3))
+    found, wanted = fast.pull_back(by), slow.pull_back(by)
+    good = slow.result.status == 0
     assert found.shape == wanted.shape == (3, LAYOUT.size, N_PARAMETERS)
+    # the one that is thrown off spoils no other
     assert good.sum() == LAYOUT.size - 1 and (found[:, ~good] == 0).all()
     assert (found[1, 7:] == 0).all() and (found[1, 5:7] != 0).all()
     size = np.abs(wanted[:, good]).max(axis=(0, 1))
+    assert (size > 0).all()  # by every parameter
     assert (np.abs(found - wanted)[:, good] <= 1e-9 * size).all()
-
-
-@pytest.mark.long  # in short: the reverse of a loop below, and gradients of tunings
-@pytest.mark.parametrize("executor", [KernelGradients, ScanGradients])
-def test_reverse_mode_agrees_with_forward_mode(chunk, executor, monkeypatch):
-    assert_gradients_agree(chunk, executor, monkeypatch)
-
-
-def test_mode_by_number_of_parameters(chunk):
-    """Forward for few parameters, reverse for many."""
-    structure = chunk[0]
-    for count, mode in ((1, "forward"), (3, "forward"), (4, "reverse"), (100, "reverse")):
-        assert make_gradients(structure, LAYOUT, place, count).mode == mode
 
 
 @pytest.mark.parametrize("has_masks", [True, False])

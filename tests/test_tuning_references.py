@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from studies.engine.frame import frame_of
+from studies.engine.function import TRACES
 from studies.engine.preflight import check_run
-from studies.engine.program import TRACES
 from studies.engine.runs import run_study
 from studies.tuning import linear_fidelity, references
 from studies.tuning.check import fresh_columns

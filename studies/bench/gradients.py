@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -12,19 +11,7 @@ from jaxmodel.case import Case
 from jaxmodel.parameters import Array
 from studies import config
 from studies.bench.works import build_work, check_executor, describe, make_layout, timed
-from studies.engine.gradients import (
-    Gradients,
-    KernelAdjoint,
-    KernelGradients,
-    ScanGradients,
-    make_gradients,
-)
-
-GRADIENTS: dict[str, Callable[..., Gradients]] = {
-    "kernel": KernelAdjoint,
-    "forward": KernelGradients,
-    "scan": ScanGradients,
-}
+from studies.engine.executor import Executor
 
 
 def place_gains(case: Case, parameters: Array) -> Case:
@@ -38,8 +25,7 @@ def bench_gradients(executor: str = "", batch: int = 0) -> dict[str, Any]:
     """Gradients per second of the residual rms of W0 by its nine gains.
 
     Args:
-        executor: "kernel", "forward" (the kernel with tangents), "scan", or "" for the fastest
-            available.
+        executor: "kernel", "scan", or "" for the fastest available.
         batch: cases per chunk; 0: two blocks of lanes on every device.
 
     Returns:
@@ -48,20 +34,17 @@ def bench_gradients(executor: str = "", batch: int = 0) -> dict[str, Any]:
     Raises:
         StudyError: unknown executor, or one that is not installed.
     """
-    check_executor(executor, GRADIENTS)
+    check_executor(executor, ("kernel", "scan"))
     config.require_configured()
     layout = make_layout(batch)
     structure, cases = build_work("W0", layout)
     random = np.random.default_rng(1)
     ratio = np.asarray(cases.control.ratio).reshape(1, -1)
     parameters = ratio * random.uniform(0.5, 2.0, (layout.size, ratio.size))
-    if executor:
-        made = GRADIENTS[executor](structure, layout, place_gains)
-    else:
-        made = make_gradients(structure, layout, place_gains, ratio.size)
+    made = Executor(structure, layout, place=place_gains, kind=executor)
 
     def gradients() -> np.ndarray:
-        found = made.evaluate(cases, parameters)
+        found = made.differentiate(cases, parameters)
         by = jax.tree.map(lambda x: np.ones((1, *x.shape)), found.result.metrics)
         return found.pull_back(by)[0]
 
@@ -69,7 +52,7 @@ def bench_gradients(executor: str = "", batch: int = 0) -> dict[str, Any]:
     gradient = found.mean(axis=0)
     return {
         "work": "grad",
-        "executor": f"{made.name}, {made.mode}",
+        "executor": made.name,
         "parameters": ratio.size,
         **describe(layout, structure, timing, gradient.dtype),
         "fingerprint": float(np.linalg.norm(gradient)),

@@ -32,9 +32,8 @@ from jaxmodel.simulate import Start, begin
 from studies import config
 from studies.bench import reference
 from studies.bench.works import build_work, make_layout, timed
-from studies.engine.kernel_executor import KernelExecutor
+from studies.engine.executor import Executor
 from studies.engine.plan import Layout
-from studies.engine.scan import ScanExecutor
 from studies.kernels.llvm import is_available
 from studies.study.cases import as_arrays
 from studies.study.spec import paper_study
@@ -117,7 +116,7 @@ def bench_peers(
     config.require_configured()
     work = make_work(is_short)
     finer = work.structure._replace(substeps=FINER)
-    exact = ScanExecutor(finer, work.layout, False).start(work.cases).wait().metrics.residual_rms
+    exact = Executor(finer, work.layout, kind="scan").start(work.cases).wait().metrics.residual_rms
     rows: list[PeerRow] = []
     peers = find_peers(work, report)
     for peer in peers:
@@ -167,17 +166,17 @@ def find_peers(work: Work, report: Callable[[str], None]) -> list[Peer]:
     """Peers that can run here; `report` is told about the others."""
     size = work.layout.size
 
-    def own(executor: Any) -> Callable[[], Any]:
-        made = executor(work.structure, work.layout, False)
+    def own(kind: str) -> Callable[[], Any]:
+        made = Executor(work.structure, work.layout, kind=kind)
         return lambda: made.start(work.cases).wait().metrics.residual_rms
 
     peers = [
-        Peer("this program, XLA scan", size, own(ScanExecutor)),
+        Peer("this program, XLA scan", size, own("scan")),
         Peer("closed form, SciPy solve_ivp (DOP853)", 1, by_scipy(work)),
         Peer("autodiff Lagrangian, RK4 in a scan, vmap", 8, by_lagrangian(work, 8)),
     ]
     if is_available():
-        peers.append(Peer(KERNEL, size, own(KernelExecutor)))
+        peers.append(Peer(KERNEL, size, own("kernel")))
     else:
         report("no traced kernel: install flexlink-studies[fast]")
     try:

@@ -16,12 +16,10 @@ from rich.console import Console
 from jaxmodel.case import Case, Structure
 from jaxmodel.simulate import Result
 from studies import config
-from studies.engine.executor import make_executor
-from studies.engine.kernel_executor import GpuExecutor, KernelExecutor
+from studies.engine.executor import Executor
+from studies.engine.function import STEPPERS
 from studies.engine.plan import Layout, even_layout, most_lanes, peak_memory
-from studies.engine.program import Executor
 from studies.engine.results import load
-from studies.engine.scan import ScanExecutor
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError, field_error
 from studies.kernels.compilation import compiler_time
@@ -67,16 +65,11 @@ WORKS: dict[str, dict[str, Any]] = {
 }
 #: Metrics they accumulate; all if not named.
 METRICS = {"W0": ("residual_rms",)}
-EXECUTORS: dict[str, Callable[..., Executor]] = {
-    "kernel": KernelExecutor,
-    "scan": ScanExecutor,
-    "gpu": GpuExecutor,
-}
 #: Number of runs; the median counts.
 REPEATS = 5
 
 
-def check_executor(executor: str, known: Iterable[str] = EXECUTORS) -> None:
+def check_executor(executor: str, known: Iterable[str] = STEPPERS) -> None:
     """Reject an executor that is unknown or cannot run here.
 
     Args:
@@ -88,7 +81,7 @@ def check_executor(executor: str, known: Iterable[str] = EXECUTORS) -> None:
     """
     if executor and executor not in known:
         raise field_error("--executor", executor, ", ".join(map(repr, known)))
-    if executor in ("kernel", "forward", "gpu") and not is_available():
+    if executor in ("kernel", "gpu") and not is_available():
         raise StudyError(f"--executor {executor}: needs llvmlite: install flexlink-studies[fast]")
     if executor == "gpu" and config.processor() != "cuda":
         raise StudyError(
@@ -170,7 +163,7 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
 
     Args:
         work: key of WORKS.
-        executor: key of EXECUTORS; "" for the fastest available.
+        executor: key of STEPPERS; "" for the fastest available.
         batch: cases per chunk; 0: as `make_layout`.
 
     Returns:
@@ -187,8 +180,7 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
     structure, exact = build_work(work, layout)
     real = jax.dtypes.canonicalize_dtype(np.float64)
     cases = in_working_precision(exact)
-    chosen = EXECUTORS[executor] if executor else None
-    made = chosen(structure, layout, False) if chosen else make_executor(structure, layout, False)
+    made = Executor(structure, layout, kind=executor)
     result, timing = timed(lambda: made.start(cases).wait())
     rms = result.metrics.residual_rms
     figures: dict[str, Any] = {"work": work, "executor": made.name}
@@ -202,7 +194,7 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
 def _errors(result: Result, structure: Structure, layout: Layout, cases: Case) -> dict[str, float]:
     """Largest error of each metric against double precision, relative to its largest value."""
     with jax.enable_x64(True):
-        reference = ScanExecutor(structure, layout, False).start(cases).wait()
+        reference = Executor(structure, layout, kind="scan").start(cases).wait()
     return {
         name: float(f"{np.nanmax(np.abs(a - b)) / max(np.nanmax(np.abs(b)), 1e-300):.2g}")
         for name, b in reference.metrics.items()

@@ -19,9 +19,8 @@ from distributed import Worker, get_worker
 from jaxmodel.case import Structure
 from studies import config, sources
 from studies.engine.chunks import JudgedChunk, start_chunk
-from studies.engine.executor import make_executor
+from studies.engine.executor import Executor
 from studies.engine.plan import chunk_cases, even_layout, local_layout
-from studies.engine.program import Executor
 from studies.errors import StudyError
 from studies.extensions import extend_as_told
 from studies.space.spec import parse_sweep
@@ -125,4 +124,4 @@ def _executor(
     precision: str, spec: str, structure: Structure, size: int, has_own_ratio: bool
 ) -> Executor:
     """The sweep's own executor: numbers shared by all its cases are compiled into its program."""
-    return make_executor(structure, even_layout(size), has_own_ratio)
+    return Executor(structure, even_layout(size), has_own_ratio)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +15,11 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.parameters import Array
-from jaxmodel.simulate import Result, simulate
-from studies.config import processor
-from studies.engine.plan import Layout, lane_unit
+from jaxmodel.simulate import Result
+from studies.engine.executor import CaseLeaves, Place
+from studies.engine.function import BlockFunction, stepper
+from studies.engine.plan import lane_unit
 from studies.engine.preflight import check_run
-from studies.engine.program import Place, Program, begin_block, conclude_all, split_cases
-from studies.engine.steps import fits_kernel, given_loop, read_leaves, start_parts
 from studies.errors import NoKernelError, StudyError, warn_of_scan
 from studies.kernels import bridge
 from studies.study.spec import Study
@@ -51,19 +49,17 @@ def batched(study: Study, place: Place) -> Callable[[Array], Result]:
     if not callable(place):
         raise StudyError(f"place: {place!r}; expected a function of a case and its parameters")
     structure, case = check_run(study)
-    if processor() != "cpu" or not fits_kernel(structure) or not bridge.is_available():
-        return _checked(case, place, _by_scan(structure, case, place))
-    exact = _by_kernel(structure, case, place)
+    exact = _of_batches(structure, case, place)
     if structure.is_smooth:
         return _checked(case, place, exact)
-    smooth = _by_kernel(structure._replace(is_smooth=True), case, place)
-    found = jax.custom_jvp(exact)
+    smooth = _of_batches(structure._replace(is_smooth=True), case, place)
+    rounded = jax.custom_jvp(exact)
 
-    @found.defjvp
+    @rounded.defjvp
     def rule(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Result, Result]:
         return exact(*primals), jax.jvp(smooth, primals, tangents)[1]
 
-    return _checked(case, place, found)
+    return _checked(case, place, rounded)
 
 
 def _checked(case: Case, place: Place, run: Callable[[Array], Result]) -> Callable[[Array], Result]:
@@ -102,53 +98,28 @@ def _check_place(case: Case, place: Place, parameters: Array) -> None:
             raise StudyError(f"place: case{name} has shape {one.shape}; expected {np.shape(two)}")
 
 
-def _by_scan(structure: Structure, case: Case, place: Place) -> Callable[[Array], Result]:
-    found: Callable[[Array], Result] = jax.vmap(lambda x: simulate(structure, place(case, x)))
-    return found
+def _of_batches(structure: Structure, case: Case, place: Place) -> Callable[[Array], Result]:
+    leaves, tree = jax.tree.flatten(case)
+    build = CaseLeaves(tree, (False,) * len(leaves), place)
 
-
-def _by_kernel(structure: Structure, case: Case, place: Place) -> Callable[[Array], Result]:
     @cache
-    def compiled(lanes: int, count: int) -> Callable[[Array], Result]:
+    def function(lanes: int, count: int) -> BlockFunction:
+        free = np.zeros((lanes, count), jax.dtypes.canonicalize_dtype(float))
+        shared = [np.asarray(leaf) for leaf in leaves]
+
+        def make(kind: str) -> BlockFunction:
+            return BlockFunction(structure, build, free, [], shared, kind)
+
         try:
-            return _program(structure, case, place, lanes, count)
+            return make(stepper(structure))
         except NoKernelError as error:
             warn_of_scan(error)
-            return _by_scan(structure, case, place)
+            return make("scan")
 
     def run(parameters: Array) -> Result:
         n, unit = len(parameters), lane_unit()
         rows = np.minimum(np.arange(-(-n // unit) * unit), n - 1)  # whole vectors
-        result = compiled(len(rows), parameters.shape[1])(parameters[rows])
-        return jax.tree.map(lambda x: x[:n], result)
-
-    return run
-
-
-def _program(
-    structure: Structure, case: Case, place: Place, lanes: int, count: int
-) -> Callable[[Array], Result]:
-    """Results of exactly `lanes` cases with `count` parameters each."""
-    layout = Layout(1, 1, lanes)
-    split = split_cases(jax.tree.map(lambda x: np.asarray(x)[None], case), layout, structure, False)
-    program = Program(
-        structure=structure,
-        layout=layout,
-        tree=split.tree,
-        is_varying=split.is_varying,
-        place=place,
-    )
-    real = jax.dtypes.canonicalize_dtype(np.float64)
-    varying = [np.zeros((lanes, count), real)]
-    parts, shared = bridge.outside(start_parts, program, split._replace(varying=varying))
-    given = given_loop(structure, parts, shared)
-    step = bridge.differentiable(*given, real, structure.n_steps, lanes)
-
-    def run(parameters: Array) -> Result:
-        start = begin_block(program, parts, [parameters], split.shared)
-        inputs = jax.tree.leaves(start.inputs)
-        last = step([*read_leaves(start, parts), *inputs, *jax.tree.leaves(start.state)])
-        state: Any = jax.tree.unflatten(jax.tree.structure(start.state), last)
-        return conclude_all(start.outline, start.state.status, state)
+        one_block = bridge.outside(function, len(rows), parameters.shape[1])
+        return jax.tree.map(lambda x: x[:n], one_block(parameters[rows], []))
 
     return run

@@ -11,10 +11,9 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure, with_ratio
 from jaxmodel.simulate import Result
-from studies.engine.executor import make_executor, own_ratios
+from studies.engine.executor import Executor, own_ratios
 from studies.engine.margins import LoopMargins, judge_loops, no_margins
 from studies.engine.plan import Chunk, Group, Layout, chunk_cases, local_layout
-from studies.engine.program import Executor
 from studies.engine.progress import Reporter
 from studies.kernels.compilation import compiler_time
 from studies.space.table import CaseTable
@@ -82,7 +81,7 @@ class Here:
     ) -> Generator[Done | Lost]:
         for group in groups:
             has_own = has_own_ratio(table, group)
-            executor = make_executor(group.structure, group.layout, has_own)
+            executor = Executor(group.structure, group.layout, has_own)
             pending: tuple[Chunk, Started] | None = None
             for chunk in group.chunks():
                 is_first = executor.compile_time == 0

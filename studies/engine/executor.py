@@ -1,88 +1,294 @@
-"""Executors: how the cases of a chunk are run. All call the same physics.
-
-- `kernels.KernelExecutor`: the traced kernel on all cores; needs the extra `fast`.
-- `kernels.GpuExecutor`: the same on Nvidia GPUs.
-- `scan.ScanExecutor`: `lax.scan` compiled by XLA; everywhere, and the reference.
-
-`make_executor` selects the fastest one that can do the job.
-"""
+"""Chunks of cases, run block by block through one function (`studies.engine.function`)."""
 
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable
-from functools import partial
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
-from jaxmodel.case import Case, Structure, uncontrolled
+from jaxmodel import status
+from jaxmodel.case import Case, Structure, uncontrolled, with_ratio
+from jaxmodel.metrics import Metrics
+from jaxmodel.simulate import Result
 from studies.config import processor
-from studies.engine.kernel_executor import GpuExecutor, KernelExecutor
+from studies.engine.function import STEPPERS, BlockFunction, block_function, stepper
 from studies.engine.plan import Layout
-from studies.engine.program import Executor, Running
-from studies.engine.scan import ScanExecutor
-from studies.engine.steps import fits_kernel
-from studies.errors import NoKernelError
+from studies.errors import NoKernelError, warn_of_scan
 from studies.kernels import native
 from studies.kernels.gpu import is_known
 from studies.kernels.llvm import is_available
 
-_Make = Callable[[Structure, Layout, bool], Executor]
+#: Puts free parameters (p,) into a case; pass the same object every time to avoid recompiling.
+Place = Callable[[Case, Any], Case]
+#: Largest difference of the GPU kernel from the scan, as a share of the largest value.
+TOLERANCE = {8: 1e-6, 4: 1e-2}
 
 
-def make_executor(structure: Structure, layout: Layout, has_own_ratio: bool) -> Executor:
-    """The fastest executor for a group.
+class Running(NamedTuple):
+    """A running chunk."""
 
-    Args:
-        structure: of the group.
-        layout: of its chunks.
-        has_own_ratio: gain ratios come from an uncontrolled pass for some cases.
+    wait: Callable[[], Result]  # until it is done; NumPy arrays
+    cancel: Callable[[], None]  # cancel what has not started yet
+
+
+@dataclass(frozen=True)
+class CaseLeaves:
+    """Makes a case of its leaves: those of its own, those shared, and free parameters, if any."""
+
+    tree: Any  # of a Case
+    is_own: tuple[bool, ...]
+    place: Place | None = None
+
+    def __call__(self, free: Any, own: list[Any], shared: list[Any]) -> Case:
+        sources = {True: iter(own), False: iter(shared)}
+        case: Case = jax.tree.unflatten(self.tree, [next(sources[x]) for x in self.is_own])
+        return case if self.place is None else self.place(case, free)
+
+
+class Executor:
+    """Runs chunks of one group, and differentiates them; cases that share everything compile once.
+
+    Kernels that a group cannot have are replaced by XLA's scan; `name` says why.
     """
-    kernels: dict[str, _Make] = {"cpu": KernelExecutor, "cuda": GpuExecutor}
-    kernel = kernels.get(processor()) if fits_kernel(structure) else None
-    if kernel is None:
-        return ScanExecutor(structure, layout, has_own_ratio)
-    return KernelOrScan(kernel, structure, layout, has_own_ratio)
-
-
-class KernelOrScan:
-    """A kernel; XLA's scan from the first chunk on if the group has none, and `name` says why."""
 
     def __init__(
-        self, kernel: _Make, structure: Structure, layout: Layout, has_own_ratio: bool
+        self,
+        structure: Structure,
+        layout: Layout,
+        has_own_ratio: bool = False,
+        place: Place | None = None,
+        kind: str = "",
     ) -> None:
         """
         Args:
-            kernel: makes the executor to try.
-            structure, layout, has_own_ratio: as for `make_executor`.
+            structure: of the group.
+            layout: of its chunks.
+            has_own_ratio: EMC ratios come from an uncontrolled pass for some cases.
+            place: puts free parameters into a case.
+            kind: how to step, a key of `STEPPERS`; default: the fastest.
         """
-        self.structure = structure
-        self._scan = partial(ScanExecutor, structure, layout, has_own_ratio)
-        self._chosen, self._reason = kernel(structure, layout, has_own_ratio), ""
+        self.structure, self.layout, self.place = structure, layout, place
+        self._has_own_ratio = has_own_ratio
+        self._kind, self._reason = kind or stepper(structure), ""
+        self._function: BlockFunction | None = None
+        self._pool = ThreadPoolExecutor(layout.devices)
+        self.compile_time = 0.0  # [s], 0 before the first chunk
 
     @property
     def name(self) -> str:
-        return self._chosen.name + (f" ({self._reason})" if self._reason else "")
+        """What steps the cases, and why if it is not the fastest."""
+        return STEPPERS[self._kind] + (f" ({self._reason})" if self._reason else "")
 
     @property
-    def compile_time(self) -> float:
-        return self._chosen.compile_time
-
-    @compile_time.setter
-    def compile_time(self, seconds: float) -> None:
-        self._chosen.compile_time = seconds
+    def operations(self) -> Counter[str]:
+        """Operations of one sample by kind, if a kernel runs."""
+        return Counter() if self._function is None else self._function.operations
 
     def start(self, cases: Case) -> Running:
-        started = time.perf_counter()
+        """Start a chunk.
+
+        Args:
+            cases: `layout.size` of them, or leaves of length 1.
+        """
+        function, blocks = self._prepared(cases, ())
+        futures = [self._submit(k, function.run, (), own) for k, own in enumerate(blocks)]
+
+        def cancel() -> None:
+            for future in futures:
+                future.cancel()
+
+        return Running(lambda: _joined([future.result() for future in futures]), cancel)
+
+    def differentiate(self, cases: Case, free: np.ndarray) -> Differentiated:
+        """Run a chunk whose metrics can then be differentiated.
+
+        Args:
+            cases: `layout.size` of them; fields set by the parameters are overwritten.
+            free: parameters, (layout.size, p).
+        """
+        free = np.asarray(free, jax.dtypes.canonicalize_dtype(np.float64))
+        function, blocks = self._prepared(cases, free)
+        parts = np.split(free, len(blocks))
+        futures = [
+            self._submit(k, function.linearise, part, own)
+            for k, (part, own) in enumerate(zip(parts, blocks, strict=True))
+        ]
+        done = [future.result() for future in futures]
+        result = _joined([result for result, _ in done])
+        return Differentiated(result, [pull for _, pull in done], free.shape[1], self._pool)
+
+    def _submit(self, k: int, run: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Run one block; on GPUs the blocks take turns with the devices."""
+        devices = jax.local_devices()
+        is_one = processor() == "cpu" or len(devices) == 1
+        device = nullcontext() if is_one else jax.default_device(devices[k % len(devices)])
+
+        def on_device() -> Any:
+            with device:
+                return run(*arguments)
+
+        return self._pool.submit(on_device)
+
+    def _prepared(self, cases: Case, free: Any) -> tuple[BlockFunction, list[list[np.ndarray]]]:
+        """The function of a block, and the numbers of each."""
+        leaves, tree = jax.tree.flatten(self._widened(cases))
+        leaves = [np.asarray(leaf) for leaf in leaves]
+        is_own = tuple(len(leaf) == self.layout.size for leaf in leaves)
+        own = [leaf for leaf, yes in zip(leaves, is_own, strict=True) if yes]
+        starts = range(0, self.layout.size, self.layout.lanes)
+        blocks = [[leaf[k : k + self.layout.lanes] for leaf in own] for k in starts]
+        if self._function is None:
+            began = time.perf_counter()
+            shared = [leaf[0] for leaf, yes in zip(leaves, is_own, strict=True) if not yes]
+            build = CaseLeaves(tree, is_own, self.place)
+            first = free[: self.layout.lanes] if self.place else (), blocks[0]
+            self._function = self._made(build, *first, shared)
+            self.compile_time = time.perf_counter() - began
+        return self._function, blocks
+
+    def _widened(self, cases: Case) -> Case:
+        """The same program for both passes, which differ in ratios and links."""
+        if not self._has_own_ratio:
+            return cases
+        shape = (self.layout.size, 3, self.structure.n_controlled)
+        cases = with_ratio(cases, np.broadcast_to(cases.control.ratio, shape))
+        links = np.broadcast_to(cases.control.link_mask, shape[:2])
+        return cases._replace(control=cases.control._replace(link_mask=links))
+
+    def _made(self, build: CaseLeaves, free: Any, own: Any, shared: Any) -> BlockFunction:
+        """The function of a block, compiled."""
+
+        def make(kind: str) -> BlockFunction:
+            return block_function(self.structure, build, free, own, shared, kind)
+
         try:
-            return self._chosen.start(cases)
+            function = make(self._kind)
+            if self._kind == "gpu":
+                _check_gpu(function, make("scan"), free, own)
+            function.compile(free, own, is_differentiated=self.place is not None)
+            return function
         except NoKernelError as error:
-            self._reason = str(error)
-            self._chosen = self._scan()
-            lost = time.perf_counter() - started
-            running = self._chosen.start(cases)
-            self.compile_time += lost
-            return running
+            self._kind, self._reason = "scan", str(error)
+            if self.place is not None:
+                warn_of_scan(error)
+            return make("scan")
+
+
+def _joined(parts: list[Result]) -> Result:
+    return jax.tree.map(lambda *x: np.concatenate([np.asarray(one) for one in x]), *parts)
+
+
+class Differentiated:
+    """A chunk whose metrics can be differentiated by the free parameters of its cases."""
+
+    def __init__(
+        self,
+        result: Result,
+        pull_backs: list[Callable[[Any], Any]],
+        n_parameters: int,
+        pool: ThreadPoolExecutor,
+    ) -> None:
+        """
+        Args:
+            result: of all cases.
+            pull_backs: of each block, from `BlockFunction.linearise`.
+            n_parameters: of a case.
+            pool: threads for the blocks.
+        """
+        self.result, self._pull_backs = result, pull_backs
+        self._n_parameters, self._pool = n_parameters, pool
+
+    def pull_back(self, cotangents: Metrics) -> np.ndarray:
+        """Gradients of some numbers by the parameters, (n, cases, p).
+
+        Args:
+            cotangents: derivatives of the numbers by the metrics, (n, cases, ...).
+
+        Returns:
+            0 for cases whose run did not finish.
+        """
+        cotangents = jax.tree.map(np.asarray, cotangents)
+        touched = [(x != 0).reshape(*x.shape[:2], -1).any(-1) for x in jax.tree.leaves(cotangents)]
+        turns = _turns(np.any(touched, axis=0) & np.isin(self.result.status, status.FINISHED))
+        bounds = np.linspace(0, turns.shape[1], len(self._pull_backs) + 1).astype(int)
+        parts = [slice(*x) for x in pairwise(bounds)]
+
+        def one(pull_back: Callable[[Any], Any], part: slice) -> np.ndarray:
+            return self._gradients(pull_back, turns[:, part], part, cotangents)
+
+        return np.concatenate(list(self._pool.map(one, self._pull_backs, parts)), axis=1)
+
+    def _gradients(
+        self,
+        pull_back: Callable[[Any], Any],
+        turns: np.ndarray,
+        part: slice,
+        cotangents: Metrics,
+    ) -> np.ndarray:
+        """Gradients of a block's numbers, (n, lanes, p); a number costs a turn, not each case's."""
+        gradients = np.zeros((*turns.shape, self._n_parameters))
+        count = int((turns >= 0).any(axis=1).sum())
+        if not count:
+            return gradients
+        # whole powers of two, so that few programs are compiled
+        rows = turns[: min(1 << (count - 1).bit_length(), len(turns))]
+        pulled = np.asarray(
+            pull_back(jax.tree.map(lambda x: _in_turn(rows, x[:, part]), cotangents))
+        )
+        turn, lane = np.nonzero(rows >= 0)
+        gradients[rows[turn, lane], lane] = pulled[turn, lane]
+        return gradients
+
+
+def _turns(is_needed: np.ndarray) -> np.ndarray:
+    """The numbers that each case is pulled back from, in turn; -1: none.
+
+    Args:
+        is_needed: (numbers, cases).
+
+    Returns:
+        (numbers, cases).
+    """
+    turns = np.full(is_needed.shape, -1)
+    number, case = np.nonzero(is_needed)
+    turns[(np.cumsum(is_needed, axis=0) - 1)[number, case], case] = number
+    return turns
+
+
+def _in_turn(turns: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Cotangents (numbers, lanes, ...) in the order of the turns."""
+    index = turns.reshape(*turns.shape, *[1] * (x.ndim - 2))
+    return np.where(index >= 0, np.take_along_axis(x, np.maximum(index, 0), 0), 0.0)
+
+
+def _check_gpu(function: BlockFunction, scan: BlockFunction, free: Any, own: Any) -> None:
+    """Compare a kernel that has never run on a device with the scan.
+
+    Raises:
+        NoKernelError: it fails or differs.
+    """
+    try:
+        results, expected = (jax.tree.map(np.asarray, f.run(free, own)) for f in (function, scan))
+    except RuntimeError as error:  # from JAX or the driver
+        raise NoKernelError(f"the GPU kernel failed: {str(error).splitlines()[0]}") from error
+    worst = 0.0
+    for a, b in zip(
+        jax.tree.leaves(results.metrics), jax.tree.leaves(expected.metrics), strict=True
+    ):
+        if not np.array_equal(np.isnan(a), np.isnan(b)):
+            worst = np.inf
+        size = np.nanmax(np.abs(b), initial=1e-300)
+        worst = max(worst, float(np.nanmax(np.abs(a - b), initial=0.0) / size))
+    if worst > TOLERANCE[expected.metrics.residual_rms.dtype.itemsize]:
+        raise NoKernelError(f"the GPU kernel differs by {worst:.1g} from the scan")
 
 
 def executor_text() -> str:
@@ -92,7 +298,7 @@ def executor_text() -> str:
     if processor() == "cpu":
         return f"traced kernel, vectors of {native.this_processor().vector_bytes} bytes"
     if processor() == "cuda" and is_known():
-        return "GPU kernel; never run on a device so far: a sweep's first cases also run on the CPU"
+        return "GPU kernel; never run on a device so far: the first cases also run by the scan"
     return "XLA scan"
 
 

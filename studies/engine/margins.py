@@ -41,8 +41,8 @@ from jaxmodel.return_difference import (
 )
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.engine.damping import damping_ratios, least_controlled
+from studies.engine.function import one_at_a_time
 from studies.engine.lanes import BLOCK, run_steps
-from studies.engine.program import one_at_a_time
 from studies.engine.stability import loop_report, with_margin_modes
 from studies.study.margin import HIGHEST, LOWEST
 

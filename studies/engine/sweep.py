@@ -19,7 +19,7 @@ from jaxmodel.case import Structure
 from studies import config
 from studies.engine.baseline import keep_baseline
 from studies.engine.chunks import Done, Here, Lost, Runner, has_own_ratio, start_chunk
-from studies.engine.executor import make_executor
+from studies.engine.executor import Executor
 from studies.engine.folder import (
     SCREEN,
     Finished,
@@ -384,7 +384,7 @@ def _steps(group: Group) -> int:
 def _timed(table: CaseTable, group: Group) -> tuple[float, float]:
     """Times to compile a program, and to run a chunk of it [s]."""
     has_own = has_own_ratio(table, group)
-    executor = make_executor(group.structure, group.layout, has_own)
+    executor = Executor(group.structure, group.layout, has_own)
     rows = group.chunks()[0].rows
     cases = chunk_cases(table, rows, group.structure, group.layout.size)
 

@@ -22,8 +22,8 @@ from jaxmodel.kinematics import lift, path_status
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.response import BenchPlant, bench_plant, held_modes
+from studies.engine.executor import Place
 from studies.engine.preflight import check_pose
-from studies.engine.program import Place
 from studies.errors import StudyError, field_error
 from studies.space.free import Placing
 from studies.study.cases import as_arrays, build_case, build_structure

@@ -12,7 +12,8 @@ import hashlib
 import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
+from functools import cache, cached_property
+from itertools import pairwise
 from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
@@ -72,73 +73,179 @@ def as_function(loop: TracedLoop, n_steps: int, lanes: int) -> Callable[[Sequenc
     return run
 
 
-def differentiable(
-    step: Callable[..., Any],
-    constants: Sequence[InputLeaf | np.ndarray],
-    inputs: Sequence[InputLeaf],
-    state: Sequence[InputLeaf],
-    dtype: Any,
-    n_steps: int,
-    lanes: int,
-) -> Callable[[list[Any]], list[Any]]:
+#: Tangents per pass of a kernel. More of them share the state's own arithmetic (1: 31 gradients/s
+#: by 9 numbers on a core, 3: 49) but take longer to compile (3 s, 5 s).
+DIRECTIONS = 3
+
+
+class DifferentiableLoop:
     """A loop as a JAX function with derivatives in both modes, all by kernels.
 
-    Args:
-        step, constants, inputs, state, dtype: as for `trace_loop`; what is not marked as moving
-            gets no derivatives.
-        n_steps, lanes: as in `as_function`.
-
-    Returns:
-        The last state as a function of the arrays: constants without known ones, inputs, state.
-
-    Raises:
-        NoKernelError: the step uses what kernels do not support.
+    Called with the arrays constants without known ones, inputs, state, lanes last, it returns the
+    last state.
     """
-    given = step, constants, inputs, state, dtype
-    has_routines = not native.this_processor().has_masks
-    still = (step, *map(_still, (constants, inputs, state)), dtype)
-    plain = as_function(outside(trace_loop, *still, 0, has_routines), n_steps, lanes)
-    tangent = cache(lambda: outside(trace_loop, *given, 1, has_routines))
-    adjoint = cache(lambda: outside(trace_adjoint, *given))
-    read = [leaf for leaf in constants if isinstance(leaf, InputLeaf)]
-    kinds = [*read, *inputs, *(leaf._replace(is_moving=True) for leaf in state)]
-    bounds = len(read), len(read) + len(inputs)
 
-    @jax.custom_jvp
-    def run(leaves: list[Any]) -> list[Any]:
-        return plain(leaves)
+    def __init__(
+        self,
+        step: Callable[..., Any],
+        constants: Sequence[InputLeaf | np.ndarray],
+        inputs: Sequence[InputLeaf],
+        state: Sequence[InputLeaf],
+        dtype: Any,
+        n_steps: int,
+        lanes: int,
+    ) -> None:
+        """
+        Args:
+            step, constants, inputs, state, dtype: as for `trace_loop`; what is not marked as moving
+                gets no derivatives. There is at least one input.
+            n_steps, lanes: as in `as_function`.
 
-    def push(moving: list[int], leaves: list[Any], tangents: list[Any]) -> list[Any]:
-        along = {k: jnp.zeros_like(leaves[k]) for k, leaf in enumerate(kinds) if leaf.is_moving}
-        along |= dict(zip(moving, tangents, strict=True))
-        arrays: list[Any] = []
-        for axis, first, last in ((0, 0, bounds[0]), (1, *bounds), (0, bounds[1], len(kinds))):
-            turned = [jnp.expand_dims(along[k], axis) for k in range(first, last) if k in along]
-            arrays += [*leaves[first:last], *turned]
-        found = as_function(tangent(), n_steps, lanes)(arrays)
-        return [x[0] for x in found[len(state) :]]
+        Raises:
+            NoKernelError: the step uses what kernels do not support.
+        """
+        self._given = step, constants, inputs, state, dtype
+        self.dtype, self.n_steps, self.lanes = dtype, n_steps, lanes
+        read = [leaf for leaf in constants if isinstance(leaf, InputLeaf)]
+        self.kinds = [*read, *inputs, *(leaf._replace(is_moving=True) for leaf in state)]
+        self.first_input, self.first_state = len(read), len(read) + len(inputs)
+        # where instructions take numbers from memory only, small code is fast
+        self._has_routines = not native.this_processor().has_masks
+        still = step, *map(_still, (constants, inputs, state)), dtype
+        self.plain = outside(trace_loop, *still, 0, self._has_routines)
+        # a state's size bounds what its reverse keeps of it
+        row = 8 * lanes * sum(leaf.size for leaf in state)
+        self._length = min(n_steps, max(1, RECORD // max(row, 1)))
+        self._tangents: dict[int, TracedLoop] = {}
+        self._kernels: dict[int, Kernel] = {}
+        self._run = jax.custom_jvp(lambda leaves: self._call(self.plain, n_steps, leaves))
+        self._run.defjvp(self._rule, symbolic_zeros=True)
+        self._ahead = jax.custom_jvp(self.ahead)
+        self._ahead.defjvp(_no_second)
 
-    def pull(moving: list[int], leaves: list[Any], cotangents: list[Any]) -> list[Any]:
-        found = _pulled(adjoint(), leaves, cotangents, bounds, n_steps, lanes)
-        order = [k for k, leaf in enumerate(kinds) if leaf.is_moving]
-        by_leaf = dict(zip(order, found, strict=True))
-        return [by_leaf[k] for k in moving]
+    def __call__(self, leaves: Sequence[Any]) -> list[Any]:
+        last: list[Any] = self._run([jnp.asarray(x, self.dtype) for x in leaves])
+        return last
 
-    def rule(primals: tuple[list[Any]], tangents: tuple[list[Any]]) -> tuple[list[Any], list[Any]]:
+    def note_run(self, seconds: float) -> None:
+        """Say how long a call took, so that kernels which run for long are compiled better."""
+        for kernel in self._kernels.values():
+            kernel.note_run(seconds / len(self._kernels))
+
+    def _call(self, loop: TracedLoop, n_steps: int, leaves: Sequence[Any]) -> list[Any]:
+        run = as_function(loop, n_steps, self.lanes)
+        kernel = _HANDLERS[_registered(loop, n_steps, self.lanes)][1]
+        self._kernels[id(kernel)] = kernel
+        return run(leaves)
+
+    def _rule(
+        self, primals: tuple[list[Any]], tangents: tuple[list[Any]]
+    ) -> tuple[list[Any], list[Any]]:
         (leaves,), (along,) = primals, tangents
-        moving = [k for k, x in enumerate(along) if not isinstance(x, SymbolicZero)]
-        turned = [along[k] for k in moving]
-        shapes = tuple(x.shape for x in leaves[bounds[1] :])
-        linear = _Linear(
-            push=partial(push, moving),
-            pull=partial(pull, moving),
-            n_leaves=len(leaves),
-            shapes=shapes,
-        )
-        return run(leaves), list(_LINEAR.bind(*leaves, *turned, linear=linear))
+        moving = tuple(k for k, x in enumerate(along) if not isinstance(x, SymbolicZero))
+        last, starts = self._ahead(leaves)
+        points = [*leaves, *jax.tree.leaves(starts)]
+        linear = _Linear(self, moving, len(points))
+        pushed = _LINEAR.bind(*points, *(along[k][None] for k in moving), linear=linear)
+        return last, [x[0] for x in pushed]
 
-    run.defjvp(rule, symbolic_zeros=True)
-    return lambda leaves: run([jnp.asarray(x, dtype) for x in leaves])
+    @cached_property
+    def adjoint(self) -> Adjoint:
+        adjoint: Adjoint = outside(trace_adjoint, *self._given)
+        return adjoint
+
+    def tangents(self, directions: int) -> TracedLoop:
+        if directions not in self._tangents:
+            given = *self._given, directions, self._has_routines
+            self._tangents[directions] = outside(trace_loop, *given)
+        return self._tangents[directions]
+
+    def ahead(self, leaves: list[Any]) -> tuple[list[Any], Any]:
+        """The last state, and the states at the starts of all pieces."""
+
+        def one(state: list[Any], rows: list[Any]) -> tuple[list[Any], list[Any]]:
+            arrays = [*leaves[: self.first_input], *rows, *state]
+            return self._call(self.plain, len(rows[0]), arrays), state
+
+        whole, rest = self._pieces(leaves)
+        last, starts = jax.lax.scan(one, leaves[self.first_state :], whole)
+        if rest is None:
+            return last, (starts,)
+        return one(last, rest)[0], (starts, last)
+
+    def _pieces(self, leaves: list[Any]) -> tuple[list[Any], list[Any] | None]:
+        """Rows of the inputs by pieces of equal length, and those of a shorter last piece."""
+        inputs = leaves[self.first_input : self.first_state]
+        count = self.n_steps // self._length
+        end = count * self._length
+        whole = [x[:end].reshape(count, self._length, *x.shape[1:]) for x in inputs]
+        return whole, None if end == self.n_steps else [x[end:] for x in inputs]
+
+    def push(self, moving: Sequence[int], points: list[Any], tangents: list[Any]) -> list[Any]:
+        """Tangents of the last state, (n, ...) each, from those of the moving leaves."""
+        leaves, count = points[: len(self.kinds)], len(tangents[0])
+        size = min(count, DIRECTIONS)
+        padded = [_first_axis_padded(x, size) for x in tangents]
+        parts = [x.reshape(-1, size, *x.shape[1:]) for x in padded]
+        ends = 0, self.first_input, self.first_state, len(self.kinds)
+
+        def one(part: list[Any]) -> list[Any]:
+            given = dict(zip(moving, part, strict=True))
+            arrays: list[Any] = []
+            for axis, (first, last) in zip((0, 1, 0), pairwise(ends), strict=True):
+                arrays += leaves[first:last]
+                for k in range(first, last):
+                    if self.kinds[k].is_moving:
+                        still = jnp.zeros((size, *leaves[k].shape), self.dtype)
+                        arrays.append(jnp.moveaxis(given.get(k, still), 0, axis))
+            results = self._call(self.tangents(size), self.n_steps, arrays)
+            return results[len(self.kinds) - self.first_state :]
+
+        pushed = jax.lax.map(one, parts)
+        return [x.reshape(-1, *x.shape[2:])[:count] for x in pushed]
+
+    def pull(self, moving: Sequence[int], points: list[Any], cotangents: list[Any]) -> list[Any]:
+        """Cotangents of the moving leaves from those of the last state, (n, ...) each.
+
+        Every piece is stepped once more, with a record, and then reversed for each number.
+        """
+        leaves, starts = points[: len(self.kinds)], points[len(self.kinds) :]
+        constants, n_state = leaves[: self.first_input], len(self.kinds) - self.first_state
+        adjoint, count = self.adjoint, len(cotangents[0])
+
+        def back(turned: list[Any], piece: tuple[list[Any], list[Any]]) -> tuple[Any, Any]:
+            rows, state = piece
+            length, given = len(rows[0]), [*constants, *rows]
+            record = self._call(adjoint.forward, length, [*given, *state])[n_state]
+
+            def one(cotangents: list[Any]) -> list[Any]:
+                return self._call(adjoint.backward, length, [*given, record, *cotangents])
+
+            results = jax.lax.map(one, turned)
+            return results[: len(turned)], results[len(turned) :]
+
+        sums = [
+            jnp.zeros((count, *x.shape, self.lanes), self.dtype)
+            for x in adjoint.backward.leaves["state"][n_state:]
+        ]
+        whole, rest = self._pieces(leaves)
+        turned, by_rest = [*cotangents, *sums], None
+        if rest is not None:
+            turned, by_rest = back(turned, (rest, starts[n_state:]))
+        turned, by_input = jax.lax.scan(back, turned, (whole, starts[:n_state]), reverse=True)
+        # (pieces, numbers, rows, ...) to (numbers, samples, ...)
+        by_input = [jnp.moveaxis(x, 0, 1).reshape(count, -1, *x.shape[3:]) for x in by_input]
+        if by_rest is not None:
+            by_input = [jnp.concatenate(x, axis=1) for x in zip(by_input, by_rest, strict=True)]
+        order = [k for k, leaf in enumerate(self.kinds) if leaf.is_moving]
+        by_leaf = [*turned[n_state:], *by_input, *turned[:n_state]]
+        pulled = dict(zip(order, by_leaf, strict=True))
+        return [pulled[k] for k in moving]
+
+
+def _first_axis_padded(x: Any, size: int) -> Any:
+    """Zeros at its end, so that a multiple of `size` divides it."""
+    return jnp.pad(x, [(0, -len(x) % size), *[(0, 0)] * (x.ndim - 1)])
 
 
 def outside(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -148,12 +255,17 @@ def outside(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 class _Linear(NamedTuple):
-    """A linear map of tangents at given leaves, and its transpose."""
+    """The tangents of a loop at a point, or, transposed, its cotangents; several at once."""
 
-    push: Callable[[list[Any], list[Any]], list[Any]]
-    pull: Callable[[list[Any], list[Any]], list[Any]]
-    n_leaves: int
-    shapes: tuple[tuple[int, ...], ...]  # of its results
+    loops: DifferentiableLoop
+    moving: tuple[int, ...]  # leaves with tangents
+    n_points: int  # operands that are not tangents: leaves, and states at the starts of pieces
+    is_transposed: bool = False
+
+    def shapes(self, points: Sequence[Any]) -> list[tuple[int, ...]]:
+        """Of the results, for one number."""
+        last = points[self.loops.first_state : len(self.loops.kinds)]
+        return [x.shape for x in ([points[k] for k in self.moving] if self.is_transposed else last)]
 
 
 #: JAX's operation for such maps; its own one for the purpose cannot be batched.
@@ -162,22 +274,25 @@ _LINEAR.multiple_results = True
 
 
 def _pushed(*args: Any, linear: _Linear) -> list[Any]:
-    return linear.push(list(args[: linear.n_leaves]), list(args[linear.n_leaves :]))
+    apply = linear.loops.pull if linear.is_transposed else linear.loops.push
+    return apply(linear.moving, list(args[: linear.n_points]), list(args[linear.n_points :]))
 
 
 def _abstract(*args: Any, linear: _Linear) -> list[Any]:
-    return [jax.core.ShapedArray(x, args[0].dtype) for x in linear.shapes]
+    count, dtype = args[linear.n_points].shape[0], args[linear.n_points].dtype
+    return [jax.core.ShapedArray((count, *x), dtype) for x in linear.shapes(args)]
 
 
 def _turned_back(cotangents: list[Any], *args: Any, linear: _Linear) -> list[Any]:
-    """Transpose: nothing for the leaves, and for tangents that are none."""
-    leaves, tangents = args[: linear.n_leaves], args[linear.n_leaves :]
+    """Transpose: nothing for the point, and for tangents that are none."""
+    points, tangents = args[: linear.n_points], args[linear.n_points :]
     given = [ad.instantiate_zeros(x) for x in cotangents]
-    shapes = tuple(t.aval.shape if ad.is_undefined_primal(t) else t.shape for t in tangents)
-    back = linear._replace(push=linear.pull, pull=linear.push, shapes=shapes)
-    found = _LINEAR.bind(*leaves, *given, linear=back)
-    kept = [x if ad.is_undefined_primal(t) else None for x, t in zip(found, tangents, strict=True)]
-    return [*[None] * len(leaves), *kept]
+    back = linear._replace(is_transposed=not linear.is_transposed)
+    results = _LINEAR.bind(*points, *given, linear=back)
+    kept = [
+        x if ad.is_undefined_primal(t) else None for x, t in zip(results, tangents, strict=True)
+    ]
+    return [*[None] * len(points), *kept]
 
 
 def _no_second(*_: Any, **__: Any) -> Any:
@@ -186,8 +301,18 @@ def _no_second(*_: Any, **__: Any) -> Any:
     )
 
 
-def _one_by_one(args: Any, axes: Any, *, linear: _Linear) -> Any:
-    """Batching: one after the other, as for the kernel itself."""
+def _batched(args: Any, axes: Any, *, linear: _Linear) -> Any:
+    """Batching: several numbers at one point together, several points one after the other."""
+    n = linear.n_points
+    if all(axis is None for axis in axes[:n]):
+        size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
+        tangents = [
+            jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+            for x, axis in zip(args[n:], axes[n:], strict=True)
+        ]
+        together = [x.reshape(-1, *x.shape[2:]) for x in tangents]
+        results = _LINEAR.bind(*args[:n], *together, linear=linear)
+        return [x.reshape(size, -1, *x.shape[1:]) for x in results], [0] * len(results)
     wide = [jnp.moveaxis(x, k, 0) for x, k in zip(args, axes, strict=True) if k is not None]
 
     def one(row: list[Any]) -> list[Any]:
@@ -195,59 +320,21 @@ def _one_by_one(args: Any, axes: Any, *, linear: _Linear) -> Any:
         own = [x if k is None else next(rest) for x, k in zip(args, axes, strict=True)]
         return list(_LINEAR.bind(*own, linear=linear))
 
-    found = jax.lax.map(one, wide)
-    return found, [0] * len(found)
+    results = jax.lax.map(one, wide)
+    return results, [0] * len(results)
 
 
 _LINEAR.def_impl(_pushed)
 _LINEAR.def_abstract_eval(_abstract)
 ad.primitive_jvps[_LINEAR] = _no_second
 ad.primitive_transposes[_LINEAR] = _turned_back
-batching.primitive_batchers[_LINEAR] = _one_by_one
+batching.primitive_batchers[_LINEAR] = _batched
 mlir.register_lowering(_LINEAR, mlir.lower_fun(_pushed, multiple_results=True))
 
 
 def _still(leaves: Sequence[Any]) -> list[Any]:
     """The same leaves without tangents."""
     return [x._replace(is_moving=False) if isinstance(x, InputLeaf) else x for x in leaves]
-
-
-def _pulled(
-    adjoint: Adjoint,
-    leaves: list[Any],
-    cotangents: list[Any],
-    bounds: tuple[int, int],
-    n_steps: int,
-    lanes: int,
-) -> list[Any]:
-    """Cotangents of the moving leaves from those of the last state, piece by piece."""
-    constants, inputs = leaves[: bounds[0]], leaves[bounds[0] : bounds[1]]
-    length = _piece(n_steps, 8 * adjoint.kept * lanes)
-    forward = as_function(adjoint.forward, length, lanes)
-    backward = as_function(adjoint.backward, length, lanes)
-    n_state = len(adjoint.forward.leaves["state"])
-    rows = [x.reshape(-1, length, *x.shape[1:]) for x in inputs]
-
-    def ahead(state: list[Any], row: list[Any]) -> tuple[list[Any], list[Any]]:
-        return forward([*constants, *row, *state])[:n_state], state
-
-    def back(turned: list[Any], piece: tuple[list[Any], list[Any]]) -> tuple[list[Any], list[Any]]:
-        row, state = piece
-        record = forward([*constants, *row, *state])[n_state]
-        found = backward([*constants, *row, record, *turned])
-        return found[: len(turned)], found[len(turned) :]
-
-    starts = jax.lax.scan(ahead, leaves[bounds[1] :], rows)[1]
-    sums = [jnp.zeros((*x.shape, lanes)) for x in adjoint.backward.leaves["state"][n_state:]]
-    turned, by_input = jax.lax.scan(back, [*cotangents, *sums], (rows, starts), reverse=True)
-    by_input = [x.reshape(n_steps, *x.shape[2:]) for x in by_input]
-    return [*turned[n_state:], *by_input, *turned[:n_state]]
-
-
-def _piece(n_steps: int, row: int) -> int:
-    """Samples of a piece: the most that divide the run and whose record stays in the cache."""
-    whole = (k for k in range(1, n_steps + 1) if n_steps % k == 0)
-    return max(k for k in whole if k == 1 or k * row <= RECORD)
 
 
 def _registered(loop: TracedLoop, n_steps: int, lanes: int) -> str:

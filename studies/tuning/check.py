@@ -13,7 +13,7 @@ from jaxmodel import status
 from jaxmodel.case import Case, Structure
 from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import Result
-from studies.engine.executor import make_executor
+from studies.engine.executor import Executor
 from studies.engine.plan import even_layout
 from studies.engine.poles import PoleReport
 from studies.engine.preflight import check_run
@@ -134,7 +134,7 @@ class PlainRuns:
         """
         self.structure = structure
         self._layout = even_layout(count)
-        self._executor = make_executor(structure, self._layout, False)
+        self._executor = Executor(structure, self._layout)
 
     def run(self, cases: Case, count: int) -> Result:
         """Run cases, leaves (count or 1, ...)."""
@@ -243,7 +243,7 @@ def search(spec: TuneSpec, screen: Any) -> Searched:
     layout = even_layout(count * (1 + CHUNK))
     rows = layout.filled(count * (1 + CHUNK))
     cases = in_working_precision(jax.tree.map(lambda x: x if len(x) == 1 else x[rows], cases))
-    executor = make_executor(structure, layout, False)
+    executor = Executor(structure, layout)
     place, merit = jax.jit(jax.vmap(spec.free.place)), merit_of(spec)
 
     def split(x: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Designs under all scenarios: objective, limits, and their derivatives by the free parameters.
 
-Runs are differentiated by kernels (`studies.engine.gradients`), all scenarios of all designs in one
+Runs are differentiated by kernels (`studies.engine.function`), all scenarios of all designs in one
 batch, with limits and rounding made smooth (`Structure.is_smooth`). Every batch includes the study
 itself as the reference.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.case import Structure
 from studies.config import processor
-from studies.engine.gradients import Differentiated, make_gradients
+from studies.engine.executor import Differentiated, Executor
 from studies.engine.plan import Layout, even_layout, lane_unit
 from studies.engine.preflight import check_run
 from studies.errors import StudyError
@@ -74,8 +74,7 @@ class Evaluator:
         self._cases = in_working_precision(build_cases(study, padded, self._structure))
         self._rows = rows // self.scenarios  # design of every lane, the baseline first
         self.run_time = float("nan")  # time per run of the last batch [s]
-        most = int(self.is_free.sum(axis=1).max())
-        self._gradients = make_gradients(self._structure, self._layout, spec.free.place, most)
+        self._executor = Executor(self._structure, self._layout, place=spec.free.place)
 
     def evaluate(self, values: np.ndarray, has_slope: np.ndarray | bool = True) -> Evaluation:
         """Objective and limits of designs.
@@ -87,11 +86,10 @@ class Evaluator:
         """
         values = np.where(self.is_free, values, np.nan)
         own = np.full((1, values.shape[1]), np.nan)
-        is_compiled, started = self._gradients.compile_time > 0, time.perf_counter()
+        is_compiled, started = self._executor.compile_time > 0, time.perf_counter()
         whole = np.concatenate([own, values])[self._rows]
-        wanted = np.isfinite(values) & np.reshape(has_slope, (-1, 1))
-        used = np.concatenate([np.zeros(own.shape, bool), wanted])[self._rows]
-        runs = self._gradients.evaluate(self._cases, whole, used)
+        needs_slope = (np.isfinite(values) & np.reshape(has_slope, (-1, 1))).any(axis=1)
+        runs = self._executor.differentiate(self._cases, whole)
         shape = (1 + len(values), self.scenarios)
 
         def split(x: Any) -> np.ndarray:
@@ -106,7 +104,7 @@ class Evaluator:
         designs = jax.tree.map(lambda x: x[1:], metrics)
         found = judged_designs(self.merit, designs, own_metrics, np.stack(allowed))
         found = jax.tree.map(np.asarray, found)
-        slopes = self._slopes(runs, found.cotangents, wanted.any(axis=1))
+        slopes = self._slopes(runs, found.cotangents, needs_slope)
         if is_compiled:
             self.run_time = (time.perf_counter() - started) / self.lanes
         beyond, change = self.linear.limits(values)

@@ -22,7 +22,7 @@ from jaxmodel.linear_residual import linear_residual
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spillover
-from studies.engine.program import one_at_a_time
+from studies.engine.function import one_at_a_time
 from studies.engine.stability import gain_margin
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.margin import MARGIN_MODES

@@ -13,7 +13,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.metrics import METRICS
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import simulate
-from studies.engine.program import Place
+from studies.engine.executor import Place
 from studies.errors import StudyError
 from studies.fitting.bench import with_slopes
 from studies.fitting.kinds.contract import Numbers, Residual, scaled

@@ -12,8 +12,8 @@ from jaxmodel import status
 from jaxmodel.case import Case, Structure
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import simulate
+from studies.engine.executor import Place
 from studies.engine.preflight import check_run
-from studies.engine.program import Place
 from studies.errors import StudyError
 from studies.fitting.bench import seen_at, with_slopes
 from studies.study.labels import describe
