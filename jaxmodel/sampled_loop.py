@@ -16,6 +16,7 @@ from jaxmodel.controller import Controller, controller_step, rest_controller, wi
 from jaxmodel.electronics import FASTEST
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.linear import LinearPlant, Moment, linearise, resting
+from jaxmodel.loop import Loop
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 
@@ -59,6 +60,19 @@ def closed_loop(
     loop = prepare(smooth, case).loop
     law = loop.controller if law is None else law
     moment = resting(structure, case) if moment is None else moment
+    return loop_matrices(structure, case, loop, law, pose, moment)
+
+
+def loop_matrices(
+    structure: Structure,
+    case: Case,
+    loop: Loop,
+    law: Controller,
+    pose: Array,
+    moment: Moment | None,
+) -> LoopMatrices:
+    """`closed_loop` of a prepared case; moment None: at rest without load."""
+    smooth = structure._replace(is_smooth=True, feedback="sampled")
     plant = linearise(smooth, loop, pose, moment)
     analogue = _with_electronics(smooth, plant, case)
     n, n_inputs = analogue.enters.shape

@@ -18,7 +18,7 @@ from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
 from studies.bench import reference
 from studies.engine.preflight import check_run
-from studies.engine.stability import loop_report, motion_report
+from studies.engine.stability import loop_report, run_report
 from studies.errors import ModelWarning, StudyError
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import load_study, paper_study
@@ -347,8 +347,9 @@ def test_ked_fails_where_the_drive_rings_with_the_links(kp, peak, residual):
 def test_margins_move_with_the_forces_of_the_motion():
     study = paper_study().change(motion__move_time=0.03)
     structure, case = arrays(study)
-    found = motion_report(structure, case)
+    loop, found = run_report(structure, case, HOME_POSE)
     at_rest = loop_report(structure, case, HOME_POSE).gain_margin
+    np.testing.assert_allclose(loop.gain_margin, at_rest, rtol=1e-9)
     np.testing.assert_allclose(found.gain_margin[0], at_rest, rtol=1e-3)
     assert found.time[0] == 0 and np.abs(found.axial_force[0]).max() < 1e-9
     assert 8 < np.abs(found.axial_force).max() < 14

@@ -13,13 +13,13 @@ from studies.engine.margins import (
     CONVERGED,
     WALKS,
     Crossings,
-    LoopMargins,
     _is_confirmed,
     _judged,
     _meet,
     _rightmost,
     judge_loops,
 )
+from studies.engine.stability import LoopFigures
 from studies.study.cases import build_cases, build_structure
 from studies.study.margin import HIGHEST
 from studies.study.spec import paper_study
@@ -155,7 +155,7 @@ def test_margins_are_the_inverse_of_the_rightmost_crossings(judged):
     assert figures.breaking_mode[:4].tolist() == [2, 1, 3, 2]
     assert np.all(np.isnan(figures.breaking_frequency[4:]))
     assert np.all(np.isnan(figures.breaking_mode[4:])) and not is_doubtful.any()
-    np.testing.assert_array_equal(figures.damping_ratio, 0.25)
+    np.testing.assert_array_equal(figures.least_damping, 0.25)
 
 
 def test_what_did_not_converge_leaves_the_margin_to_another_crossing(judged):
@@ -212,7 +212,12 @@ def test_doubtful_loops_are_walked_again_more_finely(monkeypatch):
     def block(structure, way, most, cases, rows):
         calls.append((WALKS.index(way), rows.tolist()))
         value = 10.0 * (1 + WALKS.index(way)) + rows
-        figures = LoopMargins(value, value + 100, value + 200, np.stack([value] * 3, axis=1))
+        figures = LoopFigures(
+            gain_margin=value,
+            breaking_frequency=value + 100,
+            breaking_mode=value + 200,
+            least_damping=np.stack([value] * 3, axis=1),
+        )
         return figures, np.isin(rows, [1, 4])
 
     monkeypatch.setattr(margins, "_judge_block", block)
@@ -224,7 +229,7 @@ def test_doubtful_loops_are_walked_again_more_finely(monkeypatch):
     np.testing.assert_array_equal(found.gain_margin, wanted)
     np.testing.assert_array_equal(found.breaking_frequency, wanted + 100)
     np.testing.assert_array_equal(found.breaking_mode, wanted + 200)
-    np.testing.assert_array_equal(found.damping_ratio, np.stack([wanted] * 3, axis=1))
+    np.testing.assert_array_equal(found.least_damping, np.stack([wanted] * 3, axis=1))
     assert sorted(k for way, rows in calls for k in rows if way == 0) == list(range(6))
     assert sorted(k for way, rows in calls for k in rows if way == 1) == [1, 4]
     coarse, fine = WALKS

@@ -11,7 +11,7 @@ from jaxmodel import status
 from jaxmodel.metrics import METRICS, Metrics, Sizes
 from jaxmodel.simulate import Result
 from studies.engine.runs import Run
-from studies.engine.stability import LoopReport, MotionReport
+from studies.engine.stability import LoopFigures
 from studies.show.markdown import literal
 from studies.show.units import READABLE, headed, number, readable, settling_text
 from studies.single.report import report
@@ -158,14 +158,14 @@ def made_up_run(size=1.0, margin=3.25, code=status.OK, **changes):
         singularity_distance=np.array(0.5),
         record=record,
     )
-    loop = LoopReport(
+    loop = LoopFigures(
         spectral_radius=0.987654,
         gain_margin=margin,
         frequency_hz=RNG.uniform(100, 900, (2, 3)),
         damping_ratio=RNG.uniform(0.01, 0.3, (2, 3)),
-        breaking_hz=1199.25,
+        breaking_frequency=1199.25,
     )
-    motion = MotionReport(
+    motion = LoopFigures(
         time=np.array([0.0, 0.1, 0.2]),
         axial_force=RNG.uniform(-9, 9, (3, 3)),
         gain_margin=np.array([3.125, 2.875, 3.375]),

@@ -22,12 +22,11 @@ from jaxmodel.laws.lqr import optimal_gains
 from jaxmodel.laws.ppf import HIGHEST_RATIO, design_position_filter
 from studies.engine.controller import fixed_controller
 from studies.engine.runs import run_study
-from studies.engine.stability import loop_report
+from studies.engine.stability import follow_modes, loop_report, modal_damping
 from studies.errors import StudyError
 from studies.spillover import Departure, certify, compare_laws, patch_lengths
 from studies.spillover import run as spillover_run
 from studies.spillover.comparison import _controlled_links, _View
-from studies.spillover.judgement import damping, follow
 from studies.spillover.laws import all_laws
 from studies.spillover.plants import LoopMaker, PlantVariant, all_plants, widened
 from studies.study.cases import as_arrays, build_case, build_structure
@@ -434,8 +433,8 @@ def test_damping_is_that_of_links_that_control_the_mode():
     law = all_laws(found, maker, plant)[0]
     view = _View(found, law, plant, (3,))
     loop = maker.loop(plant, law.controller)
-    tracked = follow(loop, np.linspace(0.1, 1, 16), loop.poles)[-1]
-    zeta = damping(loop, tracked)[1]
+    tracked = follow_modes(loop, np.linspace(0.1, 1, 16), loop.poles)[-1]
+    zeta = modal_damping(loop, tracked)[1]
     np.testing.assert_allclose(view.damping(1.0)[:2], zeta[:2].max(axis=1), rtol=1e-6)
     assert view.damping(1.0)[0] > 0.2 and view.damping(0.0)[0] < 0.02
     # as much as the design damps, with no larger gains: beyond its peak damping falls again

@@ -15,9 +15,10 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure, with_ratio
 from jaxmodel.kinematics import close_chain
+from jaxmodel.linear import resting
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
+from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, loop_matrices
 from studies.atlas.subsets import link_label, long_enough
 from studies.engine.batches import run_batches
 from studies.engine.preflight import check_run
@@ -167,10 +168,12 @@ def responses(study: Study, frequency: np.ndarray) -> Responses:
 @partial(jax.jit, static_argnums=0)
 def _linear(structure: Structure, case: Case, pose: Array) -> tuple[LoopMatrices, Array]:
     """Loop at a pose, and d rho/d X there, (3, 3); NaN where a force at C bends the link."""
-    plant = prepare(structure, case).loop.plant
+    loop = prepare(structure, case).loop
+    plant = loop.plant
     jacobian = jax.jacfwd(lambda at: close_chain(plant, at, jnp.zeros_like(at)).rho)(pose)
     known = jacobian if plant.tip is None else jnp.nan * jacobian
-    return closed_loop(structure, case, pose), known
+    at_rest = resting(structure, case)
+    return loop_matrices(structure, case, loop, loop.controller, pose, at_rest), known
 
 
 def _response(

@@ -12,9 +12,10 @@ import numpy as np
 from jaxmodel.case import Case, Structure, with_ratio
 from jaxmodel.simulate import Result
 from studies.engine.executor import Executor, own_ratios
-from studies.engine.margins import LoopMargins, judge_loops, no_margins
+from studies.engine.margins import judge_loops, no_margins
 from studies.engine.plan import Chunk, Group, Layout, chunk_cases, local_layout
 from studies.engine.progress import Reporter
+from studies.engine.stability import LoopFigures
 from studies.kernels.compilation import compiler_time
 from studies.space.table import CaseTable
 from studies.study.cases import powered
@@ -32,7 +33,7 @@ class JudgedChunk(NamedTuple):
     """Runs of a chunk, and the judgement of its loops."""
 
     result: Result
-    margins: LoopMargins
+    margins: LoopFigures
 
 
 class Started(NamedTuple):

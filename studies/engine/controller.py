@@ -7,7 +7,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
 from jaxmodel.laws import LAWS, is_modal, n_channels
@@ -73,7 +72,7 @@ def fixed_controller(study: Study) -> FixedController:
         controller=controller,
         channels=arrange(controller, study.control.law),
         taps=_merged(taps),
-        frequency=_frequencies(structure, case),
+        frequency=_frequencies(structure, known.believed_omega),
     )
 
 
@@ -114,9 +113,9 @@ def _any(gain: np.ndarray | None) -> bool:
     return gain is not None and bool(np.any(gain))
 
 
-def _frequencies(structure: Structure, case: Case) -> np.ndarray:
+def _frequencies(structure: Structure, believed_omega: np.ndarray) -> np.ndarray:
     """Where the velocity estimate of each channel is exact [Hz], (3, C)."""
-    hertz = np.asarray(find_bases(structure, case).believed_omega) / (2 * np.pi)
+    hertz = believed_omega / (2 * np.pi)
     return hertz if is_modal(structure) else np.repeat(hertz[:, :1], n_channels(structure), axis=1)
 
 

@@ -43,7 +43,7 @@ from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.engine.damping import damping_ratios, least_controlled
 from studies.engine.function import one_at_a_time
 from studies.engine.lanes import BLOCK, run_steps
-from studies.engine.stability import loop_report, with_margin_modes
+from studies.engine.stability import LoopFigures, loop_report, with_margin_modes
 from studies.study.margin import HIGHEST, LOWEST
 
 
@@ -94,17 +94,11 @@ class Look(NamedTuple):
 LOOK = Look(0.3, 10, 3, 24)
 
 
-class LoopMargins(NamedTuple):
-    """Margins of each case, (n,); NaN without a sampled loop."""
-
-    gain_margin: np.ndarray  # largest factor on all gains with every smaller one stable [1]
-    breaking_frequency: np.ndarray  # of what goes unstable there [Hz], NaN if nothing does
-    # order of the nearest link mode, 0: the drive; NaN as above, and for the static stiffness
-    breaking_mode: np.ndarray
-    damping_ratio: np.ndarray  # least of the controlled modes of each order [1], (n, C)
+#: What a batch has of `LoopFigures`.
+BATCHED = ("gain_margin", "breaking_frequency", "breaking_mode", "least_damping")
 
 
-def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
+def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
     """Judge the sampled loops of cases.
 
     Args:
@@ -130,8 +124,8 @@ def judge_loops(structure: Structure, cases: Case) -> LoopMargins:
             found = list(pool.map(partial(_judge_block, structure, way, most, whole), parts))
             doubtful = []
             for part, (those, is_doubtful) in zip(parts, found, strict=True):
-                for old, new in zip(figures, those, strict=True):
-                    old[part] = new
+                for name in BATCHED:
+                    getattr(figures, name)[part] = getattr(those, name)
                 doubtful.append(part[is_doubtful])
             return np.concatenate(doubtful)
 
@@ -161,7 +155,7 @@ def _unevenness(cases: Case) -> np.ndarray:
         return np.max(np.nan_to_num(ratio.max(axis=1) / ratio.min(axis=1)), axis=1)
 
 
-def _judge_by_eigenvalues(structure: Structure, case: Case, figures: LoopMargins, k: int) -> None:
+def _judge_by_eigenvalues(structure: Structure, case: Case, figures: LoopFigures, k: int) -> None:
     """Write the figures of one case, except what breaks; takes half a second."""
     try:
         found = loop_report(structure, case, case.path.waypoints[0], structure.n_controlled)
@@ -169,12 +163,12 @@ def _judge_by_eigenvalues(structure: Structure, case: Case, figures: LoopMargins
         return
     figures.gain_margin[k] = found.gain_margin
     n_links = np.sum(case.control.link_mask > 0)
-    figures.damping_ratio[k] = least_controlled(
+    figures.least_damping[k] = least_controlled(
         found.damping_ratio.T, np.full(structure.n_controlled, n_links)
     )
 
 
-def _judge_one_by_one(structure: Structure, cases: Case) -> LoopMargins:
+def _judge_one_by_one(structure: Structure, cases: Case) -> LoopFigures:
     """Worst figures of loops whose controlled modes act one at a time, each judged alone."""
     alone = structure._replace(law=IMSC.name)
     parts = []
@@ -189,11 +183,11 @@ def _judge_one_by_one(structure: Structure, cases: Case) -> LoopMargins:
         values = np.stack([getattr(part, name) for part in parts])
         return np.take_along_axis(values, worst, axis=0)[0]
 
-    return LoopMargins(
+    return LoopFigures(
         gain_margin=of_worst("gain_margin"),
         breaking_frequency=of_worst("breaking_frequency"),
         breaking_mode=of_worst("breaking_mode"),
-        damping_ratio=np.stack([part.damping_ratio[:, j] for j, part in enumerate(parts)], axis=1),
+        least_damping=np.stack([part.least_damping[:, j] for j, part in enumerate(parts)], axis=1),
     )
 
 
@@ -201,11 +195,16 @@ def _count(cases: Case) -> int:
     return max(len(leaf) for leaf in jax.tree.leaves(cases))
 
 
-def no_margins(structure: Structure, cases: Case) -> LoopMargins:
+def no_margins(structure: Structure, cases: Case) -> LoopFigures:
     """NaN for every case; arguments as `judge_loops`."""
     count = _count(cases)
-    one, two, three = np.full((3, count), np.nan)
-    return LoopMargins(one, two, three, np.full((count, structure.n_controlled), np.nan))
+    margin, frequency, mode = np.full((3, count), np.nan)
+    return LoopFigures(
+        gain_margin=margin,
+        breaking_frequency=frequency,
+        breaking_mode=mode,
+        least_damping=np.full((count, structure.n_controlled), np.nan),
+    )
 
 
 class Crossings(NamedTuple):
@@ -218,7 +217,7 @@ class Crossings(NamedTuple):
 
 def _judge_block(
     structure: Structure, way: Walk, most: int, cases: Case, rows: np.ndarray
-) -> tuple[LoopMargins, np.ndarray]:
+) -> tuple[LoopFigures, np.ndarray]:
     """Figures of some cases, at most a block, and which of them had spurious crossings."""
     mask = cases.control.link_mask[rows].T
     n_links = np.sum(mask > 0, axis=0)
@@ -252,7 +251,7 @@ def _judged(
     weaker: np.ndarray,
     way: Walk,
     ratio: np.ndarray,
-) -> tuple[LoopMargins, np.ndarray]:
+) -> tuple[LoopFigures, np.ndarray]:
     """Figures of loops, examined with gains `weaker` by these factors, (lanes,)."""
     count, top = len(response.period), np.pi / response.period
     response = _with_gains(response, 1 / weaker)
@@ -293,11 +292,11 @@ def _judged(
     is_finite = np.all([np.isfinite(x).reshape(-1, count).all(axis=0) for x in leaves], axis=0)
     # static: not a mode's frequency
     order = np.where(is_more & (omega == 0) & ~falls, np.nan, order)
-    figures = LoopMargins(
-        np.where(is_finite, margin, np.nan),
-        np.where(is_finite, np.abs(omega) / (2 * np.pi), np.nan),
-        np.where(is_finite & breaks, order, np.nan),
-        ratio,
+    figures = LoopFigures(
+        gain_margin=np.where(is_finite, margin, np.nan),
+        breaking_frequency=np.where(is_finite, np.abs(omega) / (2 * np.pi), np.nan),
+        breaking_mode=np.where(is_finite & breaks, order, np.nan),
+        least_damping=ratio,
     )
     return figures, is_doubtful & is_finite
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.nominal_loop import nominal_loop
-from studies.engine.stability import LoopReport
+from studies.engine.stability import LoopFigures
 
 #: Relative difference of a decay or frequency that is worth a sentence [1].
 NOTABLE = 0.02
@@ -28,14 +28,22 @@ class PoleReport(NamedTuple):
     is_by_damping: bool = False  # specified as added damping ratios, and shown as such
 
 
-def pole_report(structure: Structure, case: Case, loop: LoopReport) -> PoleReport | None:
+def tracked_modes(structure: Structure) -> int:
+    """How many link modes are followed: three, or all controlled ones if poles are specified."""
+    most = max(3, structure.n_controlled) if structure.has_poles else 3
+    return min(most, structure.n_modes)
+
+
+def pole_report(structure: Structure, case: Case, loop: LoopFigures) -> PoleReport | None:
     """Where specified poles lie; None if no mode that acts has any.
 
     Args:
-        structure: with `has_poles` and feedback "sampled".
+        structure: with feedback "sampled".
         case: the numbers.
-        loop: its report, with all controlled modes tracked.
+        loop: its figures, with `tracked_modes`.
     """
+    if not structure.has_poles:
+        return None
     specified, matrix = map(np.asarray, jax.jit(partial(nominal_loop, structure))(case))
     is_on, period = ~np.isnan(specified), float(case.electronics.period)
     if not is_on.any():

@@ -57,6 +57,7 @@ class Preflight(NamedTuple):
     steady_load: Any  # compression of the links at way-points over their critical force [1], (n, 3)
     critical_force: Any  # [N], (3,)
     lumping: Any  # what lumping the axial inertia costs along the unshaped path [1], ()
+    believed_omega: Any  # the controller's modes, as it believes them [rad/s], (3, C)
     controller: Controller
     taps: Taps  # of the shaper
 
@@ -98,6 +99,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
         steady_load(structure, case, plant),
         critical_force(plant),
         lumping,
+        prepared.bases.believed_omega,
         prepared.loop.controller,
         prepared.taps,
     )

@@ -13,9 +13,9 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.case import Case, Structure, uncontrolled, with_ratio
 from jaxmodel.simulate import Result, simulate
-from studies.engine.poles import PoleReport, pole_report
+from studies.engine.poles import PoleReport, pole_report, tracked_modes
 from studies.engine.preflight import check_run
-from studies.engine.stability import LoopReport, MotionReport, loop_report, motion_report
+from studies.engine.stability import LoopFigures, run_report
 from studies.study.cases import powered
 from studies.study.spec import Study
 
@@ -30,8 +30,8 @@ class Run(NamedTuple):
     case: Case
     result: Result  # NumPy arrays
     status: int  # code of `jaxmodel.status`; UNSTABLE comes from the linearised loop
-    loop: LoopReport | None = None  # linearised sampled loop, if there is one and it is judged
-    motion: MotionReport | None = None  # the same with the forces of the motion
+    loop: LoopFigures | None = None  # of its linearised sampled loop, if that is judged
+    motion: LoopFigures | None = None  # with the forces of the motion, (k,)
     poles: PoleReport | None = None  # specified and obtained, where gains follow from poles
 
 
@@ -53,8 +53,10 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
     if not has_loop or structure.feedback != "sampled":
         return run
     try:
-        loop, poles = loop_and_poles(study, structure, case, run.status)
-        motion = motion_report(structure, case)
+        home, n_tracked = np.array(study.motion.waypoints[0], float), tracked_modes(structure)
+        loop, motion = run_report(structure, case, home, n_tracked)
+        has_poles = run.status != status.UNPLACEABLE
+        poles = pole_report(structure, case, loop) if has_poles else None
     except np.linalg.LinAlgError:  # a non-finite entry
         return run._replace(status=run.status or status.NON_FINITE)
     code = judged_status(run.status, loop)
@@ -65,27 +67,6 @@ def _run(study: Study, structure: Structure, case: Case, has_record: bool) -> Ru
     """Run a case without judging its loop."""
     result = jax.tree.map(np.asarray, _simulate(structure, case, has_record))
     return Run(study, structure, case, result, int(result.status))
-
-
-def loop_and_poles(
-    study: Study, structure: Structure, case: Case, code: int
-) -> tuple[LoopReport, PoleReport | None]:
-    """The linearised sampled loop, and specified and obtained poles, if there are any.
-
-    Args:
-        study, structure, case: the design, as of `check_run`.
-        code: status of its run.
-
-    Raises:
-        LinAlgError: an entry of the loop's matrices is not finite.
-    """
-    tracked = max(3, structure.n_controlled) if structure.has_poles else 3
-    loop = loop_report(
-        structure, case, np.array(study.motion.waypoints[0], float), min(tracked, structure.n_modes)
-    )
-    if not structure.has_poles or code == status.UNPLACEABLE:
-        return loop, None
-    return loop, pole_report(structure, case, loop)
 
 
 def _own_ratio(study: Study, structure: Structure, case: Case, has_record: bool) -> np.ndarray:
@@ -130,6 +111,6 @@ def run_uncontrolled(study: Study, is_linear: bool = False) -> Run:
     return _run(study, structure._replace(is_linear=is_linear), case, False)
 
 
-def judged_status(code: int, loop: LoopReport) -> int:
+def judged_status(code: int, loop: LoopFigures) -> int:
     """Status of a run: UNSTABLE if its loop is and nothing else stopped it."""
     return status.UNSTABLE if code in status.FINISHED and not loop.is_stable else code

@@ -1,6 +1,7 @@
-"""Stability of a linearised sampled loop: spectral radius, gain margin, damping of its modes.
+"""Stability of linearised sampled loops: spectral radius, gain margin, damping of their modes.
 
-Eigenvalues of small matrices, on the host; `jaxmodel.sampled_loop` builds the matrices.
+Eigenvalues of small matrices, on the host; one compiled program makes all matrices of a case
+(`jaxmodel.sampled_loop`): at rest, and frozen at the extreme instants of its motion.
 """
 
 from __future__ import annotations
@@ -18,21 +19,69 @@ from jaxmodel.axial import axial_force
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, linear_parts
 from jaxmodel.laws import LAWS
-from jaxmodel.linear import Moment
+from jaxmodel.linear import Moment, resting
 from jaxmodel.motion import PathSample, end_of_path, sample_path
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
+from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, loop_matrices
 from studies.study.margin import HIGHEST, LOWEST, MARGIN_MODES
 
 #: Largest ratio of successive gain factors [1].
 STRIDE = 1.25
 #: The first factor, and the ratio of smaller ones if it is unstable [1].
 FIRST, DESCENT = 0.01, 4.0
-
-
 #: Gain factors at which modes are traced from no control to the given gains [1].
 STEPS = np.linspace(0, 1, 41)[1:]
+#: Instants of a motion at which axial forces are evaluated.
+INSTANTS = 401
+
+
+class LoopFigures(NamedTuple):
+    """Figures of one sampled loop, or of many with leading axes (...); None: not computed.
+
+    Of a law whose channels act one at a time: the worst figures of its parts, each judged alone.
+    """
+
+    gain_margin: Array  # largest common factor on all gains, all smaller ones stable [1], (...)
+    spectral_radius: Array = None  # of the closed loop [1], (...)
+    breaking_frequency: Array = None  # of what goes unstable at the margin [Hz], (...)
+    # order of the nearest link mode, 0: the drive; NaN as above, and for the static stiffness
+    breaking_mode: Array = None
+    # least [1] of the most damped modes of each order, one per controlled link, (..., J)
+    least_damping: Array = None
+    frequency_hz: Array = None  # of the tracked link modes [Hz], (..., J, 3)
+    damping_ratio: Array = None  # [1], (..., J, 3): three assembled modes per link mode
+    time: Array = None  # of the frozen instants of a motion [s], (k,)
+    axial_force: Array = None  # tension in the links then [N], (k, 3)
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether this loop and every one with smaller gains is stable."""
+        return self.spectral_radius <= 1 + RADIUS_TOLERANCE and self.gain_margin >= 1
+
+
+class SampledLoop(NamedTuple):
+    """A linearised loop on the host."""
+
+    open: np.ndarray  # transition over a sample without gains, (n, n)
+    feedback: np.ndarray  # what the gains add, (n, n)
+    mode_poles: np.ndarray  # of the link modes without control [rad/s], NaN: overdamped, (J, 3)
+    omega: np.ndarray  # of the plant's modal coordinates [rad/s], (3, R)
+    period: float  # [s]
+
+    @property
+    def n_modes(self) -> int:
+        """R of each link."""
+        return self.omega.shape[1]
+
+    @property
+    def is_open_loop_stable(self) -> bool:
+        """Whether the plant is stable without control: no link beyond its critical force."""
+        return bool(np.abs(self.poles(0.0)).max() <= 1 + RADIUS_TOLERANCE)
+
+    def poles(self, factor: float) -> np.ndarray:
+        """Discrete poles with all gains times a factor, (n,)."""
+        return np.linalg.eigvals(self.open + factor * self.feedback)
 
 
 def with_margin_modes(
@@ -59,39 +108,62 @@ def with_margin_modes(
     return structure, case
 
 
-class LoopReport(NamedTuple):
-    """Judgement of a sampled loop."""
+class _Loops(NamedTuple):
+    """Matrices of a case's loops; axes: instants of its motion (k), parts of its law (p)."""
 
-    spectral_radius: float  # of the closed loop [1]
-    gain_margin: float  # largest common factor on all gains with every smaller one stable [1]
-    frequency_hz: np.ndarray  # of the tracked controlled link modes [Hz], (J, 3)
-    damping_ratio: np.ndarray  # [1], (J, 3): three assembled modes per link mode
-    breaking_hz: float  # of the pole that leaves the unit circle at the margin, NaN: none does
-
-    @property
-    def is_stable(self) -> bool:
-        """Whether this loop and every one with smaller gains is stable."""
-        return self.spectral_radius <= 1 + RADIUS_TOLERANCE and self.gain_margin >= 1
+    at_rest: LoopMatrices  # (p, ...)
+    omega: Array  # of the plant's modal coordinates [rad/s], (3, R)
+    time: Array | None  # [s], (k,)
+    axial_force: Array | None  # tension in the links [N], (k, 3)
+    in_motion: LoopMatrices | None  # (k, p, ...)
 
 
-class MotionReport(NamedTuple):
-    """How the forces of a motion change the margin: at rest, and where they are largest."""
+@partial(jax.jit, static_argnums=(0, 1))
+def _loops(
+    structure: Structure, has_motion: bool, case: Case, pose: Array, parts: Controller | None
+) -> _Loops:
+    """All loops of a case.
 
-    time: np.ndarray  # [s], (k,)
-    axial_force: np.ndarray  # tension in the links [N], (k, 3)
-    gain_margin: np.ndarray  # of the loop with the instant frozen [1], (k,)
+    Args:
+        structure: static choices, feedback "sampled".
+        has_motion: also at its start, and where the tension in a link is smallest or largest.
+        case: the numbers.
+        pose: of the loop at rest [m, m, rad], (3,).
+        parts: controllers to judge, stacked; None: the case's own.
+    """
+    loop = prepare(structure, case).loop
+    if parts is None:
+        parts = jax.tree.map(lambda x: jnp.asarray(x)[None], loop.controller)
 
+    def matrices(pose: Array, moment: Moment | None) -> LoopMatrices:
+        return jax.lax.map(
+            lambda law: loop_matrices(structure, case, loop, law, pose, moment), parts
+        )
 
-_closed_loop = jax.jit(closed_loop, static_argnums=0)
+    if not has_motion:
+        at_rest = matrices(pose, resting(structure, case))
+        return _Loops(at_rest, loop.omega, time=None, axial_force=None, in_motion=None)
+    time = jnp.linspace(0.0, 1.0, INSTANTS) * end_of_path(case.path)
+    sample = sample_path(case.path, time)
+    each = jax.vmap(axial_force, (None, 0, 0, 0, None))
+    force = each(loop.plant, *sample, case.load.wrench)
+    extremes = jnp.concatenate([force, -force], axis=1).argmin(axis=0)
+    instants = jnp.concatenate([jnp.zeros(1, int), extremes])
+    wrench = jnp.asarray(case.load.wrench, force.dtype)
+    home = PathSample(pose, jnp.zeros_like(pose), jnp.zeros_like(pose))
+    points = jax.tree.map(lambda one, x: jnp.concatenate([one[None], x[instants]]), home, sample)
 
+    def at(point: PathSample) -> LoopMatrices:
+        return matrices(point.position, Moment(point.velocity, point.acceleration, wrench))
 
-#: Instants of a motion at which axial forces are evaluated.
-INSTANTS = 401
-
-
-def _poles(still: np.ndarray, moved: np.ndarray, factor: float) -> np.ndarray:
-    """Discrete poles with all gains times a factor."""
-    return np.linalg.eigvals(still + factor * moved)
+    every = jax.lax.map(at, points)
+    return _Loops(
+        at_rest=jax.tree.map(lambda x: x[0], every),
+        omega=loop.omega,
+        time=time[instants],
+        axial_force=force[instants],
+        in_motion=jax.tree.map(lambda x: x[1:], every),
+    )
 
 
 @partial(jax.jit, static_argnums=0)
@@ -100,57 +172,22 @@ def _controller(structure: Structure, case: Case) -> Controller:
 
 
 def _parts(
-    structure: Structure, case: Case, law: Controller | None = None
-) -> list[tuple[slice, Controller | None]]:
-    """Controllers to judge, and the modes that each covers; None: the case's own."""
+    structure: Structure, case: Case, law: Controller | None
+) -> tuple[list[slice], Controller | None]:
+    """The modes that each controller to judge covers, and these, stacked; None: the case's own."""
     if law is None and not LAWS[structure.law].is_switching:
-        return [(slice(None), None)]
+        return [slice(None)], None
     law = _controller(structure, case) if law is None else law
-    return [*linear_parts(jax.tree.map(np.asarray, law))]
+    modes, parts = zip(*linear_parts(jax.tree.map(np.asarray, law)), strict=True)
+    return list(modes), jax.tree.map(lambda *x: np.stack(x), *parts)
 
 
-@partial(jax.jit, static_argnums=0)
-def _forces(structure: Structure, case: Case) -> tuple[Array, PathSample, Array]:
-    """Instants of the unshaped motion, and the tension in the links [N], (n, 3)."""
-    plant = prepare(structure, case).loop.plant
-    time = jnp.linspace(0.0, 1.0, INSTANTS) * end_of_path(case.path)
-    sample = sample_path(case.path, time)
-    each = jax.vmap(axial_force, (None, 0, 0, 0, None))
-    return time, sample, each(plant, *sample, case.load.wrench)
-
-
-def motion_report(structure: Structure, case: Case) -> MotionReport:
-    """Gain margins with the forces that act during the unshaped motion.
-
-    Linearised at its start and where the tension in a link is largest or smallest, with that
-    instant frozen, with at least `MARGIN_MODES` plant modes.
-
-    Args:
-        structure: static choices, feedback "sampled".
-        case: the numbers.
-
-    Raises:
-        LinAlgError: an entry of the loop's matrices is not finite.
-    """
-    plain, case = with_margin_modes(structure, case)
-    time, sample, force = jax.tree.map(np.asarray, _forces(plain, case))
-    chosen = np.unique([0, *force.argmin(axis=0), *force.argmax(axis=0)])
-    wrench = np.asarray(case.load.wrench, force.dtype)
-
-    parts = _parts(plain, case)
-
-    def margin(k: int) -> float:
-        moment = Moment(sample.velocity[k], sample.acceleration[k], wrench)
-        margins = []
-        for _, part in parts:
-            matrices = _closed_loop(plain, case, sample.position[k], part, moment)
-            poles = partial(_poles, np.asarray(matrices.open), np.asarray(matrices.feedback))
-            margins.append(gain_margin(cache(poles)))
-        return min(margins)
-
-    with threadpool_limits(1, "blas"):
-        margins = [margin(k) for k in chosen]
-    return MotionReport(time[chosen], force[chosen], np.array(margins))
+def sampled_loop(
+    matrices: LoopMatrices, omega: np.ndarray, period: float, n_tracked: int
+) -> SampledLoop:
+    """A loop on the host from matrices of `jaxmodel.sampled_loop`, NumPy arrays."""
+    poles = link_poles(matrices.plant, n_tracked)
+    return SampledLoop(matrices.open, matrices.feedback, poles, omega, period)
 
 
 def loop_report(
@@ -160,11 +197,11 @@ def loop_report(
     n_tracked: int = 3,
     law: Controller | None = None,
     n_modes: int = MARGIN_MODES,
-) -> LoopReport:
+) -> LoopFigures:
     """Spectral radius, gain margin and damping of the lowest link modes.
 
     Modes are traced from zero gain to full gain, so that filter poles are not mistaken for them.
-    If channels act one at a time, the report is the worst over them, each judged alone.
+    If channels act one at a time, the figures are the worst over them, each judged alone.
 
     Args:
         structure: static choices.
@@ -177,66 +214,147 @@ def loop_report(
     Raises:
         LinAlgError: an entry of the loop's matrices is not finite.
     """
-    plain, case = with_margin_modes(structure, case, n_modes)
-    parts = _parts(plain, case, law)
-    period = float(case.electronics.period)
-    with threadpool_limits(1, "blas"):  # many small matrices: more threads only slow them down
-        reports = [
-            _judged(_closed_loop(plain, case, pose, part), period, n_tracked) for _, part in parts
-        ]
-    chosen = [modes for modes, _ in parts]
-    least = min(reports, key=lambda one: one.gain_margin)
-    return LoopReport(
-        spectral_radius=max(one.spectral_radius for one in reports),
-        gain_margin=least.gain_margin,
-        frequency_hz=mode_by_mode(chosen, [one.frequency_hz for one in reports]),
-        damping_ratio=mode_by_mode(chosen, [one.damping_ratio for one in reports]),
-        breaking_hz=least.breaking_hz,
-    )
+    return _figures(structure, case, pose, n_tracked, law, n_modes, has_motion=False)[0]
 
 
-def mode_by_mode(modes: list[slice], each: list[np.ndarray]) -> np.ndarray:
-    """Merge the results of a law's parts, each for its own modes; the first part's for the rest.
+def run_report(
+    structure: Structure, case: Case, pose: Array, n_tracked: int = 3
+) -> tuple[LoopFigures, LoopFigures]:
+    """Figures of a run's loop at rest, as `loop_report`, and gain margins during its motion.
+
+    The second is linearised at the start of the unshaped motion and where the tension in a link is
+    largest or smallest, with that instant frozen, under the forces that act then.
 
     Args:
-        modes: those each part covers, see `linear_parts`.
-        each: each part's result for all modes, (J, ...).
+        structure, case, pose, n_tracked: as for `loop_report`.
+
+    Raises:
+        LinAlgError: an entry of the loops' matrices is not finite.
     """
-    whole = np.array(each[0])
-    for chosen, values in zip(modes, each, strict=True):
-        whole[chosen] = values[chosen]
-    return whole
-
-
-def _judged(matrices: LoopMatrices, period: float, n_tracked: int) -> LoopReport:
-    matrices = jax.tree.map(np.asarray, matrices)
-    poles = cache(partial(_poles, matrices.open, matrices.feedback))
-    start = np.exp(link_poles(matrices.plant, n_tracked).ravel() * period)
-    tracked = follow_poles(start, map(poles, map(float, STEPS)))[-1].reshape(-1, 3)
-    decay = np.log(tracked) / period
-    missing = ((0, n_tracked - len(tracked)), (0, 0))
-    frequency, zeta = (
-        np.pad(x, missing, constant_values=np.nan)
-        for x in (np.abs(decay) / (2 * np.pi), -decay.real / np.abs(decay))
+    at_rest, in_motion = _figures(
+        structure, case, pose, n_tracked, None, MARGIN_MODES, has_motion=True
     )
-    radius = float(np.abs(poles(1.0)).max())
-    margin = gain_margin(poles, STEPS)
-    return LoopReport(
-        spectral_radius=radius,
+    assert in_motion is not None
+    return at_rest, in_motion
+
+
+def _figures(
+    structure: Structure,
+    case: Case,
+    pose: Array,
+    n_tracked: int,
+    law: Controller | None,
+    n_modes: int,
+    has_motion: bool,
+) -> tuple[LoopFigures, LoopFigures | None]:
+    plain, case = with_margin_modes(structure, case, n_modes)
+    modes, stacked = _parts(plain, case, law)
+    loops = jax.tree.map(np.asarray, _loops(plain, has_motion, case, pose, stacked))
+    period = float(case.electronics.period)
+
+    def loop(matrices: LoopMatrices, *place: int) -> SampledLoop:
+        matrices = jax.tree.map(lambda x: x[place], matrices)
+        return sampled_loop(matrices, loops.omega, period, n_tracked)
+
+    with threadpool_limits(1, "blas"):  # many small matrices: more threads only slow them down
+        parts = [judge_loop(loop(loops.at_rest, p)) for p in range(len(modes))]
+        figures = worst_figures(list(zip(modes, parts, strict=True)))
+        if not has_motion:
+            return figures, None
+        _, instants = np.unique(loops.time, return_index=True)
+        margins = [
+            min(gain_margin(cache(loop(loops.in_motion, k, p).poles)) for p in range(len(modes)))
+            for k in instants
+        ]
+    time, force = loops.time[instants], loops.axial_force[instants]
+    return figures, LoopFigures(np.array(margins), time=time, axial_force=force)
+
+
+def judge_loop(loop: SampledLoop, steps: np.ndarray = STEPS) -> LoopFigures:
+    """Figures of one loop, whose gains belong to factor 1.
+
+    Args:
+        loop: the loop.
+        steps: gain factors at which its modes are traced, from near 0 to 1 [1].
+    """
+    poles = cache(loop.poles)
+    frequency, ratio = modal_damping(loop, follow_modes(loop, steps, poles)[-1])
+    margin = gain_margin(poles, steps)
+    beyond = pole_beyond(loop, margin)
+    return LoopFigures(
         gain_margin=margin,
+        spectral_radius=float(np.abs(poles(1.0)).max()),
+        breaking_frequency=float(abs(np.angle(beyond)) / (2 * np.pi * loop.period)),
         frequency_hz=frequency,
-        damping_ratio=zeta,
-        breaking_hz=_breaking_hz(poles, margin, period),
+        damping_ratio=ratio,
     )
 
 
-def _breaking_hz(poles: Callable[[float], np.ndarray], margin: float, period: float) -> float:
-    """Frequency of the pole that is unstable just beyond a margin [Hz], NaN if none is."""
+def worst_figures(parts: list[tuple[slice, LoopFigures]]) -> LoopFigures:
+    """Worst figures of a law's parts, with the modes that each covers, see `linear_parts`."""
+
+    def mode_by_mode(name: str) -> np.ndarray:
+        whole = np.array(getattr(parts[0][1], name))
+        for modes, part in parts:
+            whole[modes] = getattr(part, name)[modes]
+        return whole
+
+    each = [part for _, part in parts]
+    return min(each, key=lambda part: part.gain_margin)._replace(
+        spectral_radius=max(part.spectral_radius for part in each),
+        frequency_hz=mode_by_mode("frequency_hz"),
+        damping_ratio=mode_by_mode("damping_ratio"),
+    )
+
+
+def breaking_factor(margin: float) -> float:
+    """A factor on all gains just beyond a margin [1]."""
+    return max(1.001 * margin, LOWEST)
+
+
+def pole_beyond(loop: SampledLoop, margin: float) -> complex:
+    """The pole that is unstable just beyond a margin, NaN if none is up to `HIGHEST`."""
     if margin >= HIGHEST:
-        return np.nan
-    beyond = poles(max(1.001 * margin, LOWEST))
-    pole = beyond[np.argmax(np.abs(beyond))]
-    return float(abs(np.angle(pole)) / (2 * np.pi * period))
+        return complex(np.nan)
+    poles = loop.poles(breaking_factor(margin))
+    return complex(poles[np.argmax(np.abs(poles))])
+
+
+def follow_modes(
+    loop: SampledLoop, factors: np.ndarray, poles: Callable[[float], np.ndarray]
+) -> np.ndarray:
+    """Discrete poles of the link modes while the gains grow, (steps, J, 3), NaN: overdamped.
+
+    Args:
+        loop: the loop.
+        factors: gain factors, rising from near 0 [1], (steps,).
+        poles: `loop.poles`, or a cached version.
+    """
+    has_poles = ~np.isnan(loop.mode_poles[:, 0])
+    start = np.exp(loop.mode_poles[has_poles] * loop.period)
+    path = follow_poles(start.ravel(), map(poles, map(float, factors)))
+    tracked = np.full((len(factors), *loop.mode_poles.shape), np.nan, complex)
+    tracked[:, has_poles] = path.reshape(len(factors), -1, 3)
+    return tracked
+
+
+def modal_damping(loop: SampledLoop, tracked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Frequency [Hz] and damping ratio of traced modes.
+
+    A pole z of a mode above half the sample rate is exp(s T) of an s that differs from ln(z)/T by a
+    multiple of 2 pi/T: the one nearest to the mode without control is used.
+
+    Args:
+        loop: the loop.
+        tracked: discrete poles, (..., J, 3).
+
+    Returns:
+        two arrays (..., J, 3).
+    """
+    rate = np.log(tracked) / loop.period
+    turn = 2 * np.pi / loop.period
+    rate = rate + 1j * turn * np.round((loop.mode_poles.imag - rate.imag) / turn)
+    return np.abs(rate) / (2 * np.pi), -rate.real / np.abs(rate)
 
 
 def gain_margin(
@@ -294,11 +412,11 @@ def follow_poles(start: np.ndarray, sets: Iterable[np.ndarray]) -> np.ndarray:
     """
     tracked, velocity, path = start, np.zeros_like(start), []
     for candidates in map(list, sets):
-        found = []
-        for wanted in tracked + velocity:
-            nearest = int(np.argmin(np.abs(np.array(candidates) - wanted)))
-            found.append(candidates.pop(nearest))
-        velocity, tracked = np.array(found) - tracked, np.array(found)
+        matched = []
+        for predicted in tracked + velocity:
+            nearest = int(np.argmin(np.abs(np.array(candidates) - predicted)))
+            matched.append(candidates.pop(nearest))
+        velocity, tracked = np.array(matched) - tracked, np.array(matched)
         path.append(tracked)
     return np.array(path)
 
@@ -306,11 +424,12 @@ def follow_poles(start: np.ndarray, sets: Iterable[np.ndarray]) -> np.ndarray:
 def link_poles(state: np.ndarray, n_tracked: int) -> np.ndarray:
     """Poles [rad/s] of the uncontrolled link modes, in threes by ascending frequency, (J, 3).
 
-    These are the eigenvalues whose eigenvectors lie mainly in the modal coordinates.
+    These are the eigenvalues whose eigenvectors lie mainly in the modal coordinates; overdamped
+    modes have no such pole: NaN.
 
     Args:
         state: A of the plant, `LoopMatrices.plant`.
-        n_tracked: J at most; overdamped modes have no such pole.
+        n_tracked: J.
     """
     modes = (state.shape[0] - 6) // 2
     value, vector = np.linalg.eig(state)
@@ -322,4 +441,6 @@ def link_poles(state: np.ndarray, n_tracked: int) -> np.ndarray:
     flexible = np.sort_complex(1j * value[np.argsort(weight)[: value.size - max(n_rigid, 0)]])
     flexible = flexible[np.argsort(np.abs(flexible))] / 1j
     kept = min(flexible.size // 3, n_tracked)
-    return flexible[: 3 * kept].reshape(kept, 3)
+    poles = np.full((n_tracked, 3), np.nan, complex)
+    poles[:kept] = flexible[: 3 * kept].reshape(kept, 3)
+    return poles

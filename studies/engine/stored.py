@@ -72,7 +72,13 @@ def chunk_variables(table: CaseTable, done: Done, kept: list[str]) -> dict[str, 
     """
     rows, result = done.chunk.rows, done.judged.result
     count = len(rows)
-    margins = {name: data[:count] for name, data in done.judged.margins._asdict().items()}
+    loops = done.judged.margins
+    margins = {
+        "gain_margin": loops.gain_margin[:count],
+        "breaking_frequency": loops.breaking_frequency[:count],
+        "breaking_mode": loops.breaking_mode[:count],
+        "damping_ratio": loops.least_damping[:count],
+    }
     code = np.asarray(result.status)[:count].copy()
     code[done.chunk.is_too_stiff] = status.TOO_STIFF
     code[np.isin(code, status.FINISHED) & (margins["gain_margin"] < 1)] = status.UNSTABLE

@@ -13,7 +13,7 @@ from jaxmodel import status
 from studies.engine.blocks import Blocks, restored
 from studies.engine.channels import Channels, unfold
 from studies.engine.controller import FixedController
-from studies.engine.stability import LoopReport, loop_report
+from studies.engine.stability import LoopFigures, loop_report
 from studies.errors import StudyError, field_error
 from studies.export.cost import Cost
 from studies.export.fixed import FixedPoint, rail_samples
@@ -40,13 +40,13 @@ class Made(NamedTuple):
     """The result of an export."""
 
     files: dict[str, str]
-    loop: LoopReport  # with the exported coefficients
+    loop: LoopFigures  # with the exported coefficients
     verified: Verification | None
     fixed: FixedPoint | FixedBlocks | None = None
     cost: Cost | None = None
 
 
-def judged(found: FixedController, arranged: Channels | Blocks, note: str) -> LoopReport:
+def judged(found: FixedController, arranged: Channels | Blocks, note: str) -> LoopFigures:
     """Linearised sampled loop with given coefficients; rejected if unstable."""
     home = np.array(found.study.motion.waypoints[0], float)
     restore = restored if isinstance(arranged, Blocks) else unfold

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from studies.engine.controller import FixedController
-from studies.engine.stability import LoopReport
+from studies.engine.stability import LoopFigures
 from studies.export.c_fixed import format_lines
 from studies.export.cost import Cost
 from studies.export.fixed import MARGIN, FixedPoint
@@ -20,7 +20,7 @@ from studies.study.margin import caution
 def report(
     found: FixedController,
     origin: list[str],
-    loop: LoopReport,
+    loop: LoopFigures,
     verified: Verification,
     fixed: FixedPoint | FixedBlocks | None = None,
     cost: Cost | None = None,

@@ -24,7 +24,7 @@ from studies.engine.batches import BATCH, Tell, run_batches
 from studies.engine.frame import SharedFrame, frame_of
 from studies.engine.preflight import check_run
 from studies.engine.runs import judged_status, run_study
-from studies.engine.stability import LoopReport, loop_report
+from studies.engine.stability import LoopFigures, loop_report
 from studies.study.files import READY
 from studies.study.spec import Flags, Study, load_study
 
@@ -119,7 +119,7 @@ class PaperRuns(NamedTuple):
     result: Result
     status: np.ndarray  # codes; UNSTABLE if the linearised sampled loop is, (n,)
     ratio: np.ndarray  # gains of the modes over that of mode 1 [1], (n, 3, C)
-    loops: dict[str, LoopReport]  # by case name, if the loop was linearised
+    loops: dict[str, LoopFigures]  # by case name, if the loop was linearised
     link_hz: np.ndarray  # frequencies of each link between held ends [Hz], (3, C)
 
     @property
@@ -279,7 +279,7 @@ def _ratio(case: PaperCase, by_counterpart: dict[tuple[Any, ...], np.ndarray]) -
 
 def _judge(
     structure: Structure, arrays: dict[str, Case], base: Study, tell: Tell
-) -> dict[str, LoopReport]:
+) -> dict[str, LoopFigures]:
     """Linearised sampled loops of the JUDGED cases at home."""
     loops = {}
     for name in [name for name in JUDGED if name in arrays]:

@@ -172,10 +172,11 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
             poles.add_row(*row)
         console.print(poles)
         console.print(difference(run.poles), soft_wrap=True)
-    if not math.isnan(run.loop.breaking_hz):
+    frequency = run.loop.breaking_frequency
+    if not math.isnan(frequency):
         console.print(
-            f"beyond that margin, motion at {run.loop.breaking_hz:.4g} Hz grows, of a link's mode "
-            "or of a controller's filter: `studies spillover` names it",
+            f"beyond that margin, motion at {frequency:.4g} Hz grows, of a link's mode or "
+            "of a controller's filter: `studies spillover` names it",
             soft_wrap=True,
         )
     if warning := caution(run.loop.gain_margin):

@@ -11,8 +11,9 @@ from jaxmodel.beam import BASES
 from jaxmodel.controller import linear_parts
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.engine.controller import FixedController, fixed_controller
+from studies.engine.stability import LoopFigures, judge_loop, worst_figures
 from studies.errors import StudyError, field_error
-from studies.spillover.judgement import Judgement, judge, worst_of
+from studies.spillover.judgement import breaking_motion, weakest_mode
 from studies.spillover.plants import (
     DEPARTURES,
     Departure,
@@ -25,6 +26,8 @@ from studies.spillover.plants import (
 from studies.study.consistency import each_link
 from studies.study.spec import Study
 
+#: Gain factors at which modes are traced from no control to the design's gains.
+STEPS = np.linspace(0, 1, 17)[1:]
 #: Share of its damping that an uncontrolled mode may lose before it is named [1].
 SPILLOVER = 0.1
 
@@ -140,75 +143,100 @@ def certify(
     """
     if not 1 < margin <= 32:
         raise field_error("--margin", margin, "more than 1, up to 32", "1")
-    found = fixed_controller(study)
-    believed = each_link(found.study.link.joint_inertia_c)
+    design = fixed_controller(study)
+    nominal = each_link(design.study.link.joint_inertia_c)
     departures = tuple(
-        d for d in departures if d.joint_inertia is None or np.any(d.joint_inertia != believed)
+        d for d in departures if d.joint_inertia is None or np.any(d.joint_inertia != nominal)
     )
-    plants = all_plants(bases, departures, plant_sizes(found, sizes))
-    maker = LoopMaker(found)
+    plants = all_plants(bases, departures, plant_sizes(design, sizes))
+    maker = LoopMaker(design)
     faults = np.vectorize(maker.fault, otypes=[object])(plants)
-    judgements = _judged(found, maker, plants[faults == ""].tolist())
-    for at in map(tuple, np.argwhere(faults == "")):
-        if plants[at] not in judgements:
-            faults[at] = f"{plants[at].basis}, {plants[at].departure}: it buckles without control"
-    if not judgements:
-        raise StudyError(f"no plant to judge on: {'; '.join(dict.fromkeys(faults.ravel()))}")
-    return _collected(found, margin, maker, plants, faults, judgements)
-
-
-def _judged(
-    found: FixedController, maker: LoopMaker, plants: list[PlantVariant]
-) -> dict[PlantVariant, Judgement]:
-    """Judgement of every plant that is stable without control."""
-    parts = [
-        (modes, widened(part, found.n_patches)) for modes, part in linear_parts(found.controller)
-    ]
-    judgements = {}
     try:
         with threadpool_limits(1, "blas"):
-            for plant in plants:
-                loops = [(modes, maker.loop(plant, part)) for modes, part in parts]
-                if loops[0][1].stands:
-                    judgements[plant] = worst_of([(modes, judge(loop)) for modes, loop in loops])
-        return judgements
+            judgements = _judge_plants(design, maker, plants, faults)
     except np.linalg.LinAlgError:
         raise StudyError("a linearised loop is not finite: nothing to judge") from None
+    if not judgements:
+        raise StudyError(f"no plant to judge on: {'; '.join(dict.fromkeys(faults.ravel()))}")
+    return _certificate(design, margin, maker, plants, faults, judgements)
 
 
-def _collected(
-    found: FixedController,
+class _Judgement(NamedTuple):
+    """A plant's loop; texts as in `Certificate`."""
+
+    figures: LoopFigures
+    free_damping: np.ndarray  # of the link modes without control [1], (R, 3)
+    weakest: str
+    breaking: str
+
+
+def _judge_plants(
+    design: FixedController, maker: LoopMaker, plants: np.ndarray, faults: np.ndarray
+) -> dict[tuple[int, ...], _Judgement]:
+    """Judgement of every plant that exists, by its place; writes which ones buckle into `faults`.
+
+    Args:
+        design: whose controller is judged.
+        maker: of its loops.
+        plants: (B, D, N).
+        faults: why they do not exist, (B, D, N).
+    """
+    parts = [
+        (modes, widened(part, design.n_patches)) for modes, part in linear_parts(design.controller)
+    ]
+    judgements = {}
+    for at in map(tuple, np.argwhere(faults == "")):
+        loops = [maker.loop(plants[at], part) for _, part in parts]
+        if not loops[0].is_open_loop_stable:
+            faults[at] = f"{plants[at].basis}, {plants[at].departure}: it buckles without control"
+            continue
+        each = [judge_loop(loop, STEPS) for loop in loops]
+        least = int(np.argmin([figures.gain_margin for figures in each]))
+        loop, poles = loops[least], loops[least].mode_poles
+        judgements[at] = _Judgement(
+            figures=worst_figures(
+                [(modes, figures) for (modes, _), figures in zip(parts, each, strict=True)]
+            ),
+            free_damping=-poles.real / np.abs(poles),
+            weakest=weakest_mode(loop, each[least]),
+            breaking=breaking_motion(loop, each[least].gain_margin),
+        )
+    return judgements
+
+
+def _certificate(
+    design: FixedController,
     margin: float,
     maker: LoopMaker,
     plants: np.ndarray,
     faults: np.ndarray,
-    judgements: dict[PlantVariant, Judgement],
+    judgements: dict[tuple[int, ...], _Judgement],
 ) -> Certificate:
     shape, largest = plants.shape, max(plant.n_modes for plant in plants.ravel())
     exists = faults == ""
-    law = widened(found.controller, found.n_patches)
-    channels = found.controller.velocity_gain.shape[1]
+    law = widened(design.controller, design.n_patches)
+    channels = design.controller.velocity_gain.shape[1]
 
     radius, limit = np.full((2, *shape), np.nan)
     frequency, zeta, free = np.full((3, *shape, largest, 3), np.nan)
     weakest, breaking = np.full((2, *shape), "", object)
     observation = np.full((*shape[:2], 3, channels, largest), np.nan)
     actuation = np.full((*shape[:2], 3, largest, channels), np.nan)
-    for at in map(tuple, np.argwhere(exists)):
-        one, n = judgements[plants[at]], plants[at].n_modes
-        radius[at], limit[at] = one.radius, one.margin
-        frequency[at][:n], zeta[at][:n] = one.frequency_hz, one.damping_ratio
-        free[at][:n] = one.free_damping
-        weakest[at], breaking[at] = one.weakest, one.breaking
+    for at, (figures, free_damping, *texts) in judgements.items():
+        n = plants[at].n_modes
+        radius[at], limit[at] = figures.spectral_radius, figures.gain_margin
+        frequency[at][:n], zeta[at][:n] = figures.frequency_hz, figures.damping_ratio
+        free[at][:n] = free_damping
+        weakest[at], breaking[at] = texts
     for at in map(tuple, np.argwhere(exists.any(axis=2))):
         plant = plants[at][0]._replace(n_modes=largest)
         leakage = maker.leakage(plant, law)
         observation[at] = leakage.observation[:, :channels]
         actuation[at] = leakage.actuation[:, :, :channels]
     return Certificate(
-        study=found.study,
+        study=design.study,
         required=margin,
-        n_controlled=found.structure.n_controlled,
+        n_controlled=design.structure.n_controlled,
         plants=plants,
         exists=exists,
         radius=radius,

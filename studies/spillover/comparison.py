@@ -15,8 +15,9 @@ from jaxmodel.laws.srf import SRF
 from jaxmodel.simulate import Result, simulate
 from studies.engine.controller import FixedController, fixed_controller
 from studies.engine.preflight import check_run
-from studies.engine.stability import gain_margin
-from studies.spillover.judgement import STEPS, breaking_motion, damping, follow
+from studies.engine.stability import follow_modes, gain_margin, modal_damping
+from studies.spillover.certificate import STEPS
+from studies.spillover.judgement import breaking_motion
 from studies.spillover.laws import Candidate, all_laws
 from studies.spillover.plants import LoopMaker, PlantVariant, plant_sizes
 from studies.study.margin import HIGHEST, LOWEST
@@ -147,9 +148,9 @@ class _View:
         """The same as the gains grow through factors, (steps, `SHOWN`)."""
         found = np.full((len(factors), SHOWN), np.nan)
         for modes, loop in self._parts:
-            tracked = follow(loop, factors, loop.poles)
+            tracked = follow_modes(loop, factors, loop.poles)
             # a mode's three poles belong to no single link; uncontrolled links keep the weak ones
-            zeta = -np.sort(-damping(loop, tracked)[1][:, :SHOWN], axis=2)
+            zeta = -np.sort(-modal_damping(loop, tracked)[1][:, :SHOWN], axis=2)
             last = self._n_links[None, : zeta.shape[1], None] - 1
             zeta = np.take_along_axis(zeta, last, axis=2)[..., 0]
             found[:, : zeta.shape[1]][:, modes] = zeta[:, modes]

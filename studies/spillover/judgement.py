@@ -1,124 +1,37 @@
-"""Judgement of one loop by its poles: damping, gain margin, the mode that breaks it."""
+"""What moves at the poles of a loop, in words: the mode of least damping, and what breaks it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
-from typing import NamedTuple
-
 import numpy as np
 
-from studies.engine.stability import follow_poles, gain_margin, mode_by_mode
-from studies.spillover.plants import SampledLoop
-from studies.study.margin import HIGHEST, LOWEST
+from studies.engine.stability import LoopFigures, SampledLoop, breaking_factor, pole_beyond
+from studies.study.margin import HIGHEST
 
-#: Gain factors at which modes are traced from no control to the design's gains.
-STEPS = np.linspace(0, 1, 17)[1:]
 #: A mode or link with this share of the largest one's energy is named with it [1].
 PART = 1 / 3
 
 
-class Judgement(NamedTuple):
-    """Judgement of one loop."""
-
-    radius: float  # spectral radius at the given gains [1]
-    margin: float  # largest common factor on all gains with every smaller one stable [1]
-    frequency_hz: np.ndarray  # of the link modes at the given gains, (r, 3), NaN: overdamped
-    damping_ratio: np.ndarray  # [1], (r, 3)
-    free_damping: np.ndarray  # without control [1], (r, 3)
-    weakest: str  # the mode of least damping
-    breaking: str  # what goes unstable first, "" if nothing does up to `HIGHEST`
-
-
-def judge(loop: SampledLoop) -> Judgement:
-    """Judge a loop.
-
-    Args:
-        loop: the loop; its gains belong to factor 1.
-    """
-    poles = cache(loop.poles)
-    tracked = follow(loop, STEPS, poles)[-1]
-    frequency, zeta = damping(loop, tracked)
-    free = np.pad(
-        -loop.mode_poles.real / np.abs(loop.mode_poles),
-        ((0, loop.n_modes - len(loop.mode_poles)), (0, 0)),
-        constant_values=np.nan,
-    )
-    weakest = ""
-    if not np.all(np.isnan(zeta)):
-        at = np.unravel_index(np.nanargmin(zeta), zeta.shape)
-        weakest = name_motion(loop, 1.0, tracked[at])
-    margin = gain_margin(poles, STEPS)
-    return Judgement(
-        radius=float(np.abs(poles(1.0)).max()),
-        margin=margin,
-        frequency_hz=frequency,
-        damping_ratio=zeta,
-        free_damping=free,
-        weakest=weakest,
-        breaking=breaking_motion(loop, margin),
-    )
-
-
-def worst_of(parts: list[tuple[slice, Judgement]]) -> Judgement:
-    """Worst judgement of a law whose channels act one at a time, each with the modes it covers."""
-    modes, each = [modes for modes, _ in parts], [judgement for _, judgement in parts]
-    lowest = min(each, key=lambda one: one.margin)
-    return lowest._replace(
-        radius=max(one.radius for one in each),
-        frequency_hz=mode_by_mode(modes, [one.frequency_hz for one in each]),
-        damping_ratio=mode_by_mode(modes, [one.damping_ratio for one in each]),
-    )
-
-
-def follow(
-    loop: SampledLoop, factors: np.ndarray, poles: Callable[[float], np.ndarray]
-) -> np.ndarray:
-    """Discrete poles of the link modes while the gains grow.
+def weakest_mode(loop: SampledLoop, figures: LoopFigures) -> str:
+    """The mode of least damping, "" if all are overdamped.
 
     Args:
         loop: the loop.
-        factors: gain factors, rising from near 0 [1], (steps,).
-        poles: `loop.poles`, or a cached version.
-
-    Returns:
-        (steps, r, 3), NaN where modes are overdamped without control.
+        figures: its figures.
     """
-    start = np.exp(loop.mode_poles * loop.period)
-    path = follow_poles(start.ravel(), map(poles, map(float, factors)))
-    path = path.reshape(len(path), -1, 3)
-    missing = loop.n_modes - path.shape[1]
-    return np.pad(path, ((0, 0), (0, missing), (0, 0)), constant_values=np.nan)
-
-
-def damping(loop: SampledLoop, tracked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Frequency [Hz] and damping ratio of traced modes.
-
-    A pole z of a mode above half the sample rate is exp(s T) of an s that differs from ln(z)/T by a
-    multiple of 2 pi/T: the one nearest to the mode without control is used.
-
-    Args:
-        loop: the loop.
-        tracked: discrete poles, (..., r, 3).
-
-    Returns:
-        two arrays (..., r, 3).
-    """
-    missing = loop.n_modes - len(loop.mode_poles)
-    start = np.pad(loop.mode_poles, ((0, missing), (0, 0)), constant_values=np.nan)
-    rate = np.log(tracked) / loop.period
-    turn = 2j * np.pi / loop.period
-    rate = rate + turn * np.round((start.imag - rate.imag) / turn.imag)
-    return np.abs(rate) / (2 * np.pi), -rate.real / np.abs(rate)
+    ratio = figures.damping_ratio
+    if np.all(np.isnan(ratio)):
+        return ""
+    at = np.unravel_index(np.nanargmin(ratio), ratio.shape)
+    zeta, omega = ratio[at], 2 * np.pi * figures.frequency_hz[at]
+    decay = omega * (-zeta + 1j * np.sqrt(max(1 - zeta**2, 0.0)))
+    return name_motion(loop, 1.0, np.exp(decay * loop.period))
 
 
 def breaking_motion(loop: SampledLoop, margin: float) -> str:
     """What goes unstable just beyond the margin, "" if that is `HIGHEST`."""
     if margin >= HIGHEST:
         return ""
-    factor = max(1.001 * margin, LOWEST)
-    poles = loop.poles(factor)
-    return name_motion(loop, factor, poles[np.argmax(np.abs(poles))])
+    return name_motion(loop, breaking_factor(margin), pole_beyond(loop, margin))
 
 
 def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:

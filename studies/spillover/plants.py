@@ -18,12 +18,13 @@ from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
 from jaxmodel.laws.srf import SRF
+from jaxmodel.linear import resting
 from jaxmodel.parameters import Array
 from jaxmodel.piezo import placement_faults
 from jaxmodel.prepare import prepare
-from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, closed_loop
+from jaxmodel.sampled_loop import LoopMatrices, loop_matrices
 from studies.engine.controller import FixedController
-from studies.engine.stability import link_poles
+from studies.engine.stability import SampledLoop, sampled_loop
 from studies.errors import field_error
 from studies.study.margin import MARGIN_MODES
 
@@ -75,30 +76,6 @@ class PlantVariant(NamedTuple):
     departure: Departure = Departure()
 
 
-class SampledLoop(NamedTuple):
-    """A linearised loop on the host, without the modes that its plant does not have."""
-
-    open: np.ndarray  # transition over a sample without gains, (n, n)
-    feedback: np.ndarray  # what the gains add, (n, n)
-    mode_poles: np.ndarray  # of the link modes without control [rad/s], complex, (J, 3)
-    omega: np.ndarray  # of the plant's modal coordinates [rad/s], (3, r)
-    period: float  # [s]
-
-    @property
-    def n_modes(self) -> int:
-        """r of each link."""
-        return self.omega.shape[1]
-
-    @property
-    def stands(self) -> bool:
-        """Whether the plant is stable without control: no link beyond its critical force."""
-        return bool(np.abs(self.poles(0.0)).max() <= 1 + RADIUS_TOLERANCE)
-
-    def poles(self, factor: float) -> np.ndarray:
-        """Discrete poles with all gains times a factor, (n,)."""
-        return np.linalg.eigvals(self.open + factor * self.feedback)
-
-
 class Leakage(NamedTuple):
     """Coupling between channels and plant modes, in the scale of the plant's basis."""
 
@@ -140,13 +117,13 @@ class LoopMaker:
         """The loop of a plant and a controller with a channel for each patch, see `widened`."""
         matrices, omega, _ = self._look(plant, law)
         kept, of_plant = _kept(matrices, plant.n_modes)
-        return SampledLoop(
+        matrices = matrices._replace(
             open=matrices.open[np.ix_(kept, kept)],
             feedback=matrices.feedback[np.ix_(kept, kept)],
-            mode_poles=link_poles(matrices.plant[np.ix_(of_plant, of_plant)], plant.n_modes),
-            omega=omega[:, : plant.n_modes],
-            period=float(self._found.case.electronics.period),
+            plant=matrices.plant[np.ix_(of_plant, of_plant)],
         )
+        period = float(self._found.case.electronics.period)
+        return sampled_loop(matrices, omega[:, : plant.n_modes], period, plant.n_modes)
 
     def leakage(self, plant: PlantVariant, law: Controller) -> Leakage:
         """Coupling of the channels of a `widened` controller with a plant's modes, both ways."""
@@ -206,7 +183,9 @@ def _look(
     force = loop.plant.modal_mass[:, None, None] * loop.actuator
     actuation = jnp.einsum("irk,ikc->irc", force, law.synthesizer)
     leakage = Leakage(observation, actuation)
-    return closed_loop(structure, case, pose, law), loop.omega, leakage
+    at_rest = resting(structure, case)
+    matrices = loop_matrices(structure, case, loop, law, pose, at_rest)
+    return matrices, loop.omega, leakage
 
 
 def _kept(matrices: LoopMatrices, n_modes: int) -> tuple[np.ndarray, np.ndarray]:

@@ -15,9 +15,10 @@ from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import Result
 from studies.engine.executor import Executor
 from studies.engine.plan import even_layout
-from studies.engine.poles import PoleReport
+from studies.engine.poles import PoleReport, pole_report, tracked_modes
 from studies.engine.preflight import check_run
-from studies.engine.runs import loop_and_poles, run_study
+from studies.engine.runs import run_study
+from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.study.cases import as_arrays, build_case, build_cases, in_working_precision
 from studies.study.paths import set_values
@@ -189,7 +190,12 @@ def _poles(study: Study, run: Result | None) -> PoleReport | None:
     """Specified and obtained poles of a design's own file; None if it has none or cannot run."""
     if run is None or not study.control.has_poles or study.control.feedback != "sampled":
         return None
-    return loop_and_poles(study, *check_run(study), int(run.status))[1]
+    if run.status == status.UNPLACEABLE:
+        return None
+    structure, case = check_run(study)
+    home = np.array(study.motion.waypoints[0], float)
+    loop = loop_report(structure, case, home, tracked_modes(structure))
+    return pole_report(structure, case, loop)
 
 
 def _own_run(study: Study) -> Result | None:
