@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from studies.export.document import import_study
     from studies.export.run import export_design
     from studies.extensions import extend
-    from studies.fitting.run import fit, run_fit
+    from studies.fitting.estimate import fit
+    from studies.fitting.run import run_fit
     from studies.fitting.spec import load_fit
     from studies.paper.run import run_paper
     from studies.single.run import replay, simulate
@@ -101,7 +102,7 @@ __getattr__ = lazily(
         "configure": "studies.config",
         "export_design": "studies.export.run",
         "extend": "studies.extensions",
-        "fit": "studies.fitting.run",
+        "fit": "studies.fitting.estimate",
         "import_study": "studies.export.document",
         "info": "studies.config",
         "load": "studies.engine.results",

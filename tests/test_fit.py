@@ -15,6 +15,7 @@ from rich.console import Console
 from scipy.stats import chi2
 
 from studies.errors import StudyError
+from studies.fitting.estimate import fit
 from studies.fitting.kinds.contract import Line
 from studies.fitting.kinds.modes import TWO_PI, pair_modes
 from studies.fitting.plots import curves, samples
@@ -22,7 +23,7 @@ from studies.fitting.posterior import log_density, sample, shape
 from studies.fitting.problem import Problem
 from studies.fitting.profiles import profile
 from studies.fitting.report import told, undetermined
-from studies.fitting.run import fit, run_fit
+from studies.fitting.run import run_fit
 from studies.fitting.solve import descend, solve
 from studies.fitting.spec import parse_fit
 from studies.fitting.statistics import describe_fit

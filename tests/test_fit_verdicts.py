@@ -11,10 +11,11 @@ from scipy.stats import chi2
 
 from studies.fitting import run
 from studies.fitting.bench import Modes
+from studies.fitting.estimate import estimate
 from studies.fitting.experiment import next_experiments
 from studies.fitting.kinds.modes import Measured, pair_modes
 from studies.fitting.report import is_good, sentences, summary
-from studies.fitting.run import estimate, run_fit
+from studies.fitting.run import run_fit
 from studies.fitting.solve import SAME, exchanges
 from studies.fitting.statistics import UNKNOWN, describe_fit
 from studies.tuning.spec import load_tuning
@@ -122,7 +123,7 @@ def exchanged(tmp_path_factory):
         raise np.linalg.LinAlgError("Eigenvalues did not converge")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "next_experiments", fail)
+        patch.setattr("studies.fitting.estimate.next_experiments", fail)
         patch.setattr(run, "estimate", lambda *_: estimated("symmetric pose"))
         found = run_fit(CASES["symmetric pose"].spec(1), out, Console(file=io.StringIO()))
     return out, found
@@ -166,7 +167,7 @@ def test_results_are_written_before_experiments_are_sought(exchanged, tmp_path, 
     def end(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run, "next_experiments", end)
+    monkeypatch.setattr("studies.fitting.estimate.next_experiments", end)
     monkeypatch.setattr(run, "estimate", lambda *_: exchanged[1])
     with pytest.raises(KeyboardInterrupt):
         run_fit(exchanged[1].spec, tmp_path / "out", QUIET)

@@ -9,8 +9,8 @@ data leave possible, and the next experiment.
 - Answer: `problem` stacks the residuals, `solve` finds the least by multi-start, `statistics`,
   `profiles` and `posterior` say what is known, `draw` draws machines, `experiment` says what to
   measure next.
-- `run` leads from the file to the folder, `report` and `plots` present it, `commands` is
-  `studies fit`.
+- `estimate` leads through all of these, `run` writes the folder, `report` and `plots` present it,
+  `commands` is `studies fit`.
 
 To add a kind of measurement, see `kinds`.
 """

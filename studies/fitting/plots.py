@@ -14,7 +14,7 @@ from studies.fitting.statistics import WIDE
 from studies.show.figures import SMALL, WIDTH, legend_above, new_figure
 
 if TYPE_CHECKING:
-    from studies.fitting.run import Fitted
+    from studies.fitting.estimate import Fitted
 
 #: All figures there can be.
 NAMES = ("fit", "numbers", "correlations", "profiles", "samples")

@@ -14,7 +14,7 @@ from studies.show.markdown import literal
 from studies.show.templates import render
 
 if TYPE_CHECKING:
-    from studies.fitting.run import Fitted
+    from studies.fitting.estimate import Fitted
 
 #: Experiments in the report.
 SHOWN = 5

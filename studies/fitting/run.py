@@ -4,210 +4,29 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 
-from studies.engine.preflight import check_run
 from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
 from studies.errors import StudyError
 from studies.fitting import plots
-from studies.fitting.draw import draw_machines
-from studies.fitting.experiment import Experiment, next_experiments
-from studies.fitting.kinds.contract import DataAndModel, Line, Measurement
-from studies.fitting.measurements import guess, make_bench, make_measurements
-from studies.fitting.posterior import Posterior, load_blackjax, sample, shape
-from studies.fitting.problem import Problem, complaints
-from studies.fitting.profiles import Likelihood, describe_confirmed
+from studies.fitting.estimate import Fitted, estimate, fit_phases, named_values, suggest
+from studies.fitting.kinds.contract import Line
 from studies.fitting.report import is_good, report, sentences, summary
-from studies.fitting.solve import Optimum, Solution, solve
 from studies.fitting.spec import FitSpec
-from studies.fitting.statistics import REGION, Answer, Misfit, misfit, rivals
+from studies.fitting.statistics import REGION
 from studies.show import figures
 from studies.show.pages import write_report
 from studies.store import Variable, check_folder, replacing, staged, write_store
-from studies.study.paths import set_values
-from studies.study.spec import Study, parse_study
 from studies.study.template import study_template
 
-#: Parameters up to which all likelihoods are profiled.
-PROFILED = 6
-#: Machines in the file of a tuning.
-MACHINES = 64
 #: Least gain margin of that tuning [1].
 MARGIN = 2.0
 #: Files of the folder.
 STUDY, TUNE, DATA, DOCUMENT = "fitted.toml", "fitted_tune.toml", "fit.h5", "fit.json"
-
-
-class Fitted(NamedTuple):
-    """A finished fit."""
-
-    spec: FitSpec
-    problem: Problem
-    solution: Solution
-    answer: Answer
-    rivals: tuple[Optimum, ...]  # as good as the best one, and elsewhere
-    machines: np.ndarray  # drawn from what the data leave possible, in the study's units, (n, p)
-    study: Study  # with the fitted parameters
-    comparisons: tuple[DataAndModel, ...]  # of all measurements
-    checks: tuple[Misfit, ...]  # of those held out
-    unpredicted: tuple[str, ...]  # why others held out are not among them
-    profiles: tuple[Likelihood, ...]
-    posterior: Posterior | None  # if samples were asked for
-    fault: str  # why the fitted study does not run, "" if it does
-    experiments: tuple[Experiment, ...] = ()  # the most telling first; none if the model fails
-    experiment_fault: str = ""  # why none was found
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return self.spec.free.names
-
-
-def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
-    """Fit a model to measurements.
-
-    Args:
-        spec: from `load_fit`.
-        console: where progress goes; default: nowhere.
-
-    Raises:
-        StudyError: data that cannot be used, or no starting point that leads to a fit.
-    """
-    with Phases(console or Console(quiet=True), fit_phases(spec)) as phases:
-        return suggest(estimate(spec, phases), phases)
-
-
-def fit_phases(spec: FitSpec) -> tuple[str, ...]:
-    """Names of the phases of a fit that is written."""
-    samples = ("sample",) if spec.fit.samples else ()
-    return ("fit", "profile", "machines", *samples, "check", "draw", "next experiment")
-
-
-def estimate(spec: FitSpec, phases: Phases | None = None) -> Fitted:
-    """Fit a model to measurements, without the next experiment.
-
-    Args:
-        spec: from `load_fit`.
-        phases: with those of `fit_phases`; default: shown nowhere.
-
-    Raises:
-        StudyError: as `fit`.
-    """
-    fit, phases = spec.fit, phases or Phases(Console(quiet=True), fit_phases(spec))
-    if fit.samples:
-        load_blackjax()
-    phases.begin("fit")
-    bench = make_bench(spec)
-    every = make_measurements(spec, bench)
-    kept = tuple(x for x in every if not x.is_checked)
-    complaints(kept, guess(spec))
-    problem = Problem(
-        free=spec.free,
-        priors=spec.priors,
-        measurements=kept,
-        bench=bench,
-        is_robust=fit.loss == "robust",
-    )
-    _check(problem, phases, fit.starts)
-    solution = solve(problem, fit.starts, fit.refine, fit.iterations, fit.seed)
-    phases.begin("profile", "the likelihood")
-    has_all = fit.profile and len(spec.free.numbers) <= PROFILED
-    answer, profiles = describe_confirmed(problem, solution.best.u, has_all)
-    phases.begin("machines", f"{MACHINES} that the data leave possible")
-    places = draw_machines(problem, solution, MACHINES, fit.seed)
-    posterior = None
-    if fit.samples:
-        phases.begin("sample", f"{fit.samples} from the posterior")
-        posterior = sample(problem, shape(answer), fit.samples, fit.seed)
-    phases.begin("check")
-    checks, unpredicted = _predictable([x for x in every if x.is_checked], answer.values)
-    study = parse_study(set_values(spec.study, _numbers(spec, answer.values)))
-    return Fitted(
-        spec=spec,
-        problem=problem,
-        solution=solution,
-        answer=answer,
-        rivals=rivals(problem, solution, answer),
-        machines=problem.free.values(places),
-        study=study,
-        comparisons=tuple(
-            DataAndModel(x.name, x.is_checked, x.comparison(answer.values))
-            for x in (*kept, *checks)
-        ),
-        checks=tuple(misfit(x, x.residual(answer.values, False)) for x in checks),
-        unpredicted=unpredicted,
-        profiles=profiles,
-        posterior=posterior,
-        fault=_fault(study),
-    )
-
-
-def suggest(found: Fitted, phases: Phases) -> Fitted:
-    """The same with the next experiment, or with the reason why there is none."""
-    if not found.answer.is_explained:  # a wrong model does not know what it would learn
-        return found
-    phases.begin("next experiment")
-    given = found.problem.bench, found.problem.free, found.answer.place, found.answer.covariance
-    try:
-        return found._replace(experiments=tuple(next_experiments(*given)))
-    except (StudyError, ArithmeticError, ValueError) as error:  # LinAlgError is a ValueError
-        return found._replace(experiment_fault=str(error))
-
-
-def _check(problem: Problem, phases: Phases, starts: int) -> None:
-    """Refuse data too large or too few for the parameters.
-
-    Raises:
-        StudyError: naming what is allowed.
-    """
-    first = problem.residual(problem.free.places())
-    if not np.isfinite(np.sum(first**2)):
-        raise StudyError(
-            "fit.data: squared residuals of the starting point overflow; allowed: data and noise "
-            "within many orders of magnitude of the model"
-        )
-    size, priors = len(problem.free.numbers), len(problem.priors)
-    count = len(first) - priors
-    if count + priors < size:
-        raise StudyError(
-            f"fit: {count} measured numbers and {priors} known beforehand for {size} parameters; "
-            "allowed: as many or more. Fix some, or give mean and sigma of what is known"
-        )
-    phases.say(f"{count} measured numbers, {size} parameters; {starts} starting points")
-
-
-def _predictable(
-    checks: list[Measurement], values: np.ndarray
-) -> tuple[list[Measurement], tuple[str, ...]]:
-    """Held-out measurements that the fitted model predicts, and why it does not the others."""
-    kept, faults = [], []
-    for one in checks:
-        try:
-            fault = one.complaint(values)
-            one.reweigh(values)
-            one.residual(values, False)
-            kept.append(one)
-        except (StudyError, np.linalg.LinAlgError) as error:
-            fault = str(error).removeprefix(f"{one.name}: ")
-        if fault:
-            faults.append(f"{one.name} (held out): {fault}")
-    return kept, tuple(faults)
-
-
-def _fault(study: Study) -> str:
-    try:
-        check_run(study)
-    except StudyError as error:
-        return str(error)
-    return ""
-
-
-def _numbers(spec: FitSpec, values: np.ndarray) -> dict[str, float]:
-    return {x.name: float(v) for x, v in zip(spec.free.numbers, values, strict=True)}
 
 
 def run_fit(
@@ -343,7 +162,7 @@ def document(found: Fitted) -> str:
             {found.names[k]: float(x.parts[k]) for k in x.named()} for x in answer.undetermined
         ],
         "equally_good": [
-            {"rise": found.solution.rise(x), "values": _numbers(found.spec, free.values(x.u))}
+            {"rise": found.solution.rise(x), "values": named_values(found.spec, free.values(x.u))}
             for x in found.rivals
         ],
         "correlation": answer.correlation.tolist(),
