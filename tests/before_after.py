@@ -49,6 +49,7 @@ def write(out: Path) -> None:
         ended = subprocess.run(
             [sys.executable, "-c", "from studies.cli import main; main()", *job],
             stdout=subprocess.DEVNULL,
+            timeout=3600,
         )
         print(*job, "->", ended.returncode, flush=True)
 

@@ -94,7 +94,7 @@ class Machines:
             with suppress(psutil.Error):
                 process.kill()
         for process in self.processes:
-            process.wait()
+            process.wait(timeout=60)
 
 
 @contextmanager

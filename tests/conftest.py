@@ -48,8 +48,15 @@ HEAVY = (
 )
 
 
+#: Limit of a long campaign [s]; that of every other test stands in pyproject.toml.
+LONG = 600
+
+
 def pytest_collection_modifyitems(items):
-    """Heavy files first; otherwise as collected."""
+    """Heavy files first, otherwise as collected; more time for long campaigns."""
+    for item in items:
+        if item.get_closest_marker("long") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(LONG))
     place = {f"test_{name}.py": k for k, name in enumerate(HEAVY)}
     items.sort(key=lambda item: place.get(Path(item.fspath).name, len(HEAVY)))
 

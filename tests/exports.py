@@ -67,8 +67,13 @@ def needs_sanitizers(folder):
     command = [*needs_compiler(), "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     source = folder / "nothing.c"
     source.write_text("int main(void) { return 0; }\n")
-    done = subprocess.run([*command, "-o", folder / "nothing", source], capture_output=True)
-    if done.returncode or subprocess.run([folder / "nothing"], capture_output=True).returncode:
+    done = subprocess.run(
+        [*command, "-o", folder / "nothing", source], capture_output=True, timeout=120
+    )
+    if (
+        done.returncode
+        or subprocess.run([folder / "nothing"], capture_output=True, timeout=120).returncode
+    ):
         pytest.skip("the C compiler here has no address and undefined-behaviour sanitizers")
     return command
 

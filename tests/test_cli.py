@@ -468,7 +468,9 @@ def test_commands_that_run_nothing_need_no_jax(capsys):
         "        pass\n"
         "print(sorted({'jax', 'matplotlib', 'scipy'} & set(sys.modules)), file=sys.stderr)\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120
+    )
     assert "velocity_gain" in done.stdout
     assert done.stderr.strip() == "[]"
 

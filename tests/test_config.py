@@ -251,6 +251,7 @@ def test_what_keeps_jax_from_starting_is_said():
         env={**os.environ, "JAX_PLATFORMS": "nonsense"},
         capture_output=True,
         text=True,
+        timeout=120,
     )
     assert done.returncode == 2 and done.stderr.startswith("studies: JAX cannot start: ")
     assert "JAX_PLATFORMS='nonsense'" in done.stderr and "Traceback" not in done.stderr

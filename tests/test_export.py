@@ -113,9 +113,9 @@ def test_code_compiles_as_cpp_and_under_more_warnings(
     out, _ = exported(capsys, designs, folders, name, target)
     strict = [*STRICT, "-Wconversion", "-Wsign-conversion", "-Wshadow", "-Wstrict-prototypes"]
     made = ["-c", "-o", tmp_path / "object.o"]
-    subprocess.run([*needs_compiler(), *strict, *made, out / "flexlink.c"], check=True)
+    subprocess.run([*needs_compiler(), *strict, *made, out / "flexlink.c"], check=True, timeout=120)
     flags = ["-std=c++11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", *made, "-x", "c++"]
-    subprocess.run([*needs_cpp(), *flags, out / "flexlink.c"], check=True)
+    subprocess.run([*needs_cpp(), *flags, out / "flexlink.c"], check=True, timeout=120)
 
 
 STUBS = """
@@ -135,13 +135,13 @@ def test_the_example_of_the_documentation_compiles(capsys, designs, folders, tmp
     example = re.search(r"```c\n(#include.*?)```", page, re.DOTALL)[1]
     (tmp_path / "main.c").write_text(STUBS + example)
     made = ["-I", out, "-c", "-o", tmp_path / "main.o", tmp_path / "main.c"]
-    subprocess.run([*needs_compiler(), *STRICT, *made], check=True)
+    subprocess.run([*needs_compiler(), *STRICT, *made], check=True, timeout=120)
 
 
 def test_code_refuses_to_be_compiled_without_nan(capsys, designs, folders, tmp_path):
     out, _ = exported(capsys, designs, folders, "paper", "c")
     command = [*needs_compiler(), "-ffast-math", "-c", "-o", tmp_path / "o.o", out / "flexlink.c"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode and "leave out the check for NaN" in done.stderr
 
 
@@ -152,10 +152,16 @@ def fuzz(out, target, folder, samples, seeds, single=False):
     flags += ["-DFLEXLINK_REAL=float"] if single else []
     program = folder / "fuzz"
     sources = ["tests/data/fuzz.c", out / "flexlink.c"]
-    subprocess.run([*needs_sanitizers(folder), *flags, "-o", program, *sources], check=True)
+    subprocess.run(
+        [*needs_sanitizers(folder), *flags, "-o", program, *sources], check=True, timeout=120
+    )
     for seed in range(seeds):
         done = subprocess.run(
-            [program, str(samples), str(seed)], capture_output=True, text=True, check=False
+            [program, str(samples), str(seed)],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=120,
         )
         assert done.returncode == 0, done.stdout + done.stderr[-3000:]
         assert re.fullmatch(rf"{samples} samples, [1-9]\d* faults\n", done.stdout)
@@ -201,8 +207,10 @@ def test_the_shaper_holds_the_last_finite_reference(capsys, designs, folders, tm
     out, _ = exported(capsys, designs, folders, "single", "c")
     (tmp_path / "held.c").write_text(HELD)
     command = [*needs_compiler(), "-std=c99", "-I", out, "-o", tmp_path / "held"]
-    subprocess.run([*command, tmp_path / "held.c", out / "flexlink.c"], check=True)
-    done = subprocess.run([tmp_path / "held"], capture_output=True, text=True, check=True)
+    subprocess.run([*command, tmp_path / "held.c", out / "flexlink.c"], check=True, timeout=120)
+    done = subprocess.run(
+        [tmp_path / "held"], capture_output=True, text=True, check=True, timeout=120
+    )
     assert done.stdout == "5 2 3 0 0 0"
 
 
@@ -418,7 +426,7 @@ def test_a_title_stays_a_comment(capsys, tmp_path, title):
     arguments = ("--target", "c", "--no-verify", "--out", tmp_path / "out")
     assert run(capsys, "export", path, *arguments)[0] == 0
     made = ["-c", "-o", tmp_path / "object.o", tmp_path / "out" / "flexlink.c"]
-    subprocess.run([*needs_compiler(), *STRICT, *made], check=True)
+    subprocess.run([*needs_compiler(), *STRICT, *made], check=True, timeout=120)
     assert "evil" not in re.sub(
         r"/\*.*?\*/", "", (tmp_path / "out" / "flexlink.c").read_text(), flags=re.DOTALL
     )

@@ -182,4 +182,6 @@ def test_the_call_is_lowered_for_cuda(every_loop):
 def test_ptx_is_valid(every_loop, tmp_path):
     source = tmp_path / "run.ptx"
     source.write_text(gpu.write_ptx(every_loop, 100, 4 * gpu.BLOCK))
-    subprocess.run(["ptxas", "-arch=sm_90", source, "-o", tmp_path / "run.cubin"], check=True)
+    subprocess.run(
+        ["ptxas", "-arch=sm_90", source, "-o", tmp_path / "run.cubin"], check=True, timeout=120
+    )

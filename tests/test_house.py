@@ -64,6 +64,19 @@ def test_choices_from_tables_are_compared_with_their_names_nowhere_else():
     assert found == []
 
 
+def test_every_child_process_of_a_test_has_a_limit_of_time():
+    endless = [
+        f"{path.name}:{node.lineno}"
+        for path in sorted((TOP / "tests").glob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call)
+        and ast.unparse(node.func).split(".")[-2:]
+        in (["subprocess", "run"], ["subprocess", "check_output"], ["process", "communicate"])
+        and "timeout" not in {keyword.arg for keyword in node.keywords}
+    ]
+    assert endless == []
+
+
 def test_formatting_has_no_exceptions():
     mark = "fmt: " + "skip"
     files = [

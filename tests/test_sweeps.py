@@ -289,7 +289,7 @@ def killed_until_done(data, out, n_kills, seed):
             time.sleep(0.002)
         time.sleep(rng.random() * 0.05)
         process.send_signal(signal.SIGKILL)
-        process.communicate()
+        process.communicate(timeout=120)
         seen.append(set(finished_cases(out).case_id.tolist()))
         assert kill == 0 or seen[-1] >= seen[-2]
     return seen
@@ -471,7 +471,7 @@ def test_full_disk_keeps_what_is_finished(tmp_path, mixed):
         assert not list((out / "s" / CHUNKS).glob("*.tmp"))
         if is_mounted:
             assert 0 < kept < 72
-            subprocess.run(["mount", "-o", "remount,size=8m", str(out)], check=True)
+            subprocess.run(["mount", "-o", "remount,size=8m", str(out)], check=True, timeout=120)
         else:
             resource.setrlimit(resource.RLIMIT_FSIZE, old)
         assert run(small_spec(), out / "s", is_resumed=True).n_run == 72 - kept
@@ -479,13 +479,13 @@ def test_full_disk_keeps_what_is_finished(tmp_path, mixed):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, old)
         if is_mounted:
-            subprocess.run(["umount", "-l", str(out)], check=False)
+            subprocess.run(["umount", "-l", str(out)], check=False, timeout=120)
 
 
 def _mount(folder, options):
     with contextlib.suppress(OSError):
         command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
-        return subprocess.run(command, capture_output=True).returncode == 0
+        return subprocess.run(command, capture_output=True, timeout=120).returncode == 0
     return False
 
 
