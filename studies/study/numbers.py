@@ -1,0 +1,149 @@
+"""The numbers of a study, or of many, by the names of the file.
+
+They are one dictionary: the name of each field, as in the file and in its unit, with an array of a
+shape that the schema decides. Lists of unequal length are padded with NaN, a number that stands for
+all links is there three times, choices are positions among their names, truth values are 1 or 0.
+`studies.study.cases.case_of` turns them into the arrays of the model.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from types import EllipsisType
+from typing import Any, Literal, get_args, get_origin
+
+import jax
+import numpy as np
+
+from jaxmodel.case import Structure
+from jaxmodel.laws.state_space import STATE_SPACE
+from studies.study.fields import Columns, Fields, nesting
+from studies.study.paths import LINKS, all_fields, field_choices, parse_entry
+from studies.study.spec import OWN_FIELDS, Study
+from studies.study.state_space import system_of
+from studies.study.window import DELAY, residual_delay
+
+Numbers = dict[str, Any]
+#: How a field's array looks, without the axis of cases: () for a number or (n, ...) for a list;
+#: one entry a link, (3,); a list a link, (3, n); one entry for each controlled mode of each link,
+#: (3, C); a position among names; one entry a move, (n,), n = 1 if one stands for all.
+Form = Literal["plain", "integer", "choice", "link", "list of links", "mode", "move"]
+#: Its number, or one a link, is that of mode 1; those of other fields are the same for all modes.
+OF_MODE_1 = "control.damping"
+
+
+@cache
+def form_of(field: str) -> Form:
+    """How the array of a field looks, from its type in the schema."""
+    if field.startswith(f"{OWN_FIELDS}."):
+        return "link"
+    if field_choices(field):
+        return "choice"
+    alternatives = _alternatives(field)
+    if alternatives == (int,):
+        return "integer"
+    depths = set(map(_depth, alternatives))
+    has_triple = any(len(set(get_args(x))) == 1 and len(get_args(x)) == LINKS for x in alternatives)
+    if {1, 2} <= depths:
+        return "mode" if has_triple else "list of links"
+    if {0, 1} <= depths:
+        return "link" if has_triple else "move"
+    return "plain"
+
+
+def _alternatives(field: str) -> tuple[Any, ...]:
+    """Types that a field can have, without the empty list."""
+    section, _, leaf = field.partition(".")
+    model: Any = Study.model_fields[section].annotation
+    annotation = model.model_fields[leaf].annotation
+    is_one = get_origin(annotation) in (None, tuple)
+    return tuple(x for x in ((annotation,) if is_one else get_args(annotation)) if x != tuple[()])
+
+
+def _depth(annotation: Any) -> int:
+    """Levels of lists."""
+    return 1 + _depth(get_args(annotation)[0]) if get_origin(annotation) is tuple else 0
+
+
+def study_numbers(study: Study, structure: Structure, columns: Columns | None = None) -> Numbers:
+    """The numbers of many studies that differ in some fields, NumPy arrays.
+
+    Args:
+        study: values of all fields that no column names.
+        structure: sizes; those of the largest case.
+        columns: values of the others, one per case (see `studies.study.fields`).
+
+    Returns:
+        By field, with a leading axis: the cases, or of length 1 where they do not differ. A
+        controller from a file is `state_space`, in real modal form.
+    """
+    fields = Fields(study, columns)
+    numbers: Numbers = {
+        name: _array(fields, name, structure)
+        for name in all_fields()
+        if name != DELAY and not name.startswith((f"{OWN_FIELDS}.", "state_space."))
+    }
+    own = f"{OWN_FIELDS}.{structure.law}."
+    numbers |= {name: fields.each_link(name) for name in all_fields() if name.startswith(own)}
+    # "auto" is that of the study without columns
+    is_given = DELAY in fields.columns
+    numbers[DELAY] = fields.numbers(DELAY) if is_given else np.array([residual_delay(study)])
+    if structure.law == STATE_SPACE.name:
+        system = system_of(study.state_space, structure.n_patches)
+        numbers["state_space"] = jax.tree.map(lambda x: np.asarray(x)[None], system)
+    return numbers
+
+
+def one_study(study: Study, structure: Structure) -> Numbers:
+    """The numbers of a study, without an axis of cases."""
+    numbers: Numbers = jax.tree.map(lambda x: x[0], study_numbers(study, structure))
+    return numbers
+
+
+def _array(fields: Fields, field: str, structure: Structure) -> np.ndarray:
+    form = form_of(field)
+    if form == "choice":
+        return fields.choices(field, field_choices(field))
+    if form == "integer":
+        return fields.raw(field).astype(int)
+    if form == "mode":
+        return _by_mode(fields, field, (LINKS, structure.n_controlled))
+    if form == "link":
+        return fields.each_link(field)
+    array = fields.numbers(field)
+    if form == "plain":  # lists of lists keep their axes where there is none
+        missing = max(map(_depth, _alternatives(field))) + 1 - array.ndim
+        return array.reshape(*array.shape, *[0] * missing)
+    if array.ndim == 1:
+        array = array[:, None]
+    is_for_all = form == "list of links" and array.ndim == 2
+    return np.repeat(array[:, None], LINKS, axis=1) if is_for_all else array
+
+
+def _by_mode(fields: Fields, field: str, shape: tuple[int, int]) -> np.ndarray:
+    array = fields.spread(field, shape, missing=np.nan)
+    if field != OF_MODE_1:
+        return array
+    is_by_mode = np.array([nesting(value) > 0 for value in fields.raw(field)])
+    return np.where(is_by_mode[:, None, None] | (np.arange(shape[1]) == 0), array, np.nan)
+
+
+def position(study: Study, name: str) -> tuple[str, tuple[int | EllipsisType, ...]]:
+    """Where a number of a study is among its numbers.
+
+    Args:
+        study: which says whether a list is one for all links.
+        name: a field, or an entry of it.
+
+    Returns:
+        field, and index into its array without an axis of cases; all that the number stands for.
+    """
+    entry = parse_entry(name)
+    assert entry is not None
+    field, indices = entry
+    if len(indices) < 2:
+        if form_of(field) == "list of links":
+            return field, (..., *indices)
+        if field == OF_MODE_1:
+            return field, (*(indices or (...,)), 0)
+    return field, (*indices, ...)
