@@ -176,10 +176,10 @@ def linear_parts(controller: Controller) -> list[tuple[slice, Controller]]:
         part = controller._replace(
             velocity_gain=alone * controller.velocity_gain,
             position_gain=None if position is None else alone * position,
-            rival_omega=np.zeros_like(controller.rival_omega),
+            rival_omega=None,
         )
         parts.append((slice(j, j + 1), part))
-    return parts or [(slice(None), controller)]
+    return parts or [(slice(None), controller._replace(rival_omega=None))]
 
 
 def controller_step(

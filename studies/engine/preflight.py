@@ -51,6 +51,7 @@ class Preflight(NamedTuple):
     motion_end: Any  # of the unshaped motion [s], ()
     shaper_length: Any  # [s], ()
     condition: Any  # worst condition number of filter and synthesizer [1], ()
+    drive_rate: Any  # of the sliders' drive and friction [1/s], ()
     highest: Any  # frequency of the highest plant mode [rad/s], ()
     damping: Any  # largest damping ratio of a link mode [1], ()
     corner: Any  # highest low-pass corner of the velocity estimate [rad/s], ()
@@ -93,6 +94,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
         end,
         shaper_length,
         worst,
+        drive_rate(case),
         jnp.max(prepared.loop.omega),
         damping,
         corner,
@@ -136,8 +138,8 @@ def check_run(study: Study) -> tuple[Structure, Case]:
     config.require_configured()
     check_locked(study)
     structure, case = build_structure(study), as_arrays(build_case(study))
-    structure = structure._replace(substeps=_drive_substeps(study, structure, case))
     known = preflight(structure, case)
+    structure = structure._replace(substeps=_drive_substeps(study, float(known.drive_rate)))
     for k, pose in enumerate(study.motion.waypoints):
         check_pose(study, f"motion.waypoints.{k}", pose, int(known.pose_status[k]), known.lift[k])
     if int(known.path_status) != status.OK:
@@ -332,9 +334,8 @@ def step_counts(needed: Any) -> np.ndarray:
     return 2 ** np.ceil(np.log2(np.maximum(needed, 1))).astype(int)
 
 
-def _drive_substeps(study: Study, structure: Structure, case: Case) -> int:
+def _drive_substeps(study: Study, rate: float) -> int:
     """Plant steps per sample that the sliders' drive and friction need, or as given."""
-    rate = float(drive_rate(case))
     needed = max(int(np.ceil(rate / study.electronics.sample_rate_hz / STIFFNESS_LIMIT)), 1)
     given, drive = study.run.substeps, study.drive
     if needed <= (given or SUBSTEP_LIMIT):

@@ -83,6 +83,9 @@ class Leakage(NamedTuple):
     actuation: Array  # modal force per channel force, actuator x synthesizer, (3, R, C)
 
 
+_placement_faults = jax.jit(placement_faults)
+
+
 class LoopMaker:
     """Builds loops of one design's machine with any controller; one compilation per basis."""
 
@@ -100,7 +103,7 @@ class LoopMaker:
     def fault(self, plant: PlantVariant) -> str:
         """Why there is no such plant, "" if there is one."""
         study, machine = self._found.study, self._placed(plant).machine
-        is_off, is_overlapping = placement_faults(machine.patches, machine.beam.length)
+        is_off, is_overlapping = _placement_faults(machine.patches, machine.beam.length)
         if is_off or is_overlapping:
             what = "patches leave the link" if is_off else "patches overlap"
             return f"{plant.departure}: {what}"
@@ -154,7 +157,7 @@ class LoopMaker:
             has_sensor_highpass=known.has_sensor_highpass,
             has_amplifier=known.has_amplifier,
         )
-        law = jax.tree.map(jnp.asarray, law)
+        law = jax.tree.map(jnp.asarray, law._replace(rival_omega=None))  # linear: nothing switches
         return jax.tree.map(np.asarray, _look(structure, self._placed(plant), self._pose, law))
 
     def _placed(self, plant: PlantVariant) -> Case:
