@@ -65,8 +65,8 @@ def measured_modes(bench, one, values):
     plant = bench.plant(one._pose, values, False)
     modes = plant.modes
     frequency = np.abs(modes.pole) / TWO_PI
-    bending = np.flatnonzero(frequency > 60)[: len(one._measured.frequency)]
-    return one._measured._replace(
+    bending = np.flatnonzero(frequency > 60)[: len(one._modes.frequency)]
+    return one._modes._replace(
         frequency=frequency[bending],
         damping=(-modes.pole.real / np.abs(modes.pole))[bending],
         shapes=(np.asarray(plant.value.sensor) @ modes.shape[:, bending]).T,
@@ -105,7 +105,7 @@ def test_derivatives_of_every_kind(every_kind, kind):
     bench, values, measurements = every_kind
     one = measurements[kind]
     if kind == "modes":
-        one._measured = measured_modes(bench, one, values * 1.001)
+        one.use(measured_modes(bench, one, values * 1.001))
     found = one.residual(values, True)
     step = 1e-3 if kind == "reduction" else 1e-4  # whose steps round off
     wanted = fourth_order(lambda x: one.residual(x, False).value, values, step)
@@ -126,7 +126,7 @@ def test_modes_are_paired_by_shape(folder):
     pairs = pair_modes(mixed, modes, np.asarray(plant.value.sensor))
     frequency = np.abs(modes.pole[pairs.mode]) / TWO_PI
     np.testing.assert_allclose(frequency, mixed.frequency, rtol=1e-9)
-    assert np.ptp(truth.frequency[:3]) < 0.02 * truth.frequency[0] and pairs.likeness.min() > 0.9
+    assert np.ptp(truth.frequency[:3]) < 0.02 * truth.frequency[0] and pairs.mac.min() > 0.9
 
 
 def noisy(one, kind, values, rng):
@@ -134,12 +134,14 @@ def noisy(one, kind, values, rng):
     if kind == "modes":
         truth = measured_modes(one._bench, one, values)
         n = len(truth.frequency)
-        one._measured = truth._replace(
-            frequency=truth.frequency + truth.sigma * rng.normal(size=n),
-            damping=truth.damping + truth.damping_sigma * rng.normal(size=n),
+        one.use(
+            truth._replace(
+                frequency=truth.frequency + truth.sigma * rng.normal(size=n),
+                damping=truth.damping + truth.damping_sigma * rng.normal(size=n),
+            )
         )
         return
-    found = one.predicted(values, False)[0]
+    found = one.predict(values, False)[0]
     if kind == "spectrum":
         shape = 64
         one.measured = np.abs(found) ** 2 * rng.gamma(shape, 1 / shape, len(found))
@@ -614,12 +616,12 @@ def test_poses_out_of_reach_are_no_data(folder):
 def test_spectra_of_few_averages_have_the_residuals_of_their_likelihood(folder):
     """Squares add up to twice the negative log likelihood, up to a constant."""
     bench, (one,), values = made(spec_of(folder, SPECTRUM | {"averages": 2}))
-    model = np.abs(one.predicted(values, False)[0]) ** 2
+    model = np.abs(one.predict(values, False)[0]) ** 2
     rng = np.random.default_rng(0)
     one.measured = 3.0 * model * rng.gamma(2, 0.5, len(model))
 
     def likelihood(values):
-        model = np.abs(one.predicted(values, False)[0]) ** 2
+        model = np.abs(one.predict(values, False)[0]) ** 2
         level = np.mean(one.measured / model)
         return 2 * np.sum(2 * (np.log(level * model) + one.measured / (level * model)))
 

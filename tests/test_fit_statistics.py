@@ -68,7 +68,7 @@ def test_an_interval_is_1_96_standard_deviations(size):
     assert found.chi_square == pytest.approx(square) and found.freedom == 200 - size
     assert found.probability == pytest.approx(chi2.sf(square, 200 - size))
     assert found.is_explained and not found.undetermined and not found.is_too_close
-    np.testing.assert_allclose(found.push, 0, atol=1e-9)
+    np.testing.assert_allclose(found.gradient, 0, atol=1e-9)
 
 
 def test_an_interval_ends_at_the_bounds():
@@ -133,7 +133,7 @@ def test_neighbours_that_correlate_are_no_noise(n):
         r = autoregressive(correlation, n)
         found = measured(r)
         own = np.sum(r[1:] * r[:-1]) / np.sum(r**2)
-        assert found.likeness == pytest.approx(own) and found.square == pytest.approx(n)
+        assert found.autocorrelation == pytest.approx(own) and found.square == pytest.approx(n)
         assert (abs(own) < 4 / np.sqrt(n)) == is_noise == found.is_noise
     # in another order they are
     assert measured(autoregressive(0.5, n), is_ordered=False).is_noise
@@ -143,7 +143,7 @@ def test_the_limit_of_correlation_falls_as_the_root_of_the_number():
     n = 400
     for correlation, is_noise in ((0.13, True), (0.28, False)):
         found = measured(autoregressive(correlation, n, seed=4))
-        assert found.is_noise == is_noise, found.likeness
+        assert found.is_noise == is_noise, found.autocorrelation
 
 
 def test_residuals_that_are_too_large_are_no_noise():
@@ -153,8 +153,8 @@ def test_residuals_that_are_too_large_are_no_noise():
     # of measurements that were softened, by what noise would have there
     scaled = measured(1.3 * r, mean_square=1.69)
     assert scaled.is_noise and scaled.square == pytest.approx(400)
-    assert _misfit(scaled) == ["a/b", "400", "1", f"{scaled.likeness:.2f}", "yes"]
-    assert _misfit(measured(2 * r))[2:] == ["4", f"{scaled.likeness:.2f}", "**no**"]
+    assert _misfit(scaled) == ["a/b", "400", "1", f"{scaled.autocorrelation:.2f}", "yes"]
+    assert _misfit(measured(2 * r))[2:] == ["4", f"{scaled.autocorrelation:.2f}", "**no**"]
 
 
 def test_one_free_number_in_two_is_no_information():

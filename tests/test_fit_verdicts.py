@@ -299,7 +299,7 @@ def test_correlated_noise_is_said_once(tmp_path):
     blank(tmp_path)
     spec = spec_of(tmp_path, entry, free=MODULUS, study=machine(), starts=4, refine=1)
     _, (one,), values = made(spec)
-    model, rng = one.predicted(values, False)[0], np.random.default_rng(0)
+    model, rng = one.predict(values, False)[0], np.random.default_rng(0)
     real, imag = (x + 0.8e-3 * noise_of(0.9, rng, len(x)) for x in (model.real, model.imag))
     write(tmp_path, "response.csv", frequency_hz=FREQUENCY, real=real, imag=imag)
     found = estimate(spec)

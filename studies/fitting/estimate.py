@@ -15,7 +15,7 @@ from studies.fitting.experiment import Experiment, next_experiments
 from studies.fitting.kinds.contract import DataAndModel, Measurement
 from studies.fitting.measurements import guess, make_bench, make_measurements
 from studies.fitting.posterior import Posterior, load_blackjax, sample, shape
-from studies.fitting.problem import Problem, complaints
+from studies.fitting.problem import Problem, check_sanity
 from studies.fitting.profiles import Likelihood, describe_confirmed
 from studies.fitting.solve import Optimum, Solution, solve
 from studies.fitting.spec import FitSpec
@@ -91,7 +91,7 @@ def estimate(spec: FitSpec, phases: Phases | None = None) -> Fitted:
     bench = make_bench(spec)
     every = make_measurements(spec, bench)
     kept = tuple(x for x in every if not x.is_checked)
-    complaints(kept, guess(spec))
+    check_sanity(kept, guess(spec))
     problem = Problem(
         free=spec.free,
         priors=spec.priors,
@@ -122,8 +122,7 @@ def estimate(spec: FitSpec, phases: Phases | None = None) -> Fitted:
         machines=problem.free.values(places),
         study=study,
         comparisons=tuple(
-            DataAndModel(x.name, x.is_checked, x.comparison(answer.values))
-            for x in (*kept, *checks)
+            DataAndModel(x.name, x.is_checked, x.compare(answer.values)) for x in (*kept, *checks)
         ),
         checks=tuple(misfit(x, x.residual(answer.values, False)) for x in checks),
         unpredicted=unpredicted,
@@ -174,7 +173,7 @@ def _predictable(
     kept, faults = [], []
     for one in checks:
         try:
-            fault = one.complaint(values)
+            fault = one.sanity_error(values)
             one.reweigh(values)
             one.residual(values, False)
             kept.append(one)

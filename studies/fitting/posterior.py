@@ -66,8 +66,8 @@ def shape(answer: Answer) -> Shape:
         u = expit(v)
         away = u - answer.place
         pull = answer.information @ away
-        value = answer.push @ away + 0.5 * away @ pull - np.sum(_log_width(v))
-        return float(value), (answer.push + pull) * u * (1 - u) - (1 - 2 * u)
+        value = answer.gradient @ away + 0.5 * away @ pull - np.sum(_log_width(v))
+        return float(value), (answer.gradient + pull) * u * (1 - u) - (1 - 2 * u)
 
     start = logit(np.clip(answer.place, 0.02, 0.98))
     middle = minimize(cost, start, jac=True, method="BFGS").x

@@ -92,13 +92,13 @@ def softened(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return value, slope
 
 
-def complaints(measurements: Sequence[Measurement], values: np.ndarray) -> None:
+def check_sanity(measurements: Sequence[Measurement], values: np.ndarray) -> None:
     """Refuse data whose unit or order cannot be meant.
 
     Raises:
         StudyError: naming the measurement.
     """
     for one in measurements:
-        fault = one.complaint(values)
+        fault = one.sanity_error(values)
         if fault:
             raise StudyError(f"{one.name}: {fault}")

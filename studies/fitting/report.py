@@ -176,9 +176,9 @@ def _unexplained(answer: Answer) -> list[str]:
         )
     return lines + [
         f"The noise of {cell(one.name)} is correlated from one value to the next "
-        f"({one.likeness:.2f}), as of data sampled faster than their noise changes: the values are "
-        f"not independent, and uncertainties are about {one.understated:.2g} times those given "
-        "here. Take fewer values, further apart."
+        f"({one.autocorrelation:.2f}), as of data sampled faster than their noise changes: the "
+        f"values are not independent, and uncertainties are about {one.understated:.2g} times "
+        "those given here. Take fewer values, further apart."
         for one in answer.correlated
     ]
 
@@ -281,12 +281,12 @@ def cell(name: str) -> str:
 
 
 def _misfit(one: Misfit) -> list[str]:
-    likeness = "-" if np.isnan(one.likeness) else f"{one.likeness:.2f}"
+    autocorrelation = "-" if np.isnan(one.autocorrelation) else f"{one.autocorrelation:.2f}"
     return [
         cell(one.name),
         str(one.size),
         f"{one.square / max(one.size, 1):.3g}",
-        likeness,
+        autocorrelation,
         "yes" if one.is_noise else "**no**",
     ]
 

@@ -51,14 +51,14 @@ class Misfit(NamedTuple):
     name: str
     size: int  # residuals
     square: float  # their sum of squares
-    likeness: float  # of neighbours: correlation [1]; 0 for noise, nan if they have no order
+    autocorrelation: float  # of neighbours: correlation [1]; 0 for noise, nan if they have no order
     is_noise: bool  # whether the residuals look like the stated noise
     is_correlated: bool  # no larger than the stated noise, but neighbours are alike
 
     @property
     def understated(self) -> float:
         """Uncertainties over those quoted, as the noise is correlated [1] (first-order process)."""
-        return correlated_scale(self.square / self.size, self.likeness)
+        return correlated_scale(self.square / self.size, self.autocorrelation)
 
 
 class Answer(NamedTuple):
@@ -71,7 +71,7 @@ class Answer(NamedTuple):
     correlation: np.ndarray  # (p, p)
     covariance: np.ndarray  # between the bounds [1], (p, p)
     information: np.ndarray  # J^T J of the residuals by the places, and of profiles, (p, p)
-    push: np.ndarray  # J^T r: slope of half chi square, 0 but for numbers at a bound, (p,)
+    gradient: np.ndarray  # J^T r: slope of half chi square, 0 but for numbers at a bound, (p,)
     directions: tuple[Direction, ...]  # the widest first
     misfits: tuple[Misfit, ...]
     chi_square: float
@@ -139,7 +139,7 @@ def describe_fit(
         correlation=covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance))),
         covariance=covariance,
         information=known.T @ known,
-        push=jacobian.T @ residual,
+        gradient=jacobian.T @ residual,
         directions=directions,
         misfits=tuple(
             misfit(x, part) for x, part in zip(problem.measurements, parts, strict=False)
@@ -203,33 +203,35 @@ def misfit(one: Measurement, part: Residual) -> Misfit:
     """How well a measurement is met."""
     r = part.value / np.sqrt(one.mean_square)
     square, n = float(np.sum(r**2)), len(r)
-    likeness = np.nan
+    autocorrelation = np.nan
     if one.is_ordered and n > 10 and square > 0:
-        likeness = float(np.sum(r[1:] * r[:-1]) / square)
-    is_white = np.isnan(likeness) or abs(likeness) < 4 / np.sqrt(n) or square < 0.25 * n
+        autocorrelation = float(np.sum(r[1:] * r[:-1]) / square)
+    is_white = (
+        np.isnan(autocorrelation) or abs(autocorrelation) < 4 / np.sqrt(n) or square < 0.25 * n
+    )
     is_small = chi2.sf(square, n) >= UNLIKELY / 10
     is_correlated = False
-    if likeness >= 4 / np.sqrt(n):
+    if autocorrelation >= 4 / np.sqrt(n):
         # as many independent squares as these have the same variance as n correlated ones
-        m = n * (1 - likeness**2) / (1 + likeness**2)
+        m = n * (1 - autocorrelation**2) / (1 + autocorrelation**2)
         is_met = chi2.sf(square * m / n, m) >= UNLIKELY / 10
-        is_telling = square >= 0.25 * n or correlated_scale(square / n, likeness) > 1
+        is_telling = square >= 0.25 * n or correlated_scale(square / n, autocorrelation) > 1
         is_correlated = bool(is_met and is_telling)
     return Misfit(
         name=one.name,
         size=n,
         square=square,
-        likeness=likeness,
+        autocorrelation=autocorrelation,
         is_noise=bool(is_white and is_small and not is_correlated),
         is_correlated=is_correlated,
     )
 
 
-def correlated_scale(mean_square: float, likeness: float) -> float:
+def correlated_scale(mean_square: float, autocorrelation: float) -> float:
     """Standard deviation of a mean over that of as many independent values of variance 1.
 
     Args:
         mean_square: of the values [1].
-        likeness: correlation of neighbours [1].
+        autocorrelation: correlation of neighbours [1].
     """
-    return float(np.sqrt(mean_square * (1 + likeness) / (1 - likeness)))
+    return float(np.sqrt(mean_square * (1 + autocorrelation) / (1 - autocorrelation)))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -15,10 +16,10 @@ class Residual(NamedTuple):
 
 
 def scaled(
-    found: np.ndarray, slope: np.ndarray | None, measured: np.ndarray, sigma: np.ndarray
+    model: np.ndarray, slope: np.ndarray | None, measured: np.ndarray, sigma: np.ndarray
 ) -> Residual:
     """The residual of real numbers of the model, (m,), with their derivatives, (m, p)."""
-    value = (found - measured) / sigma
+    value = (model - measured) / sigma
     return Residual(value, None if slope is None else slope / sigma[:, None])
 
 
@@ -78,31 +79,55 @@ class Noise(NamedTuple):
         return np.where(found > 0, found, self.sigma(measured))
 
 
-class Measurement(Protocol):
-    """One set of measured numbers and its model."""
+class Measurement(ABC):
+    """One set of measured numbers and its model.
 
-    name: str
-    kind: str
-    is_checked: bool  # held out: not fitted, only compared
-    is_ordered: bool  # neighbours in `residual` are neighbours in time or frequency
-    n_hidden: int  # numbers that it fits by itself
-    mean_square: float  # of residuals that are noise [1]
+    Where `predict` gives real numbers, and every one of them has its label, the defaults will do.
+    """
+
+    kind: ClassVar[str]
+    is_ordered: ClassVar[bool] = False  # neighbours in `residual` are neighbours in time, frequency
+    n_hidden: ClassVar[int] = 0  # numbers that it fits by itself
+    mean_square: float = 1.0  # of residuals that are noise [1]
+    labels: tuple[str, ...] = ()  # of the numbers, with their units
+
+    def __init__(
+        self, name: str, is_checked: bool, measured: np.ndarray, sigma: np.ndarray
+    ) -> None:
+        """
+        Args:
+            name: in messages and figures.
+            is_checked: held out: not fitted, only compared.
+            measured: (n,).
+            sigma: standard deviations of the measured values, (n,).
+        """
+        self.name, self.is_checked = name, is_checked
+        self.measured, self.sigma = measured, sigma
+
+    @abstractmethod
+    def predict(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
+        """Numbers of the model at some values of the parameters (p,), (n,).
+
+        Returns:
+            (the numbers, their derivatives by the parameters (n, p) or None).
+        """
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
         """At some values of the parameters, (p,)."""
-        ...
+        return scaled(*self.predict(values, has_slopes), self.measured, self.sigma)
 
-    def reweigh(self, values: np.ndarray) -> None:
+    def reweigh(self, values: np.ndarray) -> None:  # noqa: B027
         """Take noise that is a share of the value from the model's values from now on.
 
-        Of measured values, those that noise made small would count more than the others.
+        Of measured values, those that noise made small would count more than the others. By
+        default the noise is no share, or one of the measured values.
         """
-        ...
 
-    def comparison(self, values: np.ndarray) -> Line | Numbers:
+    def compare(self, values: np.ndarray) -> Line | Numbers:
         """For figures and tables."""
-        ...
+        model, _ = self.predict(values, False)
+        return Numbers(labels=self.labels, measured=self.measured, model=model, sigma=self.sigma)
 
-    def complaint(self, values: np.ndarray) -> str:
+    def sanity_error(self, values: np.ndarray) -> str:
         """What looks wrong with the data at the starting point, "" if nothing."""
-        ...
+        return ""

@@ -16,7 +16,7 @@ from jaxmodel.simulate import simulate
 from studies.engine.executor import Place
 from studies.errors import StudyError
 from studies.fitting.bench import with_slopes
-from studies.fitting.kinds.contract import Numbers, Residual, scaled
+from studies.fitting.kinds.contract import Measurement
 from studies.fitting.kinds.motions import OFF, check_finished, smooth_run
 from studies.study.entries import Entries
 from studies.study.spec import Study
@@ -73,22 +73,22 @@ class Runs:
         needed = [x.switch for x in compared] + [_off(x) for x in compared if x.is_reduction]
         self._switches += [x for x in dict.fromkeys(needed) if x not in self._switches]
 
-    def find(self, values: np.ndarray, has_slopes: bool) -> Any:
+    def run(self, values: np.ndarray, has_slopes: bool) -> Any:
         """Metrics of all runs and, perhaps, their derivatives.
 
         Raises:
             StudyError: a run that does not reach its end.
         """
-        key, slopes, found = self._kept
+        key, slopes, outcome = self._kept
         if key != values.tobytes() or (has_slopes and not slopes):
             masks = np.array([x.links for x in self._switches], float)
             modes = np.array([x.modes for x in self._switches])
             structure = self._structure._replace(metrics=tuple(sorted(self._metrics)))
             run = _metric_slopes if has_slopes else _metrics
-            given = structure, self._place, self._case, masks, modes, values
-            found = jax.tree.map(np.asarray, run(*given))
-            self._kept = values.tobytes(), has_slopes, found
-        metrics, code, *by = found
+            outcome = run(structure, self._place, self._case, masks, modes, values)
+            outcome = jax.tree.map(np.asarray, outcome)
+            self._kept = values.tobytes(), has_slopes, outcome
+        metrics, code, *by = outcome
         for one in code:
             check_finished("figures", int(one))
         return metrics, *by[: int(has_slopes)]
@@ -98,25 +98,26 @@ class Runs:
         return self._switches.index(switch)
 
 
-class Figures:
+class Figures(Measurement):
     """Metrics of runs that differ in which links are controlled."""
 
-    kind, is_ordered, n_hidden = "figures", False, 0
-    mean_square = 1.0
+    kind = "figures"
 
     def __init__(
         self, name: str, is_checked: bool, runs: Runs, compared: tuple[Compared, ...]
     ) -> None:
-        self.name, self.is_checked, self._runs, self._compared = name, is_checked, runs, compared
+        measured, sigma = (
+            np.array([getattr(x, k) for x in compared]) for k in ("measured", "sigma")
+        )
+        super().__init__(name, is_checked, measured, sigma)
+        self.labels = tuple(x.title for x in compared)
+        self._runs, self._compared = runs, compared
         runs.add(compared)
-        self.measured = np.array([x.measured for x in compared])
-        self.sigma = np.array([x.sigma for x in compared])
 
-    def predicted(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
-        """Numbers of the model, (m,), and their derivatives, (m, p)."""
-        found = [self._number(x, *self._runs.find(values, has_slopes)) for x in self._compared]
-        value = np.array([x for x, _ in found])
-        return value, np.array([by for _, by in found]) if has_slopes else None
+    def predict(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
+        outcome = self._runs.run(values, has_slopes)
+        numbers, slopes = zip(*(self._number(x, *outcome) for x in self._compared), strict=True)
+        return np.array(numbers), np.array(slopes) if has_slopes else None
 
     def _number(self, one: Compared, metrics: Any, slopes: Any = None) -> tuple[Any, Any]:
         on, by_on = self._taken(one, one.switch, metrics, slopes)
@@ -142,24 +143,6 @@ class Figures:
         parts = np.stack([one.entries.take(x)[0][kept] for x in by], axis=-1)  # (entries, p)
         slope = (value @ parts) / (len(value) * size) if size != 0 else parts.sum(0)
         return root, slope / (2 * root) if one.is_amplitude and root > 0 else slope
-
-    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
-        found, slope = self.predicted(values, has_slopes)
-        return scaled(found, slope, self.measured, self.sigma)
-
-    def reweigh(self, values: np.ndarray) -> None:
-        pass  # few numbers, whose noise is a share of what was measured
-
-    def comparison(self, values: np.ndarray) -> Numbers:
-        return Numbers(
-            labels=tuple(x.title for x in self._compared),
-            measured=self.measured,
-            model=self.predicted(values, False)[0],
-            sigma=self.sigma,
-        )
-
-    def complaint(self, values: np.ndarray) -> str:
-        return ""
 
 
 def _off(one: Compared) -> Switch:

@@ -6,14 +6,15 @@ model's modes near one frequency (subspace MAC), so that three nearly equal mode
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from abc import abstractmethod
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from studies.errors import StudyError, field_error
-from studies.fitting.bench import Bench, Modes
-from studies.fitting.kinds.contract import Numbers, Residual, scaled
+from studies.fitting.bench import Bench, Modes, Pose
+from studies.fitting.kinds.contract import Measurement, Numbers
 
 #: Modes closer than this share one subspace [1].
 NEAR = 0.03
@@ -34,7 +35,7 @@ class Measured(NamedTuple):
     shapes: np.ndarray | None  # voltages of the sensors, (k, 3 K)
 
 
-class _Predicted(NamedTuple):
+class ModelModes(NamedTuple):
     """The model's modes that belong to the measured ones, and derivatives if asked for."""
 
     frequency: np.ndarray  # [Hz], (k,)
@@ -42,76 +43,69 @@ class _Predicted(NamedTuple):
     by_frequency: np.ndarray | None  # (k, p)
     by_damping: np.ndarray | None  # (k, p)
     mode: np.ndarray  # which of the model's, the lowest 0, (k,)
-    likeness: np.ndarray | None  # subspace MAC [1], (k,); None without shapes
+    mac: np.ndarray | None  # subspace MAC [1], (k,); None without shapes
 
 
-class _Modes:
-    """What measured modes share, however they are predicted."""
+class _Modes(Measurement):
+    """Measured frequencies, then those damping ratios that are known."""
 
-    kind, is_ordered, n_hidden = "modes", False, 0
-    mean_square = 1.0
+    kind = "modes"
 
-    def __init__(self, name: str, is_checked: bool, bench: Bench, measured: Measured) -> None:
-        self.name, self.is_checked = name, is_checked
-        self._bench, self._measured = bench, measured
+    def __init__(self, name: str, is_checked: bool, bench: Bench, modes: Measured) -> None:
+        super().__init__(name, is_checked, modes.frequency, modes.sigma)
+        self._bench = bench
+        self.use(modes)
 
-    def predicted(self, values: np.ndarray, has_slopes: bool) -> _Predicted:
+    def use(self, modes: Measured) -> None:
+        """Compare the model with these modes from now on."""
+        self._modes, self._damped = modes, np.zeros(0, int)
+        self.measured, self.sigma = modes.frequency, modes.sigma
+        if modes.damping is not None and modes.damping_sigma is not None:
+            self._damped = np.flatnonzero(np.isfinite(modes.damping))
+            self.measured = np.append(modes.frequency, modes.damping[self._damped])
+            self.sigma = np.append(modes.sigma, modes.damping_sigma[self._damped])
+        self.labels = (
+            *(f"mode {k + 1} [Hz]" for k in range(len(modes.frequency))),
+            *(f"damping {k + 1} [1]" for k in self._damped),
+        )
+
+    @abstractmethod
+    def model_modes(self, values: np.ndarray, has_slopes: bool) -> ModelModes:
         """The model's modes at some values of the parameters, (p,)."""
-        raise NotImplementedError
 
-    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
-        measured, found = self._measured, self.predicted(values, has_slopes)
-        parts = [scaled(found.frequency, found.by_frequency, measured.frequency, measured.sigma)]
-        if measured.damping is not None and measured.damping_sigma is not None:
-            at = np.isfinite(measured.damping)
-            by = None if found.by_damping is None else found.by_damping[at]
-            given = measured.damping[at], measured.damping_sigma[at]
-            parts.append(scaled(found.damping[at], by, *given))
-        slopes = [x.slope for x in parts if x.slope is not None]
-        value = np.concatenate([x.value for x in parts])
-        return Residual(value, np.concatenate(slopes) if slopes else None)
+    def predict(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
+        model = self.model_modes(values, has_slopes)
+        value = np.append(model.frequency, model.damping[self._damped])
+        if model.by_frequency is None or model.by_damping is None:
+            return value, None
+        return value, np.concatenate([model.by_frequency, model.by_damping[self._damped]])
 
-    def reweigh(self, values: np.ndarray) -> None:
-        pass  # its noise is no share
-
-    def comparison(self, values: np.ndarray) -> Numbers:
-        measured, found = self._measured, self.predicted(values, False)
-        parts = [(f"mode {k + 1} [Hz]" for k in range(len(found.frequency)))]
-        data, model, sigma = [measured.frequency], [found.frequency], [measured.sigma]
-        if measured.damping is not None and measured.damping_sigma is not None:
-            at = np.isfinite(measured.damping)
-            parts.append(f"damping {k + 1} [1]" for k in np.flatnonzero(at))
-            for whole, x in zip(
-                (data, model, sigma),
-                (measured.damping, found.damping, measured.damping_sigma),
-                strict=True,
-            ):
-                whole.append(x[at])
-        labels = tuple(x for part in parts for x in part)
-        notes = [f"mode {k + 1} of the model" for k in found.mode]
-        if found.likeness is not None:
-            notes = [f"{x}, shape {y:.3f} of 1" for x, y in zip(notes, found.likeness, strict=True)]
+    def compare(self, values: np.ndarray) -> Numbers:
+        model = self.model_modes(values, False)
+        notes = [f"mode {k + 1} of the model" for k in model.mode]
+        if model.mac is not None:
+            notes = [f"{x}, shape {y:.3f} of 1" for x, y in zip(notes, model.mac, strict=True)]
         return Numbers(
-            labels=labels,
-            measured=np.concatenate(data),
-            model=np.concatenate(model),
-            sigma=np.concatenate(sigma),
+            labels=self.labels,
+            measured=self.measured,
+            model=self.predict(values, False)[0],
+            sigma=self.sigma,
             notes=tuple(notes),
         )
 
-    def complaint(self, values: np.ndarray) -> str:
+    def sanity_error(self, values: np.ndarray) -> str:
         try:
-            found = self.predicted(values, False)
+            model = self.model_modes(values, False)
         except StudyError as error:
             return str(error)
-        if found.likeness is not None and found.likeness.min() < ALIKE:
-            k = int(found.likeness.argmin())
+        if model.mac is not None and model.mac.min() < ALIKE:
+            k = int(model.mac.argmin())
             return (
-                f"the shape of mode {k + 1} ({self._measured.frequency[k]:g} Hz) is only "
-                f"{found.likeness[k]:.2f} alike to any of the model's (1: the same): check order "
+                f"the shape of mode {k + 1} ({self._modes.frequency[k]:g} Hz) is only "
+                f"{model.mac[k]:.2f} alike to any of the model's (1: the same): check order "
                 "and signs of its voltages, link by link and patch by patch"
             )
-        ratio = float(np.median(found.frequency / self._measured.frequency))
+        ratio = float(np.median(model.frequency / self._modes.frequency))
         if not 0.1 < ratio < 10:
             return (
                 f"the model's frequencies are {ratio:.3g} times the measured ones at the starting "
@@ -124,24 +118,24 @@ class HeldModes(_Modes):
     """Modes of one link between held joints, in their order."""
 
     def __init__(
-        self, name: str, is_checked: bool, bench: Bench, measured: Measured, link: int
+        self, name: str, is_checked: bool, bench: Bench, modes: Measured, link: int
     ) -> None:
-        super().__init__(name, is_checked, bench, measured)
+        super().__init__(name, is_checked, bench, modes)
         self._link = link
 
-    def predicted(self, values: np.ndarray, has_slopes: bool) -> _Predicted:
-        whole = self._bench.held(values, has_slopes)
+    def model_modes(self, values: np.ndarray, has_slopes: bool) -> ModelModes:
+        count = len(self._modes.frequency)
         frequency, damping, *slopes = (
-            x[self._link, : len(self._measured.frequency)] for x in whole
+            x[self._link, :count] for x in self._bench.held(values, has_slopes)
         )
         by_frequency, by_damping = slopes or (None, None)
-        return _Predicted(
+        return ModelModes(
             frequency=frequency,
             damping=damping,
             by_frequency=by_frequency,
             by_damping=by_damping,
-            mode=np.arange(len(frequency)),
-            likeness=None,
+            mode=np.arange(count),
+            mac=None,
         )
 
 
@@ -149,19 +143,14 @@ class MachineModes(_Modes):
     """Modes of the machine at a pose, held by its drive."""
 
     def __init__(
-        self,
-        name: str,
-        is_checked: bool,
-        bench: Bench,
-        measured: Measured,
-        pose: tuple[float, float, float],
+        self, name: str, is_checked: bool, bench: Bench, modes: Measured, pose: Pose
     ) -> None:
-        super().__init__(name, is_checked, bench, measured)
+        super().__init__(name, is_checked, bench, modes)
         self._pose = pose
 
-    def predicted(self, values: np.ndarray, has_slopes: bool) -> _Predicted:
+    def model_modes(self, values: np.ndarray, has_slopes: bool) -> ModelModes:
         plant = self._bench.plant(self._pose, values, has_slopes)
-        pairs = pair_modes(self._measured, plant.modes, plant.value.sensor)
+        pairs = pair_modes(self._modes, plant.modes, plant.value.sensor)
         pole = plant.modes.pole[pairs.mode]
         size = np.abs(pole)
         by_frequency = by_damping = None
@@ -169,13 +158,13 @@ class MachineModes(_Modes):
             paired = Modes(pole, pairs.shape, pairs.dual)
             by_frequency, by_damping = mode_slopes(paired, plant.slope.state)
         order = np.argsort(np.abs(plant.modes.pole), stable=True)
-        return _Predicted(
+        return ModelModes(
             frequency=size / TWO_PI,
             damping=-pole.real / size,
             by_frequency=by_frequency,
             by_damping=by_damping,
             mode=np.argsort(order)[pairs.mode],
-            likeness=None if self._measured.shapes is None else pairs.likeness,
+            mac=None if self._modes.shapes is None else pairs.mac,
         )
 
 
@@ -199,7 +188,7 @@ class Pairs(NamedTuple):
     mode: np.ndarray  # (k,)
     shape: np.ndarray  # its right eigenvector, (n, k)
     dual: np.ndarray  # and left one, (k, n)
-    likeness: np.ndarray  # subspace MAC [1], (k,); 1 without shapes
+    mac: np.ndarray  # subspace MAC [1], (k,); 1 without shapes
 
 
 def pair_modes(measured: Measured, modes: Modes, sensor: np.ndarray) -> Pairs:
@@ -222,7 +211,7 @@ def pair_modes(measured: Measured, modes: Modes, sensor: np.ndarray) -> Pairs:
         mode = mode[np.argsort(frequency[mode])]  # crossed pairs may be as near, but not as alike
         return Pairs(mode, modes.shape[:, mode], modes.dual[mode], np.ones(len(mode)))
     seen = sensor @ modes.shape  # (3 K, m)
-    likeness = np.array(
+    mac = np.array(
         [
             [_share(shape, seen[:, _near(frequency, k, NEAR)]) for k in range(len(frequency))]
             for shape in measured.shapes
@@ -231,7 +220,7 @@ def pair_modes(measured: Measured, modes: Modes, sensor: np.ndarray) -> Pairs:
     own = np.abs(measured.shapes.conj() @ (seen / np.linalg.norm(seen, axis=0))) ** 2
     own /= np.linalg.norm(measured.shapes, axis=1)[:, None] ** 2
     # of modes in one subspace the likest, unless frequencies say otherwise
-    _, mode = linear_sum_assignment(-likeness - 0.1 * own + 0.3 * np.minimum(apart, 1.0))
+    _, mode = linear_sum_assignment(-mac - 0.1 * own + 0.3 * np.minimum(apart, 1.0))
     right, left = modes.shape[:, mode].copy(), modes.dual[mode].copy()
     for k, m in enumerate(mode):
         same = _near(frequency, m, EQUAL)
@@ -240,7 +229,7 @@ def pair_modes(measured: Measured, modes: Modes, sensor: np.ndarray) -> Pairs:
             part = part / np.linalg.norm(part)
             right[:, k] = modes.shape[:, same] @ part
             left[k] = part.conj() @ modes.dual[same]
-    return Pairs(mode, right, left, likeness[np.arange(len(mode)), mode])
+    return Pairs(mode, right, left, mac[np.arange(len(mode)), mode])
 
 
 def _near(frequency: np.ndarray, k: int, share: float) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import digamma
 
 from studies.fitting.bench import Bench, Pose, response
-from studies.fitting.kinds.contract import Line, Noise, Residual, scaled
+from studies.fitting.kinds.contract import Line, Measurement, Noise, Residual, scaled
 from studies.study.signals import Signal
 
 TWO_PI = 2 * np.pi
@@ -16,11 +16,10 @@ TWO_PI = 2 * np.pi
 OTHER_UNIT = 100.0
 
 
-class _OfBench:
+class _OfBench(Measurement):
     """What responses and spectra share: one input, one output, one pose."""
 
-    kind, is_ordered, n_hidden = "response", True, 0
-    mean_square = 1.0
+    kind, is_ordered = "response", True
 
     def __init__(
         self,
@@ -45,31 +44,22 @@ class _OfBench:
             noise: of the measured values.
             unit: of the response.
         """
-        self.name, self.is_checked = name, is_checked
+        super().__init__(name, is_checked, measured, noise.sigma(measured))
         self._bench, self._pose, self._signals, self._order = bench, pose, signals, order
-        self.frequency, self.measured, self._unit = frequency, measured, unit
-        self._noise, self.sigma = noise, noise.sigma(measured)
+        self.frequency, self._noise, self._unit = frequency, noise, unit
 
-    def predicted(
-        self, values: np.ndarray, has_slopes: bool
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Response, (f,), and its derivatives, (f, p)."""
+    def predict(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
         plant = self._bench.plant(self._pose, values, has_slopes)
         omega = TWO_PI * self.frequency
-        found = response(plant, self._signals, self._bench.places(self._signals), omega)
+        value, slope = response(plant, self._signals, self._bench.places(self._signals), omega)
         turn = (1j * omega) ** self._order
-        slope = None if found.slope is None else found.slope * turn[:, None]
-        return found.value * turn, slope
-
-    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
-        """As of every measurement."""
-        raise NotImplementedError
+        return value * turn, None if slope is None else slope * turn[:, None]
 
     def reweigh(self, values: np.ndarray) -> None:
-        self.sigma = self._noise.of_model(self.predicted(values, False)[0], self.measured)
+        self.sigma = self._noise.of_model(self.predict(values, False)[0], self.measured)
 
-    def complaint(self, values: np.ndarray) -> str:
-        model = np.abs(self.predicted(values, False)[0])
+    def sanity_error(self, values: np.ndarray) -> str:
+        model = np.abs(self.predict(values, False)[0])
         ratio = float(np.median(np.abs(self.measured)) / max(np.median(model), 1e-300))
         if 1 / OTHER_UNIT < ratio < OTHER_UNIT:
             return ""
@@ -96,37 +86,35 @@ class ComplexResponse(_OfBench):
     """Real and imaginary part."""
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
-        found, slope = self.predicted(values, has_slopes)
-        away = (found - self.measured) / self.sigma
+        model, slope = self.predict(values, has_slopes)
+        away = (model - self.measured) / self.sigma
         value = np.concatenate([away.real, away.imag])
         if slope is None:
             return Residual(value, None)
         scaled = slope / self.sigma[:, None]
         return Residual(value, np.concatenate([scaled.real, scaled.imag]))
 
-    def comparison(self, values: np.ndarray) -> Line:
-        found = np.abs(self.predicted(values, False)[0])
-        measured = np.abs(self.measured)
+    def compare(self, values: np.ndarray) -> Line:
+        model, _ = self.predict(values, False)
         label = f"response [{self._unit}]"
-        return self._line(label, measured, found, values)
+        return self._line(label, np.abs(self.measured), np.abs(model), values)
 
 
 class Magnitude(_OfBench):
     """Absolute value alone."""
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
-        found, slope = self.predicted(values, has_slopes)
-        size = np.abs(found)
+        model, slope = self.predict(values, has_slopes)
+        size = np.abs(model)
         by = None
         if slope is not None:
-            unit = np.where(size > 0, found / np.where(size > 0, size, 1.0), 0.0)
+            unit = np.where(size > 0, model / np.where(size > 0, size, 1.0), 0.0)
             by = (unit.conj()[:, None] * slope).real
         return scaled(size, by, self.measured, self.sigma)
 
-    def comparison(self, values: np.ndarray) -> Line:
-        found = np.abs(self.predicted(values, False)[0])
-        label = f"magnitude [{self._unit}]"
-        return self._line(label, self.measured, found, values)
+    def compare(self, values: np.ndarray) -> Line:
+        model, _ = self.predict(values, False)
+        return self._line(f"magnitude [{self._unit}]", self.measured, np.abs(model), values)
 
 
 class Spectrum(_OfBench):
@@ -146,12 +134,12 @@ class Spectrum(_OfBench):
         self.mean_square = float(2 * averages * (np.log(averages) - digamma(averages)))
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
-        found, slope = self.predicted(values, has_slopes)
-        weight, away = self._shares(np.abs(found) ** 2)
+        model, slope = self.predict(values, has_slopes)
+        weight, away = self._shares(np.abs(model) ** 2)
         root = np.sqrt(self._averages) * _half_deviance(away)  # over x - 1
         if slope is None:
             return Residual(-away * root, None)
-        by = 2 * (slope / found[:, None]).real
+        by = 2 * (slope / model[:, None]).real
         return Residual(-away * root, (self._averages / root)[:, None] * (by - weight @ by))
 
     def _shares(self, model: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -162,13 +150,12 @@ class Spectrum(_OfBench):
     def reweigh(self, values: np.ndarray) -> None:
         pass  # its noise follows from the averages
 
-    def comparison(self, values: np.ndarray) -> Line:
-        found = np.abs(self.predicted(values, False)[0]) ** 2
-        level = np.mean(self.measured / found)
-        label = "power spectrum [any unit]"
-        return self._line(label, self.measured, level * found, values)
+    def compare(self, values: np.ndarray) -> Line:
+        model = np.abs(self.predict(values, False)[0]) ** 2
+        level = np.mean(self.measured / model)
+        return self._line("power spectrum [any unit]", self.measured, level * model, values)
 
-    def complaint(self, values: np.ndarray) -> str:
+    def sanity_error(self, values: np.ndarray) -> str:
         return ""  # any strength will do
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from studies.errors import StudyError
-from studies.fitting.kinds.contract import Line, Noise, Numbers, Residual, scaled
+from studies.fitting.kinds.contract import Line, Measurement, Noise
 from studies.fitting.kinds.motions import Motion, Recording
 from studies.study.signals import Signal
 
@@ -17,11 +17,10 @@ STILL = 1e-15
 TINY = 1e-30
 
 
-class Trace:
+class Trace(Measurement):
     """One signal over time, compared at the times of the measurement."""
 
-    kind, is_ordered, n_hidden = "trace", True, 0
-    mean_square = 1.0
+    kind, is_ordered = "trace", True
 
     def __init__(
         self,
@@ -44,16 +43,12 @@ class Trace:
             noise: of the measured values.
             unit: of the signal.
         """
-        self.name, self.is_checked, self._unit = name, is_checked, unit
-        self._motion, self._signal = motion, signal
-        self.time, self.measured = time, measured
-        self._noise, self.sigma = noise, noise.sigma(measured)
+        super().__init__(name, is_checked, measured, noise.sigma(measured))
+        self._motion, self._signal, self._noise, self._unit = motion, signal, noise, unit
+        self.time = time
         motion.add(signal)
 
-    def predicted(
-        self, values: np.ndarray, has_slopes: bool
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """The signal at the measured times, (n,), and its derivatives, (n, p)."""
+    def predict(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
         run = self._motion.find(self.name, self._signal, values, has_slopes)
         model = np.interp(self.time, run.time, run.value)
         if run.slope is None:
@@ -61,29 +56,22 @@ class Trace:
         by = [np.interp(self.time, run.time, x) for x in run.slope.T]
         return model, np.stack(by, axis=1)
 
-    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
-        found, slope = self.predicted(values, has_slopes)
-        return scaled(found, slope, self.measured, self.sigma)
-
     def reweigh(self, values: np.ndarray) -> None:
-        self.sigma = self._noise.of_model(self.predicted(values, False)[0], self.measured)
+        self.sigma = self._noise.of_model(self.predict(values, False)[0], self.measured)
 
-    def comparison(self, values: np.ndarray) -> Line:
-        found = self.predicted(values, False)[0]
-        label = f"{self._signal.kind} [{self._unit}]"
-        away = self.residual(values, False).value
+    def compare(self, values: np.ndarray) -> Line:
         return Line(
             abscissa="time [s]",
-            ordinate=label,
+            ordinate=f"{self._signal.kind} [{self._unit}]",
             x=self.time,
             measured=self.measured,
-            model=found,
-            away=away,
+            model=self.predict(values, False)[0],
+            away=self.residual(values, False).value,
             is_log=False,
         )
 
-    def complaint(self, values: np.ndarray) -> str:
-        model = self.predicted(values, False)[0]
+    def sanity_error(self, values: np.ndarray) -> str:
+        model = self.predict(values, False)[0]
         ratio = float(np.ptp(self.measured) / max(np.ptp(model), 1e-300))
         if 0.01 < ratio < 100:
             return ""
@@ -100,15 +88,14 @@ class Band(NamedTuple):
     without: Motion | None  # the run without control, if it is a share
 
 
-class Settling:
+class Settling(Measurement):
     """Time from the end of the command until a signal stays within a band.
 
     The signal's envelope counts: from peak to peak it decays exponentially, so that the time and
     its derivatives are smooth while peaks sink below the band.
     """
 
-    kind, is_ordered, n_hidden = "settling", False, 0
-    mean_square = 1.0
+    kind, labels = "settling", ("settling time [s]",)
 
     def __init__(
         self,
@@ -129,30 +116,26 @@ class Settling:
             measured: [s].
             sigma: standard deviation [s].
         """
-        self.name, self.is_checked = name, is_checked
+        super().__init__(name, is_checked, np.array([measured]), np.array([sigma]))
         self._motion, self._signal, self._band = motion, signal, band
-        self.measured, self.sigma = np.array([measured]), np.array([sigma])
         for run in (motion, band.without):
             if run is not None:
                 run.add(signal)
 
-    def predicted(
-        self, values: np.ndarray, has_slopes: bool
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """The model's settling time, (1,), and its derivatives, (1, p)."""
+    def predict(self, values: np.ndarray, has_slopes: bool) -> tuple[np.ndarray, Any]:
         run = self._motion.find(self.name, self._signal, values, has_slopes)
         level, by_level = self._level(values, has_slopes)
-        found = settled(run, level)
-        if found is None:
+        entry = find_band_entry(run, level)
+        if entry is None:
             raise StudyError(
                 f"{self.name}: the model does not settle to {level:.3g} within the run; allowed: "
                 "a wider band or a longer run.duration"
             )
-        time = np.array([found.time])
+        time = np.array([entry.time])
         if run.slope is None or by_level is None:
             return time, None
-        size = np.sign(run.value[found.samples])[:, None] * run.slope[found.samples]
-        return time, (found.by_samples @ size + found.by_level * by_level)[None]
+        size = np.sign(run.value[entry.samples])[:, None] * run.slope[entry.samples]
+        return time, (entry.by_samples @ size + entry.by_level * by_level)[None]
 
     def _level(self, values: np.ndarray, has_slopes: bool) -> tuple[float, np.ndarray | None]:
         """The band in the unit of the signal, and its derivatives."""
@@ -164,29 +147,15 @@ class Settling:
         slope = None if free.slope is None else width * np.sign(free.value[k]) * free.slope[k]
         return width * abs(float(free.value[k])), slope
 
-    def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
-        return scaled(*self.predicted(values, has_slopes), self.measured, self.sigma)
-
-    def reweigh(self, values: np.ndarray) -> None:
-        pass  # its noise is no share
-
-    def comparison(self, values: np.ndarray) -> Numbers:
-        return Numbers(
-            labels=("settling time [s]",),
-            measured=self.measured,
-            model=self.predicted(values, False)[0],
-            sigma=self.sigma,
-        )
-
-    def complaint(self, values: np.ndarray) -> str:
-        self.predicted(values, False)  # may not settle
+    def sanity_error(self, values: np.ndarray) -> str:
+        self.predict(values, False)  # may not settle
         run = self._motion.find(self.name, self._signal, values, False)
         if np.ptp(run.value) < STILL:
             return f"the signal stays at {run.value[0]:.3g} in the model: nothing settles"
         return ""
 
 
-class Settled(NamedTuple):
+class BandEntry(NamedTuple):
     """When a signal's envelope enters a band, and how that depends on the signal."""
 
     time: float  # from the end of the command [s]
@@ -195,7 +164,7 @@ class Settled(NamedTuple):
     by_level: float  # derivative by the band
 
 
-def settled(run: Recording, level: float) -> Settled | None:
+def find_band_entry(run: Recording, level: float) -> BandEntry | None:
     """When the envelope of a recorded signal enters a band for good.
 
     Args:
@@ -210,18 +179,20 @@ def settled(run: Recording, level: float) -> Settled | None:
     peak = np.flatnonzero(inner & (run.time[:-2] >= run.command_end)) + 1
     outside = np.flatnonzero(size[peak] > level)
     if not outside.size:
-        return Settled(0.0, np.arange(6), np.zeros(6), 0.0)
+        return BandEntry(0.0, np.arange(6), np.zeros(6), 0.0)
     last = int(outside[-1])
     if last + 1 == len(peak):
         return None
     first, second = peak[last], peak[last + 1]
     samples = np.concatenate([first + np.arange(-1, 2), second + np.arange(-1, 2)])
     start = run.time[first] - run.command_end, run.time[second] - run.command_end
-    given = start, run.time[1] - run.time[0]
+    period = run.time[1] - run.time[0]
     x = np.append(size[samples], level)
     steps = x + 1j * TINY * np.diag(np.maximum(x, 1e-300))
-    by = np.array([_entered(row, *given).imag for row in steps]) / (TINY * np.maximum(x, 1e-300))
-    return Settled(float(_entered(x, *given).real), samples, by[:6], float(by[6]))
+    by = np.array([_entered(row, start, period).imag for row in steps]) / (
+        TINY * np.maximum(x, 1e-300)
+    )
+    return BandEntry(float(_entered(x, start, period).real), samples, by[:6], float(by[6]))
 
 
 def _entered(x: np.ndarray, start: tuple[float, float], period: float) -> Any:
