@@ -8,41 +8,6 @@ collects everything; `plots`, `drawing` and `figures` show it, `report` writes t
 is `studies atlas`.
 """
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from studies.lazy import lazily
-
-if TYPE_CHECKING:
-    from studies.atlas.attribution import effects, interaction, shapley
-    from studies.atlas.platform import platform_error, responses
-    from studies.atlas.subsets import Subsets, atlas_sweep, read_subsets
-    from studies.atlas.workspace import map_workspace, natural_modes_at
-
-__all__ = [
-    "Subsets",
-    "atlas_sweep",
-    "effects",
-    "interaction",
-    "map_workspace",
-    "natural_modes_at",
-    "platform_error",
-    "read_subsets",
-    "responses",
-    "shapley",
-]
-
-__getattr__ = lazily(
-    __name__,
-    {
-        "Subsets": "studies.atlas.subsets",
-        "atlas_sweep": "studies.atlas.subsets",
-        "effects": "studies.atlas.attribution",
-        "interaction": "studies.atlas.attribution",
-        "map_workspace": "studies.atlas.workspace",
-        "natural_modes_at": "studies.atlas.workspace",
-        "platform_error": "studies.atlas.platform",
-        "read_subsets": "studies.atlas.subsets",
-        "responses": "studies.atlas.platform",
-        "shapley": "studies.atlas.attribution",
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -7,32 +7,6 @@
 - `report`, `plots` and `run` write everything into a folder, `commands` is `studies spillover`.
 """
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from studies.lazy import lazily
-
-if TYPE_CHECKING:
-    from studies.spillover.certificate import Certificate, certify
-    from studies.spillover.comparison import Comparison, compare_laws
-    from studies.spillover.plants import Departure, patch_lengths
-
-__all__ = [
-    "Certificate",
-    "Comparison",
-    "Departure",
-    "certify",
-    "compare_laws",
-    "patch_lengths",
-]
-
-__getattr__ = lazily(
-    __name__,
-    {
-        "Certificate": "studies.spillover.certificate",
-        "Comparison": "studies.spillover.comparison",
-        "Departure": "studies.spillover.plants",
-        "certify": "studies.spillover.certificate",
-        "compare_laws": "studies.spillover.comparison",
-        "patch_lengths": "studies.spillover.plants",
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

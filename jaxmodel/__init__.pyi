@@ -1,0 +1,41 @@
+from .bases import find_bases
+from .beam import BASES, build_basis
+from .case import Case, Structure
+from .control import efficient_modal_control, pole_placement
+from .dynamics import accelerations, kinetic_energy, potential_energy
+from .kinematics import close_chain, inverse_kinematics
+from .linear import frequency_response, linearise, natural_modes
+from .loop import step
+from .parameters import HOME, Machine, paper_machine
+from .plant import build_plant
+from .prepare import prepare
+from .sampled_loop import closed_loop
+from .simulate import Result, command, simulate
+
+__all__ = [
+    "BASES",
+    "HOME",
+    "Case",
+    "Machine",
+    "Result",
+    "Structure",
+    "accelerations",
+    "build_basis",
+    "build_plant",
+    "close_chain",
+    "closed_loop",
+    "command",
+    "efficient_modal_control",
+    "find_bases",
+    "frequency_response",
+    "inverse_kinematics",
+    "kinetic_energy",
+    "linearise",
+    "natural_modes",
+    "paper_machine",
+    "pole_placement",
+    "potential_energy",
+    "prepare",
+    "simulate",
+    "step",
+]

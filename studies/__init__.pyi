@@ -1,0 +1,79 @@
+from .atlas.run import run_atlas
+from .bench.run import run_bench
+from .config import configure, info
+from .engine.batched import batched
+from .engine.design import load_design
+from .engine.modes import machine_modes
+from .engine.results import load
+from .engine.run_data import chord_deflection
+from .engine.runs import Run, run_study
+from .engine.sweep import make_plan, run_sweep
+from .errors import StudyError
+from .export.document import import_study
+from .export.run import export_design
+from .extensions import extend
+from .fitting.estimate import fit
+from .fitting.run import run_fit
+from .fitting.spec import load_fit
+from .paper.run import run_paper
+from .single.run import replay, simulate
+from .space.spec import load_sweep, parse_sweep
+from .spillover.run import spillover_design
+from .study.cases import as_arrays, build_case, build_structure
+from .study.spec import Study, load_study, paper_study, parse_study
+from .study.template import write_study
+from .sweeps.plots import plot
+from .sweeps.report import write_sweep_report
+from .sweeps.sensitivity import analyse
+from .sweeps.show import best_cases, status_rows
+from .tuning.audit import audit
+from .tuning.run import run_tuning
+from .tuning.spec import load_tuning
+
+__all__ = [
+    "Run",
+    "Study",
+    "StudyError",
+    "__version__",
+    "analyse",
+    "as_arrays",
+    "audit",
+    "batched",
+    "best_cases",
+    "build_case",
+    "build_structure",
+    "chord_deflection",
+    "configure",
+    "export_design",
+    "extend",
+    "fit",
+    "import_study",
+    "info",
+    "load",
+    "load_design",
+    "load_fit",
+    "load_study",
+    "load_sweep",
+    "load_tuning",
+    "machine_modes",
+    "make_plan",
+    "paper_study",
+    "parse_study",
+    "parse_sweep",
+    "plot",
+    "replay",
+    "run_atlas",
+    "run_bench",
+    "run_fit",
+    "run_paper",
+    "run_study",
+    "run_sweep",
+    "run_tuning",
+    "simulate",
+    "spillover_design",
+    "status_rows",
+    "write_study",
+    "write_sweep_report",
+]
+
+__version__: str
