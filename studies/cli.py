@@ -17,7 +17,7 @@ from typer.exceptions import Abort, TyperException
 from studies import __version__
 from studies.atlas.commands import add_commands as add_atlas
 from studies.bench.commands import add_commands as add_bench
-from studies.config import PACKAGE, configure, start
+from studies.config import PACKAGE, configure, keep_programs, start
 from studies.errors import OWN_WARNINGS, StudyError, printable
 from studies.export.commands import add_commands as add_export
 from studies.fitting.commands import add_commands as add_fit
@@ -55,6 +55,7 @@ INTERRUPTED = 130
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `studies` command."""
+    keep_programs()
     try:
         _check_text(sys.argv[1:] if arguments is None else arguments)
         with warnings.catch_warnings():

@@ -12,6 +12,8 @@ import platform
 import re
 import stat
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +115,38 @@ def configure(
 def _look_less_for_garbage() -> None:
     if gc.get_threshold() in PYTHONS_OWN:
         gc.set_threshold(*GARBAGE)
+
+
+_keeps_programs = False
+
+
+def keep_programs() -> None:
+    """Keep the compiled programs of this process on disk, and use those that were kept.
+
+    For commands: what a session of Python changes by hand in a module would not be noticed.
+    """
+    global _keeps_programs
+    _keeps_programs = True
+
+
+def is_keeping() -> bool:
+    """Whether compiled programs are kept, see `keep_programs`."""
+    return _keeps_programs
+
+
+@contextmanager
+def without_jax_cache() -> Iterator[None]:
+    """Compile anew: an executable from JAX's own cache lacks what it needs to be kept elsewhere."""
+    from jax.experimental.compilation_cache.compilation_cache import reset_cache
+
+    is_enabled = _settings().jax_enable_compilation_cache
+    _settings().update("jax_enable_compilation_cache", False)
+    reset_cache()  # what JAX has decided when it compiled first
+    try:
+        yield
+    finally:
+        _settings().update("jax_enable_compilation_cache", is_enabled)
+        reset_cache()
 
 
 def start(precision: str = "float64", cpu_only: bool = False) -> None:

@@ -12,7 +12,7 @@ import jax
 import jaxlib
 import pytest
 
-from studies.config import configure
+from studies import config
 
 FLAGS = "--xla_backend_optimization_level=0"
 # without the threshold for small loops, which takes a sixth of the time to compile
@@ -23,7 +23,9 @@ FLAGS += "simplify-while-loops,while-loop-invariant-code-motion,while-loop-const
 if jaxlib.__version__.startswith("0.10."):  # unknown flags stop XLA
     FLAGS += " --xla_cpu_use_fusion_emitters=false"
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FLAGS}"
-configure()
+config.configure()
+# tests patch modules, which kept programs would not notice
+config.keep_programs = lambda: None
 # tables as wide as they need to be, wherever the tests run
 os.environ["COLUMNS"] = "240"
 

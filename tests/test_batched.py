@@ -196,7 +196,7 @@ def test_second_derivatives_are_refused_in_words(smooth, parameters):
 
 def test_lanes_fill_vectors():
     with pytest.raises(ValueError, match="lanes = 3; allowed: multiples of"):
-        bridge.as_function(
+        bridge.call_of_loop(
             bridge.trace_loop(lambda *x: x[2], [], [], [bridge.InputLeaf((), True)], float), 5, 3
-        )
+        ).kernel()
     assert native.this_processor().vector_bytes in (16, 32, 64)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +18,7 @@ from jaxmodel.dynamics import modal_chain
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from studies.engine.preflight import check_run
+from studies.engine.programs import kept_jit
 from studies.show.figures import SERIES, SMALL, WIDTH, axes_or_new, styled
 from studies.show.sketch import guides
 from studies.study.consistency import each_link
@@ -60,7 +60,7 @@ def skeleton(study: Study, pose: np.ndarray, q: np.ndarray, exaggeration: float)
     return Skeleton(np.stack([start, end], axis=1), slider, joint, link)
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _positions(
     structure: Structure, case: Case, pose: Array, q: Array, exaggeration: Array
 ) -> tuple[Array, Array, Array]:

@@ -6,7 +6,6 @@ flexible machine's error is vibration error (the paper's figures 5, 6, 8, 10 sho
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +21,7 @@ from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, loop_matrices
 from studies.atlas.subsets import link_label, long_enough
 from studies.engine.batches import run_batches
 from studies.engine.preflight import check_run
+from studies.engine.programs import kept_jit
 from studies.engine.runs import resolved_study
 from studies.study.cases import powered
 from studies.study.spec import Study
@@ -165,7 +165,7 @@ def responses(study: Study, frequency: np.ndarray) -> Responses:
     return Responses(frequency, np.stack(value), np.array(radius))
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _linear(structure: Structure, case: Case, pose: Array) -> tuple[LoopMatrices, Array]:
     """Loop at a pose, and d rho/d X there, (3, 3); NaN where a force at C bends the link."""
     loop = prepare(structure, case).loop

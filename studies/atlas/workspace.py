@@ -7,7 +7,6 @@ M_c = M_qq - M_qX M_XX^-1 M_Xq, it is |M_c,ik|/sqrt(M_c,ii M_c,kk) for links i a
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -21,6 +20,7 @@ from jaxmodel.linear import linearise, mass_and_stiffness, resting
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from studies.engine.preflight import check_pose, check_run
+from studies.engine.programs import kept_jit
 from studies.study.spec import Study
 
 #: Modes per link in these matrices; assembled frequencies converge with the first one.
@@ -156,7 +156,7 @@ def _extent(
     )
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _stand(structure: Structure, case: Case, poses: Array) -> tuple[Array, Array, Array]:
     """Status, link angles [rad] and `lift` of poses, (n,), (n, 3) and (n, 3)."""
     plant = prepare(structure, case).loop.plant
@@ -168,7 +168,7 @@ def _stand(structure: Structure, case: Case, poses: Array) -> tuple[Array, Array
     return jax.vmap(one)(poses)
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _matrices(structure: Structure, case: Case, poses: Array) -> tuple[Array, Array, Array]:
     """Mass and stiffness matrices in (X, q), and k_j of the links, (n, m, m) twice, (3, R)."""
     loop = prepare(structure, case).loop

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +10,7 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.simulate import Result, simulate
+from studies.engine.programs import kept_jit
 
 #: Cases per call of the compiled program; the last batch is filled up with copies.
 BATCH = 8
@@ -19,7 +19,7 @@ BATCH = 8
 Tell = Callable[[str, float], None]
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _simulate_batch(structure: Structure, cases: Case) -> Result:
     return jax.vmap(lambda case: simulate(structure, case, True))(cases)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,6 +12,7 @@ from jaxmodel.bases import station_places
 from jaxmodel.beam import build_basis
 from jaxmodel.case import Case, Structure
 from jaxmodel.prepare import prepare
+from studies.engine.programs import kept_jit
 
 
 class SharedFrame(NamedTuple):
@@ -23,7 +23,7 @@ class SharedFrame(NamedTuple):
     adc_step: np.ndarray  # of one ADC step, in the deflection of mode 1 [m], (3,)
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _prepare_frame(structure: Structure, case: Case) -> SharedFrame:
     loop = prepare(structure, case).loop
     machine, n = case.machine, structure.n_controlled

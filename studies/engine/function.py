@@ -15,6 +15,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import cached_property, partial
+from hashlib import sha256
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -25,7 +26,8 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.loop import State, step
 from jaxmodel.simulate import Outline, Result, Start, begin, conclude
-from studies.config import processor
+from studies.config import is_keeping, processor
+from studies.engine.programs import kept_data, program
 from studies.errors import NoKernelError
 from studies.kernels import bridge, gpu, llvm, native
 from studies.kernels.equations import Function, call_of, literal, trace
@@ -116,16 +118,17 @@ class BlockFunction:
         """
         self.structure, self.build, self.kind = structure, build, kind
         self.lanes = len(jax.tree.leaves((free, own))[0])
-        self._numbers = shared
-        first = *jax.tree.map(lambda x: x[0], (free, own)), shared
-        self.parts = _find_parts(self._begin, *first)
-        # run once, so compiled without optimisation: saves a quarter of two to four seconds
-        common = jax.jit(
-            partial(self._leaves, False), compiler_options={"xla_backend_optimization_level": 0}
+        self._numbers, self._names = shared, _names(structure, build, kind, free, own, shared)
+        first = [*jax.tree.map(lambda x: x[0], (free, own)), shared]
+        self.parts: StartParts = kept_data(
+            self._names and ["parts", *self._names], lambda: _find_parts(self._begin, *first)
         )
-        self.shared = [np.asarray(x, order="C") for x in _Alone(common)(*first)]
         self._programs: dict[str, Any] = {}
         self._compiling = Lock()
+        # run once, so compiled without optimisation: saves a quarter of two to four seconds
+        options = {"xla_backend_optimization_level": 0}
+        common = self._program("shared", partial(self._leaves, False), *first, options=options)
+        self.shared = [np.asarray(x, order="C") for x in common]
         TRACES.append(structure)
         self._step_all = {"kernel": self._kernel, "gpu": self._gpu, "scan": lambda: None}[kind]()
 
@@ -190,7 +193,10 @@ class BlockFunction:
 
     def _kernel(self) -> Callable[[list[Any]], list[Any]]:
         arguments = *self.loop_arguments(), _real(), self.structure.n_steps, self.lanes
-        return bridge.DifferentiableLoop(*arguments)
+        name = (
+            sha256(repr(self._names).encode()).hexdigest() if self._names and is_keeping() else ""
+        )
+        return bridge.DifferentiableLoop(*arguments, name)
 
     def _gpu(self) -> Callable[[Any], list[Any]]:
         if not gpu.is_known():
@@ -276,15 +282,26 @@ class BlockFunction:
         if isinstance(self._step_all, bridge.DifferentiableLoop):
             self._step_all.note_run(time.perf_counter() - began)
 
-    def _program(self, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    def _program(
+        self, name: str, function: Callable[..., Any], *arguments: Any, options: Any = None
+    ) -> Any:
         """Result of a program that prepares cases."""
+        compiled = self._compiled(name, function, *arguments, options=options)
         with _ALONE:
-            return jax.block_until_ready(self._compiled(name, function, *arguments)(*arguments))
+            return jax.block_until_ready(compiled(*arguments))
 
-    def _compiled(self, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    def _compiled(
+        self, name: str, function: Callable[..., Any], *arguments: Any, options: Any = None
+    ) -> Any:
+        def lower() -> Any:
+            return jax.jit(function, compiler_options=options).lower(*arguments)
+
         with self._compiling:
             if name not in self._programs:
-                self._programs[name] = jax.jit(function).lower(*arguments).compile()
+                if self._names:
+                    self._programs[name] = program([name, *self._names], list(arguments), lower)
+                else:
+                    self._programs[name] = lower().compile()
             return self._programs[name]
 
     def compile(self, free: Any, own: Any, is_differentiated: bool = False) -> None:
@@ -349,6 +366,19 @@ def block_function(
             del _FUNCTIONS[next(iter(_FUNCTIONS))]
         _FUNCTIONS[key] = BlockFunction(structure, build, free, own, shared, kind)
     return _FUNCTIONS[key]
+
+
+def _names(
+    structure: Structure, build: Build, kind: str, free: Any, own: Any, shared: Any
+) -> list[Any]:
+    """What a function's programs are kept under; none if a user's function makes its cases."""
+    if jax.tree.leaves(free):
+        return []
+    digest = sha256()
+    for x in jax.tree.leaves(shared):
+        digest.update(repr(np.shape(x)).encode() + np.asarray(x).tobytes())
+    shapes = [np.shape(x) for x in jax.tree.leaves(own)]
+    return [structure, build, kind, str(_real()), shapes, digest.hexdigest()]
 
 
 def _real() -> Any:

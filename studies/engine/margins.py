@@ -43,6 +43,7 @@ from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.engine.damping import damping_ratios, least_controlled
 from studies.engine.function import one_at_a_time
 from studies.engine.lanes import BLOCK, run_steps
+from studies.engine.programs import kept_jit
 from studies.engine.stability import LoopFigures, loop_report, with_margin_modes
 from studies.study.margin import HIGHEST, LOWEST
 
@@ -233,7 +234,7 @@ def _judge_block(
 
 # compiled without optimisation: it takes a fiftieth of the time
 @one_at_a_time
-@partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
+@kept_jit(static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
 def _respond(structure: Structure, cases: Case) -> tuple[LoopResponse, AssembledModes, Any]:
     """The loops, their modes and their strength, lanes last."""
 

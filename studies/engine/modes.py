@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -13,6 +12,7 @@ from jaxmodel.kinematics import lift, path_status
 from jaxmodel.linear import linearise, mass_and_stiffness, natural_modes, resting
 from jaxmodel.prepare import prepare
 from studies.engine.preflight import check_pose
+from studies.engine.programs import kept_jit
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study, parse_study
 
@@ -149,7 +149,7 @@ def _turn_shares(shape: np.ndarray, mass: np.ndarray) -> np.ndarray:
     return turning / np.maximum(turning + translating, np.finfo(float).tiny)
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _at_pose(structure: Structure, case: Case, pose: np.ndarray) -> Any:
     """Status, `lift`, linear plant, its mass and stiffness matrices, and k_ij of the links."""
     loop = prepare(structure, case).loop

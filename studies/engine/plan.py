@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import resource
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +14,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.prepare import STIFFNESS_LIMIT, drive_rate
 from studies.config import processor
 from studies.engine.preflight import SUBSTEP_LIMIT, mechanics_at, step_counts
+from studies.engine.programs import kept_jit
 from studies.errors import StudyError
 from studies.kernels.cpu import LANE_BYTES
 from studies.kernels.gpu import BLOCK
@@ -209,7 +209,7 @@ def chunk_cases(table: CaseTable, rows: np.ndarray, structure: Structure, size: 
     return in_working_precision(build_cases(table.study, columns, structure))
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _mechanics(structure: Structure, cases: Case) -> Any:
     """State matrices at every way-point of every case, (n, poses, s, s)."""
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from functools import partial
 from itertools import permutations
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.nominal_loop import nominal_loop
+from studies.engine.programs import kept_jit
 from studies.engine.stability import LoopFigures
 
 #: Relative difference of a decay or frequency that is worth a sentence [1].
@@ -34,6 +33,9 @@ def tracked_modes(structure: Structure) -> int:
     return min(most, structure.n_modes)
 
 
+_nominal_loop = kept_jit(static_argnums=0)(nominal_loop)
+
+
 def pole_report(structure: Structure, case: Case, loop: LoopFigures) -> PoleReport | None:
     """Where specified poles lie; None if no mode that acts has any.
 
@@ -44,7 +46,7 @@ def pole_report(structure: Structure, case: Case, loop: LoopFigures) -> PoleRepo
     """
     if not structure.has_poles:
         return None
-    specified, matrix = map(np.asarray, jax.jit(partial(nominal_loop, structure))(case))
+    specified, matrix = map(np.asarray, _nominal_loop(structure, case))
     is_on, period = ~np.isnan(specified), float(case.electronics.period)
     if not is_on.any():
         return None

@@ -28,6 +28,7 @@ from jaxmodel.prepare import (
 from jaxmodel.shaper import Taps, last_sample
 from jaxmodel.simulate import steady_load
 from studies import config
+from studies.engine.programs import kept_jit
 from studies.errors import field_error, warn_of_model
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.consistency import check_locked, each_link
@@ -68,7 +69,7 @@ def preflight(structure: Structure, case: Case) -> Preflight:
     return jax.tree.map(np.asarray, _preflight(_without_run(structure), case))
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _preflight(structure: Structure, case: Case) -> Preflight:
     prepared = prepare(structure, case)
     plant = prepared.loop.plant
@@ -323,7 +324,7 @@ def mechanics_at(structure: Structure, case: Case, pose: Any) -> Any:
     return mechanical(linearise(structure, loop, pose, resting(structure, case)))
 
 
-_mechanics_at = jax.jit(mechanics_at, static_argnums=0)
+_mechanics_at = kept_jit(static_argnums=0)(mechanics_at)
 
 
 def step_counts(needed: Any) -> np.ndarray:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-from functools import partial
 from typing import Any
 
-import jax
 import numpy as np
 from scipy.signal import lfilter
 
@@ -18,6 +16,7 @@ from jaxmodel.prepare import left_out_deflection, spectrum_frequencies
 from jaxmodel.simulate import Result
 from studies import config
 from studies.engine.poles import PoleReport
+from studies.engine.programs import kept_jit
 from studies.engine.runs import Run
 from studies.store import Variable
 from studies.study.consistency import each_link
@@ -55,7 +54,7 @@ _RECORD_LABELS = {
 }
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _spectrum_frequencies(structure: Structure, case: Case) -> Any:
     return spectrum_frequencies(structure, find_bases(structure, case))
 
@@ -156,16 +155,22 @@ def chord_deflection(run: Run) -> np.ndarray:
 
     From the plant's modes and, for those it leaves out, the voltages on the actuators.
     """
-    machine, structure = run.case.machine, run.structure
     middle = each_link(run.study.link.length)[:, None] / 2
-    shape = build_basis(structure.basis, machine.beam, machine.patches, structure.n_modes, middle)
+    per_mode, per_volt = map(np.asarray, _deflections_at(run.structure, run.case, middle))
     record = run.result.record
     assert record is not None
-    bent = np.einsum("tir,ir->ti", record.modal_coordinate, np.asarray(shape.deflection_at)[:, 0])
-    if structure.has_static_correction:
-        per_volt = np.asarray(left_out_deflection(run.case, shape))[:, 0]
-        bent = bent + np.einsum("tik,ik->ti", _applied_voltage(run), per_volt)
+    bent = np.einsum("tir,ir->ti", record.modal_coordinate, per_mode[:, 0])
+    if run.structure.has_static_correction:
+        bent = bent + np.einsum("tik,ik->ti", _applied_voltage(run), per_volt[:, 0])
     return bent
+
+
+@kept_jit(static_argnums=0)
+def _deflections_at(structure: Structure, case: Case, places: np.ndarray) -> tuple[Any, Any]:
+    """Per modal coordinate [1], and what the kept modes leave out per volt [m/V], (3, n, ...)."""
+    machine = case.machine
+    shape = build_basis(structure.basis, machine.beam, machine.patches, structure.n_modes, places)
+    return shape.deflection_at, left_out_deflection(case, shape)
 
 
 def _applied_voltage(run: Run) -> np.ndarray:

@@ -15,11 +15,12 @@ from jaxmodel.case import Case, Structure, uncontrolled, with_ratio
 from jaxmodel.simulate import Result, simulate
 from studies.engine.poles import PoleReport, pole_report, tracked_modes
 from studies.engine.preflight import check_run
+from studies.engine.programs import kept_jit
 from studies.engine.stability import LoopFigures, run_report
 from studies.study.cases import powered
 from studies.study.spec import Study
 
-_simulate = jax.jit(simulate, static_argnums=(0, 2))
+_simulate = kept_jit(static_argnums=(0, 2))(simulate)
 
 
 class Run(NamedTuple):

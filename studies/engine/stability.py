@@ -7,7 +7,7 @@ Eigenvalues of small matrices, on the host; one compiled program makes all matri
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import cache, partial
+from functools import cache
 from typing import NamedTuple
 
 import jax
@@ -24,6 +24,7 @@ from jaxmodel.motion import PathSample, end_of_path, sample_path
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, loop_matrices
+from studies.engine.programs import kept_jit
 from studies.study.margin import HIGHEST, LOWEST, MARGIN_MODES
 
 #: Largest ratio of successive gain factors [1].
@@ -118,7 +119,7 @@ class _Loops(NamedTuple):
     in_motion: LoopMatrices | None  # (k, p, ...)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@kept_jit(static_argnums=(0, 1))
 def _loops(
     structure: Structure, has_motion: bool, case: Case, pose: Array, parts: Controller | None
 ) -> _Loops:
@@ -166,7 +167,7 @@ def _loops(
     )
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _controller(structure: Structure, case: Case) -> Controller:
     return prepare(structure, case).loop.controller
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +13,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller, adc_code, controller_step, read_back, rest_controller
 from jaxmodel.loop import Inputs, Loop, State, advance, filtered_voltage
 from jaxmodel.simulate import Result, Start, begin, conclude
+from studies.engine.programs import kept_jit
 
 #: Maps ADC codes (3, K) of a sample to actuator voltages (3, K) [V] of the next one.
 Law = Callable[[np.ndarray], np.ndarray]
@@ -55,8 +55,8 @@ def run_in_the_loop(structure: Structure, case: Case, law: Law) -> LoopRun:
     return LoopRun(np.stack(codes), np.stack(voltages), np.stack(poses), result)
 
 
-_begin: Callable[[Structure, Case], Start] = jax.jit(begin, static_argnums=0)
-_conclude = jax.jit(conclude)
+_begin: Callable[[Structure, Case], Start] = kept_jit(static_argnums=0)(begin)
+_conclude = kept_jit()(conclude)
 
 
 def _read(loop: Loop, inputs: Inputs, k: Any, state: State) -> Any:
@@ -66,10 +66,10 @@ def _read(loop: Loop, inputs: Inputs, k: Any, state: State) -> Any:
     return code, is_clipped.max()
 
 
-_look = jax.jit(_read)
+_look = kept_jit()(_read)
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _sample(
     structure: Structure,
     loop: Loop,
@@ -109,12 +109,12 @@ def jax_law(controller: Controller, dac_step: float | None = None) -> Law:
     return law
 
 
-@jax.jit
+@kept_jit()
 def _step(controller: Controller, state: Any, code: Any) -> Any:
     return controller_step(controller, state, read_back(controller, code))[0]
 
 
-@jax.jit
+@kept_jit()
 def replay(controller: Controller, codes: Any) -> Any:
     """The JAX controller from rest on a sequence of ADC codes (T, 3, K): voltages (T, 3, K)."""
 

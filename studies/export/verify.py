@@ -5,13 +5,13 @@ from __future__ import annotations
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.motion import sample_path, shape_path
 from jaxmodel.shaper import Taps
 from studies.engine.controller import FixedController, arrange
+from studies.engine.programs import kept_jit
 from studies.export.c_text import Source
 from studies.export.compiler import Code, compiled
 from studies.export.document import Document, controller_of
@@ -306,7 +306,7 @@ def _references(found: FixedController) -> tuple[np.ndarray, np.ndarray]:
     return planned, shaped
 
 
-@jax.jit
+@kept_jit()
 def _plan(path: Any, time: Any) -> Any:
     return sample_path(path, time).position
 
@@ -315,7 +315,7 @@ def _shape_path(path: Any, taps: Any, n: int, period: Any) -> Any:
     return shape_path(path, taps, n, 1, period).position
 
 
-_shape = jax.jit(_shape_path, static_argnums=2)
+_shape = kept_jit(static_argnums=2)(_shape_path)
 
 
 def _shaped(taps: Taps, path: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ from jaxmodel.prepare import prepare
 from jaxmodel.response import BenchPlant, bench_plant, held_modes
 from studies.engine.executor import Place
 from studies.engine.preflight import check_pose
+from studies.engine.programs import kept_jit
 from studies.errors import StudyError, field_error
 from studies.space.free import Placing
 from studies.study.cases import as_arrays, build_case, build_structure
@@ -251,7 +252,7 @@ def with_slopes(
     return jax.jacfwd(both, argnums=argument, has_aux=True)
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _reach(structure: Structure, case: Case, pose: Array) -> tuple[Array, Array]:
     plant = prepare(structure, case).loop.plant
     return path_status(plant, pose[None])[0], lift(plant, pose)
@@ -270,13 +271,13 @@ def _one_held(structure: Structure, place: Place, case: Case, values: Array) -> 
     return held_modes(structure, place(case, values))
 
 
-_plant = jax.jit(_at, static_argnums=(0, 1))
+_plant = kept_jit(static_argnums=(0, 1))(_at)
 _plant_slopes = jax.jit(with_slopes(_at, 4, is_first=True), static_argnums=(0, 1))
-_held = jax.jit(_one_held, static_argnums=(0, 1))
+_held = kept_jit(static_argnums=(0, 1))(_one_held)
 _held_slopes = jax.jit(with_slopes(_one_held, 3), static_argnums=(0, 1))
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@kept_jit(static_argnums=(0, 1))
 def _plant_batch(
     structure: Structure, place: Place, case: Case, pose: Array, values: Array
 ) -> tuple[BenchPlant, Array]:

@@ -27,7 +27,7 @@ from jax.interpreters import ad, batching, mlir
 
 from studies.kernels import native
 from studies.kernels.adjoint import RECORD, Adjoint, trace_adjoint
-from studies.kernels.cpu import Kernel, build_kernel
+from studies.kernels.cpu import Kernel, kept_kernel
 from studies.kernels.traced import InputLeaf, TracedLoop, trace_loop
 
 #: Places in XLA's structures [bytes], for version 0 of its interface (xla/ffi/api/c_api.h).
@@ -45,32 +45,71 @@ def is_available() -> bool:
     return _version()[0] == 0
 
 
-def as_function(loop: TracedLoop, n_steps: int, lanes: int) -> Callable[[Sequence[Any]], list[Any]]:
-    """A JAX function of a loop's arrays that returns the state after the last sample, and records.
+class LoopCall(NamedTuple):
+    """A call of a loop's kernel from XLA."""
+
+    name: str  # of the kernel: everything it depends on but the code of model and kernels
+    make: Callable[[], TracedLoop]  # traces the loop, if its kernel is not in the cache folder
+    n_given: int  # arrays that are read only
+    state: tuple[tuple[int, ...], ...]  # shapes for one case
+    records: tuple[tuple[int, ...], ...]  # of one sample
+    dtype: Any
+    n_steps: int
+    lanes: int
+
+    @property
+    def target(self) -> str:
+        """Name under which XLA knows the handler, the same in every process."""
+        key = f"{self.name} {self.n_steps} {self.lanes} {native.this_processor()}"
+        return f"flexlink_{hashlib.sha256(key.encode()).hexdigest()[:24]}"
+
+    def kernel(self) -> Kernel:
+        """The kernel, whose handler XLA now knows.
+
+        Raises:
+            NoKernelError: the step uses what kernels do not support.
+        """
+        with _REGISTERING:
+            if self.target not in _HANDLERS:
+                _HANDLERS[self.target] = _register(self)
+        return _HANDLERS[self.target][1]
+
+    def __call__(self, arrays: Sequence[Any]) -> list[Any]:
+        """State after the last sample, and records; can be part of a compiled program.
+
+        Args:
+            arrays: as for `studies.kernels.cpu.Kernel.run`, without those for records.
+        """
+        self.kernel()
+        state = [(*shape, self.lanes) for shape in self.state]
+        records = [(self.n_steps, *shape, self.lanes) for shape in self.records]
+        call = jax.ffi.ffi_call(
+            self.target,
+            [jax.ShapeDtypeStruct(shape, self.dtype) for shape in (*state, *records)],
+            input_output_aliases={self.n_given + k: k for k in range(len(state))},
+            vmap_method="sequential",
+        )
+        return list(call(*(jnp.asarray(x, self.dtype) for x in arrays)))
+
+
+def call_of_loop(loop: TracedLoop, n_steps: int, lanes: int) -> LoopCall:
+    """The call of a traced loop.
 
     Args:
         loop: from `trace_loop`.
         n_steps: samples.
         lanes: cases side by side, a multiple of the vectors' width.
-
-    Returns:
-        A function of arrays as for `studies.kernels.cpu.Kernel.run`, without those for records; it
-        can be part of a compiled program.
     """
-    state = [(*leaf.shape, lanes) for leaf in loop.leaves["state"]]
-    records = [(n_steps, *leaf.shape, lanes) for leaf in loop.leaves.get("record", ())]
-    n_given = sum(len(loop.leaves[kind]) for kind in ("constant", "input", "state"))
-    call = jax.ffi.ffi_call(
-        _registered(loop, n_steps, lanes),
-        [jax.ShapeDtypeStruct(shape, loop.dtype) for shape in (*state, *records)],
-        input_output_aliases={n_given - len(state) + k: k for k in range(len(state))},
-        vmap_method="sequential",
+    return LoopCall(
+        name=loop.text(),
+        make=lambda: loop,
+        n_given=sum(len(loop.leaves[kind]) for kind in ("constant", "input")),
+        state=tuple(leaf.shape for leaf in loop.leaves["state"]),
+        records=tuple(leaf.shape for leaf in loop.leaves.get("record", ())),
+        dtype=loop.dtype,
+        n_steps=n_steps,
+        lanes=lanes,
     )
-
-    def run(arrays: Sequence[Any]) -> list[Any]:
-        return list(call(*(jnp.asarray(x, loop.dtype) for x in arrays)))
-
-    return run
 
 
 #: Tangents per pass of a kernel. More of them share the state's own arithmetic (1: 31 gradients/s
@@ -94,12 +133,15 @@ class DifferentiableLoop:
         dtype: Any,
         n_steps: int,
         lanes: int,
+        name: str = "",
     ) -> None:
         """
         Args:
             step, constants, inputs, state, dtype: as for `trace_loop`; what is not marked as moving
                 gets no derivatives. There is at least one input.
-            n_steps, lanes: as in `as_function`.
+            n_steps, lanes: as in `call_of_loop`.
+            name: tells the loop from all others, known numbers included, so that it need not be
+                traced if its kernel is in the cache folder; default: what tracing it says.
 
         Raises:
             NoKernelError: the step uses what kernels do not support.
@@ -111,14 +153,14 @@ class DifferentiableLoop:
         self.first_input, self.first_state = len(read), len(read) + len(inputs)
         # where instructions take numbers from memory only, small code is fast
         self._has_routines = not native.this_processor().has_masks
-        still = step, *map(_still, (constants, inputs, state)), dtype
-        self.plain = outside(trace_loop, *still, 0, self._has_routines)
+        self._name = name
         # a state's size bounds what its reverse keeps of it
         row = 8 * lanes * sum(leaf.size for leaf in state)
         self._length = min(n_steps, max(1, RECORD // max(row, 1)))
         self._tangents: dict[int, TracedLoop] = {}
         self._kernels: dict[int, Kernel] = {}
-        self._run = jax.custom_jvp(lambda leaves: self._call(self.plain, n_steps, leaves))
+        self._still_call(n_steps).kernel()
+        self._run = jax.custom_jvp(lambda leaves: self._call(self._still_call(n_steps), leaves))
         self._run.defjvp(self._rule, symbolic_zeros=True)
         self._ahead = jax.custom_jvp(self.ahead)
         self._ahead.defjvp(_no_second)
@@ -132,11 +174,34 @@ class DifferentiableLoop:
         for kernel in self._kernels.values():
             kernel.note_run(seconds / len(self._kernels))
 
-    def _call(self, loop: TracedLoop, n_steps: int, leaves: Sequence[Any]) -> list[Any]:
-        run = as_function(loop, n_steps, self.lanes)
-        kernel = _HANDLERS[_registered(loop, n_steps, self.lanes)][1]
+    def _call(self, call: LoopCall, leaves: Sequence[Any]) -> list[Any]:
+        kernel = call.kernel()
         self._kernels[id(kernel)] = kernel
-        return run(leaves)
+        return call(leaves)
+
+    def _still_call(self, n_steps: int) -> LoopCall:
+        """The call of the loop without derivatives."""
+        if not self._name:
+            return call_of_loop(self.plain, n_steps, self.lanes)
+        state = tuple(leaf.shape for leaf in self.kinds[self.first_state :])
+        return LoopCall(
+            name=self._name,
+            make=lambda: self.plain,
+            n_given=self.first_state,
+            state=state,
+            records=(),
+            dtype=self.dtype,
+            n_steps=n_steps,
+            lanes=self.lanes,
+        )
+
+    @cached_property
+    def plain(self) -> TracedLoop:
+        """The loop without derivatives."""
+        step, *leaves, dtype = self._given
+        still = step, *map(_still, leaves), dtype
+        loop: TracedLoop = outside(trace_loop, *still, 0, self._has_routines)
+        return loop
 
     def _rule(
         self, primals: tuple[list[Any]], tangents: tuple[list[Any]]
@@ -165,7 +230,7 @@ class DifferentiableLoop:
 
         def one(state: list[Any], rows: list[Any]) -> tuple[list[Any], list[Any]]:
             arrays = [*leaves[: self.first_input], *rows, *state]
-            return self._call(self.plain, len(rows[0]), arrays), state
+            return self._call(self._still_call(len(rows[0])), arrays), state
 
         whole, rest = self._pieces(leaves)
         last, starts = jax.lax.scan(one, leaves[self.first_state :], whole)
@@ -198,7 +263,8 @@ class DifferentiableLoop:
                     if self.kinds[k].is_moving:
                         still = jnp.zeros((size, *leaves[k].shape), self.dtype)
                         arrays.append(jnp.moveaxis(given.get(k, still), 0, axis))
-            results = self._call(self.tangents(size), self.n_steps, arrays)
+            call = call_of_loop(self.tangents(size), self.n_steps, self.lanes)
+            results = self._call(call, arrays)
             return results[len(self.kinds) - self.first_state :]
 
         pushed = jax.lax.map(one, parts)
@@ -215,11 +281,15 @@ class DifferentiableLoop:
 
         def back(turned: list[Any], piece: tuple[list[Any], list[Any]]) -> tuple[Any, Any]:
             rows, state = piece
-            length, given = len(rows[0]), [*constants, *rows]
-            record = self._call(adjoint.forward, length, [*given, *state])[n_state]
+            given = [*constants, *rows]
+            forward, backward = (
+                call_of_loop(loop, len(rows[0]), self.lanes)
+                for loop in (adjoint.forward, adjoint.backward)
+            )
+            record = self._call(forward, [*given, *state])[n_state]
 
             def one(cotangents: list[Any]) -> list[Any]:
-                return self._call(adjoint.backward, length, [*given, record, *cotangents])
+                return self._call(backward, [*given, record, *cotangents])
 
             results = jax.lax.map(one, turned)
             return results[: len(turned)], results[len(turned) :]
@@ -337,28 +407,19 @@ def _still(leaves: Sequence[Any]) -> list[Any]:
     return [x._replace(is_moving=False) if isinstance(x, InputLeaf) else x for x in leaves]
 
 
-def _registered(loop: TracedLoop, n_steps: int, lanes: int) -> str:
-    """Name under which XLA knows the handler of a loop's kernel, the same in every process."""
-    key = f"{loop.text()} {n_steps} {lanes} {native.this_processor()}"
-    name = f"flexlink_{hashlib.sha256(key.encode()).hexdigest()[:24]}"
-    with _REGISTERING:
-        if name not in _HANDLERS:
-            _HANDLERS[name] = _register(name, loop, n_steps, lanes)
-    return name
-
-
-def _register(name: str, loop: TracedLoop, n_steps: int, lanes: int) -> tuple[Any, Kernel]:
+def _register(call: LoopCall) -> tuple[Any, Kernel]:
     """Make a handler known to XLA; returns what keeps it alive."""
-    kernel = build_kernel(loop)
-    if lanes % kernel.width:
-        raise ValueError(f"lanes = {lanes}; allowed: multiples of {kernel.width}")
-    counts = [len(loop.leaves.get(x, ())) for x in ("constant", "input", "state", "record")]
-    text = _handler(kernel, counts[0] + counts[1], counts[2] + counts[3], n_steps, lanes)
+    kernel = kept_kernel(call.name, call.make)
+    if call.lanes % kernel.width:
+        raise ValueError(f"lanes = {call.lanes}; allowed: multiples of {kernel.width}")
+    text = _handler(
+        kernel, call.n_given, len(call.state) + len(call.records), call.n_steps, call.lanes
+    )
     processor = native.this_processor()
     engine = native.load_code(native.machine_code(text, processor, 0), processor)
     pointer = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
     address = engine.get_function_address("handler")
-    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(pointer(address)), platform="cpu")
+    jax.ffi.register_ffi_target(call.target, jax.ffi.pycapsule(pointer(address)), platform="cpu")
     return engine, kernel
 
 
@@ -369,7 +430,7 @@ def _handler(kernel: Kernel, n_given: int, n_results: int, n_steps: int, lanes: 
         kernel: what it calls.
         n_given: arrays that are read only.
         n_results: state, which begins as the arguments after those, and records.
-        n_steps, lanes: as in `as_function`.
+        n_steps, lanes: as in `call_of_loop`.
     """
     major, minor = _version()
     arrays = [(_ARGUMENTS, k) for k in range(n_given)] + [(_RESULTS, k) for k in range(n_results)]

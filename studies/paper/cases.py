@@ -23,6 +23,7 @@ from jaxmodel.simulate import Result
 from studies.engine.batches import BATCH, Tell, run_batches
 from studies.engine.frame import SharedFrame, frame_of
 from studies.engine.preflight import check_run
+from studies.engine.programs import kept_jit
 from studies.engine.runs import judged_status, run_study
 from studies.engine.stability import LoopFigures, loop_report
 from studies.study.files import READY
@@ -257,7 +258,7 @@ def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:
     )
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def link_hz(structure: Structure, case: Case) -> Any:
     """Frequencies of each link between held ends [Hz], (3, C)."""
     return find_bases(structure, case).plant_omega / (2 * jnp.pi)

@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxmodel import shaper
+from studies.engine.programs import kept_jit
 from studies.paper.cases import ALL, OFF, ONE, TWO, PaperRuns
 from studies.paper.context import Machines
 from studies.show import figures
@@ -180,7 +181,7 @@ def _limit_decades(ax: Axes, density: np.ndarray) -> None:
     ax.set_ylim(max(density.min() / 3, 1e-12 * top), 5 * top)
 
 
-@jax.jit
+@kept_jit()
 def _sensitivity(kinds: Any, ratio: Any, omega: Any, zeta: Any, level: Any) -> Any:
     """Sensitivity curves of several kinds of shapers, (kinds, ratio)."""
 

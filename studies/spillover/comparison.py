@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -15,6 +14,7 @@ from jaxmodel.laws.srf import SRF
 from jaxmodel.simulate import Result, simulate
 from studies.engine.controller import FixedController, fixed_controller
 from studies.engine.preflight import check_run
+from studies.engine.programs import kept_jit
 from studies.engine.stability import follow_modes, gain_margin, modal_damping
 from studies.spillover.certificate import STEPS
 from studies.spillover.judgement import breaking_motion
@@ -179,7 +179,7 @@ def _run(found: FixedController, laws: list[Controller]) -> tuple[Study, Result]
     return study, jax.tree.map(np.asarray, _simulate(structure, case, stacked))
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _simulate(structure: Structure, case: Case, laws: Controller) -> Result:
     return jax.vmap(lambda law: simulate(structure, case, False, law))(laws)
 

@@ -6,7 +6,6 @@ mode 1 the damping that the design's own gains intend.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -21,6 +20,7 @@ from jaxmodel.laws.imsc import IMSC
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import design_controller
 from studies.engine.controller import FixedController
+from studies.engine.programs import kept_jit
 from studies.errors import field_error
 from studies.spillover.plants import LoopMaker, PlantVariant, widened
 from studies.study.cases import law_parameters
@@ -113,7 +113,7 @@ def _scaled(law: Controller, wanted: np.ndarray, has: np.ndarray) -> Controller:
     return law._replace(velocity_gain=factor[:, None] * law.velocity_gain)
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _design(structure: Structure, case: Case, gains: tuple[Array, Array] | None) -> Controller:
     """Design with the structure's law; gains: of the modal control whose strength it must match."""
     bases, law = find_bases(structure, case), LAWS[structure.law]

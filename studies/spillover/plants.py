@@ -6,7 +6,6 @@ their modal basis and one departure each from the controller's model.
 
 from __future__ import annotations
 
-from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -24,6 +23,7 @@ from jaxmodel.piezo import placement_faults
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, loop_matrices
 from studies.engine.controller import FixedController
+from studies.engine.programs import kept_jit
 from studies.engine.stability import SampledLoop, sampled_loop
 from studies.errors import field_error
 from studies.study.margin import MARGIN_MODES
@@ -177,7 +177,7 @@ class LoopMaker:
         )
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(static_argnums=0)
 def _look(
     structure: Structure, case: Case, pose: Array, law: Controller
 ) -> tuple[LoopMatrices, Array, Leakage]:

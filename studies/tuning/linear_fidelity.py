@@ -23,6 +23,7 @@ from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spillover
 from studies.engine.function import one_at_a_time
+from studies.engine.programs import kept_jit
 from studies.engine.stability import gain_margin
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.margin import MARGIN_MODES
@@ -185,7 +186,7 @@ def _singularity_distance(structure: Structure, case: Case) -> Array:
     return singularity_distance(prepare(structure, case).loop.plant, pose)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@kept_jit(static_argnums=(0, 1, 2))
 def _limit_slopes(
     structure: Structure,
     names: tuple[Any, ...],
@@ -207,7 +208,7 @@ def _limit_slopes(
     return jax.lax.map(one, (values, cases, limits))
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 6))
+@kept_jit(static_argnums=(0, 1, 2, 6))
 def _look(
     structure: Structure,
     names: tuple[Any, ...],
@@ -228,9 +229,9 @@ def _look(
     return jax.lax.map(one, values)
 
 
-_closed_loop = jax.jit(closed_loop, static_argnums=0)
-_spillover = jax.jit(spillover, static_argnums=0)
-_distance = jax.jit(_singularity_distance, static_argnums=0)
+_closed_loop = kept_jit(static_argnums=0)(closed_loop)
+_spillover = kept_jit(static_argnums=0)(spillover)
+_distance = kept_jit(static_argnums=0)(_singularity_distance)
 
 
 def loop_figures(study: Study) -> LoopFigures:

@@ -1,0 +1,172 @@
+"""Compiled programs, kept on disk: a warm start neither traces nor compiles them.
+
+XLA's own cache saves compiling, but JAX must trace and lower a program before it can look there,
+which takes most of a warm start. A program here is found by its function, its static arguments, the
+shapes of the others, and everything else that it depends on: the code of the packages and of the
+user's own files, versions, processor and flags. It is kept beside the kernels, under the user's key
+(`studies.kernels.compilation`).
+
+Only commands keep programs (`config.keep_programs`): no name tells what a session of Python has
+changed by hand in a module, so there programs are traced anew.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+from collections.abc import Callable
+from functools import cache, wraps
+from hashlib import sha256
+from pathlib import Path
+from threading import RLock
+from typing import Any
+
+import jax
+import jaxlib
+import numpy as np
+from jax.experimental.serialize_executable import deserialize_and_load, serialize
+
+from studies import sources
+from studies.config import is_keeping, without_jax_cache
+from studies.kernels import native
+from studies.kernels.compilation import ObjectCache
+
+_LOCK = RLock()
+#: Compiled programs of this process, by name.
+_PROGRAMS: dict[str, Any] = {}
+
+
+def kept_jit(
+    static_argnums: int | tuple[int, ...] = (), compiler_options: dict[str, Any] | None = None
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """`jax.jit` whose programs are kept.
+
+    Args:
+        static_argnums: arguments that are part of the program. With others than numbers, texts and
+            tuples of them the program is not kept: no name tells a function from another.
+        compiler_options: as for `jax.jit`.
+
+    Example:
+        >>> @kept_jit(static_argnums=0)
+        ... def power(n: int, x: jax.Array) -> jax.Array:
+        ...     return x**n
+    """
+    static = (static_argnums,) if isinstance(static_argnums, int) else static_argnums
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        plain = jax.jit(function, static_argnums=static, compiler_options=compiler_options)
+        name = f"{function.__module__}.{function.__qualname__}"
+
+        @wraps(function)
+        def call(*arguments: Any) -> Any:
+            fixed = [arguments[k] for k in static]
+            free = [x for k, x in enumerate(arguments) if k not in static]
+            is_traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(free))
+            if is_traced or not is_keeping() or not all(map(_is_plain, fixed)):
+                return plain(*arguments)
+            return program([name, *fixed], free, lambda: plain.lower(*arguments))(*free)
+
+        return call
+
+    return decorate
+
+
+def _is_plain(x: Any) -> bool:
+    if isinstance(x, tuple):
+        return all(map(_is_plain, x))
+    return x is None or isinstance(x, bool | int | float | str)
+
+
+def program(names: list[Any], arguments: list[Any], lower: Callable[[], Any]) -> Any:
+    """A compiled program: of this process, from disk, or compiled now and kept.
+
+    Args:
+        names: tell it from all others, by their `repr`.
+        arguments: of its calls.
+        lower: traces and lowers it.
+
+    Returns:
+        The program, a function of `arguments`.
+    """
+    leaves, tree = jax.tree.flatten(arguments)
+    name = repr((names, tree, [str(jax.typeof(x)) for x in leaves], is_keeping()))
+    with _LOCK:
+        if name not in _PROGRAMS:
+            _PROGRAMS[name] = _loaded_or_compiled(name, lower)
+        return _PROGRAMS[name]
+
+
+def _loaded_or_compiled(name: str, lower: Callable[[], Any]) -> Any:
+    if not is_keeping():
+        return lower().compile()
+    entry = ObjectCache("program", name, *environment())
+    content = entry.take()
+    loaded = None if content is None else _loaded(content)
+    if loaded is not None:
+        return loaded
+    lowered = lower()
+    with without_jax_cache():
+        compiled = lowered.compile()
+    payload, *trees = serialize(compiled)
+    # not every tree's structure can be pickled, but a tree of numbers
+    examples = [jax.tree.unflatten(tree, range(tree.num_leaves)) for tree in trees]
+    entry.keep(pickle.dumps((payload, *examples)))
+    return compiled
+
+
+def kept_data(names: list[Any], make: Callable[[], Any]) -> Any:
+    """Data that can be pickled: from disk, or made now and kept.
+
+    Args:
+        names: everything they depend on but the code, by `repr`; none: they are not kept.
+        make: makes them.
+    """
+    entry = ObjectCache("data", repr(names), *environment()) if names and is_keeping() else None
+    content = entry and entry.take()
+    if content:
+        return pickle.loads(content)
+    data = make()
+    if entry:
+        entry.keep(pickle.dumps(data))
+    return data
+
+
+def environment() -> tuple[str, ...]:
+    """All that programs depend on, whatever they compute."""
+    return (
+        code_digest(tuple(sources.OUTSIDE)),
+        jax.__version__,
+        jaxlib.version.__version__,
+        *native.this_processor(),
+        os.environ.get("XLA_FLAGS", ""),
+        str(jax.local_devices()),
+        str(jax.dtypes.canonicalize_dtype(float)),
+    )
+
+
+@cache
+def code_digest(outside: tuple[Path, ...]) -> str:
+    """Hash of the code of the packages, and of the user's own files."""
+    digest = sha256()
+    own = (x for package in sources.PACKAGES for x in (sources.TOP / package).rglob("*.py"))
+    for path in (*sorted(own), *outside):
+        digest.update(str(path).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def _loaded(content: bytes) -> Any:
+    """A program from disk; None if it cannot be used."""
+    try:
+        _initialise_lapack()
+        payload, *examples = pickle.loads(content)
+        in_tree, out_tree = map(jax.tree.structure, examples)
+        devices = jax.local_devices()[:1]
+        return deserialize_and_load(payload, in_tree, out_tree, execution_devices=devices)
+    except Exception:  # whatever a newer jaxlib raises: the cache only saves time
+        return None
+
+
+@cache
+def _initialise_lapack() -> None:
+    """JAX loads LAPACK when it first lowers a call of it."""
+    jax.jit(jax.numpy.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), np.float64))

@@ -1,0 +1,124 @@
+"""Programs kept on disk: found without being traced, and never mistaken for another."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmodel.case import Structure
+from studies.engine import programs
+from studies.engine.programs import kept_data, kept_jit
+from studies.kernels import compilation
+
+TRACED = []
+
+
+def _scaled(structure, x, y):
+    TRACED.append(structure)
+    return {"sum": structure.n_modes * x + y, "root": jnp.linalg.cholesky(jnp.eye(2) * x[0])}
+
+
+scaled = kept_jit(static_argnums=0)(_scaled)
+
+
+@pytest.fixture
+def keeping(tmp_path, monkeypatch):
+    """A process that keeps its programs in a folder of its own, and the next process."""
+    monkeypatch.setattr(compilation, "cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(programs, "is_keeping", lambda: True)
+    TRACED.clear()
+
+    def next_process():
+        monkeypatch.setattr(programs, "_PROGRAMS", {})
+        jax.clear_caches()
+
+    next_process()
+    return tmp_path, next_process
+
+
+def test_the_next_process_does_not_trace(keeping):
+    folder, next_process = keeping
+    structure, x = Structure(), np.array([2.0, 3.0])
+    first = scaled(structure, x, 1.0)
+    assert len(TRACED) == 1 and len(list(folder.glob("kernel-*"))) == 1
+    next_process()
+    again = scaled(structure, x, 1.0)
+    assert len(TRACED) == 1
+    jax.tree.map(np.testing.assert_array_equal, first, again)
+    np.testing.assert_array_equal(again["sum"], 8 * x + 1)
+    np.testing.assert_allclose(again["root"], np.sqrt(2) * np.eye(2))
+    # other numbers are served by the same program
+    assert scaled(structure, x + 1, 2.0)["sum"].tolist() == [26.0, 34.0] and len(TRACED) == 1
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        (Structure(n_modes=4), np.ones(2), 1.0),
+        (Structure(), np.ones(3), 1.0),
+        (Structure(), np.ones(2, np.float32), 1.0),
+        (Structure(), np.ones(2), np.float64(1.0)),
+    ],
+    ids=["structure", "shape", "type", "weak type"],
+)
+def test_what_differs_is_another_program(keeping, other):
+    _, next_process = keeping
+    scaled(Structure(), np.ones(2), 1.0)
+    next_process()
+    result = scaled(*other)
+    assert len(TRACED) == 2
+    assert result["sum"].shape == other[1].shape and result["sum"][0] == other[0].n_modes + 1
+
+
+def test_other_code_and_other_flags_are_other_programs(keeping, monkeypatch, tmp_path):
+    _, next_process = keeping
+    arguments = Structure(), np.ones(2), 1.0
+    scaled(*arguments)
+    own = tmp_path / "own.py"
+    own.write_text("a law")
+    for change in (
+        lambda: monkeypatch.setattr(programs.sources, "OUTSIDE", [own]),
+        lambda: monkeypatch.setenv("XLA_FLAGS", "--another"),
+    ):
+        change()
+        next_process()
+        before = len(TRACED)
+        scaled(*arguments)
+        assert len(TRACED) == before + 1
+
+
+@pytest.mark.parametrize("damage", [b"", b"nothing", None])
+def test_damaged_entries_are_made_anew(keeping, damage):
+    folder, next_process = keeping
+    scaled(Structure(), np.ones(2), 1.0)
+    (path,) = folder.glob("kernel-*")
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1] if damage is None else damage)
+    next_process()
+    assert scaled(Structure(), np.ones(2), 1.0)["sum"].tolist() == [9.0, 9.0]
+    assert len(TRACED) == 2 and len(path.read_bytes()) > len(whole) // 2
+
+
+def test_a_function_among_the_static_arguments_is_not_kept(keeping):
+    folder, _ = keeping
+    apply = kept_jit(static_argnums=0)(lambda function, x: function(x))
+    assert apply(jnp.sin, 0.5) == pytest.approx(np.sin(0.5))
+    assert not list(folder.glob("kernel-*"))
+
+
+def test_it_is_a_plain_jit_inside_other_programs(keeping):
+    folder, _ = keeping
+    x = jnp.arange(1.0, 7.0).reshape(3, 2)
+    found = jax.vmap(lambda x: scaled(Structure(), x, 0.0)["sum"])(x)
+    np.testing.assert_array_equal(found, 8 * x)
+    assert jax.grad(lambda x: scaled(Structure(), x, 0.0)["sum"][0])(x[0]).tolist() == [8.0, 0.0]
+    assert not list(folder.glob("kernel-*"))
+
+
+def test_only_commands_keep_programs(tmp_path, monkeypatch):
+    """A session of Python may change a module by hand, which no name would tell."""
+    monkeypatch.setattr(compilation, "cache_folder", lambda: str(tmp_path))
+    assert not programs.is_keeping()
+    scaled(Structure(n_modes=5), np.ones(2), 1.0)
+    assert kept_data(["numbers"], lambda: 3) == 3
+    assert not list(tmp_path.iterdir())
