@@ -546,7 +546,7 @@ def _freeze_if_bad(
     is_first = (old.status == status.OK) & (code != status.OK)
     kept = jnp.where(old.status == status.OK, code, old.status)
     is_good = kept == status.OK
-    chosen = jax.tree.map(lambda a, b: jnp.where(is_good, a, b), new, old)
+    chosen: State = jax.tree.map(lambda a, b: jnp.where(is_good, a, b), new, old)
     return chosen._replace(
         status=kept, bad_time=jnp.where(is_first, inputs.window.time, old.bad_time)
     )

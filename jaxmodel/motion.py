@@ -168,5 +168,5 @@ def shape_path(path: Path, taps: Taps, n_times: int, per_sample: int, step: Arra
 
     # Ten taps a pass: on a CPU twice as fast as one, where the running sums dominate.
     at_zero = jax.tree.map(jnp.zeros_like, sampled)
-    total, _ = jax.lax.scan(add, at_zero, (taps.weight, shifts), unroll=10)
+    total: PathSample = jax.lax.scan(add, at_zero, (taps.weight, shifts), unroll=10)[0]
     return total

@@ -130,7 +130,9 @@ class BlockFunction:
         common = self._program("shared", partial(self._leaves, False), *first, options=options)
         self.shared = [np.asarray(x, order="C") for x in common]
         TRACES.append(structure)
-        self._step_all = {"kernel": self._kernel, "gpu": self._gpu, "scan": lambda: None}[kind]()
+        loops: dict[str, Callable[[], Any]]
+        loops = {"kernel": self._kernel, "gpu": self._gpu, "scan": lambda: None}
+        self._step_all = loops[kind]()
 
     # --- the parts, as JAX functions -------------------------------------------------------------
 
