@@ -133,7 +133,7 @@ def test_limits_of_the_loop_are_those_of_its_figures(evaluated):
     spec, u, found = evaluated
     for position, first in ((0, 0), (1, STARTS)):
         study = tuned_study(spec, spec.moving[position], spec.free.values(u))
-        loop, limits = loop_figures(study), found[0, 1, 2].limits[first, 1:]
+        loop, limits = loop_figures(spec, study), found[0, 1, 2].limits[first, 1:]
         assert (limits[0] > 0) == (loop.gain_margin < 4.0) and abs(loop.gain_margin - 4) > 0.01
         for value, wanted in (
             (limits[1], 1 - loop.slowest_decay / 20.0),

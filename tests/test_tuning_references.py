@@ -55,7 +55,8 @@ def compared():
         assert len(TRACES) == before + 1  # the scan takes the program of the fresh machines
         scan = found[2].scan
         loops = [
-            loop_figures(spec.study.change(control__gain_factor=float(g))) for g in scan.gain_factor
+            loop_figures(spec, spec.study.change(control__gain_factor=float(g)))
+            for g in scan.gain_factor
         ]
     return spec, found, loops
 

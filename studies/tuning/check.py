@@ -11,13 +11,11 @@ from scipy.stats import qmc
 
 from jaxmodel import status
 from jaxmodel.case import Case, Structure
-from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import Result
 from studies.engine.executor import Executor
 from studies.engine.plan import even_layout
 from studies.engine.poles import PoleReport, pole_report, tracked_modes
 from studies.engine.preflight import check_run
-from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
 from studies.study.cases import as_arrays, build_case, build_cases, in_working_precision
@@ -27,7 +25,6 @@ from studies.tuning.evaluate import first_residual, tuned_structure
 from studies.tuning.free import PLACEMENT
 from studies.tuning.linear_fidelity import LoopFigures, loop_figures
 from studies.tuning.merit import (
-    Merit,
     all_judged,
     allowed_limits,
     largest,
@@ -156,77 +153,64 @@ def judge(spec: TuneSpec, designs: list[Study], runs: PlainRuns) -> list[JudgedD
         designs: studies that differ from the tuning's own only in numbers; its own comes first.
         runs: of `shown_structure`.
     """
-    columns = fresh_columns(spec)
-    count, merit, structure = len(columns["run.seed"]), merit_of(spec), runs.structure
-    parts = [build_cases(study, columns, structure) for study in designs]
-
-    def joined(*leaves: np.ndarray) -> np.ndarray:
-        return np.concatenate([np.broadcast_to(x, (count, *x.shape[1:])) for x in leaves])
-
-    result = runs.run(jax.tree.map(joined, *parts), count * len(designs))
-    each = [_rows(result.metrics, k * count, count) for k in range(len(designs))]
-    duration = structure.n_steps / spec.study.electronics.sample_rate_hz
-    own, found = [_own_run(study) for study in designs], []
-    for k, (study, metrics) in enumerate(zip(designs, each, strict=True)):
-        rows = slice(k * count, (k + 1) * count)
-        codes = result.status[rows]
-        objective = np.asarray(objectives(merit, metrics, each[0]))
-        objective = np.where(np.isin(codes, status.FINISHED), objective, np.nan)
-        found.append(
+    columns, merit, structure = fresh_columns(spec), merit_of(spec), runs.structure
+    count = len(columns["run.seed"])
+    parts = []
+    for study in designs:
+        fresh, file = (build_cases(study, x, structure) for x in (columns, {}))
+        parts += [_repeated(fresh, count), _repeated(file, 1)]
+    rows = len(designs) * (count + 1)
+    result = runs.run(jax.tree.map(lambda *x: np.concatenate(x), *parts), rows)
+    by_design = jax.tree.map(lambda x: x.reshape(len(designs), count + 1, *x.shape[1:]), result)
+    metrics = by_design.metrics
+    baseline = jax.tree.map(lambda x: x[0], metrics)
+    end = structure.n_steps / spec.study.electronics.sample_rate_hz
+    judged = []
+    for k, study in enumerate(designs):
+        one = jax.tree.map(lambda x, k=k: x[k], metrics)
+        codes, watched = by_design.status[k], end - by_design.command_end[k]
+        objective = np.asarray(objectives(merit, one, baseline))
+        values = {name: np.asarray(largest(merit, one, name)) for name in merit.shown}
+        judged.append(
             JudgedDesign(
-                objective=objective,
-                metrics={name: np.asarray(largest(merit, metrics, name)) for name in merit.shown},
-                status=codes,
-                watched=duration - result.command_end[rows],
-                loop=loop_figures(study) if study.control.feedback == "sampled" else None,
-                own=_seen(merit, own[k], own[0], duration),
-                poles=_poles(study, own[k]),
+                objective=np.where(np.isin(codes, status.FINISHED), objective, np.nan)[:count],
+                metrics={name: x[:count] for name, x in values.items()},
+                status=codes[:count],
+                watched=watched[:count],
+                loop=loop_figures(spec, study) if study.control.feedback == "sampled" else None,
+                own=OwnRun(
+                    objective=float(objective[count]),
+                    metrics={name: float(x[count]) for name, x in values.items()},
+                    status=int(codes[count]),
+                    watched=float(watched[count]),
+                ),
             )
         )
-    return found
+    return [_checked(study, one) for study, one in zip(designs, judged, strict=True)]
 
 
-def _poles(study: Study, run: Result | None) -> PoleReport | None:
-    """Specified and obtained poles of a design's own file; None if it has none or cannot run."""
-    if run is None or not study.control.has_poles or study.control.feedback != "sampled":
-        return None
-    if run.status == status.UNPLACEABLE:
-        return None
-    structure, case = check_run(study)
+def _repeated(cases: Case, count: int) -> Case:
+    return jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
+
+
+def _checked(study: Study, judged: JudgedDesign) -> JudgedDesign:
+    """With poles, where gains follow from them; without an own run that would be refused."""
+    try:
+        structure, case = check_run(study)
+    except StudyError:
+        nothing = dict.fromkeys(judged.own.metrics, np.nan)
+        return judged._replace(own=OwnRun(np.nan, nothing, status.NON_FINITE, np.nan))
+    has_loop = structure.feedback == "sampled" and judged.own.status != status.UNPLACEABLE
+    if not study.control.has_poles or not has_loop:
+        return judged
     home = np.array(study.motion.waypoints[0], float)
     loop = loop_report(structure, case, home, tracked_modes(structure))
-    return pole_report(structure, case, loop)
-
-
-def _own_run(study: Study) -> Result | None:
-    """The run of a design's own file; None if it cannot run."""
-    try:
-        return run_study(study, has_record=False, has_loop=False).result
-    except StudyError:
-        return None
-
-
-def _seen(merit: Merit, run: Result | None, first: Result | None, duration: float) -> OwnRun:
-    """Figures of a run, relative to the baseline's run."""
-    if run is None or first is None:
-        nothing = dict.fromkeys(merit.shown, float("nan"))
-        return OwnRun(float("nan"), nothing, status.NON_FINITE, float("nan"))
-    metrics, own = (jax.tree.map(lambda x: np.asarray(x)[None], x.metrics) for x in (run, first))
-    return OwnRun(
-        float(objectives(merit, metrics, own)[0]),
-        {name: float(largest(merit, metrics, name)[0]) for name in merit.shown},
-        int(run.status),
-        duration - float(run.command_end),
-    )
+    return judged._replace(poles=pole_report(structure, case, loop))
 
 
 def shown_structure(spec: TuneSpec) -> Structure:
     """Program of the runs shown in a report."""
     return tuned_structure(spec)._replace(metrics=merit_of(spec).shown_metrics)
-
-
-def _rows(metrics: Metrics, first: int, count: int) -> Metrics:
-    return jax.tree.map(lambda x: np.asarray(x)[first : first + count], metrics)
 
 
 def search(spec: TuneSpec, screen: Any) -> Searched:

@@ -85,7 +85,7 @@ class LinearFidelity:
         limit = family.limits[name]
         if limit != BASELINE:
             return float(limit)
-        self._own = self._own or loop_figures(self._spec.study)
+        self._own = self._own or loop_figures(self._spec, self._spec.study)
         return float(getattr(self._own, name))
 
     def limits(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -234,15 +234,18 @@ _spillover = kept_jit(static_argnums=0)(spillover)
 _distance = kept_jit(static_argnums=0)(_singularity_distance)
 
 
-def loop_figures(study: Study) -> LoopFigures:
-    """Figures of a study's loop on a plant of 12 modes or more.
+def loop_figures(spec: TuneSpec, study: Study) -> LoopFigures:
+    """Figures of a design's loop on a plant of 12 modes or more.
 
     Args:
-        study: with sampled feedback.
+        spec: of the tuning, all designs of which share a program.
+        study: one of them, with sampled feedback.
     """
     larger = with_margin_modes(study)
     structure, case = build_structure(larger), as_arrays(build_case(larger))
-    structure = structure._replace(n_frequencies=1, has_noise=False, metrics=())
+    structure = structure._replace(
+        n_frequencies=1, has_noise=False, metrics=(), has_position_gain=spec.has_position_gain
+    )
     plain = structure._replace(n_steps=1, substeps=1)
     matrices = _closed_loop(plain, case, np.array(larger.motion.waypoints[0]))
     opened, feedback = np.asarray(matrices.open), np.asarray(matrices.feedback)

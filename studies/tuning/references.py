@@ -74,7 +74,7 @@ def compare(
         The baseline, the best designs, and what they have to beat.
     """
     fresh, is_on = spec.tune.scenarios.check * len(spec.moves), spec.study.is_controlled
-    runs = PlainRuns(shown_structure(spec), fresh * (len(designs) + 2))
+    runs = PlainRuns(shown_structure(spec), (fresh + 1) * (len(designs) + 2))
     if is_on:
         say(f"{FIELD} alone, for comparison")
     scan = scan_gain(spec, runs)
@@ -161,11 +161,11 @@ def _keeps_loop(spec: TuneSpec, value: float) -> bool:
     """Whether a gain factor keeps the limits of the linearised loop."""
     if not spec.loop_limits or spec.study.control.feedback != "sampled":
         return True
-    found, own = loop_figures(gain_study(spec, value)), None
+    found, own = loop_figures(spec, gain_study(spec, value)), None
     for name in spec.loop_limits:
         limit = spec.tune.limits[name]
         if limit == BASELINE:
-            own = own or loop_figures(spec.study)
+            own = own or loop_figures(spec, spec.study)
         left = _left(name, found, getattr(own, name) if limit == BASELINE else float(limit))
         if left < -KEPT:
             return False
