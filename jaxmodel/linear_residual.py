@@ -50,8 +50,8 @@ def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) ->
     transition = matrices.open + matrices.feedback
 
     def advance(x: Array, at: tuple[Array, Array]) -> tuple[Array, None]:
-        push, is_moving = at
-        return jnp.where(is_moving, transition @ x + matrices.force @ push, x), None
+        force, is_moving = at
+        return jnp.where(is_moving, transition @ x + matrices.force @ force, x), None
 
     still = jnp.zeros(transition.shape[0], transition.dtype)
     x, _ = jax.lax.scan(advance, still, (force, is_before))

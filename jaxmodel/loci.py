@@ -4,8 +4,8 @@ The loop with all gains times k has a pole on the imaginary axis where an eigenv
 is 1/k. So the gain margin is the inverse of the rightmost point at which one of the eigenvalues'
 curves crosses the positive real axis (characteristic loci; MacFarlane and Postlethwaite 1977).
 The curves turn no faster than the damping of the uncontrolled modes allows, so the frequencies to
-visit are known beforehand. `walk` is an elementwise step for the same executors as the loop over
-samples; eigenvalues are carried from frequency to frequency by the iteration of Durand and Kerner.
+visit are known beforehand. `follow_loci` is an elementwise step for the same executors as the loop
+over samples; the iteration of Durand and Kerner carries eigenvalues from frequency to frequency.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from jaxmodel.lazy import jax, jnp
 from jaxmodel.pairs import Pair
 from jaxmodel.parameters import Array
 from jaxmodel.return_difference import (
+    LoopGain,
     LoopResponse,
-    Turn,
-    go_round,
-    spectrum_polynomial,
+    characteristic_polynomial,
+    evaluate_loop_gain,
 )
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 
@@ -29,7 +29,7 @@ ITERATIONS = 4
 
 
 class Loci(NamedTuple):
-    """State of the walk: n eigenvalues, one for each channel."""
+    """State of the sweep: n eigenvalues, one for each channel."""
 
     value: Pair  # [1], (n,)
     last: Pair  # at the last frequency where crossings were looked for [1], (n,)
@@ -42,8 +42,8 @@ class Loci(NamedTuple):
     right: Array
 
 
-class Station(NamedTuple):
-    """A frequency of the walk."""
+class FrequencyPoint(NamedTuple):
+    """A frequency of the sweep."""
 
     omega: Array  # [rad/s], rising, never 0, ()
     cosine: Array  # of omega T, ()
@@ -53,7 +53,7 @@ class Station(NamedTuple):
     kind: Array
 
 
-def start_walk(value: Pair) -> Loci:
+def start_loci(value: Pair) -> Loci:
     """State before the first station, with first guesses, (n, ...)."""
     zero = 0 * value.re
     return Loci(
@@ -61,19 +61,19 @@ def start_walk(value: Pair) -> Loci:
     )
 
 
-def walk(response: LoopResponse, spread: Array, loci: Loci, station: Station) -> Loci:
+def follow_loci(response: LoopResponse, spread: Array, loci: Loci, station: FrequencyPoint) -> Loci:
     """Carry the eigenvalues to the next frequency.
 
     Args:
         response: of the loop.
-        spread: see `go_round`, one for each channel.
+        spread: see `evaluate_loop_gain`, one for each channel.
         loci: so far.
         station: the next frequency.
     """
     s = Pair(_growth(response) + jnp.zeros_like(station.omega), station.omega)
     shift = Pair(station.cosine, -station.sine) * (1 - RADIUS_TOLERANCE)
-    turn = go_round(response, s, shift, spread)
-    value, last = _iterated(turn, loci.value), loci.last
+    loop_gain = evaluate_loop_gain(response, s, shift, spread)
+    value, last = _improve_values(loop_gain, loci.value), loci.last
     # where the straight line between two values meets the real axis
     rise = value.im - last.im
     was_above, is_above = last.im > 0, value.im > 0
@@ -98,7 +98,7 @@ def _growth(response: LoopResponse) -> Array:
     return RADIUS_TOLERANCE / response.period
 
 
-def _iterated(turn: Turn, values: Pair) -> Pair:
+def _improve_values(loop_gain: LoopGain, values: Pair) -> Pair:
     """Eigenvalues improved one by one, each using the newest of the others (Durand, Kerner)."""
 
     @jax.jit  # kernels write it once
@@ -107,7 +107,7 @@ def _iterated(turn: Turn, values: Pair) -> Pair:
         apart = x - values[1]
         for k in range(2, values.re.shape[0]):
             apart = apart * (x - values[k])
-        return x - spectrum_polynomial(turn, x) * apart.inverse()
+        return x - characteristic_polynomial(loop_gain, x) * apart.inverse()
 
     def improve(values: Pair, _: None) -> tuple[Pair, None]:
         x, join = better(values), jnp.concatenate
@@ -116,7 +116,7 @@ def _iterated(turn: Turn, values: Pair) -> Pair:
     return jax.lax.scan(improve, values, None, length=ITERATIONS * values.re.shape[0])[0]
 
 
-class Meeting(NamedTuple):
+class AxisCrossing(NamedTuple):
     """An estimate of where an eigenvalue is real and positive, to be refined."""
 
     omega: Array  # [rad/s], ()
@@ -128,8 +128,8 @@ class Meeting(NamedTuple):
     by_value: Pair
 
 
-class FoundMeeting(NamedTuple):
-    """A meeting point already found, to be excluded."""
+class KnownCrossing(NamedTuple):
+    """A crossing point already found, to be excluded."""
 
     is_there: Array  # 1 or 0, ()
     omega: Array  # [rad/s], ()
@@ -138,46 +138,50 @@ class FoundMeeting(NamedTuple):
     by_value: Pair
 
 
-#: Largest steps of `approach`, as shares of frequency and eigenvalue.
+#: Largest steps of `refine_crossing`, as shares of frequency and eigenvalue.
 STRIDE = (0.01, 0.2)
 _TERMS = 8
 
 
-def start_approach(omega: Array, value: Array, cosine: Array, sine: Array) -> Meeting:
-    """State before the first step from a guess, see `Meeting`, (...)."""
+def start_crossing(omega: Array, value: Array, cosine: Array, sine: Array) -> AxisCrossing:
+    """State before the first step from a guess, see `AxisCrossing`, (...)."""
     zero = 0 * omega
     none = Pair(zero, zero)
-    return Meeting(
+    return AxisCrossing(
         omega=omega, value=value, cosine=cosine, sine=sine, step=zero, by_omega=none, by_value=none
     )
 
 
-def approach(response: LoopResponse, known: FoundMeeting, meeting: Meeting) -> Meeting:
+def refine_crossing(
+    response: LoopResponse, known: KnownCrossing, crossing: AxisCrossing
+) -> AxisCrossing:
     """A step of Newton's iteration on det(x - L(j omega)) = 0 for real omega and x.
 
     Args:
         response: of the loop.
         known: the point to divide out.
-        meeting: so far.
+        crossing: so far.
     """
-    omega, value, zero = meeting.omega, meeting.value, jnp.zeros_like(meeting.omega)
+    omega, value, zero = crossing.omega, crossing.value, jnp.zeros_like(crossing.omega)
     one = jnp.ones_like(zero)
-    shift = Pair(meeting.cosine, -meeting.sine) * (1 - RADIUS_TOLERANCE)
+    shift = Pair(crossing.cosine, -crossing.sine) * (1 - RADIUS_TOLERANCE)
 
-    def wanted(turn: Turn, omega: Array, x: Array) -> Pair:
-        found = spectrum_polynomial(turn, Pair(x, jnp.zeros_like(x)))
+    def remaining(loop_gain: LoopGain, omega: Array, x: Array) -> Pair:
+        value = characteristic_polynomial(loop_gain, Pair(x, jnp.zeros_like(x)))
         away = known.by_omega * (omega - known.omega) + known.by_value * (x - known.value)
-        return found * (away * known.is_there + (1 - known.is_there)).inverse()
+        return value * (away * known.is_there + (1 - known.is_there)).inverse()
 
     at = (Pair(zero + _growth(response), omega), shift)
-    turning = shift * Pair(zero, -response.period * one)  # d/d omega of exp(-j omega T)
-    turn, turned = jax.jvp(partial(go_round, response), at, (Pair(zero, one), turning))
-    found, by_omega = jax.jvp(partial(wanted, x=value), (turn, omega), (turned, one))
-    _, by_value = jax.jvp(partial(wanted, turn, omega), (value,), (one,))
+    shift_rate = shift * Pair(zero, -response.period * one)  # d/d omega of exp(-j omega T)
+    loop_gain, gain_rate = jax.jvp(
+        partial(evaluate_loop_gain, response), at, (Pair(zero, one), shift_rate)
+    )
+    residual, by_omega = jax.jvp(partial(remaining, x=value), (loop_gain, omega), (gain_rate, one))
+    _, by_value = jax.jvp(partial(remaining, loop_gain, omega), (value,), (one,))
     area = by_omega.re * by_value.im - by_omega.im * by_value.re
     over = 1 / jnp.where(area == 0, one, area)
-    d_omega = (found.im * by_value.re - found.re * by_value.im) * over
-    d_value = (found.re * by_omega.im - found.im * by_omega.re) * over
+    d_omega = (residual.im * by_value.re - residual.re * by_value.im) * over
+    d_value = (residual.re * by_omega.im - residual.im * by_omega.re) * over
     step = jnp.maximum(
         jnp.abs(d_omega) / (STRIDE[0] * jnp.abs(omega)),
         jnp.abs(d_value) / (STRIDE[1] * jnp.abs(value)),
@@ -189,7 +193,7 @@ def approach(response: LoopResponse, known: FoundMeeting, meeting: Meeting) -> M
     for n in range(_TERMS - 1, 0, -1):
         ahead = ahead * angle * (1 / n) + 1.0
     after = shift * ahead * (1 / (1 - RADIUS_TOLERANCE))
-    return Meeting(
+    return AxisCrossing(
         omega=omega + d_omega,
         value=value + d_value,
         cosine=after.re,

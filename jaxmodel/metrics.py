@@ -95,7 +95,7 @@ class Metric(NamedTuple):
     text: str  # what it is
     totals: tuple[Total, ...]  # its inputs; totals of the same name are accumulated once
     finish: Callable[[Totals, Ending], Array]
-    has_slope: bool = True  # can be an objective; otherwise it only compares designs
+    is_differentiable: bool = True  # can be an objective; otherwise it only compares designs
     is_single: bool = True  # float32 has it within 1 % (`studies bench --precision float32`)
 
 
@@ -416,7 +416,7 @@ METRICS: Table[Metric] = Table(
             "from the end of the reference trajectory until all stations stay in the band",
             (Total("settled_at", ("link",), _last_outside),),
             lambda totals, _: totals["settled_at"],
-            has_slope=False,
+            is_differentiable=False,
             is_single=False,
         ),
         Metric(
@@ -459,7 +459,7 @@ METRICS: Table[Metric] = Table(
             "samples with an actuator at its limit",
             _COUNT,
             lambda at: at.sample.is_saturated,
-            has_slope=False,
+            is_differentiable=False,
         ),
         _mean(
             "clipped_fraction",
@@ -468,7 +468,7 @@ METRICS: Table[Metric] = Table(
             "samples with a clipped ADC channel",
             _COUNT,
             lambda at: at.sample.is_clipped,
-            has_slope=False,
+            is_differentiable=False,
         ),
         Metric(
             "control_energy",
@@ -492,7 +492,7 @@ METRICS: Table[Metric] = Table(
             "samples with a motor at its limit",
             _COUNT,
             lambda at: at.sample.is_motor_saturated,
-            has_slope=False,
+            is_differentiable=False,
         ),
         _peak(
             "peak_tension",

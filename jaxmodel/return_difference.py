@@ -206,9 +206,9 @@ def loop_strength(response: LoopResponse) -> Array:
     channel = jax.vmap(force, in_axes=1, out_axes=2)(shift.re, shift.im)  # (n, C, R)
     s = Pair(zero, omega)
     passed = _electronics(response, s, s * s, -shift + 1.0)
-    round_once = jnp.abs(response.observe * response.act) * _size(channel)
+    link_gain = jnp.abs(response.observe * response.act) * _size(channel)
     narrow = jnp.maximum(decay, NARROWEST * omega) * omega
-    return jnp.max(jnp.sum(round_once, axis=1) * _size(passed) / narrow)
+    return jnp.max(jnp.sum(link_gain, axis=1) * _size(passed) / narrow)
 
 
 def _size(x: Pair) -> Array:
@@ -293,8 +293,8 @@ def assembled_modes(response: LoopResponse) -> AssembledModes:
     )
 
 
-class Turn(NamedTuple):
-    """L at one s, in the form its determinants need; `spectrum_polynomial` reads it."""
+class LoopGain(NamedTuple):
+    """L at one s, in the form its determinants need; `characteristic_polynomial` reads it."""
 
     own: list[Pair]  # coefficients of det(x - L_i) of each link, highest power first, (n,) each
     joint: list[Pair]  # of entering adj(x - L_i) leaving, the same way, (n, 3, 3)
@@ -302,7 +302,9 @@ class Turn(NamedTuple):
     pose_inverse: Pair  # 1/det of that, ()
 
 
-def go_round(response: LoopResponse, s: Pair, shift: Pair, spread: Array | None = None) -> Turn:
+def evaluate_loop_gain(
+    response: LoopResponse, s: Pair, shift: Pair, spread: Array | None = None
+) -> LoopGain:
     """Evaluate L at s.
 
     Args:
@@ -312,23 +314,23 @@ def go_round(response: LoopResponse, s: Pair, shift: Pair, spread: Array | None 
         spread: subtracted from the diagonal of L, so that channels without gains have distinct
             eigenvalues [1], (n, C); None: nothing.
     """
-    n, rounds, shares = response.observe.shape[0], [], []
+    n, gains, shares = response.observe.shape[0], [], []
     # kernels write them once
-    round_once, pass_by = jax.jit(_round_of_link), jax.jit(_share_in_pose)
+    link_gain, pose_share = jax.jit(_link_gain), jax.jit(_share_in_pose)
     for i in range(response.square.shape[0]):
         link = _one_link(response, i, i < n)
         if i < n:
             apart = None if spread is None else spread[i : i + 1]
-            *found, share = round_once(link, s, shift, apart)
-            rounds.append(found)
+            *gain, share = link_gain(link, s, shift, apart)
+            gains.append(gain)
         else:
-            share = pass_by(link, s)
+            share = pose_share(link, s)
         shares.append(share)
-    own, joint = jax.tree.map(lambda *x: jnp.concatenate(x), *rounds)
+    own, joint = jax.tree.map(lambda *x: jnp.concatenate(x), *gains)
     links = sum(shares[1:], start=shares[0])
     s2 = s * s
     pose = s2 * response.mass + s * response.damping + response.stiffness - links * (s2 * s2)
-    return Turn(own, joint, pose, determinant(pose).inverse())
+    return LoopGain(own, joint, pose, determinant(pose).inverse())
 
 
 def _one_link(response: LoopResponse, i: int, has_channels: bool) -> LoopResponse:
@@ -339,16 +341,16 @@ def _one_link(response: LoopResponse, i: int, has_channels: bool) -> LoopRespons
     return response._replace(mass=None, damping=None, stiffness=None, **parts)
 
 
-def _round_of_link(
+def _link_gain(
     response: LoopResponse, s: Pair, shift: Pair, spread: Array | None
 ) -> tuple[list[Pair], list[Pair], Pair]:
-    """`own` and `joint` of a `Turn`, and what the modes take from the pose's stiffness, (3, 3)."""
+    """`own` and `joint` of a link's `LoopGain`, and its share in the pose's stiffness, (3, 3)."""
     observe, act = response.observe, response.act
-    turn = 2 * np.pi / response.period
+    sampling = 2 * np.pi / response.period
     held = -shift + 1.0
     seen = None
     for image in IMAGES:
-        at = Pair(s.re, s.im + image * turn)
+        at = Pair(s.re, s.im + image * sampling)
         at2 = at * at
         chain = _electronics(response, at, at2, held)
         inertia = 1.0 if image == 0 else response.lightness
@@ -437,18 +439,18 @@ def _plus_diagonal(matrix: Pair, value: Pair) -> Pair:
     return Pair(matrix.re + eye * value.re[:, None], matrix.im + eye * value.im[:, None])
 
 
-def spectrum_polynomial(turn: Turn, x: Pair) -> Pair:
+def characteristic_polynomial(loop_gain: LoopGain, x: Pair) -> Pair:
     """det(x - L), whose zeros are the eigenvalues of L, (); the highest power has factor 1.
 
     Args:
-        turn: L at some s.
+        loop_gain: L at some s.
         x: [1], ().
     """
-    own, joint = x + turn.own[0], turn.joint[0]
-    for constant, matrix in zip(turn.own[1:], turn.joint[1:], strict=True):
+    own, joint = x + loop_gain.own[0], loop_gain.joint[0]
+    for constant, matrix in zip(loop_gain.own[1:], loop_gain.joint[1:], strict=True):
         own, joint = own * x + constant, joint * x + matrix
-    pose = turn.pose - (joint * own.inverse()[:, None, None]).sum(0)
-    found = determinant(pose) * turn.pose_inverse
+    pose = loop_gain.pose - (joint * own.inverse()[:, None, None]).sum(0)
+    value = determinant(pose) * loop_gain.pose_inverse
     for link in range(own.re.shape[0]):
-        found = found * own[link]
-    return found
+        value = value * own[link]
+    return value

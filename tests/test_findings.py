@@ -9,7 +9,7 @@ import pytest
 from jaxmodel import status
 from studies.spillover.certificate import Certificate
 from studies.spillover.comparison import GIVEN, WITHOUT, Comparison
-from studies.spillover.plants import Departure, PlantVariant
+from studies.spillover.plants import ModelMismatch, PlantVariant
 from studies.spillover.report import document, verdict
 from studies.spillover.report import report as certificate_report
 from studies.study.margin import margin_in_db
@@ -30,16 +30,20 @@ STUDY = paper_study().change(
     title="this", control__modes=2, control__gain_factor=0.4, control__links=(True, False, True)
 )
 BASES, SIZES = ("pinned_pinned", "pinned_free"), (2, 5)
-DEPARTURES = (Departure(), Departure(1.25, 0.8), Departure(frequency=0.9, joint_inertia=2e-6))
+MISMATCHES = (
+    ModelMismatch(),
+    ModelMismatch(1.25, 0.8),
+    ModelMismatch(frequency=0.9, joint_inertia=2e-6),
+)
 
 
 def certificate(required=2.0, **changes):
-    """Two bases, three departures, two sizes; one plant does not exist."""
+    """Two bases, three mismatches, two sizes; one plant does not exist."""
     rng = np.random.default_rng(3)
     shape, largest = (2, 3, 2), SIZES[-1]
     plants = np.empty(shape, object)
     for b, d, n in np.ndindex(shape):
-        plants[b, d, n] = PlantVariant(BASES[b], SIZES[n], DEPARTURES[d])
+        plants[b, d, n] = PlantVariant(BASES[b], SIZES[n], MISMATCHES[d])
     exists = np.ones(shape, bool)
     exists[1, 2, 0] = False
     modes = (*shape, largest, 3)
@@ -131,7 +135,7 @@ def test_a_certificate_s_table_of_leakage():
     seen, pushed = np.abs(found.observation[..., 2:]), np.abs(found.actuation[:, :, :, 2:])
     b, d, _, j, r = np.unravel_index(np.argmax(seen), seen.shape)
     words = " ".join(text.split())
-    worst = f"Worst: mode {r + 3} in q^{j + 1}, {seen.max():.3g} ({BASES[b]}, {DEPARTURES[d]})."
+    worst = f"Worst: mode {r + 3} in q^{j + 1}, {seen.max():.3g} ({BASES[b]}, {MISMATCHES[d]})."
     assert worst in words
     b, d, _, r, j = np.unravel_index(np.argmax(pushed), pushed.shape)
     assert f"up to {pushed.max():.3g} of itself (mode {j + 1} on mode {r + 3}, {BASES[b]})" in words
@@ -182,7 +186,7 @@ def test_a_certificate_s_sentences():
         f"**Result:** safe on 11 of 11 plants: gain margin {shown} on the worst, 2 required; what "
         f"goes unstable first: {found.breaking[found.worst]}.",
         "basis pinned_pinned, 2 controlled modes per link on links 1+3, gain factor 0.4;",
-        f"Smallest margin: {shown}, on {at.basis}, {at.n_modes} modes per link, {at.departure}.",
+        f"Smallest margin: {shown}, on {at.basis}, {at.n_modes} modes per link, {at.mismatch}.",
         f"Margins with 2 and 5 plant modes per link differ by up to {100 * change:.2g} %.",
         f"(without control: {np.nanmin(free):.3g} to {np.nanmax(free):.3g})",
         "`studies export DESIGN --target c",
@@ -272,7 +276,7 @@ def test_a_certificate_s_document_has_every_number():
         if not found.exists[at]:
             continue
         plant = found.plants[at]
-        n, true = plant.n_modes, plant.departure
+        n, true = plant.n_modes, plant.mismatch
         wanted.append(
             {
                 "basis": plant.basis,

@@ -6,16 +6,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from jaxmodel.loci import Meeting
+from jaxmodel.loci import AxisCrossing
 from jaxmodel.pairs import Pair
 from studies.engine import margins
 from studies.engine.margins import (
     CONVERGED,
-    WALKS,
+    SWEEPS,
     Crossings,
+    _converge,
     _is_confirmed,
     _judged,
-    _meet,
     _rightmost,
     judge_loops,
 )
@@ -29,7 +29,7 @@ from studies.study.spec import paper_study
 
 def meeting(value, omega, step):
     none = Pair(np.zeros_like(value), np.zeros_like(value))
-    return Meeting(
+    return AxisCrossing(
         omega=omega,
         value=value,
         cosine=np.cos(omega),
@@ -58,11 +58,11 @@ def meeting(value, omega, step):
 def test_an_iteration_counts_when_its_last_step_is_small(monkeypatch, step, value, wanted):
     assert CONVERGED == 1e-3
     ended = meeting(np.array([value]), np.array([300.0]), np.array([step]))
-    monkeypatch.setattr(margins, "_approached", lambda *_: ended)
+    monkeypatch.setattr(margins, "run_steps", lambda *_: ended)
     response = SimpleNamespace(period=np.array([1e-4]))
     monkeypatch.setattr(margins.jax.tree, "map", lambda function, tree: tree)
     with np.errstate(invalid="ignore"):
-        _, is_met = _meet(response, Crossings(np.zeros(1, int), *np.ones((2, 1))), response)
+        _, is_met = _converge(response, Crossings(np.zeros(1, int), *np.ones((2, 1))), response)
     assert is_met.tolist() == [wanted]
 
 
@@ -122,9 +122,9 @@ def judged(monkeypatch):
             at_end[0][case], at_end[1][case] = value, 0.0
         nothing = np.empty(0)
         patches = {
-            "_walk_along": lambda *_: (crossings(seen), nothing, nothing),
-            "_look_closer": lambda *_: crossings(found),
-            "_meet": meets,
+            "_sweep_axis": lambda *_: (crossings(seen), nothing, nothing),
+            "_refine": lambda *_: crossings(found),
+            "_converge": meets,
             "_at_the_ends": lambda *_: at_end,
             "_filters_grow": lambda _: np.zeros(N, bool),
         }
@@ -140,7 +140,7 @@ def judged(monkeypatch):
             response,
             SimpleNamespace(**(modes | changes)),
             np.full(N, weaker),
-            WALKS[0],
+            SWEEPS[0],
             np.full((N, 2), 0.25),
         )
 
@@ -167,7 +167,7 @@ def test_what_did_not_converge_leaves_the_margin_to_another_crossing(judged):
 
 
 def test_strange_crossings_are_doubtful(judged):
-    """Seen on the walk, not found again, and to the right of what was found."""
+    """Seen on the sweep, not found again, and to the right of what was found."""
     seen = [(0, 0.5, 450), (1, 3.0, 450), (1, 0.4, 110), (2, 0.3, 110), (2, 0.9, 450), (3, 0.5, 9)]
     found = [(0, 0.5, 450), (1, 0.4, 110), (2, 0.9, 450)]
     figures, is_doubtful = judged(seen, found, [(0.5, 0.0), (0.4, 0.0), (0.9, 0.0)])
@@ -202,16 +202,16 @@ def test_machines_that_fall_by_themselves_have_no_margin(judged):
     np.testing.assert_allclose(figures.gain_margin[:2], [2, 0])
 
 
-# --- two walks ------------------------------------------------------------------------------------
+# --- two sweeps ----------------------------------------------------------------------------------
 
 
 def test_doubtful_loops_are_walked_again_more_finely(monkeypatch):
-    """And only they; what the finer walk finds stays."""
+    """And only they; what the finer sweep finds stays."""
     calls = []
 
-    def block(structure, way, most, cases, rows):
-        calls.append((WALKS.index(way), rows.tolist()))
-        value = 10.0 * (1 + WALKS.index(way)) + rows
+    def block(structure, sweep, most, cases, rows):
+        calls.append((SWEEPS.index(sweep), rows.tolist()))
+        value = 10.0 * (1 + SWEEPS.index(sweep)) + rows
         figures = LoopFigures(
             gain_margin=value,
             breaking_frequency=value + 100,
@@ -230,8 +230,8 @@ def test_doubtful_loops_are_walked_again_more_finely(monkeypatch):
     np.testing.assert_array_equal(found.breaking_frequency, wanted + 100)
     np.testing.assert_array_equal(found.breaking_mode, wanted + 200)
     np.testing.assert_array_equal(found.least_damping, np.stack([wanted] * 3, axis=1))
-    assert sorted(k for way, rows in calls for k in rows if way == 0) == list(range(6))
-    assert sorted(k for way, rows in calls for k in rows if way == 1) == [1, 4]
-    coarse, fine = WALKS
+    assert sorted(k for sweep, rows in calls for k in rows if sweep == 0) == list(range(6))
+    assert sorted(k for sweep, rows in calls for k in rows if sweep == 1) == [1, 4]
+    coarse, fine = SWEEPS
     assert fine.background > coarse.background and len(fine.beside) > len(coarse.beside)
     assert fine.repeats > coarse.repeats

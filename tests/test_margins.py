@@ -15,10 +15,10 @@ from jaxmodel.laws import n_channels
 from jaxmodel.pairs import Pair
 from jaxmodel.prepare import prepare
 from jaxmodel.return_difference import (
+    characteristic_polynomial,
     controlled_first,
-    go_round,
+    evaluate_loop_gain,
     loop_response,
-    spectrum_polynomial,
 )
 from jaxmodel.sampled_loop import closed_loop
 from studies.engine import lanes
@@ -70,8 +70,10 @@ def determinant(structure, case, omega, factor):
     """det(I - k L(j omega)) from det(x - L), x = 1/k."""
     response = loop_response(structure, case, prepare(structure, case).loop, POSE)
     angle = omega * response.period
-    turn = go_round(response, Pair(0 * omega, omega), Pair(jnp.cos(angle), -jnp.sin(angle)))
-    found = spectrum_polynomial(turn, Pair(1 / factor, 0 * factor))
+    gain = evaluate_loop_gain(
+        response, Pair(0 * omega, omega), Pair(jnp.cos(angle), -jnp.sin(angle))
+    )
+    found = characteristic_polynomial(gain, Pair(1 / factor, 0 * factor))
     n = 3 * n_channels(structure)
     return (found.re + 1j * found.im) * factor**n
 
@@ -251,7 +253,7 @@ def test_idle_links_cost_nothing_and_change_nothing():
     angle = 700.0 * whole.period
     at = Pair(0 * angle, 700.0 + 0 * angle), Pair(np.cos(angle), -np.sin(angle))
     x = Pair(0.3 + 0 * angle, 0.1 + 0 * angle)
-    polynomial = jax.jit(lambda one: spectrum_polynomial(go_round(one, *at), x))
+    polynomial = jax.jit(lambda one: characteristic_polynomial(evaluate_loop_gain(one, *at), x))
     found, wanted = polynomial(fewer), polynomial(whole)
     idle = (0.3 + 0.1j) ** n_channels(structure)  # eigenvalues 0
     np.testing.assert_allclose(
@@ -345,7 +347,7 @@ def test_machines_that_hardly_stand_alone(fields):
 
 
 def test_damping_by_eigenvalues_is_that_of_the_walk():
-    """Of one link under control out of three, on either side of what the walk can see."""
+    """Of one link under control out of three, on either side of what the sweep can see."""
     fields = {"control__links": (True, False, False), "control__gain_factor": 0.02}
     walked, exact = (
         single_damping(STUDY.change(link__damping_ratio=zeta, **fields))

@@ -24,11 +24,11 @@ from studies.engine.controller import fixed_controller
 from studies.engine.runs import run_study
 from studies.engine.stability import follow_modes, loop_report, modal_damping
 from studies.errors import StudyError
-from studies.spillover import Departure, certify, compare_laws, patch_lengths
+from studies.spillover import ModelMismatch, certify, compare_laws, patch_lengths
 from studies.spillover import run as spillover_run
-from studies.spillover.comparison import _controlled_links, _View
+from studies.spillover.comparison import _controlled_links, _LawLoops
 from studies.spillover.laws import all_laws
-from studies.spillover.plants import LoopMaker, PlantVariant, all_plants, widened
+from studies.spillover.plants import LoopBuilder, PlantVariant, all_plants, pad_channels
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.margin import HIGHEST
 from studies.study.spec import paper_study
@@ -47,9 +47,9 @@ DIFFERENCE = {
     "control__velocity_gain": (3.1, 3.1, 3.1),
     "link__static_correction": False,
 }
-SAME = {"bases": ("pinned_pinned",), "departures": (Departure(),)}
+SAME = {"bases": ("pinned_pinned",), "mismatches": (ModelMismatch(),)}
 #: Where the default design has its smallest margin of all plants.
-HARD = {"bases": ("pinned_pinned",), "departures": patch_lengths((0.8,)), "sizes": (8, 9)}
+HARD = {"bases": ("pinned_pinned",), "mismatches": patch_lengths((0.8,)), "sizes": (8, 9)}
 
 
 def certified(changes, **plants):
@@ -126,7 +126,7 @@ def test_margins_and_damping_are_those_of_the_loop_report():
 
 def test_longer_actuators_give_damping():
     lengths = patch_lengths((1.0, 1.25))  # sensors first
-    found = certified({}, sizes=(3,), bases=("pinned_pinned",), departures=lengths)
+    found = certified({}, sizes=(3,), bases=("pinned_pinned",), mismatches=lengths)
     first = found.damping_ratio[0, :, 0, 0].min(axis=1)
     assert np.all(first[1::2] > 1.05 * first[::2])
     # the plant sees the true length, the controller divides by what it believes: 1.2 times q^_1
@@ -140,7 +140,7 @@ def test_leakage_of_the_papers_filter():
     """In its own basis and on pinned-pinned plants: the numbers known beforehand."""
     changes = {"control__basis": "pinned_free"}
     found = certified(
-        changes, sizes=(8,), bases=("pinned_free", "pinned_pinned"), departures=(Departure(),)
+        changes, sizes=(8,), bases=("pinned_free", "pinned_pinned"), mismatches=(ModelMismatch(),)
     )
     own, other = found.observation[:, 0, 0, 0]
     np.testing.assert_allclose(own[:3], [1, 0, 0], atol=1e-9)
@@ -156,23 +156,27 @@ def test_plants_that_do_not_exist_are_left_out():
         STUDY.change(patches__centers=centers),
         sizes=(3,),
         bases=SAME["bases"],
-        departures=patch_lengths((1.0, 1.25)),
+        mismatches=patch_lengths((1.0, 1.25)),
     )
     np.testing.assert_array_equal(found.exists[0, :, 0], [True, False] * 2)
     assert np.all(np.isnan(found.margin[~found.exists])) and found.breaking[0, 1, 0] == ""
     assert found.notes[0] == "left out: sensors x 1, actuators x 1.25: patches overlap"
     assert len(found.notes) == 2
     locked = STUDY.change(drive__locked=True, motion__waypoints=STUDY.motion.waypoints[:1])
-    maker = LoopMaker(fixed_controller(STUDY)._replace(study=locked))
-    plants = all_plants(("pinned_free", "loaded"), (Departure(),), (3,)).ravel()
-    assert "locked" in maker.fault(plants[0]) and maker.fault(plants[1]) == ""
+    builder = LoopBuilder(fixed_controller(STUDY)._replace(study=locked))
+    plants = all_plants(("pinned_free", "loaded"), (ModelMismatch(),), (3,)).ravel()
+    assert "locked" in builder.fault(plants[0]) and builder.fault(plants[1]) == ""
 
 
 @pytest.mark.long  # in short: plants with other bases, and what is known to be unstable
 def test_links_that_are_softer_and_joints_with_inertia():
     """As if the study said so, the controller's coefficients staying as they are."""
-    true = (Departure(frequency=0.9), Departure(joint_inertia=1.1e-5), Departure(joint_inertia=0.0))
-    found = certified({}, sizes=(12,), bases=("pinned_pinned", "loaded"), departures=true)
+    true = (
+        ModelMismatch(frequency=0.9),
+        ModelMismatch(joint_inertia=1.1e-5),
+        ModelMismatch(joint_inertia=0.0),
+    )
+    found = certified({}, sizes=(12,), bases=("pinned_pinned", "loaded"), mismatches=true)
     # the last one is what the study says
     np.testing.assert_array_equal(found.exists[..., 0], [[True, False], [True, True]])
     assert found.notes == (
@@ -198,14 +202,14 @@ def test_links_that_are_softer_and_joints_with_inertia():
 def test_plants_that_buckle_by_themselves_are_left_out():
     """103 N of compression: links of 90 % of the frequency hold 81 % of 115 N."""
     study = STUDY.change(load__wrench=(0.0, 0.0, -18.5))
-    true = (Departure(), Departure(frequency=0.9))
-    found = certify(study, sizes=(3,), bases=SAME["bases"], departures=true)
+    true = (ModelMismatch(), ModelMismatch(frequency=0.9))
+    found = certify(study, sizes=(3,), bases=SAME["bases"], mismatches=true)
     assert found.notes == (
         "left out: pinned_pinned, frequencies x 0.9: it buckles without control",
     )
     np.testing.assert_array_equal(found.exists[0, :, 0], [True, False])
     with pytest.raises(StudyError, match="no plant to judge on: .*buckles"):
-        certify(study, sizes=(3,), bases=SAME["bases"], departures=true[1:])
+        certify(study, sizes=(3,), bases=SAME["bases"], mismatches=true[1:])
 
 
 def test_damping_stands_beside_that_without_control():
@@ -266,15 +270,15 @@ def laws():
     """All laws of the default design, by name."""
     found = fixed_controller(STUDY)
     plant = PlantVariant("pinned_pinned", 8)
-    return {law.law.text: law for law in all_laws(found, LoopMaker(found), plant)}
+    return {law.law.text: law for law in all_laws(found, LoopBuilder(found), plant)}
 
 
 def test_laws_are_equally_strong_on_mode_1(laws):
     found = fixed_controller(STUDY)
-    maker, plant = LoopMaker(found), PlantVariant("pinned_pinned", 8)
+    builder, plant = LoopBuilder(found), PlantVariant("pinned_pinned", 8)
 
     def strength(name):
-        seen, driven = maker.leakage(plant, laws[name].controller)
+        seen, driven = builder.spillover_gains(plant, laws[name].controller)
         gain = laws[name].controller.velocity_gain
         return np.einsum("ic,ic,ic->i", driven[:, 0], gain, seen[:, :, 0])
 
@@ -346,7 +350,7 @@ def test_idle_channels_change_nothing():
         position_gain=whole.position_gain[:, :2],
         synthesizer=whole.synthesizer[:, :, :2],
     )
-    wide = widened(plain, 3)
+    wide = pad_channels(plain, 3)
     state = rest_controller(plain)
     more = rest_controller(wide)
     step = jax.jit(controller_step)
@@ -429,10 +433,10 @@ def test_damping_is_that_of_links_that_control_the_mode():
     mask = ((True, False, False), (False, True, False), (False, False, False))
     found = fixed_controller(STUDY.change(control__mode_mask=mask))
     np.testing.assert_array_equal(_controlled_links(found.controller), [1, 1, 2])
-    maker, plant = LoopMaker(found), PlantVariant("pinned_pinned", 3)
-    law = all_laws(found, maker, plant)[0]
-    view = _View(found, law, plant, (3,))
-    loop = maker.loop(plant, law.controller)
+    builder, plant = LoopBuilder(found), PlantVariant("pinned_pinned", 3)
+    law = all_laws(found, builder, plant)[0]
+    view = _LawLoops(found, law, plant, (3,))
+    loop = builder.loop(plant, law.controller)
     tracked = follow_modes(loop, np.linspace(0.1, 1, 16), loop.poles)[-1]
     zeta = modal_damping(loop, tracked)[1]
     np.testing.assert_allclose(view.damping(1.0)[:2], zeta[:2].max(axis=1), rtol=1e-6)
@@ -447,7 +451,7 @@ def test_damping_is_that_of_links_that_control_the_mode():
 
 def few(monkeypatch, comparison):
     """A command that looks at few plants."""
-    chosen = {"bases": ("pinned_pinned",), "departures": patch_lengths((0.8, 1.0)), "sizes": (3, 9)}
+    chosen = {"bases": ("pinned_pinned",), "mismatches": patch_lengths((0.8, 1.0)), "sizes": (3, 9)}
     monkeypatch.setattr(spillover_run, "certify", partial(certify, **chosen))
     monkeypatch.setattr(spillover_run, "compare_laws", comparison)
 

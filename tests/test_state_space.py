@@ -35,7 +35,7 @@ from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.spillover.certificate import certify
 from studies.spillover.comparison import compare_laws
-from studies.spillover.plants import Departure
+from studies.spillover.plants import ModelMismatch
 from studies.study.cases import build_case
 from studies.study.spec import load_study, parse_study
 from studies.study.template import study_template
@@ -393,7 +393,7 @@ def test_it_is_certified(tmp_path, capsys):
     a, b, c, d = random_system(2, 3, gain=1e-3)
     np.savez(tmp_path / "one.npz", a=a, b=b, c=c, d=d, dt=PERIOD)
     study = study_with(tmp_path / "one.npz")
-    found = certify(study, bases=("pinned_pinned",), sizes=(3, 6), departures=(Departure(),))
+    found = certify(study, bases=("pinned_pinned",), sizes=(3, 6), mismatches=(ModelMismatch(),))
     report = loop_report(*check_run(study), np.array(study.motion.waypoints[0]), n_modes=6)
     assert found.margin[0, 0, 1] == pytest.approx(report.gain_margin, rel=1e-3)
     with pytest.raises(StudyError, match="to compare laws of equal strength"):

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from jaxmodel.pairs import Pair
-from jaxmodel.pole_paths import Trio, follow, settle
+from jaxmodel.pole_paths import PoleTriplet, refine_closed_loop_poles, refine_open_loop_poles
 from jaxmodel.return_difference import AssembledModes, LoopResponse
 from studies.engine.lanes import run_steps
 
@@ -69,8 +69,8 @@ def _poles(response: LoopResponse, modes: AssembledModes, order: int) -> np.ndar
     held = _pair(-decay + 1j * np.sqrt(square - decay**2))
     which = np.argsort(-modes.share[order + 1], axis=0)[:3]
     omega, loss = (np.take_along_axis(x, which, axis=0) for x in (modes.omega, modes.decay))
-    first = _trio(-loss + 1j * np.sqrt(omega**2 - loss**2), response.period)
-    own = run_steps(_settle, (response, held), (), first, SETTLING).pole
+    first = _triplet(-loss + 1j * np.sqrt(omega**2 - loss**2), response.period)
+    own = run_steps(_refine_open_loop_poles, (response, held), (), first, SETTLING).pole
     poles, is_found = _followed(response, own, WAYS[0])
     again = np.flatnonzero(~is_found)
     if len(again):
@@ -80,25 +80,29 @@ def _poles(response: LoopResponse, modes: AssembledModes, order: int) -> np.ndar
 
 
 def _followed(response: LoopResponse, own: Pair, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    start = _trio(own.re + 1j * own.im, response.period)
-    last = run_steps(_follow, (response, own), 1 / way, start, len(way))
+    start = _triplet(own.re + 1j * own.im, response.period)
+    last = run_steps(_refine_closed_loop_poles, (response, own), 1 / way, start, len(way))
     is_found = np.all((last.step < AT_REST) & np.isfinite(last.pole.re), axis=0)
     return last.pole.re + 1j * last.pole.im, is_found
 
 
-def _trio(poles: np.ndarray, period: np.ndarray) -> Trio:
+def _triplet(poles: np.ndarray, period: np.ndarray) -> PoleTriplet:
     """Initial guesses, slightly apart."""
     poles = poles + ASIDE * np.abs(poles) * np.exp(1j * np.array([0.3, 2.4, 4.4]))[:, None]
-    return Trio(_pair(poles), _pair(np.exp(-poles * period)), np.zeros(poles.shape))
+    return PoleTriplet(_pair(poles), _pair(np.exp(-poles * period)), np.zeros(poles.shape))
 
 
 def _pair(x: np.ndarray) -> Pair:
     return Pair(np.ascontiguousarray(x.real), np.ascontiguousarray(x.imag))
 
 
-def _settle(constants: tuple[LoopResponse, Pair], _: tuple[Any, ...], trio: Trio) -> Trio:
-    return settle(*constants, trio)
+def _refine_open_loop_poles(
+    constants: tuple[LoopResponse, Pair], _: tuple[Any, ...], triplet: PoleTriplet
+) -> PoleTriplet:
+    return refine_open_loop_poles(*constants, triplet)
 
 
-def _follow(constants: tuple[LoopResponse, Pair], inverse: Any, trio: Trio) -> Trio:
-    return follow(*constants, trio, inverse)
+def _refine_closed_loop_poles(
+    constants: tuple[LoopResponse, Pair], inverse: Any, triplet: PoleTriplet
+) -> PoleTriplet:
+    return refine_closed_loop_poles(*constants, triplet, inverse)

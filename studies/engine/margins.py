@@ -2,7 +2,7 @@
 
 See `jaxmodel.loci`. The steps run as traced kernels if available, otherwise in XLA's scan: first
 along the axis; then between the two frequencies of each crossing, with more iterations; then by
-Newton's iteration, repeated with the found points divided out, since similar links have crossings
+Newton's iteration, repeated with the points known divided out, since similar links have crossings
 close together. Uses `MARGIN_MODES` plant modes, at rest at the first way-point.
 """
 
@@ -19,14 +19,14 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.imsc import IMSC
 from jaxmodel.loci import (
-    FoundMeeting,
+    AxisCrossing,
+    FrequencyPoint,
+    KnownCrossing,
     Loci,
-    Meeting,
-    Station,
-    approach,
-    start_approach,
-    start_walk,
-    walk,
+    follow_loci,
+    refine_crossing,
+    start_crossing,
+    start_loci,
 )
 from jaxmodel.pairs import Pair
 from jaxmodel.prepare import prepare
@@ -48,42 +48,42 @@ from studies.engine.stability import LoopFigures, loop_report, with_margin_modes
 from studies.study.margin import HIGHEST, LOWEST
 
 
-class Walk(NamedTuple):
-    """Frequencies of a walk along the axis."""
+class FrequencySweep(NamedTuple):
+    """Frequencies of a sweep along the axis."""
 
     background: int  # between `LOWEST_HZ` and half the sample rate
     beside: tuple[float, ...]  # next to each mode of the machine, multiples of its zeta omega
     repeats: int  # iterations at each
 
 
-#: The walk, and a finer one for cases in which it saw spurious crossings.
-WALKS = (
-    Walk(160, (-9.0, -4.5, -2.2, -1.0, -0.3, 0.3, 1.0, 2.2, 4.5, 9.0), 1),
-    Walk(400, tuple(np.tan(np.linspace(-1.5, 1.5, 24)).tolist()), 3),
+#: The sweep, and a finer one for cases in which it saw spurious crossings.
+SWEEPS = (
+    FrequencySweep(160, (-9.0, -4.5, -2.2, -1.0, -0.3, 0.3, 1.0, 2.2, 4.5, 9.0), 1),
+    FrequencySweep(400, tuple(np.tan(np.linspace(-1.5, 1.5, 24)).tolist()), 3),
 )
 LOWEST_HZ = 5.0
 #: Replaces 0 [rad/s], where the hold would be 0/0.
 STILL = 0.01
-#: Links with less damping [1] have peaks too sharp for a walk; eigenvalues judge their loops. So
+#: Links with less damping [1] have peaks too sharp for a sweep; eigenvalues judge their loops. So
 #: they do where a mode of one link has this many times the damping of another link's: such modes
-#: stay with their links, and the walk, which takes them for modes of the machine, misses the sharp
+#: stay with their links, and the sweep, which takes them for modes of the machine, misses the sharp
 #: one (from 50 times on).
 LEAST_DAMPED, UNEVEN = 5e-4, 20.0
-#: Separates the eigenvalues of idle channels, on the walk and in the second look.
+#: Separates the eigenvalues of idle channels, on the sweep and in the refinement.
 SPREAD, FINE_SPREAD = 1e-3, 1e-6
 #: Crossings examined again per case, and kept per examined place.
 CHOSEN, KEPT = 4, 2
-#: The walk starts from small numbers, so stronger loops are examined with weaker gains [1].
+#: The sweep starts from small numbers, so stronger loops are examined with weaker gains [1].
 STRONG = 30.0
 #: Steps of Newton's iteration, and the last step that counts as converged.
 NEWTON, CONVERGED = 10, 1e-3
 #: Starting points for crossings near the rightmost one found, as multiples of it.
 AGAIN = (1.02, 1.1, 1.005)
-#: A crossing seen on the walk is examined once more if nothing is found within this factor of it.
+#: A crossing seen on the sweep is examined once more if nothing is found within this factor of it.
 NEAR = 1.2
 
 
-class Look(NamedTuple):
+class Refinement(NamedTuple):
     """How the neighbourhood of a crossing is examined."""
 
     wider: float  # beyond the two frequencies on either side of it, as a share of their distance
@@ -92,7 +92,7 @@ class Look(NamedTuple):
     starts: int  # before the first
 
 
-LOOK = Look(0.3, 10, 3, 24)
+REFINEMENT = Refinement(0.3, 10, 3, 24)
 
 
 #: What a batch has of `LoopFigures`.
@@ -118,13 +118,13 @@ def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
     threads = len(jax.local_devices())
     with ThreadPoolExecutor(threads) as pool:
 
-        def judge(rows: np.ndarray, way: Walk) -> np.ndarray:
+        def judge(rows: np.ndarray, sweep: FrequencySweep) -> np.ndarray:
             """Write the figures of these cases; returns the doubtful ones."""
             share = min(BLOCK, -(-len(rows) // threads))
             parts = [rows[k : k + share] for k in range(0, len(rows), share)]
-            found = list(pool.map(partial(_judge_block, structure, way, most, whole), parts))
+            judge_part = partial(_judge_block, structure, sweep, most, whole)
             doubtful = []
-            for part, (those, is_doubtful) in zip(parts, found, strict=True):
+            for part, (those, is_doubtful) in zip(parts, pool.map(judge_part, parts), strict=True):
                 for name in BATCHED:
                     getattr(figures, name)[part] = getattr(those, name)
                 doubtful.append(part[is_doubtful])
@@ -134,9 +134,9 @@ def judge_loops(structure: Structure, cases: Case) -> LoopFigures:
         is_sharp |= _unevenness(whole) > UNEVEN
         is_sharp |= LAWS[structure.law].channel == "none"  # no return difference link by link
         rows = np.flatnonzero(~is_sharp)
-        for way in WALKS:
+        for sweep in SWEEPS:
             if len(rows):
-                rows = judge(rows, way)
+                rows = judge(rows, sweep)
     for k in map(int, np.flatnonzero(is_sharp)):
         _judge_by_eigenvalues(structure, jax.tree.map(lambda x, k=k: x[k], whole), figures, k)
     return figures
@@ -159,13 +159,13 @@ def _unevenness(cases: Case) -> np.ndarray:
 def _judge_by_eigenvalues(structure: Structure, case: Case, figures: LoopFigures, k: int) -> None:
     """Write the figures of one case, except what breaks; takes half a second."""
     try:
-        found = loop_report(structure, case, case.path.waypoints[0], structure.n_controlled)
+        one = loop_report(structure, case, case.path.waypoints[0], structure.n_controlled)
     except np.linalg.LinAlgError:  # not finite
         return
-    figures.gain_margin[k] = found.gain_margin
+    figures.gain_margin[k] = one.gain_margin
     n_links = np.sum(case.control.link_mask > 0)
     figures.least_damping[k] = least_controlled(
-        found.damping_ratio.T, np.full(structure.n_controlled, n_links)
+        one.damping_ratio.T, np.full(structure.n_controlled, n_links)
     )
 
 
@@ -217,19 +217,19 @@ class Crossings(NamedTuple):
 
 
 def _judge_block(
-    structure: Structure, way: Walk, most: int, cases: Case, rows: np.ndarray
+    structure: Structure, sweep: FrequencySweep, most: int, cases: Case, rows: np.ndarray
 ) -> tuple[LoopFigures, np.ndarray]:
     """Figures of some cases, at most a block, and which of them had spurious crossings."""
     mask = cases.control.link_mask[rows].T
     n_links = np.sum(mask > 0, axis=0)
     filled = rows[np.minimum(np.arange(BLOCK), len(rows) - 1)]  # one size, one compilation
     block = jax.tree.map(lambda x: x[filled], cases)
-    found = _respond(structure, block)
-    response, modes, strength = jax.tree.map(lambda x: x[..., : len(rows)], found)
+    padded = _respond(structure, block)
+    response, modes, strength = jax.tree.map(lambda x: x[..., : len(rows)], padded)
     response = controlled_first(response, mask, most)
     with np.errstate(all="ignore"):  # non-finite values find no crossing
         ratio = damping_ratios(response, modes, n_links, structure.n_controlled)
-        return _judged(response, modes, np.maximum(strength / STRONG, 1.0), way, ratio)
+        return _judged(response, modes, np.maximum(strength / STRONG, 1.0), sweep, ratio)
 
 
 # compiled without optimisation: it takes a fiftieth of the time
@@ -250,32 +250,32 @@ def _judged(
     response: LoopResponse,
     modes: AssembledModes,
     weaker: np.ndarray,
-    way: Walk,
+    sweep: FrequencySweep,
     ratio: np.ndarray,
 ) -> tuple[LoopFigures, np.ndarray]:
     """Figures of loops, examined with gains `weaker` by these factors, (lanes,)."""
     count, top = len(response.period), np.pi / response.period
     response = _with_gains(response, 1 / weaker)
     least = np.maximum(1 / (HIGHEST * weaker), SPREAD)
-    seen, left, right = _walk_along(response, modes, way, 0.8 * least)
-    start = _look_closer(response, seen, left, right, 0.8 * least)
-    known = np.zeros(count)
-    np.maximum.at(known, start.case, start.value)
-    is_strange = ~_is_confirmed(seen, start) & (seen.value > known[seen.case])
+    seen, left, right = _sweep_axis(response, modes, sweep, 0.8 * least)
+    start = _refine(response, seen, left, right, 0.8 * least)
+    refined = np.zeros(count)
+    np.maximum.at(refined, start.case, start.value)
+    is_strange = ~_is_confirmed(seen, start) & (seen.value > refined[seen.case])
     is_doubtful = np.isin(np.arange(count), seen.case[is_strange])
     value, omega = np.zeros(count), np.full(count, np.nan)
-    met, is_met = _meet(response, start, _known(count, None))
-    best = _rightmost(met.value, is_met, start.case, count)
-    found = np.flatnonzero(best >= 0)
-    met = jax.tree.map(lambda x: x[best[found]], met)
-    here = jax.tree.map(lambda x: x[..., found], response)
-    for start_at in AGAIN if len(found) else ():
-        # once more, slightly to the right, with the found points divided out
-        again = Crossings(np.arange(len(found)), met.value * start_at, met.omega)
-        other, is_other = _meet(here, again, _known(len(found), met))
-        is_more = is_other & (other.value > met.value)
-        met = jax.tree.map(lambda a, b, more=is_more: np.where(more, b, a), met, other)
-    value[found], omega[found] = met.value, met.omega
+    crossing, has_converged = _converge(response, start, _known_crossing(count, None))
+    best = _rightmost(crossing.value, has_converged, start.case, count)
+    rows = np.flatnonzero(best >= 0)
+    crossing = jax.tree.map(lambda x: x[best[rows]], crossing)
+    part = jax.tree.map(lambda x: x[..., rows], response)
+    for start_at in AGAIN if len(rows) else ():
+        # once more, slightly to the right, with the known points divided out
+        again = Crossings(np.arange(len(rows)), crossing.value * start_at, crossing.omega)
+        other, is_other = _converge(part, again, _known_crossing(len(rows), crossing))
+        is_more = is_other & (other.value > crossing.value)
+        crossing = jax.tree.map(lambda a, b, more=is_more: np.where(more, b, a), crossing, other)
+    value[rows], omega[rows] = crossing.value, crossing.omega
     at_end, where = _at_the_ends(response, least)
     is_more = at_end > value
     value, omega = np.where(is_more, at_end, value), np.where(is_more, where, omega)
@@ -327,28 +327,30 @@ def _folded(omega: np.ndarray, top: np.ndarray) -> np.ndarray:
     return np.abs((omega + top) % (2 * top) - top)
 
 
-def stations(modes: AssembledModes, period: np.ndarray, way: Walk) -> np.ndarray:
-    """Frequencies of the walk, rising [rad/s], (F, lanes)."""
+def sweep_frequencies(
+    modes: AssembledModes, period: np.ndarray, sweep: FrequencySweep
+) -> np.ndarray:
+    """Frequencies of the sweep, rising [rad/s], (F, lanes)."""
     top = np.pi / period
     lowest = 2 * np.pi * LOWEST_HZ
-    background = lowest * (top / lowest) ** np.linspace(0, 1, way.background)[:, None]
+    background = lowest * (top / lowest) ** np.linspace(0, 1, sweep.background)[:, None]
     width = np.maximum(modes.decay, NARROWEST * modes.omega)
-    beside = [np.abs(_folded(modes.omega, top) + x * width) for x in way.beside]
+    beside = [np.abs(_folded(modes.omega, top) + x * width) for x in sweep.beside]
     omega = np.concatenate([background, *beside])
     omega = np.where(omega > top, 2 * top - omega, omega)
     return np.sort(np.clip(omega, 1.0, top * (1 - 1e-6)), axis=0)
 
 
-def _walk_along(
-    response: LoopResponse, modes: AssembledModes, way: Walk, least: np.ndarray
+def _sweep_axis(
+    response: LoopResponse, modes: AssembledModes, sweep: FrequencySweep, least: np.ndarray
 ) -> tuple[Crossings, np.ndarray, np.ndarray]:
     """The rightmost crossings of each case and the frequencies [rad/s] on either side."""
-    omega = np.repeat(stations(modes, response.period, way), way.repeats, axis=0)
-    turn = np.arange(len(omega)) + 1
-    kind = np.where(turn % way.repeats > 0, 0.0, np.where(turn == way.repeats, 1.0, 2.0))
+    omega = np.repeat(sweep_frequencies(modes, response.period, sweep), sweep.repeats, axis=0)
+    visit = np.arange(len(omega)) + 1
+    kind = np.where(visit % sweep.repeats > 0, 0.0, np.where(visit == sweep.repeats, 1.0, 2.0))
     spread = _spread(response, SPREAD)
     first = -spread.reshape(-1, spread.shape[2])
-    loci = _walked(response, spread, Pair(first, 0 * first), omega, kind)
+    loci = _swept(response, spread, Pair(first, 0 * first), omega, kind)
     return _crossings(loci, np.arange(spread.shape[2]), CHOSEN, least)
 
 
@@ -358,7 +360,7 @@ def _crossings(
     """The rightmost crossings of each lane, and the frequencies [rad/s] on either side.
 
     Args:
-        loci: after a walk.
+        loci: after a sweep.
         case: of each lane.
         most: crossings of a lane.
         least: value that counts [1], by case.
@@ -385,7 +387,7 @@ def _is_confirmed(seen: Crossings, found: Crossings) -> np.ndarray:
     return np.any(near & (place < end[:, None]), axis=1)
 
 
-def _look_closer(
+def _refine(
     response: LoopResponse,
     seen: Crossings,
     left: np.ndarray,
@@ -393,16 +395,19 @@ def _look_closer(
     least: np.ndarray,
 ) -> Crossings:
     """The rightmost crossings of each interval."""
-    more = LOOK.wider * (right - left)
-    share = (np.arange(LOOK.frequencies)[:, None] + 0.382) / (LOOK.frequencies - 0.5)
+    more = REFINEMENT.wider * (right - left)
+    share = (np.arange(REFINEMENT.frequencies)[:, None] + 0.382) / (REFINEMENT.frequencies - 0.5)
     omega = left - more + (right - left + 2 * more) * share
-    first, others = np.repeat(omega[:1], LOOK.starts, 0), np.repeat(omega[1:], LOOK.repeats, 0)
+    first, others = (
+        np.repeat(omega[:1], REFINEMENT.starts, 0),
+        np.repeat(omega[1:], REFINEMENT.repeats, 0),
+    )
     omega = np.concatenate([first, others])
-    kind = [0.0] * (LOOK.starts - 1) + [1.0]
-    kind += ([0.0] * (LOOK.repeats - 1) + [2.0]) * (LOOK.frequencies - 1)
+    kind = [0.0] * (REFINEMENT.starts - 1) + [1.0]
+    kind += ([0.0] * (REFINEMENT.repeats - 1) + [2.0]) * (REFINEMENT.frequencies - 1)
     here = jax.tree.map(lambda x: x[..., seen.case], response)
     spread = _spread(here, FINE_SPREAD)
-    loci = _walked(here, spread, _ring(spread, seen.value), omega, np.array(kind))
+    loci = _swept(here, spread, _ring(spread, seen.value), omega, np.array(kind))
     return _crossings(loci, seen.case, KEPT, least)[0]
 
 
@@ -416,8 +421,8 @@ def _at_the_ends(response: LoopResponse, least: np.ndarray) -> tuple[np.ndarray,
     ring = _ring(spread, np.ones_like(top))
     value, omega = np.zeros(len(top)), np.full(len(top), np.nan)
     for place, name in ((0 * top + STILL, 0 * top), (top * (1 - 1e-6), top)):
-        steps = np.repeat(place[None], LOOK.starts, axis=0)
-        found = _walked(response, spread, ring, steps, np.zeros(LOOK.starts)).value
+        steps = np.repeat(place[None], REFINEMENT.starts, axis=0)
+        found = _swept(response, spread, ring, steps, np.zeros(REFINEMENT.starts)).value
         is_real = (found.re > least) & (np.abs(found.im) < 1e-3 * found.re)
         largest = np.max(np.where(is_real, found.re, 0.0), axis=0)
         omega = np.where(largest > value, name, omega)
@@ -434,49 +439,43 @@ def _ring(spread: np.ndarray, size: np.ndarray) -> Pair:
 
 
 def _spread(response: LoopResponse, size: float) -> np.ndarray:
-    """See `go_round`: up to `size`, different for each channel, (n, C, lanes)."""
+    """See `evaluate_loop_gain`: up to `size`, different for each channel, (n, C, lanes)."""
     shape = response.velocity_gain.shape
     n = shape[0] * shape[1]
     return np.broadcast_to(size * (1 + np.arange(n).reshape(*shape[:2], 1)) / n, shape)
 
 
-def _known(count: int, found: Meeting | None) -> FoundMeeting:
-    if found is None:
-        zero = np.zeros(count)
-        return FoundMeeting(
-            is_there=zero,
-            omega=zero,
-            value=zero,
-            by_omega=Pair(zero, zero),
-            by_value=Pair(zero, zero),
-        )
-    return FoundMeeting(
-        is_there=np.ones(count),
-        omega=found.omega,
-        value=found.value,
-        by_omega=found.by_omega,
-        by_value=found.by_value,
+def _known_crossing(count: int, crossing: AxisCrossing | None) -> KnownCrossing:
+    is_there = np.full(count, float(crossing is not None))
+    crossing = crossing or start_crossing(*np.zeros((4, count)))
+    return KnownCrossing(
+        is_there=is_there,
+        omega=crossing.omega,
+        value=crossing.value,
+        by_omega=crossing.by_omega,
+        by_value=crossing.by_value,
     )
 
 
-def _meet(
-    response: LoopResponse, start: Crossings, known: FoundMeeting
-) -> tuple[Meeting, np.ndarray]:
+def _converge(
+    response: LoopResponse, start: Crossings, known: KnownCrossing
+) -> tuple[AxisCrossing, np.ndarray]:
     """Newton's iteration from each crossing; where it ended, and whether it converged."""
-    here = jax.tree.map(lambda x: x[..., start.case], response)
+    response = jax.tree.map(lambda x: x[..., start.case], response)
     known = jax.tree.map(lambda x: x[start.case], known)
-    angle = start.omega * here.period
-    guess = start_approach(start.omega, start.value, np.cos(angle), np.sin(angle))
-    found = _approached(here, known, guess)
-    is_met = (found.step < CONVERGED) & (found.value > 0) & np.isfinite(found.value)
-    return found, is_met
+    angle = start.omega * response.period
+    guess = start_crossing(start.omega, start.value, np.cos(angle), np.sin(angle))
+    last = run_steps(_refine_crossing, (response, known), (), guess, NEWTON)
+    return last, (last.step < CONVERGED) & (last.value > 0) & np.isfinite(last.value)
 
 
-def _rightmost(value: np.ndarray, is_met: np.ndarray, case: np.ndarray, count: int) -> np.ndarray:
+def _rightmost(
+    value: np.ndarray, has_converged: np.ndarray, case: np.ndarray, count: int
+) -> np.ndarray:
     """Index of the largest value of each case, -1 if it has none, (count,)."""
     best = np.full(count, -1)
-    for k in np.argsort(np.where(is_met, value, -np.inf)):
-        if is_met[k]:
+    for k in np.argsort(np.where(has_converged, value, -np.inf)):
+        if has_converged[k]:
             best[case[k]] = k
     return best
 
@@ -484,25 +483,21 @@ def _rightmost(value: np.ndarray, is_met: np.ndarray, case: np.ndarray, count: i
 # --- the steps on this machine --------------------------------------------------------------------
 
 
-def _walked(
+def _swept(
     response: LoopResponse, spread: np.ndarray, first: Pair, omega: np.ndarray, kind: np.ndarray
 ) -> Loci:
     angle = omega * response.period
-    inputs = Station(omega, np.cos(angle), np.sin(angle), kind)
-    return run_steps(_walk, (response, spread), inputs, start_walk(first), len(omega))
+    inputs = FrequencyPoint(omega, np.cos(angle), np.sin(angle), kind)
+    return run_steps(_follow_loci, (response, spread), inputs, start_loci(first), len(omega))
 
 
-def _walk(constants: tuple[LoopResponse, Any], station: Station, loci: Loci) -> Loci:
+def _follow_loci(constants: tuple[LoopResponse, Any], station: FrequencyPoint, loci: Loci) -> Loci:
     response, spread = constants
-    return walk(response, spread, loci, station)
+    return follow_loci(response, spread, loci, station)
 
 
-def _approached(response: LoopResponse, known: FoundMeeting, guess: Meeting) -> Meeting:
-    return run_steps(_approach, (response, known), (), guess, NEWTON)
-
-
-def _approach(
-    constants: tuple[LoopResponse, FoundMeeting], _: tuple[Any, ...], meeting: Meeting
-) -> Meeting:
+def _refine_crossing(
+    constants: tuple[LoopResponse, KnownCrossing], _: tuple[Any, ...], crossing: AxisCrossing
+) -> AxisCrossing:
     response, known = constants
-    return approach(response, known, meeting)
+    return refine_crossing(response, known, crossing)

@@ -325,8 +325,8 @@ def _figures(spec: FitSpec, models: Models, entry: FiguresEntry, path: str) -> M
         entries = parse_entries(name, f"{path}.values", entry_sizes(spec.study))
         if entry.amplitude and entry.of != "reduction" and value < 0:
             raise field_error(f"{path}.values.{name}", value, "0 or more where amplitude = true")
-        if not METRICS[entries.metric].has_slope:
-            smooth = [x for x in METRICS if METRICS[x].has_slope]
+        if not METRICS[entries.metric].is_differentiable:
+            smooth = [x for x in METRICS if METRICS[x].is_differentiable]
             hint = "; take kind = 'settling'" if entries.metric == "settling_time" else ""
             raise StudyError(
                 f"{path}.values: {name!r} has no derivative{hint}; allowed: {', '.join(smooth)}"

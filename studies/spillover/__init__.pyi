@@ -1,11 +1,11 @@
 from .certificate import Certificate, certify
 from .comparison import Comparison, compare_laws
-from .plants import Departure, patch_lengths
+from .plants import ModelMismatch, patch_lengths
 
 __all__ = [
     "Certificate",
     "Comparison",
-    "Departure",
+    "ModelMismatch",
     "certify",
     "compare_laws",
     "patch_lengths",

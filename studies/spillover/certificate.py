@@ -15,13 +15,13 @@ from studies.engine.stability import LoopFigures, judge_loop, worst_figures
 from studies.errors import StudyError, field_error
 from studies.spillover.judgement import breaking_motion, weakest_mode
 from studies.spillover.plants import (
-    DEPARTURES,
-    Departure,
-    LoopMaker,
+    MISMATCHES,
+    LoopBuilder,
+    ModelMismatch,
     PlantVariant,
     all_plants,
+    pad_channels,
     plant_sizes,
-    widened,
 )
 from studies.study.consistency import each_link
 from studies.study.spec import Study
@@ -42,7 +42,7 @@ class Spillover(NamedTuple):
 
 
 class Certificate(NamedTuple):
-    """The findings. Axes: B bases, D departures, N numbers of modes.
+    """The findings. Axes: B bases, D mismatches, N numbers of modes.
 
     Numbers of plants that do not exist (patches overlap, ...) are NaN, their texts "".
     """
@@ -59,7 +59,7 @@ class Certificate(NamedTuple):
     free_damping: np.ndarray  # without control [1], (B, D, N, R, 3)
     weakest: np.ndarray  # the mode of least damping, in words, (B, D, N)
     breaking: np.ndarray  # what goes unstable beyond the margin, in words, (B, D, N)
-    observation: np.ndarray  # channel signal per plant mode, (B, D, 3, C, R), see `Leakage`
+    observation: np.ndarray  # channel signal per plant mode, (B, D, 3, C, R), see `SpilloverGains`
     actuation: np.ndarray  # modal force per channel force, (B, D, 3, R, C)
     notes: tuple[str, ...]  # what was left out, and why
 
@@ -123,7 +123,7 @@ def certify(
     margin: float = 2.0,
     bases: tuple[str, ...] = tuple(BASES),
     sizes: tuple[int, ...] = (),
-    departures: tuple[Departure, ...] = DEPARTURES,
+    mismatches: tuple[ModelMismatch, ...] = MISMATCHES,
 ) -> Certificate:
     """Judge a study's controller on plants that differ from its model.
 
@@ -135,7 +135,7 @@ def certify(
         margin: gain margin required on every plant [1], above 1.
         bases: modal bases of the plant.
         sizes: plant modes per link; empty: the controlled ones, 8 and 12.
-        departures: from the controller's model; joints only in a basis that has them.
+        mismatches: from the controller's model; joints only in a basis that has them.
 
     Raises:
         StudyError: no controller to judge (ideal feedback, no link controlled, gains of zero), a
@@ -145,20 +145,20 @@ def certify(
         raise field_error("--margin", margin, "more than 1, up to 32", "1")
     design = fixed_controller(study)
     nominal = each_link(design.study.link.joint_inertia_c)
-    departures = tuple(
-        d for d in departures if d.joint_inertia is None or np.any(d.joint_inertia != nominal)
+    mismatches = tuple(
+        d for d in mismatches if d.joint_inertia is None or np.any(d.joint_inertia != nominal)
     )
-    plants = all_plants(bases, departures, plant_sizes(design, sizes))
-    maker = LoopMaker(design)
-    faults = np.vectorize(maker.fault, otypes=[object])(plants)
+    plants = all_plants(bases, mismatches, plant_sizes(design, sizes))
+    builder = LoopBuilder(design)
+    faults = np.vectorize(builder.fault, otypes=[object])(plants)
     try:
         with threadpool_limits(1, "blas"):
-            judgements = _judge_plants(design, maker, plants, faults)
+            judgements = _judge_plants(design, builder, plants, faults)
     except np.linalg.LinAlgError:
         raise StudyError("a linearised loop is not finite: nothing to judge") from None
     if not judgements:
         raise StudyError(f"no plant to judge on: {'; '.join(dict.fromkeys(faults.ravel()))}")
-    return _certificate(design, margin, maker, plants, faults, judgements)
+    return _certificate(design, margin, builder, plants, faults, judgements)
 
 
 class _Judgement(NamedTuple):
@@ -171,24 +171,25 @@ class _Judgement(NamedTuple):
 
 
 def _judge_plants(
-    design: FixedController, maker: LoopMaker, plants: np.ndarray, faults: np.ndarray
+    design: FixedController, builder: LoopBuilder, plants: np.ndarray, faults: np.ndarray
 ) -> dict[tuple[int, ...], _Judgement]:
     """Judgement of every plant that exists, by its place; writes which ones buckle into `faults`.
 
     Args:
         design: whose controller is judged.
-        maker: of its loops.
+        builder: of its loops.
         plants: (B, D, N).
         faults: why they do not exist, (B, D, N).
     """
     parts = [
-        (modes, widened(part, design.n_patches)) for modes, part in linear_parts(design.controller)
+        (modes, pad_channels(part, design.n_patches))
+        for modes, part in linear_parts(design.controller)
     ]
     judgements = {}
     for at in map(tuple, np.argwhere(faults == "")):
-        loops = [maker.loop(plants[at], part) for _, part in parts]
+        loops = [builder.loop(plants[at], part) for _, part in parts]
         if not loops[0].is_open_loop_stable:
-            faults[at] = f"{plants[at].basis}, {plants[at].departure}: it buckles without control"
+            faults[at] = f"{plants[at].basis}, {plants[at].mismatch}: it buckles without control"
             continue
         each = [judge_loop(loop, STEPS) for loop in loops]
         least = int(np.argmin([figures.gain_margin for figures in each]))
@@ -207,14 +208,14 @@ def _judge_plants(
 def _certificate(
     design: FixedController,
     margin: float,
-    maker: LoopMaker,
+    builder: LoopBuilder,
     plants: np.ndarray,
     faults: np.ndarray,
     judgements: dict[tuple[int, ...], _Judgement],
 ) -> Certificate:
     shape, largest = plants.shape, max(plant.n_modes for plant in plants.ravel())
     exists = faults == ""
-    law = widened(design.controller, design.n_patches)
+    law = pad_channels(design.controller, design.n_patches)
     channels = design.controller.velocity_gain.shape[1]
 
     radius, limit = np.full((2, *shape), np.nan)
@@ -230,9 +231,9 @@ def _certificate(
         weakest[at], breaking[at] = texts
     for at in map(tuple, np.argwhere(exists.any(axis=2))):
         plant = plants[at][0]._replace(n_modes=largest)
-        leakage = maker.leakage(plant, law)
-        observation[at] = leakage.observation[:, :channels]
-        actuation[at] = leakage.actuation[:, :, :channels]
+        gains = builder.spillover_gains(plant, law)
+        observation[at] = gains.observation[:, :channels]
+        actuation[at] = gains.actuation[:, :, :channels]
     return Certificate(
         study=design.study,
         required=margin,

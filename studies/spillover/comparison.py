@@ -19,7 +19,7 @@ from studies.engine.stability import follow_modes, gain_margin, modal_damping
 from studies.spillover.certificate import STEPS
 from studies.spillover.judgement import breaking_motion
 from studies.spillover.laws import Candidate, all_laws
-from studies.spillover.plants import LoopMaker, PlantVariant, plant_sizes
+from studies.spillover.plants import LoopBuilder, PlantVariant, plant_sizes
 from studies.study.margin import HIGHEST, LOWEST
 from studies.study.spec import Study
 from studies.study.window import residual_delay
@@ -69,9 +69,9 @@ def compare_laws(study: Study, margin: float = 2.0, sizes: tuple[int, ...] = ())
     found = fixed_controller(study)
     sizes = plant_sizes(found, sizes)
     plant = PlantVariant(found.study.link.basis, sizes[-1])
-    laws = all_laws(found, LoopMaker(found), plant)
+    laws = all_laws(found, LoopBuilder(found), plant)
     with threadpool_limits(1, "blas"):
-        views = [_View(found, law, plant, sizes) for law in laws]
+        views = [_LawLoops(found, law, plant, sizes) for law in laws]
         given = next(view for view in views if view.law.law.name == study.control.law)
         target = given.damping(1.0)[0]
         rows = [(WITHOUT, given, 0.0), (GIVEN, given, 1.0)]
@@ -97,22 +97,22 @@ def compare_laws(study: Study, margin: float = 2.0, sizes: tuple[int, ...] = ())
     )
 
 
-class _View:
+class _LawLoops:
     """A law on the design's own plants."""
 
     def __init__(
         self, found: FixedController, law: Candidate, plant: PlantVariant, sizes: tuple[int, ...]
     ) -> None:
-        self.law, maker = law, LoopMaker(found)
+        self.law, builder = law, LoopBuilder(found)
         self.limit, self.breaking = HIGHEST, ""
         self._n_links = _controlled_links(found.controller)
         parts = linear_parts(law.controller)
-        self._parts = [(modes, maker.loop(plant, part)) for modes, part in parts]
+        self._parts = [(modes, builder.loop(plant, part)) for modes, part in parts]
         for _, part in parts:
             for n in sorted(sizes, reverse=True):  # usually the lowest limit first
                 if self.limit <= LOWEST:
                     return
-                loop = maker.loop(plant._replace(n_modes=n), part)
+                loop = builder.loop(plant._replace(n_modes=n), part)
                 limit = gain_margin(loop.poles, highest=self.limit)
                 if limit < self.limit:
                     self.limit, self.breaking = limit, breaking_motion(loop, limit)

@@ -22,7 +22,7 @@ from jaxmodel.prepare import design_controller
 from studies.engine.controller import FixedController
 from studies.engine.programs import kept_jit
 from studies.errors import field_error
-from studies.spillover.plants import LoopMaker, PlantVariant, widened
+from studies.spillover.plants import LoopBuilder, PlantVariant, pad_channels
 from studies.study.cases import law_parameters
 
 #: Damping of mode 1 below this share of other modes' damping is rounding [1].
@@ -30,7 +30,7 @@ ROUNDING = 1e-9
 
 
 class Candidate(NamedTuple):
-    """A control law with a channel for each patch, see `widened`."""
+    """A control law with a channel for each patch, see `pad_channels`."""
 
     law: Law
     controller: Controller  # at factor 1
@@ -40,12 +40,12 @@ class Candidate(NamedTuple):
         return with_gains(self.controller, factor)
 
 
-def all_laws(found: FixedController, maker: LoopMaker, plant: PlantVariant) -> list[Candidate]:
+def all_laws(found: FixedController, builder: LoopBuilder, plant: PlantVariant) -> list[Candidate]:
     """All available laws; the design's own law with the design's own numbers.
 
     Args:
         found: the design.
-        maker: of its loops.
+        builder: of its loops.
         plant: where strength is compared.
 
     Raises:
@@ -61,8 +61,8 @@ def all_laws(found: FixedController, maker: LoopMaker, plant: PlantVariant) -> l
 
     def strength(law: Controller) -> np.ndarray:
         """Damping constant that a law gives mode 1 of each link [N s/m], (3,)."""
-        seen, driven = maker.leakage(plant, widened(law, found.n_patches))
-        gain = widened(law, found.n_patches).velocity_gain
+        seen, driven = builder.spillover_gains(plant, pad_channels(law, found.n_patches))
+        gain = pad_channels(law, found.n_patches).velocity_gain
         every = np.einsum("irc,ic,icr->ir", driven, gain, seen)
         return np.where(np.abs(every[:, 0]) > ROUNDING * np.abs(every).max(), every[:, 0], 0.0)
 
@@ -103,7 +103,7 @@ def _even(law: Controller, n_channels: int) -> Controller:
     """With a channel for each patch and rivals, if none: one shape for all laws."""
     if law.rival_omega is None:
         law = law._replace(rival_omega=np.zeros_like(law.velocity_gain))
-    return widened(law, n_channels)
+    return pad_channels(law, n_channels)
 
 
 def _scaled(law: Controller, wanted: np.ndarray, has: np.ndarray) -> Controller:

@@ -1,7 +1,7 @@
 """The plants on which a design is judged, and the linearised loops with its controller.
 
 The controller's coefficients stay those of the design; the plants differ in their number of modes,
-their modal basis and one departure each from the controller's model.
+their modal basis and one mismatch each from the controller's model.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ LARGEST = MARGIN_MODES
 SIZES = (8, LARGEST)
 
 
-class Departure(NamedTuple):
+class ModelMismatch(NamedTuple):
     """How a plant departs from the controller's model."""
 
     sensor: float = 1.0  # true sensor length over the one in the controller's model [1]
@@ -53,18 +53,18 @@ class Departure(NamedTuple):
         return ", ".join(words) or "as modelled"
 
 
-def patch_lengths(lengths: tuple[float, ...]) -> tuple[Departure, ...]:
+def patch_lengths(lengths: tuple[float, ...]) -> tuple[ModelMismatch, ...]:
     """Sensors and actuators with these lengths relative to the model's [1]."""
-    return tuple(Departure(*pair) for pair in product(lengths, repeat=2))
+    return tuple(ModelMismatch(*pair) for pair in product(lengths, repeat=2))
 
 
-#: Possible departures: patches, the links' stiffness, the joints (none, and as measured).
-DEPARTURES = (
+#: Possible mismatches: patches, the links' stiffness, the joints (none, and as measured).
+MISMATCHES = (
     *patch_lengths((0.8, 1.0, 1.25)),
-    Departure(frequency=0.9),
-    Departure(frequency=1.1),
-    Departure(joint_inertia=0.0),
-    Departure(joint_inertia=1.1e-5),
+    ModelMismatch(frequency=0.9),
+    ModelMismatch(frequency=1.1),
+    ModelMismatch(joint_inertia=0.0),
+    ModelMismatch(joint_inertia=1.1e-5),
 )
 
 
@@ -73,10 +73,10 @@ class PlantVariant(NamedTuple):
 
     basis: str
     n_modes: int  # per link
-    departure: Departure = Departure()
+    mismatch: ModelMismatch = ModelMismatch()
 
 
-class Leakage(NamedTuple):
+class SpilloverGains(NamedTuple):
     """Coupling between channels and plant modes, in the scale of the plant's basis."""
 
     observation: Array  # channel signal per modal coordinate, filter x sensor, (3, C, R)
@@ -86,7 +86,7 @@ class Leakage(NamedTuple):
 _placement_faults = jax.jit(placement_faults)
 
 
-class LoopMaker:
+class LoopBuilder:
     """Builds loops of one design's machine with any controller; one compilation per basis."""
 
     def __init__(self, found: FixedController) -> None:
@@ -106,10 +106,10 @@ class LoopMaker:
         is_off, is_overlapping = _placement_faults(machine.patches, machine.beam.length)
         if is_off or is_overlapping:
             what = "patches leave the link" if is_off else "patches overlap"
-            return f"{plant.departure}: {what}"
+            return f"{plant.mismatch}: {what}"
         if not BASES[plant.basis].is_on_chord and study.drive.locked:
             return f"{plant.basis}: its sliders cannot be locked"
-        link, joint = study.link, plant.departure.joint_inertia
+        link, joint = study.link, plant.mismatch.joint_inertia
         inertia = (link.joint_inertia_b, link.joint_inertia_c, joint or 0.0)
         if not BASES[plant.basis].has_joints and any(np.any(part) for part in inertia):
             size = f" of {joint:g} kg m2" if joint else ""
@@ -117,7 +117,7 @@ class LoopMaker:
         return ""
 
     def loop(self, plant: PlantVariant, law: Controller) -> SampledLoop:
-        """The loop of a plant and a controller with a channel for each patch, see `widened`."""
+        """The loop of a plant and a controller with a channel for each patch (`pad_channels`)."""
         matrices, omega, _ = self._look(plant, law)
         kept, of_plant = _kept(matrices, plant.n_modes)
         matrices = matrices._replace(
@@ -128,14 +128,14 @@ class LoopMaker:
         period = float(self._found.case.electronics.period)
         return sampled_loop(matrices, omega[:, : plant.n_modes], period, plant.n_modes)
 
-    def leakage(self, plant: PlantVariant, law: Controller) -> Leakage:
-        """Coupling of the channels of a `widened` controller with a plant's modes, both ways."""
+    def spillover_gains(self, plant: PlantVariant, law: Controller) -> SpilloverGains:
+        """Coupling of the channels of a padded controller with a plant's modes, both ways."""
         _, _, (observation, actuation) = self._look(plant, law)
-        return Leakage(observation[:, :, : plant.n_modes], actuation[:, : plant.n_modes])
+        return SpilloverGains(observation[:, :, : plant.n_modes], actuation[:, : plant.n_modes])
 
     def _look(
         self, plant: PlantVariant, law: Controller
-    ) -> tuple[LoopMatrices, np.ndarray, Leakage]:
+    ) -> tuple[LoopMatrices, np.ndarray, SpilloverGains]:
         known = self._found.structure
         # drop everything only a controller's own design depends on: one program for all laws
         structure = Structure(
@@ -148,7 +148,7 @@ class LoopMaker:
             has_shortening=known.has_shortening,
             is_distributed=known.is_distributed,
             has_static_correction=known.has_static_correction,
-            law=SRF.name,  # a channel for each patch, see `widened`
+            law=SRF.name,  # a channel for each patch, see `pad_channels`
             has_feedforward=known.has_feedforward,
             has_friction=known.has_friction,
             has_position_gain=False,
@@ -161,7 +161,7 @@ class LoopMaker:
         return jax.tree.map(np.asarray, _look(structure, self._placed(plant), self._pose, law))
 
     def _placed(self, plant: PlantVariant) -> Case:
-        machine, true = self._case.machine, plant.departure
+        machine, true = self._case.machine, plant.mismatch
         patches, beam = machine.patches, machine.beam
         patches = patches._replace(
             sensor_length=true.sensor * patches.sensor_length,
@@ -180,15 +180,15 @@ class LoopMaker:
 @kept_jit(static_argnums=0)
 def _look(
     structure: Structure, case: Case, pose: Array, law: Controller
-) -> tuple[LoopMatrices, Array, Leakage]:
+) -> tuple[LoopMatrices, Array, SpilloverGains]:
     loop = prepare(structure, case).loop
     observation = jnp.einsum("ick,ikr->icr", law.filter, loop.sensor)
     force = loop.plant.modal_mass[:, None, None] * loop.actuator
     actuation = jnp.einsum("irk,ikc->irc", force, law.synthesizer)
-    leakage = Leakage(observation, actuation)
+    gains = SpilloverGains(observation, actuation)
     at_rest = resting(structure, case)
     matrices = loop_matrices(structure, case, loop, law, pose, at_rest)
-    return matrices, loop.omega, leakage
+    return matrices, loop.omega, gains
 
 
 def _kept(matrices: LoopMatrices, n_modes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -203,7 +203,7 @@ def _kept(matrices: LoopMatrices, n_modes: int) -> tuple[np.ndarray, np.ndarray]
     return entries(len(matrices.open)), entries(len(matrices.plant))
 
 
-def widened(law: Controller, n_channels: int) -> Controller:
+def pad_channels(law: Controller, n_channels: int) -> Controller:
     """The same controller padded with idle channels, so that all laws have one shape.
 
     Args:
@@ -249,16 +249,16 @@ def plant_sizes(found: FixedController, sizes: tuple[int, ...] = ()) -> tuple[in
 
 
 def all_plants(
-    bases: tuple[str, ...], departures: tuple[Departure, ...], sizes: tuple[int, ...]
+    bases: tuple[str, ...], mismatches: tuple[ModelMismatch, ...], sizes: tuple[int, ...]
 ) -> np.ndarray:
-    """Plants of every basis, departure and size, (B, D, N) of `Plant`.
+    """Plants of every basis, mismatch and size, (B, D, N) of `Plant`.
 
     Args:
         bases: modal bases of the plant.
-        departures: from the controller's model.
+        mismatches: from the controller's model.
         sizes: modes per link.
     """
-    plants = np.empty((len(bases), len(departures), len(sizes)), object)
+    plants = np.empty((len(bases), len(mismatches), len(sizes)), object)
     for b, d, n in np.ndindex(plants.shape):
-        plants[b, d, n] = PlantVariant(bases[b], sizes[n], departures[d])
+        plants[b, d, n] = PlantVariant(bases[b], sizes[n], mismatches[d])
     return plants

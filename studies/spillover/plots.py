@@ -18,7 +18,7 @@ from studies.spillover.comparison import WITHOUT, Comparison
 from studies.study.labels import describe
 from studies.study.margin import margin_text
 
-#: Leakage above this has its own colour [1].
+#: Spillover above this has its own colour [1].
 FLOOR = 0.01
 #: Smaller margins are drawn as this [1].
 LEAST = 0.01
@@ -37,7 +37,7 @@ def _has_departures(found: Certificate) -> bool:
 
 
 def margins(found: Certificate, ax: Axes | None = None) -> Axes:
-    """Gain margin for every departure: of the largest plants, and, hollow, of the smallest.
+    """Gain margin for every mismatch: of the largest plants, and, hollow, of the smallest.
 
     Args:
         found: the certificate.
@@ -66,7 +66,7 @@ def margins(found: Certificate, ax: Axes | None = None) -> Axes:
             ha="center",
             fontsize=figures.SMALL,
         )
-    ax.set_yticks(np.arange(len(shown)), [str(found.plants[0, d, 0].departure) for d in shown])
+    ax.set_yticks(np.arange(len(shown)), [str(found.plants[0, d, 0].mismatch) for d in shown])
     ax.set(xlabel="gain margin [1]", xscale="log", ylim=(-0.6, len(shown) - 0.4))
     ax.tick_params(axis="y", labelsize=figures.SMALL)
     _plain_ticks(ax.xaxis)
@@ -161,7 +161,7 @@ def leakage_map(
 
 
 def leakage(found: Certificate) -> Figure:
-    """`leakage_map` for each basis: the largest of all links and departures."""
+    """`leakage_map` for each basis: the largest of all links and mismatches."""
     size = np.abs(found.observation)
     bases = [b for b in range(len(size)) if not np.all(np.isnan(size[b]))]
     with figures.styled():

@@ -18,7 +18,7 @@ from studies.study.labels import describe
 from studies.study.margin import margin_text
 from studies.study.window import residual_delay
 
-#: Leakage below this is rounding [1].
+#: Spillover below this is rounding [1].
 TINY = 1e-9
 
 
@@ -41,7 +41,7 @@ def spillover_text(found: Certificate) -> str:
     return (
         f"control spillover: mode {worst.mode}, which is not controlled, has a damping ratio of "
         f"{worst.damping_ratio:.2g} instead of {worst.free_damping:.2g} without control "
-        f"({worst.plant.basis}, {worst.plant.departure})"
+        f"({worst.plant.basis}, {worst.plant.mismatch})"
     )
 
 
@@ -98,7 +98,7 @@ def _free_damping(found: Certificate) -> list[float]:
 
 
 def _margins(found: Certificate) -> list[list[str]]:
-    """Row of each basis and departure: the largest plant, and the margin of the smallest."""
+    """Row of each basis and mismatch: the largest plant, and the margin of the smallest."""
     rows = []
     for b, d in np.ndindex(found.plants.shape[:2]):
         if not found.exists[b, d].any():
@@ -108,7 +108,7 @@ def _margins(found: Certificate) -> list[list[str]]:
         rows.append(
             [
                 plant.basis,
-                str(plant.departure),
+                str(plant.mismatch),
                 margin_text(found.margin[b, d, last], 3),
                 margin_text(found.margin[b, d, 0], 3) if found.exists[b, d, 0] else "-",
                 found.breaking[b, d, last] or "-",
@@ -206,7 +206,7 @@ def _spilled(worst: Spillover) -> dict[str, Any]:
         "damping_ratio_without_control": worst.free_damping,
         "basis": worst.plant.basis,
         "modes": worst.plant.n_modes,
-        "mismatch": str(worst.plant.departure),
+        "mismatch": str(worst.plant.mismatch),
     }
 
 
@@ -215,9 +215,9 @@ def _plant(found: Certificate, at: tuple[int, ...]) -> dict[str, Any]:
     return {
         "basis": plant.basis,
         "modes": plant.n_modes,
-        "sensor_length_factor": plant.departure.sensor,
-        "actuator_length_factor": plant.departure.actuator,
-        "frequency_factor": plant.departure.frequency,
+        "sensor_length_factor": plant.mismatch.sensor,
+        "actuator_length_factor": plant.mismatch.actuator,
+        "frequency_factor": plant.mismatch.frequency,
         "joint_inertia_c_kg_m2": _joint(found, plant),
         "passes": bool(found.passes[at]),
         "spectral_radius": found.radius[at],
@@ -232,7 +232,7 @@ def _plant(found: Certificate, at: tuple[int, ...]) -> dict[str, Any]:
 
 def _joint(found: Certificate, plant: PlantVariant) -> Any:
     """True J_C [kg m2], one for all links or three."""
-    known = plant.departure.joint_inertia
+    known = plant.mismatch.joint_inertia
     return found.study.link.joint_inertia_c if known is None else known
 
 

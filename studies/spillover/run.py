@@ -129,7 +129,7 @@ def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable
     plants = ("basis", "mismatch", "plant_modes")
     modes = (*plants, "link_mode", "pole")
     place, axes = plants[:2], found.plants
-    true = [plant.departure for plant in axes[0, :, 0]]
+    true = [plant.mismatch for plant in axes[0, :, 0]]
     part = {
         "basis": Variable(
             np.array([p.basis for p in axes[:, 0, 0]]), ("basis",), "1", "of the plant"

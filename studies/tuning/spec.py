@@ -312,7 +312,7 @@ def _check_metric(name: str, path: str, has_loop: bool, study: Study) -> None:
             f"{path}: {name!r}: unknown metric; "
             + (f"did you mean {hint!r}?" if hint else f"allowed: {', '.join(known)}")
         )
-    if not has_loop and not METRICS[_field(name)].has_slope:
+    if not has_loop and not METRICS[_field(name)].is_differentiable:
         raise StudyError(
             f"{path}: {_field(name)} moves in steps and has no derivative"
             + ("; take ringing_time" if _field(name) == "settling_time" else "; limit it instead")
