@@ -97,7 +97,8 @@ def prose_of(tree):
 def public_docstrings():
     """Docstrings of what `jaxmodel` and `studies` export."""
     trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in SOURCES}
-    faces = [trees[TOP / package / "__init__.py"] for package in ("jaxmodel", "studies")]
+    stubs = [TOP / package / "__init__.pyi" for package in ("jaxmodel", "studies")]
+    faces = [ast.parse(stub.read_text(encoding="utf-8")) for stub in stubs]
     names = {x.value for tree in faces for x in ast.walk(tree) if isinstance(x, ast.Constant)}
     for path, tree in trees.items():
         for node in tree.body:
