@@ -20,7 +20,7 @@ from studies.engine.run_data import chord_deflection
 from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
 from studies.fitting.bench import Bench, response
-from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.study.cases import as_arrays, build_case, build_cases, build_structure, case_of
 from studies.study.signals import Signal
 from studies.study.spec import paper_study
 
@@ -251,13 +251,13 @@ def test_stations_are_fractions_and_measured_places_metres():
     np.testing.assert_allclose(shape, np.broadcast_to(wave, (3, 2, 3)), atol=1e-12)
     bench = Bench(study, _with_length, study.motion.waypoints[:1], (0.05, 0.1))
     for length in (0.2, 0.3):
-        places = station_places(bench.place(bench.case, np.array([length])))
+        numbers = bench.place(bench.numbers, np.array([length]))
+        places = station_places(case_of(bench.structure, numbers))
         np.testing.assert_allclose(places, [[0.05, 0.1]] * 3, rtol=1e-12)
 
 
-def _with_length(case, values):
-    beam = case.machine.beam._replace(length=case.machine.beam.length.at[1].set(values[0]))
-    return case._replace(machine=case.machine._replace(beam=beam))
+def _with_length(numbers, values):
+    return numbers | {"link.length": numbers["link.length"].at[1].set(values[0])}
 
 
 def test_bench_responses_have_it():
@@ -266,7 +266,11 @@ def test_bench_responses_have_it():
     pose = study.motion.waypoints[0]
     bench = Bench(study, lambda case, values: case, (pose,), (0.1,))
     plant = bench.plant(pose, np.zeros(0), False)
-    volts, bent = by_hand(bench.case._replace(windows=prepared()[1].windows), "pinned_pinned", 0)
+    volts, bent = by_hand(
+        case_of(bench.structure, bench.numbers)._replace(windows=prepared()[1].windows),
+        "pinned_pinned",
+        0,
+    )
     station = list(prepared()[1].windows.stations).index(0.5)
     for output, wanted in (
         (Signal("sensor", 0, 1, np.nan), volts[1, 1]),

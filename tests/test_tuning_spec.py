@@ -8,13 +8,20 @@ import pytest
 
 from studies.errors import StudyError
 from studies.study import spec as spec_module
-from studies.study.cases import as_arrays, build_case
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.numbers import one_study
 from studies.study.paths import set_value
 from studies.study.spec import parse_study
 from studies.tuning.merit import tail_weights
 from studies.tuning.scenarios import lane_columns, scenario_columns
 from studies.tuning.spec import load_tuning, parse_tuning
 from tests.tunings import EVERY_KIND, GAIN, SMALL, tuning
+
+
+def placed(spec, values):
+    """The tuning's study with these values of its free parameters, as a case."""
+    structure = build_structure(spec.study)
+    return spec.free.build(structure)(one_study(spec.study, structure), np.asarray(values))
 
 
 def test_free_numbers_get_to_where_the_study_would_put_them():
@@ -24,10 +31,9 @@ def test_free_numbers_get_to_where_the_study_would_put_them():
     study = spec.study
     for name, value in zip(spec.free.names, values, strict=True):
         study = parse_study(set_value(study, name, float(value)))
-    placed = spec.free.place(as_arrays(build_case(spec.study)), values)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13),
-        placed,
+        placed(spec, values),
         as_arrays(build_case(study)),
     )
     assert len(values) == 1 + 3 + 2 + 6
@@ -52,13 +58,13 @@ def test_slopes_are_those_of_the_values():
 def test_patches_stay_on_the_link_and_apart(kind):
     spec = tuning({"placement": {"kind": kind}})
     case = as_arrays(build_case(spec.study))
-    start = spec.free.place(case, spec.free.values(spec.free.places())).machine.patches.center
+    start = placed(spec, spec.free.values(spec.free.places())).machine.patches.center
     np.testing.assert_allclose(start, case.machine.patches.center, atol=1e-12)
     pitch, length = 0.03, 0.2
     random = np.random.default_rng(0)
     corners = (np.zeros(len(spec.free.names)), np.ones(len(spec.free.names)))
     for u in [*corners, *random.uniform(size=(50, len(spec.free.names)))]:
-        center = np.asarray(spec.free.place(case, spec.free.values(u)).machine.patches.center)
+        center = np.asarray(placed(spec, spec.free.values(u)).machine.patches.center)
         assert center.shape == (3, 3)
         assert center.min() >= pitch / 2 - 1e-12 and center.max() <= length - pitch / 2 + 1e-12
         assert np.diff(center, axis=1).min() >= pitch - 1e-12
@@ -78,7 +84,7 @@ def test_poles_can_be_free():
     spec = parse_tuning({**SMALL, "control": control, "tune": {"free": free}})
     assert len(spec.free.names) == 5 and spec.has_poles and spec.has_position_gain
     values = np.array([10.0, 20.0, 30.0, 40.0, 100.0])
-    moved = spec.free.place(as_arrays(build_case(spec.study)), values).control
+    moved = placed(spec, values).control
     np.testing.assert_array_equal(moved.pole_decay[:, :2], [[10, 20], [30, 0], [40, 0]])
     np.testing.assert_allclose(moved.pole_frequency[:, 0], 2 * np.pi * np.array([120, 100, 122]))
 
@@ -94,8 +100,8 @@ def test_added_damping_can_be_free():
         control = {**SMALL["control"], "damping": damping}
         spec = parse_tuning({**SMALL, "control": control, "tune": {"free": free}})
         assert spec.has_poles and spec.has_position_gain
-        placed = spec.free.place(as_arrays(build_case(spec.study)), np.array(values)).control
-        np.testing.assert_allclose(placed.damping[:, :2], moved, atol=1e-15)
+        control = placed(spec, values).control
+        np.testing.assert_allclose(control.damping[:, :2], moved, atol=1e-15)
 
 
 def test_gains_that_poles_decide_cannot_be_free():
@@ -110,12 +116,11 @@ def test_numbers_a_link_move_links():
     control = {**SMALL["control"], "pole_decay": [100.0, 110.0, 120.0]}
     free = {"control.pole_decay": {"from": 5.0, "to": 500.0}}
     spec = parse_tuning({**SMALL, "control": control, "tune": {"free": free}})
-    case = as_arrays(build_case(spec.study))
-    moved = spec.free.place(case, np.array([10.0, 20.0, 30.0])).control.pole_decay
+    moved = placed(spec, [10.0, 20.0, 30.0]).control.pole_decay
     np.testing.assert_array_equal(moved, [[10, 10], [20, 20], [30, 30]])
     one = {"control.pole_decay[1]": {"from": 5.0, "to": 500.0}}
     spec = parse_tuning({**SMALL, "control": control, "tune": {"free": one}})
-    moved = spec.free.place(case, np.array([20.0])).control.pole_decay
+    moved = placed(spec, [20.0]).control.pole_decay
     np.testing.assert_array_equal(moved, [[100, 100], [20, 20], [120, 120]])
 
 
@@ -124,7 +129,7 @@ def test_what_is_no_number_stays_as_it_is():
     del free["patches.centers[1]"]
     spec = tuning(free)
     case = as_arrays(build_case(spec.study))
-    kept = spec.free.place(case, np.full(len(spec.free.names), np.nan))
+    kept = placed(spec, np.full(len(spec.free.names), np.nan))
     jax.tree.map(np.testing.assert_array_equal, kept, case)
 
 

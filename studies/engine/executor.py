@@ -26,8 +26,9 @@ from studies.kernels import native
 from studies.kernels.gpu import is_known
 from studies.kernels.llvm import is_available
 
-#: Puts free parameters (p,) into a case; pass the same object every time to avoid recompiling.
-Place = Callable[[Case, Any], Case]
+#: Makes a case of a chunk's numbers, or of a case, and free parameters (p,); pass the same object
+#: every time to avoid recompiling.
+Place = Callable[[Any, Any], Case]
 #: Largest difference of the GPU kernel from the scan, as a share of the largest value.
 TOLERANCE = {8: 1e-6, 4: 1e-2}
 
@@ -107,11 +108,11 @@ class Executor:
 
         return Running(lambda: _joined([future.result() for future in futures]), cancel)
 
-    def differentiate(self, cases: Case, free: np.ndarray) -> Differentiated:
+    def differentiate(self, cases: Any, free: np.ndarray) -> Differentiated:
         """Run a chunk whose metrics can then be differentiated.
 
         Args:
-            cases: `layout.size` of them; fields set by the parameters are overwritten.
+            cases: `layout.size` of them, or what `place` makes them of.
             free: parameters, (layout.size, p).
         """
         free = np.asarray(free, jax.dtypes.canonicalize_dtype(np.float64))
@@ -137,7 +138,7 @@ class Executor:
 
         return self._pool.submit(on_device)
 
-    def _prepared(self, cases: Case, free: Any) -> tuple[BlockFunction, list[list[np.ndarray]]]:
+    def _prepared(self, cases: Any, free: Any) -> tuple[BlockFunction, list[list[np.ndarray]]]:
         """The function of a block, and the numbers of each."""
         leaves, tree = jax.tree.flatten(self._widened(cases))
         leaves = [np.asarray(leaf) for leaf in leaves]
@@ -154,7 +155,7 @@ class Executor:
             self.compile_time = time.perf_counter() - began
         return self._function, blocks
 
-    def _widened(self, cases: Case) -> Case:
+    def _widened(self, cases: Any) -> Any:
         """The same program for both passes, which differ in ratios and links."""
         if not self._has_own_ratio:
             return cases

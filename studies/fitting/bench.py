@@ -17,19 +17,19 @@ import numpy as np
 
 from jaxmodel import status
 from jaxmodel.beam import BASES
-from jaxmodel.case import Case, Structure
+from jaxmodel.case import Structure
 from jaxmodel.kinematics import lift, path_status
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.response import BenchPlant, bench_plant, held_modes
-from studies.engine.executor import Place
 from studies.engine.preflight import check_pose
 from studies.engine.programs import kept_jit
 from studies.errors import StudyError, field_error
-from studies.space.free import Placing
-from studies.study.cases import as_arrays, build_case, build_structure
+from studies.space.free import Place, Placing
+from studies.study.cases import as_arrays, build_structure, case_of
 from studies.study.consistency import each_link
 from studies.study.labels import describe
+from studies.study.numbers import Numbers, one_study
 from studies.study.signals import Signal
 from studies.study.spec import Study
 
@@ -116,7 +116,7 @@ def seen_at(study: Study, place: Place, places: tuple[float, ...]) -> tuple[Stud
 
     Args:
         study: the model.
-        place: puts parameters into a case.
+        place: puts parameters among the numbers.
         places: from the slider joint on, the same on all links, within the shortest one [m].
     """
     longest = float(each_link(study.link.length).max())
@@ -124,11 +124,12 @@ def seen_at(study: Study, place: Place, places: tuple[float, ...]) -> tuple[Stud
     return study, Placing(_place_and_see, (place, places))
 
 
-def _place_and_see(place: Place, places: tuple[float, ...], case: Case, values: Array) -> Case:
-    case = place(case, values)
-    length = jnp.broadcast_to(case.machine.beam.length, (3,))
-    stations = jnp.asarray(places, length.dtype) / length[:, None]
-    return case._replace(windows=case.windows._replace(stations=stations))
+def _place_and_see(
+    place: Place, places: tuple[float, ...], numbers: Numbers, values: Array
+) -> Numbers:
+    numbers = place(numbers, values)
+    length = jnp.asarray(numbers["link.length"])
+    return numbers | {"metrics.stations": jnp.asarray(places, length.dtype) / length[:, None]}
 
 
 class Bench:
@@ -138,7 +139,7 @@ class Bench:
         """
         Args:
             study: the model.
-            place: puts parameters into a case.
+            place: puts parameters among the numbers.
             poses: where measurements were taken.
             places: positions along the links of hammers and displacement sensors [m].
 
@@ -159,7 +160,7 @@ class Bench:
         study = study.change(control__feedback="none", shaper__kind="none")
         self.study, self.place = seen_at(study, place, self.stations)
         self.structure = build_structure(self.study)
-        self.case = as_arrays(build_case(self.study))
+        self.numbers = as_arrays(one_study(self.study, self.structure))
         self.n_patches = self.structure.n_patches
         self.poses = tuple(dict.fromkeys(poses))
         self._kept: dict[tuple[Pose, bool], tuple[bytes, PlantAt]] = {}
@@ -175,7 +176,7 @@ class Bench:
         Raises:
             StudyError: out of reach or singular.
         """
-        code, lifts = _reach(self.structure, self.case, np.array(pose))
+        code, lifts = _reach(self.structure, self.numbers, np.array(pose))
         check_pose(self.study, path, pose, int(code), np.asarray(lifts))
 
     def plant(self, pose: Pose, values: np.ndarray, has_slopes: bool) -> PlantAt:
@@ -189,7 +190,7 @@ class Bench:
             known, plant = self._kept.get((pose, slopes), (b"", None))
             if known == key and plant is not None:
                 return plant
-        given = self.structure, self.place, self.case, np.array(pose), values
+        given = self.structure, self.place, self.numbers, np.array(pose), values
         slope, value = _plant_slopes(*given) if has_slopes else (None, _plant(*given))
         (value, code), slope = jax.tree.map(np.asarray, (value, slope))
         _check_reached(code, pose)
@@ -205,7 +206,7 @@ class Bench:
         found: list[dict[Pose, PlantAt]] = [{} for _ in values]
         for pose, first in product(self.poses, range(0, len(values), BATCH)):
             part = np.arange(first, first + BATCH).clip(max=len(values) - 1)  # of one program
-            given = self.structure, self.place, self.case, np.array(pose), values[part]
+            given = self.structure, self.place, self.numbers, np.array(pose), values[part]
             whole, codes = jax.tree.map(np.asarray, _plant_batch(*given))
             for i in np.flatnonzero(codes == status.OK):  # the others are refused when needed
                 found[part[i]][pose] = PlantAt(jax.tree.map(lambda x, i=i: x[i], whole), None)
@@ -218,7 +219,7 @@ class Bench:
 
     def held(self, values: np.ndarray, has_slopes: bool) -> list[np.ndarray]:
         """Frequencies [Hz] and damping ratios of the links alone, (3, R), and their slopes."""
-        given = self.structure, self.place, self.case, values
+        given = self.structure, self.place, self.numbers, values
         slope, value = _held_slopes(*given) if has_slopes else ((), _held(*given))
         return [np.asarray(x) for x in (*value, *slope)]
 
@@ -253,22 +254,24 @@ def with_slopes(
 
 
 @kept_jit(static_argnums=0)
-def _reach(structure: Structure, case: Case, pose: Array) -> tuple[Array, Array]:
-    plant = prepare(structure, case).loop.plant
+def _reach(structure: Structure, numbers: Numbers, pose: Array) -> tuple[Array, Array]:
+    plant = prepare(structure, case_of(structure, numbers)).loop.plant
     return path_status(plant, pose[None])[0], lift(plant, pose)
 
 
 def _at(
-    structure: Structure, place: Place, case: Case, pose: Array, values: Array
+    structure: Structure, place: Place, numbers: Numbers, pose: Array, values: Array
 ) -> tuple[BenchPlant, Array]:
     """The plant, and whether the pose is reached: kinematics are finite everywhere."""
-    placed = place(case, values)
+    placed = case_of(structure, place(numbers, values))
     plant = prepare(structure, placed).loop.plant
     return bench_plant(structure, placed, pose), path_status(plant, pose[None])[0]
 
 
-def _one_held(structure: Structure, place: Place, case: Case, values: Array) -> tuple[Array, Array]:
-    return held_modes(structure, place(case, values))
+def _one_held(
+    structure: Structure, place: Place, numbers: Numbers, values: Array
+) -> tuple[Array, Array]:
+    return held_modes(structure, case_of(structure, place(numbers, values)))
 
 
 _plant = kept_jit(static_argnums=(0, 1))(_at)
@@ -279,9 +282,9 @@ _held_slopes = jax.jit(with_slopes(_one_held, 3), static_argnums=(0, 1))
 
 @kept_jit(static_argnums=(0, 1))
 def _plant_batch(
-    structure: Structure, place: Place, case: Case, pose: Array, values: Array
+    structure: Structure, place: Place, numbers: Numbers, pose: Array, values: Array
 ) -> tuple[BenchPlant, Array]:
-    return jax.vmap(partial(_at, structure, place, case, pose))(values)
+    return jax.vmap(partial(_at, structure, place, numbers, pose))(values)
 
 
 class FrequencyResponse(NamedTuple):

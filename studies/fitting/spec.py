@@ -15,8 +15,6 @@ from studies.engine.preflight import check_run
 from studies.errors import StudyError, field_error, nearest, shown_name
 from studies.space.axes import Range
 from studies.space.free import (
-    DESIGN,
-    MACHINE,
     FreeNumbers,
     check_twice,
     join_numbers,
@@ -25,7 +23,7 @@ from studies.space.free import (
 from studies.study.explain import explain
 from studies.study.files import find_spec, read_toml
 from studies.study.paths import as_tuples, field_unit, parse_entry
-from studies.study.spec import Section, Study, described, parse_study
+from studies.study.spec import DESIGN, MACHINE, Section, Study, described, parse_study
 from studies.study.window import with_window
 
 Positive = Annotated[float, Field(ge=1e-30, le=1e12)]
@@ -277,7 +275,7 @@ def _free(fit: Fit, study: Study) -> tuple[FreeNumbers, tuple[Prior, ...]]:
                 raise field_error(f"{path}.{key}", written[key], ", ".join(known_keys), hint=hint)
             prior = {k: written[k] for k in ("mean", "sigma") if k in written}
             written = {k: v for k, v in written.items() if k not in prior}
-        parts.append(plain_numbers(name, written, study, path, DESIGN | MACHINE))
+        parts.append(plain_numbers(name, written, study, path, (DESIGN, MACHINE)))
         known += [(prior, path)] * len(parts[-1][0])
     free = join_numbers(parts)
     check_twice(free.numbers, "fit.free")

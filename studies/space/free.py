@@ -1,91 +1,29 @@
-"""Free parameters: their names, bounds and scale, and how they get into a `Case`.
+"""Free parameters: their names, bounds and scale, and how they get into a study's numbers.
 
 A free field is a number of the study file, an entry of a list, or a list, each of whose entries is
-then free by itself. `DESIGN` are the fields that a designer decides, `MACHINE` those that he finds
-in his machine.
+then free by itself. The schema says which fields can be free.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.case import Case
-from jaxmodel.laws import LAWS
+from jaxmodel.case import Case, Structure
 from jaxmodel.parameters import Array
 from studies.errors import StudyError, field_error, nearest
 from studies.space.axes import ALIASES, READY_MADE, Range, parse_range
-from studies.study.paths import checked_value, is_each_link, known_field, overlaps, parse_entry
-from studies.study.spec import OWN_FIELDS, Study
+from studies.study.cases import case_of
+from studies.study.numbers import Numbers, position, put
+from studies.study.paths import checked_value, free_fields, known_field, overlaps, parse_entry
+from studies.study.spec import Study
 
-TWO_PI = 2 * np.pi
-
-
-class FieldPlace(NamedTuple):
-    """Where a field of the study is in a Case."""
-
-    path: str
-    factor: float = 1.0  # the Case's unit in the study's
-    is_of_mode_1: bool = False  # one number, or one a link, is that of mode 1, not of all
-
-
-def _same(section: str, inside: str, *names: str) -> dict[str, FieldPlace]:
-    return {f"{section}.{name}": FieldPlace(f"{inside}.{name}") for name in names}
-
-
-#: Fields that a designer decides.
-DESIGN: dict[str, FieldPlace] = {
-    **_same(
-        "control", "control", "velocity_gain", "position_gain", "gain_factor", "feedthrough_factor"
-    ),
-    "control.ratios": FieldPlace("control.ratio"),
-    "control.damping": FieldPlace("control.damping", is_of_mode_1=True),
-    "control.pole_decay": FieldPlace("control.pole_decay"),
-    "control.pole_frequency_hz": FieldPlace("control.pole_frequency", TWO_PI),
-    "electronics.highpass_hz": FieldPlace("electronics.highpass", TWO_PI),
-    "electronics.antialias_hz": FieldPlace("electronics.antialias", TWO_PI),
-    "electronics.difference_cutoff_hz": FieldPlace("electronics.difference_cutoff", TWO_PI),
-    **_same("electronics", "electronics", "lowpass_ratio", "lowpass_zeta"),
-    "shaper.frequencies_hz": FieldPlace("shaping.omega", TWO_PI),
-    "shaper.damping_ratio": FieldPlace("shaping.zeta"),
-    "shaper.tolerance": FieldPlace("shaping.tolerance"),
-    "patches.centers": FieldPlace("machine.patches.center"),
-    **_same("patches", "machine.patches", "sensor_length", "actuator_length", "width", "thickness"),
-    **_same("drive", "drive", "kp", "kd"),
-    **_same("link", "machine.beam", "length", "thickness", "width"),
-    **_same("machine", "machine.masses", "platform_mass", "platform_inertia", "slider_mass"),
-    "load.mass": FieldPlace("machine.masses.payload_mass"),
-    "load.inertia": FieldPlace("machine.masses.payload_inertia"),
-}
-#: Fields that are found by measuring, besides.
-MACHINE: dict[str, FieldPlace] = {
-    **_same("machine", "machine.geometry", "guide_side", "joint_radius"),
-    **_same(
-        "link",
-        "machine.beam",
-        "density",
-        "youngs_modulus",
-        "stiffness_factor",
-        "joint_inertia_b",
-        "joint_inertia_c",
-    ),
-    "link.damping_ratio": FieldPlace("machine.damping.ratio"),
-    **_same(
-        "patches",
-        "machine.patches",
-        "youngs_modulus",
-        "d31",
-        "relative_permittivity",
-        "density",
-    ),
-    **_same("drive", "drive", "coulomb_friction", "viscous_friction", "pulse_force", "ripple"),
-    "electronics.conditioner_gain": FieldPlace("electronics.conditioner_gain"),
-    "electronics.sensor_highpass_hz": FieldPlace("electronics.sensor_highpass", TWO_PI),
-}
+#: Puts values (p,) of free parameters, in the study's units, among the numbers of one case; nan
+#: leaves the case's value. Pass the same object, or an equal one, to avoid recompiling.
+Place = Callable[[Numbers, Array], Numbers]
 
 
 class Free(NamedTuple):
@@ -101,28 +39,22 @@ class Free(NamedTuple):
 class Placing:
     """A function with its first arguments given; equal ones share their compiled programs."""
 
-    function: Callable[..., Case]
+    function: Callable[..., Any]
     given: tuple[Any, ...]  # hashable
 
-    def __call__(self, case: Case, values: Array) -> Case:
-        """The case with the values put into it."""
-        return self.function(*self.given, case, values)
-
-
-class Setter(NamedTuple):
-    """Writes one number into a Case; hashable."""
-
-    path: str
-    indices: tuple[Any, ...]  # those of links end with an ellipsis: all below
-    factor: float
+    def __call__(self, numbers: Numbers, values: Array) -> Any:
+        return self.function(*self.given, numbers, values)
 
 
 class FreeNumbers(NamedTuple):
     """All free parameters of a design, in the order of the parameter vector."""
 
     numbers: tuple[Free, ...]
-    #: Puts values (p,) in the study's units into a case; nan leaves the case's value.
-    place: Callable[[Case, Array], Case]
+    place: Place
+
+    def build(self, structure: Structure) -> Callable[[Numbers, Array], Case]:
+        """What makes a case of numbers without the free ones, and these."""
+        return Placing(_case, (structure, self.place))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -156,13 +88,13 @@ class FreeNumbers(NamedTuple):
 
 
 def join_numbers(
-    parts: Sequence[tuple[list[Free], Callable[[Case, Array], Case]]],
+    parts: Sequence[tuple[list[Free], Place]],
 ) -> FreeNumbers:
     """All free parameters, from those of each field."""
     numbers: list[Free] = []
-    places: list[Callable[[Case, Array], Case]] = []
-    for added, put in parts:
-        places.append(Placing(_part, (put, len(numbers), len(numbers) + len(added))))
+    places: list[Place] = []
+    for added, place in parts:
+        places.append(Placing(_part, (place, len(numbers), len(numbers) + len(added))))
         numbers += added
     return FreeNumbers(tuple(numbers), Placing(_place_all, (tuple(places),)))
 
@@ -179,14 +111,14 @@ def check_twice(numbers: Sequence[Free], path: str) -> None:
             raise StudyError(f"{path}.{name}: free twice")
 
 
-def _place_all(places: tuple[Any, ...], case: Case, values: Array) -> Case:
+def _place_all(places: tuple[Place, ...], numbers: Numbers, values: Array) -> Numbers:
     for place in places:
-        case = place(case, values)
-    return case
+        numbers = place(numbers, values)
+    return numbers
 
 
-def _part(put: Callable[..., Any], first: int, after: int, case: Case, values: Array) -> Case:
-    return put(case, values[first:after])
+def _part(place: Place, first: int, after: int, numbers: Numbers, values: Array) -> Numbers:
+    return place(numbers, values[first:after])
 
 
 def plain_numbers(
@@ -194,17 +126,17 @@ def plain_numbers(
     bounds: Any,
     study: Study,
     path: str,
-    leaves: Mapping[str, FieldPlace],
+    roles: Sequence[str],
     others: Sequence[str] = (),
-) -> tuple[list[Free], Callable[[Case, Array], Case]]:
-    """The numbers of one free field, and what puts their values into a case.
+) -> tuple[list[Free], Place]:
+    """The numbers of one free field, and what puts their values among those of a study.
 
     Args:
         name: field, entry of a list, or list.
         bounds: its range as the file writes it.
         study: where it starts from.
         path: where it is written, for messages.
-        leaves: fields that can be free, without the law's own.
+        roles: of the fields that can be free, besides the law's own.
         others: further names that can be, for messages.
 
     Raises:
@@ -218,17 +150,16 @@ def plain_numbers(
         raise StudyError(f"{path}: cannot be free; {hint}")
     value = known_field(name, study, path)  # names the nearest field if there is none
     assert entry is not None
-    leaves = {**leaves, **_own_leaves(study)}
-    leaf = leaves.get(entry.field)
-    if leaf is None:
-        hint = nearest(entry.field, leaves)
+    allowed = free_fields(study, *roles)
+    if entry.field not in allowed:
+        hint = nearest(entry.field, allowed)
         raise StudyError(
-            f"{path}: cannot be free; fields that can are {', '.join((*leaves, *others))}"
+            f"{path}: cannot be free; fields that can are {', '.join((*allowed, *others))}"
             + (f"; did you mean {hint!r}?" if hint else "")
         )
     _check_field(entry.field, study, path)
     span = parse_bounds(bounds, path)
-    numbers, setters = [], []
+    numbers, positions = [], []
     for indices, start in _entries(value):
         whole = (*entry.indices, *indices)
         label = entry.field + "".join(f"[{k}]" for k in whole)
@@ -238,22 +169,10 @@ def plain_numbers(
         if not span.low <= start <= span.high:
             raise field_error(label, start, f"{span.low:g} to {span.high:g}, the bounds of {path}")
         numbers.append(Free(label, span, float(start), name))
-        at = (*whole, Ellipsis) if whole and is_each_link(entry.field) else whole
-        if leaf.is_of_mode_1 and len(whole) < 2:
-            at = (*(whole or (Ellipsis,)), 0)
-        setters.append(Setter(leaf.path, at, leaf.factor))
+        positions.append(position(study, label))
     if not numbers:
         raise field_error(name, value, f"one number or more, where {path} is to be free")
-    return numbers, Placing(_set, (tuple(setters),))
-
-
-def _own_leaves(study: Study) -> dict[str, FieldPlace]:
-    """The own fields of the study's law."""
-    law = LAWS[study.control.law]
-    return {
-        f"{OWN_FIELDS}.{law.name}.{x.name}": FieldPlace(f"control.parameters.{x.name}")
-        for x in law.parameters
-    }
+    return numbers, Placing(_set, (tuple(positions),))
 
 
 def _check_field(field: str, study: Study, path: str) -> None:
@@ -287,34 +206,11 @@ def _entries(value: Any, indices: tuple[int, ...] = ()) -> list[tuple[tuple[int,
     return [found for k, x in enumerate(value) for found in _entries(x, (*indices, k))]
 
 
-def _set(setters: tuple[Setter, ...], case: Case, values: Array) -> Case:
-    for k, setter in enumerate(setters):
-        case = _replaced(case, setter.path.split("."), setter.indices, values[k] * setter.factor)
-    return case
+def _set(positions: tuple[Any, ...], numbers: Numbers, values: Array) -> Numbers:
+    for k, at in enumerate(positions):
+        numbers = put(numbers, at, values[k], keeps_missing=True)
+    return numbers
 
 
-def _replaced(tree: Any, path: list[str], indices: tuple[Any, ...], value: Array) -> Any:
-    """A tree of named tuples and dictionaries with one number replaced.
-
-    Fewer indices than axes select everything below.
-    """
-    if not path:
-        whole = jnp.asarray(tree, value.dtype)
-        at = _widened(indices, whole.ndim)
-        return whole.at[at].set(jnp.where(jnp.isnan(value), whole[at], known(value)))
-    first, *rest = path
-    if isinstance(tree, dict):
-        return tree | {first: _replaced(tree[first], rest, indices, value)}
-    return tree._replace(**{first: _replaced(getattr(tree, first), rest, indices, value)})
-
-
-def _widened(indices: tuple[Any, ...], depth: int) -> Any:
-    """One list of patch centres, or of one number, stands for those of all links."""
-    if Ellipsis in indices:
-        return indices
-    return (Ellipsis, *indices) if indices and depth > len(indices) else (indices or Ellipsis)
-
-
-def known(value: Array) -> Array:
-    """Replace nan, whose derivatives would spoil those of the selected alternative."""
-    return jnp.where(jnp.isnan(value), 1.0, value)
+def _case(structure: Structure, place: Place, numbers: Numbers, values: Array) -> Case:
+    return case_of(structure, place(numbers, values))

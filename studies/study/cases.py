@@ -6,7 +6,7 @@ column makes it vary, so that a batch computes only once what its cases share.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,7 @@ from studies.study.fields import Columns, Fields
 from studies.study.numbers import Numbers, one_study, study_numbers
 from studies.study.spec import OWN_FIELDS, Study
 
+Tree = TypeVar("Tree")  # a Case, or numbers
 TWO_PI = 2 * np.pi
 #: Duration of a move that only pads a path with fewer moves [s].
 NO_TIME = 1e-12
@@ -137,17 +138,18 @@ def _library(numbers: Numbers) -> Any:
     return np if all(isinstance(x, np.ndarray | np.generic) for x in leaves) else jnp
 
 
-def in_working_precision(cases: Case) -> Case:
+def in_working_precision(cases: Tree) -> Tree:
     """NumPy leaves in JAX's working precision (integers stay integers)."""
     real = np.dtype(jnp.result_type(float))
 
     def cast(x: np.ndarray) -> np.ndarray:
         return x if np.issubdtype(x.dtype, np.integer) else x.astype(real)
 
-    return jax.tree.map(cast, cases)
+    changed: Tree = jax.tree.map(cast, cases)
+    return changed
 
 
-def as_arrays(case: Case) -> Case:
+def as_arrays(case: Tree) -> Tree:
     """Every leaf as an array of the working precision (integers stay integers)."""
     real = jnp.result_type(float)
 
@@ -155,7 +157,8 @@ def as_arrays(case: Case) -> Case:
         x = np.asarray(x)
         return jnp.asarray(x, None if np.issubdtype(x.dtype, np.integer) else real)
 
-    return jax.tree.map(leaf, case)
+    arrays: Tree = jax.tree.map(leaf, case)
+    return arrays
 
 
 def _machine(numbers: Numbers, structure: Structure, xp: Any) -> Machine:

@@ -8,11 +8,13 @@ all links is there three times, choices are positions among their names, truth v
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from types import EllipsisType
 from typing import Any, Literal, get_args, get_origin
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxmodel.case import Structure
@@ -100,6 +102,24 @@ def one_study(study: Study, structure: Structure) -> Numbers:
     return numbers
 
 
+def stack_numbers(parts: Sequence[Numbers]) -> Numbers:
+    """Numbers of several studies as those of as many cases; shorter lists are padded."""
+
+    def stacked(*leaves: np.ndarray) -> np.ndarray:
+        shape = np.max([x.shape for x in leaves], axis=0).astype(int)
+        return np.stack([_padded(np.asarray(x), shape) for x in leaves])
+
+    numbers: Numbers = jax.tree.map(stacked, *parts)
+    return numbers
+
+
+def _padded(array: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    if array.shape == tuple(shape):
+        return array
+    widths = [(0, most - n) for n, most in zip(array.shape, shape, strict=True)]
+    return np.pad(array, widths, constant_values=np.nan)
+
+
 def _array(fields: Fields, field: str, structure: Structure) -> np.ndarray:
     form = form_of(field)
     if form == "choice":
@@ -147,3 +167,20 @@ def position(study: Study, name: str) -> tuple[str, tuple[int | EllipsisType, ..
         if field == OF_MODE_1:
             return field, (*(indices or (...,)), 0)
     return field, (*indices, ...)
+
+
+def put(numbers: Numbers, at: tuple[str, Any], value: Any, keeps_missing: bool = False) -> Numbers:
+    """The numbers with one replaced, in JAX.
+
+    Args:
+        numbers: of one case.
+        at: from `position`.
+        value: in the field's unit, ().
+        keeps_missing: nan leaves what is there.
+    """
+    field, index = at
+    whole = jnp.asarray(numbers[field], jnp.result_type(float))
+    if keeps_missing:
+        # nan would spoil the derivatives of the selected alternative
+        value = jnp.where(jnp.isnan(value), whole[index], jnp.where(jnp.isnan(value), 1.0, value))
+    return numbers | {field: whole.at[index].set(value)}

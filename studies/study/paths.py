@@ -112,6 +112,21 @@ def field_choices(field: str) -> tuple[str, ...]:
     return choices_of(fields[leaf].annotation, fields[leaf].metadata) if leaf in fields else ()
 
 
+def free_fields(study: Study, *roles: str) -> tuple[str, ...]:
+    """Fields that can be free, and those of the study's law.
+
+    roles: `DESIGN`, `MACHINE`.
+    """
+    names = [
+        f"{section}.{leaf}"
+        for section, outer in Study.model_fields.items()
+        for leaf, info in getattr(outer.annotation, "model_fields", {}).items()
+        if isinstance(info.json_schema_extra, dict) and info.json_schema_extra.get("free") in roles
+    ]
+    law = LAWS[study.control.law]
+    return (*names, *(f"{OWN_FIELDS}.{law.name}.{x.name}" for x in law.parameters))
+
+
 def as_list(field: str, value: Any) -> Any:
     """A field's value as a list of entries: three if one number stands for all links."""
     return (value,) * LINKS if is_each_link(field) and not isinstance(value, tuple) else value

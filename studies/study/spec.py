@@ -68,8 +68,13 @@ class OwnFields:
         return f"tables by law; {', '.join(known)}"
 
 
-def described(default: Any, unit: str, text: str, **bounds: Any) -> Any:
-    return Field(default, description=text, json_schema_extra={"unit": unit}, **bounds)
+#: What can be free: tunings move what a designer decides, fits also what is found by measuring.
+DESIGN, MACHINE = "design", "machine"
+
+
+def described(default: Any, unit: str, text: str, free: str = "", **bounds: Any) -> Any:
+    extra = {"unit": unit, "free": free}
+    return Field(default, description=text, json_schema_extra=extra, **bounds)  # type: ignore[arg-type]
 
 
 class Section(BaseModel):
@@ -93,7 +98,9 @@ class RunSection(Section):
 class MachineSection(Section):
     """Guides, platform, sliders."""
 
-    guide_side: float = described(0.6, "m", "side of the guide triangle", ge=0.01, le=10)
+    guide_side: float = described(
+        0.6, "m", "side of the guide triangle", ge=0.01, le=10, free=MACHINE
+    )
     guide_angles_deg: tuple[Degrees, Degrees, Degrees] = described(
         (120.0, 240.0, 0.0), "deg", "direction alpha of each guide; the platform is on its left"
     )
@@ -107,14 +114,17 @@ class MachineSection(Section):
         (), "deg", "of the platform's joints in its own axes; empty: according to assembly"
     )
     joint_radius: EachLink[Annotated[float, Field(ge=1e-4, le=5)]] = described(
-        round(0.12 / 3**0.5, 12), "m", "distance of the joints from the platform's reference point"
+        round(0.12 / 3**0.5, 12),
+        "m",
+        "distance of the joints from the platform's reference point",
+        free=MACHINE,
     )
-    platform_mass: float = described(0.25, "kg", "mass m_p", ge=1e-3, le=1e3)
+    platform_mass: float = described(0.25, "kg", "mass m_p", ge=1e-3, le=1e3, free=DESIGN)
     platform_inertia: float = described(
-        3.0e-4, "kg m2", "I_p about the reference point", ge=1e-7, le=1e2
+        3.0e-4, "kg m2", "I_p about the reference point", ge=1e-7, le=1e2, free=DESIGN
     )
     slider_mass: EachLink[Annotated[float, Field(ge=1e-3, le=1e3)]] = described(
-        0.15, "kg", "m_s of each slider"
+        0.15, "kg", "m_s of each slider", free=DESIGN
     )
 
 
@@ -139,33 +149,41 @@ class LinkSection(Section):
         "-",
         "static correction for the modes left out; false: the paper's truncated model",
     )
-    length: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(0.2, "m", "length L")
-    thickness: EachLink[Annotated[float, Field(ge=1e-5, le=0.1)]] = described(
-        2e-3, "m", "thickness t_b"
+    length: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(
+        0.2, "m", "length L", free=DESIGN
     )
-    width: EachLink[Annotated[float, Field(ge=1e-4, le=1)]] = described(10e-3, "m", "width")
-    density: EachLink[Annotated[float, Field(ge=1, le=3e4)]] = described(2750.0, "kg/m3", "density")
+    thickness: EachLink[Annotated[float, Field(ge=1e-5, le=0.1)]] = described(
+        2e-3, "m", "thickness t_b", free=DESIGN
+    )
+    width: EachLink[Annotated[float, Field(ge=1e-4, le=1)]] = described(
+        10e-3, "m", "width", free=DESIGN
+    )
+    density: EachLink[Annotated[float, Field(ge=1, le=3e4)]] = described(
+        2750.0, "kg/m3", "density", free=MACHINE
+    )
     youngs_modulus: EachLink[Annotated[float, Field(ge=1e3, le=2e12)]] = described(
-        70e9,
-        "Pa",
-        "E, also of the nominal model; stiffness_factor is not in it",
+        70e9, "Pa", "E, also of the nominal model; stiffness_factor is not in it", free=MACHINE
     )
     stiffness_factor: EachLink[Annotated[float, Field(ge=1e-3, le=10)]] = described(
         1.0,
         "1",
         "model mismatch: true over nominal bending stiffness, which controller and shaper assume",
+        free=MACHINE,
     )
     damping_ratio: Zeta | tuple[Zeta, ...] | tuple[tuple[Zeta, ...], ...] = described(
-        0.01, "1", "of mode 1; or by mode, for example measured: one list for all links, or three"
+        0.01,
+        "1",
+        "of mode 1; or by mode, for example measured: one list for all links, or three",
+        free=MACHINE,
     )
     damping_law: Literal["constant", "mass", "stiffness"] = described(
         "constant", "-", "of further modes: same ratio, falling with frequency, or rising"
     )
     joint_inertia_b: EachLink[Annotated[float, Field(ge=0, le=1)]] = described(
-        0.0, "kg m2", "at the slider joint (basis loaded)"
+        0.0, "kg m2", "at the slider joint (basis loaded)", free=MACHINE
     )
     joint_inertia_c: EachLink[Annotated[float, Field(ge=0, le=1)]] = described(
-        0.0, "kg m2", "at the platform joint (basis loaded)"
+        0.0, "kg m2", "at the platform joint (basis loaded)", free=MACHINE
     )
 
     @property
@@ -181,27 +199,34 @@ class PatchesSection(Section):
     """Piezo pairs: sensor and actuator on opposite faces share a centre; one number, or three."""
 
     centers: tuple[float, ...] | tuple[tuple[float, ...], ...] = described(
-        (0.05, 0.10, 0.15), "m", "centres along the link; one list for all links, or three lists"
+        (0.05, 0.10, 0.15),
+        "m",
+        "centres along the link; one list for all links, or three lists",
+        free=DESIGN,
     )
     sensor_length: EachLink[Annotated[float, Field(ge=1e-5, le=1)]] = described(
-        0.010, "m", "sensor length"
+        0.010, "m", "sensor length", free=DESIGN
     )
     actuator_length: EachLink[Annotated[float, Field(ge=1e-5, le=1)]] = described(
-        0.030, "m", "actuator length"
+        0.030, "m", "actuator length", free=DESIGN
     )
-    width: EachLink[Annotated[float, Field(ge=1e-5, le=1)]] = described(0.010, "m", "patch width")
-    thickness: EachLink[Annotated[float, Field(ge=1e-6, le=0.01)]] = described(0.2e-3, "m", "t_p")
+    width: EachLink[Annotated[float, Field(ge=1e-5, le=1)]] = described(
+        0.010, "m", "patch width", free=DESIGN
+    )
+    thickness: EachLink[Annotated[float, Field(ge=1e-6, le=0.01)]] = described(
+        0.2e-3, "m", "t_p", free=DESIGN
+    )
     youngs_modulus: EachLink[Annotated[float, Field(ge=1e3, le=2e12)]] = described(
-        66e9, "Pa", "E_p"
+        66e9, "Pa", "E_p", free=MACHINE
     )
     d31: EachLink[Annotated[float, Field(ge=-1e-9, le=1e-9)]] = described(
-        -180e-12, "C/N", "piezoelectric constant (its sign has no effect)"
+        -180e-12, "C/N", "piezoelectric constant (its sign has no effect)", free=MACHINE
     )
     relative_permittivity: EachLink[Annotated[float, Field(ge=1, le=1e5)]] = described(
-        1750.0, "1", "eps33T/eps0"
+        1750.0, "1", "eps33T/eps0", free=MACHINE
     )
     density: EachLink[Annotated[float, Field(ge=0, le=3e4)]] = described(
-        7800.0, "kg/m3", "density of the ceramic"
+        7800.0, "kg/m3", "density of the ceramic", free=MACHINE
     )
 
 
@@ -235,9 +260,12 @@ class ShaperSection(Section):
         "Hz",
         "modes to shape for, in series; empty: mode 1 of the controller's model",
         max_length=3,
+        free=DESIGN,
     )
-    damping_ratio: float = described(0.01, "1", "zeta assumed by the shaper", ge=0, lt=0.9)
-    tolerance: float = described(0.05, "1", "V of the EI family", ge=0, lt=1)
+    damping_ratio: float = described(
+        0.01, "1", "zeta assumed by the shaper", ge=0, lt=0.9, free=DESIGN
+    )
+    tolerance: float = described(0.05, "1", "V of the EI family", ge=0, lt=1, free=DESIGN)
     split: Literal["linear", "exact"] = described("linear", "-", "impulses onto the sample grid")
 
 
@@ -267,9 +295,10 @@ class ControlSection(Section):
         (1.55, 1.75, 1.7),
         "N s/m or 1/s",
         "k_d of mode 1 per link, half of the paper's by default (SRF: s)",
+        free=DESIGN,
     )
     position_gain: tuple[Gain, Gain, Gain] = described(
-        (0.0, 0.0, 0.0), "N/m or 1/s2", "k_p of mode 1 per link (SRF: 1)"
+        (0.0, 0.0, 0.0), "N/m or 1/s2", "k_p of mode 1 per link (SRF: 1)", free=DESIGN
     )
     damping: EachMode[Zeta] = described(
         (),
@@ -277,15 +306,20 @@ class ControlSection(Section):
         "added damping ratio, beside link.damping_ratio, from which the gains follow; natural "
         "frequencies are kept: one number, or one a link, is that of mode 1, others by (24); or "
         "one list a link by mode; 0: none, empty: gains or decays as below",
+        free=DESIGN,
     )
     pole_decay: EachMode[Decay] = described(
         (),
         "1/s",
         "alpha of the specified poles -alpha +- j beta, from which the gains follow: one "
         "number for all modes, one a link, or one list a link by mode, others by (24)",
+        free=DESIGN,
     )
     pole_frequency_hz: EachMode[OwnOrHertz] = described(
-        (), "Hz", "beta/2 pi of these poles, by mode; empty or 0: the mode keeps its frequency"
+        (),
+        "Hz",
+        "beta/2 pi of these poles, by mode; empty or 0: the mode keeps its frequency",
+        free=DESIGN,
     )
     gain_unit: Literal["N s/m", "1/s"] = described(
         "N s/m", "-", "modal force or modal acceleration"
@@ -294,6 +328,7 @@ class ControlSection(Section):
         ((1.0, 0.345, 0.045), (1.0, 0.304, 0.041), (1.0, 0.321, 0.038)),
         "1",
         "efficient modal control (EMC): ratios k_dj : k_d1 per link (24); missing ones are 0",
+        free=DESIGN,
     )
     ratio_source: Literal["given", "own_run"] = described(
         "given", "-", "ratios as given, or from the same case's uncontrolled run by (24)"
@@ -307,9 +342,10 @@ class ControlSection(Section):
         "factor on the loop gain: it multiplies the controller's output, whatever the law",
         ge=0,
         le=1e3,
+        free=DESIGN,
     )
     feedthrough_factor: float = described(
-        0.0, "1", "subtracted share of the residual modes' feed-through", ge=0, le=1
+        0.0, "1", "subtracted share of the residual modes' feed-through", ge=0, le=1, free=DESIGN
     )
 
     @property
@@ -338,7 +374,9 @@ class ElectronicsSection(Section):
     """Sampling, converters, velocity estimate."""
 
     sample_rate_hz: float = described(10_000.0, "Hz", "f_s", gt=100, le=1e6)
-    antialias_hz: float = described(2_000.0, "Hz", "2nd-order Butterworth corner", gt=10, le=1e6)
+    antialias_hz: float = described(
+        2_000.0, "Hz", "2nd-order Butterworth corner", gt=10, le=1e6, free=DESIGN
+    )
     sensor_highpass_hz: float = described(
         0.0,
         "Hz",
@@ -346,6 +384,7 @@ class ElectronicsSection(Section):
         "amplifier's input R; 0: none",
         ge=0,
         le=1e5,
+        free=MACHINE,
     )
     amplifier_hz: float = described(
         0.0, "Hz", "bandwidth (-3 dB) of the actuators' amplifiers; 0: no limit", ge=0, le=1e6
@@ -353,20 +392,29 @@ class ElectronicsSection(Section):
     estimator: Annotated[str, OneOf(lambda: KINDS)] = described(
         "modal_phase", "-", "velocity estimate"
     )
-    highpass_hz: float = described(60.0, "Hz", "high-pass of modal_phase", gt=0, le=1e5)
+    highpass_hz: float = described(
+        60.0, "Hz", "high-pass of modal_phase", gt=0, le=1e5, free=DESIGN
+    )
     lowpass_ratio: tuple[Annotated[float, Field(gt=0.1, le=100)], ...] = described(
         (3.0, 2.0, 2.0),
         "1",
         "kappa_j, low-pass corner over omega_j; the last one repeats",
         min_length=1,
+        free=DESIGN,
     )
     lowpass_zeta: tuple[Annotated[float, Field(gt=0, le=5)], ...] = described(
-        (0.7, 0.7, 0.7), "1", "damping of the low-pass; the last one repeats", min_length=1
+        (0.7, 0.7, 0.7),
+        "1",
+        "damping of the low-pass; the last one repeats",
+        min_length=1,
+        free=DESIGN,
     )
     difference_cutoff_hz: float = described(
-        2_000.0, "Hz", "low-pass of the difference", gt=0, le=1e6
+        2_000.0, "Hz", "low-pass of the difference", gt=0, le=1e6, free=DESIGN
     )
-    conditioner_gain: float = described(0.1, "1", "ADC volt per sensor volt", gt=0, le=1e3)
+    conditioner_gain: float = described(
+        0.1, "1", "ADC volt per sensor volt", gt=0, le=1e3, free=MACHINE
+    )
     conditioner_bias: float = described(1.5, "V", "bias at the ADC", ge=0, le=100)
     adc_range: float = described(3.0, "V", "full scale, from 0", gt=0, le=100)
     adc_bits: int = described(12, "1", "resolution", ge=4, le=32)
@@ -378,17 +426,21 @@ class DriveSection(Section):
     """Slider servo and disturbances."""
 
     kind: Literal["pd", "computed_torque"] = described("pd", "-", "PD, or PD with computed torque")
-    kp: float = described(2e4, "N/m", "position gain Kp", ge=0, le=1e8)
-    kd: float = described(60.0, "N s/m", "velocity gain Kd", ge=0, le=1e5)
+    kp: float = described(2e4, "N/m", "position gain Kp", ge=0, le=1e8, free=DESIGN)
+    kd: float = described(60.0, "N s/m", "velocity gain Kd", ge=0, le=1e5, free=DESIGN)
     force_limit: float = described(1e3, "N", "motors, +-", gt=0, le=1e6)
-    coulomb_friction: float = described(0.0, "N", "F_c of F_c tanh(v/v_0)", ge=0, le=1e3)
+    coulomb_friction: float = described(
+        0.0, "N", "F_c of F_c tanh(v/v_0)", ge=0, le=1e3, free=MACHINE
+    )
     friction_speed: float = described(1e-3, "m/s", "v_0", gt=0, le=1)
-    viscous_friction: float = described(0.0, "N s/m", "viscous friction", ge=0, le=1e4)
+    viscous_friction: float = described(
+        0.0, "N s/m", "viscous friction", ge=0, le=1e4, free=MACHINE
+    )
     ripple: float = described(
-        0.0, "N", "seeded force ripple, rms, new at every sample", ge=0, le=1e3
+        0.0, "N", "seeded force ripple, rms, new at every sample", ge=0, le=1e3, free=MACHINE
     )
     pulse_force: tuple[Force, Force, Force] = described(
-        (0.0, 0.0, 0.0), "N", "disturbance on the sliders"
+        (0.0, 0.0, 0.0), "N", "disturbance on the sliders", free=MACHINE
     )
     pulse_start: float = described(0.0, "s", "its start", ge=0, le=100)
     pulse_length: float = described(0.001, "s", "its length", ge=0, le=100)
@@ -398,9 +450,14 @@ class DriveSection(Section):
 class LoadSection(Section):
     """Payload of the platform, and loads on it, at its reference point (the pose)."""
 
-    mass: float = described(0.0, "kg", "payload, added to m_p", ge=0, le=1e3)
+    mass: float = described(0.0, "kg", "payload, added to m_p", ge=0, le=1e3, free=DESIGN)
     inertia: float = described(
-        0.0, "kg m2", "payload about its own centre of mass, added to I_p", ge=0, le=1e2
+        0.0,
+        "kg m2",
+        "payload about its own centre of mass, added to I_p",
+        ge=0,
+        le=1e2,
+        free=DESIGN,
     )
     offset: tuple[Offset, Offset] = described(
         (0.0, 0.0), "m", "payload's centre of mass in the platform's axes"

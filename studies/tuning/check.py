@@ -18,7 +18,8 @@ from studies.engine.poles import PoleReport, pole_report, tracked_modes
 from studies.engine.preflight import check_run
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
-from studies.study.cases import as_arrays, build_case, build_cases, in_working_precision
+from studies.study.cases import build_cases, build_structure, in_working_precision
+from studies.study.numbers import one_study, study_numbers
 from studies.study.paths import set_values
 from studies.study.spec import Study, parse_study
 from studies.tuning.evaluate import first_residual, tuned_structure
@@ -111,8 +112,9 @@ def patch_centers(spec: TuneSpec, family: Family, values: np.ndarray) -> np.ndar
 
 def _placed(spec: TuneSpec, family: Family, study: Study, values: np.ndarray) -> Case:
     """A family's study with those of the free parameters (p,) that it moves."""
-    case = as_arrays(build_case(study))
-    return spec.free.place(case, np.where(family.is_free, values, np.nan))
+    structure = build_structure(study)
+    values = np.where(family.is_free, values, np.nan)
+    return spec.free.build(structure)(one_study(study, structure), values)
 
 
 def fresh_columns(spec: TuneSpec) -> dict[str, np.ndarray]:
@@ -229,12 +231,12 @@ def search(spec: TuneSpec, screen: Any) -> Searched:
     columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)
     count, structure = len(columns["run.seed"]), shown_structure(spec)
     lanes = lane_columns(spec, columns, [None, *[family] * CHUNK])
-    cases = build_cases(spec.study, lanes, structure)
+    numbers = study_numbers(spec.study, structure, lanes)
     layout = even_layout(count * (1 + CHUNK))
     rows = layout.filled(count * (1 + CHUNK))
-    cases = in_working_precision(jax.tree.map(lambda x: x if len(x) == 1 else x[rows], cases))
+    numbers = in_working_precision(jax.tree.map(lambda x: x if len(x) == 1 else x[rows], numbers))
     executor = Executor(structure, layout)
-    place, merit = jax.jit(jax.vmap(spec.free.place)), merit_of(spec)
+    build, merit = jax.jit(jax.vmap(spec.free.build(structure))), merit_of(spec)
 
     def split(x: np.ndarray) -> np.ndarray:
         return x[: count * (1 + CHUNK)].reshape((1 + CHUNK, count, *x.shape[1:]))
@@ -243,8 +245,8 @@ def search(spec: TuneSpec, screen: Any) -> Searched:
     for first in range(0, n, CHUNK):
         part = values[np.minimum(np.arange(first, first + CHUNK), n - 1)]
         part = np.concatenate([np.full((1, part.shape[1]), np.nan), part])
-        whole = jax.tree.map(lambda x: np.broadcast_to(x, (layout.size, *x.shape[1:])), cases)
-        placed = jax.tree.map(np.asarray, place(whole, part[rows // count]))
+        whole = jax.tree.map(lambda x: np.broadcast_to(x, (layout.size, *x.shape[1:])), numbers)
+        placed = jax.tree.map(np.asarray, build(whole, part[rows // count]))
         started = time.perf_counter()
         result = jax.tree.map(np.asarray, executor.start(placed).wait())
         spent += time.perf_counter() - started

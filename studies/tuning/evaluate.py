@@ -20,7 +20,8 @@ from studies.engine.executor import Differentiated, Executor
 from studies.engine.plan import Layout, even_layout, lane_unit
 from studies.engine.preflight import check_run
 from studies.errors import StudyError
-from studies.study.cases import build_cases, build_structure, in_working_precision
+from studies.study.cases import build_structure, in_working_precision
+from studies.study.numbers import study_numbers
 from studies.tuning.linear_fidelity import LinearFidelity
 from studies.tuning.merit import (
     Merit,
@@ -71,10 +72,13 @@ class Evaluator:
         whole = lane_columns(spec, columns, [None, *families])
         study = spec.study.change(run__smooth=True)
         padded = {name: column[rows] for name, column in whole.items()}
-        self._cases = in_working_precision(build_cases(study, padded, self._structure))
+        numbers = study_numbers(study, self._structure, padded)
+        self._numbers = in_working_precision(numbers)
         self._rows = rows // self.scenarios  # design of every lane, the baseline first
         self.run_time = float("nan")  # time per run of the last batch [s]
-        self._executor = Executor(self._structure, self._layout, place=spec.free.place)
+        self._executor = Executor(
+            self._structure, self._layout, place=spec.free.build(self._structure)
+        )
 
     def evaluate(self, values: np.ndarray, has_slope: np.ndarray | bool = True) -> Evaluation:
         """Objective and limits of designs.
@@ -89,7 +93,7 @@ class Evaluator:
         is_compiled, started = self._executor.compile_time > 0, time.perf_counter()
         whole = np.concatenate([own, values])[self._rows]
         needs_slope = (np.isfinite(values) & np.reshape(has_slope, (-1, 1))).any(axis=1)
-        runs = self._executor.differentiate(self._cases, whole)
+        runs = self._executor.differentiate(self._numbers, whole)
         shape = (1 + len(values), self.scenarios)
 
         def split(x: Any) -> np.ndarray:

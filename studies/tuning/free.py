@@ -1,4 +1,4 @@
-"""Free parameters of a design: their names, bounds and scale, and how they get into a `Case`.
+"""Free parameters of a design: their names, bounds and scale, and how they get into its numbers.
 
 A free field is a number of the study file, an entry of a list, or a list, each of whose entries is
 then free by itself. `placement` stands for several numbers: patch centres on the link and without
@@ -7,30 +7,29 @@ overlap, for any numbers in [0, 1].
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.case import Case
 from jaxmodel.parameters import Array
 from studies.errors import StudyError, field_error, shown_name
 from studies.space.axes import Range
 from studies.space.free import (
-    DESIGN,
     Free,
     FreeNumbers,
+    Place,
     Placing,
     check_twice,
     join_numbers,
-    known,
     plain_numbers,
 )
 from studies.study.consistency import each_link, patch_centers, patch_pitch
-from studies.study.spec import Study
+from studies.study.numbers import Numbers
+from studies.study.spec import DESIGN, Study
 
-#: Free name that stands for several numbers of a Case.
+#: Free name that stands for several numbers.
 PLACEMENT = "placement"
 PLACEMENTS = ("same", "per_link")
 #: Fields that it sets or relies on.
@@ -54,13 +53,13 @@ def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
     """
     if not written:
         raise field_error("tune.free", {}, "one free field or more")
-    parts: list[tuple[list[Free], Callable[[Case, Array], Case]]] = []
+    parts: list[tuple[list[Free], Place]] = []
     for name, bounds in written.items():
         path = f"tune.free.{shown_name(name)}"
         if name == PLACEMENT:
             parts.append(_placement(bounds, study, path))
         else:
-            parts.append(plain_numbers(name, bounds, study, path, DESIGN, (PLACEMENT,)))
+            parts.append(plain_numbers(name, bounds, study, path, (DESIGN,), (PLACEMENT,)))
     found = join_numbers(parts)
     check_twice(found.numbers, "tune.free")
     _check_decided(found.numbers)
@@ -81,7 +80,7 @@ def _check_decided(numbers: Sequence[Free]) -> None:
             raise StudyError(f"tune.free.{number.key}: {PLACEMENT} is free too and decides it")
 
 
-def _placement(bounds: Any, study: Study, path: str) -> tuple[list[Free], Callable[..., Any]]:
+def _placement(bounds: Any, study: Study, path: str) -> tuple[list[Free], Place]:
     if not isinstance(bounds, dict) or set(bounds) != {"kind"} or bounds["kind"] not in PLACEMENTS:
         raise field_error(path, bounds, "{kind = 'same'} or {kind = 'per_link'}")
     centers, pitch, length = patch_centers(study), patch_pitch(study), each_link(study.link.length)
@@ -112,24 +111,24 @@ def _shares(gaps: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
-def _place_patches(links: int, pitches: tuple[float, ...], case: Case, values: Array) -> Case:
+def _place_patches(
+    links: int, pitches: tuple[float, ...], numbers: Numbers, values: Array
+) -> Numbers:
     """Place patches one by one, each after a gap that is its share of the remaining free length.
 
     Of k gaps to come, a number v takes 1 - (1 - v)^(1/k): equal numbers are drawn evenly from all
     placements.
     """
-    patches, pitch = case.machine.patches, jnp.asarray(pitches)
+    pitch, length = jnp.asarray(pitches), numbers["link.length"]
     count = values.shape[0] // links
-    length = jnp.broadcast_to(case.machine.beam.length, (3,))
     left = (jnp.min(length) if links == 1 else length) - count * pitch
     begin, centers = jnp.zeros((links,), values.dtype), []
-    is_kept, shares = jnp.isnan(jnp.sum(values)), jnp.reshape(known(values), (links, count))
+    is_kept = jnp.isnan(jnp.sum(values))  # nan would spoil derivatives
+    shares = jnp.reshape(jnp.where(jnp.isnan(values), 1.0, values), (links, count))
     for k in range(count):
         # the root has no slope at 0, where no free length is left
         kept = jnp.maximum(1 - shares[:, k], 1e-12) ** (1 / (count - k))
         begin, left = begin + left * (1 - kept), left * kept
         centers.append(begin + pitch * (k + 0.5))
     center = jnp.broadcast_to(jnp.stack(centers, axis=-1), (3, count))
-    center = jnp.where(is_kept, patches.center, center)
-    machine = case.machine._replace(patches=patches._replace(center=center))
-    return case._replace(machine=machine)
+    return numbers | {"patches.centers": jnp.where(is_kept, numbers["patches.centers"], center)}

@@ -25,8 +25,9 @@ from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spil
 from studies.engine.function import one_at_a_time
 from studies.engine.programs import kept_jit
 from studies.engine.stability import gain_margin
-from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.cases import as_arrays, build_case, build_structure, case_of
 from studies.study.margin import MARGIN_MODES
+from studies.study.numbers import Numbers, one_study, stack_numbers
 from studies.study.spec import Study
 from studies.tuning.scenarios import nominal
 from studies.tuning.spec import BASELINE, Family, TuneSpec
@@ -70,12 +71,11 @@ class LinearFidelity:
             n_frequencies=1, has_noise=False, metrics=(), has_position_gain=spec.has_position_gain
         )
         self._pose = np.array(own.motion.waypoints[0])
-        known = {
-            name: as_arrays(build_case(with_margin_modes(nominal(spec, family))))
+        of_family = {
+            name: one_study(with_margin_modes(nominal(spec, family)), self._structure)
             for name, family in {family.name: family for family in families}.items()
         }
-        self._cases = [known[family.name] for family in families]
-        self._stacked = jax.tree.map(lambda *x: jnp.stack(x), *self._cases)
+        self._numbers = as_arrays(stack_numbers([of_family[family.name] for family in families]))
         self._own: LoopFigures | None = None
         self._limits = np.array(
             [[self._limit(family, name) for name in self.names] for family in families]
@@ -104,7 +104,7 @@ class LinearFidelity:
             self._plain,
             self.names,
             self._spec.free.place,
-            self._stacked,
+            self._numbers,
             self._pose,
             self._limits,
             values,
@@ -134,7 +134,7 @@ class LinearFidelity:
             self._structure,
             names,
             self._spec.free.place,
-            self._cases[position],
+            jax.tree.map(lambda x: x[position], self._numbers),
             self._pose,
             limits,
             self._links,
@@ -191,13 +191,13 @@ def _limit_slopes(
     structure: Structure,
     names: tuple[Any, ...],
     place: Any,
-    cases: Case,
+    numbers: Numbers,
     pose: Array,
     limits: Array,
     values: Array,
 ) -> tuple[Array, Array]:
-    def figures(x: Array, case: Case, limit: Array) -> tuple[Array, Array]:
-        placed = place(case, x)
+    def figures(x: Array, one: Numbers, limit: Array) -> tuple[Array, Array]:
+        placed = case_of(structure, place(one, x))
         found = _excess(structure, names, placed, closed_loop(structure, placed, pose), limit)
         return found, found
 
@@ -205,7 +205,7 @@ def _limit_slopes(
         slope, found = jax.jacrev(figures, has_aux=True)(*given)  # the figures come with it
         return found, slope
 
-    return jax.lax.map(one, (values, cases, limits))
+    return jax.lax.map(one, (values, numbers, limits))
 
 
 @kept_jit(static_argnums=(0, 1, 2, 6))
@@ -213,14 +213,14 @@ def _look(
     structure: Structure,
     names: tuple[Any, ...],
     place: Any,
-    case: Case,
+    numbers: Numbers,
     pose: Array,
     limits: Array,
     links: tuple[int, ...],
     values: Array,
 ) -> tuple[Array, Array]:
     def one(x: Array) -> tuple[Array, Array]:
-        placed = place(case, x)
+        placed = case_of(structure, place(numbers, x))
         matrices = closed_loop(structure, placed, pose)
         rms = linear_residual(structure, placed, matrices)
         excess = _excess(structure, names, placed, matrices, limits)

@@ -9,16 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.case import Case, Structure
+from jaxmodel.case import Structure
 from jaxmodel.metrics import METRICS
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import simulate
-from studies.engine.executor import Place
 from studies.errors import StudyError
 from studies.fitting.bench import with_slopes
 from studies.fitting.kinds.contract import Measurement
 from studies.fitting.kinds.motions import OFF, check_finished, smooth_run
+from studies.space.free import Place
+from studies.study.cases import case_of
 from studies.study.entries import Entries
+from studies.study.numbers import Numbers
 from studies.study.spec import Study
 
 
@@ -56,12 +58,12 @@ class Runs:
     """
 
     def __init__(self, study: Study, place: Place) -> None:
-        """Arguments: what all runs share, and what puts parameters into a case.
+        """Arguments: what all runs share, and what puts parameters among them.
 
         Raises:
             StudyError: as `check_run`.
         """
-        self._structure, self._case = smooth_run(study)
+        self._structure, self._numbers = smooth_run(study)
         self._place = place
         self._metrics: set[str] = set()
         self._switches: list[Switch] = []
@@ -85,7 +87,7 @@ class Runs:
             modes = np.array([x.modes for x in self._switches])
             structure = self._structure._replace(metrics=tuple(sorted(self._metrics)))
             run = _metric_slopes if has_slopes else _metrics
-            outcome = run(structure, self._place, self._case, masks, modes, values)
+            outcome = run(structure, self._place, self._numbers, masks, modes, values)
             outcome = jax.tree.map(np.asarray, outcome)
             self._kept = values.tobytes(), has_slopes, outcome
         metrics, code, *by = outcome
@@ -150,9 +152,14 @@ def _off(one: Compared) -> Switch:
 
 
 def _run_metrics(
-    structure: Structure, place: Place, case: Case, masks: Array, modes: Array, values: Array
+    structure: Structure,
+    place: Place,
+    numbers: Numbers,
+    masks: Array,
+    modes: Array,
+    values: Array,
 ) -> Any:
-    changed = place(case, values)
+    changed = case_of(structure, place(numbers, values))
 
     def one(mask: Array, count: Array) -> Any:
         control = changed.control._replace(
@@ -170,8 +177,13 @@ _metrics = jax.jit(_run_metrics, static_argnums=(0, 1))
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _metric_slopes(
-    structure: Structure, place: Place, case: Case, masks: Array, modes: Array, values: Array
+    structure: Structure,
+    place: Place,
+    numbers: Numbers,
+    masks: Array,
+    modes: Array,
+    values: Array,
 ) -> Any:
     run = with_slopes(_run_metrics, 5, is_first=True)
-    slopes, (metrics, code) = run(structure, place, case, masks, modes, values)
+    slopes, (metrics, code) = run(structure, place, numbers, masks, modes, values)
     return metrics, code, slopes

@@ -9,14 +9,16 @@ import jax
 import numpy as np
 
 from jaxmodel import status
-from jaxmodel.case import Case, Structure
+from jaxmodel.case import Structure
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import simulate
-from studies.engine.executor import Place
 from studies.engine.preflight import check_run
 from studies.errors import StudyError
 from studies.fitting.bench import seen_at, with_slopes
+from studies.space.free import Place
+from studies.study.cases import as_arrays, case_of
 from studies.study.labels import describe
+from studies.study.numbers import Numbers, one_study
 from studies.study.signals import Signal
 from studies.study.spec import Study
 
@@ -44,12 +46,12 @@ class Motion:
     """A study's run with some links under control, kept for the last parameters."""
 
     def __init__(self, study: Study, place: Place, places: tuple[float, ...]) -> None:
-        """Arguments: the run, what puts parameters into a case, and its stations [m], if any.
+        """Arguments: the run, what puts parameters among the numbers, and its stations [m], if any.
 
         Raises:
             StudyError: as `check_run`.
         """
-        self._structure, self._case = smooth_run(study)
+        self._structure, self._numbers = smooth_run(study)
         self._place, self._places = place, places
         self._kinds: set[str] = set()
         self._kept: tuple[Any, Any] = None, None
@@ -69,7 +71,7 @@ class Motion:
         known, found = self._kept
         if known not in ((*key, True), (*key, has_slopes)):
             run = _recorded_slopes if has_slopes else _recorded
-            found = run(self._structure, self._place, kinds, self._case, values)
+            found = run(self._structure, self._place, kinds, self._numbers, values)
             found = jax.tree.map(np.asarray, found)
             self._kept = (*key, has_slopes), found
         signals, (time, command_end, code), *slopes = found
@@ -104,14 +106,14 @@ class Motions:
         return self._known[links]
 
 
-def smooth_run(study: Study) -> tuple[Structure, Case]:
+def smooth_run(study: Study) -> tuple[Structure, Numbers]:
     """A study's run with derivatives.
 
     Raises:
         StudyError: as `check_run`.
     """
-    structure, case = check_run(study)
-    return structure._replace(is_smooth=True), case
+    structure = check_run(study)[0]._replace(is_smooth=True)
+    return structure, as_arrays(one_study(study, structure))
 
 
 def check_finished(name: str, code: int) -> None:
@@ -125,9 +127,9 @@ def check_finished(name: str, code: int) -> None:
 
 
 def _run(
-    structure: Structure, place: Place, kinds: tuple[str, ...], case: Case, values: Array
+    structure: Structure, place: Place, kinds: tuple[str, ...], numbers: Numbers, values: Array
 ) -> Any:
-    result = simulate(structure, place(case, values), has_record=True)
+    result = simulate(structure, case_of(structure, place(numbers, values)), has_record=True)
     record = result.record
     assert record is not None
     signals = {kind: getattr(record, RECORDED[kind]) for kind in kinds}
@@ -139,7 +141,7 @@ _recorded = jax.jit(_run, static_argnums=(0, 1, 2))
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _recorded_slopes(
-    structure: Structure, place: Place, kinds: tuple[str, ...], case: Case, values: Array
+    structure: Structure, place: Place, kinds: tuple[str, ...], numbers: Numbers, values: Array
 ) -> Any:
-    slopes, found = with_slopes(_run, 4, is_first=True)(structure, place, kinds, case, values)
+    slopes, found = with_slopes(_run, 4, is_first=True)(structure, place, kinds, numbers, values)
     return *found, slopes
