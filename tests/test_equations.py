@@ -159,7 +159,7 @@ def test_gradients_without_a_kernel(chunk, no_structure):  # noqa: F811
 
 def test_batched_without_a_kernel(no_structure):
     parameters = np.array([[0.5, 0.05, 0.0], [1.0, 0.05, 0.0]])
-    run_batch = batched_module.batched(test_batched.STUDY, test_batched.place)
+    run_batch = batched_module.batched(test_batched.STUDY, test_batched.NAMES)
     with pytest.warns(NoKernelWarning, match="XLA's scan runs instead"):
         found = jax.jit(run_batch)(parameters)
     assert (np.asarray(found.status) == 0).all()

@@ -1,5 +1,7 @@
 """From a sweep file to its table of cases: designs, conditions, ids; and what is refused."""
 
+from functools import partial
+
 import jax
 import numpy as np
 import pytest
@@ -10,8 +12,9 @@ from studies.errors import StudyError
 from studies.space.methods import morris_points, saltelli_points
 from studies.space.spec import load_sweep, parse_sweep
 from studies.space.table import build_table, case_study
-from studies.study.cases import as_arrays, build_case, build_cases, build_structure
+from studies.study.cases import as_arrays, build_case, build_cases, build_structure, case_of
 from studies.study.fields import Fields, padded
+from studies.study.numbers import study_numbers
 from tests.sweeps import BASE, MIXED, small, small_spec
 
 
@@ -183,6 +186,26 @@ def leaves(tree):
     import jax
 
     return jax.tree.leaves(tree)
+
+
+@pytest.mark.parametrize("name", ["gains", "links", "mistuning", "models", "placement"])
+def test_the_map_from_names_to_the_model_is_jax(name):
+    """Traced and mapped over the numbers that vary it gives what it gives with NumPy."""
+    table = build_table(load_sweep(f"studies/specs/{name}.toml"))
+    columns = {**table.fields, "run.seed": table.seed}
+    structure = build_structure(table.study, columns)
+    numbers = study_numbers(table.study, structure, columns)
+    is_own = jax.tree.map(lambda x: len(x) > 1, numbers)
+    assert 0 < sum(jax.tree.leaves(is_own)) < 12
+    axes = jax.tree.map(lambda own: 0 if own else None, is_own)
+    mapped = jax.vmap(partial(case_of, structure), (axes,))
+    given = jax.tree.map(lambda x, own: x if own else x[0], numbers, is_own)
+    for x, y in zip(
+        jax.tree.leaves(jax.jit(mapped)(given)),
+        jax.tree.leaves(case_of(structure, numbers)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(x, np.broadcast_to(y, x.shape), rtol=1e-14)
 
 
 def test_an_entry_that_is_a_list_can_vary():

@@ -6,8 +6,10 @@ modes; the kernel's tangents and its reverse are kernels too.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,96 +18,121 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import Result
-from studies.engine.executor import CaseLeaves, Place
 from studies.engine.function import BlockFunction, stepper
-from studies.engine.plan import lane_unit
+from studies.engine.plan import STATIC, lane_unit
 from studies.engine.preflight import check_run
 from studies.errors import NoKernelError, StudyError, warn_of_scan
 from studies.kernels import bridge
+from studies.study.cases import case_of, with_used
+from studies.study.numbers import Numbers, one_study, position, put
+from studies.study.paths import known_field, overlaps
 from studies.study.spec import Study
 
 
-def batched(study: Study, place: Place) -> Callable[[Array], Result]:
-    """A study's results as a JAX function of the parameters of many cases.
+def batched(study: Study, names: Sequence[str]) -> Callable[[Array], Result]:
+    """A study's results as a JAX function of some of its numbers, for many cases.
 
     A call runs its cases on one core; `jax.shard_map` divides them among several.
 
     Args:
         study: what all cases share.
-        place: `place(case, parameters)` returns the `jaxmodel` case with the parameters of one
-            case, (p,), in their places, as JAX operations.
+        names: of the numbers that vary, as in files: fields, which then have one value for all
+            that they stand for, or entries of lists, such as `control.velocity_gain[0]`.
 
     Returns:
-        A function of parameters (n, p) that gives the results of n cases, leaves (n, ...). Its
-        derivatives, forward and reverse, are those of the smooth loop: converters without
-        rounding, limits with round corners. It raises StudyError for parameters of another shape
-        and for a `place` that does not return such a case.
+        A function of values (n, p), one column a name, in the units of the file, that gives the
+        results of n cases, leaves (n, ...). Its derivatives, forward and reverse, are those of the
+        smooth loop: converters without rounding, limits with round corners. It raises StudyError
+        for values of another shape. Unlike files it does not check ranges.
 
     Raises:
-        StudyError: as `check_run`, or not a study or a function. Call it outside of `jit`.
+        StudyError: as `check_run`, not a study, or a name that is none of its numbers. Call it
+            outside of `jit`.
+
+    Example:
+        >>> run = batched(load_study("paper"), ["control.gain_factor", "drive.kp"])
+        >>> run(np.array([[1.0, 2e4], [0.5, 2e4]])).metrics.residual_rms.shape
+        (2, 2, 3, 3)
     """
     if not isinstance(study, Study):
         raise StudyError(f"study: {study!r}; expected a study, as load_study returns")
-    if not callable(place):
-        raise StudyError(f"place: {place!r}; expected a function of a case and its parameters")
-    structure, case = check_run(study)
-    exact = _of_batches(structure, case, place)
+    positions = _positions(study, names)
+    structure = with_used(check_run(study)[0], [field for field, _ in positions])
+    exact = _of_batches(study, structure, positions)
     if structure.is_smooth:
-        return _checked(case, place, exact)
-    smooth = _of_batches(structure._replace(is_smooth=True), case, place)
+        return _checked(len(positions), exact)
+    smooth = _of_batches(study, structure._replace(is_smooth=True), positions)
     rounded = jax.custom_jvp(exact)
 
     @rounded.defjvp
     def rule(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Result, Result]:
         return exact(*primals), jax.jvp(smooth, primals, tangents)[1]
 
-    return _checked(case, place, rounded)
+    return _checked(len(positions), rounded)
 
 
-def _checked(case: Case, place: Place, run: Callable[[Array], Result]) -> Callable[[Array], Result]:
-    """The same for parameters that are what they should be."""
+def _positions(study: Study, names: Sequence[str]) -> tuple[Any, ...]:
+    """Where the numbers that vary are."""
+    if isinstance(names, str) or not names:
+        raise StudyError(f"names: {names!r}; expected names of numbers, such as ['drive.kp']")
+    for k, name in enumerate(names):
+        value = known_field(name, study, f"names[{k}]")
+        if not _is_real(value) or name in STATIC:
+            raise StudyError(f"names[{k}]: {name!r} = {value}; expected real numbers, not sizes")
+        if any(overlaps(name, other) for other in names[:k]):
+            raise StudyError(f"names[{k}]: {name!r} is there twice")
+    return tuple(position(study, name) for name in names)
 
-    def checked(parameters: Array) -> Result:
+
+def _is_real(value: Any) -> bool:
+    """Whether it is a real number, or a list of such numbers."""
+    is_list = isinstance(value, tuple) and len(value) > 0
+    return all(map(_is_real, value)) if is_list else isinstance(value, float)
+
+
+def _checked(count: int, run: Callable[[Array], Result]) -> Callable[[Array], Result]:
+    """The same for values that are what they should be."""
+
+    def checked(values: Array) -> Result:
         try:
-            given = jnp.asarray(parameters)
+            array = jnp.asarray(values)
         except (TypeError, ValueError) as error:
-            raise StudyError(f"parameters: not an array of numbers ({error})") from None
-        if given.ndim != 2 or 0 in given.shape or jnp.iscomplexobj(given):
+            raise StudyError(f"values: not an array of numbers ({error})") from None
+        is_fitting = array.ndim == 2 and len(array) > 0 and array.shape[1] == count
+        if not is_fitting or jnp.iscomplexobj(array):
             raise StudyError(
-                f"parameters: {given.dtype} of shape {given.shape}; expected real numbers of shape "
-                "(cases, parameters), at least one of each"
+                f"values: {array.dtype} of shape {array.shape}; expected real numbers of shape "
+                f"(cases, {count}), one case or more"
             )
-        given = given.astype(jax.dtypes.canonicalize_dtype(float))
-        _check_place(case, place, given)
-        # a number that is none must not spoil the derivatives of the cases beside it
-        return run(jnp.where(jnp.isfinite(given), given, jax.lax.stop_gradient(given)))
+        array = array.astype(jax.dtypes.canonicalize_dtype(float))
+        # a NaN must not spoil the derivatives of the cases beside it
+        return run(jnp.where(jnp.isfinite(array), array, jax.lax.stop_gradient(array)))
 
     return checked
 
 
-def _check_place(case: Case, place: Place, parameters: Array) -> None:
-    row = jax.ShapeDtypeStruct(parameters.shape[1:], parameters.dtype)
-    found = jax.eval_shape(place, case, row)
-    if not isinstance(found, Case):
-        raise StudyError(f"place: returns a {type(found).__name__}; expected the case it was given")
-    for (path, one), (other, two) in zip(
-        jax.tree_util.tree_leaves_with_path(found),
-        jax.tree_util.tree_leaves_with_path(case),
-        strict=False,
-    ):
-        if path != other or one.shape != np.shape(two):
-            name = jax.tree_util.keystr(other)
-            raise StudyError(f"place: case{name} has shape {one.shape}; expected {np.shape(two)}")
+@dataclass(frozen=True)
+class _Build:
+    """Makes a case of the values that vary and the study's numbers."""
+
+    structure: Structure
+    positions: tuple[Any, ...]
+
+    def __call__(self, free: Array, own: Any, shared: Numbers) -> Case:
+        numbers = shared
+        for k, at in enumerate(self.positions):
+            numbers = put(numbers, at, free[k])
+        return case_of(self.structure, numbers)
 
 
-def _of_batches(structure: Structure, case: Case, place: Place) -> Callable[[Array], Result]:
-    leaves, tree = jax.tree.flatten(case)
-    build = CaseLeaves(tree, (False,) * len(leaves), place)
+def _of_batches(
+    study: Study, structure: Structure, positions: tuple[Any, ...]
+) -> Callable[[Array], Result]:
+    shared, build = one_study(study, structure), _Build(structure, positions)
 
     @cache
     def function(lanes: int, count: int) -> BlockFunction:
         free = np.zeros((lanes, count), jax.dtypes.canonicalize_dtype(float))
-        shared = [np.asarray(leaf) for leaf in leaves]
 
         def make(kind: str) -> BlockFunction:
             return BlockFunction(structure, build, free, [], shared, kind)

@@ -20,7 +20,6 @@ from studies.kernels.cpu import LANE_BYTES
 from studies.kernels.gpu import BLOCK
 from studies.space.table import CaseTable, loose_study
 from studies.study.cases import build_cases, build_structure, in_working_precision
-from studies.study.fields import Fields
 
 #: Fields that change the program; each combination of their values is compiled separately.
 STATIC = (
@@ -38,8 +37,6 @@ STATIC = (
     "run.duration",
     "electronics.sample_rate_hz",
 )
-_POSITION = "control.position_gain"
-_WRENCH = ("load.wrench", "load.pulse")
 #: More programs than this are rejected.
 PROGRAM_LIMIT = 32
 #: Cases side by side on one device: enough to fill vectors, few enough to fit into its cache.
@@ -167,28 +164,8 @@ def _accumulated(table: CaseTable, kept: tuple[str, ...]) -> tuple[str, ...]:
 def _structure(table: CaseTable, members: np.ndarray) -> Structure:
     """Sizes of the largest case, choices of all of them."""
 
-    def column(name: str) -> np.ndarray:
-        return table.values(name)[members]
-
-    one = build_structure(loose_study(table, int(members[0])))
-    noisy = (column("electronics.adc_noise") > 0).any() | (column("drive.ripple") > 0).any()
-    fields = Fields(table.study, table.fields)
-    poles = (fields.numbers(f"control.{name}") for name in ("damping", "pole_decay"))
-    has_poles = any(bool(np.any(given >= 0)) for given in poles)
-    return one._replace(
-        n_modes=int(column("link.modes").max()),
-        n_controlled=min(int(column("control.modes").max()), one.n_patches),
-        has_sensor_highpass=bool((column("electronics.sensor_highpass_hz") > 0).any()),
-        has_amplifier=bool((column("electronics.amplifier_hz") > 0).any()),
-        has_noise=bool(noisy) or one.is_smooth,
-        has_friction=bool((column("drive.coulomb_friction") > 0).any()),
-        has_poles=has_poles,
-        has_position_gain=one.has_position_gain
-        or has_poles
-        or bool(np.any(fields.numbers(_POSITION) != 0)),
-        has_wrench=any(np.any(fields.numbers(name) != 0) for name in _WRENCH),
-        has_payload_offset=bool(np.any(fields.numbers("load.offset") != 0)),
-    )
+    columns = {name: column[members] for name, column in table.fields.items()}
+    return build_structure(loose_study(table, int(members[0])), columns)
 
 
 def chunk_cases(table: CaseTable, rows: np.ndarray, structure: Structure, size: int) -> Case:

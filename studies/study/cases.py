@@ -6,6 +6,7 @@ column makes it vary, so that a batch computes only once what its cases share.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import jax
@@ -34,47 +35,67 @@ from studies.study.spec import OWN_FIELDS, Study
 
 Tree = TypeVar("Tree")  # a Case, or numbers
 TWO_PI = 2 * np.pi
+#: What the program needs only where one of these fields is not 0, of poles: given at all.
+SWITCHES = {
+    "has_wrench": ("load.wrench", "load.pulse"),
+    "has_payload_offset": ("load.offset",),
+    "has_sensor_highpass": ("electronics.sensor_highpass_hz",),
+    "has_amplifier": ("electronics.amplifier_hz",),
+    "has_noise": ("electronics.adc_noise", "drive.ripple"),
+    "has_friction": ("drive.coulomb_friction",),
+    "has_poles": ("control.damping", "control.pole_decay"),
+    "has_position_gain": ("control.position_gain", "control.damping", "control.pole_decay"),
+}
 #: Duration of a move that only pads a path with fewer moves [s].
 NO_TIME = 1e-12
 
 
-def build_structure(study: Study, substeps: int | None = None) -> Structure:
-    """Static part of a study.
+def build_structure(study: Study, columns: Columns | None = None) -> Structure:
+    """Static part of a study, or of many that differ in some fields: sizes of the largest case.
 
     Args:
         study: validated study.
-        substeps: plant steps per sample if `run.substeps` leaves it open; default 1.
+        columns: values of the fields that differ, one per case (see `studies.study.fields`).
     """
+    fields = Fields(study, columns)
     steps = round(study.run.duration * study.electronics.sample_rate_hz)
-    noisy = study.electronics.adc_noise > 0 or study.drive.ripple > 0 or study.run.smooth
     n_patches = patch_centers(study).shape[1]
-    return Structure(
-        n_modes=study.link.modes,
-        n_controlled=min(study.control.modes, n_patches),
+    structure = Structure(
+        n_modes=int(fields.numbers("link.modes").max()),
+        n_controlled=min(int(fields.numbers("control.modes").max()), n_patches),
         n_patches=n_patches,
         n_steps=max(steps, 1),
-        substeps=study.run.substeps or substeps or 1,
+        substeps=study.run.substeps or 1,
         basis=study.link.basis,
         has_shortening=study.link.shortening,
         is_distributed=study.link.axial_inertia == "distributed",
         has_static_correction=study.link.static_correction,
         is_coupled=study.run.model == "coupled",
-        has_wrench=any(x != 0 for x in (*study.load.wrench, *study.load.pulse)),
-        has_payload_offset=any(x != 0 for x in study.load.offset),
         controller_basis=study.control.basis,
         feedback=study.control.feedback,
         law=study.control.law,
         has_feedforward=study.drive.kind == "computed_torque",
-        has_sensor_highpass=study.electronics.sensor_highpass_hz > 0,
-        has_amplifier=study.electronics.amplifier_hz > 0,
-        has_noise=noisy,
-        has_friction=study.drive.coulomb_friction > 0,
-        has_poles=study.control.has_poles,
-        has_position_gain=LAWS[study.control.law].has_position
-        or study.control.has_poles
-        or any(gain != 0 for gain in study.control.position_gain),
+        has_noise=study.run.smooth,
+        has_position_gain=LAWS[study.control.law].has_position,
         is_smooth=study.run.smooth,
     )
+    names = {name for group in SWITCHES.values() for name in group}
+    return with_used(structure, [name for name in names if _is_used(name, fields.numbers(name))])
+
+
+def _is_used(field: str, values: np.ndarray) -> bool:
+    if field in SWITCHES["has_poles"]:  # added damping of 0 specifies poles, too; NaN is none
+        return bool(np.any(values >= 0))
+    return bool(np.any(values != 0))
+
+
+def with_used(structure: Structure, fields: Iterable[str]) -> Structure:
+    """The structure with everything that some fields, which are not 0 in all cases, need."""
+    used = set(fields)
+    switches: dict[str, Any] = {
+        name: True for name, switching in SWITCHES.items() if not used.isdisjoint(switching)
+    }
+    return structure._replace(**switches)
 
 
 def build_case(study: Study) -> Case:
