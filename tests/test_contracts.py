@@ -392,7 +392,7 @@ def test_every_source_of_a_number_is_in_the_digest(tmp_path):
     for name, roots in (
         ("jaxmodel/laws/ppf.py", sweeps),
         ("jaxmodel/laws/__init__.py", sweeps),
-        ("studies/engine/runs.py", sweeps),
+        ("studies/engine/preflight.py", sweeps),
         ("studies/engine/screen.py", sweeps),
         ("studies/study/consistency.py", sweeps),
         ("studies/kernels/derivatives.py", sweeps),

@@ -67,7 +67,8 @@ def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> R
 def _run(study: Study, structure: Structure, case: Case, has_record: bool) -> Run:
     """Run a case without judging its loop."""
     result = jax.tree.map(np.asarray, _simulate(structure, case, has_record))
-    return Run(study, structure, case, result, int(result.status))
+    code = int(result.status)
+    return Run(study=study, structure=structure, case=case, result=result, status=code)
 
 
 def _own_ratio(study: Study, structure: Structure, case: Case, has_record: bool) -> np.ndarray:

@@ -188,7 +188,9 @@ def sampled_loop(
 ) -> SampledLoop:
     """A loop on the host from matrices of `jaxmodel.sampled_loop`, NumPy arrays."""
     poles = link_poles(matrices.plant, n_tracked)
-    return SampledLoop(matrices.open, matrices.feedback, poles, omega, period)
+    return SampledLoop(
+        open=matrices.open, feedback=matrices.feedback, poles=poles, omega=omega, period=period
+    )
 
 
 def loop_report(

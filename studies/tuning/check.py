@@ -24,7 +24,7 @@ from studies.study.paths import set_values
 from studies.study.spec import Study, parse_study
 from studies.tuning.evaluate import first_residual, tuned_structure
 from studies.tuning.free import PLACEMENT
-from studies.tuning.linear_fidelity import LoopFigures, loop_figures
+from studies.tuning.linear_fidelity import DesignFigures, loop_figures
 from studies.tuning.merit import (
     all_judged,
     allowed_limits,
@@ -48,7 +48,7 @@ class JudgedDesign(NamedTuple):
     metrics: dict[str, np.ndarray]  # largest entry of the links that count, (S,)
     status: np.ndarray  # (S,)
     watched: np.ndarray  # from the end of the command to that of the run [s], (S,)
-    loop: LoopFigures | None  # None with other feedback than sampled
+    loop: DesignFigures | None  # None with other feedback than sampled
     own: OwnRun
     poles: PoleReport | None = None  # where the design's gains follow from poles
 

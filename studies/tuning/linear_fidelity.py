@@ -41,7 +41,7 @@ PATH_POINTS = 17
 BATCH = 16
 
 
-class LoopFigures(NamedTuple):
+class DesignFigures(NamedTuple):
     """Figures of a design, on the host."""
 
     gain_margin: float  # largest factor on all gains with every smaller one stable [1]
@@ -76,7 +76,7 @@ class LinearFidelity:
             for name, family in {family.name: family for family in families}.items()
         }
         self._numbers = as_arrays(stack_numbers([of_family[family.name] for family in families]))
-        self._own: LoopFigures | None = None
+        self._own: DesignFigures | None = None
         self._limits = np.array(
             [[self._limit(family, name) for name in self.names] for family in families]
         ).reshape(len(families), len(self.names))
@@ -234,7 +234,7 @@ _spillover = kept_jit(static_argnums=0)(spillover)
 _distance = kept_jit(static_argnums=0)(_singularity_distance)
 
 
-def loop_figures(spec: TuneSpec, study: Study) -> LoopFigures:
+def loop_figures(spec: TuneSpec, study: Study) -> DesignFigures:
     """Figures of a design's loop on a plant of 12 modes or more.
 
     Args:
@@ -254,7 +254,7 @@ def loop_figures(spec: TuneSpec, study: Study) -> LoopFigures:
     def poles(factor: float) -> np.ndarray:
         return np.linalg.eigvals(opened + factor * feedback)
 
-    return LoopFigures(
+    return DesignFigures(
         gain_margin(poles),
         float(-np.log(np.abs(poles(1.0)).max()) / period),
         float(_spillover(plain, case, matrices)),

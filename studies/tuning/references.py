@@ -21,7 +21,7 @@ from studies.study.entries import parse_entries
 from studies.study.resolution import is_deflection, least_step, resolution_text
 from studies.study.spec import Study
 from studies.tuning.check import JudgedDesign, PlainRuns, judge, shown_structure
-from studies.tuning.linear_fidelity import LoopFigures, loop_figures
+from studies.tuning.linear_fidelity import DesignFigures, loop_figures
 from studies.tuning.merit import all_judged, allowed_limits, merit_of, own_limits
 from studies.tuning.optimise import KEPT, excess
 from studies.tuning.scenarios import lane_columns, scenario_columns
@@ -172,7 +172,7 @@ def _keeps_loop(spec: TuneSpec, value: float) -> bool:
     return True
 
 
-def _left(name: str, found: LoopFigures, allowed: float) -> float:
+def _left(name: str, found: DesignFigures, allowed: float) -> float:
     """How far a figure of the loop is from its limit, as a share of it; negative: violated."""
     share: float = getattr(found, name) / allowed - 1
     return -share if name == "spillover" else share

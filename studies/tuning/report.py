@@ -19,7 +19,7 @@ from studies.study.margin import MARGIN_MODES, caution, margin_in_db, margin_tex
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
 from studies.tuning.check import JudgedDesign, Searched, patch_centers
 from studies.tuning.free import PLACEMENT
-from studies.tuning.linear_fidelity import LoopFigures
+from studies.tuning.linear_fidelity import DesignFigures
 from studies.tuning.merit import SHOWN
 from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
 from studies.tuning.references import References, reference_lines, resolution_lines
@@ -195,7 +195,7 @@ def _metric_gain(metric: str, one: JudgedDesign, own: JudgedDesign) -> Gain:
     )
 
 
-def _loop_gains(one: LoopFigures, own: LoopFigures) -> list[Gain]:
+def _loop_gains(one: DesignFigures, own: DesignFigures) -> list[Gain]:
     """Figures of the linearised loop, of which more is better."""
     margins = [x.gain_margin for x in (one, own)]
     decays = [x.slowest_decay for x in (one, own)]
