@@ -16,7 +16,7 @@ from studies.study.margin import margin_in_db
 from studies.study.spec import paper_study
 from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, OwnRun, patch_centers
-from studies.tuning.linear_fidelity import LoopFigures
+from studies.tuning.linear_fidelity import DesignFigures
 from studies.tuning.optimise import begin
 from studies.tuning.report import TuneFindings, summary
 from studies.tuning.report import report as tuning_report
@@ -369,9 +369,9 @@ def tuned():
         )
 
     loops = (
-        LoopFigures(3.125, 71.25, 0.875, 0.5),
-        LoopFigures(2.625, 81.5, 0.75, 0.625),
-        LoopFigures(2.375, 91.75, 0.125, 0.375),
+        DesignFigures(3.125, 71.25, 0.875, 0.5),
+        DesignFigures(2.625, 81.5, 0.75, 0.625),
+        DesignFigures(2.375, 91.75, 0.125, 0.375),
     )
     own, *designs = (judged(s, x) for s, x in zip((1.0, 0.5, 0.25), loops, strict=True))
     audited = [

@@ -25,7 +25,7 @@ from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, OwnRun
 from studies.tuning.evaluate import Evaluation, Evaluator
 from studies.tuning.folder import open_tuning
-from studies.tuning.linear_fidelity import LoopFigures
+from studies.tuning.linear_fidelity import DesignFigures
 from studies.tuning.merit import merit_of
 from studies.tuning.optimise import begin, fits
 from studies.tuning.report import TuneFindings, report
@@ -156,7 +156,7 @@ def test_a_report_says_what_its_numbers_are():
             {name: np.array([value, 1.1 * value]) for name, value in metrics.items()},
             np.zeros(2, int),
             np.full(2, 0.03),
-            LoopFigures(margin, 70.0, 1.0, 0.5),
+            DesignFigures(margin, 70.0, 1.0, 0.5),
             OwnRun(share, metrics, 0, 0.03),
         )
 

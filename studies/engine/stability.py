@@ -189,7 +189,7 @@ def sampled_loop(
     """A loop on the host from matrices of `jaxmodel.sampled_loop`, NumPy arrays."""
     poles = link_poles(matrices.plant, n_tracked)
     return SampledLoop(
-        open=matrices.open, feedback=matrices.feedback, poles=poles, omega=omega, period=period
+        open=matrices.open, feedback=matrices.feedback, mode_poles=poles, omega=omega, period=period
     )
 
 
