@@ -2,29 +2,27 @@
 
 Feedback is modal filter, estimator, gains and synthesizer, channel by channel, or a linear system
 of any order. `controller_step` is what a DSP does once per sample. Shapes: links first, then
-patches (K) or channels (C), then lanes.
+patches (K), then lanes.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
-from jaxmodel.estimator import Estimator, FilterState, advance_filters, weighted
+from jaxmodel.channels import Channels
+from jaxmodel.estimator import FilterState
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
-from jaxmodel.state_space import StateSpace, advance, amplified, at_rest
+from jaxmodel.state_space import StateSpace
+
+#: From sensor to actuator voltages, in either form; both have the same methods.
+Feedback = Channels | StateSpace
 
 
 class Controller(NamedTuple):
     """Coefficients, computed once per case."""
 
-    filter: Array  # channels from sensor voltages [m/V] (SRF: identity), (3, C, K)
-    estimator: Estimator  # (3, C) each
-    velocity_gain: Array  # [N s/m] (SRF: [s]), (3, C)
-    position_gain: Array | None  # [N/m] (SRF: [1]), (3, C), None if there is none
-    synthesizer: Array  # voltages from channel forces [V/N] (SRF: identity), (3, K, C)
+    feedback: Feedback
     feedthrough: Array  # sensor volts per actuator volt to subtract [1], (3, K, K)
     voltage_limit: Array  # [V], ()
     adc_gain: Array  # conditioner gain [1], ()
@@ -32,19 +30,13 @@ class Controller(NamedTuple):
     adc_step: Array  # one code [V], ()
     adc_top: Array  # highest code [1], ()
     adc_noise: Array  # rms at the ADC input [V], ()
-    # [rad/s], (3, C): among a link's channels with a value above 0, only the one of highest modal
-    # energy acts (modified IMSC); None: all act
-    rival_omega: Array | None = None
-    system: StateSpace | None = None  # instead of channels, of which there are none then
 
 
 class ControllerState(NamedTuple):
     """What the controller remembers from sample to sample."""
 
-    first: Array  # state of the first-order section, (3, C)
-    second: tuple[Array, Array]  # delay line of the second-order section, (3, C) each
+    feedback: FilterState | Array  # of channels, or of a linear system, (G, N, b)
     voltage: Array  # command applied during this sample, computed in the last one [V], (3, K)
-    system: Array | None = None  # state of `Controller.system`, (G, N, b)
 
 
 class ControllerInfo(NamedTuple):
@@ -57,20 +49,13 @@ class ControllerInfo(NamedTuple):
 
 def rest_controller(controller: Controller) -> ControllerState:
     """All zeros."""
-    zero = jnp.zeros_like(jnp.asarray(controller.velocity_gain))
     voltage = jnp.zeros_like(jnp.asarray(controller.feedthrough)[..., 0])
-    system = None if controller.system is None else at_rest(controller.system)
-    return ControllerState(zero, (zero, zero), voltage, system)
+    return ControllerState(controller.feedback.at_rest(), voltage)
 
 
 def with_gains(controller: Controller, factor: Array) -> Controller:
     """All gains times a common factor."""
-    position, system = controller.position_gain, controller.system
-    return controller._replace(
-        velocity_gain=factor * controller.velocity_gain,
-        position_gain=None if position is None else factor * position,
-        system=None if system is None else amplified(system, factor),
-    )
+    return controller._replace(feedback=controller.feedback.amplified(factor))
 
 
 #: Half-width of a smooth limit's corner, as a share of the limit.
@@ -141,23 +126,6 @@ def read_back(controller: Controller, code: Array) -> Array:
     return (code * controller.adc_step - controller.adc_bias) / controller.adc_gain
 
 
-def strongest(omega: Array, value: Array, rate: Array) -> Array:
-    """1 for the channel of highest modal energy (omega q)^2 + q'^2 of each link, 0 for its rivals.
-
-    Modified IMSC (Baz and Poh 1988): all actuators of a link serve one mode at a time. A channel
-    with omega = 0 has no rivals and always acts.
-
-    Args:
-        omega: frequency of each channel [rad/s], (3, C).
-        value: estimated q [m], (3, C).
-        rate: estimated q' [m/s], (3, C).
-    """
-    is_rival = omega > 0
-    energy = jnp.where(is_rival, (omega * value) ** 2 + rate**2, 0.0)
-    is_first = energy >= jnp.max(energy, axis=1, keepdims=True)
-    return jnp.where(is_rival & ~is_first, 0.0, 1.0).astype(energy.dtype)
-
-
 def linear_parts(controller: Controller) -> list[tuple[slice, Controller]]:
     """Parts that a linear analysis can judge: the controller, or each rival channel by itself.
 
@@ -167,19 +135,8 @@ def linear_parts(controller: Controller) -> list[tuple[slice, Controller]]:
     Args:
         controller: NumPy arrays.
     """
-    if controller.rival_omega is None:
-        return [(slice(None), controller)]
-    parts = []
-    for j in np.flatnonzero(np.any(controller.rival_omega, axis=0)):
-        alone = np.arange(controller.rival_omega.shape[1]) == j
-        position = controller.position_gain
-        part = controller._replace(
-            velocity_gain=alone * controller.velocity_gain,
-            position_gain=None if position is None else alone * position,
-            rival_omega=None,
-        )
-        parts.append((slice(j, j + 1), part))
-    return parts or [(slice(None), controller._replace(rival_omega=None))]
+    parts = controller.feedback.linear_parts()
+    return [(modes, controller._replace(feedback=part)) for modes, part in parts]
 
 
 def controller_step(
@@ -203,35 +160,6 @@ def controller_step(
     """
     measured, is_clipped = convert(controller, voltage, noise, is_smooth)
     own = jnp.sum(controller.feedthrough * state.voltage[:, None], axis=2)
-    find = _from_channels if controller.system is None else _from_system
-    after, wanted = find(controller, state, measured - own)
+    after, wanted = controller.feedback.step(state.feedback, measured - own)
     command = soft_limit(wanted, controller.voltage_limit, is_smooth)
-    return after._replace(voltage=command), ControllerInfo(measured, command, is_clipped)
-
-
-def _from_system(
-    controller: Controller, state: ControllerState, voltage: Array
-) -> tuple[ControllerState, Array]:
-    """Next state, and voltages wanted on the actuators [V], (3, K)."""
-    assert controller.system is not None
-    x, wanted = advance(controller.system, state.system, voltage)
-    return state._replace(system=x), wanted
-
-
-def _from_channels(
-    controller: Controller, state: ControllerState, voltage: Array
-) -> tuple[ControllerState, Array]:
-    """As `_from_system`."""
-    channel = jnp.sum(controller.filter * voltage[:, None], axis=2)
-    estimator = controller.estimator
-    filters, line = advance_filters(estimator, FilterState(state.first, state.second), channel)
-    rate = weighted(estimator.velocity, line)
-    force = -controller.velocity_gain * rate
-    if controller.position_gain is not None or controller.rival_omega is not None:
-        value = weighted(estimator.position, line) + estimator.direct * channel
-        if controller.position_gain is not None:
-            force = force - controller.position_gain * value
-        if controller.rival_omega is not None:
-            force = force * strongest(controller.rival_omega, value, rate)
-    wanted = jnp.sum(controller.synthesizer * force[:, None], axis=2)
-    return state._replace(first=filters.first, second=filters.second), wanted
+    return ControllerState(after, command), ControllerInfo(measured, command, is_clipped)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
+from jaxmodel.channels import Channels
 from jaxmodel.controller import Controller
 from jaxmodel.estimator import FilterState, advance_filters, weighted
 from jaxmodel.laws.contract import Known
@@ -16,6 +17,7 @@ from jaxmodel.laws.poles import is_placed, nominal_modes, specified_poles
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import design_controller
+from jaxmodel.state_space import StateSpace
 
 
 def nominal_loop(structure: Structure, case: Case) -> tuple[Array, Array]:
@@ -32,12 +34,15 @@ def nominal_loop(structure: Structure, case: Case) -> tuple[Array, Array]:
     design = design_controller(structure, case, find_bases(structure, case))
     poles = specified_poles(case, design.known)
     s = -poles.decay + 1j * poles.frequency
-    loop = _of_modes if design.controller.system is None else _of_links
-    matrix = loop(structure, case, design.controller, design.known)
+    controller, known = design.controller, design.known
+    if isinstance(controller.feedback, Channels):
+        matrix = _of_modes(structure, case, controller.feedback, known)
+    else:
+        matrix = _of_links(structure, case, controller, controller.feedback, known)
     return jnp.where(is_placed(case, design.known), s, jnp.nan), matrix
 
 
-def _of_modes(structure: Structure, case: Case, law: Controller, known: Known) -> Array:
+def _of_modes(structure: Structure, case: Case, law: Channels, known: Known) -> Array:
     model = nominal_modes(structure, case, known)
     position = 0 * law.velocity_gain if law.position_gain is None else law.position_gain
     n = model.state.shape[-1]
@@ -57,9 +62,10 @@ def _of_modes(structure: Structure, case: Case, law: Controller, known: Known) -
     return jax.vmap(jax.vmap(one))(model, law.estimator, law.velocity_gain, position)
 
 
-def _of_links(structure: Structure, case: Case, law: Controller, known: Known) -> Array:
-    model, system = link_model(structure, case, known), law.system
-    assert system is not None
+def _of_links(
+    structure: Structure, case: Case, law: Controller, system: StateSpace, known: Known
+) -> Array:
+    model = link_model(structure, case, known)
     a, b, c, d = system.state[:, 0], system.enter[:, 0], system.leave[:, :, 0], system.direct
     last = jnp.zeros_like(model.sensor).at[:, :, -structure.n_patches :].set(law.feedthrough)
     seen = model.sensor - last

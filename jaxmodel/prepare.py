@@ -10,8 +10,9 @@ from jaxmodel.axial import axial_compliance
 from jaxmodel.bases import Bases, find_bases
 from jaxmodel.beam import ModalBasis
 from jaxmodel.case import Case, Structure
+from jaxmodel.channels import Channels
 from jaxmodel.control import active_modes, condition_number, left_inverse
-from jaxmodel.controller import Controller, with_gains
+from jaxmodel.controller import Controller, Feedback, with_gains
 from jaxmodel.drive import Reference
 from jaxmodel.dynamics import inverse_dynamics
 from jaxmodel.electronics import design_amplifier, voltage_passage
@@ -99,7 +100,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         actuator=lambda_a[:, None, None] * basis.actuator_slope / basis.mass[:, :, None],
         deflection_at=basis.deflection_at,
         controller=design.controller,
-        ideal=_ideal(design.controller, sensor) if structure.feedback == "ideal" else None,
+        ideal=_ideal(design.controller.feedback, sensor) if structure.feedback == "ideal" else None,
         observer=jnp.einsum("ick,ikr->icr", design.known.observer, sensor),
         modal_omega=design.modal_omega,
         rotation=(jnp.cos(angle), jnp.sin(angle)),
@@ -173,16 +174,17 @@ def _rest(structure: Structure, case: Case, plant: Plant) -> Rest:
     return Rest(pose, held)
 
 
-def _ideal(controller: Controller, sensor: Array) -> tuple[Array, Array | None]:
+def _ideal(feedback: Feedback, sensor: Array) -> tuple[Array, Array | None]:
     """Voltages of continuous feedback per modal velocity and position, (3, K, R) each."""
-    channel = jnp.einsum("ick,ikr->icr", controller.filter, sensor)
+    assert isinstance(feedback, Channels)
+    channel = jnp.einsum("ick,ikr->icr", feedback.filter, sensor)
 
     def matrix(gain: Array | None) -> Array | None:
         if gain is None:
             return None
-        return -jnp.einsum("ikc,icr->ikr", controller.synthesizer, gain[:, :, None] * channel)
+        return -jnp.einsum("ikc,icr->ikr", feedback.synthesizer, gain[:, :, None] * channel)
 
-    return matrix(controller.velocity_gain), matrix(controller.position_gain)
+    return matrix(feedback.velocity_gain), matrix(feedback.position_gain)
 
 
 _PER_LINK_DRIVE = (
@@ -247,12 +249,10 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
     law = LAWS[structure.law]
     feedback = law.design(structure, case, known)
     check_feedback(law, feedback, n_channels(structure), structure.n_patches)
+    if isinstance(feedback, Channels) and not structure.has_position_gain:
+        feedback = feedback._replace(position_gain=None)
     controller = Controller(
-        filter=feedback.filter,
-        estimator=feedback.estimator,
-        velocity_gain=feedback.velocity_gain,
-        position_gain=feedback.position_gain if structure.has_position_gain else None,
-        synthesizer=feedback.synthesizer,
+        feedback=feedback,
         feedthrough=control.feedthrough_factor * known.feedthrough,
         voltage_limit=jnp.asarray(electronics.voltage_limit),
         adc_gain=jnp.asarray(electronics.conditioner_gain),
@@ -260,8 +260,6 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         adc_step=jnp.asarray(electronics.adc_range / electronics.adc_levels),
         adc_top=jnp.asarray(electronics.adc_levels - 1.0),
         adc_noise=jnp.asarray(electronics.adc_noise),
-        rival_omega=feedback.rival_omega,
-        system=feedback.system,
     )
     return ControllerDesign(
         controller=with_gains(controller, control.gain_factor),

@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxmodel.axial import axial_force, chord_slopes
 from jaxmodel.case import Case, Structure
+from jaxmodel.channels import Channels
 from jaxmodel.dynamics import mass_matrix, platform_mass
 from jaxmodel.estimator import Estimator
 from jaxmodel.kinematics import close_chain
@@ -69,7 +70,9 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
     Returns:
         LoopResponse.
     """
-    plant, law, drive, electronics = loop.plant, loop.controller, loop.drive, case.electronics
+    plant, drive, electronics = loop.plant, loop.drive, case.electronics
+    law, through = loop.controller.feedback, loop.controller.feedthrough
+    assert isinstance(law, Channels)
     pose = jnp.asarray(pose, loop.omega.dtype)
     still = jnp.zeros_like(pose)
 
@@ -120,7 +123,7 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
     drag = jnp.einsum("ipr,pq,iqr->ir", enter, jnp.linalg.inv(mass), leave)
     if not structure.is_coupled:
         enter, drag = jnp.zeros_like(enter), jnp.zeros_like(drag)
-    through = jnp.zeros_like(law.feedthrough) if loop.left_out is None else loop.left_out.sensor
+    left_out = jnp.zeros_like(through) if loop.left_out is None else loop.left_out.sensor
     return LoopResponse(
         mass=mass,
         damping=jnp.einsum("i,ip,iq->pq", slope, to_rho, to_rho),
@@ -132,8 +135,8 @@ def loop_response(structure: Structure, case: Case, loop: Loop, pose: Array) -> 
         leave=leave,
         observe=observe,
         act=act,
-        direct=jnp.einsum("ick,ikl,ild->icd", law.filter, through, law.synthesizer),
-        feedthrough=jnp.einsum("ick,ikl,ild->icd", law.filter, law.feedthrough, law.synthesizer),
+        direct=jnp.einsum("ick,ikl,ild->icd", law.filter, left_out, law.synthesizer),
+        feedthrough=jnp.einsum("ick,ikl,ild->icd", law.filter, through, law.synthesizer),
         estimator=law.estimator,
         velocity_gain=law.velocity_gain,
         position_gain=law.position_gain,

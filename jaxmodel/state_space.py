@@ -25,51 +25,82 @@ class StateSpace(NamedTuple):
     leave: Array  # C, actuator volts per state, (G, M, N, b)
     direct: Array  # D [1], (G, M, M)
 
+    @property
+    def acting(self) -> np.ndarray:
+        """It has no channels, (3, 0)."""
+        return np.zeros((3, 0), bool)
+
+    @property
+    def filter(self) -> np.ndarray:
+        """Of its channels, of which there are none, (3, 0, K)."""
+        return np.zeros((3, 0, self._n_patches))
+
+    @property
+    def synthesizer(self) -> np.ndarray:
+        """The same, (3, K, 0)."""
+        return np.zeros((3, self._n_patches, 0))
+
+    @property
+    def has_output(self) -> bool:
+        """Whether it does anything; NumPy arrays."""
+        return bool(np.any(self.leave) or np.any(self.direct))
+
+    @property
+    def _n_patches(self) -> int:
+        groups, size = self.direct.shape[:2]
+        return int(groups * size // 3)
+
+    def at_rest(self) -> Array:
+        """State zero, (G, N, b)."""
+        return jnp.zeros_like(jnp.asarray(self.state)[..., 0])
+
+    def step(self, state: Array, voltage: Array) -> tuple[Array, Array]:
+        """One sample.
+
+        Args:
+            state: x, (G, N, b).
+            voltage: of the sensors [V], (3, K).
+
+        Returns:
+            (next state, voltages wanted on the actuators [V], (3, K)).
+        """
+        y = jnp.reshape(voltage, (state.shape[0], -1, *voltage.shape[2:]))
+        after = jnp.sum(self.state * state[:, :, None], axis=3)
+        after = after + jnp.sum(self.enter * y[:, None, None], axis=3)
+        wanted = jnp.sum(jnp.sum(self.leave * state[:, None], axis=3), axis=2)
+        wanted = wanted + jnp.sum(self.direct * y[:, None], axis=2)
+        return after, jnp.reshape(wanted, voltage.shape)
+
+    def amplified(self, factor: Array) -> StateSpace:
+        """Outputs times a factor: one for all, or one for each actuator, (3, K)."""
+        groups, size = self.direct.shape[:2]
+        each = jnp.reshape(jnp.broadcast_to(factor, (3, groups * size // 3)), (groups, size))
+        return self._replace(
+            leave=self.leave * each[:, :, None, None], direct=self.direct * each[:, :, None]
+        )
+
+    def with_sensors(self, factor: Array) -> StateSpace:
+        """Sensor voltages times a factor each, (3, K)."""
+        each = jnp.reshape(factor, (self.direct.shape[0], -1))
+        return self._replace(
+            enter=self.enter * each[:, None, None], direct=self.direct * each[:, None]
+        )
+
+    def without_rivals(self) -> StateSpace:
+        """Itself: it has no channels."""
+        return self
+
+    def linear_parts(self) -> list[tuple[slice, StateSpace]]:
+        """See `jaxmodel.controller.linear_parts`."""
+        return [(slice(None), self)]
+
+    def padded(self, n_channels: int) -> StateSpace:
+        """Itself: it has no channels that another law could have more of."""
+        return self
+
 
 class IllConditionedError(ValueError):
     """No well-conditioned modal form."""
-
-
-def at_rest(system: StateSpace) -> Array:
-    """State zero, (G, N, b)."""
-    return jnp.zeros_like(jnp.asarray(system.state)[..., 0])
-
-
-def advance(system: StateSpace, x: Array, voltage: Array) -> tuple[Array, Array]:
-    """One sample.
-
-    Args:
-        system: coefficients.
-        x: state, (G, N, b).
-        voltage: of the sensors [V], (3, K).
-
-    Returns:
-        (next state, voltages wanted on the actuators [V], (3, K)).
-    """
-    groups = x.shape[0]
-    y = jnp.reshape(voltage, (groups, -1, *voltage.shape[2:]))
-    after = jnp.sum(system.state * x[:, :, None], axis=3)
-    after = after + jnp.sum(system.enter * y[:, None, None], axis=3)
-    wanted = jnp.sum(jnp.sum(system.leave * x[:, None], axis=3), axis=2)
-    wanted = wanted + jnp.sum(system.direct * y[:, None], axis=2)
-    return after, jnp.reshape(wanted, voltage.shape)
-
-
-def amplified(system: StateSpace, factor: Array) -> StateSpace:
-    """Outputs times a factor: one for all, or one for each actuator, (3, K)."""
-    groups, size = system.direct.shape[:2]
-    each = jnp.reshape(jnp.broadcast_to(factor, (3, groups * size // 3)), (groups, size))
-    return system._replace(
-        leave=system.leave * each[:, :, None, None], direct=system.direct * each[:, :, None]
-    )
-
-
-def with_sensors(system: StateSpace, factor: Array) -> StateSpace:
-    """Sensor voltages times a factor each, (3, K)."""
-    each = jnp.reshape(factor, (system.direct.shape[0], -1))
-    return system._replace(
-        enter=system.enter * each[:, None, None], direct=system.direct * each[:, None]
-    )
 
 
 def dense(system: StateSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

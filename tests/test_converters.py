@@ -2,9 +2,11 @@
 
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 
+from jaxmodel.channels import Channels
 from jaxmodel.controller import (
     Controller,
     ControllerState,
@@ -14,7 +16,7 @@ from jaxmodel.controller import (
     read_back,
     with_gains,
 )
-from jaxmodel.estimator import Estimator
+from jaxmodel.estimator import Estimator, FilterState
 from jaxmodel.simulate import _disturbance, _windows
 from studies.study.cases import as_arrays, build_case, build_structure
 from tests.test_batch import short_study
@@ -29,18 +31,20 @@ def controller(**changes):
     def random(*shape):
         return rng.normal(size=(LINKS, *shape))
 
-    coefficients = {
-        "filter": random(CHANNELS, PATCHES),
-        "estimator": Estimator(
+    channels = Channels(
+        filter=random(CHANNELS, PATCHES),
+        estimator=Estimator(
             first=random(3, CHANNELS).swapaxes(0, 1),
             velocity=random(3, CHANNELS).swapaxes(0, 1),
             position=random(3, CHANNELS).swapaxes(0, 1),
             denominator=random(2, CHANNELS).swapaxes(0, 1),
             direct=random(CHANNELS),
         ),
-        "velocity_gain": random(CHANNELS),
-        "position_gain": random(CHANNELS),
-        "synthesizer": random(PATCHES, CHANNELS),
+        velocity_gain=random(CHANNELS),
+        position_gain=random(CHANNELS),
+        synthesizer=random(PATCHES, CHANNELS),
+    )
+    coefficients = {
         "feedthrough": 0.1 * random(PATCHES, PATCHES),
         "voltage_limit": 4.0,
         "adc_gain": GAIN,
@@ -49,7 +53,9 @@ def controller(**changes):
         "adc_top": float(TOP),
         "adc_noise": 3 * STEP,
     }
-    return Controller(**(coefficients | changes))
+    if "position_gain" in changes:
+        channels = channels._replace(position_gain=changes.pop("position_gain"))
+    return Controller(feedback=channels, **(coefficients | changes))
 
 
 def at_code(code):
@@ -128,29 +134,30 @@ def by_hand(one, state, measured):
     """Next state and command by the difference equations, channel by channel."""
     first, second = np.zeros((LINKS, CHANNELS)), np.zeros((LINKS, CHANNELS))
     command = np.zeros((LINKS, PATCHES))
-    b0, b1, a1 = one.estimator.first
+    law, memory = one.feedback, state.feedback
+    b0, b1, a1 = law.estimator.first
     for i in range(LINKS):
         seen = measured[i] - one.feedthrough[i] @ state.voltage[i]
         force = np.zeros(CHANNELS)
         for j in range(CHANNELS):
-            channel = one.filter[i, j] @ seen
-            high = b0[i, j] * channel + state.first[i, j]
-            past = [x[i, j] for x in state.second]
+            channel = law.filter[i, j] @ seen
+            high = b0[i, j] * channel + memory.first[i, j]
+            past = [x[i, j] for x in memory.second]
             newest = high - sum(
-                d[i, j] * x for d, x in zip(one.estimator.denominator, past, strict=True)
+                d[i, j] * x for d, x in zip(law.estimator.denominator, past, strict=True)
             )
             line = [newest, *past]
             rate, value = (
                 sum(n[i, j] * x for n, x in zip(numerator, line, strict=True))
-                for numerator in (one.estimator.velocity, one.estimator.position)
+                for numerator in (law.estimator.velocity, law.estimator.position)
             )
-            value += one.estimator.direct[i, j] * channel
-            force[j] = -one.velocity_gain[i, j] * rate
-            if one.position_gain is not None:
-                force[j] -= one.position_gain[i, j] * value
+            value += law.estimator.direct[i, j] * channel
+            force[j] = -law.velocity_gain[i, j] * rate
+            if law.position_gain is not None:
+                force[j] -= law.position_gain[i, j] * value
             first[i, j], second[i, j] = b1[i, j] * channel - a1[i, j] * high, newest
-        command[i] = np.clip(one.synthesizer[i] @ force, -one.voltage_limit, one.voltage_limit)
-    return ControllerState(first, (second, state.second[0]), command)
+        command[i] = np.clip(law.synthesizer[i] @ force, -one.voltage_limit, one.voltage_limit)
+    return ControllerState(FilterState(first, (second, memory.second[0])), command)
 
 
 @pytest.mark.parametrize("changes", [{}, {"position_gain": None}, {"voltage_limit": 0.3}])
@@ -158,8 +165,7 @@ def test_a_sample_is_the_difference_equations(changes):
     one, rng = controller(**changes), np.random.default_rng(8)
     size = LINKS, CHANNELS
     state = ControllerState(
-        rng.normal(size=size),
-        (rng.normal(size=size), rng.normal(size=size)),
+        FilterState(rng.normal(size=size), (rng.normal(size=size), rng.normal(size=size))),
         rng.normal(size=(LINKS, PATCHES)),
     )
     at_limit = 0
@@ -170,7 +176,7 @@ def test_a_sample_is_the_difference_equations(changes):
         wanted = by_hand(one, state, measured)
         np.testing.assert_allclose(info.measured, measured, rtol=1e-12)
         np.testing.assert_allclose(info.command, wanted.voltage, rtol=1e-10)
-        kept = zip((after.first, *after.second), (wanted.first, *wanted.second), strict=True)
+        kept = zip(*map(jax.tree.leaves, (after.feedback, wanted.feedback)), strict=True)
         for found, right in kept:
             np.testing.assert_allclose(found, right, rtol=1e-10)
         np.testing.assert_array_equal(after.voltage, info.command)
@@ -181,8 +187,12 @@ def test_a_sample_is_the_difference_equations(changes):
 
 def test_a_factor_scales_every_gain():
     one = with_gains(controller(), 0.25)
-    np.testing.assert_allclose(one.velocity_gain, 0.25 * controller().velocity_gain)
-    np.testing.assert_allclose(one.position_gain, 0.25 * controller().position_gain)
+    np.testing.assert_allclose(
+        one.feedback.velocity_gain, 0.25 * controller().feedback.velocity_gain
+    )
+    np.testing.assert_allclose(
+        one.feedback.position_gain, 0.25 * controller().feedback.position_gain
+    )
 
 
 # --- noise and windows ----------------------------------------------------------------------------

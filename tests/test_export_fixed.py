@@ -148,7 +148,7 @@ def test_formats_leave_the_stated_margin(kind):
 def test_unfolded_channels_are_the_controller(kind):
     found, codes, seen, fixed = kind
     law = unfold(found.channels, found.controller)
-    again = respond_floating(fold(law, found.study.control.law), law, codes)
+    again = respond_floating(fold(law.feedback, found.study.control.law), law, codes)
     np.testing.assert_allclose(again.force, seen.force, rtol=1e-12)
     near = rounded(fixed, found.channels)
     error = np.abs(near.force - found.channels.force).max(axis=1)

@@ -122,7 +122,7 @@ def test_damping_and_margin_are_those_of_an_independent_computation():
         return value[np.argsort(-np.abs(value))][:40]
 
     own = jax.jit(controller_of, static_argnums=0)(plain, wide)
-    given = own._replace(system=jax.tree.map(jnp.asarray, other))
+    given = own._replace(feedback=jax.tree.map(jnp.asarray, other))
     mine, theirs = poles(own), poles(given)
     apart = np.abs(mine[:, None] - theirs[None]).min(axis=1)
     assert apart.max() < 1e-7
@@ -143,7 +143,7 @@ def test_certainty_equivalence():
     found = jax.jit(
         lambda s, k: design_controller(s, k, find_bases(s, k)).controller, static_argnums=0
     )
-    system = jax.tree.map(np.asarray, found(structure, case).system)
+    system = jax.tree.map(np.asarray, found(structure, case).feedback)
     mine = dense(StateSpace(*(part[:1] for part in system)))
     z = np.exp(0.4j)
 

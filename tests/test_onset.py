@@ -131,7 +131,7 @@ def test_runs_of_a_given_system_grow_beyond_the_printed_margin(k):
     design = DESIGNS["lqg"][k]
     structure, case = check_run(study_of("lqg", design))
     law = jax.jit(lambda c: design_controller(structure, c, find_bases(structure, c)).controller)
-    a, b, c, d = dense(jax.tree.map(np.asarray, law(as_arrays(case)).system))
+    a, b, c, d = dense(jax.tree.map(np.asarray, law(as_arrays(case)).feedback))
     rate = design.get("electronics", {}).get("sample_rate_hz", 10_000.0)
     section = {
         "sample_time": 1 / rate,

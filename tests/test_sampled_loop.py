@@ -263,7 +263,7 @@ def test_feedthrough_of_the_aliased_modes():
     case = case._replace(n_modes=np.array(many), initial=still)
     loop = prepared(structure._replace(n_modes=many), case).loop
     compliance = 1 / np.asarray(loop.omega[0]) ** 2  # per modal mass, as is the actuator
-    drive = np.asarray(loop.actuator[0] @ loop.controller.synthesizer[0])[:, 0]
+    drive = np.asarray(loop.actuator[0] @ loop.controller.feedback.synthesizer[0])[:, 0]
     through = np.asarray(loop.observer[0, 0]) * compliance * drive
     np.testing.assert_allclose(through[3:].sum() / through[0], 0.65, atol=5e-3)
 

@@ -10,12 +10,12 @@ import pytest
 import scipy.linalg
 import xarray
 
+from jaxmodel.channels import strongest
 from jaxmodel.controller import (
     ControllerState,
     controller_step,
     linear_parts,
     rest_controller,
-    strongest,
 )
 from jaxmodel.electronics import measurement_chain
 from jaxmodel.laws.lqr import optimal_gains
@@ -279,7 +279,7 @@ def test_laws_are_equally_strong_on_mode_1(laws):
 
     def strength(name):
         seen, driven = builder.spillover_gains(plant, laws[name].controller)
-        gain = laws[name].controller.velocity_gain
+        gain = laws[name].controller.feedback.velocity_gain
         return np.einsum("ic,ic,ic->i", driven[:, 0], gain, seen[:, :, 0])
 
     own = strength("IMSC")
@@ -287,7 +287,7 @@ def test_laws_are_equally_strong_on_mode_1(laws):
     np.testing.assert_allclose(strength("strain rate feedback"), own, rtol=1e-9)
     # one weight for all links, so only their mean is the design's
     np.testing.assert_allclose(strength("IMSC-LQR"), own.mean(), rtol=1e-6)
-    push = laws["positive position feedback"].controller
+    push = laws["positive position feedback"].controller.feedback
     assert np.all(push.position_gain < 0) and not np.any(push.velocity_gain)
 
 
@@ -307,8 +307,10 @@ def stepped(law, n_samples=40):
 def test_modified_control_of_one_mode_is_plain_control(laws):
     law = laws["modified IMSC"].controller
     one = np.arange(3) == 0
-    alone = law._replace(velocity_gain=one * law.velocity_gain, rival_omega=one * law.rival_omega)
-    plain = alone._replace(rival_omega=None)
+    gain, rival = law.feedback.velocity_gain, law.feedback.rival_omega
+    channels = law.feedback._replace(velocity_gain=one * gain, rival_omega=one * rival)
+    alone = law._replace(feedback=channels)
+    plain = law._replace(feedback=channels._replace(rival_omega=None))
     found, _ = stepped(alone)
     np.testing.assert_allclose(found, stepped(plain)[0], atol=1e-12)
     assert np.abs(found).max() > 0
@@ -318,7 +320,7 @@ def test_modified_control_acts_on_one_mode_of_a_link_at_a_time(laws):
     law = laws["modified IMSC"].controller
     commands, _ = stepped(law)
     # as if forces of one column only
-    force = np.linalg.solve(np.asarray(law.synthesizer)[None], commands[..., None])[..., 0]
+    force = np.linalg.solve(np.asarray(law.feedback.synthesizer)[None], commands[..., None])[..., 0]
     size = np.abs(force) / np.abs(force).max(axis=2, keepdims=True)
     assert np.all(np.sort(size, axis=2)[..., :2] < 1e-9)
     acting = np.argmax(size, axis=2)
@@ -335,21 +337,23 @@ def test_the_strongest_is_that_of_highest_energy_and_others_are_no_rivals():
 
 def test_parts_of_the_modified_law_are_its_channels(laws):
     parts = linear_parts(laws["modified IMSC"].controller)
-    whole = laws["modified IMSC"].controller.velocity_gain
-    np.testing.assert_allclose(sum(part.velocity_gain for _, part in parts), whole)
+    whole = laws["modified IMSC"].controller.feedback.velocity_gain
+    np.testing.assert_allclose(sum(part.feedback.velocity_gain for _, part in parts), whole)
     assert [modes.start for modes, _ in parts] == [0, 1, 2]
     assert len(linear_parts(laws["IMSC"].controller)) == 1
 
 
 def test_idle_channels_change_nothing():
-    whole = fixed_controller(STUDY).controller
-    plain = whole._replace(
+    controller = fixed_controller(STUDY).controller
+    whole = controller.feedback
+    channels = whole._replace(
         filter=whole.filter[:, :2],
         estimator=jax.tree.map(lambda x: x[:, :2], whole.estimator),
         velocity_gain=whole.velocity_gain[:, :2],
         position_gain=whole.position_gain[:, :2],
         synthesizer=whole.synthesizer[:, :, :2],
     )
+    plain = controller._replace(feedback=channels)
     wide = pad_channels(plain, 3)
     state = rest_controller(plain)
     more = rest_controller(wide)
@@ -358,7 +362,7 @@ def test_idle_channels_change_nothing():
         state, info = step(plain, state, voltage)
         more, wider = step(wide, more, voltage)
         np.testing.assert_allclose(wider.command, info.command, atol=1e-12)
-    assert isinstance(more, ControllerState) and more.first.shape == (3, 3)
+    assert isinstance(more, ControllerState) and more.feedback.first.shape == (3, 3)
 
 
 # --- beside each other, and the command -----------------------------------------------------------

@@ -15,10 +15,8 @@ from jaxmodel.prepare import prepare
 from jaxmodel.state_space import (
     IllConditionedError,
     StateSpace,
-    amplified,
     dense,
     modal_form,
-    with_sensors,
 )
 from studies.cli import main
 from studies.engine.blocks import responses
@@ -156,7 +154,7 @@ def test_gains_and_sensors_scale_the_system():
     system = StateSpace(*(0.4 * rng.normal(size=shape) for shape in shapes))
     left, right = rng.normal(size=(2, 3, 3))
     a, b, c, d = dense(system)
-    a2, b2, c2, d2 = dense(jax.tree.map(np.asarray, with_sensors(amplified(system, left), right)))
+    a2, b2, c2, d2 = dense(jax.tree.map(np.asarray, system.amplified(left).with_sensors(right)))
     rows, columns = np.diag(left.ravel()), np.diag(right.ravel())
     for found, wanted in ((a2, a), (b2, b @ columns), (c2, rows @ c), (d2, rows @ d @ columns)):
         np.testing.assert_allclose(found, wanted, atol=1e-14)
@@ -234,7 +232,7 @@ def test_formats_and_names(tmp_path):
     assert found[0].a == found[1].a == found[2].a
     assert found[0].inputs == found[1].inputs == found[2].inputs == tuple(ports["inputs"])
     controller = controller_of(study_with(tmp_path / "x.mat"))
-    assert np.abs(dense(controller.system)[3][7, 3]) == pytest.approx(abs(d[0, 0]))
+    assert np.abs(dense(controller.feedback)[3][7, 3]) == pytest.approx(abs(d[0, 0]))
     text = study_template(study_with(tmp_path / "x.npz"))
     (tmp_path / "x.npz").unlink()
     (tmp_path / "study.toml").write_text(text)

@@ -1,9 +1,10 @@
 """What a control law is: how its channels are formed and fed back, and its parameters.
 
-A law turns the numbers of a case into coefficients of the one sampled controller
-(`jaxmodel.controller`): channel signals y = `filter` V_s, estimates of their rates and values,
-channel forces, V_a = `synthesizer` f. Per link; shapes (3, C, ...) with C channels. A law without
-channels returns a linear system from sensors to actuators instead, see `system_feedback`.
+A law turns the numbers of a case into the feedback of the one sampled controller
+(`jaxmodel.controller`), before `control.gain_factor`. Either `Channels`: channel signals
+y = `filter` V_s, estimates of their rates and values, channel forces, V_a = `synthesizer` f. Per
+link; shapes (3, C, ...) with C channels. Or `StateSpace`, a linear system from sensors to
+actuators, see `system_feedback`.
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple, get_args
 
 from jaxmodel.case import Case, Control, Structure
+from jaxmodel.channels import Channels
 from jaxmodel.control import force_gains
+from jaxmodel.controller import Feedback
 from jaxmodel.estimator import Estimator, design_estimator
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
-from jaxmodel.state_space import StateSpace, amplified, with_sensors
+from jaxmodel.state_space import StateSpace
 from jaxmodel.table import PartError
 
 #: What a channel is: a controlled mode, or a patch pair; "none" for a linear system without them.
@@ -46,18 +49,6 @@ class Known(NamedTuple):
     modal_mass: Array  # [kg], (3, C)
     mask: Array  # 1 for controlled modes, at most as many as patches, (C,)
     feedthrough: Array  # sensor volts per actuator volt by all other modes [V/V], (3, K, K)
-
-
-class Feedback(NamedTuple):
-    """What a law returns, before `control.gain_factor`; see `jaxmodel.controller.Controller`."""
-
-    filter: Array  # (3, C, K)
-    synthesizer: Array  # (3, K, C)
-    estimator: Estimator
-    velocity_gain: Array  # (3, C)
-    position_gain: Array  # (3, C)
-    rival_omega: Array | None = None  # (3, C)
-    system: StateSpace | None = None  # instead of channels
 
 
 class Law(NamedTuple):
@@ -101,41 +92,41 @@ def check_law(law: Law) -> None:
         seen.add(x.name)
 
 
-def check_feedback(law: Law, made: Feedback, n_channels: int, n_patches: int) -> None:
-    """Raise PartError unless a law returned a `Feedback` with the right shapes."""
-    if not isinstance(made, Feedback):
-        raise PartError(f"law {law.name!r}: design returns {made!r}; expected a Feedback")
-    wanted = {
-        "filter": (3, n_channels, n_patches),
-        "synthesizer": (3, n_patches, n_channels),
-        "velocity_gain": (3, n_channels),
-        "position_gain": (3, n_channels),
-    }
-    for name, shape in wanted.items():
-        found = jnp.shape(getattr(made, name))
-        if found != shape:
-            raise PartError(f"law {law.name!r}: {name} has shape {found}; expected {shape}")
-        if jnp.iscomplexobj(getattr(made, name)):
+def check_feedback(law: Law, feedback: Feedback, n_channels: int, n_patches: int) -> None:
+    """Raise PartError unless a law returned feedback of the right kind and shapes."""
+    kind = StateSpace if law.channel == "none" else Channels
+    if not isinstance(feedback, kind):
+        raise PartError(
+            f"law {law.name!r}: design returns {feedback!r}; expected {kind.__name__}, as its "
+            f"channel = {law.channel!r} says"
+        )
+    for name, shape in _shapes(feedback, n_channels, n_patches).items():
+        value = getattr(feedback, name)
+        if jnp.shape(value) != shape:
+            raise PartError(
+                f"law {law.name!r}: {name} has shape {jnp.shape(value)}; expected {shape}"
+            )
+        if jnp.iscomplexobj(value):
             raise PartError(f"law {law.name!r}: {name} is complex; expected real numbers")
-    if (made.system is None) != (law.channel != "none"):
-        raise PartError(f"law {law.name!r}: a system is for channel = 'none', and the reverse")
-    if made.system is not None:
-        _check_system(law, made.system, n_patches)
 
 
-def _check_system(law: Law, system: StateSpace, n_patches: int) -> None:
-    groups, n, b = jnp.shape(system.state)[:3]
-    size = 3 * n_patches // max(groups, 1)
-    wanted = {
+def _shapes(feedback: Feedback, n_channels: int, n_patches: int) -> dict[str, tuple[int, ...]]:
+    if isinstance(feedback, Channels):
+        return {
+            "filter": (3, n_channels, n_patches),
+            "synthesizer": (3, n_patches, n_channels),
+            "velocity_gain": (3, n_channels),
+            "position_gain": (3, n_channels),
+        }
+    groups, n, b = jnp.shape(feedback.state)[:3]
+    groups = 1 if groups == 1 else 3
+    size = 3 * n_patches // groups
+    return {
         "state": (groups, n, b, b),
         "enter": (groups, n, b, size),
         "leave": (groups, size, n, b),
         "direct": (groups, size, size),
     }
-    for name, shape in wanted.items():
-        found = jnp.shape(getattr(system, name))
-        if found != shape or groups not in (1, 3):
-            raise PartError(f"law {law.name!r}: system.{name} has shape {found}; expected {shape}")
 
 
 def acting_channels(case: Case, known: Known) -> Array:
@@ -183,30 +174,10 @@ def study_estimator(case: Case, known: Known) -> Estimator:
     )
 
 
-def system_feedback(structure: Structure, case: Case, system: StateSpace) -> Feedback:
+def system_feedback(structure: Structure, case: Case, system: StateSpace) -> StateSpace:
     """Feedback by a linear system, of controlled links only."""
     mask = jnp.asarray(case.control.link_mask)[:, None] * jnp.ones((1, structure.n_patches))
-    system = amplified(with_sensors(system, mask), mask)
-    return no_channels(system, structure.n_patches)
-
-
-def no_channels(system: StateSpace, n_patches: int) -> Feedback:
-    """Feedback by a system alone."""
-    none = jnp.zeros((3, 0), system.state.dtype)
-    return Feedback(
-        filter=jnp.zeros((3, 0, n_patches), none.dtype),
-        synthesizer=jnp.zeros((3, n_patches, 0), none.dtype),
-        estimator=Estimator(
-            first=(none,) * 3,
-            denominator=(none,) * 2,
-            velocity=(none,) * 3,
-            position=(none,) * 3,
-            direct=none,
-        ),
-        velocity_gain=none,
-        position_gain=none,
-        system=system,
-    )
+    return system.with_sensors(mask).amplified(mask)
 
 
 def modal_feedback(
@@ -216,7 +187,7 @@ def modal_feedback(
     position: Array,
     estimator: Estimator | None = None,
     rival_omega: Array | None = None,
-) -> Feedback:
+) -> Channels:
     """Feedback of modes: modal filter and synthesizer around the gains of each mode.
 
     Args:
@@ -225,9 +196,9 @@ def modal_feedback(
         velocity: gains [N s/m], (3, C).
         position: gains [N/m], (3, C).
         estimator: of modal velocities and positions; None: that of the study.
-        rival_omega: see `Controller`.
+        rival_omega: see `Channels`.
     """
-    return Feedback(
+    return Channels(
         filter=known.observer,
         synthesizer=known.synthesizer,
         estimator=study_estimator(case, known) if estimator is None else estimator,

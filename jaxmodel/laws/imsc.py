@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from jaxmodel.case import Case, Control, Structure
-from jaxmodel.laws.contract import Feedback, Known, Law, modal_feedback
+from jaxmodel.channels import Channels
+from jaxmodel.laws.contract import Known, Law, modal_feedback
 from jaxmodel.laws.poles import modal_gains
 
 
-def design(structure: Structure, case: Case, known: Known) -> Feedback:
+def design(structure: Structure, case: Case, known: Known) -> Channels:
     """Gains of mode 1 and ratios (24), by modal filter and synthesizer."""
     return modal_feedback(case, known, *modal_gains(structure, case, known))
 

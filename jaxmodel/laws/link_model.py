@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from jaxmodel.case import Case, Electronics, Structure
-from jaxmodel.laws.contract import Feedback, Known, Parameter, system_feedback
+from jaxmodel.laws.contract import Known, Parameter, system_feedback
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.state_space import StateSpace
@@ -159,7 +159,7 @@ def _direct_path(a: Array, at: dict[str, slice], electronics: Electronics) -> tu
 
 def compensated(
     structure: Structure, case: Case, model: LinkModel, gain: Array, correct: Array
-) -> Feedback:
+) -> StateSpace:
     """u = -K x of an observer's state x, corrected with the sample at hand.
 
     Args:

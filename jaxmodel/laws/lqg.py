@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.laws.contract import Feedback, Known, Law, Parameter
+from jaxmodel.laws.contract import Known, Law, Parameter
 from jaxmodel.laws.link_model import DAMPING, LinkModel, compensated, link_model
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.riccati import filter_gain, regulator_gain
+from jaxmodel.state_space import StateSpace
 
 
-def design(structure: Structure, case: Case, known: Known) -> Feedback:
+def design(structure: Structure, case: Case, known: Known) -> StateSpace:
     """Regulator and filter of every link."""
     given = case.control.parameters
     weights = (jnp.asarray(given[x]) for x in ("voltage_weight", "disturbance", "sensor_noise"))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from jaxmodel.case import Case, Control, Structure
+from jaxmodel.channels import Channels
 from jaxmodel.control import PoleGains
 from jaxmodel.laws.contract import (
-    Feedback,
     Known,
     Law,
     Parameter,
@@ -36,7 +36,7 @@ def optimal_gains(omega: Array, control_weight: Array) -> PoleGains:
     return PoleGains(position, jnp.sqrt(2 * position + share))
 
 
-def design(structure: Structure, case: Case, known: Known) -> Feedback:
+def design(structure: Structure, case: Case, known: Known) -> Channels:
     """Optimal gains of every controlled mode, one weight for each link."""
     weight = jnp.asarray(case.control.parameters["control_weight"])[:, None]
     gains = optimal_gains(known.omega, weight)

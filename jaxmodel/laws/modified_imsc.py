@@ -1,19 +1,20 @@
 """Modified IMSC (Baz and Poh 1988): the actuators of a link serve one mode at a time.
 
 The mode with the highest modal energy (omega q)^2 + q'^2 is served; it may change at every sample
-(`jaxmodel.controller.strongest`).
+(`jaxmodel.channels.strongest`).
 """
 
 from __future__ import annotations
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.laws.contract import Feedback, Known, Law, modal_feedback
+from jaxmodel.channels import Channels
+from jaxmodel.laws.contract import Known, Law, modal_feedback
 from jaxmodel.laws.imsc import same
 from jaxmodel.laws.poles import modal_gains
 from jaxmodel.lazy import jnp
 
 
-def design(structure: Structure, case: Case, known: Known) -> Feedback:
+def design(structure: Structure, case: Case, known: Known) -> Channels:
     """As IMSC; modes with gains are rivals."""
     velocity, position = modal_gains(structure, case, known)
     is_on = (velocity != 0) | (position != 0)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from functools import reduce
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.laws.contract import Feedback, Known, Law, Parameter, acting_channels
+from jaxmodel.laws.contract import Known, Law, Parameter, acting_channels
 from jaxmodel.laws.link_model import (
     DAMPING,
     LinkModel,
@@ -24,6 +24,7 @@ from jaxmodel.laws.link_model import (
 from jaxmodel.laws.poles import closed_modes
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
+from jaxmodel.state_space import StateSpace
 
 
 def corrections(structure: Structure, case: Case, known: Known, state: Array) -> Array:
@@ -119,7 +120,7 @@ def _cosine(square: Array) -> Array:
     return jnp.where(is_ringing, turned, jnp.cosh(jnp.sqrt(jnp.where(is_ringing, 1.0, -square))))
 
 
-def design(structure: Structure, case: Case, known: Known) -> Feedback:
+def design(structure: Structure, case: Case, known: Known) -> StateSpace:
     """Observers of all modes, and a regulator of what they predict."""
     model = link_model(structure, case, known)
     n = model.state.shape[1]

@@ -11,9 +11,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from jaxmodel.case import Case, Electronics, Structure
+from jaxmodel.channels import Channels
 from jaxmodel.electronics import measurement_chain
 from jaxmodel.estimator import Estimator, second_order
-from jaxmodel.laws.contract import Feedback, Known, Law, Parameter, given_gains, modal_feedback
+from jaxmodel.laws.contract import Known, Law, Parameter, given_gains, modal_feedback
 from jaxmodel.laws.imsc import same
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
@@ -69,7 +70,7 @@ def design_position_filter(omega: Array, zeta: Array, electronics: Electronics) 
     return PositionFilter(estimator, corner, -jnp.imag(whole) / omega)
 
 
-def design(structure: Structure, case: Case, known: Known) -> Feedback:
+def design(structure: Structure, case: Case, known: Known) -> Channels:
     """Damp each assembled mode as much as the study's velocity gains intend: g = k_d/damping.
 
     Modes at which the measurement chain lags too much get no gain.

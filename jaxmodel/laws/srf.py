@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from jaxmodel.case import Case, Structure
+from jaxmodel.channels import Channels
 from jaxmodel.estimator import design_estimator
-from jaxmodel.laws.contract import Feedback, Known, Law
+from jaxmodel.laws.contract import Known, Law
 from jaxmodel.lazy import jnp
 
 
-def design(structure: Structure, case: Case, known: Known) -> Feedback:
+def design(structure: Structure, case: Case, known: Known) -> Channels:
     """Gains of the link [s] and [1]; the estimator is exact at mode 1."""
     control, electronics, n = case.control, case.electronics, structure.n_patches
     on = jnp.asarray(control.link_mask)[:, None]
     eye = jnp.broadcast_to(jnp.eye(n), (3, n, n))
-    return Feedback(
+    return Channels(
         filter=eye,
         synthesizer=eye,
         estimator=design_estimator(

@@ -16,7 +16,7 @@ from jaxmodel.state_space import IllConditionedError, StateSpace, dense, modal_f
 from studies.errors import StudyError
 
 
-class Blocks(NamedTuple):
+class BlockFlow(NamedTuple):
     """G groups of N blocks with M sensors and as many actuators; NumPy arrays."""
 
     link: np.ndarray  # controlled links, from 0
@@ -25,7 +25,7 @@ class Blocks(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """As `Channels.kind`."""
+        """As `ChannelFlow.kind`."""
         return "none"
 
     @property
@@ -59,25 +59,19 @@ class Blocks(NamedTuple):
         return whole.reshape(*volts.shape[:-2], 3, n_patches)
 
 
-def blocks(controller: Controller) -> Blocks:
-    """Blocks of a controller; systems of links without output are left out.
-
-    Args:
-        controller: NumPy arrays, with a system.
+def blocks(system: StateSpace) -> BlockFlow:
+    """BlockFlow of a system, NumPy arrays; systems of links without output are left out.
 
     Raises:
         StudyError: no well-conditioned modal form.
     """
-    system = controller.system
-    assert system is not None
-    is_on = np.any(system.leave, axis=(2, 3)) | np.any(system.direct, axis=2)
-    n_patches = controller.feedthrough.shape[1]
-    used = np.flatnonzero(is_on.reshape(3, n_patches).any(axis=1))
+    is_on = (np.any(system.leave, axis=(2, 3)) | np.any(system.direct, axis=2)).reshape(3, -1)
+    used, n_patches = np.flatnonzero(is_on.any(axis=1)), is_on.shape[1]
     if system.state.shape[0] == 1:
         groups, first = [0], np.array([0])
     else:
         groups, first = list(used), used * n_patches
-    return Blocks(used, first, _stacked([_in_pairs(system, g) for g in groups]))
+    return BlockFlow(used, first, _stacked([_in_pairs(system, g) for g in groups]))
 
 
 def _in_pairs(system: StateSpace, group: int) -> StateSpace:
@@ -109,18 +103,18 @@ def _stacked(parts: list[StateSpace]) -> StateSpace:
     )
 
 
-def restored(arranged: Blocks, like: Controller) -> Controller:
+def restored(arranged: BlockFlow, like: Controller) -> Controller:
     """A controller equivalent to the blocks; `like` supplies what they leave open."""
-    system, count = arranged.system, like.system.state.shape[0]  # type: ignore[union-attr]
+    system, count = arranged.system, len(like.feedback.state)  # type: ignore[union-attr]
     if count == 1:
-        return like._replace(system=system)
+        return like._replace(feedback=system)
 
     def spread(part: np.ndarray) -> np.ndarray:
         whole = np.zeros((count, *part.shape[1:]))
         whole[arranged.link] = part
         return whole
 
-    return like._replace(system=StateSpace(*map(spread, system)))
+    return like._replace(feedback=StateSpace(*map(spread, system)))
 
 
 class ImpulseResponses(NamedTuple):

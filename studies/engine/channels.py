@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxmodel.channels import Channels
 from jaxmodel.controller import Controller
 
 
-class Channels(NamedTuple):
+class ChannelFlow(NamedTuple):
     """M channels in the order of links; numbers in SI units."""
 
     kind: str  # what a channel is, "mode" or "patch"
@@ -30,7 +31,7 @@ class Channels(NamedTuple):
 
     @property
     def is_rival(self) -> np.ndarray:
-        """Channels that act only while no other channel of their link has more energy, (M,)."""
+        """ChannelFlow that act only while no other channel of their link has more energy, (M,)."""
         if self.energy is None:
             return np.zeros(len(self.link), bool)
         return np.any(self.energy, axis=(1, 2))
@@ -61,7 +62,7 @@ def acting(link: np.ndarray, is_rival: np.ndarray, energy: np.ndarray) -> np.nda
 
     Args:
         link: of each channel, (M,).
-        is_rival: see `Channels`, (M,).
+        is_rival: see `ChannelFlow`, (M,).
         energy: in any common unit, (..., M).
     """
     is_served = np.ones(energy.shape, bool)
@@ -71,17 +72,17 @@ def acting(link: np.ndarray, is_rival: np.ndarray, energy: np.ndarray) -> np.nda
     return is_served
 
 
-def fold(controller: Controller, kind: str) -> Channels:
-    """Channels of a controller.
+def fold(feedback: Channels, kind: str) -> ChannelFlow:
+    """ChannelFlow of a controller.
 
     u = -k_d v - k_p x, with v and x outputs of one filter, has one numerator -k_d n_v - k_p n_x.
 
     Args:
-        controller: NumPy arrays; a channel without gains is left out.
+        feedback: NumPy arrays; a channel without gains is left out.
         kind: what a channel is, "mode" or "patch".
     """
-    estimator, velocity = controller.estimator, controller.velocity_gain
-    position = controller.position_gain
+    estimator, velocity = feedback.estimator, feedback.velocity_gain
+    position = feedback.position_gain
     if position is None:
         position = np.zeros_like(velocity)
     link, number = np.nonzero((velocity != 0) | (position != 0))
@@ -90,7 +91,7 @@ def fold(controller: Controller, kind: str) -> Channels:
     def gathered(parts: tuple[Any, ...]) -> np.ndarray:
         return np.stack([np.broadcast_to(part, velocity.shape)[at] for part in parts], axis=1)
 
-    energy, rival = None, controller.rival_omega
+    energy, rival = None, feedback.rival_omega
     if rival is not None and np.any(rival):
         omega, direct = np.broadcast_to(rival, velocity.shape)[at], gathered((estimator.direct,))
         rate = np.hstack([gathered(estimator.velocity), 0 * direct])
@@ -98,44 +99,46 @@ def fold(controller: Controller, kind: str) -> Channels:
         energy = np.stack([rate * (omega > 0)[:, None], place], axis=1)
     force = -velocity[at][:, None] * gathered(estimator.velocity)
     force = force - position[at][:, None] * gathered(estimator.position)
-    return Channels(
+    return ChannelFlow(
         kind=kind,
         link=link,
         number=number,
-        filter=controller.filter[at],
+        filter=feedback.filter[at],
         first=gathered(estimator.first),
         denominator=gathered(estimator.denominator),
         force=force,
         direct=-position[at] * np.broadcast_to(estimator.direct, velocity.shape)[at],
-        synthesizer=np.swapaxes(controller.synthesizer, 1, 2)[at],
+        synthesizer=np.swapaxes(feedback.synthesizer, 1, 2)[at],
         energy=energy,
     )
 
 
-def unfold(channels: Channels, like: Controller) -> Controller:
+def unfold(channels: ChannelFlow, like: Controller) -> Controller:
     """A controller equivalent to the channels, with gains of 1.
 
     Args:
         channels: of the same law as `like`, for instance with rounded coefficients.
         like: supplies what the channels leave open.
     """
+    whole = like.feedback
+    assert isinstance(whole, Channels)
     at = channels.link, channels.number
-    gain = np.zeros_like(like.velocity_gain)
+    gain = np.zeros_like(whole.velocity_gain)
     gain[at] = 1.0
 
     def spread(values: np.ndarray, rest: np.ndarray) -> np.ndarray:
-        whole = np.array(np.broadcast_to(rest, gain.shape))
-        whole[at] = values
-        return whole
+        spread = np.array(np.broadcast_to(rest, gain.shape))
+        spread[at] = values
+        return spread
 
     def columns(table: np.ndarray, rest: tuple[Any, ...]) -> tuple[Any, ...]:
         return tuple(spread(column, part) for column, part in zip(table.T, rest, strict=True))
 
-    estimator = like.estimator
+    estimator = whole.estimator
     none = np.zeros_like(gain)
-    taps, back = np.array(like.filter), np.swapaxes(np.array(like.synthesizer), 1, 2)
+    taps, back = np.array(whole.filter), np.swapaxes(np.array(whole.synthesizer), 1, 2)
     taps[at], back[at] = channels.filter, channels.synthesizer
-    return like._replace(
+    feedback = whole._replace(
         filter=taps,
         synthesizer=np.swapaxes(back, 1, 2),
         velocity_gain=gain,
@@ -148,3 +151,4 @@ def unfold(channels: Channels, like: Controller) -> Controller:
             direct=spread(-channels.direct, none),
         ),
     )
+    return like._replace(feedback=feedback)

@@ -11,8 +11,9 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.controller import Controller
 from jaxmodel.laws import LAWS, is_modal, n_channels
 from jaxmodel.shaper import Taps
-from studies.engine.blocks import Blocks, blocks
-from studies.engine.channels import Channels, fold
+from jaxmodel.state_space import StateSpace
+from studies.engine.blocks import BlockFlow, blocks
+from studies.engine.channels import ChannelFlow, fold
 from studies.engine.preflight import check_run, preflight
 from studies.engine.runs import resolved_study
 from studies.errors import StudyError, field_error
@@ -26,7 +27,7 @@ class FixedController(NamedTuple):
     structure: Structure
     case: Case
     controller: Controller
-    channels: Channels | Blocks  # the same as code needs it
+    channels: ChannelFlow | BlockFlow  # the same as code needs it
     taps: Taps  # shaper on the sample grid, one tap per delay, delays rising
     frequency: np.ndarray  # each channel's velocity estimate is exact there [Hz], (3, C)
 
@@ -54,9 +55,7 @@ def fixed_controller(study: Study) -> FixedController:
     structure, case = check_run(study)
     known = preflight(structure, case)
     controller, taps = known.controller, known.taps
-    if not any(
-        map(_any, (controller.velocity_gain, controller.position_gain, *_outputs(controller)))
-    ):
+    if not controller.feedback.has_output:
         raise field_error(
             "control.gain_factor",
             study.control.gain_factor,
@@ -95,22 +94,15 @@ def _check_exportable(study: Study) -> None:
         raise field_error("control.links", control.links, "at least one link that is controlled")
 
 
-def arrange(controller: Controller, law: str) -> Channels | Blocks:
+def arrange(controller: Controller, law: str) -> ChannelFlow | BlockFlow:
     """A controller as code needs it.
 
     Raises:
         StudyError: a system without a well-conditioned modal form.
     """
-    return blocks(controller) if controller.system else fold(controller, LAWS[law].channel)
-
-
-def _outputs(controller: Controller) -> tuple[np.ndarray, ...]:
-    system = controller.system
-    return () if system is None else (system.leave, system.direct)
-
-
-def _any(gain: np.ndarray | None) -> bool:
-    return gain is not None and bool(np.any(gain))
+    if isinstance(controller.feedback, StateSpace):
+        return blocks(controller.feedback)
+    return fold(controller.feedback, LAWS[law].channel)
 
 
 def _frequencies(structure: Structure, believed_omega: np.ndarray) -> np.ndarray:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from studies.engine.blocks import Blocks
-from studies.engine.channels import Channels
+from studies.engine.blocks import BlockFlow
+from studies.engine.channels import ChannelFlow
 from studies.engine.controller import FixedController
 from studies.export.c_text import Source, source
 from studies.export.fixed import WORD, FixedPoint, IntegerRow, shaper_row
@@ -50,7 +50,9 @@ def fixed_source(
     )
 
 
-def _constants(arranged: Channels | Blocks, fixed: FixedPoint | FixedBlocks) -> dict[str, Any]:
+def _constants(
+    arranged: ChannelFlow | BlockFlow, fixed: FixedPoint | FixedBlocks
+) -> dict[str, Any]:
     if isinstance(fixed, FixedBlocks):
         advance, leave = fixed.advance, fixed.leave
         return {
@@ -59,7 +61,7 @@ def _constants(arranged: Channels | Blocks, fixed: FixedPoint | FixedBlocks) -> 
             "leave": leave.integers.reshape(-1, leave.integers.shape[-1]),
             "leave_shift": leave.shift.ravel(),
         }
-    assert isinstance(arranged, Channels)
+    assert isinstance(arranged, ChannelFlow)
     first, memory, numerator = fixed.high_pass, fixed.memory, fixed.numerator.integers
     each = np.arange(len(arranged.link))
     return {

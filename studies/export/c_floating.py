@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from studies.engine.blocks import Blocks
-from studies.engine.channels import Channels
+from studies.engine.blocks import BlockFlow
+from studies.engine.channels import ChannelFlow
 from studies.engine.controller import FixedController
 from studies.export.c_text import Source, real, source
 
@@ -35,8 +35,8 @@ def floating_source(found: FixedController, name: str, origin: Iterable[str]) ->
     )
 
 
-def _constants(arranged: Channels | Blocks) -> dict[str, Any]:
-    if isinstance(arranged, Channels):
+def _constants(arranged: ChannelFlow | BlockFlow) -> dict[str, Any]:
+    if isinstance(arranged, ChannelFlow):
         energy = arranged.energy
         return {
             "has_rivals": energy is not None,

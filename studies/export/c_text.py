@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from studies.engine.blocks import Blocks
-from studies.engine.channels import Channels
+from studies.engine.blocks import BlockFlow
+from studies.engine.channels import ChannelFlow
 from studies.engine.controller import FixedController
 from studies.export.fixed import rail_samples
 from studies.show.templates import render
@@ -55,7 +55,7 @@ def source(
         "is_used": np.isin(np.arange(3), arranged.link).astype(int),
         "patches": [f"link {i}, patch {k + 1}" for i in (1, 2, 3) for k in range(found.n_patches)],
         "has_feedthrough": has_feedthrough,
-        "has_first": has_feedthrough or isinstance(arranged, Channels),
+        "has_first": has_feedthrough or isinstance(arranged, ChannelFlow),
         "rail": rail,
         "rail_ms": f"{1e3 * rail / electronics.sample_rate_hz:.3g}",
         "settle": arranged.memory(1e-4),
@@ -68,9 +68,9 @@ def source(
     return Source(*(render(f"export/templates/{file}", **values) for file in files))
 
 
-def _arranged(arranged: Channels | Blocks) -> dict[str, Any]:
+def _arranged(arranged: ChannelFlow | BlockFlow) -> dict[str, Any]:
     """What templates read of channels, or of blocks; the other is None."""
-    if isinstance(arranged, Channels):
+    if isinstance(arranged, ChannelFlow):
         return {
             "blocks": None,
             "channels": arranged,

@@ -10,10 +10,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from jaxmodel.controller import Controller
+from jaxmodel.channels import Channels
+from jaxmodel.controller import Controller, Feedback
 from jaxmodel.estimator import KINDS, Estimator
 from jaxmodel.laws import LAWS
-from jaxmodel.laws.contract import Feedback, no_channels
 from jaxmodel.shaper import Taps
 from jaxmodel.state_space import StateSpace
 from studies import config
@@ -126,35 +126,29 @@ def document(found: FixedController, case_id: str = "") -> Document:
         law=study.control.law,
         estimator=study.electronics.estimator,
         order=ORDER,
-        steps=_steps(controller),
+        steps=_steps(controller.feedback),
         masks=Masks(
-            links=[k in found.channels.link for k in range(3)], modes=_acting(controller).tolist()
+            links=[k in found.channels.link for k in range(3)],
+            modes=controller.feedback.acting.tolist(),
         ),
         numbers=_numbers(found),
         study=json.loads(json.dumps(study.model_dump(mode="json"))),
     )
 
 
-def _steps(controller: Controller) -> list[str]:
-    if controller.system is not None:
+def _steps(feedback: Feedback) -> list[str]:
+    if isinstance(feedback, StateSpace):
         return [SYSTEMS[0], *STEPS[1:3], *SYSTEMS[1:], *STEPS[9:]]
-    return STEPS if controller.rival_omega is None else [*STEPS[:8], RIVALS, *STEPS[8:]]
-
-
-def _acting(controller: Controller) -> np.ndarray:
-    """Channels with gains, (3, C)."""
-    return (controller.velocity_gain != 0) | (_position_gain(controller) != 0)
-
-
-def _position_gain(controller: Controller) -> np.ndarray:
-    gain = controller.position_gain
-    return np.zeros_like(controller.velocity_gain) if gain is None else gain
+    return STEPS if feedback.rival_omega is None else [*STEPS[:8], RIVALS, *STEPS[8:]]
 
 
 def _numbers(found: FixedController) -> dict[str, Quantity]:
     """Every number of the controller, by name."""
     controller, electronics = found.controller, found.study.electronics
-    feedback = _of_channels if controller.system is None else _of_system
+    if isinstance(controller.feedback, StateSpace):
+        of_feedback = _of_system(controller.feedback)
+    else:
+        of_feedback = _of_channels(found, controller.feedback)
     return {
         "sample_rate": _one(electronics.sample_rate_hz, "Hz", "how often a sample is taken"),
         "antialias": _one(
@@ -173,7 +167,7 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
             "sensor volts that an actuator volt causes by modes that are not controlled",
             [_LINK, _PATCH, "actuator"],
         ),
-        **feedback(found),
+        **of_feedback,
         "voltage_limit": _one(controller.voltage_limit, "V", "of every actuator, +-"),
         "shaper_weight": _one(found.taps.weight, "1", "of each tap of the input shaper", ["tap"]),
         "shaper_delay": _one(
@@ -186,10 +180,8 @@ def _one(value: Any, unit: str, meaning: str, axes: list[str] | None = None) -> 
     return Quantity(value=np.asarray(value).tolist(), unit=unit, axes=axes or [], meaning=meaning)
 
 
-def _of_system(found: FixedController) -> dict[str, Quantity]:
+def _of_system(system: StateSpace) -> dict[str, Quantity]:
     """The systems of a controller without channels."""
-    system = found.controller.system
-    assert system is not None
     block = ["system", "block"]
     return {
         "state_matrix": _one(system.state, "1", "A in blocks", [*block, "to", "from"]),
@@ -201,14 +193,13 @@ def _of_system(found: FixedController) -> dict[str, Quantity]:
     }
 
 
-def _of_channels(found: FixedController) -> dict[str, Quantity]:
+def _of_channels(found: FixedController, feedback: Channels) -> dict[str, Quantity]:
     """Filters, sections and gains of the channels."""
-    controller, electronics = found.controller, found.study.electronics
-    estimator = controller.estimator
+    estimator, position = feedback.estimator, feedback.position_gain
     to_signal, from_force = ("m/V", "V/N") if found.is_modal else ("1", "1")
     on_rate, on_value = ("N s/m", "N/m") if found.is_modal else ("s", "1")
-    shape = controller.velocity_gain.shape
-    is_phase = electronics.estimator == "modal_phase"
+    shape = feedback.velocity_gain.shape
+    is_phase = found.study.electronics.estimator == "modal_phase"
     # the section that differentiates turns the signal into a rate: the last one of modal_phase
     rate = "1" if is_phase else "1/s"
     last = "1/s" if is_phase else "1"
@@ -221,7 +212,7 @@ def _of_channels(found: FixedController) -> dict[str, Quantity]:
 
     return {
         "modal_filter": _one(
-            controller.filter,
+            feedback.filter,
             to_signal,
             "channel signal of each sensor voltage",
             [*each_axes, _PATCH],
@@ -245,16 +236,16 @@ def _of_channels(found: FixedController) -> dict[str, Quantity]:
             [*each_axes, "power of z^-1"],
         ),
         "position_direct": each(estimator.direct, "1", "share of the signal in the position"),
-        "velocity_gain": each(controller.velocity_gain, on_rate, "k_d, masks and factors put in"),
+        "velocity_gain": each(feedback.velocity_gain, on_rate, "k_d, masks and factors put in"),
         "position_gain": each(
-            _position_gain(controller), on_value, "k_p, masks and factors put in"
+            0.0 if position is None else position, on_value, "k_p, masks and factors put in"
         ),
         **(
             {}
-            if controller.rival_omega is None
+            if feedback.rival_omega is None
             else {
                 "rival_frequency": each(
-                    controller.rival_omega,
+                    feedback.rival_omega,
                     "rad/s",
                     "above 0: of the channels of a link with one only "
                     "those of highest energy act, (rival_frequency position)^2 + velocity^2",
@@ -262,7 +253,7 @@ def _of_channels(found: FixedController) -> dict[str, Quantity]:
             }
         ),
         "synthesizer": _one(
-            controller.synthesizer,
+            feedback.synthesizer,
             from_force,
             "voltages of a channel's force",
             [_LINK, _PATCH, channel],
@@ -273,13 +264,9 @@ def _of_channels(found: FixedController) -> dict[str, Quantity]:
 def controller_of(document: Document) -> tuple[Controller, Taps]:
     """Controller and shaper built only from a document's numbers."""
     number = {name: np.array(entry.value) for name, entry in document.numbers.items()}
-    feedback = _system_of(number) if "state_matrix" in number else _channels_of(number)
+    is_system = "state_matrix" in number
     controller = Controller(
-        filter=feedback.filter,
-        estimator=feedback.estimator,
-        velocity_gain=feedback.velocity_gain,
-        position_gain=feedback.position_gain,
-        synthesizer=feedback.synthesizer,
+        feedback=_system_of(number) if is_system else _channels_of(number),
         feedthrough=number["feedthrough"],
         voltage_limit=number["voltage_limit"],
         adc_gain=number["conditioner_gain"],
@@ -287,27 +274,24 @@ def controller_of(document: Document) -> tuple[Controller, Taps]:
         adc_step=number["adc_step"],
         adc_top=number["adc_top"],
         adc_noise=np.zeros(()),
-        rival_omega=feedback.rival_omega,
-        system=feedback.system,
     )
     return controller, Taps(number["shaper_weight"], number["shaper_delay"].astype(int))
 
 
-def _system_of(number: dict[str, np.ndarray]) -> Feedback:
-    system = StateSpace(
+def _system_of(number: dict[str, np.ndarray]) -> StateSpace:
+    return StateSpace(
         state=number["state_matrix"],
         enter=number["input_matrix"],
         leave=number["output_matrix"],
         direct=number["direct"],
     )
-    return no_channels(system, number["feedthrough"].shape[1])
 
 
-def _channels_of(number: dict[str, np.ndarray]) -> Feedback:
+def _channels_of(number: dict[str, np.ndarray]) -> Channels:
     velocity, position = (
         tuple(np.moveaxis(number[f"{name}_numerator"], 2, 0)) for name in ("velocity", "position")
     )
-    return Feedback(
+    return Channels(
         filter=number["modal_filter"],
         synthesizer=number["synthesizer"],
         estimator=Estimator(

@@ -15,8 +15,8 @@ from scipy.signal import lfilter
 
 from jaxmodel.controller import Controller
 from jaxmodel.shaper import Taps
-from studies.engine.blocks import Blocks
-from studies.engine.channels import Channels
+from studies.engine.blocks import BlockFlow
+from studies.engine.channels import ChannelFlow
 from studies.engine.controller import FixedController
 from studies.errors import StudyError, field_error
 from studies.export.floating import Signals, respond_from
@@ -148,7 +148,7 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
         StudyError: what cannot be represented, with the number and a remedy.
     """
     controller, channels = found.controller, found.channels
-    assert isinstance(channels, Channels)
+    assert isinstance(channels, ChannelFlow)
     check_words(found)
     if channels.energy is not None and np.any(controller.feedthrough):
         raise field_error(
@@ -249,7 +249,7 @@ def check_words(found: FixedController) -> None:
         )
     slowest = 1 + np.log(FORGOTTEN) / LONGEST_MEMORY  # slowest pole that forgets in time
     pole = found.channels.slowest_pole
-    if pole > slowest and isinstance(found.channels, Blocks):
+    if pole > slowest and isinstance(found.channels, BlockFlow):
         raise StudyError(
             f"fixed point: the controller has a pole of modulus {pole:.12g}; allowed: up to "
             f"{slowest:.12g}, or it keeps rounding errors for too long (or --target c)"
@@ -268,7 +268,7 @@ def check_words(found: FixedController) -> None:
 
 
 def _energy(
-    channels: Channels, bound: np.ndarray, inner: Format, signal: Format, memory: int
+    channels: ChannelFlow, bound: np.ndarray, inner: Format, signal: Format, memory: int
 ) -> IntegerRow | None:
     """Roots of the energies of rivals: the squares of two of them sum within 63 bits.
 
@@ -297,7 +297,7 @@ def _energy(
     return find_row(factors, "modal energies")
 
 
-def _responses(channels: Channels, m: int, n: int) -> tuple[np.ndarray, ...]:
+def _responses(channels: ChannelFlow, m: int, n: int) -> tuple[np.ndarray, ...]:
     """Impulse responses of channel m: to high, inner, force; from high and inner to force."""
     impulse = np.zeros(n)
     impulse[0] = 1.0
@@ -312,7 +312,7 @@ def _responses(channels: Channels, m: int, n: int) -> tuple[np.ndarray, ...]:
     return high, inner, force, of_high, of_inner
 
 
-def peak_gains(channels: Channels, n: int) -> Gains:
+def peak_gains(channels: ChannelFlow, n: int) -> Gains:
     """Peak gains of all channels by impulse responses of n samples."""
     rows = [
         [np.abs(response).sum() for response in _responses(channels, m, n)]
@@ -355,7 +355,7 @@ def find_row(factors: np.ndarray, name: str) -> IntegerRow:
     return IntegerRow(np.round(factors * 2.0 ** shift[..., None]).astype(np.int64), shift)
 
 
-def rounded(fixed: FixedPoint, like: Channels) -> Channels:
+def rounded(fixed: FixedPoint, like: ChannelFlow) -> ChannelFlow:
     """The channels that the integers represent, in SI units."""
     f = fixed
     scale = f.low_pass.values[:, 0] * f.inner.step / f.high.step  # 1, rounded
@@ -381,7 +381,7 @@ def rounded(fixed: FixedPoint, like: Channels) -> Channels:
 def _error_bound(found: FixedController, fixed: FixedPoint, gains: Gains, n: int) -> ErrorBound:
     """Peak errors at the actuators: the sum of every rounding through its peak gain."""
     exact = found.channels
-    assert isinstance(exact, Channels)
+    assert isinstance(exact, ChannelFlow)
     near = rounded(fixed, exact)
     half = 0.5
     # bias and feed-through are rounded once each
@@ -406,10 +406,10 @@ def _error_bound(found: FixedController, fixed: FixedPoint, gains: Gains, n: int
     np.add.at(rounding, exact.link, force[:, None] * size)
     np.add.at(coefficients, exact.link, wrong)
     inside = rounding + coefficients + half * fixed.wires.dac_step
-    return ErrorBound(rounding, coefficients, brought_back(found, inside))
+    return ErrorBound(rounding, coefficients, output_error_bound(found, inside))
 
 
-def brought_back(found: FixedController, error: np.ndarray) -> np.ndarray:
+def output_error_bound(found: FixedController, error: np.ndarray) -> np.ndarray:
     """Errors of commands including their feed-through, (3, K).
 
     An error of a command enters the sensors in the next sample, and so the next command. Uses peak

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.state_space import StateSpace
-from studies.engine.blocks import Blocks, ImpulseResponses, responses
+from studies.engine.blocks import BlockFlow, ImpulseResponses, responses
 from studies.engine.controller import FixedController
 from studies.export.fixed import (
     FORGOTTEN,
@@ -19,22 +19,22 @@ from studies.export.fixed import (
     Format,
     IntegerRow,
     Wires,
-    brought_back,
     check_error,
     check_words,
     design_wires,
     find_format,
     find_row,
+    output_error_bound,
     sensor_bound,
 )
 from studies.export.floating import BlockSignals
 
 
 class FixedBlocks(NamedTuple):
-    """A controller in fixed point; groups first, as in `Blocks`."""
+    """A controller in fixed point; groups first, as in `BlockFlow`."""
 
     wires: Wires
-    blocks: Blocks  # the same in SI units
+    blocks: BlockFlow  # the same in SI units
     state: Format  # [V], (G, N, 2)
     advance: IntegerRow  # two states of the block, then the sensors, (G, N, 2, 2 + M)
     leave: IntegerRow  # all states of the group, then the sensors, (G, M, 2 N + M)
@@ -60,7 +60,7 @@ class FixedBlocks(NamedTuple):
 def design_blocks(found: FixedController, seen: BlockSignals, dac_bits: int) -> FixedBlocks:
     """Formats and coefficients; arguments and errors as `studies.export.fixed.design_fixed`."""
     arranged = found.channels
-    assert isinstance(arranged, Blocks)
+    assert isinstance(arranged, BlockFlow)
     check_words(found)
     wires = design_wires(found, dac_bits)
     system, memory = arranged.system, arranged.memory(FORGOTTEN)
@@ -87,7 +87,7 @@ def design_blocks(found: FixedController, seen: BlockSignals, dac_bits: int) -> 
     return fixed._replace(error=error)
 
 
-def rounded_blocks(fixed: FixedBlocks, like: Blocks) -> Blocks:
+def rounded_blocks(fixed: FixedBlocks, like: BlockFlow) -> BlockFlow:
     """The blocks that the integers represent, in SI units."""
     step, wires = fixed.state.step, fixed.wires
     groups, n = step.shape[:2]
@@ -105,7 +105,7 @@ def rounded_blocks(fixed: FixedBlocks, like: Blocks) -> Blocks:
 
 def _error_bound(
     found: FixedController,
-    exact: Blocks,
+    exact: BlockFlow,
     fixed: FixedBlocks,
     each: list[ImpulseResponses],
     memory: int,
@@ -123,4 +123,4 @@ def _error_bound(
         coefficients.append(np.abs(own.command - true.command).sum(axis=2) @ volts[g])
     parts = [exact.of_patches(np.array(x), found.n_patches) for x in (rounding, coefficients)]
     inside = parts[0] + parts[1] + half * fixed.wires.dac_step
-    return ErrorBound(parts[0], parts[1], brought_back(found, inside))
+    return ErrorBound(parts[0], parts[1], output_error_bound(found, inside))

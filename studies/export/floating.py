@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.controller import Controller, read_back
-from studies.engine.blocks import Blocks
-from studies.engine.channels import Channels, acting
+from studies.engine.blocks import BlockFlow
+from studies.engine.channels import ChannelFlow, acting
 
 
 class BlockSignals(NamedTuple):
@@ -29,7 +29,7 @@ class Signals(NamedTuple):
 
 
 def respond(
-    arranged: Channels | Blocks, controller: Controller, codes: np.ndarray
+    arranged: ChannelFlow | BlockFlow, controller: Controller, codes: np.ndarray
 ) -> Signals | BlockSignals:
     """Run a controller, from rest, on sequences of ADC codes.
 
@@ -42,10 +42,13 @@ def respond(
 
 
 def respond_from(
-    arranged: Channels | Blocks, controller: Controller, codes: np.ndarray, command: np.ndarray
+    arranged: ChannelFlow | BlockFlow,
+    controller: Controller,
+    codes: np.ndarray,
+    command: np.ndarray,
 ) -> Signals | BlockSignals:
     """The same with voltages on the actuators at the beginning [V], (..., 3, K)."""
-    run = _by_blocks if isinstance(arranged, Blocks) else _by_channels
+    run = _by_blocks if isinstance(arranged, BlockFlow) else _by_channels
     return run(arranged, controller, codes, command)  # type: ignore[arg-type]
 
 
@@ -56,7 +59,7 @@ def _sensed(controller: Controller, code: np.ndarray, command: np.ndarray) -> np
 
 
 def _by_blocks(
-    blocks: Blocks, controller: Controller, codes: np.ndarray, command: np.ndarray
+    blocks: BlockFlow, controller: Controller, codes: np.ndarray, command: np.ndarray
 ) -> BlockSignals:
     rows, system = [], blocks.system
     state = np.zeros((*codes.shape[1:-2], *system.state.shape[:3]))
@@ -73,7 +76,7 @@ def _by_blocks(
 
 
 def _by_channels(
-    channels: Channels, controller: Controller, codes: np.ndarray, command: np.ndarray
+    channels: ChannelFlow, controller: Controller, codes: np.ndarray, command: np.ndarray
 ) -> Signals:
     rows = []
     link, many = channels.link, codes.shape[1:-2]

@@ -10,8 +10,8 @@ import numpy as np
 from rich.console import Console
 
 from jaxmodel import status
-from studies.engine.blocks import Blocks, restored
-from studies.engine.channels import Channels, unfold
+from studies.engine.blocks import BlockFlow, restored
+from studies.engine.channels import ChannelFlow, unfold
 from studies.engine.controller import FixedController
 from studies.engine.stability import LoopFigures, loop_report
 from studies.errors import StudyError, field_error
@@ -46,10 +46,10 @@ class Made(NamedTuple):
     cost: Cost | None = None
 
 
-def judged(found: FixedController, arranged: Channels | Blocks, note: str) -> LoopFigures:
+def judged(found: FixedController, arranged: ChannelFlow | BlockFlow, note: str) -> LoopFigures:
     """Linearised sampled loop with given coefficients; rejected if unstable."""
     home = np.array(found.study.motion.waypoints[0], float)
-    restore = restored if isinstance(arranged, Blocks) else unfold
+    restore = restored if isinstance(arranged, BlockFlow) else unfold
     law = restore(arranged, found.controller)  # type: ignore[arg-type]
     law = jax.tree.map(jnp.asarray, law)
     try:

@@ -51,7 +51,7 @@ def report(
         ],
         controllers=_controllers(found, verified),
         code=code,
-        deflection=code * np.abs(controller.filter[:, :1]).max(initial=0.0),
+        deflection=code * np.abs(controller.feedback.filter[:, :1]).max(initial=0.0),
         fixed=fixed,
         cost=cost,
         **(_of_fixed(found, fixed, verified) if fixed is not None else {}),

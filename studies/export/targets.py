@@ -11,8 +11,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from jaxmodel.table import Table
-from studies.engine.blocks import Blocks
-from studies.engine.channels import Channels
+from studies.engine.blocks import BlockFlow
+from studies.engine.channels import ChannelFlow
 from studies.engine.controller import FixedController
 from studies.export.c_fixed import fixed_source
 from studies.export.c_floating import floating_source
@@ -80,9 +80,9 @@ def _as_fixed(job: Job) -> Made:
 
 def _designed(
     found: FixedController, seen: Signals | BlockSignals, dac_bits: int
-) -> tuple[FixedPoint | FixedBlocks, Channels | Blocks]:
+) -> tuple[FixedPoint | FixedBlocks, ChannelFlow | BlockFlow]:
     """A controller in fixed point, and what its integers represent."""
-    if isinstance(found.channels, Blocks):
+    if isinstance(found.channels, BlockFlow):
         assert isinstance(seen, BlockSignals)
         blocks = design_blocks(found, seen, dac_bits)
         return blocks, rounded_blocks(blocks, found.channels)

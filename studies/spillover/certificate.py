@@ -216,7 +216,7 @@ def _certificate(
     shape, largest = plants.shape, max(plant.n_modes for plant in plants.ravel())
     exists = faults == ""
     law = pad_channels(design.controller, design.n_patches)
-    channels = design.controller.velocity_gain.shape[1]
+    channels = design.controller.feedback.acting.shape[1]
 
     radius, limit = np.full((2, *shape), np.nan)
     frequency, zeta, free = np.full((3, *shape, largest, 3), np.nan)

@@ -159,9 +159,7 @@ class _LawLoops:
 
 def _controlled_links(law: Controller) -> np.ndarray:
     """How many links control each of modes 1 to `SHOWN`; if none does, all links with gains."""
-    is_on = law.velocity_gain != 0
-    if law.position_gain is not None:
-        is_on = is_on | (law.position_gain != 0)
+    is_on = law.feedback.acting
     is_on, n_links = is_on[:, :SHOWN], is_on.any(axis=1).sum()
     count = np.pad(is_on.sum(axis=0), (0, SHOWN - is_on.shape[1]))
     return np.where(count > 0, count, n_links)

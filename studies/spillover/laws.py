@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
+from jaxmodel.channels import Channels
 from jaxmodel.controller import Controller, with_gains
 from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law, as_modal
@@ -51,24 +52,25 @@ def all_laws(found: FixedController, builder: LoopBuilder, plant: PlantVariant) 
     Raises:
         StudyError: velocity gains that do not damp mode 1, so nothing to compare strength by.
     """
-    control, given = found.study.control, found.controller
-    own_law = LAWS[control.law]
+    control, own_law = found.study.control, LAWS[found.study.control.law]
     channels = {name: law for name, law in LAWS.items() if law.channel != "none"}
     if own_law.name not in channels:
         raise field_error(
             "control.law", control.law, f"{', '.join(channels)}, to compare laws of equal strength"
         )
 
+    given = found.controller
+
     def strength(law: Controller) -> np.ndarray:
         """Damping constant that a law gives mode 1 of each link [N s/m], (3,)."""
-        seen, driven = builder.spillover_gains(plant, pad_channels(law, found.n_patches))
-        gain = pad_channels(law, found.n_patches).velocity_gain
-        every = np.einsum("irc,ic,icr->ir", driven, gain, seen)
+        padded = pad_channels(law, found.n_patches)
+        seen, driven = builder.spillover_gains(plant, padded)
+        every = np.einsum("irc,ic,icr->ir", driven, _channels(padded).velocity_gain, seen)
         return np.where(np.abs(every[:, 0]) > ROUNDING * np.abs(every).max(), every[:, 0], 0.0)
 
     modal = given if control.law == IMSC.name else _designed(found, IMSC)
     # a law without velocity feedback counts as strong as modal control with the same settings
-    wanted = strength(given if np.any(given.velocity_gain) else modal)
+    wanted = strength(given if np.any(_channels(given).velocity_gain) else modal)
     if not np.any(wanted > 0) or np.any(wanted < 0):
         raise field_error(
             "control.velocity_gain",
@@ -101,16 +103,24 @@ def all_laws(found: FixedController, builder: LoopBuilder, plant: PlantVariant) 
 
 def _even(law: Controller, n_channels: int) -> Controller:
     """With a channel for each patch and rivals, if none: one shape for all laws."""
-    if law.rival_omega is None:
-        law = law._replace(rival_omega=np.zeros_like(law.velocity_gain))
-    return pad_channels(law, n_channels)
+    channels = _channels(law)
+    if channels.rival_omega is None:
+        channels = channels._replace(rival_omega=np.zeros_like(channels.velocity_gain))
+    return pad_channels(law._replace(feedback=channels), n_channels)
+
+
+def _channels(law: Controller) -> Channels:
+    assert isinstance(law.feedback, Channels)
+    return law.feedback
 
 
 def _scaled(law: Controller, wanted: np.ndarray, has: np.ndarray) -> Controller:
     """Velocity gains of each link times wanted/has, (3,) each; 0 where there are none."""
     is_there = has != 0
     factor = np.where(is_there, wanted / np.where(is_there, has, 1.0), 0.0)
-    return law._replace(velocity_gain=factor[:, None] * law.velocity_gain)
+    channels = _channels(law)
+    velocity = factor[:, None] * channels.velocity_gain
+    return law._replace(feedback=channels._replace(velocity_gain=velocity))
 
 
 @kept_jit(static_argnums=0)
@@ -141,8 +151,7 @@ def _designed(found: FixedController, law: Law, modal: Controller | None = None)
     control = found.case.control._replace(parameters=law_parameters(found.study, law))
     gains = None
     if modal is not None:
-        position = modal.position_gain
-        velocity = modal.velocity_gain
+        velocity, position = _channels(modal).velocity_gain, _channels(modal).position_gain
         gains = velocity, np.zeros_like(velocity) if position is None else position
     case = found.case._replace(control=control)
     return jax.tree.map(np.asarray, _design(structure, case, gains))

@@ -7,7 +7,7 @@ their modal basis and one mismatch each from the controller's model.
 from __future__ import annotations
 
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -157,7 +157,8 @@ class LoopBuilder:
             has_sensor_highpass=known.has_sensor_highpass,
             has_amplifier=known.has_amplifier,
         )
-        law = jax.tree.map(jnp.asarray, law._replace(rival_omega=None))  # linear: nothing switches
+        law = law._replace(feedback=law.feedback.without_rivals())  # linear: nothing switches
+        law = jax.tree.map(jnp.asarray, law)
         return jax.tree.map(np.asarray, _look(structure, self._placed(plant), self._pose, law))
 
     def _placed(self, plant: PlantVariant) -> Case:
@@ -182,9 +183,9 @@ def _look(
     structure: Structure, case: Case, pose: Array, law: Controller
 ) -> tuple[LoopMatrices, Array, SpilloverGains]:
     loop = prepare(structure, case).loop
-    observation = jnp.einsum("ick,ikr->icr", law.filter, loop.sensor)
+    observation = jnp.einsum("ick,ikr->icr", law.feedback.filter, loop.sensor)
     force = loop.plant.modal_mass[:, None, None] * loop.actuator
-    actuation = jnp.einsum("irk,ikc->irc", force, law.synthesizer)
+    actuation = jnp.einsum("irk,ikc->irc", force, law.feedback.synthesizer)
     gains = SpilloverGains(observation, actuation)
     at_rest = resting(structure, case)
     matrices = loop_matrices(structure, case, loop, law, pose, at_rest)
@@ -210,27 +211,7 @@ def pad_channels(law: Controller, n_channels: int) -> Controller:
         law: NumPy arrays.
         n_channels: of each link; a controller without any stays as it is.
     """
-    if law.system is not None:
-        return law
-    shape = law.velocity_gain.shape
-    more = n_channels - shape[1]
-
-    def padded(x: Any, axis: int = 1) -> np.ndarray:
-        return np.pad(x, [(0, more if k == axis else 0) for k in range(x.ndim)])
-
-    def full(x: Any) -> np.ndarray:
-        return np.pad(np.broadcast_to(x, shape), ((0, 0), (0, more)), mode="edge")
-
-    none = np.zeros(shape)
-    position, rival = law.position_gain, law.rival_omega
-    return law._replace(
-        filter=padded(law.filter),
-        estimator=jax.tree.map(full, law.estimator),
-        velocity_gain=padded(law.velocity_gain),
-        position_gain=padded(none if position is None else position),
-        synthesizer=padded(law.synthesizer, 2),
-        rival_omega=None if rival is None else padded(rival),
-    )
+    return law._replace(feedback=law.feedback.padded(n_channels))
 
 
 def plant_sizes(found: FixedController, sizes: tuple[int, ...] = ()) -> tuple[int, ...]:
