@@ -1,56 +1,53 @@
-"""Labelled results in one file: netCDF-4 written as plain HDF5, which xarray opens by name.
+"""Labelled results in one file: netCDF-4 by h5netcdf, which xarray opens by name.
 
-Every axis has a dimension scale, every variable its units and long name, and the file appears
-whole or not at all.
+Every axis has its coordinate, every variable its units and long name, and the file appears whole or
+not at all. xarray itself takes a second to import; commands do without it.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import secrets
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import h5netcdf
 import h5py
 import numpy as np
 
-from studies.errors import StudyError, field_error
+from studies.errors import StudyError
 from studies.reading import open_hdf5
 
-# What netCDF, HDF5 and xarray's attribute access all take as a name.
-_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 # What the words of flag_meanings may not contain.
 _NO_FLAG = re.compile(r"[^A-Za-z0-9_.+@-]+")
+_TEXT = h5py.string_dtype("utf-8")
 #: Name prefix of the folders of `staged`.
 _STAGED = ".unfinished-"
-_TEXT = h5py.string_dtype("utf-8")
+#: Files up to this size are built in memory: HDF5 itself can crash on a full disk [bytes].
+_IN_MEMORY = 2**26
+#: Rows are written in blocks of this size [bytes].
+BLOCK_BYTES = 2**25
 
 
-class Streamed(NamedTuple):
-    """Data too large for memory, written part by part along the first axis.
-
-    parts: called once, yields (first row, rows); what no part covers is NaN or -1.
-    """
+class Rows(NamedTuple):
+    """An array too large for memory, read some rows at a time."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
-    parts: Callable[[], Iterable[tuple[int, np.ndarray]]]
-
-    @property
-    def ndim(self) -> int:
-        return len(self.shape)
+    read: Callable[[slice], np.ndarray]
 
 
 class Variable(NamedTuple):
     """One labelled array.
 
-    data: numbers, booleans or text, one axis per name in dims; `Streamed` only for writing.
+    data: numbers, booleans or text, one axis per name in dims; for writing, also `Rows`.
     dims: name of each axis; a one-dimensional variable named like its axis is its coordinate.
     units: SI symbol such as "m" or "Hz", "1" for none. Not "seconds": xarray turns that into dates.
     long_name: what it is, in words.
@@ -72,73 +69,90 @@ def write_store(
     path: the file; its folder must exist. attributes: text, numbers or lists of one of them.
     An axis without a coordinate gets its numbers, from 1. Booleans become int8.
 
-    Raises StudyError for a target that cannot be written, and for data that netCDF cannot label or
-    hold; an existing file at `path` is then left unchanged.
+    Raises StudyError for a target that cannot be written; an existing file at `path` is then left
+    unchanged.
     """
     check_target(path)
-    arrays = {name: _stored(name, variable) for name, variable in variables.items()}
-    sizes = _axis_sizes(variables, arrays)
-    labels = {name: _attribute(name, value) for name, value in attributes.items()}
-    coordinates = {
-        axis: Variable(np.arange(1, size + 1), (axis,), "1", f"number of {axis}")
-        for axis, size in sizes.items()
-        if axis not in variables
+    variables = {
+        name: variable._replace(data=_array(variable.data))
+        for name, variable in with_coordinates(variables).items()
     }
-    arrays |= {axis: coordinate.data for axis, coordinate in coordinates.items()}
-    everything = coordinates | dict(variables)
-
-    def fill(file: h5py.File) -> None:
-        file.attrs.update(labels)
-        for name, variable in everything.items():
-            dataset = _dataset(file, name, arrays[name])
-            dataset.attrs.update(variable_labels(variable))
-        for axis in sizes:
-            file[axis].make_scale(axis)
-        for name, variable in variables.items():
-            if name not in sizes:
-                for position, axis in enumerate(variable.dims):
-                    file[name].dims[position].attach_scale(file[axis])
-
+    needed = sum(_size(variable.data) for variable in variables.values())
     with replacing(path) as temporary:
-        # HDF5 itself can crash on a full disk: build small files in memory, check space for others
-        if any(isinstance(array, Streamed) for array in arrays.values()):
-            _check_room(path, arrays)
-            with h5py.File(temporary, "w", track_order=True) as file:
-                fill(file)
+        if needed > _IN_MEMORY:
+            _check_room(path, needed)
+            _write(temporary, variables, attributes)
         else:
             image = BytesIO()
-            with h5py.File(image, "w", track_order=True) as file:
-                fill(file)
+            _write(image, variables, attributes)
             temporary.write_bytes(image.getbuffer())
 
 
-def _dataset(file: h5py.File, name: str, array: np.ndarray | Streamed) -> h5py.Dataset:
-    if not isinstance(array, Streamed):
-        return file.create_dataset(name, data=array, track_order=True)
-    empty = np.nan if array.dtype.kind == "f" else -1
-    dataset = file.create_dataset(
-        name, array.shape, array.dtype, fillvalue=empty, fletcher32=True, track_order=True
-    )
-    for start, rows in array.parts():
-        dataset[start : start + len(rows)] = rows
-    return dataset
+def _array(data: Any) -> np.ndarray | Rows:
+    return data if isinstance(data, Rows) else np.asarray(data)
 
 
-def _check_room(path: str | Path, arrays: Mapping[str, np.ndarray | Streamed]) -> None:
-    """Raise StudyError if the disk has no room for the arrays."""
-    text, labels = 32, 4096  # estimated bytes of a short text, and of a variable's labels
-    needed = sum(
-        labels
-        + float(np.prod(np.array(array.shape, float)))
-        * (text if array.dtype.kind == "O" else array.dtype.itemsize)
-        for array in arrays.values()
-    )
+def _write(target: Any, variables: Mapping[str, Variable], attributes: Mapping[str, Any]) -> None:
+    with h5netcdf.File(target, "w") as file:
+        file.attrs.update(attributes)
+        file.dimensions = axis_sizes(variables)
+        for name, variable in variables.items():
+            data = variable.data
+            dtype = {"b": np.int8, "U": _TEXT, "O": _TEXT}.get(data.dtype.kind, data.dtype)
+            stored = file.create_variable(name, variable.dims, dtype)
+            stored.attrs.update(variable_labels(variable))
+            if isinstance(data, Rows):
+                for rows in _blocks(data):
+                    stored[rows] = data.read(rows)
+            else:
+                stored[...] = data.astype(dtype)
+
+
+def _blocks(data: Rows) -> Iterator[slice]:
+    """Rows of at most `BLOCK_BYTES` together."""
+    count = max(1, BLOCK_BYTES // (data.dtype.itemsize * math.prod(data.shape[1:])))
+    for start in range(0, data.shape[0], count):
+        yield slice(start, min(start + count, data.shape[0]))
+
+
+def _size(data: np.ndarray | Rows) -> int:
+    """Bytes in the file, about."""
+    text, labels = 32, 4096
+    item = text if data.dtype.kind in "UO" else data.dtype.itemsize
+    return labels + item * math.prod(data.shape)
+
+
+def _check_room(path: str | Path, needed: int) -> None:
+    """Raise StudyError if the disk has no room for so many bytes."""
     free = shutil.disk_usage(Path(os.path.realpath(path)).parent).free
     if free < 1.1 * needed:
         raise StudyError(
             f"{path}: cannot write it, {needed / 2**20:.1f} MiB are needed and "
             f"{free / 2**20:.1f} MiB are free"
         )
+
+
+def axis_sizes(variables: Mapping[str, Variable]) -> dict[str, int]:
+    """Length of each axis."""
+    return {
+        axis: size
+        for variable in variables.values()
+        for axis, size in zip(variable.dims, _shape(variable.data), strict=True)
+    }
+
+
+def _shape(data: Any) -> tuple[int, ...]:
+    return data.shape if isinstance(data, Rows) else np.shape(data)
+
+
+def with_coordinates(variables: Mapping[str, Variable]) -> dict[str, Variable]:
+    """The same, and the numbers from 1 of every axis without a coordinate."""
+    numbers = {
+        axis: Variable(np.arange(1, size + 1), (axis,), "1", f"number of {axis}")
+        for axis, size in axis_sizes(variables).items()
+        if axis not in variables
+    }
+    return numbers | dict(variables)
 
 
 def variable_labels(variable: Variable) -> dict[str, Any]:
@@ -152,19 +166,30 @@ def variable_labels(variable: Variable) -> dict[str, Any]:
 
 
 def read_store(path: str | Path) -> tuple[dict[str, Variable], dict[str, Any]]:
-    """Read what `write_store` wrote: the variables, index coordinates with them, and attributes.
+    """Read what `write_store` wrote: the variables, coordinates with them, and attributes.
 
     Raises StudyError if there is no such file or it is not a store.
     """
     if not Path(path).is_file():
         raise StudyError(f"{path}: no such file")
     try:
-        with open_hdf5(Path(path)) as file:
-            variables = {name: _read_variable(dataset) for name, dataset in file.items()}
-            attributes = {name: _plain(value) for name, value in file.attrs.items()}
+        with open_hdf5(Path(path)) as file, h5netcdf.File(file, decode_vlen_strings=True) as store:
+            variables = {name: _read_variable(stored) for name, stored in store.variables.items()}
+            attributes = dict(store.attrs)
     except (OSError, RuntimeError, KeyError, AttributeError, TypeError, ValueError) as error:
         raise StudyError(f"{path}: not a store of results ({error})") from error
     return variables, attributes
+
+
+def _read_variable(stored: h5netcdf.Variable) -> Variable:
+    data, labels = np.asarray(stored[...]), stored.attrs
+    if data.dtype.kind == "O":
+        data = data.astype(str)
+    flags = None
+    if "flag_values" in labels:
+        words = labels["flag_meanings"].split()
+        flags = dict(zip(labels["flag_values"].tolist(), words, strict=True))
+    return Variable(data, stored.dimensions, labels["units"], labels["long_name"], flags)
 
 
 def check_target(path: str | Path) -> None:
@@ -253,92 +278,3 @@ def replacing(path: str | Path) -> Iterator[Path]:
         raise StudyError(f"{path}: cannot write it ({error.strerror or error})") from error
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def _stored(name: str, variable: Variable) -> np.ndarray | Streamed:
-    """The array as the file holds it, or StudyError for what netCDF cannot label or hold."""
-    _check_name("variable", name)
-    for label in ("units", "long_name"):
-        text = getattr(variable, label)
-        if not text:
-            raise field_error(f"{name}.{label}", text, "a text that is not empty")
-    data = variable.data
-    if not isinstance(data, Streamed):
-        data = np.asarray(data)
-    dims = variable.dims
-    for axis in dims:
-        _check_name(f"dimension of {name}", axis)
-    if len(dims) != data.ndim or len(set(dims)) != len(dims):
-        raise field_error(f"{name}.dims", dims, f"one distinct name for each of {data.ndim} axes")
-    if name in dims and len(dims) > 1:
-        raise field_error(f"{name}.dims", dims, f"only ({name!r},) for the coordinate of {name}")
-    return data if isinstance(data, Streamed) else _storable(name, data)
-
-
-def _storable(field: str, data: np.ndarray) -> np.ndarray:
-    """Text as UTF-8 strings, booleans as int8, numbers unchanged; StudyError for the rest."""
-    if data.dtype.kind == "U" or (
-        data.dtype.kind == "O" and all(isinstance(value, str) for value in data.flat)
-    ):
-        if any("\0" in text for text in data.flat):
-            raise field_error(field, "text with a NUL character", "text without NUL characters")
-        return data.astype(_TEXT)
-    if data.dtype.kind == "b":
-        return data.astype(np.int8)
-    if data.dtype.kind in "iu" or data.dtype in (np.float32, np.float64):
-        return data
-    raise field_error(f"type of {field}", data.dtype, "integers, float32, float64, bool or text")
-
-
-def _axis_sizes(
-    variables: Mapping[str, Variable], arrays: Mapping[str, np.ndarray | Streamed]
-) -> dict[str, int]:
-    """Length of each axis, which must be the same in all variables."""
-    sizes: dict[str, int] = {}
-    for name, variable in variables.items():
-        for axis, size in zip(variable.dims, arrays[name].shape, strict=True):
-            if sizes.setdefault(axis, size) != size:
-                raise field_error(
-                    f"length of {name} along {axis}", size, f"{sizes[axis]} as in other variables"
-                )
-    for axis in sizes:
-        if axis in variables and variables[axis].dims != (axis,):
-            raise field_error(f"{axis}.dims", variables[axis].dims, f"({axis!r},), it is an axis")
-    return sizes
-
-
-def _attribute(name: str, value: Any) -> Any:
-    """A global attribute as the file holds it."""
-    _check_name("attribute", name)
-    data = np.asarray(value)
-    if data.ndim > 1:
-        raise field_error(f"shape of attribute {name}", data.shape, "one value or a list")
-    return _storable(f"attribute {name}", data)
-
-
-def _check_name(kind: str, name: str) -> None:
-    if not _NAME.fullmatch(name):
-        raise field_error(kind, name, "letters, digits and _, not beginning with a digit")
-
-
-def _read_variable(dataset: h5py.Dataset) -> Variable:
-    is_text = h5py.check_string_dtype(dataset.dtype) is not None
-    data = dataset.asstr()[()] if is_text else dataset[()]
-    if dataset.is_scale:
-        dims: tuple[str, ...] = (dataset.name.lstrip("/"),)
-    else:
-        dims = tuple(axis[0].name.lstrip("/") for axis in dataset.dims)
-    array = np.asarray(data, dtype=str if is_text else None)
-    labels = dataset.attrs
-    flags = None
-    if "flag_values" in labels:
-        words = labels["flag_meanings"].split()
-        flags = dict(zip(labels["flag_values"].tolist(), words, strict=True))
-    return Variable(array, dims, labels["units"], labels["long_name"], flags)
-
-
-def _plain(value: Any) -> Any:
-    """An attribute as Python text or number if it is one value, otherwise as an array."""
-    if isinstance(value, np.ndarray) and value.dtype.kind == "O":
-        return value.astype(str)
-    return value.item() if isinstance(value, np.generic) else value

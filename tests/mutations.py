@@ -174,13 +174,11 @@ def sweep_folder(folder):
     table, rng = build_table(parse_sweep(data)), np.random.default_rng(0)
     manifest = make_manifest(data)
     for name, count in (("whole", 6), ("part", 4)):
-        chunk = {"case_id": Variable(table.case_id[:count].astype(str), ("case",), "1", "id")}
+        chunk = {"case_id": table.case_id[:count]}
         for metric in (*PER_CASE, *METRICS):
-            dims, *label = label_of(metric)
-            shape = (count, *(3 for _ in dims))
+            shape = (count, *(3 for _ in label_of(metric)[0]))
             codes = metric in ("status", "substeps")
-            values = np.zeros(shape, int) if codes else rng.uniform(1, 2, shape)
-            chunk[metric] = Variable(values, ("case", *dims), *label)
+            chunk[metric] = np.zeros(shape, int) if codes else rng.uniform(1, 2, shape)
         with open_folder(folder / name, manifest, False) as out:
             out.begin(manifest)
             out.write_chunk(chunk)

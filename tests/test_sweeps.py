@@ -460,7 +460,7 @@ def test_full_disk_keeps_what_is_finished(tmp_path, mixed):
     """A small file system where the test may mount one, else a limit on the size of files."""
     out = tmp_path / "disk"
     out.mkdir()
-    is_mounted = _mount(out, "size=240k")
+    is_mounted = _mount(out, "size=96k")
     old = resource.getrlimit(resource.RLIMIT_FSIZE)
     if not is_mounted:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, old[1]))

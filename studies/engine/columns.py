@@ -142,3 +142,9 @@ def label_of(name: str) -> tuple[Any, ...]:
         return (PER_CASE | SCREENED)[name]
     metric = METRICS[name]
     return metric.dims, metric.unit, metric.text
+
+
+def labelled(name: str, data: Any) -> Variable:
+    """What a chunk holds, with its axes and labels."""
+    dims, *label = label_of(name)
+    return Variable(data, ("case", *dims), *label)

@@ -16,6 +16,7 @@ import subprocess
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from hashlib import file_digest
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +28,7 @@ from studies import config, sources
 from studies.engine.columns import PER_CASE, SCREENED, label_of
 from studies.errors import StudyError
 from studies.reading import open_hdf5, open_regular, read_json
-from studies.store import Variable, replacing, write_store
+from studies.store import replacing
 
 RESULTS, MANIFEST, CHUNKS, LOCK = "results.h5", "sweep.json", "chunks", ".lock"
 #: Where the chunks of the linear model are, if there is a screen.
@@ -80,11 +81,11 @@ class SweepFolder:
     def results(self) -> Path:
         return self.path / RESULTS
 
-    def write_chunk(self, variables: Mapping[str, Variable], place: str = CHUNKS) -> None:
+    def write_chunk(self, arrays: Mapping[str, np.ndarray], place: str = CHUNKS) -> None:
         """Save a finished chunk: write to a temporary file, flush, rename.
 
         Args:
-            variables: contents.
+            arrays: contents, by the names of `label_of`, which labels them when they are joined.
             place: `CHUNKS` or `SCREEN`.
 
         Raises:
@@ -92,9 +93,16 @@ class SweepFolder:
         """
         folder = self.path / place
         temporary = folder / "unfinished.tmp"
+        image = BytesIO()  # HDF5 itself can crash on a full disk
+        with h5py.File(image, "w") as file:
+            for name, array in arrays.items():
+                file[name] = array
         try:
             folder.mkdir(exist_ok=True)
-            write_store(temporary, variables, {})
+            with open(temporary, "wb") as file:
+                file.write(image.getbuffer())
+                file.flush()
+                os.fsync(file.fileno())
             number = 1 + max((n for n, _ in _chunk_files(folder)), default=-1)
             os.replace(temporary, folder / f"{number:06d}-{file_hash(temporary)}.h5")
             _sync(folder)

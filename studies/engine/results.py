@@ -26,14 +26,14 @@ from studies.engine.folder import (
     finished_cases,
     read_manifest,
 )
-from studies.engine.stored import axis_sizes, gather
+from studies.engine.stored import gather
 from studies.errors import StudyError, nearest
 from studies.reading import parse_json
 from studies.space.axes import LABELS, SHOWN_AS
 from studies.space.condition import evaluate
 from studies.space.spec import SweepSpec, parse_sweep
 from studies.space.table import CaseTable, build_table, case_ids
-from studies.store import Variable, read_store, variable_labels
+from studies.store import Variable, axis_sizes, read_store, variable_labels, with_coordinates
 from studies.study.fields import Fields
 from studies.study.paths import NAMED_INDEX, known_field, parse_entry
 
@@ -81,15 +81,9 @@ class SweepData:
         )
 
     def to_xarray(self) -> Any:
-        """The same as an xarray dataset.
+        """The same as an xarray dataset."""
+        import xarray
 
-        Raises:
-            StudyError: xarray is not installed.
-        """
-        try:
-            import xarray
-        except ImportError:
-            raise StudyError("xarray is missing: install flexlink-studies[xarray]") from None
         return xarray.Dataset(
             {name: (v.dims, v.data, variable_labels(v)) for name, v in self.variables.items()},
             attrs=self.attributes,
@@ -128,11 +122,8 @@ def load(path: str | Path, cases: CaseTable | None = None) -> SweepData:
             return SweepData(variables, attributes, spec, cases, baseline)
     table = build_table(spec) if cases is None else cases
     gathered = gather(table, finished_cases(folder))
-    sizes = axis_sizes(gathered)
-    variables = case_variables(table) | gathered | axis_variables(table, sizes)
-    for axis, size in (axis_sizes(variables)).items():
-        if axis not in variables:
-            variables[axis] = Variable(np.arange(1, size + 1), (axis,), "1", f"number of {axis}")
+    variables = case_variables(table) | gathered | axis_variables(table, axis_sizes(gathered))
+    variables = with_coordinates(variables)
     return SweepData(variables, {"title": spec.study.title}, spec, table, baseline)
 
 

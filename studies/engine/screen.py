@@ -17,16 +17,15 @@ from jaxmodel import status
 from jaxmodel.case import Structure
 from jaxmodel.metrics import METRICS, Sizes
 from studies.engine.chunks import Done
-from studies.engine.columns import NOT_RUN, PER_CASE, SCREENED
+from studies.engine.columns import PER_CASE, SCREENED, labelled
 from studies.engine.folder import SCREEN, Finished, finished_cases
 from studies.engine.plan import Group, Layout, plan_groups
 from studies.engine.results import SweepData, direction, meets, metric_values
-from studies.engine.stored import chunk_variables, gather, joined, kept_metrics, positions
+from studies.engine.stored import chunk_arrays, gather, kept_metrics
 from studies.errors import StudyError, nearest
 from studies.space.condition import evaluate
 from studies.space.spec import Screen, SweepSpec
 from studies.space.table import CaseTable
-from studies.store import Variable
 from studies.study.entries import parse_entries
 from studies.study.paths import NAMED_INDEX
 
@@ -92,7 +91,7 @@ def screen_groups(
     return plan_groups(table, rows, lay_out, (screen.metric,), is_linear=True, is_judged=False)
 
 
-def screen_variables(spec: SweepSpec, table: CaseTable, done: Done) -> dict[str, Variable]:
+def screen_arrays(spec: SweepSpec, table: CaseTable, done: Done) -> dict[str, np.ndarray]:
     """Contents of a file of the screen: ids, status and value of its cases.
 
     Args:
@@ -101,13 +100,14 @@ def screen_variables(spec: SweepSpec, table: CaseTable, done: Done) -> dict[str,
         done: a chunk of the linear model.
     """
     assert spec.screen is not None
-    found = chunk_variables(table, done, [spec.screen.metric])
-    value = metric_values(SweepData(found, {}, spec, table), spec.screen.entry)
-    code, value = found["status"].data, np.asarray(value, float)
-    data = {"screen_status": code, "screen_value": value}
+    arrays = chunk_arrays(table, done, [spec.screen.metric])
+    case_id = arrays.pop("case_id")
+    variables = {name: labelled(name, data) for name, data in arrays.items()}
+    value = metric_values(SweepData(variables, {}, spec, table), spec.screen.entry)
     return {
-        "case_id": found["case_id"],
-        **{name: Variable(data[name], ("case",), *about) for name, (_, *about) in SCREENED.items()},
+        "case_id": case_id,
+        "screen_status": arrays["status"],
+        "screen_value": np.asarray(value, float),
     }
 
 
@@ -119,10 +119,10 @@ def ranked(table: CaseTable, screened: Finished, screen: Screen) -> np.ndarray:
         screened: from `screened_cases`.
         screen: of the sweep.
     """
-    target, is_known = positions(table, screened)
-    value, code = np.full(len(table), np.nan), np.full(len(table), NOT_RUN)
-    for whole, name in ((code, "screen_status"), (value, "screen_value")):
-        whole[target[is_known]] = joined(screened, name)[is_known]
+    columns = gather(table, screened, SCREENED)
+    if "screen_value" not in columns:
+        return np.empty(0, int)
+    code, value = columns["screen_status"].data, columns["screen_value"].data
     return in_order(code, value, table.case_id, screen)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,13 +23,13 @@ from studies.engine.columns import (
     axis_variables,
     case_variables,
     forget,
-    label_of,
+    labelled,
 )
 from studies.engine.folder import JOINED, Finished
 from studies.errors import field_error, nearest
 from studies.space.spec import SweepSpec
 from studies.space.table import CaseTable
-from studies.store import Streamed, Variable, write_store
+from studies.store import Rows, Variable, axis_sizes, write_store
 
 if TYPE_CHECKING:
     from studies.engine.chunks import Done
@@ -59,7 +59,7 @@ def kept_metrics(spec: SweepSpec) -> list[str]:
     return kept
 
 
-def chunk_variables(table: CaseTable, done: Done, kept: list[str]) -> dict[str, Variable]:
+def chunk_arrays(table: CaseTable, done: Done, kept: list[str]) -> dict[str, np.ndarray]:
     """Contents of a chunk's file: ids, status, metrics of its cases, without padding.
 
     Args:
@@ -68,7 +68,8 @@ def chunk_variables(table: CaseTable, done: Done, kept: list[str]) -> dict[str, 
         kept: metrics to keep.
 
     Returns:
-        Variables; NaN for metrics of cases that did not finish, and of modes they do not have.
+        One row per case; NaN for metrics of cases that did not finish, and of modes they do not
+        have.
     """
     rows, result = done.chunk.rows, done.judged.result
     count = len(rows)
@@ -84,70 +85,50 @@ def chunk_variables(table: CaseTable, done: Done, kept: list[str]) -> dict[str, 
     code[np.isin(code, status.FINISHED) & (margins["gain_margin"] < 1)] = status.UNSTABLE
     is_finished = np.isin(code, status.FINISHED)
     modes, controlled = (table.values(name)[rows] for name in ("link.modes", "control.modes"))
-    variables = {
-        "case_id": Variable(table.case_id[rows].astype(str), ("case",), "1", "hash of the case")
-    }
-    known = {"status": code, "substeps": np.full(count, done.substeps), **margins}
-    for name, (dims, *about) in PER_CASE.items():
-        data = known[name] if name in known else np.asarray(getattr(result, name))[:count]
+    arrays = {"case_id": table.case_id[rows]}
+    judged = {"status": code, "substeps": np.full(count, done.substeps), **margins}
+    for name, (dims, *_) in PER_CASE.items():
+        data = judged[name] if name in judged else np.asarray(getattr(result, name))[:count]
         if name in LEAST:
             data = data.copy()
             forget(data, dims.index("controlled_mode"), controlled)
-        variables[name] = Variable(data, ("case", *dims), *about)
+        arrays[name] = data
     for name in kept:
         data = np.array(result.metrics[name], copy=True)[:count]
-        dims, unit, text = label_of(name)
+        dims = METRICS[name].dims
         if "mode" in dims:
             forget(data, dims.index("mode"), modes)
         if "controlled_mode" in dims:
             forget(data, dims.index("controlled_mode"), controlled)
         data[~is_finished] = np.nan
-        variables[name] = Variable(data, ("case", *dims), unit, text)
-    return variables
+        arrays[name] = data
+    return arrays
 
 
-def axis_sizes(variables: Mapping[str, Variable]) -> dict[str, int]:
-    return {
-        axis: size
-        for v in variables.values()
-        for axis, size in zip(v.dims, v.data.shape, strict=True)
-    }
+#: Variables of the whole model's files.
+FULL = (*PER_CASE, *METRICS)
+#: How cases ended.
+CODES = {"status", "screen_status"}
 
 
-def gather(table: CaseTable, finished: Finished) -> dict[str, Variable]:
-    """Status and metrics of all cases of a table, from the files that hold them.
+def gather(
+    table: CaseTable, finished: Finished, names: Iterable[str] = FULL
+) -> dict[str, Variable]:
+    """Variables of all cases of a table, from the files that hold them.
 
     Args:
         table: all cases.
         finished: from `finished_cases`.
+        names: of the variables.
 
     Returns:
-        Variables with the axis `case`; NaN and status -1 for missing cases.
+        Those that any file has, and the status; NaN and -1 for missing cases.
     """
-    target, is_known = positions(table, finished)
-    variables: dict[str, Variable] = {}
-    n = len(table)
-    largest = _largest(finished.files, (*PER_CASE, *METRICS))
-    for number, file in enumerate(finished.files):
-        chosen = is_known & (finished.file == number)
-        if not chosen.any():
-            continue
-        with h5py.File(file, "r") as store:
-            for name, dataset in store.items():
-                if name not in PER_CASE and name not in METRICS:
-                    continue
-                data = dataset[()]
-                if name not in variables:
-                    shape = (n, *largest[name][0][1:])
-                    empty = np.full(shape, -1 if data.dtype.kind == "i" else np.nan)
-                    dims, *label = label_of(name)
-                    filled = empty.astype(data.dtype)
-                    variables[name] = Variable(filled, ("case", *dims), *label)
-                inside = (target[chosen], *map(slice, data.shape[1:]))
-                variables[name].data[inside] = data[finished.row[chosen]]
-    if "status" not in variables:
-        empty = np.full(n, NOT_RUN)
-        variables["status"] = Variable(empty, ("case",), *PER_CASE["status"][1:])
+    columns = joined_columns(table, finished, names)
+    whole = slice(0, len(table))
+    variables = {name: v._replace(data=v.data.read(whole)) for name, v in columns.items()}
+    for name in CODES.intersection(names) - variables.keys():
+        variables[name] = labelled(name, np.full(len(table), NOT_RUN))
     return variables
 
 
@@ -166,7 +147,7 @@ def merge(
     attributes: dict[str, Any],
     screened: Finished | None = None,
 ) -> None:
-    """Join all finished cases in one file, file by file to save memory.
+    """Join all finished cases in one file, in parts to save memory.
 
     Args:
         folder: the sweep's folder.
@@ -179,107 +160,58 @@ def merge(
         StudyError: the disk is full or not writable.
     """
     variables = case_variables(table)
-    rest = np.full(len(table), NOT_RUN)
+    code = gather(table, finished, ["status"])["status"].data
     if screened is not None:
-        target, is_known = positions(table, screened)
-        code = joined(screened, "screen_status")
+        variables |= joined_columns(table, screened, SCREENED)
+        linear = gather(table, screened, ["screen_status"])["screen_status"].data
         # what no run can start with is a fault in either model
-        left = np.where(np.isin(code, status.FINISHED), LEFT_OUT, code)
-        rest[target[is_known]] = left[is_known]
-        variables |= _streamed(table, screened, tuple(SCREENED), np.full(len(table), NOT_RUN))
-    found = _streamed(table, finished, (*PER_CASE, *METRICS), rest)
-    variables |= found or {"status": Variable(rest, ("case",), *PER_CASE["status"][1:])}
+        rest = np.where(np.isin(linear, status.FINISHED), LEFT_OUT, linear)
+        code = np.where(code == NOT_RUN, rest, code)
+    variables |= joined_columns(table, finished, FULL)
+    variables["status"] = labelled("status", code)
     variables |= axis_variables(table, axis_sizes(variables))
     write_store(folder / JOINED, variables, attributes)
 
 
-#: Bytes of a variable that are joined at once.
-BLOCK_BYTES = 2**25
-
-
-def joined(finished: Finished, name: str) -> np.ndarray:
-    """Values of a number of each finished case, (n,).
-
-    Args:
-        finished: from `finished_cases`.
-        name: of the number.
-    """
-    found = np.empty(len(finished.case_id))
-    for number, path in enumerate(finished.files):
-        chosen = finished.file == number
-        with h5py.File(path, "r") as store:
-            found[chosen] = store[name][()][finished.row[chosen]]
-    return found
-
-
-def _streamed(
-    table: CaseTable, finished: Finished, names: tuple[str, ...], rest: np.ndarray
+def joined_columns(
+    table: CaseTable, finished: Finished, names: Iterable[str]
 ) -> dict[str, Variable]:
-    """Variables of these names, read from the files that hold them as they are written.
-
-    Args:
-        table: all cases.
-        finished: where they are.
-        names: of the variables, as far as they exist.
-        rest: codes of cases that are in no file, (n,).
-    """
-    target, is_known = positions(table, finished)
+    """The same as `gather`, but the data are read when they are needed."""
+    order = np.argsort(table.case_id)
+    at = np.searchsorted(table.case_id[order], finished.case_id)
+    target = order[np.minimum(at, len(table) - 1)]
+    is_known = table.case_id[target] == finished.case_id
     places = []
     for number, path in enumerate(finished.files):
         chosen = np.flatnonzero(is_known & (finished.file == number))
         chosen = chosen[np.argsort(target[chosen])]
         places.append((path, target[chosen], finished.row[chosen]))
 
-    def parts(name: str, shape: tuple[int, ...], dtype: np.dtype) -> Iterator[Any]:
-        size = max(1, BLOCK_BYTES // (dtype.itemsize * int(np.prod(shape[1:]))))
-        for start in range(0, shape[0], size):
-            count = min(size, shape[0] - start)
-            whole = np.full((count, *shape[1:]), np.nan if dtype.kind == "f" else NOT_RUN, dtype)
-            if name == "status":
-                whole[:] = rest[start : start + count]
-            for path, at, row in places:
-                here = slice(*np.searchsorted(at, (start, start + count)))
-                if here.start < here.stop:
-                    with h5py.File(path, "r") as store:
-                        data = _fitted(store[name][()], shape[1:])
-                    whole[at[here] - start] = data[row[here]]
-            yield start, whole
+    def read(name: str, shape: tuple[int, ...], dtype: np.dtype, rows: slice) -> np.ndarray:
+        empty = np.nan if dtype.kind == "f" else NOT_RUN
+        part = np.full((rows.stop - rows.start, *shape), empty, dtype)
+        for path, at, row in places:
+            inside = slice(*np.searchsorted(at, (rows.start, rows.stop)))
+            if inside.start < inside.stop:
+                with h5py.File(path, "r") as store:
+                    data = store[name][()]
+                into = (at[inside] - rows.start, *map(slice, data.shape[1:]))
+                part[into] = data[row[inside]]
+        return part
 
-    variables = {}
-    for name, (shape, dtype) in _largest(finished.files, names).items():
-        dims, *label = label_of(name)
-        whole = (len(table), *shape[1:])
-        streamed = Streamed(whole, dtype, partial(parts, name, whole, dtype))
-        variables[name] = Variable(streamed, ("case", *dims), *label)
-    return variables
+    columns = {}
+    for name, (shape, dtype) in _largest(finished.files, set(names)).items():
+        column = Rows((len(table), *shape), dtype, partial(read, name, shape, dtype))
+        columns[name] = labelled(name, column)
+    return columns
 
 
-def positions(table: CaseTable, finished: Finished) -> tuple[np.ndarray, np.ndarray]:
-    """Number of each finished case in the table, and whether it is one of its cases."""
-    order = np.argsort(table.case_id)
-    at = np.searchsorted(table.case_id[order], finished.case_id)
-    target = order[np.minimum(at, len(table) - 1)]
-    return target, table.case_id[target] == finished.case_id
-
-
-def _largest(
-    files: list[Path], names: tuple[str, ...]
-) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
-    """Largest shape of each variable, and its type: programs can have different mode counts."""
+def _largest(files: list[Path], names: set[str]) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+    """Largest shape of a row of each variable, and its type: programs differ in mode counts."""
     largest: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
     for file in files:
         with h5py.File(file, "r") as store:
-            for name, dataset in store.items():
-                if name in names:
-                    shape = largest[name][0] if name in largest else dataset.shape
-                    largest[name] = tuple(map(max, shape, dataset.shape)), dataset.dtype
+            for name in names & store.keys():
+                shape, dtype = store[name].shape[1:], store[name].dtype
+                largest[name] = tuple(map(max, largest.get(name, (shape,))[0], shape)), dtype
     return largest
-
-
-def _fitted(data: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Rows padded to a larger shape with NaN."""
-    if data.shape[1:] == shape:
-        return data
-    whole = np.full((len(data), *shape), np.nan, data.dtype)
-    whole[(slice(None), *map(slice, data.shape[1:]))] = data
-    return whole

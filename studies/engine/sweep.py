@@ -36,12 +36,12 @@ from studies.engine.screen import (
     first_round,
     next_round,
     ranked,
+    screen_arrays,
     screen_groups,
-    screen_variables,
     screened_cases,
     wanted,
 )
-from studies.engine.stored import chunk_variables, kept_metrics, manifest_attributes, merge
+from studies.engine.stored import chunk_arrays, kept_metrics, manifest_attributes, merge
 from studies.errors import StudyError
 from studies.kernels.cpu import full_effort
 from studies.space.spec import SweepSpec
@@ -203,10 +203,10 @@ class _Run:
         groups = plan_groups(self.table, left, self._layout, sweep.metrics, is_linear)
 
         def save(done: Done) -> np.ndarray:
-            variables = chunk_variables(self.table, done, kept)
-            self.folder.write_chunk(variables)
+            arrays = chunk_arrays(self.table, done, kept)
+            self.folder.write_chunk(arrays)
             self.n_run += len(done.chunk.rows)
-            return variables["status"].data
+            return arrays["status"]
 
         n_before = len(rows) - len(left)
         text = headline(self.table, groups, n_before)
@@ -227,9 +227,9 @@ class _Run:
         groups = screen_groups(table, left, self.runner.layout, screen)
 
         def save(done: Done) -> np.ndarray:
-            variables = screen_variables(self.spec, table, done)
-            self.folder.write_chunk(variables, SCREEN)
-            return variables["screen_status"].data
+            arrays = screen_arrays(self.spec, table, done)
+            self.folder.write_chunk(arrays, SCREEN)
+            return arrays["screen_status"]
 
         n_before = len(table) - len(left)
         text = f"screen by the linear model: {_headline(table, groups, n_before)}"
