@@ -32,30 +32,35 @@ def digest(*modules: str, top: Path = TOP) -> str:
 
 def closure(modules: Iterable[str], top: Path = TOP) -> list[Path]:
     """Source files of modules and of all modules of these packages that they import, sorted."""
-    found: set[Path] = set()
-    waiting = [path for name in modules for path in _files(name, top, is_whole=True)]
+    sources: set[Path] = set()
+    waiting = [path for name in modules for path in _whole(name, top)]
     while waiting:
         path = waiting.pop()
-        if path not in found:
-            found.add(path)
+        if path not in sources:
+            sources.add(path)
             waiting += [file for name in _imports(path) for file in _files(name, top)]
-    return sorted(found)
+    return sorted(sources)
 
 
-def _files(name: str, top: Path, is_whole: bool = False) -> list[Path]:
+def _whole(name: str, top: Path) -> Iterable[Path]:
+    """Files of a module or of a whole package."""
+    folder = top.joinpath(*name.split("."))
+    is_package = name.partition(".")[0] in PACKAGES and folder.is_dir()
+    return sorted(folder.rglob("*.py")) if is_package else _files(name, top)
+
+
+@cache
+def _files(name: str, top: Path) -> tuple[Path, ...]:
     """File of a module, or of the module with a name; re-exports of packages are left out."""
     parts = name.split(".")
     if parts[0] not in PACKAGES:
-        return []
-    folder = top.joinpath(*parts)
-    if is_whole and folder.is_dir():
-        return sorted(folder.rglob("*.py"))
+        return ()
     for k in range(len(parts), 0, -1):
         at = top.joinpath(*parts[:k])
         for file in (at.with_suffix(".py"), at / "__init__.py"):
             if file.is_file():
-                return [file]
-    return []
+                return (file,)
+    return ()
 
 
 @cache
