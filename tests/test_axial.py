@@ -15,9 +15,9 @@ from jaxmodel.kinematics import close_chain
 from jaxmodel.linear import Moment, linearise, natural_modes
 from jaxmodel.parameters import HOME
 from jaxmodel.prepare import prepare
-from jaxmodel.simulate import simulate
 from studies.bench import reference
 from studies.engine.preflight import check_run
+from studies.engine.runs import _simulate
 from studies.engine.stability import loop_report, run_report
 from studies.errors import ModelWarning, StudyError
 from studies.study.cases import as_arrays, build_case, build_structure
@@ -82,7 +82,7 @@ def fast_square(**changes):
         metrics__residual_length=0.1,
         **changes,
     )
-    record = jax.jit(simulate, static_argnums=(0, 2))(*arrays(study), True).record
+    record = _simulate(*arrays(study), True).record
     at = np.round(given[:, 0] / 1e-4).astype(int)
     deflection = np.asarray(record.chord_deflection_stations)[at, :, 0]
     return given[:, 0], (deflection, given[:, 1:4]), (np.asarray(record.pose)[at], given[:, 4:7])
@@ -91,7 +91,7 @@ def fast_square(**changes):
 FAST = [
     pytest.param({"link__modes": 3}, marks=pytest.mark.long),
     {"link__modes": 8},
-    {"link__modes": 3, "link__axial_inertia": "distributed"},
+    {"link__modes": 8, "link__axial_inertia": "distributed"},
 ]
 
 
@@ -111,14 +111,15 @@ def test_the_model_without_shortening_is_far_off_on_fast_moves():
     assert np.abs(deflection - wanted).max() > 0.03 * np.abs(wanted).max()
 
 
-#: Links ten times as dense and half as thick.
+#: Links ten times as dense and half as thick, in the programs of the fast square.
 HEAVY_LINKS = BARE.change(
+    link__modes=8,
     link__density=27500.0,
     link__thickness=1e-3,
     drive__kd=60.0,
     motion__move_time=0.05,
     shaper__kind="none",
-    run__duration=0.3,
+    run__duration=0.3001,
     metrics__residual_delay=0.0,
     metrics__residual_length=0.05,
     metrics__stations=(0.5,),
@@ -134,9 +135,7 @@ def test_lumped_inertia_of_heavy_links_is_estimated_and_reported():
         warnings.simplefilter("error")
         distributed, _ = check_run(HEAVY_LINKS.change(link__axial_inertia="distributed"))
         check_run(HEAVY_LINKS.change(link__shortening=False))
-    results = (
-        jax.jit(simulate, static_argnums=(0, 2))(x, case, True) for x in (lumped, distributed)
-    )
+    results = (_simulate(x, case, True) for x in (lumped, distributed))
     mine, true = (np.asarray(x.record.chord_deflection_stations) for x in results)
     error = np.abs(mine - true).max() / np.abs(true).max()
     assert estimate / 3 < error < 3 * estimate  # undamped: phases drift apart
@@ -194,7 +193,7 @@ def test_a_load_beyond_the_critical_force_is_a_status(share, code):
     """The moment that compresses all links alike up to N_cr, and a little beyond."""
     moment = -share * N_CR * 5.0 / statics((0.0, 0.0, 5.0))[0]
     study = BARE.change(
-        run__duration=0.02,
+        run__duration=0.1,
         metrics__residual_delay=0.0,
         metrics__residual_length=0.001,
         shaper__kind="none",
@@ -202,9 +201,7 @@ def test_a_load_beyond_the_critical_force_is_a_status(share, code):
     )
     structure, case = arrays(study)
     load = case.load._replace(wrench=np.array([0.0, 0.0, moment]))
-    result = jax.jit(simulate, static_argnums=0)(
-        structure._replace(has_wrench=True), case._replace(load=load)
-    )
+    result = _simulate(structure._replace(has_wrench=True), case._replace(load=load), True)
     assert result.status == code
     assert np.isfinite(result.metrics.residual_rms).all() == (code == status.OK)
     if code == status.BUCKLED:
@@ -223,11 +220,11 @@ def test_a_steady_load_is_held_and_a_pulse_moves_the_platform():
         load__wrench=(20.0, 0.0, 0.1),
         link__damping_ratio=0.01,
     )
-    run = jax.jit(simulate, static_argnums=(0, 2))
-    held = run(*arrays(study), True)
+    held = _simulate(*arrays(study), True)
     np.testing.assert_allclose(held.record.pose, np.tile(HOME, (1000, 1)), atol=1e-12)
     # a long pulse: the platform sags as on the springs of the drive, dX = (J^t Kp J)^-1 W
-    pushed = run(*arrays(study.change(load__pulse=(5.0, 0.0, 0.0), load__pulse_length=0.1)), True)
+    pulse = {"load__pulse": (5.0, 0.0, 0.0), "load__pulse_length": 0.1}
+    pushed = _simulate(*arrays(study.change(**pulse)), True)
     plant = plant_of(*arrays(study))
     jacobian = jax.jacfwd(lambda at: close_chain(plant, at, np.zeros(3)).rho)(HOME_POSE)
     sag = np.linalg.solve(jacobian.T @ jacobian * 2e4, [5.0, 0.0, 0.0])
@@ -272,11 +269,10 @@ def test_ked_leaves_uncontrolled_links_as_they_are():
         metrics__residual_length=0.03,
         metrics__residual_delay=0.05,
     )
-    run = jax.jit(simulate, static_argnums=0)
 
     def residual(links, model):
-        made = study.change(control__links=links, run__model=model)
-        return np.asarray(run(*arrays(made)).metrics.residual_rms)[:, 1]
+        changed = study.change(control__links=links, run__model=model)
+        return np.asarray(_simulate(*arrays(changed), False).metrics.residual_rms)[:, 1]
 
     none, one = ((False,) * 3, (True, False, False))
     before, after = (residual(links, "ked") for links in (none, one))
@@ -290,11 +286,12 @@ def test_ked_bends_links_by_the_rigid_motion_alone():
     """A heavy, stiffly driven machine follows its command, and both models bend alike."""
     study = paper_study().change(
         link__modes=3,
-        motion__move_time=0.1,
+        motion__move_time=0.06,
         shaper__kind="none",
-        run__duration=0.5,
+        run__duration=0.3001,
         metrics__residual_delay=0.0,
         metrics__residual_length=0.05,
+        metrics__stations=(0.5,),
         control__feedback="none",
         drive__kp=1e7,
         drive__kd=3e3,
@@ -303,9 +300,8 @@ def test_ked_bends_links_by_the_rigid_motion_alone():
         machine__platform_inertia=0.05,
         link__shortening=False,
     )
-    run = jax.jit(simulate, static_argnums=0)
     ked, coupled = (
-        np.asarray(run(*arrays(study.change(run__model=m))).metrics.structural_peak)
+        np.asarray(_simulate(*arrays(study.change(run__model=m)), True).metrics.structural_peak)
         for m in ("ked", "coupled")
     )
     np.testing.assert_allclose(ked, coupled, rtol=0.03)
@@ -325,9 +321,9 @@ def test_ked_fails_where_the_drive_rings_with_the_links(kp, peak, residual):
         metrics__residual_length=0.1,
         drive__kp=kp,
     )
-    run = jax.jit(simulate, static_argnums=0)
     coupled, ked = (
-        run(*arrays(study.change(run__model=model))).metrics for model in ("coupled", "ked")
+        _simulate(*arrays(study.change(run__model=model)), False).metrics
+        for model in ("coupled", "ked")
     )
 
     def error(name):
@@ -387,7 +383,7 @@ def test_spectra_of_the_measured_machine_stand_on_their_peaks():
         metrics__residual_delay=0.0,
         metrics__residual_length=0.1,
     )
-    result = jax.jit(simulate, static_argnums=0)(*arrays(study))
+    result = _simulate(*arrays(study), False)
     density = np.asarray(result.metrics.spectral_density)
     assert (np.abs(density[:, 0].argmax(axis=-1) - 4) <= 1).all()  # of 9 points, +-10 %
     bases = jax.jit(find_bases, static_argnums=0)(*arrays(study))
@@ -408,8 +404,7 @@ def test_one_step_per_sample_is_enough_for_the_fastest_moves():
         control__gain_factor=1.0,
         run__smooth=True,
     )
-    run = jax.jit(simulate, static_argnums=(0, 2))
-    one, eight = (run(*arrays(study.change(run__substeps=n)), True) for n in (1, 8))
+    one, eight = (_simulate(*arrays(study.change(run__substeps=n)), True) for n in (1, 8))
     assert eight.metrics.peak_voltage.max() > 90
     signals = (np.asarray(x.record.chord_deflection_stations) for x in (one, eight))
     coarse, fine = signals

@@ -1,4 +1,4 @@
-"""A single run: steps it needs, statuses that must not read ok, ratios from its own first pass."""
+"""A single run: steps it needs, how it ends, statuses that must not read ok, ratios of its own."""
 
 import subprocess
 import sys
@@ -7,16 +7,30 @@ import numpy as np
 import pytest
 
 from jaxmodel import status
+from jaxmodel.parameters import HOME
+from jaxmodel.simulate import _share_on
 from studies.engine.preflight import check_run
-from studies.engine.runs import run_study
+from studies.engine.runs import _simulate, run_study
 from studies.errors import StudyError
+from studies.study.cases import as_arrays, build_case, build_structure
 from tests.test_batch import short_study
 
-SMALL = {"link__modes": 2, "control__modes": 2}
+#: Runs of all tests here have one length and two modes, so that they share two programs: links
+#: with and without shortening.
+SMALL = {"link__modes": 2, "control__modes": 2, "run__duration": 0.08}
+#: A move that ends well, if little is left.
+FAST = {
+    "shaper__kind": "none",
+    "motion__waypoints": (HOME, (0.0, 0.01, HOME[2])),
+    "motion__move_time": 0.04,
+    "metrics__residual_length": 0.02,
+    "metrics__residual_delay": 0.01,
+}
+UNCONTROLLED = {"control__links": (False, False, False)}
 
 
 def judged(**changes):
-    return run_study(short_study(**SMALL, **changes), has_record=False, has_loop=False)
+    return run_study(short_study(**SMALL | changes), has_record=False, has_loop=False)
 
 
 def test_stiff_drive_gets_the_steps_it_needs():
@@ -50,12 +64,12 @@ def test_stiff_drive_runs_as_with_many_steps():
 )
 def test_what_no_run_can_do_is_refused(changes, words):
     with pytest.raises(StudyError) as caught:
-        check_run(short_study(**SMALL, **changes))
+        check_run(short_study(**SMALL | changes))
     assert words in str(caught.value)
 
 
 def test_a_blind_controller_is_not_ok():
-    found = judged(electronics__conditioner_bias=100.0, control__links=(False, False, False))
+    found = judged(electronics__conditioner_bias=100.0, **UNCONTROLLED)
     assert found.status == status.CLIPPED
     assert found.result.metrics.clipped_fraction == 1
 
@@ -69,7 +83,7 @@ def test_a_run_that_stops_has_no_metrics():
 def test_ratios_of_the_own_run():
     """Two passes in one: uncontrolled for the ratios (24), then controlled with them."""
     found = judged(control__ratio_source="own_run", control__ratio_exponent=0.5)
-    off = judged(control__links=(False, False, False))
+    off = judged(**UNCONTROLLED)
     ratio = off.result.metrics.energy_ratio
     np.testing.assert_allclose(ratio[:, 0], 1)
     assert np.all((ratio[:, 1] > 0) & (ratio[:, 1] < 1))
@@ -78,6 +92,72 @@ def test_ratios_of_the_own_run():
     a, b = found.result.metrics.control_energy, given.result.metrics.control_energy
     np.testing.assert_allclose(a, b, rtol=1e-9)
     assert abs(judged().result.metrics.control_energy / b - 1) > 1e-6
+
+
+def test_a_sound_run_is_ok_and_says_how_far_it_stays_from_singular_poses():
+    found = judged(**FAST)
+    assert found.status == status.OK
+    # guide 3: h = 0.1732 m + y, and gamma = arcsin(h/L) at most
+    nearest = np.pi / 2 - np.arcsin((0.3 / 3**0.5 + 0.01) / 0.2)
+    np.testing.assert_allclose(found.result.singularity_distance, nearest, rtol=1e-4)
+    assert found.result.metrics.motor_saturated_fraction == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ({"drive__force_limit": 0.1}, status.NOT_ARRIVED),  # a machine that hardly moves
+        ({"drive__force_limit": 15.0}, status.MOTORS_SATURATED),
+        (
+            {"motion__waypoints": (HOME, (0.0, 0.0266, HOME[2]))} | UNCONTROLLED,
+            status.NEAR_SINGULAR,
+        ),
+        ({"metrics__arrival_tolerance": 1e-9}, status.NOT_ARRIVED),
+        (
+            {"load__mass": 2.5, "motion__move_time": 0.03} | UNCONTROLLED,
+            status.OVERLOADED,
+        ),
+        (  # a model that cannot buckle says so, too
+            {"load__wrench": (200.0, 0.0, 0.0), "link__shortening": False} | UNCONTROLLED,
+            status.OVERLOADED,
+        ),
+        ({"metrics__singularity_margin": 0.5}, status.NEAR_SINGULAR),
+    ],
+)
+def test_a_run_that_ends_badly_says_so(changes, code):
+    found = judged(**FAST | changes)
+    assert found.status == code
+    assert np.isfinite(found.result.metrics.residual_rms).all()  # its numbers stay
+
+
+def test_modes_damped_beyond_critical_are_refused():
+    changes = {"link__damping_ratio": 0.3, "link__damping_law": "stiffness"}
+    with pytest.raises(StudyError, match="link.damping_ratio = 0.3; allowed: ratios .* up to 1.2"):
+        judged(**FAST, **changes)
+    study = short_study(**SMALL, **FAST, **changes)
+    found = _simulate(build_structure(study), as_arrays(build_case(study)), False)
+    assert found.status == status.OVERDAMPED
+
+
+@pytest.mark.parametrize(
+    ("start", "length"), [(0.01, 0.0), (0.01, 1e-5), (0.01003, 1e-5), (0.01, 1.5e-4), (0.0, 1.0)]
+)
+def test_pulses_keep_their_impulse(start, length):
+    time = 1e-4 * np.arange(400)
+    share = np.asarray(_share_on(time, start, length))
+    acts = min(start + length, 0.04) - start
+    np.testing.assert_allclose(share.sum() * 1e-4, acts, rtol=1e-9, atol=1e-15)
+    assert np.all((share >= 0) & (share <= 1 + 1e-9))
+    first = np.flatnonzero(share)
+    assert first.size == 0 or time[first[0]] <= start + 1e-12
+
+
+def test_forces_along_the_links_are_those_of_the_rigid_motion():
+    """N reaches 4.5 N for 10 mm in 0.05 s; what the links would stretch by then."""
+    metrics = judged(**FAST | {"motion__move_time": 0.05} | UNCONTROLLED).result.metrics
+    highest = max(metrics.peak_tension.max(), metrics.peak_compression.max())
+    assert 3.0 < highest < 6.0
+    assert 0.1e-6 < metrics.stretch_error_peak[:2].max() < 2 * highest * 0.2 / 1.4e6
 
 
 def test_configure_comes_first():
