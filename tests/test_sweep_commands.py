@@ -12,6 +12,7 @@ from studies.engine import plan
 from studies.engine.design import load_design
 from studies.engine.folder import BASELINE
 from studies.engine.frame import frame_of
+from studies.engine.function import TRACES
 from studies.engine.preflight import check_run
 from studies.engine.results import load
 from studies.engine.runs import run_study
@@ -57,8 +58,9 @@ def spec(tmp_path_factory):
 
 def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     out = tmp_path / "s"
+    before = TRACES.copy()
     code, text, _ = run(capsys, "sweep", spec, "--dry-run")
-    assert code == 0 and "40 cases" in text and "estimate:" in text and "sample: case 20" in text
+    assert code == 0 and "40 cases" in text and "sample: case 20" in text and before == TRACES
     assert not out.exists() and "cannot run" not in text
     code, text, _ = run(capsys, "sweep", spec, "--out", out, "--report")
     assert code == 0 and "40/40 cases" in text and "compiled in" in text and "results.h5" in text

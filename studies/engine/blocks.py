@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 from jaxmodel.controller import Controller
 from jaxmodel.state_space import IllConditionedError, StateSpace, dense, modal_form
@@ -148,7 +148,10 @@ def responses(system: StateSpace, group: int, n: int) -> ImpulseResponses:
         # (z - A)^-1 = (z + A - tr A)/(z^2 - z tr A + det A), in powers of 1/z
         last = a + below[1] * np.eye(2)
         moved = np.array(
-            [[lfilter([0.0, i == r, last[i, r]], below, impulse) for r in (0, 1)] for i in (0, 1)]
+            [
+                [scipy.signal.lfilter([0.0, i == r, last[i, r]], below, impulse) for r in (0, 1)]
+                for i in (0, 1)
+            ]
         )
         found.state[k] = np.einsum("irn,rm->imn", moved, enter[k])
         found.command[:] += np.einsum("pi,imn->pmn", leave[:, k], found.state[k])

@@ -15,8 +15,9 @@ from __future__ import annotations
 import os
 import pickle
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import cache, update_wrapper
 from hashlib import sha256
+from operator import itemgetter
 from pathlib import Path
 from threading import RLock
 from typing import Any
@@ -36,9 +37,50 @@ _LOCK = RLock()
 _PROGRAMS: dict[str, Any] = {}
 
 
+class KeptFunction:
+    """A function whose programs are kept, made by `kept_jit`."""
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        static: tuple[int, ...],
+        compiler_options: dict[str, Any] | None,
+    ) -> None:
+        update_wrapper(self, function)
+        self._name = f"{function.__module__}.{function.__qualname__}"
+        self._static = static
+        self._jit = jax.jit(function, static_argnums=static, compiler_options=compiler_options)
+
+    def __call__(self, *arguments: Any) -> Any:
+        fixed, free = self._parted(arguments)
+        if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(free)):
+            return self._jit(*arguments)
+        return self.program(*arguments)(*free)
+
+    def program(self, *arguments: Any) -> Callable[..., Any]:
+        """The program for arguments like these, a function of those that are not static.
+
+        Called often, it saves finding it anew.
+        """
+        fixed, free = self._parted(arguments)
+        if not is_keeping() or not all(map(_is_plain, fixed)):
+            return lambda *free: self._jit(*self._joined(fixed, free))
+        return program([self._name, *fixed], free, lambda: self._jit.lower(*arguments))
+
+    def _parted(self, arguments: tuple[Any, ...]) -> tuple[list[Any], list[Any]]:
+        free = [x for k, x in enumerate(arguments) if k not in self._static]
+        return [arguments[k] for k in self._static], free
+
+    def _joined(self, fixed: list[Any], free: tuple[Any, ...]) -> list[Any]:
+        arguments = list(free)
+        for k, x in sorted(zip(self._static, fixed, strict=True), key=itemgetter(0)):
+            arguments.insert(k, x)
+        return arguments
+
+
 def kept_jit(
     static_argnums: int | tuple[int, ...] = (), compiler_options: dict[str, Any] | None = None
-) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+) -> Callable[[Callable[..., Any]], KeptFunction]:
     """`jax.jit` whose programs are kept.
 
     Args:
@@ -52,23 +94,7 @@ def kept_jit(
         ...     return x**n
     """
     static = (static_argnums,) if isinstance(static_argnums, int) else static_argnums
-
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        plain = jax.jit(function, static_argnums=static, compiler_options=compiler_options)
-        name = f"{function.__module__}.{function.__qualname__}"
-
-        @wraps(function)
-        def call(*arguments: Any) -> Any:
-            fixed = [arguments[k] for k in static]
-            free = [x for k, x in enumerate(arguments) if k not in static]
-            is_traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(free))
-            if is_traced or not is_keeping() or not all(map(_is_plain, fixed)):
-                return plain(*arguments)
-            return program([name, *fixed], free, lambda: plain.lower(*arguments))(*free)
-
-        return call
-
-    return decorate
+    return lambda function: KeptFunction(function, static, compiler_options)
 
 
 def _is_plain(x: Any) -> bool:

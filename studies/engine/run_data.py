@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 from jaxmodel.bases import find_bases
 from jaxmodel.beam import build_basis
@@ -181,7 +181,7 @@ def _applied_voltage(run: Run) -> np.ndarray:
         return command
     electronics = run.case.electronics
     kept = np.exp(-electronics.period / electronics.amplifier_lag)
-    return lfilter([0.0, 1 - kept], [1.0, -kept], command, axis=0)
+    return scipy.signal.lfilter([0.0, 1 - kept], [1.0, -kept], command, axis=0)
 
 
 def run_attributes(study: Study) -> dict[str, Any]:

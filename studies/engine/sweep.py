@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from functools import partial
@@ -18,8 +17,7 @@ from rich.console import Console
 from jaxmodel.case import Structure
 from studies import config
 from studies.engine.baseline import keep_baseline
-from studies.engine.chunks import Done, Here, Lost, Runner, has_own_ratio, start_chunk
-from studies.engine.executor import Executor
+from studies.engine.chunks import Done, Here, Lost, Runner
 from studies.engine.folder import (
     SCREEN,
     Finished,
@@ -28,7 +26,7 @@ from studies.engine.folder import (
     make_manifest,
     open_folder,
 )
-from studies.engine.plan import Group, Layout, chunk_cases, local_layout, plan_groups
+from studies.engine.plan import Group, Layout, local_layout, plan_groups
 from studies.engine.progress import Phases, Reporter
 from studies.engine.screen import (
     Round,
@@ -43,7 +41,6 @@ from studies.engine.screen import (
 )
 from studies.engine.stored import chunk_arrays, kept_metrics, manifest_attributes, merge
 from studies.errors import StudyError
-from studies.kernels.cpu import full_effort
 from studies.space.spec import SweepSpec
 from studies.space.table import CaseTable, build_table
 
@@ -360,39 +357,3 @@ class Estimate(NamedTuple):
     compile_time: float  # of all programs [s]
     chunk_time: float  # of a chunk of the last one [s]
     total: float  # compiling and running everything [s]
-
-
-def calibrate(plan: Plan) -> Estimate:
-    """Compile the first program, and that of a screen, and time one chunk of each."""
-    compiling = running = chunk_time = 0.0
-    for is_linear in (True, False):
-        groups = [g for g in plan.groups if g.structure.is_linear == is_linear]
-        if not groups:
-            continue
-        compile_time, chunk_time = _timed(plan.table, groups[0])
-        per_step = chunk_time / _steps(groups[0])
-        running += sum(len(g.chunks()) * _steps(g) * per_step for g in groups)
-        compiling += len(groups) * compile_time
-    return Estimate(compiling, chunk_time, compiling + running)
-
-
-def _steps(group: Group) -> int:
-    """Plant steps of a chunk."""
-    return group.layout.size * group.structure.n_steps * group.structure.substeps
-
-
-def _timed(table: CaseTable, group: Group) -> tuple[float, float]:
-    """Times to compile a program, and to run a chunk of it [s]."""
-    has_own = has_own_ratio(table, group)
-    executor = Executor(group.structure, group.layout, has_own)
-    rows = group.chunks()[0].rows
-    cases = chunk_cases(table, rows, group.structure, group.layout.size)
-
-    def run() -> float:
-        began = time.perf_counter()
-        start_chunk(executor, table, rows, cases, has_own, group.is_judged).wait()
-        return time.perf_counter() - began
-
-    with full_effort():  # most of a sweep's cases run so
-        run()
-        return executor.compile_time, run()

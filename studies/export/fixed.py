@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 from jaxmodel.controller import Controller
 from jaxmodel.shaper import Taps
@@ -286,9 +286,10 @@ def _energy(
     for m, (rows, first, below) in enumerate(
         zip(channels.energy, channels.first, channels.denominator, strict=True)
     ):
-        line = lfilter([1.0], [1.0, *below], lfilter(first[:2], [1.0, first[2]], impulse))
+        high = scipy.signal.lfilter(first[:2], [1.0, first[2]], impulse)
+        line = scipy.signal.lfilter([1.0], [1.0, *below], high)
         for part, row in enumerate(rows):
-            root = lfilter(row[:3], [1.0], line)
+            root = scipy.signal.lfilter(row[:3], [1.0], line)
             root[0] += row[3]
             largest[m, part] = bound[m] * np.abs(root).sum()
     step = largest.max() / 2.0 ** (WORD - 3)
@@ -303,12 +304,12 @@ def _responses(channels: ChannelFlow, m: int, n: int) -> tuple[np.ndarray, ...]:
     impulse[0] = 1.0
     b0, b1, a1 = channels.first[m]
     below, numerator = [1.0, *channels.denominator[m]], channels.force[m]
-    high = lfilter([b0, b1], [1.0, a1], impulse)
-    inner = lfilter([1.0], below, high)
-    force = lfilter(numerator, [1.0], inner)
+    high = scipy.signal.lfilter([b0, b1], [1.0, a1], impulse)
+    inner = scipy.signal.lfilter([1.0], below, high)
+    force = scipy.signal.lfilter(numerator, [1.0], inner)
     force[0] += channels.direct[m]
-    of_inner = lfilter(numerator, below, impulse)
-    of_high = lfilter([1.0], [1.0, a1], of_inner)
+    of_inner = scipy.signal.lfilter(numerator, below, impulse)
+    of_high = scipy.signal.lfilter([1.0], [1.0, a1], of_inner)
     return high, inner, force, of_high, of_inner
 
 

@@ -41,21 +41,21 @@ def run_in_the_loop(structure: Structure, case: Case, law: Law) -> LoopRun:
     start = _begin(structure, case)
     state, inputs = start.state, start.inputs
     code, clipped = _look(start.loop, inputs, 0, state)
+    voltage = np.zeros_like(np.asarray(code))
+    sample = _sample.program(structure, start.loop, inputs, 0, state, voltage, clipped)
     codes, voltages, poses = [], [], []
     for k in range(structure.n_steps):
         code = np.asarray(code)
         voltage = np.asarray(law(code), code.dtype)
         codes.append(code)
         voltages.append(voltage)
-        state, pose, code, clipped = _sample(
-            structure, start.loop, inputs, k, state, voltage, clipped
-        )
+        state, pose, code, clipped = sample(start.loop, inputs, k, state, voltage, clipped)
         poses.append(pose)
     result = jax.tree.map(np.asarray, _conclude(start.outline, start.state.status, state))
     return LoopRun(np.stack(codes), np.stack(voltages), np.stack(poses), result)
 
 
-_begin: Callable[[Structure, Case], Start] = kept_jit(static_argnums=0)(begin)
+_begin = kept_jit(static_argnums=0)(begin)
 _conclude = kept_jit()(conclude)
 
 
@@ -87,26 +87,41 @@ def _sample(
     return following, record.pose, *_read(loop, inputs, k + 1, following)
 
 
-def jax_law(controller: Controller, dac_step: float | None = None) -> Law:
-    """The JAX controller as a `Law` with a state.
+def run_controller(
+    structure: Structure, case: Case, controller: Controller, dac_step: float = 0.0
+) -> LoopRun:
+    """Run a case with the JAX controller.
 
     Args:
+        structure: as for `run_in_the_loop`.
+        case: the numbers.
         controller: coefficients.
-        dac_step: round commands to multiples of it [V]; None: leave them.
+        dac_step: commands are rounded to multiples of it [V]; 0: they are not.
     """
+    structure = structure._replace(has_position_gain=False)
+    start = _begin(structure, case)
     controller = jax.tree.map(jnp.asarray, controller)
-    state = rest_controller(controller)
+    state, *run = _samples(structure, start, controller, jnp.asarray(dac_step))
+    result = _conclude(start.outline, start.state.status, state)
+    return LoopRun(*jax.tree.map(np.asarray, (*run, result)))
 
-    def law(code: np.ndarray) -> np.ndarray:
-        nonlocal state
-        state = _step(controller, state, code)
-        if dac_step is None:
-            return np.asarray(state.voltage)
-        voltage = np.round(np.asarray(state.voltage) / dac_step) * dac_step
-        state = state._replace(voltage=voltage)
-        return voltage
 
-    return law
+@kept_jit(static_argnums=0)
+def _samples(structure: Structure, start: Start, controller: Controller, dac_step: Any) -> Any:
+    """The last state; codes, commands and poses of all samples."""
+    loop, inputs = start.loop, start.inputs
+
+    def body(carry: Any, k: Any) -> Any:
+        state, own, code, clipped = carry
+        own = _step(controller, own, code)
+        rounded = jnp.round(own.voltage / jnp.where(dac_step > 0, dac_step, 1.0)) * dac_step
+        voltage = jnp.where(dac_step > 0, rounded, own.voltage)
+        state, pose, *after = _sample(structure, loop, inputs, k, state, voltage, clipped)
+        return (state, own._replace(voltage=voltage), *after), (code, voltage, pose)
+
+    first = start.state, rest_controller(controller), *_read(loop, inputs, 0, start.state)
+    last, records = jax.lax.scan(body, first, jnp.arange(structure.n_steps))
+    return last[0], *records
 
 
 @kept_jit()

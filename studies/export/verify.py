@@ -18,7 +18,7 @@ from studies.export.document import Document, controller_of
 from studies.export.fixed import FixedPoint, rail_samples, shaper_row
 from studies.export.fixed_blocks import FixedBlocks
 from studies.export.floating import respond as respond_floating
-from studies.export.in_the_loop import LoopRun, jax_law, replay, run_in_the_loop
+from studies.export.in_the_loop import LoopRun, replay, run_controller, run_in_the_loop
 from studies.export.integers import Response, shifted
 from studies.export.integers import respond as respond_fixed
 from studies.export.sequences import hard_sequences, stuck_at_end
@@ -87,8 +87,7 @@ def vibration(run: LoopRun) -> float:
 
 def reference_run(found: FixedController) -> LoopRun:
     """The case's motion with the JAX controller."""
-    law = jax_law(found.controller)
-    return run_in_the_loop(found.structure, found.case, law)
+    return run_controller(found.structure, found.case, found.controller)
 
 
 def verify_document(found: FixedController, reference: LoopRun, document: Document) -> Verification:
@@ -156,8 +155,9 @@ def verify_fixed(
     """C in fixed point against its integer model, bit by bit, and against the JAX controller."""
     rail = rail_samples(found.study.electronics.sample_rate_hz)
     checks, runs = [], {"JAX": reference}
-    behind_dac = jax_law(found.controller, fixed.wires.dac_step)
-    runs["JAX behind the DAC"] = run_in_the_loop(found.structure, found.case, behind_dac)
+    runs["JAX behind the DAC"] = run_controller(
+        found.structure, found.case, found.controller, float(fixed.wires.dac_step)
+    )
     shape = reference.codes.shape[1:]
     with _loaded(found, source, name, compiler, np.uint16, np.int32) as code:
 

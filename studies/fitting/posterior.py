@@ -9,8 +9,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.special import expit, logit
+import scipy
 
 from studies.errors import StudyError
 from studies.fitting.problem import Problem
@@ -50,11 +49,11 @@ class Shape(NamedTuple):
     def draw(self, count: int, seed: int) -> np.ndarray:
         """Places between the bounds, (n, p)."""
         z = np.random.default_rng(seed).normal(size=(count, len(self.middle)))
-        return np.asarray(expit(self.middle + z @ self.root.T))
+        return np.asarray(scipy.special.expit(self.middle + z @ self.root.T))
 
     def log_density(self, u: np.ndarray) -> np.ndarray:
         """Logarithm of the density of places between the bounds, (n, p), up to a constant."""
-        v = logit(u)
+        v = scipy.special.logit(u)
         z = np.linalg.solve(self.root, (v - self.middle).T)
         return -0.5 * np.sum(z**2, axis=0) - np.sum(_log_width(v), axis=1)
 
@@ -63,15 +62,15 @@ def shape(answer: Answer) -> Shape:
     """Shape of the posterior, from the model's derivatives at the optimum."""
 
     def cost(v: np.ndarray) -> tuple[float, np.ndarray]:
-        u = expit(v)
+        u = scipy.special.expit(v)
         away = u - answer.place
         pull = answer.information @ away
         value = answer.gradient @ away + 0.5 * away @ pull - np.sum(_log_width(v))
         return float(value), (answer.gradient + pull) * u * (1 - u) - (1 - 2 * u)
 
-    start = logit(np.clip(answer.place, 0.02, 0.98))
-    middle = minimize(cost, start, jac=True, method="BFGS").x
-    u = expit(middle)
+    start = scipy.special.logit(np.clip(answer.place, 0.02, 0.98))
+    middle = scipy.optimize.minimize(cost, start, jac=True, method="BFGS").x
+    u = scipy.special.expit(middle)
     width = u * (1 - u)
     # the second derivatives of u by v, times the slope of the cost by u, which the width balances
     bend = (1 - 2 * u) ** 2 + 2 * width
@@ -118,7 +117,7 @@ def sample(problem: Problem, about: Shape, count: int, seed: int) -> Posterior:
                 found.append(np.asarray(state.position))
         chains.append(found)
     walked = np.array(chains)  # (chains, n, p)
-    places = expit(about.middle + walked.reshape(-1, size) @ about.root.T)[:count]
+    places = scipy.special.expit(about.middle + walked.reshape(-1, size) @ about.root.T)[:count]
     logits = walked @ about.root.T
     return Posterior(
         places=places,
@@ -154,7 +153,7 @@ def log_density(problem: Problem, about: Shape) -> Any:
 
     def both(z: Any) -> tuple[float, np.ndarray]:
         v = about.middle + about.root @ np.asarray(z)
-        u = expit(v)
+        u = scipy.special.expit(v)
         try:
             parts = problem.parts(problem.free.values(u), True)
         except (StudyError, np.linalg.LinAlgError):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
+import scipy
 
 from studies.errors import StudyError
 from studies.fitting.problem import Problem
@@ -45,7 +45,7 @@ class Likelihood(NamedTuple):
         way = np.sign(self.values - self.values[int(np.argmin(self.rise))])
         signed = way * np.sqrt(np.maximum(self.rise, 0.0))  # a straight line for a parabola
         x = np.linspace(self.values[0], self.values[-1], 201)
-        return x, PchipInterpolator(self.values, signed)(x) ** 2
+        return x, scipy.interpolate.PchipInterpolator(self.values, signed)(x) ** 2
 
     def interval(self) -> tuple[float, float]:
         """Where the rise is that of 95 %, or the last values that were tried."""

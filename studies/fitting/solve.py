@@ -8,8 +8,7 @@ from itertools import permutations, product
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import OptimizeResult, least_squares
-from scipy.stats import qmc
+import scipy
 
 from studies.errors import StudyError
 from studies.fitting.problem import Problem
@@ -76,7 +75,7 @@ def solve(problem: Problem, starts: int, refine: int, iterations: int, seed: int
         StudyError: no starting point has residuals.
     """
     own = problem.free.places()
-    sobol = qmc.Sobol(len(own), seed=seed)
+    sobol = scipy.stats.qmc.Sobol(len(own), seed=seed)
     drawn = sobol.random_base2(max(int(np.ceil(np.log2(max(starts - 1, 1)))), 0))[: starts - 1]
     first = np.clip(np.vstack([own[None], drawn]), INSIDE, 1 - INSIDE)
     cost = problem.costs(first)
@@ -167,7 +166,7 @@ def descend(problem: Problem, u: np.ndarray, iterations: int) -> Optimum:
 
 def follow(
     problem: Problem, u: np.ndarray, moving: np.ndarray, iterations: int, tolerance: float
-) -> OptimizeResult:
+) -> scipy.optimize.OptimizeResult:
     """Move some of the numbers to where the residuals are least.
 
     Steps to where the model fails are taken back.
@@ -199,7 +198,7 @@ def follow(
             return problem.residual(whole(x))
         return failed
 
-    return least_squares(
+    return scipy.optimize.least_squares(
         residual,
         start,
         lambda x: problem.jacobian(whole(x))[:, moving],

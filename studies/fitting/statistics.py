@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from studies.fitting.kinds.contract import Measurement, Residual
 from studies.fitting.problem import Problem
@@ -30,7 +30,7 @@ REGION = 0.99
 
 def region_rise(p: int) -> float:
     """Rise of chi square up to which a machine with p parameters is within the data's region."""
-    return float(chi2.ppf(REGION, p))
+    return float(scipy.stats.chi2.ppf(REGION, p))
 
 
 class Direction(NamedTuple):
@@ -93,7 +93,7 @@ class Answer(NamedTuple):
         """Whether the data are met more closely than their noise allows."""
         if self.freedom == 0 or self.undetermined or not self.is_explained:
             return False
-        return bool(chi2.cdf(self.chi_square, self.freedom) < UNLIKELY)
+        return bool(scipy.stats.chi2.cdf(self.chi_square, self.freedom) < UNLIKELY)
 
     @property
     def is_explained(self) -> bool:
@@ -146,7 +146,7 @@ def describe_fit(
         ),
         chi_square=square,
         freedom=freedom,
-        probability=float(chi2.sf(square, freedom)) if freedom else 1.0,
+        probability=float(scipy.stats.chi2.sf(square, freedom)) if freedom else 1.0,
     )
 
 
@@ -209,12 +209,12 @@ def misfit(one: Measurement, part: Residual) -> Misfit:
     is_white = (
         np.isnan(autocorrelation) or abs(autocorrelation) < 4 / np.sqrt(n) or square < 0.25 * n
     )
-    is_small = chi2.sf(square, n) >= UNLIKELY / 10
+    is_small = scipy.stats.chi2.sf(square, n) >= UNLIKELY / 10
     is_correlated = False
     if autocorrelation >= 4 / np.sqrt(n):
         # as many independent squares as these have the same variance as n correlated ones
         m = n * (1 - autocorrelation**2) / (1 + autocorrelation**2)
-        is_met = chi2.sf(square * m / n, m) >= UNLIKELY / 10
+        is_met = scipy.stats.chi2.sf(square * m / n, m) >= UNLIKELY / 10
         is_telling = square >= 0.25 * n or correlated_scale(square / n, autocorrelation) > 1
         is_correlated = bool(is_met and is_telling)
     return Misfit(

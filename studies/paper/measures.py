@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import periodogram
+import scipy
 
 from studies.paper.cases import PaperRuns
 
@@ -40,7 +40,9 @@ def measure(runs: PaperRuns) -> Measures:
     assert record is not None
     rate = runs.study.electronics.sample_rate_hz
     time = record.time[0]
-    frequency, density = periodogram(record.controlled_coordinate, rate, window="hann", axis=1)
+    frequency, density = scipy.signal.periodogram(
+        record.controlled_coordinate, rate, window="hann", axis=1
+    )
     keep = frequency <= TOP_HZ
     frequency, density = frequency[keep], np.moveaxis(density[:, keep], 1, -1)
     middle = middle_station(runs)

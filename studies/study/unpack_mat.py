@@ -9,7 +9,7 @@ from io import BytesIO
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat
+import scipy
 
 #: Address space [bytes].
 MEMORY = 2**33
@@ -30,7 +30,7 @@ def main() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     try:
-        found = numbers_and_texts(loadmat(BytesIO(sys.stdin.buffer.read())))
+        found = numbers_and_texts(scipy.io.loadmat(BytesIO(sys.stdin.buffer.read())))
         packed = BytesIO()
         np.savez(packed, allow_pickle=False, **found)
     except NotImplementedError:

@@ -1,12 +1,11 @@
-"""The plan and estimated time of a sweep, before it runs."""
+"""The plan of a sweep, before it runs."""
 
 from __future__ import annotations
 
 from rich.console import Console
 
-from studies.engine.plan import peak_memory
 from studies.engine.preflight import check_run
-from studies.engine.sweep import Plan, calibrate
+from studies.engine.sweep import Plan
 from studies.errors import StudyError
 from studies.show.units import count_text
 from studies.space.table import CaseTable, case_study
@@ -15,7 +14,7 @@ from studies.sweeps.show import Rows, print_rows, short_value
 
 
 def print_plan(plan: Plan, console: Console) -> None:
-    """Print what a sweep would run, a sample case, and the estimated time."""
+    """Print what a sweep would run, and a sample case; builds no program."""
     table = plan.table
     console.print(
         f"{len(table)} cases ({table.n_dropped} left out by where, {table.n_double} duplicates, "
@@ -43,13 +42,6 @@ def print_plan(plan: Plan, console: Console) -> None:
         console.print(f"the sample cannot run: {error}")
     if not plan.groups:
         console.print("nothing left to run")
-        return
-    found = calibrate(plan)
-    console.print(
-        f"estimate: {found.total:.0f} s, of which {found.compile_time:.0f} s "
-        f"compiling; {found.chunk_time:.2g} s a chunk; memory so far "
-        f"{peak_memory() / 2**20:.0f} MiB"
-    )
 
 
 def axis_rows(table: CaseTable) -> Rows:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import qmc
+import scipy
 
 from studies.tuning.evaluate import Evaluation, Evaluator
 from studies.tuning.linear_fidelity import LinearFidelity
@@ -138,7 +138,7 @@ def audit_places(spec: TuneSpec, count: int = DESIGNS) -> np.ndarray:
         count: how many, (count, p).
     """
     own, family = spec.free.places(), spec.families[spec.main]
-    points = qmc.Sobol(len(own), rng=spec.tune.seed).random(16)
+    points = scipy.stats.qmc.Sobol(len(own), rng=spec.tune.seed).random(16)
     way = np.where(family.is_free, points - own, 0.0)
     points = own + way / 2  # where a tuning searches
     values = np.where(family.is_free, spec.free.values(points), np.nan)

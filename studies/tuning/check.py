@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from scipy.stats import qmc
+import scipy
 
 from jaxmodel import status
 from jaxmodel.case import Case, Structure
@@ -225,7 +225,8 @@ def search(spec: TuneSpec, screen: Any) -> Searched:
     family = spec.families[spec.main]
     own_place = spec.free.places()
     n = spec.tune.samples
-    points = qmc.Sobol(len(own_place), rng=spec.tune.seed + 1).random(1 << (n - 1).bit_length())
+    sobol = scipy.stats.qmc.Sobol(len(own_place), rng=spec.tune.seed + 1)
+    points = sobol.random(1 << (n - 1).bit_length())
     points = np.where(family.is_free, points[:n], own_place)
     values = np.where(family.is_free, spec.free.values(points), np.nan)
     columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)

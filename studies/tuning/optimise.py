@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import qmc
+import scipy
 
 from studies.errors import StudyError
 from studies.tuning.descent import Adam, Descent, Lbfgs, Trial
@@ -90,7 +90,7 @@ def first_places(spec: TuneSpec, evaluator: Evaluator) -> np.ndarray:
         found.append(own[None])
         if count == 1:
             continue
-        sobol = qmc.Sobol(len(own), rng=spec.tune.seed)
+        sobol = scipy.stats.qmc.Sobol(len(own), rng=spec.tune.seed)
         points = sobol.random(1 << int(np.ceil(np.log2(LOOKED_AT * count))))
         points = np.where(family.is_free, points, own)
         values = np.where(family.is_free, spec.free.values(points), np.nan)

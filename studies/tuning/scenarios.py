@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
+import scipy
 
 from studies.space.axes import column_of
 from studies.study.fields import Columns
@@ -33,7 +33,7 @@ def scenario_columns(
     is_own = (np.arange(count) == 0) & (not is_fresh)
     machines = {"run.seed": np.where(is_own, spec.study.run.seed, noise)}
     if spread:
-        shift = 2 * qmc.LatinHypercube(len(spread), rng=seed).random(count) - 1
+        shift = 2 * scipy.stats.qmc.LatinHypercube(len(spread), rng=seed).random(count) - 1
         shift[is_own] = 0.0
         for k, (name, percent) in enumerate(spread.items()):
             share = 1 + percent / 100 * shift[:, k]

@@ -10,7 +10,7 @@ from abc import abstractmethod
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+import scipy
 
 from studies.errors import StudyError, field_error
 from studies.fitting.bench import Bench, Modes, Pose
@@ -207,7 +207,7 @@ def pair_modes(measured: Measured, modes: Modes, sensor: np.ndarray) -> Pairs:
         raise StudyError(f"has more modes than the model's {len(frequency)}; raise link.modes")
     apart = np.abs(np.log(frequency[None] / measured.frequency[:, None]))
     if measured.shapes is None:
-        _, mode = linear_sum_assignment(apart)
+        _, mode = scipy.optimize.linear_sum_assignment(apart)
         mode = mode[np.argsort(frequency[mode])]  # crossed pairs may be as near, but not as alike
         return Pairs(mode, modes.shape[:, mode], modes.dual[mode], np.ones(len(mode)))
     seen = sensor @ modes.shape  # (3 K, m)
@@ -220,7 +220,7 @@ def pair_modes(measured: Measured, modes: Modes, sensor: np.ndarray) -> Pairs:
     own = np.abs(measured.shapes.conj() @ (seen / np.linalg.norm(seen, axis=0))) ** 2
     own /= np.linalg.norm(measured.shapes, axis=1)[:, None] ** 2
     # of modes in one subspace the likest, unless frequencies say otherwise
-    _, mode = linear_sum_assignment(-mac - 0.1 * own + 0.3 * np.minimum(apart, 1.0))
+    _, mode = scipy.optimize.linear_sum_assignment(-mac - 0.1 * own + 0.3 * np.minimum(apart, 1.0))
     right, left = modes.shape[:, mode].copy(), modes.dual[mode].copy()
     for k, m in enumerate(mode):
         same = _near(frequency, m, EQUAL)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.special import digamma
+import scipy
 
 from studies.fitting.bench import Bench, Pose, response
 from studies.fitting.kinds.contract import Line, Measurement, Noise, Residual, scaled
@@ -131,7 +131,9 @@ class Spectrum(_OfBench):
         """Arguments: n; and those of a response, with any noise."""
         super().__init__(*arguments)
         self._averages = averages
-        self.mean_square = float(2 * averages * (np.log(averages) - digamma(averages)))
+        self.mean_square = float(
+            2 * averages * (np.log(averages) - scipy.special.digamma(averages))
+        )
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
         model, slope = self.predict(values, has_slopes)
