@@ -109,7 +109,14 @@ def test_a_sound_run_is_ok_and_says_how_far_it_stays_from_singular_poses():
         ({"drive__force_limit": 0.1}, status.NOT_ARRIVED),  # a machine that hardly moves
         ({"drive__force_limit": 15.0}, status.MOTORS_SATURATED),
         (
-            {"motion__waypoints": (HOME, (0.0, 0.0266, HOME[2]))} | UNCONTROLLED,
+            {
+                "motion__waypoints": (HOME, (0.0, 0.0266, HOME[2])),
+                "motion__move_time": 0.06,
+                "metrics__residual_length": 0.01,
+                "metrics__residual_delay": 0.005,
+                "electronics__conditioner_gain": 0.01,  # within the range of the ADC
+            }
+            | UNCONTROLLED,
             status.NEAR_SINGULAR,
         ),
         ({"metrics__arrival_tolerance": 1e-9}, status.NOT_ARRIVED),
