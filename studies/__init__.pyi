@@ -2,9 +2,9 @@ from .atlas.run import run_atlas
 from .bench.run import run_bench
 from .config import configure, info
 from .engine.batched import batched
+from .engine.dataset import load
 from .engine.design import load_design
 from .engine.modes import machine_modes
-from .engine.results import load
 from .engine.run_data import chord_deflection
 from .engine.runs import Run, run_study
 from .engine.sweep import make_plan, run_sweep

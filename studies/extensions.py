@@ -27,7 +27,6 @@ from studies import sources
 from studies.errors import StudyError
 from studies.space.methods import METHODS, Method
 from studies.study.labels import RESERVED
-from studies.study.spec import Study
 
 #: Where child processes find what was loaded, as paths or module names.
 VARIABLE = "FLEXLINK_WITH"
@@ -62,8 +61,9 @@ def extend(
             raise StudyError(f"{module}: {kind} = {own!r}; expected a list")
         for entry in [*own, *given]:
             try:
-                if kind == "metrics":
-                    _check_metric_name(str(getattr(entry, "name", "")))
+                name = str(getattr(entry, "name", ""))
+                if kind == "metrics" and name in RESERVED:
+                    raise PartError(f"metric {name!r}: files use this name; choose another")
                 _table(kind).add(entry)
             except PartError as error:
                 raise StudyError(f"{module or 'extend'}: {error}") from None
@@ -101,17 +101,6 @@ def blamed(error: BaseException) -> str:
 
 def _told() -> list[str]:
     return [name for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
-
-
-def _check_metric_name(name: str) -> None:
-    """Raise PartError for a name that a variable of a sweep's file may have."""
-    fields = [
-        f"{section}_{field}"
-        for section, info in Study.model_fields.items()
-        for field in getattr(info.annotation, "model_fields", {})
-    ]
-    if name in (*RESERVED, *fields) or name.startswith(tuple(f"{field}_" for field in fields)):
-        raise PartError(f"metric {name!r}: files use this name for something else; choose another")
 
 
 def _table(kind: str) -> Table[Any]:

@@ -24,7 +24,7 @@ from studies.engine.controller import fixed_controller
 from studies.engine.design import load_design
 from studies.engine.folder import BASELINE, MANIFEST, RESULTS, file_hash, make_manifest, open_folder
 from studies.engine.folder import finished_cases as finished
-from studies.engine.results import baseline_id, load
+from studies.engine.results import baseline_id, read_sweep
 from studies.engine.stored import manifest_attributes, merge
 from studies.errors import StudyError
 from studies.export.document import (
@@ -45,7 +45,7 @@ from studies.space.table import build_table
 from studies.store import Variable, write_store
 from studies.study.files import READY, read_toml
 from studies.study.spec import load_study
-from studies.sweeps.show import best_cases, print_cases, show
+from studies.sweeps.show import print_cases, ranked_cases, show
 from studies.tuning.folder import open_tuning, save_progress
 from studies.tuning.optimise import Progress, fits, start_families
 from studies.tuning.spec import load_tuning
@@ -233,16 +233,16 @@ def read_fit(path):
             read_columns(entry.file, spec.folder, "file")
 
 
-def read_sweep(path):
+def read_sweep_file(path):
     spec = load_sweep(path)
     if spec.sweep.count < 10_000 and spec.sweep.repeats < 100:
         build_table(spec)
 
 
 def read_sweep_folder(path):
-    data, console = load(path), Console(file=StringIO())
+    data, console = read_sweep(path), Console(file=StringIO())
     show(data, console, False)
-    cases = best_cases(data, "residual_rms", "gain_margin > 0", 10)
+    cases = ranked_cases(data, "residual_rms", "gain_margin > 0", 10)
     print_cases(data, cases, ["residual_rms"], console)
     load_design(path, "0")
 
@@ -259,7 +259,7 @@ def read_tuning_folder(path):
 
 KINDS = {
     "study": Kind(ready("study"), load_study),
-    "sweep": Kind(ready("sweep"), read_sweep),
+    "sweep": Kind(ready("sweep"), read_sweep_file),
     "tuning": Kind(ready("tune"), load_tuning),
     "fit": Kind(ready("fit"), read_fit),
     "controller": Kind(controllers, read_controller),

@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
-import studies
 from studies.atlas import attribution, claims, figures, findings, run, subsets, workspace
 from studies.atlas.platform import LINK_SETS, responses
 from studies.engine.modes import machine_modes
+from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.study.spec import paper_study
@@ -293,7 +293,7 @@ def test_atlas_leaves_a_folder_of_something_else_alone(tmp_path):
 
 def test_atlas_goes_on_after_an_interrupt_and_refuses_to_start_over(atlas, tmp_path):
     folder = atlas[0]
-    assert studies.load(folder / run.RUNS_FOLDER).is_finished.all()
+    assert read_sweep(folder / run.RUNS_FOLDER).is_finished.all()
     with pytest.raises(StudyError, match="add --resume"):
         run.run_atlas(small_study(), folder, False, Console(file=io.StringIO()))
     assert Path(folder / "report.md").is_file()

@@ -23,7 +23,7 @@ from studies.engine import plan
 from studies.engine.chunks import Here
 from studies.engine.columns import NOT_RUN
 from studies.engine.folder import CHUNKS, SweepFolder, finished_cases, read_manifest
-from studies.engine.results import load
+from studies.engine.results import read_sweep
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
 from studies.tuning.run import make_evaluator
@@ -250,7 +250,7 @@ def test_a_chunk_that_kills_workers_is_left_out_until_resumed(cluster, local, tm
     first, last = map(int, entry["cases"].split("-"))
     assert first <= 70 <= last == first + 15 and "died" in entry["reason"]
     assert f"cases {entry['cases']} are left out" in text
-    status = load(out)["status"]
+    status = read_sweep(out)["status"]
     np.testing.assert_array_equal(np.flatnonzero(status == NOT_RUN), outcome.lost)
     cluster.trouble()
     again = run_sweep(SPEC, out, True, is_quiet=True)  # here

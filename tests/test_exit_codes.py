@@ -18,7 +18,7 @@ from studies.engine import sweep as engine_sweep
 from studies.engine.chunks import Done, Lost
 from studies.engine.plan import Layout, plan_groups
 from studies.engine.progress import Phases, Reporter
-from studies.engine.results import load
+from studies.engine.results import read_sweep
 from studies.engine.sweep import Outcome
 from studies.single import run as single_run
 from studies.space.table import build_table
@@ -81,7 +81,7 @@ def test_a_sweep_with_lost_cases_fails_and_says_how_to_retry(
     remedy = f"6 of 6 cases were left out, see above; retry them with --resume --out {out}"
     assert err == f"studies: {remedy}\n"
     assert "no room" in text and "0 cases in" in text
-    np.testing.assert_array_equal(load(out)["status"], -1)
+    np.testing.assert_array_equal(read_sweep(out)["status"], -1)
     # and again, where they are lost again
     assert run(capsys, "sweep", sweep_file, "--out", out, "--resume")[0] == 1
 

@@ -24,7 +24,7 @@ from jaxmodel.sampled_loop import closed_loop
 from studies.engine import lanes
 from studies.engine.margins import LEAST_DAMPED, judge_loops
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
-from studies.engine.results import load
+from studies.engine.results import read_sweep
 from studies.engine.stability import loop_report, with_margin_modes
 from studies.engine.sweep import run_sweep
 from studies.space.spec import parse_sweep
@@ -32,7 +32,7 @@ from studies.space.table import build_table
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.margin import HIGHEST, LOWEST
 from studies.study.spec import paper_study
-from studies.sweeps.show import best_cases
+from studies.sweeps.show import ranked_cases
 from tests.loops import Loops, _matrices, exact_margins, random_loops
 from tests.sweeps import FAST_MOVE
 
@@ -383,7 +383,7 @@ def test_cases_that_are_ok_have_stable_loops(tmp_path):
     """200 of them by eigenvalues, and 50 of those called unstable; none was saturated instead."""
     spec = parse_sweep(tomllib.loads(TWO_LINKS))
     run_sweep(spec, tmp_path / "sweep", is_quiet=True)
-    data, table = load(tmp_path / "sweep"), build_table(spec)
+    data, table = read_sweep(tmp_path / "sweep"), build_table(spec)
     rng = np.random.default_rng(0)
     group = plan_groups(table, np.arange(len(table)), local_layout)[0]
     assert set(np.unique(data["status"])) <= {status.OK, status.UNSTABLE}
@@ -394,5 +394,5 @@ def test_cases_that_are_ok_have_stable_loops(tmp_path):
         wanted = exact_margins(Loops(group.structure, cases))
         assert np.all((wanted > 1) == (code == status.OK))
         np.testing.assert_allclose(data["gain_margin"][np.sort(rows)], wanted, rtol=0.02, atol=1e-2)
-    best = best_cases(data, "residual_rms", "gain_margin >= 2", 10)
+    best = ranked_cases(data, "residual_rms", "gain_margin >= 2", 10)
     assert np.all(data["gain_margin"][best] >= 2)

@@ -11,7 +11,6 @@ import xarray
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from studies import load
 from studies.atlas import atlas_sweep, read_subsets
 from studies.cli import main
 from studies.engine.preflight import check_run
@@ -199,7 +198,7 @@ def test_atlas_has_the_numbers_of_the_paper_s_cases(short, tmp_path):
     settings = tuple((time, shaper) for time in MOVES.values() for shaper in SHAPERS)
     quiet = Console(file=io.StringIO())
     run_sweep(atlas_sweep(study, settings, has_modes=False), tmp_path / "runs", console=quiet)
-    seen = read_subsets(load(tmp_path / "runs"))
+    seen = read_subsets(tmp_path / "runs")
     for place, (time, shaper) in enumerate(settings):
         move = next(name for name, value in MOVES.items() if value == time)
         for links in (OFF, ONE, TWO, ALL):

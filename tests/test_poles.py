@@ -16,7 +16,7 @@ from jaxmodel.status import OK, UNPLACEABLE
 from studies.engine.controller import fixed_controller
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
 from studies.engine.poles import PoleReport, _matched, difference, pole_rows
-from studies.engine.results import load
+from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
 from studies.engine.sweep import run_sweep
@@ -397,7 +397,7 @@ def test_poles_are_axes_of_a_sweep(tmp_path):
     axes = {"control.pole_decay": [50.0, 200.0, by_mode], "control.modes": [2, 3]}
     spec = parse_sweep({**short, "sweep": {"axes": axes}})
     run_sweep(spec, tmp_path / "sweep", is_quiet=True)
-    found = load(tmp_path / "sweep")
+    found = read_sweep(tmp_path / "sweep")
     table, rms = found.table, found["residual_modal_rms"]
     assert len(table) == 6 and np.all(found["status"] == OK)
     for k in range(6):

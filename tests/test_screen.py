@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 
-import studies
 from jaxmodel import status
 from jaxmodel.sampled_loop import closed_loop
 from jaxmodel.simulate import simulate
 from studies.engine.columns import LEFT_OUT
 from studies.engine.executor import Executor
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
-from studies.engine.results import metric_values
+from studies.engine.results import metric_values, read_sweep
 from studies.engine.sweep import make_plan, run_sweep
 from studies.errors import StudyError
 from studies.space.spec import parse_sweep
@@ -19,7 +18,7 @@ from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study
 from studies.sweeps.report import report, write_sweep_report
 from studies.sweeps.screening import _rank_correlation, check_screen
-from studies.sweeps.show import best_cases, recommended
+from studies.sweeps.show import ranked_cases, recommended
 from tests.sweeps import HOME_PHI, small, small_spec
 from tests.test_kernel import ALL_SORTS, check_equal
 from tests.test_sweeps import killed_until_done, partly_done
@@ -163,7 +162,7 @@ def folders(tmp_path_factory):
 
 
 def read(folder):
-    return studies.load(folder)
+    return read_sweep(folder)
 
 
 def test_a_screen_runs_the_best_of_the_linear_model(folders):
@@ -259,7 +258,7 @@ def test_what_is_recommended_meets_the_screens_condition(tmp_path, folders):
     found = read(tmp_path / "s")
     voltage = metric_values(found, "peak_voltage")
     assert (voltage[recommended(found, "-residual_rms")] < limit).all()
-    assert not (voltage[best_cases(found, "-residual_rms")] < limit).all()
+    assert not (voltage[ranked_cases(found, "-residual_rms")] < limit).all()
     write_sweep_report(tmp_path / "s")
     text = (tmp_path / "s" / "report.md").read_text()
     assert f'--subject-to "peak_voltage < {limit} and gain_margin >= 2"' in text

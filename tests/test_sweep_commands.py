@@ -14,7 +14,7 @@ from studies.engine.folder import BASELINE
 from studies.engine.frame import frame_of
 from studies.engine.function import TRACES
 from studies.engine.preflight import check_run
-from studies.engine.results import load
+from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.study.template import toml_value
@@ -122,7 +122,7 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
 
 def check_uncontrolled(capsys, spec, folder):
     """The baseline without control is a run of its own; resuming keeps it, older sweeps lack it."""
-    data = load(folder)
+    data = read_sweep(folder)
     alone = run_study(data.spec.study.change(control__feedback="none"), has_record=False)
     wanted = alone.result.metrics["residual_rms"]
     np.testing.assert_allclose(data.baseline["residual_rms"].data, wanted, rtol=1e-9)
@@ -147,15 +147,15 @@ def check_uncontrolled(capsys, spec, folder):
     text = run(capsys, "show", folder)[1]
     assert "best cases by residual_rms" in text and "without control" not in text
     assert run(capsys, "sweep", spec, "--out", folder, "--resume", "--quiet") == (0, "", "")
-    np.testing.assert_array_equal(load(folder).baseline["residual_rms"].data, kept)
+    np.testing.assert_array_equal(read_sweep(folder).baseline["residual_rms"].data, kept)
 
 
 def check_report(folder):
     """The report of the sweep against its data; then with other outcomes."""
     html = (folder / "report.html").read_text(encoding="utf-8")
     page, text = parsed(html), (folder / "report.md").read_text(encoding="utf-8")
-    data = load(folder)
-    code, gain = data["status"], data["control_gain_factor"]
+    data = read_sweep(folder)
+    code, gain = data["status"], data["control.gain_factor"]
     count = int(np.sum(code == 0))
     for part in (
         "- 8 base points of a Saltelli design of",
@@ -187,7 +187,7 @@ def check_report(folder):
     text = told(np.where(gain > 0.5, 4, 0), ["cases.png"])
     assert 0 < loud < 40 and f"| non-finite number | {loud} | {loud / 0.4:.1f} |" in text
     first = text.partition("## What the failures depend on")[2].split("\n| ")[3]
-    assert first.startswith("control_gain_factor | 1.00 |") and "| 0 % (<=" in first
+    assert first.startswith("control.gain_factor | 1.00 |") and "| 0 % (<=" in first
     text = told(np.full(40, 4), [])
     assert "No case of status ok has it." in text and "![" not in text
     assert (

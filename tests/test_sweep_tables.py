@@ -26,6 +26,7 @@ from studies.sweeps.show import (
     counted_text,
     label,
     margin_warning,
+    ranked_cases,
     requirement,
     status_rows,
     uncontrolled_text,
@@ -107,8 +108,8 @@ def test_best_cases_come_in_their_order(by, subject_to, wanted):
         name, (link, station) = by.partition("[")[0], (1, 2) if "station" in by else (0, None)
         array = data[name][:, link] if station is None else data[name][:, link, station]
         wanted = sorted(wanted, key=lambda k: array[k])
-    assert best_cases(data, by, subject_to).tolist() == wanted
-    assert best_cases(data, by, subject_to, 2).tolist() == wanted[:2]
+    assert ranked_cases(data, by, subject_to).tolist() == wanted
+    assert ranked_cases(data, by, subject_to, 2).tolist() == wanted[:2]
 
 
 def test_cases_without_the_number_are_never_best():
@@ -119,21 +120,21 @@ def test_cases_without_the_number_are_never_best():
     codes[[6, 7]] = status.SATURATED, -1
     data = usual(codes=codes, residual_rms=rms)
     for by, wanted in (("residual_rms", [1, 0, 5, 2]), ("-residual_rms", [2, 5, 0, 1])):
-        assert best_cases(data, by, count=20).tolist() == wanted
-        assert best_cases(data, by, "gain > 0.15", count=20).tolist() == [k for k in wanted if k]
+        assert ranked_cases(data, by, count=20).tolist() == wanted
+        assert ranked_cases(data, by, "gain > 0.15", count=20).tolist() == [k for k in wanted if k]
     with pytest.raises(StudyError, match="no case with status ok meets it"):
-        best_cases(data, "residual_rms", "gain < 0.05")
+        ranked_cases(data, "residual_rms", "gain < 0.05")
     with pytest.raises(StudyError, match="no case with status ok has this metric"):
-        best_cases(usual(residual_rms=np.full_like(rms, np.nan)), "residual_rms")
+        ranked_cases(usual(residual_rms=np.full_like(rms, np.nan)), "residual_rms")
 
 
 def test_a_condition_on_a_missing_number_is_not_met():
     volts = of_links(VOLTS)
     volts[[0, 4]] = np.nan
     data = usual(peak_voltage=volts)
-    assert best_cases(data, "residual_rms", "peak_voltage < 45").tolist() == [3, 1, 2]
-    assert best_cases(data, "residual_rms", "not peak_voltage < 45").tolist() == [6, 7, 5]
-    assert best_cases(data, "residual_rms", "peak_voltage != 20").tolist() == [3, 6, 7, 5, 2]
+    assert ranked_cases(data, "residual_rms", "peak_voltage < 45").tolist() == [3, 1, 2]
+    assert ranked_cases(data, "residual_rms", "not peak_voltage < 45").tolist() == [6, 7, 5]
+    assert ranked_cases(data, "residual_rms", "peak_voltage != 20").tolist() == [3, 6, 7, 5, 2]
 
 
 def test_only_controlled_links_count():
@@ -228,14 +229,14 @@ def test_rates_of_failure_are_those_of_the_lowest_and_highest_quarter():
     axes = {"method": "zip", "axes": {"gain": GAINS, "drive.kd": [1, 2, 3, 4, 5, 6, 7, 80.0]}}
     codes = [0, 0, 0, 4, 0, 0, 4, 4]
     found = {cause.name: cause for cause in failure_causes(made_up(axes, codes))}
-    one, other = found["control_gain_factor"], found["drive_kd"]
+    one, other = found["control.gain_factor"], found["drive.kd"]
     assert one.low == (0.0, "<= 0.275") and one.high == (1.0, ">= 0.625")
     assert other.low == (0.0, "<= 2.75") and other.high == (1.0, ">= 6.25")
     # distributions: failed at 0.4, 0.7, 0.8, ok at the five others; apart most at 0.6
     assert one.distance == pytest.approx(1 - 1 / 3)
     assert one.p_value == pytest.approx(2 * 8 / 56)  # exact: 2 x 8 of the 56 orders are as far
-    row = next(x for x in cause_rows(made_up(axes, codes)).rows if x[0] == "control_gain_factor")
-    assert row == ["control_gain_factor", "0.67", "0.3", "0 % (<= 0.275)", "100 % (>= 0.625)"]
+    row = next(x for x in cause_rows(made_up(axes, codes)).rows if x[0] == "control.gain_factor")
+    assert row == ["control.gain_factor", "0.67", "0.3", "0 % (<= 0.275)", "100 % (>= 0.625)"]
 
 
 def test_rates_of_failure_with_unequal_quarters():
@@ -250,7 +251,7 @@ def test_rates_of_failure_with_unequal_quarters():
 def test_choices_name_their_best_and_worst():
     axes = {"method": "zip", "axes": {"shaper": ["zv"] * 3 + ["ei"] * 4 + ["none"], "gain": GAINS}}
     codes = [4, 4, 0, 0, 0, 4, 0, 0]
-    found = {cause.name: cause for cause in failure_causes(made_up(axes, codes))}["shaper_kind"]
+    found = {cause.name: cause for cause in failure_causes(made_up(axes, codes))}["shaper.kind"]
     assert found.low == (0.0, "none") and found.high == (2 / 3, "zv")
     # half the sum of |2/3 - 1/5|, |1/3 - 3/5|, |0 - 1/5|
     assert found.distance == pytest.approx((7 / 15 + 4 / 15 + 3 / 15) / 2)
@@ -348,7 +349,7 @@ def cells(text):
 @pytest.fixture
 def printed(capsys, monkeypatch):
     def command(data, *arguments):
-        monkeypatch.setattr(results, "load", lambda *_: data)
+        monkeypatch.setattr(results, "read_sweep", lambda *_: data)
         code, text, err = run(capsys, *arguments)
         assert (code, err) == (0, "")
         return text
@@ -373,7 +374,7 @@ def with_baseline(data, code=0, step=1e-9):
 
 def test_cases_worse_than_no_control_are_marked(printed):
     data = with_baseline(usual())
-    cases = best_cases(data, "residual_rms")
+    cases = ranked_cases(data, "residual_rms")
     marked = [row[3] for row in case_rows(data, cases, ["residual_rms"]).rows]
     assert marked == ["1", "2", "3", "4", "5", "6 *", "7 *", "8 *"]
     told = "residual_rms of the baseline without control: 5.5 µm"
@@ -446,8 +447,8 @@ def test_other_windows_are_not_compared_with_the_baseline_s():
 def test_show_prints_statuses_and_the_best(printed):
     data = usual(codes=[0, 0, 0, 0, 0, 0, 4, 5])
     text = printed(data, "show", "DIR")
-    assert "small: 8 cases, control_gain_factor\n" in text
-    best = case_rows(data, best_cases(data, "residual_rms", "gain_margin >= 2"), ["residual_rms"])
+    assert "small: 8 cases, control.gain_factor\n" in text
+    best = case_rows(data, ranked_cases(data, "residual_rms", "gain_margin >= 2"), ["residual_rms"])
     assert [row[0] for row in best.rows] == ["4", "1", "0", "5", "2"]
     causes = cause_rows(data)
     endings = status_rows(data)
@@ -468,7 +469,7 @@ def test_show_lists_the_failed(printed):
     found = cells(printed(data, "show", "DIR", "--failed"))
     ids = [str(x)[:8] for x in data["case_id"]]
     assert found[:3] == [
-        ["case", "id", "status", "from [s]", "control_gain_factor"],
+        ["case", "id", "status", "from [s]", "control.gain_factor"],
         ["4", ids[4], "diverged: bending beyond a tenth of the link", "0.004", "0.5"],
         ["6", ids[6], "actuators saturated too often", "", "0.7"],  # it finished
     ]
@@ -574,11 +575,11 @@ def test_a_report_names_links_that_no_case_controls():
     rms = np.ones((2, 3, 3)) * 1e-6 * np.array([[[2.0], [5.0], [1.0]], [[1.0], [7.0], [3.0]]])
     data = made_up({"link_subsets": ["1", "1+3"]}, residual_rms=rms)
     head = report(data, "residual_rms", [], "DIR").partition("## ")[0]
-    assert "case 0 with 2 µm (link_subset = 1); link 2, which no case controls: 5 µm;" in head
+    assert "case 0 with 2 µm (link_subsets = 1); link 2, which no case controls: 5 µm;" in head
     assert "largest of links 1 and 3 and all stations" in head
 
 
 def test_ties_keep_the_order_of_the_cases():
     data = usual(residual_rms=np.ones((8, 3, 3)))
-    assert best_cases(data, "residual_rms").tolist() == list(range(8))
-    assert best_cases(data, "-residual_rms").tolist() == list(range(8))
+    assert ranked_cases(data, "residual_rms").tolist() == list(range(8))
+    assert ranked_cases(data, "-residual_rms").tolist() == list(range(8))

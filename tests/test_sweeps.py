@@ -18,18 +18,17 @@ import pytest
 import xarray
 from rich.console import Console
 
-import studies
 from jaxmodel import status
 from studies.engine import function, plan
 from studies.engine import sweep as run_module
 from studies.engine.design import deviation, load_design
 from studies.engine.folder import CHUNKS, finished_cases, make_manifest, open_folder
 from studies.engine.function import TRACES
-from studies.engine.results import load, metric_values
+from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_study
 from studies.engine.sweep import make_plan, run_sweep
 from studies.errors import StudyError
-from studies.sweeps.show import best_cases, case_rows, margin_warning
+from studies.sweeps.show import case_rows, margin_warning, ranked_cases
 from tests.sweeps import FAST_MOVE, MIXED, small, small_spec
 
 SILENT = Console(file=open(os.devnull, "w"))  # noqa: SIM115
@@ -61,7 +60,7 @@ def mixed(tmp_path_factory):
 
 
 def arrays(folder):
-    return {name: v.data for name, v in load(folder).variables.items()}
+    return {name: v.data for name, v in read_sweep(folder).variables.items()}
 
 
 def assert_same(a, b, tolerance=1e-12):
@@ -79,20 +78,20 @@ def assert_same(a, b, tolerance=1e-12):
 def test_mode_counts_subsets_and_placements_share_one_compilation(mixed):
     folder, traces = mixed
     assert traces == 1
-    data = load(folder)
+    data = read_sweep(folder)
     assert data.n_cases == 72 and not (folder / CHUNKS).exists()
     assert set(np.unique(data["status"])) <= {status.OK, status.SATURATED, status.UNSTABLE}
     np.testing.assert_array_equal(data["status"] == status.UNSTABLE, data["gain_margin"] < 1)
     rms = data["residual_modal_rms"]
-    assert np.isnan(rms[data["link_modes"] == 2][:, :, 2]).all()  # a mode that does not exist
-    assert np.isfinite(rms[data["link_modes"] == 3]).all()
+    assert np.isnan(rms[data["link.modes"] == 2][:, :, 2]).all()  # a mode that does not exist
+    assert np.isfinite(rms[data["link.modes"] == 3]).all()
     assert len(np.unique(data["residual_rms"][:, 0, 0])) > 40
 
 
 def test_every_case_equals_its_replay(mixed):
     folder, _ = mixed
-    data = load(folder)
-    full = np.flatnonzero((data["link_modes"] == 3) & (data["control_modes"] == 3))
+    data = read_sweep(folder)
+    full = np.flatnonzero((data["link.modes"] == 3) & (data["control.modes"] == 3))
     for case in full[[0, 5, 11]]:
         design = load_design(folder, int(case))
         found = run_study(design.study, has_record=False, has_loop=False)
@@ -109,10 +108,10 @@ def test_results_open_in_xarray_and_in_plain_hdf5(mixed):
     with xarray.open_dataset(folder / "results.h5") as data:
         assert data.residual_rms.dims == ("case", "link", "station")
         assert data.residual_rms.attrs["units"] == "m"
-        assert data.control_modes.dims == ("case",)
-        assert set(data.link_subset.values) == {"none", "1", "1+2+3"}
+        assert data["control.modes"].dims == ("case",)
+        assert set(data.link_subsets.values) == {"none", "1", "1+2+3"}
         assert "git" in data.attrs and float(data.attrs["run_time"]) > 0
-        assert load(folder).to_xarray().residual_rms.equals(data.residual_rms)
+        assert read_sweep(folder).to_xarray().residual_rms.equals(data.residual_rms)
     with h5py.File(folder / "results.h5") as file:
         for name, dataset in file.items():
             assert dataset.is_scale or all(len(axis) == 1 for axis in dataset.dims), name
@@ -161,7 +160,7 @@ def test_impossible_cases_do_not_touch_the_others(tmp_path):
     for name, cases in (("a", good), ("b", mixed_list)):
         run(small_spec({"method": "list", "cases": cases}), tmp_path / name)
     assert len(TRACES) == before + 1
-    clean, dirty = load(tmp_path / "a"), load(tmp_path / "b")
+    clean, dirty = read_sweep(tmp_path / "a"), read_sweep(tmp_path / "b")
     codes = dirty["status"]
     is_bad = np.isin(np.arange(len(codes)), range(4, 11))
     wanted = [
@@ -185,8 +184,8 @@ def test_impossible_cases_do_not_touch_the_others(tmp_path):
 def test_gains_from_each_cases_own_uncontrolled_run(tmp_path):
     axes = {"control.ratio_source": "all", "emc_exponent": [0.5, 1.0], "move_time": [0.008, 0.01]}
     run(small_spec({"axes": axes}), tmp_path / "s")
-    data = load(tmp_path / "s")
-    is_own = data["control_ratio_source"] == "own_run"
+    data = read_sweep(tmp_path / "s")
+    is_own = data["control.ratio_source"] == "own_run"
     assert is_own.sum() == 4
     for case in np.flatnonzero(is_own):
         design = load_design(tmp_path / "s", int(case))
@@ -202,7 +201,7 @@ def test_programs_of_different_mode_counts_join(tmp_path):
         {"link.modes": 2, "control.modes": 1, "run.duration": 0.026},
     ]
     run(small_spec({"method": "list", "cases": cases}), tmp_path / "s")
-    data = load(tmp_path / "s")
+    data = read_sweep(tmp_path / "s")
     assert np.all(data["status"] == status.OK) and data["residual_modal_rms"].shape == (2, 3, 3)
     assert np.isnan(data["residual_modal_rms"][1, :, 2]).all()
     assert np.isfinite(data["residual_modal_rms"][0]).all()
@@ -214,9 +213,9 @@ def test_noise_differs_between_repeats_and_is_the_same_again(tmp_path):
     sweep = {"axes": {"gain": [0.5]}, "repeats": 4}
     run(small_spec(sweep, electronics=electronics), tmp_path / "a")
     run(small_spec(sweep, electronics=electronics), tmp_path / "b")
-    energy = load(tmp_path / "a")["control_energy"]
+    energy = read_sweep(tmp_path / "a")["control_energy"]
     assert len(np.unique(energy)) == 4
-    np.testing.assert_array_equal(energy, load(tmp_path / "b")["control_energy"])
+    np.testing.assert_array_equal(energy, read_sweep(tmp_path / "b")["control_energy"])
 
 
 @pytest.mark.long
@@ -228,7 +227,7 @@ def test_each_case_takes_the_plant_steps_that_it_takes_alone(tmp_path):
         control={"modes": 1, "feedback": "ideal", "velocity_gain": [0.1] * 3},
     )
     run(spec, tmp_path / "s")
-    data = load(tmp_path / "s")
+    data = read_sweep(tmp_path / "s")
     np.testing.assert_array_equal(data["status"], [status.OK, status.SATURATED, status.TOO_STIFF])
     assert data["substeps"][0] == 1 < data["substeps"][1]
     for case in (0, 1):
@@ -345,7 +344,7 @@ def test_ctrl_c_finishes_the_chunk_and_says_so(tmp_path, mixed):
     outcome = partly_done(out)
     assert outcome.is_interrupted and 32 <= outcome.n_done < 72
     assert signal.getsignal(signal.SIGINT) is before
-    data = load(out)
+    data = read_sweep(out)
     assert np.sum(data["status"] >= 0) == outcome.n_done
     assert np.isnan(data["residual_rms"][data["status"] < 0]).all()
     resumed = run(small_spec(), out, is_resumed=True)
@@ -395,7 +394,7 @@ def test_extended_sweep_runs_only_new_cases(tmp_path):
     run(spec(8, [2, 3]), out)
     with open_folder(out, make_manifest(spec(16, [1, 2, 3]).data), True) as folder:
         folder.begin(make_manifest(spec(16, [1, 2, 3]).data))
-    begun = load(out)  # stopped before the first chunk: old cases are known by their ids
+    begun = read_sweep(out)  # stopped before the first chunk: old cases are known by their ids
     assert begun.n_cases == 48 and np.sum(begun["status"] >= 0) == 16
     case = int(np.flatnonzero(begun["status"] >= 0)[3])
     found = run_study(load_design(out, case).study, has_record=False, has_loop=False)
@@ -439,10 +438,10 @@ def test_what_does_not_fit_is_refused(tmp_path, mixed):
     content[len(content) // 3] ^= 1
     (copy / "results.h5").write_bytes(content)
     with pytest.raises(StudyError, match="results.h5: damaged, or not of this sweep"):
-        load(copy)
+        read_sweep(copy)
     (copy / "sweep.json").write_text("{")
     with pytest.raises(StudyError, match="damaged"):
-        load(copy)
+        read_sweep(copy)
 
 
 def test_two_processes_cannot_share_a_folder(tmp_path):
@@ -490,33 +489,33 @@ def _mount(folder, options):
 
 
 def test_best_cases_obey_conditions(mixed):
-    data = studies.load(mixed[0])
-    first = best_cases(data, "residual_rms", count=5)
+    data = read_sweep(mixed[0])
+    first = ranked_cases(data, "residual_rms", count=5)
     value = data["residual_rms"].max(axis=(1, 2))
     is_ok = data["status"] == status.OK
     assert value[first[0]] == value[is_ok].min() and np.all(np.diff(value[first]) >= 0)
-    limited = best_cases(data, "residual_rms[1]", "peak_voltage < 1 and control.modes == 2", 99)
+    limited = ranked_cases(data, "residual_rms[1]", "peak_voltage < 1 and control.modes == 2", 99)
     assert len(limited) and np.all(data["peak_voltage"][limited].max(axis=1) < 1)
-    assert np.all(data["control_modes"][limited] == 2)
+    assert np.all(data["control.modes"][limited] == 2)
     worst = data["sensor_condition"].max(axis=1)
-    apart = best_cases(data, "residual_rms", f"sensor_condition < {np.median(worst)}", 99)
+    apart = ranked_cases(data, "residual_rms", f"sensor_condition < {np.median(worst)}", 99)
     assert len(apart) < is_ok.sum() and worst[apart].max() < np.median(worst)
     second = data["residual_rms"][:, 1].max(axis=1)
-    named = best_cases(data, "residual_rms[link=2]", "peak_voltage[link=1] > 0", 99)
+    named = ranked_cases(data, "residual_rms[link=2]", "peak_voltage[link=1] > 0", 99)
     assert np.all(np.diff(second[named]) >= 0) and np.all(data["peak_voltage"][named, 0] > 0)
     np.testing.assert_array_equal(
         metric_values(data, "residual_rms[station=2][link=3]"), data["residual_rms"][:, 2, 1]
     )
     with pytest.raises(StudyError, match="allowed: link = 1 to 3, station = 1 to 3"):
-        best_cases(data, "residual_rms[link=4]")
+        ranked_cases(data, "residual_rms[link=4]")
     with pytest.raises(StudyError, match="did you mean 'peak_voltage'"):
-        best_cases(data, "voltage_peak")
+        ranked_cases(data, "voltage_peak")
     with pytest.raises(StudyError, match="no case with status ok"):
-        best_cases(data, "residual_rms", "peak_voltage < 0")
+        ranked_cases(data, "residual_rms", "peak_voltage < 0")
 
 
 def test_small_margins_are_not_passed_over(mixed):
-    data = studies.load(mixed[0])
+    data = read_sweep(mixed[0])
     order = np.argsort(data["gain_margin"])
     warned, fine = margin_warning(data, order[:3]), margin_warning(data, order[-1:])
     assert f"smallest {data['gain_margin'].min():.3g}" in warned and "gain_margin > 2" in warned

@@ -10,7 +10,7 @@ from rich.console import Console
 from scipy.stats import spearmanr
 
 from studies import cli
-from studies.engine.results import load
+from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
@@ -19,7 +19,7 @@ from studies.store import read_store
 from studies.study import spec as spec_module
 from studies.study.files import read_toml
 from studies.study.spec import load_study, paper_study
-from studies.sweeps.show import best_cases
+from studies.sweeps.show import ranked_cases
 from studies.tuning import audit as audit_module
 from studies.tuning.audit import Disagreement
 from studies.tuning.check import JudgedDesign, OwnRun
@@ -103,8 +103,8 @@ def check_report(out):
     compared = ["without control", "gain_factor alone"]
     assert list(own) == list(fresh) == ["baseline", *data["family"].data, *compared]
     assert len(files) == len(own) - 3  # nor has a family that moves nothing a file
-    moduli = data["scenario_link_youngs_modulus"].data
-    seeds = data["scenario_run_seed"].data.tolist()
+    moduli = data["link.youngs_modulus"].data
+    seeds = data["run.seed"].data.tolist()
     assert load_study(out / "study.toml").link.youngs_modulus not in moduli
     first = None
     for name, file in files.items():
@@ -251,8 +251,8 @@ def test_placement_by_gradient_is_as_good_as_the_sweep(tmp_path):
     for section in ("run", "link", "motion", "shaper", "drive", "metrics"):
         assert spec.data[section] == asked[section]
     swept = run_sweep(parse_sweep(asked), tmp_path / "sweep", is_quiet=True)
-    data = load(tmp_path / "sweep")
-    best = best_cases(data, "residual_rms", "gain_margin >= 2", 15)
+    data = read_sweep(tmp_path / "sweep")
+    best = ranked_cases(data, "residual_rms", "gain_margin >= 2", 15)
     residual = np.max(data["residual_rms"], axis=(1, 2))
     # it is the links' own vibration that ranks them: what no run decides ranks alike
     safe = (data["status"] == 0) & (data["gain_margin"] >= 2)

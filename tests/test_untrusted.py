@@ -22,7 +22,7 @@ from studies.engine.folder import (
     locked_folder,
     read_manifest,
 )
-from studies.engine.results import load
+from studies.engine.results import read_sweep
 from studies.errors import StudyError
 from studies.export.document import read_document
 from studies.reading import DEEPEST, LARGEST, open_hdf5, read_bytes, read_json, read_npz
@@ -218,7 +218,7 @@ def test_forged_results_are_refused(tmp_path, sweep, change, said):
     manifest = read_manifest(out) | {"results": [file_hash(out / RESULTS)]}
     (out / MANIFEST).write_text(json.dumps(manifest))
     with pytest.raises(StudyError, match=said):
-        load(out)
+        read_sweep(out)
 
 
 def test_cases_that_its_sweep_does_not_have_are_refused(tmp_path, sweep):
@@ -231,7 +231,7 @@ def test_cases_that_its_sweep_does_not_have_are_refused(tmp_path, sweep):
     manifest["results"] = [file_hash(out / RESULTS)]
     (out / MANIFEST).write_text(json.dumps(manifest))
     with pytest.raises(StudyError, match="6 cases; its sweep has 2"):
-        len(load(out).table)
+        len(read_sweep(out).table)
 
 
 def test_a_lock_that_is_a_pipe_is_not_waited_for(tmp_path):

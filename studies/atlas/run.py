@@ -28,7 +28,6 @@ from studies.atlas.subsets import (
 from studies.atlas.workspace import PAIRS
 from studies.engine.folder import ATLASES, locked_folder, refuse_existing
 from studies.engine.progress import Phases
-from studies.engine.results import load
 from studies.engine.run_data import run_attributes
 from studies.engine.sweep import run_sweep, sweep_phases
 from studies.errors import StudyError
@@ -91,7 +90,7 @@ def _finish(study: Study, out: Path, phases: Phases, has_pdf: bool) -> None:
             phases.say(text)
 
     phases.begin("analyse")
-    subsets, dropped = sound_settings(read_subsets(load(out / RUNS_FOLDER)))
+    subsets, dropped = sound_settings(read_subsets(out / RUNS_FOLDER))
     with threadpool_limits(1, "blas"):  # many small matrices: more threads only slow them down
         found = look_around(study, subsets, tell)
     phases.begin("draw")

@@ -6,6 +6,7 @@ subset's number says whether it is controlled.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from jaxmodel.laws import LAWS
 from studies.engine.columns import NOT_RUN
 from studies.engine.preflight import preflight
-from studies.engine.results import SweepData
+from studies.engine.results import read_sweep
 from studies.engine.runs import resolved_study
 from studies.errors import field_error
 from studies.space.spec import SweepSpec, parse_sweep
@@ -196,19 +197,20 @@ def _whole_links(modes: int) -> np.ndarray:
     return np.flatnonzero((masks == masks[..., :1]).all(axis=(1, 2)))
 
 
-def read_subsets(data: SweepData) -> Subsets:
+def read_subsets(path: str | Path) -> Subsets:
     """Residuals of a finished `atlas_sweep`.
 
     Args:
-        data: from `studies.load`.
+        path: its folder.
 
     Returns:
         Subsets; NaN where a case did not finish, or where only whole links were run.
     """
-    mask = data["control_mode_mask"].astype(bool)
+    data = read_sweep(path)
+    mask = data["control.mode_mask"].astype(bool)
     modes = mask.shape[2]
     setting = list(
-        zip(data["motion_move_time"].tolist(), data["shaper_kind"].tolist(), strict=True)
+        zip(data["motion.move_time"].tolist(), data["shaper.kind"].tolist(), strict=True)
     )
     settings = list(dict.fromkeys(setting))
     subset = mask.reshape(len(mask), -1) @ 2 ** np.arange(3 * modes)

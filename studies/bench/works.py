@@ -19,7 +19,7 @@ from studies import config
 from studies.engine.executor import Executor
 from studies.engine.function import STEPPERS
 from studies.engine.plan import Layout, even_layout, most_lanes, peak_memory
-from studies.engine.results import load
+from studies.engine.results import read_sweep
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError, field_error
 from studies.kernels.compilation import compiler_time
@@ -214,7 +214,7 @@ def bench_sweep(cases: int, console: Console) -> dict[str, Any]:
         out = Path(folder) / "sweep"
         done = run_sweep(parse_sweep(data), out, console=console)
         size = sum(file.stat().st_size for file in out.rglob("*.h5"))
-        rms = load(out)["residual_rms"]
+        rms = read_sweep(out)["residual_rms"]
     return {
         "work": "sweep",
         "executor": done.executor,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -94,11 +93,6 @@ def forget(data: np.ndarray, axis: int, count: np.ndarray) -> None:
     data[np.broadcast_to(order >= limit, data.shape)] = np.nan
 
 
-def variable_name(field: str) -> str:
-    """Name in a file: `control.velocity_gain[0]` is `control_velocity_gain_0`."""
-    return re.sub(r"\W+", "_", field).strip("_")
-
-
 def case_variables(table: CaseTable) -> dict[str, Variable]:
     """What distinguishes the cases: number, id, seed, repeat and every column."""
     axis = ("case",)
@@ -114,8 +108,8 @@ def case_variables(table: CaseTable) -> dict[str, Variable]:
         field = entry.field if entry else name
         dims = _LIST_AXES.get(field, ())[-(array.ndim - 1) :] if array.ndim > 1 else ()
         if len(dims) != array.ndim - 1:
-            dims = tuple(f"{variable_name(name)}_{k}" for k in range(1, array.ndim))
-        variables[variable_name(name)] = Variable(array, (*axis, *dims), field_unit(field), name)
+            dims = tuple(f"{name}_{k}" for k in range(1, array.ndim))
+        variables[name] = Variable(array, (*axis, *dims), field_unit(field), name)
     return variables
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.engine.folder import MANIFEST, TUNING, read_manifest
-from studies.engine.results import SweepData, load
+from studies.engine.results import SweepData, read_sweep
 from studies.engine.run_data import metric_variables
 from studies.engine.runs import Run
 from studies.errors import StudyError, field_error, nearest
@@ -50,7 +50,7 @@ def load_design(path: str | Path, case: int | str | None = None) -> Design:
         return Design(load_study(path), {})
     if (path / TUNING).is_file():
         return Design(load_study(_tuned(path, case)), {})
-    data = load(path)
+    data = read_sweep(path)
     number = _number(data, None if case is None else str(case), path)
     spec = parse_sweep(read_manifest(path)["spec"])
     table = build_table(spec)

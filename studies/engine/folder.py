@@ -39,6 +39,8 @@ GIVEN_UP = "given_up"
 TUNING = "tune.json"
 #: The baseline of the sweep without control.
 BASELINE = "baseline.h5"
+#: Of the files in a folder: names of variables, contents of chunks.
+FORMAT = 2
 #: Temporary name of the results.
 JOINED = ".joined.h5"
 _CHUNK = re.compile(r"(\d{6,})-([0-9a-f]{16})\.h5")
@@ -235,6 +237,7 @@ def make_manifest(data: dict[str, Any], modules: Iterable[str] = DECISIVE) -> di
         modules: those that determine them, with everything they import.
     """
     return {
+        "format": FORMAT,
         "spec": data,
         "code": sources.digest(*modules),
         "git": git_state(),
@@ -246,7 +249,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
     """The manifest of a sweep's folder.
 
     Raises:
-        StudyError: no sweep there.
+        StudyError: no sweep there, or one in another format.
     """
     try:
         manifest = read_json(path / MANIFEST)
@@ -266,6 +269,13 @@ def read_manifest(path: Path) -> dict[str, Any]:
         raise StudyError(f"{path}: not the folder of a sweep ({MANIFEST} is missing)") from None
     except ValueError as error:
         raise StudyError(f"{path / MANIFEST}: damaged ({error})") from None
+    if manifest.get("format", 1) != FORMAT:
+        version, commit = (manifest.get(key, "unknown") for key in (config.PACKAGE, "git"))
+        raise StudyError(
+            f"{path}: its results have format {manifest.get('format', 1)}, this version reads "
+            f"format {FORMAT}; run the sweep again in a new folder, or install the version that "
+            f"wrote it ({version}, commit {commit})"
+        )
     return manifest
 
 

@@ -17,7 +17,6 @@ from studies.engine.columns import (
     WANTED_LARGE,
     axis_variables,
     case_variables,
-    variable_name,
 )
 from studies.engine.folder import (
     BASELINE,
@@ -33,7 +32,7 @@ from studies.space.axes import LABELS, SHOWN_AS
 from studies.space.condition import evaluate
 from studies.space.spec import SweepSpec, parse_sweep
 from studies.space.table import CaseTable, build_table, case_ids
-from studies.store import Variable, axis_sizes, read_store, variable_labels, with_coordinates
+from studies.store import Variable, axis_sizes, read_store, with_coordinates
 from studies.study.fields import Fields
 from studies.study.paths import NAMED_INDEX, known_field, parse_entry
 
@@ -80,24 +79,20 @@ class SweepData:
             f"{', '.join(swept_names(self))}; {len(self.variables)} variables>"
         )
 
-    def to_xarray(self) -> Any:
-        """The same as an xarray dataset."""
-        import xarray
-
-        return xarray.Dataset(
-            {name: (v.dims, v.data, variable_labels(v)) for name, v in self.variables.items()},
-            attrs=self.attributes,
-        )
-
 
 def swept_names(data: SweepData) -> list[str]:
     """What varies, as variables of the file, in the order of the sweep; labels stand for fields."""
     columns = data.table.columns
     labelled = {LABELS[name] for name in columns if name in LABELS}
-    return [variable_name(name) for name in columns if name not in labelled]
+    return [name for name in columns if name not in labelled]
 
 
-def load(path: str | Path, cases: CaseTable | None = None) -> SweepData:
+def as_sweep(sweep: SweepData | str | Path) -> SweepData:
+    """What a function of a sweep is given: its data, or its folder; errors as `read_sweep`."""
+    return sweep if isinstance(sweep, SweepData) else read_sweep(sweep)
+
+
+def read_sweep(path: str | Path, cases: CaseTable | None = None) -> SweepData:
     """Read a sweep, finished or not; cases that have not run have status -1 and NaN.
 
     Args:
@@ -105,7 +100,7 @@ def load(path: str | Path, cases: CaseTable | None = None) -> SweepData:
         cases: its table, if it is at hand.
 
     Raises:
-        StudyError: no sweep there, or a damaged file.
+        StudyError: no sweep there, a damaged file, or results of another version.
     """
     folder = Path(path)
     written = read_manifest(folder)["spec"]
@@ -214,7 +209,7 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
         entry = parse_entry(name)
     key = entry.field if entry else name
     variables = data.variables
-    for candidate in (variable_name(name), variable_name(key)):
+    for candidate in (name, key):
         if candidate in variables and variables[candidate].dims[:1] == ("case",):
             return _entry(data, name, entry.indices if entry else (), candidate)
     if "." in key:
@@ -226,7 +221,7 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
             raise StudyError(f"{name}: a list; name one entry of it, such as {name}[0]")
         return np.full(data.n_cases, value)
     known = [n for n, v in variables.items() if v.dims[:1] == ("case",)]
-    ready = [n for n, field in SHOWN_AS.items() if variable_name(field) in known]
+    ready = [n for n, field in SHOWN_AS.items() if field in known]
     close = nearest(key, [*ready, *known]) or _turned(key, known)
     hint = f"did you mean {close!r}?" if close else f"known: {', '.join(known)}"
     if key in METRICS and key in (data.spec.sweep.metrics or METRICS):
@@ -330,7 +325,7 @@ def _turned(name: str, known: list[str]) -> str:
 def _entry(data: SweepData, name: str, indices: tuple[int, ...], candidate: str) -> np.ndarray:
     variable = data.variables[candidate]
     array, dims = variable.data, variable.dims
-    is_own = variable_name(name) == candidate and "[" in name  # the entry is itself a variable
+    is_own = name == candidate and "[" in name  # the entry is itself a variable
     used = () if is_own else indices
     for index in used:
         if array.ndim < 2 or index >= array.shape[1]:

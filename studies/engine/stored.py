@@ -160,6 +160,7 @@ def merge(
         StudyError: the disk is full or not writable.
     """
     variables = case_variables(table)
+    labels = {**attributes, "coordinates": " ".join(variables)}  # for xarray
     code = gather(table, finished, ["status"])["status"].data
     if screened is not None:
         variables |= joined_columns(table, screened, SCREENED)
@@ -170,7 +171,7 @@ def merge(
     variables |= joined_columns(table, finished, FULL)
     variables["status"] = labelled("status", code)
     variables |= axis_variables(table, axis_sizes(variables))
-    write_store(folder / JOINED, variables, attributes)
+    write_store(folder / JOINED, variables, labels)
 
 
 def joined_columns(

@@ -47,14 +47,12 @@ ALIASES = {
 #: Labels and the fields they stand for.
 LABELS = {
     "frequency_error": "link.stiffness_factor",
-    "link_subset": "control.links",
-    "link_mode_mask": "control.mode_mask",
+    "link_subsets": "control.links",
+    "link_mode_masks": "control.mode_mask",
 }
 #: Columns that ready-made axes are found under in results.
 SHOWN_AS = ALIASES | {
     "placement": "patches.centers",
-    "link_subsets": "link_subset",
-    "link_mode_masks": "link_mode_mask",
     "shaper_frequency": "shaper.frequencies_hz",
 }
 PLACEMENTS = ("same", "mirrored", "per_link")
@@ -289,7 +287,7 @@ def _link_subsets(written: Any, study: Study, path: str) -> Axis:
             hint = nearest(str(value), names)
             raise field_error(path, value, ", ".join(names), hint=hint)
     flags = np.array([[str(i) in name for i in (1, 2, 3)] for name in chosen])
-    return choice_axis({"control.links": flags, "link_subset": np.array(chosen)})
+    return choice_axis({"control.links": flags, "link_subsets": np.array(chosen)})
 
 
 def _link_mode_masks(written: Any, study: Study, path: str) -> Axis:
@@ -300,7 +298,7 @@ def _link_mode_masks(written: Any, study: Study, path: str) -> Axis:
         raise field_error(path, written, f"control.modes up to 5 here; it is {modes}")
     bits = np.array(list(product((False, True), repeat=3 * modes))).reshape(-1, 3, modes)
     text = ["/".join("".join(str(int(b)) for b in row) for row in mask) for mask in bits]
-    return choice_axis({"control.mode_mask": bits, "link_mode_mask": np.array(text)})
+    return choice_axis({"control.mode_mask": bits, "link_mode_masks": np.array(text)})
 
 
 def _placement(written: Any, study: Study, path: str) -> Axis:

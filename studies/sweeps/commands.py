@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +15,8 @@ from studies.cluster.connect import LocalWorkers, Scheduler, Workers, WorkerTime
 from studies.config import start
 from studies.errors import StudyError
 
+#: Replaced in names of files: the brackets of entries.
+_NO_NAME = r"[^\w.-]+"
 Folder = Annotated[Path, typer.Argument(help="folder of a sweep")]
 
 
@@ -92,10 +95,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
                 soft_wrap=True,
             )
         if asked.screen is not None and not quiet:
-            from studies.engine.results import load
+            from studies.engine.results import read_sweep
             from studies.sweeps.screening import check_screen
 
-            checked = check_screen(load(out, done.table))
+            checked = check_screen(read_sweep(out, done.table))
             console.print("" if checked is None else checked.text, soft_wrap=True)
         if report and not quiet:
             console.print(f"report: {out / 'report.html'}", soft_wrap=True)
@@ -108,11 +111,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         failed: Annotated[bool, typer.Option("--failed", help="list failed cases")] = False,
     ) -> None:
         """Show statuses and best cases of a sweep, or its failed cases."""
-        from studies.engine.results import load
+        from studies.engine.results import read_sweep
         from studies.sweeps.show import print_causes
         from studies.sweeps.show import show as show_sweep
 
-        data = load(folder)
+        data = read_sweep(folder)
         show_sweep(data, console, failed)
         print_causes(data, console)
 
@@ -124,7 +127,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         count: Annotated[int, typer.Option(min=1, help="number of cases")] = 10,
     ) -> None:
         """List the best cases of a sweep by a metric."""
-        from studies.engine.results import direction, load
+        from studies.engine.results import direction, read_sweep
         from studies.sweeps.show import (
             counted_text,
             print_cases,
@@ -133,7 +136,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             tell_left_out,
         )
 
-        data, name = load(folder), by.removeprefix("-")
+        data, name = read_sweep(folder), by.removeprefix("-")
         cases = ranked_cases(data, by, subject_to, count)
         print_uncontrolled(data, name, console)
         console.print(f"by {name}, {direction(by)} first, {counted_text(data, name)}:")
@@ -153,17 +156,16 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         ] = None,
     ) -> None:
         """Plot a sweep; the axes determine the kind of figure."""
-        from studies.engine.columns import variable_name
-        from studies.engine.results import load
+        from studies.engine.results import read_sweep
         from studies.sweeps.plots import plot as draw
         from studies.sweeps.plots import save_plot
         from studies.sweeps.show import ranking, tell_left_out
 
-        data = load(folder)
+        data = read_sweep(folder)
         y = y or ranking(data)
         parts = (("", y), ("-over-", x), ("-by-", hue))
-        name = "".join(f"{word}{variable_name(one)}" for word, one in parts if one)
-        path = out or folder / f"{name}.png"
+        name = "".join(f"{word}{one}" for word, one in parts if one)
+        path = out or folder / f"{re.sub(_NO_NAME, '_', name).strip('_')}.png"
         save_plot(draw(data, x, y, hue), path)
         tell_left_out(data, console)
         console.print(f"written: {path}", soft_wrap=True)
@@ -174,11 +176,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         by: Annotated[str, typer.Option(help="metric")] = "residual_rms",
     ) -> None:
         """Show which parameters matter, from a sweep with method morris or saltelli."""
-        from studies.engine.results import load
+        from studies.engine.results import read_sweep
         from studies.sweeps.sensitivity import analyse
         from studies.sweeps.show import label
 
-        data = load(folder)
+        data = read_sweep(folder)
         found = analyse(data, by)
         design = f"a {data.spec.sweep.method} design"
         console.print(f"{label(data, by)}, {len(data.table.origin)} rows of {design}")

@@ -15,8 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxmodel import status
-from studies.engine.columns import LEFT_OUT, variable_name
-from studies.engine.results import SweepData, metric_values, swept_names
+from studies.engine.columns import LEFT_OUT
+from studies.engine.results import SweepData, as_sweep, metric_values, swept_names
 from studies.errors import StudyError
 from studies.show import figures
 from studies.show.sketch import ACTUATOR, SENSOR
@@ -42,11 +42,11 @@ MARKERS = ("o", "^", "s")
 MOST_BANDS = 4
 
 
-def plot(data: SweepData, x: str | None, y: str, hue: str | None = None) -> Figure:
+def plot(sweep: SweepData | str | Path, x: str | None, y: str, hue: str | None = None) -> Figure:
     """The figure of a sweep.
 
     Args:
-        data: the sweep.
+        sweep: its folder, or its data as read.
         x: axis or metric along the abscissa; None: all axes at once.
         y: metric or axis.
         hue: axis or metric that sets the colour.
@@ -54,6 +54,7 @@ def plot(data: SweepData, x: str | None, y: str, hue: str | None = None) -> Figu
     Raises:
         StudyError: unknown name, or no finished case.
     """
+    data = as_sweep(sweep)
     value = metric_values(data, y)
     if value.dtype.kind not in "fiub":
         raise StudyError(f"--y {y}: a text, not a number")
@@ -63,7 +64,7 @@ def plot(data: SweepData, x: str | None, y: str, hue: str | None = None) -> Figu
     if x is None:
         if hue is not None:
             raise StudyError("--hue: needs --x")
-        if "patches_centers" in data.variables and data["patches_centers"].ndim == 2:
+        if "patches.centers" in data.variables and data["patches.centers"].ndim == 2:
             return _placements(data, y)
         return _parallel(data, y, chosen)
     for option, name in (("--x", x), ("--hue", hue)):
@@ -167,8 +168,7 @@ def is_log(data: SweepData, name: str) -> bool:
             own |= scales(child)
         return own
 
-    found = {variable_name(axis): scale for axis, scale in scales(data.spec.root).items()}
-    return found.get(variable_name(SHOWN_AS.get(name, name))) == "log"
+    return scales(data.spec.root).get(SHOWN_AS.get(name, name)) == "log"
 
 
 def _scale_ordinate(ax: Axes, value: np.ndarray) -> None:
@@ -428,13 +428,13 @@ def _placements(data: SweepData, y: str) -> Figure:
 
     Links of different length, or with patches of different length, have a line each.
     """
-    centers, value = data["patches_centers"], shown_metric(data, y)
+    centers, value = data["patches.centers"], shown_metric(data, y)
     study = data.spec.study
     sizes = (study.link.length, study.patches.actuator_length, study.patches.sensor_length)
     links = list(dict.fromkeys(zip(*(map(float, each_link(x)) for x in sizes), strict=True)))
     chosen = recommended(data, y, N_PLACEMENTS)
     is_ok = (data["status"] == status.OK) & np.isfinite(value)
-    others = [name for name in swept_names(data) if name != "patches_centers"]
+    others = [name for name in swept_names(data) if name != "patches.centers"]
     unit = 1e3
     with figures.styled():
         figure = Figure(figsize=(figures.WIDTH, 5.6), layout="constrained")

@@ -14,8 +14,8 @@ from studies.engine.results import (
     SweepData,
     counted_links,
     direction,
-    load,
     metric_values,
+    read_sweep,
     swept_names,
 )
 from studies.errors import StudyError, shown
@@ -54,7 +54,6 @@ from studies.sweeps.show import (
     status_rows,
     uncontrolled_text,
     unit_of_metric,
-    written_name,
 )
 
 REPORT, FIGURE, FRONT, MACHINE = "report.html", "cases.png", "front.png", "machine.png"
@@ -102,7 +101,7 @@ def write_sweep_report(folder: str | Path) -> None:
         StudyError: no sweep there, or a file cannot be written.
     """
     folder = Path(folder)
-    data = load(folder)
+    data = read_sweep(folder)
     spec = data.spec
     metric = ranking(data)
     drawn = []
@@ -169,7 +168,7 @@ def report(data: SweepData, metric: str, drawn: list[str], folder: str = "DIR") 
         metric=metric,
         others=[x for x in OTHERS if x in data.variables and x != metric.partition("[")[0]],
         counted=counted_text(data, metric),
-        axes=[written_name(data, name) for name in swept_names(data)],
+        axes=swept_names(data),
         n_ok=int(np.sum(data["status"] == status.OK)),
         failures=[f"{count}: {name}" for name, count, _ in endings.rows if name != "ok"][:3],
         endings=_literal(endings),
@@ -210,9 +209,7 @@ def _best(data: SweepData, metric: str) -> BestCase | None:
     return BestCase(
         case=first,
         value=told(readings[first]),
-        setting=", ".join(
-            f"{written_name(data, x)} = {shown_value(data, x, first)}" for x in names
-        ),
+        setting=", ".join(f"{x} = {shown_value(data, x, first)}" for x in names),
         margin=float(margin[first]) if np.isfinite(margin[first]) else None,
         median=told(np.median(readings[is_known])),
         spread=spread if len(best) > 3 and spread < ALIKE else None,

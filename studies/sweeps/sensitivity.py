@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxmodel import status
-from studies.engine.results import SweepData, metric_values, swept_names
+from studies.engine.results import SweepData, as_sweep, metric_values, swept_names
 from studies.errors import StudyError
 from studies.space.axes import build_axis
 from studies.space.designs import unit_points
@@ -38,8 +39,10 @@ def failure_causes(data: SweepData) -> list[Cause]:
     if not is_failed.any() or is_failed.all():
         return []
     causes = []
-    for name, column in _scalar_columns(data):
+    for name, column in scalar_columns(data):
         value = column[is_run]
+        if value.dtype.kind == "b":
+            value = value.astype(float)
         if len(np.unique(value)) < 2:
             continue
         if value.dtype.kind in "UO":
@@ -83,7 +86,7 @@ def _cause_of_choice(name: str, value: np.ndarray, is_failed: np.ndarray) -> Cau
     )
 
 
-def _scalar_columns(data: SweepData) -> list[tuple[str, np.ndarray]]:
+def scalar_columns(data: SweepData) -> list[tuple[str, np.ndarray]]:
     """Axes as columns of single numbers or texts."""
     found = []
     for name in swept_names(data):
@@ -91,7 +94,7 @@ def _scalar_columns(data: SweepData) -> list[tuple[str, np.ndarray]]:
         if array.dtype.kind in "UO":
             found.append((name, array))
             continue
-        flat = array.reshape(len(array), -1).astype(float)
+        flat = array.reshape(len(array), -1)
         for k in range(flat.shape[1]):
             index = np.unravel_index(k, array.shape[1:])
             entry = "".join(f"[{i}]" for i in index) if array.ndim > 1 else ""
@@ -101,20 +104,21 @@ def _scalar_columns(data: SweepData) -> list[tuple[str, np.ndarray]]:
     return found
 
 
-def analyse(data: SweepData, metric: str) -> Analysis:
+def analyse(sweep: SweepData | str | Path, metric: str) -> Analysis:
     """Analyse the factors of a sweep's design.
 
     Args:
-        data: of a method with an analysis.
+        sweep: folder of one by a method with an analysis, or its data as read.
         metric: to analyse.
 
     Raises:
         StudyError: no such design or metric, or too many cases failed.
     """
+    data = as_sweep(sweep)
     names, value = factor_names(data), design_values(data, metric)
-    sweep, analysis = data.spec.sweep, METHODS[data.spec.sweep.method].analysis
+    seed, analysis = data.spec.sweep.seed, METHODS[data.spec.sweep.method].analysis
     assert analysis is not None
-    return analysis(unit_points(data.spec.root, len(names), sweep.seed), value, names)
+    return analysis(unit_points(data.spec.root, len(names), seed), value, names)
 
 
 def factor_names(data: SweepData) -> list[str]:

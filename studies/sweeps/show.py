@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -13,10 +14,11 @@ from rich.table import Table as RichTable
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
-from studies.engine.columns import NOT_RUN, PER_CASE, variable_name
+from studies.engine.columns import NOT_RUN, PER_CASE
 from studies.engine.results import (
     ROUNDING,
     SweepData,
+    as_sweep,
     counted_links,
     direction,
     is_worse,
@@ -31,7 +33,10 @@ from studies.show.units import headed, readable, settling_text
 from studies.study.entries import links_text
 from studies.study.margin import ENOUGH, margin_text
 from studies.study.resolution import is_deflection, least_step, resolution_text
-from studies.sweeps.sensitivity import failure_causes
+from studies.sweeps.sensitivity import failure_causes, scalar_columns
+
+if TYPE_CHECKING:
+    import pandas
 
 MARGIN = "gain_margin"
 #: After a value that is worse than that of the baseline without control.
@@ -84,30 +89,42 @@ def select(data: SweepData, subject_to: str) -> np.ndarray:
     return (data["status"] == status.OK) & meets(data, subject_to, "--subject-to")
 
 
-def best_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) -> np.ndarray:
-    """Numbers of the cases with the smallest metric, best first; for `WANTED_LARGE`, the largest.
+def best_cases(
+    sweep: SweepData | str | Path, by: str, subject_to: str = "", count: int = 10
+) -> pandas.DataFrame:
+    """The cases with the smallest metric, best first; for `WANTED_LARGE`, the largest.
 
-    Warns (`ResolutionWarning`) of deflections below one ADC step, which the controller cannot
-    measure.
+    For example `best_cases("gains", "residual_rms", "gain_margin > 2", count=5)`. Warns
+    (`ResolutionWarning`) of deflections below one ADC step, which the controller cannot measure.
 
     Args:
-        data: the sweep.
+        sweep: its folder, or its data as read.
         by: metric or entry of one; with "-" in front, in reverse order.
         subject_to: condition on metrics and axes.
         count: how many.
 
+    Returns:
+        A row per case: its id, what varies, the metric, peak voltage, damping and gain margin, in
+        SI units under their names in the sweep file. The index is the number of the case.
+
     Raises:
         StudyError: unknown metric, or no case left.
     """
-    found = ranked_cases(data, by, subject_to, count)
-    text = resolution_warning(data, found, by.removeprefix("-"))
+    import pandas
+
+    data, name = as_sweep(sweep), by.removeprefix("-")
+    cases = ranked_cases(data, by, subject_to, count)
+    text = resolution_warning(data, cases, name)
     if text:
         warnings.warn(text, ResolutionWarning, stacklevel=2)
-    return found
+    columns = {"case_id": data["case_id"], **dict(scalar_columns(data))}
+    columns |= {metric: metric_values(data, metric) for metric in _with_others(data, [name])}
+    table = {key: column[cases] for key, column in columns.items()}
+    return pandas.DataFrame(table, index=pandas.Index(cases, name="case"))
 
 
 def ranked_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10) -> np.ndarray:
-    """As `best_cases`, for tables, which have `resolution_warning` below them."""
+    """Numbers of the best cases; arguments and errors as `best_cases`, but no warning."""
     name, is_large = by.removeprefix("-"), direction(by) == "largest"
     value = metric_values(data, name)
     if value.dtype.kind not in "fiub":
@@ -142,8 +159,9 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
         print_cases(data, best, [by], console)
 
 
-def status_rows(data: SweepData) -> Rows:
-    """Number of cases by status."""
+def status_rows(sweep: SweepData | str | Path) -> Rows:
+    """Number of cases by status; of a folder, or of its data as read."""
+    data = as_sweep(sweep)
     counts = Counter(data["status"].tolist()).most_common()
     rows = [[reason(code), str(n), f"{100 * n / data.n_cases:.1f}"] for code, n in counts]
     return Rows(["status", "cases", "share [%]"], rows)
@@ -251,10 +269,7 @@ def margin_warning(data: SweepData, cases: np.ndarray) -> str:
 def case_rows(data: SweepData, cases: np.ndarray, metrics: list[str]) -> Rows:
     """Cases with what varies, some metrics, and what else to look at before acting on them."""
     names = swept_names(data)
-    metrics = [
-        *metrics,
-        *(name for name in BESIDE if name not in metrics and _is_there(data, name)),
-    ]
+    metrics = _with_others(data, metrics)
     columns = [shown_metric(data, name) for name in metrics]
     free = uncontrolled_value(data, metrics[0])
     is_marked = np.zeros(data.n_cases, bool)
@@ -269,8 +284,13 @@ def case_rows(data: SweepData, cases: np.ndarray, metrics: list[str]) -> Rows:
         ]
         numbers[0] += f" {MARK}" if is_marked[k] else ""
         rows.append([str(k), short_id(data, k), *cells, *numbers])
-    heads = [*(written_name(data, name) for name in names), *(label(data, x) for x in metrics)]
+    heads = [*names, *(label(data, x) for x in metrics)]
     return Rows(["case", "id", *heads], rows)
+
+
+def _with_others(data: SweepData, metrics: list[str]) -> list[str]:
+    """Metrics, and what else to look at before acting on them."""
+    return metrics + [name for name in BESIDE if name not in metrics and _is_there(data, name)]
 
 
 def _is_there(data: SweepData, name: str) -> bool:
@@ -287,12 +307,6 @@ def _number_text(data: SweepData, name: str, column: np.ndarray, case: int) -> s
         watched = data.spec.study.run.duration - float(data["command_end"][case])
         return settling_text(1e-3 * float(column[case]), watched)
     return f"{column[case]:.4g}"
-
-
-def written_name(data: SweepData, name: str) -> str:
-    """An axis as the sweep's file writes it: `link.thickness[1]`, not `link_thickness_1`."""
-    columns = data.table.columns
-    return next((column for column in columns if variable_name(column) == name), name)
 
 
 def short_id(data: SweepData, case: int) -> str:
@@ -396,8 +410,7 @@ def short_value(value: Any) -> str:
 
 def unit_of_metric(data: SweepData, name: str) -> str:
     """Unit of a metric or axis, "" if it has none."""
-    key = variable_name(name)
-    variable = data.variables.get(key) or data.variables.get(variable_name(name.split("[")[0]))
+    variable = data.variables.get(name) or data.variables.get(name.split("[")[0])
     return "" if variable is None or variable.units == "1" else variable.units
 
 

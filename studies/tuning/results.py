@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from jaxmodel.metrics import METRICS
-from studies.engine.columns import variable_name
 from studies.space.table import as_numbers
 from studies.store import Variable
 from studies.study.entries import links_text, parse_entries
@@ -113,10 +112,10 @@ def _fresh(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
     fresh = {}
     for name, column in fresh_columns(spec).items():
         array = as_numbers(column)
-        dims = tuple(f"{variable_name(name)}_{k}" for k in range(1, array.ndim))
+        dims = tuple(f"{name}_{k}" for k in range(1, array.ndim))
         entry = parse_entry(name)
         unit = field_unit(entry.field) if entry else "1"
-        fresh[f"scenario_{variable_name(name)}"] = Variable(array, (*axis, *dims), unit, name)
+        fresh[name] = Variable(array, (*axis, *dims), unit, name)
 
     def each(take: str) -> np.ndarray:
         return np.stack([getattr(one, take) for one in found.judged])
@@ -126,17 +125,17 @@ def _fresh(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
     fresh["baseline_status"] = Variable(found.own.status, axis, *STATUS_LABEL)
     links = links_text(spec.counted_links)
     for name, own in found.own.metrics.items():
-        label, unit = variable_name(name), METRICS[name.partition("[")[0]].unit
+        unit = METRICS[name.partition("[")[0]].unit
         values = np.stack([one.metrics[name] for one in found.judged])
         text = name if parse_entries(name).names_a_link else f"{name}, largest of {links}"
-        fresh[f"fresh_{label}"] = Variable(values, both, unit, f"{text}, fresh machines")
-        fresh[f"baseline_{label}"] = Variable(
+        fresh[f"fresh_{name}"] = Variable(values, both, unit, f"{text}, fresh machines")
+        fresh[f"baseline_{name}"] = Variable(
             own, axis, unit, f"{text}, fresh machines, the baseline"
         )
         values = np.array([one.own.metrics[name] for one in found.judged])
-        fresh[f"file_{label}"] = Variable(values, ("family",), unit, f"{text}, as the file runs")
+        fresh[f"file_{name}"] = Variable(values, ("family",), unit, f"{text}, as the file runs")
         before = np.array(found.own.own.metrics[name])
-        fresh[f"file_baseline_{label}"] = Variable(
+        fresh[f"file_baseline_{name}"] = Variable(
             before, (), unit, f"{text}, the baseline's file as it runs"
         )
     if found.own.loop is not None:
@@ -184,10 +183,10 @@ def _references(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
         for name, values in one.metrics.items():
             unit = METRICS[name.partition("[")[0]].unit
             what = name if parse_entries(name).names_a_link else f"{name}, largest of {links}"
-            told[f"{label}_{variable_name(name)}"] = Variable(
+            told[f"{label}_{name}"] = Variable(
                 values, ("scenario",), unit, f"{what}, fresh machines, {text}"
             )
-            told[f"file_{label}_{variable_name(name)}"] = Variable(
+            told[f"file_{label}_{name}"] = Variable(
                 np.array(one.own.metrics[name]), (), unit, f"{what}, the baseline's run, {text}"
             )
     if scan is not None:
