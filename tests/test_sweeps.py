@@ -18,6 +18,7 @@ import pytest
 import xarray
 from rich.console import Console
 
+import studies
 from jaxmodel import status
 from studies.engine import function, plan
 from studies.engine import sweep as run_module
@@ -111,7 +112,7 @@ def test_results_open_in_xarray_and_in_plain_hdf5(mixed):
         assert data["control.modes"].dims == ("case",)
         assert set(data.link_subsets.values) == {"none", "1", "1+2+3"}
         assert "git" in data.attrs and float(data.attrs["run_time"]) > 0
-        assert read_sweep(folder).to_xarray().residual_rms.equals(data.residual_rms)
+        assert studies.load(folder).residual_rms.equals(data.residual_rms)
     with h5py.File(folder / "results.h5") as file:
         for name, dataset in file.items():
             assert dataset.is_scale or all(len(axis) == 1 for axis in dataset.dims), name

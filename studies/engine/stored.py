@@ -105,25 +105,24 @@ def chunk_arrays(table: CaseTable, done: Done, kept: list[str]) -> dict[str, np.
     return arrays
 
 
-#: Variables of the whole model's files.
-FULL = (*PER_CASE, *METRICS)
 #: How cases ended.
 CODES = {"status", "screen_status"}
 
 
 def gather(
-    table: CaseTable, finished: Finished, names: Iterable[str] = FULL
+    table: CaseTable, finished: Finished, names: Iterable[str] | None = None
 ) -> dict[str, Variable]:
     """Variables of all cases of a table, from the files that hold them.
 
     Args:
         table: all cases.
         finished: from `finished_cases`.
-        names: of the variables.
+        names: of the variables; None: all of the whole model.
 
     Returns:
         Those that any file has, and the status; NaN and -1 for missing cases.
     """
+    names = (*PER_CASE, *METRICS) if names is None else tuple(names)
     columns = joined_columns(table, finished, names)
     whole = slice(0, len(table))
     variables = {name: v._replace(data=v.data.read(whole)) for name, v in columns.items()}
@@ -168,7 +167,7 @@ def merge(
         # what no run can start with is a fault in either model
         rest = np.where(np.isin(linear, status.FINISHED), LEFT_OUT, linear)
         code = np.where(code == NOT_RUN, rest, code)
-    variables |= joined_columns(table, finished, FULL)
+    variables |= joined_columns(table, finished, (*PER_CASE, *METRICS))
     variables["status"] = labelled("status", code)
     variables |= axis_variables(table, axis_sizes(variables))
     write_store(folder / JOINED, variables, labels)
