@@ -297,7 +297,7 @@ def killed_until_done(data, out, n_kills, seed):
 
 def check_kills(sweep, out, whole, n_kills, seed):
     """Kill a sweep, resume it, and compare it with the same in one go."""
-    n = load(whole).n_cases
+    n = read_sweep(whole).n_cases
     seen = killed_until_done(small(sweep), out, n_kills, seed)
     assert any(0 < len(ids) < n for ids in seen)
     outcome = run(small_spec(sweep), out, is_resumed=True)
