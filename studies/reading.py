@@ -87,19 +87,19 @@ def read_json(path: Path) -> Any:
 def parse_json(text: str) -> Any:
     """The same from text; errors as `read_json`."""
     try:
-        found = json.loads(text, object_pairs_hook=_without_doubles, parse_int=_whole)
+        content = json.loads(text, object_pairs_hook=_unique, parse_int=_whole)
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
-    check_depth(found)
-    return found
+    check_depth(content)
+    return content
 
 
 _TOO_DEEP = f"nested deeper than {DEEPEST} levels"
 
 
-def check_depth(found: Any) -> None:
+def check_depth(content: Any) -> None:
     """Raise ValueError if nested deeper than `DEEPEST`, or if a text has half a character."""
-    left = [(found, 0)]
+    left = [(content, 0)]
     while left:
         value, depth = left.pop()
         if isinstance(value, str):
@@ -120,13 +120,13 @@ def _check_text(text: str) -> None:
         raise ValueError(f"{text[:40]!a} is not text") from None
 
 
-def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    table: dict[str, Any] = {}
     for name, value in pairs:
-        if name in found:
+        if name in table:
             raise ValueError(f"{name[:40]!a} occurs twice")
-        found[name] = value
-    return found
+        table[name] = value
+    return table
 
 
 def _whole(digits: str) -> int | float:
@@ -192,10 +192,10 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
-    with h5py.File(path, "r") as found:
+    with h5py.File(path, "r") as opened:
         try:
-            _check_group(found, _PACKED * size + _SPARE, set(), 0)
-            yield found
+            _check_group(opened, _PACKED * size + _SPARE, set(), 0)
+            yield opened
         except (RuntimeError, KeyError) as error:  # h5py's, for a damaged or missing part
             raise ValueError(str(error)) from None
 

@@ -36,7 +36,7 @@ _IN_MEMORY = 2**26
 BLOCK_BYTES = 2**25
 
 
-class Rows(NamedTuple):
+class LazyArray(NamedTuple):
     """An array too large for memory, read some rows at a time."""
 
     shape: tuple[int, ...]
@@ -47,7 +47,7 @@ class Rows(NamedTuple):
 class Variable(NamedTuple):
     """One labelled array.
 
-    data: numbers, booleans or text, one axis per name in dims; for writing, also `Rows`.
+    data: numbers, booleans or text, one axis per name in dims; for writing, also `LazyArray`.
     dims: name of each axis; a one-dimensional variable named like its axis is its coordinate.
     units: SI symbol such as "m" or "Hz", "1" for none. Not "seconds": xarray turns that into dates.
     long_name: what it is, in words.
@@ -88,8 +88,8 @@ def write_store(
             temporary.write_bytes(image.getbuffer())
 
 
-def _array(data: Any) -> np.ndarray | Rows:
-    return data if isinstance(data, Rows) else np.asarray(data)
+def _array(data: Any) -> np.ndarray | LazyArray:
+    return data if isinstance(data, LazyArray) else np.asarray(data)
 
 
 def _write(target: Any, variables: Mapping[str, Variable], attributes: Mapping[str, Any]) -> None:
@@ -101,21 +101,21 @@ def _write(target: Any, variables: Mapping[str, Variable], attributes: Mapping[s
             dtype = {"b": np.int8, "U": _TEXT, "O": _TEXT}.get(data.dtype.kind, data.dtype)
             stored = file.create_variable(name, variable.dims, dtype)
             stored.attrs.update(variable_labels(variable))
-            if isinstance(data, Rows):
+            if isinstance(data, LazyArray):
                 for rows in _blocks(data):
                     stored[rows] = data.read(rows)
             else:
                 stored[...] = data.astype(dtype)
 
 
-def _blocks(data: Rows) -> Iterator[slice]:
+def _blocks(data: LazyArray) -> Iterator[slice]:
     """Rows of at most `BLOCK_BYTES` together."""
     count = max(1, BLOCK_BYTES // (data.dtype.itemsize * math.prod(data.shape[1:])))
     for start in range(0, data.shape[0], count):
         yield slice(start, min(start + count, data.shape[0]))
 
 
-def _size(data: np.ndarray | Rows) -> int:
+def _size(data: np.ndarray | LazyArray) -> int:
     """Bytes in the file, about."""
     text, labels = 32, 4096
     item = text if data.dtype.kind in "UO" else data.dtype.itemsize
@@ -142,7 +142,7 @@ def axis_sizes(variables: Mapping[str, Variable]) -> dict[str, int]:
 
 
 def _shape(data: Any) -> tuple[int, ...]:
-    return data.shape if isinstance(data, Rows) else np.shape(data)
+    return data.shape if isinstance(data, LazyArray) else np.shape(data)
 
 
 def with_coordinates(variables: Mapping[str, Variable]) -> dict[str, Variable]:

@@ -12,7 +12,7 @@ import xarray
 
 from studies import store
 from studies.errors import StudyError, field_error, nearest
-from studies.store import Rows, Variable, check_target, read_store, write_store
+from studies.store import LazyArray, Variable, check_target, read_store, write_store
 
 VARIABLES = {
     "case": Variable(np.array([10, 20, 30]), ("case",), "1", "number of the case"),
@@ -140,7 +140,7 @@ def test_rows_are_written_part_by_part(tmp_path, monkeypatch):
         parts.append(rows)
         return values[rows]
 
-    wide = Variable(Rows(values.shape, values.dtype, read), ("case", "link"), "m", "x")
+    wide = Variable(LazyArray(values.shape, values.dtype, read), ("case", "link"), "m", "x")
     write_store(tmp_path / "a.h5", {"x": wide}, {})
     assert [(rows.start, rows.stop) for rows in parts] == [(k, k + 4) for k in range(0, 20, 4)]
     np.testing.assert_array_equal(read_store(tmp_path / "a.h5")[0]["x"].data, values)

@@ -26,6 +26,7 @@ from studies.atlas.subsets import (
     setting_label,
 )
 from studies.atlas.workspace import PAIRS
+from studies.engine.columns import LINK_AXIS
 from studies.engine.folder import ATLASES, locked_folder, refuse_existing
 from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
@@ -152,7 +153,7 @@ def _subset_variables(subsets: Subsets) -> dict[str, Variable]:
         ),
         "player": _names(player_labels(subsets.modes), "player", "link.mode"),
         "target": _names(list(TARGETS), "target", "whose residual"),
-        "link": Variable(np.arange(1, 4), ("link",), "1", "link number"),
+        "link": LINK_AXIS,
         "links": _names([link_label(k) for k in range(8)], "links", "whole links controlled"),
         "links_subset": Variable(subsets.link_subsets, ("links",), "1", "their subset"),
         "residual_rms": Variable(

@@ -78,13 +78,15 @@ SCREENED: dict[str, tuple[Any, ...]] = {
 }
 
 
+LINK_AXIS = Variable(np.arange(1, 4), ("link",), "1", "link number")
+POSE_AXIS = Variable(np.array(["x", "y", "phi"]), ("pose_axis",), "1", "pose component")
 #: For these, the smallest entry is the worst.
 LEAST = ("damping_ratio",)
 #: For these, the largest value is the best.
-WANTED_LARGE = ("gain_margin", "damping_ratio", "singularity_distance")
+LARGEST_FIRST = ("gain_margin", "damping_ratio", "singularity_distance")
 
 
-def forget(data: np.ndarray, axis: int, count: np.ndarray) -> None:
+def mask_unused(data: np.ndarray, axis: int, count: np.ndarray) -> None:
     """NaN beyond the first `count` entries of an axis (after the one of cases)."""
     shape = [1] * data.ndim
     shape[axis + 1] = -1
@@ -115,19 +117,18 @@ def case_variables(table: CaseTable) -> dict[str, Variable]:
 
 def axis_variables(table: CaseTable, sizes: Mapping[str, int]) -> dict[str, Variable]:
     """Coordinates of the metrics' axes."""
-    found = {"link": Variable(np.arange(1, 4), ("link",), "1", "link number")}
+    axes = {"link": LINK_AXIS}
     if "pose_axis" in sizes:
-        names = np.array(["x", "y", "phi"])
-        found["pose_axis"] = Variable(names, ("pose_axis",), "1", "pose component")
+        axes["pose_axis"] = POSE_AXIS
     if "station" in sizes and "metrics.stations" not in table.columns:
         stations = np.array(field_value(table.study, "metrics.stations"))
-        found["station"] = Variable(stations, ("station",), "1", STATION_TEXT)
+        axes["station"] = Variable(stations, ("station",), "1", STATION_TEXT)
     if "spectrum_point" in sizes:
         ratio = np.linspace(1 - SPECTRUM_SPAN, 1 + SPECTRUM_SPAN, sizes["spectrum_point"])
-        found["spectrum_point"] = Variable(
+        axes["spectrum_point"] = Variable(
             ratio, ("spectrum_point",), "1", "frequency over the modal frequency"
         )
-    return found
+    return axes
 
 
 def label_of(name: str) -> tuple[Any, ...]:

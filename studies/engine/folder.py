@@ -13,7 +13,7 @@ import json
 import os
 import re
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from hashlib import file_digest
 from io import BytesIO
@@ -305,7 +305,7 @@ def refuse_existing(path: Path, content: Content, is_resumed: bool) -> None:
 
 def _refuse_others(path: Path, leftover: re.Pattern[str]) -> None:
     """Raise StudyError if a new folder holds anything but its lock and leftovers of a kill."""
-    names = [found.name for found in path.iterdir() if found.name != LOCK]
+    names = [entry.name for entry in path.iterdir() if entry.name != LOCK]
     others = sorted(name for name in names if not leftover.fullmatch(name))
     if others:
         raise StudyError(
@@ -319,19 +319,20 @@ def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bo
     if not (folder.path / MANIFEST).exists():
         return
     old = read_manifest(folder.path)
-    for name, default in (("metrics", []), ("fidelity", "full")):
-        kept, wanted = (m["spec"]["sweep"].get(name, default) for m in (old, manifest))
-        if kept != wanted:
+    before, now = (
+        {
+            "metrics": sweep.get("metrics", []),
+            "fidelity": sweep.get("fidelity", "full"),
+            "screen.by": sweep.get("screen", {}).get("by"),
+        }
+        for sweep in (old["spec"]["sweep"], manifest["spec"]["sweep"])
+    )
+    for name, value in before.items():
+        if value != now[name] and value is not None:
             raise StudyError(
-                f"--resume: {folder.path} has sweep.{name} = {kept!r}, now {wanted!r}; a resumed "
-                "sweep keeps the same"
+                f"--resume: {folder.path} has sweep.{name} = {value!r}, now {now[name]!r}; a "
+                "resumed sweep keeps the same"
             )
-    rank_before, rank = (m["spec"]["sweep"].get("screen", {}).get("by") for m in (old, manifest))
-    if rank_before != rank and rank_before is not None:
-        raise StudyError(
-            f"--resume: {folder.path} has sweep.screen.by = {rank_before!r}, now {rank!r}; a "
-            "resumed sweep keeps the same"
-        )
     for key, what in (
         ("code", "code"),
         ("precision", "precision"),
@@ -344,12 +345,14 @@ def _check_content(folder: SweepFolder, manifest: dict[str, Any], is_resumed: bo
             )
 
 
-def finished_cases(path: Path, tell: Any = None, place: str = CHUNKS) -> Finished:
+def finished_cases(
+    path: Path, report: Callable[[str], object] | None = None, place: str = CHUNKS
+) -> Finished:
     """Finished cases, each once; damaged chunks are set aside and reported.
 
     Args:
         path: the sweep's folder.
-        tell: called with a message for every damaged file; None: leave it in place.
+        report: called with a message for every damaged file; None: leave it in place.
         place: `CHUNKS`, or `SCREEN` for those that the linear model has finished.
     """
     code = "status" if place == CHUNKS else "screen_status"
@@ -358,8 +361,8 @@ def finished_cases(path: Path, tell: Any = None, place: str = CHUNKS) -> Finishe
     for _, chunk in _chunk_files(path / place):
         if file_hash(chunk) == _CHUNK.fullmatch(chunk.name)[2]:  # type: ignore[index]
             files.append(chunk)
-        elif tell is not None:
-            tell(f"{chunk.name} is damaged; its cases run again")
+        elif report is not None:
+            report(f"{chunk.name} is damaged; its cases run again")
             chunk.rename(chunk.with_suffix(".damaged"))
     ids, sources, rows = [], [], []
     kept: list[Path] = []
@@ -389,11 +392,15 @@ def finished_cases(path: Path, tell: Any = None, place: str = CHUNKS) -> Finishe
 
 def _check_columns(store: h5py.File, count: int) -> None:
     """Raise ValueError unless what a case has is there as numbers, for each case."""
-    for name, found in store.items():
+    for name, stored in store.items():
         if name in METRICS or name in PER_CASE or name in SCREENED:
-            shape = np.shape(found) if isinstance(found, h5py.Dataset) else ()
+            shape = np.shape(stored) if isinstance(stored, h5py.Dataset) else ()
             dims = label_of(name)[0]
-            if shape[:1] != (count,) or len(shape) != 1 + len(dims) or found.dtype.kind not in "if":
+            if (
+                shape[:1] != (count,)
+                or len(shape) != 1 + len(dims)
+                or stored.dtype.kind not in "if"
+            ):
                 raise ValueError(f"{name} is not a table of numbers for {count} cases")
 
 
@@ -402,8 +409,8 @@ def check_results(path: Path) -> None:
     results = path / RESULTS
     if not results.is_file():
         return
-    found = file_hash(results)
-    if not found or found not in read_manifest(path).get("results", []):
+    digest = file_hash(results)
+    if not digest or digest not in read_manifest(path).get("results", []):
         raise StudyError(
             f"{results}: damaged, or not of this sweep; put the right one back, or remove it "
             "and run its cases again with --resume"
@@ -428,8 +435,8 @@ def file_hash(path: Path) -> str:
 def _chunk_files(folder: Path) -> list[tuple[int, Path]]:
     if not folder.is_dir():
         return []
-    found = ((_CHUNK.fullmatch(path.name), path) for path in folder.iterdir())
-    return sorted((int(match[1]), path) for match, path in found if match)
+    matches = ((_CHUNK.fullmatch(path.name), path) for path in folder.iterdir())
+    return sorted((int(match[1]), path) for match, path in matches if match)
 
 
 def _sync(folder: Path) -> None:

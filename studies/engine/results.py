@@ -12,9 +12,9 @@ import numpy as np
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.engine.columns import (
+    LARGEST_FIRST,
     LEAST,
     PER_CASE,
-    WANTED_LARGE,
     axis_variables,
     case_variables,
 )
@@ -146,27 +146,25 @@ def read_baseline(folder: Path, spec: SweepSpec) -> dict[str, Variable]:
         variables, attributes = read_store(path)
     except StudyError:
         raise StudyError(f"{path}: damaged; remove it and go on with --resume") from None
-    for name, found in variables.items():
+    for name, stored in variables.items():
         dims = BASELINE_DIMS.get(name, METRICS[name].dims if name in METRICS else None)
         if dims is None:
             continue
-        sizes = dict(zip(found.dims, found.data.shape, strict=False))
-        if found.dims != dims or sizes.get("link", 3) != 3 or found.data.dtype.kind not in "if":
+        sizes = dict(zip(stored.dims, stored.data.shape, strict=False))
+        if stored.dims != dims or sizes.get("link", 3) != 3 or stored.data.dtype.kind not in "if":
             raise StudyError(f"{path}: damaged ({name}); remove it and go on with --resume")
     return variables if attributes.get("case_id") == baseline_id(spec) else {}
 
 
 def baseline_id(spec: SweepSpec) -> str:
     """Hash of all parameters of a sweep's baseline."""
-    found: str = case_ids(spec.study, {}, np.zeros(1, int))[0].decode()
-    return found
+    return str(case_ids(spec.study, {}, np.zeros(1, int))[0].decode())
 
 
 def is_worse(values: np.ndarray, uncontrolled: float) -> np.ndarray:
     """Which values of a metric are above that without control by more than rounding, (n,)."""
     with np.errstate(invalid="ignore"):
-        found: np.ndarray = np.greater(values, uncontrolled * (1 + ROUNDING))
-    return found
+        return np.asarray(values > uncontrolled * (1 + ROUNDING))
 
 
 def uncontrolled_value(data: SweepData, name: str) -> float | None:
@@ -209,9 +207,9 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
         entry = parse_entry(name)
     key = entry.field if entry else name
     variables = data.variables
-    for candidate in (name, key):
+    for candidate, indices in ((name, ()), (key, entry.indices if entry else ())):
         if candidate in variables and variables[candidate].dims[:1] == ("case",):
-            return _entry(data, name, entry.indices if entry else (), candidate)
+            return _entry(data, name, indices, candidate)
     if "." in key:
         swept = data.table.columns
         if name == key and any(column.startswith(f"{key}[") for column in swept):
@@ -220,13 +218,13 @@ def metric_values(data: SweepData, name: str) -> np.ndarray:
         if isinstance(value, tuple):
             raise StudyError(f"{name}: a list; name one entry of it, such as {name}[0]")
         return np.full(data.n_cases, value)
-    known = [n for n, v in variables.items() if v.dims[:1] == ("case",)]
-    ready = [n for n, field in SHOWN_AS.items() if field in known]
-    close = nearest(key, [*ready, *known]) or _turned(key, known)
-    hint = f"did you mean {close!r}?" if close else f"known: {', '.join(known)}"
+    names = [n for n, v in variables.items() if v.dims[:1] == ("case",)]
+    ready = [n for n, field in SHOWN_AS.items() if field in names]
+    close = nearest(key, [*ready, *names]) or _same_words(key, names)
+    hint = f"did you mean {close!r}?" if close else f"known: {', '.join(names)}"
     if key in METRICS and key in (data.spec.sweep.metrics or METRICS):
         raise StudyError(f"{name!r}: no case has finished, so none has it")
-    if any(np.any(data[n] == key) for n in known if data[n].dtype.kind in "OSUT"):
+    if any(np.any(data[n] == key) for n in names if data[n].dtype.kind in "OSUT"):
         hint = f"a text stands in quotes: '{key}'"
     raise StudyError(f"{name!r}: unknown metric or axis; {hint}")
 
@@ -259,7 +257,7 @@ def meets(data: SweepData, condition: str, field: str) -> np.ndarray:
 
 def direction(by: str) -> str:
     """Which values of a metric come first: "smallest" or "largest"; - in front reverses that."""
-    is_large = by.removeprefix("-").partition("[")[0] in WANTED_LARGE
+    is_large = by.removeprefix("-").partition("[")[0] in LARGEST_FIRST
     return "largest" if is_large != by.startswith("-") else "smallest"
 
 
@@ -305,8 +303,8 @@ def counted_links(data: SweepData) -> np.ndarray:
 
     The same for all cases; otherwise fewer controlled links would look like less vibration.
     """
-    found: np.ndarray = np.any(controlled(data.table), axis=0)
-    return found if found.any() else np.ones(3, bool)
+    is_counted = np.any(controlled(data.table), axis=0)
+    return is_counted if is_counted.any() else np.ones(3, bool)
 
 
 def controlled(table: CaseTable) -> np.ndarray:
@@ -316,18 +314,16 @@ def controlled(table: CaseTable) -> np.ndarray:
     return (fields.numbers("control.links") != 0) & is_closed[:, None]
 
 
-def _turned(name: str, known: list[str]) -> str:
-    """A known name with the same words in another order."""
+def _same_words(name: str, names: list[str]) -> str:
+    """One of the names with the same words in another order."""
     words = sorted(name.split("_"))
-    return next((other for other in known if sorted(other.split("_")) == words), "")
+    return next((other for other in names if sorted(other.split("_")) == words), "")
 
 
 def _entry(data: SweepData, name: str, indices: tuple[int, ...], candidate: str) -> np.ndarray:
     variable = data.variables[candidate]
     array, dims = variable.data, variable.dims
-    is_own = name == candidate and "[" in name  # the entry is itself a variable
-    used = () if is_own else indices
-    for index in used:
+    for index in indices:
         if array.ndim < 2 or index >= array.shape[1]:
             sizes = ", ".join(
                 f"{axis}: 0 to {size - 1}"

@@ -15,12 +15,13 @@ from jaxmodel.metrics import METRICS
 from jaxmodel.prepare import left_out_deflection, spectrum_frequencies
 from jaxmodel.simulate import Result
 from studies import config
+from studies.engine.columns import LINK_AXIS, PER_CASE, POSE_AXIS
 from studies.engine.poles import PoleReport
 from studies.engine.programs import kept_jit
 from studies.engine.runs import Run
 from studies.store import Variable
 from studies.study.consistency import each_link
-from studies.study.labels import DISTANCE_TEXT, STATION_TEXT, STATUS_LABEL
+from studies.study.labels import STATION_TEXT, STATUS_LABEL
 from studies.study.margin import MARGIN_MODES
 from studies.study.spec import Study
 
@@ -54,6 +55,16 @@ _RECORD_LABELS = {
 }
 
 
+#: Labelled as in the files of sweeps.
+_OF_RESULTS = (
+    "bad_time",
+    "command_end",
+    "sensor_condition",
+    "actuator_condition",
+    "singularity_distance",
+)
+
+
 @kept_jit(static_argnums=0)
 def _spectrum_frequencies(structure: Structure, case: Case) -> Any:
     return spectrum_frequencies(structure, find_bases(structure, case))
@@ -65,8 +76,8 @@ def run_variables(run: Run) -> dict[str, Variable]:
     frequency = np.asarray(_spectrum_frequencies(run.structure, run.case))
     variables = {
         "station": Variable(stations, ("station",), "1", STATION_TEXT),
-        "link": Variable(np.arange(1, 4), ("link",), "1", "link number"),
-        "pose_axis": Variable(np.array(["x", "y", "phi"]), ("pose_axis",), "1", "pose component"),
+        "link": LINK_AXIS,
+        "pose_axis": POSE_AXIS,
         "spectrum_frequency": Variable(
             frequency,
             ("link", "controlled_mode", "spectrum_point"),
@@ -74,22 +85,7 @@ def run_variables(run: Run) -> dict[str, Variable]:
             "frequency of spectral_density",
         ),
         "status": Variable(np.array(run.status), (), *STATUS_LABEL),
-        "bad_time": Variable(run.result.bad_time, (), "s", "when the status appeared, 0 if ok"),
-        "command_end": Variable(
-            run.result.command_end, (), "s", "end of the shaped reference trajectory"
-        ),
-        "sensor_condition": Variable(
-            run.result.sensor_condition, ("link",), "1", "condition number of the modal filter"
-        ),
-        "actuator_condition": Variable(
-            run.result.actuator_condition, ("link",), "1", "condition number of the synthesizer"
-        ),
-        "singularity_distance": Variable(
-            run.result.singularity_distance,
-            (),
-            "rad",
-            DISTANCE_TEXT,
-        ),
+        **{name: Variable(getattr(run.result, name), *PER_CASE[name]) for name in _OF_RESULTS},
         **metric_variables(run.result),
     }
     if run.loop is not None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -200,6 +200,6 @@ def next_round(
     return last._replace(first=order[: min(needed, FURTHER * so_far)])
 
 
-def screened_cases(folder: Path, tell: Any = None) -> Finished:
+def screened_cases(folder: Path, report: Callable[[str], object] | None = None) -> Finished:
     """Where the results of the linear model are; arguments as `finished_cases`."""
-    return finished_cases(folder, tell, SCREEN)
+    return finished_cases(folder, report, SCREEN)

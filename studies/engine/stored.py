@@ -22,14 +22,14 @@ from studies.engine.columns import (
     SCREENED,
     axis_variables,
     case_variables,
-    forget,
     labelled,
+    mask_unused,
 )
 from studies.engine.folder import JOINED, Finished
 from studies.errors import field_error, nearest
 from studies.space.spec import SweepSpec
 from studies.space.table import CaseTable
-from studies.store import Rows, Variable, axis_sizes, write_store
+from studies.store import LazyArray, Variable, axis_sizes, write_store
 
 if TYPE_CHECKING:
     from studies.engine.chunks import Done
@@ -91,15 +91,15 @@ def chunk_arrays(table: CaseTable, done: Done, kept: list[str]) -> dict[str, np.
         data = judged[name] if name in judged else np.asarray(getattr(result, name))[:count]
         if name in LEAST:
             data = data.copy()
-            forget(data, dims.index("controlled_mode"), controlled)
+            mask_unused(data, dims.index("controlled_mode"), controlled)
         arrays[name] = data
     for name in kept:
         data = np.array(result.metrics[name], copy=True)[:count]
         dims = METRICS[name].dims
         if "mode" in dims:
-            forget(data, dims.index("mode"), modes)
+            mask_unused(data, dims.index("mode"), modes)
         if "controlled_mode" in dims:
-            forget(data, dims.index("controlled_mode"), controlled)
+            mask_unused(data, dims.index("controlled_mode"), controlled)
         data[~is_finished] = np.nan
         arrays[name] = data
     return arrays
@@ -201,7 +201,7 @@ def joined_columns(
 
     columns = {}
     for name, (shape, dtype) in _largest(finished.files, set(names)).items():
-        column = Rows((len(table), *shape), dtype, partial(read, name, shape, dtype))
+        column = LazyArray((len(table), *shape), dtype, partial(read, name, shape, dtype))
         columns[name] = labelled(name, column)
     return columns
 

@@ -17,6 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 
 from studies.engine.batches import Tell
+from studies.engine.columns import LINK_AXIS, POSE_AXIS
 from studies.engine.run_data import metric_variables, run_attributes
 from studies.errors import StudyError
 from studies.paper.cases import (
@@ -191,13 +192,13 @@ def _axes(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
     return {
         "case": Variable(names, ("case",), "1", "name of the case"),
         "time": Variable(runs.record.time[0], ("time",), "s", "time"),
-        "link": Variable(np.arange(1, 4), ("link",), "1", "link number"),
+        "link": LINK_AXIS,
         "station": Variable(np.array(runs.study.metrics.stations), ("station",), "1", STATION_TEXT),
         "patch": Variable(np.arange(1, 4), ("patch",), "1", "patch pair, from the slider on"),
         "controlled_mode": Variable(
             np.arange(1, count + 1), ("controlled_mode",), "1", "mode of the controller"
         ),
-        "pose_axis": Variable(np.array(["x", "y", "phi"]), ("pose_axis",), "1", "pose component"),
+        "pose_axis": POSE_AXIS,
         "frequency": Variable(measures.frequency, ("frequency",), "Hz", "frequency"),
     }
 

@@ -92,7 +92,7 @@ def select(data: SweepData, subject_to: str) -> np.ndarray:
 def best_cases(
     sweep: SweepData | str | Path, by: str, subject_to: str = "", count: int = 10
 ) -> pandas.DataFrame:
-    """The cases with the smallest metric, best first; for `WANTED_LARGE`, the largest.
+    """The cases with the smallest metric, best first; for `LARGEST_FIRST`, the largest.
 
     For example `best_cases("gains", "residual_rms", "gain_margin > 2", count=5)`. Warns
     (`ResolutionWarning`) of deflections below one ADC step, which the controller cannot measure.
