@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeVar
 
 import typer
 
+from studies.cluster.watch import wait_for_workers
 from studies.config import usable_cores
 from studies.errors import StudyError, field_error
 from studies.reading import read_json
@@ -44,8 +45,8 @@ WorkerTimeout = Annotated[
 ]
 
 
-#: Time limits for the scheduler to answer and for its first worker to join [s].
-PATIENCE, WORKER_PATIENCE = 15, 300
+#: Time limit for the scheduler to answer [s].
+PATIENCE = 15
 
 
 class Workers(NamedTuple):
@@ -225,14 +226,6 @@ def _graphics(number: int) -> dict[str, str]:
     found = [str(k) for k in range(len(glob.glob("/dev/nvidia[0-9]*")))]
     devices = named.split(",") if named else found
     return {"CUDA_VISIBLE_DEVICES": devices[number % len(devices)]} if devices else {}
-
-
-def wait_for_workers(client: Client) -> None:
-    """Raise StudyError if no worker joins in time."""
-    try:
-        client.wait_for_workers(1, timeout=WORKER_PATIENCE)
-    except TimeoutError:
-        raise StudyError(f"no worker has joined within {WORKER_PATIENCE} s") from None
 
 
 def refuse_other_versions(client: Client) -> None:

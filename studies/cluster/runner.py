@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jaxmodel.case import Structure
 from studies import config
-from studies.cluster.connect import wait_for_workers
-from studies.cluster.watch import Watch
+from studies.cluster.watch import Watch, wait_for_workers
 from studies.cluster.worker import ChunkDone, ChunkJob, chunk_size, identity, run_chunk
 from studies.engine.chunks import Done, Lost, has_own_ratio
 from studies.engine.plan import Chunk, Group, Layout

@@ -16,8 +16,18 @@ if TYPE_CHECKING:
 GONE = "the scheduler is gone; finished work is safe; continue with --resume"
 #: How often workers are checked [s].
 LOOK = 1.0
+#: Time limit for the first worker to join [s].
+WORKER_PATIENCE = 300
 #: Time allowed for stopping a worker that hangs [s].
 KILL_TIME = 10
+
+
+def wait_for_workers(client: Client) -> None:
+    """Raise StudyError if no worker joins in time."""
+    try:
+        client.wait_for_workers(1, timeout=WORKER_PATIENCE)
+    except TimeoutError:
+        raise StudyError(f"no worker has joined within {WORKER_PATIENCE} s") from None
 
 
 class Watch:
