@@ -14,8 +14,8 @@ from jaxmodel.riccati import filter_gain, regulator_gain, solve_riccati
 from jaxmodel.sampled_loop import closed_loop
 from jaxmodel.simulate import simulate
 from jaxmodel.state_space import StateSpace, dense
-from studies.engine.preflight import check_run
 from studies.engine.stability import loop_report, with_margin_modes
+from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import parse_study
 
 SHORT = {
@@ -97,6 +97,10 @@ def compensator(study, known, case, link):
     return after @ kept, after @ correct, -gain @ kept, -gain @ correct
 
 
+def arrays(study):
+    return build_structure(study), as_arrays(build_case(study))
+
+
 def known_of(structure, case):
     return design_controller(structure, case, find_bases(structure, case)).known
 
@@ -108,7 +112,7 @@ def controller_of(structure, case):
 def test_damping_and_margin_are_those_of_an_independent_computation():
     """Filter and regulator by SciPy in other coordinates, put into the same plant."""
     study = parse_study(SHORT)
-    structure, case = check_run(study)
+    structure, case = arrays(study)
     known = jax.tree.map(np.asarray, jax.jit(known_of, static_argnums=0)(structure, case))
     parts = [compensator(study, known, case, link) for link in range(3)]
     a, b, c, d = (np.stack([part[k] for part in parts]) for k in range(4))
@@ -137,7 +141,7 @@ def test_damping_and_margin_are_those_of_an_independent_computation():
 def test_certainty_equivalence():
     """On its own model, the loop's poles are those of regulator and filter, and all are stable."""
     study = parse_study(SHORT | {"link": {"modes": 2}})
-    structure, case = check_run(study)
+    structure, case = arrays(study)
     known = jax.tree.map(np.asarray, jax.jit(known_of, static_argnums=0)(structure, case))
     a, b, c, d = compensator(study, known, case, 0)
     found = jax.jit(
@@ -156,7 +160,7 @@ def test_certainty_equivalence():
 def test_gradients_equal_differences():
     """Of residual vibration after the motion, by the logarithms of all weights, to 1e-4."""
     study = parse_study(SHORT | {"run": {"duration": 0.06, "smooth": True}})
-    structure, case = check_run(study)
+    structure, case = arrays(study)
     structure = structure._replace(metrics=("residual_rms",))
     names = ("voltage_weight", "disturbance", "sensor_noise")
 
@@ -166,11 +170,12 @@ def test_gradients_equal_differences():
         parameters = {**given, **moved}
         control = case.control._replace(parameters=parameters)
         found = simulate(structure, case._replace(control=control))
-        return jnp.sum(found.metrics.residual_rms**2) * 1e9
+        squares = jnp.sum(found.metrics.residual_rms**2) * 1e9
+        return squares, squares
 
-    run, steps = jax.jit(residual), 1e-3 * np.eye(3)
-    slope = jax.jit(jax.jacfwd(residual))(np.zeros(3))
-    wanted = [float(run(x) - run(-x)) / 2e-3 for x in steps]
+    run = jax.jit(jax.jacfwd(residual, has_aux=True))  # one program for both
+    slope = run(np.zeros(3))[0]
+    wanted = [float(run(x)[1] - run(-x)[1]) / 2e-3 for x in 1e-3 * np.eye(3)]
     np.testing.assert_allclose(slope, wanted, rtol=1e-4)
 
 
@@ -180,7 +185,7 @@ def test_observers_have_the_poles_that_were_placed(highpass):
     control = {"law": "observer", "modes": 2, "laws": {"observer": {"observer_damping": 0.4}}}
     electronics = {"sensor_highpass_hz": highpass}
     study = parse_study(SHORT | {"control": control, "electronics": electronics})
-    structure, case = check_run(study)
+    structure, case = arrays(study)
 
     def both(case):
         known = known_of(structure, case)
@@ -207,7 +212,7 @@ def test_modal_control_by_observers_damps_as_modal_filters_do():
     found = {}
     for law in ("imsc", "observer"):
         control = {"law": law, "velocity_gain": (0.6, 0.7, 0.7), "modes": 2}
-        structure, case = check_run(parse_study(SHORT | {"control": control}))
+        structure, case = arrays(parse_study(SHORT | {"control": control}))
         found[law] = loop_report(structure, case, np.array([0.0, 0.0, 0.5236]))
         assert found[law].gain_margin > 2
     damping = [found[law].damping_ratio[0].mean() for law in ("imsc", "observer")]
