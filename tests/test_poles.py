@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import expm
 
 from jaxmodel.bases import find_bases
-from jaxmodel.case import Case
+from jaxmodel.case import Case, Structure
 from jaxmodel.nominal_loop import nominal_loop
 from jaxmodel.prepare import design_controller, prepare
 from jaxmodel.status import OK, UNPLACEABLE
@@ -26,6 +26,8 @@ from studies.space.table import build_table, case_study
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study, parse_study
 
+_nominal = jax.jit(nominal_loop, static_argnums=0)
+_prepared = jax.jit(prepare, static_argnums=0)
 #: Sets of poles.
 N = 200
 #: Added damping ratios by mode.
@@ -35,6 +37,11 @@ BY_MODE = [[0.2, 0.03, 0.01], [0.15, 0.02, 0.005], [0.1, 0.0, 0.02]]
 def study_with(law: str = "imsc", decay: object = 100.0, **changes: object) -> Study:
     control = {"law": law, "pole_decay": decay} | changes.pop("control", {})
     return parse_study({"control": control, "link": {"modes": 3}} | changes)
+
+
+def arrays(study: Study) -> tuple[Structure, Case]:
+    """Without a run, whose length would make programs differ."""
+    return build_structure(study)._replace(n_steps=1), as_arrays(build_case(study))
 
 
 def nearest_poles(asked: np.ndarray, matrix: np.ndarray, period: float) -> np.ndarray:
@@ -72,22 +79,23 @@ def random_poles(case: Case, rng: np.random.Generator, omega: np.ndarray) -> Cas
 def test_random_poles_are_obtained_on_the_nominal_link(law, changes):
     """200 sets of nine, to 1e-9 of their size."""
     study = study_with(law, **changes)
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    omega = np.asarray(jax.jit(partial(_omega, structure))(case))
+    structure, case = arrays(study)
+    omega = np.asarray(_omega(structure, case))
     rng = np.random.default_rng(1)
-    run = jax.jit(partial(nominal_loop, structure))
     worst = 0.0
     for _ in range(N):
-        asked, matrix = map(np.asarray, run(random_poles(case, rng, omega)))
+        asked, matrix = map(np.asarray, _nominal(structure, random_poles(case, rng, omega)))
         found = nearest_poles(asked, matrix, float(case.electronics.period))
         worst = max(worst, np.max(np.abs(found - asked) / np.abs(asked)))
     assert worst < 1e-9
 
 
+@partial(jax.jit, static_argnums=0)
 def _omega(structure, case):
     return find_bases(structure, case).believed_omega
 
 
+@partial(jax.jit, static_argnums=0)
 def _gains(structure, case):
     law = design_controller(structure, case, find_bases(structure, case)).controller.feedback
     return law.velocity_gain, law.position_gain
@@ -96,8 +104,8 @@ def _gains(structure, case):
 def test_gains_agree_with_an_independent_loop():
     """Mode, filter, hold, delay and estimates by SciPy's exponential and polynomials, to 1e-8."""
     study = study_with(decay=[[150.0, 80.0, 90.0], [100.0, 70.0, 80.0], [60.0, 90.0, 200.0]])
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    design = jax.jit(partial(_design, structure))(case)
+    structure, case = arrays(study)
+    design = _design(structure, case)
     law, known = jax.tree.map(np.asarray, (design.controller.feedback, design.known))
     period, corner = float(case.electronics.period), float(case.electronics.antialias)
     static = known.observer @ known.feedthrough @ known.synthesizer
@@ -133,6 +141,7 @@ def test_gains_agree_with_an_independent_loop():
         assert np.abs(poles - wanted).min() < 1e-8
 
 
+@partial(jax.jit, static_argnums=0)
 def _design(structure, case):
     return design_controller(structure, case, find_bases(structure, case))
 
@@ -148,9 +157,9 @@ def test_modes_without_a_decay_follow_the_ratios():
     ratios = [[1.0, 0.5, 0.0], [1.0, 0.3, 2.0], [1.0, 0.0, 0.1]]
     decay = [[150.0], [100.0, 77.0], [60.0]]
     study = study_with(decay=decay, control={"ratios": ratios})
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    asked, matrix = map(np.asarray, jax.jit(partial(nominal_loop, structure))(case))
-    omega = np.asarray(jax.jit(partial(_omega, structure))(case))
+    structure, case = arrays(study)
+    asked, matrix = map(np.asarray, _nominal(structure, case))
+    omega = np.asarray(_omega(structure, case))
     first = np.array([150.0, 100.0, 60.0])[:, None] - 0.01 * omega[:, :1]
     wanted = 0.01 * omega + np.array(ratios) * first
     wanted[1, 1] = 77.0
@@ -158,7 +167,7 @@ def test_modes_without_a_decay_follow_the_ratios():
     np.testing.assert_allclose(np.abs(asked), omega, rtol=1e-12)
     found = nearest_poles(asked, matrix, float(case.electronics.period))
     np.testing.assert_allclose(found, asked, rtol=1e-9)
-    velocity, position = map(np.asarray, jax.jit(partial(_gains, structure))(case))
+    velocity, position = map(np.asarray, _gains(structure, case))
     assert velocity[0, 2] == position[0, 2] == velocity[2, 1] == 0.0
     assert np.all(velocity[[0, 1, 1, 2], [1, 1, 2, 2]] != 0)
 
@@ -167,9 +176,9 @@ def test_continuous_feedback_has_the_gains_of_the_paper():
     """(22)-(23), less the structural damping that is there already."""
     control = {"feedback": "ideal", "pole_frequency_hz": [[120.0, 0.0], [0.0, 470.0], [125.0]]}
     study = study_with(decay=90.0, control=control)
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    omega = np.asarray(jax.jit(partial(_omega, structure))(case))
-    velocity, position = map(np.asarray, jax.jit(partial(_gains, structure))(case))
+    structure, case = arrays(study)
+    omega = np.asarray(_omega(structure, case))
+    velocity, position = map(np.asarray, _gains(structure, case))
     mass = study.link.density * study.link.width * study.link.thickness * study.link.length / 2
     beta = np.sqrt(omega**2 - 90.0**2)
     for at, hertz in (((0, 0), 120.0), ((1, 1), 470.0), ((2, 0), 125.0)):
@@ -182,8 +191,8 @@ def test_continuous_feedback_has_the_gains_of_the_paper():
 def test_gains_are_differentiable():
     """By decays and frequencies, forward against differences, 1e-6."""
     study = study_with(decay=[[150.0, 80.0, 90.0]] * 3)
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    omega = jax.jit(partial(_omega, structure))(case)
+    structure, case = arrays(study)
+    omega = _omega(structure, case)
 
     def gains(x):
         control = case.control._replace(
@@ -216,8 +225,8 @@ def test_gains_are_differentiable():
 )
 def test_what_cannot_be_placed_is_a_status(law, changes, code):
     study = study_with(law, control=changes)
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    found = jax.jit(lambda c: prepare(structure, c))(case)
+    structure, case = arrays(study)
+    found = _prepared(structure, case)
     assert int(found.status) == code
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(found.loop.controller.feedback))
 
@@ -260,9 +269,9 @@ def test_the_observers_loop_has_the_poles_of_continuous_feedback(rate):
     electronics = {"sample_rate_hz": rate, "antialias_hz": 1_500.0, "amplifier_hz": 3_000.0}
     gains = {"velocity_gain": (1.0, 2.0, 3.0), "position_gain": (0.0, 200.0, -300.0)}
     study = parse_study({"control": {"law": "observer"} | gains, "electronics": electronics})
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    _, matrix = map(np.asarray, jax.jit(partial(nominal_loop, structure))(case))
-    known = jax.tree.map(np.asarray, jax.jit(partial(_design, structure))(case).known)
+    structure, case = arrays(study)
+    _, matrix = map(np.asarray, _nominal(structure, case))
+    known = jax.tree.map(np.asarray, _design(structure, case).known)
     ratio = np.array(study.control.ratios)
     velocity = np.array(gains["velocity_gain"])[:, None] * ratio / known.modal_mass
     position = np.array(gains["position_gain"])[:, None] * ratio / known.modal_mass
@@ -291,16 +300,13 @@ def test_added_damping_is_obtained_on_any_machine():
     """
     payload = {"load": {"mass": 0.0, "offset": [0.01, 0.005]}}  # massless: the default machine
     ratio = np.array(Study().control.ratios)
-    structure = nominal = natural = None
     for machine, damping in ((payload, 0.2), (OWN_LINKS, 0.2), (OWN_LINKS, BY_MODE)):
         link = machine.get("link", {}) | {"modes": 3}
         study = parse_study({**machine, "link": link, "control": {"damping": damping}})
-        if structure is None:
-            structure = build_structure(study)
-            nominal, natural = (jax.jit(partial(f, structure)) for f in (nominal_loop, _omega))
-        case = as_arrays(build_case(study))
-        asked, matrix = map(np.asarray, nominal(case))
-        found, omega = nearest_poles(asked, matrix, float(case.electronics.period)), natural(case)
+        structure, case = arrays(study)
+        asked, matrix = map(np.asarray, _nominal(structure, case))
+        found = nearest_poles(asked, matrix, float(case.electronics.period))
+        omega = _omega(structure, case)
         added = 0.2 * ratio * omega[:, :1] / omega if damping == 0.2 else np.array(damping)
         np.testing.assert_allclose(np.abs(found), omega, rtol=1e-9)
         np.testing.assert_allclose(-found.real / np.abs(found), 0.01 + added, rtol=1e-9)
@@ -318,8 +324,8 @@ def test_added_damping_leaves_modes_alone_where_it_is_none():
             "control": {"damping": [[0.2, 0.0], [0.0], [0.1, 0.05, 0.0]]},
         }
     )
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    found = jax.jit(lambda c: prepare(structure, c))(case)
+    structure, case = arrays(study)
+    found = _prepared(structure, case)
     assert int(found.status) == OK
     is_on = np.asarray(found.loop.controller.feedback.velocity_gain) != 0
     np.testing.assert_array_equal(is_on, [[True, False, True], [False] * 3, [True, True, False]])
@@ -366,8 +372,8 @@ def test_decays_and_damping_ratios_are_shown_in_their_units():
 def test_exports_and_certificates_get_the_controller_that_runs(law, electronics):
     """With poles, amplifiers and drained patches, which are part of the design."""
     study = study_with(law, [160.0, 120.0, 90.0], electronics=electronics)
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    runs = jax.jit(partial(_design, structure))(case).controller
+    structure, case = arrays(study)
+    runs = _design(structure, case).controller
     exported = fixed_controller(study).controller
     near = partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-12)
     jax.tree.map(near, exported.feedback, runs.feedback)
@@ -377,7 +383,7 @@ def test_observers_leave_modes_alone_whatever_the_links_damping():
     """A ratio of 0 is no gain, where the law's model has more damping than the links."""
     link = {"modes": 3, "damping_ratio": 0.001}
     study = study_with("observer", [[160.0]] * 3, link=link, control={"ratios": [[1.0, 0, 0]] * 3})
-    structure, case = build_structure(study), as_arrays(build_case(study))
+    structure, case = arrays(study)
     report = loop_report(structure, case, np.array(study.motion.waypoints[0]))
     assert report.is_stable and report.gain_margin > 2
     assert np.all((report.damping_ratio[1:] > 0.0009) & (report.damping_ratio[1:] < 0.0015))
