@@ -99,7 +99,7 @@ def spec_of(folder, *entries, free=None, study=None, **fit):
     return parse_fit(data | {"fit": {"free": free or FREE, "data": list(entries)} | fit}, folder)
 
 
-def made(spec):
-    """Bench and measurements."""
-    bench = make_bench(spec)
+def made(spec, bench=None):
+    """Bench and measurements; bench: one that serves all entries, whose programs are compiled."""
+    bench = bench or make_bench(spec)
     return bench, make_measurements(spec, bench), guess(spec)

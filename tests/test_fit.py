@@ -18,6 +18,7 @@ from studies.errors import StudyError
 from studies.fitting.estimate import fit
 from studies.fitting.kinds.contract import Line
 from studies.fitting.kinds.modes import TWO_PI, pair_modes
+from studies.fitting.measurements import make_bench
 from studies.fitting.plots import curves, samples
 from studies.fitting.posterior import log_density, sample, shape
 from studies.fitting.problem import Problem
@@ -93,16 +94,22 @@ ENTRIES = {
 
 
 @pytest.fixture(scope="module")
-def every_kind(folder):
-    """Bench, values and measurements by kind; programs are shared."""
-    bench, measurements, values = made(spec_of(folder, *ENTRIES.values()))
-    return bench, values, dict(zip(ENTRIES, measurements, strict=True))
+def bench(folder):
+    """The machine of all kinds of entries, whose programs all tests with `FREE` share."""
+    return make_bench(spec_of(folder, *ENTRIES.values()))
+
+
+@pytest.fixture(scope="module")
+def every_kind(folder, bench):
+    """Values and measurements by kind; programs are shared."""
+    _, measurements, values = made(spec_of(folder, *ENTRIES.values()), bench)
+    return values, dict(zip(ENTRIES, measurements, strict=True))
 
 
 @pytest.mark.parametrize("kind", ENTRIES)
-def test_derivatives_of_every_kind(every_kind, kind):
+def test_derivatives_of_every_kind(bench, every_kind, kind):
     """Against central differences of fourth order, each column within 1e-5 of its size."""
-    bench, values, measurements = every_kind
+    values, measurements = every_kind
     one = measurements[kind]
     if kind == "modes":
         one.use(measured_modes(bench, one, values * 1.001))
@@ -114,9 +121,9 @@ def test_derivatives_of_every_kind(every_kind, kind):
     assert np.max(np.abs(found.slope - wanted) / size) < 1e-5
 
 
-def test_modes_are_paired_by_shape(folder):
+def test_modes_are_paired_by_shape(folder, bench):
     """Three nearly equal modes, measured in another order and mixed with noise."""
-    bench, (one,), values = made(spec_of(folder, MODES))
+    _, (one,), values = made(spec_of(folder, MODES), bench)
     truth = measured_modes(bench, one, values)
     order = [2, 0, 1, 5, 3, 4]
     noise = np.random.default_rng(0).normal(size=(6, 9)) * 0.03 * np.abs(truth.shapes).max()
@@ -155,10 +162,10 @@ def noisy(one, kind, values, rng):
     one.sigma = one._noise.sigma(one.measured)
 
 
-def repeated(folder, kind, repetitions, seed=0):
+def repeated(folder, bench, kind, repetitions, seed=0):
     """How many repetitions have the truth in their 95 % region."""
     spec = spec_of(folder, ENTRIES[kind])
-    bench, (one,), values = made(spec)
+    _, (one,), values = made(spec, bench)
     problem = Problem(free=spec.free, priors=(), measurements=(one,), bench=bench)
     truth, rng, inside = spec.free.places(), np.random.default_rng(seed), 0
     for _ in range(repetitions):
@@ -175,15 +182,15 @@ def repeated(folder, kind, repetitions, seed=0):
 
 
 @pytest.mark.parametrize("kind", ["modes", "response"])
-def test_the_truth_is_inside_the_region(folder, kind):
+def test_the_truth_is_inside_the_region(folder, bench, kind):
     """In 20 repetitions; of 95 %, fewer than 15 would come 3 times in 10,000."""
-    assert repeated(folder, kind, 20) >= 15
+    assert repeated(folder, bench, kind, 20) >= 15
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["modes", "response", "magnitude", "spectrum", "trace"])
-def test_the_truth_is_inside_95_percent_of_the_regions(folder, kind):
-    inside = repeated(folder, kind, 100, 1)
+def test_the_truth_is_inside_95_percent_of_the_regions(folder, bench, kind):
+    inside = repeated(folder, bench, kind, 100, 1)
     print(f"{kind}: the truth is inside {inside} of 100 regions")
     assert 90 <= inside <= 99
 
@@ -233,10 +240,10 @@ def test_three_numbers_that_belong_together_are_one_group(folder):
     assert "determine 1 combination of these 3 parameters" in sentence and "Fix 2" in sentence
 
 
-def test_outliers_pull_less(folder):
+def test_outliers_pull_less(folder, bench):
     """One point in twenty is half as large again; profiles follow the same loss."""
     spec = spec_of(folder, RESPONSE)
-    bench, (one,), values = made(spec)
+    _, (one,), values = made(spec, bench)
     noisy(one, "response", values, np.random.default_rng(4))
     one.measured[::20] *= 1.5
     found = {}
@@ -258,13 +265,13 @@ def test_outliers_pull_less(folder):
     assert np.all(found[True] < 0.6 * found[False])
 
 
-def test_a_wrong_model_is_noticed(folder):
+def test_a_wrong_model_is_noticed(folder, bench):
     """Links with joint inertia, fitted without it."""
     spec = spec_of(folder, RESPONSE, study={"link": SHORT["link"] | LOADED})
-    bench, (one,), values = made(spec)
+    _, (one,), values = made(spec)
     noisy(one, "response", values, np.random.default_rng(0))
     poor = spec_of(folder, RESPONSE)
-    bench, (other,), _ = made(poor)
+    _, (other,), _ = made(poor, bench)
     other.measured, other.sigma = one.measured, one.sigma
     problem = Problem(free=poor.free, priors=(), measurements=(other,), bench=bench)
     answer = describe_fit(problem, solve(problem, 4, 1, 60, 0).best.u)
@@ -613,9 +620,9 @@ def test_poses_out_of_reach_are_no_data(folder):
     assert list(np.isfinite(problem.costs(np.array([[0.2], [0.5]])))) == [False, True]
 
 
-def test_spectra_of_few_averages_have_the_residuals_of_their_likelihood(folder):
+def test_spectra_of_few_averages_have_the_residuals_of_their_likelihood(folder, bench):
     """Squares add up to twice the negative log likelihood, up to a constant."""
-    bench, (one,), values = made(spec_of(folder, SPECTRUM | {"averages": 2}))
+    _, (one,), values = made(spec_of(folder, SPECTRUM | {"averages": 2}), bench)
     model = np.abs(one.predict(values, False)[0]) ** 2
     rng = np.random.default_rng(0)
     one.measured = 3.0 * model * rng.gamma(2, 0.5, len(model))
