@@ -36,10 +36,25 @@ UNLIKE = {
 }
 
 
-def prepared(**fields):
+@partial(jax.jit, static_argnums=0)
+def loop_of(structure, case):
+    return prepare(structure, case).loop
+
+
+@partial(jax.jit, static_argnums=0)
+def plant_of(structure, case):
+    """Linearised at the first way-point."""
+    return linearise(structure, prepare(structure, case).loop, case.path.waypoints[0])
+
+
+def arrays(**fields):
     study = paper_study().change(**fields)
-    structure, case = build_structure(study), as_arrays(build_case(study))
-    return structure, case, prepare(structure, case).loop
+    return build_structure(study), as_arrays(build_case(study))
+
+
+def prepared(**fields):
+    structure, case = arrays(**fields)
+    return structure, case, loop_of(structure, case)
 
 
 def by_hand(case, basis, link):
@@ -92,14 +107,13 @@ def test_held_voltages_bend_the_links_as_statics_says(basis, n_modes):
     """A step on each patch, all sensors and stations of the assembled machine, in the long run."""
     fields = UNLIKE if n_modes != 1 else {}
     fields = {**fields, "control__modes": 1, "metrics__stations": (0.25, 0.5, 0.75)}
-    structure, case, loop = prepared(link__basis=basis, link__modes=n_modes, **fields)
+    structure, case = arrays(link__basis=basis, link__modes=n_modes, **fields)
     if n_modes != 1:
         centers = np.array(case.machine.patches.center)
         centers[2, 1] = 0.072
         patches = case.machine.patches._replace(center=centers)
         case = case._replace(machine=case.machine._replace(patches=patches))
-        loop = prepare(structure, case).loop
-    plant = linearise(structure, loop, case.path.waypoints[0])
+    plant = plant_of(structure, case)
     still = np.linalg.solve(plant.state, -plant.voltage)
     volts = np.array(plant.sensor @ still + plant.direct_sensor)
     bent = np.array(plant.deflection @ still + plant.direct_deflection)
@@ -115,7 +129,7 @@ def test_held_voltages_bend_the_links_as_statics_says(basis, n_modes):
 
 
 def test_no_other_sensor_answers():
-    volts, _ = by_hand(prepared()[1], "pinned_pinned", 0)
+    volts, _ = by_hand(arrays()[1], "pinned_pinned", 0)
     assert np.count_nonzero(volts) == 3
 
 
@@ -161,7 +175,7 @@ FINITE_ELEMENTS = {
     ],
 )
 def test_margins_are_those_of_finite_elements(basis, n_modes, within):
-    structure, case, _ = prepared(link__modes=n_modes, link__basis=basis)
+    structure, case = arrays(link__modes=n_modes, link__basis=basis)
     found = loop_report(structure, case, case.path.waypoints[0], n_modes=n_modes)
     margin, damping = FINITE_ELEMENTS[basis]
     assert found.gain_margin == pytest.approx(margin, rel=within)
@@ -267,11 +281,11 @@ def test_bench_responses_have_it():
     bench = Bench(study, lambda case, values: case, (pose,), (0.1,))
     plant = bench.plant(pose, np.zeros(0), False)
     volts, bent = by_hand(
-        case_of(bench.structure, bench.numbers)._replace(windows=prepared()[1].windows),
+        case_of(bench.structure, bench.numbers)._replace(windows=arrays()[1].windows),
         "pinned_pinned",
         0,
     )
-    station = list(prepared()[1].windows.stations).index(0.5)
+    station = list(arrays()[1].windows.stations).index(0.5)
     for output, wanted in (
         (Signal("sensor", 0, 1, np.nan), volts[1, 1]),
         (Signal("deflection", 0, 0, 0.1), bent[station, 1]),
