@@ -152,7 +152,7 @@ def with_coordinates(variables: Mapping[str, Variable]) -> dict[str, Variable]:
         for axis, size in axis_sizes(variables).items()
         if axis not in variables
     }
-    return numbers | dict(variables)
+    return dict(variables) | numbers
 
 
 def variable_labels(variable: Variable) -> dict[str, Any]:

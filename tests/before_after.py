@@ -93,11 +93,17 @@ def arrays(path: Path) -> dict[str, Any]:
 
     def visit(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset):
-            found[name] = item[()]
+            found[_name_before(name)] = item[()]
 
     with h5py.File(path) as file:
         file.visititems(visit)
     return found
+
+
+def _name_before(name: str) -> str:
+    """A variable's name before the files took those of fields: `control_gain_factor`."""
+    plain = re.sub(r"\W+", "_", name).strip("_").removeprefix("scenario_")
+    return re.sub("^(link_subset|link_mode_mask)s$", r"\1", plain)
 
 
 def numbers(path: Path) -> dict[str, Any]:

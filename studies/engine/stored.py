@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -110,7 +110,7 @@ CODES = {"status", "screen_status"}
 
 
 def gather(
-    table: CaseTable, finished: Finished, names: Iterable[str] | None = None
+    table: CaseTable, finished: Finished, names: Collection[str] | None = None
 ) -> dict[str, Variable]:
     """Variables of all cases of a table, from the files that hold them.
 
@@ -126,7 +126,7 @@ def gather(
     columns = joined_columns(table, finished, names)
     whole = slice(0, len(table))
     variables = {name: v._replace(data=v.data.read(whole)) for name, v in columns.items()}
-    for name in CODES.intersection(names) - variables.keys():
+    for name in sorted(CODES.intersection(names) - variables.keys()):
         variables[name] = labelled(name, np.full(len(table), NOT_RUN))
     return variables
 
@@ -174,7 +174,7 @@ def merge(
 
 
 def joined_columns(
-    table: CaseTable, finished: Finished, names: Iterable[str]
+    table: CaseTable, finished: Finished, names: Collection[str]
 ) -> dict[str, Variable]:
     """The same as `gather`, but the data are read when they are needed."""
     order = np.argsort(table.case_id)
@@ -200,18 +200,20 @@ def joined_columns(
         return part
 
     columns = {}
-    for name, (shape, dtype) in _largest(finished.files, set(names)).items():
+    for name, (shape, dtype) in _largest(finished.files, names).items():
         column = LazyArray((len(table), *shape), dtype, partial(read, name, shape, dtype))
         columns[name] = labelled(name, column)
     return columns
 
 
-def _largest(files: list[Path], names: set[str]) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+def _largest(
+    files: list[Path], names: Collection[str]
+) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     """Largest shape of a row of each variable, and its type: programs differ in mode counts."""
     largest: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
     for file in files:
         with h5py.File(file, "r") as store:
-            for name in names & store.keys():
+            for name in (name for name in names if name in store):
                 shape, dtype = store[name].shape[1:], store[name].dtype
                 largest[name] = tuple(map(max, largest.get(name, (shape,))[0], shape)), dtype
     return largest
