@@ -29,24 +29,40 @@ config.keep_programs = lambda: None
 # tables as wide as they need to be, wherever the tests run
 os.environ["COLUMNS"] = "240"
 
-#: Files that take longest, begun first so that the workers end together.
+#: Files that take longest, begun first so that the workers end together: the longest of all first.
 HEAVY = (
-    "notebooks",
-    "margins",
-    "contracts",
-    "atlas",
-    "cluster",
     "fit",
+    "poles",
+    "contracts",
+    "margins",
+    "cluster",
     "state_space",
-    "observers",
     "sweeps",
+    "static",
     "axial",
-    "gradients",
+    "screen",
+    "sampled_loop",
+    "batched",
     "tuning",
     "spillover",
-    "paper",
     "export",
-    "sampled_loop",
+    "atlas",
+    "sweep_commands",
+    "examples",
+    "observers",
+    "kernel",
+    "cli",
+    "paper",
+    "dynamics",
+    "notebooks",
+    "fit_verdicts",
+    "integrator",
+    "gradients",
+    "runs",
+    "batch",
+    "way_of_a_gain",
+    "exit_codes",
+    "metrics",
 )
 
 
