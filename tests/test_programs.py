@@ -9,6 +9,7 @@ from jaxmodel.case import Structure
 from studies.engine import programs
 from studies.engine.programs import kept_data, kept_jit
 from studies.kernels import compilation
+from studies.space.free import Placing
 
 TRACED = []
 
@@ -104,6 +105,27 @@ def test_a_function_among_the_static_arguments_is_not_kept(keeping):
     apply = kept_jit(static_argnums=0)(lambda function, x: function(x))
     assert apply(jnp.sin, 0.5) == pytest.approx(np.sin(0.5))
     assert not list(folder.glob("kernel-*"))
+
+
+def _raised(n, x, _):
+    TRACED.append(n)
+    return x**n
+
+
+def test_a_function_with_plain_arguments_given_is_kept(keeping):
+    """As those that place free numbers."""
+    _, next_process = keeping
+    apply = kept_jit(static_argnums=0)(lambda placing, x, y: placing(x, y))
+
+    def raised(x, n):
+        return apply(Placing(_raised, (n,)), x, 0.0).tolist()
+
+    assert raised(np.array([2.0]), 3) == [8.0] and raised(np.array([2.0]), 2) == [4.0]
+    next_process()
+    count = len(TRACED)
+    assert raised(np.array([3.0]), 2) == [9.0] and raised(np.array([3.0]), 3) == [27.0]
+    assert len(TRACED) == count == 2
+    assert raised(np.array([3.0]), 4) == [81.0] and len(TRACED) == 3
 
 
 def test_it_is_a_plain_jit_inside_other_programs(keeping):

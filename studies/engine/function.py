@@ -27,7 +27,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.loop import State, step
 from jaxmodel.simulate import Outline, Result, Start, begin, conclude
 from studies.config import is_keeping, processor
-from studies.engine.programs import kept_data, program
+from studies.engine.programs import is_plain, kept_data, program
 from studies.errors import NoKernelError
 from studies.kernels import bridge, gpu, llvm, native
 from studies.kernels.equations import Function, call_of, literal, trace
@@ -44,6 +44,8 @@ KERNEL_SUBSTEPS = 4
 #: How the steps are made, in words.
 STEPPERS = {"kernel": "traced kernel", "gpu": "GPU kernel", "scan": "XLA scan"}
 
+#: Programs whose results contain functions, which cannot be kept on disk.
+_WITH_FUNCTIONS = ("prepare_vjp", "finish_vjp")
 _FUNCTIONS: dict[Any, BlockFunction] = {}
 _ALONE = Lock()
 
@@ -300,7 +302,7 @@ class BlockFunction:
 
         with self._compiling:
             if name not in self._programs:
-                if self._names:
+                if self._names and name not in _WITH_FUNCTIONS:
                     self._programs[name] = program([name, *self._names], list(arguments), lower)
                 else:
                     self._programs[name] = lower().compile()
@@ -374,12 +376,12 @@ def _names(
     structure: Structure, build: Build, kind: str, free: Any, own: Any, shared: Any
 ) -> list[Any]:
     """What a function's programs are kept under; none if a user's function makes its cases."""
-    if jax.tree.leaves(free):
+    if jax.tree.leaves(free) and not is_plain(getattr(build, "place", build)):
         return []
     digest = sha256()
     for x in jax.tree.leaves(shared):
         digest.update(repr(np.shape(x)).encode() + np.asarray(x).tobytes())
-    shapes = [np.shape(x) for x in jax.tree.leaves(own)]
+    shapes = [[np.shape(x) for x in jax.tree.leaves(numbers)] for numbers in (free, own)]
     return [structure, build, kind, str(_real()), shapes, digest.hexdigest()]
 
 

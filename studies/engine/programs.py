@@ -31,6 +31,7 @@ from studies import sources
 from studies.config import is_keeping, without_jax_cache
 from studies.kernels import native
 from studies.kernels.compilation import ObjectCache
+from studies.space.free import Placing
 
 _LOCK = RLock()
 #: Compiled programs of this process, by name.
@@ -63,7 +64,7 @@ class KeptFunction:
         Called often, it saves finding it anew.
         """
         fixed, free = self._parted(arguments)
-        if not is_keeping() or not all(map(_is_plain, fixed)):
+        if not is_keeping() or not all(map(is_plain, fixed)):
             return lambda *free: self._jit(*self._joined(fixed, free))
         return program([self._name, *fixed], free, lambda: self._jit.lower(*arguments))
 
@@ -84,8 +85,9 @@ def kept_jit(
     """`jax.jit` whose programs are kept.
 
     Args:
-        static_argnums: arguments that are part of the program. With others than numbers, texts and
-            tuples of them the program is not kept: no name tells a function from another.
+        static_argnums: arguments that are part of the program. With others than numbers, texts,
+            tuples of them and `Placing`, the program is not kept: no name tells a function from
+            another.
         compiler_options: as for `jax.jit`.
 
     Example:
@@ -97,9 +99,12 @@ def kept_jit(
     return lambda function: KeptFunction(function, static, compiler_options)
 
 
-def _is_plain(x: Any) -> bool:
+def is_plain(x: Any) -> bool:
+    """Whether the `repr` of a static argument names it in every process."""
+    if isinstance(x, Placing):
+        return is_plain(x.given)
     if isinstance(x, tuple):
-        return all(map(_is_plain, x))
+        return all(map(is_plain, x))
     return x is None or isinstance(x, bool | int | float | str)
 
 

@@ -39,11 +39,14 @@ class Free(NamedTuple):
 class Placing:
     """A function with its first arguments given; equal ones share their compiled programs."""
 
-    function: Callable[..., Any]
+    function: Callable[..., Any]  # of a module
     given: tuple[Any, ...]  # hashable
 
     def __call__(self, numbers: Numbers, values: Array) -> Any:
         return self.function(*self.given, numbers, values)
+
+    def __repr__(self) -> str:
+        return f"{self.function.__module__}.{self.function.__qualname__}{self.given}"
 
 
 class FreeNumbers(NamedTuple):
