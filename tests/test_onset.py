@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from jaxmodel.bases import find_bases
+from jaxmodel.case import Case, Structure
 from jaxmodel.prepare import design_controller
 from jaxmodel.simulate import simulate
 from jaxmodel.state_space import dense
-from studies.engine.preflight import check_run
 from studies.engine.stability import loop_report
-from studies.study.cases import as_arrays
+from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study, parse_study
 
 HOME = (0.0, 0.0, 0.5235987755982988)
@@ -99,10 +99,13 @@ def grows(structure, case, factor: float) -> bool:
     return late > FLOOR and late > size[-4 * tenth : -3 * tenth].mean()
 
 
+def arrays(study: Study) -> tuple[Structure, Case]:
+    return build_structure(study), as_arrays(build_case(study))
+
+
 def onset_is_at_the_margin(study: Study) -> None:
     """Decays at 0.95 and grows at 1.05 of the printed margin."""
-    structure, case = check_run(study)
-    case = as_arrays(case)
+    structure, case = arrays(study)
     margin = loop_report(structure, case, np.array(HOME), n_modes=4).gain_margin
     assert 1 < margin < 1e3
     factor = study.control.gain_factor * margin
@@ -129,9 +132,9 @@ def test_runs_of_every_law_grow_beyond_the_printed_margin(law, k):
 def test_runs_of_a_given_system_grow_beyond_the_printed_margin(k):
     """An LQG design handed in as matrices, with another gain factor."""
     design = DESIGNS["lqg"][k]
-    structure, case = check_run(study_of("lqg", design))
+    structure, case = arrays(study_of("lqg", design))
     law = jax.jit(lambda c: design_controller(structure, c, find_bases(structure, c)).controller)
-    a, b, c, d = dense(jax.tree.map(np.asarray, law(as_arrays(case)).feedback))
+    a, b, c, d = dense(jax.tree.map(np.asarray, law(case).feedback))
     rate = design.get("electronics", {}).get("sample_rate_hz", 10_000.0)
     section = {
         "sample_time": 1 / rate,

@@ -24,7 +24,6 @@ from studies.engine.controller import fixed_controller
 from studies.engine.executor import Executor
 from studies.engine.margins import judge_loops
 from studies.engine.plan import chunk_cases, local_layout, plan_groups
-from studies.engine.preflight import check_run
 from studies.engine.runs import run_study
 from studies.engine.stability import loop_report
 from studies.errors import StudyError
@@ -34,7 +33,7 @@ from studies.space.table import build_table
 from studies.spillover.certificate import certify
 from studies.spillover.comparison import compare_laws
 from studies.spillover.plants import ModelMismatch
-from studies.study.cases import build_case
+from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import load_study, parse_study
 from studies.study.template import study_template
 
@@ -83,10 +82,14 @@ def stepped(matrices, volts, limit):
     return np.array(rows)
 
 
+def without_run(study):
+    """Structure of one step, so that runs of any length share programs, and case."""
+    return build_structure(study)._replace(n_steps=1), as_arrays(build_case(study))
+
+
 def controller_of(study):
-    structure, case = check_run(study)
-    made = jax.jit(prepare, static_argnums=0)(structure, case).loop.controller
-    return jax.tree.map(np.asarray, made)
+    prepared = jax.jit(prepare, static_argnums=0)(*without_run(study))
+    return jax.tree.map(np.asarray, prepared.loop.controller)
 
 
 @pytest.mark.parametrize("order", [0, 1, 5, 12])
@@ -372,7 +375,7 @@ def test_a_static_gain_has_a_margin_and_an_export(tmp_path, capsys):
     study = study_with(tmp_path / "d.json")
     pose = np.array(study.motion.waypoints[0])
     margin, twice = (
-        loop_report(*check_run(study_with(tmp_path / "d.json", control={"gain_factor": f})), pose)
+        loop_report(*without_run(study_with(tmp_path / "d.json", control={"gain_factor": f})), pose)
         for f in (1.0, 2.0)
     )
     assert twice.gain_margin == pytest.approx(margin.gain_margin / 2, rel=1e-3)
@@ -392,7 +395,7 @@ def test_it_is_certified(tmp_path, capsys):
     np.savez(tmp_path / "one.npz", a=a, b=b, c=c, d=d, dt=PERIOD)
     study = study_with(tmp_path / "one.npz")
     found = certify(study, bases=("pinned_pinned",), sizes=(3, 6), mismatches=(ModelMismatch(),))
-    report = loop_report(*check_run(study), np.array(study.motion.waypoints[0]), n_modes=6)
+    report = loop_report(*without_run(study), np.array(study.motion.waypoints[0]), n_modes=6)
     assert found.margin[0, 0, 1] == pytest.approx(report.gain_margin, rel=1e-3)
     with pytest.raises(StudyError, match="to compare laws of equal strength"):
         compare_laws(study, 2.0)
