@@ -127,11 +127,19 @@ def test_errors_of_a_graph_name_the_version(no_structure):
         translated(lambda x, c: x * c, (3,))
 
 
+SWEEP = """
+[sweep]
+metrics = ["residual_rms"]
+[sweep.axes]
+gain = [0.2, 0.4]
+"""
+
+
 def test_a_sweep_runs_by_the_scan_and_says_so(capsys, tmp_path, monkeypatch, no_structure):
     monkeypatch.setattr(plan, "LANES", 8)
     monkeypatch.setattr(plan, "LARGEST_CHUNK", 16)
     path = tmp_path / "small.toml"
-    path.write_text(text_of("\n[sweep.axes]\ngain = [0.2, 0.4]\n"))
+    path.write_text(text_of(SWEEP))
     code, text, errors = run(capsys, "sweep", path, "--out", tmp_path / "out")
     assert code == 0 and "2/2 cases" in text and "Traceback" not in text + errors
     (line,) = [x for x in text.splitlines() if x.startswith("executor: ")]
@@ -151,7 +159,8 @@ def test_the_results_are_those_of_the_kernel(chunk, no_structure, monkeypatch): 
 
 def test_gradients_without_a_kernel(chunk, no_structure):  # noqa: F811
     structure, cases, parameters = chunk
-    executor = Executor(structure, LAYOUT, place=place)
+    # unoptimised, a scan takes its time for each sample, forward and back
+    executor = Executor(structure._replace(n_steps=20), LAYOUT, place=place)
     with pytest.warns(NoKernelWarning, match="XLA's scan runs instead"):
         executor.differentiate(cases, parameters)
     assert executor.name.startswith("XLA scan (") and executor.compile_time > 0

@@ -39,11 +39,11 @@ LONG = ("ideal", "paper-gains-own-ratios", "paper-ratios", "paper-preset", "diff
 
 
 def short_study():
-    """One move, few modes, 0.3 s."""
+    """One move, few modes, 0.4 s."""
     home = paper_study().motion.waypoints[0]
     return paper_study().change(
-        run__duration=0.3,
-        metrics__residual_length=0.1,
+        run__duration=0.4,
+        metrics__residual_length=0.2,
         link__modes=3,
         motion__waypoints=(home, (home[0], 0.01, home[2])),
     )
