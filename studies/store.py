@@ -9,11 +9,8 @@ from __future__ import annotations
 import math
 import os
 import re
-import secrets
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,13 +19,12 @@ import h5py
 import numpy as np
 
 from studies.errors import StudyError
+from studies.publish import check_target, replacing
 from studies.reading import open_hdf5
 
 # What the words of flag_meanings may not contain.
 _NO_FLAG = re.compile(r"[^A-Za-z0-9_.+@-]+")
 _TEXT = h5py.string_dtype("utf-8")
-#: Name prefix of the folders of `staged`.
-_STAGED = ".unfinished-"
 #: Files up to this size are built in memory: HDF5 itself can crash on a full disk [bytes].
 _IN_MEMORY = 2**26
 #: Rows are written in blocks of this size [bytes].
@@ -195,91 +191,3 @@ def _read_variable(name: str, stored: h5py.Dataset) -> Variable:
         words = labels["flag_meanings"].split()
         flags = dict(zip(labels["flag_values"].tolist(), words, strict=True))
     return Variable(data, dims, labels["units"], labels["long_name"], flags)
-
-
-def check_target(path: str | Path) -> None:
-    """Raise StudyError unless a file can be written at `path`; call it before long work."""
-    target = Path(os.path.realpath(path))
-    folder = target.parent
-    if not folder.is_dir():
-        raise StudyError(f"{path}: cannot write there, {folder} is not a folder; create it first")
-    try:
-        is_there = target.exists()
-    except OSError as error:  # a name that is too long
-        raise StudyError(f"{path}: cannot write there ({error.strerror})") from None
-    if is_there and not target.is_file():
-        raise StudyError(f"{path}: cannot write there, it is a folder or a device; name a file")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise StudyError(f"{path}: cannot write there, no permission for the folder {folder}")
-    if target.exists() and not os.access(target, os.W_OK):
-        raise StudyError(f"{path}: cannot write there, the file is write-protected")
-
-
-def check_folder(out: Path) -> None:
-    """Raise StudyError if `out` cannot be a folder with files; call it before long work."""
-    there = Path(os.path.abspath(out))
-    while not os.path.lexists(there):
-        there = there.parent
-    if not there.is_dir():
-        raise StudyError(f"--out {out}: {there} is not a folder; name another one")
-    most = os.pathconf(there, "PC_NAME_MAX")
-    longest = max((len(os.fsencode(part)) for part in out.parts), default=0)
-    if longest > most:
-        raise StudyError(f"--out: a name of {longest} bytes; allowed: {most} at most")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise StudyError(f"--out {out}: no permission to write in {there}")
-
-
-def _is_alive(process: str) -> bool:
-    """Whether a process of that number runs on this machine."""
-    try:
-        os.kill(int(process), 0)
-    except PermissionError:
-        return True
-    except (ValueError, OSError, OverflowError):
-        return False
-    return True
-
-
-@contextmanager
-def staged(out: Path) -> Iterator[Path]:
-    """Yield a folder inside `out` whose files move to `out` at the end; on a failure, none does.
-
-    Leftovers of a killed process are removed.
-
-    Args:
-        out: folder that exists.
-
-    Raises:
-        StudyError: a file cannot be moved there; then none is.
-    """
-    for left in out.glob(f"{_STAGED}*"):
-        if not _is_alive(left.name.removeprefix(_STAGED).partition("-")[0]):
-            shutil.rmtree(left, ignore_errors=True)
-    with tempfile.TemporaryDirectory(dir=out, prefix=f"{_STAGED}{os.getpid()}-") as folder:
-        yield Path(folder)
-        files = sorted(Path(folder).iterdir())
-        for file in files:
-            check_target(out / file.name)
-        for file in files:
-            os.replace(file, out / file.name)
-
-
-@contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path that becomes `path` on success, and is removed on any failure.
-
-    Write errors are raised as StudyError.
-    """
-    check_target(path)
-    target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        yield temporary
-        with open(temporary, "rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, target)
-    except OSError as error:
-        raise StudyError(f"{path}: cannot write it ({error.strerror or error})") from error
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -13,8 +13,7 @@ from matplotlib.text import Text
 from PIL import Image
 
 from studies.show.figures import STYLE
-from studies.show.pages import WIDE
-from studies.show.templates import render
+from studies.show.pages import WIDE, render
 
 #: A title that would be more than text, in HTML and in Markdown.
 TITLE = "<script>alert(1)</script> *fast* | 10 mm ![x](http://e.org/x.png) &amp; a_b"
@@ -85,6 +84,101 @@ def parsed(text):
     assert page.tags.count("figcaption") == len(page.images)
     assert all(size[0] > 300 and description for size, description in page.images)
     return page
+
+
+#: How `text_of` begins the line of an element, and how it marks text in one.
+BEGIN = {
+    "pre": "",
+    "h1": "# ",
+    "h2": "## ",
+    "h3": "### ",
+    "p": "",
+    "li": "- ",
+    "tr": "|",
+    "figcaption": "",
+}
+MARKS = {"b": "**", "code": "`"}
+
+
+class Reader(HTMLParser):
+    """Lines and tables of a page, up to its table of versions."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.lines, self.line, self.kind = [], "", ""
+        self.tables, self.heading, self.cell = {}, "", None
+        self.open = []
+        self.feed(html.partition("<main>")[2].partition('<h2 id="versions">')[0])
+
+    def end_line(self):
+        text = " ".join(self.line.split()) if self.kind else ""
+        text = self.line if self.kind == "pre" else text
+        if text:
+            depth = "  " * (self.open.count("ul") - 1) if self.kind == "li" else ""
+            before = self.lines[-1].strip()[:2] if self.lines else ""
+            is_next = text[:2] == before in ("- ", "| ")
+            self.lines += ([""] if before and not is_next else []) + [depth + text]
+        self.line, self.kind = "", ""
+
+    def handle_starttag(self, tag, attributes):
+        if tag in BEGIN:
+            self.end_line()
+            self.line, self.kind = BEGIN[tag], tag
+        if tag == "ul":
+            self.end_line()
+        if tag == "figure":
+            self.figure = dict(attributes)["id"].removeprefix("figure-")
+        if tag == "figcaption":
+            self.line = f"![{self.figure}] "
+        if tag == "table":
+            self.tables.setdefault(self.heading, []).append([])
+        if tag == "tr":
+            self.tables[self.heading][-1].append([])
+        if tag in ("td", "th"):
+            self.cell = ""
+        self.mark(MARKS.get(tag, ""))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        self.mark(MARKS.get(tag, ""))
+        if tag in ("td", "th"):
+            self.tables[self.heading][-1][-1].append(self.cell)
+            self.line += f" {self.cell} |"
+            self.cell = None
+        if tag in ("h1", "h2", "h3"):
+            self.heading = self.line.lstrip("# ")
+        if tag in BEGIN:
+            self.end_line()
+        self.open.remove(tag)
+
+    def mark(self, text):
+        if self.cell is None:
+            self.line += text
+        else:
+            self.cell += text
+
+    def handle_data(self, data):
+        self.mark(data.replace("\xa0", " "))
+
+
+def text_of(html):
+    """A page's text with a line for each paragraph.
+
+    Headings begin with #, entries of lists with -, and rows of tables are between |.
+    """
+    return "\n".join(Reader(html).lines)
+
+
+def tables_of(html):
+    """Tables of a page: for each heading a list of {column: cells}."""
+    columns = {}
+    for heading, tables in Reader(html).tables.items():
+        for heads, *rows in tables:
+            assert len(set(heads)) == len(heads) and all(len(row) == len(heads) for row in rows)
+            of_table = {name: [row[k] for row in rows] for k, name in enumerate(heads)}
+            columns.setdefault(heading, []).append(of_table)
+    return columns
 
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "microsoft-edge")

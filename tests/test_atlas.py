@@ -20,7 +20,7 @@ from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
 from studies.errors import StudyError
 from studies.study.spec import paper_study
-from tests.pages import Page
+from tests.pages import Page, text_of
 from tests.test_cli import run as command
 
 SETTINGS = ((0.05, "ei"), (0.03, "none"))
@@ -138,12 +138,12 @@ def test_a_case_of_the_atlas_is_the_run_of_its_study(atlas):
 
 def test_atlas_writes_what_its_report_shows(atlas):
     folder = atlas[0]
-    text = (folder / "report.md").read_text(encoding="utf-8")
+    text = text_of((folder / "report.html").read_text(encoding="utf-8"))
     assert text.startswith("# Coupling atlas")
     for name in ("subsets.png", "modes.png", figures.ANIMATION, run.DATA):
         assert (folder / name).stat().st_size > 1000
     for name in figures.FIGURES:
-        assert f"({name}.png)" in text
+        assert f"![{name}]" in text
     assert "nan" not in text.lower()
     page = Page((folder / "report.html").read_text(encoding="utf-8"))
     assert len(page.images) == len(figures.FIGURES) + 2
@@ -296,7 +296,7 @@ def test_atlas_goes_on_after_an_interrupt_and_refuses_to_start_over(atlas, tmp_p
     assert read_sweep(folder / run.RUNS_FOLDER).is_finished.all()
     with pytest.raises(StudyError, match="add --resume"):
         run.run_atlas(small_study(), folder, False, Console(file=io.StringIO()))
-    assert Path(folder / "report.md").is_file()
+    assert Path(folder / "report.html").is_file()
 
 
 @pytest.mark.long  # in short: an interrupted screen, in test_screen

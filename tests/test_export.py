@@ -24,6 +24,7 @@ from tests.exports import (
     needs_sanitizers,
     write_study,
 )
+from tests.pages import text_of
 from tests.test_cli import refused, run
 
 TARGETS = ("json", "c", "c-fixed")
@@ -71,19 +72,19 @@ def exported(capsys, designs, folders, name, target):
 )
 def test_export_is_verified(capsys, designs, folders, name, target):
     out, text = exported(capsys, designs, folders, name, target)
-    report = (out / "verification.md").read_text()
+    report = text_of((out / "verification.html").read_text())
     assert report.startswith("# Verification: passed") and "FAILED" not in report
     assert "comparisons agree" in text
     files = {"json": {"flexlink.json", "flexlink.schema.json"}}.get(
         target, {"flexlink.h", "flexlink.c"}
     )
-    assert {path.name for path in out.iterdir()} == files | {"verification.md", "verification.html"}
+    assert {path.name for path in out.iterdir()} == files | {"verification.html"}
     if target == "c-fixed":
         assert "multiplications a sample" in text
         loss = float(re.search(r"Residual vibration: ([+-][\d.]+) % against", report)[1])
         assert abs(loss) < 100 * AIM
         assert re.search(r"\| bit by bit, recorded codes \| 0 of \d+ codes differ", report)
-        assert re.search(r"\n```\nsignal {20,}Q {10,}base +room +reach\nsensors {20,}", report)
+        assert re.search(r"\n`signal {20,}Q {10,}base +room +reach\nsensors {20,}", report)
     else:
         found = [
             float(x) for x in re.findall(r"open loop, [^|]*codes \| ([\d.e+-]+) \| 1e-12", report)
@@ -247,13 +248,12 @@ def test_wrong_code_is_not_written(capsys, designs, tmp_path, monkeypatch):
     out = tmp_path / "wrong"
     code, text, _ = run(capsys, "export", designs["paper"], "--target", "c", "--out", out)
     assert code == 1 and "FAILED: open loop, recorded codes" in text
-    failed = {"verification-failed.md", "verification-failed.html"}
-    assert {path.name for path in out.iterdir()} == failed
-    assert "no code was written" in (out / "verification-failed.md").read_text()
+    assert {path.name for path in out.iterdir()} == {"verification-failed.html"}
+    assert "no code was written" in text_of((out / "verification-failed.html").read_text())
     monkeypatch.undo()
     code, text, _ = run(capsys, "export", designs["paper"], "--target", "c", "--out", out)
     assert code == 0
-    files = {"flexlink.h", "flexlink.c", "verification.md", "verification.html"}
+    files = {"flexlink.h", "flexlink.c", "verification.html"}
     assert {path.name for path in out.iterdir()} == files
 
 

@@ -21,7 +21,8 @@ from studies.tuning.optimise import begin
 from studies.tuning.report import TuneFindings, summary
 from studies.tuning.report import report as tuning_report
 from studies.tuning.spec import parse_tuning
-from tests.test_reports import assert_cells, tables_of
+from tests.pages import tables_of, text_of
+from tests.test_reports import assert_cells
 from tests.tunings import GAIN, SMALL
 
 # --- certificates ---------------------------------------------------------------------------------
@@ -124,8 +125,9 @@ def test_a_certificate_s_table_of_plants():
 
 def test_a_certificate_s_table_of_leakage():
     found = certificate()
-    text = certificate_report(found, None)
-    (table,) = tables_of(text)["Observation and control spillover"]
+    html = certificate_report(found, None)
+    text = text_of(html)
+    (table,) = tables_of(html)["Observation and control spillover"]
     size = np.abs(found.observation).max(axis=(1, 2))
     assert table["basis"] == [BASES[0]] * 2 + [BASES[1]] * 2
     assert table["estimate"] == ["q^1", "q^2"] * 2
@@ -143,8 +145,9 @@ def test_a_certificate_s_table_of_leakage():
 
 def test_a_certificate_s_table_of_laws():
     found, laws = certificate(), comparison()
-    text = certificate_report(found, laws)
-    (table,) = tables_of(text)["Laws"]
+    html = certificate_report(found, laws)
+    text = text_of(html)
+    (table,) = tables_of(html)["Laws"]
     rms = laws.residual_rms
     assert table["law"] == list(laws.names)
     assert_cells(table["factor"], laws.factor, 3)
@@ -174,7 +177,7 @@ def test_a_certificate_s_table_of_laws():
 def test_a_certificate_s_sentences():
     found = certificate()
     margin = np.nanmin(found.margin)
-    words = " ".join(certificate_report(found, None).split())
+    words = text_of(certificate_report(found, None))
     at = found.plants[np.unravel_index(np.nanargmin(found.margin), found.margin.shape)]
     free = found.free_damping
     last = found.margin[:, :, 1]
@@ -221,7 +224,7 @@ def test_an_unstable_plant_fails_whatever_its_margin():
 def test_a_certificate_names_the_uncontrolled_mode_that_control_makes_worst():
     """Of existing plants and modes beyond the controlled ones, in the first lines and in JSON."""
     found = certificate()
-    first = certificate_report(found, None).partition("**Question:**")[0]
+    first = text_of(certificate_report(found, None)).partition("**Question:**")[0]
     assert found.spillover is None and "ontrol spillover" not in first
     assert json.loads(document(found, None))["spillover"] is None
     zeta = found.damping_ratio.copy()
@@ -233,7 +236,7 @@ def test_a_certificate_names_the_uncontrolled_mode_that_control_makes_worst():
     assert (at.mode, at.plant) == (5, found.plants[1, 1, 1])
     assert at.damping_ratio == zeta[1, 1, 1, 4, 2]
     assert at.free_damping == found.free_damping[1, 1, 1, 4, 2]
-    text = certificate_report(worse, None)
+    text = text_of(certificate_report(worse, None))
     sentence = (
         f"Control spillover: mode 5, which is not controlled, has a damping ratio of "
         f"{at.damping_ratio:.2g} instead of {at.free_damping:.2g} without control"
@@ -250,11 +253,11 @@ def test_a_failed_certificate_says_what_would_pass():
     margin[1, 1, 0] = 1.5
     found = certificate(margin=margin)
     assert verdict(found) == "failed by breaks 8: gain margin 1.5, 2 required"
-    words = " ".join(certificate_report(found, None).split())
+    words = text_of(certificate_report(found, None))
     assert "with its gains scaled by 0.75 the controller would pass" in words
     assert "`control.gain_factor = 0.3`" in words and "**not safe** on 10 of 11 plants" in words
     margin[1, 1, 0] = 0
-    words = " ".join(certificate_report(certificate(margin=margin), None).split())
+    words = text_of(certificate_report(certificate(margin=margin), None))
     assert "no gain passes: choose another law" in words
     passed = verdict(certificate())
     at = certificate().worst
@@ -390,7 +393,8 @@ def tuned():
         run_time=0.1,
         runs=20,
     )
-    return spec, found, tables_of(tuning_report(spec, found)), tuning_report(spec, found)
+    html = tuning_report(spec, found)
+    return spec, found, tables_of(html), text_of(html)
 
 
 NAMES = ("residual_rms", "settling_time", "peak_voltage")
@@ -490,8 +494,9 @@ def test_placements_are_shown_in_millimetres_along_each_link():
         linear=np.full(1, np.nan),
         residual=np.full(1, np.nan),
     )
-    text = tuning_report(spec, found)
-    (table,) = tables_of(text)["Parameters"]
+    html = tuning_report(spec, found)
+    text = text_of(html)
+    (table,) = tables_of(html)["Parameters"]
     centers = 1e3 * patch_centers(spec, spec.moving[0], place[0])
     assert table["design"] == ["baseline", "tuned"]
     for i, row in enumerate(centers):

@@ -29,7 +29,7 @@ from studies.fitting.solve import descend, solve
 from studies.fitting.spec import parse_fit
 from studies.fitting.statistics import describe_fit
 from studies.fitting.tables import column, read_columns
-from studies.store import check_folder
+from studies.publish import check_folder
 from studies.study.spec import load_study
 from studies.tuning.spec import load_tuning
 from tests.fits import (
@@ -50,6 +50,7 @@ from tests.fits import (
     spec_of,
     write,
 )
+from tests.pages import text_of
 
 LOADED = {"basis": "loaded", "joint_inertia_c": 1.1e-5}
 
@@ -300,7 +301,7 @@ def test_the_paper_s_frequencies_from_modulus_and_joint(tmp_path):
     assert set(machines) == set(free)
     drawn = np.corrcoef(list(machines.values()))[0, 1]  # drawn together, not number by number
     assert abs(drawn) > 0.8 and np.sign(drawn) == np.sign(answer.correlation[0, 1])
-    text = (tmp_path / "out" / "report.md").read_text()
+    text = text_of((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
     assert "strongly correlated" in text and "## Next experiment" in text
     assert "from 1 measurement (and 1 held out)" in text
     assert "| second link (held out) | mode 2 [Hz] | 241.3 |" in text
@@ -380,7 +381,7 @@ def test_an_optimum_at_a_bound(folder, tmp_path):
     found = run_fit(spec, tmp_path / "out", Console(file=io.StringIO()))
     assert found.answer.values[0] == pytest.approx(72e9, rel=1e-6)
     assert np.all(np.diff(found.profiles[0].values) > 0)
-    text = (tmp_path / "out" / "report.md").read_text()
+    text = text_of((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
     assert "link.youngs_modulus ended at its upper bound, 7.2e+10 Pa" in text
     assert found.posterior.effective.shape == (1,) and (tmp_path / "out/profiles.png").is_file()
 

@@ -20,6 +20,7 @@ from studies.fitting.solve import SAME, exchanges
 from studies.fitting.statistics import UNKNOWN, describe_fit
 from studies.tuning.spec import load_tuning
 from tests.fits import ASKEW, FREQUENCY, RESPONSE, blank, made, spec_of, write
+from tests.pages import text_of
 
 HOME = [0.0, 0.0, 0.5235987755982988]
 MODULUS = {"link.youngs_modulus": {"from": 60e9, "to": 80e9}}
@@ -140,7 +141,7 @@ def test_equally_good_optima_come_first(exchanged):
     assigned = [sorted(x["values"].values()) for x in document["equally_good"]]
     np.testing.assert_allclose(assigned, [np.sort(found.answer.values)] * 5, rtol=1e-4)
     assert all(x["rise"] < 0.01 for x in document["equally_good"])
-    assert first in (out / "report.md").read_text()
+    assert first in text_of((out / "report.html").read_text(encoding="utf-8"))
 
 
 def test_machines_come_from_all_equally_good_optima(exchanged):

@@ -9,18 +9,53 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from jinja2 import ChoiceLoader, DictLoader
 from matplotlib.figure import Figure
 
 import studies
+from studies.show import pages
 from studies.show.figures import SMALL, WIDTH, new_figure, styled
-from studies.show.markdown import literal, picture, table
-from studies.show.pages import page, report_files
+from studies.show.pages import page
 from studies.study import spec as spec_module
 from studies.study.template import toml_text
-from tests.pages import READABLE, TITLE, parsed, rendered, smallest_text
+from tests.pages import (
+    READABLE,
+    TITLE,
+    parsed,
+    rendered,
+    smallest_text,
+    tables_of,
+    text_of,
+)
 from tests.sweeps import MIXED, small
 
-VERSIONS = {"python": "3", "jax": "<1>"}
+REPORT = """{% extends "show/page.html" %}
+{% from "show/macros.html" import table, figure with context %}
+{% block title %}{{ title }}{% endblock %}
+{% block summary %}<p>{{ text }}</p>{% endblock %}
+{% block sections %}
+{{ section("Numbers of " ~ title) }}
+<ul><li>{{ text }}</li></ul>
+{{ table(heads, rows) }}
+{% if file %}{{ figure(file, "Bending of `link`, *all*") }}{% endif %}
+{% endblock %}
+"""
+
+
+@pytest.fixture
+def made(tmp_path, monkeypatch):
+    """Function that fills in REPORT."""
+    loader = ChoiceLoader([DictLoader({"report.html": REPORT}), pages._environment().loader])
+    monkeypatch.setattr(pages._environment(), "loader", loader)
+    monkeypatch.setattr(pages.config, "origin", lambda: {"python": "3", "jax": "<1>"})
+
+    def make(title="Title", text="", heads=(), rows=(), file="", image=b"", files=None):
+        if image:
+            (tmp_path / file).write_bytes(image)
+        values = {"title": title, "text": text, "heads": heads, "rows": rows, "file": file}
+        return page("report.html", tmp_path, files or {}, **values)
+
+    return make
 
 
 def png(width=400):
@@ -29,32 +64,41 @@ def png(width=400):
     return image.getvalue()
 
 
-def test_a_text_becomes_a_whole_page():
-    lines = [f"# {literal(TITLE)}: study", "", "E = ω²q² in <b>µm</b>, 5 %", ""]
-    lines += [table(("", "x [µm]"), [["a", "1.2 †"], [literal("b | c"), "`k`"]]), ""]
-    lines += [picture("my run 100%.png", "Bending of `link`, *all*")]
-    files = {"Study file": 'title = "</pre><script>"\n'}
-    html = page("\n".join(lines), {"my run 100%.png": png()}, files, VERSIONS)
+def test_a_template_becomes_a_whole_page(made):
+    html = made(
+        f"{TITLE}: study",
+        "E = ω²q² in <b>µm</b>, 5 %",
+        ("", "x [µm]"),
+        [["a", "1.2 †"], ["b | c", "`k`"], ["control.gain[0]", "2"]],
+        "my run 100%.png",
+        png(),
+        {"Study file": 'title = "</pre><script>"\n'},
+    )
     found = parsed(html)
     assert found.title == f"{TITLE}: study" and TITLE in found.text
-    assert found.images == [((400, 200), "Bending of link, all")]
-    assert found.rows == [[2, 2, 2], [2, 2]]
+    assert found.images == [((400, 200), "Bending of link, *all*")]
+    assert found.rows == [[2, 2, 2, 2], [2, 2]]
     for part in (
         "E = ω²q² in <b>µm</b>, 5\xa0%",
         "1.2\xa0†",
         "b | c",
+        "`k`",
         "<1>",
         '"</pre><script>"',
     ):
         assert part in found.text
-    assert "<figcaption>Bending of <code>link</code>, <em>all</em></figcaption>" in html
+    assert "<figcaption>Bending of <code>link</code>, *all*</figcaption>" in html
+    assert "<td>control.<wbr>gain<wbr>[0]</td>" in html
+    links = re.findall('<a href="#([^"]*)">', html)
+    assert links[1:] == ["versions", "study-file"] and links[0].startswith("numbers-of-script")
+    assert all(html.count(f'id="{link}"') == 1 for link in links)
     policy = re.search('<meta http-equiv="Content-Security-Policy" content="([^"]*)">', html)[1]
     assert policy.startswith("default-src 'none'; img-src data:; style-src 'unsafe-inline'")
     assert "script" not in policy
     assert '<div class="table">\n<table>' in html and '<meta charset="utf-8">' in html
 
 
-REPORTS = {x.parent.name: x for x in sorted(Path(studies.__file__).parent.glob("*/report.md"))}
+REPORTS = {x.parent.name: x for x in sorted(Path(studies.__file__).parent.glob("*/report.html"))}
 
 
 @pytest.mark.parametrize("name", REPORTS)
@@ -62,15 +106,14 @@ def test_a_report_begins_with_its_result(name):
     """Then come the question and the next steps, in this order."""
     path = REPORTS[name]
     text = path.read_text(encoding="utf-8")
-    title = text.index("\n# ") if not text.startswith("# ") else 0
-    heads = re.findall(r"\*\*([A-Z][a-z ]+):\*\*", text[title:])
+    heads = re.findall(r"<b>([A-Z][a-z ]+):</b>", text)
     assert [x for x in heads if x in ("Result", "Question", "Next steps")] == [
         "Result",
         "Question",
         "Next steps",
     ]
-    first = text[title:].lstrip("\n").partition("\n\n")[2]
-    assert first.startswith("**Result:**")
+    first = text.partition("{% block summary %}\n")[2]
+    assert first.startswith("<p><b>Result:</b>")
 
 
 def test_small_text_in_a_figure_is_found():
@@ -84,9 +127,9 @@ def test_small_text_in_a_figure_is_found():
     assert 40 * 16 / WIDTH * 6 / 72 < READABLE < 40 * 16 / WIDTH * SMALL / 72
 
 
-def test_a_figure_without_its_image_is_a_fault_of_the_program(tmp_path):
+def test_a_figure_without_its_image_is_a_fault_of_the_program(made):
     with pytest.raises(ValueError, match="'none.png'"):
-        report_files(tmp_path, f"# Title\n\n{picture('none.png', 'none')}", {})
+        made(file="none.png")
 
 
 @pytest.mark.parametrize(
@@ -113,17 +156,20 @@ def test_a_figure_without_its_image_is_a_fault_of_the_program(tmp_path):
         "&lt;",
     ],
 )
-def test_texts_of_users_are_shown_as_they_are(text):
-    for before in ("# ", "- ", "| a |\n| --- |\n| ", "# a\n\n"):
-        found = parsed(
-            page(f"{before}{literal(text)}" + "\n\n# b" * (before[0] != "#"), {}, {}, VERSIONS)
-        )
-        assert text in found.text.splitlines()
-        assert set(found.tags) <= {
-            *["html", "head", "meta", "title", "style", "body", "main", "h1", "h2", "p"],
-            "div",
-            *["table", "thead", "tbody", "tr", "th", "td", "ul", "li", "wbr"],
-        }
+def test_texts_of_users_are_shown_as_they_are(made, text):
+    html = made(text, text, [text], [[text]])
+    found = parsed(html)
+    assert found.title == text and found.text.count(text) == 7  # twice in the heading and its link
+    assert text_of(html).splitlines()[:3] == [f"# {text}", "", text]
+    assert tables_of(html) == {f"Numbers of {text}": [{text: [text]}]}
+    assert set(found.tags) <= {
+        *["html", "head", "meta", "title", "style", "body", "main", "h1", "h2", "p", "a"],
+        *["div", "table", "thead", "tbody", "tr", "th", "td", "ul", "li", "wbr"],
+    }
+
+
+def test_control_characters_are_shown_as_escapes(made):
+    assert "a\\x1bb" in parsed(made("a\x1bb")).text
 
 
 HEAD = '<!DOCTYPE html>\n<html lang="en"><body><h1>a</h1>'
@@ -161,30 +207,20 @@ def test_toml_is_read_back():
 
 
 @pytest.mark.parametrize("width", [1280, 600])
-def test_a_wide_report_fits_a_browsers_window(tmp_path, width):
-    wide = table([f"column {k}" for k in range(30)], [["123456789"] * 30])
-    lines = [
-        "# Title `" + "b" * 200 + "`",
-        "",
-        "a" * 300,
-        "",
-        wide,
-        "",
-        picture("a.png", "a figure"),
-    ]
+def test_a_wide_report_fits_a_browsers_window(made, tmp_path, width):
+    heads = [f"column {k}" for k in range(30)]
     files = {"Study file": "x = " + "1" * 500}
-    html = page("\n".join(lines), {"a.png": png(3000)}, files, VERSIONS)
+    html = made("b" * 200, "a" * 300, heads, [["123456789"] * 30], "a.png", png(3000), files)
     assert rendered(html, tmp_path, width) == (1, 0, 0, 1)
 
 
 @pytest.mark.parametrize(("width", "cut"), [(1280, 0), (600, 1)])
-def test_a_table_of_a_sweep_is_seen_whole_on_a_wide_screen(tmp_path, width, cut):
+def test_a_table_of_a_sweep_is_seen_whole_on_a_wide_screen(made, tmp_path, width, cut):
     """Long names of columns break at their joints; a narrow screen scrolls and says so."""
     names = ["control.velocity_gain[0]", "electronics.lowpass_ratio[2]", "link.stiffness_factor"]
     metrics = ["residual_rms [µm]", "peak_voltage [V]", "damping_ratio[controlled_mode=1]"]
     heads = ["case", "id", *names, *(f"{x}[1]" for x in names), *metrics, "gain_margin"]
-    text = "# Title\n\n" + table(heads, [["1", "efac70d3", *["0.1234"] * 10]])
-    html = page(text, {}, {}, VERSIONS)
+    html = made(heads=heads, rows=[["1", "efac70d3", *["0.1234"] * 10]])
     assert rendered(html, tmp_path, width) == (0, 0, 0, cut)
     assert ".table:has(th:nth-child(4))::before" in html and "scroll sideways" in html
 

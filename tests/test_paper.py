@@ -30,10 +30,10 @@ from studies.show.units import span
 from studies.store import read_store
 from studies.study.printed import TABLE_1
 from studies.study.spec import paper_study
+from tests.pages import text_of
 
 #: Figures that are written; the others are only drawn.
 FIGURES = ("fig03", "shapers")
-REPORTS = ("report.html", "report.md")
 #: Cases left out of the short run: more compilations, or seconds of eigenvalues each.
 LONG = ("ideal", "paper-gains-own-ratios", "paper-ratios", "paper-preset", "difference")
 
@@ -94,7 +94,7 @@ def short(tmp_path_factory):
 def test_folder_holds_whole_files_and_nothing_else(short):
     names = sorted(file.name for file in short.folder.iterdir())
     figures = [f"{name}.png" for name in FIGURES]
-    assert names == sorted([*figures, "machine.png", "fitted.h5", "nominal.h5", *REPORTS])
+    assert names == sorted([*figures, "machine.png", "fitted.h5", "nominal.h5", "report.html"])
     assert (short.folder / "fig03.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
@@ -256,7 +256,7 @@ def test_settling_of_a_known_decay(short):
 
 
 def test_report_holds_the_papers_numbers_and_those_of_the_run(short):
-    text = (short.folder / "report.md").read_text(encoding="utf-8")
+    text = text_of((short.folder / "report.html").read_text(encoding="utf-8"))
     for value in ("0.345", "0.412", "-44.97 %", "-43.23 %", "-52.21 %", "0.07 s", "241.3"):
         assert value in text
     cells = ["mode 1, first two: link 1", "-43.62 %"]
@@ -267,14 +267,14 @@ def test_report_holds_the_papers_numbers_and_those_of_the_run(short):
     assert f"| {' | '.join(cells)} |" in text
     assert text.splitlines()[2].startswith("**Result:**")
     for name in FIGURES:
-        assert f"({name}.png)" in text
+        assert f"![{name}]" in text
     rows = [line for line in text.splitlines() if line.startswith("|")]
-    assert len(rows) > 60
+    assert len(rows) > 51
 
 
 def test_every_figure_stands_beside_its_table():
-    text = Path(report.__file__).with_suffix(".md").read_text(encoding="utf-8")
-    assert sorted(re.findall(r'figure\("(\w+)"', text)) == sorted(paper_figures.PAPER_FIGURES)
+    text = Path(report.__file__).with_suffix(".html").read_text(encoding="utf-8")
+    assert sorted(re.findall(r'counterpart\("(\w+)"', text)) == sorted(paper_figures.PAPER_FIGURES)
 
 
 def test_table_1_percentages_are_the_papers():
@@ -323,7 +323,7 @@ def test_refuses_a_bad_folder_before_any_work(tmp_path, capsys, place):
 
 def test_failure_while_writing_leaves_old_files_whole(short, tmp_path, monkeypatch):
     """A figure that cannot be written: the earlier report stays, nothing half-written appears."""
-    (tmp_path / "report.md").write_text("old")
+    (tmp_path / "report.html").write_text("old")
 
     def fail(*_):
         raise OSError("disk full")
@@ -334,8 +334,8 @@ def test_failure_while_writing_leaves_old_files_whole(short, tmp_path, monkeypat
     with pytest.raises(StudyError, match="disk full"):
         studies = (context.runs.study for context in short.machines)
         paper.write_paper(tmp_path, Console(quiet=True), *studies, short.runs.cases)
-    assert [file.name for file in tmp_path.iterdir()] == ["report.md"]
-    assert (tmp_path / "report.md").read_text() == "old"
+    assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
+    assert (tmp_path / "report.html").read_text() == "old"
 
 
 def test_stored_metrics_are_the_runs(short):

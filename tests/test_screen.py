@@ -19,6 +19,7 @@ from studies.study.spec import paper_study
 from studies.sweeps.report import report, write_sweep_report
 from studies.sweeps.screening import _rank_correlation, check_screen
 from studies.sweeps.show import ranked_cases, recommended
+from tests.pages import text_of
 from tests.sweeps import HOME_PHI, small, small_spec
 from tests.test_kernel import ALL_SORTS, check_equal
 from tests.test_sweeps import killed_until_done, partly_done
@@ -185,7 +186,7 @@ def test_linear_runs_are_judged_like_others(folders):
     np.testing.assert_allclose(linear["gain_margin"], full["gain_margin"], rtol=1e-9)
     value, other = (metric_values(data, "residual_rms") for data in (full, linear))
     assert 0 < np.nanmax(np.abs(other / value - 1)) < 0.05  # 2 mm in 10 ms
-    assert "All runs are of the linear model" in report(linear, "residual_rms", [])
+    assert "All runs are of the linear model" in text_of(report(linear, "residual_rms", []))
 
 
 @pytest.mark.parametrize("sorts", ["few", pytest.param("all", marks=pytest.mark.long)])
@@ -229,8 +230,8 @@ def test_the_report_compares_both_models(folders):
     assert 0 < checked.n_random <= 8 and checked.correlation > 0.9
     assert 0 < checked.n_found <= checked.n_good <= checked.n_random
     write_sweep_report(folders / "screened")
-    text = (folders / "screened" / "report.md").read_text()
-    assert checked.text in text and "screen.png" in text and "left out by the screen" in text
+    text = text_of((folders / "screened" / "report.html").read_text(encoding="utf-8"))
+    assert checked.text in text and "![screen]" in text and "left out by the screen" in text
     assert (folders / "screened" / "screen.png").is_file()
     assert check_screen(read(folders / "full")) is None
 
@@ -243,7 +244,7 @@ def test_a_condition_sends_the_screen_further_down(tmp_path, folders):
     assert is_met.sum() >= 8 and (found["status"] >= 0).sum() > 16
     run(screened(subject_to="peak_voltage < 0"), tmp_path / "none")  # runs all there are
     write_sweep_report(tmp_path / "none")
-    report = (tmp_path / "none" / "report.md").read_text()
+    report = text_of((tmp_path / "none" / "report.html").read_text(encoding="utf-8"))
     assert (
         "None of them meets peak_voltage < 0" in report and "best by residual_rms: case" in report
     )
@@ -260,7 +261,7 @@ def test_what_is_recommended_meets_the_screens_condition(tmp_path, folders):
     assert (voltage[recommended(found, "-residual_rms")] < limit).all()
     assert not (voltage[ranked_cases(found, "-residual_rms")] < limit).all()
     write_sweep_report(tmp_path / "s")
-    text = (tmp_path / "s" / "report.md").read_text()
+    text = text_of((tmp_path / "s" / "report.html").read_text(encoding="utf-8"))
     assert f'--subject-to "peak_voltage < {limit} and gain_margin >= 2"' in text
 
 

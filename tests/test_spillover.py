@@ -33,7 +33,7 @@ from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.margin import HIGHEST
 from studies.study.spec import paper_study
 from studies.study.template import study_template
-from tests.pages import parsed
+from tests.pages import parsed, text_of
 from tests.test_cli import refused, run
 
 #: One move of a small plant: what the run needs; certificates have plants of their own.
@@ -476,14 +476,14 @@ def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_
         for name in ("margins", "damping", "leakage", "laws")
         for kind in ("png", "pdf")
     ]
-    files = {"report.md", "report.html", "certificate.json", "spillover.h5", *figures}
+    files = {"report.html", "certificate.json", "spillover.h5", *figures}
     assert {path.name for path in out.iterdir()} == files | {"machine.png"}
     assert (out / "laws.pdf").read_bytes()[:5] == b"%PDF-"
-    report = (out / "report.md").read_text()
+    report = text_of((out / "report.html").read_text(encoding="utf-8"))
     assert report.startswith(
         "# Spillover certificate passed: gain margin 2.88 (9.2 dB), 2 required"
     )
-    assert all(f"({name}.png)" in report for name in ("margins", "damping", "leakage", "laws"))
+    assert all(f"![{name}]" in report for name in ("margins", "damping", "leakage", "laws"))
     assert "| modified IMSC |" in report and "Not covered" in report
     page = parsed((out / "report.html").read_text())
     assert len(page.images) == 5 and page.title.startswith("Spillover certificate passed")
@@ -535,7 +535,7 @@ def test_command_fails_a_design(capsys, monkeypatch, tmp_path):
     code, text, _ = run(capsys, "spillover", design, "--out", out, "--margin", "1.5")
     assert code == 1 and "failed by mode" in text and "unstable" in text
     assert "laws are not compared: not today" in text
-    report = (out / "report.md").read_text()
+    report = text_of((out / "report.html").read_text(encoding="utf-8"))
     assert (
         report.startswith("# Spillover certificate failed: gain margin") and "## Laws" not in report
     )
@@ -551,12 +551,14 @@ def test_a_certificate_is_written_whole_or_not_at_all(capsys, monkeypatch, tmp_p
         lambda _, out, name, __: (out / f"{name}.png").write_bytes(b"-"),
     )
     design, out = write(tmp_path), tmp_path / "out"
-    (out / "report.md").mkdir(parents=True)
+    (out / "report.html").mkdir(parents=True)
     (out / ".unfinished-killed").mkdir()
     (out / "notes.txt").write_text("mine")
     said = run(capsys, "spillover", design, "--out", out)[2]
-    assert said.startswith("studies: ") and "report.md: cannot write there, it is a folder" in said
-    assert {path.name for path in out.iterdir()} == {"report.md", "notes.txt"}
+    assert (
+        said.startswith("studies: ") and "report.html: cannot write there, it is a folder" in said
+    )
+    assert {path.name for path in out.iterdir()} == {"report.html", "notes.txt"}
 
 
 @pytest.mark.parametrize(

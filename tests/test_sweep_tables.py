@@ -31,6 +31,7 @@ from studies.sweeps.show import (
     status_rows,
     uncontrolled_text,
 )
+from tests.pages import tables_of, text_of
 from tests.sweeps import small_spec
 from tests.test_cli import run
 
@@ -384,8 +385,8 @@ def test_cases_worse_than_no_control_are_marked(printed):
     text = printed(data, "best", "DIR", "--by", "residual_rms", "--count", "5")
     assert f"{told}\n" in text and note not in text
     assert f"{told}\n" in printed(data, "show", "DIR")
-    text = report(data, "residual_rms", [])
-    assert f"; {told}." in text.partition("## ")[0] and f"\\{note}" in text
+    text = text_of(report(data, "residual_rms", []))
+    assert f"; {told}." in text.partition("## ")[0] and f"\n{note}" in text
     assert "without control" not in printed(data, "best", "DIR", "--by", "gain_margin")
     for by, value in (("residual_rms[link=3]", "4 µm"), ("residual_rms[0][2]", "4 µm")):
         assert f"control: {value}" in uncontrolled_text(data, by)
@@ -419,7 +420,7 @@ def test_deflections_below_one_adc_step_are_not_ranked_in_silence(printed):
     assert text in printed(data, "best", "DIR", "--by", "residual_rms")
     shown = text.replace("2 of these 8 cases are", "1 of these 7 cases are")  # of the safe ones
     assert shown in printed(data, "show", "DIR")
-    assert report(data, "residual_rms", []).partition("## ")[0].count(shown) == 1
+    assert text_of(report(data, "residual_rms", [])).partition("## ")[0].count(shown) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for by in ("-residual_rms", "gain_margin", "peak_voltage", "settling_time"):
@@ -510,20 +511,9 @@ def test_sensitivity_prints_its_rows(printed, method, count):
 # --- the report -----------------------------------------------------------------------------------
 
 
-def tables_of(text):
-    """Rows of the Markdown tables of a report, by the heading before them."""
-    found, heading = {}, ""
-    for line in text.splitlines():
-        if line.startswith("#"):
-            heading = line.lstrip("# ")
-        elif line.startswith("| ") and not line.startswith("| ---"):
-            found.setdefault(heading, []).append([x.strip() for x in line[2:-2].split(" | ")])
-    return found
-
-
 def test_the_head_of_a_report_says_what_the_data_say():
     data = usual(codes=[0, 0, 0, 0, 0, 0, 0, 4])
-    text = report(data, "residual_rms", [], "DIR")
+    text = text_of(report(data, "residual_rms", [], "DIR"))
     head = text.partition("## ")[0]
     assert "8 cases of control.gain_factor, ranked by residual_rms (smallest first;" in head
     assert "7 of 8 cases ended ok (1: non-finite number)." in head
@@ -549,23 +539,23 @@ def test_the_tables_of_a_report_are_those_of_the_data():
     }
     assert set(found) == set(wanted)
     for name, (heads, rows) in wanted.items():
-        plain = [[x.replace("\\", "") for x in row] for row in found[name]]
-        assert plain == [heads, *rows], name
+        (columns,) = found[name]
+        assert list(columns) == heads and [*map(list, zip(*columns.values(), strict=True))] == rows
     assert axis_rows(data.table).rows == [["control.gain_factor", "1", "8", "0.1", "0.8"]]
 
 
 def test_a_report_names_what_does_not_tell_cases_apart():
     rms = of_stations(1e-6 * (1 + 1e-3 * np.arange(8)))
-    text = report(usual(residual_rms=rms), "residual_rms", [], "DIR")
+    text = text_of(report(usual(residual_rms=rms), "residual_rms", [], "DIR"))
     # seven cases have a margin of 2, without the fourth
     assert "**The 7 best differ by only 0.7 %: residual_rms does not distinguish them;" in text
-    wide = report(usual(residual_rms=rms**30), "residual_rms", [], "DIR")
+    wide = text_of(report(usual(residual_rms=rms**30), "residual_rms", [], "DIR"))
     assert "differ by only" not in wide
 
 
 def test_a_report_warns_where_no_margin_is_enough():
     data = usual(gain_margin=np.linspace(1.1, 1.8, 8))
-    text = report(data, "residual_rms", [], "DIR")
+    text = text_of(report(data, "residual_rms", [], "DIR"))
     assert "**CAUTION: 8 of these 8 cases have a gain margin below 2 (smallest 1.1);" in text
     assert "case 3 with 1 µm (control.gain_factor = 0.4), gain margin 1.4 (2.9 dB);" in text
     assert "Regardless" not in text and "Cases of status ok, smallest residual_rms first." in text
@@ -574,7 +564,7 @@ def test_a_report_warns_where_no_margin_is_enough():
 def test_a_report_names_links_that_no_case_controls():
     rms = np.ones((2, 3, 3)) * 1e-6 * np.array([[[2.0], [5.0], [1.0]], [[1.0], [7.0], [3.0]]])
     data = made_up({"link_subsets": ["1", "1+3"]}, residual_rms=rms)
-    head = report(data, "residual_rms", [], "DIR").partition("## ")[0]
+    head = text_of(report(data, "residual_rms", [], "DIR")).partition("## ")[0]
     assert "case 0 with 2 µm (link_subsets = 1); link 2, which no case controls: 5 µm;" in head
     assert "largest of links 1 and 3 and all stations" in head
 

@@ -31,7 +31,7 @@ from studies.tuning.optimise import begin, fits
 from studies.tuning.report import TuneFindings, report
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import load_tuning, parse_tuning
-from tests.pages import parsed
+from tests.pages import parsed, text_of
 from tests.tunings import GAIN, SMALL, tuning
 
 FILE = """
@@ -70,7 +70,7 @@ def table_of(text, title):
     """Rows of the first table below a heading of a report, by their first cell."""
     part = text.split(f"## {title}")[1].split("\n## ")[0]
     lines = [line for line in part.splitlines() if line.startswith("|")]
-    heads, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    heads, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     return {row[0]: dict(zip(heads, row, strict=True)) for row in rows}
 
 
@@ -96,7 +96,10 @@ def same(told, value):
 
 def check_report(out):
     """Every number of its tables, from the files of the designs, on the machines of the file."""
-    text, data = (out / "report.md").read_text(), read_store(out / "tune.h5")[0]
+    text, data = (
+        text_of((out / "report.html").read_text(encoding="utf-8")),
+        read_store(out / "tune.h5")[0],
+    )
     own = table_of(text, "On the nominal machine")
     fresh = table_of(text, "On fresh machines")
     files = {name: row["file"].strip("`") for name, row in own.items() if row["file"] != "-"}
@@ -173,7 +176,7 @@ def test_a_report_says_what_its_numbers_are():
         0.1,
         14,
     )
-    text = report(spec, found)
+    text = text_of(report(spec, found))
     head = text.split("## ")[0]
     for words in (
         "the least residual_rms of links 1 and 3 with peak_voltage at most 30",
@@ -199,7 +202,7 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
     file, out = tmp_path / "t.toml", tmp_path / "out"
     file.write_text(FILE)
     cli.main(["tune", str(file), "--out", str(out)])
-    text = (out / "report.md").read_text()
+    text = text_of((out / "report.html").read_text(encoding="utf-8"))
     for part in (
         "which design has the least residual_rms of all links with peak_voltage at most",
         "| gains |",
@@ -213,7 +216,7 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
         assert part in text
     page = parsed((out / "report.html").read_text())
     for name in ("descent", "gains", "front"):
-        assert (out / f"{name}.png").stat().st_size > 10_000 and f"({name}.png)" in text
+        assert (out / f"{name}.png").stat().st_size > 10_000 and f"![{name}]" in text
     assert len(page.images) == 4  # the sketch of the machine, then these
     assert page.images[0][1].startswith("The machine at its first way-point")
     assert "[tune.free]" in page.text
@@ -283,10 +286,10 @@ def opened(out, is_resumed, **other):
 
 
 def test_a_folder_of_other_things_is_left_alone(tmp_path):
-    (tmp_path / "report.md").write_text("precious")
-    with pytest.raises(StudyError, match="holds other files .report.md.; name a new or empty"):
+    (tmp_path / "report.html").write_text("precious")
+    with pytest.raises(StudyError, match="holds other files .report.html.; name a new or empty"):
         opened(tmp_path, False)
-    assert [file.name for file in tmp_path.iterdir() if file.name[0] != "."] == ["report.md"]
+    assert [file.name for file in tmp_path.iterdir() if file.name[0] != "."] == ["report.html"]
 
 
 def test_a_folder_belongs_to_its_tuning(tmp_path):

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from studies.config import start
+from studies.publish import REPORT, announce
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -56,4 +57,4 @@ def add_commands(app: typer.Typer, console: Console) -> None:
                 file=sys.stderr,
             )
             sys.exit(130)
-        console.print(f"report: {out / 'report.html'}", soft_wrap=True)
+        announce(console, out / REPORT)

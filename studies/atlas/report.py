@@ -1,8 +1,9 @@
-"""`report.md` of the atlas: where the paper's statements hold, and the numbers behind it."""
+"""The report of the atlas: where the paper's statements hold, and the numbers behind it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,24 +16,27 @@ from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.plots import length_text
 from studies.atlas.subsets import TARGETS, link_label, setting_label
 from studies.atlas.workspace import MAP_MODES, Map
+from studies.show.pages import page
 from studies.show.sketch import CAPTION
-from studies.show.templates import render
 from studies.show.units import span
 from studies.study.window import residual_delay
 
 ALL_LINKS, PLATFORM = TARGETS.index("all links"), TARGETS.index("platform")
 
 
-def report(found: AtlasFindings, dropped: list[str]) -> str:
-    """Text of the report, in Markdown.
+def report(found: AtlasFindings, dropped: list[str], images: Path | None = None) -> str:
+    """The page of an atlas.
 
     Args:
         found: everything.
         dropped: settings left out, and why.
+        images: folder with the figures; None: a page without.
     """
     stable = found.responses.is_stable
-    return render(
-        "atlas/report.md",
+    return page(
+        "atlas/report.html",
+        images,
+        found.study,
         study=found.study,
         delay=residual_delay(found.study),
         subsets=found.subsets,
@@ -51,6 +55,7 @@ def report(found: AtlasFindings, dropped: list[str]) -> str:
         pairs=_pairs(found),
         workspace=_workspace(found),
         runs=_runs(found),
+        errors=_error_rows(found),
         responses=_responses(found),
         link_sets=list(LINK_LABELS),
         filmed=setting_label(RUNS[-1]),
@@ -230,39 +235,42 @@ def _border(chart: Map) -> str:
     return "square" if high.all() else "both" if high.any() else "along"
 
 
-def _runs(found: AtlasFindings) -> list[dict[str, Any]]:
-    """Rms errors of the platform in each of the runs, due to drive and vibration."""
+def _rms(found: AtlasFindings) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Rms errors of the platform due to drive, (3,), and vibration, (4, 3), by setting."""
     runs = found.platform
-    drive, vibration = runs.rms(runs.drive), runs.rms(runs.vibration)
-    return [
-        {
-            "setting": setting_label(setting),
-            "drive": _errors(drive[k]),
-            "vibration": dict(zip(LINK_LABELS, map(_errors, vibration[k]), strict=True)),
-            "part": _part(drive[k], vibration[k]),
-        }
-        for k, setting in enumerate(RUNS)
-    ]
+    every = zip(RUNS, runs.rms(runs.drive), runs.rms(runs.vibration), strict=True)
+    return ((setting_label(setting), drive, vibration) for setting, drive, vibration in every)
+
+
+def _error_rows(found: AtlasFindings) -> list[list[str]]:
+    """Row of each setting and part of the error."""
+    rows = []
+    for setting, drive, vibration in _rms(found):
+        rows.append([setting, "drive error", *_errors(drive)])
+        for links, error in zip(LINK_LABELS, vibration, strict=True):
+            rows.append([setting, f"vibration error, controlled: {links}", *_errors(error)])
+    return rows
+
+
+def _runs(found: AtlasFindings) -> list[dict[str, Any]]:
+    """What control of all links does to the errors of each setting."""
+    runs = []
+    for setting, drive, vibration in _rms(found):
+        centre = np.hypot(vibration[:, 0], vibration[:, 1])
+        runs.append(
+            {
+                "setting": setting,
+                "is_drive": np.hypot(*drive[:2]) > centre[0],
+                "centre": _change(centre[-1] / centre[0] - 1),
+                "turn": _change(vibration[-1, 2] / vibration[0, 2] - 1),
+            }
+        )
+    return runs
 
 
 def _errors(rms: np.ndarray) -> list[str]:
     """Errors of centre [nm] and turn [nrad], of (3,)."""
     return [f"{1e9 * x:.3g}" for x in (np.hypot(rms[0], rms[1]), rms[2])]
-
-
-def _part(drive: np.ndarray, vibration: np.ndarray) -> dict[str, Any]:
-    """Result of the split.
-
-    Args:
-        drive: rms error, (3,).
-        vibration: the same by choice of links, (4, 3).
-    """
-    centre = np.hypot(vibration[:, 0], vibration[:, 1])
-    return {
-        "is_drive": np.hypot(*drive[:2]) > centre[0],
-        "centre": _change(centre[-1] / centre[0] - 1),
-        "turn": _change(vibration[-1, 2] / vibration[0, 2] - 1),
-    }
 
 
 def _responses(found: AtlasFindings) -> list[list[str]]:

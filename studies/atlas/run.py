@@ -32,10 +32,10 @@ from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
 from studies.engine.sweep import run_sweep, sweep_phases
 from studies.errors import StudyError
+from studies.publish import REPORT, publish
 from studies.show.figures import save, styled, write_figure
-from studies.show.pages import write_report
 from studies.show.sketch import sketch
-from studies.store import Variable, staged, write_store
+from studies.store import Variable, write_store
 from studies.study.spec import Study
 
 DATA, RUNS_FOLDER = "atlas.h5", ATLASES.mark
@@ -95,17 +95,14 @@ def _finish(study: Study, out: Path, phases: Phases, has_pdf: bool) -> None:
     with threadpool_limits(1, "blas"):  # many small matrices: more threads only slow them down
         found = look_around(study, subsets, tell)
     phases.begin("draw")
-    try:
-        with staged(out) as staging:
-            write_store(staging / DATA, variables(found), run_attributes(study))
-            with styled():
-                for name, draw in FIGURES.items():
-                    save(draw(found), staging, name, has_pdf)
-                write_figure(sketch(study), staging / "machine.png")
-            write_animation(found, staging)
-            write_report(staging, report(found, dropped), study)
-    except OSError as error:
-        raise StudyError(f"--out {out}: cannot write there ({error})") from error
+    with publish(out) as staging:
+        write_store(staging / DATA, variables(found), run_attributes(study))
+        with styled():
+            for name, draw in FIGURES.items():
+                save(draw(found), staging, name, has_pdf)
+            write_figure(sketch(study), staging / "machine.png")
+        write_animation(found, staging)
+        (staging / REPORT).write_text(report(found, dropped, staging), encoding="utf-8")
 
 
 def sound_settings(subsets: Subsets) -> tuple[Subsets, list[str]]:

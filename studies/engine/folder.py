@@ -27,8 +27,8 @@ from jaxmodel.metrics import METRICS
 from studies import config, sources
 from studies.engine.columns import PER_CASE, SCREENED, label_of
 from studies.errors import StudyError
+from studies.publish import replacing
 from studies.reading import open_hdf5, open_regular, read_json
-from studies.store import replacing
 
 RESULTS, MANIFEST, CHUNKS, LOCK = "results.h5", "sweep.json", "chunks", ".lock"
 #: Where the chunks of the linear model are, if there is a screen.

@@ -16,7 +16,7 @@ from studies.engine.blocks import BlockFlow
 from studies.engine.channels import ChannelFlow
 from studies.engine.controller import FixedController
 from studies.export.fixed import rail_samples
-from studies.show.templates import render
+from studies.show.pages import render
 
 
 class Source(NamedTuple):

@@ -37,7 +37,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         ] = None,
     ) -> None:
         """Export the controller of a design to a real-time target, and verify it."""
-        from studies.store import check_folder
+        from studies.publish import check_folder
 
         check_folder(out)
         start()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from studies.engine.controller import FixedController
 from studies.engine.stability import LoopFigures
@@ -13,8 +14,11 @@ from studies.export.cost import Cost
 from studies.export.fixed import MARGIN, FixedPoint
 from studies.export.fixed_blocks import FixedBlocks
 from studies.export.verify import AIM, Verification
-from studies.show.templates import render
+from studies.show.pages import page
 from studies.study.margin import caution
+
+#: In place of "ok".
+FAULT = Markup("<b>FAILED</b>")
 
 
 def report(
@@ -25,7 +29,7 @@ def report(
     fixed: FixedPoint | FixedBlocks | None = None,
     cost: Cost | None = None,
 ) -> str:
-    """Text of the report, in Markdown.
+    """The page of an export.
 
     Args:
         found: the controller.
@@ -36,8 +40,10 @@ def report(
     """
     controller = found.controller
     code = float(controller.adc_step / controller.adc_gain)
-    return render(
-        "export/report.md",
+    return page(
+        "export/report.html",
+        None,
+        found.study,
         found=found,
         origin=origin,
         loop=loop,
@@ -46,7 +52,7 @@ def report(
         verified=verified,
         kept=sum(check.is_met for check in verified.checks),
         checks=[
-            [check.what, check.found, check.allowed, "ok" if check.is_met else "**FAILED**"]
+            [check.what, check.found, check.allowed, "ok" if check.is_met else FAULT]
             for check in verified.checks
         ],
         controllers=_controllers(found, verified),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from contextlib import ExitStack
 from pathlib import Path
 
 from rich.console import Console
@@ -20,10 +19,9 @@ from studies.export.targets import TARGETS
 from studies.export.verify import (
     Verification,
 )
-from studies.show.pages import report_files
-from studies.store import check_folder, replacing
+from studies.publish import check_folder, publish
 
-REPORT, FAILED = "verification", "verification-failed"
+REPORT, FAILED = "verification.html", "verification-failed.html"
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,30}")
 _DAC_BITS = (4, 16)
 DAC_BITS = 12
@@ -89,11 +87,13 @@ def export_design(
     texts = made.files if is_good else {}  # files of an earlier export stay unchanged
     if verified is not None:
         text = report(found, job.origin, made.loop, verified, made.fixed, made.cost)
-        texts |= report_files(out, text, found.study, REPORT if is_good else FAILED)
+        texts |= {REPORT if is_good else FAILED: text}
         _tell(verified, console)
-    reports = [f"{name}.{kind}" for name in (REPORT, FAILED) for kind in ("md", "html")]
-    stale = [file for file in reports if file not in texts] if is_good else []
-    _write(out, texts, stale, console)
+    with publish(out, stale=(REPORT, FAILED) if is_good else ()) as staging:
+        for file, text in texts.items():
+            (staging / file).write_text(text, encoding="utf-8")
+    for file in texts:
+        console.print(f"written: {out / file}", soft_wrap=True)
     return is_good
 
 
@@ -140,19 +140,3 @@ def _tell(verified: Verification, console: Console) -> None:
                 f"in the loop, {name}: voltage differs by {at.voltage:.2g} V, platform by "
                 f"{1e9 * at.pose[:2].max():.2g} nm, residual vibration by {100 * at.loss:+.2g} %"
             )
-
-
-def _write(out: Path, texts: dict[str, str], stale: list[str], console: Console) -> None:
-    """Write all files or none; `stale` are reports about other code."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StudyError(f"--out {out}: cannot write there ({error.strerror})") from None
-    with ExitStack() as stack:
-        for name, text in texts.items():
-            temporary = stack.enter_context(replacing(out / name))
-            temporary.write_text(text, encoding="utf-8")
-    for name in stale:
-        (out / name).unlink(missing_ok=True)
-    for name in texts:
-        console.print(f"written: {out / name}", soft_wrap=True)

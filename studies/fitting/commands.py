@@ -23,7 +23,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
     ) -> None:
         """Fit parameters of a study to measurements, and say how well they are known."""
-        from studies.store import check_folder
+        from studies.publish import check_folder
 
         check_folder(out)
         start()

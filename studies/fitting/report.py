@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 
+from studies.errors import printable
 from studies.fitting.kinds.contract import Line
 from studies.fitting.plots import MOST
 from studies.fitting.spec import number_unit
 from studies.fitting.statistics import REGION, UNKNOWN, Answer, Direction, Misfit, region_rise
-from studies.show.markdown import literal
-from studies.show.templates import render
+from studies.show.pages import page
 
 if TYPE_CHECKING:
     from studies.fitting.estimate import Fitted
@@ -39,17 +41,24 @@ def _said(found: Fitted) -> list[str]:
     return [GOOD] * is_good(found) + sentences(found)
 
 
-def report(found: Fitted) -> str:
-    """Markdown text."""
+def report(found: Fitted, images: Path | None = None) -> str:
+    """The page of a fit.
+
+    Args:
+        found: the fit.
+        images: folder with its figures; None: a page without.
+    """
     first, *others = _said(found)
-    return render(
-        "fitting/report.md",
+    return page(
+        "fitting/report.html",
+        images,
+        found.study,
         found=found,
         spec=found.spec,
         answer=found.answer,
         rows=_rows(found),
         is_good=is_good(found),
-        first=f"{'good' if is_good(found) else '**not good**'}. {first}",
+        first=first,
         others_said=others,
         misfits=[_misfit(x) for x in found.answer.misfits],
         checks=[_misfit(x) for x in found.checks],
@@ -276,8 +285,8 @@ def _correlated(found: Fitted) -> list[str]:
 
 
 def cell(name: str) -> str:
-    """A user's name as text of a table."""
-    return literal(" ".join(name.replace("|", "/").split()))
+    """A user's name on one line, without control sequences."""
+    return printable(" ".join(name.split()))
 
 
 def _misfit(one: Misfit) -> list[str]:
@@ -287,7 +296,7 @@ def _misfit(one: Misfit) -> list[str]:
         str(one.size),
         f"{one.square / max(one.size, 1):.3g}",
         autocorrelation,
-        "yes" if one.is_noise else "**no**",
+        "yes" if one.is_noise else Markup("<b>no</b>"),
     ]
 
 

@@ -11,16 +11,15 @@ from rich.console import Console
 
 from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
-from studies.errors import StudyError
 from studies.fitting import plots
 from studies.fitting.estimate import Fitted, estimate, fit_phases, named_values, suggest
 from studies.fitting.kinds.contract import Line
 from studies.fitting.report import is_good, report, sentences, summary
 from studies.fitting.spec import FitSpec
 from studies.fitting.statistics import REGION
+from studies.publish import REPORT, announce, check_folder, publish
 from studies.show import figures
-from studies.show.pages import write_report
-from studies.store import Variable, check_folder, replacing, staged, write_store
+from studies.store import Variable, write_store
 from studies.study.template import study_template
 
 #: Least gain margin of that tuning [1].
@@ -48,47 +47,29 @@ def run_fit(
     with Phases(console, fit_phases(spec)) as phases:
         found = estimate(spec, phases)
         phases.begin("draw")
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-            with staged(out) as staging:
-                drawn = _draw(staging, found, has_pdf)
-                (staging / STUDY).write_text(study_template(found.study), encoding="utf-8")
-                (staging / TUNE).write_text(_tuning(found), encoding="utf-8")
-                write_store(staging / DATA, variables(found), run_attributes(found.study))
-                _present(staging, found)
-            for name in plots.NAMES:  # of an earlier fit
-                if name not in drawn:
-                    (out / f"{name}.png").unlink(missing_ok=True)
-                if name not in drawn or not has_pdf:
-                    (out / f"{name}.pdf").unlink(missing_ok=True)
-            found = suggest(found, phases)
-            _present(out, found)
-        except OSError as error:
-            raise StudyError(f"--out {out}: cannot write there ({error})") from error
+        with publish(
+            out, [f"{x}.{kind}" for x in plots.NAMES for kind in ("png", "pdf")]
+        ) as staging:
+            with figures.styled():
+                for name, figure in plots.all_figures(found):
+                    figures.save(figure, staging, name, has_pdf)
+            (staging / STUDY).write_text(study_template(found.study), encoding="utf-8")
+            (staging / TUNE).write_text(_tuning(found), encoding="utf-8")
+            write_store(staging / DATA, variables(found), run_attributes(found.study))
+            _present(staging, staging, found)
+        found = suggest(found, phases)
+        with publish(out) as staging:
+            _present(staging, out, found)
     console.print(summary(found), soft_wrap=True)
-    console.print(
-        f"written: {out / 'report.html'}; {STUDY} is the fitted study, {TUNE} a tuning for "
-        "machines like it",
-        soft_wrap=True,
-    )
+    more = f"; {STUDY} is the fitted study, {TUNE} a tuning for machines like it"
+    announce(console, out / REPORT, more)
     return found
 
 
-def _present(folder: Path, found: Fitted) -> None:
-    """Write the answer in words, beside its figures."""
-    with replacing(folder / DOCUMENT) as file:
-        file.write_text(document(found), encoding="utf-8")
-    write_report(folder, report(found), found.study)
-
-
-def _draw(folder: Path, found: Fitted, has_pdf: bool) -> list[str]:
-    """Names of the figures that there are."""
-    drawn = []
-    with figures.styled():
-        for name, figure in plots.all_figures(found):
-            figures.save(figure, folder, name, has_pdf)
-            drawn.append(name)
-    return drawn
+def _present(folder: Path, images: Path, found: Fitted) -> None:
+    """Write the answer in words; `images`: folder with its figures."""
+    (folder / DOCUMENT).write_text(document(found), encoding="utf-8")
+    (folder / REPORT).write_text(report(found, images), encoding="utf-8")
 
 
 def machines(found: Fitted) -> dict[str, list[float]]:

@@ -23,8 +23,8 @@ import jax
 
 from studies.config import cache_folder
 from studies.errors import StudyError
+from studies.publish import replacing
 from studies.reading import open_regular, read_bytes
-from studies.store import replacing
 
 #: JAX's name for the time its backend takes to compile, or to find a program in the cache.
 _EVENT = "/jax/core/compile/backend_compile_duration"

@@ -224,7 +224,7 @@ def _shapers(machines: Machines) -> Figure:
     return figure
 
 
-#: Figures by file name; captions are in `report.md`.
+#: Figures by file name; captions are in `report.html`.
 PAPER_FIGURES: dict[str, Callable[[Machines], Figure]] = {
     "fig03": partial(_deflection, links=ALL, is_whole=True),
     "fig04": _modes,

@@ -1,10 +1,11 @@
 """The report of the paper's study: its numbers next to those of two machines, and why they differ.
 
-The text is in `report.md`; the rows of its tables come from `tables`.
+The text is in `report.html`; the rows of its tables come from `tables`.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,19 +37,25 @@ from studies.paper.tables import (
     settling_rows,
     table_1_rows,
 )
-from studies.show.markdown import picture
+from studies.show.pages import page
 from studies.show.sketch import CAPTION
-from studies.show.templates import render
 from studies.study.window import residual_delay
 
 
-def report(machines: Machines) -> str:
-    """Markdown text; its figures are PAPER_FIGURES."""
+def report(machines: Machines, images: Path | None = None) -> str:
+    """The page of the paper's study.
+
+    Args:
+        machines: both.
+        images: folder with its figures, PAPER_FIGURES; None: a page without.
+    """
     fitted, nominal = machines
     runs, study = nominal.runs, nominal.runs.study
     cases = {case.name: k for k, case in enumerate(runs.cases)}
-    return render(
-        "paper/report.md",
+    return page(
+        "paper/report.html",
+        images,
+        study,
         fitted=fitted.runs.study,
         study=study,
         machines=machine_rows(machines),
@@ -95,12 +102,8 @@ def report(machines: Machines) -> str:
         ideal_factor=_ideal_factor(nominal, cases),
         drop=lambda name, mode: nominal.drop(cases[name], mode),
         sketch_caption=CAPTION,
-        figure=_figure,
+        drawn=list(PAPER_FIGURES),
     )
-
-
-def _figure(name: str, caption: str) -> str:
-    return picture(f"{name}.png", f"`{name}`: {caption}") if name in PAPER_FIGURES else ""
 
 
 def _agreement(context: Context) -> dict[str, Any]:

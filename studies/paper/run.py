@@ -2,12 +2,11 @@
 
 Two machines stand beside the paper's numbers: the one fitted to its measurements, and the nominal
 one. The folder gets a file of runs for each, the counterparts of the paper's figures, and the
-report, as Markdown and as a web page.
+report.
 """
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from rich.table import Column, Table
 from studies.engine.batches import Tell
 from studies.engine.columns import LINK_AXIS, POSE_AXIS
 from studies.engine.run_data import metric_variables, run_attributes
-from studies.errors import StudyError
 from studies.paper.cases import (
     EXECUTOR,
     MOVES,
@@ -34,14 +32,13 @@ from studies.paper.context import Context, Machines
 from studies.paper.figures import PAPER_FIGURES, draw_figure
 from studies.paper.measures import Measures, measure, middle_station
 from studies.paper.report import report
+from studies.publish import REPORT, announce, check_folder, publish
 from studies.show.figures import styled, write_figure
-from studies.show.pages import write_report
 from studies.show.sketch import sketch
-from studies.store import Variable, check_target, staged, write_store
+from studies.store import Variable, write_store
 from studies.study.labels import STATION_TEXT, STATUS_LABEL, describe
 from studies.study.spec import Study, paper_study
 
-REPORT = "report.html"
 #: File of a machine's runs, by its field in `Machines`.
 DATA = {name: f"{name}.h5" for name in Machines._fields}
 
@@ -82,7 +79,7 @@ def write_paper(
     Raises:
         StudyError: as `run_paper` and `run_cases`.
     """
-    _open_folder(out)
+    check_folder(out)
     columns = (TextColumn("{task.description:<44}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as progress:
         compared = [case for case in cases if case.is_compared]
@@ -96,10 +93,7 @@ def write_paper(
             _context("fitted machine", run_cases(fitted, compared, tell)),
             _context("nominal machine", run_cases(nominal, cases, tell)),
         )
-        try:
-            _write(out, machines, tell, has_pdf)
-        except OSError as error:
-            raise StudyError(f"--out {out}: cannot write there ({error})") from error
+        _write(out, machines, tell, has_pdf)
         progress.update(task, description="done", completed=work)
     _print_outcome(out, console, machines)
 
@@ -109,8 +103,7 @@ def _context(name: str, runs: PaperRuns) -> Context:
 
 
 def _write(out: Path, machines: Machines, tell: Tell, has_pdf: bool) -> None:
-    """Write everything elsewhere first, so that an interruption leaves old files intact."""
-    with staged(out) as staging:
+    with publish(out) as staging:
         tell("writing data", 0.0)
         for file, context in zip(DATA.values(), machines, strict=True):
             variables = paper_variables(context.runs, context.measures)
@@ -122,22 +115,7 @@ def _write(out: Path, machines: Machines, tell: Tell, has_pdf: bool) -> None:
         study = machines.nominal.runs.study
         with styled():
             write_figure(sketch(study), staging / "machine.png")
-        write_report(staging, report(machines), study)
-
-
-def _open_folder(out: Path) -> None:
-    """Create the folder; raise StudyError if it cannot be created or written to."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except FileExistsError:
-        raise StudyError(f"--out {out}: this is a file; name a folder") from None
-    except OSError as error:
-        raise StudyError(
-            f"--out {out}: cannot make this folder ({error.strerror}); name one in a place "
-            "that can be written to"
-        ) from None
-    for file in DATA.values():
-        check_target(out / file)
+        (staging / REPORT).write_text(report(machines, staging), encoding="utf-8")
 
 
 def _print_outcome(out: Path, console: Console, machines: Machines) -> None:
@@ -147,9 +125,7 @@ def _print_outcome(out: Path, console: Console, machines: Machines) -> None:
             table.add_row(name, case.name, case.links_text, str(case.modes), describe(int(code)))
     console.print(table)
     console.print(f"executor: {EXECUTOR}")
-    console.print(f"report:  {out / REPORT}")
-    console.print(f"figures: {out}{os.sep}*.png")
-    console.print(f"data:    {', '.join(str(out / file) for file in DATA.values())}")
+    announce(console, out / REPORT, f"; data: {', '.join(DATA.values())} in the same folder")
 
 
 def paper_variables(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:

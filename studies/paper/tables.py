@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from studies.paper.cases import ALL, COMPARED, EXPERIMENT_RATIOS, MOVES, OFF, PAPER_RATIOS
 from studies.paper.context import PLACES, Context, Machines, change, residual, residuals
@@ -212,7 +213,7 @@ def design_rows(context: Context) -> list[list[str]]:
             zeta = ", ".join(f"{z:.3f}" for z in loop.damping_ratio.min(axis=1))
         rows.append(
             [
-                f"`{case.name}`",
+                Markup("<code>{}</code>").format(case.name),
                 case.feedback,
                 case.estimator,
                 f"{case.gain_factor:g}",

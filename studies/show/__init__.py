@@ -1,7 +1,6 @@
 """Presentation: figures, pages, formatted numbers.
 
-In: results. Out: Markdown and HTML with figures inside. `templates` fills the `report.md` texts
-next to the modules; `pages` turns Markdown into a page; `markdown` writes tables and figures;
-`units` writes numbers in readable units; `sketch` draws a machine; `figures` defines the style of
-all drawings.
+In: results. Out: HTML with figures inside. `pages` fills the `report.html` templates next to the
+modules; `units` writes numbers in readable units; `sketch` draws a machine; `figures` defines the
+style of all drawings.
 """

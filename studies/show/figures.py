@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from studies.store import replacing
+from studies.publish import replacing
 
 WITHOUT: dict[str, Any] = {"color": "#E69F00", "linewidth": 1.6, "label": "without control"}
 CONTROLLED: dict[str, Any] = {"color": "#0B3C6F", "linewidth": 0.8, "label": "with control"}

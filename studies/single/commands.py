@@ -13,13 +13,14 @@ from rich.console import Console
 from rich.table import Table
 
 from studies.config import start
+from studies.publish import announce
 
 if TYPE_CHECKING:
     from studies.engine.runs import Run
 
 _Report = Annotated[
     bool,
-    typer.Option("--report", help="also write a report with figures, in Markdown and HTML"),
+    typer.Option("--report", help="also write a report with figures, as HTML"),
 ]
 
 
@@ -187,4 +188,4 @@ def _print_files(out: Path | None, has_report: bool, console: Console) -> None:
     if out is not None:
         console.print(f"written: {out}", soft_wrap=True)
     if out is not None and has_report:
-        console.print(f"report: {out.with_name(out.stem)}.html", soft_wrap=True)
+        announce(console, out.with_suffix(".html"))

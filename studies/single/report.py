@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -16,14 +17,13 @@ from studies.engine.poles import HEADER, difference, pole_rows
 from studies.engine.run_data import chord_deflection, run_attributes, run_variables
 from studies.engine.runs import Run, uncontrolled_twin
 from studies.errors import StudyError
+from studies.publish import check_target, publish
 from studies.show import figures, units
-from studies.show.markdown import picture
-from studies.show.pages import write_report
+from studies.show.pages import page
 from studies.show.sketch import CAPTION, sketch
-from studies.show.templates import render
 from studies.show.units import number
 from studies.show.words import control_text, motion_text
-from studies.store import check_target, write_store
+from studies.store import write_store
 from studies.study.margin import ENOUGH, MARGIN_MODES, caution
 
 #: Figures, by the end of the file name.
@@ -34,7 +34,7 @@ VERDICTS = {
     "margin": "too little margin for a machine",
     "uncontrolled": "nothing is controlled",
     "calm": "hardly anything to suppress",
-    "worse": "**control makes it worse**",
+    "worse": Markup("<b>control makes it worse</b>"),
     "well": "control works",
 }
 #: Settling later than without control is pointed out from this share on [1].
@@ -57,7 +57,7 @@ def check_results(out: Path, has_report: bool) -> None:
     if out.suffix == ".toml":
         raise StudyError(f"--out {out}: results are HDF5, not a study; name the file *.h5")
     check_target(out)
-    names = [f"{out.stem}.html", f"{out.stem}.md", *(_figure(out, name) for name in FIGURES)]
+    names = [f"{out.stem}.html", *(f"{out.stem}-{name}.png" for name in FIGURES)]
     for name in names if has_report else []:
         if name == out.name:
             raise StudyError(f"--out {out}: --report writes a file of this name; name it *.h5")
@@ -79,28 +79,44 @@ def write_results(
     Raises:
         StudyError: a file cannot be written.
     """
-    write_store(out, run_variables(run), run_attributes(run.study))
-    if not has_report:
-        return
-    twin = uncontrolled_twin(run)
-    with figures.styled():
-        for kind, figure in {**draw(run, twin), "machine": sketch(run.study)}.items():
-            figures.write_figure(figure, out.with_name(_figure(out, kind)))
-    write_report(out.parent, report(out, run, twin, notes, name), run.study, out.stem)
+    with publish(out.parent) as staging:
+        write_store(staging / out.name, run_variables(run), run_attributes(run.study))
+        if not has_report:
+            return
+        twin = uncontrolled_twin(run)
+        with figures.styled():
+            for kind, figure in {**draw(run, twin), "machine": sketch(run.study)}.items():
+                figures.write_figure(figure, staging / f"{out.stem}-{kind}.png")
+        text = report(out.stem, run, twin, notes, name, staging)
+        (staging / f"{out.stem}.html").write_text(text, encoding="utf-8")
 
 
-def _figure(out: Path, name: str) -> str:
-    """File of one of FIGURES."""
-    return f"{out.stem}-{name}.png"
+def report(
+    stem: str,
+    run: Run,
+    twin: Run | None,
+    notes: Sequence[str],
+    name: str,
+    folder: Path | None = None,
+) -> str:
+    """The page of a run.
 
-
-def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str], name: str) -> str:
-    """Markdown text; arguments of `write_results`, and the same run without control."""
+    Args:
+        stem: with which the names of its figures begin.
+        run: with trajectories.
+        twin: the same run without control.
+        notes: sentences to add.
+        name: of the study on the command line.
+        folder: with the figures; None: a page without.
+    """
     result, study = run.result, run.study
     worst = int(np.argmax(np.nan_to_num(result.metrics.residual_rms.max(axis=1), nan=-1.0)))
     free = twin if twin is not None and twin.status in status.FINISHED else None
-    return render(
-        "single/report.md",
+    return page(
+        "single/report.html",
+        folder,
+        study,
+        stem=stem,
         run=run,
         study=study,
         twin=twin,
@@ -136,7 +152,6 @@ def report(out: Path, run: Run, twin: Run | None, notes: Sequence[str], name: st
         pole_rows=pole_rows(run.poles) if run.poles is not None else [],
         pole_difference=difference(run.poles) if run.poles is not None else "",
         sketch_caption=CAPTION,
-        figure=lambda name, caption: picture(_figure(out, name), caption),
     )
 
 

@@ -31,7 +31,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
     ) -> None:
         """Certify a controller on plants that differ from its model."""
-        from studies.store import check_folder
+        from studies.publish import check_folder
 
         check_folder(out)
         start()

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from jaxmodel.laws import LAWS
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
+from studies.show.pages import page
 from studies.show.sketch import CAPTION
-from studies.show.templates import render
 from studies.spillover.certificate import Certificate, Spillover
 from studies.spillover.comparison import FAST, GIVEN, SHOWN, WINDOW, WITHOUT, Comparison
 from studies.spillover.plants import PlantVariant
@@ -45,16 +47,19 @@ def spillover_text(found: Certificate) -> str:
     )
 
 
-def report(found: Certificate, laws: Comparison | None) -> str:
-    """Markdown text.
+def report(found: Certificate, laws: Comparison | None, images: Path | None = None) -> str:
+    """The page of a certificate.
 
     Args:
         found: the certificate.
         laws: comparison of laws, if they can be compared.
+        images: folder with the figures; None: a page without.
     """
     study, margin = found.study, float(found.margin[found.worst])
-    return render(
-        "spillover/report.md",
+    return page(
+        "spillover/report.html",
+        images,
+        study,
         found=found,
         study=study,
         law=LAWS[study.control.law],
@@ -114,19 +119,10 @@ def _margins(found: Certificate) -> list[list[str]]:
                 found.breaking[b, d, last] or "-",
                 f"{found.least_damping[b, d, last]:.3g}",
                 found.weakest[b, d, last],
-                "yes" if found.passes[b, d][found.exists[b, d]].all() else "**no**",
+                "yes" if found.passes[b, d][found.exists[b, d]].all() else Markup("<b>no</b>"),
             ]
         )
     return rows
-
-
-class Leak(NamedTuple):
-    """Coupling between a controlled mode and an uncontrolled one; modes count from 1."""
-
-    size: float  # [1]
-    mode: int  # not under control
-    controlled: int
-    plant: PlantVariant
 
 
 def _leakage(found: Certificate) -> dict[str, Any] | None:
@@ -152,11 +148,15 @@ def _leakage(found: Certificate) -> dict[str, Any] | None:
     }
 
 
-def _largest(found: Certificate, leakage: np.ndarray) -> Leak:
-    """The largest entry of a leakage of all plants, (B, D, 3, C, uncontrolled modes)."""
+def _largest(found: Certificate, leakage: np.ndarray) -> dict[str, Any]:
+    """The largest entry of a leakage of all plants, (B, D, 3, C, uncontrolled modes).
+
+    Its size [1], the uncontrolled and the controlled mode, from 1, and the plant.
+    """
     size = np.nan_to_num(np.abs(leakage))
     b, d, _, j, r = np.unravel_index(np.argmax(size), size.shape)
-    return Leak(size.max(), int(r) + found.n_controlled + 1, int(j) + 1, found.plants[b, d, 0])
+    mode, plant = int(r) + found.n_controlled + 1, found.plants[b, d, 0]
+    return {"size": size.max(), "mode": mode, "controlled": int(j) + 1, "plant": plant}
 
 
 def _laws(laws: Comparison) -> list[list[str]]:

@@ -15,15 +15,15 @@ from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
 from studies.engine.runs import resolved_study
 from studies.errors import StudyError
+from studies.publish import REPORT, announce, check_folder, publish
 from studies.reading import read_json
 from studies.show import figures
-from studies.show.pages import write_report
 from studies.show.sketch import sketch
 from studies.spillover import plots
 from studies.spillover.certificate import Certificate, certify
 from studies.spillover.comparison import Comparison, compare_laws
 from studies.spillover.report import document, report, spillover_text, verdict
-from studies.store import Variable, check_folder, staged, write_store
+from studies.store import Variable, write_store
 from studies.study.labels import STATUS_LABEL
 from studies.study.spec import Study
 
@@ -70,12 +70,14 @@ def spillover_design(
         except StudyError as error:
             found = found._replace(notes=(*found.notes, f"laws are not compared: {error}"))
         phases.begin("draw")
-        _write(out, found, laws, has_pdf)
+        with publish(out) as staging:
+            _draw(staging, found, laws, has_pdf)
+            write_store(staging / DATA, variables(found, laws), run_attributes(study))
+            (staging / DOCUMENT).write_text(document(found, laws), encoding="utf-8")
+            (staging / REPORT).write_text(report(found, laws, staging), encoding="utf-8")
     for note in found.notes:
         console.print(note, soft_wrap=True)
-    console.print(
-        f"written: {out / 'report.html'}, data and figures in the same folder", soft_wrap=True
-    )
+    announce(console, out / REPORT, ", data and figures in the same folder")
     return found.is_passed
 
 
@@ -93,18 +95,6 @@ def _check_whose(out: Path, study: Study) -> None:
         raise StudyError(
             f"--out {out}: has the certificate of another design; give another folder, or delete it"
         )
-
-
-def _write(out: Path, found: Certificate, laws: Comparison | None, has_pdf: bool) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with staged(out) as staging:  # an interruption leaves the old files intact
-            _draw(staging, found, laws, has_pdf)
-            write_store(staging / DATA, variables(found, laws), run_attributes(found.study))
-            (staging / DOCUMENT).write_text(document(found, laws), encoding="utf-8")
-            write_report(staging, report(found, laws), found.study)
-    except OSError as error:
-        raise StudyError(f"--out {out}: cannot write there ({error})") from error
 
 
 def _draw(folder: Path, found: Certificate, laws: Comparison | None, has_pdf: bool) -> None:

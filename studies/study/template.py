@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from studies.errors import StudyError
-from studies.store import check_target, replacing
+from studies.publish import check_target, replacing
 from studies.study.explain import allowed_values, choices_of, unit_of
 from studies.study.spec import Study
 

@@ -14,6 +14,7 @@ from rich.table import Table
 from studies.cluster.connect import LocalWorkers, Scheduler, Workers, WorkerTimeout, runner_for
 from studies.config import start
 from studies.errors import StudyError
+from studies.publish import REPORT, announce
 
 #: Replaced in names of files: the brackets of entries.
 _NO_NAME = r"[^\w.-]+"
@@ -101,7 +102,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             checked = check_screen(read_sweep(out, done.table))
             console.print("" if checked is None else checked.text, soft_wrap=True)
         if report and not quiet:
-            console.print(f"report: {out / 'report.html'}", soft_wrap=True)
+            announce(console, out / REPORT)
         if len(done.lost):
             sys.exit(1)
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,16 +19,15 @@ from studies.engine.results import (
     swept_names,
 )
 from studies.errors import StudyError, shown
+from studies.publish import REPORT, publish
 from studies.show.figures import styled
-from studies.show.markdown import literal
-from studies.show.pages import write_report
+from studies.show.pages import page
 from studies.show.sketch import CAPTION, sketch
-from studies.show.templates import render
 from studies.show.units import readable
 from studies.show.words import motion_text
 from studies.space.axes import SHOWN_AS
 from studies.space.methods import METHODS
-from studies.space.spec import BlockNode
+from studies.space.spec import Block
 from studies.space.table import case_study
 from studies.study.spec import Study
 from studies.study.template import study_template, toml_text, toml_value
@@ -38,7 +37,6 @@ from studies.sweeps.screening import check_screen, draw_screen
 from studies.sweeps.show import (
     MARGIN,
     SHARES,
-    Rows,
     case_rows,
     cause_rows,
     counted_text,
@@ -56,43 +54,15 @@ from studies.sweeps.show import (
     unit_of_metric,
 )
 
-REPORT, FIGURE, FRONT, MACHINE = "report.html", "cases.png", "front.png", "machine.png"
-SCREEN = "screen.png"
+FIGURE, FRONT, SCREEN, MACHINE = "cases.png", "front.png", "screen.png", "machine.png"
 #: Other metrics to check.
 OTHERS = ("settling_time", "peak_voltage")
 #: The best cases count as equal if they differ by less than this share.
 ALIKE = 0.02
 
 
-class Rival(NamedTuple):
-    """A case that is better than the best one, but has a smaller gain margin."""
-
-    case: int
-    value: str  # of the metric, with its unit
-    margin: float
-
-
-class BestCase(NamedTuple):
-    """What a report says about the best cases; values of the metric include their unit."""
-
-    case: int  # the first of them
-    value: str  # of the metric there
-    setting: str  # what varies, and its values there
-    margin: float | None  # gain margin there, None if unknown
-    median: str  # of the metric, over all cases of status ok
-    spread: float | None  # relative spread of the metric among them, None if it distinguishes them
-    warning: str  # of small gain margins among them
-    is_safe: bool  # their gain margins are `ENOUGH`
-    condition: str  # what the best cases meet, "" for nothing
-    rival: Rival | None
-    idle: list[tuple[str, str]]  # links that no case controls, and the metric there
-    table: Rows
-    note: str  # what marks in the table stand for
-    unmeasured: str  # warning of values that the controller cannot measure
-
-
 def write_sweep_report(folder: str | Path) -> None:
-    """Write `report.md` and `report.html` of a sweep, with its figures, into its folder.
+    """Write `report.html` of a sweep, with its figures, into its folder.
 
     Args:
         folder: of a finished sweep.
@@ -102,28 +72,25 @@ def write_sweep_report(folder: str | Path) -> None:
     """
     folder = Path(folder)
     data = read_sweep(folder)
-    spec = data.spec
     metric = ranking(data)
-    drawn = []
-    for name, draw in ((FIGURE, _all_axes), (FRONT, _front), (SCREEN, _screen)):
-        try:
-            figure = draw(data, metric)
-        except StudyError:  # no case is ok, or nothing to draw over
-            continue
-        save_plot(figure, folder / name)
-        drawn.append(name)
-    with styled():
-        save_plot(sketch(_best_study(data, metric)), folder / MACHINE)
-    files = {"Sweep file": toml_text(spec.data), "Study of all cases": study_template(spec.study)}
-    write_report(folder, report(data, metric, [*drawn, MACHINE], str(folder)), files)
-
-
-def _all_axes(data: SweepData, metric: str) -> Figure:
-    return plot(data, None, metric, None)
-
-
-def _screen(data: SweepData, metric: str) -> Figure:
-    return draw_screen(data)
+    drawn = [MACHINE]
+    drawings: dict[str, Callable[[], Figure]] = {
+        FIGURE: lambda: plot(data, None, metric, None),
+        FRONT: lambda: _front(data, metric),
+        SCREEN: lambda: draw_screen(data),
+    }
+    with publish(folder, stale=drawings) as staging:
+        for name, draw in drawings.items():
+            try:
+                figure = draw()
+            except StudyError:  # no case is ok, or nothing to draw over
+                continue
+            save_plot(figure, staging / name)
+            drawn.append(name)
+        with styled():
+            save_plot(sketch(_best_study(data, metric)), staging / MACHINE)
+        text = report(data, metric, drawn, str(folder), staging)
+        (staging / REPORT).write_text(text, encoding="utf-8")
 
 
 def _front(data: SweepData, metric: str) -> Figure:
@@ -146,24 +113,34 @@ def _best_study(data: SweepData, metric: str) -> Study:
         return data.spec.study
 
 
-def report(data: SweepData, metric: str, drawn: list[str], folder: str = "DIR") -> str:
-    """Markdown text.
+def report(
+    data: SweepData,
+    metric: str,
+    drawn: list[str],
+    folder: str = "DIR",
+    images: Path | None = None,
+) -> str:
+    """The page of a sweep.
 
     Args:
         data: the sweep.
         metric: ranks the cases.
         drawn: existing figures among `FIGURE`, `FRONT`, `SCREEN` and `MACHINE`.
         folder: of the sweep, for commands.
+        images: folder with the figures; None: a page without.
     """
     endings = status_rows(data)
-    return render(
-        "sweeps/report.md",
-        title=data.spec.study.title,
+    spec = data.spec
+    return page(
+        "sweeps/report.html",
+        images,
+        {"Sweep file": toml_text(spec.data), "Study of all cases": study_template(spec.study)},
+        title=spec.study.title,
         folder=folder,
         first=direction(metric),
-        motion=motion_text(data.spec.study),
-        window=data.spec.study.metrics,
-        sweep=data.spec.sweep,
+        motion=motion_text(spec.study),
+        window=spec.study.metrics,
+        sweep=spec.sweep,
         cases=data.table,
         metric=metric,
         others=[x for x in OTHERS if x in data.variables and x != metric.partition("[")[0]],
@@ -171,20 +148,23 @@ def report(data: SweepData, metric: str, drawn: list[str], folder: str = "DIR") 
         axes=swept_names(data),
         n_ok=int(np.sum(data["status"] == status.OK)),
         failures=[f"{count}: {name}" for name, count, _ in endings.rows if name != "ok"][:3],
-        endings=_literal(endings),
+        endings=endings,
         best=_best(data, metric),
         uncontrolled=uncontrolled_text(data, metric),
         screen=check_screen(data),
-        blocks=_blocks(data.spec.root),
-        columns=_literal(axis_rows(data.table)),
-        causes=_literal(cause_rows(data)),
+        root=spec.root,
+        method_text=_method_text,
+        shown_as=SHOWN_AS,
+        axis_values=_values,
+        columns=axis_rows(data.table),
+        causes=cause_rows(data),
         shares=SHARES,
         sketch_caption=CAPTION,
         drawn=drawn,
     )
 
 
-def _best(data: SweepData, metric: str) -> BestCase | None:
+def _best(data: SweepData, metric: str) -> dict[str, Any] | None:
     """The best cases; None if no case of status ok has the metric."""
     if metric.partition("[")[0] not in data.variables:
         return None
@@ -203,25 +183,26 @@ def _best(data: SweepData, metric: str) -> BestCase | None:
     unit = readable(unit_of_metric(data, metric))[1]
     spread = float(np.ptp(readings[best]) / max(abs(readings[first]), 1e-300))
 
-    def told(number: float) -> str:
+    def with_unit(number: float) -> str:
         return f"{number:.4g} {unit}".rstrip()
 
-    return BestCase(
-        case=first,
-        value=told(readings[first]),
-        setting=", ".join(f"{x} = {shown_value(data, x, first)}" for x in names),
-        margin=float(margin[first]) if np.isfinite(margin[first]) else None,
-        median=told(np.median(readings[is_known])),
-        spread=spread if len(best) > 3 and spread < ALIKE else None,
-        warning=warning,
-        is_safe=is_safe,
-        condition=condition,
-        idle=_idle(data, metric, first),
-        rival=Rival(free, told(readings[free]), margin[free]) if is_beaten else None,
-        table=_literal(case_rows(data, best, [metric])),
-        note=mark_note(data, best, metric),
-        unmeasured=resolution_warning(data, best, metric),
-    )
+    return {
+        "case": first,
+        "value": with_unit(readings[first]),
+        "setting": ", ".join(f"{x} = {shown_value(data, x, first)}" for x in names),
+        "margin": float(margin[first]) if np.isfinite(margin[first]) else None,
+        "median": with_unit(np.median(readings[is_known])),
+        "spread": spread if len(best) > 3 and spread < ALIKE else None,
+        "warning": warning,
+        "is_safe": is_safe,
+        "condition": condition,
+        "idle": _idle(data, metric, first),
+        # better than the best one, but with a smaller gain margin
+        "rival": (free, with_unit(readings[free]), margin[free]) if is_beaten else None,
+        "table": case_rows(data, best, [metric]),
+        "note": mark_note(data, best, metric),
+        "unmeasured": resolution_warning(data, best, metric),
+    }
 
 
 def _idle(data: SweepData, metric: str, case: int) -> list[tuple[str, str]]:
@@ -235,22 +216,9 @@ def _idle(data: SweepData, metric: str, case: int) -> list[tuple[str, str]]:
     return [(k, f"{shown_metric(data, name)[case]:.4g} {unit}".rstrip()) for k, name in names]
 
 
-def _blocks(node: BlockNode, depth: int = 0) -> list[tuple[int, str, list[tuple[str, str, Any]]]]:
-    """A block and the further blocks in it.
-
-    Args:
-        node: of the block.
-        depth: how deep it lies.
-
-    Returns:
-        Of each block its depth, how it combines its axes, and of each axis its name, the field that
-        it stands for ("" where that is its name) and its values.
-    """
-    block = node.block
-    text = METHODS[block.method].text.format(block.count or len(block.cases))
-    axes = [(name, SHOWN_AS.get(name, ""), _values(x)) for name, x in block.axes.items()]
-    further = [entry for child in node.children for entry in _blocks(child, depth + 1)]
-    return [(depth, text, axes), *further]
+def _method_text(block: Block) -> str:
+    """How a block combines its axes."""
+    return METHODS[block.method].text.format(block.count or len(block.cases))
 
 
 def _values(written: Any) -> Mapping[str, Any] | list[str]:
@@ -260,8 +228,3 @@ def _values(written: Any) -> Mapping[str, Any] | list[str]:
     if isinstance(written, list):
         return [value if isinstance(value, str) else shown(value) for value in written]
     return written if "from" in written else [toml_value(written)]
-
-
-def _literal(found: Rows) -> Rows:
-    """A table with its cells escaped for Markdown."""
-    return Rows(found.heads, [list(map(literal, row)) for row in found.rows])

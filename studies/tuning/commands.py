@@ -50,7 +50,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if out is not None and not audit:
             refuse_existing(out, TUNINGS, resume)
         start(cpu_only=workers.are_named)
-        from studies.tuning.run import REPORT, run_tuning
+        from studies.publish import REPORT, announce
+        from studies.tuning.run import run_tuning
         from studies.tuning.spec import load_tuning
         from studies.tuning.workers import evaluator_for
 
@@ -71,7 +72,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         with evaluator_for(asked, workers, tell) as evaluator:
             run_tuning(asked, out, resume, console, quiet, evaluator)
-        console.print(f"report: {out / REPORT}; tuned studies in the same folder", soft_wrap=True)
+        announce(console, out / REPORT, "; tuned studies in the same folder")
 
 
 def _audit(spec: TuneSpec, console: Console) -> None:

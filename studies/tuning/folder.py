@@ -13,8 +13,8 @@ import numpy as np
 
 from studies.engine.folder import TUNING, TUNINGS, locked_folder, refuse_existing
 from studies.errors import StudyError
+from studies.publish import check_target, replacing
 from studies.reading import read_json, read_npz
-from studies.store import check_target, replacing
 from studies.tuning.optimise import Progress
 
 MANIFEST, PROGRESS, RESULTS = TUNING, "progress.npz", "tune.h5"

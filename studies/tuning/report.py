@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.engine.poles import HEADER, difference, pole_rows
-from studies.show.markdown import literal
+from studies.show.pages import page
 from studies.show.sketch import CAPTION
-from studies.show.templates import render
 from studies.show.units import count_text, headed, number, readable, settling_text
 from studies.study.entries import parse_entries
 from studies.study.margin import MARGIN_MODES, caution, margin_in_db, margin_text
+from studies.study.template import study_template, toml_text
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
 from studies.tuning.check import JudgedDesign, Searched, patch_centers
 from studies.tuning.free import PLACEMENT
@@ -53,61 +55,24 @@ class TuneFindings(NamedTuple):
     references: References = References(None, None, None, None)  # what designs have to beat
 
 
-class Gain(NamedTuple):
-    """A figure of the design to recommend, beside the baseline's."""
-
-    figure: str
-    change: str  # relative, "" if not known
-    after: str
-    before: str  # with the unit
-    is_worse: bool  # by more than `ALIKE`
-
-
-class BestFamily(NamedTuple):
-    """The design to recommend."""
-
-    family: str
-    file: str  # of its study
-    gains: list[Gain]  # what is worse comes last
-    objective: np.ndarray  # on the fresh machines
-    caution: str  # warning about its gain margin, "" if there is none
-    is_violated: bool  # a limit
-
-
-class Limit(NamedTuple):
-    """How well the best design of a family keeps a limit."""
-
-    name: str
-    value: float | str  # as the tuning file gives it
-    state: str  # violated, kept, active or inactive
-    left: float | None  # share of the limit, negative where violated; None if not known
-
-
-class Fidelity(NamedTuple):
-    """Residual vibration of the linearised loop over that of the run."""
-
-    designs: int
-    low: float  # 90 % of the ratios lie from here
-    median: float
-    high: float  # to here
-    case: str  # ranked, or why the order of designs is meaningless: few, alike
-    spread: float  # of the runs' residual vibration, as a share of the least
-    rank: float  # coefficient of correlation
-
-
-def report(spec: TuneSpec, found: TuneFindings, folder: str = "") -> str:
-    """Markdown text.
+def report(
+    spec: TuneSpec, found: TuneFindings, folder: str = "", images: Path | None = None
+) -> str:
+    """The page of a tuning.
 
     Args:
         spec: of the tuning.
         found: what it found.
         folder: that holds the tuned studies, for commands.
+        images: folder with the figures; None: a page without.
     """
     at, seen = found.at, found.searched
     worst = max(found.audited, key=lambda entry: entry.share)
     names = list(found.own.metrics)
-    return render(
-        "tuning/report.md",
+    return page(
+        "tuning/report.html",
+        images,
+        {"Tuning file": toml_text(spec.data), "Study file": study_template(spec.study)},
         spec=spec,
         tune=spec.tune,
         found=found,
@@ -127,7 +92,7 @@ def report(spec: TuneSpec, found: TuneFindings, folder: str = "") -> str:
         changes=_changes(spec, found, names),
         limits=_limits(spec, found),
         front=spec.tune.pareto.get("limit", spec.metric_limits[0]) if spec.metric_limits else "",
-        families=[literal(family.name) for family in spec.moving],
+        families=[family.name for family in spec.moving],
         numbers=_numbers(spec, found),
         alike=ALIKE,
         pole_header=HEADER,
@@ -161,7 +126,8 @@ def ended(spec: TuneSpec, at: Progress) -> str:
     return f"Ended after all {asked} iterations ({spec.tune.method})."
 
 
-def _best(spec: TuneSpec, found: TuneFindings) -> BestFamily:
+def _best(spec: TuneSpec, found: TuneFindings) -> dict[str, Any]:
+    """The design to recommend, and its figures beside the baseline's, the worse ones last."""
     k = best_family(spec, found)
     one, own, family = found.judged[k], found.own, spec.families[k]
     gains = [
@@ -169,53 +135,55 @@ def _best(spec: TuneSpec, found: TuneFindings) -> BestFamily:
     ]
     if one.loop is not None and own.loop is not None:
         gains += _loop_gains(one.loop, own.loop)
-    return BestFamily(
-        family=family.name,
-        file=file_name(spec, family),
-        gains=sorted(gains, key=lambda gain: gain.is_worse),
-        objective=one.objective,
-        caution=caution(one.loop.gain_margin) if one.loop is not None else "",
-        is_violated=found.at.beyond(found.at.winner(k)) > 0,
-    )
+    return {
+        "family": family.name,
+        "file": file_name(spec, family),
+        "gains": sorted(gains, key=lambda gain: gain["is_worse"]),
+        "objective": one.objective,
+        "caution": caution(one.loop.gain_margin) if one.loop is not None else "",
+        "is_violated": found.at.beyond(found.at.winner(k)) > 0,
+    }
 
 
-def _metric_gain(metric: str, one: JudgedDesign, own: JudgedDesign) -> Gain:
+def _metric_gain(metric: str, one: JudgedDesign, own: JudgedDesign) -> dict[str, Any]:
     """A metric, of which less is better."""
     after, before = (float(x.own.metrics[metric]) for x in (one, own))
     texts = [_value(metric, x.own.metrics, x.own.watched) for x in (one, own)]
     unit = readable(METRICS[parse_entries(metric).metric].unit)[1]
     change = "" if any(text.startswith("not") for text in texts) else _relative(before, after)
     with_unit = texts[1] if unit == "1" else f"{texts[1]} {unit}"
-    return Gain(
-        figure=metric,
-        change=change,
-        after=texts[0],
-        before=with_unit,
-        is_worse=after > (1 + ALIKE) * before,
-    )
+    is_worse = after > (1 + ALIKE) * before
+    return _gain(metric, change, texts[0], with_unit, is_worse)
 
 
-def _loop_gains(one: DesignFigures, own: DesignFigures) -> list[Gain]:
+def _gain(figure: str, change: str, after: str, before: str, is_worse: bool) -> dict[str, Any]:
+    """A figure beside the baseline's, with its unit there.
+
+    Args:
+        figure: its name.
+        change: relative, "" if not known.
+        after: of the design.
+        before: of the baseline.
+        is_worse: by more than `ALIKE`.
+    """
+    return {
+        "figure": figure,
+        "change": change,
+        "after": after,
+        "before": before,
+        "is_worse": is_worse,
+    }
+
+
+def _loop_gains(one: DesignFigures, own: DesignFigures) -> list[dict[str, Any]]:
     """Figures of the linearised loop, of which more is better."""
     margins = [x.gain_margin for x in (one, own)]
     decays = [x.slowest_decay for x in (one, own)]
     lost = [after < (1 - ALIKE) * before for after, before in (margins, decays)]
     change = _relative(decays[1], decays[0])
     return [
-        Gain(
-            figure="gain margin",
-            change="",
-            after=margin_in_db(margins[0], 3),
-            before=margin_in_db(margins[1], 3),
-            is_worse=lost[0],
-        ),
-        Gain(
-            figure="slowest decay",
-            change=change,
-            after=f"{decays[0]:.3g}",
-            before=f"{decays[1]:.3g} 1/s",
-            is_worse=lost[1],
-        ),
+        _gain("gain margin", "", margin_in_db(margins[0], 3), margin_in_db(margins[1], 3), lost[0]),
+        _gain("slowest decay", change, f"{decays[0]:.3g}", f"{decays[1]:.3g} 1/s", lost[1]),
     ]
 
 
@@ -266,8 +234,8 @@ def _unmeasured(spec: TuneSpec, found: TuneFindings) -> list[str]:
 
 
 def _designs(spec: TuneSpec, found: TuneFindings) -> list[tuple[str, JudgedDesign]]:
-    """The baseline, the best design of every family, what they have to beat; by Markdown names."""
-    names = [literal(family.name) for family in spec.families]
+    """The baseline, the best design of every family, what they have to beat; by name."""
+    names = [family.name for family in spec.families]
     compared = found.references.designs
     return [(REFERENCE, found.own), *zip(names, found.judged, strict=True), *compared]
 
@@ -292,7 +260,7 @@ def _own_machine(spec: TuneSpec, found: TuneFindings, names: list[str]) -> list[
                 f"{one.loop.slowest_decay:.4g}",
                 f"{one.loop.spillover:.4g}",
             ]
-        file = f"`{files[k]}`" if k < len(files) else "-"
+        file = Markup("<code>{}</code>").format(files[k]) if k < len(files) else "-"
         end = status.REASONS[one.own.status]
         rows.append([name, file, f"{one.own.objective:.4f}", *cells, *loop, end])
     return rows
@@ -322,7 +290,7 @@ def _changes(spec: TuneSpec, found: TuneFindings, names: list[str]) -> list[list
             changes += [
                 _change(own.metrics[x][part].mean(), one.metrics[x][part].mean()) for x in names
             ]
-            rows.append([name, literal(move_label(move)) or "-", *changes])
+            rows.append([name, move_label(move) or "-", *changes])
     return rows
 
 
@@ -330,19 +298,25 @@ def _change(before: float, after: float) -> str:
     return f"{100 * (after / before - 1):+.1f} %" if before else f"{after:.3g} (was 0)"
 
 
-def _limits(spec: TuneSpec, found: TuneFindings) -> list[tuple[str, list[Limit]]]:
+def _limits(spec: TuneSpec, found: TuneFindings) -> list[tuple[str, list[dict[str, Any]]]]:
     """Limits of each family on the scenarios of the tuning."""
-    told = []
+    by_family = []
     for k, family in enumerate(spec.moving):
         excesses = found.at.best_limits[found.at.winner(k)]
         limits = []
         for name, beyond in zip(spec.limit_names, excesses, strict=True):
             limit = family.limits[name]
             left = _loop_margin(found, k, name, limit) if name in LOOP_LIMITS else -float(beyond)
-            known = left if np.isfinite(left) else None
-            limits.append(Limit(name, limit, _state(float(beyond), left), known))
-        told.append((family.name, limits))
-    return told if spec.limit_names else []
+            limits.append(
+                {
+                    "name": name,
+                    "value": limit,
+                    "state": _state(float(beyond), left),
+                    "left": left if np.isfinite(left) else None,  # a share, negative if violated
+                }
+            )
+        by_family.append((family.name, limits))
+    return by_family if spec.limit_names else []
 
 
 def _loop_margin(found: TuneFindings, k: int, name: str, limit: float | str) -> float:
@@ -390,7 +364,7 @@ def _centers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
     designs = [(REFERENCE, spec.moving[0]._replace(columns={}), unmoved)]
     for k, family in enumerate(spec.moving):
         place = at.best_place[at.winner(k)]
-        designs.append((literal(family.name), family, spec.free.values(place)))
+        designs.append((family.name, family, spec.free.values(place)))
     rows = []
     for name, family, values in designs:
         centers = 1e3 * patch_centers(spec, family, values)
@@ -412,7 +386,7 @@ def is_kept(spec: TuneSpec, seen: Searched) -> np.ndarray:
     return np.isfinite(seen.objective) & (excess(seen.limits) == 0) & (loop <= KEPT)
 
 
-def _fidelity(spec: TuneSpec, found: TuneFindings) -> Fidelity | None:
+def _fidelity(spec: TuneSpec, found: TuneFindings) -> dict[str, Any] | None:
     """Linear residual vibration compared with that of runs; None if there are too few."""
     kept = excess(found.at.best_limits) == 0
     linear, residual = found.linear[kept], found.residual[kept]
@@ -427,15 +401,15 @@ def _fidelity(spec: TuneSpec, found: TuneFindings) -> Fidelity | None:
     spread = float(b.max() / b.min() - 1)
     case = "few" if len(b) < FEW else "alike" if spread < NARROW else "ranked"
     low, median, high = np.percentile(a / b, [5, 50, 95])
-    return Fidelity(
-        designs=len(b),
-        low=low,
-        median=median,
-        high=high,
-        case=case,
-        spread=spread,
-        rank=rank_correlation(a, b),
-    )
+    return {
+        "designs": len(b),
+        "low": low,
+        "median": median,
+        "high": high,
+        "case": case,  # ranked, or why the order of designs is meaningless
+        "spread": spread,
+        "rank": rank_correlation(a, b),
+    }
 
 
 def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:

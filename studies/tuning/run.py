@@ -1,6 +1,6 @@
 """A tuning in its folder: `tune.json` (the request), `progress.npz` (progress), `tune.h5` (every
 start), `study.toml` (the reference), `tuned.toml` (the study with the best numbers, one file per
-family), the report (`report.md`, `report.html`) and its figures.
+family), the report (`report.html`) and its figures.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from studies.engine.folder import make_manifest
 from studies.engine.progress import Phases, duration_text
 from studies.engine.run_data import run_attributes
 from studies.errors import StudyError
+from studies.publish import REPORT, publish
 from studies.show.figures import save, styled, write_figure
-from studies.show.pages import write_report
 from studies.show.sketch import sketch
-from studies.store import replacing, write_store
-from studies.study.template import study_template, toml_text
+from studies.store import write_store
+from studies.study.template import study_template
 from studies.tuning import plots
 from studies.tuning.audit import audit
 from studies.tuning.check import search, tuned_study
@@ -41,8 +41,6 @@ from studies.tuning.report import (
 )
 from studies.tuning.results import variables
 from studies.tuning.spec import TuneSpec
-
-REPORT = "report.html"
 
 #: Modules that determine the numbers of a tuning, with everything they import.
 DECISIVE = ("studies.tuning.check", "studies.tuning.evaluate", "studies.tuning.optimise")
@@ -229,17 +227,17 @@ def _write(spec: TuneSpec, found: TuneFindings, out: Path) -> None:
         tuned = tuned_study(spec, family, values)
         title = f"{spec.study.title or 'study'}, tuned: {family.name}"
         studies[file_name(spec, family)] = tuned.model_copy(update={"title": title})
-    for name, study in studies.items():
-        with replacing(out / name) as temporary:
-            temporary.write_text(study_template(study), encoding="utf-8")
     attributes = run_attributes(spec.study) | {"tuning": json.dumps(spec.data)}
-    write_store(out / RESULTS, variables(spec, found), attributes)
     best = spec.moving[best_family(spec, found)]
-    with styled():
-        write_figure(sketch(studies[file_name(spec, best)]), out / "machine.png")
-    save(plots.descent(spec, found), out, "descent")
-    save(plots.gains(spec, found), out, "gains")
-    for limit in spec.metric_limits[:1]:
-        save(plots.front(spec, found, spec.tune.pareto.get("limit", limit)), out, "front")
-    files = {"Tuning file": toml_text(spec.data), "Study file": study_template(spec.study)}
-    write_report(out, report(spec, found, str(out)), files)
+    with publish(out) as staging:
+        for name, study in studies.items():
+            (staging / name).write_text(study_template(study), encoding="utf-8")
+        write_store(staging / RESULTS, variables(spec, found), attributes)
+        with styled():
+            write_figure(sketch(studies[file_name(spec, best)]), staging / "machine.png")
+        save(plots.descent(spec, found), staging, "descent")
+        save(plots.gains(spec, found), staging, "gains")
+        for limit in spec.metric_limits[:1]:
+            front = plots.front(spec, found, spec.tune.pareto.get("limit", limit))
+            save(front, staging, "front")
+        (staging / REPORT).write_text(report(spec, found, str(out), staging), encoding="utf-8")

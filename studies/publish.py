@@ -1,0 +1,123 @@
+"""Publishing results: files appear in their folder when all of them are whole, or not at all."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+
+from studies.errors import StudyError
+
+#: Of every command that writes a folder.
+REPORT = "report.html"
+#: Name prefix of the folders in which files are prepared.
+_STAGED = ".unfinished-"
+
+
+def check_folder(out: str | Path) -> None:
+    """Raise StudyError if `out` cannot be a folder with files; call it before long work."""
+    out = Path(out)
+    there = Path(os.path.abspath(out))
+    while not os.path.lexists(there):
+        there = there.parent
+    if not there.is_dir():
+        raise StudyError(f"--out {out}: {there} is not a folder; name another one")
+    most = os.pathconf(there, "PC_NAME_MAX")
+    longest = max((len(os.fsencode(part)) for part in out.parts), default=0)
+    if longest > most:
+        raise StudyError(f"--out: a name of {longest} bytes; allowed: {most} at most")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise StudyError(f"--out {out}: no permission to write in {there}")
+
+
+def check_target(path: str | Path) -> None:
+    """Raise StudyError unless a file can be written at `path`; call it before long work."""
+    target = Path(os.path.realpath(path))
+    folder = target.parent
+    if not folder.is_dir():
+        raise StudyError(f"{path}: cannot write there, {folder} is not a folder; create it first")
+    try:
+        is_there = target.exists()
+    except OSError as error:  # a name that is too long
+        raise StudyError(f"{path}: cannot write there ({error.strerror})") from None
+    if is_there and not target.is_file():
+        raise StudyError(f"{path}: cannot write there, it is a folder or a device; name a file")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise StudyError(f"{path}: cannot write there, no permission for the folder {folder}")
+    if target.exists() and not os.access(target, os.W_OK):
+        raise StudyError(f"{path}: cannot write there, the file is write-protected")
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path that becomes `path` on success, and is removed on any failure.
+
+    Write errors are raised as StudyError.
+    """
+    check_target(path)
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        yield temporary
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, target)
+    except OSError as error:
+        raise StudyError(f"{path}: cannot write it ({error.strerror or error})") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def publish(out: str | Path, stale: Iterable[str] = ()) -> Iterator[Path]:
+    """Yield a folder whose files move to `out` at the end; on a failure, none does.
+
+    The folder is prepared inside `out`, which is created if missing. Files of the same names are
+    replaced, others are left alone. What a killed process left unfinished is removed.
+
+    Args:
+        out: where the files appear.
+        stale: names of files of an earlier result, removed unless they are written again.
+
+    Raises:
+        StudyError: the folder cannot be written to, or a file cannot be moved there.
+    """
+    out = Path(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for left in out.glob(f"{_STAGED}*"):
+            if not _is_alive(left.name.removeprefix(_STAGED).partition("-")[0]):
+                shutil.rmtree(left, ignore_errors=True)
+        with tempfile.TemporaryDirectory(dir=out, prefix=f"{_STAGED}{os.getpid()}-") as folder:
+            yield Path(folder)
+            names = sorted(os.listdir(folder))
+            for name in names:
+                check_target(out / name)
+            for name in names:
+                os.replace(Path(folder) / name, os.path.realpath(out / name))
+        for name in set(stale) - set(names):
+            (out / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise StudyError(f"--out {out}: cannot write there ({error})") from error
+
+
+def announce(console: Console, report: Path, more: str = "") -> None:
+    """Print where a report is, and what else there is."""
+    console.print(f"report: {report}{more}", soft_wrap=True)
+
+
+def _is_alive(process: str) -> bool:
+    """Whether a process of that number runs on this machine."""
+    try:
+        os.kill(int(process), 0)
+    except PermissionError:
+        return True
+    except (ValueError, OSError, OverflowError):
+        return False
+    return True
