@@ -107,6 +107,8 @@ def test_import_sets_nothing_and_configure_does(tmp_path):
         "import studies.config as config\n"
         "untouched = [os.environ['XLA_FLAGS'], jax.config.jax_enable_x64,\n"
         "             jax.config.jax_compilation_cache_dir, config.is_backend_started()]\n"
+        "try:\n    config.require_configured()\n"
+        "except config.StudyError as error:\n    untouched.append(str(error)[:40])\n"
         "config.configure('float32', devices=3)\n"
         "config.configure('float32', devices=3)\n"
         "started = config.is_backend_started()\n"
@@ -119,7 +121,9 @@ def test_import_sets_nothing_and_configure_does(tmp_path):
         JAX_COMPILATION_CACHE_DIR="",
     )
     untouched, started, flags, facts = seen
+    *untouched, refusal = untouched
     assert untouched == [f"--xla_cpu_prefer_vector_width=256 {DEVICE_FLAG}=2", False, "", False]
+    assert refusal == "studies.configure() must be called first"
     assert started is False
     width, *others = COMPILER_FLAGS
     added = [f"{name}={COMPILER_FLAGS[name]}" for name in others]

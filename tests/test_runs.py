@@ -1,14 +1,12 @@
 """A single run: steps it needs, how it ends, statuses that must not read ok, ratios of its own."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
 from jaxmodel import status
 from jaxmodel.parameters import HOME
 from jaxmodel.simulate import _share_on
+from studies import config
 from studies.engine.preflight import check_run
 from studies.engine.runs import _simulate, run_study
 from studies.errors import StudyError
@@ -167,8 +165,7 @@ def test_forces_along_the_links_are_those_of_the_rigid_motion():
     assert 0.1e-6 < metrics.stretch_error_peak[:2].max() < 2 * highest * 0.2 / 1.4e6
 
 
-def test_configure_comes_first():
-    code = "from studies.study.spec import paper_study; from studies.engine.runs import run_study\n"
-    code += "run_study(paper_study())"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 1 and "studies.configure() must be called first" in done.stderr
+def test_configure_comes_first(monkeypatch):
+    monkeypatch.setattr(config, "_is_configured", False)  # as after an import: see test_config
+    with pytest.raises(StudyError, match=r"studies\.configure\(\) must be called first"):
+        run_study(short_study())
