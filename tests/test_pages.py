@@ -43,7 +43,7 @@ REPORT = """{% extends "show/page.html" %}
 
 
 @pytest.fixture
-def made(tmp_path, monkeypatch):
+def fill_report(tmp_path, monkeypatch):
     """Function that fills in REPORT."""
     loader = ChoiceLoader([DictLoader({"report.html": REPORT}), pages._environment().loader])
     monkeypatch.setattr(pages._environment(), "loader", loader)
@@ -64,8 +64,8 @@ def png(width=400):
     return image.getvalue()
 
 
-def test_a_template_becomes_a_whole_page(made):
-    html = made(
+def test_a_template_becomes_a_whole_page(fill_report):
+    html = fill_report(
         f"{TITLE}: study",
         "E = ω²q² in <b>µm</b>, 5 %",
         ("", "x [µm]"),
@@ -127,9 +127,9 @@ def test_small_text_in_a_figure_is_found():
     assert 40 * 16 / WIDTH * 6 / 72 < READABLE < 40 * 16 / WIDTH * SMALL / 72
 
 
-def test_a_figure_without_its_image_is_a_fault_of_the_program(made):
+def test_a_figure_without_its_image_is_a_fault_of_the_program(fill_report):
     with pytest.raises(ValueError, match="'none.png'"):
-        made(file="none.png")
+        fill_report(file="none.png")
 
 
 @pytest.mark.parametrize(
@@ -156,8 +156,8 @@ def test_a_figure_without_its_image_is_a_fault_of_the_program(made):
         "&lt;",
     ],
 )
-def test_texts_of_users_are_shown_as_they_are(made, text):
-    html = made(text, text, [text], [[text]])
+def test_texts_of_users_are_shown_as_they_are(fill_report, text):
+    html = fill_report(text, text, [text], [[text]])
     found = parsed(html)
     assert found.title == text and found.text.count(text) == 7  # twice in the heading and its link
     assert text_of(html).splitlines()[:3] == [f"# {text}", "", text]
@@ -168,8 +168,8 @@ def test_texts_of_users_are_shown_as_they_are(made, text):
     }
 
 
-def test_control_characters_are_shown_as_escapes(made):
-    assert "a\\x1bb" in parsed(made("a\x1bb")).text
+def test_control_characters_are_shown_as_escapes(fill_report):
+    assert "a\\x1bb" in parsed(fill_report("a\x1bb")).text
 
 
 HEAD = '<!DOCTYPE html>\n<html lang="en"><body><h1>a</h1>'
@@ -207,20 +207,20 @@ def test_toml_is_read_back():
 
 
 @pytest.mark.parametrize("width", [1280, 600])
-def test_a_wide_report_fits_a_browsers_window(made, tmp_path, width):
+def test_a_wide_report_fits_a_browsers_window(fill_report, tmp_path, width):
     heads = [f"column {k}" for k in range(30)]
     files = {"Study file": "x = " + "1" * 500}
-    html = made("b" * 200, "a" * 300, heads, [["123456789"] * 30], "a.png", png(3000), files)
+    html = fill_report("b" * 200, "a" * 300, heads, [["123456789"] * 30], "a.png", png(3000), files)
     assert rendered(html, tmp_path, width) == (1, 0, 0, 1)
 
 
 @pytest.mark.parametrize(("width", "cut"), [(1280, 0), (600, 1)])
-def test_a_table_of_a_sweep_is_seen_whole_on_a_wide_screen(made, tmp_path, width, cut):
+def test_a_table_of_a_sweep_is_seen_whole_on_a_wide_screen(fill_report, tmp_path, width, cut):
     """Long names of columns break at their joints; a narrow screen scrolls and says so."""
     names = ["control.velocity_gain[0]", "electronics.lowpass_ratio[2]", "link.stiffness_factor"]
     metrics = ["residual_rms [µm]", "peak_voltage [V]", "damping_ratio[controlled_mode=1]"]
     heads = ["case", "id", *names, *(f"{x}[1]" for x in names), *metrics, "gain_margin"]
-    html = made(heads=heads, rows=[["1", "efac70d3", *["0.1234"] * 10]])
+    html = fill_report(heads=heads, rows=[["1", "efac70d3", *["0.1234"] * 10]])
     assert rendered(html, tmp_path, width) == (0, 0, 0, cut)
     assert ".table:has(th:nth-child(4))::before" in html and "scroll sideways" in html
 
