@@ -63,6 +63,12 @@ def new_figure(
     return figure, axes
 
 
+def one_panel(height: float) -> tuple[Figure, Axes]:
+    """Figure of the printed page's width with one pair of axes; height in inches."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    return figure, figure.subplots()
+
+
 def legend_above(figure: Figure, *axes: Axes) -> None:
     """One legend for the whole figure, with the entries of these axes."""
     entries = [ax.get_legend_handles_labels() for ax in axes]

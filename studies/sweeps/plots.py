@@ -77,8 +77,7 @@ def plot(sweep: SweepData | str | Path, x: str | None, y: str, hue: str | None =
     group = None if hue is None else shown_metric(data, hue)[chosen]
     shown = shown_metric(data, y)[chosen]
     with figures.styled():
-        figure = Figure(figsize=(figures.WIDTH, 4.2), layout="constrained")
-        ax = figure.subplots()
+        figure, ax = figures.one_panel(4.2)
         _say_left_out(figure, data, chosen)
         ax.set_xlabel(label(data, x))
         if group is not None and _is_grid(across, group):
@@ -109,8 +108,7 @@ def front(data: SweepData, y: str) -> Figure:
     chosen = np.flatnonzero((data["status"] == status.OK) & np.isfinite(metric_values(data, y)))
     margin, value = data[MARGIN][chosen], shown_metric(data, y)[chosen]
     with figures.styled():
-        figure = Figure(figsize=(figures.WIDTH, 4.2), layout="constrained")
-        ax = figure.subplots()
+        figure, ax = figures.one_panel(4.2)
         color: Any = figures.SERIES[0]
         if VOLTAGE in data.variables:
             color = metric_values(data, VOLTAGE)[chosen]
@@ -379,8 +377,7 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
     rank = np.argsort(np.argsort(value)) / max(len(value) - 1, 1)
     lines = []
     with figures.styled():
-        figure = Figure(figsize=(figures.WIDTH, 4.2), layout="constrained")
-        ax = figure.subplots()
+        figure, ax = figures.one_panel(4.2)
         for k, name in enumerate([*names, y]):
             column = value if k == len(names) else data[name][chosen]
             if column.dtype.kind in "UO":

@@ -147,8 +147,7 @@ def draw_screen(data: SweepData) -> Figure:
     if not is_fine.any():
         raise StudyError("no case of status ok to draw")
     with figures.styled():
-        figure = Figure(figsize=(figures.WIDTH, 4.2), layout="constrained")
-        axes = figure.subplots()
+        figure, axes = figures.one_panel(4.2)
         for rows, name, colour in groups:
             rows = rows[is_fine[rows]]
             axes.plot(linear[rows], value[rows], ".", ms=3, color=colour, label=name)

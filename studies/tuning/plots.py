@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -21,8 +20,7 @@ OBJECTIVE = "objective (baseline: 1)"
 def descent(spec: TuneSpec, found: TuneFindings) -> Figure:
     """Best objective that keeps the limits, over iterations, by family; thin: every start."""
     with figures.styled():
-        figure = Figure(figsize=(figures.WIDTH, 3.6), layout="constrained")
-        ax: Axes = figure.subplots()
+        figure, ax = figures.one_panel(3.6)
         history = found.at.history[: int(found.at.iteration)]
         best = np.fmin.accumulate(np.where(history[..., 1] <= KEPT, history[..., 0], np.nan))
         iteration = np.arange(1, len(best) + 1)
@@ -86,8 +84,7 @@ def front(spec: TuneSpec, found: TuneFindings, limit: str) -> Figure:
         limit: metric along the abscissa, one of `spec.metric_limits`.
     """
     with figures.styled():
-        figure = Figure(figsize=(figures.WIDTH, 4.2), layout="constrained")
-        ax: Axes = figure.subplots()
+        figure, ax = figures.one_panel(4.2)
         column = spec.metric_limits.index(limit)
         if found.searched is not None:
             seen, kept = found.searched, is_kept(spec, found.searched)
