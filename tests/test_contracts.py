@@ -397,7 +397,7 @@ def test_every_source_of_a_number_is_in_the_digest(tmp_path):
         ("studies/study/consistency.py", sweeps),
         ("studies/kernels/derivatives.py", sweeps),
         ("studies/engine/function.py", workers),
-        ("studies/tuning/merit.py", workers),
+        ("studies/tuning/objective.py", workers),
     ):
         path = tmp_path / name
         text = path.read_bytes()

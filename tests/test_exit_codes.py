@@ -254,7 +254,7 @@ def test_an_audit_finds_a_falsified_derivative(monkeypatch, error):
             limit_slope=none[:, :, None],
         )
 
-    monkeypatch.setattr(audit_module, "_evaluated", evaluated)
+    monkeypatch.setattr(audit_module, "_evaluate", evaluated)
     monkeypatch.setattr(audit_module, "Evaluator", lambda spec, families: None)
     (one,) = audit(spec, np.array([[0.3], [0.6]]))
     assert one.share == pytest.approx(error / (1 + error), abs=1e-8)

@@ -229,7 +229,7 @@ class Known:
         self._function = jax.jit(jax.vmap(jax.value_and_grad(function)))
         self._limits = limits or (lambda x: np.zeros(0))
 
-    def evaluate(self, values, has_slope=True):
+    def evaluate(self, values, needs_gradient=True):
         objective, slope = map(np.asarray, self._function(values))
         limits = np.array([self._limits(x) for x in values])
         each = [jax.jacfwd(self._limits)(x) for x in values] if limits.size else None
@@ -342,7 +342,7 @@ def test_designs_are_handed_on_along_a_front():
     evaluator = Known(spec, lambda v: 2 + jax.numpy.cos(14 * v[0]) - v[0])  # a valley each
     plain = evaluator.evaluate
 
-    def evaluate(values, has_slope=True):
+    def evaluate(values, needs_gradient=True):
         found = plain(values)
         allowed = np.array([0.4, 0.4, 0.9, 0.9])[:, None]
         slope = np.broadcast_to(1 / allowed[..., None], (4, 1, 1))

@@ -26,7 +26,7 @@ from studies.tuning.check import JudgedDesign, OwnRun
 from studies.tuning.evaluate import Evaluation, Evaluator
 from studies.tuning.folder import open_tuning
 from studies.tuning.linear_fidelity import DesignFigures
-from studies.tuning.merit import merit_of
+from studies.tuning.objective import objective_of
 from studies.tuning.optimise import begin, fits
 from studies.tuning.report import TuneFindings, report
 from studies.tuning.run import run_tuning
@@ -361,7 +361,7 @@ def test_own_limits_need_something_to_be_a_share_of():
             },
         }
     )
-    checked = SimpleNamespace(spec=spec, families=list(spec.families), merit=merit_of(spec))
+    checked = SimpleNamespace(spec=spec, families=list(spec.families), goal=objective_of(spec))
     metrics = SimpleNamespace(residual_rms=np.ones((1, 3, 3)), peak_voltage=np.zeros((1, 3)))
     with pytest.raises(StudyError, match="peak_voltage = 'baseline': the baseline has 0"):
         Evaluator._check_own(checked, np.array([0]), metrics)
@@ -380,7 +380,7 @@ def test_neighbours_of_a_corner_do_not_fail_an_audit(monkeypatch):
         )
 
     for sign, is_fine in ((1.0, True), (0.9, False), (-1.0, False)):
-        monkeypatch.setattr(audit_module, "_evaluated", partial(designs, sign=sign))
+        monkeypatch.setattr(audit_module, "_evaluate", partial(designs, sign=sign))
         monkeypatch.setattr(audit_module, "Evaluator", lambda spec, families: None)
         (one,) = audit_module.audit(spec, np.array([[own]]))
         assert (one.share < audit_module.ALLOWED) == is_fine

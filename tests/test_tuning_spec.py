@@ -12,7 +12,7 @@ from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.numbers import one_study
 from studies.study.paths import set_value
 from studies.study.spec import parse_study
-from studies.tuning.merit import tail_weights
+from studies.tuning.objective import tail_weights
 from studies.tuning.scenarios import lane_columns, scenario_columns
 from studies.tuning.spec import load_tuning, parse_tuning
 from tests.tunings import EVERY_KIND, GAIN, SMALL, tuning

@@ -1,7 +1,7 @@
 """Tuning by gradient: minimise an objective over free parameters of a study.
 
 - Problem: `spec` reads the file, `free` puts free parameters into cases, `scenarios` makes the
-  machines and moves, `merit` rates a design.
+  machines and moves, `objective` rates a design.
 - Descent: `evaluate` runs designs and differentiates them, `linear_fidelity` does the same for
   the linearised loop, `descent` steps (L-BFGS, Adam), `optimise` drives all starts.
 - Results: `check` runs them on fresh machines with the real converters, `audit` compares

@@ -66,7 +66,7 @@ def audit(spec: TuneSpec, places: np.ndarray | None = None) -> list[Disagreement
         evaluator = Evaluator(spec, [spec.moving[position]] * len(start_families(spec)))
         own, exact = [], []
         for place in np.clip(places, 3 * STEPS[0], 1 - 3 * STEPS[0]):
-            slopes, differences = _compared(spec, evaluator, position, numbers, place)
+            slopes, differences = _compare(spec, evaluator, position, numbers, place)
             own.append(slopes)
             exact.append(differences)
         a, b = np.array(own), np.array(exact)  # (places, figures, numbers)
@@ -88,16 +88,16 @@ def audit(spec: TuneSpec, places: np.ndarray | None = None) -> list[Disagreement
 def _covering(spec: TuneSpec) -> dict[int, list[int]]:
     """Families by position, with the numbers to check in each, so that all are covered."""
     left = np.any([family.is_free for family in spec.moving], axis=0)
-    found: dict[int, list[int]] = {}
+    checks: dict[int, list[int]] = {}
     while left.any():
         counts = [int((family.is_free & left).sum()) for family in spec.moving]
         best = int(np.argmax(counts))
-        found[best] = [int(k) for k in np.flatnonzero(spec.moving[best].is_free & left)]
+        checks[best] = [int(k) for k in np.flatnonzero(spec.moving[best].is_free & left)]
         left = left & ~spec.moving[best].is_free
-    return found
+    return checks
 
 
-def _compared(
+def _compare(
     spec: TuneSpec, evaluator: Evaluator, position: int, numbers: list[int], place: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """(derivatives by places, differences) of all figures by some numbers, (figures, numbers)."""
@@ -105,28 +105,28 @@ def _compared(
     place = np.where(spec.moving[position].is_free, place, own)
     unit = np.eye(p)[numbers]
     moved = [k * step * unit for step in STEPS for k in (-2, -1, 1, 2)]
-    found = _evaluated(spec, evaluator, place + np.concatenate([np.zeros((1, p)), *moved]))
-    values = np.concatenate([found.objective[:, None], found.limits], axis=1)
-    slopes = np.concatenate([found.slope[:, None], found.limit_slope], axis=1)[0]
+    evaluation = _evaluate(spec, evaluator, place + np.concatenate([np.zeros((1, p)), *moved]))
+    values = np.concatenate([evaluation.objective[:, None], evaluation.limits], axis=1)
+    slopes = np.concatenate([evaluation.slope[:, None], evaluation.limit_slope], axis=1)[0]
     slopes = (slopes * spec.free.slopes(place))[:, numbers]
     differences: list[np.ndarray] = []
     for step, part in zip(STEPS, np.split(values[1:], len(STEPS)), strict=True):
         a, b, c, d = part.reshape(4, len(numbers), -1)
         differences.append(((a - 8 * b + 8 * c - d) / (12 * step)).T)
-    here = values[0]
-    differences.append(((a - 4 * b + 3 * here) / (2 * step)).T)
-    differences.append(((4 * c - d - 3 * here) / (2 * step)).T)
+    center = values[0]
+    differences.append(((a - 4 * b + 3 * center) / (2 * step)).T)
+    differences.append(((4 * c - d - 3 * center) / (2 * step)).T)
     nearest = np.argmin(np.abs(np.array(differences) - slopes), axis=0)
     return slopes, np.take_along_axis(np.array(differences), nearest[None], axis=0)[0]
 
 
-def _evaluated(spec: TuneSpec, evaluator: Evaluator, designs: np.ndarray) -> Evaluation:
+def _evaluate(spec: TuneSpec, evaluator: Evaluator, designs: np.ndarray) -> Evaluation:
     """Designs of one family, batch by batch; derivatives only of the first one."""
     batch, parts = len(evaluator.families), []
     for first in range(0, len(designs), batch):
         rows = np.minimum(np.arange(first, first + batch), len(designs) - 1)
-        found = evaluator.evaluate(spec.free.values(designs[rows]), rows == 0)
-        parts.append(Evaluation(*(x[: len(designs) - first] for x in found)))
+        evaluation = evaluator.evaluate(spec.free.values(designs[rows]), rows == 0)
+        parts.append(Evaluation(*(x[: len(designs) - first] for x in evaluation)))
     return Evaluation(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
 

@@ -25,11 +25,11 @@ from studies.study.spec import Study, parse_study
 from studies.tuning.evaluate import first_residual, tuned_structure
 from studies.tuning.free import PLACEMENT
 from studies.tuning.linear_fidelity import DesignFigures, loop_figures
-from studies.tuning.merit import (
+from studies.tuning.objective import (
     all_judged,
     allowed_limits,
     largest,
-    merit_of,
+    objective_of,
     objectives,
     own_limits,
 )
@@ -62,7 +62,7 @@ class OwnRun(NamedTuple):
     watched: float  # [s]
 
 
-class Searched(NamedTuple):
+class RandomSearch(NamedTuple):
     """Random designs of the family with the most free parameters, on the tuning's scenarios."""
 
     objective: np.ndarray  # nan if a run did not finish, (n,)
@@ -155,7 +155,7 @@ def judge(spec: TuneSpec, designs: list[Study], runs: PlainRuns) -> list[JudgedD
         designs: studies that differ from the tuning's own only in numbers; its own comes first.
         runs: of `shown_structure`.
     """
-    columns, merit, structure = fresh_columns(spec), merit_of(spec), runs.structure
+    columns, goal, structure = fresh_columns(spec), objective_of(spec), runs.structure
     count = len(columns["run.seed"])
     parts = []
     for study in designs:
@@ -171,8 +171,8 @@ def judge(spec: TuneSpec, designs: list[Study], runs: PlainRuns) -> list[JudgedD
     for k, study in enumerate(designs):
         one = jax.tree.map(lambda x, k=k: x[k], metrics)
         codes, watched = by_design.status[k], end - by_design.command_end[k]
-        objective = np.asarray(objectives(merit, one, baseline))
-        values = {name: np.asarray(largest(merit, one, name)) for name in merit.shown}
+        objective = np.asarray(objectives(goal, one, baseline))
+        values = {name: np.asarray(largest(goal, one, name)) for name in goal.shown}
         judged.append(
             JudgedDesign(
                 objective=np.where(np.isin(codes, status.FINISHED), objective, np.nan)[:count],
@@ -212,10 +212,10 @@ def _checked(study: Study, judged: JudgedDesign) -> JudgedDesign:
 
 def shown_structure(spec: TuneSpec) -> Structure:
     """Program of the runs shown in a report."""
-    return tuned_structure(spec)._replace(metrics=merit_of(spec).shown_metrics)
+    return tuned_structure(spec)._replace(metrics=objective_of(spec).shown_metrics)
 
 
-def search(spec: TuneSpec, screen: Any) -> Searched:
+def search(spec: TuneSpec, screen: Any) -> RandomSearch:
     """Run random designs (Sobol points between the bounds) on the scenarios of the tuning.
 
     Args:
@@ -237,12 +237,12 @@ def search(spec: TuneSpec, screen: Any) -> Searched:
     rows = layout.filled(count * (1 + CHUNK))
     numbers = in_working_precision(jax.tree.map(lambda x: x if len(x) == 1 else x[rows], numbers))
     executor = Executor(structure, layout)
-    build, merit = jax.jit(jax.vmap(spec.free.build(structure))), merit_of(spec)
+    build, goal = jax.jit(jax.vmap(spec.free.build(structure))), objective_of(spec)
 
     def split(x: np.ndarray) -> np.ndarray:
         return x[: count * (1 + CHUNK)].reshape((1 + CHUNK, count, *x.shape[1:]))
 
-    found, spent = [], 0.0
+    batches, spent = [], 0.0
     for first in range(0, n, CHUNK):
         part = values[np.minimum(np.arange(first, first + CHUNK), n - 1)]
         part = np.concatenate([np.full((1, part.shape[1]), np.nan), part])
@@ -253,17 +253,17 @@ def search(spec: TuneSpec, screen: Any) -> Searched:
         spent += time.perf_counter() - started
         metrics = jax.tree.map(split, result.metrics)
         own, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
-        allowed = allowed_limits(merit, family, own_limits(merit, own))
-        judgement = all_judged(merit, others, own, allowed)
-        found.append((*map(np.asarray, judgement), first_residual(merit, metrics)[1:]))
-    objective, limits, peaks, residual = (np.concatenate(x)[:n] for x in zip(*found, strict=True))
+        allowed = allowed_limits(goal, family, own_limits(goal, own))
+        judgement = all_judged(goal, others, own, allowed)
+        batches.append((*map(np.asarray, judgement), first_residual(goal, metrics)[1:]))
+    objective, limits, peaks, residual = (np.concatenate(x)[:n] for x in zip(*batches, strict=True))
     spent -= executor.compile_time
     beyond, linear = np.full(n, np.inf), np.full(n, np.nan)
     kept = np.isfinite(objective) & (excess(limits) == 0)
     if kept.any():
         beyond[kept], linear[kept] = screen(values[kept])
     run_time = spent / (-(-n // CHUNK) * count * (1 + CHUNK))
-    return Searched(
+    return RandomSearch(
         objective=objective,
         limits=limits,
         peaks=peaks,

@@ -55,23 +55,23 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.tuning.spec import load_tuning
         from studies.tuning.workers import evaluator_for
 
-        asked = load_tuning(spec)
+        tuning = load_tuning(spec)
         if audit and (out or resume or quiet or workers.are_named):
             raise StudyError(
                 "--audit: writes no files; leave --out, --resume, --quiet and workers out"
             )
         if audit:
-            _audit(asked, console)
+            _audit(tuning, console)
             return
         if out is None:
             raise StudyError("--out: name a folder for the results")
 
-        def tell(text: str) -> None:
+        def notify(text: str) -> None:
             if not quiet:
                 console.print(text, soft_wrap=True)
 
-        with evaluator_for(asked, workers, tell) as evaluator:
-            run_tuning(asked, out, resume, console, quiet, evaluator)
+        with evaluator_for(tuning, workers, notify) as evaluator:
+            run_tuning(tuning, out, resume, console, quiet, evaluator)
         announce(console, out / REPORT, "; tuned studies in the same folder")
 
 
@@ -80,20 +80,20 @@ def _audit(spec: TuneSpec, console: Console) -> None:
 
     console.print(f"comparing derivatives with finite differences at {DESIGNS} designs")
     names = "parameter", "family", "worst for", "at", "derivative", "difference", "disagreement"
-    table, found = Table(*names), audit(spec)
-    for one in found:
+    table, checks = Table(*names), audit(spec)
+    for check in checks:
         table.add_row(
-            one.name,
-            one.family,
-            one.figure,
-            f"{one.place + 1}",
-            f"{one.derivative:.6g}",
-            f"{one.difference:.6g}",
-            f"{one.share:.1e}",
+            check.name,
+            check.family,
+            check.figure,
+            f"{check.place + 1}",
+            f"{check.derivative:.6g}",
+            f"{check.difference:.6g}",
+            f"{check.share:.1e}",
         )
     console.print(table)
     console.print(f"Design 1 is close to the baseline. {MEANING}", soft_wrap=True)
-    worst = max(one.share for one in found)
+    worst = max(check.share for check in checks)
     is_fine = worst <= ALLOWED
     console.print(f"worst: {worst:.1e}, {'below' if is_fine else 'above'} {ALLOWED:g}")
     if not is_fine:

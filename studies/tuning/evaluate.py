@@ -23,12 +23,12 @@ from studies.errors import StudyError
 from studies.study.cases import build_structure, in_working_precision
 from studies.study.numbers import study_numbers
 from studies.tuning.linear_fidelity import LinearFidelity
-from studies.tuning.merit import (
-    Merit,
+from studies.tuning.objective import (
+    Objective,
     allowed_limits,
     judged_designs,
     largest,
-    merit_of,
+    objective_of,
     own_limits,
     size,
 )
@@ -61,7 +61,7 @@ class Evaluator:
             StudyError: as `check_run`; the baseline does not finish a run.
         """
         self.spec, self.families = spec, families
-        self.merit, self.linear = merit_of(spec), LinearFidelity(spec, families)
+        self.goal, self.linear = objective_of(spec), LinearFidelity(spec, families)
         self.is_free = np.stack([family.is_free for family in families])
         self._structure = tuned_structure(spec)._replace(is_smooth=True, has_noise=True)
         columns = scenario_columns(spec, spec.tune.scenarios.count, spec.tune.scenarios.seed)
@@ -80,19 +80,19 @@ class Evaluator:
             self._structure, self._layout, place=spec.free.build(self._structure)
         )
 
-    def evaluate(self, values: np.ndarray, has_slope: np.ndarray | bool = True) -> Evaluation:
+    def evaluate(self, values: np.ndarray, needs_gradient: np.ndarray | bool = True) -> Evaluation:
         """Objective and limits of designs.
 
         Args:
             values: of the free parameters in the study's units, (designs, p); those that a design's
                 family does not move are ignored.
-            has_slope: designs that need derivatives; others can have any, (designs,).
+            needs_gradient: designs that need derivatives; others can have any, (designs,).
         """
         values = np.where(self.is_free, values, np.nan)
         own = np.full((1, values.shape[1]), np.nan)
         is_compiled, started = self._executor.compile_time > 0, time.perf_counter()
         whole = np.concatenate([own, values])[self._rows]
-        needs_slope = (np.isfinite(values) & np.reshape(has_slope, (-1, 1))).any(axis=1)
+        is_differentiated = (np.isfinite(values) & np.reshape(needs_gradient, (-1, 1))).any(axis=1)
         runs = self._executor.differentiate(self._numbers, whole)
         shape = (1 + len(values), self.scenarios)
 
@@ -103,33 +103,35 @@ class Evaluator:
         codes = split(runs.result.status)
         self._check_own(codes[0], jax.tree.map(lambda x: x[0], metrics))
         own_metrics = jax.tree.map(lambda x: x[0], metrics)
-        reached = own_limits(self.merit, own_metrics)
-        allowed = [allowed_limits(self.merit, family, reached) for family in self.families]
+        reached = own_limits(self.goal, own_metrics)
+        allowed = [allowed_limits(self.goal, family, reached) for family in self.families]
         designs = jax.tree.map(lambda x: x[1:], metrics)
-        found = judged_designs(self.merit, designs, own_metrics, np.stack(allowed))
-        found = jax.tree.map(np.asarray, found)
-        slopes = self._slopes(runs, found.cotangents, needs_slope)
+        judged = judged_designs(self.goal, designs, own_metrics, np.stack(allowed))
+        judged = jax.tree.map(np.asarray, judged)
+        slopes = self._slopes(runs, judged.cotangents, is_differentiated)
         if is_compiled:
             self.run_time = (time.perf_counter() - started) / self.lanes
         beyond, change = self.linear.limits(values)
         limit_slope = np.concatenate([slopes[:, 1:], change], axis=1)
         return Evaluation(
-            objective=found.objective,
+            objective=judged.objective,
             slope=np.where(self.is_free, slopes[:, 0], 0.0),
-            limits=np.concatenate([found.limits, beyond], axis=1),
+            limits=np.concatenate([judged.limits, beyond], axis=1),
             limit_slope=np.where(self.is_free[:, None], limit_slope, 0.0),
-            peaks=np.concatenate([found.peaks, np.full(beyond.shape, np.nan)], axis=1),
+            peaks=np.concatenate([judged.peaks, np.full(beyond.shape, np.nan)], axis=1),
             status=codes[1:],
-            residual=first_residual(self.merit, metrics)[1:],
+            residual=first_residual(self.goal, metrics)[1:],
         )
 
-    def _slopes(self, runs: Differentiated, cotangents: Any, has_slope: np.ndarray) -> np.ndarray:
+    def _slopes(
+        self, runs: Differentiated, cotangents: Any, needs_gradient: np.ndarray
+    ) -> np.ndarray:
         """Derivatives of the designs' objectives and limits by the free parameters.
 
         Args:
             runs: all of a batch.
             cotangents: from `judged_designs`.
-            has_slope: designs that need derivatives, (designs,).
+            needs_gradient: designs that need derivatives, (designs,).
 
         Returns:
             (designs, 1 + m, p).
@@ -138,11 +140,11 @@ class Evaluator:
         def of_runs(x: np.ndarray) -> np.ndarray:
             """Zeros for the baseline, the designs' runs, zeros up to the batch's size."""
             count, designs = x.shape[:2]
-            wanted = np.where(has_slope.reshape(-1, *[1] * (x.ndim - 2)), x, 0.0)
-            found = np.zeros((count, len(self._rows), *x.shape[3:]), x.dtype)
+            used = np.where(needs_gradient.reshape(-1, *[1] * (x.ndim - 2)), x, 0.0)
+            padded = np.zeros((count, len(self._rows), *x.shape[3:]), x.dtype)
             begin = self.scenarios
-            found[:, begin : begin + designs * begin] = wanted.reshape(count, -1, *x.shape[3:])
-            return found
+            padded[:, begin : begin + designs * begin] = used.reshape(count, -1, *x.shape[3:])
+            return padded
 
         slopes = runs.pull_back(jax.tree.map(of_runs, cotangents))
         slopes = slopes[:, self.scenarios : self.lanes]
@@ -157,15 +159,17 @@ class Evaluator:
                 f"tune: the baseline does not finish a run in scenario {k}: "
                 f"{status.REASONS[int(codes[k])]}; every design is measured against it"
             )
-        for name, _ in self.merit.objective:
-            if (np.asarray(size(self.merit, metrics, name)) == 0).any():
+        for name, _ in self.goal.terms:
+            if (np.asarray(size(self.goal, metrics, name)) == 0).any():
                 raise StudyError(
                     f"tune.objective: {name} is 0 in a run of the baseline, so nothing can be "
                     "measured against it; limit it instead"
                 )
-        wanted = {name for one in self.families for name, x in one.limits.items() if x == BASELINE}
-        for name in wanted & set(self.merit.limits):
-            if (np.asarray(largest(self.merit, metrics, name)) <= 0).any():
+        relative = {
+            name for family in self.families for name, x in family.limits.items() if x == BASELINE
+        }
+        for name in relative & set(self.goal.limits):
+            if (np.asarray(largest(self.goal, metrics, name)) <= 0).any():
                 raise StudyError(
                     f"tune.limits.{name} = {BASELINE!r}: the baseline has 0 in a run, which "
                     "leaves no room; give a number"
@@ -181,23 +185,23 @@ def _layout(lanes: int) -> Layout:
     return Layout(whole.devices, -(-lanes // (whole.devices * block)), block)
 
 
-def first_residual(merit: Merit, metrics: Any) -> np.ndarray:
+def first_residual(goal: Objective, metrics: Any) -> np.ndarray:
     """Residual rms of the first scenario [m], (designs,); nan if missing.
 
     Root of the mean square of all stations of the links that count.
     """
     if metrics.residual_rms is None:
         return np.full(len(metrics.saturated_fraction), np.nan)
-    return np.sqrt(np.mean(metrics.residual_rms[:, 0, list(merit.links)] ** 2, axis=(1, 2)))
+    return np.sqrt(np.mean(metrics.residual_rms[:, 0, list(goal.links)] ** 2, axis=(1, 2)))
 
 
 def tuned_structure(spec: TuneSpec) -> Structure:
     """Program of all families and scenarios, with everything that can be free."""
-    found = [check_run(nominal(spec, family))[0] for family in (None, *spec.families)]
+    structures = [check_run(nominal(spec, family))[0] for family in (None, *spec.families)]
     return build_structure(spec.study)._replace(
-        metrics=merit_of(spec).metrics,
-        substeps=max(one.substeps for one in found),
-        has_noise=any(one.has_noise for one in found),
+        metrics=objective_of(spec).metrics,
+        substeps=max(x.substeps for x in structures),
+        has_noise=any(x.has_noise for x in structures),
         has_poles=spec.has_poles,
         has_position_gain=spec.has_position_gain,
     )

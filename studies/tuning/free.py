@@ -60,15 +60,15 @@ def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
             parts.append(_placement(bounds, study, path))
         else:
             parts.append(plain_numbers(name, bounds, study, path, (DESIGN,), (PLACEMENT,)))
-    found = join_numbers(parts)
-    check_twice(found.numbers, "tune.free")
-    _check_decided(found.numbers)
+    free = join_numbers(parts)
+    check_twice(free.numbers, "tune.free")
+    _check_decided(free.numbers)
     if study.control.has_poles:
         poles = "damping" if study.control.damping != () else "pole_decay"
-        for number in found.numbers:
+        for number in free.numbers:
             if number.key.startswith(("control.velocity_gain", "control.position_gain")):
                 raise StudyError(f"tune.free.{number.key}: control.{poles} decides the gains")
-    return found
+    return free
 
 
 def _check_decided(numbers: Sequence[Free]) -> None:
@@ -103,12 +103,12 @@ def _placement(bounds: Any, study: Study, path: str) -> tuple[list[Free], Place]
 
 def _shares(gaps: np.ndarray) -> np.ndarray:
     """Numbers for which `_place_patches` leaves these gaps, as shares of the free length."""
-    left, found = 1.0, []
+    left, shares = 1.0, []
     for k, gap in enumerate(gaps):
         kept = np.clip(1 - gap / left, 0.0, 1.0) if left > 0 else 1.0
-        found.append(1 - kept ** (len(gaps) - k))
+        shares.append(1 - kept ** (len(gaps) - k))
         left -= gap
-    return np.array(found)
+    return np.array(shares)
 
 
 def _place_patches(

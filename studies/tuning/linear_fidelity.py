@@ -92,7 +92,7 @@ class LinearFidelity:
         """How far designs exceed the limits of their loop, with derivatives.
 
         Args:
-            values: one design for each family given at the start, (designs, p).
+            values: one design for each family of the constructor, (designs, p).
 
         Returns:
             (x/(1 + |x|) of x = value/limit - 1, positive where violated, (designs, m), its
@@ -100,7 +100,7 @@ class LinearFidelity:
         """
         if not self.names:
             return np.zeros((len(values), 0)), np.zeros((len(values), 0, values.shape[1]))
-        found = _limit_slopes(
+        excess, slopes = _limit_slopes(
             self._plain,
             self.names,
             self._spec.free.place,
@@ -109,13 +109,13 @@ class LinearFidelity:
             self._limits,
             values,
         )
-        return np.asarray(found[0]), np.asarray(found[1])
+        return np.asarray(excess), np.asarray(slopes)
 
     def screen(self, position: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A quick evaluation of designs of one family.
 
         Args:
-            position: index of a design of that family among those given at the start.
+            position: index of a design of that family among those of the constructor.
             values: (n, p), any number of them.
 
         Returns:
@@ -129,8 +129,8 @@ class LinearFidelity:
         # a basis with joints solves an eigenvalue problem
         bases = self._structure.basis, self._structure.controller_basis
         is_alone = any(BASES[name].has_joints for name in bases)
-        look = partial(
-            one_at_a_time(_look) if is_alone else _look,
+        evaluate = partial(
+            one_at_a_time(_screen_batch) if is_alone else _screen_batch,
             self._structure,
             names,
             self._spec.free.place,
@@ -143,8 +143,8 @@ class LinearFidelity:
         rows = np.minimum(np.arange(-(-count // BATCH) * BATCH), count - 1)
         parts = np.split(values[rows], len(rows) // BATCH)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            found = list(pool.map(lambda part: jax.tree.map(np.asarray, look(part)), parts))
-        excess, residual = (np.concatenate(x)[:count] for x in zip(*found, strict=True))
+            results = list(pool.map(lambda part: jax.tree.map(np.asarray, evaluate(part)), parts))
+        excess, residual = (np.concatenate(x)[:count] for x in zip(*results, strict=True))
         worst = excess.max(axis=1)
         return (
             np.where(np.isfinite(worst), worst, np.inf),
@@ -162,9 +162,9 @@ def _excess(
 ) -> Array:
     """x/(1 + |x|) for each limit, (m,): decay rates reach hundreds of their limit on both sides.
 
-    x is value/limit - 1, or -decay/STABLE of the loop with all gains times the wanted margin.
+    x is value/limit - 1, or -decay/STABLE of the loop with all gains times the required margin.
     """
-    period, found = case.electronics.period, []
+    period, excesses = case.electronics.period, []
     for k, name in enumerate(names):
         if name == "spillover":
             x = spillover(structure, case, matrices) / limits[k] - 1
@@ -174,8 +174,8 @@ def _excess(
             factor = limits[k] if name == "gain_margin" else 1.0
             decay = slowest_decay(matrices.open + factor * matrices.feedback, period)
             x = -decay / STABLE if name == "gain_margin" else 1 - decay / limits[k]
-        found.append(x / (1 + jnp.abs(x)))
-    return jnp.stack(found)
+        excesses.append(x / (1 + jnp.abs(x)))
+    return jnp.stack(excesses)
 
 
 def _singularity_distance(structure: Structure, case: Case) -> Array:
@@ -198,18 +198,18 @@ def _limit_slopes(
 ) -> tuple[Array, Array]:
     def figures(x: Array, one: Numbers, limit: Array) -> tuple[Array, Array]:
         placed = case_of(structure, place(one, x))
-        found = _excess(structure, names, placed, closed_loop(structure, placed, pose), limit)
-        return found, found
+        excess = _excess(structure, names, placed, closed_loop(structure, placed, pose), limit)
+        return excess, excess
 
-    def one(given: tuple[Any, ...]) -> tuple[Array, Array]:
-        slope, found = jax.jacrev(figures, has_aux=True)(*given)  # the figures come with it
-        return found, slope
+    def one(design: tuple[Any, ...]) -> tuple[Array, Array]:
+        slope, excess = jax.jacrev(figures, has_aux=True)(*design)  # the figures come with it
+        return excess, slope
 
     return jax.lax.map(one, (values, numbers, limits))
 
 
 @kept_jit(static_argnums=(0, 1, 2, 6))
-def _look(
+def _screen_batch(
     structure: Structure,
     names: tuple[Any, ...],
     place: Any,

@@ -22,7 +22,7 @@ ROUND = 5
 #: A limit counts as kept if exceeded by at most this share.
 KEPT = 1e-3
 #: Sobol points screened for each start, by the linearised loop alone.
-LOOKED_AT = 8
+SCREENED = 8
 #: A tuning ends when no start has improved on its best by this share within this many iterations.
 GAIN, PATIENCE = 1e-3, 12
 #: Initial penalty of the limits; the objective counts as 1.
@@ -85,27 +85,27 @@ def first_places(spec: TuneSpec, evaluator: Evaluator) -> np.ndarray:
         (B, p) between 0 and 1.
     """
     own, count = spec.free.places(), spec.tune.starts
-    found = []
+    places = []
     for k, family in enumerate(spec.moving):
-        found.append(own[None])
+        places.append(own[None])
         if count == 1:
             continue
         sobol = scipy.stats.qmc.Sobol(len(own), rng=spec.tune.seed)
-        points = sobol.random(1 << int(np.ceil(np.log2(LOOKED_AT * count))))
+        points = sobol.random(1 << int(np.ceil(np.log2(SCREENED * count))))
         points = np.where(family.is_free, points, own)
         values = np.where(family.is_free, spec.free.values(points), np.nan)
         beyond, residual = evaluator.linear.screen(k * count, values)
         order = np.lexsort((residual, np.maximum(beyond, 0.0)))
-        found.append(points[np.sort(order[: count - 1])])
-    return np.concatenate(found)
+        places.append(points[np.sort(order[: count - 1])])
+    return np.concatenate(places)
 
 
 def begin(spec: TuneSpec, evaluator: Evaluator) -> Progress:
     """State before the first iteration."""
-    return _untried(spec, first_places(spec, evaluator))
+    return _fresh_progress(spec, first_places(spec, evaluator))
 
 
-def _untried(spec: TuneSpec, place: np.ndarray) -> Progress:
+def _fresh_progress(spec: TuneSpec, place: np.ndarray) -> Progress:
     """Unevaluated starts at places between the bounds (B, p)."""
     starts, p = place.shape
     m = len(spec.limit_names)
@@ -150,16 +150,20 @@ def advance(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> Progress:
         StudyError: in the first iteration, a free parameter without any effect.
     """
     k = int(at.iteration)
-    found = evaluator.evaluate(spec.free.values(at.place))
+    evaluation = evaluator.evaluate(spec.free.values(at.place))
     if k == 0:
-        _check_dependence(spec, at, found)
-    is_fine = np.isfinite(found.objective) & np.isfinite(found.limits).all(axis=1)
-    is_fine &= np.isfinite(found.slope).all(axis=1) & np.isfinite(found.limit_slope).all((1, 2))
+        _check_dependence(spec, at, evaluation)
+    is_fine = np.isfinite(evaluation.objective) & np.isfinite(evaluation.limits).all(axis=1)
+    is_fine &= np.isfinite(evaluation.slope).all(axis=1) & np.isfinite(evaluation.limit_slope).all(
+        (1, 2)
+    )
     is_fine &= np.isfinite(at.place).all(axis=1) & ~at.is_frozen
-    at = _kept(at, found, is_fine)
+    at = _record(at, evaluation, is_fine)
     turn = spec.free.slopes(at.place)  # from values to places
-    slope, limit_slope = found.slope * turn, found.limit_slope * turn[:, None]
-    merit, merit_slope = _lagrangian(at, found.objective, slope, found.limits, limit_slope)
+    slope, limit_slope = evaluation.slope * turn, evaluation.limit_slope * turn[:, None]
+    merit, merit_slope = _lagrangian(
+        at, evaluation.objective, slope, evaluation.limits, limit_slope
+    )
     base_merit, base_slope = _lagrangian(
         at, at.base_objective, at.base_slope, at.base_limits, at.base_limit_slope
     )
@@ -180,21 +184,21 @@ def advance(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> Progress:
     at = at._replace(
         iteration=np.array(k + 1),
         base=taken(at.place, at.base),
-        base_objective=taken(found.objective, at.base_objective),
+        base_objective=taken(evaluation.objective, at.base_objective),
         base_slope=taken(slope, at.base_slope),
-        base_limits=taken(found.limits, at.base_limits),
+        base_limits=taken(evaluation.limits, at.base_limits),
         base_limit_slope=taken(limit_slope, at.base_limit_slope),
         place=np.where(free & ~at.is_frozen[:, None], place, at.place),
         descent=state,
     )
-    return _handed_on(spec, _updated(at)) if (k + 1) % ROUND == 0 else at
+    return _hand_on(spec, _update_multipliers(at)) if (k + 1) % ROUND == 0 else at
 
 
-def _check_dependence(spec: TuneSpec, at: Progress, found: Evaluation) -> None:
+def _check_dependence(spec: TuneSpec, at: Progress, evaluation: Evaluation) -> None:
     for position, family in enumerate(spec.moving):
-        members = (at.family == position) & np.isfinite(found.objective)
-        is_idle = np.all(found.slope[members] == 0, axis=0) & family.is_free
-        is_idle &= np.all(found.limit_slope[members] == 0, axis=(0, 1))
+        members = (at.family == position) & np.isfinite(evaluation.objective)
+        is_idle = np.all(evaluation.slope[members] == 0, axis=0) & family.is_free
+        is_idle &= np.all(evaluation.limit_slope[members] == 0, axis=(0, 1))
         idle = [name for name, is_one in zip(spec.free.names, is_idle, strict=True) if is_one]
         if idle and members.any():
             raise StudyError(
@@ -203,27 +207,29 @@ def _check_dependence(spec: TuneSpec, at: Progress, found: Evaluation) -> None:
             )
 
 
-def _kept(at: Progress, found: Evaluation, is_fine: np.ndarray) -> Progress:
+def _record(at: Progress, evaluation: Evaluation, is_fine: np.ndarray) -> Progress:
     """Progress with this iteration's findings recorded."""
     k = int(at.iteration)
-    violation = found.limits.max(axis=1, initial=-np.inf)
+    violation = evaluation.limits.max(axis=1, initial=-np.inf)
     history = at.history.copy()
-    history[k] = np.where(is_fine[:, None], np.stack([found.objective, violation], axis=1), np.nan)
-    new, old = excess(found.limits), excess(at.best_limits)
-    is_better = (new < old) | ((new == old) & (found.objective < at.best_objective))
+    history[k] = np.where(
+        is_fine[:, None], np.stack([evaluation.objective, violation], axis=1), np.nan
+    )
+    new, old = excess(evaluation.limits), excess(at.best_limits)
+    is_better = (new < old) | ((new == old) & (evaluation.objective < at.best_objective))
     is_better &= is_fine
     with np.errstate(invalid="ignore"):
-        step = (new < old) | (found.objective < (1 - GAIN) * at.best_objective)
+        step = (new < old) | (evaluation.objective < (1 - GAIN) * at.best_objective)
     gained = at.gained.copy()
     gained[np.unique(at.family[is_better & step])] = k
     chosen, least = is_better[:, None], at.least.copy()
-    np.minimum.at(least, at.family[is_fine], found.limits[is_fine])
+    np.minimum.at(least, at.family[is_fine], evaluation.limits[is_fine])
     return at._replace(
         is_frozen=at.is_frozen | (~is_fine & ~np.isfinite(at.best_objective)),
         best_place=np.where(chosen, at.place, at.best_place),
-        best_objective=np.where(is_better, found.objective, at.best_objective),
-        best_limits=np.where(chosen, found.limits, at.best_limits),
-        best_peaks=np.where(chosen, found.peaks, at.best_peaks),
+        best_objective=np.where(is_better, evaluation.objective, at.best_objective),
+        best_limits=np.where(chosen, evaluation.limits, at.best_limits),
+        best_peaks=np.where(chosen, evaluation.peaks, at.best_peaks),
         least=least,
         gained=gained,
         history=history,
@@ -243,7 +249,7 @@ def _lagrangian(
     return merit, slope + np.einsum("bm,bmp->bp", force, limit_slope)
 
 
-def _updated(at: Progress) -> Progress:
+def _update_multipliers(at: Progress) -> Progress:
     """New multipliers; a larger penalty if the violation has not halved."""
     is_known = np.isfinite(at.base_objective)
     multiplier = np.maximum(at.multiplier + at.penalty[:, None] * at.base_limits, 0.0)
@@ -256,7 +262,7 @@ def _updated(at: Progress) -> Progress:
     )
 
 
-def _handed_on(spec: TuneSpec, at: Progress) -> Progress:
+def _hand_on(spec: TuneSpec, at: Progress) -> Progress:
     """Move the worst start of a family to another family's better design, and continue there.
 
     Eligible families move no additional numbers of the same study; their limit on a front can
@@ -264,19 +270,21 @@ def _handed_on(spec: TuneSpec, at: Progress) -> Progress:
     """
     for k, family in enumerate(spec.moving):
         members = np.flatnonzero(at.family == k)
-        given = [
+        donors = [
             at.winner(j) for j, other in enumerate(spec.moving) if _can_take(spec, family, other)
         ]
-        if not given or len(members) < 2:
+        if not donors or len(members) < 2:
             continue
         mine = at.winner(k)
-        limits = {j: _limits_there(spec, at, j, family) for j in given}
-        kept = [j for j in given if np.isfinite(limits[j]).all() and not excess(limits[j][None])[0]]
+        limits = {j: _limits_in(spec, at, j, family) for j in donors}
+        kept = [
+            j for j in donors if np.isfinite(limits[j]).all() and not excess(limits[j][None])[0]
+        ]
         best = min(kept, key=lambda j: at.best_objective[j], default=mine)
         is_kept = at.beyond(mine) == 0
         if best != mine and (at.best_objective[best] < at.best_objective[mine] or not is_kept):
             worst = max(members, key=lambda j: at.best_objective[j])
-            at = _moved(spec, at, int(worst), best, limits[best])
+            at = _move(spec, at, int(worst), best, limits[best])
     return at
 
 
@@ -292,7 +300,7 @@ def _can_take(spec: TuneSpec, family: Family, other: Family) -> bool:
     return other is not family and is_same_study and is_part and is_known
 
 
-def _limits_there(spec: TuneSpec, at: Progress, start: int, family: Family) -> np.ndarray:
+def _limits_in(spec: TuneSpec, at: Progress, start: int, family: Family) -> np.ndarray:
     """Violation of another family's limits by a start's best design, (m,)."""
     limits, along = at.best_limits[start].copy(), spec.tune.pareto.get("limit")
     if along in spec.limit_names and family.limits[along] != BASELINE:
@@ -301,7 +309,7 @@ def _limits_there(spec: TuneSpec, at: Progress, start: int, family: Family) -> n
     return limits
 
 
-def _moved(spec: TuneSpec, at: Progress, start: int, to: int, limits: np.ndarray) -> Progress:
+def _move(spec: TuneSpec, at: Progress, start: int, to: int, limits: np.ndarray) -> Progress:
     """Progress with a start moved to another's best place, with its limits in the new family."""
     place, base = at.place.copy(), at.base_objective.copy()
     place[start], base[start] = at.best_place[to], np.nan
@@ -340,7 +348,7 @@ def optimise(
     while int(at.iteration) < spec.tune.iterations and not is_settled(spec, at):
         at = advance(spec, evaluator, at)
         keep(at)
-    return _handed_on(spec, at)
+    return _hand_on(spec, at)
 
 
 def fits(spec: TuneSpec, at: Progress) -> bool:
@@ -351,10 +359,10 @@ def fits(spec: TuneSpec, at: Progress) -> bool:
         kinds = [np.asarray(x).dtype.kind for x in (history, *arrays, *descent)]
         return [*kinds, np.shape(history)[1:], *map(np.shape, (*arrays, *descent))]
 
-    wanted = _untried(spec, np.zeros((len(start_families(spec)), len(spec.free.names))))
+    expected = _fresh_progress(spec, np.zeros((len(start_families(spec)), len(spec.free.names))))
     return (
-        forms(at) == forms(wanted)
-        and np.array_equal(at.family, wanted.family)
+        forms(at) == forms(expected)
+        and np.array_equal(at.family, expected.family)
         and 0 <= int(at.iteration) <= len(at.history)
     )
 

@@ -22,7 +22,7 @@ from studies.study.resolution import is_deflection, least_step, resolution_text
 from studies.study.spec import Study
 from studies.tuning.check import JudgedDesign, PlainRuns, judge, shown_structure
 from studies.tuning.linear_fidelity import DesignFigures, loop_figures
-from studies.tuning.merit import all_judged, allowed_limits, merit_of, own_limits
+from studies.tuning.objective import all_judged, allowed_limits, objective_of, own_limits
 from studies.tuning.optimise import KEPT, excess
 from studies.tuning.scenarios import lane_columns, scenario_columns
 from studies.tuning.spec import BASELINE, Family, TuneSpec
@@ -86,12 +86,12 @@ def compare(
     say(f"the results on {fresh} fresh scenarios")
     own, *judged = judge(spec, [*designs, *others.values()], runs)
     count = len(designs) - 1
-    found = dict(zip(others, judged[count:], strict=True))
-    if WITHOUT in found:
-        found[WITHOUT] = found[WITHOUT]._replace(loop=None, poles=None)
+    compared = dict(zip(others, judged[count:], strict=True))
+    if WITHOUT in compared:
+        compared[WITHOUT] = compared[WITHOUT]._replace(loop=None, poles=None)
     has_adc = is_on and spec.study.control.feedback == "sampled"
     step = frame_of(*check_run(spec.study)).adc_step if has_adc else None
-    references = References(found.get(WITHOUT), scan, found.get(ALONE), step)
+    references = References(compared.get(WITHOUT), scan, compared.get(ALONE), step)
     return own, judged[:count], references
 
 
@@ -105,14 +105,14 @@ def scan_gain(spec: TuneSpec, runs: PlainRuns) -> GainScan | None:
     Returns:
         None where it is the only free parameter, or has no effect.
     """
-    asked, start = spec.tune.scenarios, spec.study.control.gain_factor
-    others = {*asked.spread, *asked.machines, *asked.each}
+    scenarios, start = spec.tune.scenarios, spec.study.control.gain_factor
+    others = {*scenarios.spread, *scenarios.machines, *scenarios.each}
     is_tuned_alone = set(spec.free.names) == {FIELD}
     if not spec.study.is_controlled or start == 0 or is_tuned_alone or FIELD in others:
         return None
     values = start * np.append(np.geomspace(LOWEST, HIGHEST, COUNT), 1.0)
     values = np.unique(np.minimum(values, MOST))
-    objective, beyond = _evaluated(spec, runs, values)
+    objective, beyond = _evaluate(spec, runs, values)
     is_known = np.isfinite(objective)
     if not is_known.any() or np.ptp(objective[is_known]) == 0:
         return None
@@ -121,11 +121,9 @@ def scan_gain(spec: TuneSpec, runs: PlainRuns) -> GainScan | None:
     return GainScan(values, objective, beyond, int(next(kept, -1)))
 
 
-def _evaluated(
-    spec: TuneSpec, runs: PlainRuns, values: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _evaluate(spec: TuneSpec, runs: PlainRuns, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Objective and largest violation of the limits on metrics for gain factors (n,)."""
-    merit, nothing = merit_of(spec), np.zeros(len(spec.free.names), bool)
+    goal, nothing = objective_of(spec), np.zeros(len(spec.free.names), bool)
     designs = [
         Family(
             name=ALONE,
@@ -146,8 +144,8 @@ def _evaluated(
 
     metrics = jax.tree.map(split, result.metrics)
     own, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
-    allowed = allowed_limits(merit, designs[0], own_limits(merit, own))
-    objective, limits, _ = map(np.asarray, all_judged(merit, others, own, allowed))
+    allowed = allowed_limits(goal, designs[0], own_limits(goal, own))
+    objective, limits, _ = map(np.asarray, all_judged(goal, others, own, allowed))
     is_whole = np.isin(split(result.status)[1:], status.FINISHED).all(axis=1)
     return np.where(is_whole, objective, np.nan), excess(limits)
 
@@ -161,48 +159,48 @@ def _keeps_loop(spec: TuneSpec, value: float) -> bool:
     """Whether a gain factor keeps the limits of the linearised loop."""
     if not spec.loop_limits or spec.study.control.feedback != "sampled":
         return True
-    found, own = loop_figures(spec, gain_study(spec, value)), None
+    figures, own = loop_figures(spec, gain_study(spec, value)), None
     for name in spec.loop_limits:
         limit = spec.tune.limits[name]
         if limit == BASELINE:
             own = own or loop_figures(spec, spec.study)
-        left = _left(name, found, getattr(own, name) if limit == BASELINE else float(limit))
+        left = _left(name, figures, getattr(own, name) if limit == BASELINE else float(limit))
         if left < -KEPT:
             return False
     return True
 
 
-def _left(name: str, found: DesignFigures, allowed: float) -> float:
+def _left(name: str, figures: DesignFigures, allowed: float) -> float:
     """How far a figure of the loop is from its limit, as a share of it; negative: violated."""
-    share: float = getattr(found, name) / allowed - 1
+    share: float = getattr(figures, name) / allowed - 1
     return -share if name == "spillover" else share
 
 
-def reference_lines(spec: TuneSpec, own: JudgedDesign, found: References) -> list[str]:
+def reference_lines(spec: TuneSpec, own: JudgedDesign, references: References) -> list[str]:
     """What no control and the gain factor alone achieve, one sentence each.
 
     Args:
         spec: of the tuning.
         own: the baseline, judged.
-        found: what a tuned design has to beat.
+        references: what a tuned design has to beat.
     """
     machines = count_text(spec.tune.scenarios.check, "fresh machine")
     lines = []
-    for name, one in found.designs:
+    for name, one in references.designs:
         which = name
-        if name == ALONE and found.scan is not None:
-            value = found.scan.gain_factor[found.scan.best]
+        if name == ALONE and references.scan is not None:
+            value = references.scan.gain_factor[references.scan.best]
             which = (
                 f"{name}, {value:.4g} instead of {spec.study.control.gain_factor:.4g} (the best "
-                f"of {len(found.scan.gain_factor)} values on the scenarios of the tuning)"
+                f"of {len(references.scan.gain_factor)} values on the scenarios of the tuning)"
             )
         terms = ", ".join(_term(x, one, own) for x in spec.tune.objective)
         lines.append(
             f"{which}: {one.objective.mean():.4f} of the baseline's objective on {machines}; "
             f"on its own machine {terms}"
         )
-    if found.scan is not None and found.scan.best < 0:
-        values = found.scan.gain_factor
+    if references.scan is not None and references.scan.best < 0:
+        values = references.scan.gain_factor
         lines.append(
             f"{ALONE}: none of {len(values)} values from {values[0]:.3g} to {values[-1]:.3g} "
             "keeps the limits"
@@ -229,9 +227,9 @@ def resolution_lines(
     """
     if adc_step is None:
         return []
-    found = []
+    lines = []
     for name in filter(is_deflection, spec.tune.objective):
         step = least_step(name, adc_step, spec.counted_links)
         values = np.array([one.own.metrics[name] for one in designs])
-        found.append(resolution_text(name, values[np.isfinite(values)], step, "design"))
-    return list(filter(None, found))
+        lines.append(resolution_text(name, values[np.isfinite(values)], step, "design"))
+    return list(filter(None, lines))

@@ -19,10 +19,10 @@ from studies.study.entries import parse_entries
 from studies.study.margin import MARGIN_MODES, caution, margin_in_db, margin_text
 from studies.study.template import study_template, toml_text
 from studies.tuning.audit import ALLOWED, MEANING, Disagreement
-from studies.tuning.check import JudgedDesign, Searched, patch_centers
+from studies.tuning.check import JudgedDesign, RandomSearch, patch_centers
 from studies.tuning.free import PLACEMENT
 from studies.tuning.linear_fidelity import DesignFigures
-from studies.tuning.merit import SHOWN
+from studies.tuning.objective import SHOWN
 from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
 from studies.tuning.references import References, reference_lines, resolution_lines
 from studies.tuning.scenarios import move_label
@@ -49,7 +49,7 @@ class TuneFindings(NamedTuple):
     audited: list[Disagreement]  # at the best design of the family with most parameters
     linear: np.ndarray  # linear residual vibration of each start's best design [m], (B,)
     residual: np.ndarray  # of its own run on the first scenario [m], (B,); nan if not judged by it
-    searched: Searched | None
+    searched: RandomSearch | None
     run_time: float  # of a differentiated run [s]
     runs: int  # how many there were
     references: References = References(None, None, None, None)  # what designs have to beat
@@ -380,7 +380,7 @@ def _alike(at: Progress, family: int) -> np.ndarray:
     return np.flatnonzero((at.family == family) & is_near & is_kept)
 
 
-def is_kept(spec: TuneSpec, seen: Searched) -> np.ndarray:
+def is_kept(spec: TuneSpec, seen: RandomSearch) -> np.ndarray:
     """Which random designs finish and keep all limits, (n,)."""
     loop = seen.beyond_loop if spec.loop_limits else np.full(len(seen.objective), -np.inf)
     return np.isfinite(seen.objective) & (excess(seen.limits) == 0) & (loop <= KEPT)

@@ -25,14 +25,14 @@ def free_unit(key: str) -> str:
     return field_unit(entry.field) if entry and "." in entry.field else "1"
 
 
-def variables(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
+def variables(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
     """All starts, the best design of each family on fresh machines, random designs."""
     return {
-        **_asked(spec),
-        **_starts(spec, found),
-        **_fresh(spec, found),
-        **_random(found),
-        **_references(spec, found),
+        **_settings(spec),
+        **_starts(spec, findings),
+        **_fresh(spec, findings),
+        **_random(findings),
+        **_references(spec, findings),
     }
 
 
@@ -40,13 +40,13 @@ def _text(values: list[str], axis: str, what: str) -> Variable:
     return Variable(np.array(values), (axis,), "1", what)
 
 
-def _asked(spec: TuneSpec) -> dict[str, Variable]:
+def _settings(spec: TuneSpec) -> dict[str, Variable]:
     numbers, axis = spec.free.numbers, ("free",)
     low, high, start = (
         np.array(x)
         for x in zip(*((f.span.low, f.span.high, f.start) for f in numbers), strict=True)
     )
-    asked = {
+    settings = {
         "free": _text([f.name for f in numbers], "free", "free parameter"),
         "free_unit": _text([free_unit(f.key) for f in numbers], "free", "its unit"),
         "free_low": Variable(low, axis, "1", "lower bound, in the parameter's unit"),
@@ -56,15 +56,15 @@ def _asked(spec: TuneSpec) -> dict[str, Variable]:
     }
     if spec.limit_names:
         limits = [[str(x.limits[name]) for name in spec.limit_names] for x in spec.families]
-        asked["limit"] = _text(list(spec.limit_names), "limit", "what is limited")
-        asked["family_limit"] = Variable(
+        settings["limit"] = _text(list(spec.limit_names), "limit", "what is limited")
+        settings["family_limit"] = Variable(
             np.array(limits), ("family", "limit"), "1", "limit; baseline: its value"
         )
-    return asked
+    return settings
 
 
-def _starts(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
-    at = found.at
+def _starts(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
+    at = findings.at
     family = [spec.moving[k] for k in at.family]
     values = spec.free.values(at.best_place)
     centers = [patch_centers(spec, *pair) for pair in zip(family, values, strict=True)]
@@ -91,7 +91,7 @@ def _starts(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
         ),
         "is_frozen": Variable(at.is_frozen, axis, "1", "stopped, a run did not finish"),
         "linear_residual": Variable(
-            found.linear, axis, "m", "linear residual vibration of the best design"
+            findings.linear, axis, "m", "linear residual vibration of the best design"
         ),
         "trial_objective": Variable(whole[..., 0], trial, "1", "objective of each trial"),
         "trial_excess": Variable(whole[..., 1], trial, "1", "largest excess of each trial"),
@@ -107,7 +107,7 @@ def _starts(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
     return starts
 
 
-def _fresh(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
+def _fresh(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
     axis, both = ("scenario",), ("family", "scenario")
     fresh = {}
     for name, column in fresh_columns(spec).items():
@@ -118,32 +118,32 @@ def _fresh(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
         fresh[name] = Variable(array, (*axis, *dims), unit, name)
 
     def each(take: str) -> np.ndarray:
-        return np.stack([getattr(one, take) for one in found.judged])
+        return np.stack([getattr(one, take) for one in findings.judged])
 
     fresh["fresh_objective"] = Variable(each("objective"), both, "1", "objective, fresh machines")
     fresh["fresh_status"] = Variable(each("status"), both, *STATUS_LABEL)
-    fresh["baseline_status"] = Variable(found.own.status, axis, *STATUS_LABEL)
+    fresh["baseline_status"] = Variable(findings.own.status, axis, *STATUS_LABEL)
     links = links_text(spec.counted_links)
-    for name, own in found.own.metrics.items():
+    for name, own in findings.own.metrics.items():
         unit = METRICS[name.partition("[")[0]].unit
-        values = np.stack([one.metrics[name] for one in found.judged])
+        values = np.stack([one.metrics[name] for one in findings.judged])
         text = name if parse_entries(name).names_a_link else f"{name}, largest of {links}"
         fresh[f"fresh_{name}"] = Variable(values, both, unit, f"{text}, fresh machines")
         fresh[f"baseline_{name}"] = Variable(
             own, axis, unit, f"{text}, fresh machines, the baseline"
         )
-        values = np.array([one.own.metrics[name] for one in found.judged])
+        values = np.array([one.own.metrics[name] for one in findings.judged])
         fresh[f"file_{name}"] = Variable(values, ("family",), unit, f"{text}, as the file runs")
-        before = np.array(found.own.own.metrics[name])
+        before = np.array(findings.own.own.metrics[name])
         fresh[f"file_baseline_{name}"] = Variable(
             before, (), unit, f"{text}, the baseline's file as it runs"
         )
-    if found.own.loop is not None:
+    if findings.own.loop is not None:
         for name, unit in LOOP_UNITS.items():
             what = f"{name.replace('_', ' ')} of the linearised loop"
-            values = np.array([_loop_figure(one, name) for one in found.judged])
+            values = np.array([_loop_figure(one, name) for one in findings.judged])
             fresh[name] = Variable(values, ("family",), unit, what)
-            own = np.array(_loop_figure(found.own, name))
+            own = np.array(_loop_figure(findings.own, name))
             fresh[f"baseline_{name}"] = Variable(own, (), unit, f"{what}, the baseline")
     return fresh
 
@@ -152,46 +152,46 @@ def _loop_figure(judged: JudgedDesign, name: str) -> float:
     return float("nan") if judged.loop is None else float(getattr(judged.loop, name))
 
 
-def _random(found: TuneFindings) -> dict[str, Variable]:
-    seen = found.searched
-    if seen is None:
+def _random(findings: TuneFindings) -> dict[str, Variable]:
+    search = findings.searched
+    if search is None:
         return {}
     return {
         "search_objective": Variable(
-            seen.objective, ("sample",), "1", "objective of random designs"
+            search.objective, ("sample",), "1", "objective of random designs"
         ),
         "search_linear_residual": Variable(
-            seen.linear, ("sample",), "m", "linear residual vibration of random designs"
+            search.linear, ("sample",), "m", "linear residual vibration of random designs"
         ),
     }
 
 
-def _references(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
+def _references(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
     """No control, and the gain factor alone."""
-    links, told = links_text(spec.counted_links), {}
-    scan, axis = found.references.scan, ("scanned",)
-    designs = found.references.uncontrolled, found.references.gain_alone
+    links, references = links_text(spec.counted_links), {}
+    scan, axis = findings.references.scan, ("scanned",)
+    designs = findings.references.uncontrolled, findings.references.gain_alone
     for label, text, one in zip(
         ("uncontrolled", "gain_alone"), (WITHOUT, ALONE), designs, strict=True
     ):
         if one is None:
             continue
-        told[f"{label}_objective"] = Variable(
+        references[f"{label}_objective"] = Variable(
             one.objective, ("scenario",), "1", f"objective, fresh machines, {text}"
         )
-        told[f"{label}_status"] = Variable(one.status, ("scenario",), *STATUS_LABEL)
+        references[f"{label}_status"] = Variable(one.status, ("scenario",), *STATUS_LABEL)
         for name, values in one.metrics.items():
             unit = METRICS[name.partition("[")[0]].unit
             what = name if parse_entries(name).names_a_link else f"{name}, largest of {links}"
-            told[f"{label}_{name}"] = Variable(
+            references[f"{label}_{name}"] = Variable(
                 values, ("scenario",), unit, f"{what}, fresh machines, {text}"
             )
-            told[f"file_{label}_{name}"] = Variable(
+            references[f"file_{label}_{name}"] = Variable(
                 np.array(one.own.metrics[name]), (), unit, f"{what}, the baseline's run, {text}"
             )
     if scan is not None:
         best = scan.gain_factor[scan.best] if scan.best >= 0 else np.nan
-        told |= {
+        references |= {
             "gain_alone_factor": Variable(np.array(best), (), "1", f"control.gain_factor, {ALONE}"),
             "scanned_gain_factor": Variable(scan.gain_factor, axis, "1", "control.gain_factor"),
             "scanned_objective": Variable(
@@ -201,4 +201,4 @@ def _references(spec: TuneSpec, found: TuneFindings) -> dict[str, Variable]:
                 scan.excess, axis, "1", "largest excess over limits of metrics then, 0: kept"
             ),
         }
-    return told
+    return references

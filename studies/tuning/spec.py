@@ -184,8 +184,8 @@ def parse_tuning(data: dict[str, Any]) -> TuneSpec:
     _check_spread(tune, study)
     _check_machines(tune.scenarios, study)
     _check_feedback(tune, study)
-    asked = tune.scenarios
-    check_varied(data, study, (*tune.free, *asked.each, *asked.spread, *asked.machines))
+    scenarios = tune.scenarios
+    check_varied(data, study, (*tune.free, *scenarios.each, *scenarios.spread, *scenarios.machines))
     free = free_numbers(tune.free, study)
     moves = _moves(tune, study)
     families = _families(tune, study, free)
@@ -234,9 +234,9 @@ def _check_spread(tune: Tune, study: Study) -> None:
             checked_value(study, name, (np.array(value) * share).tolist(), path)
 
 
-def _check_machines(asked: Scenarios, study: Study) -> None:
-    needed = asked.count - 1 + asked.check
-    for name, values in asked.machines.items():
+def _check_machines(scenarios: Scenarios, study: Study) -> None:
+    needed = scenarios.count - 1 + scenarios.check
+    for name, values in scenarios.machines.items():
         path = f"tune.scenarios.machines.{shown_name(name)}"
         known_field(name, study, "tune.scenarios.machines")
         if name.partition(".")[0] in ("run", "metrics", "motion"):
@@ -246,27 +246,27 @@ def _check_machines(asked: Scenarios, study: Study) -> None:
         if len(values) < needed:
             raise StudyError(
                 f"{path}: {len(values)} values; allowed: {needed} or more, for "
-                f"tune.scenarios.count = {asked.count} without the nominal machine, and for "
-                f"tune.scenarios.check = {asked.check}"
+                f"tune.scenarios.count = {scenarios.count} without the nominal machine, and for "
+                f"tune.scenarios.check = {scenarios.check}"
             )
         for k, value in enumerate(values):
             checked_value(study, name, value, f"{path}[{k}]")
-    sizes = {name: len(values) for name, values in asked.machines.items()}
+    sizes = {name: len(values) for name, values in scenarios.machines.items()}
     if len(set(sizes.values())) > 1:
-        told = ", ".join(f"{shown_name(name)} {size}" for name, size in sizes.items())
+        lengths = ", ".join(f"{shown_name(name)} {size}" for name, size in sizes.items())
         raise StudyError(
-            f"tune.scenarios.machines: lists of unequal length ({told}); allowed: one value for "
+            f"tune.scenarios.machines: lists of unequal length ({lengths}); allowed: one value for "
             "each machine"
         )
 
 
-def _each_machine(asked: Scenarios) -> list[dict[str, Any]]:
+def _each_machine(scenarios: Scenarios) -> list[dict[str, Any]]:
     """What differs on each machine that is run."""
-    if not asked.machines:
+    if not scenarios.machines:
         return []
-    rows = zip(*asked.machines.values(), strict=True)
-    whole = [dict(zip(asked.machines, row, strict=True)) for row in rows]
-    return others(whole, asked.count, False) + others(whole, asked.check, True)
+    rows = zip(*scenarios.machines.values(), strict=True)
+    whole = [dict(zip(scenarios.machines, row, strict=True)) for row in rows]
+    return others(whole, scenarios.count, False) + others(whole, scenarios.check, True)
 
 
 def others(values: list[Any], count: int, is_fresh: bool) -> list[Any]:
@@ -283,12 +283,12 @@ def others(values: list[Any], count: int, is_fresh: bool) -> list[Any]:
 def _check_feedback(tune: Tune, study: Study) -> None:
     if study.control.ratio_source != "given":
         raise field_error("control.ratio_source", study.control.ratio_source, "'given' in a tuning")
-    wanted = [name for name in tune.limits if name in OF_LOOP]
-    if study.control.feedback != "sampled" and wanted:
+    loop_limits = [name for name in tune.limits if name in OF_LOOP]
+    if study.control.feedback != "sampled" and loop_limits:
         raise field_error(
             "control.feedback",
             study.control.feedback,
-            "'sampled' where tune.limits holds " + " or ".join(wanted),
+            "'sampled' where tune.limits holds " + " or ".join(loop_limits),
         )
 
 
@@ -305,12 +305,12 @@ def _check_metric(name: str, path: str, has_loop: bool, study: Study) -> None:
         return
     if has_loop and _field(name) in LOOP_LIMITS:
         raise StudyError(f"{path}: {name!r} has no such entry; allowed: {_field(name)}")
-    known = [*METRICS, *(LOOP_LIMITS if has_loop else ())]
-    if _field(name) not in known:
-        hint = nearest(name, known)
+    allowed = [*METRICS, *(LOOP_LIMITS if has_loop else ())]
+    if _field(name) not in allowed:
+        hint = nearest(name, allowed)
         raise StudyError(
             f"{path}: {name!r}: unknown metric; "
-            + (f"did you mean {hint!r}?" if hint else f"allowed: {', '.join(known)}")
+            + (f"did you mean {hint!r}?" if hint else f"allowed: {', '.join(allowed)}")
         )
     if not has_loop and not METRICS[_field(name)].is_differentiable:
         raise StudyError(
@@ -334,8 +334,8 @@ def _moves(tune: Tune, study: Study) -> tuple[dict[str, Any], ...]:
 
 def _check_clashes(tune: Tune, free: FreeNumbers, families: tuple[Family, ...]) -> None:
     """Reject fields that are set twice."""
-    asked = tune.scenarios
-    parts = {"spread": asked.spread, "machines": asked.machines, "each": asked.each}
+    scenarios = tune.scenarios
+    parts = {"spread": scenarios.spread, "machines": scenarios.machines, "each": scenarios.each}
     named = [(part, name) for part, names in parts.items() for name in names]
     for (one, name), (other, second) in combinations(named, 2):
         if overlaps(name, second):
@@ -382,24 +382,24 @@ def _field(name: str) -> str:
 def _families(tune: Tune, study: Study, free: FreeNumbers) -> tuple[Family, ...]:
     everything = np.ones(len(free.numbers), bool)
     if not tune.families:
-        found = [
+        families = [
             Family(name="tuned", is_free=everything, columns={}, limits=dict(tune.limits), front="")
         ]
     else:
-        found = [_family(name, x, tune, study, free) for name, x in tune.families.items()]
-    if not any(family.is_free.any() for family in found):
+        families = [_family(name, x, tune, study, free) for name, x in tune.families.items()]
+    if not any(family.is_free.any() for family in families):
         raise field_error("tune.families", list(tune.families), "one or more with free parameters")
-    found += _front(tune, found)
-    names = [label(family.name) for family in found]
+    families += _front(tune, families)
+    names = [label(family.name) for family in families]
     for k, name in enumerate(names):
         if name in names[:k]:
             raise field_error(
                 "tune.families",
-                found[k].name,
-                f"names that differ in letters and digits, {found[names.index(name)].name!r} is "
+                families[k].name,
+                f"names that differ in letters and digits, {families[names.index(name)].name!r} is "
                 "one already",
             )
-    return tuple(sorted(found, key=lambda family: not family.is_free.any()))
+    return tuple(sorted(families, key=lambda family: not family.is_free.any()))
 
 
 def label(name: str) -> str:
@@ -445,10 +445,12 @@ def _front(tune: Tune, families: list[Family]) -> list[Family]:
     if set(tune.pareto) - {"limit", "values", "family"} or "limit" not in tune.pareto:
         raise field_error("tune.pareto", tune.pareto, "{limit, values, family}")
     limit, values = tune.pareto["limit"], tune.pareto.get("values")
-    known = [name for name in tune.limits if name not in LOOP_LIMITS]
-    if not isinstance(limit, str) or limit not in known:
-        told = "one of the metrics in tune.limits" + (f": {', '.join(known)}" if known else "")
-        raise field_error("tune.pareto.limit", limit, told)
+    metrics = [name for name in tune.limits if name not in LOOP_LIMITS]
+    if not isinstance(limit, str) or limit not in metrics:
+        allowed = "one of the metrics in tune.limits" + (
+            f": {', '.join(metrics)}" if metrics else ""
+        )
+        raise field_error("tune.pareto.limit", limit, allowed)
     if not isinstance(values, list) or len(values) < 2:
         raise field_error("tune.pareto.values", values, "a list of two limits or more")
     for k, value in enumerate(values):
@@ -474,19 +476,19 @@ def _check_family(family: Family, move: dict[str, Any], study: Study) -> None:
     """Check that a family's settings run, with the baseline's program."""
     where = [f"tune.families.{shown_name(family.name)}"] if family.columns else []
     where += [f"{name} = {shown(value)} of tune.scenarios" for name, value in move.items()]
-    told = f"{', '.join(where)}: " if where else ""
+    prefix = f"{', '.join(where)}: " if where else ""
     try:
         changed = family.study(study)
         for name, value in move.items():
             changed = parse_study(set_value(changed, name, value))
         check_run(changed)
     except StudyError as error:
-        raise StudyError(f"{told}{error}") from None
+        raise StudyError(f"{prefix}{error}") from None
     one, other = build_structure(study), build_structure(changed)
     kept = {"has_poles", "has_position_gain", "has_noise", "substeps"}
     for field, a, b in zip(one._fields, one, other, strict=True):
         if a != b and field not in kept:
             raise StudyError(
-                f"{told}{field} = {shown(b)} where the study has {shown(a)}; allowed: what runs by "
-                "the same program"
+                f"{prefix}{field} = {shown(b)} where the study has {shown(a)}; allowed: what runs "
+                "by the same program"
             )

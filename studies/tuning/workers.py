@@ -34,13 +34,13 @@ class Share(NamedTuple):
     spec: str  # the tuning as JSON
     families: tuple[int, ...]  # of the designs, positions in `spec.moving`
     values: np.ndarray  # of the free parameters, (designs, p)
-    has_slope: np.ndarray  # (designs,)
+    needs_gradient: np.ndarray  # (designs,)
 
 
 class ShareDone(NamedTuple):
     """A worker's result of its part."""
 
-    found: Evaluation
+    evaluation: Evaluation
     worker: str  # address
 
 
@@ -55,7 +55,7 @@ def evaluate_part(part: Share) -> ShareDone:
         refuse_difference(part.identity, worker)
         get_ready(part.precision, worker)
         evaluator = _evaluator(part.precision, part.spec, part.families)
-        return ShareDone(evaluator.evaluate(part.values, part.has_slope), worker.address)
+        return ShareDone(evaluator.evaluate(part.values, part.needs_gradient), worker.address)
 
 
 @lru_cache(maxsize=2)
@@ -68,18 +68,18 @@ class ClusterEvaluator(Evaluator):
     """The same designs in the same order, evaluated in parts by the currently available workers."""
 
     def __init__(
-        self, client: Client, spec: TuneSpec, timeout: float, tell: Callable[[str], None]
+        self, client: Client, spec: TuneSpec, timeout: float, notify: Callable[[str], None]
     ) -> None:
         """
         Args:
             client: from `connected`.
             spec: the tuning.
             timeout: a worker that stays busy for longer without answering is restarted [s].
-            tell: called with what users should know.
+            notify: called with what users should know.
         """
         families = start_families(spec)
         super().__init__(spec, [spec.moving[k] for k in families])
-        self._client, self._watch = client, Watch(client, timeout, tell)
+        self._client, self._watch = client, Watch(client, timeout, notify)
         self._text, self._identity = json.dumps(spec.data), identity()
         self._precision = config.origin()["precision"]
         count = min(max(self._watch.n_workers, 1), len(families))
@@ -87,10 +87,10 @@ class ClusterEvaluator(Evaluator):
         self._families = [tuple(map(int, families[part])) for part in self._parts]
         self._is_compiled = False
         most = len(self._parts[0])
-        tell(f"workers: {self._watch.n_workers}, each with {most} starting points or fewer")
+        notify(f"workers: {self._watch.n_workers}, each with {most} starting points or fewer")
 
-    def evaluate(self, values: np.ndarray, has_slope: np.ndarray | bool = True) -> Evaluation:
-        wanted, started = np.broadcast_to(has_slope, len(values)), time.perf_counter()
+    def evaluate(self, values: np.ndarray, needs_gradient: np.ndarray | bool = True) -> Evaluation:
+        needed, started = np.broadcast_to(needs_gradient, len(values)), time.perf_counter()
         futures = [
             self._client.submit(
                 evaluate_part,
@@ -100,17 +100,17 @@ class ClusterEvaluator(Evaluator):
                     spec=self._text,
                     families=families,
                     values=values[part],
-                    has_slope=wanted[part],
+                    needs_gradient=needed[part],
                 ),
                 pure=False,
             )
             for part, families in zip(self._parts, self._families, strict=True)
         ]
-        found = self._gathered(futures)
+        evaluations = self._gathered(futures)
         if self._is_compiled:
             self.run_time = (time.perf_counter() - started) / self.lanes
         self._is_compiled = True
-        return Evaluation(*(np.concatenate(x) for x in zip(*found, strict=True)))
+        return Evaluation(*(np.concatenate(x) for x in zip(*evaluations, strict=True)))
 
     def _gathered(self, futures: list[Future[Any]]) -> list[Evaluation]:
         """Answers in the order of the parts."""
@@ -127,11 +127,11 @@ class ClusterEvaluator(Evaluator):
                         )
         finally:
             self._client.cancel(futures)
-        return [answers[future].found for future in futures]
+        return [answers[future].evaluation for future in futures]
 
 
 def evaluator_for(
-    spec: TuneSpec, workers: Workers, tell: Callable[[str], None]
+    spec: TuneSpec, workers: Workers, notify: Callable[[str], None]
 ) -> AbstractContextManager[Evaluator | None]:
     """The evaluator of a tuning's designs on workers, None for this process.
 
@@ -139,5 +139,5 @@ def evaluator_for(
         StudyError: as `connected`.
     """
     return on_workers(
-        workers, tell, lambda client: ClusterEvaluator(client, spec, workers.timeout, tell)
+        workers, notify, lambda client: ClusterEvaluator(client, spec, workers.timeout, notify)
     )

@@ -18,10 +18,10 @@ from studies.tuning.spec import BASELINE, Family, TuneSpec
 SHOWN = ("residual_rms", "settling_time", "peak_voltage")
 
 
-class Merit(NamedTuple):
-    """Criteria for judging designs; hashable."""
+class Objective(NamedTuple):
+    """What a tuning minimises, and the metrics that it limits; hashable."""
 
-    objective: tuple[tuple[str, float], ...]  # metric and weight, sum 1
+    terms: tuple[tuple[str, float], ...]  # metric and weight, sum 1
     limits: tuple[str, ...]  # metrics with a limit
     tail: float  # share of worst scenarios that count
     links: tuple[int, ...]  # those that count if a name gives no link, from 0
@@ -29,12 +29,12 @@ class Merit(NamedTuple):
     @property
     def metrics(self) -> tuple[str, ...]:
         """Fields of `Metrics` that it needs."""
-        return _fields((*dict(self.objective), *self.limits))
+        return _fields((*dict(self.terms), *self.limits))
 
     @property
     def shown(self) -> tuple[str, ...]:
         """Names that reports show: those requested, and `SHOWN`."""
-        return tuple(dict.fromkeys((*dict(self.objective), *self.limits, *SHOWN)))
+        return tuple(dict.fromkeys((*dict(self.terms), *self.limits, *SHOWN)))
 
     @property
     def shown_metrics(self) -> tuple[str, ...]:
@@ -46,30 +46,30 @@ def _fields(names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(sorted({parse_entries(name).metric for name in names}))
 
 
-def merit_of(spec: TuneSpec) -> Merit:
-    """Criteria of a tuning."""
+def objective_of(spec: TuneSpec) -> Objective:
+    """Objective of a tuning."""
     total = sum(map(float, spec.tune.objective.values()))
     weights = tuple((name, float(weight) / total) for name, weight in spec.tune.objective.items())
     tail = float(spec.tune.scenarios.tail)
-    return Merit(weights, spec.metric_limits, tail, spec.counted_links)
+    return Objective(weights, spec.metric_limits, tail, spec.counted_links)
 
 
-def entries(merit: Merit, metrics: Metrics, name: str) -> Array:
+def entries(goal: Objective, metrics: Metrics, name: str) -> Array:
     """Entries of a metric, of the links that count, (S, n)."""
     chosen = parse_entries(name)
-    return chosen.take(getattr(metrics, chosen.metric), merit.links)
+    return chosen.take(getattr(metrics, chosen.metric), goal.links)
 
 
-def size(merit: Merit, metrics: Metrics, name: str) -> Array:
+def size(goal: Objective, metrics: Metrics, name: str) -> Array:
     """Root of the mean square of the entries, (S,)."""
-    square = jnp.mean(entries(merit, metrics, name) ** 2, axis=1)
+    square = jnp.mean(entries(goal, metrics, name) ** 2, axis=1)
     # the root has no slope at 0; NaN stays NaN
     return jnp.where(square == 0, 0.0, jnp.sqrt(jnp.where(square == 0, 1.0, square)))
 
 
-def largest(merit: Merit, metrics: Metrics, name: str) -> Array:
+def largest(goal: Objective, metrics: Metrics, name: str) -> Array:
     """Largest entry, (S,)."""
-    return jnp.max(entries(merit, metrics, name), axis=1)
+    return jnp.max(entries(goal, metrics, name), axis=1)
 
 
 def tail_weights(count: int, tail: float) -> np.ndarray:
@@ -78,27 +78,25 @@ def tail_weights(count: int, tail: float) -> np.ndarray:
     return np.clip(most - np.arange(count), 0.0, 1.0) / most
 
 
-def objectives(merit: Merit, metrics: Metrics, own: Metrics) -> Array:
+def objectives(goal: Objective, metrics: Metrics, own: Metrics) -> Array:
     """Objective in each scenario, (S,); the baseline's is 1.
 
     Args:
-        merit: weights.
+        goal: weights.
         metrics: of the design, (S, ...).
         own: of the baseline in the same scenarios, (S, ...).
     """
-    shares = [
-        weight * size(merit, metrics, x) / size(merit, own, x) for x, weight in merit.objective
-    ]
+    shares = [weight * size(goal, metrics, x) / size(goal, own, x) for x, weight in goal.terms]
     return jnp.sum(jnp.stack(shares), axis=0)
 
 
 def judged(
-    merit: Merit, metrics: Metrics, own: Metrics, allowed: Array
+    goal: Objective, metrics: Metrics, own: Metrics, allowed: Array
 ) -> tuple[Array, Array, Array]:
     """Judge a design.
 
     Args:
-        merit: criteria.
+        goal: terms and limits.
         metrics: (S, ...).
         own: of the baseline, (S, ...).
         allowed: limits in each scenario, (S, m).
@@ -106,9 +104,9 @@ def judged(
     Returns:
         objective (), largest value over limit - 1 (m,), largest values (m,).
     """
-    each = objectives(merit, metrics, own)
-    weights = tail_weights(each.shape[0], merit.tail)
-    values = [largest(merit, metrics, name) for name in merit.limits]
+    each = objectives(goal, metrics, own)
+    weights = tail_weights(each.shape[0], goal.tail)
+    values = [largest(goal, metrics, name) for name in goal.limits]
     peaks = jnp.stack(values, axis=1) if values else jnp.zeros((each.shape[0], 0))
     excess = jnp.max(peaks / allowed - 1, axis=0)
     return jnp.sum(-jnp.sort(-each) * weights), excess, jnp.max(peaks, axis=0)
@@ -116,10 +114,10 @@ def judged(
 
 @partial(jax.jit, static_argnums=0)
 def all_judged(
-    merit: Merit, metrics: Metrics, own: Metrics, allowed: Array
+    goal: Objective, metrics: Metrics, own: Metrics, allowed: Array
 ) -> tuple[Array, Array, Array]:
     """`judged` for designs under the same limits, metrics (designs, S, ...)."""
-    return jax.vmap(lambda x: judged(merit, x, own, allowed))(metrics)
+    return jax.vmap(lambda x: judged(goal, x, own, allowed))(metrics)
 
 
 class JudgedDesigns(NamedTuple):
@@ -132,11 +130,13 @@ class JudgedDesigns(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=0)
-def judged_designs(merit: Merit, metrics: Metrics, own: Metrics, allowed: Array) -> JudgedDesigns:
+def judged_designs(
+    goal: Objective, metrics: Metrics, own: Metrics, allowed: Array
+) -> JudgedDesigns:
     """Judge designs and differentiate by the metrics.
 
     Args:
-        merit: criteria.
+        goal: terms and limits.
         metrics: (designs, S, ...).
         own: of the baseline, (S, ...).
         allowed: limits in each scenario, (designs, S, m).
@@ -144,28 +144,28 @@ def judged_designs(merit: Merit, metrics: Metrics, own: Metrics, allowed: Array)
 
     def one(metrics: Metrics, allowed: Array) -> JudgedDesigns:
         def figures(x: Metrics) -> tuple[Array, Array]:
-            objective, limits, peaks = judged(merit, x, own, allowed)
+            objective, limits, peaks = judged(goal, x, own, allowed)
             return jnp.concatenate([objective[None], limits]), peaks
 
-        found, back, peaks = jax.vjp(figures, metrics, has_aux=True)
-        (cotangents,) = jax.vmap(back)(jnp.eye(found.size, dtype=found.dtype))
-        return JudgedDesigns(found[0], found[1:], peaks, cotangents)
+        values, back, peaks = jax.vjp(figures, metrics, has_aux=True)
+        (cotangents,) = jax.vmap(back)(jnp.eye(values.size, dtype=values.dtype))
+        return JudgedDesigns(values[0], values[1:], peaks, cotangents)
 
     axes: Any = JudgedDesigns._make((0, 0, 0, 1))
     return jax.vmap(one, out_axes=axes)(metrics, allowed)
 
 
-def own_limits(merit: Merit, own: Metrics) -> np.ndarray:
+def own_limits(goal: Objective, own: Metrics) -> np.ndarray:
     """The baseline's values, (S, m)."""
-    columns = [np.asarray(largest(merit, own, name)) for name in merit.limits]
+    columns = [np.asarray(largest(goal, own, name)) for name in goal.limits]
     count = len(jax.tree.leaves(own)[0])
     return np.stack(columns, axis=1) if columns else np.zeros((count, 0))
 
 
-def allowed_limits(merit: Merit, family: Family, own: np.ndarray) -> np.ndarray:
+def allowed_limits(goal: Objective, family: Family, own: np.ndarray) -> np.ndarray:
     """Limits of a family's runs in each scenario, (S, m); `own` is from `own_limits`."""
-    given = [family.limits[name] for name in merit.limits]
+    limits = [family.limits[name] for name in goal.limits]
     columns = [
-        own[:, k] if x == BASELINE else np.full(len(own), float(x)) for k, x in enumerate(given)
+        own[:, k] if x == BASELINE else np.full(len(own), float(x)) for k, x in enumerate(limits)
     ]
     return np.stack(columns, axis=1) if columns else own
