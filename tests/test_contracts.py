@@ -305,7 +305,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxmodel.laws.contract import Law, modal_feedback
 from jaxmodel.metrics import Metric, Total
-from studies.export.job import Made, judged
+from studies.export.job import ExportResult, check_loop
 from studies.export.targets import Target
 from studies.space.methods import Method
 
@@ -329,7 +329,8 @@ methods = [
 ]
 
 def up(job):
-    return Made({"../up.txt": ""}, judged(job.found, job.found.channels, ""), None)
+    loop = check_loop(job.exported, job.exported.channels, "")
+    return ExportResult({"../up.txt": ""}, loop, None)
 
 targets = [Target("up", "up", up)]
 """

@@ -19,7 +19,7 @@ from studies.export.fixed import design_fixed, peak_gains, rail_samples, rounded
 from studies.export.floating import respond as respond_floating
 from studies.export.in_the_loop import replay
 from studies.export.integers import respond
-from studies.export.job import judged
+from studies.export.job import check_loop
 from studies.export.verify import reference_run
 from studies.study.spec import parse_study
 from tests.exports import PAPER, SINGLE, TUNED, needs_compiler
@@ -287,13 +287,13 @@ def test_unstable_loops_are_refused_with_their_margin():
     with pytest.raises(
         StudyError, match=r"gain_factor = 4.0; .* spectral radius is 1\.\d+.*margin"
     ):
-        judged(found, found.channels, "")
+        check_loop(found, found.channels, "")
     # a design that is stable, until its filters are rounded to a few bits
     found = fixed_controller(parse_study(PAPER))
-    assert judged(found, found.channels, "").is_stable
+    assert check_loop(found, found.channels, "").is_stable
     coarse = found.channels._replace(denominator=np.round(found.channels.denominator * 4) / 4)
     with pytest.raises(StudyError, match="coefficients rounded"):
-        judged(found, coarse, ", coefficients rounded")
+        check_loop(found, coarse, ", coefficients rounded")
 
 
 def random_design(rng):

@@ -16,7 +16,7 @@ from jaxmodel.state_space import IllConditionedError, StateSpace, dense, modal_f
 from studies.errors import StudyError
 
 
-class BlockFlow(NamedTuple):
+class ModalBlocks(NamedTuple):
     """G groups of N blocks with M sensors and as many actuators; NumPy arrays."""
 
     link: np.ndarray  # controlled links, from 0
@@ -25,7 +25,7 @@ class BlockFlow(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """As `ChannelFlow.kind`."""
+        """As `ActiveChannels.kind`."""
         return "none"
 
     @property
@@ -59,8 +59,8 @@ class BlockFlow(NamedTuple):
         return whole.reshape(*volts.shape[:-2], 3, n_patches)
 
 
-def blocks(system: StateSpace) -> BlockFlow:
-    """BlockFlow of a system, NumPy arrays; systems of links without output are left out.
+def blocks(system: StateSpace) -> ModalBlocks:
+    """Modal blocks of a system, NumPy arrays; systems of links without output are left out.
 
     Raises:
         StudyError: no well-conditioned modal form.
@@ -71,7 +71,7 @@ def blocks(system: StateSpace) -> BlockFlow:
         groups, first = [0], np.array([0])
     else:
         groups, first = list(used), used * n_patches
-    return BlockFlow(used, first, _stacked([_in_pairs(system, g) for g in groups]))
+    return ModalBlocks(used, first, _stacked([_in_pairs(system, g) for g in groups]))
 
 
 def _in_pairs(system: StateSpace, group: int) -> StateSpace:
@@ -103,7 +103,7 @@ def _stacked(parts: list[StateSpace]) -> StateSpace:
     )
 
 
-def restored(arranged: BlockFlow, like: Controller) -> Controller:
+def restored(arranged: ModalBlocks, like: Controller) -> Controller:
     """A controller equivalent to the blocks; `like` supplies what they leave open."""
     system, count = arranged.system, len(like.feedback.state)  # type: ignore[union-attr]
     if count == 1:

@@ -13,7 +13,7 @@ from jaxmodel.channels import Channels
 from jaxmodel.controller import Controller
 
 
-class ChannelFlow(NamedTuple):
+class ActiveChannels(NamedTuple):
     """M channels in the order of links; numbers in SI units."""
 
     kind: str  # what a channel is, "mode" or "patch"
@@ -31,7 +31,7 @@ class ChannelFlow(NamedTuple):
 
     @property
     def is_rival(self) -> np.ndarray:
-        """ChannelFlow that act only while no other channel of their link has more energy, (M,)."""
+        """Channels that act only while no other channel of their link has more energy, (M,)."""
         if self.energy is None:
             return np.zeros(len(self.link), bool)
         return np.any(self.energy, axis=(1, 2))
@@ -62,7 +62,7 @@ def acting(link: np.ndarray, is_rival: np.ndarray, energy: np.ndarray) -> np.nda
 
     Args:
         link: of each channel, (M,).
-        is_rival: see `ChannelFlow`, (M,).
+        is_rival: see `ActiveChannels`, (M,).
         energy: in any common unit, (..., M).
     """
     is_served = np.ones(energy.shape, bool)
@@ -72,8 +72,8 @@ def acting(link: np.ndarray, is_rival: np.ndarray, energy: np.ndarray) -> np.nda
     return is_served
 
 
-def fold(feedback: Channels, kind: str) -> ChannelFlow:
-    """ChannelFlow of a controller.
+def fold(feedback: Channels, kind: str) -> ActiveChannels:
+    """Active channels of a controller.
 
     u = -k_d v - k_p x, with v and x outputs of one filter, has one numerator -k_d n_v - k_p n_x.
 
@@ -99,7 +99,7 @@ def fold(feedback: Channels, kind: str) -> ChannelFlow:
         energy = np.stack([rate * (omega > 0)[:, None], place], axis=1)
     force = -velocity[at][:, None] * gathered(estimator.velocity)
     force = force - position[at][:, None] * gathered(estimator.position)
-    return ChannelFlow(
+    return ActiveChannels(
         kind=kind,
         link=link,
         number=number,
@@ -113,7 +113,7 @@ def fold(feedback: Channels, kind: str) -> ChannelFlow:
     )
 
 
-def unfold(channels: ChannelFlow, like: Controller) -> Controller:
+def unfold(channels: ActiveChannels, like: Controller) -> Controller:
     """A controller equivalent to the channels, with gains of 1.
 
     Args:

@@ -12,8 +12,8 @@ from jaxmodel.controller import Controller
 from jaxmodel.laws import LAWS, is_modal, n_channels
 from jaxmodel.shaper import Taps
 from jaxmodel.state_space import StateSpace
-from studies.engine.blocks import BlockFlow, blocks
-from studies.engine.channels import ChannelFlow, fold
+from studies.engine.blocks import ModalBlocks, blocks
+from studies.engine.channels import ActiveChannels, fold
 from studies.engine.preflight import check_run, preflight
 from studies.engine.runs import resolved_study
 from studies.errors import StudyError, field_error
@@ -27,7 +27,7 @@ class FixedController(NamedTuple):
     structure: Structure
     case: Case
     controller: Controller
-    channels: ChannelFlow | BlockFlow  # the same as code needs it
+    channels: ActiveChannels | ModalBlocks  # the same as code needs it
     taps: Taps  # shaper on the sample grid, one tap per delay, delays rising
     frequency: np.ndarray  # each channel's velocity estimate is exact there [Hz], (3, C)
 
@@ -94,7 +94,7 @@ def _check_exportable(study: Study) -> None:
         raise field_error("control.links", control.links, "at least one link that is controlled")
 
 
-def arrange(controller: Controller, law: str) -> ChannelFlow | BlockFlow:
+def arrange(controller: Controller, law: str) -> ActiveChannels | ModalBlocks:
     """A controller as code needs it.
 
     Raises:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from studies.engine.blocks import BlockFlow
-from studies.engine.channels import ChannelFlow
+from studies.engine.blocks import ModalBlocks
+from studies.engine.channels import ActiveChannels
 from studies.engine.controller import FixedController
 from studies.export.c_text import Source, source
 from studies.export.fixed import WORD, FixedPoint, IntegerRow, shaper_row
@@ -16,7 +16,7 @@ from studies.export.fixed_blocks import FixedBlocks
 
 
 def fixed_source(
-    found: FixedController,
+    exported: FixedController,
     fixed: FixedPoint | FixedBlocks,
     name: str,
     origin: Iterable[str],
@@ -25,33 +25,33 @@ def fixed_source(
     """Controller in fixed point.
 
     Args:
-        found: the controller.
+        exported: the controller.
         fixed: the same in integers.
         name: prefix of functions and types, and name of the files.
         origin: lines that say where the numbers come from.
         cost: cost of a sample, for the file's header.
     """
-    shaper, wires = shaper_row(found.taps), fixed.wires
+    shaper, wires = shaper_row(exported.taps), fixed.wires
     return source(
         "fixed.c",
-        found,
+        exported,
         name,
         origin,
         fixed=fixed,
         word="int32_t",
         wire="uint16_t",
-        formats=format_lines(fixed, found),
+        formats=format_lines(fixed, exported),
         cost=cost,
         code=wires.sensor_step * 2.0**wires.adc_bits,
         weight=shaper.integers[0],
         weight_shift=shaper.shift[0],
-        feedthrough=_rows(wires.feedthrough, found.n_patches),
-        **_constants(found.channels, fixed),
+        feedthrough=_rows(wires.feedthrough, exported.n_patches),
+        **_constants(exported.channels, fixed),
     )
 
 
 def _constants(
-    arranged: ChannelFlow | BlockFlow, fixed: FixedPoint | FixedBlocks
+    channels: ActiveChannels | ModalBlocks, fixed: FixedPoint | FixedBlocks
 ) -> dict[str, Any]:
     if isinstance(fixed, FixedBlocks):
         advance, leave = fixed.advance, fixed.leave
@@ -61,19 +61,19 @@ def _constants(
             "leave": leave.integers.reshape(-1, leave.integers.shape[-1]),
             "leave_shift": leave.shift.ravel(),
         }
-    assert isinstance(arranged, ChannelFlow)
+    assert isinstance(channels, ActiveChannels)
     first, memory, numerator = fixed.high_pass, fixed.memory, fixed.numerator.integers
-    each = np.arange(len(arranged.link))
+    each = np.arange(len(channels.link))
     return {
-        "first_mode": np.searchsorted(arranged.link, np.arange(4)),
+        "first_mode": np.searchsorted(channels.link, np.arange(4)),
         "high_pass": np.hstack([first.integers, memory.integers]),
         "high_pass_shift": np.stack([first.shift, memory.shift], axis=1),
         "force": numerator[:, :3],
         "direct": numerator[:, 3],
-        "synthesizer": fixed.synthesizer.integers[arranged.link, :, each],
+        "synthesizer": fixed.synthesizer.integers[channels.link, :, each],
         "energy": _rows(fixed.energy, 4),
         "energy_names": [
-            f"{c}, {what}" for c in arranged.names for what in ("velocity", "position")
+            f"{c}, {what}" for c in channels.names for what in ("velocity", "position")
         ],
     }
 
@@ -83,15 +83,15 @@ def _rows(table: IntegerRow | None, length: int) -> np.ndarray | None:
     return None if table is None else table.integers.reshape(-1, length)
 
 
-def format_lines(fixed: FixedPoint | FixedBlocks, found: FixedController) -> list[str]:
+def format_lines(fixed: FixedPoint | FixedBlocks, exported: FixedController) -> list[str]:
     """Table of formats; word range and reach of ADC codes in units of the base."""
     lines = [
         f"{'signal':<30}{'Q':>4}{'base':>20}{'room':>9}{'reach':>9}",
         f"{'sensors':<30}{fixed.wires.adc_bits:>4}{'1 code':>20}",
     ]
-    for m, name in enumerate(found.channels.names):
+    for m, name in enumerate(exported.channels.names):
         for text, form, unit in fixed.formats:
-            unit = unit if found.is_modal else "V"
+            unit = unit if exported.is_modal else "V"
             lines.append(
                 f"{f'{text}, {name}':<30}{form.bits[m]:>4}{f'{form.base[m]:.9e} {unit}':>20}"
                 f"{2.0 ** (WORD - 1 - form.bits[m]):>9.0f}{form.bound[m] / form.base[m]:>9.1f}"

@@ -5,45 +5,45 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from studies.engine.blocks import BlockFlow
-from studies.engine.channels import ChannelFlow
+from studies.engine.blocks import ModalBlocks
+from studies.engine.channels import ActiveChannels
 from studies.engine.controller import FixedController
 from studies.export.c_text import Source, real, source
 
 
-def floating_source(found: FixedController, name: str, origin: Iterable[str]) -> Source:
+def floating_source(exported: FixedController, name: str, origin: Iterable[str]) -> Source:
     """Controller in double or single precision.
 
     Args:
-        found: the controller.
+        exported: the controller.
         name: prefix of functions and types, and name of the files.
         origin: lines that say where the numbers come from.
     """
     return source(
         "floating.c",
-        found,
+        exported,
         name,
         origin,
         fixed=None,
         word=f"{name}_real",
         wire=f"{name}_real",
-        is_modal=found.is_modal,
-        feedthrough=found.controller.feedthrough.reshape(-1, found.n_patches),
-        weight=found.taps.weight,
+        is_modal=exported.is_modal,
+        feedthrough=exported.controller.feedthrough.reshape(-1, exported.n_patches),
+        weight=exported.taps.weight,
         real=real,
-        **_constants(found.channels),
+        **_constants(exported.channels),
     )
 
 
-def _constants(arranged: ChannelFlow | BlockFlow) -> dict[str, Any]:
-    if isinstance(arranged, ChannelFlow):
-        energy = arranged.energy
+def _constants(channels: ActiveChannels | ModalBlocks) -> dict[str, Any]:
+    if isinstance(channels, ActiveChannels):
+        energy = channels.energy
         return {
             "has_rivals": energy is not None,
             "velocity": None if energy is None else energy[:, 0, :3],
             "position": None if energy is None else energy[:, 1],
         }
-    system = arranged.system
+    system = channels.system
     size = system.direct.shape[1]
     return {
         "has_rivals": False,

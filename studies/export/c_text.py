@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from studies.engine.blocks import BlockFlow
-from studies.engine.channels import ChannelFlow
+from studies.engine.blocks import ModalBlocks
+from studies.engine.channels import ActiveChannels
 from studies.engine.controller import FixedController
 from studies.export.fixed import rail_samples
 from studies.show.pages import render
@@ -27,40 +27,42 @@ class Source(NamedTuple):
 
 
 def source(
-    template: str, found: FixedController, name: str, origin: Iterable[str], **values: Any
+    template: str, exported: FixedController, name: str, origin: Iterable[str], **values: Any
 ) -> Source:
     """Header and code from their templates.
 
     Args:
         template: file of the code.
-        found: the controller.
+        exported: the controller.
         name: prefix of functions and types, and name of the files.
         origin: lines that say where the numbers come from.
         values: for one kind of arithmetic: `word` and `wire`, the types of stored values and of
             sensors and actuators; `fixed`, the controller in integers or None; `weight` of the
             shaper's taps; and what only this code needs.
     """
-    arranged, electronics = found.channels, found.study.electronics
+    channels, electronics = exported.channels, exported.study.electronics
     rail = rail_samples(electronics.sample_rate_hz)
-    has_feedthrough = bool(np.any(found.controller.feedthrough))
+    has_feedthrough = bool(np.any(exported.controller.feedthrough))
     values |= {
         "name": name,
         "NAME": name.upper(),
         "origin": [plain(line) for line in origin],
-        "controller": found.controller,
-        **_arranged(arranged),
+        "controller": exported.controller,
+        **_channel_values(channels),
         "electronics": electronics,
-        "shaper": found.study.shaper.kind,
-        "n_patches": found.n_patches,
-        "is_used": np.isin(np.arange(3), arranged.link).astype(int),
-        "patches": [f"link {i}, patch {k + 1}" for i in (1, 2, 3) for k in range(found.n_patches)],
+        "shaper": exported.study.shaper.kind,
+        "n_patches": exported.n_patches,
+        "is_used": np.isin(np.arange(3), channels.link).astype(int),
+        "patches": [
+            f"link {i}, patch {k + 1}" for i in (1, 2, 3) for k in range(exported.n_patches)
+        ],
         "has_feedthrough": has_feedthrough,
-        "has_first": has_feedthrough or isinstance(arranged, ChannelFlow),
+        "has_first": has_feedthrough or isinstance(channels, ActiveChannels),
         "rail": rail,
         "rail_ms": f"{1e3 * rail / electronics.sample_rate_hz:.3g}",
-        "settle": arranged.memory(1e-4),
-        "delay": found.taps.sample,
-        "shaper_length": int(found.taps.sample.max()) + 1,
+        "settle": channels.memory(1e-4),
+        "delay": exported.taps.sample,
+        "shaper_length": int(exported.taps.sample.max()) + 1,
         "exact": exact,
         "array": array,
     }
@@ -68,18 +70,18 @@ def source(
     return Source(*(render(f"export/templates/{file}", **values) for file in files))
 
 
-def _arranged(arranged: ChannelFlow | BlockFlow) -> dict[str, Any]:
+def _channel_values(channels: ActiveChannels | ModalBlocks) -> dict[str, Any]:
     """What templates read of channels, or of blocks; the other is None."""
-    if isinstance(arranged, ChannelFlow):
+    if isinstance(channels, ActiveChannels):
         return {
             "blocks": None,
-            "channels": arranged,
-            "is_rival": arranged.is_rival.astype(int),
+            "channels": channels,
+            "is_rival": channels.is_rival.astype(int),
         }
-    groups, n, _, size = arranged.system.enter.shape
+    groups, n, _, size = channels.system.enter.shape
     ports = [f"system {g + 1}, actuator {k + 1}" for g in range(groups) for k in range(size)]
     return {
-        "blocks": arranged,
+        "blocks": channels,
         "channels": None,
         "order": 2 * n,
         "n_ports": size,

@@ -44,8 +44,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.engine.design import load_design
         from studies.export.run import export_design
 
-        found = load_design(design, case)
-        if not export_design(found, target, out, verify, name, dac_bits, console):
+        chosen = load_design(design, case)
+        if not export_design(chosen, target, out, verify, name, dac_bits, console):
             sys.exit(1)
 
     @app.command("import-gains")

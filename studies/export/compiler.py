@@ -21,7 +21,7 @@ from studies.export.c_text import Source
 #: Flags with which exported code must compile without warnings.
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 _NAMES = ("cc", "gcc", "clang")
-_WANTED = "allowed: a C99 compiler for this machine, named by the variable CC; or --no-verify"
+_ALLOWED = "allowed: a C99 compiler for this machine, named by the variable CC; or --no-verify"
 NO_COMPILER = "no C compiler found (the command in the variable CC if it is set, or cc, gcc, clang)"
 
 
@@ -42,9 +42,9 @@ class Code(NamedTuple):
 
     def step(self, sensor: np.ndarray) -> tuple[np.ndarray, int]:
         """One sample: actuator values and the fault, from sensor values (3 K,)."""
-        given: np.ndarray = np.ascontiguousarray(sensor, self.real).ravel()
+        inputs: np.ndarray = np.ascontiguousarray(sensor, self.real).ravel()
         out: np.ndarray = np.empty(self.n_channels, self.real)
-        fault = getattr(self.library, f"{self.name}_step")(self.state, _at(given), _at(out))
+        fault = getattr(self.library, f"{self.name}_step")(self.state, _at(inputs), _at(out))
         return out, fault
 
     def respond(self, sensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -57,11 +57,11 @@ class Code(NamedTuple):
     def shape(self, reference: np.ndarray) -> np.ndarray:
         """A shaped reference (T, 3), starting at rest in its first row."""
         room = ctypes.create_string_buffer(self.shaper_length * 3 * 8 + 64)
-        given: np.ndarray = np.ascontiguousarray(reference, self.reference)
-        getattr(self.library, f"{self.name}_shape_init")(room, _at(given[0]))
-        out = np.empty_like(given)
+        poses: np.ndarray = np.ascontiguousarray(reference, self.reference)
+        getattr(self.library, f"{self.name}_shape_init")(room, _at(poses[0]))
+        out = np.empty_like(poses)
         step = getattr(self.library, f"{self.name}_shape_step")
-        for row, shaped in zip(given, out, strict=True):
+        for row, shaped in zip(poses, out, strict=True):
             step(room, _at(row), _at(shaped))
         return out
 
@@ -73,10 +73,10 @@ def _at(array: np.ndarray) -> ctypes.c_void_p:
 def find_compiler() -> list[str]:
     """Command of a C compiler, from the variable CC or by name; [] if there is none."""
     try:
-        given = shlex.split(os.environ.get("CC", ""))
+        custom = shlex.split(os.environ.get("CC", ""))
     except ValueError as error:
         raise StudyError(f"CC = {os.environ['CC']!r}: not a command ({error})") from None
-    for command in [given] if given else [[name] for name in _NAMES]:
+    for command in [custom] if custom else [[name] for name in _NAMES]:
         if shutil.which(command[0]):
             return command
     return []
@@ -129,7 +129,7 @@ def compiled(
         except OSError as error:
             raise StudyError(
                 f"C compiler {shlex.join(compiler)}: its code does not run here ({error}); "
-                f"{_WANTED}"
+                f"{_ALLOWED}"
             ) from None
         yield Code(
             library=loaded,
@@ -146,6 +146,6 @@ def _run(command: list[str]) -> None:
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise StudyError(f"C compiler {command[0]}: does not work ({error}); {_WANTED}") from None
+        raise StudyError(f"C compiler {command[0]}: does not work ({error}); {_ALLOWED}") from None
     if done.returncode:
-        raise StudyError(f"C compiler {command[0]}: {done.stderr.strip()[:2000]}; {_WANTED}")
+        raise StudyError(f"C compiler {command[0]}: {done.stderr.strip()[:2000]}; {_ALLOWED}")

@@ -35,21 +35,21 @@ CLOCK = 150e6
 CYCLES = (12, 30, 30, 200)
 
 
-def cost_of(found: FixedController, fixed: FixedPoint | FixedBlocks) -> Cost:
+def cost_of(exported: FixedController, fixed: FixedPoint | FixedBlocks) -> Cost:
     """Multiplications, cycles, load and memory of a sample."""
-    n_taps, k = len(found.taps.weight), found.n_patches
-    n_channels = k * len(np.unique(found.channels.link))
+    n_taps, k = len(exported.taps.weight), exported.n_patches
+    n_channels = k * len(np.unique(exported.channels.link))
     count = _of_blocks if isinstance(fixed, FixedBlocks) else _of_channels
     products, roundings, words = count(fixed)  # type: ignore[arg-type]
     # codes to counts; three coordinates of the shaper
     products, roundings = products + n_channels + 3 * n_taps, roundings + 2 * n_channels + 3
-    words += 3 * k + 1 + 2 * (3 * (int(found.taps.sample.max()) + 1) + 1)
+    words += 3 * k + 1 + 2 * (3 * (int(exported.taps.sample.max()) + 1) + 1)
     if fixed.wires.feedthrough is not None:
         products, roundings = products + n_channels * k, roundings + n_channels
         words += 2 * 3 * k
     parts = (products, roundings, n_channels, 1)
     cycles = sum(count * each for count, each in zip(parts, CYCLES, strict=True))
-    load = cycles * found.study.electronics.sample_rate_hz / CLOCK
+    load = cycles * exported.study.electronics.sample_rate_hz / CLOCK
     return Cost(products=products, roundings=roundings, cycles=cycles, load=load, words=words)
 
 

@@ -111,9 +111,9 @@ def study_hash(study: Study) -> str:
     return sha256(text.encode()).hexdigest()
 
 
-def document(found: FixedController, case_id: str = "") -> Document:
+def document(exported: FixedController, case_id: str = "") -> Document:
     """The document of a controller; case_id: of the case in its sweep."""
-    study, controller = found.study, found.controller
+    study, controller = exported.study, exported.controller
     facts = config.info()
     kept = (config.PACKAGE, "python", "jax", "jaxlib", "numpy")
     return Document(
@@ -128,10 +128,10 @@ def document(found: FixedController, case_id: str = "") -> Document:
         order=ORDER,
         steps=_steps(controller.feedback),
         masks=Masks(
-            links=[k in found.channels.link for k in range(3)],
+            links=[k in exported.channels.link for k in range(3)],
             modes=controller.feedback.acting.tolist(),
         ),
-        numbers=_numbers(found),
+        numbers=_numbers(exported),
         study=json.loads(json.dumps(study.model_dump(mode="json"))),
     )
 
@@ -142,13 +142,13 @@ def _steps(feedback: Feedback) -> list[str]:
     return STEPS if feedback.rival_omega is None else [*STEPS[:8], RIVALS, *STEPS[8:]]
 
 
-def _numbers(found: FixedController) -> dict[str, Quantity]:
+def _numbers(exported: FixedController) -> dict[str, Quantity]:
     """Every number of the controller, by name."""
-    controller, electronics = found.controller, found.study.electronics
+    controller, electronics = exported.controller, exported.study.electronics
     if isinstance(controller.feedback, StateSpace):
         of_feedback = _of_system(controller.feedback)
     else:
-        of_feedback = _of_channels(found, controller.feedback)
+        of_feedback = _of_channels(exported, controller.feedback)
     return {
         "sample_rate": _one(electronics.sample_rate_hz, "Hz", "how often a sample is taken"),
         "antialias": _one(
@@ -169,9 +169,11 @@ def _numbers(found: FixedController) -> dict[str, Quantity]:
         ),
         **of_feedback,
         "voltage_limit": _one(controller.voltage_limit, "V", "of every actuator, +-"),
-        "shaper_weight": _one(found.taps.weight, "1", "of each tap of the input shaper", ["tap"]),
+        "shaper_weight": _one(
+            exported.taps.weight, "1", "of each tap of the input shaper", ["tap"]
+        ),
         "shaper_delay": _one(
-            found.taps.sample.astype(float), "1", "of each tap [samples]", ["tap"]
+            exported.taps.sample.astype(float), "1", "of each tap [samples]", ["tap"]
         ),
     }
 
@@ -193,18 +195,18 @@ def _of_system(system: StateSpace) -> dict[str, Quantity]:
     }
 
 
-def _of_channels(found: FixedController, feedback: Channels) -> dict[str, Quantity]:
+def _of_channels(exported: FixedController, feedback: Channels) -> dict[str, Quantity]:
     """Filters, sections and gains of the channels."""
     estimator, position = feedback.estimator, feedback.position_gain
-    to_signal, from_force = ("m/V", "V/N") if found.is_modal else ("1", "1")
-    on_rate, on_value = ("N s/m", "N/m") if found.is_modal else ("s", "1")
+    to_signal, from_force = ("m/V", "V/N") if exported.is_modal else ("1", "1")
+    on_rate, on_value = ("N s/m", "N/m") if exported.is_modal else ("s", "1")
     shape = feedback.velocity_gain.shape
-    is_phase = found.study.electronics.estimator == "modal_phase"
+    is_phase = exported.study.electronics.estimator == "modal_phase"
     # the section that differentiates turns the signal into a rate: the last one of modal_phase
     rate = "1" if is_phase else "1/s"
     last = "1/s" if is_phase else "1"
 
-    channel = found.channels.kind
+    channel = exported.channels.kind
     each_axes = [_LINK, channel]
 
     def each(value: Any, unit: str, meaning: str) -> Quantity:
@@ -217,7 +219,7 @@ def _of_channels(found: FixedController, feedback: Channels) -> dict[str, Quanti
             "channel signal of each sensor voltage",
             [*each_axes, _PATCH],
         ),
-        "channel_frequency": each(found.frequency, "Hz", "the velocity estimate is exact there"),
+        "channel_frequency": each(exported.frequency, "Hz", "the velocity estimate is exact there"),
         "high_pass_b0": each(estimator.first[0], rate, "first section, numerator"),
         "high_pass_b1": each(estimator.first[1], rate, "first section, numerator of z^-1"),
         "high_pass_a1": each(estimator.first[2], "1", "first section, denominator of z^-1"),
@@ -351,54 +353,56 @@ def import_study(path: str | Path) -> Study:
         StudyError: unreadable, not a document, changed by hand.
     """
     path = Path(path)
-    given = read_document(path)
+    imported = read_document(path)
     try:
-        study = parse_study(given.study)
+        study = parse_study(imported.study)
     except StudyError as error:
         raise StudyError(f"{path}: study: {error}") from None
-    if study_hash(study) != given.study_hash:
+    if study_hash(study) != imported.study_hash:
         raise StudyError(
             f"{path}: study was changed after the export; allowed: the study as exported (change a "
             "study file and export it again)"
         )
-    wanted = document(fixed_controller(study), given.case_id)
+    expected = document(fixed_controller(study), imported.case_id)
     for field in ("title", "law", "estimator", "masks"):
-        mine, own = getattr(given, field), getattr(wanted, field)
-        if mine != own:
-            raise StudyError(f"{path}: {field} = {shown(mine)}; allowed: {shown(own)}, {_AS_STUDY}")
-    for name in sorted(set(wanted.numbers) | set(given.numbers)):
-        if name not in given.numbers or name not in wanted.numbers:
-            fault = "missing" if name in wanted.numbers else "unknown"
+        text, allowed = getattr(imported, field), getattr(expected, field)
+        if text != allowed:
+            raise StudyError(
+                f"{path}: {field} = {shown(text)}; allowed: {shown(allowed)}, {_AS_STUDY}"
+            )
+    for name in sorted(set(expected.numbers) | set(imported.numbers)):
+        if name not in imported.numbers or name not in expected.numbers:
+            fault = "missing" if name in expected.numbers else "unknown"
             raise StudyError(f"{path}: numbers.{name}: {fault}")
-        _check_equal(path, name, given.numbers[name], wanted.numbers[name])
+        _check_equal(path, name, imported.numbers[name], expected.numbers[name])
     return study
 
 
 _AS_STUDY = "which its study gives; change the study and export it again"
 
 
-def _check_equal(path: Path, name: str, given: Quantity, wanted: Quantity) -> None:
+def _check_equal(path: Path, name: str, imported: Quantity, expected: Quantity) -> None:
     """Reject numbers that the study does not reproduce."""
     for label in ("unit", "axes"):
-        mine, right = getattr(given, label), getattr(wanted, label)
-        if mine != right:
+        text, allowed = getattr(imported, label), getattr(expected, label)
+        if text != allowed:
             raise StudyError(
-                f"{path}: numbers.{name}.{label} = {shown(mine)}; allowed: {shown(right)}"
+                f"{path}: numbers.{name}.{label} = {shown(text)}; allowed: {shown(allowed)}"
             )
     try:
-        found, own = np.array(given.value, float), np.array(wanted.value, float)
+        values, own = np.array(imported.value, float), np.array(expected.value, float)
     except ValueError:  # lists of unequal length
         raise StudyError(f"{path}: numbers.{name}: not a table of numbers") from None
-    if found.shape != own.shape:
+    if values.shape != own.shape:
         raise StudyError(
-            f"{path}: numbers.{name} has shape {found.shape}; allowed: {own.shape}, as its study"
+            f"{path}: numbers.{name} has shape {values.shape}; allowed: {own.shape}, as its study"
         )
     size = np.abs(own).max(initial=0.0)
     # a non-finite number also differs
-    wrong = ~(np.abs(found - own) <= ROUNDING * np.abs(own) + CANCELLED * size)
+    wrong = ~(np.abs(values - own) <= ROUNDING * np.abs(own) + CANCELLED * size)
     if np.any(wrong):
         at = tuple(int(k) for k in np.argwhere(wrong)[0])
         raise StudyError(
-            f"{path}: numbers.{name}{list(at) if at else ''} = {found[at]:.9g}; allowed: "
-            f"{own[at]:.9g} [{wanted.unit}], {_AS_STUDY}"
+            f"{path}: numbers.{name}{list(at) if at else ''} = {values[at]:.9g}; allowed: "
+            f"{own[at]:.9g} [{expected.unit}], {_AS_STUDY}"
         )

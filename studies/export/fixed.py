@@ -15,8 +15,8 @@ import scipy
 
 from jaxmodel.controller import Controller
 from jaxmodel.shaper import Taps
-from studies.engine.blocks import BlockFlow
-from studies.engine.channels import ChannelFlow
+from studies.engine.blocks import ModalBlocks
+from studies.engine.channels import ActiveChannels
 from studies.engine.controller import FixedController
 from studies.errors import StudyError, field_error
 from studies.export.floating import Signals, respond_from
@@ -136,42 +136,42 @@ def rail_samples(rate: float) -> int:
     return min(max(round(RAIL_TIME * rate), 2), 2**15 - 1)
 
 
-def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedPoint:
+def design_fixed(exported: FixedController, signals: Signals, dac_bits: int) -> FixedPoint:
     """Formats and coefficients for a controller.
 
     Args:
-        found: the controller.
-        seen: signals of the simulated motion, (T, ...).
+        exported: the controller.
+        signals: signals of the simulated motion, (T, ...).
         dac_bits: resolution of the DAC, whose codes 1 to 2^bits - 1 span +-voltage_limit.
 
     Raises:
         StudyError: what cannot be represented, with the number and a remedy.
     """
-    controller, channels = found.controller, found.channels
-    assert isinstance(channels, ChannelFlow)
-    check_words(found)
+    controller, channels = exported.controller, exported.channels
+    assert isinstance(channels, ActiveChannels)
+    check_words(exported)
     if channels.energy is not None and np.any(controller.feedthrough):
         raise field_error(
             "control.feedthrough_factor",
-            found.study.control.feedthrough_factor,
+            exported.study.control.feedthrough_factor,
             "0 for fixed point with a law whose channels act one at a time (or --target c): "
             "what a switch brings back by feed-through has no bound",
             "1",
         )
-    wires = design_wires(found, dac_bits)
+    wires = design_wires(exported, dac_bits)
     step, dac_step = wires.sensor_step, wires.dac_step
     memory = channels.memory(FORGOTTEN)
     gains = peak_gains(channels, memory)
     sensor = sensor_bound(controller)  # (3, K)
     bound = np.sum(np.abs(channels.filter) * sensor[channels.link], axis=1)
-    signal = find_format(seen.signal, bound)
-    high = find_format(seen.high, bound * gains.high)
-    inner = find_format(seen.inner, bound * gains.inner)
-    force = find_format(seen.force, bound * gains.force)
+    signal = find_format(signals.signal, bound)
+    high = find_format(signals.high, bound * gains.high)
+    inner = find_format(signals.inner, bound * gains.inner)
+    force = find_format(signals.force, bound * gains.force)
     b0, b1, a1 = channels.first.T
     one = np.ones_like(b0)
     tap = channels.force * (inner.step / force.step)[:, None]
-    back = np.zeros((3, found.n_patches, len(channels.link)))
+    back = np.zeros((3, exported.n_patches, len(channels.link)))
     back[channels.link, :, np.arange(len(channels.link))] = channels.synthesizer
     fixed = FixedPoint(
         wires=wires,
@@ -193,20 +193,20 @@ def design_fixed(found: FixedController, seen: Signals, dac_bits: int) -> FixedP
         synthesizer=find_row(back * force.step / dac_step, "synthesizer"),
         is_rival=channels.is_rival,
         energy=_energy(channels, bound, inner, signal, memory),
-        error=ErrorBound(*np.zeros((3, 3, found.n_patches))),
+        error=ErrorBound(*np.zeros((3, 3, exported.n_patches))),
     )
-    error = _error_bound(found, fixed, gains, memory)
-    check_error(found, error, dac_step)
+    error = _error_bound(exported, fixed, gains, memory)
+    check_error(exported, error, dac_step)
     return fixed._replace(error=error)
 
 
-def design_wires(found: FixedController, dac_bits: int) -> Wires:
+def design_wires(exported: FixedController, dac_bits: int) -> Wires:
     """Formats of sensors and actuators.
 
     Raises:
         StudyError: sensor signals too large for a word.
     """
-    controller = found.controller
+    controller = exported.controller
     rest = 2 ** (dac_bits - 1)
     dac_step = float(controller.voltage_limit) / (rest - 1)
     code = float(controller.adc_step / controller.adc_gain)  # one ADC code at the sensor [V]
@@ -233,13 +233,13 @@ def design_wires(found: FixedController, dac_bits: int) -> Wires:
     )
 
 
-def check_words(found: FixedController) -> None:
+def check_words(exported: FixedController) -> None:
     """Reject converters and filters that do not fit into words, before anything runs.
 
     Raises:
         StudyError: codes too long, or a filter that retains rounding errors for too long.
     """
-    electronics = found.study.electronics
+    electronics = exported.study.electronics
     if electronics.adc_bits > ADC_BITS:
         raise field_error(
             "electronics.adc_bits",
@@ -248,8 +248,8 @@ def check_words(found: FixedController) -> None:
             "1",
         )
     slowest = 1 + np.log(FORGOTTEN) / LONGEST_MEMORY  # slowest pole that forgets in time
-    pole = found.channels.slowest_pole
-    if pole > slowest and isinstance(found.channels, BlockFlow):
+    pole = exported.channels.slowest_pole
+    if pole > slowest and isinstance(exported.channels, ModalBlocks):
         raise StudyError(
             f"fixed point: the controller has a pole of modulus {pole:.12g}; allowed: up to "
             f"{slowest:.12g}, or it keeps rounding errors for too long (or --target c)"
@@ -268,7 +268,7 @@ def check_words(found: FixedController) -> None:
 
 
 def _energy(
-    channels: ChannelFlow, bound: np.ndarray, inner: Format, signal: Format, memory: int
+    channels: ActiveChannels, bound: np.ndarray, inner: Format, signal: Format, memory: int
 ) -> IntegerRow | None:
     """Roots of the energies of rivals: the squares of two of them sum within 63 bits.
 
@@ -298,7 +298,7 @@ def _energy(
     return find_row(factors, "modal energies")
 
 
-def _responses(channels: ChannelFlow, m: int, n: int) -> tuple[np.ndarray, ...]:
+def _responses(channels: ActiveChannels, m: int, n: int) -> tuple[np.ndarray, ...]:
     """Impulse responses of channel m: to high, inner, force; from high and inner to force."""
     impulse = np.zeros(n)
     impulse[0] = 1.0
@@ -313,7 +313,7 @@ def _responses(channels: ChannelFlow, m: int, n: int) -> tuple[np.ndarray, ...]:
     return high, inner, force, of_high, of_inner
 
 
-def peak_gains(channels: ChannelFlow, n: int) -> Gains:
+def peak_gains(channels: ActiveChannels, n: int) -> Gains:
     """Peak gains of all channels by impulse responses of n samples."""
     rows = [
         [np.abs(response).sum() for response in _responses(channels, m, n)]
@@ -356,7 +356,7 @@ def find_row(factors: np.ndarray, name: str) -> IntegerRow:
     return IntegerRow(np.round(factors * 2.0 ** shift[..., None]).astype(np.int64), shift)
 
 
-def rounded(fixed: FixedPoint, like: ChannelFlow) -> ChannelFlow:
+def rounded(fixed: FixedPoint, like: ActiveChannels) -> ActiveChannels:
     """The channels that the integers represent, in SI units."""
     f = fixed
     scale = f.low_pass.values[:, 0] * f.inner.step / f.high.step  # 1, rounded
@@ -379,10 +379,10 @@ def rounded(fixed: FixedPoint, like: ChannelFlow) -> ChannelFlow:
     )
 
 
-def _error_bound(found: FixedController, fixed: FixedPoint, gains: Gains, n: int) -> ErrorBound:
+def _error_bound(exported: FixedController, fixed: FixedPoint, gains: Gains, n: int) -> ErrorBound:
     """Peak errors at the actuators: the sum of every rounding through its peak gain."""
-    exact = found.channels
-    assert isinstance(exact, ChannelFlow)
+    exact = exported.channels
+    assert isinstance(exact, ActiveChannels)
     near = rounded(fixed, exact)
     half = 0.5
     # bias and feed-through are rounded once each
@@ -390,7 +390,7 @@ def _error_bound(found: FixedController, fixed: FixedPoint, gains: Gains, n: int
     force = entering * gains.force + half * fixed.force.step
     force = force + 2 * half * fixed.high.step * gains.force_of_high
     force = force + half * fixed.inner.step * gains.force_of_inner
-    size, volts = np.abs(exact.synthesizer), sensor_bound(found.controller)[exact.link]
+    size, volts = np.abs(exact.synthesizer), sensor_bound(exported.controller)[exact.link]
     change = np.array(
         [
             np.abs(_responses(near, m, n)[2] - _responses(exact, m, n)[2]).sum()
@@ -403,31 +403,31 @@ def _error_bound(found: FixedController, fixed: FixedPoint, gains: Gains, n: int
     wrong = wrong[:, None] * size + (signal * gains.force)[:, None] * np.abs(
         near.synthesizer - exact.synthesizer
     )
-    rounding, coefficients = np.zeros((2, 3, found.n_patches))
+    rounding, coefficients = np.zeros((2, 3, exported.n_patches))
     np.add.at(rounding, exact.link, force[:, None] * size)
     np.add.at(coefficients, exact.link, wrong)
     inside = rounding + coefficients + half * fixed.wires.dac_step
-    return ErrorBound(rounding, coefficients, output_error_bound(found, inside))
+    return ErrorBound(rounding, coefficients, output_error_bound(exported, inside))
 
 
-def output_error_bound(found: FixedController, error: np.ndarray) -> np.ndarray:
+def output_error_bound(exported: FixedController, error: np.ndarray) -> np.ndarray:
     """Errors of commands including their feed-through, (3, K).
 
     An error of a command enters the sensors in the next sample, and so the next command. Uses peak
     gains of this recursion from its impulse response, valid while no actuator is at its limit.
     Infinite if it does not die out.
     """
-    controller = found.controller
+    controller = exported.controller
     if not np.any(controller.feedthrough):
         return error
-    n = found.n_patches
+    n = exported.n_patches
     kick = np.broadcast_to(np.eye(n)[:, None], (n, 3, n))  # one actuator of each link at a time
     linear = controller._replace(
         voltage_limit=np.inf, adc_bias=np.zeros(()), adc_step=np.ones(()), adc_gain=np.ones(())
     )
     silent = np.zeros((ECHO, n, 3, n))
     with np.errstate(over="ignore", invalid="ignore"):
-        echo = respond_from(found.channels, linear, silent, kick).command
+        echo = respond_from(exported.channels, linear, silent, kick).command
     peak = np.abs(echo)
     if not np.all(np.isfinite(peak)) or peak[-ECHO // 10 :].max() > 1e-6 * peak.max():
         return np.full_like(error, np.inf)
@@ -435,7 +435,7 @@ def output_error_bound(found: FixedController, error: np.ndarray) -> np.ndarray:
     return error + np.einsum("lik,il->ik", gain, error)
 
 
-def check_error(found: FixedController, error: ErrorBound, dac_step: float) -> None:
+def check_error(exported: FixedController, error: ErrorBound, dac_step: float) -> None:
     worst = error.inside
     if worst.max() <= ALLOWED_ERROR * dac_step:
         return
@@ -443,8 +443,8 @@ def check_error(found: FixedController, error: ErrorBound, dac_step: float) -> N
     raise StudyError(
         f"fixed point: rounding can add up to {worst.max():.3g} V at actuator {patch + 1} of link "
         f"{link + 1}; allowed: {ALLOWED_ERROR * dac_step:.3g} [V], half a step of the DAC; lower "
-        f"electronics.sample_rate_hz = {found.study.electronics.sample_rate_hz:g} or the gains, "
-        f"raise electronics.highpass_hz = {found.study.electronics.highpass_hz:g}, choose "
+        f"electronics.sample_rate_hz = {exported.study.electronics.sample_rate_hz:g} or the gains, "
+        f"raise electronics.highpass_hz = {exported.study.electronics.highpass_hz:g}, choose "
         "patches.centers whose modal filter is better conditioned, or take --target c"
     )
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.state_space import StateSpace
-from studies.engine.blocks import BlockFlow, ImpulseResponses, responses
+from studies.engine.blocks import ImpulseResponses, ModalBlocks, responses
 from studies.engine.controller import FixedController
 from studies.export.fixed import (
     FORGOTTEN,
@@ -31,10 +31,10 @@ from studies.export.floating import BlockSignals
 
 
 class FixedBlocks(NamedTuple):
-    """A controller in fixed point; groups first, as in `BlockFlow`."""
+    """A controller in fixed point; groups first, as in `ModalBlocks`."""
 
     wires: Wires
-    blocks: BlockFlow  # the same in SI units
+    blocks: ModalBlocks  # the same in SI units
     state: Format  # [V], (G, N, 2)
     advance: IntegerRow  # two states of the block, then the sensors, (G, N, 2, 2 + M)
     leave: IntegerRow  # all states of the group, then the sensors, (G, M, 2 N + M)
@@ -57,18 +57,18 @@ class FixedBlocks(NamedTuple):
         return
 
 
-def design_blocks(found: FixedController, seen: BlockSignals, dac_bits: int) -> FixedBlocks:
+def design_blocks(exported: FixedController, signals: BlockSignals, dac_bits: int) -> FixedBlocks:
     """Formats and coefficients; arguments and errors as `studies.export.fixed.design_fixed`."""
-    arranged = found.channels
-    assert isinstance(arranged, BlockFlow)
-    check_words(found)
-    wires = design_wires(found, dac_bits)
-    system, memory = arranged.system, arranged.memory(FORGOTTEN)
+    blocks = exported.channels
+    assert isinstance(blocks, ModalBlocks)
+    check_words(exported)
+    wires = design_wires(exported, dac_bits)
+    system, memory = blocks.system, blocks.memory(FORGOTTEN)
     groups, n, _, size = system.enter.shape
-    volts = arranged.of_groups(sensor_bound(found.controller))  # (G, M)
+    volts = blocks.of_groups(sensor_bound(exported.controller))  # (G, M)
     each = [responses(system, g, memory) for g in range(groups)]
     bound = np.stack([np.abs(x.state).sum(axis=3) @ v for x, v in zip(each, volts, strict=True)])
-    state = find_format(seen.state, np.maximum(bound, np.finfo(float).tiny))
+    state = find_format(signals.state, np.maximum(bound, np.finfo(float).tiny))
     step, sensor = state.step, wires.sensor_step
     within = system.state * step[:, :, None, :] / step[..., None]
     entering = system.enter * sensor / step[..., None]
@@ -76,18 +76,18 @@ def design_blocks(found: FixedController, seen: BlockSignals, dac_bits: int) -> 
     direct = system.direct * sensor / wires.dac_step
     fixed = FixedBlocks(
         wires=wires,
-        blocks=arranged,
+        blocks=blocks,
         state=state,
         advance=find_row(np.concatenate([within, entering], axis=3), "states"),
         leave=find_row(np.concatenate([leaving, direct], axis=2), "outputs"),
-        error=ErrorBound(*np.zeros((3, 3, found.n_patches))),
+        error=ErrorBound(*np.zeros((3, 3, exported.n_patches))),
     )
-    error = _error_bound(found, arranged, fixed, each, memory)
-    check_error(found, error, wires.dac_step)
+    error = _error_bound(exported, blocks, fixed, each, memory)
+    check_error(exported, error, wires.dac_step)
     return fixed._replace(error=error)
 
 
-def rounded_blocks(fixed: FixedBlocks, like: BlockFlow) -> BlockFlow:
+def rounded_blocks(fixed: FixedBlocks, like: ModalBlocks) -> ModalBlocks:
     """The blocks that the integers represent, in SI units."""
     step, wires = fixed.state.step, fixed.wires
     groups, n = step.shape[:2]
@@ -104,15 +104,15 @@ def rounded_blocks(fixed: FixedBlocks, like: BlockFlow) -> BlockFlow:
 
 
 def _error_bound(
-    found: FixedController,
-    exact: BlockFlow,
+    exported: FixedController,
+    exact: ModalBlocks,
     fixed: FixedBlocks,
     each: list[ImpulseResponses],
     memory: int,
 ) -> ErrorBound:
     """Peak errors at the actuators: the sum of every rounding through its peak gain."""
     near, half = rounded_blocks(fixed, exact), 0.5
-    volts = exact.of_groups(sensor_bound(found.controller))
+    volts = exact.of_groups(sensor_bound(exported.controller))
     rounding, coefficients = [], []
     for g, true in enumerate(each):
         own = responses(near.system, g, memory)
@@ -121,6 +121,6 @@ def _error_bound(
         states = np.abs(own.kicked).sum(axis=3)  # (M, N, 2)
         rounding.append(entering + half * np.sum(states * fixed.state.step[g], axis=(1, 2)))
         coefficients.append(np.abs(own.command - true.command).sum(axis=2) @ volts[g])
-    parts = [exact.of_patches(np.array(x), found.n_patches) for x in (rounding, coefficients)]
+    parts = [exact.of_patches(np.array(x), exported.n_patches) for x in (rounding, coefficients)]
     inside = parts[0] + parts[1] + half * fixed.wires.dac_step
-    return ErrorBound(parts[0], parts[1], output_error_bound(found, inside))
+    return ErrorBound(parts[0], parts[1], output_error_bound(exported, inside))

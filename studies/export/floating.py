@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmodel.controller import Controller, read_back
-from studies.engine.blocks import BlockFlow
-from studies.engine.channels import ChannelFlow, acting
+from studies.engine.blocks import ModalBlocks
+from studies.engine.channels import ActiveChannels, acting
 
 
 class BlockSignals(NamedTuple):
@@ -29,27 +29,27 @@ class Signals(NamedTuple):
 
 
 def respond(
-    arranged: ChannelFlow | BlockFlow, controller: Controller, codes: np.ndarray
+    channels: ActiveChannels | ModalBlocks, controller: Controller, codes: np.ndarray
 ) -> Signals | BlockSignals:
     """Run a controller, from rest, on sequences of ADC codes.
 
     Args:
-        arranged: the controller as code needs it.
+        channels: the controller as code needs it.
         controller: the same, for converters, limit and feed-through; NumPy arrays.
         codes: of the sensors, (T, ..., 3, K); sequences side by side.
     """
-    return respond_from(arranged, controller, codes, np.zeros(codes.shape[1:]))
+    return respond_from(channels, controller, codes, np.zeros(codes.shape[1:]))
 
 
 def respond_from(
-    arranged: ChannelFlow | BlockFlow,
+    channels: ActiveChannels | ModalBlocks,
     controller: Controller,
     codes: np.ndarray,
     command: np.ndarray,
 ) -> Signals | BlockSignals:
     """The same with voltages on the actuators at the beginning [V], (..., 3, K)."""
-    run = _by_blocks if isinstance(arranged, BlockFlow) else _by_channels
-    return run(arranged, controller, codes, command)  # type: ignore[arg-type]
+    run = _by_blocks if isinstance(channels, ModalBlocks) else _by_channels
+    return run(channels, controller, codes, command)  # type: ignore[arg-type]
 
 
 def _sensed(controller: Controller, code: np.ndarray, command: np.ndarray) -> np.ndarray:
@@ -59,24 +59,24 @@ def _sensed(controller: Controller, code: np.ndarray, command: np.ndarray) -> np
 
 
 def _by_blocks(
-    blocks: BlockFlow, controller: Controller, codes: np.ndarray, command: np.ndarray
+    blocks: ModalBlocks, controller: Controller, codes: np.ndarray, command: np.ndarray
 ) -> BlockSignals:
     rows, system = [], blocks.system
     state = np.zeros((*codes.shape[1:-2], *system.state.shape[:3]))
     limit = float(controller.voltage_limit)
     for code in codes:
         volts = blocks.of_groups(_sensed(controller, code, command))
-        wanted = np.einsum("gpnb,...gnb->...gp", system.leave, state)
-        wanted = wanted + np.einsum("gpm,...gm->...gp", system.direct, volts)
+        demand = np.einsum("gpnb,...gnb->...gp", system.leave, state)
+        demand = demand + np.einsum("gpm,...gm->...gp", system.direct, volts)
         state = np.einsum("gnbc,...gnc->...gnb", system.state, state)
         state = state + np.einsum("gnbm,...gm->...gnb", system.enter, volts)
-        command = blocks.of_patches(np.clip(wanted, -limit, limit), codes.shape[-1])
+        command = blocks.of_patches(np.clip(demand, -limit, limit), codes.shape[-1])
         rows.append((state, command))
     return BlockSignals(*map(np.stack, zip(*rows, strict=True)))
 
 
 def _by_channels(
-    channels: ChannelFlow, controller: Controller, codes: np.ndarray, command: np.ndarray
+    channels: ActiveChannels, controller: Controller, codes: np.ndarray, command: np.ndarray
 ) -> Signals:
     rows = []
     link, many = channels.link, codes.shape[1:-2]

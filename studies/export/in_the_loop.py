@@ -40,7 +40,7 @@ def run_in_the_loop(structure: Structure, case: Case, law: Law) -> LoopRun:
     structure = structure._replace(has_position_gain=False)
     start = _begin(structure, case)
     state, inputs = start.state, start.inputs
-    code, clipped = _look(start.loop, inputs, 0, state)
+    code, clipped = _read_adc(start.loop, inputs, 0, state)
     voltage = np.zeros_like(np.asarray(code))
     sample = _sample.program(structure, start.loop, inputs, 0, state, voltage, clipped)
     codes, voltages, poses = [], [], []
@@ -66,7 +66,7 @@ def _read(loop: Loop, inputs: Inputs, k: Any, state: State) -> Any:
     return code, is_clipped.max()
 
 
-_look = kept_jit()(_read)
+_read_adc = kept_jit()(_read)
 
 
 @kept_jit(static_argnums=0)

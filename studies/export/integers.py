@@ -26,11 +26,11 @@ class Response(NamedTuple):
 class _Memory(Protocol):
     """What the arithmetic remembers between samples."""
 
-    def wanted(self, sensor: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
+    def step(self, sensor: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
         """Counts for the actuators, (..., 3, K), from those of the sensors."""
         ...
 
-    def forget(self, is_faulty: np.ndarray) -> None:
+    def reset(self, is_faulty: np.ndarray) -> None:
         """Begin again in some sequences, (...)."""
         ...
 
@@ -64,9 +64,9 @@ def respond(fixed: FixedPoint | FixedBlocks, codes: np.ndarray, rail: int) -> Re
         if wires.feedthrough is not None:
             own = _products(wires.feedthrough, command[..., None, :])
             sensor = _limited(sensor - own, cut, SENSORS)
-        wanted = _limited(memory.wanted(sensor, cut), cut, SENSORS)
-        command = np.minimum(np.maximum(wanted, 1 - wires.dac_rest), wires.dac_rest - 1)
-        memory.forget(is_faulty)
+        demand = _limited(memory.step(sensor, cut), cut, SENSORS)
+        command = np.minimum(np.maximum(demand, 1 - wires.dac_rest), wires.dac_rest - 1)
+        memory.reset(is_faulty)
         command = np.where(is_faulty[..., None, None], 0, command)
         full = np.sum(np.abs(command) == wires.dac_rest - 1, axis=(-2, -1))
         # a faulty sample ends before the arithmetic
@@ -82,7 +82,7 @@ class _ChannelMemory:
         self._fixed = fixed
         self._high, self._older, self._old = np.zeros((3, *many, len(fixed.link)), np.int64)
 
-    def wanted(self, sensor: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
+    def step(self, sensor: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
         fixed, old, older = self._fixed, self._old, self._older
         signal = _limited(_products(fixed.filter, sensor[..., fixed.link, :]), cut)
         high = _limited(_products(fixed.high_pass, signal[..., None]) + self._high, cut)
@@ -97,7 +97,7 @@ class _ChannelMemory:
         self._older, self._old = old, inner
         return _products(fixed.synthesizer, force[..., None, None, :])
 
-    def forget(self, is_faulty: np.ndarray) -> None:
+    def reset(self, is_faulty: np.ndarray) -> None:
         at = is_faulty[..., None]
         self._high, self._old, self._older = (
             np.where(at, 0, x) for x in (self._high, self._old, self._older)
@@ -111,17 +111,17 @@ class _BlockMemory:
         self._fixed = fixed
         self._state = np.zeros((*many, *fixed.state.bits.shape), np.int64)
 
-    def wanted(self, sensor: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
+    def step(self, sensor: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
         fixed, state = self._fixed, self._state
         volts = fixed.blocks.of_groups(sensor)  # (..., G, M)
         flat = state.reshape(*state.shape[:-2], -1)
-        found = _products(fixed.leave, np.concatenate([flat, volts], -1)[..., None, :])
+        counts = _products(fixed.leave, np.concatenate([flat, volts], -1)[..., None, :])
         entering = np.broadcast_to(volts[..., None, :], (*state.shape[:-1], volts.shape[-1]))
         read = np.concatenate([state, entering], -1)[..., None, :]
         self._state = _limited(_products(fixed.advance, read), cut, STATES)
-        return fixed.blocks.of_patches(found, sensor.shape[-1])
+        return fixed.blocks.of_patches(counts, sensor.shape[-1])
 
-    def forget(self, is_faulty: np.ndarray) -> None:
+    def reset(self, is_faulty: np.ndarray) -> None:
         self._state = np.where(is_faulty[..., None, None, None], 0, self._state)
 
 

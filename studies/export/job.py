@@ -10,8 +10,8 @@ import numpy as np
 from rich.console import Console
 
 from jaxmodel import status
-from studies.engine.blocks import BlockFlow, restored
-from studies.engine.channels import ChannelFlow, unfold
+from studies.engine.blocks import ModalBlocks, restored
+from studies.engine.channels import ActiveChannels, unfold
 from studies.engine.controller import FixedController
 from studies.engine.stability import LoopFigures, loop_report
 from studies.errors import StudyError, field_error
@@ -26,7 +26,7 @@ from studies.study.labels import describe
 class Job(NamedTuple):
     """What to export, and how."""
 
-    found: FixedController
+    exported: FixedController
     name: str
     origin: list[str]
     case_id: str
@@ -36,7 +36,7 @@ class Job(NamedTuple):
     console: Console
 
 
-class Made(NamedTuple):
+class ExportResult(NamedTuple):
     """The result of an export."""
 
     files: dict[str, str]
@@ -46,20 +46,22 @@ class Made(NamedTuple):
     cost: Cost | None = None
 
 
-def judged(found: FixedController, arranged: ChannelFlow | BlockFlow, note: str) -> LoopFigures:
+def check_loop(
+    exported: FixedController, channels: ActiveChannels | ModalBlocks, note: str
+) -> LoopFigures:
     """Linearised sampled loop with given coefficients; rejected if unstable."""
-    home = np.array(found.study.motion.waypoints[0], float)
-    restore = restored if isinstance(arranged, BlockFlow) else unfold
-    law = restore(arranged, found.controller)  # type: ignore[arg-type]
+    home = np.array(exported.study.motion.waypoints[0], float)
+    restore = restored if isinstance(channels, ModalBlocks) else unfold
+    law = restore(channels, exported.controller)  # type: ignore[arg-type]
     law = jax.tree.map(jnp.asarray, law)
     try:
         # not the case's own controller, so its kind must not cost another compilation
-        structure = found.structure._replace(has_position_gain=False)
-        loop = loop_report(structure, found.case, home, 1, law=law)
+        structure = exported.structure._replace(has_position_gain=False)
+        loop = loop_report(structure, exported.case, home, 1, law=law)
     except np.linalg.LinAlgError:
         raise StudyError("the linearised loop is not finite: no controller to export") from None
     if not loop.is_stable:
-        factor = found.study.control.gain_factor
+        factor = exported.study.control.gain_factor
         way = f"at most {0.5 * factor * loop.gain_margin:.3g}, half of what is stable"
         if loop.gain_margin == 0:
             way = "smaller ones do not help either: see studies simulate and docs/theory.md"
@@ -75,25 +77,25 @@ def judged(found: FixedController, arranged: ChannelFlow | BlockFlow, note: str)
 
 def reference_motion(job: Job) -> LoopRun:
     """The case's motion with the JAX controller; it must finish."""
-    found = job.found
-    job.console.print(f"in the loop: {found.structure.n_steps} samples for each controller")
-    run = reference_run(found)
+    exported = job.exported
+    job.console.print(f"in the loop: {exported.structure.n_steps} samples for each controller")
+    run = reference_run(exported)
     code = int(run.result.status)
     if code not in status.FINISHED:
         raise StudyError(
-            f"{found.study.title}: {describe(code)} at {run.result.bad_time:.4g} s; allowed: a "
+            f"{exported.study.title}: {describe(code)} at {run.result.bad_time:.4g} s; allowed: a "
             "study that runs to its end (see studies simulate)"
         )
-    _check_clipping(found, run)
+    _check_clipping(exported, run)
     return run
 
 
-def _check_clipping(found: FixedController, run: LoopRun) -> None:
+def _check_clipping(exported: FixedController, run: LoopRun) -> None:
     """Reject a motion that the exported code would take for a broken sensor."""
-    electronics = found.study.electronics
+    electronics = exported.study.electronics
     rail = rail_samples(electronics.sample_rate_hz)
-    used = np.isin(np.arange(3), found.channels.link)[:, None]
-    for end in (0.0, float(found.controller.adc_top)):
+    used = np.isin(np.arange(3), exported.channels.link)[:, None]
+    for end in (0.0, float(exported.controller.adc_top)):
         length = np.zeros(run.codes.shape[1:])
         for k, code in enumerate(run.codes):
             length = np.where((code == end) & used, length + 1, 0)

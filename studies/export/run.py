@@ -69,7 +69,7 @@ def export_design(
 
     found = fixed_controller(design.study)
     job = Job(
-        found=found,
+        exported=found,
         name=name,
         origin=_origin(found, design.case_id),
         case_id=design.case_id,

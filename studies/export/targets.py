@@ -11,8 +11,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from jaxmodel.table import Table
-from studies.engine.blocks import BlockFlow
-from studies.engine.channels import ChannelFlow
+from studies.engine.blocks import ModalBlocks
+from studies.engine.channels import ActiveChannels
 from studies.engine.controller import FixedController
 from studies.export.c_fixed import fixed_source
 from studies.export.c_floating import floating_source
@@ -22,7 +22,7 @@ from studies.export.document import document, schema, to_json
 from studies.export.fixed import FixedPoint, check_words, design_fixed, rounded
 from studies.export.fixed_blocks import FixedBlocks, design_blocks, rounded_blocks
 from studies.export.floating import BlockSignals, Signals, respond
-from studies.export.job import Job, Made, judged, reference_motion
+from studies.export.job import ExportResult, Job, check_loop, reference_motion
 from studies.export.verify import verify_document, verify_fixed, verify_floating
 
 
@@ -31,64 +31,66 @@ class Target(NamedTuple):
 
     name: str
     text: str  # what they are
-    make: Callable[[Job], Made]
+    make: Callable[[Job], ExportResult]
     needs_compiler: bool = False  # for verification
     has_dac: bool = False  # accepts the resolution of a DAC
 
 
-def _as_json(job: Job) -> Made:
-    loop = judged(job.found, job.found.channels, "")
-    described = document(job.found, job.case_id)
+def _as_json(job: Job) -> ExportResult:
+    loop = check_loop(job.exported, job.exported.channels, "")
+    described = document(job.exported, job.case_id)
     files = {
         f"{job.name}.json": to_json(described),
         f"{job.name}.schema.json": json.dumps(schema(), indent=1) + "\n",
     }
     if not job.is_verified:
-        return Made(files, loop, None)
-    return Made(files, loop, verify_document(job.found, reference_motion(job), described))
+        return ExportResult(files, loop, None)
+    return ExportResult(
+        files, loop, verify_document(job.exported, reference_motion(job), described)
+    )
 
 
-def _as_floating(job: Job) -> Made:
-    loop = judged(job.found, job.found.channels, "")
-    source = floating_source(job.found, job.name, job.origin)
+def _as_floating(job: Job) -> ExportResult:
+    loop = check_loop(job.exported, job.exported.channels, "")
+    source = floating_source(job.exported, job.name, job.origin)
     files = _files(source, job.name)
     if not job.is_verified:
-        return Made(files, loop, None)
+        return ExportResult(files, loop, None)
     reference = reference_motion(job)
-    verified = verify_floating(job.found, reference, source, job.name, job.compiler)
-    return Made(files, loop, verified)
+    verified = verify_floating(job.exported, reference, source, job.name, job.compiler)
+    return ExportResult(files, loop, verified)
 
 
-def _as_fixed(job: Job) -> Made:
-    found = job.found
-    check_words(found)
-    judged(found, found.channels, "")
+def _as_fixed(job: Job) -> ExportResult:
+    exported = job.exported
+    check_words(exported)
+    check_loop(exported, exported.channels, "")
     reference = reference_motion(job)
-    seen = respond(found.channels, found.controller, reference.codes)
-    fixed, near = _designed(found, seen, job.dac_bits)
-    loop = judged(found, near, ", coefficients rounded to 32 bits")
-    cost = cost_of(found, fixed)
+    signals = respond(exported.channels, exported.controller, reference.codes)
+    fixed, near = _designed(exported, signals, job.dac_bits)
+    loop = check_loop(exported, near, ", coefficients rounded to 32 bits")
+    cost = cost_of(exported, fixed)
     job.console.print(cost.text)
-    source = fixed_source(found, fixed, job.name, job.origin, cost.text)
+    source = fixed_source(exported, fixed, job.name, job.origin, cost.text)
     verified = None
     if job.is_verified:
-        verified = verify_fixed(found, fixed, reference, source, job.name, job.compiler)
-    return Made(
+        verified = verify_fixed(exported, fixed, reference, source, job.name, job.compiler)
+    return ExportResult(
         files=_files(source, job.name), loop=loop, verified=verified, fixed=fixed, cost=cost
     )
 
 
 def _designed(
-    found: FixedController, seen: Signals | BlockSignals, dac_bits: int
-) -> tuple[FixedPoint | FixedBlocks, ChannelFlow | BlockFlow]:
+    exported: FixedController, signals: Signals | BlockSignals, dac_bits: int
+) -> tuple[FixedPoint | FixedBlocks, ActiveChannels | ModalBlocks]:
     """A controller in fixed point, and what its integers represent."""
-    if isinstance(found.channels, BlockFlow):
-        assert isinstance(seen, BlockSignals)
-        blocks = design_blocks(found, seen, dac_bits)
-        return blocks, rounded_blocks(blocks, found.channels)
-    assert isinstance(seen, Signals)
-    fixed = design_fixed(found, seen, dac_bits)
-    return fixed, rounded(fixed, found.channels)
+    if isinstance(exported.channels, ModalBlocks):
+        assert isinstance(signals, BlockSignals)
+        blocks = design_blocks(exported, signals, dac_bits)
+        return blocks, rounded_blocks(blocks, exported.channels)
+    assert isinstance(signals, Signals)
+    fixed = design_fixed(exported, signals, dac_bits)
+    return fixed, rounded(fixed, exported.channels)
 
 
 def _files(source: Source, name: str) -> dict[str, str]:

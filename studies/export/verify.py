@@ -64,12 +64,12 @@ class Verification(NamedTuple):
 
     def beside(self, name: str) -> InTheLoop:
         """One of the runs against that of the JAX controller."""
-        wanted, run = self.runs["JAX"], self.runs[name]
-        differing = np.flatnonzero(np.any(run.codes != wanted.codes, axis=(1, 2)))
-        size = vibration(wanted)
+        reference, run = self.runs["JAX"], self.runs[name]
+        differing = np.flatnonzero(np.any(run.codes != reference.codes, axis=(1, 2)))
+        size = vibration(reference)
         return InTheLoop(
-            float(np.abs(run.voltage - wanted.voltage).max()),
-            np.abs(run.pose - wanted.pose).max(axis=0),
+            float(np.abs(run.voltage - reference.voltage).max()),
+            np.abs(run.pose - reference.pose).max(axis=0),
             int(differing[0]) if len(differing) else -1,
             vibration(run) / size - 1 if size > 0 else 0.0,
         )
@@ -85,12 +85,14 @@ def vibration(run: LoopRun) -> float:
     return float(np.sqrt(np.mean(worst**2)))
 
 
-def reference_run(found: FixedController) -> LoopRun:
+def reference_run(exported: FixedController) -> LoopRun:
     """The case's motion with the JAX controller."""
-    return run_controller(found.structure, found.case, found.controller)
+    return run_controller(exported.structure, exported.case, exported.controller)
 
 
-def verify_document(found: FixedController, reference: LoopRun, document: Document) -> Verification:
+def verify_document(
+    exported: FixedController, reference: LoopRun, document: Document
+) -> Verification:
     """A controller built only from its document, against the JAX controller."""
     controller, taps = controller_of(document)
     channels = arrange(controller, document.law)
@@ -98,18 +100,18 @@ def verify_document(found: FixedController, reference: LoopRun, document: Docume
         _compare(
             f"open loop, {name}",
             respond_floating(channels, controller, codes).command,
-            _replayed(found, codes),
+            _replayed(exported, codes),
             DOUBLE,
         )
-        for name, codes in {"recorded codes": reference.codes, **_hard(found, reference)}.items()
+        for name, codes in {"recorded codes": reference.codes, **_hard(exported, reference)}.items()
     ]
-    path, shaped = _references(found)
+    path, shaped = _references(exported)
     checks.append(_compare("shaper, the case's motion", _shaped(taps, path), shaped, DOUBLE))
     return Verification(checks, [], {"JAX": reference}, {})
 
 
 def verify_floating(
-    found: FixedController,
+    exported: FixedController,
     reference: LoopRun,
     source: Source,
     name: str,
@@ -117,27 +119,29 @@ def verify_floating(
 ) -> Verification:
     """C in double and single precision against the JAX controller."""
     checks, runs = [], {"JAX": reference}
-    with _loaded(found, source, name, compiler, np.float64, np.float64) as code:
-        sequences = {"recorded codes": reference.codes, **_hard(found, reference)}
+    with _loaded(exported, source, name, compiler, np.float64, np.float64) as code:
+        sequences = {"recorded codes": reference.codes, **_hard(exported, reference)}
         for label, codes in sequences.items():
-            volts, faults = code.respond(codes * float(found.controller.adc_step))
-            wanted = _replayed(found, codes)
-            check = _compare(f"open loop, {label}", volts, wanted, DOUBLE)
+            volts, faults = code.respond(codes * float(exported.controller.adc_step))
+            expected = _replayed(exported, codes)
+            check = _compare(f"open loop, {label}", volts, expected, DOUBLE)
             checks.append(check._replace(is_met=check.is_met and not faults.any()))
-        top = float(found.controller.adc_top + 3)
+        top = float(exported.controller.adc_top + 3)
         bad = {"beyond the range": top, "NaN": np.nan, "infinite": np.inf}
-        step = float(found.controller.adc_step)
-        checks += _faults(found, code, reference, bad, step, 0.0)
-        path, shaped = _references(found)
+        step = float(exported.controller.adc_step)
+        checks += _faults(exported, code, reference, bad, step, 0.0)
+        path, shaped = _references(exported)
         checks.append(_compare("shaper, the case's motion", code.shape(path), shaped, DOUBLE))
         shape = reference.codes.shape[1:]
         code.begin()
         runs["C, double"] = run_in_the_loop(
-            found.structure, found.case, lambda codes: code.step(codes * step)[0].reshape(shape)
+            exported.structure,
+            exported.case,
+            lambda codes: code.step(codes * step)[0].reshape(shape),
         )
-    with _loaded(found, source, name, compiler, np.float32, np.float32) as code:
+    with _loaded(exported, source, name, compiler, np.float32, np.float32) as code:
         volts, _ = code.respond(reference.codes * step)
-        checks += _faults(found, code, reference, bad, step, 0.0, ", float")
+        checks += _faults(exported, code, reference, bad, step, 0.0, ", float")
         single = _compare("", volts, reference.voltage, SINGLE)
         advice = "precise enough" if single.is_met else "NOT precise enough, keep to double"
         note = f"With float, recorded codes in open loop differ by {single.found}: {advice}."
@@ -145,7 +149,7 @@ def verify_floating(
 
 
 def verify_fixed(
-    found: FixedController,
+    exported: FixedController,
     fixed: FixedPoint | FixedBlocks,
     reference: LoopRun,
     source: Source,
@@ -153,37 +157,37 @@ def verify_fixed(
     compiler: list[str],
 ) -> Verification:
     """C in fixed point against its integer model, bit by bit, and against the JAX controller."""
-    rail = rail_samples(found.study.electronics.sample_rate_hz)
+    rail = rail_samples(exported.study.electronics.sample_rate_hz)
     checks, runs = [], {"JAX": reference}
     runs["JAX behind the DAC"] = run_controller(
-        found.structure, found.case, found.controller, float(fixed.wires.dac_step)
+        exported.structure, exported.case, exported.controller, float(fixed.wires.dac_step)
     )
     shape = reference.codes.shape[1:]
-    with _loaded(found, source, name, compiler, np.uint16, np.int32) as code:
+    with _loaded(exported, source, name, compiler, np.uint16, np.int32) as code:
 
         def in_volts(codes: np.ndarray) -> np.ndarray:
             out = code.step(codes)[0].reshape(shape).astype(float)
             return (out - fixed.wires.dac_rest) * fixed.wires.dac_step
 
         code.begin()
-        runs["C, fixed point"] = own = run_in_the_loop(found.structure, found.case, in_volts)
+        runs["C, fixed point"] = own = run_in_the_loop(exported.structure, exported.case, in_volts)
         sequences = {
             "recorded codes": reference.codes,
             "own run in the loop": own.codes,
-            **_hard(found, reference),
-            "stuck at the end of the range": _stuck(found, reference),
+            **_hard(exported, reference),
+            "stuck at the end of the range": _stuck(exported, reference),
             "words beyond the ADC's codes": np.random.default_rng(1).integers(
                 0, 2**16, (50, *shape)
             ),
         }
         counts = _modelled(fixed, sequences, rail)
         for label, codes in sequences.items():
-            given, _ = code.respond(codes)
-            differing = int(np.sum(given != counts[label].codes))
+            codes_out, _ = code.respond(codes)
+            differing = int(np.sum(codes_out != counts[label].codes))
             checks.append(
                 Check(
                     f"bit by bit, {label}",
-                    f"{differing} of {given.size} codes differ",
+                    f"{differing} of {codes_out.size} codes differ",
                     "0",
                     differing == 0,
                 )
@@ -194,9 +198,9 @@ def verify_fixed(
             if fixed.wires.adc_top < 2**16 - 1
             else {}
         )
-        checks += _faults(found, code, reference, bad, 1.0, float(fixed.wires.dac_rest))
-        checks.append(_check_shaper(found, code))
-    checks.append(_check_error(found, fixed, reference, counts["recorded codes"]))
+        checks += _faults(exported, code, reference, bad, 1.0, float(fixed.wires.dac_rest))
+        checks.append(_check_shaper(exported, code))
+    checks.append(_check_error(exported, fixed, reference, counts["recorded codes"]))
     for label in ("recorded codes", "own run in the loop"):
         at_rest = int(counts[label].is_faulty.sum())
         checks.append(
@@ -221,42 +225,46 @@ def _modelled(
 
 
 def _loaded(
-    found: FixedController,
+    exported: FixedController,
     source: Source,
     name: str,
     compiler: list[str],
     real: type,
     reference: type,
 ) -> AbstractContextManager[Code]:
-    sizes = (3 * found.n_patches, len(found.channels.names), int(found.taps.sample.max()) + 1)
+    sizes = (
+        3 * exported.n_patches,
+        len(exported.channels.names),
+        int(exported.taps.sample.max()) + 1,
+    )
     return compiled(source, name, compiler, real, reference, sizes)
 
 
-def _hard(found: FixedController, reference: LoopRun) -> dict[str, np.ndarray]:
-    top = int(found.controller.adc_top)
-    rail = rail_samples(found.study.electronics.sample_rate_hz)
+def _hard(exported: FixedController, reference: LoopRun) -> dict[str, np.ndarray]:
+    top = int(exported.controller.adc_top)
+    rail = rail_samples(exported.study.electronics.sample_rate_hz)
     return hard_sequences(reference.codes, top, rail)
 
 
-def _replayed(found: FixedController, codes: np.ndarray) -> np.ndarray:
-    return np.asarray(replay(found.controller, codes))
+def _replayed(exported: FixedController, codes: np.ndarray) -> np.ndarray:
+    return np.asarray(replay(exported.controller, codes))
 
 
-def _compare(what: str, found: np.ndarray, wanted: np.ndarray, allowed: float) -> Check:
+def _compare(what: str, values: np.ndarray, expected: np.ndarray, allowed: float) -> Check:
     """Largest difference over the largest value."""
-    size = np.abs(wanted).max()
-    difference = float(np.abs(found - wanted).max() / (size if size > 0 else 1.0))
+    size = np.abs(expected).max()
+    difference = float(np.abs(values - expected).max() / (size if size > 0 else 1.0))
     return Check(what, f"{difference:.1e}", f"{allowed:.0e}", difference <= allowed)
 
 
-def _stuck(found: FixedController, reference: LoopRun) -> np.ndarray:
+def _stuck(exported: FixedController, reference: LoopRun) -> np.ndarray:
     return stuck_at_end(
-        reference.codes, int(found.controller.adc_top), (found.channels.link[-1], 0)
+        reference.codes, int(exported.controller.adc_top), (exported.channels.link[-1], 0)
     )
 
 
 def _faults(
-    found: FixedController,
+    exported: FixedController,
     code: Code,
     reference: LoopRun,
     bad: dict[str, float],
@@ -267,7 +275,7 @@ def _faults(
     """Check that a faulty sensor is reported and all actuators rest from then on.
 
     Args:
-        found: the controller.
+        exported: the controller.
         code: the same in C.
         reference: its run.
         bad: codes that are faulty immediately, by name.
@@ -275,9 +283,9 @@ def _faults(
         rest: an actuator's value at rest.
         note: for the names of the checks.
     """
-    link, top = int(found.channels.link[-1]), float(found.controller.adc_top)
-    rail = rail_samples(found.study.electronics.sample_rate_hz)
-    number, begin = link * found.n_patches + 1, len(reference.codes) // 3
+    link, top = int(exported.channels.link[-1]), float(exported.controller.adc_top)
+    rail = rail_samples(exported.study.electronics.sample_rate_hz)
+    number, begin = link * exported.n_patches + 1, len(reference.codes) // 3
     faults = {"stuck at the end of the range": (top, rail)}
     faults |= {name: (value, 1) for name, value in bad.items()}
     checks = []
@@ -291,18 +299,18 @@ def _faults(
         is_met &= np.all(out[first:] == rest) and np.all(np.isfinite(out))
         at = np.flatnonzero(numbers)
         text = f"sensor {numbers[at[0]]}, sample {at[0] - begin + 1}" if len(at) else "nothing"
-        wanted = f"sensor {number}, sample {needed}; at rest from then on"
-        checks.append(Check(f"faulty sensor: {name}{note}", text, wanted, bool(is_met)))
+        expected = f"sensor {number}, sample {needed}; at rest from then on"
+        checks.append(Check(f"faulty sensor: {name}{note}", text, expected, bool(is_met)))
     return checks
 
 
-def _references(found: FixedController) -> tuple[np.ndarray, np.ndarray]:
+def _references(exported: FixedController) -> tuple[np.ndarray, np.ndarray]:
     """Planned poses and JAX's shaped ones at the samples, (T, 3)."""
-    n, period = found.structure.n_steps, float(found.case.electronics.period)
-    taps = Taps(jnp.asarray(found.taps.weight), jnp.asarray(found.taps.sample))
+    n, period = exported.structure.n_steps, float(exported.case.electronics.period)
+    taps = Taps(jnp.asarray(exported.taps.weight), jnp.asarray(exported.taps.sample))
     time = period * np.arange(n)
-    planned = np.asarray(_plan(found.case.path, time))
-    shaped = np.asarray(_shape(found.case.path, taps, n, period))
+    planned = np.asarray(_plan(exported.case.path, time))
+    shaped = np.asarray(_shape(exported.case.path, taps, n, period))
     return planned, shaped
 
 
@@ -329,16 +337,16 @@ def _shaped(taps: Taps, path: np.ndarray) -> np.ndarray:
     return sum(parts)
 
 
-def _check_shaper(found: FixedController, code: Code) -> Check:
+def _check_shaper(exported: FixedController, code: Code) -> Check:
     """The shaper in fixed point: bit by bit like its integer model, within a count of JAX's."""
-    path, shaped = _references(found)
+    path, shaped = _references(exported)
     scale = min(REFERENCE_COUNTS, 2.0**30 / np.abs(path).max())
     counts = np.round(path * scale).astype(np.int64)
-    given = code.shape(counts)
-    row = shaper_row(found.taps)
-    total = _shaped(found.taps._replace(weight=row.integers[0]), counts)
-    differing = int(np.sum(given != shifted(total, row.shift[0])))
-    off = np.abs(given / scale - shaped).max() * scale
+    counts_out = code.shape(counts)
+    row = shaper_row(exported.taps)
+    total = _shaped(exported.taps._replace(weight=row.integers[0]), counts)
+    differing = int(np.sum(counts_out != shifted(total, row.shift[0])))
+    off = np.abs(counts_out / scale - shaped).max() * scale
     # half a count of the reference, half of the result, and what JAX's path differs by
     return Check(
         "shaper, the case's motion",
@@ -349,7 +357,10 @@ def _check_shaper(found: FixedController, code: Code) -> Check:
 
 
 def _check_error(
-    found: FixedController, fixed: FixedPoint | FixedBlocks, reference: LoopRun, response: Response
+    exported: FixedController,
+    fixed: FixedPoint | FixedBlocks,
+    reference: LoopRun,
+    response: Response,
 ) -> Check:
     """Fixed point against the JAX controller on the same codes, with the allowed difference.
 
@@ -386,9 +397,9 @@ def _check_error(
 
 def _same_status(runs: dict[str, LoopRun]) -> list[Check]:
     """Check that every run ends like that of the JAX controller."""
-    wanted, *others = (describe(int(run.result.status)) for run in runs.values())
+    expected, *others = (describe(int(run.result.status)) for run in runs.values())
     names = list(runs)[1:]
     return [
-        Check(f"status in the loop, {name}", found, wanted, found == wanted)
-        for name, found in zip(names, others, strict=True)
+        Check(f"status in the loop, {name}", actual, expected, actual == expected)
+        for name, actual in zip(names, others, strict=True)
     ]
