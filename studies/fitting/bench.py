@@ -187,30 +187,30 @@ class Bench:
         """
         key = values.tobytes()
         for slopes in (True, False)[: 1 if has_slopes else 2]:
-            known, plant = self._kept.get((pose, slopes), (b"", None))
-            if known == key and plant is not None:
+            kept_key, plant = self._kept.get((pose, slopes), (b"", None))
+            if kept_key == key and plant is not None:
                 return plant
-        given = self.structure, self.place, self.numbers, np.array(pose), values
-        slope, value = _plant_slopes(*given) if has_slopes else (None, _plant(*given))
+        arguments = self.structure, self.place, self.numbers, np.array(pose), values
+        slope, value = _plant_slopes(*arguments) if has_slopes else (None, _plant(*arguments))
         (value, code), slope = jax.tree.map(np.asarray, (value, slope))
         _check_reached(code, pose)
-        found = PlantAt(value, slope)
-        self._kept[pose, has_slopes] = key, found
-        return found
+        plant = PlantAt(value, slope)
+        self._kept[pose, has_slopes] = key, plant
+        return plant
 
     def many(self, values: np.ndarray) -> list[dict[Pose, PlantAt]]:
         """Plants at `poses` for many values of the parameters, (n, p), without derivatives.
 
         Poses out of reach are left out.
         """
-        found: list[dict[Pose, PlantAt]] = [{} for _ in values]
+        plants: list[dict[Pose, PlantAt]] = [{} for _ in values]
         for pose, first in product(self.poses, range(0, len(values), BATCH)):
             part = np.arange(first, first + BATCH).clip(max=len(values) - 1)  # of one program
-            given = self.structure, self.place, self.numbers, np.array(pose), values[part]
-            whole, codes = jax.tree.map(np.asarray, _plant_batch(*given))
+            arguments = self.structure, self.place, self.numbers, np.array(pose), values[part]
+            whole, codes = jax.tree.map(np.asarray, _plant_batch(*arguments))
             for i in np.flatnonzero(codes == status.OK):  # the others are refused when needed
-                found[part[i]][pose] = PlantAt(jax.tree.map(lambda x, i=i: x[i], whole), None)
-        return found
+                plants[part[i]][pose] = PlantAt(jax.tree.map(lambda x, i=i: x[i], whole), None)
+        return plants
 
     def keep(self, values: np.ndarray, plants: dict[Pose, PlantAt]) -> None:
         """Use these plants for some values of the parameters."""
@@ -219,8 +219,8 @@ class Bench:
 
     def held(self, values: np.ndarray, has_slopes: bool) -> list[np.ndarray]:
         """Frequencies [Hz] and damping ratios of the links alone, (3, R), and their slopes."""
-        given = self.structure, self.place, self.numbers, values
-        slope, value = _held_slopes(*given) if has_slopes else ((), _held(*given))
+        arguments = self.structure, self.place, self.numbers, values
+        slope, value = _held_slopes(*arguments) if has_slopes else ((), _held(*arguments))
         return [np.asarray(x) for x in (*value, *slope)]
 
 
@@ -246,8 +246,8 @@ def with_slopes(
         is_first: derivatives of the first part of its value only.
     """
 
-    def both(*given: Any) -> tuple[Any, Any]:
-        value = function(*given)
+    def both(*arguments: Any) -> tuple[Any, Any]:
+        value = function(*arguments)
         return value[0] if is_first else value, value
 
     return jax.jacfwd(both, argnums=argument, has_aux=True)
@@ -319,14 +319,14 @@ def response(
         resolvent = 1 / (1j * omega[:, None] - pole)
         x = (resolvent * (left @ source[0])) @ right.T
         y = (resolvent * (output[0] @ right)) @ left
-    found = x @ output[0] + direct[0]
+    gain = x @ output[0] + direct[0]
     if plant.slope is None or source[1] is None or output[1] is None or direct[1] is None:
-        return FrequencyResponse(found, None)
+        return FrequencyResponse(gain, None)
     change = plant.slope.state  # (n, n, p)
     n, _, p = change.shape
     turned = (y @ change.reshape(n, n * p)).reshape(len(omega), n, p)
     slope = np.einsum("fnp,fn->fp", turned, x) + x @ output[1] + y @ source[1] + direct[1]
-    return FrequencyResponse(found, slope)
+    return FrequencyResponse(gain, slope)
 
 
 def _solved(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:

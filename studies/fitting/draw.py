@@ -41,12 +41,12 @@ def draw_machines(problem: Problem, solution: Solution, count: int, seed: int) -
     weight = np.exp([optima[0].cost - x.cost for x in optima])
     share = np.cumsum(weight) / np.sum(weight)
     which = np.searchsorted(share, (np.arange(count) + 0.5) / count)
-    found = [
+    parts = [
         _about(problem, one, limit, int(np.sum(which == k)), rng)
         for k, one in enumerate(optima)
         if np.any(which == k)
     ]
-    return np.concatenate(found)
+    return np.concatenate(parts)
 
 
 def _about(
@@ -67,7 +67,7 @@ def _about(
         place[out] = (place[out] + one.u) / 2
         cost[out] = problem.costs(place[out])
     if share < ALIKE:
-        place = walk(problem, place, cost, limit, rng)
+        place = move_ensemble(problem, place, cost, limit, rng)
     return place[:count]
 
 
@@ -94,7 +94,7 @@ def measured(problem: Problem, answer: Answer, least: float) -> Answer:
     return answer._replace(information=(axes * size) @ axes.T)
 
 
-def walk(
+def move_ensemble(
     problem: Problem, place: np.ndarray, cost: np.ndarray, limit: float, rng: np.random.Generator
 ) -> np.ndarray:
     """Places after moves that leave the posterior as it is: each along its line to another.

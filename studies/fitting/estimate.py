@@ -132,16 +132,21 @@ def estimate(spec: FitSpec, phases: Phases | None = None) -> Fitted:
     )
 
 
-def suggest(found: Fitted, phases: Phases) -> Fitted:
+def suggest(fitted: Fitted, phases: Phases) -> Fitted:
     """The same with the next experiment, or with the reason why there is none."""
-    if not found.answer.is_explained:  # a wrong model does not know what it would learn
-        return found
+    if not fitted.answer.is_explained:  # a wrong model does not know what it would learn
+        return fitted
     phases.begin("next experiment")
-    given = found.problem.bench, found.problem.free, found.answer.place, found.answer.covariance
+    inputs = (
+        fitted.problem.bench,
+        fitted.problem.free,
+        fitted.answer.place,
+        fitted.answer.covariance,
+    )
     try:
-        return found._replace(experiments=tuple(next_experiments(*given)))
+        return fitted._replace(experiments=tuple(next_experiments(*inputs)))
     except (StudyError, ArithmeticError, ValueError) as error:  # LinAlgError is a ValueError
-        return found._replace(experiment_fault=str(error))
+        return fitted._replace(experiment_fault=str(error))
 
 
 def _check(problem: Problem, phases: Phases, starts: int) -> None:

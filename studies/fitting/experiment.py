@@ -53,9 +53,9 @@ def next_experiments(
         u: the optimum, between the bounds, (p,).
         covariance: there, (p, p).
     """
-    known = np.linalg.inv(covariance + 1e-18 * np.eye(len(u)))
+    prior = np.linalg.inv(covariance + 1e-18 * np.eye(len(u)))
     values, slopes = free.values(u), free.slopes(u)
-    found = []
+    experiments = []
     for pose in _poses(bench):
         try:
             plant = bench.plant(pose, values, True)
@@ -63,9 +63,11 @@ def next_experiments(
             continue
         for text, slope in _candidates(bench, plant):
             by = slope[np.isfinite(slope).all(axis=1)] * slopes
-            after = np.linalg.inv(known + (by.conj().T @ by).real)
-            found.append(Experiment(pose, text, float(np.sqrt(np.linalg.eigvalsh(after)[-1]))))
-    return sorted(found, key=lambda x: x.widest)
+            after = np.linalg.inv(prior + (by.conj().T @ by).real)
+            experiments.append(
+                Experiment(pose, text, float(np.sqrt(np.linalg.eigvalsh(after)[-1])))
+            )
+    return sorted(experiments, key=lambda x: x.widest)
 
 
 def _candidates(bench: Bench, plant: PlantAt) -> Iterator[tuple[str, np.ndarray]]:

@@ -71,9 +71,9 @@ def make_measurements(spec: FitSpec, bench: Bench) -> list[Measurement]:
     Raises:
         StudyError: a file that cannot be used, data that do not fit the machine.
     """
-    given = spec.study, spec.free.place
+    inputs = spec.study, spec.free.place
     models = Models(
-        bench, Runs(*given), Motions(*given, _places(spec, (TraceEntry, SettlingEntry)))
+        bench, Runs(*inputs), Motions(*inputs, _places(spec, (TraceEntry, SettlingEntry)))
     )
     return [
         _MAKERS[type(entry)](spec, models, entry, f"fit.data[{k}]")
@@ -89,22 +89,22 @@ def _signals(spec: FitSpec, entry: Common, path: str) -> tuple[Signal, ...]:
     """Input and output of an entry, or its output."""
     if not isinstance(entry, Seen):
         return ()
-    given = build_structure(spec.study).n_patches, each_link(spec.study.link.length)
-    output = parse_signal(entry.output, OUTPUTS, *given, f"{path}.output")
+    sizes = build_structure(spec.study).n_patches, each_link(spec.study.link.length)
+    output = parse_signal(entry.output, OUTPUTS, *sizes, f"{path}.output")
     if not isinstance(entry, (ResponseEntry, SpectrumEntry)):
         return (output,)
-    return parse_signal(entry.input, INPUTS, *given, f"{path}.input"), output
+    return parse_signal(entry.input, INPUTS, *sizes, f"{path}.input"), output
 
 
 def _places(spec: FitSpec, kinds: tuple[type[Seen], ...]) -> tuple[float, ...]:
     """Where along the links hammers and deflections of some kinds of entries are [m], ascending."""
-    found = {
+    places = {
         signal.place
         for k, entry in enumerate(spec.entries)
         if isinstance(entry, kinds)
         for signal in _signals(spec, entry, f"fit.data[{k}]")
     }
-    return tuple(sorted(x for x in found if not np.isnan(x)))
+    return tuple(sorted(x for x in places if not np.isnan(x)))
 
 
 def _each(value: Any, count: int, path: str) -> np.ndarray:
@@ -116,11 +116,11 @@ def _each(value: Any, count: int, path: str) -> np.ndarray:
 
 def _modes(spec: FitSpec, models: Models, entry: ModesEntry, path: str) -> Measurement:
     count = len(entry.frequency_hz)
-    given = entry.model_fields_set
+    written = entry.model_fields_set
     for name, ends in (("link", "machine"), ("pose", "held")):
-        if name in given and entry.ends == ends:
+        if name in written and entry.ends == ends:
             raise StudyError(f"{path}.{name}: has no meaning with ends = {ends!r}")
-    if "damping_sigma" in given and not entry.damping_ratio:
+    if "damping_sigma" in written and not entry.damping_ratio:
         raise StudyError(f"{path}.damping_sigma: has no meaning without damping_ratio")
     check_ascending(entry.frequency_hz, bool(entry.shapes), path)
     damping = sigma = shapes = None
@@ -163,8 +163,8 @@ def _modes(spec: FitSpec, models: Models, entry: ModesEntry, path: str) -> Measu
 
 
 def _read(spec: FitSpec, entry: FileEntry, path: str) -> Callable[[str], np.ndarray]:
-    found = read_columns(entry.file, spec.folder, f"{path}.file")
-    return lambda name: column(found, name, entry.file, path)
+    columns = read_columns(entry.file, spec.folder, f"{path}.file")
+    return lambda name: column(columns, name, entry.file, path)
 
 
 def _real(x: np.ndarray, name: str, path: str) -> np.ndarray:
@@ -307,8 +307,8 @@ def _settling(spec: FitSpec, models: Models, entry: SettlingEntry, path: str) ->
     if share is not None:
         band = Band(share / 100, models.motions.of(OFF))
     motion = models.motions.of(entry.links)
-    given = motion, signal, band, entry.time_s, entry.sigma_s
-    return Settling(entry.name, entry.check, *given)
+    data = motion, signal, band, entry.time_s, entry.sigma_s
+    return Settling(entry.name, entry.check, *data)
 
 
 def _figures(spec: FitSpec, models: Models, entry: FiguresEntry, path: str) -> Measurement:

@@ -106,7 +106,7 @@ def sample(problem: Problem, about: Shape, count: int, seed: int) -> Posterior:
     size, each = len(about.middle), -(-count // CHAINS)
     warm, chains = max(int(WARM_UP * each), min(WARM_STEPS, 5 * each)), []
     for _ in range(CHAINS):
-        step, found = 0.9 * size ** (-1 / 3), []
+        step, draws = 0.9 * size ** (-1 / 3), []
         state = blackjax.mala.init(jnp.asarray(rng.normal(size=size)), density)
         for k in range(warm + each):
             key = jax.random.key(int(rng.integers(2**31)))
@@ -114,8 +114,8 @@ def sample(problem: Problem, about: Shape, count: int, seed: int) -> Posterior:
             if k < warm:
                 step *= float(np.exp((float(info.acceptance_rate) - ACCEPTED) / np.sqrt(1 + k)))
             else:
-                found.append(np.asarray(state.position))
-        chains.append(found)
+                draws.append(np.asarray(state.position))
+        chains.append(draws)
     walked = np.array(chains)  # (chains, n, p)
     places = scipy.special.expit(about.middle + walked.reshape(-1, size) @ about.root.T)[:count]
     logits = walked @ about.root.T

@@ -35,14 +35,14 @@ class Problem(NamedTuple):
 
     def parts(self, values: np.ndarray, has_slopes: bool) -> list[Residual]:
         """Residuals of each measurement, and of the priors at the end if there are any."""
-        found = [x.residual(values, has_slopes) for x in self.measurements]
+        residuals = [x.residual(values, has_slopes) for x in self.measurements]
         if self.priors:
             at = np.array([x.number for x in self.priors])
             mean, sigma = (np.array([x[k] for x in self.priors]) for k in (1, 2))
             slope = np.zeros((len(at), len(values)))
             slope[np.arange(len(at)), at] = 1 / sigma
-            found.append(Residual((values[at] - mean) / sigma, slope if has_slopes else None))
-        return found
+            residuals.append(Residual((values[at] - mean) / sigma, slope if has_slopes else None))
+        return residuals
 
     def residual(self, u: np.ndarray) -> np.ndarray:
         """All residuals, (m,), at places between the bounds, (p,)."""
@@ -71,15 +71,15 @@ class Problem(NamedTuple):
         long, and six seconds to compile.
         """
         values = self.free.values(u)
-        many, found = self.bench.many(values), []
+        many, costs = self.bench.many(values), []
         for k, row in enumerate(values):
             self.bench.keep(row, many[k])
             try:
                 cost = 0.5 * float(np.sum(self.residual(u[k]) ** 2))
             except (StudyError, np.linalg.LinAlgError):
                 cost = np.inf
-            found.append(cost if np.isfinite(cost) else np.inf)
-        return np.array(found)
+            costs.append(cost if np.isfinite(cost) else np.inf)
+        return np.array(costs)
 
 
 def softened(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

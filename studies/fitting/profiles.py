@@ -72,37 +72,37 @@ def describe_confirmed(
         has_all: profile all parameters; otherwise those of directions without information.
     """
     answer = describe_fit(problem, u)
-    known: dict[int, float] = {}
-    found: dict[int, Likelihood] = {}
+    replaced: dict[int, float] = {}
+    profiles: dict[int, Likelihood] = {}
     for _ in range(len(u)):
         sigma = np.sqrt(np.diag(answer.covariance))
         named = {k for x in answer.undetermined for k in x.named()}
-        for k in (set(range(len(u))) if has_all else named) - found.keys():
-            found[k] = profile(problem, u, k, float(sigma[k]))
-        told = {k: _told(x, problem, u) for k, x in found.items()}
+        for k in (set(range(len(u))) if has_all else named) - profiles.keys():
+            profiles[k] = profile(problem, u, k, float(sigma[k]))
+        sigmas = {k: _implied_sigma(x, problem, u) for k, x in profiles.items()}
         confirmed = {
             k
             for x in answer.undetermined
-            if any(told[i] > UNKNOWN for i in x.named())
+            if any(sigmas[i] > UNKNOWN for i in x.named())
             for k in x.named()
         }
         corrected = {
             k: x
-            for k, x in told.items()
-            if k not in confirmed and k not in known and (np.isinf(x) or x * WRONG < sigma[k])
+            for k, x in sigmas.items()
+            if k not in confirmed and k not in replaced and (np.isinf(x) or x * WRONG < sigma[k])
         }
         if not corrected:
             break
-        known |= corrected
-        answer = describe_fit(problem, u, known)
+        replaced |= corrected
+        answer = describe_fit(problem, u, replaced)
     interval = answer.interval.copy()
-    for k, one in found.items():
+    for k, one in profiles.items():
         if len(one.values) > 2:
             interval[k] = one.interval()
-    return answer._replace(interval=interval), tuple(found[k] for k in sorted(found))
+    return answer._replace(interval=interval), tuple(profiles[k] for k in sorted(profiles))
 
 
-def _told(one: Likelihood, problem: Problem, u: np.ndarray) -> float:
+def _implied_sigma(one: Likelihood, problem: Problem, u: np.ndarray) -> float:
     """Standard deviation between the bounds that a profile says [1]; inf if it has no end."""
     if not one.ends:
         return np.inf
@@ -121,7 +121,7 @@ def profile(problem: Problem, u: np.ndarray, number: int, sigma: float) -> Likel
     """
     others = np.delete(np.arange(len(u)), number)
     least = float(np.sum(problem.residual(u) ** 2))
-    found = [(float(u[number]), 0.0)]
+    points = [(float(u[number]), 0.0)]
     for way in (1, -1):
         at, stride, last = u, way * STRIDE * sigma, 0.0
         for _ in range(STEPS):
@@ -140,13 +140,13 @@ def profile(problem: Problem, u: np.ndarray, number: int, sigma: float) -> Likel
             if np.sqrt(max(rise, 0.0)) - last < STRIDE / 2:
                 stride *= 2
             at, last = trial, np.sqrt(max(rise, 0.0))
-            found.append((float(at[number]), rise))
+            points.append((float(at[number]), rise))
             if rise > ENOUGH or not 0 < at[number] < 1:
                 break
     # bounds may be closer than the values' digits tell apart
     by_value = {
         float(problem.free.values(_with(u, number, x))[number]): rise
-        for x, rise in sorted(found, key=lambda one: -abs(one[1]))
+        for x, rise in sorted(points, key=lambda one: -abs(one[1]))
     }
     values = np.array(sorted(by_value))
     return Likelihood(number, values, np.array([by_value[x] for x in values]))

@@ -83,21 +83,21 @@ def solve(problem: Problem, starts: int, refine: int, iterations: int, seed: int
         raise StudyError("the model fails at every starting point; see the study and the bounds")
     kept = [0] if np.isfinite(cost[0]) else []
     kept += [int(k) for k in np.argsort(cost) if np.isfinite(cost[k]) and k != 0]
-    found = descend_all(problem, first[kept[:refine]], iterations)
-    if not found:
+    optima = descend_all(problem, first[kept[:refine]], iterations)
+    if not optima:
         raise StudyError("no starting point leads to a fit: each leaves where the model works")
-    found = distinct(found)
-    images = exchanges(problem.free.numbers, [x.u for x in found])
+    optima = distinct(optima)
+    images = exchanges(problem.free.numbers, [x.u for x in optima])
     order = np.argsort(problem.costs(np.array(images).reshape(-1, len(own))))
     best = [images[k] for k in order[: EXCHANGED * refine]]
-    found = distinct(found + descend_all(problem, best, iterations))
+    optima = distinct(optima + descend_all(problem, best, iterations))
     for one in problem.measurements:
-        one.reweigh(problem.free.values(found[0].u))
+        one.reweigh(problem.free.values(optima[0].u))
     # away from the bounds, along which the method may have crept
-    near = [x for k, x in enumerate(found) if k < refine or x.cost - found[0].cost < NEAR]
+    near = [x for k, x in enumerate(optima) if k < refine or x.cost - optima[0].cost < NEAR]
     inner = [np.clip(x.u, AWAY, 1 - AWAY) for x in near]
-    found = distinct(descend_all(problem, inner, iterations) or found)
-    return Solution(tuple(found), len(first))
+    optima = distinct(descend_all(problem, inner, iterations) or optima)
+    return Solution(tuple(optima), len(first))
 
 
 def exchanges(numbers: Sequence[Free], places: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -115,25 +115,25 @@ def exchanges(numbers: Sequence[Free], places: Sequence[np.ndarray]) -> list[np.
             key = entry.field, entry.indices[1:], one.span
             fields.setdefault(key, {})[entry.indices[0]] = k
     links = np.array([[x[i] for i in range(3)] for x in fields.values() if set(x) == {0, 1, 2}])
-    found: list[np.ndarray] = []
+    images: list[np.ndarray] = []
     for u in places if len(links) else ():
         mirrored = np.clip(2 * u[links].mean(axis=1, keepdims=True) - u[links], 0, 1)
         near = max(SAME, ALIKE * float(np.ptp(u[links], axis=1).max()))
-        for given, order in product((u[links], mirrored), permutations(range(3))):
+        for positions, order in product((u[links], mirrored), permutations(range(3))):
             changed = u.copy()
-            changed[links] = given[:, order]
-            if not _is_among(changed, [*places, *found], near):
-                found.append(changed)
-    return found
+            changed[links] = positions[:, order]
+            if not _is_among(changed, [*places, *images], near):
+                images.append(changed)
+    return images
 
 
 def distinct(optima: Sequence[Optimum]) -> list[Optimum]:
     """One optimum of each place, the best first."""
-    found: list[Optimum] = []
+    kept: list[Optimum] = []
     for one in sorted(optima, key=lambda x: x.cost):
-        if not _is_among(one.u, [x.u for x in found]):
-            found.append(one)
-    return found
+        if not _is_among(one.u, [x.u for x in kept]):
+            kept.append(one)
+    return kept
 
 
 def _is_among(u: np.ndarray, places: Sequence[np.ndarray], near: float = SAME) -> bool:
@@ -142,11 +142,11 @@ def _is_among(u: np.ndarray, places: Sequence[np.ndarray], near: float = SAME) -
 
 def descend_all(problem: Problem, first: Sequence[np.ndarray], iterations: int) -> list[Optimum]:
     """Optima that starting points lead to, without those that leave where the model works."""
-    found = []
+    optima = []
     for u in first:
         with suppress(StudyError, np.linalg.LinAlgError, ValueError):
-            found.append(descend(problem, u, iterations))
-    return found
+            optima.append(descend(problem, u, iterations))
+    return optima
 
 
 def descend(problem: Problem, u: np.ndarray, iterations: int) -> Optimum:

@@ -264,7 +264,7 @@ def parse_fit(data: dict[str, Any], folder: str | Path = ".") -> FitSpec:
 def _free(fit: Fit, study: Study) -> tuple[FreeNumbers, tuple[Prior, ...]]:
     if not fit.free:
         raise field_error("fit.free", {}, "one free field or more")
-    parts, known = [], []
+    parts, priors = [], []
     for name, written in fit.free.items():
         path = f"fit.free.{shown_name(name)}"
         prior = {}
@@ -276,14 +276,14 @@ def _free(fit: Fit, study: Study) -> tuple[FreeNumbers, tuple[Prior, ...]]:
             prior = {k: written[k] for k in ("mean", "sigma") if k in written}
             written = {k: v for k, v in written.items() if k not in prior}
         parts.append(plain_numbers(name, written, study, path, (DESIGN, MACHINE)))
-        known += [(prior, path)] * len(parts[-1][0])
+        priors += [(prior, path)] * len(parts[-1][0])
     free = join_numbers(parts)
     check_twice(free.numbers, "fit.free")
-    priors = []
-    for k, (prior, path) in enumerate(known):
-        if prior:
-            priors.append(_prior(prior, k, path, free.numbers[k].span))
-    return free, tuple(priors)
+    return free, tuple(
+        _prior(prior, k, path, free.numbers[k].span)
+        for k, (prior, path) in enumerate(priors)
+        if prior
+    )
 
 
 def number_unit(name: str) -> str:

@@ -116,9 +116,9 @@ def describe_fit(
     values = problem.free.values(u)
     parts = problem.parts(values, True)
     residual, jacobian = problem.stacked(parts), problem.stacked_slopes(parts, u)
-    told = np.array([np.eye(len(u))[k] / x for k, x in profiled.items()]).reshape(-1, len(u))
-    known = np.vstack([jacobian, told])
-    covariance, directions = spread(known)
+    by_profiles = np.array([np.eye(len(u))[k] / x for k, x in profiled.items()]).reshape(-1, len(u))
+    augmented = np.vstack([jacobian, by_profiles])
+    covariance, directions = spread(augmented)
     directions = (*_open(directions, profiled), *directions)
     sigma_u = np.sqrt(np.diag(covariance))
     for k, x in profiled.items():
@@ -138,7 +138,7 @@ def describe_fit(
         interval=np.stack([low, high], axis=1),
         correlation=covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance))),
         covariance=covariance,
-        information=known.T @ known,
+        information=augmented.T @ augmented,
         gradient=jacobian.T @ residual,
         directions=directions,
         misfits=tuple(
@@ -152,14 +152,14 @@ def describe_fit(
 
 def rivals(problem: Problem, solution: Solution, answer: Answer) -> tuple[Optimum, ...]:
     """Other optima in the data's region that the intervals of the best one leave out."""
-    limit, found = region_rise(len(answer.values)), []
+    limit, others = region_rise(len(answer.values)), []
     low, high = answer.interval.T
     for one in solution.others:
         values = problem.free.values(one.u)
         is_elsewhere = np.any((values < low) | (values > high))
         if solution.rise(one) <= limit and is_elsewhere:
-            found.append(one)
-    return tuple(found)
+            others.append(one)
+    return tuple(others)
 
 
 def _open(

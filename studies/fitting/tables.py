@@ -38,33 +38,35 @@ def read_columns(file: str, folder: Path, path: str) -> dict[str, np.ndarray]:
         with open_regular(where):  # of any size: pyuff opens its files itself
             pass
         if where.suffix.lower() in (".h5", ".hdf5"):
-            found = _from_hdf5(where, inside)
+            columns = _from_hdf5(where, inside)
         elif where.suffix.lower() in (".uff", ".unv"):
-            found = _from_uff(where, inside, path)
+            columns = _from_uff(where, inside, path)
         else:
-            found = _from_csv(where)
+            columns = _from_csv(where)
     except (OSError, ValueError, KeyError, csv.Error) as error:
         reason = (isinstance(error, OSError) and error.strerror) or error
         raise StudyError(f"{path}: {where} cannot be read ({reason})") from None
-    if len({len(x) for x in found.values()}) != 1:
-        lengths = sorted({len(x) for x in found.values()})
-        told = f"columns of {lengths[0]} to {lengths[-1]} rows" if lengths else "no columns"
-        raise StudyError(f"{path}: {where} has {told}; allowed: columns of one length")
-    return found
+    if len({len(x) for x in columns.values()}) != 1:
+        lengths = sorted({len(x) for x in columns.values()})
+        sizes = f"columns of {lengths[0]} to {lengths[-1]} rows" if lengths else "no columns"
+        raise StudyError(f"{path}: {where} has {sizes}; allowed: columns of one length")
+    return columns
 
 
-def column(found: dict[str, np.ndarray], name: str, file: str, path: str) -> np.ndarray:
+def column(columns: dict[str, np.ndarray], name: str, file: str, path: str) -> np.ndarray:
     """One column as numbers; others may hold anything.
 
     Raises:
         StudyError: there is none of that name, or it has entries that are no finite numbers.
     """
-    if name not in found:
-        hint = nearest(name, found)
-        told = f"; did you mean {hint!r}?" if hint else ""
-        known = ", ".join(shown(x) for x in found)
-        raise StudyError(f"{path}: {shown(file)} has no column {shown(name)}; it has {known}{told}")
-    values = found[name]
+    if name not in columns:
+        hint = nearest(name, columns)
+        suggestion = f"; did you mean {hint!r}?" if hint else ""
+        names = ", ".join(shown(x) for x in columns)
+        raise StudyError(
+            f"{path}: {shown(file)} has no column {shown(name)}; it has {names}{suggestion}"
+        )
+    values = columns[name]
     if values.dtype.kind == "U":
         values = np.array(
             [
@@ -145,11 +147,11 @@ def _from_uff(where: Path, number: str, path: str) -> dict[str, np.ndarray]:
         index = int(number or 1) - 1
         if not 0 <= index < functions.size:
             raise ValueError(f"has functions 1 to {functions.size}")
-        found = sets.read_sets(int(functions[index]))
+        dataset = sets.read_sets(int(functions[index]))
     except Exception as error:  # of any kind, for a damaged file
         raise ValueError(str(error) or "damaged") from error
-    given, read = int(found.get("num_pts", len(found["data"]))), len(found["data"])
-    if given != read:
-        raise ValueError(f"promises {given} points and has {read}")
-    abscissa = "frequency_hz" if found["abscissa_spec_data_type"] == _FREQUENCY else "time"
-    return {abscissa: np.asarray(found["x"]), "value": np.asarray(found["data"])}
+    promised, read = int(dataset.get("num_pts", len(dataset["data"]))), len(dataset["data"])
+    if promised != read:
+        raise ValueError(f"promises {promised} points and has {read}")
+    abscissa = "frequency_hz" if dataset["abscissa_spec_data_type"] == _FREQUENCY else "time"
+    return {abscissa: np.asarray(dataset["x"]), "value": np.asarray(dataset["data"])}

@@ -62,7 +62,7 @@ def trace_adjoint(
     results = [x for part in graph.trace(step, arguments, real) for x in part.flat]
     sums = [leaf._replace(is_varying=True) for leaf in read if leaf.is_moving]
     turned = [*state, *sums]
-    given = reads_of(graph, {"state": turned})["state"]
+    adjoint_reads = reads_of(graph, {"state": turned})["state"]
     moving = {
         kind: [
             x
@@ -71,10 +71,10 @@ def trace_adjoint(
         ]
         for kind in ("constant", "input")
     }
-    wanted = [*reads["state"], *moving["constant"], *moving["input"]]
-    pulled = pull_back(graph, results, given[: len(results)], wanted)
-    before, n = pulled[: len(results)], len(given)
-    added = zip(given[len(results) :], pulled[len(results) : n], strict=True)
+    sources = [*reads["state"], *moving["constant"], *moving["input"]]
+    pulled = pull_back(graph, results, adjoint_reads[: len(results)], sources)
+    before, n = pulled[: len(results)], len(adjoint_reads)
+    added = zip(adjoint_reads[len(results) :], pulled[len(results) : n], strict=True)
     pulled = fused([*before, *(graph.operation("add")(x, y) for x, y in added), *pulled[n:]])
 
     read_back = {id(node) for node in in_order(pulled)}
@@ -111,9 +111,9 @@ def _loop(
 
 def _moved(results: Sequence[Any], places: dict[int, tuple[str, int]]) -> list[Any]:
     """Results that take some reads, by their identity, from other places."""
-    made: dict[int, Node] = {}
+    moved: dict[int, Node] = {}
     for node in in_order(results):
-        args = tuple(x if is_known(x) else made[id(x)] for x in node.args)
+        args = tuple(x if is_known(x) else moved[id(x)] for x in node.args)
         place = places.get(id(node), node.place)
-        made[id(node)] = Node(node.operation, args, node.is_varying, node.is_truth, place)
-    return [x if is_known(x) else made[id(x)] for x in results]
+        moved[id(node)] = Node(node.operation, args, node.is_varying, node.is_truth, place)
+    return [x if is_known(x) else moved[id(x)] for x in results]

@@ -221,8 +221,8 @@ class DifferentiableLoop:
 
     def tangents(self, directions: int) -> TracedLoop:
         if directions not in self._tangents:
-            given = *self._given, directions, self._has_routines
-            self._tangents[directions] = outside(trace_loop, *given)
+            arguments = *self._given, directions, self._has_routines
+            self._tangents[directions] = outside(trace_loop, *arguments)
         return self._tangents[directions]
 
     def ahead(self, leaves: list[Any]) -> tuple[list[Any], Any]:
@@ -255,14 +255,14 @@ class DifferentiableLoop:
         ends = 0, self.first_input, self.first_state, len(self.kinds)
 
         def one(part: list[Any]) -> list[Any]:
-            given = dict(zip(moving, part, strict=True))
+            tangent_of = dict(zip(moving, part, strict=True))
             arrays: list[Any] = []
             for axis, (first, last) in zip((0, 1, 0), pairwise(ends), strict=True):
                 arrays += leaves[first:last]
                 for k in range(first, last):
                     if self.kinds[k].is_moving:
                         still = jnp.zeros((size, *leaves[k].shape), self.dtype)
-                        arrays.append(jnp.moveaxis(given.get(k, still), 0, axis))
+                        arrays.append(jnp.moveaxis(tangent_of.get(k, still), 0, axis))
             call = call_of_loop(self.tangents(size), self.n_steps, self.lanes)
             results = self._call(call, arrays)
             return results[len(self.kinds) - self.first_state :]
@@ -281,15 +281,15 @@ class DifferentiableLoop:
 
         def back(turned: list[Any], piece: tuple[list[Any], list[Any]]) -> tuple[Any, Any]:
             rows, state = piece
-            given = [*constants, *rows]
+            inputs = [*constants, *rows]
             forward, backward = (
                 call_of_loop(loop, len(rows[0]), self.lanes)
                 for loop in (adjoint.forward, adjoint.backward)
             )
-            record = self._call(forward, [*given, *state])[n_state]
+            record = self._call(forward, [*inputs, *state])[n_state]
 
             def one(cotangents: list[Any]) -> list[Any]:
-                return self._call(backward, [*given, record, *cotangents])
+                return self._call(backward, [*inputs, record, *cotangents])
 
             results = jax.lax.map(one, turned)
             return results[: len(turned)], results[len(turned) :]
@@ -356,9 +356,9 @@ def _abstract(*args: Any, linear: _Linear) -> list[Any]:
 def _turned_back(cotangents: list[Any], *args: Any, linear: _Linear) -> list[Any]:
     """Transpose: nothing for the point, and for tangents that are none."""
     points, tangents = args[: linear.n_points], args[linear.n_points :]
-    given = [ad.instantiate_zeros(x) for x in cotangents]
+    seeds = [ad.instantiate_zeros(x) for x in cotangents]
     back = linear._replace(is_transposed=not linear.is_transposed)
-    results = _LINEAR.bind(*points, *given, linear=back)
+    results = _LINEAR.bind(*points, *seeds, linear=back)
     kept = [
         x if ad.is_undefined_primal(t) else None for x, t in zip(results, tangents, strict=True)
     ]

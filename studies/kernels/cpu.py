@@ -234,21 +234,21 @@ def kept_kernel(
         return head, code
 
     def better(is_apart: bool) -> bytes | None:
-        found = kept(_effort()).take()
-        if found is not None:  # another process was faster
-            return found.split(b"\n", 1)[1]
-        made = compiled(_effort(), is_apart)
-        return None if made is None else made[1]
+        stored = kept(_effort()).take()
+        if stored is not None:  # another process was faster
+            return stored.split(b"\n", 1)[1]
+        result = compiled(_effort(), is_apart)
+        return None if result is None else result[1]
 
     for effort in _efforts():
-        found = kept(effort).take()
-        if found is not None:
-            head, code = found.split(b"\n", 1)
+        stored = kept(effort).take()
+        if stored is not None:
+            head, code = stored.split(b"\n", 1)
             break
     else:
-        made = compiled(effort)
-        assert made is not None
-        head, code = made
+        result = compiled(effort)
+        assert result is not None
+        head, code = result
     width, numbers, operations = json.loads(head)
     dtype = np.dtype(f"f{at.vector_bytes // width}")
     return Kernel(
@@ -268,8 +268,8 @@ def _code() -> str:
 
 def _effort() -> int:
     """LLVM's optimisation level; 0 compiles six times as fast as 3, and runs half as fast."""
-    found = _LEVEL.search(os.environ.get("XLA_FLAGS", ""))
-    return int(found[1]) if found else 3
+    match = _LEVEL.search(os.environ.get("XLA_FLAGS", ""))
+    return int(match[1]) if match else 3
 
 
 def _efforts() -> list[int]:

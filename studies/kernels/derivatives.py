@@ -70,23 +70,23 @@ def pull_back(
             moves[id(node)] = not is_flat and any(
                 moves[id(x)] for x in node.args if not is_known(x)
             )
-    found: dict[int, Any] = {}
+    sums: dict[int, Any] = {}
 
-    def give(x: Any, part: Any) -> None:
+    def add(x: Any, part: Any) -> None:
         if not is_known(x) and moves[id(x)] and not _is_zero(part):
-            before = found.get(id(x), 0.0)
-            found[id(x)] = graph.operation("add")(before, part)
+            before = sums.get(id(x), 0.0)
+            sums[id(x)] = graph.operation("add")(before, part)
 
     for x, cotangent in zip(results, cotangents, strict=True):
-        give(x, cotangent)
+        add(x, cotangent)
     for node in reversed(order):
-        if id(node) in found and node.operation != "read":
+        if id(node) in sums and node.operation != "read":
             rule = _COTANGENTS[node.operation]
-            parts = rule(graph.operation, node, found[id(node)])
+            parts = rule(graph.operation, node, sums[id(node)])
             # a selection's condition gets nothing
             for x, part in zip(node.args[-len(parts) :], parts, strict=True):
-                give(x, part)
-    return [found.get(id(node), 0.0) for node in reads]
+                add(x, part)
+    return [sums.get(id(node), 0.0) for node in reads]
 
 
 def _is_zero(x: Any) -> bool:

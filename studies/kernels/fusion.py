@@ -34,7 +34,7 @@ def fused(results: Sequence[Any]) -> list[Any]:
         only = None if is_known(x) else reader[id(x)]
         return only is not None and only.operation in _SUMS
 
-    made: dict[int, Any] = {}
+    new_nodes: dict[int, Any] = {}
 
     def terms(x: Any, sign: int, is_root: bool) -> list[tuple[int, Any]]:
         if is_known(x) or x.operation not in _SUMS or not (is_root or is_inner(x)):
@@ -44,26 +44,28 @@ def fused(results: Sequence[Any]) -> list[Any]:
             signs = (-sign,)
         return [t for s, a in zip(signs, x.args, strict=True) for t in terms(a, s, False)]
 
-    def new(x: Any) -> Any:
-        return x if is_known(x) else made[id(x)]
+    def replacement(x: Any) -> Any:
+        return x if is_known(x) else new_nodes[id(x)]
 
     for node in order:
         if node.operation == "read":
-            made[id(node)] = node
+            new_nodes[id(node)] = node
         elif node.operation in _SUMS:
             if is_inner(node):
                 continue
             products, plain = [], []
             for sign, x in terms(node, 1, True):
                 if not is_known(x) and x.operation == "mul" and is_inner(x):
-                    products.append((sign, new(x.args[0]), new(x.args[1])))
+                    products.append((sign, replacement(x.args[0]), replacement(x.args[1])))
                 else:
-                    plain.append((sign, new(x)))
-            made[id(node)] = _chain(products, plain)
+                    plain.append((sign, replacement(x)))
+            new_nodes[id(node)] = _chain(products, plain)
         elif not (node.operation == "mul" and is_inner(node)):
-            args = tuple(map(new, node.args))
-            made[id(node)] = Node(node.operation, args, node.is_varying, node.is_truth, node.place)
-    return [new(x) for x in results]
+            args = tuple(map(replacement, node.args))
+            new_nodes[id(node)] = Node(
+                node.operation, args, node.is_varying, node.is_truth, node.place
+            )
+    return [replacement(x) for x in results]
 
 
 def _like(operation: str, *args: Any) -> Node:
@@ -90,26 +92,26 @@ def _chain(products: list[tuple[int, Any, Any]], plain: list[tuple[int, Any]]) -
     return total
 
 
-def in_order(wanted: Iterable[Any]) -> list[Node]:
+def in_order(outputs: Iterable[Any]) -> list[Node]:
     """Nodes needed by some results, each after its arguments and as late as possible.
 
     Depth first, the argument with the longest history first, keeps few numbers in flight.
 
     Args:
-        wanted: nodes; plain numbers are ignored.
+        outputs: nodes; plain numbers are ignored.
     """
-    wanted = list(wanted)
+    outputs = list(outputs)
     height: dict[int, int] = {}
-    for node in _depth_first(wanted):
+    for node in _depth_first(outputs):
         height[id(node)] = 1 + max([height.get(id(x), 0) for x in node.args], default=0)
-    return _depth_first(wanted, lambda x: height.get(id(x), 0))
+    return _depth_first(outputs, lambda x: height.get(id(x), 0))
 
 
-def _depth_first(wanted: list[Any], priority: Callable[[Any], int] | None = None) -> list[Node]:
+def _depth_first(outputs: list[Any], priority: Callable[[Any], int] | None = None) -> list[Node]:
     """Each node after its arguments, those with the highest priority first."""
     order: list[Node] = []
     seen: set[int] = set()
-    stack: list[Any] = wanted[::-1]
+    stack: list[Any] = outputs[::-1]
     while stack:
         node = stack.pop()
         if type(node) is tuple:  # its arguments are done
@@ -121,6 +123,6 @@ def _depth_first(wanted: list[Any], priority: Callable[[Any], int] | None = None
     return order
 
 
-def count_operations(wanted: Iterable[Any]) -> Counter[str]:
+def count_operations(outputs: Iterable[Any]) -> Counter[str]:
     """Number of operations of each kind that some results need."""
-    return Counter(node.operation for node in _depth_first(list(wanted)))
+    return Counter(node.operation for node in _depth_first(list(outputs)))

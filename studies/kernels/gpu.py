@@ -62,8 +62,8 @@ def build_kernel(
     numbers = {name: np.int32(size) for name, size in sizes.items()}
 
     def run(arrays: Sequence[Any]) -> list[Any]:
-        given = [jnp.asarray(x, loop.dtype) for x in arrays]
-        return list(call(*given, name="run", kernel_type="ptx", kernel_data=source, **numbers))
+        inputs = [jnp.asarray(x, loop.dtype) for x in arrays]
+        return list(call(*inputs, name="run", kernel_type="ptx", kernel_data=source, **numbers))
 
     return run
 

@@ -41,7 +41,7 @@ class Graph:
     """Creates nodes; one instance per traced function."""
 
     def __init__(self) -> None:
-        self._made: dict[tuple[Any, ...], Node] = {}
+        self._nodes: dict[tuple[Any, ...], Node] = {}
 
     def read(self, place: Any, is_varying: bool) -> Node:
         """A number from memory."""
@@ -66,10 +66,10 @@ class Graph:
         """
         shapes = [[jax.ShapeDtypeStruct(x.shape, dtype) for x in part] for part in arguments]
         traced, _ = trace(function, *shapes)  # runs the function: its errors are its own
-        given = [x for part in arguments for x in part]
+        inputs = [x for part in arguments for x in part]
         try:
-            self._survey(traced, given)
-            return self._evaluate(traced, given)
+            self._survey(traced, inputs)
+            return self._evaluate(traced, inputs)
         except NotImplementedError as error:
             raise NoKernelError(f"the traced kernel does not support {error}") from None
         except Exception as error:  # a structure of JAX's that is not expected
@@ -78,20 +78,20 @@ class Graph:
                 f"JAX {jax.__version__} gives no traced kernel of the step ({reason})"
             ) from error
 
-    def _survey(self, traced: Function, given: list[np.ndarray]) -> None:
+    def _survey(self, traced: Function, inputs: list[np.ndarray]) -> None:
         """What is to be known of a function before its equations are carried out; here nothing."""
 
     # --- equations --------------------------------------------------------------------------------
 
-    def _evaluate(self, function: Function, given: list[np.ndarray]) -> list[Any]:
-        known: dict[Any, np.ndarray] = {}
+    def _evaluate(self, function: Function, inputs: list[np.ndarray]) -> list[Any]:
+        values: dict[Any, np.ndarray] = {}
 
         def value(atom: Any) -> np.ndarray:
             number = literal(atom)
-            return known[atom] if number is None else _numbers(number)
+            return values[atom] if number is None else _numbers(number)
 
-        known |= {variable: _numbers(x) for variable, x in function.constants}
-        known |= dict(zip(function.inputs, given, strict=True))
+        values |= {variable: _numbers(x) for variable, x in function.constants}
+        values |= dict(zip(function.inputs, inputs, strict=True))
         for equation in function.equations:
             arguments = [value(atom) for atom in equation.invars]
             scan, inner = scan_of(equation), call_of(equation)
@@ -101,19 +101,19 @@ class Graph:
                 results = self._inlined(inner, arguments)
             else:
                 results = [self._apply(equation, arguments)]
-            known |= dict(zip(equation.outvars, results, strict=True))
+            values |= dict(zip(equation.outvars, results, strict=True))
         return [value(atom) for atom in function.outputs]
 
-    def _inlined(self, inner: Function, given: list[np.ndarray]) -> list[Any]:
+    def _inlined(self, inner: Function, inputs: list[np.ndarray]) -> list[Any]:
         """A function that is called."""
-        return self._evaluate(inner, given)
+        return self._evaluate(inner, inputs)
 
-    def _unrolled(self, scan: Scan, given: list[np.ndarray]) -> list[np.ndarray]:
+    def _unrolled(self, scan: Scan, inputs: list[np.ndarray]) -> list[np.ndarray]:
         first = scan.n_constants + scan.n_carry
         constants, carry, stacked = (
-            given[: scan.n_constants],
-            given[scan.n_constants : first],
-            given[first:],
+            inputs[: scan.n_constants],
+            inputs[scan.n_constants : first],
+            inputs[first:],
         )
         kept = []
         order = range(scan.length)[:: -1 if scan.is_reversed else 1]
@@ -125,24 +125,24 @@ class Graph:
         kept = kept[:: order.step]
         return [*carry, *(np.stack(parts) for parts in zip(*kept, strict=True))]
 
-    def _apply(self, equation: Any, given: list[np.ndarray]) -> np.ndarray:
+    def _apply(self, equation: Any, inputs: list[np.ndarray]) -> np.ndarray:
         name, params = equation.primitive.name, equation.params
         shape = equation.outvars[0].aval.shape
         if name in _STRUCTURAL:
-            return _STRUCTURAL[name](params, shape, *given)
+            return _STRUCTURAL[name](params, shape, *inputs)
         if name.startswith("reduce_"):
-            return self._reduce(name.removeprefix("reduce_"), given[0], params["axes"], shape)
+            return self._reduce(name.removeprefix("reduce_"), inputs[0], params["axes"], shape)
         if name == "integer_pow":
-            return self._each(lambda x: self._power(x, params["y"]), given, shape)
+            return self._each(lambda x: self._power(x, params["y"]), inputs, shape)
         if name == "convert_element_type":
             is_truth = np.dtype(params["new_dtype"]) == bool
-            return self._each(lambda x: self._converted(x, is_truth), given, shape)
-        return self._each(self.operation(name), given, shape)
+            return self._each(lambda x: self._converted(x, is_truth), inputs, shape)
+        return self._each(self.operation(name), inputs, shape)
 
     def _each(
-        self, operation: Callable[..., Any], given: list[np.ndarray], shape: tuple[int, ...]
+        self, operation: Callable[..., Any], inputs: list[np.ndarray], shape: tuple[int, ...]
     ) -> np.ndarray:
-        wide = [np.broadcast_to(array, shape) for array in given]
+        wide = [np.broadcast_to(array, shape) for array in inputs]
         values = [operation(*row) for row in zip(*(array.flat for array in wide), strict=True)]
         return objects(values, shape)
 
@@ -164,23 +164,23 @@ class Graph:
         """
         if name in _COMPARE:
             return partial(self._compared, name)
-        found = getattr(self, f"_op_{name}", None)
-        if found is None:
+        method = getattr(self, f"_op_{name}", None)
+        if method is None:
             raise NotImplementedError(f"operation {name!r} of the step")
-        return found
+        return method
 
     def _node(self, operation: str, *args: Any, is_truth: bool = False) -> Node:
         names = [id(x) if type(x) is Node else (type(x), x) for x in args]
         if operation in _SYMMETRIC:
             names.sort(key=hash)
         key = (operation, *names)
-        found = self._made.get(key)
-        if found is None:
+        node = self._nodes.get(key)
+        if node is None:
             is_varying = any(
                 [type(x) is Node and x.is_varying for x in args]  # noqa: C419 (faster)
             )
-            found = self._made[key] = Node(operation, args, is_varying, is_truth)
-        return found
+            node = self._nodes[key] = Node(operation, args, is_varying, is_truth)
+        return node
 
     def _op_add(self, a: Any, b: Any) -> Any:
         if is_known(a) and is_known(b):
@@ -241,14 +241,14 @@ class Graph:
 
     def _op_and(self, a: Any, b: Any) -> Any:
         if is_known(a) or is_known(b):
-            known, other = (a, b) if is_known(a) else (b, a)
-            return other if known else False
+            constant, other = (a, b) if is_known(a) else (b, a)
+            return other if constant else False
         return self._node("and", a, b, is_truth=True)
 
     def _op_or(self, a: Any, b: Any) -> Any:
         if is_known(a) or is_known(b):
-            known, other = (a, b) if is_known(a) else (b, a)
-            return True if known else other
+            constant, other = (a, b) if is_known(a) else (b, a)
+            return True if constant else other
         return self._node("or", a, b, is_truth=True)
 
     def _op_not(self, a: Any) -> Any:

@@ -130,13 +130,13 @@ class Writer:
 
         None: before all of them.
         """
-        found: dict[Any, list[tuple[Any, Any]]] = defaultdict(list)
+        records: dict[Any, list[tuple[Any, Any]]] = defaultdict(list)
         if self.loop.records:
             places = self._places("record", "record", frame, row)
             for x, place in zip(self.loop.records, places, strict=True):
                 is_early = is_known(x) or is_fixed[id(x)]
-                found[None if is_early else id(x)].append((x, place))
-        return found
+                records[None if is_early else id(x)].append((x, place))
+        return records
 
     def _record(self, records: list[tuple[Any, Any]]) -> None:
         for x, place in records:
@@ -167,7 +167,7 @@ class Writer:
 
     def _places(self, kind: str, base: str, frame: Arguments, sample: Any = None) -> list[Any]:
         """Address of every number, in this sample's row if there is one."""
-        found = []
+        places = []
         leaves: list[InputLeaf] = self.loop.leaves[kind]
         for leaf, start_of_leaf in zip(leaves, frame.bases[base], strict=True):
             stride = frame.lanes if leaf.is_varying else ir.Constant(self.index, 1)
@@ -179,8 +179,8 @@ class Writer:
                 offset = self.builder.mul(ir.Constant(self.index, k), stride)
                 offset = self.builder.add(start, offset)
                 place = self.builder.gep(start_of_leaf, [offset], source_etype=self.scalar)
-                found.append(place)
-        return found
+                places.append(place)
+        return places
 
     def _load(self, place: Any, is_varying: bool) -> Any:
         kind = self.vector if is_varying else self.scalar

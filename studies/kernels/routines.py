@@ -49,37 +49,38 @@ class RoutineGraph(Graph):
         """
         super().__init__()
         self._seeds = seeds
-        self._asked: dict[int, list[list[Any]]] | None = None  # numbers of all calls, by function
+        # numbers of all calls, by function
+        self._pending_calls: dict[int, list[list[Any]]] | None = None
         self._routines: dict[int, Routine] = {}
         self._calls: dict[tuple[Any, ...], list[Any]] = {}  # results of each call
         self._is_fixed: dict[int, bool] = {}
         self._moves: dict[int, bool] = {}
         self._alive: list[Any] = []  # what is known by its identity
 
-    def _survey(self, traced: Function, given: list[np.ndarray]) -> None:
+    def _survey(self, traced: Function, inputs: list[np.ndarray]) -> None:
         """Find the routines."""
-        found = _repeated(traced)
-        self._alive += found.values()
+        repeated = _repeated(traced)
+        self._alive += repeated.values()
         # in the order of their first calls, so that each is given what the others before it return
-        for name, inner in found.items():
+        for name, inner in repeated.items():
             # what the calls are given, while the results of further routines are still unknown
-            self._asked = {x: [] for x in found if x not in self._routines}
-            self._evaluate(traced, given)
-            calls, self._asked = self._asked[name], None
+            self._pending_calls = {x: [] for x in repeated if x not in self._routines}
+            self._evaluate(traced, inputs)
+            calls, self._pending_calls = self._pending_calls[name], None
             self._routines[name] = self._routine(inner, calls)
 
-    def _inlined(self, inner: Function, given: list[np.ndarray]) -> list[Any]:
+    def _inlined(self, inner: Function, inputs: list[np.ndarray]) -> list[Any]:
         name = id(inner.source)
-        numbers = [x for array in given for x in array.flat]
-        if self._asked is not None and name in self._asked:
-            self._asked[name].append(numbers)
+        numbers = [x for array in inputs for x in array.flat]
+        if self._pending_calls is not None and name in self._pending_calls:
+            self._pending_calls[name].append(numbers)
             call = self._new("call", (), None)
             count = sum(int(np.prod(shape)) for shape in inner.shapes)
             results = [self._new("result", (call,), k) for k in range(count)]
         elif name in self._routines:
             results = self._called(self._routines[name], numbers)
         else:
-            return super()._inlined(inner, given)
+            return super()._inlined(inner, inputs)
         return _arrays(results, inner.shapes)
 
     def _new(self, operation: str, args: tuple[Any, ...], place: Any) -> Node:
@@ -94,19 +95,19 @@ class RoutineGraph(Graph):
             inner: its equations.
             calls: what each call is given.
         """
-        routine, given = Routine(), []
+        routine, inputs = Routine(), []
         self._classify([x for numbers in calls for x in numbers])
         for position, column in enumerate(zip(*calls, strict=True)):
             if all(_is_same(x, column[0]) for x in column) and self._is_usable(column[0], routine):
-                given.append(column[0])
+                inputs.append(column[0])
                 continue
             if self._seeds and any(not is_known(x) and self._moves[id(x)] for x in column):
                 routine.moving.append(len(routine.parameters))
             routine.positions.append(position)
             routine.parameters.append(self._parameter(routine))
-            given.append(routine.parameters[-1])
-        found = super()._inlined(inner, _arrays(given, [x.aval.shape for x in inner.inputs]))
-        routine.results = [x for array in found for x in array.flat]
+            inputs.append(routine.parameters[-1])
+        outputs = super()._inlined(inner, _arrays(inputs, [x.aval.shape for x in inner.inputs]))
+        routine.results = [x for array in outputs for x in array.flat]
         routine.size = len(routine.results)
         own, primal = list(routine.parameters), list(routine.results)
         for seed in self._seeds:
@@ -148,17 +149,17 @@ class RoutineGraph(Graph):
         for seed in self._seeds:
             values += push_forward(self, moving, seed)
         call = self._new("call", (*values, *routine.shared.values()), routine)
-        given = {id(x): value for x, value in zip(routine.parameters, values, strict=True)}
+        arguments = {id(x): value for x, value in zip(routine.parameters, values, strict=True)}
 
         def result(k: int, x: Any) -> Any:
             if self.is_fixed(x) or id(x) in routine.shared:
                 return x
-            return given[id(x)] if id(x) in given else self._new("result", (call,), k)
+            return arguments[id(x)] if id(x) in arguments else self._new("result", (call,), k)
 
-        found = [result(k, x) for k, x in enumerate(routine.results)]
-        primal = found[: routine.size]
+        results = [result(k, x) for k, x in enumerate(routine.results)]
+        primal = results[: routine.size]
         for n, seed in enumerate(self._seeds, 1):
-            along = found[n * routine.size : (n + 1) * routine.size]
+            along = results[n * routine.size : (n + 1) * routine.size]
             for x, tangent in zip(primal, along, strict=True):
                 if not is_known(x) and x.operation == "result":
                     seed[id(x)] = tangent
@@ -186,19 +187,19 @@ class RoutineGraph(Graph):
 def _repeated(traced: Function) -> dict[int, Function]:
     """Functions of some length that are called more than once, by the identity of their source."""
     count: Counter[int] = Counter()
-    found = {}
+    inners = {}
 
-    def look(function: Function, times: int) -> None:
+    def count_calls(function: Function, times: int) -> None:
         for equation in function.equations:
             scan, inner = scan_of(equation), call_of(equation)
             if scan is not None:
-                look(scan.body, times * scan.length)
+                count_calls(scan.body, times * scan.length)
             elif inner is not None and len(inner.equations) >= SHORTEST:
                 count[id(inner.source)] += times
-                found[id(inner.source)] = inner
+                inners[id(inner.source)] = inner
 
-    look(traced, 1)
-    return {name: inner for name, inner in found.items() if count[name] > 1 and inner.is_real}
+    count_calls(traced, 1)
+    return {name: inner for name, inner in inners.items() if count[name] > 1 and inner.is_real}
 
 
 def _arrays(numbers: Sequence[Any], shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:

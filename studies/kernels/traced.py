@@ -63,15 +63,15 @@ class TracedLoop(NamedTuple):
 
     def fixed(self) -> dict[int, bool]:
         """Which nodes stay the same from sample to sample, by identity."""
-        found: dict[int, bool] = {}
+        is_fixed: dict[int, bool] = {}
         for node in self.order:
             if node.operation == "read":
-                found[id(node)] = node.place[0] == "constant"
+                is_fixed[id(node)] = node.place[0] == "constant"
             elif node.operation == "call":
-                found[id(node)] = False
+                is_fixed[id(node)] = False
             else:
-                found[id(node)] = all(found[id(x)] for x in node.args if not is_known(x))
-        return found
+                is_fixed[id(node)] = all(is_fixed[id(x)] for x in node.args if not is_known(x))
+        return is_fixed
 
     def text(self) -> str:
         """All that the loop's code depends on."""
@@ -88,14 +88,14 @@ class TracedLoop(NamedTuple):
                 kind = node.operation, place, node.is_varying, node.is_truth
                 yield f"{kind} {' '.join(map(named, node.args))}"
 
-        found = [f"{self.leaves} {self.dtype} {self.is_reversed}", *lines(self.order)]
-        found += [f"{c.slot} {named(c.mask)} {named(c.value)}" for c in self.changes]
-        found += map(named, self.records)
+        parts = [f"{self.leaves} {self.dtype} {self.is_reversed}", *lines(self.order)]
+        parts += [f"{c.slot} {named(c.mask)} {named(c.value)}" for c in self.changes]
+        parts += map(named, self.records)
         for body in self.bodies.values():
-            found += [f"routine {body.n_parameters} {' '.join(map(named, body.fixed))}"]
-            found += lines(body.order)
-            found += [f"{k} {named(x)}" for k, x in body.results.items()]
-        return "\n".join(found)
+            parts += [f"routine {body.n_parameters} {' '.join(map(named, body.fixed))}"]
+            parts += lines(body.order)
+            parts += [f"{k} {named(x)}" for k, x in body.results.items()]
+        return "\n".join(parts)
 
     def operations(self) -> Counter[str]:
         """Operations of one sample by kind."""
@@ -174,10 +174,10 @@ def arguments_of(
     reads: dict[str, list[Node]], leaves: Sequence[Sequence[InputLeaf | np.ndarray]]
 ) -> list[list[np.ndarray]]:
     """What the step is given: arrays of reads, and of known numbers."""
-    found = []
+    arguments = []
     for nodes, part in zip(reads.values(), leaves, strict=True):
         rest = iter(nodes)
-        found.append(
+        arguments.append(
             [
                 objects([next(rest) for _ in range(leaf.size)], leaf.shape)
                 if isinstance(leaf, InputLeaf)
@@ -185,7 +185,7 @@ def arguments_of(
                 for leaf in part
             ]
         )
-    return found
+    return arguments
 
 
 def needed_by(changes: Sequence[Change], others: Iterable[Any]) -> list[Node]:
@@ -210,11 +210,11 @@ def _tangents(
         seeds: tangents of what moves, for each direction.
     """
     pushed = [push_forward(graph, results, seed) for seed in seeds]
-    found, first = [], 0
+    tangents, first = [], 0
     for size in sizes:
-        found += [x for along in pushed for x in along[first : first + size]]
+        tangents += [x for along in pushed for x in along[first : first + size]]
         first += size
-    return found
+    return tangents
 
 
 def numbers(nodes: Sequence[Node], leaves: Sequence[InputLeaf]) -> list[list[Node]]:
@@ -246,23 +246,23 @@ def closed(graph: Graph, results: list[Any]) -> tuple[list[Any], dict[int, Body]
     if not isinstance(graph, RoutineGraph):
         return fused(results), {}
     calls: dict[int, list[Node]] = {}
-    wanted: dict[int, set[int]] = {}
+    used: dict[int, set[int]] = {}
     routines: dict[int, Routine] = {}
 
-    def look() -> int:
+    def collect() -> int:
         calls.clear()
-        wanted.clear()
+        used.clear()
         for node in in_order(results):
             if node.operation == "result":
-                wanted.setdefault(id(node.args[0].place), set()).add(node.place)
+                used.setdefault(id(node.args[0].place), set()).add(node.place)
             elif node.operation == "call":
                 routines[id(node.place)] = node.place
                 calls.setdefault(id(node.place), []).append(node)
-        return sum(map(len, wanted.values()))
+        return sum(map(len, used.values()))
 
-    count, before = look(), -1
+    count, before = collect(), -1
     while count != before:
-        for name, numbers in wanted.items():
+        for name, numbers in used.items():
             needed = {
                 node.place[1]
                 for node in in_order([routines[name].results[k] for k in numbers])
@@ -271,15 +271,15 @@ def closed(graph: Graph, results: list[Any]) -> tuple[list[Any], dict[int, Body]
             for call in calls[name]:
                 # None where nothing is read, so that places stay
                 call.args = tuple(x if k in needed else None for k, x in enumerate(call.args))
-        before, count = count, look()
+        before, count = count, collect()
     bodies, fixed = {}, []
-    for name, numbers in wanted.items():
-        wanted_ones = [routines[name].results[k] for k in sorted(numbers)]
-        body, own = _cut(graph, wanted_ones, routines[name])
+    for name, numbers in used.items():
+        outputs = [routines[name].results[k] for k in sorted(numbers)]
+        body, own = _cut(graph, outputs, routines[name])
         body = fused(body)
-        found = dict(zip(sorted(numbers), body, strict=True))
+        results_of = dict(zip(sorted(numbers), body, strict=True))
         n_parameters = len(routines[name].parameters)
-        bodies[name] = Body(found, in_order(body), own, n_parameters)
+        bodies[name] = Body(results_of, in_order(body), own, n_parameters)
         fixed += own
     whole = fused([*results, *fixed])
     rest = iter(whole[len(results) :])
@@ -293,22 +293,22 @@ def _cut(graph: RoutineGraph, results: list[Any], routine: Routine) -> tuple[lis
     Returns:
         (results; of those numbers the ones that are also the same at every sample).
     """
-    made: dict[int, Node] = {}
+    new_nodes: dict[int, Node] = {}
     fixed: list[Node] = []
     shared = {name: k for k, name in enumerate(routine.shared)}
 
     def is_outer(x: Node) -> bool:
         return (graph.is_fixed(x) and not x.is_truth) or id(x) in shared
 
-    def new(x: Any) -> Any:
+    def replacement(x: Any) -> Any:
         if is_known(x):
             return x
-        if id(x) not in made and id(x) in shared:
-            made[id(x)] = Node("read", (), True, False, ("shared", shared[id(x)]))
-        elif id(x) not in made and is_outer(x):
-            made[id(x)] = Node("read", (), True, False, ("fixed", len(fixed)))
+        if id(x) not in new_nodes and id(x) in shared:
+            new_nodes[id(x)] = Node("read", (), True, False, ("shared", shared[id(x)]))
+        elif id(x) not in new_nodes and is_outer(x):
+            new_nodes[id(x)] = Node("read", (), True, False, ("fixed", len(fixed)))
             fixed.append(x)
-        return made[id(x)]
+        return new_nodes[id(x)]
 
     own, left = set(), [x for x in results if not is_known(x)]
     while left:  # what leads to an outer number stays outside too
@@ -318,9 +318,9 @@ def _cut(graph: RoutineGraph, results: list[Any], routine: Routine) -> tuple[lis
             left += (y for y in x.args if not is_known(y))
     for node in in_order(results):
         if id(node) in own and node.operation == "read":
-            made[id(node)] = node
+            new_nodes[id(node)] = node
         elif id(node) in own:
-            args = tuple(map(new, node.args))
+            args = tuple(map(replacement, node.args))
             is_varying = any(not is_known(x) and x.is_varying for x in args)
-            made[id(node)] = Node(node.operation, args, is_varying, node.is_truth, node.place)
-    return [new(x) for x in results], fixed
+            new_nodes[id(node)] = Node(node.operation, args, is_varying, node.is_truth, node.place)
+    return [replacement(x) for x in results], fixed

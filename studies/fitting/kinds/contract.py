@@ -75,8 +75,8 @@ class Noise(NamedTuple):
 
     def of_model(self, model: np.ndarray, measured: np.ndarray) -> np.ndarray:
         """The same of a model's values; of measured ones where the model is 0."""
-        found = self.sigma(model)
-        return np.where(found > 0, found, self.sigma(measured))
+        sigma = self.sigma(model)
+        return np.where(sigma > 0, sigma, self.sigma(measured))
 
 
 class Measurement(ABC):

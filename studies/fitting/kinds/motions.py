@@ -68,13 +68,13 @@ class Motion:
         """
         kinds = tuple(sorted(self._kinds))
         key = values.tobytes(), kinds
-        known, found = self._kept
-        if known not in ((*key, True), (*key, has_slopes)):
+        kept_key, results = self._kept
+        if kept_key not in ((*key, True), (*key, has_slopes)):
             run = _recorded_slopes if has_slopes else _recorded
-            found = run(self._structure, self._place, kinds, self._numbers, values)
-            found = jax.tree.map(np.asarray, found)
-            self._kept = (*key, has_slopes), found
-        signals, (time, command_end, code), *slopes = found
+            results = run(self._structure, self._place, kinds, self._numbers, values)
+            results = jax.tree.map(np.asarray, results)
+            self._kept = (*key, has_slopes), results
+        signals, (time, command_end, code), *slopes = results
         check_finished(name, int(code))
         at = (slice(None), *self._entry(signal))
         slope = slopes[0][signal.kind][at] if has_slopes else None
@@ -143,5 +143,5 @@ _recorded = jax.jit(_run, static_argnums=(0, 1, 2))
 def _recorded_slopes(
     structure: Structure, place: Place, kinds: tuple[str, ...], numbers: Numbers, values: Array
 ) -> Any:
-    slopes, found = with_slopes(_run, 4, is_first=True)(structure, place, kinds, numbers, values)
-    return *found, slopes
+    slopes, results = with_slopes(_run, 4, is_first=True)(structure, place, kinds, numbers, values)
+    return *results, slopes
