@@ -264,7 +264,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
     except OSError:
         if (path / TUNING).is_file():
             raise StudyError(
-                f"{path}: holds a tuning, not a sweep; see its report.md, or tune.h5 with xarray"
+                f"{path}: holds a tuning, not a sweep; see its report.html, or tune.h5 with xarray"
             ) from None
         raise StudyError(f"{path}: not the folder of a sweep ({MANIFEST} is missing)") from None
     except ValueError as error:
