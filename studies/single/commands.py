@@ -124,7 +124,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 def _print_run(run: Run, twin: Run | None, console: Console) -> None:
     """Print status, link metrics and stability; twin: the same run without control."""
     from studies.engine.poles import HEADER, difference, pole_rows
-    from studies.single.report import limits_text, settling_text
+    from studies.single.summary import limits_text, settling_text
     from studies.study.labels import describe, remedy
     from studies.study.margin import MARGIN_MODES, caution, margin_in_db
     from studies.study.spec import AUTO

@@ -14,20 +14,17 @@ from matplotlib.figure import Figure
 from jaxmodel import status
 from jaxmodel.axial import euler_force
 from studies.engine.poles import HEADER, difference, pole_rows
-from studies.engine.run_data import chord_deflection, run_attributes, run_variables
-from studies.engine.runs import Run, uncontrolled_twin
-from studies.errors import StudyError
-from studies.publish import check_target, publish
-from studies.show import figures, units
+from studies.engine.run_data import chord_deflection
+from studies.engine.runs import Run
+from studies.show import figures
 from studies.show.pages import page
-from studies.show.sketch import CAPTION, sketch
+from studies.show.sketch import CAPTION
 from studies.show.units import number
 from studies.show.words import control_text, motion_text
-from studies.store import write_store
+from studies.single.summary import limits_text, settling_text, watched
 from studies.study.margin import ENOUGH, MARGIN_MODES, caution
 
 #: Figures, by the end of the file name.
-FIGURES = ("deflection", "error", "voltage", "machine")
 #: What a run means, by its situation.
 VERDICTS = {
     "stopped": "the run stopped",
@@ -42,53 +39,6 @@ LATER = 0.02
 #: Grey of the residual window and of markers.
 GREY = "#888888"
 _POSE = ("x [µm]", "y [µm]", "φ [µrad]")
-
-
-def check_results(out: Path, has_report: bool) -> None:
-    """Raise StudyError unless the files of a run can be written; call it before long work.
-
-    Args:
-        out: file of the run.
-        has_report: whether its report will be written next to it.
-
-    Raises:
-        StudyError: a file cannot be written, or `out` has the name of one of the report.
-    """
-    if out.suffix == ".toml":
-        raise StudyError(f"--out {out}: results are HDF5, not a study; name the file *.h5")
-    check_target(out)
-    names = [f"{out.stem}.html", *(f"{out.stem}-{name}.png" for name in FIGURES)]
-    for name in names if has_report else []:
-        if name == out.name:
-            raise StudyError(f"--out {out}: --report writes a file of this name; name it *.h5")
-        check_target(out.with_name(name))
-
-
-def write_results(
-    out: Path, run: Run, has_report: bool, notes: Sequence[str] = (), name: str = "STUDY"
-) -> None:
-    """Write a run to its file and, if requested, its report next to it.
-
-    Args:
-        out: file of the run.
-        run: with trajectories.
-        has_report: whether to write the report.
-        notes: sentences that the report adds.
-        name: of the study on the command line, for commands in the report.
-
-    Raises:
-        StudyError: a file cannot be written.
-    """
-    with publish(out.parent) as staging:
-        write_store(staging / out.name, run_variables(run), run_attributes(run.study))
-        if not has_report:
-            return
-        twin = uncontrolled_twin(run)
-        with figures.styled():
-            for kind, figure in {**draw(run, twin), "machine": sketch(run.study)}.items():
-                figures.write_figure(figure, staging / f"{out.stem}-{kind}.png")
-        text = report(out.stem, run, twin, notes, name, staging)
-        (staging / f"{out.stem}.html").write_text(text, encoding="utf-8")
 
 
 def report(
@@ -141,7 +91,7 @@ def report(
         band=study.metrics.settling_band,
         windows=run.case.windows,
         stations=", ".join(f"{100 * x:g}" for x in study.metrics.stations),
-        watched=_watched(run),
+        watched=watched(run),
         command_end=float(result.command_end),
         buckling=np.broadcast_to(euler_force(run.case.machine.beam), (3,)),
         n_modes=max(MARGIN_MODES, study.link.modes),
@@ -153,22 +103,6 @@ def report(
         pole_difference=difference(run.poles) if run.poles is not None else "",
         sketch_caption=CAPTION,
     )
-
-
-def limits_text(run: Run) -> str:
-    """Warning about converters and actuators at their limits in a run that ended ok, "" if none."""
-    metrics = run.result.metrics
-    shares = {
-        "an ADC channel clipped": float(metrics.clipped_fraction),
-        "an actuator at its limit": float(metrics.saturated_fraction),
-        "a motor at its limit": float(metrics.motor_saturated_fraction),
-    }
-    told = [
-        f"{100 * share:.2g} % of the samples have {what}"
-        for what, share in shares.items()
-        if share > 0
-    ]
-    return f"CAUTION: {'; '.join(told)}." if told and run.status == status.OK else ""
 
 
 def _situation(run: Run, twin: Run | None) -> str:
@@ -214,16 +148,6 @@ def _links(run: Run, twin: Run | None) -> list[list[str]]:
     ]
 
 
-def _watched(run: Run) -> float:
-    """From the end of the shaped command to that of the run [s]."""
-    return run.study.run.duration - float(run.result.command_end)
-
-
-def settling_text(run: Run, link: int) -> str:
-    """Settling time of a link [ms], or that it was outside the band to the end."""
-    return units.settling_text(float(run.result.metrics.settling_time[link]), _watched(run))
-
-
 def _platform(run: Run) -> list[list[str]]:
     """Row of each coordinate."""
     metrics = run.result.metrics
@@ -246,7 +170,7 @@ def _modes(run: Run) -> list[list[str]]:
 
 
 def draw(run: Run, twin: Run | None = None) -> dict[str, Figure]:
-    """FIGURES of a run, three rows each, in the style of the caller; twin: without control."""
+    """Figures of a run, three rows each, in the style of the caller; twin: without control."""
     record = run.result.record
     assert record is not None
     pairs = [f"pair {k + 1}" for k in range(record.actuator_voltage.shape[2])]

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from studies.engine.design import deviation, load_design
-from studies.engine.runs import Run, run_study
+from studies.engine.run_data import run_attributes, run_variables
+from studies.engine.runs import Run, run_study, uncontrolled_twin
 from studies.errors import StudyError
-from studies.single.report import check_results, write_results
+from studies.publish import check_target, publish
+from studies.store import write_store
 from studies.study.labels import describe
 from studies.study.spec import Study, load_study
+
+#: Drawn next to the file of a run.
+FIGURES = ("deflection", "error", "voltage", "machine")
 
 
 class Replay(NamedTuple):
@@ -88,6 +94,57 @@ def replay(
         name = str(design) if case is None else f"{design} --case {case}"
         write_results(file, run, has_report, again.notes, name)
     return again
+
+
+def write_results(
+    out: Path, run: Run, has_report: bool, notes: Sequence[str] = (), name: str = "STUDY"
+) -> None:
+    """Write a run to its file and, if requested, its report next to it.
+
+    Args:
+        out: file of the run.
+        run: with trajectories.
+        has_report: whether to write the report.
+        notes: sentences that the report adds.
+        name: of the study on the command line, for commands in the report.
+
+    Raises:
+        StudyError: a file cannot be written.
+    """
+    with publish(out.parent) as staging:
+        write_store(staging / out.name, run_variables(run), run_attributes(run.study))
+        if not has_report:
+            return
+        from studies.show import figures
+        from studies.show.sketch import sketch
+        from studies.single.report import draw, report
+
+        twin = uncontrolled_twin(run)
+        with figures.styled():
+            for kind, figure in {**draw(run, twin), "machine": sketch(run.study)}.items():
+                figures.write_figure(figure, staging / f"{out.stem}-{kind}.png")
+        text = report(out.stem, run, twin, notes, name, staging)
+        (staging / f"{out.stem}.html").write_text(text, encoding="utf-8")
+
+
+def check_results(out: Path, has_report: bool) -> None:
+    """Raise StudyError unless the files of a run can be written; call it before long work.
+
+    Args:
+        out: file of the run.
+        has_report: whether its report will be written next to it.
+
+    Raises:
+        StudyError: a file cannot be written, or `out` has the name of one of the report.
+    """
+    if out.suffix == ".toml":
+        raise StudyError(f"--out {out}: results are HDF5, not a study; name the file *.h5")
+    check_target(out)
+    names = [f"{out.stem}.html", *(f"{out.stem}-{name}.png" for name in FIGURES)]
+    for name in names if has_report else []:
+        if name == out.name:
+            raise StudyError(f"--out {out}: --report writes a file of this name; name it *.h5")
+        check_target(out.with_name(name))
 
 
 def _checked(out: str | Path | None, has_report: bool) -> Path | None:
