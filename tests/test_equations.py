@@ -18,7 +18,7 @@ from studies.kernels.equations import call_of, literal, scan_of, trace
 from tests import test_batched
 from tests.test_cli import run
 from tests.test_kernel import check_equal, translated
-from tests.test_sweep_commands import text_of
+from tests.test_sweep_commands import toml_of
 from tests.test_tangents import LAYOUT, chunk, place  # noqa: F401 (a fixture)
 
 
@@ -139,7 +139,7 @@ def test_a_sweep_runs_by_the_scan_and_says_so(capsys, tmp_path, monkeypatch, no_
     monkeypatch.setattr(plan, "LANES", 8)
     monkeypatch.setattr(plan, "LARGEST_CHUNK", 16)
     path = tmp_path / "small.toml"
-    path.write_text(text_of(SWEEP))
+    path.write_text(toml_of(SWEEP))
     code, text, errors = run(capsys, "sweep", path, "--out", tmp_path / "out")
     assert code == 0 and "2/2 cases" in text and "Traceback" not in text + errors
     (line,) = [x for x in text.splitlines() if x.startswith("executor: ")]

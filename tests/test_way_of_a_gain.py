@@ -17,7 +17,7 @@ import jaxmodel
 import studies
 from studies.cli import main
 from studies.engine import plan
-from tests.test_sweep_commands import text_of
+from tests.test_sweep_commands import toml_of
 
 #: Modules that hold the gain today. The aim is 18.
 LIMIT = 31
@@ -87,7 +87,7 @@ def module_of(code):
 def test_few_modules_hold_a_gain_between_its_file_and_its_results(tmp_path, monkeypatch):
     monkeypatch.setattr(plan, "LANES", 8)
     path = tmp_path / "gains.toml"
-    path.write_text(text_of(SWEEP))
+    path.write_text(toml_of(SWEEP))
     command = ["sweep", str(path), "--quiet", "--out"]
     main([*command, str(tmp_path / "compiled")])  # calls that trace programs are not its way
     way = Way()
