@@ -31,11 +31,11 @@ _ERRORS = ("x [nm]", "y [nm]", "φ [nrad]")
 _COLUMNS = ["link 1", "link 2", "link 3", "platform"]
 
 
-def _subsets(found: AtlasFindings) -> Figure:
-    subsets = found.subsets
-    figure, axes = _panels(found, 2.2)
+def _subsets(findings: AtlasFindings) -> Figure:
+    subsets = findings.subsets
+    figure, axes = _panels(findings, 2.2)
     rows = [link_label(k) for k in range(1, 8)]
-    for ax, change in zip(axes, _link_changes(found), strict=True):
+    for ax, change in zip(axes, _link_changes(findings), strict=True):
         image = plots.change_map(change[1:], rows, _COLUMNS, ax)
     for ax in axes[: len(subsets.setting) : 2]:
         ax.set_ylabel("controlled links")
@@ -45,37 +45,37 @@ def _subsets(found: AtlasFindings) -> Figure:
     return figure
 
 
-def _link_changes(found: AtlasFindings) -> np.ndarray:
+def _link_changes(findings: AtlasFindings) -> np.ndarray:
     """Change of the residual of links 1 to 3 and platform, (settings, 8, 4)."""
-    subsets = found.subsets
+    subsets = findings.subsets
     chosen = subsets.link_subsets
     residual = np.concatenate([subsets.link[:, chosen], subsets.platform[:, chosen, None]], axis=-1)
     return residual / residual[:, :1] - 1
 
 
-def _panels(found: AtlasFindings, height: float) -> tuple[Figure, np.ndarray]:
+def _panels(findings: AtlasFindings, height: float) -> tuple[Figure, np.ndarray]:
     """Two panels per row, one for each setting."""
-    settings = found.subsets.setting
+    settings = findings.subsets.setting
     figure, axes = new_figure(-(-len(settings) // 2), min(len(settings), 2), height, False)
     for k, ax in enumerate(axes.flat[: len(settings)]):
-        ax.set_title(found.setting(k))
+        ax.set_title(findings.setting(k))
     for ax in axes.flat[len(settings) :]:
         ax.remove()
     return figure, axes.ravel()[: len(settings)]
 
 
-def _lattice(found: AtlasFindings) -> Figure:
-    subsets = found.subsets
-    figure, axes = _panels(found, 1.9)
+def _lattice(findings: AtlasFindings) -> Figure:
+    subsets = findings.subsets
+    figure, axes = _panels(findings, 1.9)
     every = np.sqrt(np.mean(subsets.link[:, subsets.link_subsets] ** 2, axis=-1))
     for ax, residual in zip(axes, every, strict=True):
         plots.lattice(residual, ax)
     return figure
 
 
-def _helps(found: AtlasFindings) -> Figure:
-    figure, axes = _panels(found, 1.5)
-    for ax, change in zip(axes, _link_changes(found), strict=True):
+def _helps(findings: AtlasFindings) -> Figure:
+    figure, axes = _panels(findings, 1.5)
+    for ax, change in zip(axes, _link_changes(findings), strict=True):
         image = plots.change_map(effects(1 + change), _COLUMNS[:3], _COLUMNS, ax)
     for ax in axes[::2]:
         ax.set_ylabel("controlled alone")
@@ -85,8 +85,8 @@ def _helps(found: AtlasFindings) -> Figure:
     return figure
 
 
-def _shares(found: AtlasFindings) -> Figure:
-    subsets = found.subsets
+def _shares(findings: AtlasFindings) -> Figure:
+    subsets = findings.subsets
     share = shapley(subsets.removed()).reshape(-1, len(TARGETS), 3, subsets.modes)
     figure, axes = new_figure(len(subsets.setting), len(TARGETS), 1.3, False)
     for row in range(len(subsets.setting)):
@@ -99,13 +99,13 @@ def _shares(found: AtlasFindings) -> Figure:
                 ax.set_title(target)
             if row == len(subsets.setting) - 1:
                 ax.set_xlabel("mode")
-        axes[row, 0].set_ylabel(f"{found.setting(row)}\nlink", fontsize=SMALL)
+        axes[row, 0].set_ylabel(f"{findings.setting(row)}\nlink", fontsize=SMALL)
     return figure
 
 
-def _interactions(found: AtlasFindings) -> Figure:
-    subsets = found.subsets
-    figure, axes = _panels(found, 2.4)
+def _interactions(findings: AtlasFindings) -> Figure:
+    subsets = findings.subsets
+    figure, axes = _panels(findings, 2.4)
     every = interaction(subsets.removed()[:, TARGETS.index("all links")])
     limit = float(np.max(np.abs(np.nan_to_num(every)), initial=1e-6))
     for ax, index in zip(axes, every, strict=True):
@@ -119,15 +119,15 @@ def _interactions(found: AtlasFindings) -> Figure:
     return figure
 
 
-def _workspace(found: AtlasFindings) -> Figure:
-    chart = found.map
+def _workspace(findings: AtlasFindings) -> Figure:
+    chart = findings.map
     figure, axes = new_figure(3, len(chart.phi), 1.8, False)
     rows = (
         (chart.frequency[..., 0], "lowest frequency [Hz]"),
         (100 * chart.spread, "spread of the first\nbending modes [%]"),
         (100 * chart.coupling.max(axis=-1), "largest coupling of\ntwo links [%]"),
     )
-    path = np.array(found.study.motion.waypoints)
+    path = np.array(findings.study.motion.waypoints)
     for row, (value, label) in enumerate(rows):
         limits = (float(np.nanpercentile(value, 1)), float(np.nanpercentile(value, 99)))
         for column, phi in enumerate(chart.phi):
@@ -151,9 +151,9 @@ def _workspace(found: AtlasFindings) -> Figure:
     return figure
 
 
-def _participation(found: AtlasFindings) -> Figure:
+def _participation(findings: AtlasFindings) -> Figure:
     """Participation of the links in the first three bending modes, over the workspace."""
-    chart = found.map
+    chart = findings.map
     turn = len(chart.phi) // 2
     figure, axes = new_figure(3, 3, 1.8, False)
     for row in range(3):
@@ -175,18 +175,18 @@ def _participation(found: AtlasFindings) -> Figure:
     return figure
 
 
-def _modes(found: AtlasFindings) -> Figure:
+def _modes(findings: AtlasFindings) -> Figure:
     figure, axes = new_figure(3, 3, 2.2, False)
-    home, far = found.poses
-    first = np.sort(np.argsort(-found.modes.order_share[:, :, 0], axis=1)[:, :3], axis=1)
+    home, far = findings.poses
+    first = np.sort(np.argsort(-findings.modes.order_share[:, :, 0], axis=1)[:, :3], axis=1)
     chosen = [(0, k) for k in range(3)] + [(0, k) for k in first[0]] + [(1, k) for k in first[1]]
     for ax, (place, k) in zip(axes.flat, chosen, strict=True):
-        parts = mode_skeleton(found.study, (home, far)[place], found.modes.shape[place, :, k])
+        parts = mode_skeleton(findings.study, (home, far)[place], findings.modes.shape[place, :, k])
         draw_mode(parts, ax)
-        share = found.modes.share[place, k]
+        share = findings.modes.share[place, k]
         names = [f"{100 * s:.0f} %" for s in share[:3]]
         ax.set_title(
-            f"{found.modes.frequency[place, k]:.1f} Hz; "
+            f"{findings.modes.frequency[place, k]:.1f} Hz; "
             + (f"links {', '.join(names)}" if share[3] < 0.5 else f"drive {100 * share[3]:.0f} %"),
             fontsize=SMALL,
         )
@@ -202,9 +202,9 @@ def _modes(found: AtlasFindings) -> Figure:
     return figure
 
 
-def _platform(found: AtlasFindings) -> Figure:
+def _platform(findings: AtlasFindings) -> Figure:
     """Drive error above, what the bending of the links adds below."""
-    runs = found.platform
+    runs = findings.platform
     figure, axes = new_figure(4, len(RUNS), 1.7)
     for column, setting in enumerate(RUNS):
         axes[0, column].set_title(setting_label(setting))
@@ -228,9 +228,9 @@ def _platform(found: AtlasFindings) -> Figure:
     return figure
 
 
-def _vibration_after(found: AtlasFindings) -> Figure:
+def _vibration_after(findings: AtlasFindings) -> Figure:
     """Vibration error after the command, for the paper's choices of links."""
-    runs = found.platform
+    runs = findings.platform
     figure, axes = new_figure(3, len(RUNS), 1.9)
     for column, setting in enumerate(RUNS):
         axes[0, column].set_title(setting_label(setting))
@@ -253,8 +253,8 @@ def _vibration_after(found: AtlasFindings) -> Figure:
     return figure
 
 
-def _responses(found: AtlasFindings) -> Figure:
-    size = np.abs(found.responses.value)
+def _responses(findings: AtlasFindings) -> Figure:
+    size = np.abs(findings.responses.value)
     figure, axes = new_figure(2, 2, 2.3)
     shown = (
         ("slider 1 to mid-span\nof link 1 [m/N]", 0, 0),
@@ -264,7 +264,7 @@ def _responses(found: AtlasFindings) -> Figure:
     )
     for ax, (label, output, source) in zip(axes.flat, shown, strict=True):
         curves = {text: size[k, :, output, source] for k, text in enumerate(_SETS)}
-        plots.response(found.responses.frequency, curves, label, ax)
+        plots.response(findings.responses.frequency, curves, label, ax)
     for ax in axes[-1]:
         ax.set_xlabel("frequency [Hz]")
     legend_above(figure, axes[0, 0])
@@ -287,16 +287,18 @@ FIGURES: dict[str, Callable[[AtlasFindings], Figure]] = {
 }
 
 
-def write_animation(found: AtlasFindings, folder: Path) -> None:
+def write_animation(findings: AtlasFindings, folder: Path) -> None:
     """The machine after its faster move, without control and with all links controlled."""
-    runs, which = found.platform, len(RUNS) - 1
+    runs, which = findings.platform, len(RUNS) - 1
     end = runs.command_end[which]
-    wanted = end + np.arange(*CLIP)
-    index = np.searchsorted(runs.time, wanted - 1e-9)
+    time = end + np.arange(*CLIP)
+    index = np.searchsorted(runs.time, time - 1e-9)
     index = index[index < len(runs.time)]
     q = runs.modal[which, :, index]
     peak = np.abs(runs.modal[which, 0, runs.time >= end, :, 0]).max(initial=1e-9)
-    factor = float(f"{CLIP_SIZE * each_link(found.study.link.length).min() / peak:.1g}")
-    off, on = (skeleton(found.study, runs.pose[which, k, index], q[:, k], factor) for k in (0, -1))
+    factor = float(f"{CLIP_SIZE * each_link(findings.study.link.length).min() / peak:.1g}")
+    off, on = (
+        skeleton(findings.study, runs.pose[which, k, index], q[:, k], factor) for k in (0, -1)
+    )
     titles = ("without control", "three links controlled")
     animate(Clip(runs.time[index] - end, (off, on), titles, factor), folder / ANIMATION)

@@ -9,7 +9,7 @@ import numpy as np
 from studies.atlas.platform import PlatformError, Responses, platform_error, responses
 from studies.atlas.subsets import Subsets, setting_label
 from studies.atlas.workspace import Map, PoseModes, map_workspace, natural_modes_at
-from studies.engine.batches import Tell
+from studies.engine.batches import ProgressCallback
 from studies.engine.frame import frame_of
 from studies.engine.preflight import check_run
 from studies.study.spec import Study
@@ -40,22 +40,22 @@ class AtlasFindings(NamedTuple):
         return setting_label(self.subsets.setting[k]) + (" †" if is_small else "")
 
 
-def look_around(study: Study, subsets: Subsets, tell: Tell) -> AtlasFindings:
+def look_around(study: Study, subsets: Subsets, on_progress: ProgressCallback) -> AtlasFindings:
     """All of the atlas except the runs of the subsets.
 
     Args:
         study: the design.
         subsets: from `read_subsets`.
-        tell: called with progress messages.
+        on_progress: called with progress messages.
 
     Raises:
         StudyError: as `check_run`.
     """
-    runs = platform_error(study, tell)
-    tell("frequency responses", 0.0)
+    runs = platform_error(study, on_progress)
+    on_progress("frequency responses", 0.0)
     own = natural_modes_at(study, [study.motion.waypoints[0]]).frequency[0]
     linear = responses(study, _frequencies(study, own))
-    tell("natural modes over the workspace", 0.0)
+    on_progress("natural modes over the workspace", 0.0)
     chart = map_workspace(study)
     poses = np.stack([np.array(study.motion.waypoints[0]), _far_pose(chart)])
     modes = natural_modes_at(study, poses)

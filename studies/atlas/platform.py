@@ -64,31 +64,31 @@ class PlatformError(NamedTuple):
         return np.sqrt(total / count)
 
 
-def platform_error(study: Study, tell: Any = None) -> PlatformError:
+def platform_error(study: Study, on_progress: Any = None) -> PlatformError:
     """Run the paper's choices of links, and the machine with rigid links, with trajectories.
 
     Args:
         study: the design; move time, shaper and links are replaced.
-        tell: called with the current step and the share of the work since the last call.
+        on_progress: called with the current step and the share of the work since the last call.
 
     Raises:
         StudyError: as `check_run`.
     """
-    tell = tell or (lambda text, share: None)
+    on_progress = on_progress or (lambda text, share: None)
     study = long_enough(study, SETTINGS)
     built = [
         check_run(study.change(motion__move_time=t, shaper__kind=kind)) for t, kind in SETTINGS
     ]
     structure = built[0][0]._replace(substeps=max(one.substeps for one, _ in built))
     first = [one for _, case in built for one in (_with_links(case, LINK_SETS[0]), _rigid(case))]
-    quiet = run_batches(structure, first, tell)
+    quiet = run_batches(structure, first, on_progress)
     cases = []
     for k, (_, case) in enumerate(built):
         if study.control.ratio_source == "own_run":
             own = powered(quiet.metrics.energy_ratio[2 * k], study.control.ratio_exponent)
             case = with_ratio(case, own)
         cases += [_with_links(case, links) for links in LINK_SETS[1:]]
-    active = run_batches(structure, cases, tell)
+    active = run_batches(structure, cases, on_progress)
     assert quiet.record is not None and active.record is not None
     count = len(SETTINGS)
 
@@ -158,10 +158,10 @@ def responses(study: Study, frequency: np.ndarray) -> Responses:
         matrices, jacobian = _linear(structure, _with_links(case, links), pose)
         transition = np.asarray(matrices.open + matrices.feedback)
         radius.append(np.abs(np.linalg.eigvals(transition)).max())
-        found = _response(
+        response = _response(
             matrices, transition, jacobian, frequency / study.electronics.sample_rate_hz
         )
-        value.append(found if radius[-1] <= 1 + RADIUS_TOLERANCE else np.nan * found)
+        value.append(response if radius[-1] <= 1 + RADIUS_TOLERANCE else np.nan * response)
     return Responses(frequency, np.stack(value), np.array(radius))
 
 
@@ -171,9 +171,9 @@ def _linear(structure: Structure, case: Case, pose: Array) -> tuple[LoopMatrices
     loop = prepare(structure, case).loop
     plant = loop.plant
     jacobian = jax.jacfwd(lambda at: close_chain(plant, at, jnp.zeros_like(at)).rho)(pose)
-    known = jacobian if plant.tip is None else jnp.nan * jacobian
+    exact = jacobian if plant.tip is None else jnp.nan * jacobian
     at_rest = resting(structure, case)
-    return loop_matrices(structure, case, loop, loop.controller, pose, at_rest), known
+    return loop_matrices(structure, case, loop, loop.controller, pose, at_rest), exact
 
 
 def _response(

@@ -152,8 +152,8 @@ def long_enough(study: Study, settings: tuple[tuple[float, str], ...]) -> Study:
     ends = []
     for time, shaper in settings:
         moved = study.change(motion__move_time=time, shaper__kind=shaper)
-        known = preflight(build_structure(moved), as_arrays(build_case(moved)))
-        ends.append(float(known.motion_end + known.shaper_length))
+        timing = preflight(build_structure(moved), as_arrays(build_case(moved)))
+        ends.append(float(timing.motion_end + timing.shaper_length))
     needed = max(ends) + residual_delay(study) + study.metrics.residual_length
     return study.change(run__duration=max(study.run.duration, float(np.ceil(100 * needed) / 100)))
 

@@ -39,13 +39,13 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         start(precision)
         from studies.bench.run import run_bench
 
-        found = run_bench(what, work, executor, batch, cases)
+        figures = run_bench(what, work, executor, batch, cases)
         if as_json:
-            print(json.dumps(found))
-        elif isinstance(found, list):
-            console.print(_peers(found))
+            print(json.dumps(figures))
+        elif isinstance(figures, list):
+            console.print(_peers(figures))
         else:
-            console.print(_figures(found))
+            console.print(_figures(figures))
 
 
 def _peers(rows: list[dict[str, Any]]) -> Table:
@@ -60,9 +60,9 @@ def _peers(rows: list[dict[str, Any]]) -> Table:
     return table
 
 
-def _figures(found: dict[str, Any]) -> Table:
+def _figures(figures: dict[str, Any]) -> Table:
     table = Table(show_header=False)
-    for name, value in found.items():
+    for name, value in figures.items():
         parts = value if isinstance(value, dict) else {"": value}
         for part, number in parts.items():
             table.add_row(f"{name} {part}".strip(), str(number))

@@ -41,18 +41,18 @@ def bench_gradients(executor: str = "", batch: int = 0) -> dict[str, Any]:
     random = np.random.default_rng(1)
     ratio = np.asarray(cases.control.ratio).reshape(1, -1)
     parameters = ratio * random.uniform(0.5, 2.0, (layout.size, ratio.size))
-    made = Executor(structure, layout, place=place_gains, kind=executor)
+    stepper = Executor(structure, layout, place=place_gains, kind=executor)
 
     def gradients() -> np.ndarray:
-        found = made.differentiate(cases, parameters)
-        by = jax.tree.map(lambda x: np.ones((1, *x.shape)), found.result.metrics)
-        return found.pull_back(by)[0]
+        runs = stepper.differentiate(cases, parameters)
+        by = jax.tree.map(lambda x: np.ones((1, *x.shape)), runs.result.metrics)
+        return runs.pull_back(by)[0]
 
-    found, timing = timed(gradients)
-    gradient = found.mean(axis=0)
+    by_case, timing = timed(gradients)
+    gradient = by_case.mean(axis=0)
     return {
         "work": "grad",
-        "executor": made.name,
+        "executor": stepper.name,
         "parameters": ratio.size,
         **describe(layout, structure, timing, gradient.dtype),
         "fingerprint": float(np.linalg.norm(gradient)),

@@ -121,9 +121,9 @@ def bench_peers(
     peers = find_peers(work, report)
     for peer in peers:
         report(f"{peer.name}: {peer.n_cases} cases")
-        found, timing = timed(peer.finish, repeats)
-        right = exact[: peer.n_cases]
-        error = float(np.max(np.abs(found - right)) / np.max(right))
+        rms, timing = timed(peer.finish, repeats)
+        exact_rms = exact[: peer.n_cases]
+        error = float(np.max(np.abs(rms - exact_rms)) / np.max(exact_rms))
         speed = peer.n_cases / timing.seconds
         rows.append(PeerRow(peer.name, speed, error, 1.0))
     kernel, c = (next((p for p in peers if p.name.startswith(x)), None) for x in (KERNEL, C))
@@ -150,15 +150,15 @@ def speed_ratio(
     Returns:
         (by time, by processor time).
     """
-    found = []
+    ratios = []
     for _ in range(rounds):
         times = []
         for run in (other, one):
             wall, processor = time.perf_counter(), time.process_time()
             run()
             times.append((time.perf_counter() - wall, time.process_time() - processor))
-        found.append([a / b for a, b in zip(*times, strict=True)])
-    wall_ratio, processor_ratio = np.median(found, axis=0)
+        ratios.append([a / b for a, b in zip(*times, strict=True)])
+    wall_ratio, processor_ratio = np.median(ratios, axis=0)
     return float(wall_ratio), float(processor_ratio)
 
 
@@ -167,8 +167,8 @@ def find_peers(work: Work, report: Callable[[str], None]) -> list[Peer]:
     size = work.layout.size
 
     def own(kind: str) -> Callable[[], Any]:
-        made = Executor(work.structure, work.layout, kind=kind)
-        return lambda: made.start(work.cases).wait().metrics.residual_rms
+        stepper = Executor(work.structure, work.layout, kind=kind)
+        return lambda: stepper.start(work.cases).wait().metrics.residual_rms
 
     peers = [
         Peer("this program, XLA scan", size, own("scan")),
@@ -201,17 +201,19 @@ def _slopes(structure: Structure, start: Start, time: Any, state: PlantState) ->
     x = time / PERIOD - k
     weights = jnp.array([(1 - x) * (1 - 2 * x), 4 * x * (1 - x), x * (2 * x - 1)])
     inputs = start.inputs
-    wanted = Reference(
+    reference_input = Reference(
         weights @ inputs.rho[k], weights @ inputs.rho_rate[k], None, inputs.disturbance[k]
     )
-    found = plant_rates(structure, start.loop, state, wanted, jnp.zeros((3, 3))).acceleration
+    rates = plant_rates(
+        structure, start.loop, state, reference_input, jnp.zeros((3, 3))
+    ).acceleration
     plant = start.loop.plant
     own = (plant.stiffness * state.q + plant.damping * state.q_rate) / plant.modal_mass[:, None]
     return PlantState(
         pose=state.pose_rate,
-        pose_rate=found.pose,
+        pose_rate=rates.pose,
         q=state.q_rate,
-        q_rate=found.coupling - own,
+        q_rate=rates.coupling - own,
         z=None,
         z_rate=None,
     )
@@ -293,8 +295,8 @@ def by_lagrangian(work: Work, n: int) -> Callable[[], Any]:
         loop = start.loop
         mass, drive = loop.plant.modal_mass[:, None], loop.drive
 
-        def slope(at: reference.RigidState, wanted: tuple[Any, ...]) -> reference.RigidState:
-            rho, rho_rate = wanted
+        def slope(at: reference.RigidState, references: tuple[Any, ...]) -> reference.RigidState:
+            rho, rho_rate = references
             place = partial(reference.close, machine, basis)
             (now, _), (rate, _) = jax.jvp(place, (at.pose, at.q), (at.pose_rate, at.q_rate))
             force = drive.kp * (rho - now) + drive.kd * (rho_rate - rate)
@@ -305,8 +307,8 @@ def by_lagrangian(work: Work, n: int) -> Callable[[], Any]:
             pose, q = reference.by_lagrangian(machine, basis, at, loads)
             return reference.RigidState(at.pose_rate, pose, at.q_rate, q)
 
-        def body(at: reference.RigidState, wanted: tuple[Any, ...]) -> tuple[Any, ...]:
-            points = [(wanted[0][k], wanted[1][k]) for k in range(3)]
+        def body(at: reference.RigidState, references: tuple[Any, ...]) -> tuple[Any, ...]:
+            points = [(references[0][k], references[1][k]) for k in range(3)]
             return reference.rk4_step(slope, at, PERIOD, points), at.q
 
         plant = start.state.plant
@@ -363,7 +365,7 @@ def by_c(work: Work, compiler: str, width: int) -> Callable[[], Any]:
         start.loop.controller.voltage_limit,
     )
     machine = np.concatenate([np.ravel(x) for x in fields])
-    wanted = np.ascontiguousarray(np.stack([start.inputs.rho, start.inputs.rho_rate], axis=2))
+    inputs = np.ascontiguousarray(np.stack([start.inputs.rho, start.inputs.rho_rate], axis=2))
     weight = np.asarray(start.inputs.window.is_residual)
     pose = np.asarray(start.state.plant.pose)
     home = np.array([*pose, pose[2], np.sin(pose[2]), np.cos(pose[2])])
@@ -373,7 +375,7 @@ def by_c(work: Work, compiler: str, width: int) -> Callable[[], Any]:
 
     def group(gain: np.ndarray) -> np.ndarray:
         square = _aligned(np.zeros((9, width)))
-        arrays = (wanted, weight, home, gain, square)
+        arrays = (inputs, weight, home, gain, square)
         function(machine.ctypes.data, n, ctypes.c_double(PERIOD), *(x.ctypes.data for x in arrays))
         return square.T.reshape(width, 3, 3)
 

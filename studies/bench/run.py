@@ -57,12 +57,12 @@ def run_bench(
 def _check(what: str, work: str, executor: str, batch: int, cases: int) -> None:
     """Reject options that have no effect."""
     if what == "peers":
-        given = {"--work": work, "--executor": executor, "--batch": batch, "--cases": cases}
+        options = {"--work": work, "--executor": executor, "--batch": batch, "--cases": cases}
         reason = "with peers, which do W0 in double precision"
     elif work == "sweep":
-        given, reason = {"--executor": executor, "--batch": batch}, "with --work sweep"
+        options, reason = {"--executor": executor, "--batch": batch}, "with --work sweep"
     else:
-        given, reason = {"--cases": cases}, "but with --work sweep"
-    for name, value in given.items():
+        options, reason = {"--cases": cases}, "but with --work sweep"
+    for name, value in options.items():
         if value:
             raise StudyError(f"{name} {value}: not allowed {reason}; leave it out")

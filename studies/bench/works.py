@@ -69,18 +69,18 @@ METRICS = {"W0": ("residual_rms",)}
 REPEATS = 5
 
 
-def check_executor(executor: str, known: Iterable[str] = STEPPERS) -> None:
+def check_executor(executor: str, allowed: Iterable[str] = STEPPERS) -> None:
     """Reject an executor that is unknown or cannot run here.
 
     Args:
         executor: name, or "".
-        known: available names.
+        allowed: available names.
 
     Raises:
         StudyError: if so.
     """
-    if executor and executor not in known:
-        raise field_error("--executor", executor, ", ".join(map(repr, known)))
+    if executor and executor not in allowed:
+        raise field_error("--executor", executor, ", ".join(map(repr, allowed)))
     if executor in ("kernel", "gpu") and not is_available():
         raise StudyError(f"--executor {executor}: needs llvmlite: install flexlink-studies[fast]")
     if executor == "gpu" and config.processor() != "cuda":
@@ -180,10 +180,10 @@ def bench_runs(work: str, executor: str = "", batch: int = 0) -> dict[str, Any]:
     structure, exact = build_work(work, layout)
     real = jax.dtypes.canonicalize_dtype(np.float64)
     cases = in_working_precision(exact)
-    made = Executor(structure, layout, kind=executor)
-    result, timing = timed(lambda: made.start(cases).wait())
+    stepper = Executor(structure, layout, kind=executor)
+    result, timing = timed(lambda: stepper.start(cases).wait())
     rms = result.metrics.residual_rms
-    figures: dict[str, Any] = {"work": work, "executor": made.name}
+    figures: dict[str, Any] = {"work": work, "executor": stepper.name}
     figures |= describe(layout, structure, timing, rms.dtype)
     figures["fingerprint"] = float(np.mean(rms))
     if real != np.float64:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from studies.space.spec import SweepSpec
 
 
-Made = TypeVar("Made")
+T = TypeVar("T")
 
 #: Options of the commands that can use workers.
 Scheduler = Annotated[
@@ -69,7 +69,7 @@ class Workers(NamedTuple):
 
 
 def runner_for(
-    spec: SweepSpec, workers: Workers, tell: Callable[[str], None]
+    spec: SweepSpec, workers: Workers, on_progress: Callable[[str], None]
 ) -> AbstractContextManager[Runner | None]:
     """The runner of a sweep on workers, None for this process.
 
@@ -82,18 +82,18 @@ def runner_for(
 
         return ClusterRunner(client, spec, workers.timeout)
 
-    return on_workers(workers, tell, make)
+    return on_workers(workers, on_progress, make)
 
 
 @contextmanager
 def on_workers(
-    workers: Workers, tell: Callable[[str], None], make: Callable[[Client], Made]
-) -> Iterator[Made | None]:
+    workers: Workers, on_progress: Callable[[str], None], make: Callable[[Client], T]
+) -> Iterator[T | None]:
     """Make something from a client of the workers, None if no workers are named.
 
     Args:
         workers: which ones.
-        tell: called with progress messages.
+        on_progress: called with progress messages.
         make: called with the client.
 
     Raises:
@@ -102,17 +102,17 @@ def on_workers(
     if not workers.are_named:
         yield None
         return
-    with connected(workers, tell) as client:
+    with connected(workers, on_progress) as client:
         yield make(client)
 
 
 @contextmanager
-def connected(workers: Workers, tell: Callable[[str], None]) -> Iterator[Client]:
+def connected(workers: Workers, on_progress: Callable[[str], None]) -> Iterator[Client]:
     """A client of a cluster with compatible workers.
 
     Args:
         workers: which ones.
-        tell: called with progress messages.
+        on_progress: called with progress messages.
 
     Raises:
         StudyError: no extra `cluster`, no such scheduler, no worker, workers of other versions.
@@ -131,12 +131,12 @@ def connected(workers: Workers, tell: Callable[[str], None]) -> Iterator[Client]
     # this package itself reports what users should know
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    found = (
+    cluster = (
         _started(workers.local or 0) if workers.scheduler is None else _joined(workers.scheduler)
     )
-    with found as client:
+    with cluster as client:
         if not client.ncores():
-            tell("waiting for a worker to join")
+            on_progress("waiting for a worker to join")
         wait_for_workers(client)
         refuse_other_versions(client)
         yield client
@@ -223,8 +223,8 @@ def _deaf() -> Iterator[None]:
 def _graphics(number: int) -> dict[str, str]:
     """Environment that shows a worker one of the GPUs; empty if there is none."""
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
-    found = [str(k) for k in range(len(glob.glob("/dev/nvidia[0-9]*")))]
-    devices = named.split(",") if named else found
+    numbers = [str(k) for k in range(len(glob.glob("/dev/nvidia[0-9]*")))]
+    devices = named.split(",") if named else numbers
     return {"CUDA_VISIBLE_DEVICES": devices[number % len(devices)]} if devices else {}
 
 
@@ -232,7 +232,7 @@ def refuse_other_versions(client: Client) -> None:
     """Raise StudyError if a worker has other versions than this process."""
     from studies.cluster.worker import difference, identity
 
-    wanted, faults = identity(), []
+    own, faults = identity(), []
     try:
         answers = client.run(identity, on_error="return")
     except Exception as error:  # Dask cannot pass on every error of a worker
@@ -240,11 +240,11 @@ def refuse_other_versions(client: Client) -> None:
             f"cannot ask workers for their versions ({error or type(error).__name__}); is "
             "flexlink-studies installed there?"
         ) from None
-    for address, found in answers.items():
-        if isinstance(found, Exception):
-            faults.append(f"{address}: {str(found) or type(found).__name__}")
-        elif difference(found, wanted):
-            faults.append(f"{address}: {difference(found, wanted)}")
+    for address, answer in answers.items():
+        if isinstance(answer, Exception):
+            faults.append(f"{address}: {str(answer) or type(answer).__name__}")
+        elif difference(answer, own):
+            faults.append(f"{address}: {difference(answer, own)}")
     if faults:
         more = f" (and {len(faults) - 3} more)" if len(faults) > 3 else ""
         raise StudyError(

@@ -59,9 +59,9 @@ class ClusterRunner:
     def layout(self, n: int, structure: Structure) -> Layout:
         wait_for_workers(self._client)
         share = -(-n // (LEAST_CHUNKS * max(len(self._client.ncores()), 1)))
-        asked = self._client.submit(chunk_size, share, structure, self._precision, pure=False)
+        future = self._client.submit(chunk_size, share, structure, self._precision, pure=False)
         try:
-            size: int = asked.result(timeout=self._timeout)
+            size: int = future.result(timeout=self._timeout)
         except StudyError:
             raise
         except Exception as error:  # too late, cancelled, the worker died

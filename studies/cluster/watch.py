@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 #: Message when the scheduler no longer answers.
 GONE = "the scheduler is gone; finished work is safe; continue with --resume"
 #: How often workers are checked [s].
-LOOK = 1.0
+CHECK_INTERVAL = 1.0
 #: Time limit for the first worker to join [s].
 WORKER_PATIENCE = 300
 #: Time allowed for stopping a worker that hangs [s].
@@ -33,16 +33,16 @@ def wait_for_workers(client: Client) -> None:
 class Watch:
     """Waits for work, counts workers, restarts those that stay busy for too long."""
 
-    def __init__(self, client: Client, timeout: float, tell: Callable[[str], None]) -> None:
+    def __init__(self, client: Client, timeout: float, on_progress: Callable[[str], None]) -> None:
         """
         Args:
             client: from `connected`.
             timeout: a worker that stays busy for longer without answering is restarted [s].
-            tell: called with what users should know.
+            on_progress: called with what users should know.
         """
-        self._client, self._timeout, self._tell = client, timeout, tell
+        self._client, self._timeout, self._on_progress = client, timeout, on_progress
         self._idle: dict[str, float] = {}  # when a worker last had nothing to do, or answered
-        self._looked = 0.0
+        self._last_check = 0.0
         self.n_workers = len(client.ncores())
 
     def landed(self, flying: Iterable[Future[Any]]) -> list[Future[Any]]:
@@ -52,10 +52,10 @@ class Watch:
         futures = list(flying)
         try:
             with self._client.as_current():
-                wait(futures, timeout=LOOK, return_when="FIRST_COMPLETED")
+                wait(futures, timeout=CHECK_INTERVAL, return_when="FIRST_COMPLETED")
         except (TimeoutError, CancelledError):
             pass
-        self._look({future.key for future in futures})
+        self._check_workers({future.key for future in futures})
         return [future for future in futures if future.status != "pending"]
 
     def outcome(self, future: Future[Any]) -> Any:
@@ -80,11 +80,11 @@ class Watch:
         self._idle[answer.worker] = time.monotonic()
         return answer
 
-    def _look(self, keys: set[Any]) -> None:
+    def _check_workers(self, keys: set[Any]) -> None:
         now = time.monotonic()
-        if now - self._looked < LOOK:
+        if now - self._last_check < CHECK_INTERVAL:
             return
-        self._looked = now
+        self._last_check = now
         with suppress(OSError):  # the work itself will report a lost scheduler
             self._judge(self._client.processing(), keys, now)
 
@@ -93,12 +93,12 @@ class Watch:
         if len(busy) != self.n_workers:
             self.n_workers = len(busy)
             wait = "" if busy else "; waiting for one to join"
-            self._tell(f"workers: {self.n_workers}{wait}")
+            self._on_progress(f"workers: {self.n_workers}{wait}")
         for address, processing in busy.items():
             if not keys.intersection(processing):
                 self._idle[address] = now
             elif now - self._idle.setdefault(address, now) > self._timeout:
-                self._tell(
+                self._on_progress(
                     f"worker {address} has not answered for {self._timeout:g} s; its work is done "
                     "elsewhere"
                 )

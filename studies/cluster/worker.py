@@ -63,21 +63,21 @@ def identity() -> dict[str, str]:
     }
 
 
-def difference(found: dict[str, str], wanted: dict[str, str]) -> str:
+def difference(versions: dict[str, str], expected: dict[str, str]) -> str:
     """How a worker differs from the client, "" if it does not."""
     parts = [
-        f"{name} {found.get(name)} (client: {value})"
-        for name, value in wanted.items()
-        if found.get(name) != value
+        f"{name} {versions.get(name)} (client: {value})"
+        for name, value in expected.items()
+        if versions.get(name) != value
     ]
     return ", ".join(parts)
 
 
-def refuse_difference(wanted: dict[str, str], worker: Worker) -> None:
+def refuse_difference(expected: dict[str, str], worker: Worker) -> None:
     """Raise StudyError if this worker, which may have joined late, differs from the client."""
-    found = difference(identity(), wanted)
-    if found:
-        raise StudyError(f"worker {worker.address}: {found}; install the same there")
+    fault = difference(identity(), expected)
+    if fault:
+        raise StudyError(f"worker {worker.address}: {fault}; install the same there")
 
 
 def get_ready(precision: str, worker: Worker) -> None:

@@ -16,7 +16,7 @@ from studies.engine.programs import kept_jit
 BATCH = 8
 
 #: Called with the current step in words, and the share of the work since the last call.
-Tell = Callable[[str, float], None]
+ProgressCallback = Callable[[str, float], None]
 
 
 @kept_jit(static_argnums=0)
@@ -24,13 +24,13 @@ def _simulate_batch(structure: Structure, cases: Case) -> Result:
     return jax.vmap(lambda case: simulate(structure, case, True))(cases)
 
 
-def run_batches(structure: Structure, cases: list[Case], tell: Tell) -> Result:
+def run_batches(structure: Structure, cases: list[Case], on_progress: ProgressCallback) -> Result:
     """Run cases, `BATCH` at a time, with trajectories.
 
     Args:
         structure: of all of them.
         cases: one or more.
-        tell: called with progress messages.
+        on_progress: called with progress messages.
 
     Returns:
         Result of NumPy arrays, (cases, ...).
@@ -38,9 +38,9 @@ def run_batches(structure: Structure, cases: list[Case], tell: Tell) -> Result:
     parts = []
     for start in range(0, len(cases), BATCH):
         batch = cases[start : start + BATCH]
-        tell(f"simulating {len(batch)} cases", 0.0)
+        on_progress(f"simulating {len(batch)} cases", 0.0)
         filled = batch + [batch[-1]] * (BATCH - len(batch))
         result = _simulate_batch(structure, jax.tree.map(lambda *x: jnp.stack(x), *filled))
         parts.append(jax.tree.map(lambda x: np.asarray(x)[: len(batch)], result))  # noqa: B023
-        tell(f"simulated {len(batch)} cases", 1.0)
+        on_progress(f"simulated {len(batch)} cases", 1.0)
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)

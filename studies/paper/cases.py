@@ -20,7 +20,7 @@ from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.loop import Record
 from jaxmodel.simulate import Result
-from studies.engine.batches import BATCH, Tell, run_batches
+from studies.engine.batches import BATCH, ProgressCallback, run_batches
 from studies.engine.frame import SharedFrame, frame_of
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
@@ -129,12 +129,12 @@ class PaperRuns(NamedTuple):
         assert self.result.record is not None
         return self.result.record
 
-    def where(self, **wanted: Any) -> int:
+    def where(self, **fields: Any) -> int:
         """Index of the first case with these values."""
         for k, case in enumerate(self.cases):
-            if all(getattr(case, field) == value for field, value in wanted.items()):
+            if all(getattr(case, field) == value for field, value in fields.items()):
                 return k
-        raise KeyError(wanted)
+        raise KeyError(fields)
 
 
 def fitted_study() -> Study:
@@ -207,13 +207,13 @@ def build_paper_case(
     return structure, arrays._replace(control=arrays.control._replace(n_active=count))
 
 
-def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:
+def run_cases(base: Study, cases: list[PaperCase], on_progress: ProgressCallback) -> PaperRuns:
     """Run the paper's cases.
 
     Args:
         base: the machine; move, shaper and control come from the cases.
         cases: including the uncontrolled counterparts of all controlled ones.
-        tell: called with progress messages.
+        on_progress: called with progress messages.
 
     Returns:
         PaperRuns, cases in the order: uncontrolled, controlled, ideal feedback.
@@ -221,23 +221,25 @@ def run_cases(base: Study, cases: list[PaperCase], tell: Tell) -> PaperRuns:
     Raises:
         StudyError: as `check_run`.
     """
-    tell("checking the cases", 0.0)
+    on_progress("checking the cases", 0.0)
     off = [case for case in cases if not case.is_controlled]
     on = [case for case in cases if case.is_controlled and case.feedback == "sampled"]
     ideal = [case for case in cases if case.feedback == "ideal"]
     # a program of its own, compiled on the second core while the first one runs the batches
     with ThreadPoolExecutor(1) as side:
-        ideal_runs = [side.submit(_run_ideal, base, case, tell) for case in ideal]
+        ideal_runs = [side.submit(_run_ideal, base, case, on_progress) for case in ideal]
         built = [build_paper_case(base, case) for case in off]
         structure = built[0][0]
         frame = frame_of(structure, built[0][1])
-        results = [run_batches(structure, [arrays for _, arrays in built], tell)]
+        results = [run_batches(structure, [arrays for _, arrays in built], on_progress)]
         energy_ratio = results[0].metrics.energy_ratio
         by_counterpart = {case.counterpart: energy_ratio[k] for k, case in enumerate(off)}
         ratios = [_ratio(case, by_counterpart) for case in on]
         arrays = [build_paper_case(base, case, r)[1] for case, r in zip(on, ratios, strict=True)]
-        results += [run_batches(structure, arrays, tell)] if arrays else []
-        loops = _judge(structure, {c.name: a for c, a in zip(on, arrays, strict=True)}, base, tell)
+        results += [run_batches(structure, arrays, on_progress)] if arrays else []
+        loops = _judge(
+            structure, {c.name: a for c, a in zip(on, arrays, strict=True)}, base, on_progress
+        )
         results += [run.result() for run in ideal_runs]
     result = jax.tree.map(lambda *x: np.concatenate(x), *results)
     ordered = off + on + ideal
@@ -264,11 +266,11 @@ def link_hz(structure: Structure, case: Case) -> Any:
     return find_bases(structure, case).plant_omega / (2 * jnp.pi)
 
 
-def _run_ideal(base: Study, case: PaperCase, tell: Tell) -> Result:
+def _run_ideal(base: Study, case: PaperCase, on_progress: ProgressCallback) -> Result:
     """A case with ideal feedback, as a batch of one."""
-    tell("simulating ideal feedback", 0.0)
+    on_progress("simulating ideal feedback", 0.0)
     result = run_study(case_study(base, case), has_loop=False).result
-    tell("simulated ideal feedback", 1.0)
+    on_progress("simulated ideal feedback", 1.0)
     return jax.tree.map(lambda x: np.asarray(x)[None], result)
 
 
@@ -279,14 +281,14 @@ def _ratio(case: PaperCase, by_counterpart: dict[tuple[Any, ...], np.ndarray]) -
 
 
 def _judge(
-    structure: Structure, arrays: dict[str, Case], base: Study, tell: Tell
+    structure: Structure, arrays: dict[str, Case], base: Study, on_progress: ProgressCallback
 ) -> dict[str, LoopFigures]:
     """Linearised sampled loops of the JUDGED cases at home."""
     loops = {}
     for name in [name for name in JUDGED if name in arrays]:
-        tell("judging the linearised sampled loop", 0.0)
+        on_progress("judging the linearised sampled loop", 0.0)
         loops[name] = loop_report(structure, arrays[name], np.array(base.motion.waypoints[0]))
-        tell("judged the linearised sampled loop", 1.0)
+        on_progress("judged the linearised sampled loop", 1.0)
     return loops
 
 

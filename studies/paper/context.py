@@ -22,8 +22,8 @@ class Context(NamedTuple):
 
     def find(self, move: str, shaper: str, modes: int, links: tuple[bool, ...]) -> int:
         """Index of a case of the grid, with the machine's own damping."""
-        wanted = {"move": move, "shaper": shaper, "modes": modes, "links": links}
-        return self.runs.where(**wanted, damping_ratio=None)
+        fields = {"move": move, "shaper": shaper, "modes": modes, "links": links}
+        return self.runs.where(**fields, damping_ratio=None)
 
     def compared(self, modes: int, links: tuple[bool, ...]) -> int:
         """Index of a case on the move that is compared with the paper's numbers."""
@@ -36,7 +36,7 @@ class Context(NamedTuple):
 
     def pairs(self) -> list[tuple[int, int, str]]:
         """Cases without control and with three links, and their motion; also the damped ones."""
-        found = [
+        pairs = [
             (self.find(m, s, 3, OFF), self.find(m, s, 3, ALL), move_text(m, s))
             for m, s in settings()
         ]
@@ -44,8 +44,8 @@ class Context(NamedTuple):
         damped = [k for k, case in enumerate(cases) if case.damping_ratio is not None]
         if len(damped) == 2:
             zeta = cases[damped[0]].damping_ratio
-            found.append((damped[0], damped[1], f"{move_text('fast', 'none')}, damping {zeta:g}"))
-        return found
+            pairs.append((damped[0], damped[1], f"{move_text('fast', 'none')}, damping {zeta:g}"))
+        return pairs
 
 
 class Machines(NamedTuple):

@@ -112,9 +112,9 @@ def _agreement(context: Context) -> dict[str, Any]:
     settling = [1e3 * measures.settling[context.compared(2, links)] for links in (OFF, ALL)]
     changes = {
         is_controlled: [
-            float(found)
+            float(change)
             for _, links, mode, _ in printed_changes()
-            for found, is_on in zip(amplitude_change(context, links, mode), links, strict=True)
+            for change, is_on in zip(amplitude_change(context, links, mode), links, strict=True)
             if is_on == is_controlled
         ]
         for is_controlled in (True, False)

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 
-from studies.engine.batches import Tell
+from studies.engine.batches import ProgressCallback
 from studies.engine.columns import LINK_AXIS, POSE_AXIS
 from studies.engine.run_data import metric_variables, run_attributes
 from studies.paper.cases import (
@@ -86,14 +86,14 @@ def write_paper(
         work = work_of(compared) + work_of(cases) + 1 + len(PAPER_FIGURES) / 4
         task = progress.add_task("starting", total=work)
 
-        def tell(text: str, share: float) -> None:
+        def on_progress(text: str, share: float) -> None:
             progress.update(task, description=text, advance=share)
 
         machines = Machines(
-            _context("fitted machine", run_cases(fitted, compared, tell)),
-            _context("nominal machine", run_cases(nominal, cases, tell)),
+            _context("fitted machine", run_cases(fitted, compared, on_progress)),
+            _context("nominal machine", run_cases(nominal, cases, on_progress)),
         )
-        _write(out, machines, tell, has_pdf)
+        _write(out, machines, on_progress, has_pdf)
         progress.update(task, description="done", completed=work)
     _print_outcome(out, console, machines)
 
@@ -102,15 +102,15 @@ def _context(name: str, runs: PaperRuns) -> Context:
     return Context(name, runs, measure(runs))
 
 
-def _write(out: Path, machines: Machines, tell: Tell, has_pdf: bool) -> None:
+def _write(out: Path, machines: Machines, on_progress: ProgressCallback, has_pdf: bool) -> None:
     with publish(out) as staging:
-        tell("writing data", 0.0)
+        on_progress("writing data", 0.0)
         for file, context in zip(DATA.values(), machines, strict=True):
             variables = paper_variables(context.runs, context.measures)
             write_store(staging / file, variables, run_attributes(context.runs.study))
-        tell("writing data", 1.0)
+        on_progress("writing data", 1.0)
         for name in PAPER_FIGURES:
-            tell(f"drawing {name}", 0.25)
+            on_progress(f"drawing {name}", 0.25)
             draw_figure(name, machines, staging, has_pdf)
         study = machines.nominal.runs.study
         with styled():

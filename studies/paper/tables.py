@@ -36,10 +36,10 @@ PLATFORM = ("damped fast", "by more than -50 %", "limited effect")
 
 
 def _row(
-    name: str, paper: str, machines: Machines, number: Callable[..., str], *given: Any
+    name: str, paper: str, machines: Machines, number: Callable[..., str], *arguments: Any
 ) -> list[str]:
     """A row whose numbers are `number(context, *given)`."""
-    return [name, paper, *(number(context, *given) for context in machines)]
+    return [name, paper, *(number(context, *arguments) for context in machines)]
 
 
 def machine_rows(machines: Machines) -> list[list[str]]:

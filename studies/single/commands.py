@@ -57,12 +57,12 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.single.run import replay as replay_case
         from studies.study.labels import describe
 
-        found = replay_case(design, case, out, report)
-        console.print(f"{found.run.study.title}: {describe(found.run.status)}")
-        for note in found.notes:
+        rerun = replay_case(design, case, out, report)
+        console.print(f"{rerun.run.study.title}: {describe(rerun.run.status)}")
+        for note in rerun.notes:
             console.print(note)
         _print_files(out, report, console)
-        if not found.agrees:
+        if not rerun.agrees:
             sys.exit(1)
 
     @app.command()
@@ -92,7 +92,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.engine.modes import machine_modes
         from studies.study.spec import load_study
 
-        found = machine_modes(
+        result = machine_modes(
             None if study is None else load_study(study),
             pose=pose,
             kp=kp,
@@ -104,9 +104,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         )
         if as_json:
             text = {
-                "frequencies_hz": found.frequency.tolist(),
-                "damping_ratios": found.damping_ratio.tolist(),
-                "names": found.names,
+                "frequencies_hz": result.frequency.tolist(),
+                "damping_ratios": result.damping_ratio.tolist(),
+                "names": result.names,
             }
             print(json.dumps(text))
             return
@@ -115,7 +115,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
                 "the paper's machine without damping; with it: studies modes paper", soft_wrap=True
             )
         table = Table("mode", "frequency [Hz]", "damping ratio [1]", "share of its energy")
-        rows = zip(found.frequency, found.damping_ratio, found.names, strict=True)
+        rows = zip(result.frequency, result.damping_ratio, result.names, strict=True)
         for k, (f, z, name) in enumerate(rows):
             table.add_row(str(k + 1), f"{f:.4f}", f"{z:.5f}", name)
         console.print(table)

@@ -84,10 +84,10 @@ def replay(
         StudyError: as `load_design` and `simulate`.
     """
     file = _checked(out, has_report)
-    found = load_design(design, case)
-    run = run_study(found.study)
-    if found.stored:
-        again = Replay(run, int(found.stored["status"]), *deviation(run, found.stored))
+    loaded = load_design(design, case)
+    run = run_study(loaded.study)
+    if loaded.stored:
+        again = Replay(run, int(loaded.stored["status"]), *deviation(run, loaded.stored))
     else:
         again = Replay(run, None, 0.0, "")
     if file is not None:

@@ -66,8 +66,8 @@ class Certificate(NamedTuple):
     @property
     def least_damping(self) -> np.ndarray:
         """Smallest damping ratio of all link modes [1], (B, D, N)."""
-        known = np.where(np.isnan(self.damping_ratio), np.inf, self.damping_ratio)
-        least = known.min(axis=(3, 4))
+        finite = np.where(np.isnan(self.damping_ratio), np.inf, self.damping_ratio)
+        least = finite.min(axis=(3, 4))
         return np.where(np.isfinite(least), least, np.nan)
 
     @property

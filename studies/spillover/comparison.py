@@ -66,23 +66,23 @@ def compare_laws(study: Study, margin: float = 2.0, sizes: tuple[int, ...] = ())
     Raises:
         StudyError: as `certify`, or a design that does not damp mode 1.
     """
-    found = fixed_controller(study)
-    sizes = plant_sizes(found, sizes)
-    plant = PlantVariant(found.study.link.basis, sizes[-1])
-    laws = all_laws(found, LoopBuilder(found), plant)
+    design = fixed_controller(study)
+    sizes = plant_sizes(design, sizes)
+    plant = PlantVariant(design.study.link.basis, sizes[-1])
+    laws = all_laws(design, LoopBuilder(design), plant)
     with threadpool_limits(1, "blas"):
-        views = [_LawLoops(found, law, plant, sizes) for law in laws]
-        given = next(view for view in views if view.law.law.name == study.control.law)
-        target = given.damping(1.0)[0]
-        rows = [(WITHOUT, given, 0.0), (GIVEN, given, 1.0)]
+        views = [_LawLoops(design, law, plant, sizes) for law in laws]
+        own = next(view for view in views if view.law.law.name == study.control.law)
+        target = own.damping(1.0)[0]
+        rows = [(WITHOUT, own, 0.0), (GIVEN, own, 1.0)]
         for view in views:
-            is_own = view is given and view.limit >= margin
+            is_own = view is own and view.limit >= margin
             rows.append((view.law.law.text, view, 1.0 if is_own else view.fair(margin, target)))
         zeta = np.array([view.damping(factor) for _, view, factor in rows])
-    moved, result = _run(found, [view.law.at(factor) for _, view, factor in rows])
+    fast, result = _run(design, [view.law.at(factor) for _, view, factor in rows])
     metrics = result.metrics
     return Comparison(
-        study=moved,
+        study=fast,
         required=margin,
         plant=plant,
         names=tuple(name for name, _, _ in rows),
@@ -101,11 +101,11 @@ class _LawLoops:
     """A law on the design's own plants."""
 
     def __init__(
-        self, found: FixedController, law: Candidate, plant: PlantVariant, sizes: tuple[int, ...]
+        self, design: FixedController, law: Candidate, plant: PlantVariant, sizes: tuple[int, ...]
     ) -> None:
-        self.law, builder = law, LoopBuilder(found)
+        self.law, builder = law, LoopBuilder(design)
         self.limit, self.breaking = HIGHEST, ""
-        self._n_links = _controlled_links(found.controller)
+        self._n_links = _controlled_links(design.controller)
         parts = linear_parts(law.controller)
         self._parts = [(modes, builder.loop(plant, part)) for modes, part in parts]
         for _, part in parts:
@@ -146,15 +146,15 @@ class _LawLoops:
 
     def _path(self, factors: np.ndarray) -> np.ndarray:
         """The same as the gains grow through factors, (steps, `SHOWN`)."""
-        found = np.full((len(factors), SHOWN), np.nan)
+        damping = np.full((len(factors), SHOWN), np.nan)
         for modes, loop in self._parts:
             tracked = follow_modes(loop, factors, loop.poles)
             # a mode's three poles belong to no single link; uncontrolled links keep the weak ones
             zeta = -np.sort(-modal_damping(loop, tracked)[1][:, :SHOWN], axis=2)
             last = self._n_links[None, : zeta.shape[1], None] - 1
             zeta = np.take_along_axis(zeta, last, axis=2)[..., 0]
-            found[:, : zeta.shape[1]][:, modes] = zeta[:, modes]
-        return found
+            damping[:, : zeta.shape[1]][:, modes] = zeta[:, modes]
+        return damping
 
 
 def _controlled_links(law: Controller) -> np.ndarray:
@@ -165,9 +165,9 @@ def _controlled_links(law: Controller) -> np.ndarray:
     return np.where(count > 0, count, n_links)
 
 
-def _run(found: FixedController, laws: list[Controller]) -> tuple[Study, Result]:
+def _run(design: FixedController, laws: list[Controller]) -> tuple[Study, Result]:
     """The design's first move made fast under each law, and the study of it."""
-    study = _made_fast(found.study)
+    study = _made_fast(design.study)
     structure, case = check_run(study)
     # a channel per patch, whatever the law
     structure = structure._replace(

@@ -41,62 +41,62 @@ class Candidate(NamedTuple):
         return with_gains(self.controller, factor)
 
 
-def all_laws(found: FixedController, builder: LoopBuilder, plant: PlantVariant) -> list[Candidate]:
+def all_laws(design: FixedController, builder: LoopBuilder, plant: PlantVariant) -> list[Candidate]:
     """All available laws; the design's own law with the design's own numbers.
 
     Args:
-        found: the design.
+        design: whose machine the laws control.
         builder: of its loops.
         plant: where strength is compared.
 
     Raises:
         StudyError: velocity gains that do not damp mode 1, so nothing to compare strength by.
     """
-    control, own_law = found.study.control, LAWS[found.study.control.law]
+    control, own_law = design.study.control, LAWS[design.study.control.law]
     channels = {name: law for name, law in LAWS.items() if law.channel != "none"}
     if own_law.name not in channels:
         raise field_error(
             "control.law", control.law, f"{', '.join(channels)}, to compare laws of equal strength"
         )
 
-    given = found.controller
+    controller = design.controller
 
     def strength(law: Controller) -> np.ndarray:
         """Damping constant that a law gives mode 1 of each link [N s/m], (3,)."""
-        padded = pad_channels(law, found.n_patches)
+        padded = pad_channels(law, design.n_patches)
         seen, driven = builder.spillover_gains(plant, padded)
         every = np.einsum("irc,ic,icr->ir", driven, _channels(padded).velocity_gain, seen)
         return np.where(np.abs(every[:, 0]) > ROUNDING * np.abs(every).max(), every[:, 0], 0.0)
 
-    modal = given if control.law == IMSC.name else _designed(found, IMSC)
+    modal = controller if control.law == IMSC.name else _design_law(design, IMSC)
     # a law without velocity feedback counts as strong as modal control with the same settings
-    wanted = strength(given if np.any(_channels(given).velocity_gain) else modal)
-    if not np.any(wanted > 0) or np.any(wanted < 0):
+    target = strength(controller if np.any(_channels(controller).velocity_gain) else modal)
+    if not np.any(target > 0) or np.any(target < 0):
         raise field_error(
             "control.velocity_gain",
             control.velocity_gain,
             "with control.ratios and control.mode_mask, gains that damp mode 1, to compare laws of "
             "equal strength",
         )
-    if modal is not given:
-        has = strength(modal)
-        if np.any((wanted > 0) & (has == 0)):
+    if modal is not controller:
+        modal_strength = strength(modal)
+        if np.any((target > 0) & (modal_strength == 0)):
             raise field_error(
                 "control.ratios",
                 control.ratios,
                 "with control.mode_mask, mode 1 on, to compare with IMSC of equal strength",
             )
-        modal = _scaled(modal, wanted, has)
+        modal = _scale(modal, target, modal_strength)
 
     def as_strong(law: Law) -> Controller:
         if law.as_strong is not None:
-            return _designed(found, law, modal)
-        own = _designed(found, law)
-        return _scaled(own, wanted, strength(own))
+            return _design_law(design, law, modal)
+        own = _design_law(design, law)
+        return _scale(own, target, strength(own))
 
-    own = {control.law: given, IMSC.name: modal}
+    own = {control.law: controller, IMSC.name: modal}
     return [
-        Candidate(law, _even(own[name] if name in own else as_strong(law), found.n_patches))
+        Candidate(law, _even(own[name] if name in own else as_strong(law), design.n_patches))
         for name, law in channels.items()
     ]
 
@@ -114,10 +114,10 @@ def _channels(law: Controller) -> Channels:
     return law.feedback
 
 
-def _scaled(law: Controller, wanted: np.ndarray, has: np.ndarray) -> Controller:
-    """Velocity gains of each link times wanted/has, (3,) each; 0 where there are none."""
-    is_there = has != 0
-    factor = np.where(is_there, wanted / np.where(is_there, has, 1.0), 0.0)
+def _scale(law: Controller, target: np.ndarray, strength: np.ndarray) -> Controller:
+    """Velocity gains of each link times target/strength, (3,) each; 0 where there are none."""
+    is_there = strength != 0
+    factor = np.where(is_there, target / np.where(is_there, strength, 1.0), 0.0)
     channels = _channels(law)
     velocity = factor[:, None] * channels.velocity_gain
     return law._replace(feedback=channels._replace(velocity_gain=velocity))
@@ -130,28 +130,28 @@ def _design(structure: Structure, case: Case, gains: tuple[Array, Array] | None)
     if gains is not None:
         assert law.as_strong is not None
         case = case._replace(control=as_modal(case.control, *gains))
-        known = design_controller(structure, case, bases).known
-        case = case._replace(control=law.as_strong(case, known))
+        model = design_controller(structure, case, bases).known
+        case = case._replace(control=law.as_strong(case, model))
     return design_controller(structure, case, bases).controller
 
 
-def _designed(found: FixedController, law: Law, modal: Controller | None = None) -> Controller:
+def _design_law(design: FixedController, law: Law, modal: Controller | None = None) -> Controller:
     """The study's controller with another law, NumPy arrays.
 
     Args:
-        found: the design.
+        design: of the study.
         law: which one.
         modal: modal control whose strength it must match; None: the study's settings.
     """
-    structure = found.structure._replace(
+    structure = design.structure._replace(
         law=law.name,
         n_steps=1,
-        has_position_gain=law.has_position or found.structure.has_position_gain,
+        has_position_gain=law.has_position or design.structure.has_position_gain,
     )
-    control = found.case.control._replace(parameters=law_parameters(found.study, law))
+    control = design.case.control._replace(parameters=law_parameters(design.study, law))
     gains = None
     if modal is not None:
         velocity, position = _channels(modal).velocity_gain, _channels(modal).position_gain
         gains = velocity, np.zeros_like(velocity) if position is None else position
-    case = found.case._replace(control=control)
+    case = design.case._replace(control=control)
     return jax.tree.map(np.asarray, _design(structure, case, gains))

@@ -89,20 +89,20 @@ _placement_faults = jax.jit(placement_faults)
 class LoopBuilder:
     """Builds loops of one design's machine with any controller; one compilation per basis."""
 
-    def __init__(self, found: FixedController) -> None:
+    def __init__(self, design: FixedController) -> None:
         """
         Args:
-            found: the design with its own controller.
+            design: with its own controller.
         """
-        self._found = found
-        self._case = found.case._replace(
-            initial=found.case.initial._replace(modal=np.zeros((3, LARGEST)))
+        self._design = design
+        self._case = design.case._replace(
+            initial=design.case.initial._replace(modal=np.zeros((3, LARGEST)))
         )
-        self._pose = np.array(found.study.motion.waypoints[0], float)
+        self._pose = np.array(design.study.motion.waypoints[0], float)
 
     def fault(self, plant: PlantVariant) -> str:
         """Why there is no such plant, "" if there is one."""
-        study, machine = self._found.study, self._placed(plant).machine
+        study, machine = self._design.study, self._placed(plant).machine
         is_off, is_overlapping = _placement_faults(machine.patches, machine.beam.length)
         if is_off or is_overlapping:
             what = "patches leave the link" if is_off else "patches overlap"
@@ -118,48 +118,50 @@ class LoopBuilder:
 
     def loop(self, plant: PlantVariant, law: Controller) -> SampledLoop:
         """The loop of a plant and a controller with a channel for each patch (`pad_channels`)."""
-        matrices, omega, _ = self._look(plant, law)
+        matrices, omega, _ = self._evaluate(plant, law)
         kept, of_plant = _kept(matrices, plant.n_modes)
         matrices = matrices._replace(
             open=matrices.open[np.ix_(kept, kept)],
             feedback=matrices.feedback[np.ix_(kept, kept)],
             plant=matrices.plant[np.ix_(of_plant, of_plant)],
         )
-        period = float(self._found.case.electronics.period)
+        period = float(self._design.case.electronics.period)
         return sampled_loop(matrices, omega[:, : plant.n_modes], period, plant.n_modes)
 
     def spillover_gains(self, plant: PlantVariant, law: Controller) -> SpilloverGains:
         """Coupling of the channels of a padded controller with a plant's modes, both ways."""
-        _, _, (observation, actuation) = self._look(plant, law)
+        _, _, (observation, actuation) = self._evaluate(plant, law)
         return SpilloverGains(observation[:, :, : plant.n_modes], actuation[:, : plant.n_modes])
 
-    def _look(
+    def _evaluate(
         self, plant: PlantVariant, law: Controller
     ) -> tuple[LoopMatrices, np.ndarray, SpilloverGains]:
-        known = self._found.structure
+        nominal = self._design.structure
         # drop everything only a controller's own design depends on: one program for all laws
         structure = Structure(
             n_modes=LARGEST,
-            n_controlled=known.n_controlled,
-            n_patches=known.n_patches,
+            n_controlled=nominal.n_controlled,
+            n_patches=nominal.n_patches,
             n_steps=1,
             n_frequencies=1,
             basis=plant.basis,
-            has_shortening=known.has_shortening,
-            is_distributed=known.is_distributed,
-            has_static_correction=known.has_static_correction,
+            has_shortening=nominal.has_shortening,
+            is_distributed=nominal.is_distributed,
+            has_static_correction=nominal.has_static_correction,
             law=SRF.name,  # a channel for each patch, see `pad_channels`
-            has_feedforward=known.has_feedforward,
-            has_friction=known.has_friction,
+            has_feedforward=nominal.has_feedforward,
+            has_friction=nominal.has_friction,
             has_position_gain=False,
-            is_coupled=known.is_coupled,
-            has_wrench=known.has_wrench,
-            has_sensor_highpass=known.has_sensor_highpass,
-            has_amplifier=known.has_amplifier,
+            is_coupled=nominal.is_coupled,
+            has_wrench=nominal.has_wrench,
+            has_sensor_highpass=nominal.has_sensor_highpass,
+            has_amplifier=nominal.has_amplifier,
         )
         law = law._replace(feedback=law.feedback.without_rivals())  # linear: nothing switches
         law = jax.tree.map(jnp.asarray, law)
-        return jax.tree.map(np.asarray, _look(structure, self._placed(plant), self._pose, law))
+        return jax.tree.map(
+            np.asarray, _evaluate_loop(structure, self._placed(plant), self._pose, law)
+        )
 
     def _placed(self, plant: PlantVariant) -> Case:
         machine, true = self._case.machine, plant.mismatch
@@ -179,7 +181,7 @@ class LoopBuilder:
 
 
 @kept_jit(static_argnums=0)
-def _look(
+def _evaluate_loop(
     structure: Structure, case: Case, pose: Array, law: Controller
 ) -> tuple[LoopMatrices, Array, SpilloverGains]:
     loop = prepare(structure, case).loop
@@ -214,13 +216,13 @@ def pad_channels(law: Controller, n_channels: int) -> Controller:
     return law._replace(feedback=law.feedback.padded(n_channels))
 
 
-def plant_sizes(found: FixedController, sizes: tuple[int, ...] = ()) -> tuple[int, ...]:
+def plant_sizes(design: FixedController, sizes: tuple[int, ...] = ()) -> tuple[int, ...]:
     """Numbers of plant modes per link, rising; default: the controlled ones, and `SIZES`.
 
     Raises:
         StudyError: fewer than are controlled, or more than `LARGEST`.
     """
-    smallest = found.structure.n_controlled
+    smallest = design.structure.n_controlled
     if smallest > LARGEST:
         raise field_error("control.modes", smallest, f"1 to {LARGEST}, the most plant modes")
     sizes = tuple(sorted(sizes or {smallest, *(n for n in SIZES if n > smallest)}))

@@ -56,21 +56,21 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.space.spec import load_sweep
         from studies.sweeps.dry_run import print_plan
 
-        asked = load_sweep(spec)
+        sweep_spec = load_sweep(spec)
         if dry_run and workers.are_named:
             raise StudyError("--dry-run: plans for this process only; leave the workers out")
         if dry_run and report:
             raise StudyError("--report: --dry-run produces no results; leave one of them out")
         if dry_run:
-            print_plan(make_plan(asked, out if resume else None), console)
+            print_plan(make_plan(sweep_spec, out if resume else None), console)
             return
         if out is None:
             raise StudyError("--out: name a folder for the results")
 
-        names = (*sweep_phases(asked), *(["report"] if report else []))
+        names = (*sweep_phases(sweep_spec), *(["report"] if report else []))
         with Phases(console, names, quiet) as phases:
-            with runner_for(asked, workers, phases.say) as runner:
-                done = run_sweep(asked, out, resume, runner=runner, phases=phases)
+            with runner_for(sweep_spec, workers, phases.say) as runner:
+                done = run_sweep(sweep_spec, out, resume, runner=runner, phases=phases)
             if report and not done.is_interrupted:
                 from studies.sweeps.report import write_sweep_report
 
@@ -95,7 +95,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
                 f"compiling; results: {out / 'results.h5'}",
                 soft_wrap=True,
             )
-        if asked.screen is not None and not quiet:
+        if sweep_spec.screen is not None and not quiet:
             from studies.engine.results import read_sweep
             from studies.sweeps.screening import check_screen
 
@@ -182,14 +182,16 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.sweeps.show import label
 
         data = read_sweep(folder)
-        found = analyse(data, by)
+        analysis = analyse(data, by)
         design = f"a {data.spec.sweep.method} design"
         console.print(f"{label(data, by)}, {len(data.table.origin)} rows of {design}")
-        table = Table(*found.heads)
-        for row in found.rows:
+        table = Table(*analysis.heads)
+        for row in analysis.rows:
             table.add_row(*row)
-        for note in found.notes:
+        for note in analysis.notes:
             console.print(note)
         console.print(table)
-        if found.n_left_out:
-            console.print(f"left out because of failed cases: {found.n_left_out} {found.what}")
+        if analysis.n_left_out:
+            console.print(
+                f"left out because of failed cases: {analysis.n_left_out} {analysis.what}"
+            )

@@ -144,13 +144,13 @@ def front(data: SweepData, y: str) -> Figure:
 
 def not_beaten(margin: np.ndarray, value: np.ndarray) -> list[int]:
     """Cases on the Pareto front: none has a smaller value at the same or a larger margin."""
-    found: list[int] = []
+    front: list[int] = []
     lowest = np.inf
     for k in np.lexsort((value, -margin)):
         if value[k] < lowest:
-            found.append(int(k))
+            front.append(int(k))
             lowest = value[k]
-    return found
+    return front
 
 
 def is_log(data: SweepData, name: str) -> bool:
@@ -279,11 +279,11 @@ def _lines(
     for k, name in enumerate(groups):
         part = np.ones(len(across), bool) if group is None else group == name
         is_text = across.dtype.kind in "UOb"
-        wanted = np.array(_distinct(across))  # texts in the order of the file, on one axis
-        at = np.array([x for x in wanted if np.any(across[part] == x)])
+        places = np.array(_distinct(across))  # texts in the order of the file, on one axis
+        at = np.array([x for x in places if np.any(across[part] == x)])
         inside = [value[part][across[part] == x] for x in at]
         middle = [np.median(v) for v in inside]
-        position = np.flatnonzero(np.isin(wanted, at)) if is_text else at
+        position = np.flatnonzero(np.isin(places, at)) if is_text else at
         style: dict[str, Any] = {
             "color": figures.SERIES[k % len(figures.SERIES)],
             "linestyle": figures.DASHES[(k // len(figures.SERIES)) % len(figures.DASHES)],
@@ -302,7 +302,7 @@ def _lines(
             span = ", smallest to largest" if is_text or len(groups) <= MOST_BANDS else ""
             ax.set_title(f"median{span}", fontsize=figures.SMALL, loc="right")
         if is_text:
-            ax.set_xticks(range(len(wanted)), [str(v) for v in wanted], rotation=30, ha="right")
+            ax.set_xticks(range(len(places)), [str(v) for v in places], rotation=30, ha="right")
     if group is not None:
         figures.legend_beside(ax)
     if _is_wide(value):
@@ -313,8 +313,8 @@ def _lines(
 
 def _distinct(values: np.ndarray) -> list[Any]:
     """Distinct values: numbers sorted, texts in order of first appearance."""
-    found, first = np.unique(values, return_index=True)
-    return list(found if values.dtype.kind in "fi" else values[np.sort(first)])
+    distinct, first = np.unique(values, return_index=True)
+    return list(distinct if values.dtype.kind in "fi" else values[np.sort(first)])
 
 
 def _short(value: object) -> str:

@@ -88,11 +88,11 @@ def _cause_of_choice(name: str, value: np.ndarray, is_failed: np.ndarray) -> Cau
 
 def scalar_columns(data: SweepData) -> list[tuple[str, np.ndarray]]:
     """Axes as columns of single numbers or texts."""
-    found = []
+    columns = []
     for name in swept_names(data):
         array = data[name]
         if array.dtype.kind in "UO":
-            found.append((name, array))
+            columns.append((name, array))
             continue
         flat = array.reshape(len(array), -1)
         for k in range(flat.shape[1]):
@@ -100,8 +100,8 @@ def scalar_columns(data: SweepData) -> list[tuple[str, np.ndarray]]:
             entry = "".join(f"[{i}]" for i in index) if array.ndim > 1 else ""
             column = flat[:, k]
             if not np.isnan(column).any():  # lists of different lengths have gaps
-                found.append((name + entry, column))
-    return found
+                columns.append((name + entry, column))
+    return columns
 
 
 def analyse(sweep: SweepData | str | Path, metric: str) -> Analysis:

@@ -67,9 +67,9 @@ class Rows(NamedTuple):
     rows: list[list[str]]
 
 
-def print_rows(found: Rows, console: Console) -> None:
-    table = RichTable(*found.heads)
-    for row in found.rows:
+def print_rows(listing: Rows, console: Console) -> None:
+    table = RichTable(*listing.heads)
+    for row in listing.rows:
         table.add_row(*row)
     console.print(table)
 
@@ -343,11 +343,11 @@ def counted_text(data: SweepData, by: str) -> str:
     if metric not in data.variables:
         return "of no case"
     axes = list(data.variables[metric].dims[1:])
-    told = []
+    parts = []
     if "link" in axes and "link=" not in by:
-        told.append(links_text(tuple(np.flatnonzero(counted_links(data)).tolist())))
-    told += [f"all {axis}s" for axis in axes if axis != "link" and f"{axis}=" not in by]
-    return f"largest of {' and '.join(told)}" if told else "one number"
+        parts.append(links_text(tuple(np.flatnonzero(counted_links(data)).tolist())))
+    parts += [f"all {axis}s" for axis in axes if axis != "link" and f"{axis}=" not in by]
+    return f"largest of {' and '.join(parts)}" if parts else "one number"
 
 
 def is_metric(name: str) -> bool:
@@ -381,8 +381,8 @@ def requirement(data: SweepData, by: str, is_safe: bool = True) -> str:
     """
     own = data.spec.screen.subject_to if data.spec.screen is not None else ""
     has_margin = is_safe and MARGIN in data.variables and bool(np.isfinite(data[MARGIN]).any())
-    wanted = [x for x in (own, f"{MARGIN} >= {ENOUGH:g}" if has_margin else "") if x]
-    for condition in dict.fromkeys((" and ".join(map(_bracketed, wanted)), *wanted)):
+    conditions = [x for x in (own, f"{MARGIN} >= {ENOUGH:g}" if has_margin else "") if x]
+    for condition in dict.fromkeys((" and ".join(map(_bracketed, conditions)), *conditions)):
         try:
             ranked_cases(data, by, condition, 1)
             return condition
@@ -416,10 +416,10 @@ def unit_of_metric(data: SweepData, name: str) -> str:
 
 def print_causes(data: SweepData, console: Console) -> None:
     """Print which parameters correlate with the failures, if any do."""
-    found = cause_rows(data)
-    if found.rows:
+    causes = cause_rows(data)
+    if causes.rows:
         console.print(f"what the failures depend on ({SHARES}):", soft_wrap=True)
-        print_rows(found, console)
+        print_rows(causes, console)
 
 
 def cause_rows(data: SweepData) -> Rows:
