@@ -24,39 +24,39 @@ from studies.study.window import residual_delay
 ALL_LINKS, PLATFORM = TARGETS.index("all links"), TARGETS.index("platform")
 
 
-def report(found: AtlasFindings, dropped: list[str], images: Path | None = None) -> str:
+def report(findings: AtlasFindings, dropped: list[str], images: Path | None = None) -> str:
     """The page of an atlas.
 
     Args:
-        found: everything.
+        findings: from `look_around`.
         dropped: settings left out, and why.
         images: folder with the figures; None: a page without.
     """
-    stable = found.responses.is_stable
+    stable = findings.responses.is_stable
     return page(
         "atlas/report.html",
         images,
-        found.study,
-        study=found.study,
-        delay=residual_delay(found.study),
-        subsets=found.subsets,
+        findings.study,
+        study=findings.study,
+        delay=residual_delay(findings.study),
+        subsets=findings.subsets,
         dropped=dropped,
-        most=_most_vibration(found),
-        adc_step=length_text(found.adc_step.max()),
+        most=_most_vibration(findings),
+        adc_step=length_text(findings.adc_step.max()),
         is_stable=stable.all(),
         unstable=[name for name, fine in zip(LINK_LABELS, stable, strict=True) if not fine],
-        radius=found.responses.radius.max(),
+        radius=findings.responses.radius.max(),
         choices=[link_label(k) for k in range(8)],
-        residuals=_residuals(found),
-        shares=_shares(found),
-        signs=_signs(found),
-        steps=_steps(found),
-        at_drive=_at_drive(found),
-        pairs=_pairs(found),
-        workspace=_workspace(found),
-        runs=_runs(found),
-        errors=_error_rows(found),
-        responses=_responses(found),
+        residuals=_residuals(findings),
+        shares=_shares(findings),
+        signs=_signs(findings),
+        steps=_steps(findings),
+        at_drive=_at_drive(findings),
+        pairs=_pairs(findings),
+        workspace=_workspace(findings),
+        runs=_runs(findings),
+        errors=_error_rows(findings),
+        responses=_responses(findings),
         link_sets=list(LINK_LABELS),
         filmed=setting_label(RUNS[-1]),
         sketch_caption=CAPTION,
@@ -69,31 +69,31 @@ def _change(value: float) -> str:
     return f"{text if float(text) else '0.0'} %"
 
 
-def _by_setting(found: AtlasFindings, cells: Iterable[Iterable[str]]) -> list[list[str]]:
+def _by_setting(findings: AtlasFindings, cells: Iterable[Iterable[str]]) -> list[list[str]]:
     """Row of each setting.
 
     Args:
-        found: everything.
+        findings: from `look_around`.
         cells: of each setting, after its name.
     """
-    return [[found.setting(k), *row] for k, row in enumerate(cells)]
+    return [[findings.setting(k), *row] for k, row in enumerate(cells)]
 
 
-def _all_links(found: AtlasFindings) -> np.ndarray:
+def _all_links(findings: AtlasFindings) -> np.ndarray:
     """Residual of the three links by choice of controlled links [m], (settings, 8)."""
-    link = found.subsets.link[:, found.subsets.link_subsets]
+    link = findings.subsets.link[:, findings.subsets.link_subsets]
     return np.sqrt(np.mean(link**2, axis=-1))
 
 
-def _most_vibration(found: AtlasFindings) -> dict[str, Any]:
+def _most_vibration(findings: AtlasFindings) -> dict[str, Any]:
     """The answer for the setting with the most residual vibration."""
-    rms = _all_links(found)
+    rms = _all_links(findings)
     k = int(np.argmax(rms[:, 0]))
     best = min((1, 2, 4), key=lambda subset: rms[k, subset])
-    link = found.subsets.link[k, found.subsets.link_subsets]  # (8, 3)
-    change = one_more_link(found.subsets).change[k, ALL_LINKS]
+    link = findings.subsets.link[k, findings.subsets.link_subsets]  # (8, 3)
+    change = one_more_link(findings.subsets).change[k, ALL_LINKS]
     return {
-        "setting": found.setting(k),
+        "setting": findings.setting(k),
         "free": length_text(rms[k, 0]),
         "controlled": length_text(rms[k, 7]),
         "best": link_label(best),
@@ -105,25 +105,25 @@ def _most_vibration(found: AtlasFindings) -> dict[str, Any]:
     }
 
 
-def _residuals(found: AtlasFindings) -> list[list[str]]:
+def _residuals(findings: AtlasFindings) -> list[list[str]]:
     """Rows of settings: residual of the three links for each choice of controlled links."""
-    return _by_setting(found, (map(length_text, row) for row in _all_links(found)))
+    return _by_setting(findings, (map(length_text, row) for row in _all_links(findings)))
 
 
-def _shares(found: AtlasFindings) -> list[list[str]]:
+def _shares(findings: AtlasFindings) -> list[list[str]]:
     """Row of each setting: Shapley shares of links, and of modes beyond the first."""
-    game = found.subsets.removed()[:, ALL_LINKS]
+    game = findings.subsets.removed()[:, ALL_LINKS]
     share = 100 * shapley(game).reshape(len(game), 3, -1)
     cells = (
         [*(f"{x:.2f}" for x in (*one.sum(axis=1), np.abs(one[:, 1:]).sum())), f"{100 * total:.4g}"]
         for one, total in zip(share, game[:, -1], strict=True)
     )
-    return _by_setting(found, cells)
+    return _by_setting(findings, cells)
 
 
-def _signs(found: AtlasFindings) -> dict[str, Any]:
+def _signs(findings: AtlasFindings) -> dict[str, Any]:
     """Table 1: changes of the spectral peak [%], and how many agree."""
-    signs = table_1_signs(found.subsets)
+    signs = table_1_signs(findings.subsets)
     on, paper, ours = signs.is_controlled, 100 * signs.paper, 100 * signs.ours
     agree = signs.agree[:, ~on]
 
@@ -137,7 +137,7 @@ def _signs(found: AtlasFindings) -> dict[str, Any]:
 
     agreeing = (f"{row.sum()} of {row.size}" for row in agree)
     return {
-        "rows": [["paper", *cells(paper, "")], *_by_setting(found, map(cells, ours, agreeing))],
+        "rows": [["paper", *cells(paper, "")], *_by_setting(findings, map(cells, ours, agreeing))],
         "fallen": np.sum(ours[:, on] < 0),
         "controlled": ours[:, on].size,
         "is_deeper": np.all(ours[:, on] < paper[on]),
@@ -148,9 +148,9 @@ def _signs(found: AtlasFindings) -> dict[str, Any]:
     }
 
 
-def _steps(found: AtlasFindings) -> dict[str, Any]:
+def _steps(findings: AtlasFindings) -> dict[str, Any]:
     """Steps to one more controlled link: how many of them increase vibration."""
-    steps = one_more_link(found.subsets)
+    steps = one_more_link(findings.subsets)
 
     def cell(change: np.ndarray) -> str:
         worst = int(np.argmax(change))
@@ -162,7 +162,7 @@ def _steps(found: AtlasFindings) -> dict[str, Any]:
     single = steps.change[:, :3] > NO_CHANGE
     shown = steps.change[:, [ALL_LINKS, PLATFORM]]
     return {
-        "rows": _by_setting(found, (map(cell, one) for one in shown)),
+        "rows": _by_setting(findings, (map(cell, one) for one in shown)),
         "count": steps.change[:, ALL_LINKS].size,
         "links": steps.rises[:, ALL_LINKS].sum(),
         "platform": steps.rises[:, PLATFORM].sum(),
@@ -172,38 +172,38 @@ def _steps(found: AtlasFindings) -> dict[str, Any]:
     }
 
 
-def _at_drive(found: AtlasFindings) -> dict[str, float] | None:
+def _at_drive(findings: AtlasFindings) -> dict[str, float] | None:
     """Effect of control on link 1 at the drive's lowest mode, if it can be determined."""
-    share, frequency = found.modes.share[0, :, 3], found.modes.frequency[0]
+    share, frequency = findings.modes.share[0, :, 3], findings.modes.frequency[0]
     at_drive = frequency[share > 0.5]
-    if not len(at_drive) or not found.responses.is_stable[[0, -1]].all():
+    if not len(at_drive) or not findings.responses.is_stable[[0, -1]].all():
         return None
-    at = int(np.argmin(np.abs(found.responses.frequency - at_drive[0])))
-    size = np.abs(found.responses.value[:, at, 0, 0])
+    at = int(np.argmin(np.abs(findings.responses.frequency - at_drive[0])))
+    size = np.abs(findings.responses.value[:, at, 0, 0])
     return {"frequency": at_drive[0], "ratio": size[-1] / size[0]}
 
 
-def _pairs(found: AtlasFindings) -> dict[str, Any]:
+def _pairs(findings: AtlasFindings) -> dict[str, Any]:
     """Two links controlled: change of the platform's error [%]."""
-    pairs = two_links(found.subsets)
+    pairs = two_links(findings.subsets)
     return {
         "labels": [f"links {label}" for label in pairs.labels],
-        "rows": _by_setting(found, (map(_change, one) for one in pairs.change)),
+        "rows": _by_setting(findings, (map(_change, one) for one in pairs.change)),
         "change": 100 * pairs.change,
         "kept": np.sum(pairs.change < -0.5),
         "count": pairs.change.size,
     }
 
 
-def _workspace(found: AtlasFindings) -> dict[str, Any]:
+def _workspace(findings: AtlasFindings) -> dict[str, Any]:
     """Natural modes over the workspace, at the turn of the path's first pose."""
-    chart = found.map
-    turn = int(np.argmin(np.abs(chart.phi - found.poses[0, 2])))
+    chart = findings.map
+    turn = int(np.argmin(np.abs(chart.phi - findings.poses[0, 2])))
     reach = np.isfinite(chart.margin).sum(axis=(1, 2))
     cell = 1e4 * (chart.x[1] - chart.x[0]) * (chart.y[1] - chart.y[0])  # [cm2]
-    rate = found.study.link.first_damping * 2 * np.pi * np.nanmedian(chart.bending)
+    rate = findings.study.link.first_damping * 2 * np.pi * np.nanmedian(chart.bending)
     return {
-        "modes": min(MAP_MODES, found.study.link.modes),
+        "modes": min(MAP_MODES, findings.study.link.modes),
         "areas": list(zip(cell * reach, np.degrees(chart.phi), strict=True)),
         "border": _border(chart),
         "turn": np.degrees(chart.phi[turn]),
@@ -211,7 +211,7 @@ def _workspace(found: AtlasFindings) -> dict[str, Any]:
         "bending": _reach(chart.bending[turn]),
         "spread": _reach(100 * chart.spread[turn]),
         "coupling": _reach(100 * chart.coupling[turn], ".2f"),
-        "beat": _beat(found.modes.frequency[0], found.modes.order_share[0]),
+        "beat": _beat(findings.modes.frequency[0], findings.modes.order_share[0]),
         "decay": 1 / rate if rate > 0 else None,
     }
 
@@ -235,27 +235,27 @@ def _border(chart: Map) -> str:
     return "square" if high.all() else "both" if high.any() else "along"
 
 
-def _rms(found: AtlasFindings) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+def _rms(findings: AtlasFindings) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Rms errors of the platform due to drive, (3,), and vibration, (4, 3), by setting."""
-    runs = found.platform
+    runs = findings.platform
     every = zip(RUNS, runs.rms(runs.drive), runs.rms(runs.vibration), strict=True)
     return ((setting_label(setting), drive, vibration) for setting, drive, vibration in every)
 
 
-def _error_rows(found: AtlasFindings) -> list[list[str]]:
+def _error_rows(findings: AtlasFindings) -> list[list[str]]:
     """Row of each setting and part of the error."""
     rows = []
-    for setting, drive, vibration in _rms(found):
+    for setting, drive, vibration in _rms(findings):
         rows.append([setting, "drive error", *_errors(drive)])
         for links, error in zip(LINK_LABELS, vibration, strict=True):
             rows.append([setting, f"vibration error, controlled: {links}", *_errors(error)])
     return rows
 
 
-def _runs(found: AtlasFindings) -> list[dict[str, Any]]:
+def _runs(findings: AtlasFindings) -> list[dict[str, Any]]:
     """What control of all links does to the errors of each setting."""
     runs = []
-    for setting, drive, vibration in _rms(found):
+    for setting, drive, vibration in _rms(findings):
         centre = np.hypot(vibration[:, 0], vibration[:, 1])
         runs.append(
             {
@@ -273,9 +273,9 @@ def _errors(rms: np.ndarray) -> list[str]:
     return [f"{1e9 * x:.3g}" for x in (np.hypot(rms[0], rms[1]), rms[2])]
 
 
-def _responses(found: AtlasFindings) -> list[list[str]]:
+def _responses(findings: AtlasFindings) -> list[list[str]]:
     """Largest magnitudes: a row for each pair of force and motion."""
-    peak = np.abs(found.responses.value).max(axis=1)
+    peak = np.abs(findings.responses.value).max(axis=1)
     shown = [("slider 1", 0, i) for i in range(3)] + [("platform y", 4, i) for i in (0, 4)]
     return [
         [f"{name} to {OUTPUTS[i].split(' [')[0]}", *map(_number, peak[:, i, source])]

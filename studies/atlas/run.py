@@ -86,23 +86,23 @@ def run_atlas(
 def _finish(study: Study, out: Path, phases: Phases, has_pdf: bool) -> None:
     """Everything after the runs of the subsets."""
 
-    def tell(text: str, share: float) -> None:
+    def on_progress(text: str, share: float) -> None:
         if share == 0:  # the beginning of a step; its end needs no message
             phases.say(text)
 
     phases.begin("analyse")
     subsets, dropped = sound_settings(read_subsets(out / RUNS_FOLDER))
     with threadpool_limits(1, "blas"):  # many small matrices: more threads only slow them down
-        found = look_around(study, subsets, tell)
+        findings = look_around(study, subsets, on_progress)
     phases.begin("draw")
     with publish(out) as staging:
-        write_store(staging / DATA, variables(found), run_attributes(study))
+        write_store(staging / DATA, variables(findings), run_attributes(study))
         with styled():
             for name, draw in FIGURES.items():
-                save(draw(found), staging, name, has_pdf)
+                save(draw(findings), staging, name, has_pdf)
             write_figure(sketch(study), staging / "machine.png")
-        write_animation(found, staging)
-        (staging / REPORT).write_text(report(found, dropped, staging), encoding="utf-8")
+        write_animation(findings, staging)
+        (staging / REPORT).write_text(report(findings, dropped, staging), encoding="utf-8")
 
 
 def sound_settings(subsets: Subsets) -> tuple[Subsets, list[str]]:
@@ -127,9 +127,13 @@ def sound_settings(subsets: Subsets) -> tuple[Subsets, list[str]]:
     return subsets._replace(setting=kept, **arrays), dropped
 
 
-def variables(found: AtlasFindings) -> dict[str, Variable]:
+def variables(findings: AtlasFindings) -> dict[str, Variable]:
     """All variables of `atlas.h5`."""
-    return {**_subset_variables(found.subsets), **_map_variables(found), **_run_variables(found)}
+    return {
+        **_subset_variables(findings.subsets),
+        **_map_variables(findings),
+        **_run_variables(findings),
+    }
 
 
 def _names(values: list[str], axis: str, text: str) -> Variable:
@@ -190,8 +194,8 @@ def _subset_variables(subsets: Subsets) -> dict[str, Variable]:
     }
 
 
-def _map_variables(found: AtlasFindings) -> dict[str, Variable]:
-    chart = found.map
+def _map_variables(findings: AtlasFindings) -> dict[str, Variable]:
+    chart = findings.map
     grid = ("map_phi", "map_y", "map_x")
     pairs = [f"{i + 1}-{k + 1}" for i, k in PAIRS]
     return {
@@ -213,12 +217,12 @@ def _map_variables(found: AtlasFindings) -> dict[str, Variable]:
         "inertial_coupling": Variable(
             chart.coupling, (*grid, "pair"), "1", "of the links' first modes, pose condensed out"
         ),
-        "pose_of_modes": Variable(found.poses, ("mode_pose", "pose_axis"), "m; m; rad", "pose"),
+        "pose_of_modes": Variable(findings.poses, ("mode_pose", "pose_axis"), "m; m; rad", "pose"),
         "mode_frequency": Variable(
-            found.modes.frequency, ("mode_pose", "natural_mode"), "Hz", "at these poses"
+            findings.modes.frequency, ("mode_pose", "natural_mode"), "Hz", "at these poses"
         ),
         "mode_shape": Variable(
-            found.modes.shape,
+            findings.modes.shape,
             ("mode_pose", "coordinate", "natural_mode"),
             "m; m; rad; m ...",
             "pose and modal coordinates, largest entry 1",
@@ -226,8 +230,8 @@ def _map_variables(found: AtlasFindings) -> dict[str, Variable]:
     }
 
 
-def _run_variables(found: AtlasFindings) -> dict[str, Variable]:
-    runs, answers = found.platform, found.responses
+def _run_variables(findings: AtlasFindings) -> dict[str, Variable]:
+    runs, answers = findings.platform, findings.responses
     series = ("run", "run_links", "time", "pose_axis")
     return {
         "run": _names([setting_label(s) for s in RUNS], "run", "move, shaper"),

@@ -108,8 +108,8 @@ def map_workspace(study: Study, count: int = GRID, turns: tuple[float, ...] = TU
     poses = grid.reshape(-1, 3)
     codes, gamma, _ = (np.asarray(part) for part in _stand(structure, case, poses))
     good = codes == status.OK
-    found = _solve(structure, case, poses[good])
-    chosen = np.sort(np.argsort(-found.order_share[..., 0], axis=1)[:, :3], axis=1)
+    modes = _solve(structure, case, poses[good])
+    chosen = np.sort(np.argsort(-modes.order_share[..., 0], axis=1)[:, :3], axis=1)
 
     def placed(values: np.ndarray) -> np.ndarray:
         whole = np.full((len(poses), *values.shape[1:]), np.nan)
@@ -122,10 +122,10 @@ def map_workspace(study: Study, count: int = GRID, turns: tuple[float, ...] = TU
         phi=phi,
         status=codes.astype(int).reshape(grid.shape[:-1]),
         gamma=placed(gamma[good]),
-        frequency=placed(found.frequency),
-        bending=placed(np.take_along_axis(found.frequency, chosen, axis=1)),
-        share=placed(np.take_along_axis(found.share, chosen[..., None], axis=1)),
-        coupling=placed(found.coupling),
+        frequency=placed(modes.frequency),
+        bending=placed(np.take_along_axis(modes.frequency, chosen, axis=1)),
+        share=placed(np.take_along_axis(modes.share, chosen[..., None], axis=1)),
+        coupling=placed(modes.coupling),
     )
 
 
@@ -145,12 +145,12 @@ def _extent(
     structure: Structure, case: Case, study: Study, phi: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Grid lines that cover all feasible poses."""
-    look = np.linspace(-0.6, 0.6, 121) * study.machine.guide_side
-    grid = np.stack(np.meshgrid(phi, look, look, indexing="ij")[::-1], axis=-1)
+    axis = np.linspace(-0.6, 0.6, 121) * study.machine.guide_side
+    grid = np.stack(np.meshgrid(phi, axis, axis, indexing="ij")[::-1], axis=-1)
     codes, _, _ = _stand(structure, case, grid.reshape(-1, 3))
     good = (np.asarray(codes) == status.OK).reshape(grid.shape[:-1]).any(axis=0)
-    step = look[1] - look[0]
-    rows, columns = (look[np.flatnonzero(good.any(axis=k))] for k in (1, 0))
+    step = axis[1] - axis[0]
+    rows, columns = (axis[np.flatnonzero(good.any(axis=k))] for k in (1, 0))
     return tuple(  # type: ignore[return-value]
         np.linspace(lines[0] - step, lines[-1] + step, count) for lines in (columns, rows)
     )

@@ -31,31 +31,33 @@ def _plain_ticks(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _has_departures(found: Certificate) -> bool:
+def _has_departures(certificate: Certificate) -> bool:
     """Whether plants of the same basis and size differ."""
-    return found.plants.shape[1] > 1
+    return certificate.plants.shape[1] > 1
 
 
-def margins(found: Certificate, ax: Axes | None = None) -> Axes:
+def margins(certificate: Certificate, ax: Axes | None = None) -> Axes:
     """Gain margin for every mismatch: of the largest plants, and, hollow, of the smallest.
 
     Args:
-        found: the certificate.
+        certificate: from `certify`.
         ax: where to draw; default: a new figure.
     """
     ax = figures.axes_or_new(ax)
-    sizes = [plant.n_modes for plant in found.plants[0, 0]]
-    shown = np.flatnonzero(found.exists.any(axis=(0, 2)))[::-1]  # the first one on top
-    values = np.maximum(found.margin, LEAST)
+    sizes = [plant.n_modes for plant in certificate.plants[0, 0]]
+    shown = np.flatnonzero(certificate.exists.any(axis=(0, 2)))[::-1]  # the first one on top
+    values = np.maximum(certificate.margin, LEAST)
     for b, color, marker in zip(range(len(values)), figures.SERIES, "osD", strict=False):
-        if not found.exists[b].any():
+        if not certificate.exists[b].any():
             continue
         at = np.arange(len(shown)) + 0.2 * (b - (len(values) - 1) / 2)
         style: dict[str, Any] = {"color": color, "marker": marker, "linestyle": "none"}
-        ax.plot(values[b, shown, -1], at, markersize=4, label=found.plants[b, 0, 0].basis, **style)
+        ax.plot(
+            values[b, shown, -1], at, markersize=4, label=certificate.plants[b, 0, 0].basis, **style
+        )
         if len(sizes) > 1:
             ax.plot(values[b, shown, 0], at, markersize=7, markerfacecolor="none", **style)
-    for place, text in ((found.required, "required"), (1.0, "unstable")):
+    for place, text in ((certificate.required, "required"), (1.0, "unstable")):
         ax.axvline(place, color="black", linewidth=0.9, linestyle="--" if place > 1 else "-")
         ax.annotate(
             text,
@@ -66,7 +68,7 @@ def margins(found: Certificate, ax: Axes | None = None) -> Axes:
             ha="center",
             fontsize=figures.SMALL,
         )
-    ax.set_yticks(np.arange(len(shown)), [str(found.plants[0, d, 0].mismatch) for d in shown])
+    ax.set_yticks(np.arange(len(shown)), [str(certificate.plants[0, d, 0].mismatch) for d in shown])
     ax.set(xlabel="gain margin [1]", xscale="log", ylim=(-0.6, len(shown) - 0.4))
     ax.tick_params(axis="y", labelsize=figures.SMALL)
     _plain_ticks(ax.xaxis)
@@ -75,15 +77,15 @@ def margins(found: Certificate, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
+def mode_damping(certificate: Certificate, ax: Axes | None = None) -> Axes:
     """Damping ratio over frequency of every link mode at the design's gains, largest plants.
 
     Args:
-        found: the certificate.
+        certificate: from `certify`.
         ax: where to draw; default: a new figure.
     """
     ax = figures.axes_or_new(ax)
-    frequency, zeta = found.frequency_hz[:, :, -1], found.damping_ratio[:, :, -1]
+    frequency, zeta = certificate.frequency_hz[:, :, -1], certificate.damping_ratio[:, :, -1]
     for b, color, marker in zip(range(len(frequency)), figures.SERIES, "osD^v", strict=False):
         if np.all(np.isnan(zeta[b])):
             continue
@@ -95,11 +97,11 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
             markersize=3,
             alpha=0.6,
             markeredgewidth=0,
-            label=found.plants[b, 0, 0].basis,
+            label=certificate.plants[b, 0, 0].basis,
         )
     ax.plot(
         frequency.ravel(),
-        found.free_damping[:, :, -1].ravel(),
+        certificate.free_damping[:, :, -1].ravel(),
         "_",
         color="black",
         markersize=4,
@@ -119,8 +121,8 @@ def mode_damping(found: Certificate, ax: Axes | None = None) -> Axes:
     ax.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     ax.yaxis.set_minor_locator(NullLocator())
     _plain_ticks(ax.xaxis)
-    size = found.plants[0, 0, -1].n_modes
-    which = ", all mismatches" if _has_departures(found) else ""
+    size = certificate.plants[0, 0, -1].n_modes
+    which = ", all mismatches" if _has_departures(certificate) else ""
     ax.set(
         xlabel=f"frequency [Hz], plants of {size} modes a link{which}",
         ylabel="damping ratio [1]",
@@ -160,50 +162,50 @@ def leakage_map(
     return ax
 
 
-def leakage(found: Certificate) -> Figure:
+def leakage(certificate: Certificate) -> Figure:
     """`leakage_map` for each basis: the largest of all links and mismatches."""
-    size = np.abs(found.observation)
+    size = np.abs(certificate.observation)
     bases = [b for b in range(len(size)) if not np.all(np.isnan(size[b]))]
     with figures.styled():
         figure, axes = figures.new_figure(len(bases), 1, 0.55 + 0.28 * size.shape[3])
         for b, ax in zip(bases, axes[:, 0], strict=True):
-            name = found.plants[b, 0, 0].basis
-            leakage_map(np.nanmax(size[b], axis=(0, 1)), found.n_controlled, name, ax)
+            name = certificate.plants[b, 0, 0].basis
+            leakage_map(np.nanmax(size[b], axis=(0, 1)), certificate.n_controlled, name, ax)
         for ax in axes[:-1, 0]:
             ax.set_xlabel("")
     return figure
 
 
-def law_bars(found: Comparison, ax: Axes | None = None) -> Axes:
+def law_bars(comparison: Comparison, ax: Axes | None = None) -> Axes:
     """Residual vibration of each law on the fast move, with its margin and voltage.
 
     Args:
-        found: the comparison.
+        comparison: from `compare_laws`.
         ax: where to draw; default: a new figure.
     """
     ax = figures.axes_or_new(ax)
-    rows = np.arange(len(found.names))
+    rows = np.arange(len(comparison.names))
     height = 0.25
     for i in range(3):
         ax.barh(
             rows + (i - 1) * height,
-            1e6 * found.residual_rms[:, i],
+            1e6 * comparison.residual_rms[:, i],
             height,
             color=figures.SERIES[i],
             label=f"link {i + 1}",
         )
-    most = 1e6 * np.nanmax(found.residual_rms)
-    for k, name in enumerate(found.names):
+    most = 1e6 * np.nanmax(comparison.residual_rms)
+    for k, name in enumerate(comparison.names):
         if name == WITHOUT:
             continue
-        margin = margin_text(found.margin[k], 3)
-        end = 1e6 * np.nanmax(found.residual_rms[k], initial=0.0)
-        text = f"margin {margin}, peak {found.peak_voltage[k]:.3g} V"
-        text = text if found.margin[k] > 0 else "no stable gains"
-        if found.status[k] != status.OK:
-            text += f"; {describe(int(found.status[k]))}"
+        margin = margin_text(comparison.margin[k], 3)
+        end = 1e6 * np.nanmax(comparison.residual_rms[k], initial=0.0)
+        text = f"margin {margin}, peak {comparison.peak_voltage[k]:.3g} V"
+        text = text if comparison.margin[k] > 0 else "no stable gains"
+        if comparison.status[k] != status.OK:
+            text += f"; {describe(int(comparison.status[k]))}"
         ax.text(end + 0.01 * most, k, text, va="center", fontsize=figures.SMALL)
-    ax.set_yticks(rows, found.names)
+    ax.set_yticks(rows, comparison.names)
     ax.invert_yaxis()
     ax.margins(x=0.32)
     ax.grid(axis="y", visible=False)

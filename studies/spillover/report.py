@@ -24,20 +24,20 @@ from studies.study.window import residual_delay
 TINY = 1e-9
 
 
-def verdict(found: Certificate) -> str:
+def verdict(certificate: Certificate) -> str:
     """One line: passed or failed, and the deciding plant."""
-    at = found.worst
-    margin, breaking = margin_text(found.margin[at], 3), found.breaking[at]
-    if found.is_passed:
+    at = certificate.worst
+    margin, breaking = margin_text(certificate.margin[at], 3), certificate.breaking[at]
+    if certificate.is_passed:
         first = f"; first to go unstable beyond it: {breaking}" if breaking else ""
-        return f"passed: gain margin {margin}, {found.required:g} required{first}"
-    state = "" if found.radius[at] <= 1 + RADIUS_TOLERANCE else "unstable, "
-    return f"failed by {breaking}: {state}gain margin {margin}, {found.required:g} required"
+        return f"passed: gain margin {margin}, {certificate.required:g} required{first}"
+    state = "" if certificate.radius[at] <= 1 + RADIUS_TOLERANCE else "unstable, "
+    return f"failed by {breaking}: {state}gain margin {margin}, {certificate.required:g} required"
 
 
-def spillover_text(found: Certificate) -> str:
+def spillover_text(certificate: Certificate) -> str:
     """The uncontrolled mode that control makes worst, in a sentence; "" if there is none."""
-    worst = found.spillover
+    worst = certificate.spillover
     if worst is None:
         return ""
     return (
@@ -47,37 +47,37 @@ def spillover_text(found: Certificate) -> str:
     )
 
 
-def report(found: Certificate, laws: Comparison | None, images: Path | None = None) -> str:
+def report(certificate: Certificate, laws: Comparison | None, images: Path | None = None) -> str:
     """The page of a certificate.
 
     Args:
-        found: the certificate.
+        certificate: from `certify`.
         laws: comparison of laws, if they can be compared.
         images: folder with the figures; None: a page without.
     """
-    study, margin = found.study, float(found.margin[found.worst])
+    study, margin = certificate.study, float(certificate.margin[certificate.worst])
     return page(
         "spillover/report.html",
         images,
         study,
-        found=found,
+        certificate=certificate,
         study=study,
         law=LAWS[study.control.law],
         laws=laws,
-        breaking=found.breaking[found.worst],
+        breaking=certificate.breaking[certificate.worst],
         residual=_residual(laws) if laws is not None else None,
-        spillover=spillover_text(found),
+        spillover=spillover_text(certificate),
         margin=margin,
-        worst=found.plants[found.worst],
-        share=margin / found.required,
-        total=int(found.exists.sum()),
-        good=int(found.passes[found.exists].sum()),
+        worst=certificate.plants[certificate.worst],
+        share=margin / certificate.required,
+        total=int(certificate.exists.sum()),
+        good=int(certificate.passes[certificate.exists].sum()),
         links="+".join(str(i + 1) for i in range(3) if study.control.links[i]),
-        fewest=found.plants[0, 0, 0].n_modes,
-        sizes=[plant.n_modes for plant in found.plants[0, 0]],
-        free_damping=_free_damping(found),
-        margins=_margins(found),
-        leakage=_leakage(found),
+        fewest=certificate.plants[0, 0, 0].n_modes,
+        sizes=[plant.n_modes for plant in certificate.plants[0, 0]],
+        free_damping=_free_damping(certificate),
+        margins=_margins(certificate),
+        leakage=_leakage(certificate),
         given=GIVEN,
         fast=FAST,
         delay=residual_delay(laws.study) if laws is not None else None,
@@ -96,66 +96,71 @@ def _residual(laws: Comparison) -> tuple[float, float] | None:
     return (with_it, without) if np.isfinite(with_it) and without > 0 else None
 
 
-def _free_damping(found: Certificate) -> list[float]:
+def _free_damping(certificate: Certificate) -> list[float]:
     """Least and largest damping ratio without control [1], or one if they hardly differ."""
-    low, high = float(np.nanmin(found.free_damping)), float(np.nanmax(found.free_damping))
+    low, high = (
+        float(np.nanmin(certificate.free_damping)),
+        float(np.nanmax(certificate.free_damping)),
+    )
     return [low] if high - low < 0.1 * high else [low, high]
 
 
-def _margins(found: Certificate) -> list[list[str]]:
+def _margins(certificate: Certificate) -> list[list[str]]:
     """Row of each basis and mismatch: the largest plant, and the margin of the smallest."""
     rows = []
-    for b, d in np.ndindex(found.plants.shape[:2]):
-        if not found.exists[b, d].any():
+    for b, d in np.ndindex(certificate.plants.shape[:2]):
+        if not certificate.exists[b, d].any():
             continue
-        last = int(np.flatnonzero(found.exists[b, d])[-1])
-        plant = found.plants[b, d, last]
+        last = int(np.flatnonzero(certificate.exists[b, d])[-1])
+        plant = certificate.plants[b, d, last]
         rows.append(
             [
                 plant.basis,
                 str(plant.mismatch),
-                margin_text(found.margin[b, d, last], 3),
-                margin_text(found.margin[b, d, 0], 3) if found.exists[b, d, 0] else "-",
-                found.breaking[b, d, last] or "-",
-                f"{found.least_damping[b, d, last]:.3g}",
-                found.weakest[b, d, last],
-                "yes" if found.passes[b, d][found.exists[b, d]].all() else Markup("<b>no</b>"),
+                margin_text(certificate.margin[b, d, last], 3),
+                margin_text(certificate.margin[b, d, 0], 3) if certificate.exists[b, d, 0] else "-",
+                certificate.breaking[b, d, last] or "-",
+                f"{certificate.least_damping[b, d, last]:.3g}",
+                certificate.weakest[b, d, last],
+                "yes"
+                if certificate.passes[b, d][certificate.exists[b, d]].all()
+                else Markup("<b>no</b>"),
             ]
         )
     return rows
 
 
-def _leakage(found: Certificate) -> dict[str, Any] | None:
+def _leakage(certificate: Certificate) -> dict[str, Any] | None:
     """Uncontrolled modes in the estimates, and forces on them; None: no such modes."""
-    first, last = found.n_controlled, found.observation.shape[4]
-    if first == last or found.observation.shape[3] == 0:
+    first, last = certificate.n_controlled, certificate.observation.shape[4]
+    if first == last or certificate.observation.shape[3] == 0:
         return None
-    seen = found.observation[..., first:]
+    seen = certificate.observation[..., first:]
     size = np.nan_to_num(np.abs(seen)).max(axis=(1, 2))
     return {
-        "seen": _largest(found, seen),
-        "pushed": _largest(found, np.swapaxes(found.actuation, 3, 4)[..., first:]),
+        "seen": _largest(certificate, seen),
+        "pushed": _largest(certificate, np.swapaxes(certificate.actuation, 3, 4)[..., first:]),
         "modes": [f"mode {r + 1}" for r in range(first, last)],
         "rows": [
             [
-                found.plants[b, 0, 0].basis,
+                certificate.plants[b, 0, 0].basis,
                 f"q^{j + 1}",
                 *(f"{x:.2g}" if x > TINY else "0" for x in size[b, j]),
             ]
             for b, j in np.ndindex(size.shape[:2])
-            if found.exists[b].any()
+            if certificate.exists[b].any()
         ],
     }
 
 
-def _largest(found: Certificate, leakage: np.ndarray) -> dict[str, Any]:
+def _largest(certificate: Certificate, leakage: np.ndarray) -> dict[str, Any]:
     """The largest entry of a leakage of all plants, (B, D, 3, C, uncontrolled modes).
 
     Its size [1], the uncontrolled and the controlled mode, from 1, and the plant.
     """
     size = np.nan_to_num(np.abs(leakage))
     b, d, _, j, r = np.unravel_index(np.argmax(size), size.shape)
-    mode, plant = int(r) + found.n_controlled + 1, found.plants[b, d, 0]
+    mode, plant = int(r) + certificate.n_controlled + 1, certificate.plants[b, d, 0]
     return {"size": size.max(), "mode": mode, "controlled": int(j) + 1, "plant": plant}
 
 
@@ -179,22 +184,22 @@ def _laws(laws: Comparison) -> list[list[str]]:
     ]
 
 
-def document(found: Certificate, laws: Comparison | None) -> str:
+def document(certificate: Certificate, laws: Comparison | None) -> str:
     """JSON text: the verdict and every number, null if there is none."""
     whole: dict[str, Any] = {
         "format": "flexlink-spillover",
         "format_version": 2,
-        "title": found.study.title,
-        "is_passed": found.is_passed,
-        "spillover": found.spillover and _spilled(found.spillover),
-        "verdict": verdict(found),
-        "required_margin": found.required,
-        "smallest_margin": float(np.nanmin(found.margin)),
-        "fails_from_modes": found.fails_from or None,
-        "notes": list(found.notes),
-        "plants": [_plant(found, tuple(at)) for at in np.argwhere(found.exists)],
+        "title": certificate.study.title,
+        "is_passed": certificate.is_passed,
+        "spillover": certificate.spillover and _spilled(certificate.spillover),
+        "verdict": verdict(certificate),
+        "required_margin": certificate.required,
+        "smallest_margin": float(np.nanmin(certificate.margin)),
+        "fails_from_modes": certificate.fails_from or None,
+        "notes": list(certificate.notes),
+        "plants": [_plant(certificate, tuple(at)) for at in np.argwhere(certificate.exists)],
         "laws": [] if laws is None else [_law(laws, k) for k in range(len(laws.names))],
-        "study": found.study.model_dump(mode="json"),
+        "study": certificate.study.model_dump(mode="json"),
     }
     return json.dumps(_plain(whole), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
@@ -210,30 +215,30 @@ def _spilled(worst: Spillover) -> dict[str, Any]:
     }
 
 
-def _plant(found: Certificate, at: tuple[int, ...]) -> dict[str, Any]:
-    plant = found.plants[at]
+def _plant(certificate: Certificate, at: tuple[int, ...]) -> dict[str, Any]:
+    plant = certificate.plants[at]
     return {
         "basis": plant.basis,
         "modes": plant.n_modes,
         "sensor_length_factor": plant.mismatch.sensor,
         "actuator_length_factor": plant.mismatch.actuator,
         "frequency_factor": plant.mismatch.frequency,
-        "joint_inertia_c_kg_m2": _joint(found, plant),
-        "passes": bool(found.passes[at]),
-        "spectral_radius": found.radius[at],
-        "gain_margin": found.margin[at],
-        "broken_by": str(found.breaking[at]),
-        "least_damped": str(found.weakest[at]),
-        "frequency_hz": found.frequency_hz[at][: plant.n_modes],
-        "damping_ratio": found.damping_ratio[at][: plant.n_modes],
-        "damping_ratio_without_control": found.free_damping[at][: plant.n_modes],
+        "joint_inertia_c_kg_m2": _joint(certificate, plant),
+        "passes": bool(certificate.passes[at]),
+        "spectral_radius": certificate.radius[at],
+        "gain_margin": certificate.margin[at],
+        "broken_by": str(certificate.breaking[at]),
+        "least_damped": str(certificate.weakest[at]),
+        "frequency_hz": certificate.frequency_hz[at][: plant.n_modes],
+        "damping_ratio": certificate.damping_ratio[at][: plant.n_modes],
+        "damping_ratio_without_control": certificate.free_damping[at][: plant.n_modes],
     }
 
 
-def _joint(found: Certificate, plant: PlantVariant) -> Any:
+def _joint(certificate: Certificate, plant: PlantVariant) -> Any:
     """True J_C [kg m2], one for all links or three."""
-    known = plant.mismatch.joint_inertia
-    return found.study.link.joint_inertia_c if known is None else known
+    joint_inertia = plant.mismatch.joint_inertia
+    return certificate.study.link.joint_inertia_c if joint_inertia is None else joint_inertia
 
 
 def _law(laws: Comparison, k: int) -> dict[str, Any]:

@@ -59,26 +59,28 @@ def spillover_design(
     _check_whose(out, study)
     with Phases(console, PHASES) as phases:
         phases.begin("judge", "the controller on plants that differ from its nominal model")
-        found = certify(study, margin)
-        console.print(verdict(found), soft_wrap=True)
-        if text := spillover_text(found):
+        certificate = certify(study, margin)
+        console.print(verdict(certificate), soft_wrap=True)
+        if text := spillover_text(certificate):
             console.print(text, soft_wrap=True)
         phases.begin("compare laws")
         laws = None
         try:
-            laws = compare_laws(found.study, margin)
+            laws = compare_laws(certificate.study, margin)
         except StudyError as error:
-            found = found._replace(notes=(*found.notes, f"laws are not compared: {error}"))
+            certificate = certificate._replace(
+                notes=(*certificate.notes, f"laws are not compared: {error}")
+            )
         phases.begin("draw")
         with publish(out) as staging:
-            _draw(staging, found, laws, has_pdf)
-            write_store(staging / DATA, variables(found, laws), run_attributes(study))
-            (staging / DOCUMENT).write_text(document(found, laws), encoding="utf-8")
-            (staging / REPORT).write_text(report(found, laws, staging), encoding="utf-8")
-    for note in found.notes:
+            _draw(staging, certificate, laws, has_pdf)
+            write_store(staging / DATA, variables(certificate, laws), run_attributes(study))
+            (staging / DOCUMENT).write_text(document(certificate, laws), encoding="utf-8")
+            (staging / REPORT).write_text(report(certificate, laws, staging), encoding="utf-8")
+    for note in certificate.notes:
         console.print(note, soft_wrap=True)
     announce(console, out / REPORT, ", data and figures in the same folder")
-    return found.is_passed
+    return certificate.is_passed
 
 
 def _check_whose(out: Path, study: Study) -> None:
@@ -97,10 +99,10 @@ def _check_whose(out: Path, study: Study) -> None:
         )
 
 
-def _draw(folder: Path, found: Certificate, laws: Comparison | None, has_pdf: bool) -> None:
+def _draw(folder: Path, certificate: Certificate, laws: Comparison | None, has_pdf: bool) -> None:
     drawn: list[tuple[str, Callable[..., Any], Any]] = [
-        ("margins", plots.margins, found),
-        ("damping", plots.mode_damping, found),
+        ("margins", plots.margins, certificate),
+        ("damping", plots.mode_damping, certificate),
     ]
     if laws is not None:
         drawn.append(("laws", plots.law_bars, laws))
@@ -109,16 +111,16 @@ def _draw(folder: Path, found: Certificate, laws: Comparison | None, has_pdf: bo
             figure, axes = figures.new_figure(1, 1, 3.6 if plot is plots.margins else 2.65)
             plot(data, axes[0, 0])
             figures.save(figure, folder, name, has_pdf)
-        if LAWS[found.study.control.law].channel == "mode":
-            figures.save(plots.leakage(found), folder, "leakage", has_pdf)
-        figures.write_figure(sketch(found.study), folder / "machine.png")
+        if LAWS[certificate.study.control.law].channel == "mode":
+            figures.save(plots.leakage(certificate), folder, "leakage", has_pdf)
+        figures.write_figure(sketch(certificate.study), folder / "machine.png")
 
 
-def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable]:
+def variables(certificate: Certificate, laws: Comparison | None) -> dict[str, Variable]:
     """Labelled numbers of a certificate and of the comparison of laws."""
     plants = ("basis", "mismatch", "plant_modes")
     modes = (*plants, "link_mode", "pole")
-    place, axes = plants[:2], found.plants
+    place, axes = plants[:2], certificate.plants
     true = [plant.mismatch for plant in axes[0, :, 0]]
     part = {
         "basis": Variable(
@@ -145,29 +147,40 @@ def variables(found: Certificate, laws: Comparison | None) -> dict[str, Variable
         "plant_modes": Variable(
             np.array([p.n_modes for p in axes[0, 0]]), ("plant_modes",), "1", "per link"
         ),
-        "passes": Variable(found.passes, plants, "1", "stable with the margin required"),
-        "spectral_radius": Variable(found.radius, plants, "1", "of the loop at its own gains"),
-        "gain_margin": Variable(found.margin, plants, "1", "common gain factor before instability"),
-        "frequency": Variable(
-            found.frequency_hz, modes, "Hz", "of link modes under control, three of each order"
+        "passes": Variable(certificate.passes, plants, "1", "stable with the margin required"),
+        "spectral_radius": Variable(
+            certificate.radius, plants, "1", "of the loop at its own gains"
         ),
-        "damping_ratio": Variable(found.damping_ratio, modes, "1", "their damping ratios"),
-        "free_damping_ratio": Variable(found.free_damping, modes, "1", "without control"),
-        "least_damped": Variable(found.weakest, plants, "1", "mode of least damping"),
-        "broken_by": Variable(found.breaking, plants, "1", "what goes unstable beyond the margin"),
+        "gain_margin": Variable(
+            certificate.margin, plants, "1", "common gain factor before instability"
+        ),
+        "frequency": Variable(
+            certificate.frequency_hz,
+            modes,
+            "Hz",
+            "of link modes under control, three of each order",
+        ),
+        "damping_ratio": Variable(certificate.damping_ratio, modes, "1", "their damping ratios"),
+        "free_damping_ratio": Variable(certificate.free_damping, modes, "1", "without control"),
+        "least_damped": Variable(certificate.weakest, plants, "1", "mode of least damping"),
+        "broken_by": Variable(
+            certificate.breaking, plants, "1", "what goes unstable beyond the margin"
+        ),
         "observation": Variable(
-            found.observation,
+            certificate.observation,
             (*place, "link", "channel", "link_mode"),
             "1",
             "channel signal per modal coordinate of the plant (SRF: V/m)",
         ),
         "actuation": Variable(
-            found.actuation,
+            certificate.actuation,
             (*place, "link", "link_mode", "channel"),
             "1",
             "modal force on the plant per force of a channel (SRF: N/V)",
         ),
-        "required_margin": Variable(np.array(found.required), (), "1", "gain margin required"),
+        "required_margin": Variable(
+            np.array(certificate.required), (), "1", "gain margin required"
+        ),
     }
     if laws is None:
         return part

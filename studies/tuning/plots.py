@@ -17,15 +17,15 @@ GREY = "#999999"
 OBJECTIVE = "objective (baseline: 1)"
 
 
-def descent(spec: TuneSpec, found: TuneFindings) -> Figure:
+def descent(spec: TuneSpec, findings: TuneFindings) -> Figure:
     """Best objective that keeps the limits, over iterations, by family; thin: every start."""
     with figures.styled():
         figure, ax = figures.one_panel(3.6)
-        history = found.at.history[: int(found.at.iteration)]
+        history = findings.at.history[: int(findings.at.iteration)]
         best = np.fmin.accumulate(np.where(history[..., 1] <= KEPT, history[..., 0], np.nan))
         iteration = np.arange(1, len(best) + 1)
         for k, family in enumerate(spec.moving):
-            members = best[:, found.at.family == k]
+            members = best[:, findings.at.family == k]
             color = figures.SERIES[k % len(figures.SERIES)]
             dash = figures.DASHES[(k // len(figures.SERIES)) % len(figures.DASHES)]
             ax.plot(iteration, members, color=color, linewidth=0.4, alpha=0.5)
@@ -40,7 +40,7 @@ def descent(spec: TuneSpec, found: TuneFindings) -> Figure:
     return figure
 
 
-def gains(spec: TuneSpec, found: TuneFindings) -> Figure:
+def gains(spec: TuneSpec, findings: TuneFindings) -> Figure:
     """What each family gains on fresh machines, one panel for each move."""
     with figures.styled():
         rows = len(spec.families)
@@ -48,7 +48,7 @@ def gains(spec: TuneSpec, found: TuneFindings) -> Figure:
         axes = figure.subplots(1, len(spec.moves), squeeze=False, sharex=True, sharey=True)[0]
         count = spec.tune.scenarios.check
         for k, (ax, move) in enumerate(zip(axes, spec.moves, strict=True)):
-            for row, one in enumerate(found.judged):
+            for row, one in enumerate(findings.judged):
                 value, first = one.objective[k * count : (k + 1) * count], row == 0
                 ax.plot(
                     value,
@@ -75,34 +75,34 @@ def gains(spec: TuneSpec, found: TuneFindings) -> Figure:
     return figure
 
 
-def front(spec: TuneSpec, found: TuneFindings, limit: str) -> Figure:
+def front(spec: TuneSpec, findings: TuneFindings, limit: str) -> Figure:
     """Objective over a limited metric: random designs, the tuned ones, the study.
 
     Args:
         spec: of the tuning.
-        found: what it found.
+        findings: what it found.
         limit: metric along the abscissa, one of `spec.metric_limits`.
     """
     with figures.styled():
         figure, ax = figures.one_panel(4.2)
         column = spec.metric_limits.index(limit)
-        if found.searched is not None:
-            seen, kept = found.searched, is_kept(spec, found.searched)
+        if findings.searched is not None:
+            search, kept = findings.searched, is_kept(spec, findings.searched)
             for chosen, color, label in (
-                (np.isfinite(seen.objective) & ~kept, "#CCCCCC", "random, a limit violated"),
+                (np.isfinite(search.objective) & ~kept, "#CCCCCC", "random, a limit violated"),
                 (kept, figures.SERIES[0], "random, all limits satisfied"),
             ):
                 if chosen.any():
                     ax.scatter(
-                        seen.peaks[chosen, column],
-                        seen.objective[chosen],
+                        search.peaks[chosen, column],
+                        search.objective[chosen],
                         s=5,
                         color=color,
                         linewidths=0,
                         label=label,
                         rasterized=True,
                     )
-        at = found.at
+        at = findings.at
         done = np.isfinite(at.best_objective) & (excess(at.best_limits) == 0)
         ax.plot(
             at.best_peaks[done, column],
@@ -112,7 +112,7 @@ def front(spec: TuneSpec, found: TuneFindings, limit: str) -> Figure:
             markersize=4,
             label="every starting point, machines of the tuning",
         )
-        points = [(x.metrics[limit].max(), x.objective.mean()) for x in found.judged]
+        points = [(x.metrics[limit].max(), x.objective.mean()) for x in findings.judged]
         line = np.array(
             [p for p, family in zip(points, spec.families, strict=True) if family.front]
         )
@@ -126,7 +126,7 @@ def front(spec: TuneSpec, found: TuneFindings, limit: str) -> Figure:
                 label="Pareto front, on fresh machines",
             )
         marks = iter("^vD*P<>")
-        own = found.own.metrics[limit].max(), found.own.objective.mean()
+        own = findings.own.metrics[limit].max(), findings.own.objective.mean()
         ax.plot(*own, "s", color="black", label="baseline")
         for point, family in zip(points, spec.families, strict=True):
             if not family.front:
@@ -148,5 +148,5 @@ def front(spec: TuneSpec, found: TuneFindings, limit: str) -> Figure:
 
 
 def _label(metric: str) -> str:
-    found = METRICS[metric.partition("[")[0]]
-    return f"{found.text} [{found.unit}]"
+    metric_field = METRICS[metric.partition("[")[0]]
+    return f"{metric_field.text} [{metric_field.unit}]"

@@ -56,57 +56,57 @@ class TuneFindings(NamedTuple):
 
 
 def report(
-    spec: TuneSpec, found: TuneFindings, folder: str = "", images: Path | None = None
+    spec: TuneSpec, findings: TuneFindings, folder: str = "", images: Path | None = None
 ) -> str:
     """The page of a tuning.
 
     Args:
         spec: of the tuning.
-        found: what it found.
+        findings: what it found.
         folder: that holds the tuned studies, for commands.
         images: folder with the figures; None: a page without.
     """
-    at, seen = found.at, found.searched
-    worst = max(found.audited, key=lambda entry: entry.share)
-    names = list(found.own.metrics)
+    at, search = findings.at, findings.searched
+    worst = max(findings.audited, key=lambda entry: entry.share)
+    names = list(findings.own.metrics)
     return page(
         "tuning/report.html",
         images,
         {"Tuning file": toml_text(spec.data), "Study file": study_template(spec.study)},
         spec=spec,
         tune=spec.tune,
-        found=found,
+        findings=findings,
         ended=ended(spec, at),
         n_frozen=int(at.is_frozen.sum()),
         names_links=all(parse_entries(name).names_a_link for name in spec.tune.objective),
         lower=LOWER,
-        best=_best(spec, found),
-        references=reference_lines(spec, found.own, found.references),
-        unmeasured=_unmeasured(spec, found),
+        best=_best(spec, findings),
+        references=reference_lines(spec, findings.own, findings.references),
+        unmeasured=_unmeasured(spec, findings),
         folder=f"{folder}/" if folder else "",
         heads=[headed(x, METRICS[parse_entries(x).metric].unit) for x in names],
-        own=_own_machine(spec, found, names),
+        own=_own_machine(spec, findings, names),
         n_modes=max(MARGIN_MODES, spec.study.link.modes),
-        fresh=_fresh(spec, found, names),
+        fresh=_fresh(spec, findings, names),
         metrics=names,
-        changes=_changes(spec, found, names),
-        limits=_limits(spec, found),
+        changes=_changes(spec, findings, names),
+        limits=_limits(spec, findings),
         front=spec.tune.pareto.get("limit", spec.metric_limits[0]) if spec.metric_limits else "",
         families=[family.name for family in spec.moving],
-        numbers=_numbers(spec, found),
+        numbers=_numbers(spec, findings),
         alike=ALIKE,
         pole_header=HEADER,
         poles=[
             (name, difference(one.poles), pole_rows(one.poles))
-            for name, one in _designs(spec, found)
+            for name, one in _designs(spec, findings)
             if one.poles is not None
         ],
-        centers=_centers(spec, found) if PLACEMENT in spec.tune.free else [],
+        centers=_centers(spec, findings) if PLACEMENT in spec.tune.free else [],
         main=spec.families[spec.main].name,
-        searched=seen,
-        kept=seen.objective[is_kept(spec, seen)] if seen is not None else [],
+        searched=search,
+        kept=search.objective[is_kept(spec, search)] if search is not None else [],
         tuned=at.best_objective[at.winner(spec.main)],
-        fidelity=_fidelity(spec, found),
+        fidelity=_fidelity(spec, findings),
         worst=worst,
         worst_name=PLACEMENT if worst.name.startswith(PLACEMENT) else worst.name,
         allowed=ALLOWED,
@@ -117,19 +117,19 @@ def report(
 
 def ended(spec: TuneSpec, at: Progress) -> str:
     """Why a tuning ended, in a sentence."""
-    done, asked = int(at.iteration), spec.tune.iterations
-    if done < asked:
+    done, total = int(at.iteration), spec.tune.iterations
+    if done < total:
         return (
-            f"Ended after {done} of {asked} iterations: for {PATIENCE} no family had gained "
+            f"Ended after {done} of {total} iterations: for {PATIENCE} no family had gained "
             f"{100 * GAIN:g} %."
         )
-    return f"Ended after all {asked} iterations ({spec.tune.method})."
+    return f"Ended after all {total} iterations ({spec.tune.method})."
 
 
-def _best(spec: TuneSpec, found: TuneFindings) -> dict[str, Any]:
+def _best(spec: TuneSpec, findings: TuneFindings) -> dict[str, Any]:
     """The design to recommend, and its figures beside the baseline's, the worse ones last."""
-    k = best_family(spec, found)
-    one, own, family = found.judged[k], found.own, spec.families[k]
+    k = best_family(spec, findings)
+    one, own, family = findings.judged[k], findings.own, spec.families[k]
     gains = [
         _metric_gain(metric, one, own) for metric in dict.fromkeys((*spec.tune.objective, *SHOWN))
     ]
@@ -141,7 +141,7 @@ def _best(spec: TuneSpec, found: TuneFindings) -> dict[str, Any]:
         "gains": sorted(gains, key=lambda gain: gain["is_worse"]),
         "objective": one.objective,
         "caution": caution(one.loop.gain_margin) if one.loop is not None else "",
-        "is_violated": found.at.beyond(found.at.winner(k)) > 0,
+        "is_violated": findings.at.beyond(findings.at.winner(k)) > 0,
     }
 
 
@@ -192,13 +192,13 @@ def _relative(before: float, after: float) -> str:
     return f"{100 * (after / before - 1):+.3g} %" if before else ""
 
 
-def best_family(spec: TuneSpec, found: TuneFindings) -> int:
+def best_family(spec: TuneSpec, findings: TuneFindings) -> int:
     """Index of the family to recommend: limits kept first, then the least objective."""
 
     def rank(k: int) -> tuple[bool, bool, float]:
         is_moving = k < len(spec.moving)
-        beyond = found.at.beyond(found.at.winner(k)) if is_moving else 0.0
-        value = found.judged[k].objective.mean()
+        beyond = findings.at.beyond(findings.at.winner(k)) if is_moving else 0.0
+        value = findings.judged[k].objective.mean()
         return beyond > 0, not np.isfinite(value), value
 
     return min(range(len(spec.moving)), key=rank)
@@ -211,33 +211,33 @@ def file_name(spec: TuneSpec, family: Family) -> str:
     return f"tuned_{label(family.name)}.toml"
 
 
-def summary(spec: TuneSpec, found: TuneFindings) -> list[str]:
+def summary(spec: TuneSpec, findings: TuneFindings) -> list[str]:
     """What improved, one line per family."""
     machines = count_text(spec.tune.scenarios.check, "fresh machine")
     lines = []
-    for k, (family, one) in enumerate(zip(spec.families, found.judged, strict=True)):
+    for k, (family, one) in enumerate(zip(spec.families, findings.judged, strict=True)):
         is_moving = k < len(spec.moving)
-        lost = is_moving and found.at.beyond(found.at.winner(k)) > 0
+        lost = is_moving and findings.at.beyond(findings.at.winner(k)) > 0
         lines.append(
             f"{family.name}: {one.objective.mean():.4f} of the baseline's objective on {machines}"
             + (f", worst {one.objective.max():.4f}" if len(one.objective) > 1 else "")
             + ("; a limit is violated" if lost else "")
         )
-    lines += reference_lines(spec, found.own, found.references)
-    return lines + _unmeasured(spec, found)
+    lines += reference_lines(spec, findings.own, findings.references)
+    return lines + _unmeasured(spec, findings)
 
 
-def _unmeasured(spec: TuneSpec, found: TuneFindings) -> list[str]:
+def _unmeasured(spec: TuneSpec, findings: TuneFindings) -> list[str]:
     """Warnings of what is compared though the controller cannot measure it."""
-    designs = [one for _, one in _designs(spec, found)]
-    return resolution_lines(spec, designs, found.references.adc_step)
+    designs = [one for _, one in _designs(spec, findings)]
+    return resolution_lines(spec, designs, findings.references.adc_step)
 
 
-def _designs(spec: TuneSpec, found: TuneFindings) -> list[tuple[str, JudgedDesign]]:
+def _designs(spec: TuneSpec, findings: TuneFindings) -> list[tuple[str, JudgedDesign]]:
     """The baseline, the best design of every family, what they have to beat; by name."""
     names = [family.name for family in spec.families]
-    compared = found.references.designs
-    return [(REFERENCE, found.own), *zip(names, found.judged, strict=True), *compared]
+    compared = findings.references.designs
+    return [(REFERENCE, findings.own), *zip(names, findings.judged, strict=True), *compared]
 
 
 def _value(metric: str, values: Mapping[str, Any], watched: float) -> str:
@@ -248,10 +248,10 @@ def _value(metric: str, values: Mapping[str, Any], watched: float) -> str:
     return number(value, METRICS[parse_entries(metric).metric].unit)
 
 
-def _own_machine(spec: TuneSpec, found: TuneFindings, names: list[str]) -> list[list[str]]:
+def _own_machine(spec: TuneSpec, findings: TuneFindings, names: list[str]) -> list[list[str]]:
     """Row of each design on the machine of its own file; `names`: of metrics."""
     rows, files = [], ["study.toml", *(file_name(spec, family) for family in spec.moving)]
-    for k, (name, one) in enumerate(_designs(spec, found)):
+    for k, (name, one) in enumerate(_designs(spec, findings)):
         cells = [_value(metric, one.own.metrics, one.own.watched) for metric in names]
         loop = ["-"] * 3
         if one.loop is not None:
@@ -266,10 +266,10 @@ def _own_machine(spec: TuneSpec, found: TuneFindings, names: list[str]) -> list[
     return rows
 
 
-def _fresh(spec: TuneSpec, found: TuneFindings, names: list[str]) -> list[list[str]]:
+def _fresh(spec: TuneSpec, findings: TuneFindings, names: list[str]) -> list[list[str]]:
     """Row of each design on the worst of all fresh machines and moves; `names`: of metrics."""
     rows = []
-    for name, one in _designs(spec, found):
+    for name, one in _designs(spec, findings):
         worst = [int(np.argmax(np.nan_to_num(one.metrics[x], nan=-np.inf))) for x in names]
         cells = [
             _value(x, {x: one.metrics[x][k]}, one.watched[k])
@@ -280,10 +280,10 @@ def _fresh(spec: TuneSpec, found: TuneFindings, names: list[str]) -> list[list[s
     return rows
 
 
-def _changes(spec: TuneSpec, found: TuneFindings, names: list[str]) -> list[list[str]]:
+def _changes(spec: TuneSpec, findings: TuneFindings, names: list[str]) -> list[list[str]]:
     """Row of each design and move: changes of the mean over the fresh machines."""
-    count, own, rows = spec.tune.scenarios.check, found.own, []
-    for name, one in _designs(spec, found)[1:]:
+    count, own, rows = spec.tune.scenarios.check, findings.own, []
+    for name, one in _designs(spec, findings)[1:]:
         for k, move in enumerate(spec.moves):
             part = slice(k * count, (k + 1) * count)
             changes = [_change(1.0, one.objective[part].mean())]
@@ -298,15 +298,15 @@ def _change(before: float, after: float) -> str:
     return f"{100 * (after / before - 1):+.1f} %" if before else f"{after:.3g} (was 0)"
 
 
-def _limits(spec: TuneSpec, found: TuneFindings) -> list[tuple[str, list[dict[str, Any]]]]:
+def _limits(spec: TuneSpec, findings: TuneFindings) -> list[tuple[str, list[dict[str, Any]]]]:
     """Limits of each family on the scenarios of the tuning."""
     by_family = []
     for k, family in enumerate(spec.moving):
-        excesses = found.at.best_limits[found.at.winner(k)]
+        excesses = findings.at.best_limits[findings.at.winner(k)]
         limits = []
         for name, beyond in zip(spec.limit_names, excesses, strict=True):
             limit = family.limits[name]
-            left = _loop_margin(found, k, name, limit) if name in LOOP_LIMITS else -float(beyond)
+            left = _loop_margin(findings, k, name, limit) if name in LOOP_LIMITS else -float(beyond)
             limits.append(
                 {
                     "name": name,
@@ -319,9 +319,9 @@ def _limits(spec: TuneSpec, found: TuneFindings) -> list[tuple[str, list[dict[st
     return by_family if spec.limit_names else []
 
 
-def _loop_margin(found: TuneFindings, k: int, name: str, limit: float | str) -> float:
+def _loop_margin(findings: TuneFindings, k: int, name: str, limit: float | str) -> float:
     """How far a figure of the loop is from its limit, as a share of it; nan if not known."""
-    loop, own = found.judged[k].loop, found.own.loop
+    loop, own = findings.judged[k].loop, findings.own.loop
     if loop is None or own is None:
         return float("nan")
     allowed = getattr(own, name) if limit == BASELINE else float(limit)
@@ -338,9 +338,9 @@ def _state(beyond: float, left: float) -> str:
     return "active" if left < NEAR else "inactive"
 
 
-def _numbers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
+def _numbers(spec: TuneSpec, findings: TuneFindings) -> list[list[str]]:
     """Row of each free parameter but those of the placement, which `_centers` shows in mm."""
-    at, families, rows = found.at, spec.moving, []
+    at, families, rows = findings.at, spec.moving, []
     places = [at.best_place[at.winner(k)] for k in range(len(families))]
     alike = [at.best_place[_alike(at, k)] for k in range(len(families))]
     for n, free in enumerate(spec.free.numbers):
@@ -358,9 +358,9 @@ def _numbers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
     return rows
 
 
-def _centers(spec: TuneSpec, found: TuneFindings) -> list[list[str]]:
+def _centers(spec: TuneSpec, findings: TuneFindings) -> list[list[str]]:
     """Row of each design: its patch centres [mm], which the free parameters do not show."""
-    at, unmoved = found.at, np.full(len(spec.free.numbers), np.nan)
+    at, unmoved = findings.at, np.full(len(spec.free.numbers), np.nan)
     designs = [(REFERENCE, spec.moving[0]._replace(columns={}), unmoved)]
     for k, family in enumerate(spec.moving):
         place = at.best_place[at.winner(k)]
@@ -380,20 +380,20 @@ def _alike(at: Progress, family: int) -> np.ndarray:
     return np.flatnonzero((at.family == family) & is_near & is_kept)
 
 
-def is_kept(spec: TuneSpec, seen: RandomSearch) -> np.ndarray:
+def is_kept(spec: TuneSpec, search: RandomSearch) -> np.ndarray:
     """Which random designs finish and keep all limits, (n,)."""
-    loop = seen.beyond_loop if spec.loop_limits else np.full(len(seen.objective), -np.inf)
-    return np.isfinite(seen.objective) & (excess(seen.limits) == 0) & (loop <= KEPT)
+    loop = search.beyond_loop if spec.loop_limits else np.full(len(search.objective), -np.inf)
+    return np.isfinite(search.objective) & (excess(search.limits) == 0) & (loop <= KEPT)
 
 
-def _fidelity(spec: TuneSpec, found: TuneFindings) -> dict[str, Any] | None:
+def _fidelity(spec: TuneSpec, findings: TuneFindings) -> dict[str, Any] | None:
     """Linear residual vibration compared with that of runs; None if there are too few."""
-    kept = excess(found.at.best_limits) == 0
-    linear, residual = found.linear[kept], found.residual[kept]
-    if found.searched is not None:
-        stable = found.searched.beyond_loop <= KEPT
-        linear = np.concatenate([linear, found.searched.linear[stable]])
-        residual = np.concatenate([residual, found.searched.residual[stable]])
+    kept = excess(findings.at.best_limits) == 0
+    linear, residual = findings.linear[kept], findings.residual[kept]
+    if findings.searched is not None:
+        stable = findings.searched.beyond_loop <= KEPT
+        linear = np.concatenate([linear, findings.searched.linear[stable]])
+        residual = np.concatenate([residual, findings.searched.residual[stable]])
     is_known = np.isfinite(linear) & np.isfinite(residual) & (residual > 0)
     if is_known.sum() < 3:
         return None
@@ -424,7 +424,7 @@ def _codes(judged: JudgedDesign) -> str:
     return ", ".join(f"{count} {status.REASONS[int(code)]}" for code, count in pairs)
 
 
-def unkept(spec: TuneSpec, at: Progress) -> list[str]:
+def violated_limits(spec: TuneSpec, at: Progress) -> list[str]:
     """Limits that no start of a family keeps, one line per family; empty if all are kept."""
     lines = []
     for k, family in enumerate(spec.moving):

@@ -37,7 +37,7 @@ from studies.tuning.report import (
     file_name,
     report,
     summary,
-    unkept,
+    violated_limits,
 )
 from studies.tuning.results import variables
 from studies.tuning.spec import TuneSpec
@@ -85,11 +85,11 @@ def run_tuning(
         if before is not None and not fits(spec, before):
             raise StudyError(f"{out / PROGRESS}: damaged; name a new folder")
         with Phases(console, tune_phases(spec), is_quiet) as phases:
-            found = _tuned(spec, out, before, evaluator, phases)
-    faults = unkept(spec, found.at)
+            findings = _tune(spec, out, before, evaluator, phases)
+    faults = violated_limits(spec, findings.at)
     if faults:
         raise StudyError("tune.limits: not satisfied together; " + "; ".join(faults))
-    return found
+    return findings
 
 
 def tune_phases(spec: TuneSpec) -> tuple[str, ...]:
@@ -98,7 +98,7 @@ def tune_phases(spec: TuneSpec) -> tuple[str, ...]:
     return ("compile", "descend", "check", *random, "compare derivatives", "draw")
 
 
-def _tuned(
+def _tune(
     spec: TuneSpec,
     out: Path,
     before: Progress | None,
@@ -116,7 +116,7 @@ def _tuned(
         if phases.present == "compile":  # the first iteration compiles
             phases.begin("descend")
         done, total = int(at.iteration), spec.tune.iterations
-        phases.advance(done, total, _told(spec, at), clock.left(total - done))
+        phases.advance(done, total, _progress_text(spec, at), clock.left(total - done))
 
     at = optimise(spec, evaluator, before, keep)
     lost = [f.name for k, f in enumerate(spec.moving) if not _has_finished(at, k)]
@@ -126,12 +126,12 @@ def _tuned(
             "with the family's settings should be one that does (try studies simulate)"
         )
     phases.say(ended(spec, at))
-    found = find(spec, evaluator, at, phases)
+    findings = find(spec, evaluator, at, phases)
     phases.begin("draw")
-    _write(spec, found, out)
-    for line in summary(spec, found):
+    _write(spec, findings, out)
+    for line in summary(spec, findings):
         phases.say(line)
-    return found
+    return findings
 
 
 class _Clock:
@@ -153,7 +153,7 @@ def _has_finished(at: Progress, family: int) -> bool:
     return bool(np.isfinite(at.best_objective[at.family == family]).any())
 
 
-def _told(spec: TuneSpec, at: Progress) -> str:
+def _progress_text(spec: TuneSpec, at: Progress) -> str:
     parts = []
     for k, family in enumerate(spec.moving):
         best = at.winner(k)
@@ -219,8 +219,8 @@ def find(spec: TuneSpec, evaluator: Evaluator, at: Progress, phases: Phases) -> 
     )
 
 
-def _write(spec: TuneSpec, found: TuneFindings, out: Path) -> None:
-    at = found.at
+def _write(spec: TuneSpec, findings: TuneFindings, out: Path) -> None:
+    at = findings.at
     studies = {"study.toml": spec.study}
     for k, family in enumerate(spec.moving):
         values = spec.free.values(at.best_place[at.winner(k)])
@@ -228,16 +228,16 @@ def _write(spec: TuneSpec, found: TuneFindings, out: Path) -> None:
         title = f"{spec.study.title or 'study'}, tuned: {family.name}"
         studies[file_name(spec, family)] = tuned.model_copy(update={"title": title})
     attributes = run_attributes(spec.study) | {"tuning": json.dumps(spec.data)}
-    best = spec.moving[best_family(spec, found)]
+    best = spec.moving[best_family(spec, findings)]
     with publish(out) as staging:
         for name, study in studies.items():
             (staging / name).write_text(study_template(study), encoding="utf-8")
-        write_store(staging / RESULTS, variables(spec, found), attributes)
+        write_store(staging / RESULTS, variables(spec, findings), attributes)
         with styled():
             write_figure(sketch(studies[file_name(spec, best)]), staging / "machine.png")
-        save(plots.descent(spec, found), staging, "descent")
-        save(plots.gains(spec, found), staging, "gains")
+        save(plots.descent(spec, findings), staging, "descent")
+        save(plots.gains(spec, findings), staging, "gains")
         for limit in spec.metric_limits[:1]:
-            front = plots.front(spec, found, spec.tune.pareto.get("limit", limit))
+            front = plots.front(spec, findings, spec.tune.pareto.get("limit", limit))
             save(front, staging, "front")
-        (staging / REPORT).write_text(report(spec, found, str(out), staging), encoding="utf-8")
+        (staging / REPORT).write_text(report(spec, findings, str(out), staging), encoding="utf-8")
