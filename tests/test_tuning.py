@@ -22,7 +22,7 @@ from studies.tuning.evaluate import Evaluation
 from studies.tuning.folder import load_progress, save_progress
 from studies.tuning.linear_fidelity import loop_figures
 from studies.tuning.optimise import advance, begin, optimise, start_families
-from studies.tuning.report import unkept
+from studies.tuning.report import violated_limits
 from studies.tuning.run import make_evaluator
 from studies.tuning.scenarios import scenario_columns
 from studies.tuning.spec import Family, Tune, TuneSpec
@@ -166,7 +166,7 @@ def test_tuning_goes_downhill_within_limits(judged, tuned):
     still = ~spec.moving[0].is_free
     own = np.broadcast_to(spec.free.places()[still], (STARTS, still.sum()))
     np.testing.assert_array_equal(end.best_place[:STARTS][:, still], own)
-    assert not unkept(spec, end)
+    assert not violated_limits(spec, end)
 
 
 def test_resumed_tuning_equals_an_uninterrupted_one(judged, tuned, tmp_path):
@@ -325,7 +325,7 @@ def test_limits_that_contradict_are_named():
         at = begin(spec, evaluator)
         place = np.array([[0.05], [0.95], [0.4], [0.5]])
         end = optimise(spec, evaluator, at._replace(place=place), lambda at: None)
-        told = unkept(spec, end)
+        told = violated_limits(spec, end)
         assert len(told) == 1 and message in told[0] and told[0].startswith("known: ")
 
 

@@ -25,9 +25,9 @@ def limits_text(run: Run) -> str:
         "an actuator at its limit": float(metrics.saturated_fraction),
         "a motor at its limit": float(metrics.motor_saturated_fraction),
     }
-    told = [
+    warnings = [
         f"{100 * share:.2g} % of the samples have {what}"
         for what, share in shares.items()
         if share > 0
     ]
-    return f"CAUTION: {'; '.join(told)}." if told and run.status == status.OK else ""
+    return f"CAUTION: {'; '.join(warnings)}." if warnings and run.status == status.OK else ""
