@@ -47,7 +47,7 @@ from studies.study.files import READY, read_toml
 from studies.study.spec import load_study
 from studies.sweeps.show import print_cases, ranked_cases, show
 from studies.tuning.folder import open_tuning, save_progress
-from studies.tuning.optimise import Progress, fits, start_families
+from studies.tuning.optimise import Progress, is_compatible, start_families
 from studies.tuning.spec import load_tuning
 from tests.sweeps import small
 from tests.tunings import EVERY_KIND, tuning
@@ -254,7 +254,7 @@ def read_tuning_folder(path):
         path, {"spec": spec.data, "code": "", "jaxlib": "", "precision": ""}, True
     ) as at:
         if at is not None:
-            fits(spec, at)
+            is_compatible(spec, at)
 
 
 KINDS = {

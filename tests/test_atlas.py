@@ -58,12 +58,12 @@ def atlas(tmp_path_factory):
     folder, kept = tmp_path_factory.mktemp("atlas") / "out", {}
 
     def look(*arguments):
-        kept["found"] = findings.look_around(*arguments)
+        kept["found"] = findings.evaluate_atlas(*arguments)
         return kept["found"]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "atlas_sweep", partial(subsets.atlas_sweep, settings=SETTINGS))
-        patch.setattr(run, "look_around", look)
+        patch.setattr(run, "evaluate_atlas", look)
         patch.setattr(run, "FIGURES", {n: drawn(n) for n in figures.FIGURES})
         patch.setattr(figures, "CLIP", (-0.002, 0.002, 1e-3))
         patch.setattr(findings, "map_workspace", partial(workspace.map_workspace, count=9))

@@ -135,9 +135,9 @@ class FakeCluster:
         self.most = max(self.most, len(self.flying))
         return future
 
-    def landed(self, flying):
+    def finished(self, pending):
         """One at a time, the latest first."""
-        last = max(flying)
+        last = max(pending)
         self.flying.discard(last)
         return [last]
 

@@ -446,7 +446,7 @@ def test_damping_is_that_of_links_that_control_the_mode():
     np.testing.assert_allclose(view.damping(1.0)[:2], zeta[:2].max(axis=1), rtol=1e-6)
     assert view.damping(1.0)[0] > 0.2 and view.damping(0.0)[0] < 0.02
     # as much as the design damps, with no larger gains: beyond its peak damping falls again
-    factor = view.fair(2.0, view.damping(1.0)[0])
+    factor = view.matched_factor(2.0, view.damping(1.0)[0])
     assert 0.9 < factor <= 1
     np.testing.assert_allclose(view.damping(factor)[0], view.damping(1.0)[0], rtol=1e-2)
     # no gains at all leave every margin

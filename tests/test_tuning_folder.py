@@ -27,7 +27,7 @@ from studies.tuning.evaluate import Evaluation, Evaluator
 from studies.tuning.folder import open_tuning
 from studies.tuning.linear_fidelity import DesignFigures
 from studies.tuning.objective import objective_of
-from studies.tuning.optimise import begin, fits
+from studies.tuning.optimise import begin, is_compatible
 from studies.tuning.report import TuneFindings, report
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import load_tuning, parse_tuning
@@ -345,9 +345,9 @@ def test_progress_of_other_shapes_is_damaged():
     spec = tuning(GAIN, starts=2, iterations=3)
     linear = SimpleNamespace(screen=lambda k, values: np.zeros((2, len(values))))
     at = begin(spec, SimpleNamespace(linear=linear))
-    assert fits(spec, at) and fits(spec._replace(tune=spec.tune.model_copy()), at)
-    assert not fits(spec, at._replace(best_place=at.best_place[:1]))
-    assert not fits(tuning(GAIN, starts=3, iterations=3), at)
+    assert is_compatible(spec, at) and is_compatible(spec._replace(tune=spec.tune.model_copy()), at)
+    assert not is_compatible(spec, at._replace(best_place=at.best_place[:1]))
+    assert not is_compatible(tuning(GAIN, starts=3, iterations=3), at)
 
 
 def test_own_limits_need_something_to_be_a_share_of():

@@ -32,14 +32,14 @@ class Signs(NamedTuple):
 def table_1_signs(subsets: Subsets) -> Signs:
     """Our Table 1: three links with two modes each, the others with the first mode only."""
     table = np.array(TABLE_1).T
-    columns = [_modes_of(subsets, TABLE_1_LINKS[0], 2)]
-    columns += [_modes_of(subsets, links, 1) for links in TABLE_1_LINKS[1:]]
+    columns = [_subset_number(subsets, TABLE_1_LINKS[0], 2)]
+    columns += [_subset_number(subsets, links, 1) for links in TABLE_1_LINKS[1:]]
     peak = subsets.peak[:, :, :, 0]
     on = (np.array(TABLE_1_LINKS)[:, None] >> np.arange(3)) & 1
     return Signs(table[1:] / table[0] - 1, peak[:, columns] / peak[:, :1] - 1, on.astype(bool))
 
 
-def _modes_of(subsets: Subsets, links: int, count: int) -> int:
+def _subset_number(subsets: Subsets, links: int, count: int) -> int:
     """Number of the subset with the first modes of some links."""
     modes = subsets.modes
     players = (i * modes + j for i in range(3) if links >> i & 1 for j in range(min(count, modes)))
@@ -69,16 +69,16 @@ def one_more_link(subsets: Subsets) -> LinkSteps:
     return LinkSteps(labels, on.astype(bool), after / before - 1)
 
 
-class Halved(NamedTuple):
+class PairChanges(NamedTuple):
     """Two controlled links: change of the platform's residual error."""
 
     labels: list[str]  # "1+2", (3,)
     change: np.ndarray  # [1], (settings, 3)
 
 
-def two_links(subsets: Subsets) -> Halved:
+def two_links(subsets: Subsets) -> PairChanges:
     """The paper's claim: with two links controlled the residual error falls by more than 50 %."""
     pairs = [1 << i | 1 << k for i, k in combinations(range(3), 2)]
     error = subsets.platform[..., subsets.link_subsets]
     change = error[..., pairs] / error[..., :1] - 1
-    return Halved([link_label(pair) for pair in pairs], change)
+    return PairChanges([link_label(pair) for pair in pairs], change)

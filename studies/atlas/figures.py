@@ -73,7 +73,7 @@ def _lattice(findings: AtlasFindings) -> Figure:
     return figure
 
 
-def _helps(findings: AtlasFindings) -> Figure:
+def _effects(findings: AtlasFindings) -> Figure:
     figure, axes = _panels(findings, 1.5)
     for ax, change in zip(axes, _link_changes(findings), strict=True):
         image = plots.change_map(effects(1 + change), _COLUMNS[:3], _COLUMNS, ax)
@@ -274,7 +274,7 @@ def _responses(findings: AtlasFindings) -> Figure:
 #: What draws each figure, by its name.
 FIGURES: dict[str, Callable[[AtlasFindings], Figure]] = {
     "subsets": _subsets,
-    "helps": _helps,
+    "helps": _effects,
     "lattice": _lattice,
     "shares": _shares,
     "interactions": _interactions,

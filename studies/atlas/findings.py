@@ -40,7 +40,7 @@ class AtlasFindings(NamedTuple):
         return setting_label(self.subsets.setting[k]) + (" †" if is_small else "")
 
 
-def look_around(study: Study, subsets: Subsets, on_progress: ProgressCallback) -> AtlasFindings:
+def evaluate_atlas(study: Study, subsets: Subsets, on_progress: ProgressCallback) -> AtlasFindings:
     """All of the atlas except the runs of the subsets.
 
     Args:

@@ -92,7 +92,7 @@ def platform_error(study: Study, on_progress: Any = None) -> PlatformError:
     assert quiet.record is not None and active.record is not None
     count = len(SETTINGS)
 
-    def joined(name: str) -> np.ndarray:
+    def join(name: str) -> np.ndarray:
         off = getattr(quiet.record, name)[::2, None]
         on = getattr(active.record, name)
         return np.concatenate([off, on.reshape(count, len(LINK_SETS) - 1, *on.shape[1:])], axis=1)
@@ -107,9 +107,9 @@ def platform_error(study: Study, on_progress: Any = None) -> PlatformError:
         command_end=end,
         window=window,
         drive=drive,
-        vibration=joined("pose_error") - drive[:, None],
-        pose=joined("pose"),
-        modal=joined("modal_coordinate"),
+        vibration=join("pose_error") - drive[:, None],
+        pose=join("pose"),
+        modal=join("modal_coordinate"),
     )
 
 

@@ -28,7 +28,7 @@ def length_text(value: float) -> str:
     return f"{1e6 * value:.3g} µm"
 
 
-def _whole(value: float, sign: str = "+") -> str:
+def _signed(value: float, sign: str = "+") -> str:
     """A whole number with its sign; no sign at zero."""
     text = f"{value:{sign}.0f}"
     return "0" if text in ("+0", "-0") else text
@@ -55,7 +55,7 @@ def change_map(
         ax.text(
             column,
             row,
-            _whole(value),
+            _signed(value),
             ha="center",
             va="center",
             fontsize=SMALL,
@@ -127,7 +127,7 @@ def share_map(share: np.ndarray, ax: Axes | None = None) -> Axes:
     ax = axes_or_new(ax)
     change_map(-share, [f"link {i + 1}" for i in range(3)], modes, ax)
     for text, value in zip(ax.texts, 100 * share.ravel(), strict=True):
-        text.set_text(_whole(value, "-"))
+        text.set_text(_signed(value, "-"))
     return ax
 
 

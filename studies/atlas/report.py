@@ -28,7 +28,7 @@ def report(findings: AtlasFindings, dropped: list[str], images: Path | None = No
     """The page of an atlas.
 
     Args:
-        findings: from `look_around`.
+        findings: from `evaluate_atlas`.
         dropped: settings left out, and why.
         images: folder with the figures; None: a page without.
     """
@@ -73,7 +73,7 @@ def _by_setting(findings: AtlasFindings, cells: Iterable[Iterable[str]]) -> list
     """Row of each setting.
 
     Args:
-        findings: from `look_around`.
+        findings: from `evaluate_atlas`.
         cells: of each setting, after its name.
     """
     return [[findings.setting(k), *row] for k, row in enumerate(cells)]

@@ -12,7 +12,7 @@ from jaxmodel import status
 from studies import config
 from studies.atlas.attribution import interaction, shapley
 from studies.atlas.figures import FIGURES, write_animation
-from studies.atlas.findings import AtlasFindings, look_around
+from studies.atlas.findings import AtlasFindings, evaluate_atlas
 from studies.atlas.platform import LINK_LABELS
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.report import report
@@ -93,7 +93,7 @@ def _finish(study: Study, out: Path, phases: Phases, has_pdf: bool) -> None:
     phases.begin("analyse")
     subsets, dropped = sound_settings(read_subsets(out / RUNS_FOLDER))
     with threadpool_limits(1, "blas"):  # many small matrices: more threads only slow them down
-        findings = look_around(study, subsets, on_progress)
+        findings = evaluate_atlas(study, subsets, on_progress)
     phases.begin("draw")
     with publish(out) as staging:
         write_store(staging / DATA, variables(findings), run_attributes(study))

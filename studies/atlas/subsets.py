@@ -125,7 +125,7 @@ def atlas_sweep(
     for time, shaper in settings:
         moved = study.change(motion__move_time=time, shaper__kind=shaper)
         # the same on every machine, so that a sweep can be resumed
-        ratios = np.vectorize(_rounded)(resolved_study(moved).control.ratios)
+        ratios = np.vectorize(_round)(resolved_study(moved).control.ratios)
         cases.append(
             {
                 "motion.move_time": time,
@@ -143,7 +143,7 @@ def atlas_sweep(
     return parse_sweep(data)
 
 
-def _rounded(x: float) -> float:
+def _round(x: float) -> float:
     return float(f"{x:.10g}")
 
 
@@ -217,7 +217,7 @@ def read_subsets(path: str | Path) -> Subsets:
     index = (np.array([settings.index(one) for one in setting]), subset)
     shape = (len(settings), 2 ** (3 * modes))
 
-    def placed(values: np.ndarray, fill: Any = np.nan) -> np.ndarray:
+    def scatter(values: np.ndarray, fill: Any = np.nan) -> np.ndarray:
         whole = np.full(shape + values.shape[1:], fill, values.dtype)
         whole[index] = values
         return whole
@@ -225,10 +225,10 @@ def read_subsets(path: str | Path) -> Subsets:
     return Subsets(
         setting=tuple(settings),
         modes=modes,
-        status=placed(data["status"], NOT_RUN),
-        station=placed(data["residual_rms"]),
-        pose=placed(data["pose_error_rms"]),
-        peak=placed(data["spectral_density"].max(axis=-1)),
-        settling=placed(data["settling_time"]),
-        voltage=placed(data["peak_voltage"]),
+        status=scatter(data["status"], NOT_RUN),
+        station=scatter(data["residual_rms"]),
+        pose=scatter(data["pose_error_rms"]),
+        peak=scatter(data["spectral_density"].max(axis=-1)),
+        settling=scatter(data["settling_time"]),
+        voltage=scatter(data["peak_voltage"]),
     )

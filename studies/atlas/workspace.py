@@ -84,7 +84,7 @@ def natural_modes_at(study: Study, poses: Any) -> PoseModes:
     """
     structure, case = _machine(study)
     poses = np.asarray(poses, float)
-    codes, _, lifts = map(np.asarray, _stand(structure, case, poses))
+    codes, _, lifts = map(np.asarray, _solve_poses(structure, case, poses))
     for pose, code, heights in zip(poses, codes, lifts, strict=True):
         check_pose(study, "pose", tuple(pose.tolist()), int(code), heights)
     return _solve(structure, case, poses)
@@ -106,12 +106,12 @@ def map_workspace(study: Study, count: int = GRID, turns: tuple[float, ...] = TU
     x, y = _extent(structure, case, study, phi, count)
     grid = np.stack(np.meshgrid(phi, y, x, indexing="ij")[::-1], axis=-1)
     poses = grid.reshape(-1, 3)
-    codes, gamma, _ = (np.asarray(part) for part in _stand(structure, case, poses))
+    codes, gamma, _ = (np.asarray(part) for part in _solve_poses(structure, case, poses))
     good = codes == status.OK
     modes = _solve(structure, case, poses[good])
     chosen = np.sort(np.argsort(-modes.order_share[..., 0], axis=1)[:, :3], axis=1)
 
-    def placed(values: np.ndarray) -> np.ndarray:
+    def scatter(values: np.ndarray) -> np.ndarray:
         whole = np.full((len(poses), *values.shape[1:]), np.nan)
         whole[good] = values
         return whole.reshape(*grid.shape[:-1], *values.shape[1:])
@@ -121,11 +121,11 @@ def map_workspace(study: Study, count: int = GRID, turns: tuple[float, ...] = TU
         y=y,
         phi=phi,
         status=codes.astype(int).reshape(grid.shape[:-1]),
-        gamma=placed(gamma[good]),
-        frequency=placed(modes.frequency),
-        bending=placed(np.take_along_axis(modes.frequency, chosen, axis=1)),
-        share=placed(np.take_along_axis(modes.share, chosen[..., None], axis=1)),
-        coupling=placed(modes.coupling),
+        gamma=scatter(gamma[good]),
+        frequency=scatter(modes.frequency),
+        bending=scatter(np.take_along_axis(modes.frequency, chosen, axis=1)),
+        share=scatter(np.take_along_axis(modes.share, chosen[..., None], axis=1)),
+        coupling=scatter(modes.coupling),
     )
 
 
@@ -147,7 +147,7 @@ def _extent(
     """Grid lines that cover all feasible poses."""
     axis = np.linspace(-0.6, 0.6, 121) * study.machine.guide_side
     grid = np.stack(np.meshgrid(phi, axis, axis, indexing="ij")[::-1], axis=-1)
-    codes, _, _ = _stand(structure, case, grid.reshape(-1, 3))
+    codes, _, _ = _solve_poses(structure, case, grid.reshape(-1, 3))
     good = (np.asarray(codes) == status.OK).reshape(grid.shape[:-1]).any(axis=0)
     step = axis[1] - axis[0]
     rows, columns = (axis[np.flatnonzero(good.any(axis=k))] for k in (1, 0))
@@ -157,7 +157,7 @@ def _extent(
 
 
 @kept_jit(static_argnums=0)
-def _stand(structure: Structure, case: Case, poses: Array) -> tuple[Array, Array, Array]:
+def _solve_poses(structure: Structure, case: Case, poses: Array) -> tuple[Array, Array, Array]:
     """Status, link angles [rad] and `lift` of poses, (n,), (n, 3) and (n, 3)."""
     plant = prepare(structure, case).loop.plant
 

@@ -369,12 +369,12 @@ def by_c(work: Work, compiler: str, width: int) -> Callable[[], Any]:
     weight = np.asarray(start.inputs.window.is_residual)
     pose = np.asarray(start.state.plant.pose)
     home = np.array([*pose, pose[2], np.sin(pose[2]), np.cos(pose[2])])
-    gains = [_aligned(g.T) for g in np.asarray(each).reshape(-1, width, 27)]
-    function = _compiled(compiler, width)
+    gains = [_align(g.T) for g in np.asarray(each).reshape(-1, width, 27)]
+    function = _compile(compiler, width)
     pool = ThreadPoolExecutor(len(jax.local_devices()))
 
     def group(gain: np.ndarray) -> np.ndarray:
-        square = _aligned(np.zeros((9, width)))
+        square = _align(np.zeros((9, width)))
         arrays = (inputs, weight, home, gain, square)
         function(machine.ctypes.data, n, ctypes.c_double(PERIOD), *(x.ctypes.data for x in arrays))
         return square.T.reshape(width, 3, 3)
@@ -392,7 +392,7 @@ def _ideal(structure: Structure, case: Case) -> Any:
     return ideal[0]
 
 
-def _aligned(array: np.ndarray) -> np.ndarray:
+def _align(array: np.ndarray) -> np.ndarray:
     """A copy aligned to 64 bytes."""
     room = np.empty(array.size + 8)
     skip = -room.ctypes.data % 64 // 8
@@ -401,7 +401,7 @@ def _aligned(array: np.ndarray) -> np.ndarray:
     return copy
 
 
-def _compiled(compiler: str, width: int) -> Any:
+def _compile(compiler: str, width: int) -> Any:
     """The function `run` of `w0.c`."""
     source = Path(__file__).with_name("w0.c")
     with tempfile.TemporaryDirectory() as folder:

@@ -132,7 +132,9 @@ def connected(workers: Workers, on_progress: Callable[[str], None]) -> Iterator[
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     cluster = (
-        _started(workers.local or 0) if workers.scheduler is None else _joined(workers.scheduler)
+        _local_cluster(workers.local or 0)
+        if workers.scheduler is None
+        else _remote_cluster(workers.scheduler)
     )
     with cluster as client:
         if not client.ncores():
@@ -143,7 +145,7 @@ def connected(workers: Workers, on_progress: Callable[[str], None]) -> Iterator[
 
 
 @contextmanager
-def _joined(scheduler: str) -> Iterator[Client]:
+def _remote_cluster(scheduler: str) -> Iterator[Client]:
     from distributed import Client
     from distributed.security import Security
 
@@ -181,7 +183,7 @@ def _written_address(file: str) -> str:
 
 
 @contextmanager
-def _started(count: int) -> Iterator[Client]:
+def _local_cluster(count: int) -> Iterator[Client]:
     """Workers on this machine that share its cores, or have one GPU each."""
     from distributed import Client, Nanny, Scheduler, SpecCluster
 
@@ -196,7 +198,7 @@ def _started(count: int) -> Iterator[Client]:
     workers = {k: {"cls": Nanny, "options": options | {"env": _graphics(k)}} for k in range(count)}
     ports = {"host": "127.0.0.1", "port": 0, "dashboard": False, "dashboard_address": "127.0.0.1:0"}
     heart = {"cls": Scheduler, "options": ports}
-    with _deaf():
+    with _ignore_interrupts():
         try:
             cluster = SpecCluster(workers, heart, silence_logs=logging.CRITICAL)
         except (OSError, RuntimeError) as error:  # OSError covers timeouts
@@ -207,7 +209,7 @@ def _started(count: int) -> Iterator[Client]:
 
 
 @contextmanager
-def _deaf() -> Iterator[None]:
+def _ignore_interrupts() -> Iterator[None]:
     """Shield threads and processes started in this context, and their children, from Ctrl-C.
 
     In a terminal, Ctrl-C would reach the workers too, but only the client shuts down cleanly.

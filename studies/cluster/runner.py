@@ -33,7 +33,7 @@ AHEAD = 2
 LEAST_CHUNKS = 4
 
 
-class Flight(NamedTuple):
+class InFlight(NamedTuple):
     """A chunk in flight."""
 
     group: Group
@@ -76,55 +76,57 @@ class ClusterRunner:
         reporter.say(f"workers: {watch.n_workers}; each compiles before its first chunk")
         owns = [has_own_ratio(table, group) for group in groups]  # structures can be equal
         waiting = (
-            Flight(group, chunk, own)
+            InFlight(group, chunk, own)
             for group, own in zip(groups, owns, strict=True)
             for chunk in group.chunks()
         )
-        suspects: deque[Flight] = deque()
-        flying: dict[Future[Any], Flight] = {}
+        suspects: deque[InFlight] = deque()
+        in_flight: dict[Future[Any], InFlight] = {}
         compiled: set[Structure] = set()
 
-        def begin(flight: Flight | None) -> bool:
-            if flight is None or stop.is_set():
+        def begin(entry: InFlight | None) -> bool:
+            if entry is None or stop.is_set():
                 return False
-            flying[self._submit(flight)] = flight
+            in_flight[self._submit(entry)] = entry
             return True
 
         try:
             while True:
-                while len(flying) < AHEAD * max(watch.n_workers, 1) and begin(next(waiting, None)):
+                while len(in_flight) < AHEAD * max(watch.n_workers, 1) and begin(
+                    next(waiting, None)
+                ):
                     pass
-                if not flying and suspects:
+                if not in_flight and suspects:
                     begin(suspects.popleft())
-                if not flying or (stop.is_set() and not watch.n_workers):
+                if not in_flight or (stop.is_set() and not watch.n_workers):
                     return
-                for future in watch.landed(flying):
-                    flight = flying.pop(future)
-                    structure = flight.group.structure
+                for future in watch.finished(in_flight):
+                    entry = in_flight.pop(future)
+                    structure = entry.group.structure
                     answer = watch.outcome(future)
                     if isinstance(answer, ChunkDone):
                         if answer.compile_time and structure not in compiled:
                             compiled.add(structure)
                             reporter.compiled(answer.executor, answer.compile_time)
-                        yield Done(flight.chunk, structure.substeps, answer.judged)
-                    elif flight.is_alone:
-                        yield Lost(flight.chunk, answer)
+                        yield Done(entry.chunk, structure.substeps, answer.judged)
+                    elif entry.is_alone:
+                        yield Lost(entry.chunk, answer)
                     else:
-                        suspects.append(flight._replace(is_alone=True))
+                        suspects.append(entry._replace(is_alone=True))
         finally:
-            if flying:
-                self._client.cancel(list(flying))
+            if in_flight:
+                self._client.cancel(list(in_flight))
 
-    def _submit(self, flight: Flight) -> Future[Any]:
-        group = flight.group
+    def _submit(self, entry: InFlight) -> Future[Any]:
+        group = entry.group
         job = ChunkJob(
             identity=self._identity,
             precision=self._precision,
             spec=self._spec,
             structure=group.structure,
-            has_own_ratio=flight.has_own_ratio,
+            has_own_ratio=entry.has_own_ratio,
             is_judged=group.is_judged,
             size=group.layout.size,
-            rows=flight.chunk.rows,
+            rows=entry.chunk.rows,
         )
         return self._client.submit(run_chunk, job, pure=False)

@@ -45,11 +45,11 @@ class Watch:
         self._last_check = 0.0
         self.n_workers = len(client.ncores())
 
-    def landed(self, flying: Iterable[Future[Any]]) -> list[Future[Any]]:
+    def finished(self, pending: Iterable[Future[Any]]) -> list[Future[Any]]:
         """Work that has finished; empty if none finishes for a while."""
         from distributed import CancelledError, wait
 
-        futures = list(flying)
+        futures = list(pending)
         try:
             with self._client.as_current():
                 wait(futures, timeout=CHECK_INTERVAL, return_when="FIRST_COMPLETED")

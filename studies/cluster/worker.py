@@ -80,7 +80,7 @@ def refuse_difference(expected: dict[str, str], worker: Worker) -> None:
         raise StudyError(f"worker {worker.address}: {fault}; install the same there")
 
 
-def get_ready(precision: str, worker: Worker) -> None:
+def configure_worker(precision: str, worker: Worker) -> None:
     """Start JAX on the worker's share of the machine: one core per thread."""
     config.configure(precision, worker.state.nthreads)
     config.start(precision)
@@ -89,7 +89,7 @@ def get_ready(precision: str, worker: Worker) -> None:
 def chunk_size(n: int, structure: Structure, precision: str) -> int:
     """How many of n cases this worker prefers to run at once."""
     with alone:
-        get_ready(precision, get_worker())
+        configure_worker(precision, get_worker())
         return local_layout(n, structure).size
 
 
@@ -102,7 +102,7 @@ def run_chunk(job: ChunkJob) -> ChunkDone:
     with alone:
         worker = get_worker()
         refuse_difference(job.identity, worker)
-        get_ready(job.precision, worker)
+        configure_worker(job.precision, worker)
         table = _table(job.spec)
         executor = _executor(job.precision, job.spec, job.structure, job.size, job.has_own_ratio)
         is_first = executor.compile_time == 0

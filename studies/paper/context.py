@@ -29,7 +29,7 @@ class Context(NamedTuple):
         """Index of a case on the move that is compared with the paper's numbers."""
         return self.find(*COMPARED, modes, links)
 
-    def drop(self, k: int, mode: int) -> str:
+    def peak_change(self, k: int, mode: int) -> str:
         """Change of a mode's spectral peak relative to no control, per link."""
         peak, off = self.measures.spectral_peak[:, :, mode - 1], self.measures.counterpart[k]
         return ", ".join(change(peak[k, i], peak[off, i]) for i in range(3))

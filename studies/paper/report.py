@@ -95,12 +95,12 @@ def report(machines: Machines, images: Path | None = None) -> str:
         designs=design_rows(nominal),
         agreement=_agreement(fitted),
         nominal=_agreement(nominal),
-        halved=[(context.name, _halved(context)) for context in machines],
-        is_halved=any(len(_halved(context)) == 3 for context in machines),
-        shaped=_shaped(nominal),
+        halved=[(context.name, _halved_directions(context)) for context in machines],
+        is_halved=any(len(_halved_directions(context)) == 3 for context in machines),
+        shaped=_shaper_factors(nominal),
         difference=_difference(nominal, cases),
         ideal_factor=_ideal_factor(nominal, cases),
-        drop=lambda name, mode: nominal.drop(cases[name], mode),
+        peak_change=lambda name, mode: nominal.peak_change(cases[name], mode),
         sketch_caption=CAPTION,
         drawn=list(PAPER_FIGURES),
     )
@@ -141,7 +141,7 @@ def _agreement(context: Context) -> dict[str, Any]:
     }
 
 
-def _halved(context: Context) -> list[str]:
+def _halved_directions(context: Context) -> list[str]:
     """Directions in which two controlled links more than halve the residual error."""
     off, two = (
         context.runs.result.metrics.pose_error_rms[context.compared(3, links)]
@@ -150,7 +150,7 @@ def _halved(context: Context) -> list[str]:
     return [f"{n} ({change(x, y)})" for n, x, y in zip("xyφ", two, off, strict=True) if x < 0.5 * y]
 
 
-def _shaped(context: Context) -> list[float]:
+def _shaper_factors(context: Context) -> list[float]:
     """Factor by which the EI shaper reduces the residual vibration, per move."""
     left = context.measures.residual.max(axis=1)
     unshaped, shaped = (

@@ -156,7 +156,7 @@ def paper_variables(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
             result.command_end, per_case, "s", "end of the shaped reference trajectory"
         ),
         **metrics,
-        **_measured(runs, measures),
+        **_measure_variables(runs, measures),
         **_trajectories(runs),
         **_loops(runs),
     }
@@ -203,21 +203,21 @@ def _case_labels(runs: PaperRuns) -> dict[str, Variable]:
     }
 
 
-def _measured(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
+def _measure_variables(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
     modal = ("case", "link", "controlled_mode")
     return {
         "gain_ratio": Variable(
             runs.ratio, modal, "1", "gain of a mode over that of mode 1 (24); 0 without control"
         ),
         "spectral_density": Variable(
-            _separated(runs, measures.spectral_density),
+            _without_merged_modes(runs, measures.spectral_density),
             (*modal, "frequency"),
             "m2/Hz",
             "one-sided power spectral density of the controller's modes, Hann periodogram of the "
             "run",
         ),
         "spectral_peak": Variable(
-            _separated(runs, measures.spectral_peak),
+            _without_merged_modes(runs, measures.spectral_peak),
             modal,
             "m2/Hz",
             "largest spectral density near the mode's frequency",
@@ -232,7 +232,7 @@ def _measured(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
     }
 
 
-def _separated(runs: PaperRuns, values: np.ndarray) -> np.ndarray:
+def _without_merged_modes(runs: PaperRuns, values: np.ndarray) -> np.ndarray:
     """Copy of (n, 3, C, ...) with the modes that a case does not separate as NaN."""
     values = np.array(values)
     for k, case in enumerate(runs.cases):
@@ -244,7 +244,9 @@ def _trajectories(runs: PaperRuns) -> dict[str, Variable]:
     record = runs.record
     deflection = record.chord_deflection_stations
     series = ("case", "time")
-    modal = np.moveaxis(_separated(runs, np.moveaxis(record.controlled_coordinate, 1, -1)), -1, 1)
+    modal = np.moveaxis(
+        _without_merged_modes(runs, np.moveaxis(record.controlled_coordinate, 1, -1)), -1, 1
+    )
     return {
         "chord_deflection": Variable(
             deflection[..., middle_station(runs)],

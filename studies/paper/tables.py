@@ -50,13 +50,13 @@ def machine_rows(machines: Machines) -> list[list[str]]:
         gains = study.control.gain_factor * np.array(study.control.velocity_gain)
         n_moves = len(study.motion.waypoints) - 1
         return [
-            _listed(each_link(study.link.youngs_modulus) / 1e9),
+            _join_numbers(each_link(study.link.youngs_modulus) / 1e9),
             f"{study.link.joint_inertia_c:.3g}",
-            _listed(np.atleast_1d(study.link.damping_ratio), ".2g"),
+            _join_numbers(np.atleast_1d(study.link.damping_ratio), ".2g"),
             f"{study.drive.kp:.3g}, {study.drive.kd:.3g}",
             f"{study.link.modes}, {study.link.basis}",
             study.control.basis,
-            _listed(gains, ".2g"),
+            _join_numbers(gains, ".2g"),
             f"{count_text(n_moves, 'move')} of 10 mm in {MOVES[COMPARED[0]]:g} s, no shaper",
             str(len(context.runs.cases)),
         ]
@@ -79,7 +79,7 @@ def frequency_rows(machines: Machines) -> list[list[str]]:
     """Frequencies of the links between held ends."""
 
     def number(context: Context, mode: int) -> str:
-        return _listed(context.runs.link_hz[:, mode], ".1f")
+        return _join_numbers(context.runs.link_hz[:, mode], ".1f")
 
     return [
         _row(f"mode {k + 1}, links 1, 2, 3 [Hz]", f"{hz:g}", machines, number, k)
@@ -96,11 +96,15 @@ def ratio_rows(machines: Machines) -> list[list[str]]:
     )
 
     def number(context: Context, mode: int) -> str:
-        return _listed(energy_ratio(context)[:, mode])
+        return _join_numbers(energy_ratio(context)[:, mode])
 
     return [
         _row(
-            f"{name}, links 1, 2, 3", _listed([link[mode] for link in rows]), machines, number, mode
+            f"{name}, links 1, 2, 3",
+            _join_numbers([link[mode] for link in rows]),
+            machines,
+            number,
+            mode,
         )
         for name, rows, mode in printed
     ]
@@ -146,7 +150,7 @@ def settling_rows(machines: Machines) -> list[list[str]]:
     """Settling times and residual vibration of links 1, 2, 3, with and without control."""
 
     def time(context: Context, links: tuple[bool, ...]) -> str:
-        return _listed(1e3 * context.measures.settling[context.compared(2, links)], ".0f")
+        return _join_numbers(1e3 * context.measures.settling[context.compared(2, links)], ".0f")
 
     def rms(context: Context, links: tuple[bool, ...]) -> str:
         return residuals(context, context.measures.residual[context.compared(2, links)])
@@ -166,7 +170,7 @@ def platform_rows(machines: Machines) -> list[list[str]]:
         return np.asarray(context.runs.result.metrics.pose_error_rms[context.compared(3, links)])
 
     def without(context: Context) -> str:
-        return _listed(1e9 * error(context, OFF))
+        return _join_numbers(1e9 * error(context, OFF))
 
     def changes(context: Context, links: tuple[bool, ...]) -> str:
         pairs = zip(error(context, links), error(context, OFF), strict=True)
@@ -187,10 +191,10 @@ def motion_rows(context: Context) -> list[list[str]]:
     def cells(k: int) -> list[str]:
         metrics = context.runs.result.metrics
         return [
-            _listed(1e6 * metrics.structural_peak[k].max(axis=-1)),
+            _join_numbers(1e6 * metrics.structural_peak[k].max(axis=-1)),
             residuals(context, context.measures.residual[k]),
-            _listed(1e3 * metrics.settling_time[k], ".0f"),
-            _listed(1e3 * context.measures.settling[k], ".0f"),
+            _join_numbers(1e3 * metrics.settling_time[k], ".0f"),
+            _join_numbers(1e3 * context.measures.settling[k], ".0f"),
         ]
 
     return [
@@ -221,7 +225,7 @@ def design_rows(context: Context) -> list[list[str]]:
                 describe(int(runs.status[k])),
                 margin,
                 zeta,
-                context.drop(k, mode=1),
+                context.peak_change(k, mode=1),
                 residual(context, *_worst(context.measures.residual[k])),
                 f"{runs.result.metrics.peak_voltage[k].max():.3g}",
             ]
@@ -234,5 +238,5 @@ def _worst(values: np.ndarray) -> tuple[float, int]:
     return float(values.max()), int(values.argmax())
 
 
-def _listed(values: np.ndarray | list[float], digits: str = ".3g") -> str:
+def _join_numbers(values: np.ndarray | list[float], digits: str = ".3g") -> str:
     return ", ".join(f"{value:{digits}}" for value in values)

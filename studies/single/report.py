@@ -83,7 +83,7 @@ def report(
         free_rms=free.result.metrics.residual_rms.max(axis=1) if free else None,
         settled=[settling_text(run, link) for link in range(3)],
         free_settled=[settling_text(free, link) for link in range(3)] if free else [],
-        later=_later(run, free, worst) if free else "",
+        later=_settling_delay(run, free, worst) if free else "",
         verdict=VERDICTS,
         caution=caution(run.loop.gain_margin) if run.loop is not None else "",
         at_limit=limits_text(run),
@@ -121,7 +121,7 @@ def _situation(run: Run, twin: Run | None) -> str:
     return "worse" if left > 1.05 * free else "well"
 
 
-def _later(run: Run, free: Run, link: int) -> str:
+def _settling_delay(run: Run, free: Run, link: int) -> str:
     """By how much control delays settling, as a share; "" if it hardly does."""
     after, before = (float(x.result.metrics.settling_time[link]) for x in (run, free))
     return f"{100 * (after / before - 1):.3g} %" if after > (1 + LATER) * before > 0 else ""

@@ -59,7 +59,7 @@ def simulate(
     Raises:
         StudyError: a fault of the study, or a file that cannot be written.
     """
-    file = _checked(out, has_report)
+    file = _output_file(out, has_report)
     name = "STUDY" if isinstance(study, Study) else str(study)
     run = run_study(study if isinstance(study, Study) else load_study(study))
     if file is not None:
@@ -83,7 +83,7 @@ def replay(
     Raises:
         StudyError: as `load_design` and `simulate`.
     """
-    file = _checked(out, has_report)
+    file = _output_file(out, has_report)
     loaded = load_design(design, case)
     run = run_study(loaded.study)
     if loaded.stored:
@@ -147,7 +147,7 @@ def check_results(out: Path, has_report: bool) -> None:
         check_target(out.with_name(name))
 
 
-def _checked(out: str | Path | None, has_report: bool) -> Path | None:
+def _output_file(out: str | Path | None, has_report: bool) -> Path | None:
     """The file to write, after checking that it can be written."""
     if out is None:
         if has_report:

@@ -77,7 +77,9 @@ def compare_laws(study: Study, margin: float = 2.0, sizes: tuple[int, ...] = ())
         rows = [(WITHOUT, own, 0.0), (GIVEN, own, 1.0)]
         for view in views:
             is_own = view is own and view.limit >= margin
-            rows.append((view.law.law.text, view, 1.0 if is_own else view.fair(margin, target)))
+            rows.append(
+                (view.law.law.text, view, 1.0 if is_own else view.matched_factor(margin, target))
+            )
         zeta = np.array([view.damping(factor) for _, view, factor in rows])
     fast, result = _run(design, [view.law.at(factor) for _, view, factor in rows])
     metrics = result.metrics
@@ -125,7 +127,7 @@ class _LawLoops:
         """Smallest damping ratio of the links that control it, modes 1 to `SHOWN`, NaN: none."""
         return self._path(factor * STEPS)[-1]
 
-    def fair(self, margin: float, target: float) -> float:
+    def matched_factor(self, margin: float, target: float) -> float:
         """Largest factor with the margin, limited to where mode 1's damping reaches a target.
 
         Args:
@@ -167,7 +169,7 @@ def _controlled_links(law: Controller) -> np.ndarray:
 
 def _run(design: FixedController, laws: list[Controller]) -> tuple[Study, Result]:
     """The design's first move made fast under each law, and the study of it."""
-    study = _made_fast(design.study)
+    study = _fast_move(design.study)
     structure, case = check_run(study)
     # a channel per patch, whatever the law
     structure = structure._replace(
@@ -182,7 +184,7 @@ def _simulate(structure: Structure, case: Case, laws: Controller) -> Result:
     return jax.vmap(lambda law: simulate(structure, case, False, law))(laws)
 
 
-def _made_fast(study: Study) -> Study:
+def _fast_move(study: Study) -> Study:
     """The same with only its first move, at the acceleration of `FAST`, without shaper."""
     points = study.motion.waypoints[:2]
     distance = float(np.hypot(*np.subtract(points[-1], points[0])[:2]))

@@ -58,9 +58,9 @@ def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
         return f"drive of the sliders ({hertz:.0f} Hz)"
     q, q_rate = np.abs(right[6:last].reshape(2, 3, r))
     energy = (loop.omega * q) ** 2 + q_rate**2
-    modes, moving = _leading(energy.sum(axis=0)), _leading(energy.sum(axis=1))
+    modes, moving = _dominant(energy.sum(axis=0)), _dominant(energy.sum(axis=1))
     own = ", ".join(f"{loop.omega[moving, j].mean() / (2 * np.pi):.0f}" for j in modes)
-    text = f"{_listed('mode', modes)} of {_listed('link', moving)} ({own} Hz)"
+    text = f"{_numbered('mode', modes)} of {_numbered('link', moving)} ({own} Hz)"
     if links > filters:
         return text
     if hertz < 1:
@@ -68,12 +68,12 @@ def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
     return f"a controller's filter at {hertz:.0f} Hz, fed by {text}"
 
 
-def _leading(energy: np.ndarray) -> list[int]:
+def _dominant(energy: np.ndarray) -> list[int]:
     """The largest one and all with at least `PART` of it."""
     return [int(k) for k in np.flatnonzero(energy >= PART * energy.max())]
 
 
-def _listed(name: str, numbers: list[int]) -> str:
+def _numbered(name: str, numbers: list[int]) -> str:
     """Like "links 1+2", numbers from 0."""
     return f"{name}{'s' if len(numbers) > 1 else ''} {'+'.join(str(k + 1) for k in numbers)}"
 

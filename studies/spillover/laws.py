@@ -96,12 +96,14 @@ def all_laws(design: FixedController, builder: LoopBuilder, plant: PlantVariant)
 
     own = {control.law: controller, IMSC.name: modal}
     return [
-        Candidate(law, _even(own[name] if name in own else as_strong(law), design.n_patches))
+        Candidate(
+            law, _unify_channels(own[name] if name in own else as_strong(law), design.n_patches)
+        )
         for name, law in channels.items()
     ]
 
 
-def _even(law: Controller, n_channels: int) -> Controller:
+def _unify_channels(law: Controller, n_channels: int) -> Controller:
     """With a channel for each patch and rivals, if none: one shape for all laws."""
     channels = _channels(law)
     if channels.rival_omega is None:

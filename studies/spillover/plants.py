@@ -102,7 +102,7 @@ class LoopBuilder:
 
     def fault(self, plant: PlantVariant) -> str:
         """Why there is no such plant, "" if there is one."""
-        study, machine = self._design.study, self._placed(plant).machine
+        study, machine = self._design.study, self._mismatched_case(plant).machine
         is_off, is_overlapping = _placement_faults(machine.patches, machine.beam.length)
         if is_off or is_overlapping:
             what = "patches leave the link" if is_off else "patches overlap"
@@ -119,7 +119,7 @@ class LoopBuilder:
     def loop(self, plant: PlantVariant, law: Controller) -> SampledLoop:
         """The loop of a plant and a controller with a channel for each patch (`pad_channels`)."""
         matrices, omega, _ = self._evaluate(plant, law)
-        kept, of_plant = _kept(matrices, plant.n_modes)
+        kept, of_plant = _kept_states(matrices, plant.n_modes)
         matrices = matrices._replace(
             open=matrices.open[np.ix_(kept, kept)],
             feedback=matrices.feedback[np.ix_(kept, kept)],
@@ -160,10 +160,10 @@ class LoopBuilder:
         law = law._replace(feedback=law.feedback.without_rivals())  # linear: nothing switches
         law = jax.tree.map(jnp.asarray, law)
         return jax.tree.map(
-            np.asarray, _evaluate_loop(structure, self._placed(plant), self._pose, law)
+            np.asarray, _evaluate_loop(structure, self._mismatched_case(plant), self._pose, law)
         )
 
-    def _placed(self, plant: PlantVariant) -> Case:
+    def _mismatched_case(self, plant: PlantVariant) -> Case:
         machine, true = self._case.machine, plant.mismatch
         patches, beam = machine.patches, machine.beam
         patches = patches._replace(
@@ -194,7 +194,7 @@ def _evaluate_loop(
     return matrices, loop.omega, gains
 
 
-def _kept(matrices: LoopMatrices, n_modes: int) -> tuple[np.ndarray, np.ndarray]:
+def _kept_states(matrices: LoopMatrices, n_modes: int) -> tuple[np.ndarray, np.ndarray]:
     """Entries of the loop's and the plant's state that exist with fewer modes."""
 
     def entries(size: int) -> np.ndarray:

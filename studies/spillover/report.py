@@ -191,7 +191,7 @@ def document(certificate: Certificate, laws: Comparison | None) -> str:
         "format_version": 2,
         "title": certificate.study.title,
         "is_passed": certificate.is_passed,
-        "spillover": certificate.spillover and _spilled(certificate.spillover),
+        "spillover": certificate.spillover and _spillover_entry(certificate.spillover),
         "verdict": verdict(certificate),
         "required_margin": certificate.required,
         "smallest_margin": float(np.nanmin(certificate.margin)),
@@ -204,7 +204,7 @@ def document(certificate: Certificate, laws: Comparison | None) -> str:
     return json.dumps(_plain(whole), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _spilled(worst: Spillover) -> dict[str, Any]:
+def _spillover_entry(worst: Spillover) -> dict[str, Any]:
     return {
         "mode": worst.mode,
         "damping_ratio": worst.damping_ratio,

@@ -56,7 +56,7 @@ def spillover_design(
     out, console = Path(out), console or Console(highlight=False, markup=False)
     check_folder(out)
     study = resolved_study(design.study)
-    _check_whose(out, study)
+    _check_owner(out, study)
     with Phases(console, PHASES) as phases:
         phases.begin("judge", "the controller on plants that differ from its nominal model")
         certificate = certify(study, margin)
@@ -83,7 +83,7 @@ def spillover_design(
     return certificate.is_passed
 
 
-def _check_whose(out: Path, study: Study) -> None:
+def _check_owner(out: Path, study: Study) -> None:
     """Leave another design's certificate alone.
 
     Raises:

@@ -132,9 +132,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.sweeps.show import (
             counted_text,
             print_cases,
+            print_left_out,
             print_uncontrolled,
             ranked_cases,
-            tell_left_out,
         )
 
         data, name = read_sweep(folder), by.removeprefix("-")
@@ -142,7 +142,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         print_uncontrolled(data, name, console)
         console.print(f"by {name}, {direction(by)} first, {counted_text(data, name)}:")
         print_cases(data, cases, [name], console)
-        tell_left_out(data, console)
+        print_left_out(data, console)
 
     @app.command()
     def plot(
@@ -160,7 +160,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.engine.results import read_sweep
         from studies.sweeps.plots import plot as draw
         from studies.sweeps.plots import save_plot
-        from studies.sweeps.show import ranking, tell_left_out
+        from studies.sweeps.show import print_left_out, ranking
 
         data = read_sweep(folder)
         y = y or ranking(data)
@@ -168,7 +168,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         name = "".join(f"{word}{one}" for word, one in parts if one)
         path = out or folder / f"{re.sub(_NO_NAME, '_', name).strip('_')}.png"
         save_plot(draw(data, x, y, hue), path)
-        tell_left_out(data, console)
+        print_left_out(data, console)
         console.print(f"written: {path}", soft_wrap=True)
 
     @app.command()

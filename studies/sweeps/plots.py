@@ -78,7 +78,7 @@ def plot(sweep: SweepData | str | Path, x: str | None, y: str, hue: str | None =
     shown = shown_metric(data, y)[chosen]
     with figures.styled():
         figure, ax = figures.one_panel(4.2)
-        _say_left_out(figure, data, chosen)
+        _note_left_out(figure, data, chosen)
         ax.set_xlabel(label(data, x))
         if group is not None and _is_grid(across, group):
             _heat_map(figure, ax, across, group, shown, label(data, y))
@@ -124,7 +124,7 @@ def front(data: SweepData, y: str) -> Figure:
         )
         if VOLTAGE in data.variables:
             figure.colorbar(dots, ax=ax, label=label(data, VOLTAGE))
-        best = np.array(sorted(not_beaten(margin, value), key=lambda k: margin[k]), int)
+        best = np.array(sorted(pareto_front(margin, value), key=lambda k: margin[k]), int)
         ax.plot(margin[best], value[best], "-", color="black", linewidth=0.8, zorder=3)
         ax.plot(
             margin[best],
@@ -142,7 +142,7 @@ def front(data: SweepData, y: str) -> Figure:
     return figure
 
 
-def not_beaten(margin: np.ndarray, value: np.ndarray) -> list[int]:
+def pareto_front(margin: np.ndarray, value: np.ndarray) -> list[int]:
     """Cases on the Pareto front: none has a smaller value at the same or a larger margin."""
     front: list[int] = []
     lowest = np.inf
@@ -188,7 +188,7 @@ def _scale_ordinate(ax: Axes, value: np.ndarray) -> None:
         ax.set_title(f"{beyond} above {top:.3g} not shown", fontsize=figures.SMALL, loc="right")
 
 
-def _say_left_out(figure: Figure, data: SweepData, chosen: np.ndarray) -> None:
+def _note_left_out(figure: Figure, data: SweepData, chosen: np.ndarray) -> None:
     n_screened = int(np.sum(data["status"] == LEFT_OUT))
     n_left, parts = int(np.sum(~chosen)) - n_screened, []
     if n_screened:
@@ -416,7 +416,7 @@ def _parallel(data: SweepData, y: str, chosen: np.ndarray) -> Figure:
             fontsize=figures.SMALL,
             loc="right",
         )
-        _say_left_out(figure, data, chosen)
+        _note_left_out(figure, data, chosen)
     return figure
 
 
@@ -483,7 +483,7 @@ def _placements(data: SweepData, y: str) -> Figure:
         bottom.set_ylabel(label(data, y))
         bottom.set_title("rings: those above", fontsize=figures.SMALL, loc="left")
         figures.legend_beside(bottom, markerscale=3)
-        _say_left_out(figure, data, is_ok)
+        _note_left_out(figure, data, is_ok)
     return figure
 
 

@@ -196,7 +196,7 @@ def _best(data: SweepData, metric: str) -> dict[str, Any] | None:
         "warning": warning,
         "is_safe": is_safe,
         "condition": condition,
-        "idle": _idle(data, metric, first),
+        "idle": _uncontrolled_links(data, metric, first),
         # better than the best one, but with a smaller gain margin
         "rival": (free, with_unit(readings[free]), margin[free]) if is_beaten else None,
         "table": case_rows(data, best, [metric]),
@@ -205,7 +205,7 @@ def _best(data: SweepData, metric: str) -> dict[str, Any] | None:
     }
 
 
-def _idle(data: SweepData, metric: str, case: int) -> list[tuple[str, str]]:
+def _uncontrolled_links(data: SweepData, metric: str, case: int) -> list[tuple[str, str]]:
     """Links that no case controls, and a metric of theirs, where it is one of links."""
     dims = data.variables[metric.partition("[")[0]].dims
     if "link" not in dims or "link=" in metric:

@@ -46,7 +46,7 @@ def failure_causes(data: SweepData) -> list[Cause]:
         if len(np.unique(value)) < 2:
             continue
         if value.dtype.kind in "UO":
-            causes.append(_cause_of_choice(name, value.astype(str), is_failed))
+            causes.append(_text_cause(name, value.astype(str), is_failed))
             continue
         test = ks_2samp(value[is_failed], value[~is_failed])
         ends = np.quantile(value, (0.25, 0.75))
@@ -67,7 +67,7 @@ def failure_causes(data: SweepData) -> list[Cause]:
     return sorted(causes, key=lambda cause: -cause.distance)
 
 
-def _cause_of_choice(name: str, value: np.ndarray, is_failed: np.ndarray) -> Cause:
+def _text_cause(name: str, value: np.ndarray, is_failed: np.ndarray) -> Cause:
     """The same for texts: total variation instead of the Kolmogorov distance, chi-squared test."""
     from scipy.stats import chi2_contingency
 

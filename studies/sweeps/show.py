@@ -314,7 +314,7 @@ def short_id(data: SweepData, case: int) -> str:
     return str(data["case_id"][case])[:ID_DIGITS]
 
 
-def tell_left_out(data: SweepData, console: Console) -> None:
+def print_left_out(data: SweepData, console: Console) -> None:
     """Report how many cases are not ok and hence left out."""
     codes = data["status"]
     counts = Counter(codes[codes != status.OK].tolist())
@@ -382,7 +382,7 @@ def requirement(data: SweepData, by: str, is_safe: bool = True) -> str:
     own = data.spec.screen.subject_to if data.spec.screen is not None else ""
     has_margin = is_safe and MARGIN in data.variables and bool(np.isfinite(data[MARGIN]).any())
     conditions = [x for x in (own, f"{MARGIN} >= {ENOUGH:g}" if has_margin else "") if x]
-    for condition in dict.fromkeys((" and ".join(map(_bracketed, conditions)), *conditions)):
+    for condition in dict.fromkeys((" and ".join(map(_bracket, conditions)), *conditions)):
         try:
             ranked_cases(data, by, condition, 1)
             return condition
@@ -391,7 +391,7 @@ def requirement(data: SweepData, by: str, is_safe: bool = True) -> str:
     return ""
 
 
-def _bracketed(condition: str) -> str:
+def _bracket(condition: str) -> str:
     return f"({condition})" if " or " in condition else condition
 
 

@@ -61,7 +61,7 @@ def audit(spec: TuneSpec, places: np.ndarray | None = None) -> list[Disagreement
     """
     worst: dict[int, Disagreement] = {}
     places = audit_places(spec) if places is None else places
-    for position, numbers in _covering(spec).items():
+    for position, numbers in _cover_numbers(spec).items():
         # as many designs as the tuning has starts, to share its program
         evaluator = Evaluator(spec, [spec.moving[position]] * len(start_families(spec)))
         own, exact = [], []
@@ -85,7 +85,7 @@ def audit(spec: TuneSpec, places: np.ndarray | None = None) -> list[Disagreement
     return [worst[number] for number in sorted(worst)]
 
 
-def _covering(spec: TuneSpec) -> dict[int, list[int]]:
+def _cover_numbers(spec: TuneSpec) -> dict[int, list[int]]:
     """Families by position, with the numbers to check in each, so that all are covered."""
     left = np.any([family.is_free for family in spec.moving], axis=0)
     checks: dict[int, list[int]] = {}

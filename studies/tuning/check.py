@@ -26,8 +26,8 @@ from studies.tuning.evaluate import first_residual, tuned_structure
 from studies.tuning.free import PLACEMENT
 from studies.tuning.linear_fidelity import DesignFigures, loop_figures
 from studies.tuning.objective import (
-    all_judged,
     allowed_limits,
+    judge_designs,
     largest,
     objective_of,
     objectives,
@@ -85,7 +85,7 @@ def tuned_study(spec: TuneSpec, family: Family, values: np.ndarray) -> Study:
         values: of all free parameters, (p,).
     """
     study = family.study(spec.study)
-    case = _placed(spec, family, study, values)
+    case = _tuned_case(spec, family, study, values)
     names = list(np.array(spec.free.names)[family.is_free])
     whole: dict[str, Any] = {}
     if any(name.startswith(PLACEMENT) for name in names):
@@ -106,11 +106,11 @@ def patch_centers(spec: TuneSpec, family: Family, values: np.ndarray) -> np.ndar
         family: of the design.
         values: of the free parameters, (p,).
     """
-    placed = _placed(spec, family, family.study(spec.study), values)
+    placed = _tuned_case(spec, family, family.study(spec.study), values)
     return np.asarray(placed.machine.patches.center)
 
 
-def _placed(spec: TuneSpec, family: Family, study: Study, values: np.ndarray) -> Case:
+def _tuned_case(spec: TuneSpec, family: Family, study: Study, values: np.ndarray) -> Case:
     """A family's study with those of the free parameters (p,) that it moves."""
     structure = build_structure(study)
     values = np.where(family.is_free, values, np.nan)
@@ -160,7 +160,7 @@ def judge(spec: TuneSpec, designs: list[Study], runs: PlainRuns) -> list[JudgedD
     parts = []
     for study in designs:
         fresh, file = (build_cases(study, x, structure) for x in (columns, {}))
-        parts += [_repeated(fresh, count), _repeated(file, 1)]
+        parts += [_repeat(fresh, count), _repeat(file, 1)]
     rows = len(designs) * (count + 1)
     result = runs.run(jax.tree.map(lambda *x: np.concatenate(x), *parts), rows)
     by_design = jax.tree.map(lambda x: x.reshape(len(designs), count + 1, *x.shape[1:]), result)
@@ -188,14 +188,14 @@ def judge(spec: TuneSpec, designs: list[Study], runs: PlainRuns) -> list[JudgedD
                 ),
             )
         )
-    return [_checked(study, one) for study, one in zip(designs, judged, strict=True)]
+    return [_with_poles(study, one) for study, one in zip(designs, judged, strict=True)]
 
 
-def _repeated(cases: Case, count: int) -> Case:
+def _repeat(cases: Case, count: int) -> Case:
     return jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape[1:])), cases)
 
 
-def _checked(study: Study, judged: JudgedDesign) -> JudgedDesign:
+def _with_poles(study: Study, judged: JudgedDesign) -> JudgedDesign:
     """With poles, where gains follow from them; without an own run that would be refused."""
     try:
         structure, case = check_run(study)
@@ -254,7 +254,7 @@ def search(spec: TuneSpec, screen: Any) -> RandomSearch:
         metrics = jax.tree.map(split, result.metrics)
         own, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
         allowed = allowed_limits(goal, family, own_limits(goal, own))
-        judgement = all_judged(goal, others, own, allowed)
+        judgement = judge_designs(goal, others, own, allowed)
         batches.append((*map(np.asarray, judgement), first_residual(goal, metrics)[1:]))
     objective, limits, peaks, residual = (np.concatenate(x)[:n] for x in zip(*batches, strict=True))
     spent -= executor.compile_time

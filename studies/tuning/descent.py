@@ -72,7 +72,7 @@ class Adam:
         steps, after = self._optimiser.update(slope, jax.tree.unflatten(tree, state))
         moved = np.clip(trial.place + np.asarray(steps), 0.0, 1.0)
         # if no run finishes: half the way back
-        return _arrays(after), is_fine, np.where(is_fine[:, None], moved, _between(trial, 0.5))
+        return _arrays(after), is_fine, np.where(is_fine[:, None], moved, _interpolate(trial, 0.5))
 
 
 class Lbfgs:
@@ -95,10 +95,10 @@ class Lbfgs:
         slope = np.where(chosen, trial.slope, trial.base_slope)
         share = np.where(is_taken, 1.0, SHRINK * share)
         is_stuck = share < SHORTEST
-        ahead = _inward(base, np.where(chosen, -ahead, direction))
+        ahead = _keep_inside(base, np.where(chosen, -ahead, direction))
         is_uphill = np.sum(ahead * slope, axis=1) >= 0
         along = (is_stuck | is_uphill)[:, None]
-        direction = np.where(along, _steepest(base, slope), _shortened(ahead))
+        direction = np.where(along, _steepest(base, slope), _limit_length(ahead))
         share = np.where(is_stuck, 1.0, share)
         after = direction, share, *memory
         return after, is_taken, np.clip(base + share[:, None] * direction, 0.0, 1.0)
@@ -120,24 +120,24 @@ def _arrays(tree: Any) -> tuple[np.ndarray, ...]:
     return tuple(np.asarray(x) for x in jax.tree.leaves(tree))
 
 
-def _between(trial: Trial, share: float) -> np.ndarray:
+def _interpolate(trial: Trial, share: float) -> np.ndarray:
     """Between the accepted place and the trial, (B, p)."""
     moved = trial.base + share * (trial.place - trial.base)
     return np.where(np.isfinite(moved), moved, trial.base)
 
 
-def _inward(place: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def _keep_inside(place: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """The direction without components that leave the bounds."""
     leaves = ((place <= 0) & (direction < 0)) | ((place >= 1) & (direction > 0))
     return np.where(leaves | ~np.isfinite(direction), 0.0, direction)
 
 
 def _steepest(place: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    direction = _inward(place, -slope)
+    direction = _keep_inside(place, -slope)
     largest = np.abs(direction).max(axis=1, keepdims=True)
     return direction * STEEPEST / np.where(largest > 0, largest, 1.0)
 
 
-def _shortened(direction: np.ndarray) -> np.ndarray:
+def _limit_length(direction: np.ndarray) -> np.ndarray:
     largest = np.abs(direction).max(axis=1, keepdims=True)
     return direction * np.minimum(1.0, LONGEST / np.where(largest > 0, largest, 1.0))

@@ -26,7 +26,7 @@ from studies.tuning.linear_fidelity import LinearFidelity
 from studies.tuning.objective import (
     Objective,
     allowed_limits,
-    judged_designs,
+    judge_with_cotangents,
     largest,
     objective_of,
     own_limits,
@@ -106,7 +106,7 @@ class Evaluator:
         reached = own_limits(self.goal, own_metrics)
         allowed = [allowed_limits(self.goal, family, reached) for family in self.families]
         designs = jax.tree.map(lambda x: x[1:], metrics)
-        judged = judged_designs(self.goal, designs, own_metrics, np.stack(allowed))
+        judged = judge_with_cotangents(self.goal, designs, own_metrics, np.stack(allowed))
         judged = jax.tree.map(np.asarray, judged)
         slopes = self._slopes(runs, judged.cotangents, is_differentiated)
         if is_compiled:
@@ -130,14 +130,14 @@ class Evaluator:
 
         Args:
             runs: all of a batch.
-            cotangents: from `judged_designs`.
+            cotangents: from `judge_with_cotangents`.
             needs_gradient: designs that need derivatives, (designs,).
 
         Returns:
             (designs, 1 + m, p).
         """
 
-        def of_runs(x: np.ndarray) -> np.ndarray:
+        def pad_to_batch(x: np.ndarray) -> np.ndarray:
             """Zeros for the baseline, the designs' runs, zeros up to the batch's size."""
             count, designs = x.shape[:2]
             used = np.where(needs_gradient.reshape(-1, *[1] * (x.ndim - 2)), x, 0.0)
@@ -146,7 +146,7 @@ class Evaluator:
             padded[:, begin : begin + designs * begin] = used.reshape(count, -1, *x.shape[3:])
             return padded
 
-        slopes = runs.pull_back(jax.tree.map(of_runs, cotangents))
+        slopes = runs.pull_back(jax.tree.map(pad_to_batch, cotangents))
         slopes = slopes[:, self.scenarios : self.lanes]
         by_design = slopes.reshape(len(slopes), -1, self.scenarios, slopes.shape[-1])
         return np.swapaxes(by_design.sum(axis=2), 0, 1)

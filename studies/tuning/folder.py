@@ -39,7 +39,7 @@ def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterat
                 raise StudyError(f"{path}: damaged; name a new folder") from None
             now = json.loads(json.dumps(manifest))
             for key, what in CHECKED.items():
-                if not isinstance(old, dict) or _settled(old.get(key)) != _settled(now[key]):
+                if not isinstance(old, dict) or _fixed_part(old.get(key)) != _fixed_part(now[key]):
                     raise StudyError(
                         f"--out {out}: was begun with another {what}; name a new folder"
                     )
@@ -58,7 +58,7 @@ def open_tuning(out: Path, manifest: dict[str, Any], is_resumed: bool) -> Iterat
             raise
 
 
-def _settled(part: Any) -> Any:
+def _fixed_part(part: Any) -> Any:
     """What must not change: everything but the number of iterations, unless Adam uses it."""
     part = copy.deepcopy(part)
     tune = part.get("tune") if isinstance(part, dict) else None

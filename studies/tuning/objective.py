@@ -90,7 +90,7 @@ def objectives(goal: Objective, metrics: Metrics, own: Metrics) -> Array:
     return jnp.sum(jnp.stack(shares), axis=0)
 
 
-def judged(
+def judge_design(
     goal: Objective, metrics: Metrics, own: Metrics, allowed: Array
 ) -> tuple[Array, Array, Array]:
     """Judge a design.
@@ -113,11 +113,11 @@ def judged(
 
 
 @partial(jax.jit, static_argnums=0)
-def all_judged(
+def judge_designs(
     goal: Objective, metrics: Metrics, own: Metrics, allowed: Array
 ) -> tuple[Array, Array, Array]:
-    """`judged` for designs under the same limits, metrics (designs, S, ...)."""
-    return jax.vmap(lambda x: judged(goal, x, own, allowed))(metrics)
+    """`judge_design` for designs under the same limits, metrics (designs, S, ...)."""
+    return jax.vmap(lambda x: judge_design(goal, x, own, allowed))(metrics)
 
 
 class JudgedDesigns(NamedTuple):
@@ -130,7 +130,7 @@ class JudgedDesigns(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=0)
-def judged_designs(
+def judge_with_cotangents(
     goal: Objective, metrics: Metrics, own: Metrics, allowed: Array
 ) -> JudgedDesigns:
     """Judge designs and differentiate by the metrics.
@@ -144,7 +144,7 @@ def judged_designs(
 
     def one(metrics: Metrics, allowed: Array) -> JudgedDesigns:
         def figures(x: Metrics) -> tuple[Array, Array]:
-            objective, limits, peaks = judged(goal, x, own, allowed)
+            objective, limits, peaks = judge_design(goal, x, own, allowed)
             return jnp.concatenate([objective[None], limits]), peaks
 
         values, back, peaks = jax.vjp(figures, metrics, has_aux=True)

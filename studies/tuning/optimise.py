@@ -177,17 +177,17 @@ def advance(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> Progress:
     )
     state, is_taken, place = method(spec).step(at.descent, trial)
 
-    def taken(new: np.ndarray, old: np.ndarray) -> np.ndarray:
+    def select(new: np.ndarray, old: np.ndarray) -> np.ndarray:
         return np.where(is_taken.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
 
     free = evaluator.is_free
     at = at._replace(
         iteration=np.array(k + 1),
-        base=taken(at.place, at.base),
-        base_objective=taken(evaluation.objective, at.base_objective),
-        base_slope=taken(slope, at.base_slope),
-        base_limits=taken(evaluation.limits, at.base_limits),
-        base_limit_slope=taken(limit_slope, at.base_limit_slope),
+        base=select(at.place, at.base),
+        base_objective=select(evaluation.objective, at.base_objective),
+        base_slope=select(slope, at.base_slope),
+        base_limits=select(evaluation.limits, at.base_limits),
+        base_limit_slope=select(limit_slope, at.base_limit_slope),
         place=np.where(free & ~at.is_frozen[:, None], place, at.place),
         descent=state,
     )
@@ -344,14 +344,14 @@ def optimise(
         at: progress of an interrupted tuning; None for a new one.
         keep: called after each iteration.
     """
-    at = begin(spec, evaluator) if at is None else _with_room(at, spec.tune.iterations)
+    at = begin(spec, evaluator) if at is None else _resize(at, spec.tune.iterations)
     while int(at.iteration) < spec.tune.iterations and not is_settled(spec, at):
         at = advance(spec, evaluator, at)
         keep(at)
     return _hand_on(spec, at)
 
 
-def fits(spec: TuneSpec, at: Progress) -> bool:
+def is_compatible(spec: TuneSpec, at: Progress) -> bool:
     """Whether saved progress has the arrays of this tuning; iterations can differ."""
 
     def forms(one: Progress) -> list[Any]:
@@ -367,7 +367,7 @@ def fits(spec: TuneSpec, at: Progress) -> bool:
     )
 
 
-def _with_room(at: Progress, iterations: int) -> Progress:
+def _resize(at: Progress, iterations: int) -> Progress:
     """Progress adapted to a different number of iterations."""
     history = np.full((max(iterations, int(at.iteration)), *at.history.shape[1:]), np.nan)
     history[: int(at.iteration)] = at.history[: int(at.iteration)]

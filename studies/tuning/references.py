@@ -22,7 +22,7 @@ from studies.study.resolution import is_deflection, least_step, resolution_text
 from studies.study.spec import Study
 from studies.tuning.check import JudgedDesign, PlainRuns, judge, shown_structure
 from studies.tuning.linear_fidelity import DesignFigures, loop_figures
-from studies.tuning.objective import all_judged, allowed_limits, objective_of, own_limits
+from studies.tuning.objective import allowed_limits, judge_designs, objective_of, own_limits
 from studies.tuning.optimise import KEPT, excess
 from studies.tuning.scenarios import lane_columns, scenario_columns
 from studies.tuning.spec import BASELINE, Family, TuneSpec
@@ -145,7 +145,7 @@ def _evaluate(spec: TuneSpec, runs: PlainRuns, values: np.ndarray) -> tuple[np.n
     metrics = jax.tree.map(split, result.metrics)
     own, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
     allowed = allowed_limits(goal, designs[0], own_limits(goal, own))
-    objective, limits, _ = map(np.asarray, all_judged(goal, others, own, allowed))
+    objective, limits, _ = map(np.asarray, judge_designs(goal, others, own, allowed))
     is_whole = np.isin(split(result.status)[1:], status.FINISHED).all(axis=1)
     return np.where(is_whole, objective, np.nan), excess(limits)
 
@@ -164,13 +164,15 @@ def _keeps_loop(spec: TuneSpec, value: float) -> bool:
         limit = spec.tune.limits[name]
         if limit == BASELINE:
             own = own or loop_figures(spec, spec.study)
-        left = _left(name, figures, getattr(own, name) if limit == BASELINE else float(limit))
+        left = relative_margin(
+            name, figures, getattr(own, name) if limit == BASELINE else float(limit)
+        )
         if left < -KEPT:
             return False
     return True
 
 
-def _left(name: str, figures: DesignFigures, allowed: float) -> float:
+def relative_margin(name: str, figures: DesignFigures, allowed: float) -> float:
     """How far a figure of the loop is from its limit, as a share of it; negative: violated."""
     share: float = getattr(figures, name) / allowed - 1
     return -share if name == "spillover" else share

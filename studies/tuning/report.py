@@ -24,7 +24,7 @@ from studies.tuning.free import PLACEMENT
 from studies.tuning.linear_fidelity import DesignFigures
 from studies.tuning.objective import SHOWN
 from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
-from studies.tuning.references import References, reference_lines, resolution_lines
+from studies.tuning.references import References, reference_lines, relative_margin, resolution_lines
 from studies.tuning.scenarios import move_label
 from studies.tuning.spec import BASELINE, LOOP_LIMITS, Family, TuneSpec, label
 
@@ -150,7 +150,7 @@ def _metric_gain(metric: str, one: JudgedDesign, own: JudgedDesign) -> dict[str,
     after, before = (float(x.own.metrics[metric]) for x in (one, own))
     texts = [_value(metric, x.own.metrics, x.own.watched) for x in (one, own)]
     unit = readable(METRICS[parse_entries(metric).metric].unit)[1]
-    change = "" if any(text.startswith("not") for text in texts) else _relative(before, after)
+    change = "" if any(text.startswith("not") for text in texts) else _percent_change(before, after)
     with_unit = texts[1] if unit == "1" else f"{texts[1]} {unit}"
     is_worse = after > (1 + ALIKE) * before
     return _gain(metric, change, texts[0], with_unit, is_worse)
@@ -180,14 +180,14 @@ def _loop_gains(one: DesignFigures, own: DesignFigures) -> list[dict[str, Any]]:
     margins = [x.gain_margin for x in (one, own)]
     decays = [x.slowest_decay for x in (one, own)]
     lost = [after < (1 - ALIKE) * before for after, before in (margins, decays)]
-    change = _relative(decays[1], decays[0])
+    change = _percent_change(decays[1], decays[0])
     return [
         _gain("gain margin", "", margin_in_db(margins[0], 3), margin_in_db(margins[1], 3), lost[0]),
         _gain("slowest decay", change, f"{decays[0]:.3g}", f"{decays[1]:.3g} 1/s", lost[1]),
     ]
 
 
-def _relative(before: float, after: float) -> str:
+def _percent_change(before: float, after: float) -> str:
     """A relative change in percent, "" if there is nothing to relate to."""
     return f"{100 * (after / before - 1):+.3g} %" if before else ""
 
@@ -325,8 +325,7 @@ def _loop_margin(findings: TuneFindings, k: int, name: str, limit: float | str) 
     if loop is None or own is None:
         return float("nan")
     allowed = getattr(own, name) if limit == BASELINE else float(limit)
-    margin = getattr(loop, name) / allowed - 1
-    return -margin if name == "spillover" else margin
+    return relative_margin(name, loop, allowed)
 
 
 def _state(beyond: float, left: float) -> str:
@@ -342,7 +341,7 @@ def _numbers(spec: TuneSpec, findings: TuneFindings) -> list[list[str]]:
     """Row of each free parameter but those of the placement, which `_centers` shows in mm."""
     at, families, rows = findings.at, spec.moving, []
     places = [at.best_place[at.winner(k)] for k in range(len(families))]
-    alike = [at.best_place[_alike(at, k)] for k in range(len(families))]
+    alike = [at.best_place[_equivalent_starts(at, k)] for k in range(len(families))]
     for n, free in enumerate(spec.free.numbers):
         if free.key == PLACEMENT:
             continue
@@ -372,7 +371,7 @@ def _centers(spec: TuneSpec, findings: TuneFindings) -> list[list[str]]:
     return rows
 
 
-def _alike(at: Progress, family: int) -> np.ndarray:
+def _equivalent_starts(at: Progress, family: int) -> np.ndarray:
     """Starts of a family that end about as well as its best one."""
     best = at.winner(family)
     is_near = at.best_objective <= (1 + ALIKE) * at.best_objective[best]

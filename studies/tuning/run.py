@@ -28,7 +28,7 @@ from studies.tuning.audit import audit
 from studies.tuning.check import search, tuned_study
 from studies.tuning.evaluate import Evaluator
 from studies.tuning.folder import PROGRESS, RESULTS, open_tuning, save_progress
-from studies.tuning.optimise import Progress, fits, optimise, start_families
+from studies.tuning.optimise import Progress, is_compatible, optimise, start_families
 from studies.tuning.references import compare
 from studies.tuning.report import (
     TuneFindings,
@@ -82,7 +82,7 @@ def run_tuning(
     manifest = make_manifest(spec.data, DECISIVE)
 
     with open_tuning(out, manifest, is_resumed) as before:
-        if before is not None and not fits(spec, before):
+        if before is not None and not is_compatible(spec, before):
             raise StudyError(f"{out / PROGRESS}: damaged; name a new folder")
         with Phases(console, tune_phases(spec), is_quiet) as phases:
             findings = _tune(spec, out, before, evaluator, phases)

@@ -44,7 +44,7 @@ def scenario_columns(
         if any(isinstance(x, tuple) for x in column):  # one number stands for all links
             column = [x if isinstance(x, tuple) else (x,) * LINKS for x in column]
         machines[name] = column_of(column)
-    columns = {name: _repeated(column, moves) for name, column in machines.items()}
+    columns = {name: _repeat(column, moves) for name, column in machines.items()}
     for name in spec.tune.scenarios.each:
         columns[name] = np.repeat(column_of([move[name] for move in spec.moves]), count, axis=0)
     return columns
@@ -68,7 +68,7 @@ def lane_columns(
         families: of each design; None is the baseline.
     """
     count = len(next(iter(columns.values())))
-    lanes = {name: _repeated(column, len(families)) for name, column in columns.items()}
+    lanes = {name: _repeat(column, len(families)) for name, column in columns.items()}
     for name in sorted({name for family in families if family for name in family.columns}):
         own = known_field(name, spec.study)
         values = [family.columns.get(name, own) if family else own for family in families]
@@ -80,7 +80,7 @@ def lane_columns(
     }
 
 
-def _repeated(column: np.ndarray, times: int) -> np.ndarray:
+def _repeat(column: np.ndarray, times: int) -> np.ndarray:
     """All rows of a column, several times over."""
     return np.concatenate([column] * times)
 

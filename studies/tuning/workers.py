@@ -14,7 +14,7 @@ from distributed import get_worker
 from studies import config
 from studies.cluster.connect import Workers, on_workers
 from studies.cluster.watch import Watch
-from studies.cluster.worker import alone, get_ready, identity, refuse_difference
+from studies.cluster.worker import alone, configure_worker, identity, refuse_difference
 from studies.errors import StudyError
 from studies.tuning.evaluate import Evaluation, Evaluator
 from studies.tuning.optimise import start_families
@@ -53,7 +53,7 @@ def evaluate_part(part: Share) -> ShareDone:
     with alone:
         worker = get_worker()
         refuse_difference(part.identity, worker)
-        get_ready(part.precision, worker)
+        configure_worker(part.precision, worker)
         evaluator = _evaluator(part.precision, part.spec, part.families)
         return ShareDone(evaluator.evaluate(part.values, part.needs_gradient), worker.address)
 
@@ -106,19 +106,19 @@ class ClusterEvaluator(Evaluator):
             )
             for part, families in zip(self._parts, self._families, strict=True)
         ]
-        evaluations = self._gathered(futures)
+        evaluations = self._gather(futures)
         if self._is_compiled:
             self.run_time = (time.perf_counter() - started) / self.lanes
         self._is_compiled = True
         return Evaluation(*(np.concatenate(x) for x in zip(*evaluations, strict=True)))
 
-    def _gathered(self, futures: list[Future[Any]]) -> list[Evaluation]:
+    def _gather(self, futures: list[Future[Any]]) -> list[Evaluation]:
         """Answers in the order of the parts."""
         answers: dict[Future[Any], Any] = {}
         try:
             while len(answers) < len(futures):
                 left = [future for future in futures if future not in answers]
-                for future in self._watch.landed(left):
+                for future in self._watch.finished(left):
                     answers[future] = self._watch.outcome(future)
                     if isinstance(answers[future], str):
                         raise StudyError(
