@@ -223,14 +223,15 @@ def test_own_law_becomes_c(own, tmp_path, capsys):
 def test_what_is_taken_or_empty_is_refused(tmp_path):
     with pytest.raises(StudyError, match="metric 'residual_rms': this name is taken"):
         extend(metrics=[METRICS["residual_rms"]._replace(text="another")])
-    for text, message in (
+    refused = (
         ("", "none of the lists laws"),
         ("1/0", "ZeroDivisionError"),
         ("raise SystemExit(3)", "SystemExit: 3"),
         ("laws = 5", "laws = 5; expected a list"),
         ("methods = ['sobol']", "method 'sobol': expected a Method"),
-    ):
-        path = tmp_path / f"part{len(text)}.py"
+    )
+    for k, (text, message) in enumerate(refused):
+        path = tmp_path / f"part{k}.py"
         path.write_text(text)
         with pytest.raises(StudyError, match=message):
             extend(path)

@@ -153,7 +153,7 @@ def test_residuals_that_are_too_large_are_no_noise():
     # of measurements that were softened, by what noise would have there
     scaled = measured(1.3 * r, mean_square=1.69)
     assert scaled.is_noise and scaled.square == pytest.approx(400)
-    assert _misfit(scaled) == ["a/b", "400", "1", f"{scaled.autocorrelation:.2f}", "yes"]
+    assert _misfit(scaled) == ["a|b", "400", "1", f"{scaled.autocorrelation:.2f}", "yes"]
     assert _misfit(measured(2 * r))[2:] == ["4", f"{scaled.autocorrelation:.2f}", "**no**"]
 
 
