@@ -71,9 +71,9 @@ def main(arguments: list[str] | None = None) -> None:
         print("studies: interrupted", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except Exception as error:
-        from studies.extensions import blamed
+        from studies.extensions import plugin_error
 
-        if not (reason := blamed(error)):
+        if not (reason := plugin_error(error)):
             raise
         print(f"studies: {printable(reason)}", file=sys.stderr)
         sys.exit(2)
@@ -104,8 +104,8 @@ def _show_warning(
         print(warnings.formatwarning(message, category, filename, lineno), file=sys.stderr, end="")
 
 
-def _print_version(is_wanted: bool) -> None:
-    if is_wanted:
+def _print_version(is_requested: bool) -> None:
+    if is_requested:
         print(f"{PACKAGE} {__version__}")
         raise typer.Exit()
 

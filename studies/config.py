@@ -98,7 +98,7 @@ def configure(
     if devices is not None and (not isinstance(devices, int) or devices < 1):
         raise field_error("devices", devices, "a whole number from 1")
 
-    _look_less_for_garbage()
+    _collect_garbage_less_often()
     os.environ.setdefault(*LOG_LEVEL)
     old_flags = os.environ.get("XLA_FLAGS", "")
     new_flags = _extended(old_flags, devices, flags)
@@ -112,7 +112,7 @@ def configure(
     _set_cache(cache)
 
 
-def _look_less_for_garbage() -> None:
+def _collect_garbage_less_often() -> None:
     if gc.get_threshold() in PYTHONS_OWN:
         gc.set_threshold(*GARBAGE)
 
@@ -166,8 +166,8 @@ def start(precision: str = "float64", cpu_only: bool = False) -> None:
     except (RuntimeError, AssertionError) as error:
         reason = str(error).partition("\n")[0] or "no device of the platform asked for"
         names = ("JAX_PLATFORMS", "XLA_FLAGS")
-        given = ", ".join(f"{name}={os.environ.get(name, '')!r}" for name in names)
-        raise StudyError(f"JAX cannot start: {reason} ({given})") from None
+        settings = ", ".join(f"{name}={os.environ.get(name, '')!r}" for name in names)
+        raise StudyError(f"JAX cannot start: {reason} ({settings})") from None
 
 
 def info() -> dict[str, Any]:
@@ -232,8 +232,8 @@ def processor_text() -> str:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
         text = ""
-    found = re.search(r"^model name\s*: (.+)$", text, re.MULTILINE)
-    name = found[1].strip() if found else platform.processor() or platform.machine()
+    match = re.search(r"^model name\s*: (.+)$", text, re.MULTILINE)
+    name = match[1].strip() if match else platform.processor() or platform.machine()
     widest = next((x for x in ("avx512f", "avx2", "asimd") if re.search(rf"\b{x}\b", text)), "")
     return f"{usable_cores()} x {name}" + (f" ({widest})" if widest else "")
 
@@ -261,11 +261,11 @@ def is_backend_started() -> bool:
 
 def _extended(present: str, devices: int | None, flags: bool) -> str:
     """XLA_FLAGS with missing flags added; an explicit number of devices replaces its own."""
-    wanted = dict(COMPILER_FLAGS) if flags else {}
+    required = dict(COMPILER_FLAGS) if flags else {}
     if devices is not None:
         present = re.sub(rf"{DEVICE_FLAG}=\S*", "", present)
-    wanted[DEVICE_FLAG] = str(devices or usable_cores())
-    missing = [f"{name}={value}" for name, value in wanted.items() if name not in present]
+    required[DEVICE_FLAG] = str(devices or usable_cores())
+    missing = [f"{name}={value}" for name, value in required.items() if name not in present]
     return " ".join(present.split() + missing)
 
 

@@ -49,17 +49,17 @@ def extend(
     Raises:
         StudyError: no such module, one that fails or is empty, or a name already taken.
     """
-    found = _imported(str(module)) if str(module) else None
-    for kind, given in (
+    plugin = _imported(str(module)) if str(module) else None
+    for kind, added in (
         ("laws", laws),
         ("metrics", metrics),
         ("methods", methods),
         ("targets", targets),
     ):
-        own = getattr(found, kind, ())
+        own = getattr(plugin, kind, ())
         if not isinstance(own, (list, tuple)):
             raise StudyError(f"{module}: {kind} = {own!r}; expected a list")
-        for entry in [*own, *given]:
+        for entry in [*own, *added]:
             try:
                 name = str(getattr(entry, "name", ""))
                 if kind == "metrics" and name in RESERVED:
@@ -67,24 +67,24 @@ def extend(
                 _table(kind).add(entry)
             except PartError as error:
                 raise StudyError(f"{module or 'extend'}: {error}") from None
-    if found is None:
+    if plugin is None:
         return
-    if not any(hasattr(found, kind) for kind in ("laws", "metrics", "methods", "targets")):
+    if not any(hasattr(plugin, kind) for kind in ("laws", "metrics", "methods", "targets")):
         raise StudyError(f"{module}: has none of the lists laws, metrics, methods, targets")
-    file = Path(str(found.__file__)).resolve()
+    file = Path(str(plugin.__file__)).resolve()
     if file not in sources.OUTSIDE:
         sources.OUTSIDE.append(file)
-    os.environ[VARIABLE] = os.pathsep.join(dict.fromkeys([*_told(), str(file)]))
+    os.environ[VARIABLE] = os.pathsep.join(dict.fromkeys([*_requested_modules(), str(file)]))
 
 
-def extend_as_told() -> None:
+def extend_from_environment() -> None:
     """Load what the environment names, in a process started by another one."""
-    for module in _told():
+    for module in _requested_modules():
         if Path(module).resolve() not in sources.OUTSIDE:  # it can have another module name here
             extend(module)
 
 
-def blamed(error: BaseException) -> str:
+def plugin_error(error: BaseException) -> str:
     """Where and why a user's own file failed, in a sentence; "" if the error is not from one.
 
     Args:
@@ -99,7 +99,7 @@ def blamed(error: BaseException) -> str:
     return ""
 
 
-def _told() -> list[str]:
+def _requested_modules() -> list[str]:
     return [name for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
 
 
@@ -116,22 +116,22 @@ def _imported(module: str) -> ModuleType:
     name = path.stem if path.suffix == ".py" else module
     if path.suffix == ".py" and not path.is_file():
         raise StudyError(f"{module}: no such file")
-    known = sys.modules.get(name)
-    if path.suffix == ".py" and known is not None:
-        if Path(str(known.__file__)).resolve() == path.resolve():
-            return known
+    loaded = sys.modules.get(name)
+    if path.suffix == ".py" and loaded is not None:
+        if Path(str(loaded.__file__)).resolve() == path.resolve():
+            return loaded
         raise StudyError(f"{module}: a module {name} is loaded already; choose another file name")
     try:
         if path.suffix != ".py":
             return importlib.import_module(module)
         spec = importlib.util.spec_from_file_location(name, path)
         assert spec is not None and spec.loader is not None
-        found = importlib.util.module_from_spec(spec)
-        sys.modules[name] = found
-        spec.loader.exec_module(found)
+        imported = importlib.util.module_from_spec(spec)
+        sys.modules[name] = imported
+        spec.loader.exec_module(imported)
     except (Exception, SystemExit) as error:  # the file can do anything
         sys.modules.pop(name, None)
         raise StudyError(
             f"{module}: cannot be imported ({type(error).__name__}: {error})"
         ) from None
-    return found
+    return imported

@@ -22,12 +22,12 @@ def digest(*modules: str, top: Path = TOP) -> str:
         modules: dotted names; a package stands for all its modules.
         top: folder of the packages.
     """
-    found = sha256()
+    hasher = sha256()
     for path in closure(modules, top):
-        found.update(str(path.relative_to(top)).encode() + b"\0" + path.read_bytes())
+        hasher.update(str(path.relative_to(top)).encode() + b"\0" + path.read_bytes())
     for path in OUTSIDE:
-        found.update(path.read_bytes())
-    return found.hexdigest()[:16]
+        hasher.update(path.read_bytes())
+    return hasher.hexdigest()[:16]
 
 
 def closure(modules: Iterable[str], top: Path = TOP) -> list[Path]:

@@ -19,7 +19,7 @@ from studies.cluster.connect import Workers, connected
 from studies.cluster.runner import ClusterRunner
 from studies.cluster.worker import identity
 from studies.engine import plan
-from studies.engine.chunks import Here
+from studies.engine.chunks import LocalRunner
 from studies.engine.columns import NOT_RUN
 from studies.engine.folder import CHUNKS, SweepFolder, finished_cases, read_manifest
 from studies.engine.results import read_sweep
@@ -260,7 +260,7 @@ def test_overhead_and_scaling(tmp_path, monkeypatch):
     spec = small_spec({"axes": gain}, run={"duration": 0.4})
     cores = len(jax.local_devices())
     with ExitStack() as stack:
-        found = {"here": Here()}
+        found = {"here": LocalRunner()}
         for name, workers, threads in (("whole", 1, cores), ("one", 1, 1), ("two", 2, 1)):
             (tmp_path / name).mkdir()
             options = {"workers": workers, "threads": threads, "is_small": False}

@@ -22,7 +22,7 @@ from studies.engine.chunks import JudgedChunk, start_chunk
 from studies.engine.executor import Executor
 from studies.engine.plan import chunk_cases, even_layout, local_layout
 from studies.errors import StudyError
-from studies.extensions import extend_as_told
+from studies.extensions import extend_from_environment
 from studies.space.spec import parse_sweep
 from studies.space.table import CaseTable, build_table
 
@@ -55,7 +55,7 @@ class ChunkDone(NamedTuple):
 @cache
 def identity() -> dict[str, str]:
     """What must be the same on client and workers."""
-    extend_as_told()
+    extend_from_environment()
     return {
         "code": sources.digest("studies.cluster.worker", "studies.tuning.workers"),
         "python": ".".join(platform.python_version_tuple()[:2]),

@@ -49,8 +49,8 @@ def keep_baseline(
         text = "one ADC step, in the deflection of mode 1"
         variables["adc_step"] = Variable(step, ("link",), "m", text)
     if run.status in status.FINISHED:
-        found = metric_variables(run.result)
-        variables |= {name: found[name] for name in kept_metrics(spec)}
+        metrics = metric_variables(run.result)
+        variables |= {name: metrics[name] for name in kept_metrics(spec)}
     write_store(folder / BASELINE, variables, {"case_id": baseline_id(spec)})
 
 

@@ -103,15 +103,15 @@ def _stacked(parts: list[StateSpace]) -> StateSpace:
     )
 
 
-def restored(arranged: ModalBlocks, like: Controller) -> Controller:
+def restored(blocks: ModalBlocks, like: Controller) -> Controller:
     """A controller equivalent to the blocks; `like` supplies what they leave open."""
-    system, count = arranged.system, len(like.feedback.state)  # type: ignore[union-attr]
+    system, count = blocks.system, len(like.feedback.state)  # type: ignore[union-attr]
     if count == 1:
         return like._replace(feedback=system)
 
     def spread(part: np.ndarray) -> np.ndarray:
         whole = np.zeros((count, *part.shape[1:]))
-        whole[arranged.link] = part
+        whole[blocks.link] = part
         return whole
 
     return like._replace(feedback=StateSpace(*map(spread, system)))
@@ -137,12 +137,12 @@ def responses(system: StateSpace, group: int, n: int) -> ImpulseResponses:
     count, size = len(state), len(direct)
     impulse = np.zeros(n)
     impulse[0] = 1.0
-    found = ImpulseResponses(
+    response = ImpulseResponses(
         state=np.zeros((count, 2, size, n)),
         command=np.zeros((size, size, n)),
         kicked=np.zeros((size, count, 2, n)),
     )
-    found.command[:, :, 0] = direct
+    response.command[:, :, 0] = direct
     for k, a in enumerate(state):
         below = [1.0, -np.trace(a), np.linalg.det(a)]
         # (z - A)^-1 = (z + A - tr A)/(z^2 - z tr A + det A), in powers of 1/z
@@ -153,7 +153,7 @@ def responses(system: StateSpace, group: int, n: int) -> ImpulseResponses:
                 for i in (0, 1)
             ]
         )
-        found.state[k] = np.einsum("irn,rm->imn", moved, enter[k])
-        found.command[:] += np.einsum("pi,imn->pmn", leave[:, k], found.state[k])
-        found.kicked[:, k] = np.einsum("pi,irn->prn", leave[:, k], moved)
-    return found
+        response.state[k] = np.einsum("irn,rm->imn", moved, enter[k])
+        response.command[:] += np.einsum("pi,imn->pmn", leave[:, k], response.state[k])
+        response.kicked[:, k] = np.einsum("pi,irn->prn", leave[:, k], moved)
+    return response

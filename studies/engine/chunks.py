@@ -71,7 +71,7 @@ class Runner(Protocol):
         ...
 
 
-class Here:
+class LocalRunner:
     """Runs chunks in this process, on its own devices."""
 
     def layout(self, n: int, structure: Structure) -> Layout:

@@ -53,8 +53,8 @@ def fixed_controller(study: Study) -> FixedController:
     _check_exportable(study)
     study = resolved_study(study)
     structure, case = check_run(study)
-    known = preflight(structure, case)
-    controller, taps = known.controller, known.taps
+    prepared = preflight(structure, case)
+    controller, taps = prepared.controller, prepared.taps
     if not controller.feedback.has_output:
         raise field_error(
             "control.gain_factor",
@@ -71,7 +71,7 @@ def fixed_controller(study: Study) -> FixedController:
         controller=controller,
         channels=arrange(controller, study.control.law),
         taps=_merged(taps),
-        frequency=_frequencies(structure, known.believed_omega),
+        frequency=_frequencies(structure, prepared.believed_omega),
     )
 
 

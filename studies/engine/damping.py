@@ -44,11 +44,11 @@ def damping_ratios(
         n_orders: number of mode orders.
     """
     count = len(n_links)
-    found = np.full((count, n_orders), np.nan)
+    ratios = np.full((count, n_orders), np.nan)
     for order in range(min(n_orders, response.square.shape[1])):
         poles = _poles(response, modes, order)
-        found[:, order] = least_controlled(-poles.real / np.abs(poles), n_links)
-    return found
+        ratios[:, order] = least_controlled(-poles.real / np.abs(poles), n_links)
+    return ratios
 
 
 def least_controlled(ratio: np.ndarray, n_links: np.ndarray) -> np.ndarray:
@@ -74,8 +74,8 @@ def _poles(response: LoopResponse, modes: AssembledModes, order: int) -> np.ndar
     poles, is_found = _followed(response, own, WAYS[0])
     again = np.flatnonzero(~is_found)
     if len(again):
-        here, start = jax.tree.map(lambda x: x[..., again], (response, own))
-        poles[:, again], is_found[again] = _followed(here, start, WAYS[1])
+        remaining, start = jax.tree.map(lambda x: x[..., again], (response, own))
+        poles[:, again], is_found[again] = _followed(remaining, start, WAYS[1])
     return np.where(is_found, poles, np.nan)
 
 

@@ -78,31 +78,31 @@ def _tuned(path: Path, case: str | int | None) -> Path:
         raise StudyError(f"{path}: the tuning is not finished; continue with studies tune --resume")
     if case is None and len(files) == 1:
         return next(iter(files.values()))
-    known = f"{', '.join(sorted(filter(None, files)))}, the families of {path}"
+    allowed = f"{', '.join(sorted(filter(None, files)))}, the families of {path}"
     if case is None:
-        raise StudyError(f"--case is missing; allowed: {known}")
+        raise StudyError(f"--case is missing; allowed: {allowed}")
     if str(case) not in files:
-        raise field_error("--case", case, known, hint=nearest(str(case), files))
+        raise field_error("--case", case, allowed, hint=nearest(str(case), files))
     return files[str(case)]
 
 
 def _number(data: SweepData, case: str | None, path: Path) -> int:
     """Number of the requested case."""
-    known = (
+    allowed = (
         f"allowed: 0 to {data.n_cases - 1}, the cases of {path}, or id: and the first digits of a "
         "case's id"
     )
     if case is None:
-        raise StudyError(f"--case is missing: {known}")
+        raise StudyError(f"--case is missing: {allowed}")
     if case.startswith("id:"):
         ids = data["case_id"].astype(str)
-        found = np.flatnonzero(np.char.startswith(ids, case.removeprefix("id:").lower()))
-        if len(found) != 1:
-            raise StudyError(f"--case {case}: fits {len(found)} cases of {path}; allowed: one")
-        return int(found[0])
+        matches = np.flatnonzero(np.char.startswith(ids, case.removeprefix("id:").lower()))
+        if len(matches) != 1:
+            raise StudyError(f"--case {case}: fits {len(matches)} cases of {path}; allowed: one")
+        return int(matches[0])
     is_number = case.isascii() and case.isdigit() and len(case) < 20
     if not is_number or int(case) >= data.n_cases:
-        raise StudyError(f"--case {case}: {known}")
+        raise StudyError(f"--case {case}: {allowed}")
     return int(case)
 
 
@@ -116,13 +116,13 @@ def deviation(run: Run, stored: dict[str, np.ndarray]) -> tuple[float, str]:
     Returns:
         (difference [1], name of the metric); (0, "") if there is nothing to compare.
     """
-    found = {name: variable.data for name, variable in metric_variables(run.result).items()}
+    metrics = {name: variable.data for name, variable in metric_variables(run.result).items()}
     worst = (0.0, "")
-    for name, wanted in stored.items():
+    for name, reference in stored.items():
         if name == "status":
             continue
-        own = np.asarray(found[name])
-        part = np.asarray(wanted)[tuple(slice(0, n) for n in own.shape)]
+        own = np.asarray(metrics[name])
+        part = np.asarray(reference)[tuple(slice(0, n) for n in own.shape)]
         size = np.nanmax(np.abs(part), initial=0.0)
         difference = np.nanmax(np.abs(own - part), initial=0.0) / size if size > 0 else 0.0
         worst = max(worst, (float(difference), name))

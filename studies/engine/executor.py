@@ -140,7 +140,7 @@ class Executor:
 
     def _prepared(self, cases: Any, free: Any) -> tuple[BlockFunction, list[list[np.ndarray]]]:
         """The function of a block, and the numbers of each."""
-        leaves, tree = jax.tree.flatten(self._widened(cases))
+        leaves, tree = jax.tree.flatten(self._with_own_ratio(cases))
         leaves = [np.asarray(leaf) for leaf in leaves]
         is_own = tuple(len(leaf) == self.layout.size for leaf in leaves)
         own = [leaf for leaf, yes in zip(leaves, is_own, strict=True) if yes]
@@ -151,11 +151,11 @@ class Executor:
             shared = [leaf[0] for leaf, yes in zip(leaves, is_own, strict=True) if not yes]
             build = CaseLeaves(tree, is_own, self.place)
             first = free[: self.layout.lanes] if self.place else (), blocks[0]
-            self._function = self._made(build, *first, shared)
+            self._function = self._compiled(build, *first, shared)
             self.compile_time = time.perf_counter() - began
         return self._function, blocks
 
-    def _widened(self, cases: Any) -> Any:
+    def _with_own_ratio(self, cases: Any) -> Any:
         """The same program for both passes, which differ in ratios and links."""
         if not self._has_own_ratio:
             return cases
@@ -164,7 +164,7 @@ class Executor:
         links = np.broadcast_to(cases.control.link_mask, shape[:2])
         return cases._replace(control=cases.control._replace(link_mask=links))
 
-    def _made(self, build: CaseLeaves, free: Any, own: Any, shared: Any) -> BlockFunction:
+    def _compiled(self, build: CaseLeaves, free: Any, own: Any, shared: Any) -> BlockFunction:
         """The function of a block, compiled."""
 
         def make(kind: str) -> BlockFunction:

@@ -158,7 +158,7 @@ class BlockFunction:
         start = self.parts.joined(varying, [jnp.asarray(x)[..., None] for x in shared])
         varies: Start = jax.tree.unflatten(self.parts.tree, self.parts.is_varying)
         first, outline = (
-            jax.tree.map(self._widened, tree, variation)
+            jax.tree.map(self._broadcast, tree, variation)
             for tree, variation in ((start.state, varies.state), (start.outline, varies.outline))
         )
         if self._step_all is None:
@@ -174,7 +174,7 @@ class BlockFunction:
             )
         return _conclude(outline, first.status, last)
 
-    def _widened(self, x: Any, is_wide: bool) -> Any:
+    def _broadcast(self, x: Any, is_wide: bool) -> Any:
         return x if is_wide else jnp.broadcast_to(x, (*x.shape[:-1], self.lanes))
 
     def _begin(self, free: Any, own: Any, shared: Any) -> Start:
@@ -230,8 +230,8 @@ class BlockFunction:
         leaves = [InputLeaf(*kind) for kind in kinds]
         start: Start = jax.tree.unflatten(parts.tree, range(len(leaves)))
         trees = [jax.tree.structure(part) for part in start[:3]]
-        known = iter(self.shared)
-        values = [leaf if leaf.is_varying else next(known) for leaf in leaves]
+        shared = iter(self.shared)
+        values = [leaf if leaf.is_varying else next(shared) for leaf in leaves]
 
         def sample(constants: list[Any], row: list[Any], carried: list[Any]) -> list[Any]:
             loop, inputs, state = (

@@ -123,7 +123,7 @@ def _runner(
         return jax.lax.scan(body, state, inputs or None, length=n_steps)[0]
 
     def run_scan(leaves: list[Any], n_steps: int, lanes: int) -> list[Any]:
-        given, inputs = leaves[: sizes[0]], leaves[sizes[0] : sizes[0] + sizes[1]]
-        return list(map(np.asarray, scanned(given, inputs, leaves[-sizes[2] :], n_steps)))
+        constants, inputs = leaves[: sizes[0]], leaves[sizes[0] : sizes[0] + sizes[1]]
+        return list(map(np.asarray, scanned(constants, inputs, leaves[-sizes[2] :], n_steps)))
 
     return run_scan

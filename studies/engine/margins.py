@@ -374,22 +374,24 @@ def _crossings(
     return Crossings(case[at[1]], value[at], place[at]), left[at], right[at]
 
 
-def _is_confirmed(seen: Crossings, found: Crossings) -> np.ndarray:
+def _is_confirmed(crossings: Crossings, refined: Crossings) -> np.ndarray:
     """Whether anything was found near each crossing, (k,)."""
-    order = np.argsort(found.case, kind="stable")
-    begin, end = (np.searchsorted(found.case[order], seen.case, side) for side in ("left", "right"))
+    order = np.argsort(refined.case, kind="stable")
+    begin, end = (
+        np.searchsorted(refined.case[order], crossings.case, side) for side in ("left", "right")
+    )
     width = int(np.max(end - begin, initial=0))
     place = begin[:, None] + np.arange(width)
     value = (
-        found.value[order[np.minimum(place, len(order) - 1)]] if width else np.ones((len(end), 0))
+        refined.value[order[np.minimum(place, len(order) - 1)]] if width else np.ones((len(end), 0))
     )
-    near = np.abs(np.log(value / seen.value[:, None])) < np.log(NEAR)
+    near = np.abs(np.log(value / crossings.value[:, None])) < np.log(NEAR)
     return np.any(near & (place < end[:, None]), axis=1)
 
 
 def _refine(
     response: LoopResponse,
-    seen: Crossings,
+    crossings: Crossings,
     left: np.ndarray,
     right: np.ndarray,
     least: np.ndarray,
@@ -405,10 +407,10 @@ def _refine(
     omega = np.concatenate([first, others])
     kind = [0.0] * (REFINEMENT.starts - 1) + [1.0]
     kind += ([0.0] * (REFINEMENT.repeats - 1) + [2.0]) * (REFINEMENT.frequencies - 1)
-    here = jax.tree.map(lambda x: x[..., seen.case], response)
-    spread = _spread(here, FINE_SPREAD)
-    loci = _swept(here, spread, _ring(spread, seen.value), omega, np.array(kind))
-    return _crossings(loci, seen.case, KEPT, least)[0]
+    selected = jax.tree.map(lambda x: x[..., crossings.case], response)
+    spread = _spread(selected, FINE_SPREAD)
+    loci = _swept(selected, spread, _ring(spread, crossings.value), omega, np.array(kind))
+    return _crossings(loci, crossings.case, KEPT, least)[0]
 
 
 def _at_the_ends(response: LoopResponse, least: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -422,9 +424,9 @@ def _at_the_ends(response: LoopResponse, least: np.ndarray) -> tuple[np.ndarray,
     value, omega = np.zeros(len(top)), np.full(len(top), np.nan)
     for place, name in ((0 * top + STILL, 0 * top), (top * (1 - 1e-6), top)):
         steps = np.repeat(place[None], REFINEMENT.starts, axis=0)
-        found = _swept(response, spread, ring, steps, np.zeros(REFINEMENT.starts)).value
-        is_real = (found.re > least) & (np.abs(found.im) < 1e-3 * found.re)
-        largest = np.max(np.where(is_real, found.re, 0.0), axis=0)
+        eigenvalue = _swept(response, spread, ring, steps, np.zeros(REFINEMENT.starts)).value
+        is_real = (eigenvalue.re > least) & (np.abs(eigenvalue.im) < 1e-3 * eigenvalue.re)
+        largest = np.max(np.where(is_real, eigenvalue.re, 0.0), axis=0)
         omega = np.where(largest > value, name, omega)
         value = np.maximum(value, largest)
     return value, omega

@@ -78,7 +78,7 @@ def modes_study(
     )
     if pose is not None:
         data["motion"] = {"waypoints": [list(pose)]}
-    given = (
+    changes = (
         ("link", "basis", basis),
         ("link", "modes", n_modes),
         ("link", "damping_ratio", damping),
@@ -88,7 +88,7 @@ def modes_study(
         ("control", "feedback", "none"),
         ("shaper", "kind", "none"),
     )
-    for section, name, value in given:
+    for section, name, value in changes:
         if value is not None:
             data[section] = data.get(section, {}) | {name: value}
     return parse_study(data)
@@ -112,13 +112,13 @@ def machine_modes(study: Study | None = None, **changes: Any) -> NamedModes:
         np.asarray, _at_pose(structure, case, np.array(where))
     )
     check_pose(study, "pose", where, int(code), lifts)
-    found = natural_modes(plant)
+    modes = natural_modes(plant)
     first = 3 if study.drive.locked else 0  # the coordinates held by the sliders are not modes
-    frequency, shape = found.frequency[first:], found.shape[:, first:]
+    frequency, shape = modes.frequency[first:], modes.shape[:, first:]
     link_share = _link_shares(frequency, shape, stiffness, modal_stiffness)
     return NamedModes(
         frequency=frequency,
-        damping_ratio=found.damping_ratio[first:],
+        damping_ratio=modes.damping_ratio[first:],
         shape=shape,
         link_share=link_share,
         drive_share=1 - link_share.sum(axis=(1, 2)),

@@ -133,18 +133,18 @@ def plan_groups(
         structure = _structure(table, members)._replace(
             metrics=_accumulated(table, metrics), is_linear=is_linear
         )
-        wanted = rows[np.isin(rows, members)]
-        if len(wanted) == 0:
+        requested = rows[np.isin(rows, members)]
+        if len(requested) == 0:
             continue
         counts, is_too_stiff = _plant_steps(table, structure, members)
-        place = np.searchsorted(members, wanted)
+        place = np.searchsorted(members, requested)
         for count in np.unique(counts[place]):
             chosen = counts[place] == count
             stepped = structure._replace(substeps=int(count))
             layout = lay_out(int(chosen.sum()), stepped)
             group = Group(
                 structure=stepped,
-                rows=wanted[chosen],
+                rows=requested[chosen],
                 is_too_stiff=is_too_stiff[place][chosen],
                 layout=layout,
                 is_judged=is_judged,
@@ -205,10 +205,10 @@ def _plant_steps(
         rate = np.maximum(rate, _pole_decay(table, structure, members))
     period = 1 / table.values("electronics.sample_rate_hz")[members]
     needed = np.maximum(np.ceil(rate * period / STIFFNESS_LIMIT), 1)
-    given = int(table.values("run.substeps")[members[0]])
-    is_too_stiff = needed > (given or SUBSTEP_LIMIT)
-    counts = np.full(len(members), given) if given else step_counts(needed)
-    return np.where(is_too_stiff, given or 1, counts), is_too_stiff
+    written = int(table.values("run.substeps")[members[0]])
+    is_too_stiff = needed > (written or SUBSTEP_LIMIT)
+    counts = np.full(len(members), written) if written else step_counts(needed)
+    return np.where(is_too_stiff, written or 1, counts), is_too_stiff
 
 
 #: Columns that `drive_rate` depends on.
@@ -258,8 +258,8 @@ def local_layout(n: int, structure: Structure) -> Layout:
         lanes //= 2
     per_device = -(-n // devices)
     lanes = min(lanes, -(-per_device // unit) * unit)
-    wanted = min(max(CHUNK_WORK // (structure.n_steps * structure.substeps), 1), LARGEST_CHUNK)
-    blocks = max(min(wanted, n) // (devices * lanes), 1)
+    preferred = min(max(CHUNK_WORK // (structure.n_steps * structure.substeps), 1), LARGEST_CHUNK)
+    blocks = max(min(preferred, n) // (devices * lanes), 1)
     return Layout(devices, blocks, lanes)
 
 

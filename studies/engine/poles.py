@@ -57,20 +57,20 @@ def pole_report(structure: Structure, case: Case, loop: LoopFigures) -> PoleRepo
         near = z[np.argmin(np.abs(z - np.exp(specified[link, mode] * period)))]
         nominal[link, mode] = np.log(near) / period
     frequency, zeta = loop.frequency_hz, loop.damping_ratio
-    found = 2 * np.pi * frequency * (-zeta + 1j * np.sqrt(np.maximum(1 - zeta**2, 0)))
-    for mode in np.flatnonzero(is_on.any(axis=0))[: len(found)]:
-        matched = _matched(nominal[:, mode], found[mode])
+    poles = 2 * np.pi * frequency * (-zeta + 1j * np.sqrt(np.maximum(1 - zeta**2, 0)))
+    for mode in np.flatnonzero(is_on.any(axis=0))[: len(poles)]:
+        matched = _matched(nominal[:, mode], poles[mode])
         assembled[:, mode] = np.where(is_on[:, mode], matched, np.nan)
     is_by_damping = bool(np.any(np.asarray(case.control.damping) >= 0))
     factor = float(case.control.gain_factor)
     return PoleReport(specified, nominal, assembled, factor, is_by_damping=is_by_damping)
 
 
-def _matched(nominal: np.ndarray, found: np.ndarray) -> np.ndarray:
+def _matched(nominal: np.ndarray, poles: np.ndarray) -> np.ndarray:
     """The three assembled poles in the order that brings them nearest to the nominal link's."""
     return min(
-        (found[list(order)] for order in permutations(range(3))),
-        key=lambda poles: float(np.nansum(np.abs(poles - nominal))),
+        (poles[list(order)] for order in permutations(range(3))),
+        key=lambda ordered: float(np.nansum(np.abs(ordered - nominal))),
     )
 
 
@@ -100,18 +100,18 @@ def _in_ratio(pole: complex) -> str:
 
 def difference(report: PoleReport) -> str:
     """Where poles differ most from what is specified, and why."""
-    sentences, wanted = [], report.specified
+    sentences, reference = [], report.specified
     shown = _in_ratio if report.is_by_damping else _in_decay
     if report.gain_factor != 1:
         sentences.append(
             f"Poles are placed for control.gain_factor = 1; with {report.gain_factor:g}, the "
             "nominal link has others."
         )
-        wanted = report.nominal
-    elif np.nanmax(_apart(report.nominal, wanted)) > NOTABLE:
+        reference = report.nominal
+    elif np.nanmax(_apart(report.nominal, reference)) > NOTABLE:
         sentences.append("The nominal link does not have them: they cannot be placed.")
-    apart = _apart(report.assembled, wanted)
-    than = "specified" if wanted is report.specified else "on the nominal link"
+    apart = _apart(report.assembled, reference)
+    than = "specified" if reference is report.specified else "on the nominal link"
     if np.isnan(apart).all():
         return " ".join(sentences)
     if np.nanmax(apart) <= NOTABLE:
@@ -119,7 +119,7 @@ def difference(report: PoleReport) -> str:
     at = np.unravel_index(np.nanargmax(apart), apart.shape)
     sentences.append(
         f"The assembled machine differs most in mode {at[1] + 1} of link {at[0] + 1}: "
-        f"{shown(report.assembled[at])} instead of {shown(wanted[at])} {than}. Its links are "
+        f"{shown(report.assembled[at])} instead of {shown(reference[at])} {than}. Its links are "
         "coupled by the platform and patches act on all modes (spillover); gains are designed mode "
         "by mode."
     )

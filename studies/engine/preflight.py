@@ -78,12 +78,12 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
     each = jax.vmap(lambda pose: (path_status(plant, pose[None])[0], lift(plant, pose)))(points)
     end = end_of_path(case.path)
     time = jnp.linspace(0.0, 1.0, 2001) * end
-    wanted = sample_path(case.path, time)
-    code, index = path_status(plant, wanted.position)
+    reference = sample_path(case.path, time)
+    code, index = path_status(plant, reference.position)
     lumping = jnp.zeros(())
     if not structure.is_distributed:
         error = partial(lumping_error, plant, prepared.bases.plant)
-        lumping = jnp.max(jax.vmap(error)(*wanted))
+        lumping = jnp.max(jax.vmap(error)(*reference))
     worst = jnp.maximum(prepared.sensor_condition.max(), prepared.actuator_condition.max())
     corner = lowpass_corner(structure, case, prepared.bases)
     damping = jnp.max(damping_ratio(case.machine.damping, prepared.loop.omega))
@@ -91,7 +91,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
         *each,
         code,
         time[index],
-        wanted.position[index],
+        reference.position[index],
         end,
         shaper_length,
         worst,
@@ -139,38 +139,40 @@ def check_run(study: Study) -> tuple[Structure, Case]:
     config.require_configured()
     check_locked(study)
     structure, case = build_structure(study), as_arrays(build_case(study))
-    known = preflight(structure, case)
-    structure = structure._replace(substeps=_drive_substeps(study, float(known.drive_rate)))
+    prepared = preflight(structure, case)
+    structure = structure._replace(substeps=_drive_substeps(study, float(prepared.drive_rate)))
     for k, pose in enumerate(study.motion.waypoints):
-        check_pose(study, f"motion.waypoints.{k}", pose, int(known.pose_status[k]), known.lift[k])
-    if int(known.path_status) != status.OK:
-        x, y, phi = known.path_pose
+        check_pose(
+            study, f"motion.waypoints.{k}", pose, int(prepared.pose_status[k]), prepared.lift[k]
+        )
+    if int(prepared.path_status) != status.OK:
+        x, y, phi = prepared.path_pose
         raise field_error(
             "motion.waypoints",
-            f"path at t = {known.path_time:.4g} s, pose ({x:.4g}, {y:.4g}, {phi:.4g})",
+            f"path at t = {prepared.path_time:.4g} s, pose ({x:.4g}, {y:.4g}, {phi:.4g})",
             "a path on which every link angle gamma stays inside (0, 90) deg "
-            f"(here: {status.REASONS[int(known.path_status)]})",
+            f"(here: {status.REASONS[int(prepared.path_status)]})",
             "m, m, rad",
         )
-    _check_load(study, known)
-    if known.lumping > LUMPING_LIMIT:
+    _check_load(study, prepared)
+    if prepared.lumping > LUMPING_LIMIT:
         warn_of_model(
             f"link.axial_inertia = {study.link.axial_inertia!r} moves deflections by about "
-            f"{100 * known.lumping:.2g} % on this path (limit {100 * LUMPING_LIMIT:g} %); "
+            f"{100 * prepared.lumping:.2g} % on this path (limit {100 * LUMPING_LIMIT:g} %); "
             "'distributed' is exact"
         )
-    _check_duration(study, structure, known)
+    _check_duration(study, structure, prepared)
     is_filtered = is_modal(structure) and structure.feedback != "none"
-    if is_filtered and known.condition > study.metrics.condition_limit:
+    if is_filtered and prepared.condition > study.metrics.condition_limit:
         raise field_error(
             "patches.centers",
             study.patches.centers,
             f"a placement whose modal filter for control.modes = {study.control.modes} has on each "
             f"link a condition number up to metrics.condition_limit = "
-            f"{study.metrics.condition_limit:g}; the largest is {known.condition:.3g}",
+            f"{study.metrics.condition_limit:g}; the largest is {prepared.condition:.3g}",
             "1",
         )
-    _check_rates(study, structure, known)
+    _check_rates(study, structure, prepared)
     if structure.feedback == "ideal":
         structure = structure._replace(substeps=_ideal_substeps(study, structure, case))
     return structure, case
@@ -217,33 +219,33 @@ def check_pose(
     )
 
 
-def _check_load(study: Study, known: Preflight) -> None:
-    if np.all(known.steady_load < 1):
+def _check_load(study: Study, prepared: Preflight) -> None:
+    if np.all(prepared.steady_load < 1):
         return
-    at, link = np.unravel_index(np.argmax(known.steady_load), known.steady_load.shape)
-    critical = known.critical_force[link]
+    at, link = np.unravel_index(np.argmax(prepared.steady_load), prepared.steady_load.shape)
+    critical = prepared.critical_force[link]
     raise field_error(
         "load.wrench",
         study.load.wrench,
         f"a load that compresses no link by its critical force, {critical:.4g} N (here link "
-        f"{link + 1}: {known.steady_load[at, link] * critical:.4g} N at way-point {at + 1})",
+        f"{link + 1}: {prepared.steady_load[at, link] * critical:.4g} N at way-point {at + 1})",
         "N, N, N m",
     )
 
 
-def _check_duration(study: Study, structure: Structure, known: Preflight) -> None:
+def _check_duration(study: Study, structure: Structure, prepared: Preflight) -> None:
     duration = structure.n_steps / study.electronics.sample_rate_hz
     if duration > 1.5 * study.run.duration:
         raise field_error(
             "run.duration", study.run.duration, f"at least {duration:g}, one sample", "s"
         )
-    end = float(known.motion_end + known.shaper_length)
+    end = float(prepared.motion_end + prepared.shaper_length)
     if end > duration * (1 + 1e-12):
         raise field_error(
             "run.duration",
             study.run.duration,
             f"at least {end:.6g}, the end of the motion with its shaper of "
-            f"{known.shaper_length:.4g} s",
+            f"{prepared.shaper_length:.4g} s",
             "s",
         )
     delay = residual_delay(study)
@@ -277,29 +279,29 @@ def _wait_text(study: Study, delay: float) -> str:
     return f"metrics.residual_delay = {delay:g}"
 
 
-def _check_rates(study: Study, structure: Structure, known: Preflight) -> None:
+def _check_rates(study: Study, structure: Structure, prepared: Preflight) -> None:
     """Check plant modes against the step, and low-passes against the sample rate."""
-    if known.damping >= 1:
+    if prepared.damping >= 1:
         raise field_error(
             "link.damping_ratio",
             study.link.damping_ratio,
             f"ratios that with link.damping_law = {study.link.damping_law!r} stay below 1 for all "
-            f"link.modes = {study.link.modes} (here up to {known.damping:.3g})",
+            f"link.modes = {study.link.modes} (here up to {prepared.damping:.3g})",
             "1",
         )
     rate = study.electronics.sample_rate_hz
-    needed = known.highest / MODE_STEP_LIMIT
+    needed = prepared.highest / MODE_STEP_LIMIT
     if needed > rate * structure.substeps:
         raise field_error(
             "link.modes",
             study.link.modes,
             f"modes up to {MODE_STEP_LIMIT * rate * structure.substeps / (2 * np.pi):.4g} Hz at "
             f"electronics.sample_rate_hz = {rate:g} and run.substeps = {structure.substeps}; the "
-            f"highest one has {known.highest / (2 * np.pi):.4g} Hz",
+            f"highest one has {prepared.highest / (2 * np.pi):.4g} Hz",
             "1",
         )
     is_modal_phase = study.electronics.estimator == "modal_phase"
-    corner = known.corner / (2 * np.pi)
+    corner = prepared.corner / (2 * np.pi)
     if structure.feedback == "sampled" and is_modal_phase and corner >= rate / 2:
         raise field_error(
             "electronics.lowpass_ratio",
@@ -338,13 +340,13 @@ def step_counts(needed: Any) -> np.ndarray:
 def _drive_substeps(study: Study, rate: float) -> int:
     """Plant steps per sample that the sliders' drive and friction need, or as given."""
     needed = max(int(np.ceil(rate / study.electronics.sample_rate_hz / STIFFNESS_LIMIT)), 1)
-    given, drive = study.run.substeps, study.drive
-    if needed <= (given or SUBSTEP_LIMIT):
-        return given or int(step_counts(needed))
+    written, drive = study.run.substeps, study.drive
+    if needed <= (written or SUBSTEP_LIMIT):
+        return written or int(step_counts(needed))
     if needed <= SUBSTEP_LIMIT:
         raise field_error(
             "run.substeps",
-            given,
+            written,
             f"{needed} to {SUBSTEP_LIMIT}, or 0 for as many as needed; drive and friction have a "
             f"rate of {rate:.3g} 1/s",
             "1",
@@ -373,11 +375,11 @@ def _ideal_substeps(study: Study, structure: Structure, case: Case) -> int:
     fastest = max(pole_decay(structure, case, np.array(pose)) for pose in poses)
     needed = int(np.ceil(fastest / study.electronics.sample_rate_hz / STIFFNESS_LIMIT))
     needed = max(needed, structure.substeps)  # what the drive needs
-    given = study.run.substeps
-    if given and given < needed <= SUBSTEP_LIMIT:
+    written = study.run.substeps
+    if written and written < needed <= SUBSTEP_LIMIT:
         raise field_error(
             "run.substeps",
-            given,
+            written,
             f"{needed} to {SUBSTEP_LIMIT}, or 0 for as many as needed; ideal feedback has a pole "
             f"at {fastest:.3g} 1/s",
             "1",
@@ -390,4 +392,4 @@ def _ideal_substeps(study: Study, structure: Structure, case: Case) -> int:
             f"pole at {fastest:.3g} 1/s, which needs {needed}",
             "1",
         )
-    return given or int(step_counts(needed))
+    return written or int(step_counts(needed))

@@ -102,7 +102,7 @@ def kept_jit(
 def is_plain(x: Any) -> bool:
     """Whether the `repr` of a static argument names it in every process."""
     if isinstance(x, Placing):
-        return is_plain(x.given)
+        return is_plain(x.arguments)
     if isinstance(x, tuple):
         return all(map(is_plain, x))
     return x is None or isinstance(x, bool | int | float | str)

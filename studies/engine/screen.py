@@ -152,7 +152,7 @@ def audited(n_cases: int, order: np.ndarray, spec: SweepSpec) -> np.ndarray:
         spec: the sweep.
     """
     assert spec.screen is not None
-    count = min(AUDIT, wanted(n_cases, spec.screen))
+    count = min(AUDIT, full_runs(n_cases, spec.screen))
     return np.random.default_rng(spec.sweep.seed).permutation(np.sort(order))[:count]
 
 
@@ -165,11 +165,11 @@ def first_round(table: CaseTable, order: np.ndarray, spec: SweepSpec) -> Round:
         spec: the sweep.
     """
     assert spec.screen is not None
-    count = wanted(len(table), spec.screen)
+    count = full_runs(len(table), spec.screen)
     return Round(order[:count], audited(len(table), order, spec))
 
 
-def wanted(n_cases: int, screen: Screen) -> int:
+def full_runs(n_cases: int, screen: Screen) -> int:
     """How many of these cases a screen keeps."""
     return max(1, round(screen.keep * n_cases))
 
@@ -186,7 +186,7 @@ def next_round(
     """
     screen = spec.screen
     assert screen is not None
-    so_far, count = len(last.first), wanted(len(table), screen)
+    so_far, count = len(last.first), full_runs(len(table), screen)
     if not screen.subject_to or so_far == len(order):
         return None
     rows = np.sort(last.first)

@@ -17,7 +17,7 @@ from rich.console import Console
 from jaxmodel.case import Structure
 from studies import config
 from studies.engine.baseline import keep_baseline
-from studies.engine.chunks import Done, Here, Lost, Runner
+from studies.engine.chunks import Done, LocalRunner, Lost, Runner
 from studies.engine.folder import (
     SCREEN,
     Finished,
@@ -32,12 +32,12 @@ from studies.engine.screen import (
     Round,
     check_screen_names,
     first_round,
+    full_runs,
     next_round,
     ranked,
     screen_arrays,
     screen_groups,
     screened_cases,
-    wanted,
 )
 from studies.engine.stored import chunk_arrays, kept_metrics, manifest_attributes, merge
 from studies.errors import StudyError
@@ -94,7 +94,7 @@ def make_plan(spec: SweepSpec, out: Path | None = None) -> Plan:
     n_before, groups = len(table) - len(rows), []
     if spec.screen is not None:
         groups = screen_groups(table, rows, local_layout, spec.screen)
-        rows = rows[: wanted(len(table), spec.screen)]
+        rows = rows[: full_runs(len(table), spec.screen)]
     is_linear = sweep.fidelity == "linear"
     groups += plan_groups(table, rows, local_layout, sweep.metrics, is_linear)
     return Plan(table, groups, n_before)
@@ -127,25 +127,25 @@ def run_sweep(
         StudyError: a fault of the sweep, the folder or the disk. Finished chunks stay.
     """
     config.require_configured()
-    runner, out = runner or Here(), Path(out)
+    runner, out = runner or LocalRunner(), Path(out)
     if phases is None:
         console = console or Console(highlight=False, markup=False)
         with Phases(console, sweep_phases(spec), is_quiet) as phases:
             return run_sweep(spec, out, is_resumed, runner=runner, phases=phases)
-    tell = partial(phases.console.print, soft_wrap=True)
+    say = partial(phases.console.print, soft_wrap=True)
     manifest = make_manifest(spec.data)
     with open_folder(out, manifest, is_resumed) as folder, _interrupts() as stop:
         kept_metrics(spec)
         table = build_table(spec)
         check_screen_names(spec, table)
-        before = finished_cases(out, tell).case_id
+        before = finished_cases(out, say).case_id
         _rows_left(table, before, out)  # refuses another sweep
         folder.begin(manifest)
         run = _Run(spec, table, folder, runner, phases, stop)
         if spec.screen is None:
             rows, screened = run.full(np.arange(len(table)), _headline), None
         else:
-            rows, screened = run.screened(screened_cases(out, tell))
+            rows, screened = run.screened(screened_cases(out, say))
         if rows is not None:
             phases.begin("join")
             finished = finished_cases(out)
@@ -231,17 +231,17 @@ class _Run:
         n_before = len(table) - len(left)
         text = f"screen by the linear model: {_headline(table, groups, n_before)}"
         is_whole = self._chunks("screen", groups, len(table), n_before, text, save)
-        found = screened_cases(path)
+        stored = screened_cases(path)
         if not is_whole:
-            return None, found
-        order = ranked(table, found, screen)
+            return None, stored
+        order = ranked(table, stored, screen)
         this: Round | None = first_round(table, order, self.spec)
         while this is not None:
             rows = self.full(this.rows, _kept_headline)
             if rows is None:
-                return None, found
+                return None, stored
             this = next_round(table, order, self.spec, this, path)
-        return rows, found
+        return rows, stored
 
     def _left(self, rows: np.ndarray, finished: Finished) -> np.ndarray:
         """Those of some rows that are neither finished nor given up."""

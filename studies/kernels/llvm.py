@@ -140,7 +140,7 @@ class Writer:
 
     def _record(self, records: list[tuple[Any, Any]]) -> None:
         for x, place in records:
-            self.builder.store(self._widened(x), place, align=self.bytes)
+            self.builder.store(self._broadcast(x), place, align=self.bytes)
 
     # --- memory -----------------------------------------------------------------------------------
 
@@ -160,9 +160,9 @@ class Writer:
 
     def _store(self, change: Change, slot: Any) -> None:
         """Store a number where it changes."""
-        value = self._widened(change.value)
+        value = self._broadcast(change.value)
         if not is_known(change.mask):
-            value = self.builder.select(self._widened(change.mask), value, self._kept(slot))
+            value = self.builder.select(self._broadcast(change.mask), value, self._kept(slot))
         self._keep(value, slot)
 
     def _places(self, kind: str, base: str, frame: Arguments, sample: Any = None) -> list[Any]:
@@ -189,7 +189,7 @@ class Writer:
     # --- operations -------------------------------------------------------------------------------
 
     def _emit(self, node: Node) -> None:
-        widen = self._widened if node.is_varying else self._narrow
+        widen = self._broadcast if node.is_varying else self._narrow
         args = [widen(x) for x in node.args]
         self.values[id(node)] = getattr(self, f"_{node.operation}", self._plain)(node, *args)
 
@@ -200,7 +200,7 @@ class Writer:
             return ir.Constant(ir.IntType(1), int(x))
         return ir.Constant(self.scalar, float(x))
 
-    def _widened(self, x: Any) -> Any:
+    def _broadcast(self, x: Any) -> Any:
         one = self._narrow(x)
         if self.width == 1 or isinstance(one.type, ir.VectorType):
             return one
@@ -236,7 +236,7 @@ class Writer:
         return self._intrinsic("fmuladd", self.builder.fneg(a), b, c)
 
     def _reciprocal(self, node: Node, a: Any) -> Any:
-        one = self._widened(1.0) if node.is_varying else self._narrow(1.0)
+        one = self._broadcast(1.0) if node.is_varying else self._narrow(1.0)
         return self.builder.fdiv(one, a)
 
     def _neg(self, node: Node, a: Any) -> Any:

@@ -111,7 +111,7 @@ class MaskedWriter(VectorWriter):
             return
         name = f"llvm.masked.store.v{self.width}f{8 * self.bytes}.p0"
         alignment = ir.Constant(ir.IntType(32), self.bytes * self.width)
-        value, mask = self._widened(change.value), self._widened(change.mask)
+        value, mask = self._broadcast(change.value), self._broadcast(change.mask)
         self._call(name, ir.VoidType(), value, slot, alignment, mask)
 
     def _number(self, x: float) -> Any:
@@ -194,7 +194,7 @@ class CalledWriter(VectorWriter):
             else:
                 self._emit(node)
             if id(node) in self._fixed_at:
-                self._keep(self._widened(node), self._slot(work, self._fixed_at[id(node)]))
+                self._keep(self._broadcast(node), self._slot(work, self._fixed_at[id(node)]))
         for node in self.loop.order:
             if node.operation == "call":
                 self._give(node, work, is_fixed=True)
@@ -243,9 +243,9 @@ class CalledWriter(VectorWriter):
             return self._kept(self._memory[id(x)])
         return super()._narrow(x)
 
-    def _widened(self, x: Any) -> Any:
+    def _broadcast(self, x: Any) -> Any:
         if not is_known(x) or isinstance(x, bool) or x == 0:
-            return super()._widened(x)
+            return super()._broadcast(x)
         k = self._known.setdefault(float(x), len(self._known))
         return self._kept(self._slot(self._table, k))
 
@@ -283,7 +283,7 @@ class CalledWriter(VectorWriter):
             else:
                 outer = body.fixed[node.place[1]]
                 if is_known(outer):
-                    self.values[id(node)] = self._widened(outer)
+                    self.values[id(node)] = self._broadcast(outer)
                 else:
                     self._memory[id(node)] = self._slot(work, self._fixed_at[id(outer)])
             self._return(due[id(node)], frame)
@@ -292,7 +292,7 @@ class CalledWriter(VectorWriter):
 
     def _return(self, results: Iterable[tuple[int, Any]], frame: Any) -> None:
         for k, x in results:
-            self._keep(self._widened(x), self._slot(frame, k))
+            self._keep(self._broadcast(x), self._slot(frame, k))
 
     def _sample(self) -> Any:
         """`sample(leaves, lanes, first, row, from, to, work, numbers)`."""
@@ -332,7 +332,7 @@ class CalledWriter(VectorWriter):
             ):
                 if place not in self._shared:
                     self._shared.add(place)
-                    self._keep(self._widened(x), self._slot(work, place))
+                    self._keep(self._broadcast(x), self._slot(work, place))
             frame = self._slot(work, self._frame_at[id(node)])
             self.builder.call(self._routines[id(node.place)], [frame, work, self._table])
         elif node.operation == "result":
@@ -353,11 +353,11 @@ class CalledWriter(VectorWriter):
         for place, x in enumerate(call.args[:count], self._frame_at[id(call)]):
             stays = is_known(x) or (x is not None and self._is_fixed[id(x)])
             if x is not None and stays == is_fixed:
-                self._keep(self._widened(x), self._slot(work, place))
+                self._keep(self._broadcast(x), self._slot(work, place))
 
     def _change(self, changes: Iterable[Change], new: Any) -> None:
         for change in changes:
-            self._keep(self._widened(change.value), self._slot(new, change.slot))
+            self._keep(self._broadcast(change.value), self._slot(new, change.slot))
 
     def _repair(self, old: Any, new: Any) -> None:
         """Put the old numbers back where a case does not change."""
@@ -366,7 +366,7 @@ class CalledWriter(VectorWriter):
             return
         every = None
         for mask in {id(change.mask): change.mask for change in masked}.values():
-            one = self._widened(mask)
+            one = self._broadcast(mask)
             every = one if every is None else self.builder.and_(every, one)
         if self.width > 1:
             name = f"llvm.vector.reduce.and.v{self.width}i1"
@@ -378,7 +378,7 @@ class CalledWriter(VectorWriter):
         for change in masked:
             slot = self._slot(new, change.slot)
             kept = self._kept(self._slot(old, change.slot))
-            mask = self._widened(change.mask)
+            mask = self._broadcast(change.mask)
             self._keep(self.builder.select(mask, self._kept(slot), kept), slot)
         self.builder.branch(leave)
         self.builder.position_at_end(leave)

@@ -124,8 +124,8 @@ def _comparison(node: ast.Compare, lookup: Lookup) -> np.ndarray:
                 raise StudyError("'in' needs a list that is not empty, as in x in [1, 2]")
             value = _value(left, lookup)
             same = [np.asarray(value) == np.asarray(_value(each, lookup)) for each in right.elts]
-            found = reduce(np.logical_or, same)
-            parts.append(~found if isinstance(operator, ast.NotIn) else found)
+            is_member = reduce(np.logical_or, same)
+            parts.append(~is_member if isinstance(operator, ast.NotIn) else is_member)
         elif type(operator) in _OPERATORS:
             sides = _value(left, lookup), _value(right, lookup)
             _check_kinds(*sides)

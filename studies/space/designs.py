@@ -8,7 +8,7 @@ import numpy as np
 
 from studies.errors import StudyError
 from studies.space.axes import LIMIT, READY_MADE, Axis, build_axis, column_of
-from studies.space.methods import METHODS, Asked
+from studies.space.methods import METHODS, SamplingRequest
 from studies.space.spec import BlockNode
 from studies.study.fields import Columns
 from studies.study.paths import checked_value, known_field
@@ -148,11 +148,11 @@ def unit_points(node: BlockNode, dimensions: int, seed: int) -> np.ndarray:
     """
     method = METHODS[node.block.method]
     assert method.points is not None
-    found = np.asarray(method.points(Asked(node.block, dimensions, seed, node.path)))
-    is_right = found.dtype.kind == "f" and found.shape == (len(found) or 1, dimensions)
-    if not is_right or not np.all((found >= 0) & (found <= 1)):
+    points = np.asarray(method.points(SamplingRequest(node.block, dimensions, seed, node.path)))
+    is_right = points.dtype.kind == "f" and points.shape == (len(points) or 1, dimensions)
+    if not is_right or not np.all((points >= 0) & (points <= 1)):
         raise StudyError(
-            f"{node.path}.method = {method.name!r}: gives {found.dtype} of shape {found.shape}; "
+            f"{node.path}.method = {method.name!r}: gives {points.dtype} of shape {points.shape}; "
             f"wanted one or more points of {dimensions} numbers from 0 to 1"
         )
-    return found
+    return points

@@ -40,13 +40,13 @@ class Placing:
     """A function with its first arguments given; equal ones share their compiled programs."""
 
     function: Callable[..., Any]  # of a module
-    given: tuple[Any, ...]  # hashable
+    arguments: tuple[Any, ...]  # hashable
 
     def __call__(self, numbers: Numbers, values: Array) -> Any:
-        return self.function(*self.given, numbers, values)
+        return self.function(*self.arguments, numbers, values)
 
     def __repr__(self) -> str:
-        return f"{self.function.__module__}.{self.function.__qualname__}{self.given}"
+        return f"{self.function.__module__}.{self.function.__qualname__}{self.arguments}"
 
 
 class FreeNumbers(NamedTuple):
@@ -71,23 +71,23 @@ class FreeNumbers(NamedTuple):
 
     def slopes(self, u: np.ndarray) -> np.ndarray:
         """Derivatives of the values by their places, (..., p)."""
-        found = []
+        slopes = []
         for k, free in enumerate(self.numbers):
             low, high = free.span.low, free.span.high
             width = free.span.at(u[..., k]) * np.log(high / low) if free.span.is_log else high - low
-            found.append(np.broadcast_to(width, u.shape[:-1]))
-        return np.stack(found, axis=-1)
+            slopes.append(np.broadcast_to(width, u.shape[:-1]))
+        return np.stack(slopes, axis=-1)
 
     def places(self) -> np.ndarray:
         """Where the baseline lies between the bounds, 0 to 1; 1/2 if undefined."""
-        found = []
+        places = []
         for _, span, start, _ in self.numbers:
             if span.is_log:
                 at = np.log(start / span.low) / np.log(span.high / span.low)
             else:
                 at = (start - span.low) / (span.high - span.low)
-            found.append(0.5 if np.isnan(at) else float(np.clip(at, 0.0, 1.0)))
-        return np.array(found)
+            places.append(0.5 if np.isnan(at) else float(np.clip(at, 0.0, 1.0)))
+        return np.array(places)
 
 
 def join_numbers(
@@ -206,7 +206,7 @@ def _entries(value: Any, indices: tuple[int, ...] = ()) -> list[tuple[tuple[int,
     """Numbers of a nested list with their indices."""
     if not isinstance(value, tuple):
         return [(indices, value)]
-    return [found for k, x in enumerate(value) for found in _entries(x, (*indices, k))]
+    return [entry for k, x in enumerate(value) for entry in _entries(x, (*indices, k))]
 
 
 def _set(positions: tuple[Any, ...], numbers: Numbers, values: Array) -> Numbers:

@@ -17,7 +17,7 @@ from studies.errors import field_error
 from studies.space.indices import elementary_effects, sobol_indices
 
 
-class Asked(NamedTuple):
+class SamplingRequest(NamedTuple):
     """A request to a sampling method."""
 
     block: Any  # `studies.space.spec.Block`: count, size, levels
@@ -44,7 +44,7 @@ class Method(NamedTuple):
     fields: tuple[str, ...] = ()  # of a block that it reads, in addition to axes and blocks
     # points of the unit cube (n, d); the first ones stay the same when more are requested. None:
     # the axes' own values, combined as follows
-    points: Callable[[Asked], np.ndarray] | None = None
+    points: Callable[[SamplingRequest], np.ndarray] | None = None
     combine: Literal["product", "side by side"] = "product"
     # of the design's points (n, d), a metric there (n,), NaN where the case failed, and the names
     # of the factors; a design made for it cannot be combined with others
@@ -54,37 +54,37 @@ class Method(NamedTuple):
 # --- points ---------------------------------------------------------------------------------------
 
 
-def random_points(asked: Asked) -> np.ndarray:
+def random_points(request: SamplingRequest) -> np.ndarray:
     """Independent and uniform."""
-    return np.random.default_rng(asked.seed).random((asked.block.count, asked.dimensions))
+    return np.random.default_rng(request.seed).random((request.block.count, request.dimensions))
 
 
-def hypercube_points(asked: Asked) -> np.ndarray:
+def hypercube_points(request: SamplingRequest) -> np.ndarray:
     """One Latin hypercube of `size` points after the other."""
     from scipy.stats import qmc
 
-    size = asked.block.size or asked.block.count
+    size = request.block.size or request.block.count
     parts = [
-        qmc.LatinHypercube(asked.dimensions, rng=np.random.default_rng([asked.seed, k])).random(
+        qmc.LatinHypercube(request.dimensions, rng=np.random.default_rng([request.seed, k])).random(
             size
         )
-        for k in range(asked.block.count // size)
+        for k in range(request.block.count // size)
     ]
     return np.concatenate(parts)
 
 
-def sobol_points(asked: Asked) -> np.ndarray:
+def sobol_points(request: SamplingRequest) -> np.ndarray:
     """Scrambled Sobol points: the next power of two, a balanced sequence, truncated."""
     from scipy.stats import qmc
 
-    if asked.dimensions > 21201:
+    if request.dimensions > 21201:
         raise field_error(
-            f"{asked.path}.axes", asked.dimensions, "up to 21201 dimensions for Sobol points"
+            f"{request.path}.axes", request.dimensions, "up to 21201 dimensions for Sobol points"
         )
-    exponent = int(np.ceil(np.log2(max(asked.block.count, 1))))
-    rng = np.random.default_rng(asked.seed)
-    engine = qmc.Sobol(asked.dimensions, scramble=True, rng=rng)
-    return engine.random_base2(exponent)[: asked.block.count]
+    exponent = int(np.ceil(np.log2(max(request.block.count, 1))))
+    rng = np.random.default_rng(request.seed)
+    engine = qmc.Sobol(request.dimensions, scramble=True, rng=rng)
+    return engine.random_base2(exponent)[: request.block.count]
 
 
 def saltelli_points(points: np.ndarray) -> np.ndarray:
@@ -134,20 +134,20 @@ def _morris(points: np.ndarray, value: np.ndarray, names: list[str]) -> Analysis
 
 
 def _sobol(points: np.ndarray, value: np.ndarray, names: list[str]) -> Analysis:
-    found = sobol_indices(value, len(names))
+    indices = sobol_indices(value, len(names))
     rows = []
-    for k in np.argsort(-found.total):
-        a, b = found.first_interval[k], found.total_interval[k]
-        first, total = f"{found.first[k]:.3f}", f"{found.total[k]:.3f}"
+    for k in np.argsort(-indices.total):
+        a, b = indices.first_interval[k], indices.total_interval[k]
+        first, total = f"{indices.first[k]:.3f}", f"{indices.total[k]:.3f}"
         between = (f"{x[0]:.3f} to {x[1]:.3f}" for x in (a, b))
         rows.append((names[k], first, next(between), total, next(between)))
     notes = ("a first index beyond the total one: not settled yet, take more base points",)
-    is_unsettled = bool(np.any(found.first > found.total_interval[:, 1]))
+    is_unsettled = bool(np.any(indices.first > indices.total_interval[:, 1]))
     heads = ("factor", "first", "95 %", "total", "95 %")
     return Analysis(
         heads=heads,
         rows=tuple(rows),
-        n_left_out=found.n_left_out,
+        n_left_out=indices.n_left_out,
         what="base points",
         notes=notes if is_unsettled else (),
     )
@@ -172,8 +172,8 @@ METHODS: Table[Method] = Table(
             "morris",
             "{} trajectories of a Morris design of",
             ("count", "levels"),
-            lambda asked: morris_points(
-                asked.block.count, asked.dimensions, asked.block.levels, asked.seed
+            lambda request: morris_points(
+                request.block.count, request.dimensions, request.block.levels, request.seed
             ),
             analysis=_morris,
         ),
@@ -181,8 +181,8 @@ METHODS: Table[Method] = Table(
             "saltelli",
             "{} base points of a Saltelli design of",
             ("count",),
-            lambda asked: saltelli_points(
-                sobol_points(asked._replace(dimensions=2 * asked.dimensions))
+            lambda request: saltelli_points(
+                sobol_points(request._replace(dimensions=2 * request.dimensions))
             ),
             analysis=_sobol,
         ),

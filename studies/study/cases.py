@@ -212,8 +212,8 @@ def _machine(numbers: Numbers, structure: Structure, xp: Any) -> Machine:
 def _joint_angle(numbers: Numbers, xp: Any) -> Any:
     """psi [rad], (..., 3): as given, otherwise those of the assembly."""
     of_assembly = xp.asarray(list(ASSEMBLIES.values()))[numbers["machine.assembly"]]
-    given = xp.radians(numbers["machine.joint_angles_deg"])
-    return xp.where(xp.isnan(given), of_assembly, given) if given.shape[-1] else of_assembly
+    angle = xp.radians(numbers["machine.joint_angles_deg"])
+    return xp.where(xp.isnan(angle), of_assembly, angle) if angle.shape[-1] else of_assembly
 
 
 def _damping(numbers: Numbers, xp: Any) -> Damping:
@@ -233,9 +233,9 @@ def _path(numbers: Numbers, xp: Any) -> motion.Path:
     is_move = xp.arange(moves) < count[..., None] - 1
 
     def times(field: str, rest: float) -> Any:
-        given = numbers[field]
-        given = given if given.shape[-1] == 1 else _filled(given, (moves,), rest, xp)
-        return xp.where(is_move, given, rest)
+        time = numbers[field]
+        time = time if time.shape[-1] == 1 else _filled(time, (moves,), rest, xp)
+        return xp.where(is_move, time, rest)
 
     return motion.Path(
         points,

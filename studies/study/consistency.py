@@ -137,8 +137,8 @@ def _check_damping(study: Study) -> None:
     for leaf in ("pole_decay", "pole_frequency_hz", "velocity_gain", "position_gain"):
         value = getattr(control, leaf)
         if value != type(control).model_fields[leaf].default:
-            told = shown(control.damping)
-            allowed = f"not given where control.damping = {told} decides the gains"
+            ratios = shown(control.damping)
+            allowed = f"not given where control.damping = {ratios} decides the gains"
             raise field_error(f"control.{leaf}", value, allowed)
     most = 1 - _largest(study.link.damping_ratio)
     if _largest(control.damping) >= most:
@@ -157,12 +157,12 @@ def _check_own_fields(study: Study) -> None:
         path = f"control.laws.{name}"
         if name not in LAWS:
             raise field_error(path, fields, ", ".join(LAWS), hint=nearest(name, LAWS))
-        known = {parameter.name: parameter for parameter in LAWS[name].parameters}
+        parameters = {parameter.name: parameter for parameter in LAWS[name].parameters}
         for leaf, value in fields.items():
-            if leaf not in known:
-                allowed = ", ".join(known) or "no field of its own"
-                raise field_error(f"{path}.{leaf}", value, allowed, hint=nearest(leaf, known))
-            low, high, unit = known[leaf].low, known[leaf].high, known[leaf].unit
+            if leaf not in parameters:
+                allowed = ", ".join(parameters) or "no field of its own"
+                raise field_error(f"{path}.{leaf}", value, allowed, hint=nearest(leaf, parameters))
+            low, high, unit = parameters[leaf].low, parameters[leaf].high, parameters[leaf].unit
             if not np.all((each_link(value) >= low) & (each_link(value) <= high)):
                 raise field_error(f"{path}.{leaf}", value, f"{low:g} to {high:g}", unit)
 
@@ -181,11 +181,11 @@ def _check_patches(study: Study) -> None:
             raise field_error(
                 f"patches.{name}_length", pitch, f"at most link.length = {length:g}{of_link}", "m"
             )
-        ordered, given = np.sort(row), [float(f"{x:.9g}") for x in row]
+        ordered, centers = np.sort(row), [float(f"{x:.9g}") for x in row]
         if ordered[0] < pitch / 2 - 1e-12 or ordered[-1] > length - pitch / 2 + 1e-12:
             raise field_error(
                 "patches.centers",
-                given,
+                centers,
                 f"{pitch / 2:g} to {length - pitch / 2:g}, so that no patch leaves the "
                 f"link{of_link}",
                 "m",
@@ -193,7 +193,7 @@ def _check_patches(study: Study) -> None:
         if np.any(np.diff(ordered) < pitch - 1e-12):
             raise field_error(
                 "patches.centers",
-                given,
+                centers,
                 f"centres at least {pitch:g} apart, so that no patches overlap{of_link}",
                 "m",
             )
@@ -322,12 +322,12 @@ def _check_lists(study: Study) -> None:
     damping = study.link.damping_ratio
     if damping == () or any(row == () for row in _nested(damping)):
         raise field_error("link.damping_ratio", damping, "at least one number per link", "1")
-    given = control.frequencies_hz
-    for row in _nested(given) or (given,):
+    hertz = control.frequencies_hz
+    for row in _nested(hertz) or (hertz,):
         if any(b <= a for a, b in itertools.pairwise(row)):
-            raise field_error("control.frequencies_hz", given, "rising from mode to mode", "Hz")
+            raise field_error("control.frequencies_hz", hertz, "rising from mode to mode", "Hz")
     for name, flat, most, limit, unit in (
-        ("control.frequencies_hz", given, "control.modes", control.modes, "Hz"),
+        ("control.frequencies_hz", hertz, "control.modes", control.modes, "Hz"),
         ("link.damping_ratio", damping, "link.modes", study.link.modes, "1"),
     ):
         if isinstance(flat, tuple) and not _nested(flat) and len(flat) > limit:

@@ -69,8 +69,8 @@ def parse_entries(name: str, path: str = "", sizes: Mapping[str, int] | None = N
     plain = parse_entry(NAMED_INDEX.sub("", name))
     if plain is None or plain.field not in METRICS:
         hint = nearest(name.partition("[")[0], METRICS)
-        told = f"did you mean {hint!r}?" if hint else f"allowed: {', '.join(METRICS)}"
-        raise StudyError(f"{where}{name!r}: unknown metric; {told}")
+        suggestion = f"did you mean {hint!r}?" if hint else f"allowed: {', '.join(METRICS)}"
+        raise StudyError(f"{where}{name!r}: unknown metric; {suggestion}")
     axes = METRICS[plain.field].dims
     size = {axis: (sizes or {}).get(axis, 3) for axis in axes}
     at: dict[str, int] = {}
@@ -101,14 +101,14 @@ def entry_sizes(study: Study) -> dict[str, int]:
 
 def controlled_links(studies: Iterable[Study]) -> tuple[int, ...]:
     """Links that any of these studies controls, from 0; all if none does."""
-    found = {
+    links = {
         k
         for study in studies
         if study.control.feedback != "none"
         for k, is_on in enumerate(study.control.links)
         if is_on
     }
-    return tuple(sorted(found)) or tuple(range(LINKS))
+    return tuple(sorted(links)) or tuple(range(LINKS))
 
 
 def links_text(links: tuple[int, ...]) -> str:

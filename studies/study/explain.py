@@ -42,8 +42,8 @@ def allowed_values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
     names = choices_of(annotation, metadata)
     if names:
         notes = [f", or {item.note}" for item in metadata if isinstance(item, OneOf) and item.note]
-        told = " or ".join(filter(None, (", ".join(map(repr, names[:-1])), repr(names[-1]))))
-        return "".join([told, *notes])
+        choices = " or ".join(filter(None, (", ".join(map(repr, names[:-1])), repr(names[-1]))))
+        return "".join([choices, *notes])
     for item in metadata:
         if hasattr(item, "allowed"):  # describes itself
             return str(item.allowed)
@@ -90,10 +90,10 @@ def _entries(arguments: tuple[Any, ...], metadata: Iterable[Any]) -> str:
 
 def _limits(annotation: Any) -> list[Any]:
     """Limits of an `Annotated` type; pydantic keeps them in a FieldInfo there."""
-    found: list[Any] = []
+    limits: list[Any] = []
     for item in getattr(annotation, "__metadata__", ()):
-        found += item.metadata if isinstance(item, FieldInfo) else [item]
-    return found
+        limits += item.metadata if isinstance(item, FieldInfo) else [item]
+    return limits
 
 
 def _bound(metadata: Iterable[Any], name: str) -> Any:
@@ -169,8 +169,8 @@ def _bad_value(
     annotation, metadata = info.annotation, list(info.metadata)
     if is_missing and not entries:
         unit = unit_of(info)
-        told = f"{_dotted(inside, name)}: missing; allowed: {allowed_values(annotation, metadata)}"
-        return StudyError(f"{told} [{unit}]" if unit else told)
+        text = f"{_dotted(inside, name)}: missing; allowed: {allowed_values(annotation, metadata)}"
+        return StudyError(f"{text} [{unit}]" if unit else text)
     value: Any = data
     for part in name:
         value = value[part]

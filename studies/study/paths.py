@@ -72,8 +72,8 @@ def own_parameter(field: str) -> Parameter | None:
     if not field.startswith(f"{OWN_FIELDS}."):
         return None
     law, _, leaf = field.removeprefix(f"{OWN_FIELDS}.").partition(".")
-    known = LAWS[law].parameters if law in LAWS else ()
-    return next((parameter for parameter in known if parameter.name == leaf), None)
+    parameters = LAWS[law].parameters if law in LAWS else ()
+    return next((parameter for parameter in parameters if parameter.name == leaf), None)
 
 
 def is_each_link(field: str) -> bool:
@@ -148,8 +148,8 @@ def known_field(name: str, study: Study, path: str = "", others: Iterable[str] =
     names = all_fields()
     where = f"{path}: " if path else ""
     if entry is None or entry.field not in names:
-        wanted = entry.field if entry else name
-        close = nearest(wanted, [*names, *others]) or _by_leaf(wanted, names)
+        field = entry.field if entry else name
+        close = nearest(field, [*names, *others]) or _by_leaf(field, names)
         hint = f"did you mean {close!r}?" if close else "see studies init --all for all fields"
         raise StudyError(f"{where}{shown(name)}: unknown field; {hint}")
     value = field_value(study, entry.field)
@@ -165,8 +165,8 @@ def known_field(name: str, study: Study, path: str = "", others: Iterable[str] =
     return value
 
 
-def _by_leaf(wanted: str, names: list[str]) -> str:
-    leaf = wanted.rsplit(".", 1)[-1]
+def _by_leaf(field: str, names: list[str]) -> str:
+    leaf = field.rsplit(".", 1)[-1]
     return next((name for name in names if name.endswith(f".{leaf}")), "")
 
 
@@ -232,13 +232,13 @@ def as_tuples(value: Any) -> Any:
 
 def _each_link_fields() -> frozenset[str]:
     """Fields that take one number for all links, or one for each."""
-    found = set()
+    fields = set()
     for section, outer in Study.model_fields.items():
         for leaf, info in getattr(outer.annotation, "model_fields", {}).items():
             one, *others = get_args(info.annotation) or (None,)
             if (one,) * LINKS in [get_args(other) for other in others]:
-                found.add(f"{section}.{leaf}")
-    return frozenset(found)
+                fields.add(f"{section}.{leaf}")
+    return frozenset(fields)
 
 
 EACH_LINK = _each_link_fields()

@@ -43,13 +43,13 @@ class Signal(NamedTuple):
 
 
 def parse_signal(
-    text: str, known: dict[str, tuple[str, str]], n_patches: int, length: np.ndarray, path: str
+    text: str, kinds: dict[str, tuple[str, str]], n_patches: int, length: np.ndarray, path: str
 ) -> Signal:
     """A signal from its name.
 
     Args:
         text: as the file writes it.
-        known: INPUTS or OUTPUTS.
+        kinds: INPUTS or OUTPUTS.
         n_patches: pairs of patches on each link.
         length: of the links [m], (3,).
         path: where it is written, for messages.
@@ -57,28 +57,28 @@ def parse_signal(
     Raises:
         StudyError: no such signal.
     """
-    allowed = ", ".join(form for form, _ in known.values())
-    if text in _PLATFORM and "platform" in known:
+    allowed = ", ".join(form for form, _ in kinds.values())
+    if text in _PLATFORM and "platform" in kinds:
         return Signal("platform", _PLATFORM[text], 0, np.nan)
     match = _NUMBERED.fullmatch(text)
-    if match is None or match[1] not in known or match[1] == "platform":
+    if match is None or match[1] not in kinds or match[1] == "platform":
         raise field_error(path, text, allowed)
     kind, link = match[1], int(match[2])
     if link > 3:
         raise field_error(path, text, "links 1 to 3")
     if (kind in ("actuator", "sensor")) != (match[3] is not None):
-        raise field_error(path, text, known[kind][0])
+        raise field_error(path, text, kinds[kind][0])
     patch = int(match[3] or 1)
     if patch > n_patches:
         raise field_error(path, text, f"patches 1 to {n_patches}")
     if (kind in ("hammer", "deflection")) != (match[4] is not None):
-        raise field_error(path, text, known[kind][0])
+        raise field_error(path, text, kinds[kind][0])
     place = np.nan
     if match[4] is not None:
         try:
             place = float(match[4])
         except ValueError:
-            raise field_error(path, text, known[kind][0], "m") from None
+            raise field_error(path, text, kinds[kind][0], "m") from None
         shortest = float(np.min(length))  # places are common to all links
         if not 0 < place < shortest:
             raise field_error(path, text, f"between 0 and {shortest:g}", "m")

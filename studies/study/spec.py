@@ -60,12 +60,12 @@ class OwnFields:
 
     @property
     def allowed(self) -> str:
-        known = [
+        tables = [
             f"{law.name}.{x.name} ({x.text} [{x.unit}], {x.low:g} to {x.high:g}; {x.default:g})"
             for law in LAWS.values()
             for x in law.parameters
         ]
-        return f"tables by law; {', '.join(known)}"
+        return f"tables by law; {', '.join(tables)}"
 
 
 #: What can be free: tunings move what a designer decides, fits also what is found by measuring.

@@ -59,16 +59,16 @@ def read_system(path: Path) -> dict[str, Any]:
     if path.suffix.lower() not in FORMATS:
         raise field_error(name, str(path), f"a file {', '.join(FORMATS)}")
     try:
-        found = {key.lower(): value for key, value in _entries(path).items()}
+        entries = {key.lower(): value for key, value in _entries(path).items()}
     except OSError as error:
         reason = error.strerror or str(error)
         raise StudyError(f"{name}: {path} cannot be read ({reason})") from None
     except Exception as error:  # of any kind, for a damaged file
         raise StudyError(f"{name}: {path} cannot be read ({error})") from None
     section: dict[str, Any] = {
-        key: _matrix(found[key], f"{name}: {path}: {key.upper()}")
+        key: _matrix(entries[key], f"{name}: {path}: {key.upper()}")
         for key in MATRICES
-        if key in found
+        if key in entries
     }
     if section.get("d") and not any(any(section.get(key, ())) for key in MATRICES[:3]):
         section |= {"a": (), "b": (), "c": ((),) * len(section["d"])}  # a static gain
@@ -76,24 +76,24 @@ def read_system(path: Path) -> dict[str, Any]:
     if missing:
         raise StudyError(f"{name}: {path} has no {', '.join(missing)}; expected A, B, C, D and dt")
     for key in TIMES:
-        if key in found:
-            time = _number(found[key], f"{name}: {path}: {key}")
+        if key in entries:
+            time = _number(entries[key], f"{name}: {path}: {key}")
             if time.size != 1:
                 raise StudyError(f"{name}: {path}: {key} has {time.size} entries; expected 1 [s]")
             section["sample_time"] = float(time.item())
     for key in ("inputs", "outputs"):
-        if key in found:
-            section[key] = tuple(str(x).strip() for x in np.ravel(np.array(found[key], object)))
+        if key in entries:
+            section[key] = tuple(str(x).strip() for x in np.ravel(np.array(entries[key], object)))
     return section
 
 
 def _entries(path: Path) -> dict[str, Any]:
     kind = path.suffix.lower()
     if kind == ".json":
-        found = read_json(path)
-        if not isinstance(found, dict):
+        entries = read_json(path)
+        if not isinstance(entries, dict):
             raise ValueError("expected an object with A, B, C, D and dt")
-        return found
+        return entries
     if kind == ".npz":
         return dict(read_npz(path))
     return dict(read_mat(path))
@@ -101,20 +101,20 @@ def _entries(path: Path) -> dict[str, Any]:
 
 def _number(value: Any, what: str) -> np.ndarray:
     try:
-        found = np.array(value)
+        array = np.array(value)
     except ValueError:  # lists of unequal length
-        found = np.array(None)
-    is_real = found.dtype.kind in "biuf" or (found.dtype.kind == "c" and not found.imag.any())
+        array = np.array(None)
+    is_real = array.dtype.kind in "biuf" or (array.dtype.kind == "c" and not array.imag.any())
     if not is_real:
         raise StudyError(f"{what} = {shown(str(value))}: expected real numbers")
-    return found.real.astype(float)
+    return array.real.astype(float)
 
 
 def _matrix(value: Any, what: str) -> tuple[tuple[float, ...], ...]:
-    found = _number(value, what)
-    if found.ndim != 2 and found.size:
-        raise StudyError(f"{what} has {found.ndim} dimensions; expected 2, rows and columns")
-    return tuple(tuple(map(float, row)) for row in found) if found.ndim == 2 else ()
+    matrix = _number(value, what)
+    if matrix.ndim != 2 and matrix.size:
+        raise StudyError(f"{what} has {matrix.ndim} dimensions; expected 2, rows and columns")
+    return tuple(tuple(map(float, row)) for row in matrix) if matrix.ndim == 2 else ()
 
 
 def check_system(study: Study, n_patches: int) -> None:
@@ -162,18 +162,18 @@ def system_of(section: StateSpaceSection, n_patches: int) -> StateSpace:
     b = _sized(section.b, "b", (order, None))
     if not order:  # a static gain: only D says how many inputs it has
         b = np.zeros((0, max(map(len, section.d), default=0)))
-    given = (len(c), b.shape[1])
-    d = _sized(section.d, "d", given) if section.d else np.zeros(given)
+    shape = (len(c), b.shape[1])
+    d = _sized(section.d, "d", shape) if section.d else np.zeros(shape)
     every = 3 * n_patches
-    if not section.inputs and not section.outputs and given == (n_patches, n_patches):
+    if not section.inputs and not section.outputs and shape == (n_patches, n_patches):
         groups = 3  # the same controller for each link
     else:
         groups = 1
         inputs, outputs = (
             _ports(names, count, every, n_patches, kind)
             for names, count, kind in (
-                (section.inputs, given[1], "inputs"),
-                (section.outputs, given[0], "outputs"),
+                (section.inputs, shape[1], "inputs"),
+                (section.outputs, shape[0], "outputs"),
             )
         )
         columns, rows = np.eye(every)[inputs], np.eye(every)[:, outputs]
@@ -211,23 +211,23 @@ def _sized(
         raise StudyError(
             f"{path}: rows of {min(widths)} to {max(widths)} entries; expected a matrix"
         )
-    found = np.array(rows, float).reshape(len(rows), max(widths, default=0))
-    largest = np.abs(found).max(initial=0.0)
+    matrix = np.array(rows, float).reshape(len(rows), max(widths, default=0))
+    largest = np.abs(matrix).max(initial=0.0)
     if not largest <= LARGEST:
         raise StudyError(f"{path}: an entry of size {largest:g}; allowed: up to {LARGEST:g}")
-    wanted = shape[0], found.shape[1] if shape[1] is None else shape[1]
-    if found.shape != wanted:
-        told = " x ".join("any" if x is None else str(x) for x in shape)
+    expected = shape[0], matrix.shape[1] if shape[1] is None else shape[1]
+    if matrix.shape != expected:
+        size = " x ".join("any" if x is None else str(x) for x in shape)
         raise StudyError(
-            f"{path}: {found.shape[0]} x {found.shape[1]}; allowed: {told}, to fit state_space.c"
+            f"{path}: {matrix.shape[0]} x {matrix.shape[1]}; allowed: {size}, to fit state_space.c"
         )
-    return found
+    return matrix
 
 
 def _ports(names: tuple[str, ...], count: int, every: int, n_patches: int, kind: str) -> list[int]:
     """Places of a controller's inputs or outputs among all sensors or actuators."""
     path = f"state_space.{kind}"
-    known = {"sensor": OUTPUTS["sensor"]} if kind == "inputs" else {"actuator": INPUTS["actuator"]}
+    kinds = {"sensor": OUTPUTS["sensor"]} if kind == "inputs" else {"actuator": INPUTS["actuator"]}
     if not names:
         if count != every:
             matrix = "b has columns" if kind == "inputs" else "c has rows"
@@ -238,8 +238,8 @@ def _ports(names: tuple[str, ...], count: int, every: int, n_patches: int, kind:
         return list(range(every))
     if len(names) != count:
         raise field_error(path, names, f"{count} names, one for each of the controller's {kind}")
-    signals = [parse_signal(name, known, n_patches, np.ones(3), path) for name in names]
-    found = [signal.row(n_patches, ()) for signal in signals]
-    if len(set(found)) < len(found):
+    signals = [parse_signal(name, kinds, n_patches, np.ones(3), path) for name in names]
+    places = [signal.row(n_patches, ()) for signal in signals]
+    if len(set(places)) < len(places):
         raise field_error(path, names, "different names")
-    return found
+    return places

@@ -15,9 +15,9 @@ import scipy
 MEMORY = 2**33
 
 
-def numbers_and_texts(found: dict[str, Any]) -> dict[str, np.ndarray]:
+def numbers_and_texts(variables: dict[str, Any]) -> dict[str, np.ndarray]:
     """Variables that are numbers or texts, cells of texts included; the others are left out."""
-    arrays = {name: x for name, x in found.items() if isinstance(x, np.ndarray)}
+    arrays = {name: x for name, x in variables.items() if isinstance(x, np.ndarray)}
     texts = {
         name: np.array([str(np.ravel(cell)[0]) for cell in x.ravel() if np.size(cell)])
         for name, x in arrays.items()
@@ -30,9 +30,9 @@ def main() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     try:
-        found = numbers_and_texts(scipy.io.loadmat(BytesIO(sys.stdin.buffer.read())))
+        arrays = numbers_and_texts(scipy.io.loadmat(BytesIO(sys.stdin.buffer.read())))
         packed = BytesIO()
-        np.savez(packed, allow_pickle=False, **found)
+        np.savez(packed, allow_pickle=False, **arrays)
     except NotImplementedError:
         sys.exit("a file of MATLAB 7.3; save it with -v7")
     except Exception as error:  # of any kind, for a damaged file

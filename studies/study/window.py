@@ -52,9 +52,9 @@ def residual_delay(study: Study) -> float:
         >>> residual_delay(Study())
         0.026
     """
-    given = study.metrics.residual_delay
-    if given != AUTO:
-        return float(given)
+    delay = study.metrics.residual_delay
+    if delay != AUTO:
+        return float(delay)
     moves = len(study.motion.waypoints) - 1
     ends = _disturbance_ends(study)
     if study.drive.locked or (moves == 0 and not ends):
@@ -83,13 +83,13 @@ def never_settles(study: Study) -> StudyError:
     """What to say where the residual window would have to wait for ever."""
     drive, wait = study.drive, settling_time(study)
     name, value, unit = ("kd", drive.kd, "N s/m") if drive.kp > 0 else ("kp", drive.kp, "N/m")
-    found = f"takes {wait:.3g} s" if math.isfinite(wait) else "never does"
+    duration = f"takes {wait:.3g} s" if math.isfinite(wait) else "never does"
     return field_error(
         f"drive.{name}",
         value,
         f"a drive that settles within {LONGEST:g} s with metrics.residual_delay = 'auto', which "
         f"waits for it (with drive.kp = {drive.kp:g} N/m, drive.kd = {drive.kd:g} N s/m and this "
-        f"load it {found}); or give metrics.residual_delay in s",
+        f"load it {duration}); or give metrics.residual_delay in s",
         unit,
     )
 
