@@ -91,7 +91,7 @@ def axial_force(
     """
     still = jnp.zeros_like(plant.b)
     force = inverse_dynamics(plant, pose, pose_rate, pose_acc, wrench)
-    found = accelerations(
+    motion = accelerations(
         plant,
         close_chain(plant, pose, pose_rate),
         pose_rate,
@@ -102,7 +102,7 @@ def axial_force(
         wrench,
         is_coupled=False,
     )
-    return found.axial
+    return motion.axial
 
 
 def lumping_error(

@@ -42,7 +42,7 @@ def find_bases(structure: Structure, case: Case) -> Bases:
         plant = build_basis(both[0], beam, patches, size, stations)
         model = build_basis(both[1], belief, patches, size, stations)
     own = held_frequency(both[1], belief, model)[:, :n]
-    given = case.control.omega
+    written = case.control.omega
     is_there = (jnp.arange(structure.n_modes) < case.n_modes).astype(plant.mass.dtype)
     cut = _first_modes(plant, structure.n_modes)
     return Bases(
@@ -50,7 +50,7 @@ def find_bases(structure: Structure, case: Case) -> Bases:
         at_load=cut.deflection_at[:, -1] * is_there,
         plant_omega=held_frequency(both[0], beam, plant)[:, :n],
         model=_without_load(model),
-        believed_omega=jnp.where(given > 0, given, own),
+        believed_omega=jnp.where(written > 0, written, own),
     )
 
 

@@ -160,6 +160,6 @@ def controller_step(
     """
     measured, is_clipped = convert(controller, voltage, noise, is_smooth)
     own = jnp.sum(controller.feedthrough * state.voltage[:, None], axis=2)
-    after, wanted = controller.feedback.step(state.feedback, measured - own)
-    command = soft_limit(wanted, controller.voltage_limit, is_smooth)
+    after, demand = controller.feedback.step(state.feedback, measured - own)
+    command = soft_limit(demand, controller.voltage_limit, is_smooth)
     return ControllerState(after, command), ControllerInfo(measured, command, is_clipped)

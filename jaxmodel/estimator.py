@@ -145,8 +145,8 @@ def _modal_phase(omega: Array, electronics: Electronics, kappa: Array, zeta: Arr
     rate = jnp.tan(omega * period / 2)  # (z-1)/(z+1) = j tan(omega T/2)
 
     def numerator(target: Array) -> tuple[Array, Array, Array]:
-        wanted = target / chain
-        value, slope = jnp.real(wanted), jnp.imag(wanted) / rate
+        ratio = target / chain
+        value, slope = jnp.real(ratio), jnp.imag(ratio) / rate
         return low * (value + slope), low * 2 * value, low * (value - slope)
 
     return Estimator(

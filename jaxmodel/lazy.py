@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 
-class _Late:
+class _LazyModule:
     """A module that is imported on first attribute access."""
 
     def __init__(self, name: str) -> None:
@@ -22,6 +22,6 @@ if TYPE_CHECKING:
     import jax
     import jax.numpy as jnp
 else:
-    jax, jnp = _Late("jax"), _Late("jax.numpy")
+    jax, jnp = _LazyModule("jax"), _LazyModule("jax.numpy")
 
 __all__ = ["jax", "jnp"]

@@ -82,18 +82,18 @@ def linearise(
     zero = jnp.zeros_like(loop.omega)
     rest = flatten(PlantState(pose, rate, zero, zero))
     forward = still if structure.has_feedforward or structure.has_wrench else None
-    wanted = Reference(chain.rho, chain.rho_rate, forward, still)
+    reference = Reference(chain.rho, chain.rho_rate, forward, still)
     if moment is not None:
         held = inverse_dynamics(loop.plant, pose, rate, moment.acceleration, moment.wrench)
-        given = slider_force(
-            loop.drive, wanted, chain.rho, chain.rho_rate, structure.has_friction, True
+        drive_force = slider_force(
+            loop.drive, reference, chain.rho, chain.rho_rate, structure.has_friction, True
         )
-        wanted = wanted._replace(disturbance=held - given, wrench=moment.wrench)
+        reference = reference._replace(disturbance=held - drive_force, wrench=moment.wrench)
 
     def derivative(x: Array, voltage: Array, force: Array) -> Array:
         at = unflatten(x, structure.n_modes)
-        reference = wanted._replace(disturbance=wanted.disturbance + force)
-        rates = plant_rates(structure, loop, at, reference, jnp.reshape(voltage, (3, -1)))
+        pushed = reference._replace(disturbance=reference.disturbance + force)
+        rates = plant_rates(structure, loop, at, pushed, jnp.reshape(voltage, (3, -1)))
         moves = rates.acceleration
         return flatten(PlantState(at.pose_rate, moves.pose, at.q_rate, moves.modal))
 
@@ -214,8 +214,8 @@ def _paired(real: np.ndarray, value: np.ndarray, shape: np.ndarray) -> np.ndarra
     unit = shape / np.linalg.norm(shape, axis=0)
     order = []
     for one in slow:
-        likeness = [abs(np.vdot(unit[:, one], unit[:, two])) for two in fast]
-        order += [one, fast.pop(int(np.argmax(likeness)))]
+        similarity = [abs(np.vdot(unit[:, one], unit[:, two])) for two in fast]
+        order += [one, fast.pop(int(np.argmax(similarity)))]
     return np.array(order, int)
 
 

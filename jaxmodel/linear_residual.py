@@ -60,9 +60,11 @@ def linear_residual(structure: Structure, case: Case, matrices: LoopMatrices) ->
     x = x - jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - transition, held)
     size = jnp.sqrt(jnp.sum(x * x))
     size = jnp.where(size > 0, size, 1.0)
-    found = summed_squares(transition, jnp.outer(x, x) / size**2)
-    share = jnp.sum((matrices.deflection @ found.share) * matrices.deflection, axis=1)
+    gramian = summed_squares(transition, jnp.outer(x, x) / size**2)
+    share = jnp.sum((matrices.deflection @ gramian.share) * matrices.deflection, axis=1)
     samples = case.windows.residual_length / case.electronics.period
     # an unstable loop's sum grows without bound: large, but still a number
-    log_square = jnp.minimum(found.log_size, 100.0) + jnp.log(jnp.maximum(share, 1e-300) / samples)
+    log_square = jnp.minimum(gramian.log_size, 100.0) + jnp.log(
+        jnp.maximum(share, 1e-300) / samples
+    )
     return jnp.reshape(size * jnp.exp(log_square / 2), (3, -1))

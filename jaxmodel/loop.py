@@ -206,9 +206,8 @@ def linear_rates(
         return rates
     force = change.acceleration.axial / loop.plant.modal_mass
     stiffer = shortening_row(loop.plant, state.q) * force[:, None]
-    found = rates.acceleration
-    found = found._replace(coupling=found.coupling - stiffer, modal=found.modal - stiffer)
-    return rates._replace(acceleration=found)
+    coupling, modal = (x - stiffer for x in (rates.acceleration.coupling, rates.acceleration.modal))
+    return rates._replace(acceleration=rates.acceleration._replace(coupling=coupling, modal=modal))
 
 
 def ideal_voltage(structure: Structure, loop: Loop, q: Array, q_rate: Array) -> Array:
@@ -436,10 +435,10 @@ def deflection(loop: Loop, q: Array, voltage: Array) -> Array:
         q: modal coordinates [m], (3, R).
         voltage: on the actuators [V], (3, K).
     """
-    found = jnp.sum(loop.deflection_at * q[:, None], axis=2)
+    modal = jnp.sum(loop.deflection_at * q[:, None], axis=2)
     if loop.left_out is None:
-        return found
-    return found + jnp.sum(loop.left_out.deflection * voltage[:, None], axis=2)
+        return modal
+    return modal + jnp.sum(loop.left_out.deflection * voltage[:, None], axis=2)
 
 
 def _raw_voltage(loop: Loop, plant: PlantState, voltage: Array) -> Array:

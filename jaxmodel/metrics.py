@@ -125,7 +125,7 @@ class Metrics(dict[str, Any]):
     """Metrics of a run: arrays by name, also as attributes; None if not accumulated."""
 
     def __new__(cls, *_: Any) -> Metrics:
-        _make_known()  # before there is one
+        _register_pytree()  # before there is one
         return super().__new__(cls)
 
     def __getattr__(self, name: str) -> Any:
@@ -142,25 +142,25 @@ class Metrics(dict[str, Any]):
 
 
 @cache
-def _make_known() -> None:
+def _register_pytree() -> None:
     jax.tree_util.register_pytree_node_class(Metrics)
 
 
-def zero_totals(sizes: Sizes, dtype: Any, wanted: tuple[str, ...] = ()) -> Totals:
+def zero_totals(sizes: Sizes, dtype: Any, names: tuple[str, ...] = ()) -> Totals:
     """Totals before the first sample.
 
     Args:
         sizes: of the axes.
         dtype: of all of them.
-        wanted: metrics to accumulate, () for all.
+        names: metrics to accumulate, () for all.
     """
 
     def begin(total: Total) -> Any:
         shape = tuple(sizes.axes[name] for name in total.dims)
         return jax.tree.map(lambda start: jnp.full(shape, start, dtype), total.start)
 
-    names = {*wanted, *ALWAYS} if wanted else METRICS
-    return {x.name: begin(x) for name in METRICS if name in names for x in METRICS[name].totals}
+    selected = {*names, *ALWAYS} if names else METRICS
+    return {x.name: begin(x) for name in METRICS if name in selected for x in METRICS[name].totals}
 
 
 def accumulate(totals: Totals, instant: Instant) -> Totals:
@@ -170,8 +170,8 @@ def accumulate(totals: Totals, instant: Instant) -> Totals:
         totals: so far.
         instant: the instant's signals and weights.
     """
-    known = {total.name: total for metric in METRICS.values() for total in metric.totals}
-    after = {name: known[name].update(totals, instant) for name in totals}
+    definitions = {total.name: total for metric in METRICS.values() for total in metric.totals}
+    after = {name: definitions[name].update(totals, instant) for name in totals}
     for name, new in after.items():
         shapes = [jax.tree.map(jnp.shape, x) for x in (totals[name], new)]
         if shapes[0] != shapes[1]:
@@ -181,18 +181,18 @@ def accumulate(totals: Totals, instant: Instant) -> Totals:
 
 def finish(totals: Totals, ending: Ending) -> Metrics:
     """All metrics that can be computed from the totals of a run."""
-    found = Metrics(
+    metrics = Metrics(
         (name, metric.finish(totals, ending))
         for name, metric in METRICS.items()
         if all(total.name in totals for total in metric.totals)
     )
-    for name, value in found.items():
+    for name, value in metrics.items():
         dims = METRICS[name].dims
         if not is_real(value):
             raise PartError(f"metric {name!r}: finish returns {value!r}; expected real numbers")
         if jnp.ndim(value) != len(dims):
             raise PartError(f"metric {name!r}: {jnp.ndim(value)} axes found; its dims are {dims}")
-    return found
+    return metrics
 
 
 def is_real(value: Any) -> bool:

@@ -11,7 +11,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.controller import Controller
 from jaxmodel.estimator import FilterState, advance_filters, weighted
-from jaxmodel.laws.contract import Known
+from jaxmodel.laws.contract import NominalModel
 from jaxmodel.laws.link_model import LinkModel, link_model
 from jaxmodel.laws.poles import is_placed, nominal_modes, specified_poles
 from jaxmodel.lazy import jax, jnp
@@ -32,18 +32,18 @@ def nominal_loop(structure: Structure, case: Case) -> tuple[Array, Array]:
         matrices, (3, B, n, n): B = C modes, or 1 for a whole link.
     """
     design = design_controller(structure, case, find_bases(structure, case))
-    poles = specified_poles(case, design.known)
+    poles = specified_poles(case, design.nominal)
     s = -poles.decay + 1j * poles.frequency
-    controller, known = design.controller, design.known
+    controller, nominal = design.controller, design.nominal
     if isinstance(controller.feedback, Channels):
-        matrix = _of_modes(structure, case, controller.feedback, known)
+        matrix = _of_modes(structure, case, controller.feedback, nominal)
     else:
-        matrix = _of_links(structure, case, controller, controller.feedback, known)
-    return jnp.where(is_placed(case, design.known), s, jnp.nan), matrix
+        matrix = _of_links(structure, case, controller, controller.feedback, nominal)
+    return jnp.where(is_placed(case, design.nominal), s, jnp.nan), matrix
 
 
-def _of_modes(structure: Structure, case: Case, law: Channels, known: Known) -> Array:
-    model = nominal_modes(structure, case, known)
+def _of_modes(structure: Structure, case: Case, law: Channels, nominal: NominalModel) -> Array:
+    model = nominal_modes(structure, case, nominal)
     position = 0 * law.velocity_gain if law.position_gain is None else law.position_gain
     n = model.state.shape[-1]
 
@@ -63,9 +63,9 @@ def _of_modes(structure: Structure, case: Case, law: Channels, known: Known) -> 
 
 
 def _of_links(
-    structure: Structure, case: Case, law: Controller, system: StateSpace, known: Known
+    structure: Structure, case: Case, law: Controller, system: StateSpace, nominal: NominalModel
 ) -> Array:
-    model = link_model(structure, case, known)
+    model = link_model(structure, case, nominal)
     a, b, c, d = system.state[:, 0], system.enter[:, 0], system.leave[:, :, 0], system.direct
     last = jnp.zeros_like(model.sensor).at[:, :, -structure.n_patches :].set(law.feedthrough)
     seen = model.sensor - last

@@ -52,8 +52,8 @@ def damping_ratio(damping: Damping, omega: Array) -> Array:
     order = jnp.arange(omega.shape[1])
     own = jnp.minimum(order, jnp.asarray(damping.count, int)[:, None] - 1)
     ratio = jnp.asarray(damping.ratio)
-    known = jnp.take_along_axis(ratio, jnp.minimum(own, ratio.shape[1] - 1), axis=1)
-    return known * (omega / jnp.take_along_axis(omega, own, axis=1)) ** damping.exponent
+    specified = jnp.take_along_axis(ratio, jnp.minimum(own, ratio.shape[1] - 1), axis=1)
+    return specified * (omega / jnp.take_along_axis(omega, own, axis=1)) ** damping.exponent
 
 
 #: Mass added to locked sliders [kg]: 1 N for 1 s moves it by 0.5 nm.

@@ -20,7 +20,7 @@ from jaxmodel.estimator import KINDS
 from jaxmodel.integrator import exponential_step
 from jaxmodel.kinematics import close_chain
 from jaxmodel.laws import LAWS, is_modal, n_channels
-from jaxmodel.laws.contract import Known, check_feedback
+from jaxmodel.laws.contract import NominalModel, check_feedback
 from jaxmodel.laws.poles import is_unplaceable
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import LeftOut, Loop, Rest
@@ -53,7 +53,7 @@ class ControllerDesign(NamedTuple):
     """Controller and the by-products of its design."""
 
     controller: Controller
-    known: Known
+    nominal: NominalModel
     modal_omega: Array  # frequencies of the controller's own modes [rad/s], (3, C)
     sensor_condition: Array  # (3,)
     actuator_condition: Array  # (3,)
@@ -101,7 +101,7 @@ def prepare(structure: Structure, case: Case) -> Prepared:
         deflection_at=basis.deflection_at,
         controller=design.controller,
         ideal=_ideal(design.controller.feedback, sensor) if structure.feedback == "ideal" else None,
-        observer=jnp.einsum("ick,ikr->icr", design.known.observer, sensor),
+        observer=jnp.einsum("ick,ikr->icr", design.nominal.observer, sensor),
         modal_omega=design.modal_omega,
         rotation=(jnp.cos(angle), jnp.sin(angle)),
         drive=case.drive._replace(
@@ -235,7 +235,7 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
     inverse = jax.vmap(left_inverse, (0, None))(jnp.concatenate([seen, driven]), mask)
     observer, synthesizer = inverse[:3], jnp.swapaxes(inverse[3:], 1, 2)
 
-    known = Known(
+    nominal = NominalModel(
         observer=observer,
         synthesizer=synthesizer,
         sensor=seen,
@@ -247,13 +247,13 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
         feedthrough=_left_out_voltage(case, model, jnp.pad(mask, (0, model.mass.shape[1] - n))),
     )
     law = LAWS[structure.law]
-    feedback = law.design(structure, case, known)
+    feedback = law.design(structure, case, nominal)
     check_feedback(law, feedback, n_channels(structure), structure.n_patches)
     if isinstance(feedback, Channels) and not structure.has_position_gain:
         feedback = feedback._replace(position_gain=None)
     controller = Controller(
         feedback=feedback,
-        feedthrough=control.feedthrough_factor * known.feedthrough,
+        feedthrough=control.feedthrough_factor * nominal.feedthrough,
         voltage_limit=jnp.asarray(electronics.voltage_limit),
         adc_gain=jnp.asarray(electronics.conditioner_gain),
         adc_bias=jnp.asarray(electronics.conditioner_bias),
@@ -263,7 +263,7 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
     )
     return ControllerDesign(
         controller=with_gains(controller, control.gain_factor),
-        known=known,
+        nominal=nominal,
         modal_omega=jnp.sqrt(model.stiffness / model.mass)[:, :n],
         sensor_condition=condition_number(seen, mask),
         actuator_condition=condition_number(driven, mask),
@@ -272,9 +272,9 @@ def design_controller(structure: Structure, case: Case, bases: Bases) -> Control
 
 def _believed_damping(case: Case, omega: Array) -> Array:
     """Damping ratios of the controller's modes: of its law's model, if it has one, (3, C)."""
-    given = case.control.parameters.get("model_damping")
-    if given is not None:
-        return jnp.broadcast_to(jnp.asarray(given)[:, None], omega.shape)
+    specified = case.control.parameters.get("model_damping")
+    if specified is not None:
+        return jnp.broadcast_to(jnp.asarray(specified)[:, None], omega.shape)
     return damping_ratio(case.machine.damping, omega)
 
 
@@ -284,10 +284,10 @@ def design_taps(case: Case, bases: Bases) -> shaper.Taps:
     A frequency of zero stands for mode 1 of the controller's model, averaged over the links.
     """
     shaping, period = case.shaping, case.electronics.period
-    known = jnp.mean(bases.believed_omega[:, 0])
+    mean_omega = jnp.mean(bases.believed_omega[:, 0])
 
     def one(omega: Array, zeta: Array) -> shaper.Taps:
-        omega = jnp.where(omega > 0, omega, known)
+        omega = jnp.where(omega > 0, omega, mean_omega)
         impulses = shaper.design_shaper(shaping.kind, omega, zeta, shaping.tolerance)
         linear = shaper.split_linear(impulses, period)
         exact = shaper.split_exact(impulses, period, omega, zeta)
@@ -301,8 +301,8 @@ def _initial_modes(structure: Structure, case: Case, bases: Bases) -> Array:
     initial, at, stiffness = case.initial, bases.at_load, bases.plant.stiffness
     compliance = jnp.sum(at * at / stiffness, axis=1)
     load = jnp.asarray(initial.load_deflection) / jnp.where(compliance > 0, compliance, 1.0)
-    given = jnp.where(jnp.arange(structure.n_modes) < case.n_modes, initial.modal, 0.0)
-    return given + at / stiffness * load[:, None]
+    modal = jnp.where(jnp.arange(structure.n_modes) < case.n_modes, initial.modal, 0.0)
+    return modal + at / stiffness * load[:, None]
 
 
 def lowpass_corner(structure: Structure, case: Case, bases: Bases) -> Array:
@@ -380,7 +380,7 @@ def _is_ill_conditioned(structure: Structure, case: Case, design: ControllerDesi
 def _has_unplaceable_poles(structure: Structure, case: Case, design: ControllerDesign) -> Array:
     if not structure.has_poles or structure.feedback == "none":
         return jnp.zeros((), bool)
-    return is_unplaceable(structure, case, design.known)
+    return is_unplaceable(structure, case, design.nominal)
 
 
 def _is_too_fast(structure: Structure, case: Case, bases: Bases) -> Array:

@@ -90,7 +90,7 @@ def _hammer(structure: Structure, loop: Loop, case: Case, pose: Array) -> Array:
     on_modes = jnp.swapaxes(loop.deflection_at, 1, 2) / loop.plant.modal_mass[:, None, None]
     pushed = loop._replace(actuator=on_modes)
     chain = close_chain(loop.plant, pose, still)
-    wanted = Reference(chain.rho, chain.rho_rate, still, still)
+    reference = Reference(chain.rho, chain.rho_rate, still, still)
     open_loop = structure._replace(feedback="none")
 
     def derivative(force: Array) -> Array:
@@ -98,7 +98,7 @@ def _hammer(structure: Structure, loop: Loop, case: Case, pose: Array) -> Array:
         if structure.has_wrench:
             wrench = wrench + case.load.wrench
         at = PlantState(pose, still, zero, zero)
-        rates = plant_rates(open_loop, pushed, at, wanted._replace(wrench=wrench), force)
+        rates = plant_rates(open_loop, pushed, at, reference._replace(wrench=wrench), force)
         return flatten(PlantState(still, rates.acceleration.pose, zero, rates.acceleration.modal))
 
     return jnp.reshape(jax.jacfwd(derivative)(jnp.zeros((3, count), pose.dtype)), (-1, 3 * count))

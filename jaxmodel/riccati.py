@@ -37,8 +37,8 @@ def solve_riccati(a: Array, b: Array, q: Array, r: Array) -> Array:
         return (a @ after, (g + g.T) / 2, (h + h.T) / 2), None
 
     start = a, b @ jnp.linalg.solve(r, b.T), q
-    (_, _, found), _ = jax.lax.scan(double, start, None, length=STEPS)
-    return found
+    (_, _, solution), _ = jax.lax.scan(double, start, None, length=STEPS)
+    return solution
 
 
 def regulator_gain(a: Array, b: Array, q: Array, r: Array) -> Array:

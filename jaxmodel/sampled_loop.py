@@ -305,13 +305,13 @@ def spillover(structure: Structure, case: Case, matrices: LoopMatrices) -> Array
 
     def ringing(transition: Array) -> tuple[Array, Summed]:
         outputs = jnp.zeros(transition.shape[0], transition.dtype).at[first:last].set(weight)
-        found = summed_squares(jax.lax.stop_gradient(transition).T, jnp.diag(outputs))
-        return jnp.diagonal(found.share)[first:last], found
+        gramian = summed_squares(jax.lax.stop_gradient(transition).T, jnp.diag(outputs))
+        return jnp.diagonal(gramian.share)[first:last], gramian
 
     plant = matrices.open[: 6 + 6 * modes, : 6 + 6 * modes]
     loop = matrices.open + matrices.feedback
-    (without, free), (found, closed) = ringing(plant), ringing(loop)
-    ratio = jnp.where(is_left > 0, found / jnp.where(is_left > 0, without, 1.0), 0.0)
+    (free_energy, free), (energy, closed) = ringing(plant), ringing(loop)
+    ratio = jnp.where(is_left > 0, energy / jnp.where(is_left > 0, free_energy, 1.0), 0.0)
     mode = jnp.argmax(ratio)
     log_size = jnp.minimum(closed.log_size - free.log_size, 50.0)
     value = jax.lax.stop_gradient(ratio[mode] * jnp.exp(log_size))

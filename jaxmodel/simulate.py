@@ -63,30 +63,30 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
     n, per_sample = structure.n_steps, 2 * structure.substeps
     period, plant = case.electronics.period, prepared.loop.plant
     grid = n * per_sample + 1
-    wanted = shape_path(case.path, prepared.taps, grid, per_sample, period / per_sample)
+    reference = shape_path(case.path, prepared.taps, grid, per_sample, period / per_sample)
     rest = prepared.loop.rest
     wrench = case.load.wrench if structure.has_wrench else None
     sliders: Callable[..., Any] = partial(inverse_kinematics, plant)
     torque: Callable[..., Any] = partial(inverse_dynamics, plant, wrench=wrench)
     if rest is not None:
         sliders, torque = _about(sliders, rest.pose), _about(torque, rest.pose)
-    rho, rho_rate = sliders(wanted.position, wanted.velocity)
+    rho, rho_rate = sliders(reference.position, reference.velocity)
     forward = None
     if structure.has_feedforward:
-        forward = _points(jax.vmap(torque)(*wanted), n)
+        forward = _points(jax.vmap(torque)(*reference), n)
     elif structure.has_wrench:  # the settled output of the drive's integrators
-        still = jnp.zeros_like(wanted.position[0])
-        held = torque(wanted.position[0], still, still)
+        still = jnp.zeros_like(reference.position[0])
+        held = torque(reference.position[0], still, still)
         forward = jnp.broadcast_to(held, (n, per_sample + 1, 3))
 
     is_buckled = jnp.any(steady_load(structure, case, plant) >= 1)
     time = period * jnp.arange(n)
     end = end_of_path(case.path) + last_sample(prepared.taps) * period
-    code, index = path_status(plant, wanted.position)
+    code, index = path_status(plant, reference.position)
     bad_time = index * period / per_sample
     code = jnp.where(is_buckled, float(status.BUCKLED), code)
     bad_time = jnp.where(is_buckled, 0.0, bad_time)
-    distance = singularity_distance(plant, wanted.position)
+    distance = singularity_distance(plant, reference.position)
     is_long = end > n * period
     code = jnp.where((code == status.OK) & is_long, float(status.SHAPER_TOO_LONG), code)
     left = n * period - end - case.windows.residual_delay
@@ -100,7 +100,7 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
         rho=_points(rho, n),
         rho_rate=_points(rho_rate, n),
         feedforward=forward,
-        pose=wanted.position[:-1:per_sample],
+        pose=reference.position[:-1:per_sample],
         disturbance=disturbance,
         wrench=_wrench(case.load, time) if structure.has_wrench else None,
         adc_noise=adc_noise,
@@ -108,7 +108,7 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
     )
     return Command(
         inputs=inputs,
-        start_pose=wanted.position[0],
+        start_pose=reference.position[0],
         end=end,
         status=code,
         bad_time=bad_time,
@@ -119,10 +119,12 @@ def command(structure: Structure, case: Case, prepared: Prepared) -> Command:
 def _about(function: Callable[..., Any], pose: Array) -> Callable[..., Any]:
     """A function of pose and rates to first order about rest at a pose."""
 
-    def linear(*given: Array) -> Any:
-        rest = [jnp.zeros_like(x) for x in given]
-        rest[0] = jnp.broadcast_to(pose, given[0].shape)
-        value, change = jax.jvp(function, rest, [x - at for x, at in zip(given, rest, strict=True)])
+    def linear(*arguments: Array) -> Any:
+        rest = [jnp.zeros_like(x) for x in arguments]
+        rest[0] = jnp.broadcast_to(pose, arguments[0].shape)
+        value, change = jax.jvp(
+            function, rest, [x - at for x, at in zip(arguments, rest, strict=True)]
+        )
         return jax.tree.map(jnp.add, value, change)
 
     return linear

@@ -67,9 +67,9 @@ class StateSpace(NamedTuple):
         y = jnp.reshape(voltage, (state.shape[0], -1, *voltage.shape[2:]))
         after = jnp.sum(self.state * state[:, :, None], axis=3)
         after = after + jnp.sum(self.enter * y[:, None, None], axis=3)
-        wanted = jnp.sum(jnp.sum(self.leave * state[:, None], axis=3), axis=2)
-        wanted = wanted + jnp.sum(self.direct * y[:, None], axis=2)
-        return after, jnp.reshape(wanted, voltage.shape)
+        demand = jnp.sum(jnp.sum(self.leave * state[:, None], axis=3), axis=2)
+        demand = demand + jnp.sum(self.direct * y[:, None], axis=2)
+        return after, jnp.reshape(demand, voltage.shape)
 
     def amplified(self, factor: Array) -> StateSpace:
         """Outputs times a factor: one for all, or one for each actuator, (3, K)."""

@@ -58,9 +58,9 @@ class Table(Mapping[str, _Entry], Generic[_Entry]):
             PartError: it has the wrong type, its name is taken or invalid, or it violates its
                 contract.
         """
-        wanted = type(next(iter(self._entries.values())))
-        if not isinstance(entry, wanted):
-            raise PartError(f"{self.kind} {entry!r}: expected a {wanted.__name__}")
+        kind = type(next(iter(self._entries.values())))
+        if not isinstance(entry, kind):
+            raise PartError(f"{self.kind} {entry!r}: expected a {kind.__name__}")
         name = entry.name
         plain = name.replace("-", "_")
         if not plain.isidentifier() or name.startswith("_") or hasattr(dict, name):

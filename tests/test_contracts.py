@@ -246,10 +246,10 @@ def test_names_that_are_none_are_refused(name):
         table.add(METRICS["residual_rms"]._replace(name=name))
 
 
-def stiff(structure, case, known):
+def stiff(structure, case, nominal):
     """Positions alone."""
-    position = 20.0 * known.modal_mass * known.omega * acting_channels(case, known)
-    return modal_feedback(case, known, 0 * known.omega, position)
+    position = 20.0 * nominal.modal_mass * nominal.omega * acting_channels(case, nominal)
+    return modal_feedback(case, nominal, 0 * nominal.omega, position)
 
 
 @pytest.mark.long  # in short: margins of position feedback, in test_margins
@@ -310,16 +310,16 @@ from studies.export.job import ExportResult, check_loop
 from studies.export.targets import Target
 from studies.space.methods import Method
 
-def wide(structure, case, known):
-    return modal_feedback(case, known, jnp.ones((3, 7)), jnp.ones((3, 7)))
+def wide(structure, case, nominal):
+    return modal_feedback(case, nominal, jnp.ones((3, 7)), jnp.ones((3, 7)))
 
-def asks(structure, case, known):
+def asks(structure, case, nominal):
     if case.control.gain_factor > 0.1:
         raise RuntimeError
 
-def turns(structure, case, known):
+def turns(structure, case, nominal):
     one = jnp.ones((3, structure.n_controlled))
-    return modal_feedback(case, known, 1j * one, one)
+    return modal_feedback(case, nominal, 1j * one, one)
 
 laws = [Law(f.__name__, f.__name__, "mode", f) for f in (wide, asks, turns)]
 total = Total("pose_sum", (), lambda totals, at: at.sample.pose_error)

@@ -48,12 +48,12 @@ def test_riccati_equations_are_solved(seed):
     )
 
 
-def compensator(study, known, case, link):
+def compensator(study, nominal, case, link):
     """A, B, C, D of one link by SciPy: each mode with its own filter, then hold and delay."""
     electronics, parameters = case.electronics, case.control.parameters
     corner, period = float(electronics.antialias), float(electronics.period)
-    omega, mass = np.asarray(known.omega[link]), np.asarray(known.modal_mass[link])
-    sensor, actuator = np.asarray(known.sensor[link]), np.asarray(known.actuator[link])
+    omega, mass = np.asarray(nominal.omega[link]), np.asarray(nominal.modal_mass[link])
+    sensor, actuator = np.asarray(nominal.sensor[link]), np.asarray(nominal.actuator[link])
     count, patches = len(omega), sensor.shape[0]
     zeta = parameters["model_damping"][link]
     n = 4 * count + 2 * patches  # q, q', z, z' of one mode after another [m, m/s]; z, z' of volts
@@ -69,7 +69,7 @@ def compensator(study, known, case, link):
     for k in range(patches):  # what all other modes show of the commands, filtered as they are
         i = 4 * count + 2 * k
         a[i, i + 1], a[i + 1, i : i + 2] = 1.0, (-(corner**2), -np.sqrt(2) * corner)
-        b[i + 1, k], c[:, i] = corner**2, known.feedthrough[link][:, k]
+        b[i + 1, k], c[:, i] = corner**2, nominal.feedthrough[link][:, k]
     size = np.concatenate([np.tile([1e-6, 1e-3, 1e-6, 1e-2], count), np.tile([1.0, 1e4], patches)])
     whole = np.zeros((n + patches + count,) * 2)
     whole[:n] = np.hstack([a, b, f])
@@ -101,8 +101,8 @@ def arrays(study):
     return build_structure(study), as_arrays(build_case(study))
 
 
-def known_of(structure, case):
-    return design_controller(structure, case, find_bases(structure, case)).known
+def nominal_of(structure, case):
+    return design_controller(structure, case, find_bases(structure, case)).nominal
 
 
 def controller_of(structure, case):
@@ -113,8 +113,8 @@ def test_damping_and_margin_are_those_of_an_independent_computation():
     """Filter and regulator by SciPy in other coordinates, put into the same plant."""
     study = parse_study(SHORT)
     structure, case = arrays(study)
-    known = jax.tree.map(np.asarray, jax.jit(known_of, static_argnums=0)(structure, case))
-    parts = [compensator(study, known, case, link) for link in range(3)]
+    nominal = jax.tree.map(np.asarray, jax.jit(nominal_of, static_argnums=0)(structure, case))
+    parts = [compensator(study, nominal, case, link) for link in range(3)]
     a, b, c, d = (np.stack([part[k] for part in parts]) for k in range(4))
     other = StateSpace(a[:, None], b[:, None], c[:, :, None], d)
     plain, wide = with_margin_modes(structure, case)
@@ -142,8 +142,8 @@ def test_certainty_equivalence():
     """On its own model, the loop's poles are those of regulator and filter, and all are stable."""
     study = parse_study(SHORT | {"link": {"modes": 2}})
     structure, case = arrays(study)
-    known = jax.tree.map(np.asarray, jax.jit(known_of, static_argnums=0)(structure, case))
-    a, b, c, d = compensator(study, known, case, 0)
+    nominal = jax.tree.map(np.asarray, jax.jit(nominal_of, static_argnums=0)(structure, case))
+    a, b, c, d = compensator(study, nominal, case, 0)
     found = jax.jit(
         lambda s, k: design_controller(s, k, find_bases(s, k)).controller, static_argnums=0
     )
@@ -188,9 +188,9 @@ def test_observers_have_the_poles_that_were_placed(highpass):
     structure, case = arrays(study)
 
     def both(case):
-        known = known_of(structure, case)
-        model = link_model(structure, case, known)
-        return known.omega, model.state, corrections(structure, case, known, model.state)
+        nominal = nominal_of(structure, case)
+        model = link_model(structure, case, nominal)
+        return nominal.omega, model.state, corrections(structure, case, nominal, model.state)
 
     omega, state, own = map(np.asarray, jax.jit(both)(case))
     period, corner = float(case.electronics.period), float(case.electronics.antialias)

@@ -106,11 +106,11 @@ def test_gains_agree_with_an_independent_loop():
     study = study_with(decay=[[150.0, 80.0, 90.0], [100.0, 70.0, 80.0], [60.0, 90.0, 200.0]])
     structure, case = arrays(study)
     design = _design(structure, case)
-    law, known = jax.tree.map(np.asarray, (design.controller.feedback, design.known))
+    law, nominal = jax.tree.map(np.asarray, (design.controller.feedback, design.nominal))
     period, corner = float(case.electronics.period), float(case.electronics.antialias)
-    static = known.observer @ known.feedthrough @ known.synthesizer
+    static = nominal.observer @ nominal.feedthrough @ nominal.synthesizer
     for i, j in np.ndindex(3, 3):
-        omega, mass = known.omega[i, j], known.modal_mass[i, j]
+        omega, mass = nominal.omega[i, j], nominal.modal_mass[i, j]
         a = np.zeros((4, 4))  # q, q', z, z' of the filtered coordinate, and force [N]
         a[0, 1] = a[2, 3] = 1.0
         a[1, :2] = -(omega**2), -0.02 * omega
@@ -271,11 +271,11 @@ def test_the_observers_loop_has_the_poles_of_continuous_feedback(rate):
     study = parse_study({"control": {"law": "observer"} | gains, "electronics": electronics})
     structure, case = arrays(study)
     _, matrix = map(np.asarray, _nominal(structure, case))
-    known = jax.tree.map(np.asarray, _design(structure, case).known)
+    nominal = jax.tree.map(np.asarray, _design(structure, case).nominal)
     ratio = np.array(study.control.ratios)
-    velocity = np.array(gains["velocity_gain"])[:, None] * ratio / known.modal_mass
-    position = np.array(gains["position_gain"])[:, None] * ratio / known.modal_mass
-    damping, square = 0.01 * known.omega + velocity / 2, known.omega**2 + position
+    velocity = np.array(gains["velocity_gain"])[:, None] * ratio / nominal.modal_mass
+    position = np.array(gains["position_gain"])[:, None] * ratio / nominal.modal_mass
+    damping, square = 0.01 * nominal.omega + velocity / 2, nominal.omega**2 + position
     wanted = -damping + 1j * np.sqrt(square - damping**2)
     found = nearest_poles(wanted, matrix, 1 / rate)
     np.testing.assert_allclose(found, wanted, rtol=1e-8)

@@ -37,7 +37,7 @@ class Parameter(NamedTuple):
     high: float
 
 
-class Known(NamedTuple):
+class NominalModel(NamedTuple):
     """What a law can use: the controller's model of the machine."""
 
     observer: Array  # modal filter pinv(lambda_s Phi_s^t) of the controlled modes [m/V], (3, C, K)
@@ -57,7 +57,7 @@ class Law(NamedTuple):
     name: str  # in study files
     text: str  # in reports
     channel: Channel
-    design: Callable[[Structure, Case, Known], Feedback]
+    design: Callable[[Structure, Case, NominalModel], Feedback]
     parameters: tuple[Parameter, ...] = ()
     # position gains count always; False: they are zero, and cost nothing, where
     # `control.position_gain` is
@@ -68,7 +68,7 @@ class Law(NamedTuple):
     is_switching: bool = False
     # settings with which it damps mode 1 as much as modal control does with the case's settings;
     # None: its velocity gains are scaled to match
-    as_strong: Callable[[Case, Known], Control] | None = None
+    as_strong: Callable[[Case, NominalModel], Control] | None = None
 
 
 def check_law(law: Law) -> None:
@@ -129,18 +129,18 @@ def _shapes(feedback: Feedback, n_channels: int, n_patches: int) -> dict[str, tu
     }
 
 
-def acting_channels(case: Case, known: Known) -> Array:
+def acting_channels(case: Case, nominal: NominalModel) -> Array:
     """1 for channels that act, 0 for the others, (3, C)."""
     control = case.control
     links = jnp.asarray(control.link_mask)[:, None]
-    return links * jnp.asarray(control.mode_mask) * known.mask
+    return links * jnp.asarray(control.mode_mask) * nominal.mask
 
 
-def given_gains(case: Case, known: Known) -> tuple[Array, Array]:
+def study_gains(case: Case, nominal: NominalModel) -> tuple[Array, Array]:
     """The study's velocity [N s/m] and position gains [N/m] by mode, ratios (24), (3, C) each."""
-    control, on = case.control, acting_channels(case, known)
+    control, on = case.control, acting_channels(case, nominal)
     velocity, position = (
-        on * force_gains(first, control.ratio, known.modal_mass, control.is_per_mass)
+        on * force_gains(first, control.ratio, nominal.modal_mass, control.is_per_mass)
         for first in (control.velocity_gain, control.position_gain)
     )
     return velocity, position
@@ -166,11 +166,11 @@ def as_modal(control: Control, velocity: Array, position: Array) -> Control:
     )
 
 
-def study_estimator(case: Case, known: Known) -> Estimator:
+def study_estimator(case: Case, nominal: NominalModel) -> Estimator:
     """The study's estimator of modal velocities and positions."""
     electronics = case.electronics
     return design_estimator(
-        known.omega, electronics, electronics.lowpass_ratio, electronics.lowpass_zeta
+        nominal.omega, electronics, electronics.lowpass_ratio, electronics.lowpass_zeta
     )
 
 
@@ -182,7 +182,7 @@ def system_feedback(structure: Structure, case: Case, system: StateSpace) -> Sta
 
 def modal_feedback(
     case: Case,
-    known: Known,
+    nominal: NominalModel,
     velocity: Array,
     position: Array,
     estimator: Estimator | None = None,
@@ -192,16 +192,16 @@ def modal_feedback(
 
     Args:
         case: the numbers.
-        known: what the controller knows.
+        nominal: the model the controller is designed for.
         velocity: gains [N s/m], (3, C).
         position: gains [N/m], (3, C).
         estimator: of modal velocities and positions; None: that of the study.
         rival_omega: see `Channels`.
     """
     return Channels(
-        filter=known.observer,
-        synthesizer=known.synthesizer,
-        estimator=study_estimator(case, known) if estimator is None else estimator,
+        filter=nominal.observer,
+        synthesizer=nominal.synthesizer,
+        estimator=study_estimator(case, nominal) if estimator is None else estimator,
         velocity_gain=velocity,
         position_gain=position,
         rival_omega=rival_omega,

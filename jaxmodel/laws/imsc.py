@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from jaxmodel.case import Case, Control, Structure
 from jaxmodel.channels import Channels
-from jaxmodel.laws.contract import Known, Law, modal_feedback
+from jaxmodel.laws.contract import Law, NominalModel, modal_feedback
 from jaxmodel.laws.poles import modal_gains
 
 
-def design(structure: Structure, case: Case, known: Known) -> Channels:
+def design(structure: Structure, case: Case, nominal: NominalModel) -> Channels:
     """Gains of mode 1 and ratios (24), by modal filter and synthesizer."""
-    return modal_feedback(case, known, *modal_gains(structure, case, known))
+    return modal_feedback(case, nominal, *modal_gains(structure, case, nominal))
 
 
-def same(case: Case, known: Known) -> Control:
+def same(case: Case, nominal: NominalModel) -> Control:
     """Settings of modal control itself."""
     return case.control
 

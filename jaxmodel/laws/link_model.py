@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from jaxmodel.case import Case, Electronics, Structure
-from jaxmodel.laws.contract import Known, Parameter, system_feedback
+from jaxmodel.laws.contract import NominalModel, Parameter, system_feedback
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
 from jaxmodel.state_space import StateSpace
@@ -34,34 +34,40 @@ class LinkModel(NamedTuple):
     energy: Array  # diagonal of the modes' energy, 1 for their two states, (n,)
 
 
-def link_model(structure: Structure, case: Case, known: Known) -> LinkModel:
+def link_model(structure: Structure, case: Case, nominal: NominalModel) -> LinkModel:
     """The model of each link; leading axis 3.
 
     Args:
         structure: static choices; electronics that exist are part of the model.
         case: the numbers.
-        known: what the controller knows.
+        nominal: the model the controller is designed for.
     """
-    on = known.mask * case.control.mode_mask
+    on = nominal.mask * case.control.mode_mask
     zeta = jnp.asarray(case.control.parameters["model_damping"])
-    off = (known.mask - on) / (known.modal_mass * known.omega**2)
-    direct = known.feedthrough + jnp.einsum("ikc,ic,icl->ikl", known.sensor, off, known.actuator)
-    root_mass = jnp.sqrt(known.modal_mass)
-    given = known.omega, root_mass, known.sensor, known.actuator, direct, on, zeta
+    off = (nominal.mask - on) / (nominal.modal_mass * nominal.omega**2)
+    direct = nominal.feedthrough + jnp.einsum(
+        "ikc,ic,icl->ikl", nominal.sensor, off, nominal.actuator
+    )
+    root_mass = jnp.sqrt(nominal.modal_mass)
+    arguments = nominal.omega, root_mass, nominal.sensor, nominal.actuator, direct, on, zeta
 
     def one(*of_link: Array) -> LinkModel:
         return _one_link(structure, case, *of_link)
 
-    return jax.vmap(one)(*given)
+    return jax.vmap(one)(*arguments)
 
 
 def mode_models(
-    structure: Structure, case: Case, known: Known, zeta: Array, direct: Array | float = 0.0
+    structure: Structure,
+    case: Case,
+    nominal: NominalModel,
+    zeta: Array,
+    direct: Array | float = 0.0,
 ) -> LinkModel:
     """The nominal link seen through one mode: from modal force [N] to modal coordinate [m].
 
     Args:
-        structure, case, known: as for `link_model`.
+        structure, case, nominal: as for `link_model`.
         zeta: damping ratio of each mode [1], (3, C).
         direct: what all other modes show in its coordinate at once [m/N], (3, C).
 
@@ -74,10 +80,10 @@ def mode_models(
         each = omega[None], root_mass[None], one, one, direct[None, None], jnp.ones((1,)), zeta
         return _one_link(structure, case, *each)
 
-    shape = known.omega.shape
+    shape = nominal.omega.shape
     zeta, direct = jnp.broadcast_to(zeta, shape), jnp.broadcast_to(direct, shape)
-    root_mass = jnp.sqrt(known.modal_mass)
-    return jax.vmap(jax.vmap(single))(known.omega, root_mass, zeta, direct)
+    root_mass = jnp.sqrt(nominal.modal_mass)
+    return jax.vmap(jax.vmap(single))(nominal.omega, root_mass, zeta, direct)
 
 
 def layout(structure: Structure, n_modes: int, n_patches: int) -> dict[str, slice]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.laws.contract import Known, Law, Parameter
+from jaxmodel.laws.contract import Law, NominalModel, Parameter
 from jaxmodel.laws.link_model import DAMPING, LinkModel, compensated, link_model
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.parameters import Array
@@ -11,11 +11,13 @@ from jaxmodel.riccati import filter_gain, regulator_gain
 from jaxmodel.state_space import StateSpace
 
 
-def design(structure: Structure, case: Case, known: Known) -> StateSpace:
+def design(structure: Structure, case: Case, nominal: NominalModel) -> StateSpace:
     """Regulator and filter of every link."""
-    given = case.control.parameters
-    weights = (jnp.asarray(given[x]) for x in ("voltage_weight", "disturbance", "sensor_noise"))
-    model = link_model(structure, case, known)
+    parameters = case.control.parameters
+    weights = (
+        jnp.asarray(parameters[x]) for x in ("voltage_weight", "disturbance", "sensor_noise")
+    )
+    model = link_model(structure, case, nominal)
 
     def one(model: LinkModel, weight: Array, force: Array, noise: Array) -> tuple[Array, Array]:
         eye = jnp.eye(model.enter.shape[1])

@@ -6,12 +6,12 @@ from jaxmodel.case import Case, Control, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.control import PoleGains
 from jaxmodel.laws.contract import (
-    Known,
     Law,
+    NominalModel,
     Parameter,
     acting_channels,
-    given_gains,
     modal_feedback,
+    study_gains,
 )
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
@@ -36,30 +36,30 @@ def optimal_gains(omega: Array, control_weight: Array) -> PoleGains:
     return PoleGains(position, jnp.sqrt(2 * position + share))
 
 
-def design(structure: Structure, case: Case, known: Known) -> Channels:
+def design(structure: Structure, case: Case, nominal: NominalModel) -> Channels:
     """Optimal gains of every controlled mode, one weight for each link."""
     weight = jnp.asarray(case.control.parameters["control_weight"])[:, None]
-    gains = optimal_gains(known.omega, weight)
-    scale = acting_channels(case, known) * known.modal_mass
-    return modal_feedback(case, known, scale * gains.velocity, scale * gains.position)
+    gains = optimal_gains(nominal.omega, weight)
+    scale = acting_channels(case, nominal) * nominal.modal_mass
+    return modal_feedback(case, nominal, scale * gains.velocity, scale * gains.position)
 
 
-def as_strong(case: Case, known: Known) -> Control:
+def as_strong(case: Case, nominal: NominalModel) -> Control:
     """One weight for all links that gives the first mode the k_d of modal control, and its modes.
 
     From k_d^2 = 2 k_p + 1/R: 1/R = h (h - 2 omega) with h^2 = k_d^2 + 4 omega^2.
     """
-    velocity = case.control.gain_factor * given_gains(case, known)[0]
+    velocity = case.control.gain_factor * study_gains(case, nominal)[0]
     is_on = velocity != 0
     first = jnp.argmax(jnp.any(is_on, axis=0))
     chosen = is_on[:, first]
     count = jnp.maximum(jnp.sum(chosen), 1)
-    gain = jnp.sum(jnp.where(chosen, (velocity / known.modal_mass)[:, first], 0.0)) / count
-    at = jnp.sum(jnp.where(chosen, known.omega[:, first], 0.0)) / count
+    gain = jnp.sum(jnp.where(chosen, (velocity / nominal.modal_mass)[:, first], 0.0)) / count
+    at = jnp.sum(jnp.where(chosen, nominal.omega[:, first], 0.0)) / count
     weight = (1 + 2 * at / jnp.hypot(gain, 2 * at)) / gain**2
     return case.control._replace(
         parameters={"control_weight": jnp.full((3,), weight)},
-        mode_mask=is_on.astype(known.omega.dtype),
+        mode_mask=is_on.astype(nominal.omega.dtype),
         gain_factor=jnp.ones(()),
     )
 

@@ -8,18 +8,18 @@ from __future__ import annotations
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
-from jaxmodel.laws.contract import Known, Law, modal_feedback
+from jaxmodel.laws.contract import Law, NominalModel, modal_feedback
 from jaxmodel.laws.imsc import same
 from jaxmodel.laws.poles import modal_gains
 from jaxmodel.lazy import jnp
 
 
-def design(structure: Structure, case: Case, known: Known) -> Channels:
+def design(structure: Structure, case: Case, nominal: NominalModel) -> Channels:
     """As IMSC; modes with gains are rivals."""
-    velocity, position = modal_gains(structure, case, known)
+    velocity, position = modal_gains(structure, case, nominal)
     is_on = (velocity != 0) | (position != 0)
-    rival_omega = jnp.where(is_on, known.omega, 0.0)
-    return modal_feedback(case, known, velocity, position, rival_omega=rival_omega)
+    rival_omega = jnp.where(is_on, nominal.omega, 0.0)
+    return modal_feedback(case, nominal, velocity, position, rival_omega=rival_omega)
 
 
 MODIFIED_IMSC = Law(

@@ -12,7 +12,7 @@ from __future__ import annotations
 from functools import reduce
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.laws.contract import Known, Law, Parameter, acting_channels
+from jaxmodel.laws.contract import Law, NominalModel, Parameter, acting_channels
 from jaxmodel.laws.link_model import (
     DAMPING,
     LinkModel,
@@ -27,13 +27,13 @@ from jaxmodel.parameters import Array
 from jaxmodel.state_space import StateSpace
 
 
-def corrections(structure: Structure, case: Case, known: Known, state: Array) -> Array:
+def corrections(structure: Structure, case: Case, nominal: NominalModel, state: Array) -> Array:
     """Corrections of each mode's own states by its residual in z, (3, C, s), s = 4 or 5.
 
     Ackermann's formula for the predictor, L = phi(F) O^-1 e_s, and M = F^-1 L for the corrector.
 
     Args:
-        structure, case, known: of the law.
+        structure, case, nominal: of the law.
         state: F of each link, (3, n, n).
     """
     electronics, count = case.electronics, structure.n_controlled
@@ -41,7 +41,7 @@ def corrections(structure: Structure, case: Case, known: Known, state: Array) ->
     period = electronics.period
     filters = [electronics.antialias * jnp.sqrt(0.5) * (-1 + 1j)]
     zeta = jnp.asarray(case.control.parameters["observer_damping"])[:, None]
-    wanted = known.omega * (-zeta + 1j * jnp.sqrt(1 - zeta**2))
+    poles = nominal.omega * (-zeta + 1j * jnp.sqrt(1 - zeta**2))
     last = jnp.exp(-electronics.sensor_highpass * period)
 
     def one(f: Array, mode: Array) -> Array:
@@ -58,10 +58,10 @@ def corrections(structure: Structure, case: Case, known: Known, state: Array) ->
     blocks = jnp.stack(
         [state[:, (own + j)[:, None], (own + j)[None]] for j in range(count)], axis=1
     )
-    return jax.vmap(jax.vmap(one))(blocks, wanted)
+    return jax.vmap(jax.vmap(one))(blocks, poles)
 
 
-def regulator(structure: Structure, case: Case, known: Known, model: LinkModel) -> Array:
+def regulator(structure: Structure, case: Case, nominal: NominalModel, model: LinkModel) -> Array:
     """K of u_k = -K x_k that places the poles of every mode, (3, K, n).
 
     u_k acts from sample k+1 on, where x_(k+1) = F x_k is known: it holds all commands on their way.
@@ -71,37 +71,37 @@ def regulator(structure: Structure, case: Case, known: Known, model: LinkModel) 
     amplifiers keep theirs.
 
     Args:
-        structure, case, known: of the law.
+        structure, case, nominal: of the law.
         model: of each link, leading axis 3.
     """
     period = case.electronics.period
-    damping, square = closed_modes(structure, case, known)
+    damping, square = closed_modes(structure, case, nominal)
     # exp(s T) of both poles: their sum and product
     total = 2 * jnp.exp(-damping * period) * _cosine((square - damping**2) * period**2)
     product = jnp.exp(-2 * damping * period)
     at = layout(structure, structure.n_controlled, structure.n_patches)
     each = layout(structure, 1, 1)
     own = [each[name].start for name in ("q", "rate", "volts") if name in each]
-    single = mode_models(structure, case, known, known.damping_ratio)
+    single = mode_models(structure, case, nominal, nominal.damping_ratio)
     phi = single.state[:, :, jnp.array(own)[:, None], jnp.array(own)]
     gamma = single.state[:, :, jnp.array(own), each["last"].start]
 
     def one(phi: Array, gamma: Array, total: Array, product: Array) -> Array:
-        wanted = phi @ phi - total * phi + product * jnp.eye(len(own))
+        polynomial = phi @ phi - total * phi + product * jnp.eye(len(own))
         if len(own) > 2:  # the amplifier's pole stays
-            wanted = wanted @ (phi - phi[2, 2] * jnp.eye(len(own)))
-        return _ackermann(phi, gamma, wanted)
+            polynomial = polynomial @ (phi - phi[2, 2] * jnp.eye(len(own)))
+        return _ackermann(phi, gamma, polynomial)
 
     gain = jax.vmap(jax.vmap(one))(phi, gamma, total, product)  # (3, C, 2 or 3)
-    gain = gain * acting_channels(case, known)[..., None]
+    gain = gain * acting_channels(case, nominal)[..., None]
     rows = [model.state[:, at["q"]], model.state[:, at["rate"]]]
     if "volts" in at:
-        rows.append(known.actuator @ model.state[:, at["volts"]])
+        rows.append(nominal.actuator @ model.state[:, at["volts"]])
     force = jnp.einsum("icr,ricn->icn", gain, jnp.stack(rows))
-    return known.synthesizer @ force
+    return nominal.synthesizer @ force
 
 
-def _ackermann(phi: Array, gamma: Array, wanted: Array) -> Array:
+def _ackermann(phi: Array, gamma: Array, polynomial: Array) -> Array:
     """k of u = -k x that gives x_(k+1) = phi x_k + gamma u_k the polynomial p; wanted = p(phi).
 
     Of the transposed system, the correction of an observer.
@@ -110,7 +110,7 @@ def _ackermann(phi: Array, gamma: Array, wanted: Array) -> Array:
     reach = [gamma]
     for _ in range(n - 1):
         reach.append(phi @ reach[-1])
-    return jnp.linalg.solve(jnp.stack(reach), jnp.eye(n)[-1]) @ wanted
+    return jnp.linalg.solve(jnp.stack(reach), jnp.eye(n)[-1]) @ polynomial
 
 
 def _cosine(square: Array) -> Array:
@@ -120,17 +120,19 @@ def _cosine(square: Array) -> Array:
     return jnp.where(is_ringing, turned, jnp.cosh(jnp.sqrt(jnp.where(is_ringing, 1.0, -square))))
 
 
-def design(structure: Structure, case: Case, known: Known) -> StateSpace:
+def design(structure: Structure, case: Case, nominal: NominalModel) -> StateSpace:
     """Observers of all modes, and a regulator of what they predict."""
-    model = link_model(structure, case, known)
+    model = link_model(structure, case, nominal)
     n = model.state.shape[1]
-    root = jnp.sqrt(known.modal_mass)
-    own = corrections(structure, case, known, model.state)  # (3, C, s)
-    seen = (known.omega * root)[..., None] * known.observer  # residual in z~ per volt, (3, C, K)
+    root = jnp.sqrt(nominal.modal_mass)
+    own = corrections(structure, case, nominal, model.state)  # (3, C, s)
+    seen = (nominal.omega * root)[
+        ..., None
+    ] * nominal.observer  # residual in z~ per volt, (3, C, K)
     parts = [own[:, :, k, None] * seen for k in range(own.shape[2])]
     correct = jnp.concatenate(parts, axis=1)  # (3, s C, K)
     correct = jnp.pad(correct, ((0, 0), (0, n - correct.shape[1]), (0, 0)))
-    gain = regulator(structure, case, known, model)
+    gain = regulator(structure, case, nominal, model)
     return compensated(structure, case, model, gain, correct)
 
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 from jaxmodel.case import Case, Structure
 from jaxmodel.control import pole_placement
 from jaxmodel.estimator import Estimator, responses
-from jaxmodel.laws.contract import Known, acting_channels, given_gains, study_estimator
+from jaxmodel.laws.contract import NominalModel, acting_channels, study_estimator, study_gains
 from jaxmodel.laws.link_model import LinkModel, mode_models
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
@@ -38,7 +38,7 @@ class Poles(NamedTuple):
     frequency: Array  # beta [rad/s], (3, C)
 
 
-def specified_poles(case: Case, known: Known) -> Poles:
+def specified_poles(case: Case, nominal: NominalModel) -> Poles:
     """Poles that the study specifies, by their decays or by added damping ratios.
 
     An added damping ratio is a decay alpha_j = (zeta_j + damping_j) omega_j. A mode without either
@@ -48,86 +48,86 @@ def specified_poles(case: Case, known: Known) -> Poles:
 
     Args:
         case: the numbers.
-        known: what the controller knows.
+        nominal: the model the controller is designed for.
     """
-    control, own = case.control, known.damping_ratio * known.omega
+    control, own = case.control, nominal.damping_ratio * nominal.omega
     is_damped = control.damping >= 0
-    given = jnp.where(is_damped, own + control.damping * known.omega, control.pole_decay)
-    shared = own + control.ratio * (given[:, :1] - own[:, :1])
-    decay = jnp.where(is_damped | (given > 0), given, shared)
-    kept = jnp.sqrt(jnp.maximum(known.omega**2 - decay**2, (1e-3 * known.omega) ** 2))
+    decay = jnp.where(is_damped, own + control.damping * nominal.omega, control.pole_decay)
+    shared = own + control.ratio * (decay[:, :1] - own[:, :1])
+    decay = jnp.where(is_damped | (decay > 0), decay, shared)
+    kept = jnp.sqrt(jnp.maximum(nominal.omega**2 - decay**2, (1e-3 * nominal.omega) ** 2))
     is_given = control.pole_frequency > 0
     return Poles(decay, jnp.where(is_given, control.pole_frequency, kept))
 
 
-def is_placed(case: Case, known: Known) -> Array:
+def is_placed(case: Case, nominal: NominalModel) -> Array:
     """Whether a mode acts and its poles are specified, (3, C)."""
     control = case.control
     is_specified = (control.damping[:, :1] >= 0) | (control.pole_decay[:, :1] > 0)
-    return is_specified & (acting_channels(case, known) > 0)
+    return is_specified & (acting_channels(case, nominal) > 0)
 
 
-def continuous_gains(poles: Poles, known: Known) -> tuple[Array, Array]:
+def continuous_gains(poles: Poles, nominal: NominalModel) -> tuple[Array, Array]:
     """Velocity [N s/m] and position gains [N/m] of continuous feedback, (22)-(23), (3, C) each."""
-    gains = pole_placement(poles.decay, poles.frequency, known.omega)
-    structural = 2 * known.damping_ratio * known.omega
-    return known.modal_mass * (gains.velocity - structural), known.modal_mass * gains.position
+    gains = pole_placement(poles.decay, poles.frequency, nominal.omega)
+    structural = 2 * nominal.damping_ratio * nominal.omega
+    return nominal.modal_mass * (gains.velocity - structural), nominal.modal_mass * gains.position
 
 
 def sampled_gains(
-    structure: Structure, case: Case, known: Known, estimator: Estimator
+    structure: Structure, case: Case, nominal: NominalModel, estimator: Estimator
 ) -> tuple[Array, Array]:
     """Velocity [N s/m] and position gains [N/m] of the loop that runs, (3, C) each."""
-    poles = specified_poles(case, known)
-    is_moved = _is_moved(poles, known)
+    poles = specified_poles(case, nominal)
+    is_moved = _is_moved(poles, nominal)
     # own poles are poles of G: any others keep the unused alternative finite
-    decay = jnp.where(is_moved, poles.decay, poles.decay + 0.1 * known.omega)
+    decay = jnp.where(is_moved, poles.decay, poles.decay + 0.1 * nominal.omega)
     z = jnp.exp((-decay + 1j * poles.frequency) * case.electronics.period)
     rate, value = responses(estimator, z)
-    wanted = -1 / pulse_transfer(structure, case, known, z)
+    gain = -1 / pulse_transfer(structure, case, nominal, z)
     area = jnp.imag(jnp.conj(rate) * value)
     is_solved = is_moved & ~_is_flat(rate, value)
     area = jnp.where(is_solved, area, 1.0)
-    velocity = jnp.imag(jnp.conj(wanted) * value) / area
-    position = jnp.imag(jnp.conj(rate) * wanted) / area
+    velocity = jnp.imag(jnp.conj(gain) * value) / area
+    position = jnp.imag(jnp.conj(rate) * gain) / area
     return jnp.where(is_solved, velocity, 0.0), jnp.where(is_solved, position, 0.0)
 
 
-def pulse_transfer(structure: Structure, case: Case, known: Known, z: Array) -> Array:
+def pulse_transfer(structure: Structure, case: Case, nominal: NominalModel, z: Array) -> Array:
     """G(z) of the nominal link [m/N], complex, (3, C).
 
     Args:
-        structure, case, known: of the law.
+        structure, case, nominal: of the law.
         z: complex, (3, C).
     """
-    model = nominal_modes(structure, case, known)
+    model = nominal_modes(structure, case, nominal)
     shifted = z[..., None, None] * jnp.eye(model.state.shape[-1]) - model.state
     answer = jnp.linalg.solve(shifted, model.enter.astype(shifted.dtype))
     return (model.sensor.astype(shifted.dtype) @ answer)[..., 0, 0]
 
 
-def nominal_modes(structure: Structure, case: Case, known: Known) -> LinkModel:
+def nominal_modes(structure: Structure, case: Case, nominal: NominalModel) -> LinkModel:
     """The nominal link, mode by mode, as the controller sees it.
 
     Of the other modes' static response it subtracts a share, that of its last command.
 
     Args:
-        structure, case, known: of the law.
+        structure, case, nominal: of the law.
 
     Returns:
         LinkModel with leading axes (3, C), one input [N] and one output [m].
     """
-    direct = known.observer @ known.feedthrough @ known.synthesizer
+    direct = nominal.observer @ nominal.feedthrough @ nominal.synthesizer
     direct = jnp.diagonal(direct, axis1=1, axis2=2)
-    model = mode_models(structure, case, known, known.damping_ratio, direct)
+    model = mode_models(structure, case, nominal, nominal.damping_ratio, direct)
     subtracted = case.control.feedthrough_factor * direct
     return model._replace(sensor=model.sensor.at[..., 0, -1].add(-subtracted))
 
 
-def _is_moved(poles: Poles, known: Known) -> Array:
+def _is_moved(poles: Poles, nominal: NominalModel) -> Array:
     """Whether a mode's specified poles are not those it has without control."""
-    omega = known.omega
-    own = known.damping_ratio * omega
+    omega = nominal.omega
+    own = nominal.damping_ratio * omega
     ringing = jnp.sqrt(jnp.maximum(omega**2 - own**2, 0.0))
     shift = jnp.abs(poles.decay - own) + jnp.abs(poles.frequency - ringing)
     return shift > LEAST_SHIFT * omega
@@ -139,52 +139,52 @@ def _is_flat(rate: Array, value: Array) -> Array:
     return jnp.abs(jnp.imag(jnp.conj(rate) * value)) <= LEAST_ANGLE * size
 
 
-def modal_gains(structure: Structure, case: Case, known: Known) -> tuple[Array, Array]:
+def modal_gains(structure: Structure, case: Case, nominal: NominalModel) -> tuple[Array, Array]:
     """Velocity [N s/m] and position gains [N/m] by mode, (3, C) each.
 
     From the poles that the study specifies; of links without, its gains and ratios (24).
 
     Args:
-        structure, case, known: of the law.
+        structure, case, nominal: of the law.
     """
-    given = given_gains(case, known)
+    written = study_gains(case, nominal)
     if not structure.has_poles:
-        return given
+        return written
     if structure.feedback == "ideal":
-        placed = continuous_gains(specified_poles(case, known), known)
+        placed = continuous_gains(specified_poles(case, nominal), nominal)
     else:
-        placed = sampled_gains(structure, case, known, study_estimator(case, known))
-    chosen = is_placed(case, known)
-    velocity, position = (jnp.where(chosen, x, y) for x, y in zip(placed, given, strict=True))
+        placed = sampled_gains(structure, case, nominal, study_estimator(case, nominal))
+    chosen = is_placed(case, nominal)
+    velocity, position = (jnp.where(chosen, x, y) for x, y in zip(placed, written, strict=True))
     return velocity, position
 
 
-def closed_modes(structure: Structure, case: Case, known: Known) -> tuple[Array, Array]:
+def closed_modes(structure: Structure, case: Case, nominal: NominalModel) -> tuple[Array, Array]:
     """a [1/s] and b [1/s2] of each mode under continuous feedback, s^2 + 2 a s + b = 0, (3, C).
 
     Args:
-        structure, case, known: of the law.
+        structure, case, nominal: of the law.
     """
-    velocity, position = given_gains(case, known)
-    damping = known.damping_ratio * known.omega + velocity / (2 * known.modal_mass)
-    square = known.omega**2 + position / known.modal_mass
+    velocity, position = study_gains(case, nominal)
+    damping = nominal.damping_ratio * nominal.omega + velocity / (2 * nominal.modal_mass)
+    square = nominal.omega**2 + position / nominal.modal_mass
     if not structure.has_poles:
         return damping, square
-    poles, chosen = specified_poles(case, known), is_placed(case, known)
+    poles, chosen = specified_poles(case, nominal), is_placed(case, nominal)
     size = poles.decay**2 + poles.frequency**2
     return jnp.where(chosen, poles.decay, damping), jnp.where(chosen, size, square)
 
 
-def is_unplaceable(structure: Structure, case: Case, known: Known) -> Array:
+def is_unplaceable(structure: Structure, case: Case, nominal: NominalModel) -> Array:
     """Whether specified poles of an acting mode cannot be placed, ().
 
     No positive decay, a decay beyond the mode's frequency without a frequency of its own, a
     frequency beyond half the sample rate, or estimates that are in phase at the pole.
     """
-    poles, period = specified_poles(case, known), case.electronics.period
+    poles, period = specified_poles(case, nominal), case.electronics.period
     is_fault = (poles.decay <= 0) | (poles.frequency * period >= jnp.pi)
-    is_fault |= (poles.decay >= known.omega) & (case.control.pole_frequency <= 0)
+    is_fault |= (poles.decay >= nominal.omega) & (case.control.pole_frequency <= 0)
     if structure.feedback == "sampled":
         z = jnp.exp((-poles.decay + 1j * poles.frequency) * period)
-        is_fault |= _is_flat(*responses(study_estimator(case, known), z))
-    return jnp.any(is_fault & _is_moved(poles, known) & is_placed(case, known))
+        is_fault |= _is_flat(*responses(study_estimator(case, nominal), z))
+    return jnp.any(is_fault & _is_moved(poles, nominal) & is_placed(case, nominal))

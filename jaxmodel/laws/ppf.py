@@ -14,7 +14,7 @@ from jaxmodel.case import Case, Electronics, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.electronics import measurement_chain
 from jaxmodel.estimator import Estimator, second_order
-from jaxmodel.laws.contract import Known, Law, Parameter, given_gains, modal_feedback
+from jaxmodel.laws.contract import Law, NominalModel, Parameter, modal_feedback, study_gains
 from jaxmodel.laws.imsc import same
 from jaxmodel.lazy import jnp
 from jaxmodel.parameters import Array
@@ -70,17 +70,17 @@ def design_position_filter(omega: Array, zeta: Array, electronics: Electronics) 
     return PositionFilter(estimator, corner, -jnp.imag(whole) / omega)
 
 
-def design(structure: Structure, case: Case, known: Known) -> Channels:
+def design(structure: Structure, case: Case, nominal: NominalModel) -> Channels:
     """Damp each assembled mode as much as the study's velocity gains intend: g = k_d/damping.
 
     Modes at which the measurement chain lags too much get no gain.
     """
-    velocity, _ = given_gains(case, known)
+    velocity, _ = study_gains(case, nominal)
     zeta = jnp.asarray(case.control.parameters["filter_damping"])[:, None]
-    filters = design_position_filter(known.omega, zeta, case.electronics)
+    filters = design_position_filter(nominal.omega, zeta, case.electronics)
     is_fit = filters.damping > 0
     gain = jnp.where(is_fit, velocity / jnp.where(is_fit, filters.damping, 1.0), 0.0)
-    return modal_feedback(case, known, 0 * gain, -gain, filters.estimator)
+    return modal_feedback(case, nominal, 0 * gain, -gain, filters.estimator)
 
 
 PPF = Law(

@@ -5,11 +5,11 @@ from __future__ import annotations
 from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.estimator import design_estimator
-from jaxmodel.laws.contract import Known, Law
+from jaxmodel.laws.contract import Law, NominalModel
 from jaxmodel.lazy import jnp
 
 
-def design(structure: Structure, case: Case, known: Known) -> Channels:
+def design(structure: Structure, case: Case, nominal: NominalModel) -> Channels:
     """Gains of the link [s] and [1]; the estimator is exact at mode 1."""
     control, electronics, n = case.control, case.electronics, structure.n_patches
     on = jnp.asarray(control.link_mask)[:, None]
@@ -18,7 +18,7 @@ def design(structure: Structure, case: Case, known: Known) -> Channels:
         filter=eye,
         synthesizer=eye,
         estimator=design_estimator(
-            jnp.broadcast_to(known.omega[:, :1], (3, n)),
+            jnp.broadcast_to(nominal.omega[:, :1], (3, n)),
             electronics,
             electronics.lowpass_ratio[0],
             electronics.lowpass_zeta[0],

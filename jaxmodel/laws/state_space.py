@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from jaxmodel.case import Case, Structure
-from jaxmodel.laws.contract import Known, Law, system_feedback
+from jaxmodel.laws.contract import Law, NominalModel, system_feedback
 from jaxmodel.state_space import StateSpace
 
 
-def design(structure: Structure, case: Case, known: Known) -> StateSpace:
+def design(structure: Structure, case: Case, nominal: NominalModel) -> StateSpace:
     """The given system."""
     assert case.control.system is not None
     return system_feedback(structure, case, case.control.system)

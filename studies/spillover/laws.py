@@ -132,8 +132,8 @@ def _design(structure: Structure, case: Case, gains: tuple[Array, Array] | None)
     if gains is not None:
         assert law.as_strong is not None
         case = case._replace(control=as_modal(case.control, *gains))
-        model = design_controller(structure, case, bases).known
-        case = case._replace(control=law.as_strong(case, model))
+        nominal = design_controller(structure, case, bases).nominal
+        case = case._replace(control=law.as_strong(case, nominal))
     return design_controller(structure, case, bases).controller
 
 
