@@ -23,7 +23,7 @@ from studies.fitting.plots import curves, samples
 from studies.fitting.posterior import log_density, sample, shape
 from studies.fitting.problem import Problem
 from studies.fitting.profiles import profile
-from studies.fitting.report import told, undetermined
+from studies.fitting.report import describe_direction, undetermined
 from studies.fitting.run import run_fit
 from studies.fitting.solve import descend, solve
 from studies.fitting.spec import parse_fit
@@ -218,7 +218,7 @@ def test_a_pair_that_is_not_identifiable_is_named(folder):
     assert {spec.free.names[k] for k in direction.named()} == {*list(free)[:2]}
     assert direction.parts[0] * direction.parts[1] < 0
     assert answer.is_explained and answer.sigma[2] < 1e-3
-    text = told(direction, spec.free.names)
+    text = describe_direction(direction, spec.free.names)
     assert "are not identifiable" in text and "link.stiffness_factor" in text
 
 

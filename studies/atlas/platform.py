@@ -23,7 +23,7 @@ from studies.engine.batches import run_batches
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
 from studies.engine.runs import resolved_study
-from studies.study.cases import powered
+from studies.study.cases import signed_power
 from studies.study.spec import Study
 from studies.study.window import residual_delay
 
@@ -85,7 +85,7 @@ def platform_error(study: Study, on_progress: Any = None) -> PlatformError:
     cases = []
     for k, (_, case) in enumerate(built):
         if study.control.ratio_source == "own_run":
-            own = powered(quiet.metrics.energy_ratio[2 * k], study.control.ratio_exponent)
+            own = signed_power(quiet.metrics.energy_ratio[2 * k], study.control.ratio_exponent)
             case = with_ratio(case, own)
         cases += [_with_links(case, links) for links in LINK_SETS[1:]]
     active = run_batches(structure, cases, on_progress)

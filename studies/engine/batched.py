@@ -58,17 +58,17 @@ def batched(study: Study, names: Sequence[str]) -> Callable[[Array], Result]:
         raise StudyError(f"study: {study!r}; expected a study, as load_study returns")
     positions = _positions(study, names)
     structure = with_used(check_run(study)[0], [field for field, _ in positions])
-    exact = _of_batches(study, structure, positions)
+    exact = _batch_program(study, structure, positions)
     if structure.is_smooth:
-        return _checked(len(positions), exact)
-    smooth = _of_batches(study, structure._replace(is_smooth=True), positions)
+        return _check_shape(len(positions), exact)
+    smooth = _batch_program(study, structure._replace(is_smooth=True), positions)
     rounded = jax.custom_jvp(exact)
 
     @rounded.defjvp
     def rule(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Result, Result]:
         return exact(*primals), jax.jvp(smooth, primals, tangents)[1]
 
-    return _checked(len(positions), rounded)
+    return _check_shape(len(positions), rounded)
 
 
 def _positions(study: Study, names: Sequence[str]) -> tuple[Any, ...]:
@@ -90,7 +90,7 @@ def _is_real(value: Any) -> bool:
     return all(map(_is_real, value)) if is_list else isinstance(value, float)
 
 
-def _checked(count: int, run: Callable[[Array], Result]) -> Callable[[Array], Result]:
+def _check_shape(count: int, run: Callable[[Array], Result]) -> Callable[[Array], Result]:
     """The same for values that are what they should be."""
 
     def checked(values: Array) -> Result:
@@ -125,7 +125,7 @@ class _Build:
         return case_of(self.structure, numbers)
 
 
-def _of_batches(
+def _batch_program(
     study: Study, structure: Structure, positions: tuple[Any, ...]
 ) -> Callable[[Array], Result]:
     shared, build = one_study(study, structure), _Build(structure, positions)

@@ -59,7 +59,7 @@ class ModalBlocks(NamedTuple):
         return whole.reshape(*volts.shape[:-2], 3, n_patches)
 
 
-def blocks(system: StateSpace) -> ModalBlocks:
+def modal_blocks(system: StateSpace) -> ModalBlocks:
     """Modal blocks of a system, NumPy arrays; systems of links without output are left out.
 
     Raises:
@@ -71,10 +71,10 @@ def blocks(system: StateSpace) -> ModalBlocks:
         groups, first = [0], np.array([0])
     else:
         groups, first = list(used), used * n_patches
-    return ModalBlocks(used, first, _stacked([_in_pairs(system, g) for g in groups]))
+    return ModalBlocks(used, first, _stack_groups([_to_pairs(system, g) for g in groups]))
 
 
-def _in_pairs(system: StateSpace, group: int) -> StateSpace:
+def _to_pairs(system: StateSpace, group: int) -> StateSpace:
     """One group, its blocks of two states."""
     one = StateSpace(*(part[group : group + 1] for part in system))
     if system.state.shape[2] == 2:
@@ -87,7 +87,7 @@ def _in_pairs(system: StateSpace, group: int) -> StateSpace:
     return StateSpace(form.state[None], form.enter[None], form.leave[None], d[None])
 
 
-def _stacked(parts: list[StateSpace]) -> StateSpace:
+def _stack_groups(parts: list[StateSpace]) -> StateSpace:
     """Groups side by side, padded with blocks that stay 0."""
     most = max((part.state.shape[1] for part in parts), default=0)
 
@@ -103,7 +103,7 @@ def _stacked(parts: list[StateSpace]) -> StateSpace:
     )
 
 
-def restored(blocks: ModalBlocks, like: Controller) -> Controller:
+def unfold_blocks(blocks: ModalBlocks, like: Controller) -> Controller:
     """A controller equivalent to the blocks; `like` supplies what they leave open."""
     system, count = blocks.system, len(like.feedback.state)  # type: ignore[union-attr]
     if count == 1:

@@ -18,7 +18,7 @@ from studies.engine.progress import Reporter
 from studies.engine.stability import LoopFigures
 from studies.kernels.compilation import compiler_time
 from studies.space.table import CaseTable
-from studies.study.cases import powered
+from studies.study.cases import signed_power
 
 
 class Done(NamedTuple):
@@ -94,7 +94,7 @@ class LocalRunner:
                     reporter.compiled(executor.name, executor.compile_time)
                 # the device computes this chunk while the previous one is written
                 if pending is not None:
-                    yield _waited(group, *pending)
+                    yield _wait_for(group, *pending)
                 pending = chunk, started
                 if stop.is_set():
                     break
@@ -102,12 +102,12 @@ class LocalRunner:
                 if stop.is_set() and reporter.n_run:  # the previous is safe, this one just begun
                     pending[1].cancel()
                     return
-                yield _waited(group, *pending)
+                yield _wait_for(group, *pending)
             if stop.is_set():
                 return
 
 
-def _waited(group: Group, chunk: Chunk, running: Started) -> Done:
+def _wait_for(group: Group, chunk: Chunk, running: Started) -> Done:
     return Done(chunk, group.structure.substeps, running.wait())
 
 
@@ -142,7 +142,7 @@ def start_chunk(
         filled = np.concatenate([rows, np.full(size - len(rows), rows[-1])])
         is_own = table.values("control.ratio_source")[filled] == "own_run"
         exponent = table.values("control.ratio_exponent")[filled][:, None, None]
-        own = powered(own_ratios(executor, cases), exponent)
+        own = signed_power(own_ratios(executor, cases), exponent)
         cases = with_ratio(cases, np.where(is_own[:, None, None], own, cases.control.ratio))
     before = compiler_time()
     judge = judge_loops if is_judged else no_margins

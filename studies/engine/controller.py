@@ -12,7 +12,7 @@ from jaxmodel.controller import Controller
 from jaxmodel.laws import LAWS, is_modal, n_channels
 from jaxmodel.shaper import Taps
 from jaxmodel.state_space import StateSpace
-from studies.engine.blocks import ModalBlocks, blocks
+from studies.engine.blocks import ModalBlocks, modal_blocks
 from studies.engine.channels import ActiveChannels, fold
 from studies.engine.preflight import check_run, preflight
 from studies.engine.runs import resolved_study
@@ -70,7 +70,7 @@ def fixed_controller(study: Study) -> FixedController:
         case=case,
         controller=controller,
         channels=arrange(controller, study.control.law),
-        taps=_merged(taps),
+        taps=_merge_taps(taps),
         frequency=_frequencies(structure, prepared.believed_omega),
     )
 
@@ -101,7 +101,7 @@ def arrange(controller: Controller, law: str) -> ActiveChannels | ModalBlocks:
         StudyError: a system without a well-conditioned modal form.
     """
     if isinstance(controller.feedback, StateSpace):
-        return blocks(controller.feedback)
+        return modal_blocks(controller.feedback)
     return fold(controller.feedback, LAWS[law].channel)
 
 
@@ -111,7 +111,7 @@ def _frequencies(structure: Structure, believed_omega: np.ndarray) -> np.ndarray
     return hertz if is_modal(structure) else np.repeat(hertz[:, :1], n_channels(structure), axis=1)
 
 
-def _merged(taps: Taps) -> Taps:
+def _merge_taps(taps: Taps) -> Taps:
     """One tap per delay, none without weight."""
     weight, sample = (np.asarray(x) for x in taps)
     delays = np.unique(sample[weight != 0])

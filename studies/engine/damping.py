@@ -71,15 +71,15 @@ def _poles(response: LoopResponse, modes: AssembledModes, order: int) -> np.ndar
     omega, loss = (np.take_along_axis(x, which, axis=0) for x in (modes.omega, modes.decay))
     first = _triplet(-loss + 1j * np.sqrt(omega**2 - loss**2), response.period)
     own = run_steps(_refine_open_loop_poles, (response, held), (), first, SETTLING).pole
-    poles, is_found = _followed(response, own, WAYS[0])
+    poles, is_found = _follow(response, own, WAYS[0])
     again = np.flatnonzero(~is_found)
     if len(again):
         remaining, start = jax.tree.map(lambda x: x[..., again], (response, own))
-        poles[:, again], is_found[again] = _followed(remaining, start, WAYS[1])
+        poles[:, again], is_found[again] = _follow(remaining, start, WAYS[1])
     return np.where(is_found, poles, np.nan)
 
 
-def _followed(response: LoopResponse, own: Pair, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _follow(response: LoopResponse, own: Pair, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     start = _triplet(own.re + 1j * own.im, response.period)
     last = run_steps(_refine_closed_loop_poles, (response, own), 1 / way, start, len(way))
     is_found = np.all((last.step < AT_REST) & np.isfinite(last.pole.re), axis=0)

@@ -49,9 +49,9 @@ def load_design(path: str | Path, case: int | str | None = None) -> Design:
             raise StudyError(f"--case {case}: {path} is a file; leave --case out")
         return Design(load_study(path), {})
     if (path / TUNING).is_file():
-        return Design(load_study(_tuned(path, case)), {})
+        return Design(load_study(_tuned_file(path, case)), {})
     data = read_sweep(path)
-    number = _number(data, None if case is None else str(case), path)
+    number = _case_number(data, None if case is None else str(case), path)
     spec = parse_sweep(read_manifest(path)["spec"])
     table = build_table(spec)
     code = int(data["status"][number])
@@ -71,7 +71,7 @@ def load_design(path: str | Path, case: int | str | None = None) -> Design:
     return Design(study, {name: data[name][number] for name in names}, case_id)
 
 
-def _tuned(path: Path, case: str | int | None) -> Path:
+def _tuned_file(path: Path, case: str | int | None) -> Path:
     """File of the requested tuned study."""
     files = {file.stem.removeprefix("tuned").lstrip("_"): file for file in path.glob("tuned*.toml")}
     if not files:
@@ -86,7 +86,7 @@ def _tuned(path: Path, case: str | int | None) -> Path:
     return files[str(case)]
 
 
-def _number(data: SweepData, case: str | None, path: Path) -> int:
+def _case_number(data: SweepData, case: str | None, path: Path) -> int:
     """Number of the requested case."""
     allowed = (
         f"allowed: 0 to {data.n_cases - 1}, the cases of {path}, or id: and the first digits of a "

@@ -99,14 +99,14 @@ class Executor:
         Args:
             cases: `layout.size` of them, or leaves of length 1.
         """
-        function, blocks = self._prepared(cases, ())
+        function, blocks = self._prepare(cases, ())
         futures = [self._submit(k, function.run, (), own) for k, own in enumerate(blocks)]
 
         def cancel() -> None:
             for future in futures:
                 future.cancel()
 
-        return Running(lambda: _joined([future.result() for future in futures]), cancel)
+        return Running(lambda: _join([future.result() for future in futures]), cancel)
 
     def differentiate(self, cases: Any, free: np.ndarray) -> Differentiated:
         """Run a chunk whose metrics can then be differentiated.
@@ -116,14 +116,14 @@ class Executor:
             free: parameters, (layout.size, p).
         """
         free = np.asarray(free, jax.dtypes.canonicalize_dtype(np.float64))
-        function, blocks = self._prepared(cases, free)
+        function, blocks = self._prepare(cases, free)
         parts = np.split(free, len(blocks))
         futures = [
             self._submit(k, function.linearise, part, own)
             for k, (part, own) in enumerate(zip(parts, blocks, strict=True))
         ]
         done = [future.result() for future in futures]
-        result = _joined([result for result, _ in done])
+        result = _join([result for result, _ in done])
         return Differentiated(result, [pull for _, pull in done], free.shape[1], self._pool)
 
     def _submit(self, k: int, run: Callable[..., Any], *arguments: Any) -> Future[Any]:
@@ -138,7 +138,7 @@ class Executor:
 
         return self._pool.submit(on_device)
 
-    def _prepared(self, cases: Any, free: Any) -> tuple[BlockFunction, list[list[np.ndarray]]]:
+    def _prepare(self, cases: Any, free: Any) -> tuple[BlockFunction, list[list[np.ndarray]]]:
         """The function of a block, and the numbers of each."""
         leaves, tree = jax.tree.flatten(self._with_own_ratio(cases))
         leaves = [np.asarray(leaf) for leaf in leaves]
@@ -151,7 +151,7 @@ class Executor:
             shared = [leaf[0] for leaf, yes in zip(leaves, is_own, strict=True) if not yes]
             build = CaseLeaves(tree, is_own, self.place)
             first = free[: self.layout.lanes] if self.place else (), blocks[0]
-            self._function = self._compiled(build, *first, shared)
+            self._function = self._compile(build, *first, shared)
             self.compile_time = time.perf_counter() - began
         return self._function, blocks
 
@@ -164,7 +164,7 @@ class Executor:
         links = np.broadcast_to(cases.control.link_mask, shape[:2])
         return cases._replace(control=cases.control._replace(link_mask=links))
 
-    def _compiled(self, build: CaseLeaves, free: Any, own: Any, shared: Any) -> BlockFunction:
+    def _compile(self, build: CaseLeaves, free: Any, own: Any, shared: Any) -> BlockFunction:
         """The function of a block, compiled."""
 
         def make(kind: str) -> BlockFunction:
@@ -183,7 +183,7 @@ class Executor:
             return make("scan")
 
 
-def _joined(parts: list[Result]) -> Result:
+def _join(parts: list[Result]) -> Result:
     return jax.tree.map(lambda *x: np.concatenate([np.asarray(one) for one in x]), *parts)
 
 

@@ -276,7 +276,7 @@ def _judged(
         is_more = is_other & (other.value > crossing.value)
         crossing = jax.tree.map(lambda a, b, more=is_more: np.where(more, b, a), crossing, other)
     value[rows], omega[rows] = crossing.value, crossing.omega
-    at_end, where = _at_the_ends(response, least)
+    at_end, where = _end_eigenvalues(response, least)
     is_more = at_end > value
     value, omega = np.where(is_more, at_end, value), np.where(is_more, where, omega)
     breaks = value > least
@@ -285,7 +285,7 @@ def _judged(
     falls = (modes.growth * response.period > RADIUS_TOLERANCE) | _filters_grow(response)
     margin = np.where(falls | (margin < LOWEST), 0.0, margin)
     breaks, omega = breaks | falls, np.where(falls, 0.0, np.where(breaks, omega, np.nan))
-    apart = np.abs(_folded(modes.omega, top) - np.abs(omega))
+    apart = np.abs(_fold_frequency(modes.omega, top) - np.abs(omega))
     order = np.take_along_axis(
         np.argmax(modes.share, axis=0), np.argmin(apart, axis=0)[None], axis=0
     )[0]
@@ -322,7 +322,7 @@ def _with_gains(response: LoopResponse, factor: np.ndarray) -> LoopResponse:
     )
 
 
-def _folded(omega: np.ndarray, top: np.ndarray) -> np.ndarray:
+def _fold_frequency(omega: np.ndarray, top: np.ndarray) -> np.ndarray:
     """Frequencies after aliasing, 0 to pi/T."""
     return np.abs((omega + top) % (2 * top) - top)
 
@@ -335,7 +335,7 @@ def sweep_frequencies(
     lowest = 2 * np.pi * LOWEST_HZ
     background = lowest * (top / lowest) ** np.linspace(0, 1, sweep.background)[:, None]
     width = np.maximum(modes.decay, NARROWEST * modes.omega)
-    beside = [np.abs(_folded(modes.omega, top) + x * width) for x in sweep.beside]
+    beside = [np.abs(_fold_frequency(modes.omega, top) + x * width) for x in sweep.beside]
     omega = np.concatenate([background, *beside])
     omega = np.where(omega > top, 2 * top - omega, omega)
     return np.sort(np.clip(omega, 1.0, top * (1 - 1e-6)), axis=0)
@@ -350,7 +350,7 @@ def _sweep_axis(
     kind = np.where(visit % sweep.repeats > 0, 0.0, np.where(visit == sweep.repeats, 1.0, 2.0))
     spread = _spread(response, SPREAD)
     first = -spread.reshape(-1, spread.shape[2])
-    loci = _swept(response, spread, Pair(first, 0 * first), omega, kind)
+    loci = _follow_axis(response, spread, Pair(first, 0 * first), omega, kind)
     return _crossings(loci, np.arange(spread.shape[2]), CHOSEN, least)
 
 
@@ -409,11 +409,11 @@ def _refine(
     kind += ([0.0] * (REFINEMENT.repeats - 1) + [2.0]) * (REFINEMENT.frequencies - 1)
     selected = jax.tree.map(lambda x: x[..., crossings.case], response)
     spread = _spread(selected, FINE_SPREAD)
-    loci = _swept(selected, spread, _ring(spread, crossings.value), omega, np.array(kind))
+    loci = _follow_axis(selected, spread, _ring(spread, crossings.value), omega, np.array(kind))
     return _crossings(loci, crossings.case, KEPT, least)[0]
 
 
-def _at_the_ends(response: LoopResponse, least: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _end_eigenvalues(response: LoopResponse, least: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Largest eigenvalue above `least` at the ends of the axis, 0: none, and where [rad/s], (n,).
 
     L is real there, so its curves end on the real axis without crossing it: position feedback loses
@@ -424,7 +424,7 @@ def _at_the_ends(response: LoopResponse, least: np.ndarray) -> tuple[np.ndarray,
     value, omega = np.zeros(len(top)), np.full(len(top), np.nan)
     for place, name in ((0 * top + STILL, 0 * top), (top * (1 - 1e-6), top)):
         steps = np.repeat(place[None], REFINEMENT.starts, axis=0)
-        eigenvalue = _swept(response, spread, ring, steps, np.zeros(REFINEMENT.starts)).value
+        eigenvalue = _follow_axis(response, spread, ring, steps, np.zeros(REFINEMENT.starts)).value
         is_real = (eigenvalue.re > least) & (np.abs(eigenvalue.im) < 1e-3 * eigenvalue.re)
         largest = np.max(np.where(is_real, eigenvalue.re, 0.0), axis=0)
         omega = np.where(largest > value, name, omega)
@@ -485,7 +485,7 @@ def _rightmost(
 # --- the steps on this machine --------------------------------------------------------------------
 
 
-def _swept(
+def _follow_axis(
     response: LoopResponse, spread: np.ndarray, first: Pair, omega: np.ndarray, kind: np.ndarray
 ) -> Loci:
     angle = omega * response.period

@@ -108,9 +108,9 @@ def difference(report: PoleReport) -> str:
             "nominal link has others."
         )
         reference = report.nominal
-    elif np.nanmax(_apart(report.nominal, reference)) > NOTABLE:
+    elif np.nanmax(_relative_distance(report.nominal, reference)) > NOTABLE:
         sentences.append("The nominal link does not have them: they cannot be placed.")
-    apart = _apart(report.assembled, reference)
+    apart = _relative_distance(report.assembled, reference)
     than = "specified" if reference is report.specified else "on the nominal link"
     if np.isnan(apart).all():
         return " ".join(sentences)
@@ -126,7 +126,7 @@ def difference(report: PoleReport) -> str:
     return " ".join(sentences)
 
 
-def _apart(poles: np.ndarray, specified: np.ndarray) -> np.ndarray:
+def _relative_distance(poles: np.ndarray, specified: np.ndarray) -> np.ndarray:
     """Relative difference of decay or frequency, whichever is larger [1]."""
     decay = np.abs((poles.real - specified.real) / specified.real)
     return np.maximum(decay, np.abs((poles.imag - specified.imag) / np.abs(specified)))

@@ -263,12 +263,12 @@ def _check_duration(study: Study, structure: Structure, prepared: Preflight) -> 
             study.metrics.residual_length,
             f"{period:g} to {max(left, 0):.6g}, from one sample to what run.duration = "
             f"{duration:g} leaves after the shaped motion of {end:.4g} s and "
-            f"{_wait_text(study, delay)}; run.duration = {_rounded_up(needed):g} would do",
+            f"{_wait_text(study, delay)}; run.duration = {_round_up(needed):g} would do",
             "s",
         )
 
 
-def _rounded_up(duration: float) -> float:
+def _round_up(duration: float) -> float:
     """The next hundredth of a second [s]."""
     return float(np.ceil(100 * duration - 1e-6) / 100)
 

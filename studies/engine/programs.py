@@ -53,7 +53,7 @@ class KeptFunction:
         self._jit = jax.jit(function, static_argnums=static, compiler_options=compiler_options)
 
     def __call__(self, *arguments: Any) -> Any:
-        fixed, free = self._parted(arguments)
+        fixed, free = self._split(arguments)
         if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(free)):
             return self._jit(*arguments)
         return self.program(*arguments)(*free)
@@ -63,16 +63,16 @@ class KeptFunction:
 
         Called often, it saves finding it anew.
         """
-        fixed, free = self._parted(arguments)
+        fixed, free = self._split(arguments)
         if not is_keeping() or not all(map(is_plain, fixed)):
-            return lambda *free: self._jit(*self._joined(fixed, free))
+            return lambda *free: self._jit(*self._join(fixed, free))
         return program([self._name, *fixed], free, lambda: self._jit.lower(*arguments))
 
-    def _parted(self, arguments: tuple[Any, ...]) -> tuple[list[Any], list[Any]]:
+    def _split(self, arguments: tuple[Any, ...]) -> tuple[list[Any], list[Any]]:
         free = [x for k, x in enumerate(arguments) if k not in self._static]
         return [arguments[k] for k in self._static], free
 
-    def _joined(self, fixed: list[Any], free: tuple[Any, ...]) -> list[Any]:
+    def _join(self, fixed: list[Any], free: tuple[Any, ...]) -> list[Any]:
         arguments = list(free)
         for k, x in sorted(zip(self._static, fixed, strict=True), key=itemgetter(0)):
             arguments.insert(k, x)
@@ -123,16 +123,16 @@ def program(names: list[Any], arguments: list[Any], lower: Callable[[], Any]) ->
     name = repr((names, tree, [str(jax.typeof(x)) for x in leaves], is_keeping()))
     with _LOCK:
         if name not in _PROGRAMS:
-            _PROGRAMS[name] = _loaded_or_compiled(name, lower)
+            _PROGRAMS[name] = _load_or_compile(name, lower)
         return _PROGRAMS[name]
 
 
-def _loaded_or_compiled(name: str, lower: Callable[[], Any]) -> Any:
+def _load_or_compile(name: str, lower: Callable[[], Any]) -> Any:
     if not is_keeping():
         return lower().compile()
     entry = ObjectCache("program", name, *environment())
     content = entry.take()
-    loaded = None if content is None else _loaded(content)
+    loaded = None if content is None else _load(content)
     if loaded is not None:
         return loaded
     lowered = lower()
@@ -185,7 +185,7 @@ def code_digest(outside: tuple[Path, ...]) -> str:
     return digest.hexdigest()
 
 
-def _loaded(content: bytes) -> Any:
+def _load(content: bytes) -> Any:
     """A program from disk; None if it cannot be used."""
     try:
         _initialise_lapack()

@@ -17,7 +17,7 @@ from studies.engine.poles import PoleReport, pole_report, tracked_modes
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
 from studies.engine.stability import LoopFigures, run_report
-from studies.study.cases import powered
+from studies.study.cases import signed_power
 from studies.study.spec import Study
 
 _simulate = kept_jit(static_argnums=(0, 2))(simulate)
@@ -74,7 +74,7 @@ def _run(study: Study, structure: Structure, case: Case, has_record: bool) -> Ru
 def _own_ratio(study: Study, structure: Structure, case: Case, has_record: bool) -> np.ndarray:
     """Ratios (24) of the same case's uncontrolled run, (3, C); has_record: as the run after it."""
     ratio = _simulate(structure, uncontrolled(case), has_record).metrics.energy_ratio
-    return powered(ratio, study.control.ratio_exponent)
+    return signed_power(ratio, study.control.ratio_exponent)
 
 
 def resolved_study(study: Study) -> Study:

@@ -111,7 +111,7 @@ def array(values: Any, notes: Iterable[str] = ()) -> str:
     write = real if values.dtype.kind == "f" else str
     size = "".join(f"[{n}]" for n in values.shape)
     if values.ndim == 1:
-        return f"{size} = {{{_wrapped([write(value) for value in values])}}}"
+        return f"{size} = {{{_wrap([write(value) for value in values])}}}"
     remarks = [f" /* {note} */" for note in notes] or [""] * len(values)
     rows = [
         f"    {{{', '.join(map(write, row))}}},{remark}\n"
@@ -120,7 +120,7 @@ def array(values: Any, notes: Iterable[str] = ()) -> str:
     return f"{size} = {{\n{''.join(rows)}}}"
 
 
-def _wrapped(numbers: list[str]) -> str:
+def _wrap(numbers: list[str]) -> str:
     if len(numbers) <= 9 and sum(map(len, numbers)) < 60:
         return ", ".join(numbers)
     rows = [", ".join(numbers[k : k + 3]) for k in range(0, len(numbers), 3)]

@@ -44,7 +44,9 @@ class Code(NamedTuple):
         """One sample: actuator values and the fault, from sensor values (3 K,)."""
         inputs: np.ndarray = np.ascontiguousarray(sensor, self.real).ravel()
         out: np.ndarray = np.empty(self.n_channels, self.real)
-        fault = getattr(self.library, f"{self.name}_step")(self.state, _at(inputs), _at(out))
+        fault = getattr(self.library, f"{self.name}_step")(
+            self.state, _address(inputs), _address(out)
+        )
         return out, fault
 
     def respond(self, sensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -58,15 +60,15 @@ class Code(NamedTuple):
         """A shaped reference (T, 3), starting at rest in its first row."""
         room = ctypes.create_string_buffer(self.shaper_length * 3 * 8 + 64)
         poses: np.ndarray = np.ascontiguousarray(reference, self.reference)
-        getattr(self.library, f"{self.name}_shape_init")(room, _at(poses[0]))
+        getattr(self.library, f"{self.name}_shape_init")(room, _address(poses[0]))
         out = np.empty_like(poses)
         step = getattr(self.library, f"{self.name}_shape_step")
         for row, shaped in zip(poses, out, strict=True):
-            step(room, _at(row), _at(shaped))
+            step(room, _address(row), _address(shaped))
         return out
 
 
-def _at(array: np.ndarray) -> ctypes.c_void_p:
+def _address(array: np.ndarray) -> ctypes.c_void_p:
     return ctypes.c_void_p(array.ctypes.data)
 
 

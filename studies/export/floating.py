@@ -52,7 +52,7 @@ def respond_from(
     return run(channels, controller, codes, command)  # type: ignore[arg-type]
 
 
-def _sensed(controller: Controller, code: np.ndarray, command: np.ndarray) -> np.ndarray:
+def _sensor_volts(controller: Controller, code: np.ndarray, command: np.ndarray) -> np.ndarray:
     """Sensor voltages less the feed-through of the last command [V], (..., 3, K)."""
     own = np.einsum("ikl,...il->...ik", controller.feedthrough, command)
     return np.asarray(read_back(controller, code)) - own
@@ -65,7 +65,7 @@ def _by_blocks(
     state = np.zeros((*codes.shape[1:-2], *system.state.shape[:3]))
     limit = float(controller.voltage_limit)
     for code in codes:
-        volts = blocks.of_groups(_sensed(controller, code, command))
+        volts = blocks.of_groups(_sensor_volts(controller, code, command))
         demand = np.einsum("gpnb,...gnb->...gp", system.leave, state)
         demand = demand + np.einsum("gpm,...gm->...gp", system.direct, volts)
         state = np.einsum("gnbc,...gnc->...gnb", system.state, state)
@@ -89,7 +89,7 @@ def _by_channels(
     back = np.zeros((3, *channels.synthesizer.shape))
     back[link, np.arange(len(link))] = channels.synthesizer
     for code in codes:
-        sensor = _sensed(controller, code, command)
+        sensor = _sensor_volts(controller, code, command)
         signal = np.einsum("mk,...mk->...m", channels.filter, sensor[..., link, :])
         high = b0 * signal + memory
         memory = b1 * signal - a1 * high

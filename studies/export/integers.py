@@ -60,11 +60,11 @@ def respond(fixed: FixedPoint | FixedBlocks, codes: np.ndarray, rail: int) -> Re
         bad = ((code > wires.adc_top) | (np.abs(at_end) >= rail)) & is_used
         is_faulty = is_faulty | bad.any(axis=(-2, -1))
         cut: list[np.ndarray] = []  # per sequence, how many were clipped
-        sensor = _limited(code * 2**wires.adc_bits - wires.bias, cut, SENSORS)
+        sensor = _clip(code * 2**wires.adc_bits - wires.bias, cut, SENSORS)
         if wires.feedthrough is not None:
-            own = _products(wires.feedthrough, command[..., None, :])
-            sensor = _limited(sensor - own, cut, SENSORS)
-        demand = _limited(memory.step(sensor, cut), cut, SENSORS)
+            own = _rounded_sums(wires.feedthrough, command[..., None, :])
+            sensor = _clip(sensor - own, cut, SENSORS)
+        demand = _clip(memory.step(sensor, cut), cut, SENSORS)
         command = np.minimum(np.maximum(demand, 1 - wires.dac_rest), wires.dac_rest - 1)
         memory.reset(is_faulty)
         command = np.where(is_faulty[..., None, None], 0, command)
@@ -84,18 +84,18 @@ class _ChannelMemory:
 
     def step(self, sensor: np.ndarray, cut: list[np.ndarray]) -> np.ndarray:
         fixed, old, older = self._fixed, self._old, self._older
-        signal = _limited(_products(fixed.filter, sensor[..., fixed.link, :]), cut)
-        high = _limited(_products(fixed.high_pass, signal[..., None]) + self._high, cut)
-        self._high = _limited(_products(fixed.memory, np.stack([signal, high], -1)), cut)
-        inner = _limited(_products(fixed.low_pass, np.stack([high, old, older], -1)), cut)
+        signal = _clip(_rounded_sums(fixed.filter, sensor[..., fixed.link, :]), cut)
+        high = _clip(_rounded_sums(fixed.high_pass, signal[..., None]) + self._high, cut)
+        self._high = _clip(_rounded_sums(fixed.memory, np.stack([signal, high], -1)), cut)
+        inner = _clip(_rounded_sums(fixed.low_pass, np.stack([high, old, older], -1)), cut)
         taps = np.stack([inner, old, older, signal], -1)
-        force = _limited(_products(fixed.numerator, taps), cut)
+        force = _clip(_rounded_sums(fixed.numerator, taps), cut)
         if fixed.energy is not None:
-            roots = _limited(_products(fixed.energy, taps[..., None, :]), cut, SENSORS)
+            roots = _clip(_rounded_sums(fixed.energy, taps[..., None, :]), cut, SENSORS)
             energy = np.sum(roots * roots, axis=-1)
             force = np.where(acting(fixed.link, fixed.is_rival, energy), force, 0)
         self._older, self._old = old, inner
-        return _products(fixed.synthesizer, force[..., None, None, :])
+        return _rounded_sums(fixed.synthesizer, force[..., None, None, :])
 
     def reset(self, is_faulty: np.ndarray) -> None:
         at = is_faulty[..., None]
@@ -115,24 +115,24 @@ class _BlockMemory:
         fixed, state = self._fixed, self._state
         volts = fixed.blocks.of_groups(sensor)  # (..., G, M)
         flat = state.reshape(*state.shape[:-2], -1)
-        counts = _products(fixed.leave, np.concatenate([flat, volts], -1)[..., None, :])
+        counts = _rounded_sums(fixed.leave, np.concatenate([flat, volts], -1)[..., None, :])
         entering = np.broadcast_to(volts[..., None, :], (*state.shape[:-1], volts.shape[-1]))
         read = np.concatenate([state, entering], -1)[..., None, :]
-        self._state = _limited(_products(fixed.advance, read), cut, STATES)
+        self._state = _clip(_rounded_sums(fixed.advance, read), cut, STATES)
         return fixed.blocks.of_patches(counts, sensor.shape[-1])
 
     def reset(self, is_faulty: np.ndarray) -> None:
         self._state = np.where(is_faulty[..., None, None, None], 0, self._state)
 
 
-def _limited(x: np.ndarray, cut: list[np.ndarray], axes: tuple[int, ...] = CHANNELS) -> np.ndarray:
+def _clip(x: np.ndarray, cut: list[np.ndarray], axes: tuple[int, ...] = CHANNELS) -> np.ndarray:
     """Clip to 32 bits; the number clipped in each sequence is appended to `cut`."""
     inside = np.minimum(np.maximum(x, -(2**31)), 2**31 - 1)
     cut.append(np.sum(x != inside, axis=axes))
     return inside
 
 
-def _products(row: IntegerRow, x: np.ndarray) -> np.ndarray:
+def _rounded_sums(row: IntegerRow, x: np.ndarray) -> np.ndarray:
     """Rounded sums of products along the last axis."""
     return shifted(np.sum(row.integers * x, axis=-1), row.shift)
 

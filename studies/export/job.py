@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from jaxmodel import status
-from studies.engine.blocks import ModalBlocks, restored
+from studies.engine.blocks import ModalBlocks, unfold_blocks
 from studies.engine.channels import ActiveChannels, unfold
 from studies.engine.controller import FixedController
 from studies.engine.stability import LoopFigures, loop_report
@@ -51,7 +51,7 @@ def check_loop(
 ) -> LoopFigures:
     """Linearised sampled loop with given coefficients; rejected if unstable."""
     home = np.array(exported.study.motion.waypoints[0], float)
-    restore = restored if isinstance(channels, ModalBlocks) else unfold
+    restore = unfold_blocks if isinstance(channels, ModalBlocks) else unfold
     law = restore(channels, exported.controller)  # type: ignore[arg-type]
     law = jax.tree.map(jnp.asarray, law)
     try:

@@ -22,7 +22,7 @@ FAULT = Markup("<b>FAILED</b>")
 
 
 def report(
-    found: FixedController,
+    exported: FixedController,
     origin: list[str],
     loop: LoopFigures,
     verified: Verification,
@@ -32,19 +32,19 @@ def report(
     """The page of an export.
 
     Args:
-        found: the controller.
+        exported: the controller.
         origin: lines that say where it came from.
         loop: linearised sampled loop with the exported coefficients.
         verified: what was compared.
         fixed, cost: formats and cost in fixed point.
     """
-    controller = found.controller
+    controller = exported.controller
     code = float(controller.adc_step / controller.adc_gain)
     return page(
         "export/report.html",
         None,
-        found.study,
-        found=found,
+        exported.study,
+        exported=exported,
         origin=origin,
         loop=loop,
         margin_db=20 * np.log10(loop.gain_margin),
@@ -55,16 +55,16 @@ def report(
             [check.what, check.found, check.allowed, "ok" if check.is_met else FAULT]
             for check in verified.checks
         ],
-        controllers=_controllers(found, verified),
+        controllers=_controllers(exported, verified),
         code=code,
         deflection=code * np.abs(controller.feedback.filter[:, :1]).max(initial=0.0),
         fixed=fixed,
         cost=cost,
-        **(_of_fixed(found, fixed, verified) if fixed is not None else {}),
+        **(_of_fixed(exported, fixed, verified) if fixed is not None else {}),
     )
 
 
-def _controllers(found: FixedController, verified: Verification) -> list[list[str]]:
+def _controllers(exported: FixedController, verified: Verification) -> list[list[str]]:
     """Row of each controller that ran in the loop; none if JAX's was the only one."""
     if len(verified.runs) == 1:
         return []
@@ -73,10 +73,10 @@ def _controllers(found: FixedController, verified: Verification) -> list[list[st
         rms = " / ".join(f"{1e6 * x:.5f}" for x in np.max(run.result.metrics.residual_rms, axis=1))
         if name == "JAX":
             peak = np.abs(run.voltage).max()
-            share = 100 * peak / float(found.controller.voltage_limit)
+            share = 100 * peak / float(exported.controller.voltage_limit)
             rows.append([name, rms, "", f"peak {peak:.4g} V, {share:.2g} % of the limit", "", ""])
             continue
-        at = verified.beside(name)
+        at = verified.deviation(name)
         x, y, phi = at.pose * (1e9, 1e9, 1e6)
         rows.append(
             [
@@ -92,10 +92,10 @@ def _controllers(found: FixedController, verified: Verification) -> list[list[st
 
 
 def _of_fixed(
-    found: FixedController, fixed: FixedPoint | FixedBlocks, verified: Verification
+    exported: FixedController, fixed: FixedPoint | FixedBlocks, verified: Verification
 ) -> dict[str, Any]:
     """What the section on fixed point needs."""
-    loss, dac_loss = (verified.beside(k).loss for k in ("C, fixed point", "JAX behind the DAC"))
+    loss, dac_loss = (verified.deviation(k).loss for k in ("C, fixed point", "JAX behind the DAC"))
     forms = [form for _, form, _ in fixed.formats]
     return {
         "loss": loss,
@@ -104,7 +104,7 @@ def _of_fixed(
         "is_bounded": bool(np.all(np.isfinite(fixed.error.total))),
         "margin": min(form.margin.min() for form in forms),
         "least_margin": MARGIN,
-        "formats": format_lines(fixed, found),
+        "formats": format_lines(fixed, exported),
         "sequences": [
             [
                 name,

@@ -67,28 +67,28 @@ def export_design(
         is_verified = False
     is_verified = True if is_verified is None else is_verified
 
-    found = fixed_controller(design.study)
+    exported = fixed_controller(design.study)
     job = Job(
-        exported=found,
+        exported=exported,
         name=name,
-        origin=_origin(found, design.case_id),
+        origin=_origin(exported, design.case_id),
         case_id=design.case_id,
         compiler=compiler,
         is_verified=is_verified,
         dac_bits=dac_bits or DAC_BITS,
         console=console,
     )
-    made = TARGETS[target].make(job)
-    for file in made.files:
+    result = TARGETS[target].make(job)
+    for file in result.files:
         if Path(file).name != file or file.startswith("."):
             raise StudyError(f"--target {target}: it makes {file!r}; expected a plain file name")
-    verified = made.verified
+    verified = result.verified
     is_good = verified is None or verified.is_passed
-    texts = made.files if is_good else {}  # files of an earlier export stay unchanged
+    texts = result.files if is_good else {}  # files of an earlier export stay unchanged
     if verified is not None:
-        text = report(found, job.origin, made.loop, verified, made.fixed, made.cost)
+        text = report(exported, job.origin, result.loop, verified, result.fixed, result.cost)
         texts |= {REPORT if is_good else FAILED: text}
-        _tell(verified, console)
+        _print_verdict(verified, console)
     with publish(out, stale=(REPORT, FAILED) if is_good else ()) as staging:
         for file, text in texts.items():
             (staging / file).write_text(text, encoding="utf-8")
@@ -111,9 +111,9 @@ def _check_arguments(target: str, name: str, dac_bits: int | None) -> None:
         raise field_error("--dac-bits", dac_bits, f"{low} to {high}", "1")
 
 
-def _origin(found: FixedController, case_id: str) -> list[str]:
+def _origin(exported: FixedController, case_id: str) -> list[str]:
     """Where a controller comes from, for file headers."""
-    study = found.study
+    study = exported.study
     links = "+".join(str(i + 1) for i in range(3) if study.control.links[i])
     package = f"{config.PACKAGE} {config.info()[config.PACKAGE]}"
     return [
@@ -125,7 +125,7 @@ def _origin(found: FixedController, case_id: str) -> list[str]:
     ]
 
 
-def _tell(verified: Verification, console: Console) -> None:
+def _print_verdict(verified: Verification, console: Console) -> None:
     failed = [check for check in verified.checks if not check.is_met]
     for check in failed:
         console.print(f"FAILED: {check.what}: {check.found}, allowed {check.allowed}")
@@ -135,7 +135,7 @@ def _tell(verified: Verification, console: Console) -> None:
         console.print(note, soft_wrap=True)
     for name in verified.runs:
         if name != "JAX":
-            at = verified.beside(name)
+            at = verified.deviation(name)
             console.print(
                 f"in the loop, {name}: voltage differs by {at.voltage:.2g} V, platform by "
                 f"{1e9 * at.pose[:2].max():.2g} nm, residual vibration by {100 * at.loss:+.2g} %"

@@ -36,7 +36,7 @@ class Target(NamedTuple):
     has_dac: bool = False  # accepts the resolution of a DAC
 
 
-def _as_json(job: Job) -> ExportResult:
+def _export_json(job: Job) -> ExportResult:
     loop = check_loop(job.exported, job.exported.channels, "")
     described = document(job.exported, job.case_id)
     files = {
@@ -50,7 +50,7 @@ def _as_json(job: Job) -> ExportResult:
     )
 
 
-def _as_floating(job: Job) -> ExportResult:
+def _export_floating(job: Job) -> ExportResult:
     loop = check_loop(job.exported, job.exported.channels, "")
     source = floating_source(job.exported, job.name, job.origin)
     files = _files(source, job.name)
@@ -61,13 +61,13 @@ def _as_floating(job: Job) -> ExportResult:
     return ExportResult(files, loop, verified)
 
 
-def _as_fixed(job: Job) -> ExportResult:
+def _export_fixed(job: Job) -> ExportResult:
     exported = job.exported
     check_words(exported)
     check_loop(exported, exported.channels, "")
     reference = reference_motion(job)
     signals = respond(exported.channels, exported.controller, reference.codes)
-    fixed, near = _designed(exported, signals, job.dac_bits)
+    fixed, near = _design(exported, signals, job.dac_bits)
     loop = check_loop(exported, near, ", coefficients rounded to 32 bits")
     cost = cost_of(exported, fixed)
     job.console.print(cost.text)
@@ -80,7 +80,7 @@ def _as_fixed(job: Job) -> ExportResult:
     )
 
 
-def _designed(
+def _design(
     exported: FixedController, signals: Signals | BlockSignals, dac_bits: int
 ) -> tuple[FixedPoint | FixedBlocks, ActiveChannels | ModalBlocks]:
     """A controller in fixed point, and what its integers represent."""
@@ -101,8 +101,8 @@ def _files(source: Source, name: str) -> dict[str, str]:
 TARGETS: Table[Target] = Table(
     "target",
     [
-        Target("json", "all numbers with units and meanings", _as_json),
-        Target("c", "C99 in floating point", _as_floating, needs_compiler=True),
-        Target("c-fixed", "C99 in 32-bit fixed point", _as_fixed, True, has_dac=True),
+        Target("json", "all numbers with units and meanings", _export_json),
+        Target("c", "C99 in floating point", _export_floating, needs_compiler=True),
+        Target("c-fixed", "C99 in 32-bit fixed point", _export_fixed, True, has_dac=True),
     ],
 )

@@ -45,7 +45,7 @@ class Check(NamedTuple):
     is_met: bool
 
 
-class InTheLoop(NamedTuple):
+class LoopDeviation(NamedTuple):
     """A run in the loop compared with that of the JAX controller."""
 
     voltage: float  # largest difference of an actuator [V]
@@ -62,12 +62,12 @@ class Verification(NamedTuple):
     runs: dict[str, LoopRun]  # by controller, JAX first
     counts: dict[str, Response]  # fixed point: by sequence
 
-    def beside(self, name: str) -> InTheLoop:
+    def deviation(self, name: str) -> LoopDeviation:
         """One of the runs against that of the JAX controller."""
         reference, run = self.runs["JAX"], self.runs[name]
         differing = np.flatnonzero(np.any(run.codes != reference.codes, axis=(1, 2)))
         size = vibration(reference)
-        return InTheLoop(
+        return LoopDeviation(
             float(np.abs(run.voltage - reference.voltage).max()),
             np.abs(run.pose - reference.pose).max(axis=0),
             int(differing[0]) if len(differing) else -1,
@@ -100,13 +100,18 @@ def verify_document(
         _compare(
             f"open loop, {name}",
             respond_floating(channels, controller, codes).command,
-            _replayed(exported, codes),
+            _replay(exported, codes),
             DOUBLE,
         )
-        for name, codes in {"recorded codes": reference.codes, **_hard(exported, reference)}.items()
+        for name, codes in {
+            "recorded codes": reference.codes,
+            **_hard_codes(exported, reference),
+        }.items()
     ]
     path, shaped = _references(exported)
-    checks.append(_compare("shaper, the case's motion", _shaped(taps, path), shaped, DOUBLE))
+    checks.append(
+        _compare("shaper, the case's motion", _shape_reference(taps, path), shaped, DOUBLE)
+    )
     return Verification(checks, [], {"JAX": reference}, {})
 
 
@@ -119,17 +124,17 @@ def verify_floating(
 ) -> Verification:
     """C in double and single precision against the JAX controller."""
     checks, runs = [], {"JAX": reference}
-    with _loaded(exported, source, name, compiler, np.float64, np.float64) as code:
-        sequences = {"recorded codes": reference.codes, **_hard(exported, reference)}
+    with _load_code(exported, source, name, compiler, np.float64, np.float64) as code:
+        sequences = {"recorded codes": reference.codes, **_hard_codes(exported, reference)}
         for label, codes in sequences.items():
             volts, faults = code.respond(codes * float(exported.controller.adc_step))
-            expected = _replayed(exported, codes)
+            expected = _replay(exported, codes)
             check = _compare(f"open loop, {label}", volts, expected, DOUBLE)
             checks.append(check._replace(is_met=check.is_met and not faults.any()))
         top = float(exported.controller.adc_top + 3)
         bad = {"beyond the range": top, "NaN": np.nan, "infinite": np.inf}
         step = float(exported.controller.adc_step)
-        checks += _faults(exported, code, reference, bad, step, 0.0)
+        checks += _check_faults(exported, code, reference, bad, step, 0.0)
         path, shaped = _references(exported)
         checks.append(_compare("shaper, the case's motion", code.shape(path), shaped, DOUBLE))
         shape = reference.codes.shape[1:]
@@ -139,13 +144,13 @@ def verify_floating(
             exported.case,
             lambda codes: code.step(codes * step)[0].reshape(shape),
         )
-    with _loaded(exported, source, name, compiler, np.float32, np.float32) as code:
+    with _load_code(exported, source, name, compiler, np.float32, np.float32) as code:
         volts, _ = code.respond(reference.codes * step)
-        checks += _faults(exported, code, reference, bad, step, 0.0, ", float")
+        checks += _check_faults(exported, code, reference, bad, step, 0.0, ", float")
         single = _compare("", volts, reference.voltage, SINGLE)
         advice = "precise enough" if single.is_met else "NOT precise enough, keep to double"
         note = f"With float, recorded codes in open loop differ by {single.found}: {advice}."
-    return Verification([*checks, *_same_status(runs)], [note], runs, {})
+    return Verification([*checks, *_check_status(runs)], [note], runs, {})
 
 
 def verify_fixed(
@@ -163,7 +168,7 @@ def verify_fixed(
         exported.structure, exported.case, exported.controller, float(fixed.wires.dac_step)
     )
     shape = reference.codes.shape[1:]
-    with _loaded(exported, source, name, compiler, np.uint16, np.int32) as code:
+    with _load_code(exported, source, name, compiler, np.uint16, np.int32) as code:
 
         def in_volts(codes: np.ndarray) -> np.ndarray:
             out = code.step(codes)[0].reshape(shape).astype(float)
@@ -174,13 +179,13 @@ def verify_fixed(
         sequences = {
             "recorded codes": reference.codes,
             "own run in the loop": own.codes,
-            **_hard(exported, reference),
-            "stuck at the end of the range": _stuck(exported, reference),
+            **_hard_codes(exported, reference),
+            "stuck at the end of the range": _stuck_codes(exported, reference),
             "words beyond the ADC's codes": np.random.default_rng(1).integers(
                 0, 2**16, (50, *shape)
             ),
         }
-        counts = _modelled(fixed, sequences, rail)
+        counts = _model_responses(fixed, sequences, rail)
         for label, codes in sequences.items():
             codes_out, _ = code.respond(codes)
             differing = int(np.sum(codes_out != counts[label].codes))
@@ -198,7 +203,7 @@ def verify_fixed(
             if fixed.wires.adc_top < 2**16 - 1
             else {}
         )
-        checks += _faults(exported, code, reference, bad, 1.0, float(fixed.wires.dac_rest))
+        checks += _check_faults(exported, code, reference, bad, 1.0, float(fixed.wires.dac_rest))
         checks.append(_check_shaper(exported, code))
     checks.append(_check_error(exported, fixed, reference, counts["recorded codes"]))
     for label in ("recorded codes", "own run in the loop"):
@@ -208,10 +213,10 @@ def verify_fixed(
         )
     limited = sum(int(response.limited.sum()) for response in counts.values())
     checks.append(Check("internal overflow, all sequences", f"{limited} times", "0", limited == 0))
-    return Verification([*checks, *_same_status(runs)], [], runs, counts)
+    return Verification([*checks, *_check_status(runs)], [], runs, counts)
 
 
-def _modelled(
+def _model_responses(
     fixed: FixedPoint | FixedBlocks, sequences: dict[str, np.ndarray], rail: int
 ) -> dict[str, Response]:
     """Response of the integer model to each sequence, all side by side."""
@@ -224,7 +229,7 @@ def _modelled(
     }
 
 
-def _loaded(
+def _load_code(
     exported: FixedController,
     source: Source,
     name: str,
@@ -240,13 +245,13 @@ def _loaded(
     return compiled(source, name, compiler, real, reference, sizes)
 
 
-def _hard(exported: FixedController, reference: LoopRun) -> dict[str, np.ndarray]:
+def _hard_codes(exported: FixedController, reference: LoopRun) -> dict[str, np.ndarray]:
     top = int(exported.controller.adc_top)
     rail = rail_samples(exported.study.electronics.sample_rate_hz)
     return hard_sequences(reference.codes, top, rail)
 
 
-def _replayed(exported: FixedController, codes: np.ndarray) -> np.ndarray:
+def _replay(exported: FixedController, codes: np.ndarray) -> np.ndarray:
     return np.asarray(replay(exported.controller, codes))
 
 
@@ -257,13 +262,13 @@ def _compare(what: str, values: np.ndarray, expected: np.ndarray, allowed: float
     return Check(what, f"{difference:.1e}", f"{allowed:.0e}", difference <= allowed)
 
 
-def _stuck(exported: FixedController, reference: LoopRun) -> np.ndarray:
+def _stuck_codes(exported: FixedController, reference: LoopRun) -> np.ndarray:
     return stuck_at_end(
         reference.codes, int(exported.controller.adc_top), (exported.channels.link[-1], 0)
     )
 
 
-def _faults(
+def _check_faults(
     exported: FixedController,
     code: Code,
     reference: LoopRun,
@@ -326,7 +331,7 @@ def _shape_path(path: Any, taps: Any, n: int, period: Any) -> Any:
 _shape = kept_jit(static_argnums=2)(_shape_path)
 
 
-def _shaped(taps: Taps, path: np.ndarray) -> np.ndarray:
+def _shape_reference(taps: Taps, path: np.ndarray) -> np.ndarray:
     """Sum of the path's past."""
     longest = int(taps.sample.max())
     padded = np.concatenate([np.repeat(path[:1], longest, axis=0), path])
@@ -344,7 +349,7 @@ def _check_shaper(exported: FixedController, code: Code) -> Check:
     counts = np.round(path * scale).astype(np.int64)
     counts_out = code.shape(counts)
     row = shaper_row(exported.taps)
-    total = _shaped(exported.taps._replace(weight=row.integers[0]), counts)
+    total = _shape_reference(exported.taps._replace(weight=row.integers[0]), counts)
     differing = int(np.sum(counts_out != shifted(total, row.shift[0])))
     off = np.abs(counts_out / scale - shaped).max() * scale
     # half a count of the reference, half of the result, and what JAX's path differs by
@@ -395,7 +400,7 @@ def _check_error(
     )
 
 
-def _same_status(runs: dict[str, LoopRun]) -> list[Check]:
+def _check_status(runs: dict[str, LoopRun]) -> list[Check]:
     """Check that every run ends like that of the JAX controller."""
     expected, *others = (describe(int(run.result.status)) for run in runs.values())
     names = list(runs)[1:]

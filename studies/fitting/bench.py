@@ -111,7 +111,7 @@ class PlantAt:
         return value, None if self.slope is None else getattr(self.slope, name)[index]
 
 
-def seen_at(study: Study, place: Place, places: tuple[float, ...]) -> tuple[Study, Place]:
+def with_outputs_at(study: Study, place: Place, places: tuple[float, ...]) -> tuple[Study, Place]:
     """A study whose stations are measured places [m], on links of any length.
 
     Args:
@@ -121,10 +121,10 @@ def seen_at(study: Study, place: Place, places: tuple[float, ...]) -> tuple[Stud
     """
     longest = float(each_link(study.link.length).max())
     study = study.change(metrics__stations=tuple(x / longest for x in places))  # as many
-    return study, Placing(_place_and_see, (place, places))
+    return study, Placing(_place_with_outputs, (place, places))
 
 
-def _place_and_see(
+def _place_with_outputs(
     place: Place, places: tuple[float, ...], numbers: Numbers, values: Array
 ) -> Numbers:
     numbers = place(numbers, values)
@@ -158,7 +158,7 @@ class Bench:
             float(each_link(study.link.length).min()) / 2,
         )
         study = study.change(control__feedback="none", shaper__kind="none")
-        self.study, self.place = seen_at(study, place, self.stations)
+        self.study, self.place = with_outputs_at(study, place, self.stations)
         self.structure = build_structure(self.study)
         self.numbers = as_arrays(one_study(self.study, self.structure))
         self.n_patches = self.structure.n_patches
@@ -268,7 +268,7 @@ def _at(
     return bench_plant(structure, placed, pose), path_status(plant, pose[None])[0]
 
 
-def _one_held(
+def _held_link(
     structure: Structure, place: Place, numbers: Numbers, values: Array
 ) -> tuple[Array, Array]:
     return held_modes(structure, case_of(structure, place(numbers, values)))
@@ -276,8 +276,8 @@ def _one_held(
 
 _plant = kept_jit(static_argnums=(0, 1))(_at)
 _plant_slopes = jax.jit(with_slopes(_at, 4, is_first=True), static_argnums=(0, 1))
-_held = kept_jit(static_argnums=(0, 1))(_one_held)
-_held_slopes = jax.jit(with_slopes(_one_held, 3), static_argnums=(0, 1))
+_held = kept_jit(static_argnums=(0, 1))(_held_link)
+_held_slopes = jax.jit(with_slopes(_held_link, 3), static_argnums=(0, 1))
 
 
 @kept_jit(static_argnums=(0, 1))
@@ -313,8 +313,8 @@ def response(
     pole, right, left = plant.eigen
     if left is None:  # without eigenvectors
         whole = 1j * omega[:, None, None] * np.eye(len(pole)) - plant.value.state
-        x = _solved(whole, source[0])
-        y = _solved(np.swapaxes(whole, 1, 2), output[0])
+        x = _solve(whole, source[0])
+        y = _solve(np.swapaxes(whole, 1, 2), output[0])
     else:
         resolvent = 1 / (1j * omega[:, None] - pole)
         x = (resolvent * (left @ source[0])) @ right.T
@@ -329,7 +329,7 @@ def response(
     return FrequencyResponse(gain, slope)
 
 
-def _solved(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
+def _solve(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Solutions for one right-hand side, (f, n)."""
     many = np.broadcast_to(right[:, None], (*matrices.shape[:2], 1))
     return np.linalg.solve(matrices, many)[..., 0]

@@ -42,18 +42,18 @@ def draw_machines(problem: Problem, solution: Solution, count: int, seed: int) -
     share = np.cumsum(weight) / np.sum(weight)
     which = np.searchsorted(share, (np.arange(count) + 0.5) / count)
     parts = [
-        _about(problem, one, limit, int(np.sum(which == k)), rng)
+        _draw_about(problem, one, limit, int(np.sum(which == k)), rng)
         for k, one in enumerate(optima)
         if np.any(which == k)
     ]
     return np.concatenate(parts)
 
 
-def _about(
+def _draw_about(
     problem: Problem, one: Optimum, limit: float, count: int, rng: np.random.Generator
 ) -> np.ndarray:
     """Places about one optimum whose cost is at most the limit, (count, p)."""
-    about = shape(measured(problem, describe_fit(problem, one.u), one.cost))
+    about = shape(correct_information(problem, describe_fit(problem, one.u), one.cost))
     walkers = max(count, 2 * len(one.u) + 2)
     place = about.draw(walkers, int(rng.integers(2**31)))
     cost = problem.costs(place)
@@ -71,7 +71,7 @@ def _about(
     return place[:count]
 
 
-def measured(problem: Problem, answer: Answer, least: float) -> Answer:
+def correct_information(problem: Problem, answer: Answer, least: float) -> Answer:
     """Its information, corrected along axes on which the cost rises by more than it promises.
 
     Args:

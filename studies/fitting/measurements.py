@@ -18,15 +18,15 @@ from studies.fitting.kinds.motions import OFF, Motions
 from studies.fitting.kinds.response import ComplexResponse, Magnitude, Spectrum
 from studies.fitting.kinds.traces import Band, Settling, Trace
 from studies.fitting.spec import (
-    AtPose,
     Common,
     FiguresEntry,
     FileEntry,
     FitSpec,
     ModesEntry,
-    Noisy,
+    NoiseEntry,
+    OutputEntry,
+    PoseEntry,
     ResponseEntry,
-    Seen,
     SettlingEntry,
     SpectrumEntry,
     TraceEntry,
@@ -56,7 +56,7 @@ def make_bench(spec: FitSpec) -> Bench:
     poses: dict[At, str] = {}
     for k, entry in enumerate(spec.entries):
         is_held = isinstance(entry, ModesEntry) and entry.ends == "held"
-        if isinstance(entry, AtPose) and not is_held:
+        if isinstance(entry, PoseEntry) and not is_held:
             poses.setdefault(_pose(spec, entry), f"fit.data[{k}].pose")
     places = _places(spec, (ResponseEntry, SpectrumEntry))
     bench = Bench(spec.study, spec.free.place, tuple(poses), places)
@@ -81,13 +81,13 @@ def make_measurements(spec: FitSpec, bench: Bench) -> list[Measurement]:
     ]
 
 
-def _pose(spec: FitSpec, entry: AtPose) -> At:
+def _pose(spec: FitSpec, entry: PoseEntry) -> At:
     return entry.pose or spec.study.motion.waypoints[0]
 
 
 def _signals(spec: FitSpec, entry: Common, path: str) -> tuple[Signal, ...]:
     """Input and output of an entry, or its output."""
-    if not isinstance(entry, Seen):
+    if not isinstance(entry, OutputEntry):
         return ()
     sizes = build_structure(spec.study).n_patches, each_link(spec.study.link.length)
     output = parse_signal(entry.output, OUTPUTS, *sizes, f"{path}.output")
@@ -96,7 +96,7 @@ def _signals(spec: FitSpec, entry: Common, path: str) -> tuple[Signal, ...]:
     return parse_signal(entry.input, INPUTS, *sizes, f"{path}.input"), output
 
 
-def _places(spec: FitSpec, kinds: tuple[type[Seen], ...]) -> tuple[float, ...]:
+def _places(spec: FitSpec, kinds: tuple[type[OutputEntry], ...]) -> tuple[float, ...]:
     """Where along the links hammers and deflections of some kinds of entries are [m], ascending."""
     places = {
         signal.place
@@ -181,7 +181,7 @@ def _ascending(x: np.ndarray, what: str, path: str, least: int = 3) -> None:
         raise StudyError(f"{path}: {what} must ascend; row {row} does not")
 
 
-def _noise(entry: Noisy, value: np.ndarray, path: str) -> Noise:
+def _noise(entry: NoiseEntry, value: np.ndarray, path: str) -> Noise:
     noise = Noise(entry.sigma or 0.0, (entry.sigma_percent or 0.0) / 100)
     without = np.flatnonzero(noise.sigma(value) <= 0)
     if without.size:

@@ -23,20 +23,20 @@ MOST, MOST_NUMBERS, MOST_SAMPLED = 8, 40, 6
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#999999"
 
 
-def all_figures(found: Fitted) -> Iterator[tuple[str, Figure]]:
+def all_figures(fitted: Fitted) -> Iterator[tuple[str, Figure]]:
     """Names and figures."""
-    lines = [(_plain(x.title), x.part) for x in found.comparisons if isinstance(x.part, Line)]
-    single = [(_plain(x.title), x.part) for x in found.comparisons if isinstance(x.part, Numbers)]
+    lines = [(_plain(x.title), x.part) for x in fitted.comparisons if isinstance(x.part, Line)]
+    single = [(_plain(x.title), x.part) for x in fitted.comparisons if isinstance(x.part, Numbers)]
     if lines:
         yield "fit", curves(lines[:MOST])
     if single:
         yield "numbers", numbers(single)
-    if len(found.names) > 1:
-        yield "correlations", correlations(found)
-    if found.profiles:
-        yield "profiles", profiles(found)
-    if found.posterior is not None and len(found.names) > 1:
-        yield "samples", samples(found.posterior.values, found.names)
+    if len(fitted.names) > 1:
+        yield "correlations", correlations(fitted)
+    if fitted.profiles:
+        yield "profiles", profiles(fitted)
+    if fitted.posterior is not None and len(fitted.names) > 1:
+        yield "samples", samples(fitted.posterior.values, fitted.names)
 
 
 def _plain(text: str) -> str:
@@ -94,26 +94,26 @@ def numbers(shown: Sequence[tuple[str, Numbers]]) -> Figure:
     return figure
 
 
-def correlations(found: Fitted) -> Figure:
+def correlations(fitted: Fitted) -> Figure:
     """Correlation of the parameters."""
-    n = len(found.names)
+    n = len(fitted.names)
     figure, axes = new_figure(1, 1, min(1.2 + 0.28 * n, 7.0))
     ax = axes[0, 0]
     ax.grid(False)
-    image = ax.imshow(found.answer.correlation, vmin=-1, vmax=1, cmap="RdBu_r", aspect="auto")
-    ax.set_xticks(range(n), found.names, rotation=90, fontsize=SMALL)
-    ax.set_yticks(range(n), found.names, fontsize=SMALL)
+    image = ax.imshow(fitted.answer.correlation, vmin=-1, vmax=1, cmap="RdBu_r", aspect="auto")
+    ax.set_xticks(range(n), fitted.names, rotation=90, fontsize=SMALL)
+    ax.set_yticks(range(n), fitted.names, fontsize=SMALL)
     figure.colorbar(image, ax=ax, label="correlation [1]")
     return figure
 
 
-def profiles(found: Fitted) -> Figure:
+def profiles(fitted: Fitted) -> Figure:
     """Least misfit over each parameter, and what its standard deviation promises."""
-    count = len(found.profiles)
+    count = len(fitted.profiles)
     figure, axes = new_figure((count + 1) // 2, min(count, 2), 1.9, has_shared_abscissa=False)
-    for ax, one in zip(axes.ravel(), found.profiles, strict=False):
+    for ax, one in zip(axes.ravel(), fitted.profiles, strict=False):
         k = one.number
-        value, sigma = found.answer.values[k], found.answer.sigma[k]
+        value, sigma = fitted.answer.values[k], fitted.answer.sigma[k]
         ax.plot(*one.smooth(), color=BLUE, label="profile")
         ax.plot(one.values, one.rise, "o", ms=3, color=BLUE)
         if sigma > 0:
@@ -121,9 +121,9 @@ def profiles(found: Fitted) -> Figure:
             ax.plot(x, ((x - value) / sigma) ** 2, "--", color=ORANGE, lw=1, label="from sigma")
         ax.axhline(WIDE**2, color=GREY, lw=0.8, label="95 %")
         ax.set_ylim(0, 1.6 * WIDE**2)
-        ax.set(xlabel=f"[{number_unit(found.names[k])}]", ylabel="rise of chi square")
+        ax.set(xlabel=f"[{number_unit(fitted.names[k])}]", ylabel="rise of chi square")
         ax.locator_params(axis="x", nbins=5)
-        ax.set_title(found.names[k], loc="left", fontsize=9)
+        ax.set_title(fitted.names[k], loc="left", fontsize=9)
     legend_above(figure, axes[0, 0])
     for ax in axes.ravel()[count:]:
         ax.set_visible(False)

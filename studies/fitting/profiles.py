@@ -125,7 +125,7 @@ def profile(problem: Problem, u: np.ndarray, number: int, sigma: float) -> Likel
     for way in (1, -1):
         at, stride, last = u, way * STRIDE * sigma, 0.0
         for _ in range(STEPS):
-            trial = _with(at, number, float(np.clip(at[number] + stride, 0.0, 1.0)))
+            trial = _replace_entry(at, number, float(np.clip(at[number] + stride, 0.0, 1.0)))
             if abs(trial[number] - at[number]) < NEXT:  # at the bound already
                 break
             try:
@@ -145,14 +145,14 @@ def profile(problem: Problem, u: np.ndarray, number: int, sigma: float) -> Likel
                 break
     # bounds may be closer than the values' digits tell apart
     by_value = {
-        float(problem.free.values(_with(u, number, x))[number]): rise
+        float(problem.free.values(_replace_entry(u, number, x))[number]): rise
         for x, rise in sorted(points, key=lambda one: -abs(one[1]))
     }
     values = np.array(sorted(by_value))
     return Likelihood(number, values, np.array([by_value[x] for x in values]))
 
 
-def _with(u: np.ndarray, number: int, x: float) -> np.ndarray:
+def _replace_entry(u: np.ndarray, number: int, x: float) -> np.ndarray:
     changed = u.copy()
     changed[number] = x
     return changed

@@ -26,53 +26,53 @@ STRONG = 0.95
 GOOD = "The model explains the data within their noise, and every parameter is identifiable."
 
 
-def summary(found: Fitted) -> str:
+def summary(fitted: Fitted) -> str:
     """Some lines: the verdict, the values, and what else is to be known of them."""
-    verdict, *others = _said(found)
+    verdict, *others = _statements(fitted)
     lines = [
         f"{name} = {value} +- {sigma} {unit} (95 %: {interval})".replace("  ", " ")
-        for name, value, sigma, unit, interval, _ in _rows(found)
+        for name, value, sigma, unit, interval, _ in _rows(fitted)
     ]
     return "\n".join([verdict, *lines, *others])
 
 
-def _said(found: Fitted) -> list[str]:
+def _statements(fitted: Fitted) -> list[str]:
     """The verdict, then what else is to be known."""
-    return [GOOD] * is_good(found) + sentences(found)
+    return [GOOD] * is_good(fitted) + sentences(fitted)
 
 
-def report(found: Fitted, images: Path | None = None) -> str:
+def report(fitted: Fitted, images: Path | None = None) -> str:
     """The page of a fit.
 
     Args:
-        found: the fit.
+        fitted: the fit.
         images: folder with its figures; None: a page without.
     """
-    first, *others = _said(found)
+    first, *others = _statements(fitted)
     return page(
         "fitting/report.html",
         images,
-        found.study,
-        found=found,
-        spec=found.spec,
-        answer=found.answer,
-        rows=_rows(found),
-        is_good=is_good(found),
+        fitted.study,
+        fitted=fitted,
+        spec=fitted.spec,
+        answer=fitted.answer,
+        rows=_rows(fitted),
+        is_good=is_good(fitted),
         first=first,
         others_said=others,
-        misfits=[_misfit(x) for x in found.answer.misfits],
-        checks=[_misfit(x) for x in found.checks],
-        others=_others(found),
-        posterior=_posterior(found),
-        single=_single(found),
-        experiments=_experiments(found),
-        widest=" and ".join(found.names[k] for k in found.answer.directions[0].named()),
-        lines=sum(isinstance(x.part, Line) for x in found.comparisons),
-        kept=sum(not x.is_checked for x in found.comparisons),
-        has_entries=any("[" in name for name in found.names),
+        misfits=[_misfit(x) for x in fitted.answer.misfits],
+        checks=[_misfit(x) for x in fitted.checks],
+        others=_others(fitted),
+        posterior=_posterior(fitted),
+        single=_single(fitted),
+        experiments=_experiments(fitted),
+        widest=" and ".join(fitted.names[k] for k in fitted.answer.directions[0].named()),
+        lines=sum(isinstance(x.part, Line) for x in fitted.comparisons),
+        kept=sum(not x.is_checked for x in fitted.comparisons),
+        has_entries=any("[" in name for name in fitted.names),
         most=MOST,
         region=REGION,
-        limit=region_rise(len(found.names)),
+        limit=region_rise(len(fitted.names)),
     )
 
 
@@ -86,18 +86,20 @@ def _is_at_bound(place: float) -> bool:
     return not 1e-6 < place < 1 - 1e-6
 
 
-def _rows(found: Fitted) -> list[list[str]]:
+def _rows(fitted: Fitted) -> list[list[str]]:
     """Name, value, standard deviation, unit, 95 % interval, and where the value came to lie."""
     rows = []
-    u = found.solution.best.u
-    for k, name in enumerate(found.names):
-        value, sigma = found.answer.values[k], found.answer.sigma[k]
-        low, high = found.answer.interval[k]
+    u = fitted.solution.best.u
+    for k, name in enumerate(fitted.names):
+        value, sigma = fitted.answer.values[k], fitted.answer.sigma[k]
+        low, high = fitted.answer.interval[k]
         digits = _digits(value, sigma)
-        ends = np.array([found.spec.free.numbers[k].span.low, found.spec.free.numbers[k].span.high])
+        ends = np.array(
+            [fitted.spec.free.numbers[k].span.low, fitted.spec.free.numbers[k].span.high]
+        )
         at = "interval ends at a bound" if np.isclose([low, high], ends, rtol=1e-9).any() else ""
         at = "at its bound" if _is_at_bound(u[k]) else at
-        if found.answer.sigma[k] >= 0.99 * UNKNOWN * abs(found.spec.free.slopes(u)[k]):
+        if fitted.answer.sigma[k] >= 0.99 * UNKNOWN * abs(fitted.spec.free.slopes(u)[k]):
             at = "not identifiable"
         rows.append(
             [
@@ -119,10 +121,10 @@ def _digits(value: float, sigma: float) -> int:
     return int(np.clip(np.floor(np.log10(abs(value) / sigma)) + 3, 2, 10))
 
 
-def sentences(found: Fitted) -> list[str]:
+def sentences(fitted: Fitted) -> list[str]:
     """What a reader must know before he uses the values, the gravest first."""
-    answer = found.answer
-    lines = [*_rivals(found), *_unexplained(answer)]
+    answer = fitted.answer
+    lines = [*_rivals(fitted), *_unexplained(answer)]
     if answer.freedom == 0:
         lines.append(
             "There are as many unknowns as data: they are met whatever the model, which is not "
@@ -134,38 +136,38 @@ def sentences(found: Fitted) -> list[str]:
             f"{answer.chi_square:.3g} with {answer.freedom} degrees of freedom. The stated noise "
             "is too large, and so are the uncertainties."
         )
-    lines += [*undetermined(found), *_correlated(found), *_at_bounds(found)]
-    lines += [cell(x) + "." for x in found.unpredicted]
-    if found.fault:
-        lines.append(f"The fitted study does not run as it is: {found.fault}.")
-    if found.posterior is not None and not found.posterior.is_settled:
-        worst = int(np.argmax(found.posterior.reduction))
+    lines += [*undetermined(fitted), *_correlated(fitted), *_at_bounds(fitted)]
+    lines += [cell(x) + "." for x in fitted.unpredicted]
+    if fitted.fault:
+        lines.append(f"The fitted study does not run as it is: {fitted.fault}.")
+    if fitted.posterior is not None and not fitted.posterior.is_settled:
+        worst = int(np.argmax(fitted.posterior.reduction))
         lines.append(
-            f"The chains of samples do not agree yet, least on {found.names[worst]} (scatter "
-            f"{found.posterior.reduction[worst]:.2f}, wanted: below 1.05); raise fit.samples."
+            f"The chains of samples do not agree yet, least on {fitted.names[worst]} (scatter "
+            f"{fitted.posterior.reduction[worst]:.2f}, wanted: below 1.05); raise fit.samples."
         )
-    if not found.solution.best.is_converged:
+    if not fitted.solution.best.is_converged:
         lines.append("The search ended before it converged; raise fit.iterations.")
-    if found.experiment_fault:
-        lines.append(f"No next experiment could be computed: {found.experiment_fault}.")
+    if fitted.experiment_fault:
+        lines.append(f"No next experiment could be computed: {fitted.experiment_fault}.")
     return lines
 
 
-def _rivals(found: Fitted) -> list[str]:
+def _rivals(fitted: Fitted) -> list[str]:
     """That other optima are as good, and where the nearest is."""
-    if not found.rivals:
+    if not fitted.rivals:
         return []
-    first, values = found.rivals[0], found.problem.free.values(found.rivals[0].u)
-    low, high = found.answer.interval.T
+    first, values = fitted.rivals[0], fitted.problem.free.values(fitted.rivals[0].u)
+    low, high = fitted.answer.interval.T
     moved = np.flatnonzero((values < low) | (values > high))
-    other = ", ".join(f"{found.names[k]} = {values[k]:.5g}" for k in moved)
-    count = len(found.rivals)
+    other = ", ".join(f"{fitted.names[k]} = {values[k]:.5g}" for k in moved)
+    count = len(fitted.rivals)
     optima = f"{count} other optima lie" if count > 1 else "another optimum lies"
     what = "the best of them with" if count > 1 else "with"
-    samples = " Samples are drawn about the best optimum alone." if found.posterior else ""
+    samples = " Samples are drawn about the best optimum alone." if fitted.posterior else ""
     return [
         f"Not identifiable: {optima} in the data's region of {100 * REGION:g} %, {what} {other} "
-        f"(chi square rises by {found.solution.rise(first):.2g}; see the other optima). Measure "
+        f"(chi square rises by {fitted.solution.rise(first):.2g}; see the other optima). Measure "
         f"something in which they differ, at another pose or with shapes.{samples}"
     ]
 
@@ -192,21 +194,21 @@ def _unexplained(answer: Answer) -> list[str]:
     ]
 
 
-def is_good(found: Fitted) -> bool:
+def is_good(fitted: Fitted) -> bool:
     """Whether the model explains the data, and they identify all parameters."""
-    answer = found.answer
+    answer = fitted.answer
     is_tested = answer.freedom > 0 and not answer.is_too_close
-    is_inside = not any(_is_at_bound(u) for u in found.solution.best.u)
-    is_found = found.solution.best.is_converged and is_inside
-    is_identified = not answer.undetermined and not found.rivals
+    is_inside = not any(_is_at_bound(u) for u in fitted.solution.best.u)
+    is_found = fitted.solution.best.is_converged and is_inside
+    is_identified = not answer.undetermined and not fitted.rivals
     return bool(answer.is_explained and is_tested and is_found and is_identified)
 
 
-def _at_bounds(found: Fitted) -> list[str]:
+def _at_bounds(fitted: Fitted) -> list[str]:
     """Numbers that would go further if they could."""
     lines = []
     for name, u, number in zip(
-        found.names, found.solution.best.u, found.spec.free.numbers, strict=True
+        fitted.names, fitted.solution.best.u, fitted.spec.free.numbers, strict=True
     ):
         if not _is_at_bound(u):
             continue
@@ -219,19 +221,19 @@ def _at_bounds(found: Fitted) -> list[str]:
     return lines
 
 
-def undetermined(found: Fitted) -> list[str]:
+def undetermined(fitted: Fitted) -> list[str]:
     """Sentences on parameters that are not identifiable, group by group."""
     lines = []
-    for names, members in _groups(found.answer):
+    for names, members in _groups(fitted.answer):
         if len(members) == 1:
-            lines.append(told(members[0], found.names))
+            lines.append(describe_direction(members[0], fitted.names))
             continue
         if len(names) == len(members):
-            lines.append(f"{_listed(found, names)} are not identifiable from these data.")
+            lines.append(f"{_listed(fitted, names)} are not identifiable from these data.")
             continue
         count = len(names) - len(members)
         lines.append(
-            f"{_listed(found, names)} are not identifiable from these data, which determine "
+            f"{_listed(fitted, names)} are not identifiable from these data, which determine "
             f"{count} combination{'s' if count > 1 else ''} of these {len(names)} parameters. Fix "
             f"{len(members)} of them, or state what is known by mean and sigma."
         )
@@ -250,13 +252,13 @@ def _groups(answer: Answer) -> list[tuple[set[int], list[Direction]]]:
     return groups
 
 
-def _listed(found: Fitted, names: set[int]) -> str:
+def _listed(fitted: Fitted, names: set[int]) -> str:
     """ "a, b and c"."""
-    every = [found.names[k] for k in sorted(names)]
+    every = [fitted.names[k] for k in sorted(names)]
     return f"{', '.join(every[:-1])} and {every[-1]}"
 
 
-def told(direction: Direction, names: tuple[str, ...]) -> str:
+def describe_direction(direction: Direction, names: tuple[str, ...]) -> str:
     """What the data do not tell."""
     parts = direction.named()
     if len(parts) == 1:
@@ -271,10 +273,10 @@ def told(direction: Direction, names: tuple[str, ...]) -> str:
     )
 
 
-def _correlated(found: Fitted) -> list[str]:
+def _correlated(fitted: Fitted) -> list[str]:
     """Pairs that are hardly apart, but for those of one group that is not identifiable."""
-    matrix, names = found.answer.correlation, found.names
-    groups = [x for x, _ in _groups(found.answer)]
+    matrix, names = fitted.answer.correlation, fitted.names
+    groups = [x for x, _ in _groups(fitted.answer)]
     return [
         f"{names[k]} and {names[i]} are strongly correlated ({matrix[i, k]:.3f}): a combination of "
         "both is known much better than either."
@@ -300,47 +302,47 @@ def _misfit(one: Misfit) -> list[str]:
     ]
 
 
-def _single(found: Fitted) -> list[list[str]]:
+def _single(fitted: Fitted) -> list[list[str]]:
     """Measured numbers that stand alone, and the model's."""
     rows = []
-    for one in found.comparisons:
+    for one in fitted.comparisons:
         part = one.part
         if isinstance(part, Line):
             continue
         notes = (*part.notes, *[""] * (len(part.labels) - len(part.notes)))
-        given = zip(*part[:4], part.away, notes, strict=True)
-        for label, measured, model, sigma, far, note in given:
+        columns = zip(*part[:4], part.away, notes, strict=True)
+        for label, measured, model, sigma, far, note in columns:
             text = f"{measured:.6g}", f"{sigma:.2g}", f"{model:.6g}", f"{far:+.1f}"
             rows.append([cell(one.title), label, *text, note])
     return rows
 
 
-def _others(found: Fitted) -> list[list[str]]:
+def _others(fitted: Fitted) -> list[list[str]]:
     """Optima elsewhere, with the rise of their chi square."""
     rows: list[list[str]] = []
-    for one in found.solution.others:
-        values = found.spec.free.values(one.u)
-        rows.append([f"{found.solution.rise(one):.3g}", *(f"{x:.4g}" for x in values)])
+    for one in fitted.solution.others:
+        values = fitted.spec.free.values(one.u)
+        rows.append([f"{fitted.solution.rise(one):.3g}", *(f"{x:.4g}" for x in values)])
     return rows
 
 
-def _posterior(found: Fitted) -> list[list[str]]:
+def _posterior(fitted: Fitted) -> list[list[str]]:
     """Quantiles of the samples, and what they are worth."""
-    if found.posterior is None:
+    if fitted.posterior is None:
         return []
-    rows, samples = [], found.posterior
-    for k, name in enumerate(found.names):
-        digits = _digits(found.answer.values[k], found.answer.sigma[k])
+    rows, samples = [], fitted.posterior
+    for k, name in enumerate(fitted.names):
+        digits = _digits(fitted.answer.values[k], fitted.answer.sigma[k])
         quantiles = np.quantile(samples.values[:, k], [0.025, 0.5, 0.975])
         text = [f"{x:.{digits}g}" for x in quantiles]
         rows.append([name, *text, f"{samples.effective[k]:.0f}", f"{samples.reduction[k]:.3f}"])
     return rows
 
 
-def _experiments(found: Fitted) -> list[list[Any]]:
-    before = float(np.sqrt(np.linalg.eigvalsh(found.answer.covariance)[-1]))
+def _experiments(fitted: Fitted) -> list[list[Any]]:
+    before = float(np.sqrt(np.linalg.eigvalsh(fitted.answer.covariance)[-1]))
     rows = []
-    for one in found.experiments[:SHOWN]:
+    for one in fitted.experiments[:SHOWN]:
         pose = ", ".join(f"{x:.3g}" for x in one.pose)
         rows.append([one.text, f"({pose})", f"{one.widest / before:.3g}"])
     return rows

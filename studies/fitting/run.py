@@ -45,50 +45,50 @@ def run_fit(
     out, console = Path(out), console or Console(highlight=False, markup=False)
     check_folder(out)
     with Phases(console, fit_phases(spec)) as phases:
-        found = estimate(spec, phases)
+        fitted = estimate(spec, phases)
         phases.begin("draw")
         with publish(
             out, [f"{x}.{kind}" for x in plots.NAMES for kind in ("png", "pdf")]
         ) as staging:
             with figures.styled():
-                for name, figure in plots.all_figures(found):
+                for name, figure in plots.all_figures(fitted):
                     figures.save(figure, staging, name, has_pdf)
-            (staging / STUDY).write_text(study_template(found.study), encoding="utf-8")
-            (staging / TUNE).write_text(_tuning(found), encoding="utf-8")
-            write_store(staging / DATA, variables(found), run_attributes(found.study))
-            _present(staging, staging, found)
-        found = suggest(found, phases)
+            (staging / STUDY).write_text(study_template(fitted.study), encoding="utf-8")
+            (staging / TUNE).write_text(_tuning(fitted), encoding="utf-8")
+            write_store(staging / DATA, variables(fitted), run_attributes(fitted.study))
+            _present(staging, staging, fitted)
+        fitted = suggest(fitted, phases)
         with publish(out) as staging:
-            _present(staging, out, found)
-    console.print(summary(found), soft_wrap=True)
+            _present(staging, out, fitted)
+    console.print(summary(fitted), soft_wrap=True)
     more = f"; {STUDY} is the fitted study, {TUNE} a tuning for machines like it"
     announce(console, out / REPORT, more)
-    return found
+    return fitted
 
 
-def _present(folder: Path, images: Path, found: Fitted) -> None:
+def _present(folder: Path, images: Path, fitted: Fitted) -> None:
     """Write the answer in words; `images`: folder with its figures."""
-    (folder / DOCUMENT).write_text(document(found), encoding="utf-8")
-    (folder / REPORT).write_text(report(found, images), encoding="utf-8")
+    (folder / DOCUMENT).write_text(document(fitted), encoding="utf-8")
+    (folder / REPORT).write_text(report(fitted, images), encoding="utf-8")
 
 
-def machines(found: Fitted) -> dict[str, list[float]]:
+def machines(fitted: Fitted) -> dict[str, list[float]]:
     """Machines as the data leave them possible: by parameter, its value on each of them."""
     return {
         name: [float(f"{x:.9g}") for x in column]
-        for name, column in zip(found.names, found.machines.T, strict=True)
+        for name, column in zip(fitted.names, fitted.machines.T, strict=True)
         if not name.startswith("control.")  # which is free below
     }
 
 
-def _tuning(found: Fitted) -> str:
+def _tuning(fitted: Fitted) -> str:
     """The fitted study with machines like it, ready for `studies tune`."""
-    gain = found.study.control.gain_factor or 1.0
-    rows = "\n".join(f"{json.dumps(k)} = {v}" for k, v in machines(found).items())
-    is_sampled = found.study.control.feedback == "sampled"
+    gain = fitted.study.control.gain_factor or 1.0
+    rows = "\n".join(f"{json.dumps(k)} = {v}" for k, v in machines(fitted).items())
+    is_sampled = fitted.study.control.feedback == "sampled"
     limits = f"[tune.limits]\ngain_margin = {MARGIN}\n" if is_sampled else ""
     return (
-        f"{study_template(found.study)}\n"
+        f"{study_template(fitted.study)}\n"
         "# What moves, and how far: change it to what you can decide.\n"
         "[tune]\n"
         "# objective = { residual_rms = 1.0 }   # metric = weight, relative to this study's\n"
@@ -101,24 +101,24 @@ def _tuning(found: Fitted) -> str:
         f"# {100 * REGION:g} %, about all equally good optima. The controller\n"
         "# knows link.youngs_modulus of each machine; fit link.stiffness_factor for what it does\n"
         "# not know.\n"
-        f"{_warning(found)}"
+        f"{_warning(fitted)}"
         "[tune.scenarios]\ncount = 4   # of them to tune on, with the nominal one\n"
         "check = 16  # others to judge the result\n"
         f"[tune.scenarios.machines]\n{rows}\n"
     )
 
 
-def _warning(found: Fitted) -> str:
-    if found.answer.is_explained:
+def _warning(fitted: Fitted) -> str:
+    if fitted.answer.is_explained:
         return ""
     return (
         "# THE MODEL DOES NOT EXPLAIN THE DATA: these machines are too much alike (see report).\n"
     )
 
 
-def document(found: Fitted) -> str:
+def document(fitted: Fitted) -> str:
     """JSON text of the answer."""
-    answer, free = found.answer, found.spec.free
+    answer, free = fitted.answer, fitted.spec.free
     numbers = [
         {
             "name": name,
@@ -126,50 +126,50 @@ def document(found: Fitted) -> str:
             "sigma": float(answer.sigma[k]),
             "interval_95": [float(x) for x in answer.interval[k]],
         }
-        for k, name in enumerate(found.names)
+        for k, name in enumerate(fitted.names)
     ]
     whole: dict[str, Any] = {
         "format": "flexlink-fit",
         "format_version": 1,
-        "title": found.spec.study.title,
-        "is_good": bool(is_good(found)),
+        "title": fitted.spec.study.title,
+        "is_good": bool(is_good(fitted)),
         "is_explained": bool(answer.is_explained),
-        "is_converged": bool(found.solution.best.is_converged),
-        "messages": sentences(found),
+        "is_converged": bool(fitted.solution.best.is_converged),
+        "messages": sentences(fitted),
         "chi_square": answer.chi_square,
         "freedom": int(answer.freedom),
         "numbers": numbers,
         "undetermined": [
-            {found.names[k]: float(x.parts[k]) for k in x.named()} for x in answer.undetermined
+            {fitted.names[k]: float(x.parts[k]) for k in x.named()} for x in answer.undetermined
         ],
         "equally_good": [
-            {"rise": found.solution.rise(x), "values": named_values(found.spec, free.values(x.u))}
-            for x in found.rivals
+            {"rise": fitted.solution.rise(x), "values": named_values(fitted.spec, free.values(x.u))}
+            for x in fitted.rivals
         ],
         "correlation": answer.correlation.tolist(),
         "held_out": [
             {"name": x.name, "numbers": x.size, "chi_square": x.square, "is_noise": x.is_noise}
-            for x in found.checks
+            for x in fitted.checks
         ],
     }
     return json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def variables(found: Fitted) -> dict[str, Variable]:
+def variables(fitted: Fitted) -> dict[str, Variable]:
     """Labelled numbers of a fit."""
-    answer, axis = found.answer, ("number",)
+    answer, axis = fitted.answer, ("number",)
     part = {
-        "number": Variable(np.array(found.names), axis, "1", "parameter"),
+        "number": Variable(np.array(fitted.names), axis, "1", "parameter"),
         "value": Variable(answer.values, axis, "1", "fitted, in the field's unit"),
         "sigma": Variable(answer.sigma, axis, "1", "standard deviation, in the field's unit"),
         "interval": Variable(answer.interval, (*axis, "end"), "1", "95 %, in the field's unit"),
         "correlation": Variable(answer.correlation, (*axis, "other"), "1", "of the numbers"),
     }
-    if found.posterior is not None:
+    if fitted.posterior is not None:
         part["sample"] = Variable(
-            found.posterior.values, ("draw", *axis), "1", "posterior, in the field's unit"
+            fitted.posterior.values, ("draw", *axis), "1", "posterior, in the field's unit"
         )
-    for k, (name, _, one) in enumerate(found.comparisons):
+    for k, (name, _, one) in enumerate(fitted.comparisons):
         point = (f"point_{k}",)
         if isinstance(one, Line):
             x, unit = Variable(one.x, point, "1", one.abscissa), one.ordinate

@@ -46,13 +46,13 @@ class Common(Section):
     check: bool = described(False, "-", "held out: compared, not fitted")
 
 
-class AtPose(Common):
+class PoseEntry(Common):
     """Fields of measurements at a pose."""
 
     pose: Pose | None = described(None, "m; m; rad", "of the platform; default: first way-point")
 
 
-class ModesEntry(AtPose):
+class ModesEntry(PoseEntry):
     """Natural frequencies and damping ratios."""
 
     frequency_hz: tuple[Positive, ...] = described(..., "Hz", "measured", min_length=1)
@@ -74,26 +74,26 @@ class ModesEntry(AtPose):
     link: int = described(1, "1", "with ends = 'held'", ge=1, le=3)
 
 
-class Seen(Common):
+class OutputEntry(Common):
     """Fields of measurements of one output."""
 
     output: str = described(..., "-", "what is measured")
 
 
-class FileEntry(Seen):
+class FileEntry(OutputEntry):
     """Fields of measurements in a file of columns."""
 
     file: str = described(..., "-", "CSV, HDF5 or UFF, beside this file")
 
 
-class Noisy(Section):
+class NoiseEntry(Section):
     """Standard deviation of the values; both parts in quadrature."""
 
     sigma: Positive | None = described(None, "unit of the output", "standard deviation")
     sigma_percent: Percent | None = described(None, "%", "standard deviation over the value")
 
 
-class ResponseEntry(FileEntry, AtPose, Noisy):
+class ResponseEntry(FileEntry, PoseEntry, NoiseEntry):
     """A frequency response."""
 
     input: str = described(..., "-", "what shakes the machine")
@@ -106,7 +106,7 @@ class ResponseEntry(FileEntry, AtPose, Noisy):
     magnitude: str = described("", "-", "column; instead of real and imaginary part")
 
 
-class SpectrumEntry(FileEntry, AtPose):
+class SpectrumEntry(FileEntry, PoseEntry):
     """A power spectrum under a white input of unknown strength."""
 
     input: str = described(..., "-", "where the white force or voltage acts")
@@ -118,14 +118,14 @@ class SpectrumEntry(FileEntry, AtPose):
     averages: int = described(1, "1", "independent spectra in the mean", ge=1, le=10**6)
 
 
-class TraceEntry(FileEntry, Noisy):
+class TraceEntry(FileEntry, NoiseEntry):
     """A signal over time of the study's motion."""
 
     time: str = described("time", "-", "column [s], from the start of the motion")
     value: str = described("value", "-", "column")
 
 
-class SettlingEntry(Seen):
+class SettlingEntry(OutputEntry):
     """How long a signal takes to settle after the study's motion."""
 
     time_s: float = described(
@@ -143,7 +143,7 @@ class SettlingEntry(Seen):
     links: Flags | None = described(None, "-", "under control; default: those of the study")
 
 
-class FiguresEntry(Common, Noisy):
+class FiguresEntry(Common, NoiseEntry):
     """Metrics of the study's motion, or their reduction by control."""
 
     values: dict[str, float] = described(
@@ -317,7 +317,7 @@ def _entry(written: dict[str, Any], k: int) -> Common:
         entry = model.model_validate(as_tuples(written))
     except ValidationError as error:
         raise explain(error, model, written, inside=path) from None
-    is_bare = isinstance(entry, Noisy) and entry.sigma is None and entry.sigma_percent is None
+    is_bare = isinstance(entry, NoiseEntry) and entry.sigma is None and entry.sigma_percent is None
     if is_bare:
         raise StudyError(
             f"{path}: sigma or sigma_percent is missing; without it the data say nothing about "

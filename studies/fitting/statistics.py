@@ -119,7 +119,7 @@ def describe_fit(
     by_profiles = np.array([np.eye(len(u))[k] / x for k, x in profiled.items()]).reshape(-1, len(u))
     augmented = np.vstack([jacobian, by_profiles])
     covariance, directions = spread(augmented)
-    directions = (*_open(directions, profiled), *directions)
+    directions = (*_unbounded(directions, profiled), *directions)
     sigma_u = np.sqrt(np.diag(covariance))
     for k, x in profiled.items():
         sigma_u[k] = min(x, UNKNOWN)
@@ -162,7 +162,7 @@ def rivals(problem: Problem, solution: Solution, answer: Answer) -> tuple[Optimu
     return tuple(others)
 
 
-def _open(
+def _unbounded(
     directions: tuple[Direction, ...], profiled: Mapping[int, float]
 ) -> tuple[Direction, ...]:
     """Parameters that profiles do not end, unless the derivatives say so already."""
@@ -192,10 +192,10 @@ def spread(jacobian: np.ndarray) -> tuple[np.ndarray, tuple[Direction, ...]]:
         sigma = 1 / np.maximum(size, 1e-300)
     covariance = (rows.T / (size**2 + 1 / (10 * UNKNOWN) ** 2)) @ rows
     order = np.argsort(-sigma)
-    return covariance, tuple(Direction(float(sigma[k]), _signed(rows[k])) for k in order)
+    return covariance, tuple(Direction(float(sigma[k]), _fix_sign(rows[k])) for k in order)
 
 
-def _signed(parts: np.ndarray) -> np.ndarray:
+def _fix_sign(parts: np.ndarray) -> np.ndarray:
     return parts * np.sign(parts[np.argmax(np.abs(parts))])
 
 

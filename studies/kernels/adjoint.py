@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from studies.kernels.derivatives import pull_back
-from studies.kernels.fusion import fused, in_order
+from studies.kernels.fusion import fuse_sums, in_order
 from studies.kernels.graph import Graph, Node, is_known
 from studies.kernels.traced import (
     InputLeaf,
@@ -75,16 +75,16 @@ def trace_adjoint(
     pulled = pull_back(graph, results, adjoint_reads[: len(results)], sources)
     before, n = pulled[: len(results)], len(adjoint_reads)
     added = zip(adjoint_reads[len(results) :], pulled[len(results) : n], strict=True)
-    pulled = fused([*before, *(graph.operation("add")(x, y) for x, y in added), *pulled[n:]])
+    pulled = fuse_sums([*before, *(graph.operation("add")(x, y) for x, y in added), *pulled[n:]])
 
     read_back = {id(node) for node in in_order(pulled)}
     kept = [x for x in reads["state"] if id(x) in read_back]
     row = InputLeaf((len(kept),), True)
     places = {id(x): ("input", len(reads["input"]) + k) for k, x in enumerate(kept)}
-    pulled = _moved(pulled, places)
+    pulled = _relocate(pulled, places)
     records = [leaf._replace(is_varying=True) for leaf in inputs if leaf.is_moving]
     return Adjoint(
-        _loop({**leaves, "record": [row]}, fused(results), kept, real),
+        _loop({**leaves, "record": [row]}, fuse_sums(results), kept, real),
         _loop(
             {**leaves, "input": [*inputs, row], "state": turned, "record": records},
             pulled[:n],
@@ -109,7 +109,7 @@ def _loop(
     )
 
 
-def _moved(results: Sequence[Any], places: dict[int, tuple[str, int]]) -> list[Any]:
+def _relocate(results: Sequence[Any], places: dict[int, tuple[str, int]]) -> list[Any]:
     """Results that take some reads, by their identity, from other places."""
     moved: dict[int, Node] = {}
     for node in in_order(results):

@@ -163,7 +163,7 @@ class DifferentiableLoop:
         self._run = jax.custom_jvp(lambda leaves: self._call(self._still_call(n_steps), leaves))
         self._run.defjvp(self._rule, symbolic_zeros=True)
         self._ahead = jax.custom_jvp(self.ahead)
-        self._ahead.defjvp(_no_second)
+        self._ahead.defjvp(_refuse_second)
 
     def __call__(self, leaves: Sequence[Any]) -> list[Any]:
         last: list[Any] = self._run([jnp.asarray(x, self.dtype) for x in leaves])
@@ -199,7 +199,7 @@ class DifferentiableLoop:
     def plain(self) -> TracedLoop:
         """The loop without derivatives."""
         step, *leaves, dtype = self._given
-        still = step, *map(_still, leaves), dtype
+        still = step, *map(_without_tangents, leaves), dtype
         loop: TracedLoop = outside(trace_loop, *still, 0, self._has_routines)
         return loop
 
@@ -343,7 +343,7 @@ _LINEAR = Primitive("kernel_tangents")
 _LINEAR.multiple_results = True
 
 
-def _pushed(*args: Any, linear: _Linear) -> list[Any]:
+def _push(*args: Any, linear: _Linear) -> list[Any]:
     apply = linear.loops.pull if linear.is_transposed else linear.loops.push
     return apply(linear.moving, list(args[: linear.n_points]), list(args[linear.n_points :]))
 
@@ -353,7 +353,7 @@ def _abstract(*args: Any, linear: _Linear) -> list[Any]:
     return [jax.core.ShapedArray((count, *x), dtype) for x in linear.shapes(args)]
 
 
-def _turned_back(cotangents: list[Any], *args: Any, linear: _Linear) -> list[Any]:
+def _transpose(cotangents: list[Any], *args: Any, linear: _Linear) -> list[Any]:
     """Transpose: nothing for the point, and for tangents that are none."""
     points, tangents = args[: linear.n_points], args[linear.n_points :]
     seeds = [ad.instantiate_zeros(x) for x in cotangents]
@@ -365,13 +365,13 @@ def _turned_back(cotangents: list[Any], *args: Any, linear: _Linear) -> list[Any
     return [*[None] * len(points), *kept]
 
 
-def _no_second(*_: Any, **__: Any) -> Any:
+def _refuse_second(*_: Any, **__: Any) -> Any:
     raise NotImplementedError(
         "kernels have first derivatives only; for second ones, take jaxmodel.simulate"
     )
 
 
-def _batched(args: Any, axes: Any, *, linear: _Linear) -> Any:
+def _batch(args: Any, axes: Any, *, linear: _Linear) -> Any:
     """Batching: several numbers at one point together, several points one after the other."""
     n = linear.n_points
     if all(axis is None for axis in axes[:n]):
@@ -394,15 +394,15 @@ def _batched(args: Any, axes: Any, *, linear: _Linear) -> Any:
     return results, [0] * len(results)
 
 
-_LINEAR.def_impl(_pushed)
+_LINEAR.def_impl(_push)
 _LINEAR.def_abstract_eval(_abstract)
-ad.primitive_jvps[_LINEAR] = _no_second
-ad.primitive_transposes[_LINEAR] = _turned_back
-batching.primitive_batchers[_LINEAR] = _batched
-mlir.register_lowering(_LINEAR, mlir.lower_fun(_pushed, multiple_results=True))
+ad.primitive_jvps[_LINEAR] = _refuse_second
+ad.primitive_transposes[_LINEAR] = _transpose
+batching.primitive_batchers[_LINEAR] = _batch
+mlir.register_lowering(_LINEAR, mlir.lower_fun(_push, multiple_results=True))
 
 
-def _still(leaves: Sequence[Any]) -> list[Any]:
+def _without_tangents(leaves: Sequence[Any]) -> list[Any]:
     """The same leaves without tangents."""
     return [x._replace(is_moving=False) if isinstance(x, InputLeaf) else x for x in leaves]
 

@@ -191,7 +191,7 @@ def write_loop(loop: TracedLoop, processor: Processor) -> VectorWriter:
     return writer
 
 
-def _aligned(numbers: Sequence[float], dtype: Any) -> np.ndarray:
+def _align(numbers: Sequence[float], dtype: Any) -> np.ndarray:
     """A copy at an address that any vector may have."""
     size = np.dtype(dtype).itemsize
     room = np.empty(len(numbers) + ALIGNMENT // size, dtype)
@@ -254,7 +254,7 @@ def kept_kernel(
     return Kernel(
         load_code(code, at),
         width,
-        _aligned(numbers, dtype),
+        _align(numbers, dtype),
         Counter(operations),
         better=None if effort == _effort() else better,
     )

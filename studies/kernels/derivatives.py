@@ -111,13 +111,13 @@ _TANGENTS: dict[str, Callable[..., Any]] = {
 }
 
 
-def _chosen(op: Callable[..., Any], is_first: Any, cotangent: Any) -> tuple[Any, Any]:
+def _select(op: Callable[..., Any], is_first: Any, cotangent: Any) -> tuple[Any, Any]:
     """The cotangent for the first of two arguments or for the second."""
     select = op("select_n")
     return select(is_first, 0.0, cotangent), select(is_first, cotangent, 0.0)
 
 
-def _scaled(op: Callable[..., Any], cotangent: Any, slope: Any) -> tuple[Any]:
+def _scale(op: Callable[..., Any], cotangent: Any, slope: Any) -> tuple[Any]:
     return (op("mul")(cotangent, slope),)
 
 
@@ -128,10 +128,10 @@ _COTANGENTS: dict[str, Callable[..., tuple[Any, ...]]] = {
     "mul": lambda op, node, x: (op("mul")(x, node.args[1]), op("mul")(x, node.args[0])),
     "neg": lambda op, node, x: (op("neg")(x),),
     "reciprocal": lambda op, node, x: (op("neg")(op("mul")(x, op("mul")(node, node))),),
-    "select": lambda op, node, x: _chosen(op, node.args[0], x)[::-1],
-    "max": lambda op, node, x: _chosen(op, op("gt")(*node.args), x),
-    "min": lambda op, node, x: _chosen(op, op("lt")(*node.args), x),
+    "select": lambda op, node, x: _select(op, node.args[0], x)[::-1],
+    "max": lambda op, node, x: _select(op, op("gt")(*node.args), x),
+    "min": lambda op, node, x: _select(op, op("lt")(*node.args), x),
     "abs": lambda op, node, x: (op("select_n")(op("lt")(node.args[0], 0.0), x, op("neg")(x)),),
-    "sqrt": lambda op, node, x: _scaled(op, x, op("div")(0.5, node)),
-    "tanh": lambda op, node, x: _scaled(op, x, op("sub")(1.0, op("mul")(node, node))),
+    "sqrt": lambda op, node, x: _scale(op, x, op("div")(0.5, node)),
+    "tanh": lambda op, node, x: _scale(op, x, op("sub")(1.0, op("mul")(node, node))),
 }

@@ -54,7 +54,7 @@ def trace(function: Callable[..., Any], *arguments: Any) -> tuple[Function, Any]
         The traced function, and shapes and types of its result in the result's own tree.
     """
     jaxpr, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
-    return _opened(jaxpr), shapes
+    return _function_of(jaxpr), shapes
 
 
 def literal(atom: Any) -> np.ndarray | None:
@@ -77,7 +77,7 @@ def scan_of(equation: Any) -> Scan | None:
         else:
             n_constants, n_carry = params["num_consts"], params["num_carry"]
         return Scan(
-            body=_opened(params["jaxpr"]),
+            body=_function_of(params["jaxpr"]),
             length=params["length"],
             n_constants=n_constants,
             n_carry=n_carry,
@@ -98,11 +98,11 @@ def call_of(equation: Any) -> Function | None:
     inner = params.get("jaxpr") or params.get("call_jaxpr")
     if inner is None or equation.primitive.name == "scan":
         return None
-    function = _opened(inner)
+    function = _function_of(inner)
     return function if len(function.inputs) == len(equation.invars) else None
 
 
-def _opened(jaxpr: Any) -> Function:
+def _function_of(jaxpr: Any) -> Function:
     body = getattr(jaxpr, "jaxpr", jaxpr)
     values = map(np.asarray, getattr(jaxpr, "consts", ()))
     constants = list(zip(body.constvars, values, strict=True))

@@ -15,7 +15,7 @@ from studies.kernels.graph import Node, is_known
 _SUMS = ("add", "sub", "neg")
 
 
-def fused(results: Sequence[Any]) -> list[Any]:
+def fuse_sums(results: Sequence[Any]) -> list[Any]:
     """The same results with every sum as one chain of `fma`, each rounding once.
 
     Inner sums that nothing else reads become terms of the outer sum; products that nothing else
@@ -68,7 +68,7 @@ def fused(results: Sequence[Any]) -> list[Any]:
     return [replacement(x) for x in results]
 
 
-def _like(operation: str, *args: Any) -> Node:
+def _new_node(operation: str, *args: Any) -> Node:
     is_varying = any(not is_known(x) and x.is_varying for x in args)
     return Node(operation, args, is_varying, False)
 
@@ -77,18 +77,18 @@ def _chain(products: list[tuple[int, Any, Any]], plain: list[tuple[int, Any]]) -
     """Sum of signed products and signed numbers."""
     if all(sign < 0 for sign, *_ in (*products, *plain)):
         turned = [(1, a, b) for _, a, b in products], [(1, x) for _, x in plain]
-        return _like("neg", _chain(*turned))
+        return _new_node("neg", _chain(*turned))
     plain.sort(key=lambda term: -term[0])
     products.sort(key=lambda term: -term[0])
     if plain and plain[0][0] > 0:
         total = plain.pop(0)[1]
     else:
         _, a, b = products.pop(0)
-        total = _like("mul", a, b)
+        total = _new_node("mul", a, b)
     for sign, x in plain:
-        total = _like("add" if sign > 0 else "sub", total, x)
+        total = _new_node("add" if sign > 0 else "sub", total, x)
     for sign, a, b in products:
-        total = _like("fma" if sign > 0 else "fnma", a, b, total)
+        total = _new_node("fma" if sign > 0 else "fnma", a, b, total)
     return total
 
 

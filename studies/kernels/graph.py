@@ -96,19 +96,19 @@ class Graph:
             arguments = [value(atom) for atom in equation.invars]
             scan, inner = scan_of(equation), call_of(equation)
             if scan is not None:
-                results = self._unrolled(scan, arguments)
+                results = self._unroll(scan, arguments)
             elif inner is not None:
-                results = self._inlined(inner, arguments)
+                results = self._inline(inner, arguments)
             else:
                 results = [self._apply(equation, arguments)]
             values |= dict(zip(equation.outvars, results, strict=True))
         return [value(atom) for atom in function.outputs]
 
-    def _inlined(self, inner: Function, inputs: list[np.ndarray]) -> list[Any]:
+    def _inline(self, inner: Function, inputs: list[np.ndarray]) -> list[Any]:
         """A function that is called."""
         return self._evaluate(inner, inputs)
 
-    def _unrolled(self, scan: Scan, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    def _unroll(self, scan: Scan, inputs: list[np.ndarray]) -> list[np.ndarray]:
         first = scan.n_constants + scan.n_carry
         constants, carry, stacked = (
             inputs[: scan.n_constants],
@@ -136,7 +136,7 @@ class Graph:
             return self._each(lambda x: self._power(x, params["y"]), inputs, shape)
         if name == "convert_element_type":
             is_truth = np.dtype(params["new_dtype"]) == bool
-            return self._each(lambda x: self._converted(x, is_truth), inputs, shape)
+            return self._each(lambda x: self._convert(x, is_truth), inputs, shape)
         return self._each(self.operation(name), inputs, shape)
 
     def _each(
@@ -163,7 +163,7 @@ class Graph:
             NotImplementedError: not supported here.
         """
         if name in _COMPARE:
-            return partial(self._compared, name)
+            return partial(self._compare, name)
         method = getattr(self, f"_op_{name}", None)
         if method is None:
             raise NotImplementedError(f"operation {name!r} of the step")
@@ -227,14 +227,14 @@ class Graph:
             return self._op_div(1.0, self._power(a, -y))
         return _tree(self._op_mul, [a] * y) if y else 1.0
 
-    def _converted(self, a: Any, is_truth: bool) -> Any:
+    def _convert(self, a: Any, is_truth: bool) -> Any:
         if is_truth:
-            return self._compared("ne", a, 0.0)
+            return self._compare("ne", a, 0.0)
         if is_known(a):
             return float(a)
         return self._op_select_n(a, 0.0, 1.0) if a.is_truth else a
 
-    def _compared(self, sign: str, a: Any, b: Any) -> Any:
+    def _compare(self, sign: str, a: Any, b: Any) -> Any:
         if is_known(a) and is_known(b):
             return bool(_COMPARE[sign](a, b))
         return self._node(sign, a, b, is_truth=True)
@@ -282,11 +282,11 @@ class Graph:
         return self._op_min(self._op_max(x, low), high)
 
     def _op_sign(self, a: Any) -> Any:
-        up = self._op_select_n(self._compared("gt", a, 0.0), 0.0, 1.0)
-        return self._op_select_n(self._compared("lt", a, 0.0), up, -1.0)
+        up = self._op_select_n(self._compare("gt", a, 0.0), 0.0, 1.0)
+        return self._op_select_n(self._compare("lt", a, 0.0), up, -1.0)
 
     def _op_is_finite(self, a: Any) -> Any:
-        return self._compared("lt", self._op_abs(a), np.inf)
+        return self._compare("lt", self._op_abs(a), np.inf)
 
     def _op_abs(self, a: Any) -> Any:
         return abs(a) if is_known(a) else self._node("abs", a)

@@ -59,7 +59,7 @@ class RoutineGraph(Graph):
 
     def _survey(self, traced: Function, inputs: list[np.ndarray]) -> None:
         """Find the routines."""
-        repeated = _repeated(traced)
+        repeated = _find_repeated(traced)
         self._alive += repeated.values()
         # in the order of their first calls, so that each is given what the others before it return
         for name, inner in repeated.items():
@@ -69,7 +69,7 @@ class RoutineGraph(Graph):
             calls, self._pending_calls = self._pending_calls[name], None
             self._routines[name] = self._routine(inner, calls)
 
-    def _inlined(self, inner: Function, inputs: list[np.ndarray]) -> list[Any]:
+    def _inline(self, inner: Function, inputs: list[np.ndarray]) -> list[Any]:
         name = id(inner.source)
         numbers = [x for array in inputs for x in array.flat]
         if self._pending_calls is not None and name in self._pending_calls:
@@ -80,7 +80,7 @@ class RoutineGraph(Graph):
         elif name in self._routines:
             results = self._called(self._routines[name], numbers)
         else:
-            return super()._inlined(inner, inputs)
+            return super()._inline(inner, inputs)
         return _arrays(results, inner.shapes)
 
     def _new(self, operation: str, args: tuple[Any, ...], place: Any) -> Node:
@@ -106,7 +106,7 @@ class RoutineGraph(Graph):
             routine.positions.append(position)
             routine.parameters.append(self._parameter(routine))
             inputs.append(routine.parameters[-1])
-        outputs = super()._inlined(inner, _arrays(inputs, [x.aval.shape for x in inner.inputs]))
+        outputs = super()._inline(inner, _arrays(inputs, [x.aval.shape for x in inner.inputs]))
         routine.results = [x for array in outputs for x in array.flat]
         routine.size = len(routine.results)
         own, primal = list(routine.parameters), list(routine.results)
@@ -184,7 +184,7 @@ class RoutineGraph(Graph):
         return is_known(x) or self._is_fixed[id(x)]
 
 
-def _repeated(traced: Function) -> dict[int, Function]:
+def _find_repeated(traced: Function) -> dict[int, Function]:
     """Functions of some length that are called more than once, by the identity of their source."""
     count: Counter[int] = Counter()
     inners = {}

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from studies.kernels.derivatives import push_forward
-from studies.kernels.fusion import count_operations, fused, in_order
+from studies.kernels.fusion import count_operations, fuse_sums, in_order
 from studies.kernels.graph import Graph, Node, is_known, objects
 from studies.kernels.routines import Routine, RoutineGraph
 
@@ -151,7 +151,7 @@ def trace_loop(
                 seed.update((id(x), next(along)) for x in mine)
     results = [x for part in graph.trace(step, arguments, real) for x in part.flat]
     results += _tangents(graph, results, [leaf.size for leaf in state], seeds)
-    results, bodies = closed(graph, results)
+    results, bodies = close_routines(graph, results)
     changes = changes_of(results)
     order = needed_by(changes, (x for body in bodies.values() for x in body.fixed))
     return TracedLoop(leaves=stored, changes=changes, order=order, dtype=real, bodies=bodies)
@@ -238,13 +238,13 @@ def _is_state(x: Any, k: int) -> bool:
     return not is_known(x) and x.place == ("state", k)
 
 
-def closed(graph: Graph, results: list[Any]) -> tuple[list[Any], dict[int, Body]]:
+def close_routines(graph: Graph, results: list[Any]) -> tuple[list[Any], dict[int, Body]]:
     """Results with fused sums, and the bodies of the routines that they call.
 
     What nobody wants of a routine is left out, and so are parameters that the rest does not read.
     """
     if not isinstance(graph, RoutineGraph):
-        return fused(results), {}
+        return fuse_sums(results), {}
     calls: dict[int, list[Node]] = {}
     used: dict[int, set[int]] = {}
     routines: dict[int, Routine] = {}
@@ -275,19 +275,21 @@ def closed(graph: Graph, results: list[Any]) -> tuple[list[Any], dict[int, Body]
     bodies, fixed = {}, []
     for name, numbers in used.items():
         outputs = [routines[name].results[k] for k in sorted(numbers)]
-        body, own = _cut(graph, outputs, routines[name])
-        body = fused(body)
+        body, own = _extract_body(graph, outputs, routines[name])
+        body = fuse_sums(body)
         results_of = dict(zip(sorted(numbers), body, strict=True))
         n_parameters = len(routines[name].parameters)
         bodies[name] = Body(results_of, in_order(body), own, n_parameters)
         fixed += own
-    whole = fused([*results, *fixed])
+    whole = fuse_sums([*results, *fixed])
     rest = iter(whole[len(results) :])
     bodies = {name: b._replace(fixed=[next(rest) for _ in b.fixed]) for name, b in bodies.items()}
     return whole[: len(results)], bodies
 
 
-def _cut(graph: RoutineGraph, results: list[Any], routine: Routine) -> tuple[list[Any], list[Node]]:
+def _extract_body(
+    graph: RoutineGraph, results: list[Any], routine: Routine
+) -> tuple[list[Any], list[Node]]:
     """Results with reads in place of what is the same in all calls.
 
     Returns:

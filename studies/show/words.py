@@ -13,7 +13,7 @@ def motion_text(study: Study) -> str:
     motion, load, drive = study.motion, study.load, study.drive
     points = np.array(motion.waypoints, float)[:, :2]
     count = len(points) - 1
-    told = "the platform at rest"
+    moving = "the platform at rest"
     if count:
         longest = 1e3 * np.linalg.norm(np.diff(points, axis=0), axis=1).max()
         times = np.atleast_1d(motion.move_time)
@@ -22,7 +22,7 @@ def motion_text(study: Study) -> str:
         )
         shaper = "no shaper" if study.shaper.kind == "none" else f"shaper {study.shaper.kind}"
         moves = f"{count} move{'s' if count > 1 else ''} of {'up to ' if count > 1 else ''}"
-        told = f"{moves}{longest:.4g} mm in {span} ms{' each' if count > 1 else ''}, {shaper}"
+        moving = f"{moves}{longest:.4g} mm in {span} ms{' each' if count > 1 else ''}, {shaper}"
     disturbances = [
         f"a pulse of {', '.join(f'{x:g}' for x in force)} {unit} on the {where}"
         for force, unit, where in (
@@ -35,7 +35,7 @@ def motion_text(study: Study) -> str:
         disturbances.append(f"force ripple of {drive.ripple:g} N rms")
     if any(study.initial.load_deflection) or any(map(any, study.initial.modal)):
         disturbances.append("links bent at the start")
-    return ", ".join([told, *disturbances])
+    return ", ".join([moving, *disturbances])
 
 
 def control_text(study: Study) -> str:

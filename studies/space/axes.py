@@ -231,7 +231,7 @@ def _numeric_axis(name: str, span: Range, at: Callable[[np.ndarray], np.ndarray]
     return Axis(1, lambda u: {name: at(u[:, 0])}, grid)
 
 
-def _mapped(axis: Axis, convert: Callable[[np.ndarray], Columns], name: str) -> Axis:
+def _map_axis(axis: Axis, convert: Callable[[np.ndarray], Columns], name: str) -> Axis:
     """An axis with one column `name` whose values stand for other columns."""
     return Axis(
         axis.dimensions,
@@ -261,7 +261,7 @@ def _shaper_frequency(written: Any, study: Study, path: str) -> Axis:
     axis = _numbers_axis(written, path)
     for end in _ends(axis):
         checked_value(study, "shaper.frequencies_hz", [float(end)], path)
-    return _mapped(axis, lambda value: {"shaper.frequencies_hz": value[:, None]}, "value")
+    return _map_axis(axis, lambda value: {"shaper.frequencies_hz": value[:, None]}, "value")
 
 
 def _frequency_error(written: Any, study: Study, path: str) -> Axis:
@@ -274,7 +274,7 @@ def _frequency_error(written: Any, study: Study, path: str) -> Axis:
     def convert(error: np.ndarray) -> Columns:
         return {"link.stiffness_factor": (1 + error) ** 2, "frequency_error": error}
 
-    return _mapped(axis, convert, "value")
+    return _map_axis(axis, convert, "value")
 
 
 def _link_subsets(written: Any, study: Study, path: str) -> Axis:
@@ -318,7 +318,10 @@ def _placement(written: Any, study: Study, path: str) -> Axis:
     if kind == "per_link":
         if candidates:
             raise field_error(f"{path}.candidates", candidates, "0 with kind per_link")
-        rooms = [_Room(*room, count, False, path) for room in zip(lengths, pitches, strict=True)]
+        rooms = [
+            _PatchPlacement(*room, count, False, path)
+            for room in zip(lengths, pitches, strict=True)
+        ]
 
         def sample(u: np.ndarray) -> Columns:
             rows = [rooms[i].place(u[:, i * count : (i + 1) * count]) for i in range(3)]
@@ -329,7 +332,7 @@ def _placement(written: Any, study: Study, path: str) -> Axis:
         raise field_error(
             f"{path}.kind", kind, f"'same' or 'per_link' with link.length = {list(lengths)}"
         )
-    room = _Room(lengths.min(), pitches.max(), count, kind == "mirrored", path)
+    room = _PatchPlacement(lengths.min(), pitches.max(), count, kind == "mirrored", path)
     grid = {"patches.centers": room.grid(candidates)} if candidates else None
     if grid is not None and len(grid["patches.centers"]) == 0:
         raise field_error(
@@ -338,7 +341,7 @@ def _placement(written: Any, study: Study, path: str) -> Axis:
     return Axis(room.free, lambda u: {"patches.centers": room.place(u)}, grid)
 
 
-class _Room:
+class _PatchPlacement:
     """Room for sorted patches: the length they leave free, distributed in order."""
 
     def __init__(

@@ -29,9 +29,9 @@ def spread(node: BlockNode, study: Study, seed: int, stride: int = 1000) -> Colu
     """
     method, own = METHODS[node.block.method], None
     if node.block.cases:
-        own = _listed(node, study)
+        own = _list_cases(node, study)
     elif method.points is not None:
-        own = _sampled(node, study, seed)
+        own = _sample(node, study, seed)
     parts = [own] if own is not None else [_grid_of(a, n) for n, a in _axes(node, study).items()]
     parts += [
         spread(child, study, seed + stride * (k + 1), 1000 * stride)
@@ -39,7 +39,7 @@ def spread(node: BlockNode, study: Study, seed: int, stride: int = 1000) -> Colu
     ]
     _check_names(parts, node.path)
     if method.combine == "side by side":
-        return _paired(parts, node.path)
+        return _zip_columns(parts, node.path)
     return _product(parts, node.path)
 
 
@@ -77,7 +77,7 @@ def _check_names(parts: list[Columns], path: str) -> None:
             raise StudyError(f"{path}: {whole} varies as a whole and by its entry {name}")
 
 
-def _paired(parts: list[Columns], path: str) -> Columns:
+def _zip_columns(parts: list[Columns], path: str) -> Columns:
     sizes = [length(columns) for columns in parts]
     if len(set(sizes)) > 1:
         named = ", ".join(
@@ -102,7 +102,7 @@ def _product(parts: list[Columns], path: str) -> Columns:
     return result
 
 
-def _listed(node: BlockNode, study: Study) -> Columns:
+def _list_cases(node: BlockNode, study: Study) -> Columns:
     """Listed cases; fields that a case does not name have the base study's value."""
     path = f"{node.path}.cases"
     for k, case in enumerate(node.block.cases):
@@ -124,7 +124,7 @@ def _listed(node: BlockNode, study: Study) -> Columns:
     return columns
 
 
-def _sampled(node: BlockNode, study: Study, seed: int) -> Columns:
+def _sample(node: BlockNode, study: Study, seed: int) -> Columns:
     axes = _axes(node, study)
     dimensions = sum(axis.dimensions for axis in axes.values())
     points = unit_points(node, dimensions, seed)

@@ -141,7 +141,7 @@ def case_of(structure: Structure, numbers: Numbers) -> Case:
         drive=Drive(*(number(f"drive.{name}") for name in (*Drive._fields[:-1], "locked"))),
         load=Load(*(number(f"load.{name}") for name in Load._fields)),
         initial=Initial(
-            _filled(number("initial.modal"), (3, structure.n_modes), 0.0, xp),
+            _fill(number("initial.modal"), (3, structure.n_modes), 0.0, xp),
             # on a link that is shorter it has no deflection
             xp.minimum(
                 number("initial.load_station"), 0.999 * xp.min(number("link.length"), axis=-1)
@@ -234,7 +234,7 @@ def _path(numbers: Numbers, xp: Any) -> motion.Path:
 
     def times(field: str, rest: float) -> Any:
         time = numbers[field]
-        time = time if time.shape[-1] == 1 else _filled(time, (moves,), rest, xp)
+        time = time if time.shape[-1] == 1 else _fill(time, (moves,), rest, xp)
         return xp.where(is_move, time, rest)
 
     return motion.Path(
@@ -264,7 +264,7 @@ def _control(numbers: Numbers, structure: Structure, xp: Any) -> Control:
     number, law = numbers.__getitem__, LAWS[structure.law]
 
     def filled(field: str, fill: float) -> Any:
-        return _filled(number(field), shape, fill, xp)
+        return _fill(number(field), shape, fill, xp)
 
     exponent = number("control.ratio_exponent")[..., None, None]
     return Control(
@@ -274,7 +274,7 @@ def _control(numbers: Numbers, structure: Structure, xp: Any) -> Control:
         omega=TWO_PI * filled("control.frequencies_hz", 0.0),
         velocity_gain=number("control.velocity_gain"),
         position_gain=number("control.position_gain"),
-        ratio=powered(filled("control.ratios", 0.0), exponent, xp),
+        ratio=signed_power(filled("control.ratios", 0.0), exponent, xp),
         damping=filled("control.damping", -1.0),
         pole_decay=filled("control.pole_decay", 0.0),
         pole_frequency=TWO_PI * filled("control.pole_frequency_hz", 0.0),
@@ -293,7 +293,7 @@ def law_parameters(study: Study, law: Law) -> dict[str, np.ndarray]:
     return {name: fields.each_link(f"{OWN_FIELDS}.{law.name}.{name}")[0] for name in names}
 
 
-def powered(ratio: Any, exponent: Any, xp: Any = np) -> Any:
+def signed_power(ratio: Any, exponent: Any, xp: Any = np) -> Any:
     """|ratio|^exponent with the ratio's sign; a disabled mode (ratio 0) stays disabled."""
     size = xp.abs(ratio)
     power = xp.where(size > 0, xp.where(size > 0, size, 1.0) ** exponent, 0.0)
@@ -301,7 +301,7 @@ def powered(ratio: Any, exponent: Any, xp: Any = np) -> Any:
     return xp.where(exponent == 1, ratio, xp.where(ratio < 0, -power, power))
 
 
-def _filled(table: Any, shape: tuple[int, ...], fill: float, xp: Any) -> Any:
+def _fill(table: Any, shape: tuple[int, ...], fill: float, xp: Any) -> Any:
     """Last axes truncated or padded to a shape; NaN marks missing entries."""
     table = table[(..., *(slice(0, n) for n in shape))]
     added = [(0, n - m) for n, m in zip(shape, table.shape[-len(shape) :], strict=True)]

@@ -14,7 +14,7 @@ from jaxmodel.parameters import Array
 from jaxmodel.simulate import simulate
 from studies.engine.preflight import check_run
 from studies.errors import StudyError
-from studies.fitting.bench import seen_at, with_slopes
+from studies.fitting.bench import with_outputs_at, with_slopes
 from studies.space.free import Place
 from studies.study.cases import as_arrays, case_of
 from studies.study.labels import describe
@@ -94,7 +94,9 @@ class Motions:
 
     def __init__(self, study: Study, place: Place, places: tuple[float, ...]) -> None:
         """Arguments: as `Motion`; and where deflections are measured [m]."""
-        self._study, self._place = seen_at(study, place, places) if places else (study, place)
+        self._study, self._place = (
+            with_outputs_at(study, place, places) if places else (study, place)
+        )
         self._places = places
         self._known: dict[tuple[bool, ...] | None, Motion] = {}
 

@@ -16,7 +16,7 @@ TWO_PI = 2 * np.pi
 OTHER_UNIT = 100.0
 
 
-class _OfBench(Measurement):
+class _BenchMeasurement(Measurement):
     """What responses and spectra share: one input, one output, one pose."""
 
     kind, is_ordered = "response", True
@@ -82,7 +82,7 @@ class _OfBench(Measurement):
         )
 
 
-class ComplexResponse(_OfBench):
+class ComplexResponse(_BenchMeasurement):
     """Real and imaginary part."""
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
@@ -100,7 +100,7 @@ class ComplexResponse(_OfBench):
         return self._line(label, np.abs(self.measured), np.abs(model), values)
 
 
-class Magnitude(_OfBench):
+class Magnitude(_BenchMeasurement):
     """Absolute value alone."""
 
     def residual(self, values: np.ndarray, has_slopes: bool) -> Residual:
@@ -117,7 +117,7 @@ class Magnitude(_OfBench):
         return self._line(f"magnitude [{self._unit}]", self.measured, np.abs(model), values)
 
 
-class Spectrum(_OfBench):
+class Spectrum(_BenchMeasurement):
     """Power spectrum of the output under a white input of unknown strength.
 
     The mean of n periodograms is gamma distributed about the model's. Half the squared residuals
