@@ -154,7 +154,7 @@ def test_residuals_that_are_too_large_are_no_noise():
     scaled = measured(1.3 * r, mean_square=1.69)
     assert scaled.is_noise and scaled.square == pytest.approx(400)
     assert _misfit(scaled) == ["a|b", "400", "1", f"{scaled.autocorrelation:.2f}", "yes"]
-    assert _misfit(measured(2 * r))[2:] == ["4", f"{scaled.autocorrelation:.2f}", "**no**"]
+    assert _misfit(measured(2 * r))[2:] == ["4", f"{scaled.autocorrelation:.2f}", "<b>no</b>"]
 
 
 def test_one_free_number_in_two_is_no_information():
