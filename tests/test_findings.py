@@ -368,7 +368,7 @@ def tuned():
             status=np.array([0] * (n - 1) + [status.SATURATED]),
             watched=np.full(n, 0.03),
             loop=loop,
-            own=OwnRun(size * rng.uniform(0.9, 1.1), own, status.OK, 0.03),
+            own_run=OwnRun(size * rng.uniform(0.9, 1.1), own, status.OK, 0.03),
         )
 
     loops = (
@@ -384,7 +384,7 @@ def tuned():
     nothing = np.full(2, np.nan)
     found = TuneFindings(
         at=at,
-        own=own,
+        baseline=own,
         judged=designs,
         audited=audited,
         linear=nothing,
@@ -406,12 +406,12 @@ FACTOR = {"residual_rms": 1e6, "settling_time": 1e3, "peak_voltage": 1.0}
 def test_a_tuning_s_table_of_the_own_machine():
     _, found, tables, _ = tuned()
     (table,) = tables["On the nominal machine"]
-    designs = [found.own, *found.judged]
+    designs = [found.baseline, *found.judged]
     assert table["design"] == ["baseline", "gains", "all"]
     assert table["file"] == ["`study.toml`", "`tuned_gains.toml`", "`tuned_all.toml`"]
-    assert table["objective"] == [f"{x.own.objective:.4f}" for x in designs]
+    assert table["objective"] == [f"{x.own_run.objective:.4f}" for x in designs]
     for name in NAMES:
-        assert_cells(table[HEADS[name]], [FACTOR[name] * x.own.metrics[name] for x in designs])
+        assert_cells(table[HEADS[name]], [FACTOR[name] * x.own_run.metrics[name] for x in designs])
     assert_cells(table["gain margin"], [x.loop.gain_margin for x in designs])
     assert_cells(table["slowest decay [1/s]"], [x.loop.slowest_decay for x in designs])
     assert_cells(table["spillover"], [x.loop.spillover for x in designs])
@@ -421,7 +421,7 @@ def test_a_tuning_s_table_of_the_own_machine():
 def test_a_tuning_s_table_of_fresh_machines():
     _, found, tables, _ = tuned()
     (table,) = tables["On fresh machines"]
-    designs = [found.own, *found.judged]
+    designs = [found.baseline, *found.judged]
     assert table["objective, mean"] == [f"{x.objective.mean():.4f}" for x in designs]
     assert table["objective, worst"] == [f"{x.objective.max():.4f}" for x in designs]
     for name in NAMES:
@@ -443,7 +443,7 @@ def test_a_tuning_s_table_of_changes_has_each_move_s_own():
     assert table["objective"] == wanted and len(set(wanted)) == 4
     for name in NAMES:
         assert table[name] == [
-            change(x.metrics[name][part].mean(), found.own.metrics[name][part].mean())
+            change(x.metrics[name][part].mean(), found.baseline.metrics[name][part].mean())
             for x in found.judged
             for part in parts
         ]
@@ -508,19 +508,19 @@ def test_placements_are_shown_in_millimetres_along_each_link():
 def test_a_tuning_s_summary_and_recommendation():
     spec, found, _, text = tuned()
     head = " ".join(text.split("## ")[0].split())
-    one, own = found.judged[1], found.own
+    one, own = found.judged[1], found.baseline
     shares = one.objective
 
     def change(name):
-        return f"{100 * (one.own.metrics[name] / own.own.metrics[name] - 1):+.3g} %"
+        return f"{100 * (one.own_run.metrics[name] / own.own_run.metrics[name] - 1):+.3g} %"
 
     for part in (
         f"**Result:** all: residual_rms {change('residual_rms')} "
-        f"({1e6 * one.own.metrics['residual_rms']:.4g} instead of "
-        f"{1e6 * own.own.metrics['residual_rms']:.4g} µm), ",
+        f"({1e6 * one.own_run.metrics['residual_rms']:.4g} instead of "
+        f"{1e6 * own.own_run.metrics['residual_rms']:.4g} µm), ",
         f"settling_time {change('settling_time')} (",
-        f"peak_voltage {change('peak_voltage')} ({one.own.metrics['peak_voltage']:.4g} instead of "
-        f"{own.own.metrics['peak_voltage']:.4g} V)",
+        f"peak_voltage {change('peak_voltage')} ({one.own_run.metrics['peak_voltage']:.4g} "
+        f"instead of {own.own_run.metrics['peak_voltage']:.4g} V)",
         "gain margin 2.38 (7.5 dB) instead of 3.12 (9.9 dB) on the nominal machine",
         "slowest decay +28.8 % (91.8 instead of 71.2 1/s)",
         f"the objective on 3 fresh machines is {100 * shares.mean():.3g} % of the baseline's on "

@@ -364,7 +364,7 @@ def test_own_limits_need_something_to_be_a_share_of():
     checked = SimpleNamespace(spec=spec, families=list(spec.families), goal=objective_of(spec))
     metrics = SimpleNamespace(residual_rms=np.ones((1, 3, 3)), peak_voltage=np.zeros((1, 3)))
     with pytest.raises(StudyError, match="peak_voltage = 'baseline': the baseline has 0"):
-        Evaluator._check_own(checked, np.array([0]), metrics)
+        Evaluator._check_baseline(checked, np.array([0]), metrics)
 
 
 def test_neighbours_of_a_corner_do_not_fail_an_audit(monkeypatch):

@@ -96,15 +96,15 @@ def test_what_is_compared_is_what_its_own_file_gives(compared):
         alone = metrics_of(spec.study.change(**change))
         runs = [metrics_of(scenario(spec, columns, k, **change)) for k in range(2)]
         for name in ("residual_rms", "settling_time", "peak_voltage"):
-            np.testing.assert_allclose(one.own.metrics[name], alone[name].max(), rtol=1e-9)
+            np.testing.assert_allclose(one.own_run.metrics[name], alone[name].max(), rtol=1e-9)
             wanted = [run[name].max() for run in runs]
             np.testing.assert_allclose(one.metrics[name], wanted, rtol=1e-9)
     assert found.uncontrolled.metrics["peak_voltage"].max() == 0 and found.uncontrolled.loop is None
     np.testing.assert_array_equal(own.objective, 1.0)
     without, alone = reference_lines(spec, own, found)
-    before = f"instead of {1e6 * own.own.metrics['residual_rms']:.4g} µm"
+    before = f"instead of {1e6 * own.own_run.metrics['residual_rms']:.4g} µm"
     assert without.endswith(
-        f"residual_rms {1e6 * found.uncontrolled.own.metrics['residual_rms']:.4g} {before}"
+        f"residual_rms {1e6 * found.uncontrolled.own_run.metrics['residual_rms']:.4g} {before}"
     )
     assert alone.startswith(f"gain_factor alone, {gain:.4g} instead of 1 (the best of 8 values")
     assert f"{found.gain_alone.objective.mean():.4f} of the baseline's" in alone
@@ -116,7 +116,7 @@ def test_deflections_below_one_adc_step_are_named(compared):
     np.testing.assert_allclose(found.adc_step, frame_of(*check_run(spec.study)).adc_step)
     designs = [own, found.uncontrolled, found.gain_alone]
     assert resolution_lines(spec, designs, found.adc_step) == []
-    values = sorted(one.own.metrics["residual_rms"] for one in designs)
+    values = sorted(one.own_run.metrics["residual_rms"] for one in designs)
     between = np.array([9.0, values[1] * 1.001, 9.0])
     (line,) = resolution_lines(spec, designs, between)
     told = f"one ADC step of {1e6 * between[1]:.3g} µm: the controller cannot measure these"

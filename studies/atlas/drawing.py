@@ -146,9 +146,9 @@ def mode_skeleton(study: Study, pose: np.ndarray, shape: np.ndarray) -> Skeleton
     factor = min(
         DRAWN * length / max(np.abs(q).max(), 1e-300), DRAWN_POSE * length / max(size.max(), 1e-300)
     )
-    turn = np.array([0.0, 1.0, -1.0])
-    moved = pose + factor * turn[:, None] * shape[:3]
-    return skeleton(study, moved, factor * turn[:, None, None] * q, 1.0)
+    phases = np.array([0.0, 1.0, -1.0])
+    moved = pose + factor * phases[:, None] * shape[:3]
+    return skeleton(study, moved, factor * phases[:, None, None] * q, 1.0)
 
 
 def draw_mode(parts: Skeleton, ax: Axes | None = None) -> Axes:

@@ -154,14 +154,14 @@ def _workspace(findings: AtlasFindings) -> Figure:
 def _participation(findings: AtlasFindings) -> Figure:
     """Participation of the links in the first three bending modes, over the workspace."""
     chart = findings.map
-    turn = len(chart.phi) // 2
+    middle = len(chart.phi) // 2
     figure, axes = new_figure(3, 3, 1.8, False)
     for row in range(3):
         for link in range(3):
             ax = axes[row, link]
-            value = 100 * chart.share[turn, :, :, row, link]
+            value = 100 * chart.share[middle, :, :, row, link]
             image = plots.workspace_map(
-                chart.x, chart.y, value, chart.margin[turn], None, ax, (0.0, 100.0)
+                chart.x, chart.y, value, chart.margin[middle], None, ax, (0.0, 100.0)
             )
             rows, columns = np.nonzero(np.isfinite(value))
             ax.set_xlim(1e3 * chart.x[columns.min() - 1], 1e3 * chart.x[columns.max() + 1])
@@ -241,8 +241,8 @@ def _vibration_after(findings: AtlasFindings) -> Figure:
         for k, label in enumerate(_ERRORS):
             ax = axes[k, column]
             error = 1e9 * runs.vibration[column, :, :, k]
-            for text, one, style in zip(_SETS, error, plots.SET_STYLES, strict=True):
-                ax.plot(runs.time[part] - end, one[part], **{**style, "label": text})
+            for text, curve, style in zip(_SETS, error, plots.SET_STYLES, strict=True):
+                ax.plot(runs.time[part] - end, curve[part], **{**style, "label": text})
             top = 1.5 * np.abs(error[:, late]).max()
             ax.set_ylim(-top, top)
             ax.margins(x=0.01)

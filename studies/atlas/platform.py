@@ -79,8 +79,8 @@ def platform_error(study: Study, on_progress: Any = None) -> PlatformError:
     built = [
         check_run(study.change(motion__move_time=t, shaper__kind=kind)) for t, kind in SETTINGS
     ]
-    structure = built[0][0]._replace(substeps=max(one.substeps for one, _ in built))
-    first = [one for _, case in built for one in (_with_links(case, LINK_SETS[0]), _rigid(case))]
+    structure = built[0][0]._replace(substeps=max(x.substeps for x, _ in built))
+    first = [x for _, case in built for x in (_with_links(case, LINK_SETS[0]), _rigid(case))]
     quiet = run_batches(structure, first, on_progress)
     cases = []
     for k, (_, case) in enumerate(built):
@@ -186,7 +186,7 @@ def _response(
     source = np.concatenate([force, platform], axis=1)
     pose = np.eye(3, len(transition))
     output = np.concatenate([np.asarray(matrices.deflection), pose])
-    turn = np.exp(2j * np.pi * share)
+    points = np.exp(2j * np.pi * share)
     return np.stack(
-        [output @ np.linalg.solve(z * np.eye(len(transition)) - transition, source) for z in turn]
+        [output @ np.linalg.solve(z * np.eye(len(transition)) - transition, source) for z in points]
     )

@@ -115,8 +115,8 @@ def _shares(findings: AtlasFindings) -> list[list[str]]:
     game = findings.subsets.removed()[:, ALL_LINKS]
     share = 100 * shapley(game).reshape(len(game), 3, -1)
     cells = (
-        [*(f"{x:.2f}" for x in (*one.sum(axis=1), np.abs(one[:, 1:]).sum())), f"{100 * total:.4g}"]
-        for one, total in zip(share, game[:, -1], strict=True)
+        [*(f"{x:.2f}" for x in (*row.sum(axis=1), np.abs(row[:, 1:]).sum())), f"{100 * total:.4g}"]
+        for row, total in zip(share, game[:, -1], strict=True)
     )
     return _by_setting(findings, cells)
 

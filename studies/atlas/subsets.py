@@ -214,7 +214,7 @@ def read_subsets(path: str | Path) -> Subsets:
     )
     settings = list(dict.fromkeys(setting))
     subset = mask.reshape(len(mask), -1) @ 2 ** np.arange(3 * modes)
-    index = (np.array([settings.index(one) for one in setting]), subset)
+    index = (np.array([settings.index(x) for x in setting]), subset)
     shape = (len(settings), 2 ** (3 * modes))
 
     def scatter(values: np.ndarray, fill: Any = np.nan) -> np.ndarray:

@@ -212,16 +212,16 @@ def bench_sweep(cases: int, console: Console) -> dict[str, Any]:
     data = SHORT_RUNS | {"sweep": SHORT_RUNS["sweep"] | {"count": cases}}
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "sweep"
-        done = run_sweep(parse_sweep(data), out, console=console)
+        result = run_sweep(parse_sweep(data), out, console=console)
         size = sum(file.stat().st_size for file in out.rglob("*.h5"))
         rms = read_sweep(out)["residual_rms"]
     return {
         "work": "sweep",
-        "executor": done.executor,
-        "cases": done.n_run,
-        "configs_per_s": round(done.n_run / done.run_time, 1),
-        "run_s": round(done.run_time, 2),
-        "compile_s": round(done.compile_time, 2),
+        "executor": result.executor,
+        "cases": result.n_run,
+        "configs_per_s": round(result.n_run / result.run_time, 1),
+        "run_s": round(result.run_time, 2),
+        "compile_s": round(result.compile_time, 2),
         "peak_mib": round(peak_memory() / 2**20, 1),
         "file_mib": round(size / 2**20, 1),
         "device": str(jax.devices()[0].device_kind),

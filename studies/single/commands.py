@@ -141,7 +141,7 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
     for heading in ("settling [ms]", "peak voltage [V]"):
         table.add_column(heading)
     for i in range(3):
-        both = [one.result.metrics.residual_rms[i].max() for one in (run, twin) if one is not None]
+        both = [x.result.metrics.residual_rms[i].max() for x in (run, twin) if x is not None]
         table.add_row(
             str(i + 1),
             *(f"{1e6 * x:.4g}" for x in both),

@@ -214,8 +214,8 @@ def _deflection(run: Run, twin: Run | None) -> Figure:
         row[0].axvline(end, color=GREY, linewidth=0.8, linestyle=":")
         row[0].set_ylabel(f"link {link + 1} [µm]")
         if has_rest:
-            seen = (time >= window[0]) & (time <= window[1])
-            _zoom(row[1], [x[seen, link] for x in bent], (end, time[-1]), window)
+            is_shown = (time >= window[0]) & (time <= window[1])
+            _zoom(row[1], [x[is_shown, link] for x in bent], (end, time[-1]), window)
     for ax in axes[-1]:
         ax.set_xlabel("time [ms]")
     if twin is not None:
@@ -231,11 +231,13 @@ def _styles(run: Run, twin: Run | None) -> list[dict[str, Any]]:
 
 
 def _zoom(
-    ax: Axes, seen: list[np.ndarray], span: tuple[float, float], window: tuple[float, float]
+    ax: Axes, curves: list[np.ndarray], span: tuple[float, float], window: tuple[float, float]
 ) -> None:
     """Limit a panel to a span of time and to the size of what is seen in the residual window."""
     ax.axvspan(*window, color=GREY, alpha=0.12, linewidth=0)
     ax.set_xlim(span)
-    size = max((float(np.abs(x).max()) for x in seen if len(x) and np.isfinite(x).all()), default=0)
+    size = max(
+        (float(np.abs(x).max()) for x in curves if len(x) and np.isfinite(x).all()), default=0
+    )
     if size > 0:
         ax.set_ylim(-1.2 * size, 1.2 * size)

@@ -26,8 +26,8 @@ def limits_text(run: Run) -> str:
         "a motor at its limit": float(metrics.motor_saturated_fraction),
     }
     warnings = [
-        f"{100 * share:.2g} % of the samples have {what}"
-        for what, share in shares.items()
+        f"{100 * share:.2g} % of the samples have {event}"
+        for event, share in shares.items()
         if share > 0
     ]
     return f"CAUTION: {'; '.join(warnings)}." if warnings and run.status == status.OK else ""

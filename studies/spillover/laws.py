@@ -64,8 +64,8 @@ def all_laws(design: FixedController, builder: LoopBuilder, plant: PlantVariant)
     def strength(law: Controller) -> np.ndarray:
         """Damping constant that a law gives mode 1 of each link [N s/m], (3,)."""
         padded = pad_channels(law, design.n_patches)
-        seen, driven = builder.spillover_gains(plant, padded)
-        every = np.einsum("irc,ic,icr->ir", driven, _channels(padded).velocity_gain, seen)
+        observation, actuation = builder.spillover_gains(plant, padded)
+        every = np.einsum("irc,ic,icr->ir", actuation, _channels(padded).velocity_gain, observation)
         return np.where(np.abs(every[:, 0]) > ROUNDING * np.abs(every).max(), every[:, 0], 0.0)
 
     modal = controller if control.law == IMSC.name else _design_law(design, IMSC)

@@ -105,8 +105,8 @@ class LoopBuilder:
         study, machine = self._design.study, self._mismatched_case(plant).machine
         is_off, is_overlapping = _placement_faults(machine.patches, machine.beam.length)
         if is_off or is_overlapping:
-            what = "patches leave the link" if is_off else "patches overlap"
-            return f"{plant.mismatch}: {what}"
+            fault = "patches leave the link" if is_off else "patches overlap"
+            return f"{plant.mismatch}: {fault}"
         if not BASES[plant.basis].is_on_chord and study.drive.locked:
             return f"{plant.basis}: its sliders cannot be locked"
         link, joint = study.link, plant.mismatch.joint_inertia

@@ -165,7 +165,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         data = read_sweep(folder)
         y = y or ranking(data)
         parts = (("", y), ("-over-", x), ("-by-", hue))
-        name = "".join(f"{word}{one}" for word, one in parts if one)
+        name = "".join(f"{word}{part}" for word, part in parts if part)
         path = out or folder / f"{re.sub(_NO_NAME, '_', name).strip('_')}.png"
         save_plot(draw(data, x, y, hue), path)
         print_left_out(data, console)

@@ -64,12 +64,12 @@ def audit(spec: TuneSpec, places: np.ndarray | None = None) -> list[Disagreement
     for position, numbers in _cover_numbers(spec).items():
         # as many designs as the tuning has starts, to share its program
         evaluator = Evaluator(spec, [spec.moving[position]] * len(start_families(spec)))
-        own, exact = [], []
+        slopes_by_place, exact = [], []
         for place in np.clip(places, 3 * STEPS[0], 1 - 3 * STEPS[0]):
             slopes, differences = _compare(spec, evaluator, position, numbers, place)
-            own.append(slopes)
+            slopes_by_place.append(slopes)
             exact.append(differences)
-        a, b = np.array(own), np.array(exact)  # (places, figures, numbers)
+        a, b = np.array(slopes_by_place), np.array(exact)  # (places, figures, numbers)
         typical = SMALLEST * np.abs(b).max(axis=(0, 2), keepdims=True)
         size = np.maximum(np.maximum(np.abs(a), np.abs(b)), np.maximum(typical, NEAR_ZERO))
         share = np.where(np.isfinite(a - b), np.abs(a - b) / size, np.inf)
@@ -101,8 +101,8 @@ def _compare(
     spec: TuneSpec, evaluator: Evaluator, position: int, numbers: list[int], place: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """(derivatives by places, differences) of all figures by some numbers, (figures, numbers)."""
-    own, p = spec.free.places(), len(place)
-    place = np.where(spec.moving[position].is_free, place, own)
+    baseline, p = spec.free.places(), len(place)
+    place = np.where(spec.moving[position].is_free, place, baseline)
     unit = np.eye(p)[numbers]
     moved = [k * step * unit for step in STEPS for k in (-2, -1, 1, 2)]
     evaluation = _evaluate(spec, evaluator, place + np.concatenate([np.zeros((1, p)), *moved]))
@@ -137,11 +137,11 @@ def audit_places(spec: TuneSpec, count: int = DESIGNS) -> np.ndarray:
         spec: of the tuning.
         count: how many, (count, p).
     """
-    own, family = spec.free.places(), spec.families[spec.main]
-    points = scipy.stats.qmc.Sobol(len(own), rng=spec.tune.seed).random(16)
-    way = np.where(family.is_free, points - own, 0.0)
-    points = own + way / 2  # where a tuning searches
+    baseline, family = spec.free.places(), spec.families[spec.main]
+    points = scipy.stats.qmc.Sobol(len(baseline), rng=spec.tune.seed).random(16)
+    way = np.where(family.is_free, points - baseline, 0.0)
+    points = baseline + way / 2  # where a tuning searches
     values = np.where(family.is_free, spec.free.values(points), np.nan)
     excess, _ = LinearFidelity(spec, [family]).screen(0, values)
     order = np.argsort(np.maximum(excess, 0.0), kind="stable")
-    return np.concatenate([own + BESIDE * way[order[:1]], points[order[: count - 1]]])
+    return np.concatenate([baseline + BESIDE * way[order[:1]], points[order[: count - 1]]])

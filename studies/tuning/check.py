@@ -27,11 +27,11 @@ from studies.tuning.free import PLACEMENT
 from studies.tuning.linear_fidelity import DesignFigures, loop_figures
 from studies.tuning.objective import (
     allowed_limits,
+    baseline_limits,
     judge_designs,
     largest,
     objective_of,
     objectives,
-    own_limits,
 )
 from studies.tuning.optimise import excess
 from studies.tuning.scenarios import lane_columns, scenario_columns
@@ -49,7 +49,7 @@ class JudgedDesign(NamedTuple):
     status: np.ndarray  # (S,)
     watched: np.ndarray  # from the end of the command to that of the run [s], (S,)
     loop: DesignFigures | None  # None with other feedback than sampled
-    own: OwnRun
+    own_run: OwnRun
     poles: PoleReport | None = None  # where the design's gains follow from poles
 
 
@@ -106,8 +106,8 @@ def patch_centers(spec: TuneSpec, family: Family, values: np.ndarray) -> np.ndar
         family: of the design.
         values: of the free parameters, (p,).
     """
-    placed = _tuned_case(spec, family, family.study(spec.study), values)
-    return np.asarray(placed.machine.patches.center)
+    case = _tuned_case(spec, family, family.study(spec.study), values)
+    return np.asarray(case.machine.patches.center)
 
 
 def _tuned_case(spec: TuneSpec, family: Family, study: Study, values: np.ndarray) -> Case:
@@ -169,10 +169,10 @@ def judge(spec: TuneSpec, designs: list[Study], runs: PlainRuns) -> list[JudgedD
     end = structure.n_steps / spec.study.electronics.sample_rate_hz
     judged = []
     for k, study in enumerate(designs):
-        one = jax.tree.map(lambda x, k=k: x[k], metrics)
+        of_design = jax.tree.map(lambda x, k=k: x[k], metrics)
         codes, watched = by_design.status[k], end - by_design.command_end[k]
-        objective = np.asarray(objectives(goal, one, baseline))
-        values = {name: np.asarray(largest(goal, one, name)) for name in goal.shown}
+        objective = np.asarray(objectives(goal, of_design, baseline))
+        values = {name: np.asarray(largest(goal, of_design, name)) for name in goal.shown}
         judged.append(
             JudgedDesign(
                 objective=np.where(np.isin(codes, status.FINISHED), objective, np.nan)[:count],
@@ -180,7 +180,7 @@ def judge(spec: TuneSpec, designs: list[Study], runs: PlainRuns) -> list[JudgedD
                 status=codes[:count],
                 watched=watched[:count],
                 loop=loop_figures(spec, study) if study.control.feedback == "sampled" else None,
-                own=OwnRun(
+                own_run=OwnRun(
                     objective=float(objective[count]),
                     metrics={name: float(x[count]) for name, x in values.items()},
                     status=int(codes[count]),
@@ -188,7 +188,7 @@ def judge(spec: TuneSpec, designs: list[Study], runs: PlainRuns) -> list[JudgedD
                 ),
             )
         )
-    return [_with_poles(study, one) for study, one in zip(designs, judged, strict=True)]
+    return [_with_poles(study, design) for study, design in zip(designs, judged, strict=True)]
 
 
 def _repeat(cases: Case, count: int) -> Case:
@@ -200,9 +200,9 @@ def _with_poles(study: Study, judged: JudgedDesign) -> JudgedDesign:
     try:
         structure, case = check_run(study)
     except StudyError:
-        nothing = dict.fromkeys(judged.own.metrics, np.nan)
-        return judged._replace(own=OwnRun(np.nan, nothing, status.NON_FINITE, np.nan))
-    has_loop = structure.feedback == "sampled" and judged.own.status != status.UNPLACEABLE
+        nothing = dict.fromkeys(judged.own_run.metrics, np.nan)
+        return judged._replace(own_run=OwnRun(np.nan, nothing, status.NON_FINITE, np.nan))
+    has_loop = structure.feedback == "sampled" and judged.own_run.status != status.UNPLACEABLE
     if not study.control.has_poles or not has_loop:
         return judged
     home = np.array(study.motion.waypoints[0], float)
@@ -247,14 +247,14 @@ def search(spec: TuneSpec, screen: Any) -> RandomSearch:
         part = values[np.minimum(np.arange(first, first + CHUNK), n - 1)]
         part = np.concatenate([np.full((1, part.shape[1]), np.nan), part])
         whole = jax.tree.map(lambda x: np.broadcast_to(x, (layout.size, *x.shape[1:])), numbers)
-        placed = jax.tree.map(np.asarray, build(whole, part[rows // count]))
+        cases = jax.tree.map(np.asarray, build(whole, part[rows // count]))
         started = time.perf_counter()
-        result = jax.tree.map(np.asarray, executor.start(placed).wait())
+        result = jax.tree.map(np.asarray, executor.start(cases).wait())
         spent += time.perf_counter() - started
         metrics = jax.tree.map(split, result.metrics)
-        own, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
-        allowed = allowed_limits(goal, family, own_limits(goal, own))
-        judgement = judge_designs(goal, others, own, allowed)
+        baseline, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
+        allowed = allowed_limits(goal, family, baseline_limits(goal, baseline))
+        judgement = judge_designs(goal, others, baseline, allowed)
         batches.append((*map(np.asarray, judgement), first_residual(goal, metrics)[1:]))
     objective, limits, peaks, residual = (np.concatenate(x)[:n] for x in zip(*batches, strict=True))
     spent -= executor.compile_time

@@ -26,10 +26,10 @@ from studies.tuning.linear_fidelity import LinearFidelity
 from studies.tuning.objective import (
     Objective,
     allowed_limits,
+    baseline_limits,
     judge_with_cotangents,
     largest,
     objective_of,
-    own_limits,
     size,
 )
 from studies.tuning.scenarios import lane_columns, nominal, scenario_columns
@@ -89,9 +89,9 @@ class Evaluator:
             needs_gradient: designs that need derivatives; others can have any, (designs,).
         """
         values = np.where(self.is_free, values, np.nan)
-        own = np.full((1, values.shape[1]), np.nan)
+        unchanged = np.full((1, values.shape[1]), np.nan)
         is_compiled, started = self._executor.compile_time > 0, time.perf_counter()
-        whole = np.concatenate([own, values])[self._rows]
+        whole = np.concatenate([unchanged, values])[self._rows]
         is_differentiated = (np.isfinite(values) & np.reshape(needs_gradient, (-1, 1))).any(axis=1)
         runs = self._executor.differentiate(self._numbers, whole)
         shape = (1 + len(values), self.scenarios)
@@ -101,12 +101,12 @@ class Evaluator:
 
         metrics = jax.tree.map(split, runs.result.metrics)
         codes = split(runs.result.status)
-        self._check_own(codes[0], jax.tree.map(lambda x: x[0], metrics))
-        own_metrics = jax.tree.map(lambda x: x[0], metrics)
-        reached = own_limits(self.goal, own_metrics)
+        self._check_baseline(codes[0], jax.tree.map(lambda x: x[0], metrics))
+        baseline = jax.tree.map(lambda x: x[0], metrics)
+        reached = baseline_limits(self.goal, baseline)
         allowed = [allowed_limits(self.goal, family, reached) for family in self.families]
         designs = jax.tree.map(lambda x: x[1:], metrics)
-        judged = judge_with_cotangents(self.goal, designs, own_metrics, np.stack(allowed))
+        judged = judge_with_cotangents(self.goal, designs, baseline, np.stack(allowed))
         judged = jax.tree.map(np.asarray, judged)
         slopes = self._slopes(runs, judged.cotangents, is_differentiated)
         if is_compiled:
@@ -151,7 +151,7 @@ class Evaluator:
         by_design = slopes.reshape(len(slopes), -1, self.scenarios, slopes.shape[-1])
         return np.swapaxes(by_design.sum(axis=2), 0, 1)
 
-    def _check_own(self, codes: np.ndarray, metrics: Any) -> None:
+    def _check_baseline(self, codes: np.ndarray, metrics: Any) -> None:
         is_bad = ~np.isin(codes, status.FINISHED)
         if is_bad.any():
             k = int(np.argmax(is_bad))

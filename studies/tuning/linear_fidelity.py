@@ -65,12 +65,12 @@ class LinearFidelity:
             families: of each design, in the order given.
         """
         self._spec, self.names, self._links = spec, spec.loop_limits, spec.counted_links
-        own = nominal(spec, None)
-        larger = with_margin_modes(own)
+        baseline = nominal(spec, None)
+        larger = with_margin_modes(baseline)
         self._structure = build_structure(larger)._replace(
             n_frequencies=1, has_noise=False, metrics=(), has_position_gain=spec.has_position_gain
         )
-        self._pose = np.array(own.motion.waypoints[0])
+        self._pose = np.array(baseline.motion.waypoints[0])
         of_family = {
             name: one_study(with_margin_modes(nominal(spec, family)), self._structure)
             for name, family in {family.name: family for family in families}.items()
@@ -196,9 +196,9 @@ def _limit_slopes(
     limits: Array,
     values: Array,
 ) -> tuple[Array, Array]:
-    def figures(x: Array, one: Numbers, limit: Array) -> tuple[Array, Array]:
-        placed = case_of(structure, place(one, x))
-        excess = _excess(structure, names, placed, closed_loop(structure, placed, pose), limit)
+    def figures(x: Array, numbers: Numbers, limit: Array) -> tuple[Array, Array]:
+        case = case_of(structure, place(numbers, x))
+        excess = _excess(structure, names, case, closed_loop(structure, case, pose), limit)
         return excess, excess
 
     def one(design: tuple[Any, ...]) -> tuple[Array, Array]:
@@ -220,10 +220,10 @@ def _screen_batch(
     values: Array,
 ) -> tuple[Array, Array]:
     def one(x: Array) -> tuple[Array, Array]:
-        placed = case_of(structure, place(numbers, x))
-        matrices = closed_loop(structure, placed, pose)
-        rms = linear_residual(structure, placed, matrices)
-        excess = _excess(structure, names, placed, matrices, limits)
+        case = case_of(structure, place(numbers, x))
+        matrices = closed_loop(structure, case, pose)
+        rms = linear_residual(structure, case, matrices)
+        excess = _excess(structure, names, case, matrices, limits)
         return excess, jnp.sqrt(jnp.mean(rms[np.array(links)] ** 2))
 
     return jax.lax.map(one, values)
@@ -248,11 +248,11 @@ def loop_figures(spec: TuneSpec, study: Study) -> DesignFigures:
     )
     plain = structure._replace(n_steps=1, substeps=1)
     matrices = _closed_loop(plain, case, np.array(larger.motion.waypoints[0]))
-    opened, feedback = np.asarray(matrices.open), np.asarray(matrices.feedback)
+    open_loop, feedback = np.asarray(matrices.open), np.asarray(matrices.feedback)
     period = float(case.electronics.period)
 
     def poles(factor: float) -> np.ndarray:
-        return np.linalg.eigvals(opened + factor * feedback)
+        return np.linalg.eigvals(open_loop + factor * feedback)
 
     return DesignFigures(
         gain_margin(poles),

@@ -78,33 +78,33 @@ def tail_weights(count: int, tail: float) -> np.ndarray:
     return np.clip(most - np.arange(count), 0.0, 1.0) / most
 
 
-def objectives(goal: Objective, metrics: Metrics, own: Metrics) -> Array:
+def objectives(goal: Objective, metrics: Metrics, baseline: Metrics) -> Array:
     """Objective in each scenario, (S,); the baseline's is 1.
 
     Args:
         goal: weights.
         metrics: of the design, (S, ...).
-        own: of the baseline in the same scenarios, (S, ...).
+        baseline: of the baseline in the same scenarios, (S, ...).
     """
-    shares = [weight * size(goal, metrics, x) / size(goal, own, x) for x, weight in goal.terms]
+    shares = [weight * size(goal, metrics, x) / size(goal, baseline, x) for x, weight in goal.terms]
     return jnp.sum(jnp.stack(shares), axis=0)
 
 
 def judge_design(
-    goal: Objective, metrics: Metrics, own: Metrics, allowed: Array
+    goal: Objective, metrics: Metrics, baseline: Metrics, allowed: Array
 ) -> tuple[Array, Array, Array]:
     """Judge a design.
 
     Args:
         goal: terms and limits.
         metrics: (S, ...).
-        own: of the baseline, (S, ...).
+        baseline: of the baseline, (S, ...).
         allowed: limits in each scenario, (S, m).
 
     Returns:
         objective (), largest value over limit - 1 (m,), largest values (m,).
     """
-    each = objectives(goal, metrics, own)
+    each = objectives(goal, metrics, baseline)
     weights = tail_weights(each.shape[0], goal.tail)
     values = [largest(goal, metrics, name) for name in goal.limits]
     peaks = jnp.stack(values, axis=1) if values else jnp.zeros((each.shape[0], 0))
@@ -114,10 +114,10 @@ def judge_design(
 
 @partial(jax.jit, static_argnums=0)
 def judge_designs(
-    goal: Objective, metrics: Metrics, own: Metrics, allowed: Array
+    goal: Objective, metrics: Metrics, baseline: Metrics, allowed: Array
 ) -> tuple[Array, Array, Array]:
     """`judge_design` for designs under the same limits, metrics (designs, S, ...)."""
-    return jax.vmap(lambda x: judge_design(goal, x, own, allowed))(metrics)
+    return jax.vmap(lambda x: judge_design(goal, x, baseline, allowed))(metrics)
 
 
 class JudgedDesigns(NamedTuple):
@@ -131,20 +131,20 @@ class JudgedDesigns(NamedTuple):
 
 @partial(jax.jit, static_argnums=0)
 def judge_with_cotangents(
-    goal: Objective, metrics: Metrics, own: Metrics, allowed: Array
+    goal: Objective, metrics: Metrics, baseline: Metrics, allowed: Array
 ) -> JudgedDesigns:
     """Judge designs and differentiate by the metrics.
 
     Args:
         goal: terms and limits.
         metrics: (designs, S, ...).
-        own: of the baseline, (S, ...).
+        baseline: of the baseline, (S, ...).
         allowed: limits in each scenario, (designs, S, m).
     """
 
     def one(metrics: Metrics, allowed: Array) -> JudgedDesigns:
         def figures(x: Metrics) -> tuple[Array, Array]:
-            objective, limits, peaks = judge_design(goal, x, own, allowed)
+            objective, limits, peaks = judge_design(goal, x, baseline, allowed)
             return jnp.concatenate([objective[None], limits]), peaks
 
         values, back, peaks = jax.vjp(figures, metrics, has_aux=True)
@@ -155,17 +155,18 @@ def judge_with_cotangents(
     return jax.vmap(one, out_axes=axes)(metrics, allowed)
 
 
-def own_limits(goal: Objective, own: Metrics) -> np.ndarray:
+def baseline_limits(goal: Objective, baseline: Metrics) -> np.ndarray:
     """The baseline's values, (S, m)."""
-    columns = [np.asarray(largest(goal, own, name)) for name in goal.limits]
-    count = len(jax.tree.leaves(own)[0])
+    columns = [np.asarray(largest(goal, baseline, name)) for name in goal.limits]
+    count = len(jax.tree.leaves(baseline)[0])
     return np.stack(columns, axis=1) if columns else np.zeros((count, 0))
 
 
-def allowed_limits(goal: Objective, family: Family, own: np.ndarray) -> np.ndarray:
-    """Limits of a family's runs in each scenario, (S, m); `own` is from `own_limits`."""
+def allowed_limits(goal: Objective, family: Family, baseline: np.ndarray) -> np.ndarray:
+    """Limits of a family's runs in each scenario, (S, m); `baseline` is from `baseline_limits`."""
     limits = [family.limits[name] for name in goal.limits]
     columns = [
-        own[:, k] if x == BASELINE else np.full(len(own), float(x)) for k, x in enumerate(limits)
+        baseline[:, k] if x == BASELINE else np.full(len(baseline), float(x))
+        for k, x in enumerate(limits)
     ]
-    return np.stack(columns, axis=1) if columns else own
+    return np.stack(columns, axis=1) if columns else baseline

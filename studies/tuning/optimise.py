@@ -84,15 +84,15 @@ def first_places(spec: TuneSpec, evaluator: Evaluator) -> np.ndarray:
     Returns:
         (B, p) between 0 and 1.
     """
-    own, count = spec.free.places(), spec.tune.starts
+    baseline, count = spec.free.places(), spec.tune.starts
     places = []
     for k, family in enumerate(spec.moving):
-        places.append(own[None])
+        places.append(baseline[None])
         if count == 1:
             continue
-        sobol = scipy.stats.qmc.Sobol(len(own), rng=spec.tune.seed)
+        sobol = scipy.stats.qmc.Sobol(len(baseline), rng=spec.tune.seed)
         points = sobol.random(1 << int(np.ceil(np.log2(SCREENED * count))))
-        points = np.where(family.is_free, points, own)
+        points = np.where(family.is_free, points, baseline)
         values = np.where(family.is_free, spec.free.values(points), np.nan)
         beyond, residual = evaluator.linear.screen(k * count, values)
         order = np.lexsort((residual, np.maximum(beyond, 0.0)))
@@ -159,8 +159,8 @@ def advance(spec: TuneSpec, evaluator: Evaluator, at: Progress) -> Progress:
     )
     is_fine &= np.isfinite(at.place).all(axis=1) & ~at.is_frozen
     at = _record(at, evaluation, is_fine)
-    turn = spec.free.slopes(at.place)  # from values to places
-    slope, limit_slope = evaluation.slope * turn, evaluation.limit_slope * turn[:, None]
+    chain = spec.free.slopes(at.place)  # from values to places
+    slope, limit_slope = evaluation.slope * chain, evaluation.limit_slope * chain[:, None]
     merit, merit_slope = _lagrangian(
         at, evaluation.objective, slope, evaluation.limits, limit_slope
     )
@@ -275,14 +275,14 @@ def _hand_on(spec: TuneSpec, at: Progress) -> Progress:
         ]
         if not donors or len(members) < 2:
             continue
-        mine = at.winner(k)
+        own = at.winner(k)
         limits = {j: _limits_in(spec, at, j, family) for j in donors}
         kept = [
             j for j in donors if np.isfinite(limits[j]).all() and not excess(limits[j][None])[0]
         ]
-        best = min(kept, key=lambda j: at.best_objective[j], default=mine)
-        is_kept = at.beyond(mine) == 0
-        if best != mine and (at.best_objective[best] < at.best_objective[mine] or not is_kept):
+        best = min(kept, key=lambda j: at.best_objective[j], default=own)
+        is_kept = at.beyond(own) == 0
+        if best != own and (at.best_objective[best] < at.best_objective[own] or not is_kept):
             worst = max(members, key=lambda j: at.best_objective[j])
             at = _move(spec, at, int(worst), best, limits[best])
     return at
@@ -354,8 +354,8 @@ def optimise(
 def is_compatible(spec: TuneSpec, at: Progress) -> bool:
     """Whether saved progress has the arrays of this tuning; iterations can differ."""
 
-    def forms(one: Progress) -> list[Any]:
-        *arrays, history, descent = one
+    def forms(progress: Progress) -> list[Any]:
+        *arrays, history, descent = progress
         kinds = [np.asarray(x).dtype.kind for x in (history, *arrays, *descent)]
         return [*kinds, np.shape(history)[1:], *map(np.shape, (*arrays, *descent))]
 

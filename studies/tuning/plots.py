@@ -48,8 +48,8 @@ def gains(spec: TuneSpec, findings: TuneFindings) -> Figure:
         axes = figure.subplots(1, len(spec.moves), squeeze=False, sharex=True, sharey=True)[0]
         count = spec.tune.scenarios.check
         for k, (ax, move) in enumerate(zip(axes, spec.moves, strict=True)):
-            for row, one in enumerate(findings.judged):
-                value, first = one.objective[k * count : (k + 1) * count], row == 0
+            for row, design in enumerate(findings.judged):
+                value, first = design.objective[k * count : (k + 1) * count], row == 0
                 ax.plot(
                     value,
                     np.full(len(value), row),
@@ -126,8 +126,8 @@ def front(spec: TuneSpec, findings: TuneFindings, limit: str) -> Figure:
                 label="Pareto front, on fresh machines",
             )
         marks = iter("^vD*P<>")
-        own = findings.own.metrics[limit].max(), findings.own.objective.mean()
-        ax.plot(*own, "s", color="black", label="baseline")
+        baseline = findings.baseline.metrics[limit].max(), findings.baseline.objective.mean()
+        ax.plot(*baseline, "s", color="black", label="baseline")
         for point, family in zip(points, spec.families, strict=True):
             if not family.front:
                 ax.plot(

@@ -22,7 +22,7 @@ from studies.study.resolution import is_deflection, least_step, resolution_text
 from studies.study.spec import Study
 from studies.tuning.check import JudgedDesign, PlainRuns, judge, shown_structure
 from studies.tuning.linear_fidelity import DesignFigures, loop_figures
-from studies.tuning.objective import allowed_limits, judge_designs, objective_of, own_limits
+from studies.tuning.objective import allowed_limits, baseline_limits, judge_designs, objective_of
 from studies.tuning.optimise import KEPT, excess
 from studies.tuning.scenarios import lane_columns, scenario_columns
 from studies.tuning.spec import BASELINE, Family, TuneSpec
@@ -57,7 +57,7 @@ class References(NamedTuple):
     def designs(self) -> list[tuple[str, JudgedDesign]]:
         """Those there are, by their headings."""
         pairs = (WITHOUT, self.uncontrolled), (ALONE, self.gain_alone)
-        return [(name, one) for name, one in pairs if one is not None]
+        return [(name, design) for name, design in pairs if design is not None]
 
 
 def compare(
@@ -84,7 +84,7 @@ def compare(
     if scan is not None and scan.best >= 0:
         others[ALONE] = gain_study(spec, scan.gain_factor[scan.best])
     say(f"the results on {fresh} fresh scenarios")
-    own, *judged = judge(spec, [*designs, *others.values()], runs)
+    baseline, *judged = judge(spec, [*designs, *others.values()], runs)
     count = len(designs) - 1
     compared = dict(zip(others, judged[count:], strict=True))
     if WITHOUT in compared:
@@ -92,7 +92,7 @@ def compare(
     has_adc = is_on and spec.study.control.feedback == "sampled"
     step = frame_of(*check_run(spec.study)).adc_step if has_adc else None
     references = References(compared.get(WITHOUT), scan, compared.get(ALONE), step)
-    return own, judged[:count], references
+    return baseline, judged[:count], references
 
 
 def scan_gain(spec: TuneSpec, runs: PlainRuns) -> GainScan | None:
@@ -143,9 +143,9 @@ def _evaluate(spec: TuneSpec, runs: PlainRuns, values: np.ndarray) -> tuple[np.n
         return x.reshape(1 + len(values), count, *x.shape[1:])
 
     metrics = jax.tree.map(split, result.metrics)
-    own, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
-    allowed = allowed_limits(goal, designs[0], own_limits(goal, own))
-    objective, limits, _ = map(np.asarray, judge_designs(goal, others, own, allowed))
+    baseline, others = (jax.tree.map(lambda x, k=k: x[k], metrics) for k in (0, slice(1, None)))
+    allowed = allowed_limits(goal, designs[0], baseline_limits(goal, baseline))
+    objective, limits, _ = map(np.asarray, judge_designs(goal, others, baseline, allowed))
     is_whole = np.isin(split(result.status)[1:], status.FINISHED).all(axis=1)
     return np.where(is_whole, objective, np.nan), excess(limits)
 
@@ -159,13 +159,13 @@ def _keeps_loop(spec: TuneSpec, value: float) -> bool:
     """Whether a gain factor keeps the limits of the linearised loop."""
     if not spec.loop_limits or spec.study.control.feedback != "sampled":
         return True
-    figures, own = loop_figures(spec, gain_study(spec, value)), None
+    figures, baseline = loop_figures(spec, gain_study(spec, value)), None
     for name in spec.loop_limits:
         limit = spec.tune.limits[name]
         if limit == BASELINE:
-            own = own or loop_figures(spec, spec.study)
+            baseline = baseline or loop_figures(spec, spec.study)
         left = relative_margin(
-            name, figures, getattr(own, name) if limit == BASELINE else float(limit)
+            name, figures, getattr(baseline, name) if limit == BASELINE else float(limit)
         )
         if left < -KEPT:
             return False
@@ -178,17 +178,17 @@ def relative_margin(name: str, figures: DesignFigures, allowed: float) -> float:
     return -share if name == "spillover" else share
 
 
-def reference_lines(spec: TuneSpec, own: JudgedDesign, references: References) -> list[str]:
+def reference_lines(spec: TuneSpec, baseline: JudgedDesign, references: References) -> list[str]:
     """What no control and the gain factor alone achieve, one sentence each.
 
     Args:
         spec: of the tuning.
-        own: the baseline, judged.
+        baseline: the baseline, judged.
         references: what a tuned design has to beat.
     """
     machines = count_text(spec.tune.scenarios.check, "fresh machine")
     lines = []
-    for name, one in references.designs:
+    for name, design in references.designs:
         which = name
         if name == ALONE and references.scan is not None:
             value = references.scan.gain_factor[references.scan.best]
@@ -196,9 +196,9 @@ def reference_lines(spec: TuneSpec, own: JudgedDesign, references: References) -
                 f"{name}, {value:.4g} instead of {spec.study.control.gain_factor:.4g} (the best "
                 f"of {len(references.scan.gain_factor)} values on the scenarios of the tuning)"
             )
-        terms = ", ".join(_term(x, one, own) for x in spec.tune.objective)
+        terms = ", ".join(_term(x, design, baseline) for x in spec.tune.objective)
         lines.append(
-            f"{which}: {one.objective.mean():.4f} of the baseline's objective on {machines}; "
+            f"{which}: {design.objective.mean():.4f} of the baseline's objective on {machines}; "
             f"on its own machine {terms}"
         )
     if references.scan is not None and references.scan.best < 0:
@@ -210,10 +210,10 @@ def reference_lines(spec: TuneSpec, own: JudgedDesign, references: References) -
     return lines
 
 
-def _term(metric: str, one: JudgedDesign, own: JudgedDesign) -> str:
+def _term(metric: str, design: JudgedDesign, baseline: JudgedDesign) -> str:
     """A term of the objective, of a design and of the baseline."""
     unit = METRICS[parse_entries(metric).metric].unit
-    before, after = (number(x.own.metrics[metric], unit) for x in (own, one))
+    before, after = (number(x.own_run.metrics[metric], unit) for x in (baseline, design))
     return f"{metric} {after} instead of {before} {readable(unit)[1]}"
 
 
@@ -232,6 +232,6 @@ def resolution_lines(
     lines = []
     for name in filter(is_deflection, spec.tune.objective):
         step = least_step(name, adc_step, spec.counted_links)
-        values = np.array([one.own.metrics[name] for one in designs])
+        values = np.array([design.own_run.metrics[name] for design in designs])
         lines.append(resolution_text(name, values[np.isfinite(values)], step, "design"))
     return list(filter(None, lines))

@@ -44,7 +44,7 @@ class TuneFindings(NamedTuple):
     """Everything that a tuning found."""
 
     at: Progress
-    own: JudgedDesign  # the baseline
+    baseline: JudgedDesign  # the baseline
     judged: list[JudgedDesign]  # the best design of every family, in the order of `spec.families`
     audited: list[Disagreement]  # at the best design of the family with most parameters
     linear: np.ndarray  # linear residual vibration of each start's best design [m], (B,)
@@ -68,7 +68,7 @@ def report(
     """
     at, search = findings.at, findings.searched
     worst = max(findings.audited, key=lambda entry: entry.share)
-    names = list(findings.own.metrics)
+    names = list(findings.baseline.metrics)
     return page(
         "tuning/report.html",
         images,
@@ -81,7 +81,7 @@ def report(
         names_links=all(parse_entries(name).names_a_link for name in spec.tune.objective),
         lower=LOWER,
         best=_best(spec, findings),
-        references=reference_lines(spec, findings.own, findings.references),
+        references=reference_lines(spec, findings.baseline, findings.references),
         unmeasured=_unmeasured(spec, findings),
         folder=f"{folder}/" if folder else "",
         heads=[headed(x, METRICS[parse_entries(x).metric].unit) for x in names],
@@ -97,9 +97,9 @@ def report(
         alike=ALIKE,
         pole_header=HEADER,
         poles=[
-            (name, difference(one.poles), pole_rows(one.poles))
-            for name, one in _designs(spec, findings)
-            if one.poles is not None
+            (name, difference(design.poles), pole_rows(design.poles))
+            for name, design in _designs(spec, findings)
+            if design.poles is not None
         ],
         centers=_centers(spec, findings) if PLACEMENT in spec.tune.free else [],
         main=spec.families[spec.main].name,
@@ -129,26 +129,27 @@ def ended(spec: TuneSpec, at: Progress) -> str:
 def _best(spec: TuneSpec, findings: TuneFindings) -> dict[str, Any]:
     """The design to recommend, and its figures beside the baseline's, the worse ones last."""
     k = best_family(spec, findings)
-    one, own, family = findings.judged[k], findings.own, spec.families[k]
+    best, baseline, family = findings.judged[k], findings.baseline, spec.families[k]
     gains = [
-        _metric_gain(metric, one, own) for metric in dict.fromkeys((*spec.tune.objective, *SHOWN))
+        _metric_gain(metric, best, baseline)
+        for metric in dict.fromkeys((*spec.tune.objective, *SHOWN))
     ]
-    if one.loop is not None and own.loop is not None:
-        gains += _loop_gains(one.loop, own.loop)
+    if best.loop is not None and baseline.loop is not None:
+        gains += _loop_gains(best.loop, baseline.loop)
     return {
         "family": family.name,
         "file": file_name(spec, family),
         "gains": sorted(gains, key=lambda gain: gain["is_worse"]),
-        "objective": one.objective,
-        "caution": caution(one.loop.gain_margin) if one.loop is not None else "",
+        "objective": best.objective,
+        "caution": caution(best.loop.gain_margin) if best.loop is not None else "",
         "is_violated": findings.at.beyond(findings.at.winner(k)) > 0,
     }
 
 
-def _metric_gain(metric: str, one: JudgedDesign, own: JudgedDesign) -> dict[str, Any]:
+def _metric_gain(metric: str, design: JudgedDesign, baseline: JudgedDesign) -> dict[str, Any]:
     """A metric, of which less is better."""
-    after, before = (float(x.own.metrics[metric]) for x in (one, own))
-    texts = [_value(metric, x.own.metrics, x.own.watched) for x in (one, own)]
+    after, before = (float(x.own_run.metrics[metric]) for x in (design, baseline))
+    texts = [_value(metric, x.own_run.metrics, x.own_run.watched) for x in (design, baseline)]
     unit = readable(METRICS[parse_entries(metric).metric].unit)[1]
     change = "" if any(text.startswith("not") for text in texts) else _percent_change(before, after)
     with_unit = texts[1] if unit == "1" else f"{texts[1]} {unit}"
@@ -175,10 +176,10 @@ def _gain(figure: str, change: str, after: str, before: str, is_worse: bool) -> 
     }
 
 
-def _loop_gains(one: DesignFigures, own: DesignFigures) -> list[dict[str, Any]]:
+def _loop_gains(design: DesignFigures, baseline: DesignFigures) -> list[dict[str, Any]]:
     """Figures of the linearised loop, of which more is better."""
-    margins = [x.gain_margin for x in (one, own)]
-    decays = [x.slowest_decay for x in (one, own)]
+    margins = [x.gain_margin for x in (design, baseline)]
+    decays = [x.slowest_decay for x in (design, baseline)]
     lost = [after < (1 - ALIKE) * before for after, before in (margins, decays)]
     change = _percent_change(decays[1], decays[0])
     return [
@@ -215,21 +216,22 @@ def summary(spec: TuneSpec, findings: TuneFindings) -> list[str]:
     """What improved, one line per family."""
     machines = count_text(spec.tune.scenarios.check, "fresh machine")
     lines = []
-    for k, (family, one) in enumerate(zip(spec.families, findings.judged, strict=True)):
+    for k, (family, design) in enumerate(zip(spec.families, findings.judged, strict=True)):
         is_moving = k < len(spec.moving)
         lost = is_moving and findings.at.beyond(findings.at.winner(k)) > 0
         lines.append(
-            f"{family.name}: {one.objective.mean():.4f} of the baseline's objective on {machines}"
-            + (f", worst {one.objective.max():.4f}" if len(one.objective) > 1 else "")
+            f"{family.name}: {design.objective.mean():.4f} of the baseline's objective "
+            f"on {machines}"
+            + (f", worst {design.objective.max():.4f}" if len(design.objective) > 1 else "")
             + ("; a limit is violated" if lost else "")
         )
-    lines += reference_lines(spec, findings.own, findings.references)
+    lines += reference_lines(spec, findings.baseline, findings.references)
     return lines + _unmeasured(spec, findings)
 
 
 def _unmeasured(spec: TuneSpec, findings: TuneFindings) -> list[str]:
     """Warnings of what is compared though the controller cannot measure it."""
-    designs = [one for _, one in _designs(spec, findings)]
+    designs = [design for _, design in _designs(spec, findings)]
     return resolution_lines(spec, designs, findings.references.adc_step)
 
 
@@ -237,7 +239,7 @@ def _designs(spec: TuneSpec, findings: TuneFindings) -> list[tuple[str, JudgedDe
     """The baseline, the best design of every family, what they have to beat; by name."""
     names = [family.name for family in spec.families]
     compared = findings.references.designs
-    return [(REFERENCE, findings.own), *zip(names, findings.judged, strict=True), *compared]
+    return [(REFERENCE, findings.baseline), *zip(names, findings.judged, strict=True), *compared]
 
 
 def _value(metric: str, values: Mapping[str, Any], watched: float) -> str:
@@ -251,44 +253,45 @@ def _value(metric: str, values: Mapping[str, Any], watched: float) -> str:
 def _own_machine(spec: TuneSpec, findings: TuneFindings, names: list[str]) -> list[list[str]]:
     """Row of each design on the machine of its own file; `names`: of metrics."""
     rows, files = [], ["study.toml", *(file_name(spec, family) for family in spec.moving)]
-    for k, (name, one) in enumerate(_designs(spec, findings)):
-        cells = [_value(metric, one.own.metrics, one.own.watched) for metric in names]
+    for k, (name, design) in enumerate(_designs(spec, findings)):
+        cells = [_value(metric, design.own_run.metrics, design.own_run.watched) for metric in names]
         loop = ["-"] * 3
-        if one.loop is not None:
+        if design.loop is not None:
             loop = [
-                margin_text(one.loop.gain_margin),
-                f"{one.loop.slowest_decay:.4g}",
-                f"{one.loop.spillover:.4g}",
+                margin_text(design.loop.gain_margin),
+                f"{design.loop.slowest_decay:.4g}",
+                f"{design.loop.spillover:.4g}",
             ]
         file = Markup("<code>{}</code>").format(files[k]) if k < len(files) else "-"
-        end = status.REASONS[one.own.status]
-        rows.append([name, file, f"{one.own.objective:.4f}", *cells, *loop, end])
+        end = status.REASONS[design.own_run.status]
+        rows.append([name, file, f"{design.own_run.objective:.4f}", *cells, *loop, end])
     return rows
 
 
 def _fresh(spec: TuneSpec, findings: TuneFindings, names: list[str]) -> list[list[str]]:
     """Row of each design on the worst of all fresh machines and moves; `names`: of metrics."""
     rows = []
-    for name, one in _designs(spec, findings):
-        worst = [int(np.argmax(np.nan_to_num(one.metrics[x], nan=-np.inf))) for x in names]
+    for name, design in _designs(spec, findings):
+        worst = [int(np.argmax(np.nan_to_num(design.metrics[x], nan=-np.inf))) for x in names]
         cells = [
-            _value(x, {x: one.metrics[x][k]}, one.watched[k])
+            _value(x, {x: design.metrics[x][k]}, design.watched[k])
             for x, k in zip(names, worst, strict=True)
         ]
-        objective = [f"{one.objective.mean():.4f}", f"{one.objective.max():.4f}"]
-        rows.append([name, *objective, *cells, _codes(one)])
+        objective = [f"{design.objective.mean():.4f}", f"{design.objective.max():.4f}"]
+        rows.append([name, *objective, *cells, _codes(design)])
     return rows
 
 
 def _changes(spec: TuneSpec, findings: TuneFindings, names: list[str]) -> list[list[str]]:
     """Row of each design and move: changes of the mean over the fresh machines."""
-    count, own, rows = spec.tune.scenarios.check, findings.own, []
-    for name, one in _designs(spec, findings)[1:]:
+    count, baseline, rows = spec.tune.scenarios.check, findings.baseline, []
+    for name, design in _designs(spec, findings)[1:]:
         for k, move in enumerate(spec.moves):
             part = slice(k * count, (k + 1) * count)
-            changes = [_change(1.0, one.objective[part].mean())]
+            changes = [_change(1.0, design.objective[part].mean())]
             changes += [
-                _change(own.metrics[x][part].mean(), one.metrics[x][part].mean()) for x in names
+                _change(baseline.metrics[x][part].mean(), design.metrics[x][part].mean())
+                for x in names
             ]
             rows.append([name, move_label(move) or "-", *changes])
     return rows
@@ -321,10 +324,10 @@ def _limits(spec: TuneSpec, findings: TuneFindings) -> list[tuple[str, list[dict
 
 def _loop_margin(findings: TuneFindings, k: int, name: str, limit: float | str) -> float:
     """How far a figure of the loop is from its limit, as a share of it; nan if not known."""
-    loop, own = findings.judged[k].loop, findings.own.loop
-    if loop is None or own is None:
+    loop, baseline = findings.judged[k].loop, findings.baseline.loop
+    if loop is None or baseline is None:
         return float("nan")
-    allowed = getattr(own, name) if limit == BASELINE else float(limit)
+    allowed = getattr(baseline, name) if limit == BASELINE else float(limit)
     return relative_margin(name, loop, allowed)
 
 

@@ -36,8 +36,8 @@ def variables(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
     }
 
 
-def _text(values: list[str], axis: str, what: str) -> Variable:
-    return Variable(np.array(values), (axis,), "1", what)
+def _text(values: list[str], axis: str, text: str) -> Variable:
+    return Variable(np.array(values), (axis,), "1", text)
 
 
 def _settings(spec: TuneSpec) -> dict[str, Variable]:
@@ -73,9 +73,7 @@ def _starts(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
     is_best[[at.winner(k) for k in range(len(spec.moving))]] = True
     axis, trial = ("start",), ("iteration", "start")
     starts = {
-        "start_family": _text(
-            [one.name for one in family], "start", "family of the starting point"
-        ),
+        "start_family": _text([x.name for x in family], "start", "family of the starting point"),
         "is_best": Variable(is_best, axis, "1", "best of its family"),
         "value": Variable(
             values,
@@ -117,34 +115,34 @@ def _fresh(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
         unit = field_unit(entry.field) if entry else "1"
         fresh[name] = Variable(array, (*axis, *dims), unit, name)
 
-    def each(take: str) -> np.ndarray:
-        return np.stack([getattr(one, take) for one in findings.judged])
+    def each(field: str) -> np.ndarray:
+        return np.stack([getattr(design, field) for design in findings.judged])
 
     fresh["fresh_objective"] = Variable(each("objective"), both, "1", "objective, fresh machines")
     fresh["fresh_status"] = Variable(each("status"), both, *STATUS_LABEL)
-    fresh["baseline_status"] = Variable(findings.own.status, axis, *STATUS_LABEL)
+    fresh["baseline_status"] = Variable(findings.baseline.status, axis, *STATUS_LABEL)
     links = links_text(spec.counted_links)
-    for name, own in findings.own.metrics.items():
+    for name, baseline in findings.baseline.metrics.items():
         unit = METRICS[name.partition("[")[0]].unit
-        values = np.stack([one.metrics[name] for one in findings.judged])
+        values = np.stack([design.metrics[name] for design in findings.judged])
         text = name if parse_entries(name).names_a_link else f"{name}, largest of {links}"
         fresh[f"fresh_{name}"] = Variable(values, both, unit, f"{text}, fresh machines")
         fresh[f"baseline_{name}"] = Variable(
-            own, axis, unit, f"{text}, fresh machines, the baseline"
+            baseline, axis, unit, f"{text}, fresh machines, the baseline"
         )
-        values = np.array([one.own.metrics[name] for one in findings.judged])
+        values = np.array([design.own_run.metrics[name] for design in findings.judged])
         fresh[f"file_{name}"] = Variable(values, ("family",), unit, f"{text}, as the file runs")
-        before = np.array(findings.own.own.metrics[name])
+        before = np.array(findings.baseline.own_run.metrics[name])
         fresh[f"file_baseline_{name}"] = Variable(
             before, (), unit, f"{text}, the baseline's file as it runs"
         )
-    if findings.own.loop is not None:
+    if findings.baseline.loop is not None:
         for name, unit in LOOP_UNITS.items():
-            what = f"{name.replace('_', ' ')} of the linearised loop"
-            values = np.array([_loop_figure(one, name) for one in findings.judged])
-            fresh[name] = Variable(values, ("family",), unit, what)
-            own = np.array(_loop_figure(findings.own, name))
-            fresh[f"baseline_{name}"] = Variable(own, (), unit, f"{what}, the baseline")
+            label = f"{name.replace('_', ' ')} of the linearised loop"
+            values = np.array([_loop_figure(design, name) for design in findings.judged])
+            fresh[name] = Variable(values, ("family",), unit, label)
+            baseline = np.array(_loop_figure(findings.baseline, name))
+            fresh[f"baseline_{name}"] = Variable(baseline, (), unit, f"{label}, the baseline")
     return fresh
 
 
@@ -171,23 +169,26 @@ def _references(spec: TuneSpec, findings: TuneFindings) -> dict[str, Variable]:
     links, references = links_text(spec.counted_links), {}
     scan, axis = findings.references.scan, ("scanned",)
     designs = findings.references.uncontrolled, findings.references.gain_alone
-    for label, text, one in zip(
+    for label, text, design in zip(
         ("uncontrolled", "gain_alone"), (WITHOUT, ALONE), designs, strict=True
     ):
-        if one is None:
+        if design is None:
             continue
         references[f"{label}_objective"] = Variable(
-            one.objective, ("scenario",), "1", f"objective, fresh machines, {text}"
+            design.objective, ("scenario",), "1", f"objective, fresh machines, {text}"
         )
-        references[f"{label}_status"] = Variable(one.status, ("scenario",), *STATUS_LABEL)
-        for name, values in one.metrics.items():
+        references[f"{label}_status"] = Variable(design.status, ("scenario",), *STATUS_LABEL)
+        for name, values in design.metrics.items():
             unit = METRICS[name.partition("[")[0]].unit
             what = name if parse_entries(name).names_a_link else f"{name}, largest of {links}"
             references[f"{label}_{name}"] = Variable(
                 values, ("scenario",), unit, f"{what}, fresh machines, {text}"
             )
             references[f"file_{label}_{name}"] = Variable(
-                np.array(one.own.metrics[name]), (), unit, f"{what}, the baseline's run, {text}"
+                np.array(design.own_run.metrics[name]),
+                (),
+                unit,
+                f"{what}, the baseline's run, {text}",
             )
     if scan is not None:
         best = scan.gain_factor[scan.best] if scan.best >= 0 else np.nan

@@ -184,7 +184,7 @@ def find(spec: TuneSpec, evaluator: Evaluator, at: Progress, phases: Phases) -> 
         tuned_study(spec, family, values[winners[k]] if k < len(winners) else values[0])
         for k, family in enumerate(spec.families)
     ]
-    own, judged, references = compare(spec, designs, partial(phases.begin, "check"))
+    baseline, judged, references = compare(spec, designs, partial(phases.begin, "check"))
     main = int(np.flatnonzero(at.family == spec.main)[0])
     linear = np.concatenate(
         [
@@ -207,7 +207,7 @@ def find(spec: TuneSpec, evaluator: Evaluator, at: Progress, phases: Phases) -> 
     audited = audit(spec, np.stack([(spec.free.places() + best) / 2, best]))
     return TuneFindings(
         at=at,
-        own=own,
+        baseline=baseline,
         judged=judged,
         audited=audited,
         linear=linear,

@@ -39,8 +39,8 @@ def scenario_columns(
             share = 1 + percent / 100 * shift[:, k]
             machines[name] = np.multiply.outer(share, known_field(name, spec.study))
     for name, values in spec.tune.scenarios.machines.items():
-        own = [] if is_fresh else [known_field(name, spec.study)]
-        column = [as_tuples(x) for x in own + others(values, count, is_fresh)]
+        baseline = [] if is_fresh else [known_field(name, spec.study)]
+        column = [as_tuples(x) for x in baseline + others(values, count, is_fresh)]
         if any(isinstance(x, tuple) for x in column):  # one number stands for all links
             column = [x if isinstance(x, tuple) else (x,) * LINKS for x in column]
         machines[name] = column_of(column)
@@ -70,8 +70,8 @@ def lane_columns(
     count = len(next(iter(columns.values())))
     lanes = {name: _repeat(column, len(families)) for name, column in columns.items()}
     for name in sorted({name for family in families if family for name in family.columns}):
-        own = known_field(name, spec.study)
-        values = [family.columns.get(name, own) if family else own for family in families]
+        baseline = known_field(name, spec.study)
+        values = [family.columns.get(name, baseline) if family else baseline for family in families]
         lanes[name] = np.repeat(column_of(values), count, axis=0)
     return {
         name: column

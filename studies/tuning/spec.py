@@ -138,7 +138,9 @@ class TuneSpec(NamedTuple):
     @property
     def counted_links(self) -> tuple[int, ...]:
         """Links over which metrics are taken if none is named, from 0: the controlled ones."""
-        return controlled_links([self.study, *(one.study(self.study) for one in self.families)])
+        return controlled_links(
+            [self.study, *(family.study(self.study) for family in self.families)]
+        )
 
     @property
     def metric_limits(self) -> tuple[str, ...]:
@@ -329,7 +331,9 @@ def _moves(tune: Tune, study: Study) -> tuple[dict[str, Any], ...]:
         if not isinstance(values, list) or not values:
             raise field_error(path, values, "a list of values")
         columns[name] = [checked_value(study, name, value, path) for value in values]
-    return tuple(dict(zip(columns, one, strict=True)) for one in product(*columns.values()))
+    return tuple(
+        dict(zip(columns, combination, strict=True)) for combination in product(*columns.values())
+    )
 
 
 def _check_clashes(tune: Tune, free: FreeNumbers, families: tuple[Family, ...]) -> None:
@@ -418,13 +422,13 @@ def _family(name: str, written: Any, tune: Tune, study: Study, free: FreeNumbers
     if not isinstance(written, dict) or not set(written) <= {"free", "set"}:
         raise field_error(path, written, "{free = [names], set = {field = value}}")
     names = written.get("free", list(tune.free))
-    if not isinstance(names, list) or not all(isinstance(one, str) for one in names):
+    if not isinstance(names, list) or not all(isinstance(free_name, str) for free_name in names):
         raise field_error(f"{path}.free", names, "a list of names of tune.free")
-    for one in names:
-        if one not in tune.free:
-            hint = nearest(one, tune.free)
+    for free_name in names:
+        if free_name not in tune.free:
+            hint = nearest(free_name, tune.free)
             raise StudyError(
-                f"{path}.free: {one!r} is not in tune.free"
+                f"{path}.free: {free_name!r} is not in tune.free"
                 + (f"; did you mean {hint!r}?" if hint else "")
             )
     changes = written.get("set", {})
@@ -484,9 +488,9 @@ def _check_family(family: Family, move: dict[str, Any], study: Study) -> None:
         check_run(changed)
     except StudyError as error:
         raise StudyError(f"{prefix}{error}") from None
-    one, other = build_structure(study), build_structure(changed)
+    structure, changed_structure = build_structure(study), build_structure(changed)
     kept = {"has_poles", "has_position_gain", "has_noise", "substeps"}
-    for field, a, b in zip(one._fields, one, other, strict=True):
+    for field, a, b in zip(structure._fields, structure, changed_structure, strict=True):
         if a != b and field not in kept:
             raise StudyError(
                 f"{prefix}{field} = {shown(b)} where the study has {shown(a)}; allowed: what runs "
