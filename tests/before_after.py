@@ -93,7 +93,7 @@ def arrays(path: Path) -> dict[str, Any]:
 
     def visit(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset):
-            found[_name_before(name)] = item[()]
+            found[_name_before(name)] = np.asarray(item[()])
 
     with h5py.File(path) as file:
         file.visititems(visit)
