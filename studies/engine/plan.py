@@ -215,12 +215,15 @@ def _plant_steps(
 _DRIVE = ("drive.", "machine.slider_mass")
 
 
+_drive_rate = kept_jit()(drive_rate)
+
+
 def _drive_rates(table: CaseTable, structure: Structure, members: np.ndarray) -> np.ndarray:
     columns = {n: c[members] for n, c in table.fields.items() if n.startswith(_DRIVE)}
     case = build_cases(table.study, columns, structure)
     is_many = [len(leaf) > 1 for leaf in jax.tree.leaves(case)]
     if not any(is_many):
-        one = float(drive_rate(jax.tree.map(lambda x: x[0], case)))
+        one = float(_drive_rate(jax.tree.map(lambda x: x[0], case)))
         return np.full(len(members), one)
     axes = jax.tree.map(lambda x: 0 if len(x) > 1 else None, case)
     shared = jax.tree.map(lambda x: x if len(x) > 1 else x[0], case)

@@ -52,9 +52,14 @@ class Code(NamedTuple):
     def respond(self, sensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A sequence (T, 3, K) from rest: actuator values (T, 3, K) and faults (T,)."""
         self.begin()
-        pairs = [self.step(row) for row in sensor]
-        values = np.stack([out for out, _ in pairs]).reshape(sensor.shape)
-        return values, np.array([fault for _, fault in pairs])
+        inputs: np.ndarray = np.ascontiguousarray(sensor, self.real)
+        values = np.empty_like(inputs)
+        step = getattr(self.library, f"{self.name}_step")
+        faults = [
+            step(self.state, _address(row), _address(out))
+            for row, out in zip(inputs, values, strict=True)
+        ]
+        return values, np.array(faults)
 
     def shape(self, reference: np.ndarray) -> np.ndarray:
         """A shaped reference (T, 3), starting at rest in its first row."""

@@ -96,17 +96,18 @@ def _check_clipping(exported: FixedController, run: LoopRun) -> None:
     rail = rail_samples(electronics.sample_rate_hz)
     used = np.isin(np.arange(3), exported.channels.link)[:, None]
     for end in (0.0, float(exported.controller.adc_top)):
-        length = np.zeros(run.codes.shape[1:])
-        for k, code in enumerate(run.codes):
-            length = np.where((code == end) & used, length + 1, 0)
-            if length.max() >= rail:
-                link, patch = np.unravel_index(np.argmax(length), length.shape)
-                raise field_error(
-                    "electronics.conditioner_gain",
-                    electronics.conditioner_gain,
-                    f"so small that the motion does not hold sensor {patch + 1} of link {link + 1} "
-                    f"at an end of the ADC's range for {1e3 * rail / electronics.sample_rate_hz:g} "
-                    f"ms, as until t = {k / electronics.sample_rate_hz:.4g} s: that is taken for a "
-                    "broken sensor (see electronics.conditioner_bias, too)",
-                    "1",
-                )
+        count = np.cumsum((run.codes == end) & used, axis=0)
+        within = count[rail - 1 :].copy()  # of the last `rail` samples
+        within[1:] -= count[:-rail]
+        held = np.argwhere(within == rail)
+        if len(held):
+            k, link, patch = held[0] + (rail - 1, 0, 0)
+            raise field_error(
+                "electronics.conditioner_gain",
+                electronics.conditioner_gain,
+                f"so small that the motion does not hold sensor {patch + 1} of link {link + 1} "
+                f"at an end of the ADC's range for {1e3 * rail / electronics.sample_rate_hz:g} "
+                f"ms, as until t = {k / electronics.sample_rate_hz:.4g} s: that is taken for a "
+                "broken sensor (see electronics.conditioner_bias, too)",
+                "1",
+            )

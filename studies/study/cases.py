@@ -176,7 +176,8 @@ def as_arrays(case: Tree) -> Tree:
 
     def leaf(x: Any) -> Any:
         x = np.asarray(x)
-        return jnp.asarray(x, None if np.issubdtype(x.dtype, np.integer) else real)
+        # converted by NumPy and put there by JAX, without compiling anything
+        return jax.device_put(x if np.issubdtype(x.dtype, np.integer) else x.astype(real))
 
     arrays: Tree = jax.tree.map(leaf, case)
     return arrays
