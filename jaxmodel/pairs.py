@@ -46,9 +46,6 @@ class Pair:
         size = 1 / (self.re * self.re + self.im * self.im + least)
         return Pair(self.re * size, -self.im * size)
 
-    def conjugate(self) -> Pair:
-        return Pair(self.re, -self.im)
-
     def sum(self, axis: int) -> Pair:
         return Pair(jnp.sum(self.re, axis=axis), jnp.sum(self.im, axis=axis))
 

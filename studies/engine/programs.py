@@ -17,7 +17,6 @@ import pickle
 from collections.abc import Callable
 from functools import cache, update_wrapper
 from hashlib import sha256
-from operator import itemgetter
 from pathlib import Path
 from threading import RLock
 from typing import Any
@@ -49,14 +48,15 @@ class KeptFunction:
     ) -> None:
         update_wrapper(self, function)
         self._name = f"{function.__module__}.{function.__qualname__}"
-        self._static = static
+        self._static = static  # ascending
         self._jit = jax.jit(function, static_argnums=static, compiler_options=compiler_options)
 
     def __call__(self, *arguments: Any) -> Any:
         fixed, free = self._split(arguments)
-        if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(free)):
+        is_traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(free))
+        if is_traced or not self._is_kept(fixed):
             return self._jit(*arguments)
-        return self.program(*arguments)(*free)
+        return self._kept(fixed, free, arguments)(*free)
 
     def program(self, *arguments: Any) -> Callable[..., Any]:
         """The program for arguments like these, a function of those that are not static.
@@ -64,8 +64,14 @@ class KeptFunction:
         Called often, it saves finding it anew.
         """
         fixed, free = self._split(arguments)
-        if not is_keeping() or not all(map(is_plain, fixed)):
+        if not self._is_kept(fixed):
             return lambda *free: self._jit(*self._join(fixed, free))
+        return self._kept(fixed, free, arguments)
+
+    def _is_kept(self, fixed: list[Any]) -> bool:
+        return is_keeping() and all(map(is_plain, fixed))
+
+    def _kept(self, fixed: list[Any], free: list[Any], arguments: tuple[Any, ...]) -> Any:
         return program([self._name, *fixed], free, lambda: self._jit.lower(*arguments))
 
     def _split(self, arguments: tuple[Any, ...]) -> tuple[list[Any], list[Any]]:
@@ -74,7 +80,7 @@ class KeptFunction:
 
     def _join(self, fixed: list[Any], free: tuple[Any, ...]) -> list[Any]:
         arguments = list(free)
-        for k, x in sorted(zip(self._static, fixed, strict=True), key=itemgetter(0)):
+        for k, x in zip(self._static, fixed, strict=True):
             arguments.insert(k, x)
         return arguments
 

@@ -349,11 +349,3 @@ def _interrupts() -> Iterator[threading.Event]:
         yield stop
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-class Estimate(NamedTuple):
-    """Estimated time of a sweep."""
-
-    compile_time: float  # of all programs [s]
-    chunk_time: float  # of a chunk of the last one [s]
-    total: float  # compiling and running everything [s]

@@ -170,30 +170,6 @@ def comparison(
     return ax
 
 
-def magnified(
-    time: np.ndarray,
-    without: np.ndarray,
-    controlled: np.ndarray,
-    span: tuple[float, float],
-    limit: float,
-    ax: Axes,
-) -> Axes:
-    """Inset in the upper right of a `comparison`: the responses in `span` [s] and +- `limit`."""
-    low, high = ax.get_ylim()
-    ax.set_yticks([tick for tick in ax.get_yticks() if low <= tick <= high])
-    ax.set_ylim(low, high + 1.1 * (high - low))  # room above the curves
-    inset = ax.inset_axes((0.56, 0.58, 0.42, 0.4))
-    part = (time >= span[0]) & (time <= span[1])
-    inset.plot(time[part], without[part], **WITHOUT | {"linewidth": 1.0})
-    inset.plot(time[part], controlled[part], **CONTROLLED | {"linewidth": 0.6})
-    inset.set_xlim(span)
-    inset.set_ylim(-limit, limit)
-    inset.tick_params(labelsize=SMALL, length=2, pad=1.5)
-    inset.locator_params(nbins=3, axis="y")
-    inset.locator_params(nbins=4, axis="x")
-    return inset
-
-
 def spectrum(
     frequency: np.ndarray,
     without: np.ndarray,

@@ -176,14 +176,7 @@ _metrics = jax.jit(_run_metrics, static_argnums=(0, 1))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _metric_slopes(
-    structure: Structure,
-    place: Place,
-    numbers: Numbers,
-    masks: Array,
-    modes: Array,
-    values: Array,
-) -> Any:
-    run = with_slopes(_run_metrics, 5, is_first=True)
-    slopes, (metrics, code) = run(structure, place, numbers, masks, modes, values)
+def _metric_slopes(structure: Structure, place: Place, *others: Any) -> Any:
+    """As `_run_metrics`, with derivatives by the values."""
+    slopes, (metrics, code) = with_slopes(_run_metrics, 5, is_first=True)(structure, place, *others)
     return metrics, code, slopes
