@@ -10,7 +10,7 @@ import pytest
 from jax.sharding import AxisType, PartitionSpec
 
 from jaxmodel import status
-from studies.engine import batched as module
+from studies.engine import function
 from studies.engine.batched import batched
 from studies.errors import StudyError
 from studies.kernels import bridge, native
@@ -120,7 +120,7 @@ def test_jacobians_and_rounded_loops(rounded, smooth, parameters, monkeypatch):
 
 
 def test_without_kernels_it_is_the_scan(monkeypatch):
-    monkeypatch.setattr(module, "stepper", lambda structure: "scan")
+    monkeypatch.setattr(function, "stepper", lambda structure: "scan")
     traced = jax.make_jaxpr(batched(STUDY, NAMES))(np.ones((2, 3)))
     assert "ffi_call" not in str(traced) and "scan" in str(traced)
 

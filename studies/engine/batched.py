@@ -18,10 +18,10 @@ import numpy as np
 from jaxmodel.case import Case, Structure
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import Result
-from studies.engine.function import BlockFunction, stepper
+from studies.engine.function import BlockFunction, fastest_function
 from studies.engine.plan import STATIC, lane_unit
 from studies.engine.preflight import check_run
-from studies.errors import NoKernelError, StudyError, warn_of_scan
+from studies.errors import StudyError
 from studies.kernels import bridge
 from studies.study.cases import case_of, with_used
 from studies.study.numbers import Numbers, one_study, position, put
@@ -133,15 +133,7 @@ def _batch_program(
     @cache
     def function(lanes: int, count: int) -> BlockFunction:
         free = np.zeros((lanes, count), jax.dtypes.canonicalize_dtype(float))
-
-        def make(kind: str) -> BlockFunction:
-            return BlockFunction(structure, build, free, [], shared, kind)
-
-        try:
-            return make(stepper(structure))
-        except NoKernelError as error:
-            warn_of_scan(error)
-            return make("scan")
+        return fastest_function(structure, build, free, [], shared)
 
     def run(parameters: Array) -> Result:
         n, unit = len(parameters), lane_unit()

@@ -25,10 +25,11 @@ import numpy as np
 
 from jaxmodel.case import Case, Structure
 from jaxmodel.loop import State, step
+from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import Outline, Result, Start, begin, conclude
 from studies.config import is_keeping, processor
 from studies.engine.programs import is_plain, kept_data, program
-from studies.errors import NoKernelError
+from studies.errors import NoKernelError, warn_of_scan
 from studies.kernels import bridge, gpu, llvm, native
 from studies.kernels.equations import Function, call_of, literal, trace
 from studies.kernels.traced import InputLeaf, trace_loop
@@ -44,8 +45,9 @@ KERNEL_SUBSTEPS = 4
 #: How the steps are made, in words.
 STEPPERS = {"kernel": "traced kernel", "gpu": "GPU kernel", "scan": "XLA scan"}
 
-#: Programs whose results contain functions, which cannot be kept on disk.
-_WITH_FUNCTIONS = ("prepare_vjp", "finish_vjp")
+#: Programs that are not kept on disk: functions cannot be, and kernels of tangents have no name
+#: before they are traced.
+_NOT_KEPT = ("prepare_vjp", "finish_vjp", "finish_jvp")
 _FUNCTIONS: dict[Any, BlockFunction] = {}
 _ALONE = Lock()
 
@@ -275,10 +277,27 @@ class BlockFunction:
 
         return result, pull_back
 
-    def _finished(self, name: str, function: Callable[..., Any], varying: list[Any]) -> Any:
-        program = self._compiled(name, function, varying, self._on_device)
+    def jacobian(self, free: Any, own: Any) -> tuple[Result, Metrics]:
+        """Results of a block whose cases share their free numbers, and derivatives by these.
+
+        Args:
+            free: one case's, (p,).
+            own: of the block.
+
+        Returns:
+            results; derivatives of the metrics, (p, lanes, ...).
+        """
+        varying, tangents = self._program(
+            "prepare_jvp", self._prepare_jvp, free, own, self._numbers
+        )
+        return self._finished("finish_jvp", self._finish_jvp, varying, tangents)
+
+    def _finished(
+        self, name: str, function: Callable[..., Any], varying: list[Any], *others: Any
+    ) -> Any:
+        program = self._compiled(name, function, varying, self._on_device, *others)
         began = time.perf_counter()
-        result = jax.block_until_ready(program(varying, self._on_device))
+        result = jax.block_until_ready(program(varying, self._on_device, *others))
         self._note_run(began)
         return result
 
@@ -302,7 +321,7 @@ class BlockFunction:
 
         with self._compiling:
             if name not in self._programs:
-                if self._names and name not in _WITH_FUNCTIONS:
+                if self._names and name not in _NOT_KEPT:
                     self._programs[name] = program([name, *self._names], list(arguments), lower)
                 else:
                     self._programs[name] = lower().compile()
@@ -322,8 +341,21 @@ class BlockFunction:
     def _on_device(self) -> list[Any]:
         return [jnp.asarray(x) for x in self.shared]
 
+    def _judged(
+        self, varying: list[Any], shared: list[Any]
+    ) -> Callable[[list[Any]], tuple[Metrics, Result]]:
+        """Metrics as a function of the leaves that move, and the results."""
+
+        def judged(moving: list[Any]) -> tuple[Metrics, Result]:
+            own = iter(moving)
+            each = zip(varying, self._varying_moves, strict=True)
+            result = self.finish([next(own) if moves else x for x, moves in each], shared)
+            return result.metrics, result
+
+        return judged
+
     def _prepare_vjp(self, free: Any, own: Any, shared: Any) -> Any:
-        def moving(free: Any) -> Any:
+        def moving(free: Any) -> tuple[list[Any], list[Any]]:
             leaves = self.prepare(free, own, shared)
             return self._moving(leaves), leaves
 
@@ -331,14 +363,25 @@ class BlockFunction:
         return leaves, pull_back
 
     def _finish_vjp(self, varying: list[Any], shared: list[Any]) -> Any:
-        def judged(moving: list[Any]) -> Any:
-            own = iter(moving)
-            each = zip(varying, self._varying_moves, strict=True)
-            result = self.finish([next(own) if moves else x for x, moves in each], shared)
-            return result.metrics, result
-
+        judged = self._judged(varying, shared)
         _, pull_back, result = jax.vjp(judged, self._moving(varying), has_aux=True)
         return result, pull_back
+
+    def _prepare_jvp(self, free: Any, own: Any, shared: Any) -> Any:
+        each = jax.vmap(partial(self._leaves, True), (None, 0, None), -1)
+
+        def moving(free: Any) -> tuple[list[Any], list[Any]]:
+            leaves = each(free, own, shared)
+            return self._moving(leaves), leaves
+
+        _, push, leaves = jax.linearize(moving, free, has_aux=True)
+        # one after the other: side by side, factorisations never finish (`config.COMPILER_FLAGS`)
+        return leaves, jax.lax.map(push, jnp.eye(len(free)))
+
+    def _finish_jvp(self, varying: list[Any], shared: list[Any], tangents: list[Any]) -> Any:
+        judged = self._judged(varying, shared)
+        _, push, result = jax.linearize(judged, self._moving(varying), has_aux=True)
+        return result, jax.vmap(push)(tangents)
 
     @cached_property
     def _varying_moves(self) -> list[bool]:
@@ -370,6 +413,17 @@ def block_function(
             del _FUNCTIONS[next(iter(_FUNCTIONS))]
         _FUNCTIONS[key] = BlockFunction(structure, build, free, own, shared, kind)
     return _FUNCTIONS[key]
+
+
+def fastest_function(
+    structure: Structure, build: Build, free: Any, own: Any, shared: Any
+) -> BlockFunction:
+    """As `block_function`; where the kernel is not supported it warns and takes XLA's scan."""
+    try:
+        return block_function(structure, build, free, own, shared)
+    except NoKernelError as error:
+        warn_of_scan(error)
+        return block_function(structure, build, free, own, shared, "scan")
 
 
 def _names(

@@ -259,7 +259,8 @@ def _reach(structure: Structure, numbers: Numbers, pose: Array) -> tuple[Array, 
     return path_status(plant, pose[None])[0], lift(plant, pose)
 
 
-def _at(
+@kept_jit(static_argnums=(0, 1))
+def _plant(
     structure: Structure, place: Place, numbers: Numbers, pose: Array, values: Array
 ) -> tuple[BenchPlant, Array]:
     """The plant, and whether the pose is reached: kinematics are finite everywhere."""
@@ -268,23 +269,30 @@ def _at(
     return bench_plant(structure, placed, pose), path_status(plant, pose[None])[0]
 
 
-def _held_link(
+@kept_jit(static_argnums=(0, 1))
+def _held(
     structure: Structure, place: Place, numbers: Numbers, values: Array
 ) -> tuple[Array, Array]:
     return held_modes(structure, case_of(structure, place(numbers, values)))
 
 
-_plant = kept_jit(static_argnums=(0, 1))(_at)
-_plant_slopes = jax.jit(with_slopes(_at, 4, is_first=True), static_argnums=(0, 1))
-_held = kept_jit(static_argnums=(0, 1))(_held_link)
-_held_slopes = jax.jit(with_slopes(_held_link, 3), static_argnums=(0, 1))
+@kept_jit(static_argnums=(0, 1))
+def _plant_slopes(structure: Structure, place: Place, *others: Any) -> Any:
+    """Derivatives of `_plant` by the values, and what it returns."""
+    return with_slopes(_plant, 4, is_first=True)(structure, place, *others)
+
+
+@kept_jit(static_argnums=(0, 1))
+def _held_slopes(structure: Structure, place: Place, *others: Any) -> Any:
+    """Derivatives of `_held` by the values, and what it returns."""
+    return with_slopes(_held, 3)(structure, place, *others)
 
 
 @kept_jit(static_argnums=(0, 1))
 def _plant_batch(
     structure: Structure, place: Place, numbers: Numbers, pose: Array, values: Array
 ) -> tuple[BenchPlant, Array]:
-    return jax.vmap(partial(_at, structure, place, numbers, pose))(values)
+    return jax.vmap(partial(_plant, structure, place, numbers, pose))(values)
 
 
 class FrequencyResponse(NamedTuple):

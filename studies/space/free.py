@@ -42,8 +42,8 @@ class Placing:
     function: Callable[..., Any]  # of a module
     arguments: tuple[Any, ...]  # hashable
 
-    def __call__(self, numbers: Numbers, values: Array) -> Any:
-        return self.function(*self.arguments, numbers, values)
+    def __call__(self, *others: Any) -> Any:
+        return self.function(*self.arguments, *others)
 
     def __repr__(self) -> str:
         return f"{self.function.__module__}.{self.function.__qualname__}{self.arguments}"

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.case import Structure
-from jaxmodel.metrics import METRICS
+from jaxmodel.case import Case, Structure
+from jaxmodel.metrics import METRICS, Metrics
 from jaxmodel.parameters import Array
-from jaxmodel.simulate import simulate
+from studies.engine.function import fastest_function
+from studies.engine.plan import lane_unit
 from studies.errors import StudyError
-from studies.fitting.bench import with_slopes
 from studies.fitting.kinds.contract import Measurement
 from studies.fitting.kinds.motions import OFF, check_finished, smooth_run
-from studies.space.free import Place
+from studies.space.free import Place, Placing
 from studies.study.cases import case_of
 from studies.study.entries import Entries
 from studies.study.numbers import Numbers
@@ -83,17 +82,28 @@ class Runs:
         """
         key, slopes, outcome = self._kept
         if key != values.tobytes() or (has_slopes and not slopes):
-            masks = np.array([x.links for x in self._switches], float)
-            modes = np.array([x.modes for x in self._switches])
-            structure = self._structure._replace(metrics=tuple(sorted(self._metrics)))
-            run = _metric_slopes if has_slopes else _metrics
-            outcome = run(structure, self._place, self._numbers, masks, modes, values)
-            outcome = jax.tree.map(np.asarray, outcome)
+            outcome = jax.tree.map(np.asarray, self._run_all(values, has_slopes))
             self._kept = values.tobytes(), has_slopes, outcome
-        metrics, code, *by = outcome
-        for one in code:
+        code, *metrics = outcome
+        for one in code[: len(self._switches)]:
             check_finished("figures", int(one))
-        return metrics, *by[: int(has_slopes)]
+        return metrics[: 1 + int(has_slopes)]
+
+    def _run_all(self, values: np.ndarray, has_slopes: bool) -> Any:
+        """Statuses, metrics by name, runs first, and perhaps their derivatives, (p, runs, ...)."""
+        structure = self._structure._replace(metrics=tuple(sorted(self._metrics)))
+        unit, n = lane_unit(), len(self._switches)
+        rows = np.minimum(np.arange(-(-n // unit) * unit), n - 1)  # whole vectors
+        masks = np.array([x.links for x in self._switches], float)[rows]
+        modes = np.array([x.modes for x in self._switches])[rows]
+        free, own = np.tile(values, (len(rows), 1)), (masks, modes)
+        build = Placing(_switched_case, (structure, self._place))
+        run = fastest_function(structure, build, free, own, self._numbers)
+        if not has_slopes:
+            result = run.run(free, own)
+            return result.status, _named(structure, result.metrics)
+        result, slopes = run.jacobian(values, own)
+        return result.status, _named(structure, result.metrics), _named(structure, slopes)
 
     def at(self, switch: Switch) -> int:
         """Place of a run among all of them."""
@@ -141,7 +151,7 @@ class Figures(Measurement):
         root = np.sqrt(size) if one.is_amplitude else size
         if slopes is None:
             return root, None
-        by = np.moveaxis(slopes[name][k : k + 1], -1, 0)  # (p, 1, ...)
+        by = slopes[name][:, k : k + 1]  # (p, 1, ...)
         parts = np.stack([one.entries.take(x)[0][kept] for x in by], axis=-1)  # (entries, p)
         slope = (value @ parts) / (len(value) * size) if size != 0 else parts.sum(0)
         return root, slope / (2 * root) if one.is_amplitude and root > 0 else slope
@@ -151,32 +161,14 @@ def _off(one: Compared) -> Switch:
     return one.switch._replace(links=OFF)
 
 
-def _run_metrics(
-    structure: Structure,
-    place: Place,
-    numbers: Numbers,
-    masks: Array,
-    modes: Array,
-    values: Array,
-) -> Any:
-    changed = case_of(structure, place(numbers, values))
-
-    def one(mask: Array, count: Array) -> Any:
-        control = changed.control._replace(
-            link_mask=jnp.ones_like(changed.control.link_mask) * mask, n_active=count
-        )
-        result = simulate(structure, changed._replace(control=control))
-        named = {name: getattr(result.metrics, name) for name in structure.metrics}
-        return named, result.status
-
-    return jax.vmap(one)(jnp.asarray(masks), jnp.asarray(modes))
+def _switched_case(
+    structure: Structure, place: Place, values: Array, switch: tuple[Array, Array], numbers: Numbers
+) -> Case:
+    """The case of parameters with these links and modes under control."""
+    case, (mask, count) = case_of(structure, place(numbers, values)), switch
+    mask = jnp.ones_like(case.control.link_mask) * mask
+    return case._replace(control=case.control._replace(link_mask=mask, n_active=count))
 
 
-_metrics = jax.jit(_run_metrics, static_argnums=(0, 1))
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def _metric_slopes(structure: Structure, place: Place, *others: Any) -> Any:
-    """As `_run_metrics`, with derivatives by the values."""
-    slopes, (metrics, code) = with_slopes(_run_metrics, 5, is_first=True)(structure, place, *others)
-    return metrics, code, slopes
+def _named(structure: Structure, metrics: Metrics) -> dict[str, Any]:
+    return {name: getattr(metrics, name) for name in structure.metrics}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -13,6 +12,7 @@ from jaxmodel.case import Structure
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import simulate
 from studies.engine.preflight import check_run
+from studies.engine.programs import kept_jit
 from studies.errors import StudyError
 from studies.fitting.bench import with_outputs_at, with_slopes
 from studies.space.free import Place
@@ -128,7 +128,8 @@ def check_finished(name: str, code: int) -> None:
         raise StudyError(f"{name}: the run ends with status {describe(code)}")
 
 
-def _run(
+@kept_jit(static_argnums=(0, 1, 2))
+def _recorded(
     structure: Structure, place: Place, kinds: tuple[str, ...], numbers: Numbers, values: Array
 ) -> Any:
     result = simulate(structure, case_of(structure, place(numbers, values)), has_record=True)
@@ -138,12 +139,11 @@ def _run(
     return signals, (record.time, result.command_end, result.status)
 
 
-_recorded = jax.jit(_run, static_argnums=(0, 1, 2))
-
-
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@kept_jit(static_argnums=(0, 1, 2))
 def _recorded_slopes(
     structure: Structure, place: Place, kinds: tuple[str, ...], numbers: Numbers, values: Array
 ) -> Any:
-    slopes, results = with_slopes(_run, 4, is_first=True)(structure, place, kinds, numbers, values)
+    slopes, results = with_slopes(_recorded, 4, is_first=True)(
+        structure, place, kinds, numbers, values
+    )
     return *results, slopes
