@@ -38,8 +38,7 @@ TESTED = {
 COMPILER_FLAGS = {
     # XLA's default is at most 256 bits; CPUs with 512 take twice the cases per instruction.
     "--xla_cpu_prefer_vector_width": "512",
-    # Run side by side, factorisations of small matrices occasionally hang (jax 0.10), and with
-    # them programs that contain eigenvalue problems (basis loaded).
+    # Fewer factorisations run side by side, see `POOL`.
     "--xla_cpu_enable_concurrency_optimized_scheduler": "false",
     "--xla_backend_extra_options": ",".join(
         (
@@ -53,6 +52,10 @@ COMPILER_FLAGS = {
         )
     ),
 }
+# Threads of XLA's CPU client, by default one per core. Factorisations of many matrices are divided
+# among these threads, and the one that divides waits (jax::ParallelBatchMap, jaxlib 0.10): as many
+# of them side by side as there are threads never finish. Idle threads cost nothing.
+POOL = ("NPROC", 64)
 # Python looks for unreachable cycles after so many new objects. Tracing makes millions that stay:
 # with Python's own numbers, a fifth of a sweep's start went into looking through them.
 GARBAGE, PYTHONS_OWN = (50_000, 50, 50), ((700, 10, 10), (2000, 10, 10))
@@ -104,6 +107,9 @@ def configure(
     new_flags = _extended(old_flags, devices, flags)
     if not is_backend_started():
         os.environ["XLA_FLAGS"] = new_flags
+        name, threads = POOL
+        present = os.environ.get(name, "")
+        os.environ[name] = str(max(threads, int(present) if present.isdecimal() else 0))
     else:
         _require_in_force(old_flags, devices, flags)
     _settings().update("jax_enable_x64", precision == "float64")

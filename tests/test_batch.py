@@ -1,8 +1,5 @@
 """A batch is its members: vmap equals single runs, no member touches another, one compilation."""
 
-import time
-from concurrent.futures import ThreadPoolExecutor
-
 import jax
 import numpy as np
 import pytest
@@ -10,7 +7,6 @@ import pytest
 from jaxmodel import status
 from jaxmodel.metrics import Metrics
 from jaxmodel.simulate import simulate
-from studies.engine.function import one_at_a_time
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study
 
@@ -190,21 +186,3 @@ def test_comparator_can_fail(structure, cases, batch):
     off = Metrics(metrics | {"residual_rms": metrics.residual_rms * (1 + 1e-8)})
     with pytest.raises(AssertionError):
         compare(result, 0, single._replace(metrics=off))
-
-
-def test_programs_with_eigenvalue_problems_run_one_at_a_time():
-    running, most = [], []
-
-    def program(x):
-        running.append(x)
-        most.append(len(running))
-        time.sleep(0.01)
-        running.remove(x)
-        return jax.numpy.full(2, x), [jax.numpy.zeros(3)]
-
-    first, second = one_at_a_time(program), one_at_a_time(program)
-    with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda x: (first, second)[x % 2](x), range(8)))
-    assert max(most) == 1
-    assert [x[0][0] for x in found] == list(range(8))
-    assert all(isinstance(x, np.ndarray) for x in jax.tree.leaves(found))

@@ -115,12 +115,14 @@ def test_import_sets_nothing_and_configure_does(tmp_path):
         # slow enough to compile on any machine to be kept
         "f = jax.jit(jax.hessian(lambda x: jnp.sin(jax.scipy.linalg.expm(x)).sum()))\n"
         "f(jnp.eye(4)).block_until_ready()\n"
-        "print(json.dumps([untouched, started, os.environ['XLA_FLAGS'], config.info()]))\n",
+        "print(json.dumps([untouched, started, os.environ['XLA_FLAGS'], os.environ['NPROC'],\n"
+        "                  config.info()]))\n",
         XLA_FLAGS=f"--xla_cpu_prefer_vector_width=256 {DEVICE_FLAG}=2",
         XDG_CACHE_HOME=str(tmp_path),
         JAX_COMPILATION_CACHE_DIR="",
+        NPROC="2",
     )
-    untouched, started, flags, facts = seen
+    untouched, started, flags, threads, facts = seen
     *untouched, refusal = untouched
     assert untouched == [f"--xla_cpu_prefer_vector_width=256 {DEVICE_FLAG}=2", False, "", False]
     assert refusal == "studies.configure() must be called first"
@@ -128,6 +130,7 @@ def test_import_sets_nothing_and_configure_does(tmp_path):
     width, *others = COMPILER_FLAGS
     added = [f"{name}={COMPILER_FLAGS[name]}" for name in others]
     assert flags.split() == [f"{width}=256", *added, f"{DEVICE_FLAG}=3"]
+    assert threads == "64"  # factorisations side by side never finish with few threads
     assert facts["devices"].startswith("3 x ")
     assert facts["precision"] == "float32"
     assert facts["cache"] == str(tmp_path / "flexlink-studies")

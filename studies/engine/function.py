@@ -49,28 +49,6 @@ STEPPERS = {"kernel": "traced kernel", "gpu": "GPU kernel", "scan": "XLA scan"}
 #: before they are traced.
 _NOT_KEPT = ("prepare_vjp", "finish_vjp", "finish_jvp")
 _FUNCTIONS: dict[Any, BlockFunction] = {}
-_ALONE = Lock()
-
-
-class _Alone:
-    """A compiled program that runs alone, to its end.
-
-    Of two concurrent runs of programs with an eigenvalue problem (basis loaded), XLA's CPU client
-    occasionally never finishes one (jax 0.10), even if nobody waits for the other's results.
-    """
-
-    def __init__(self, program: Callable[..., Any]) -> None:
-        self._program = program
-
-    def __call__(self, *arguments: Any) -> Any:
-        with _ALONE:
-            return jax.block_until_ready(self._program(*arguments))
-
-
-def one_at_a_time(program: Callable[..., Any]) -> Callable[..., Any]:
-    """The program, run alone and to its end; it returns NumPy arrays."""
-    alone = _Alone(program)
-    return lambda *arguments: jax.tree.map(np.asarray, alone(*arguments))
 
 
 def stepper(structure: Structure) -> str:
@@ -273,7 +251,7 @@ class BlockFunction:
             began = time.perf_counter()
             (at_start,) = jax.block_until_ready(_pull(pull_end, cotangents))
             self._note_run(began)
-            return _pull_alone(pull_start, at_start)[0]
+            return jax.block_until_ready(_pull(pull_start, at_start))[0]
 
         return result, pull_back
 
@@ -310,8 +288,7 @@ class BlockFunction:
     ) -> Any:
         """Result of a program that prepares cases."""
         compiled = self._compiled(name, function, *arguments, options=options)
-        with _ALONE:
-            return jax.block_until_ready(compiled(*arguments))
+        return jax.block_until_ready(compiled(*arguments))
 
     def _compiled(
         self, name: str, function: Callable[..., Any], *arguments: Any, options: Any = None
@@ -375,8 +352,7 @@ class BlockFunction:
             return self._moving(leaves), leaves
 
         _, push, leaves = jax.linearize(moving, free, has_aux=True)
-        # one after the other: side by side, factorisations never finish (`config.COMPILER_FLAGS`)
-        return leaves, jax.lax.map(push, jnp.eye(len(free)))
+        return leaves, jax.vmap(push)(jnp.eye(len(free)))
 
     def _finish_jvp(self, varying: list[Any], shared: list[Any], tangents: list[Any]) -> Any:
         judged = self._judged(varying, shared)
@@ -457,9 +433,6 @@ def _conclude(outline: Outline, code: Any, last: State) -> Result:
 @jax.jit
 def _pull(pull_back: Callable[[Any], Any], cotangents: Any) -> Any:
     return jax.vmap(pull_back)(cotangents)
-
-
-_pull_alone = _Alone(_pull)
 
 
 def _find_parts(begin_case: Callable[..., Start], free: Any, own: Any, shared: Any) -> StartParts:

@@ -41,7 +41,6 @@ from jaxmodel.return_difference import (
 )
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.engine.damping import damping_ratios, least_controlled
-from studies.engine.function import one_at_a_time
 from studies.engine.lanes import BLOCK, run_steps
 from studies.engine.programs import kept_jit
 from studies.engine.stability import LoopFigures, loop_report, with_margin_modes
@@ -225,7 +224,7 @@ def _judge_block(
     filled = rows[np.minimum(np.arange(BLOCK), len(rows) - 1)]  # one size, one compilation
     block = jax.tree.map(lambda x: x[filled], cases)
     padded = _respond(structure, block)
-    response, modes, strength = jax.tree.map(lambda x: x[..., : len(rows)], padded)
+    response, modes, strength = jax.tree.map(lambda x: np.asarray(x)[..., : len(rows)], padded)
     response = controlled_first(response, mask, most)
     with np.errstate(all="ignore"):  # non-finite values find no crossing
         ratio = damping_ratios(response, modes, n_links, structure.n_controlled)
@@ -233,7 +232,6 @@ def _judge_block(
 
 
 # compiled without optimisation: it takes a fiftieth of the time
-@one_at_a_time
 @kept_jit(static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
 def _respond(structure: Structure, cases: Case) -> tuple[LoopResponse, AssembledModes, Any]:
     """The loops, their modes and their strength, lanes last."""

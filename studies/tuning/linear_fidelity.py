@@ -15,14 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
 from jaxmodel.kinematics import singularity_distance
 from jaxmodel.linear_residual import linear_residual
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spillover
-from studies.engine.function import one_at_a_time
 from studies.engine.programs import kept_jit
 from studies.engine.stability import gain_margin
 from studies.study.cases import as_arrays, build_case, build_structure, case_of
@@ -126,11 +124,8 @@ class LinearFidelity:
             return np.zeros(len(values)), np.zeros(len(values))
         names = self.names or ("slowest_decay",)
         limits = self._limits[position] if self.names else np.array([STABLE])
-        # a basis with joints solves an eigenvalue problem
-        bases = self._structure.basis, self._structure.controller_basis
-        is_alone = any(BASES[name].has_joints for name in bases)
         evaluate = partial(
-            one_at_a_time(_screen_batch) if is_alone else _screen_batch,
+            _screen_batch,
             self._structure,
             names,
             self._spec.free.place,
