@@ -135,6 +135,12 @@ def keep_programs() -> None:
     _keeps_programs = True
 
 
+def stop_keeping_programs() -> None:
+    """For parts of the user's own: no name tells what files these have read."""
+    global _keeps_programs
+    _keeps_programs = False
+
+
 def is_keeping() -> bool:
     """Whether compiled programs are kept, see `keep_programs`."""
     return _keeps_programs

@@ -13,6 +13,7 @@ import importlib
 import importlib.util
 import os
 import sys
+import sysconfig
 import traceback
 from collections.abc import Iterable
 from pathlib import Path
@@ -24,6 +25,7 @@ from jaxmodel.laws.contract import Law
 from jaxmodel.metrics import METRICS, Metric
 from jaxmodel.table import PartError, Table
 from studies import sources
+from studies.config import stop_keeping_programs
 from studies.errors import StudyError
 from studies.space.methods import METHODS, Method
 from studies.study.labels import RESERVED
@@ -49,6 +51,7 @@ def extend(
     Raises:
         StudyError: no such module, one that fails or is empty, or a name already taken.
     """
+    before = set(sys.modules)
     plugin = _imported(str(module)) if str(module) else None
     for kind, added in (
         ("laws", laws),
@@ -72,9 +75,20 @@ def extend(
     if not any(hasattr(plugin, kind) for kind in ("laws", "metrics", "methods", "targets")):
         raise StudyError(f"{module}: has none of the lists laws, metrics, methods, targets")
     file = Path(str(plugin.__file__)).resolve()
-    if file not in sources.OUTSIDE:
-        sources.OUTSIDE.append(file)
+    stop_keeping_programs()
+    for own in dict.fromkeys([file, *_sources_of(set(sys.modules) - before)]):
+        if own not in sources.OUTSIDE:
+            sources.OUTSIDE.append(own)
     os.environ[VARIABLE] = os.pathsep.join(dict.fromkeys([*_requested_modules(), str(file)]))
+
+
+def _sources_of(names: Iterable[str]) -> list[Path]:
+    """Files of loaded modules that are neither ours nor installed."""
+    files = (getattr(sys.modules.get(name), "__file__", None) for name in sorted(names))
+    paths = [Path(str(file)).resolve() for file in files if str(file).endswith(".py")]
+    installed = [Path(sysconfig.get_path(x)).resolve() for x in ("stdlib", "purelib", "platlib")]
+    installed += [sources.TOP / package for package in sources.PACKAGES]
+    return [x for x in paths if not any(x.is_relative_to(folder) for folder in installed)]
 
 
 def extend_from_environment() -> None:

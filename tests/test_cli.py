@@ -102,7 +102,7 @@ def short_folder(tmp_path_factory):
     out = folder / "my run.h5"
     with contextlib.redirect_stdout(shown):
         main(["simulate", str(folder / "short.toml"), "--out", str(out), "--report"])
-    assert "status: ok" in shown.getvalue() and "[um]" in shown.getvalue()
+    assert "status: ok" in shown.getvalue() and "[µm]" in shown.getvalue()
     assert f"written: {out}\nreport: {folder / 'my run.html'}\n" in shown.getvalue()
     return folder
 

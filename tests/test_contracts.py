@@ -16,7 +16,7 @@ from jaxmodel.laws import LAWS
 from jaxmodel.laws.contract import Law, Parameter, acting_channels, modal_feedback
 from jaxmodel.metrics import METRICS, Metric, is_real
 from jaxmodel.table import Table
-from studies import sources
+from studies import config, sources
 from studies.cli import main
 from studies.engine.columns import PER_CASE
 from studies.engine.executor import Executor
@@ -409,3 +409,19 @@ def test_every_source_of_a_number_is_in_the_digest(tmp_path):
     report = tmp_path / "studies" / "sweeps" / "report.py"
     report.write_bytes(report.read_bytes() + b"\n")
     assert all(sources.digest(*roots, top=tmp_path) == x for roots, x in before.items())
+
+
+def test_modules_that_a_file_of_parts_imports_count_as_its_code(tmp_path, monkeypatch):
+    (tmp_path / "helper_of_parts.py").write_text("SCALE = 1.0\n")
+    (tmp_path / "parts_with_helper.py").write_text("import helper_of_parts\n\nlaws = []\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sources, "OUTSIDE", [])
+    monkeypatch.setenv(VARIABLE, "")
+    monkeypatch.setattr(config, "_keeps_programs", True)
+    extend(tmp_path / "parts_with_helper.py")
+    names = [path.name for path in sources.OUTSIDE]
+    assert names == ["parts_with_helper.py", "helper_of_parts.py"]
+    assert not config.is_keeping()
+    before = sources.digest("jaxmodel")
+    (tmp_path / "helper_of_parts.py").write_text("SCALE = 0.0\n")
+    assert sources.digest("jaxmodel") != before

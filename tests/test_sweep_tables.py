@@ -418,7 +418,7 @@ def test_deflections_below_one_adc_step_are_not_ranked_in_silence(printed):
     with pytest.warns(ResolutionWarning, match="of these 8 cases are below one ADC step of 3 µm"):
         best_cases(data, "residual_rms[link=2]")  # whose step is larger
     assert text in printed(data, "best", "DIR", "--by", "residual_rms")
-    shown = text.replace("2 of these 8 cases are", "1 of these 7 cases are")  # of the safe ones
+    shown = text.replace("2 of these 8 cases are", "1 of these 7 cases is")  # of the safe ones
     assert shown in printed(data, "show", "DIR")
     assert text_of(report(data, "residual_rms", [])).partition("## ")[0].count(shown) == 1
     with warnings.catch_warnings():
@@ -432,7 +432,7 @@ def test_deflections_below_one_adc_step_are_not_ranked_in_silence(printed):
 def test_each_case_has_the_step_of_its_own_converter():
     rms = of_stations(np.array([1e-6, 1e-6]))
     data = with_baseline(made_up({"electronics.adc_bits": [4, 12]}, residual_rms=rms), step=1e-8)
-    text = "1 of these 2 cases are below one ADC step of 2.56 µm"
+    text = "1 of these 2 cases is below one ADC step of 2.56 µm"
     with pytest.warns(ResolutionWarning, match=text):
         best_cases(data, "residual_rms")
 

@@ -73,7 +73,8 @@ def batched(study: Study, names: Sequence[str]) -> Callable[[Array], Result]:
 
 def _positions(study: Study, names: Sequence[str]) -> tuple[Any, ...]:
     """Where the numbers that vary are."""
-    if isinstance(names, str) or not names:
+    is_list = isinstance(names, Sequence) and not isinstance(names, str)
+    if not is_list or not names or not all(isinstance(name, str) for name in names):
         raise StudyError(f"names: {names!r}; expected names of numbers, such as ['drive.kp']")
     for k, name in enumerate(names):
         value = known_field(name, study, f"names[{k}]")
@@ -96,7 +97,7 @@ def _check_shape(count: int, run: Callable[[Array], Result]) -> Callable[[Array]
     def checked(values: Array) -> Result:
         try:
             array = jnp.asarray(values)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise StudyError(f"values: not an array of numbers ({error})") from None
         is_fitting = array.ndim == 2 and len(array) > 0 and array.shape[1] == count
         if not is_fitting or jnp.iscomplexobj(array):

@@ -262,7 +262,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
         if not isinstance(spec["sweep"].get("screen", {}), dict):
             raise ValueError("sweep.screen is not a table")
     except OSError:
-        if (path / TUNING).is_file():
+        if os.path.isfile(path / TUNING):  # false for a name too long, too
             raise StudyError(
                 f"{path}: holds a tuning, not a sweep; see its report.html, or tune.h5 with xarray"
             ) from None

@@ -2,12 +2,12 @@
 
 XLA's own cache saves compiling, but JAX must trace and lower a program before it can look there,
 which takes most of a warm start. A program here is found by its function, its static arguments, the
-shapes of the others, and everything else that it depends on: the code of the packages and of the
-user's own files, versions, processor and flags. It is kept beside the kernels, under the user's key
+shapes of the others, and everything else that it depends on: the code of the packages, versions,
+processor and flags. It is kept beside the kernels, under the user's key
 (`studies.kernels.compilation`).
 
-Only commands keep programs (`config.keep_programs`): no name tells what a session of Python has
-changed by hand in a module, so there programs are traced anew.
+Only commands without parts of the user's own keep programs (`config.keep_programs`): no name tells
+what a session of Python has changed by hand in a module, or what files a user's law has read.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import pickle
 from collections.abc import Callable
 from functools import cache, update_wrapper
 from hashlib import sha256
-from pathlib import Path
 from threading import RLock
 from typing import Any
 
@@ -171,7 +170,7 @@ def kept_data(names: list[Any], make: Callable[[], Any]) -> Any:
 def environment() -> tuple[str, ...]:
     """All that programs depend on, whatever they compute."""
     return (
-        code_digest(tuple(sources.OUTSIDE)),
+        code_digest(),
         jax.__version__,
         jaxlib.version.__version__,
         *native.this_processor(),
@@ -182,11 +181,12 @@ def environment() -> tuple[str, ...]:
 
 
 @cache
-def code_digest(outside: tuple[Path, ...]) -> str:
-    """Hash of the code of the packages, and of the user's own files."""
+def code_digest() -> str:
+    """Hash of the code of the packages."""
     digest = sha256()
-    own = (x for package in sources.PACKAGES for x in (sources.TOP / package).rglob("*.py"))
-    for path in (*sorted(own), *outside):
+    for path in sorted(
+        x for package in sources.PACKAGES for x in (sources.TOP / package).rglob("*.py")
+    ):
         digest.update(str(path).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +27,7 @@ from studies.engine.folder import (
     read_manifest,
 )
 from studies.engine.stored import gather
-from studies.errors import StudyError, nearest
+from studies.errors import StudyError, field_error, nearest
 from studies.reading import parse_json
 from studies.space.axes import LABELS, SHOWN_AS
 from studies.space.condition import evaluate
@@ -102,6 +103,8 @@ def read_sweep(path: str | Path, cases: CaseTable | None = None) -> SweepData:
     Raises:
         StudyError: no sweep there, a damaged file, or results of another version.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise field_error("path", path, "the folder of a sweep")
     folder = Path(path)
     written = read_manifest(folder)["spec"]
     spec = parse_sweep(written)

@@ -156,7 +156,9 @@ def _check(problem: Problem, phases: Phases, starts: int) -> None:
         StudyError: naming what is allowed.
     """
     first = problem.residual(problem.free.places())
-    if not np.isfinite(np.sum(first**2)):
+    with np.errstate(over="ignore"):
+        is_finite = np.isfinite(np.sum(first**2))
+    if not is_finite:
         raise StudyError(
             "fit.data: squared residuals of the starting point overflow; allowed: data and noise "
             "within many orders of magnitude of the model"

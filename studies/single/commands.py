@@ -135,9 +135,9 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
         console.print(f"[bold red]{text}[/]", soft_wrap=True, markup=True)
     if advice := remedy(run.status):
         console.print(f"next step: {advice}", soft_wrap=True)
-    table = Table("link", "residual rms, worst station [um]")
+    table = Table("link", "residual rms, worst station [µm]")
     if twin is not None:
-        table.add_column("without control [um]")
+        table.add_column("without control [µm]")
     for heading in ("settling [ms]", "peak voltage [V]"):
         table.add_column(heading)
     for i in range(3):
@@ -176,8 +176,8 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
     frequency = run.loop.breaking_frequency
     if not math.isnan(frequency):
         console.print(
-            f"beyond that margin, motion at {frequency:.4g} Hz grows, of a link's mode or "
-            "of a controller's filter: `studies spillover` names it",
+            f"beyond that margin, a mode at {frequency:.4g} Hz becomes unstable, of a link or of a "
+            "controller's filter: `studies spillover` names it",
             soft_wrap=True,
         )
     if warning := caution(run.loop.gain_margin):

@@ -46,8 +46,9 @@ def resolution_text(name: str, values: Any, step: Any, what: str) -> str:
     if not low:
         return ""
     step = float(np.max(np.broadcast_to(step, values.shape)[is_low]))
-    which = f"this {what} is" if len(values) == 1 else f"{low} of these {len(values)} {what}s are"
+    verb = "is" if low == 1 else "are"
+    which = f"this {what}" if len(values) == 1 else f"{low} of these {len(values)} {what}s"
     return (
-        f"{name} of {which} below one ADC step of {1e6 * step:.3g} µm: the controller "
+        f"{name} of {which} {verb} below one ADC step of {1e6 * step:.3g} µm: the controller "
         "cannot measure these differences."
     )

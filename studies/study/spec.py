@@ -293,8 +293,8 @@ class ControlSection(Section):
     )
     velocity_gain: tuple[Gain, Gain, Gain] = described(
         (1.55, 1.75, 1.7),
-        "N s/m or 1/s",
-        "k_d of mode 1 per link, half of the paper's by default (SRF: s)",
+        "N s/m, 1/s or s",
+        "k_d of mode 1 per link, half of the paper's by default",
         free=DESIGN,
     )
     position_gain: tuple[Gain, Gain, Gain] = described(

@@ -87,6 +87,8 @@ def plot(sweep: SweepData | str | Path, x: str | None, y: str, hue: str | None =
         ax.set_ylabel(label(data, y))
         if len(np.unique(across)) <= min(FEW, max(len(across) // 2, 12)):
             _lines(ax, across, shown, group, hue)
+            if is_log(data, x) or _is_geometric(np.unique(across)):
+                figures.log_scale(ax, "x")
         else:
             best = np.isin(np.flatnonzero(chosen), recommended(data, y))
             hue_label = "" if hue is None else label(data, hue)
@@ -143,7 +145,11 @@ def front(data: SweepData, y: str) -> Figure:
 
 
 def pareto_front(margin: np.ndarray, value: np.ndarray) -> list[int]:
-    """Cases on the Pareto front: none has a smaller value at the same or a larger margin."""
+    """Cases on the Pareto front: none has a smaller value at the same or a larger margin.
+
+    Margins are the same if four digits are.
+    """
+    margin = np.array([float(f"{x:.4g}") for x in margin])
     front: list[int] = []
     lowest = np.inf
     for k in np.lexsort((value, -margin)):
@@ -194,7 +200,7 @@ def _note_left_out(figure: Figure, data: SweepData, chosen: np.ndarray) -> None:
     if n_screened:
         parts.append(f"the screen left out {n_screened:,} of {len(chosen):,} cases")
     if n_left:
-        parts.append(f"{n_left:,} of {len(chosen):,} cases failed and are left out")
+        parts.append(f"{n_left:,} of {len(chosen):,} cases are unstable or failed and are left out")
     if MARGIN in data.variables:
         n_low = int(np.sum(data[MARGIN][chosen] < ENOUGH))
         if n_low:
@@ -307,8 +313,6 @@ def _lines(
         figures.legend_beside(ax)
     if _is_wide(value):
         figures.log_scale(ax, "y")
-    if _is_geometric(np.unique(across)):
-        figures.log_scale(ax, "x")
 
 
 def _distinct(values: np.ndarray) -> list[Any]:

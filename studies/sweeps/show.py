@@ -28,7 +28,7 @@ from studies.engine.results import (
     uncontrolled_value,
 )
 from studies.engine.stored import kept_metrics
-from studies.errors import ResolutionWarning, StudyError
+from studies.errors import ResolutionWarning, StudyError, field_error
 from studies.show.units import headed, readable, settling_text
 from studies.study.entries import links_text
 from studies.study.margin import ENOUGH, margin_text
@@ -108,10 +108,15 @@ def best_cases(
         SI units under their names in the sweep file. The index is the number of the case.
 
     Raises:
-        StudyError: unknown metric, or no case left.
+        StudyError: an argument that is none, unknown metric, or no case left.
     """
     import pandas
 
+    for field, text in (("by", by), ("subject_to", subject_to)):
+        if not isinstance(text, str):
+            raise field_error(field, text, "a text")
+    if not isinstance(count, int) or count < 1:
+        raise field_error("count", count, "a whole number from 1")
     data, name = as_sweep(sweep), by.removeprefix("-")
     cases = ranked_cases(data, by, subject_to, count)
     text = resolution_warning(data, cases, name)

@@ -82,6 +82,7 @@ def report(
         lower=LOWER,
         best=_best(spec, findings),
         references=reference_lines(spec, findings.baseline, findings.references),
+        better=_better_references(spec, findings),
         unmeasured=_unmeasured(spec, findings),
         folder=f"{folder}/" if folder else "",
         heads=[headed(x, METRICS[parse_entries(x).metric].unit) for x in names],
@@ -227,6 +228,13 @@ def summary(spec: TuneSpec, findings: TuneFindings) -> list[str]:
         )
     lines += reference_lines(spec, findings.baseline, findings.references)
     return lines + _unmeasured(spec, findings)
+
+
+def _better_references(spec: TuneSpec, findings: TuneFindings) -> list[str]:
+    """What a tuned design should beat, but no design does."""
+    least = min(x.objective.mean() for x in findings.judged[: len(spec.moving)])
+    compared = findings.references.designs
+    return [name for name, x in compared if x.objective.mean() < least]
 
 
 def _unmeasured(spec: TuneSpec, findings: TuneFindings) -> list[str]:
