@@ -54,8 +54,9 @@ COMPILER_FLAGS = {
 }
 # Threads of XLA's CPU client, by default one per core. Factorisations of many matrices are divided
 # among these threads, and the one that divides waits (jax::ParallelBatchMap, jaxlib 0.10): as many
-# of them side by side as there are threads never finish. Idle threads cost nothing.
-POOL = ("NPROC", 64)
+# of them side by side as there are threads never finish. More threads make batches of
+# factorisations slower (32 plants on 2 cores: 13 ms with 2 threads, 22 ms with 8 or with 64).
+POOL, LEAST_THREADS, THREADS_PER_CORE = "NPROC", 64, 4
 # Python looks for unreachable cycles after so many new objects. Tracing makes millions that stay:
 # with Python's own numbers, a fifth of a sweep's start went into looking through them.
 GARBAGE, PYTHONS_OWN = (50_000, 50, 50), ((700, 10, 10), (2000, 10, 10))
@@ -88,7 +89,8 @@ def configure(
     cache: keep compiled programs in JAX_COMPILATION_CACHE_DIR or the user's cache folder, unless
         others can write there (CacheWarning).
 
-    Python then looks for cyclic garbage less often, unless `gc.set_threshold` has been used before.
+    XLA gets more threads than there are cores, through NPROC, see POOL. Python then looks for
+    cyclic garbage less often, unless `gc.set_threshold` has been used before.
     If JAX has not been imported yet, XLA's alarm about slow compilations is hidden (LOG_LEVEL),
     unless the environment sets its own level.
 
@@ -107,15 +109,19 @@ def configure(
     new_flags = _extended(old_flags, devices, flags)
     if not is_backend_started():
         os.environ["XLA_FLAGS"] = new_flags
-        name, threads = POOL
-        present = os.environ.get(name, "")
-        os.environ[name] = str(max(threads, int(present) if present.isdecimal() else 0))
+        os.environ[POOL] = str(_threads(os.environ.get(POOL, "")))
     else:
         _require_in_force(old_flags, devices, flags)
     _settings().update("jax_enable_x64", precision == "float64")
     global _is_configured
     _is_configured = True
     _set_cache(cache)
+
+
+def _threads(present: str) -> int:
+    """Threads of XLA's pool: enough, and at least as many as the environment asks for."""
+    asked = int(present) if present.isdecimal() else 0
+    return max(LEAST_THREADS, THREADS_PER_CORE * usable_cores(), asked)
 
 
 def _collect_garbage_less_often() -> None:

@@ -19,7 +19,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.parameters import Array
 from jaxmodel.simulate import Result
 from studies.engine.function import BlockFunction, fastest_function
-from studies.engine.plan import STATIC, lane_unit
+from studies.engine.plan import STATIC, lane_unit, padded_rows
 from studies.engine.preflight import check_run
 from studies.errors import StudyError
 from studies.kernels import bridge
@@ -137,8 +137,8 @@ def _batch_program(
         return fastest_function(structure, build, free, [], shared)
 
     def run(parameters: Array) -> Result:
-        n, unit = len(parameters), lane_unit()
-        rows = np.minimum(np.arange(-(-n // unit) * unit), n - 1)  # whole vectors
+        n = len(parameters)
+        rows = padded_rows(n, lane_unit())
         one_block = bridge.outside(function, len(rows), parameters.shape[1])
         return jax.tree.map(lambda x: x[:n], one_block(parameters[rows], []))
 

@@ -124,7 +124,11 @@ class BlockFunction:
 
     def prepare(self, free: Any, own: Any, shared: Any) -> list[Any]:
         """Those leaves of the cases' starts that vary, lanes last."""
-        each = jax.vmap(partial(self._leaves, True), (0, 0, None), -1)
+        return self._prepared(0, free, own, shared)
+
+    def _prepared(self, free_axis: int | None, free: Any, own: Any, shared: Any) -> list[Any]:
+        """As `prepare`; free numbers without an axis are those of all cases."""
+        each = jax.vmap(partial(self._leaves, True), (free_axis, 0, None), -1)
         leaves: list[Any] = each(free, own, shared)
         return leaves
 
@@ -318,6 +322,17 @@ class BlockFunction:
     def _on_device(self) -> list[Any]:
         return [jnp.asarray(x) for x in self.shared]
 
+    def _movement(
+        self, free_axis: int | None, own: Any, shared: Any
+    ) -> Callable[[Any], tuple[list[Any], list[Any]]]:
+        """Leaves that move as a function of the free numbers, and all that vary."""
+
+        def moving(free: Any) -> tuple[list[Any], list[Any]]:
+            leaves = self._prepared(free_axis, free, own, shared)
+            return self._moving(leaves), leaves
+
+        return moving
+
     def _judged(
         self, varying: list[Any], shared: list[Any]
     ) -> Callable[[list[Any]], tuple[Metrics, Result]]:
@@ -332,11 +347,7 @@ class BlockFunction:
         return judged
 
     def _prepare_vjp(self, free: Any, own: Any, shared: Any) -> Any:
-        def moving(free: Any) -> tuple[list[Any], list[Any]]:
-            leaves = self.prepare(free, own, shared)
-            return self._moving(leaves), leaves
-
-        _, pull_back, leaves = jax.vjp(moving, free, has_aux=True)
+        _, pull_back, leaves = jax.vjp(self._movement(0, own, shared), free, has_aux=True)
         return leaves, pull_back
 
     def _finish_vjp(self, varying: list[Any], shared: list[Any]) -> Any:
@@ -345,13 +356,7 @@ class BlockFunction:
         return result, pull_back
 
     def _prepare_jvp(self, free: Any, own: Any, shared: Any) -> Any:
-        each = jax.vmap(partial(self._leaves, True), (None, 0, None), -1)
-
-        def moving(free: Any) -> tuple[list[Any], list[Any]]:
-            leaves = each(free, own, shared)
-            return self._moving(leaves), leaves
-
-        _, push, leaves = jax.linearize(moving, free, has_aux=True)
+        _, push, leaves = jax.linearize(self._movement(None, own, shared), free, has_aux=True)
         return leaves, jax.vmap(push)(jnp.eye(len(free)))
 
     def _finish_jvp(self, varying: list[Any], shared: list[Any], tangents: list[Any]) -> Any:

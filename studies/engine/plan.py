@@ -289,6 +289,11 @@ def lane_unit() -> int:
     return int(LANE_BYTES // jax.dtypes.canonicalize_dtype(np.float64).itemsize)
 
 
+def padded_rows(count: int, unit: int) -> np.ndarray:
+    """Numbers of `count` rows, the last one repeated until `unit` divides how many there are."""
+    return np.minimum(np.arange(-(-count // unit) * unit), count - 1)
+
+
 def memory_budget() -> int:
     """Memory available for the arrays of a chunk: a quarter of the device's [bytes]."""
     if processor() != "cpu":

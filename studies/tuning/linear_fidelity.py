@@ -21,6 +21,7 @@ from jaxmodel.linear_residual import linear_residual
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, closed_loop, slowest_decay, spillover
+from studies.engine.plan import padded_rows
 from studies.engine.programs import kept_jit
 from studies.engine.stability import gain_margin
 from studies.study.cases import as_arrays, build_case, build_structure, case_of
@@ -135,7 +136,7 @@ class LinearFidelity:
             self._links,
         )
         count = len(values)
-        rows = np.minimum(np.arange(-(-count // BATCH) * BATCH), count - 1)
+        rows = padded_rows(count, BATCH)
         parts = np.split(values[rows], len(rows) // BATCH)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             results = list(pool.map(lambda part: jax.tree.map(np.asarray, evaluate(part)), parts))

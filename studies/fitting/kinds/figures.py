@@ -12,7 +12,7 @@ from jaxmodel.case import Case, Structure
 from jaxmodel.metrics import METRICS, Metrics
 from jaxmodel.parameters import Array
 from studies.engine.function import fastest_function
-from studies.engine.plan import lane_unit
+from studies.engine.plan import lane_unit, padded_rows
 from studies.errors import StudyError
 from studies.fitting.kinds.contract import Measurement
 from studies.fitting.kinds.motions import OFF, check_finished, smooth_run
@@ -92,8 +92,7 @@ class Runs:
     def _run_all(self, values: np.ndarray, has_slopes: bool) -> Any:
         """Statuses, metrics by name, runs first, and perhaps their derivatives, (p, runs, ...)."""
         structure = self._structure._replace(metrics=tuple(sorted(self._metrics)))
-        unit, n = lane_unit(), len(self._switches)
-        rows = np.minimum(np.arange(-(-n // unit) * unit), n - 1)  # whole vectors
+        rows = padded_rows(len(self._switches), lane_unit())
         masks = np.array([x.links for x in self._switches], float)[rows]
         modes = np.array([x.modes for x in self._switches])[rows]
         free, own = np.tile(values, (len(rows), 1)), (masks, modes)
