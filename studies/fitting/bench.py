@@ -38,6 +38,8 @@ Pose = tuple[float, float, float]
 WORST_CONDITION = 1e10
 #: Plants computed at once.
 BATCH = 32
+#: Frequencies whose derivatives are computed at once.
+FREQUENCIES = 100
 #: A row or column of a plant, (n,), and its derivatives, (n, p).
 Row = tuple[np.ndarray, np.ndarray | None]
 
@@ -330,11 +332,25 @@ def response(
     gain = x @ output[0] + direct[0]
     if plant.slope is None or source[1] is None or output[1] is None or direct[1] is None:
         return FrequencyResponse(gain, None)
-    change = plant.slope.state  # (n, n, p)
-    n, _, p = change.shape
-    turned = (y @ change.reshape(n, n * p)).reshape(len(omega), n, p)
-    slope = np.einsum("fnp,fn->fp", turned, x) + x @ output[1] + y @ source[1] + direct[1]
+    slope = _both_sides(y, plant.slope.state, x) + x @ output[1] + y @ source[1] + direct[1]
     return FrequencyResponse(gain, slope)
+
+
+def _both_sides(left: np.ndarray, change: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Y dA X at each frequency, (f, p), of (f, n), (n, n, p) and (f, n).
+
+    Only rows of dA that change count, and a few frequencies at a time stay in the cache.
+    """
+    rows = np.any(change, axis=(1, 2))
+    moving = change[rows].astype(complex)
+    m, n, p = moving.shape
+    moving, left = moving.reshape(m, n * p), left[:, rows]
+    whole = np.empty((len(left), p), complex)
+    for first in range(0, len(left), FREQUENCIES):
+        few = slice(first, first + FREQUENCIES)
+        turned = (left[few] @ moving).reshape(-1, n, p)
+        whole[few] = (right[few, None] @ turned)[:, 0]
+    return whole
 
 
 def _solve(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:

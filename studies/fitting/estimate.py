@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
+from threadpoolctl import threadpool_limits
 
 from studies.engine.preflight import check_run
 from studies.engine.progress import Phases
@@ -74,6 +75,11 @@ def fit_phases(spec: FitSpec) -> tuple[str, ...]:
     return ("fit", "profile", "machines", *samples, "check", "draw", "next experiment")
 
 
+#: Many small matrices: two threads of BLAS took 135 s for a fit of responses, one 82 s.
+on_one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
+
+
+@on_one_thread
 def estimate(spec: FitSpec, phases: Phases | None = None) -> Fitted:
     """Fit a model to measurements, without the next experiment.
 
@@ -132,6 +138,7 @@ def estimate(spec: FitSpec, phases: Phases | None = None) -> Fitted:
     )
 
 
+@on_one_thread
 def suggest(fitted: Fitted, phases: Phases) -> Fitted:
     """The same with the next experiment, or with the reason why there is none."""
     if not fitted.answer.is_explained:  # a wrong model does not know what it would learn
