@@ -89,6 +89,7 @@ def publish(out: str | Path, stale: Iterable[str] = ()) -> Iterator[Path]:
         StudyError: the folder cannot be written to, or a file cannot be moved there.
     """
     out = Path(out)
+    is_new = not out.exists()
     try:
         out.mkdir(parents=True, exist_ok=True)
         for left in out.glob(f"{_STAGED}*"):
@@ -104,7 +105,10 @@ def publish(out: str | Path, stale: Iterable[str] = ()) -> Iterator[Path]:
         for name in set(stale) - set(names):
             (out / name).unlink(missing_ok=True)
     except OSError as error:
-        raise StudyError(f"--out {out}: cannot write there ({error})") from error
+        raise StudyError(f"--out {out}: cannot write there ({error.strerror or error})") from error
+    finally:
+        if is_new and out.is_dir() and not any(out.iterdir()):
+            out.rmdir()
 
 
 def announce(console: Console, report: Path, more: str = "") -> None:

@@ -130,9 +130,8 @@ def test_import_sets_nothing_and_configure_does(tmp_path):
     width, *others = COMPILER_FLAGS
     added = [f"{name}={COMPILER_FLAGS[name]}" for name in others]
     assert flags.split() == [f"{width}=256", *added, f"{DEVICE_FLAG}=3"]
-    assert int(threads) == max(
-        64, 4 * config.usable_cores()
-    )  # factorisations side by side never finish with few threads
+    # factorisations side by side never finish with few threads
+    assert int(threads) == max(64, 4 * config.usable_cores())
     assert facts["devices"].startswith("3 x ")
     assert facts["precision"] == "float32"
     assert facts["cache"] == str(tmp_path / "flexlink-studies")

@@ -35,6 +35,15 @@ def test_a_failure_leaves_the_folder_as_it_was(tmp_path, error):
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a", "old")]
 
 
+def test_a_failure_leaves_no_new_folder(tmp_path):
+    out = tmp_path / "new"
+    message = f"^--out {out}: cannot write there \\(disk full\\)$"
+    with pytest.raises(StudyError, match=message), publish(out) as staging:
+        write(staging, "a")
+        raise OSError(28, "disk full", str(staging / "a"))
+    assert not out.exists()
+
+
 def test_a_file_that_cannot_be_moved_holds_all_back(tmp_path):
     (tmp_path / "b").mkdir()
     with pytest.raises(StudyError, match="b: cannot write there"), publish(tmp_path) as staging:

@@ -38,9 +38,14 @@ def settling_text(seconds: float, watched: float) -> str:
         seconds: from the end of the reference trajectory to the last time outside the band.
         watched: from there to the end of the run [s].
     """
-    if seconds > 0 and seconds > watched - CALM:
+    if is_cut_off(seconds, watched):
         return f"not within {number(watched, 's')}"
     return number(seconds, "s")
+
+
+def is_cut_off(seconds: Any, watched: Any) -> Any:
+    """Whether settling times [s] end with the run that was watched, rather than by settling."""
+    return (seconds > 0) & (seconds > watched - CALM)
 
 
 def number(value: float, unit: str) -> str:

@@ -19,7 +19,7 @@ from studies.engine.runs import Run
 from studies.show import figures
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
-from studies.show.units import number
+from studies.show.units import is_cut_off, number
 from studies.show.words import control_text, motion_text
 from studies.single.summary import limits_text, settling_text, watched
 from studies.study.margin import ENOUGH, MARGIN_MODES, caution
@@ -124,7 +124,9 @@ def _situation(run: Run, twin: Run | None) -> str:
 def _settling_delay(run: Run, free: Run, link: int) -> str:
     """By how much control delays settling, as a share; "" if it hardly does."""
     after, before = (float(x.result.metrics.settling_time[link]) for x in (run, free))
-    return f"{100 * (after / before - 1):.3g} %" if after > (1 + LATER) * before > 0 else ""
+    least = "at least " if is_cut_off(after, watched(run)) else ""
+    is_later = after > (1 + LATER) * before > 0
+    return f"{least}{100 * (after / before - 1):.3g} %" if is_later else ""
 
 
 def _links(run: Run, twin: Run | None) -> list[list[str]]:

@@ -60,7 +60,7 @@ def allowed_values(annotation: Any, metadata: Iterable[Any] = ()) -> str:
             return f"{_WORDS[inner]}, or a list of {len(several)}, each {limits}"
         return ", or ".join(allowed_values(each, metadata) for each in arguments)
     if origin is dict:
-        return "a table"
+        return f"a table{' of one entry or more' if _bound(metadata, 'min_length') else ''}"
     if origin is tuple:
         return _entries(arguments, metadata)
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):

@@ -306,7 +306,8 @@ def _lines(
             elif len(groups) <= MOST_BANDS:
                 ax.fill_between(position, low, high, color=style["color"], alpha=0.1, linewidth=0)
             span = ", smallest to largest" if is_text or len(groups) <= MOST_BANDS else ""
-            ax.set_title(f"median{span}", fontsize=figures.SMALL, loc="right")
+            most = max(len(v) for v in inside)
+            ax.set_title(f"median{span} of {most} cases", fontsize=figures.SMALL, loc="right")
         if is_text:
             ax.set_xticks(range(len(places)), [str(v) for v in places], rotation=30, ha="right")
     if group is not None:

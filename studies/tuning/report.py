@@ -14,7 +14,7 @@ from jaxmodel.metrics import METRICS
 from studies.engine.poles import HEADER, difference, pole_rows
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
-from studies.show.units import count_text, headed, number, readable, settling_text
+from studies.show.units import count_text, headed, is_cut_off, number, readable, settling_text
 from studies.study.entries import parse_entries
 from studies.study.margin import MARGIN_MODES, caution, margin_in_db, margin_text
 from studies.study.template import study_template, toml_text
@@ -297,12 +297,19 @@ def _changes(spec: TuneSpec, findings: TuneFindings, names: list[str]) -> list[l
         for k, move in enumerate(spec.moves):
             part = slice(k * count, (k + 1) * count)
             changes = [_change(1.0, design.objective[part].mean())]
-            changes += [
-                _change(baseline.metrics[x][part].mean(), design.metrics[x][part].mean())
-                for x in names
-            ]
+            changes += [_change_of(x, baseline, design, part) for x in names]
             rows.append([name, move_label(move) or "-", *changes])
     return rows
+
+
+def _change_of(name: str, baseline: DesignFigures, design: DesignFigures, part: slice) -> str:
+    """Change of the mean of a metric over some cases, unless a run ends before it settles."""
+    before, after = (x.metrics[name][part] for x in (baseline, design))
+    if name == "settling_time":
+        for figures, who in ((design, ""), (baseline, "baseline ")):
+            if np.any(is_cut_off(figures.metrics[name][part], figures.watched[part])):
+                return f"{who}not settled"
+    return _change(before.mean(), after.mean())
 
 
 def _change(before: float, after: float) -> str:
