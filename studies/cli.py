@@ -173,6 +173,17 @@ def init(
 
 
 @app.command()
+def explore(
+    folder: Annotated[Path, typer.Argument(help="folder of a sweep, a tuning, a fit or an atlas")],
+) -> None:
+    """Write a page on which all cases can be looked at: brushed plots, tables, motion."""
+    start()
+    from studies.explore import write_exploration
+
+    write_exploration(folder, console)
+
+
+@app.command()
 def info() -> None:
     """Show versions, devices, precision, compilation cache, and what sweeps run with."""
     start()

@@ -1,19 +1,20 @@
 """Reading web pages of reports as strictly as a browser is lenient, for tests of any report."""
 
+import gzip
+import json
 import re
-import shutil
 import subprocess
 from base64 import b64decode
 from html.parser import HTMLParser
 from io import BytesIO
 
 import numpy as np
-import pytest
 from matplotlib.text import Text
 from PIL import Image
 
 from studies.show.figures import STYLE
 from studies.show.pages import WIDE, render
+from tests.browser import browser_command
 
 #: A title that would be more than text, in HTML and in Markdown.
 TITLE = "<script>alert(1)</script> *fast* | 10 mm ![x](http://e.org/x.png) &amp; a_b"
@@ -181,7 +182,22 @@ def tables_of(html):
     return columns
 
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "microsoft-edge")
+def unpacked(html):
+    """What an explorer holds, and a function that gives its arrays."""
+    contents = {
+        name: re.search(f'<script[^>]* id="{name}">(.*?)</script>', html, re.DOTALL)[1]
+        for name in ("data", "arrays")
+    }
+    floats = np.frombuffer(gzip.decompress(b64decode(contents["arrays"])), np.float32)
+
+    def numbers(where):
+        n, *inner = where["shape"]
+        part = floats[where["first"] :][: int(np.prod(where["shape"]))]
+        return np.moveaxis(part.reshape(*inner, n), -1, 0)
+
+    return json.loads(contents["data"]), numbers
+
+
 PROBE = """<script>
 addEventListener("load", () => {
   const root = document.documentElement, images = [...document.images];
@@ -200,16 +216,16 @@ def rendered(html, folder, width):
     Returns images, broken ones among them, pixels by which the page is too wide, and tables of
     which only a part is seen.
     """
-    command = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if command is None:
-        pytest.skip(f"no browser here ({', '.join(BROWSERS)})")
     path = folder / "probed.html"
     html = re.sub("<meta http-equiv=[^>]*>", "", html)  # it lets no script run
     path.write_text(html.replace("</body>", f"{PROBE}</body>"), encoding="utf-8")
     options = ("--headless", "--disable-gpu", "--no-sandbox", "--dump-dom")
     own = f"--user-data-dir={folder / 'browser'}", f"--window-size={width},800"
     done = subprocess.run(
-        [command, *options, *own, path.as_uri()], capture_output=True, text=True, timeout=120
+        [browser_command(), *options, *own, path.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     found = re.search(r'data-found="(\d+) (\d+) (-?\d+) (\d+)"', done.stdout)
     assert found, done.stderr

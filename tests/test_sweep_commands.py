@@ -14,12 +14,13 @@ from studies.engine.folder import BASELINE
 from studies.engine.frame import frame_of
 from studies.engine.function import TRACES
 from studies.engine.preflight import check_run
-from studies.engine.results import read_sweep
+from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_study
 from studies.errors import StudyError
+from studies.study.consistency import patch_centers
 from studies.study.template import toml_value
 from studies.sweeps.report import report
-from tests.pages import parsed, text_of
+from tests.pages import parsed, text_of, unpacked
 from tests.sweeps import BASE
 from tests.test_cli import refused, run
 
@@ -67,6 +68,7 @@ def test_a_sweep_from_its_file_to_its_figures(capsys, spec, tmp_path):
     assert f"report: {out / 'report.html'}\n" in text
     check_report(out)
     check_uncontrolled(capsys, spec, out)
+    check_explorer(capsys, out)
     code, text, _ = run(capsys, "show", out)
     assert code == 0 and "ok" in text and "best cases by residual_rms" in text
     assert "residual_rms [µm]" in text
@@ -148,6 +150,28 @@ def check_uncontrolled(capsys, spec, folder):
     assert "best cases by residual_rms" in text and "without control" not in text
     assert run(capsys, "sweep", spec, "--out", folder, "--resume", "--quiet") == (0, "", "")
     np.testing.assert_array_equal(read_sweep(folder).baseline["residual_rms"].data, kept)
+
+
+def check_explorer(capsys, out):
+    code, text, _ = run(capsys, "explore", out)
+    assert code == 0 and text.endswith(f"explorer: {out / 'explorer.html'}\n")
+    data, numbers = unpacked((out / "explorer.html").read_text(encoding="utf-8"))
+    sweep = read_sweep(out)
+    columns = {x["name"]: numbers(x["value"]) for x in data["columns"]}
+    np.testing.assert_allclose(columns["drive.kp"], sweep["drive.kp"], rtol=1e-6)
+    shown = 1e6 * metric_values(sweep, "residual_rms")
+    np.testing.assert_allclose(columns["residual_rms"], shown, rtol=1e-6)
+    for row in (3, 17):
+        centers = 1e3 * np.asarray(patch_centers(load_design(out, row).study))
+        np.testing.assert_allclose(numbers(data["placement"]["centers"])[row], centers, rtol=1e-6)
+    replay = data["replays"][0]
+    record = run_study(load_design(out, replay["row"]).study).result.record
+    pose = numbers(replay["motions"][0]["joint"]).mean(axis=1)  # of the platform's three joints
+    last = float(numbers(replay["frameTime"])[-1])
+    command_end = float(sweep["command_end"][replay["row"]])
+    at = np.argmin(np.abs(record.time - command_end - 1e-3 * last))
+    np.testing.assert_allclose(pose[-1], 1e3 * record.pose[at, :2], atol=1e-3)
+    assert len(replay["motions"]) == 2 and "without control" not in data["reasons"].values()
 
 
 def check_report(folder):

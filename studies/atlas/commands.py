@@ -33,6 +33,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             bool, typer.Option("--resume", help="continue an interrupted run, if there is one")
         ] = False,
         pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
+        explore: Annotated[
+            bool, typer.Option("--explore", help="also write explorer.html, to look at all runs")
+        ] = False,
         quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
     ) -> None:
         """Map all subsets of controlled links and modes, workspace modes and platform error."""
@@ -58,3 +61,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             )
             sys.exit(130)
         announce(console, out / REPORT)
+        if explore:
+            from studies.atlas.explore import explore_atlas
+            from studies.explorer.page import write_explorer
+
+            write_explorer(out, explore_atlas, console, quiet)

@@ -10,11 +10,12 @@ from matplotlib.figure import Figure
 
 from studies.atlas import plots
 from studies.atlas.attribution import effects, interaction, shapley
-from studies.atlas.drawing import Clip, animate, draw_mode, mode_skeleton, skeleton
+from studies.atlas.drawing import Clip, animate, draw_mode, mode_skeleton
 from studies.atlas.findings import AtlasFindings
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.subsets import TARGETS, link_label, player_labels, setting_label
 from studies.show.figures import SERIES, SMALL, comparison, legend_above, new_figure
+from studies.show.skeleton import skeleton
 from studies.study.consistency import each_link
 
 #: The animation: from before the command's end to after it, and its frames [s].

@@ -21,6 +21,12 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         ],
         out: Annotated[Path, typer.Option(help="folder for report, fitted study and figures")],
         pdf: Annotated[bool, typer.Option("--pdf", help="also write the figures as PDF")] = False,
+        explore: Annotated[
+            bool,
+            typer.Option(
+                "--explore", help="also write explorer.html, to look at the possible machines"
+            ),
+        ] = False,
     ) -> None:
         """Fit parameters of a study to measurements, and say how well they are known."""
         from studies.publish import check_folder
@@ -31,3 +37,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.fitting.spec import load_fit
 
         run_fit(load_fit(data), out, console, pdf)
+        if explore:
+            from studies.explorer.page import write_explorer
+            from studies.fitting.explore import explore_fit
+
+            write_explorer(out, explore_fit, console)

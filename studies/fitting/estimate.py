@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 from rich.console import Console
@@ -24,6 +25,8 @@ from studies.fitting.statistics import Answer, Misfit, misfit, rivals
 from studies.study.paths import set_values
 from studies.study.spec import Study, parse_study
 
+P = ParamSpec("P")
+R = TypeVar("R")
 #: Parameters up to which all likelihoods are profiled.
 PROFILED = 6
 #: Machines in the file of a tuning.
@@ -75,8 +78,9 @@ def fit_phases(spec: FitSpec) -> tuple[str, ...]:
     return ("fit", "profile", "machines", *samples, "check", "draw", "next experiment")
 
 
-#: Many small matrices: two threads of BLAS took 135 s for a fit of responses, one 82 s.
-on_one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
+def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
+    """Let BLAS use one thread: with two, the many small matrices took 1.6 times as long."""
+    return threadpool_limits.wrap(limits=1, user_api="blas")(function)
 
 
 @on_one_thread

@@ -163,6 +163,21 @@ def variables(fitted: Fitted) -> dict[str, Variable]:
         "value": Variable(answer.values, axis, "1", "fitted, in the field's unit"),
         "sigma": Variable(answer.sigma, axis, "1", "standard deviation, in the field's unit"),
         "interval": Variable(answer.interval, (*axis, "end"), "1", "95 %, in the field's unit"),
+        "machine": Variable(
+            fitted.machines, ("machine", "number"), "1", "machines that the data leave possible"
+        ),
+        "optimum": Variable(
+            fitted.spec.free.values(np.stack([x.u for x in fitted.solution.optima])),
+            ("optimum", "number"),
+            "1",
+            "optima, the best first, in the field's unit",
+        ),
+        "optimum_rise": Variable(
+            np.array([fitted.solution.rise(x) for x in fitted.solution.optima]),
+            ("optimum",),
+            "1",
+            "rise of chi square from the best optimum",
+        ),
         "correlation": Variable(answer.correlation, (*axis, "other"), "1", "of the numbers"),
     }
     if fitted.posterior is not None:

@@ -114,6 +114,12 @@ def log_scale(ax: Axes, which: str) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
+def is_wide(values: np.ndarray) -> bool:
+    """Whether numbers need a logarithmic scale."""
+    known = values[np.isfinite(values)]
+    return bool(known.size and np.all(known > 0) and known.max() > 30 * known.min())
+
+
 def axes_or_new(ax: Axes | None) -> Axes:
     """The axes to draw on: those given, or new ones."""
     return plt.subplots(layout="constrained")[1] if ax is None else ax

@@ -39,6 +39,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         ] = False,
         quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
         report: Annotated[bool, typer.Option("--report", help="also write report.html")] = False,
+        explore: Annotated[
+            bool, typer.Option("--explore", help="also write explorer.html, to look at all cases")
+        ] = False,
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
         scheduler: Scheduler = None,
         local_workers: LocalWorkers = None,
@@ -59,8 +62,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         sweep_spec = load_sweep(spec)
         if dry_run and workers.are_named:
             raise StudyError("--dry-run: plans for this process only; leave the workers out")
-        if dry_run and report:
-            raise StudyError("--report: --dry-run produces no results; leave one of them out")
+        for name, is_wanted in (("--report", report), ("--explore", explore)):
+            if dry_run and is_wanted:
+                raise StudyError(f"{name}: --dry-run produces no results; leave one of them out")
         if dry_run:
             print_plan(make_plan(sweep_spec, out if resume else None), console)
             return
@@ -103,6 +107,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             console.print("" if checked is None else checked.text, soft_wrap=True)
         if report and not quiet:
             announce(console, out / REPORT)
+        if explore:
+            from studies.explorer.page import write_explorer
+            from studies.sweeps.explore import explore_sweep
+
+            write_explorer(out, explore_sweep, console, quiet)
         if len(done.lost):
             sys.exit(1)
 

@@ -93,7 +93,7 @@ def plot(sweep: SweepData | str | Path, x: str | None, y: str, hue: str | None =
             best = np.isin(np.flatnonzero(chosen), recommended(data, y))
             hue_label = "" if hue is None else label(data, hue)
             _points(figure, ax, across, shown, group, hue_label, best)
-            if is_log(data, x) or _is_wide(across):
+            if is_log(data, x) or figures.is_wide(across):
                 figures.log_scale(ax, "x")
             if x == MARGIN:
                 ax.axvline(ENOUGH, color="black", linewidth=0.8, linestyle=":")
@@ -122,7 +122,7 @@ def front(data: SweepData, y: str) -> Figure:
             cmap=MAP,
             linewidths=0,
             rasterized=True,
-            norm="log" if VOLTAGE in data.variables and _is_wide(color) else None,
+            norm="log" if VOLTAGE in data.variables and figures.is_wide(color) else None,
         )
         if VOLTAGE in data.variables:
             figure.colorbar(dots, ax=ax, label=label(data, VOLTAGE))
@@ -177,7 +177,7 @@ def is_log(data: SweepData, name: str) -> bool:
 
 def _scale_ordinate(ax: Axes, value: np.ndarray) -> None:
     """Logarithmic for a wide range; limits ignore a few outliers."""
-    is_wide = _is_wide(value)
+    is_wide = figures.is_wide(value)
     if is_wide:
         figures.log_scale(ax, "y")
     if len(value) < MANY:
@@ -242,7 +242,7 @@ def _heat_map(
     numbers, start = np.unique(cell[order], return_index=True)
     for number, values in zip(numbers, np.split(value[order], start[1:]), strict=True):
         middle.flat[number] = np.median(values)
-    scale = "log" if _is_wide(value) else "linear"
+    scale = "log" if figures.is_wide(value) else "linear"
     mesh = ax.pcolormesh(
         _edges(columns), _edges(rows), middle, cmap=MAP, norm=scale, rasterized=True
     )
@@ -261,11 +261,6 @@ def _edges(middles: np.ndarray) -> np.ndarray:
     inner = (middles[1:] + middles[:-1]) / 2
     ends = 2 * middles[0] - inner[0], 2 * middles[-1] - inner[-1]
     return np.concatenate([ends[:1], inner, ends[1:]])
-
-
-def _is_wide(value: np.ndarray) -> bool:
-    """Whether numbers need a logarithmic scale."""
-    return bool(np.all(value > 0) and value.max() > 30 * value.min())
 
 
 def _is_geometric(values: np.ndarray) -> bool:
@@ -312,7 +307,7 @@ def _lines(
             ax.set_xticks(range(len(places)), [str(v) for v in places], rotation=30, ha="right")
     if group is not None:
         figures.legend_beside(ax)
-    if _is_wide(value):
+    if figures.is_wide(value):
         figures.log_scale(ax, "y")
 
 

@@ -38,6 +38,12 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         audit: Annotated[
             bool, typer.Option("--audit", help="only check derivatives against finite differences")
         ] = False,
+        explore: Annotated[
+            bool,
+            typer.Option(
+                "--explore", help="also write explorer.html, to look at all starting points"
+            ),
+        ] = False,
         quiet: Annotated[bool, typer.Option("--quiet", help="hide progress")] = False,
         scheduler: Scheduler = None,
         local_workers: LocalWorkers = None,
@@ -56,9 +62,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.tuning.workers import evaluator_for
 
         tuning = load_tuning(spec)
-        if audit and (out or resume or quiet or workers.are_named):
+        if audit and (out or resume or quiet or explore or workers.are_named):
             raise StudyError(
-                "--audit: writes no files; leave --out, --resume, --quiet and workers out"
+                "--audit: writes no files; leave --out, --resume, --explore, --quiet and workers "
+                "out"
             )
         if audit:
             _audit(tuning, console)
@@ -73,6 +80,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         with evaluator_for(tuning, workers, notify) as evaluator:
             run_tuning(tuning, out, resume, console, quiet, evaluator)
         announce(console, out / REPORT, "; tuned studies in the same folder")
+        if explore:
+            from studies.explorer.page import write_explorer
+            from studies.tuning.explore import explore_tuning
+
+            write_explorer(out, explore_tuning, console, quiet)
 
 
 def _audit(spec: TuneSpec, console: Console) -> None:

@@ -1,0 +1,44 @@
+"""From a folder of results to its explorer, whatever kind of results they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from studies.atlas.explore import explore_atlas
+from studies.atlas.run import RUNS_FOLDER
+from studies.engine.folder import MANIFEST, TUNING
+from studies.errors import StudyError
+from studies.explorer.page import write_explorer
+from studies.fitting.explore import RESULTS as FIT
+from studies.fitting.explore import explore_fit
+from studies.publish import check_folder
+from studies.sweeps.explore import explore_sweep
+from studies.tuning.explore import explore_tuning
+
+#: What fills a page, by what its folder holds.
+_KINDS = {
+    MANIFEST: explore_sweep,
+    TUNING: explore_tuning,
+    FIT: explore_fit,
+    f"{RUNS_FOLDER}/{MANIFEST}": explore_atlas,
+}
+
+
+def write_exploration(folder: str | Path, console: Console | None = None) -> Path:
+    """Write `explorer.html` into a folder of results, and return its path.
+
+    Args:
+        folder: of a sweep, a tuning, a fit or an atlas.
+        console: where progress goes; default: nowhere.
+
+    Raises:
+        StudyError: no results there, damaged ones, or a file that cannot be written.
+    """
+    folder = Path(folder)
+    fill = next((fill for name, fill in _KINDS.items() if (folder / name).is_file()), None)
+    if fill is None:
+        raise StudyError(f"{folder}: no results of a sweep, a tuning, a fit or an atlas there")
+    check_folder(folder)
+    return write_explorer(folder, fill, console)

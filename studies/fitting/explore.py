@@ -1,0 +1,68 @@
+"""A fit as a page to look at, see `studies.explorer`: the machines that the data leave possible."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from studies.errors import StudyError
+from studies.explorer.table import Column, ExplorerTable, text_column
+from studies.reading import parse_json
+from studies.show.figures import is_wide
+from studies.store import read_store
+
+#: The file of a fit.
+RESULTS = "fit.h5"
+OPTIMUM, MACHINE = "optimum", "possible machine"
+#: How far a machine is from the best fit, in standard deviations along the correlated parameters.
+DISTANCE = "distance"
+
+
+def explore_fit(folder: Path, on_progress: Callable[[int, int], None]) -> ExplorerTable:
+    """Optima of a fit, and the machines drawn from what its data leave possible.
+
+    Args:
+        folder: of a finished fit.
+        on_progress: not called, nothing takes long.
+
+    Raises:
+        StudyError: a file that is damaged.
+    """
+    data, attributes = read_store(folder / RESULTS)
+    try:
+        optima, machines = data["optimum"].data, data["machine"].data
+        values = np.concatenate([optima, machines])
+        kinds = np.array([OPTIMUM] * len(optima) + [MACHINE] * len(machines))
+        away = _distances(values - data["value"].data, data)
+        rise = np.concatenate([data["optimum_rise"].data, np.full(len(machines), np.nan)])
+        names = [str(name) for name in data["number"].data]
+        title = str(parse_json(attributes["study"]).get("title", ""))
+    except (KeyError, ValueError, TypeError) as error:
+        raise StudyError(f"{folder / RESULTS}: damaged ({error})") from None
+    parameters = [
+        Column(name, "", values[:, k], is_parameter=True, is_log=is_wide(values[:, k]))
+        for k, name in enumerate(names)
+    ]
+    return ExplorerTable(
+        title=title,
+        noun="machine",
+        columns=(
+            text_column("kind", kinds, is_parameter=True),
+            *parameters,
+            Column(DISTANCE, "", away, better="smallest"),
+            Column("rise of chi square", "", rise, better="smallest"),
+        ),
+        status=np.zeros(len(values), int),
+        reasons={0: "ok"},
+        names=tuple(str(k + 1) for k in range(len(values))),
+        rank=DISTANCE,
+    )
+
+
+def _distances(gaps: np.ndarray, data: dict) -> np.ndarray:  # type: ignore[type-arg]
+    """Mahalanobis distances by the fit's standard deviations and correlation, (n,)."""
+    sigma, correlation = data["sigma"].data, data["correlation"].data
+    scaled = gaps / np.where(sigma > 0, sigma, np.inf)
+    return np.sqrt(np.maximum(np.sum(scaled * (scaled @ np.linalg.pinv(correlation)), axis=1), 0))

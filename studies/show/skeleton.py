@@ -1,0 +1,81 @@
+"""Where the parts of a moving machine are, for drawings and animations."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.beam import build_basis
+from jaxmodel.case import Case, Structure
+from jaxmodel.dynamics import modal_chain
+from jaxmodel.parameters import Array
+from jaxmodel.prepare import prepare
+from studies.engine.preflight import check_run
+from studies.engine.programs import kept_jit
+from studies.show.sketch import guides
+from studies.study.spec import Study
+
+#: Points along a link.
+POINTS = 41
+
+
+class Skeleton(NamedTuple):
+    """Positions of all parts, (T, ...) in metres."""
+
+    guide: np.ndarray  # ends of the guides, (3, 2, 2)
+    slider: np.ndarray  # B, (T, 3, 2)
+    joint: np.ndarray  # C, (T, 3, 2)
+    link: np.ndarray  # points along the links, (T, 3, points, 2)
+
+
+def skeleton(study: Study, pose: np.ndarray, q: np.ndarray, exaggeration: float) -> Skeleton:
+    """Positions of the machine's parts, with exaggerated bending.
+
+    Args:
+        study: the machine.
+        pose: (x, y, phi) [m, m, rad], (T, 3).
+        q: modal coordinates of the plant [m], (T, 3, R).
+        exaggeration: factor on the bending [1].
+    """
+    structure, case = check_run(study.change(link__modes=q.shape[-1], control__feedback="none"))
+    slider, joint, link = (
+        np.asarray(part)
+        for part in _positions(structure._replace(n_steps=1), case, pose, q, exaggeration)
+    )
+    direction, _, start = guides(case)
+    end = start + study.machine.guide_side * direction
+    return Skeleton(np.stack([start, end], axis=1), slider, joint, link)
+
+
+@kept_jit(static_argnums=0)
+def _positions(
+    structure: Structure, case: Case, pose: Array, q: Array, exaggeration: Array
+) -> tuple[Array, Array, Array]:
+    plant = prepare(structure, case).loop.plant
+    machine = case.machine
+    along = jnp.linspace(0.0, 1.0, POINTS)
+    shape = build_basis(
+        structure.basis,
+        machine.beam,
+        machine.patches,
+        structure.n_modes,
+        plant.length[:, None] * along,
+    ).deflection_at
+    u = jnp.stack([plant.ux, plant.uy], axis=1)
+    n = jnp.stack([-plant.uy, plant.ux], axis=1)
+    corner = -plant.h0[:, None] * n - plant.s0[:, None] * u
+
+    def one(pose: Array, q: Array) -> tuple[Array, Array, Array]:
+        chain = modal_chain(plant, pose, jnp.zeros_like(pose), q, jnp.zeros_like(q))
+        slider = corner + chain.rho[:, None] * u
+        joint = pose[:2] + jnp.stack([chain.cx, chain.cy], axis=1)
+        chord = joint - slider
+        across = jnp.stack([-chord[:, 1], chord[:, 0]], axis=1) / plant.length[:, None]
+        bent = exaggeration * jnp.einsum("isr,ir->is", shape, q)
+        straight = slider[:, None] + along[:, None] * chord[:, None]
+        return slider, joint, straight + bent[..., None] * across[:, None]
+
+    return jax.vmap(one)(pose, q)

@@ -1,0 +1,147 @@
+"""A sweep as a page to look at, see `studies.explorer`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxmodel import status
+from studies.engine.results import (
+    SweepData,
+    direction,
+    metric_values,
+    read_sweep,
+    uncontrolled_value,
+)
+from studies.engine.stored import kept_metrics
+from studies.errors import StudyError
+from studies.explorer.replays import replayed, rows_to_replay
+from studies.explorer.table import Column, ExplorerTable, Placement, text_column
+from studies.show.figures import is_wide
+from studies.show.units import readable
+from studies.space.table import CaseTable, case_study
+from studies.study.fields import Fields
+from studies.sweeps.sensitivity import scalar_columns
+from studies.sweeps.show import BESIDE, MARGIN, ranking, reason, shown_metric, unit_of_metric
+
+#: Figures by which replayed cases are chosen, beside the one that ranks.
+_FIGURES = (MARGIN, "peak_voltage")
+
+
+def explore_sweep(folder: Path, on_progress: Callable[[int, int], None]) -> ExplorerTable:
+    """Cases of a sweep, with a few of them replayed.
+
+    Args:
+        folder: of a sweep, finished or not.
+        on_progress: called with the numbers of replayed cases, and of all.
+
+    Raises:
+        StudyError: no sweep there, or no case has run.
+    """
+    data = read_sweep(folder)
+    rank = ranking(data)
+    codes = data["status"]
+    if not np.any(codes >= 0) or rank.partition("[")[0] not in data.variables:
+        raise StudyError(f"{folder}: no case has run, so there is nothing to explore")
+    names = [rank, *(x for x in (MARGIN, *BESIDE, *kept_metrics(data.spec)) if x != rank)]
+    figures = [_figure(data, x) for x in dict.fromkeys(names) if _has_numbers(data, x)]
+    table = ExplorerTable(
+        title=data.spec.study.title,
+        noun="case",
+        columns=(*_parameters(data), *figures),
+        status=codes,
+        reasons={int(code): reason(int(code)) for code in np.unique(codes)},
+        names=tuple(map(str, range(data.n_cases))),
+        rank=rank,
+        baseline=_baseline(data, [x.name for x in figures]),
+        command=f"studies replay {folder} --case {{}} --report --out case-{{}}.h5",
+        placement=_placement(data.table),
+    )
+    n_ok = int(np.sum(codes == status.OK))
+    by = [x for x in (rank, *_FIGURES) if _has_numbers(data, x)]
+    smaller = [(-1 if direction(x) == "largest" else 1) * metric_values(data, x) for x in by]
+    rows = rows_to_replay(table.order[:n_ok], np.stack(smaller, axis=1))
+    done = replayed(
+        rows,
+        lambda row: case_study(data.table, row),
+        on_progress,
+    )
+    return table._replace(replays=done)
+
+
+def _parameters(data: SweepData) -> list[Column]:
+    """What varies."""
+    columns = []
+    for name, values in scalar_columns(data):
+        if values.dtype.kind in "UO":
+            columns.append(text_column(name, values, is_parameter=True))
+            continue
+        unit = unit_of_metric(data, name)
+        columns.append(
+            Column(
+                name=name,
+                unit=unit,
+                value=values.astype(float),
+                is_parameter=True,
+                is_log=is_wide(values),
+            )
+        )
+    return columns
+
+
+def _has_numbers(data: SweepData, name: str) -> bool:
+    """Whether some case has this figure, as one number of one unit."""
+    variable = data.variables.get(name.partition("[")[0])
+    if variable is None or ";" in variable.units:
+        return False
+    return bool(np.isfinite(metric_values(data, name)).any())
+
+
+def _figure(data: SweepData, name: str) -> Column:
+    values = shown_metric(data, name).astype(float)
+    return Column(
+        name=name,
+        unit=_shown_unit(data, name),
+        value=values,
+        is_log=is_wide(values),
+        better=direction(name),
+    )
+
+
+def _shown_unit(data: SweepData, name: str) -> str:
+    return readable(unit_of_metric(data, name))[1]
+
+
+def _baseline(data: SweepData, names: list[str]) -> dict[str, float]:
+    """Figures without control, in the units shown."""
+    found: dict[str, Any] = {name: uncontrolled_value(data, name) for name in names}
+    return {
+        name: readable(unit_of_metric(data, name))[0] * value
+        for name, value in found.items()
+        if value is not None
+    }
+
+
+def _placement(table: CaseTable) -> Placement:
+    """Links and patches of every case."""
+    fields, n = Fields(table.study, table.fields), len(table)
+
+    def all_cases(array: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(array, (n, *array.shape[1:]))
+
+    centers = fields.numbers("patches.centers")
+    if centers.ndim == 2:  # one list for all links
+        centers = np.repeat(centers[:, None], 3, axis=1)
+    is_on = fields.numbers("control.links") * (fields.raw("control.feedback") != "none")[:, None]
+    lengths = ("link.length", "patches.actuator_length", "patches.sensor_length")
+    length, actuator, sensor = (1e3 * all_cases(fields.each_link(name)) for name in lengths)
+    return Placement(
+        length=length,
+        actuator=actuator,
+        sensor=sensor,
+        centers=1e3 * all_cases(centers),
+        is_controlled=all_cases(is_on),
+    )
