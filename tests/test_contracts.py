@@ -147,7 +147,7 @@ def test_every_law_runs_and_is_judged_and_exported(name, tmp_path, capsys):
 @pytest.mark.long
 def test_laws_are_a_choice_like_any_other(tmp_path):
     """All of them in one sweep, each with its own margin; the short one sweeps a user's law."""
-    text = SMALL + '[sweep]\n[sweep.axes]\n"control.law" = "all"\ngain = [0.05]\n'
+    text = SMALL + '[sweep]\n[sweep.axes]\n"control.law" = "all"\ngain = [1.0]\n'
     main(["sweep", written(tmp_path, text), "--out", str(tmp_path / "sweep"), "--quiet"])
     data = read_sweep(tmp_path / "sweep")
     assert list(data["control.law"]) == ALONE

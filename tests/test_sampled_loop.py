@@ -181,9 +181,9 @@ def test_difference_destabilises_the_paper_gains_with_eight_modes():
 
 
 @pytest.mark.long
-def test_difference_is_stable_with_six_modes():
-    report = by_difference(6)
-    assert report.is_stable and report.gain_margin > 5
+def test_so_it_does_with_six_modes_and_the_static_correction_of_the_others():
+    report = by_difference(6)  # truncated, six modes would be stable
+    assert not report.is_stable and report.gain_margin < 0.5
 
 
 def test_gain_margin_stops_at_the_first_unstable_gap():
