@@ -211,26 +211,26 @@ def test_code_is_kept_and_damage_is_noticed(tmp_path, monkeypatch):
 def test_only_the_users_own_code_is_taken_from_the_cache(tmp_path, monkeypatch):
     """Neither code with a hash of its own, nor another entry, nor one under another key."""
     monkeypatch.setattr(compilation, "cache_folder", lambda: str(tmp_path))
-    kept = ObjectCache("a")
+    kept = ObjectCache("kernel", "a")
     kept.keep(b"code")
-    assert ObjectCache("a").take() == b"code"
+    assert ObjectCache("kernel", "a").take() == b"code"
     (entry,) = tmp_path.glob("kernel-*")
     whole = entry.read_bytes()
     entry.write_bytes(hashlib.sha256(b"evil").hexdigest().encode() + b"\nevil")
-    assert ObjectCache("a").take() is None
-    ObjectCache("b").keep(b"other")
+    assert ObjectCache("kernel", "a").take() is None
+    ObjectCache("kernel", "b").keep(b"other")
     (other,) = set(tmp_path.glob("kernel-*")) - {entry}
     entry.write_bytes(other.read_bytes())
-    assert ObjectCache("a").take() is None
+    assert ObjectCache("kernel", "a").take() is None
     entry.write_bytes(whole)
-    assert ObjectCache("a").take() == b"code"
+    assert ObjectCache("kernel", "a").take() == b"code"
     assert (tmp_path / "key").stat().st_mode & 0o777 == 0o600
     (tmp_path / "key").chmod(0o644)  # a key that others have read is replaced
     compilation._key.cache_clear()
-    assert ObjectCache("a").take() is None
+    assert ObjectCache("kernel", "a").take() is None
     assert (tmp_path / "key").stat().st_mode & 0o777 == 0o600
-    ObjectCache("a").keep(b"code")
-    assert ObjectCache("a").take() == b"code"
+    ObjectCache("kernel", "a").keep(b"code")
+    assert ObjectCache("kernel", "a").take() == b"code"
 
 
 # --- other processors -----------------------------------------------------------------------------

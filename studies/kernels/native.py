@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 try:
     from llvmlite import binding as binding
-except ImportError:  # the extra is not installed
+except ImportError:  # not on this platform
     binding = None
 
 #: Longest time that a process of its own may take [s].
