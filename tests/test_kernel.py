@@ -10,9 +10,10 @@ import pytest
 from jaxmodel import status
 from jaxmodel.trigonometry import sine_cosine
 from studies.bench.works import METRICS, WORKS
-from studies.engine.executor import CaseLeaves, Executor
+from studies.engine.executor import CaseLeaves, Executor, executor_text
 from studies.engine.function import STEPPERS, TRACES, block_function
 from studies.engine.plan import Layout, chunk_cases, local_layout, plan_groups
+from studies.engine.programs import environment
 from studies.errors import NoKernelError
 from studies.kernels import compilation, cpu, llvm, native
 from studies.kernels.compilation import ObjectCache
@@ -132,8 +133,15 @@ def test_without_llvmlite_the_scan_runs(monkeypatch):
     table = build_table(small_spec(MIXED))
     group = plan_groups(table, np.arange(8), local_layout)[0]
     assert Executor(group.structure, LAYOUT).name == STEPPERS["kernel"]
-    monkeypatch.setattr(llvm, "binding", None)
-    assert Executor(group.structure, LAYOUT).name == STEPPERS["scan"]
+    for module in (llvm, native):
+        monkeypatch.setattr(module, "binding", None)
+    native.this_processor.cache_clear()
+    executor = Executor(group.structure, LAYOUT)
+    assert executor.name == STEPPERS["scan"]
+    result = executor.start(chunk_cases(table, group.rows, group.structure, LAYOUT.size)).wait()
+    assert np.all(np.isin(result.status, status.FINISHED))
+    assert "needs llvmlite" in executor_text() and len(environment()) > 8
+    native.this_processor.cache_clear()
 
 
 # --- the translation itself -----------------------------------------------------------------------

@@ -173,16 +173,12 @@ def environment() -> tuple[str, ...]:
         code_digest(),
         jax.__version__,
         jaxlib.version.__version__,
-        *_processor(),
+        *native.this_processor(),
+        processor_text(),
         os.environ.get("XLA_FLAGS", ""),
         str(jax.local_devices()),
         str(jax.dtypes.canonicalize_dtype(float)),
     )
-
-
-def _processor() -> tuple[str, ...]:
-    """What compiled code is for, whether or not LLVM is there to say so."""
-    return native.this_processor() if native.binding else (processor_text(),)
 
 
 @cache
