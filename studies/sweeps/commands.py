@@ -58,6 +58,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.engine.progress import Phases
         from studies.engine.sweep import make_plan, run_sweep, sweep_phases
         from studies.space.spec import load_sweep
+        from studies.sweeps.dry_run import plan_document, print_plan
 
         sweep_spec = load_sweep(spec)
         if dry_run and workers.are_named:
@@ -67,13 +68,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if dry_run:
             plan = make_plan(sweep_spec, out if resume else None)
             if as_json:
-                from studies.sweeps.documents import plan_document
-
                 print_document("sweep", plan_document(plan))
-                return
-            from studies.sweeps.dry_run import print_plan
-
-            print_plan(plan, console)
+            else:
+                print_plan(plan, console)
             return
         if out is None:
             raise StudyError("--out: name a folder for the results")

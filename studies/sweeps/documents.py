@@ -1,8 +1,6 @@
-"""JSON documents of a sweep: its overview, its best cases, its sensitivities, its plan."""
+"""JSON documents of a sweep: its overview, its best cases, its sensitivities."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
@@ -14,9 +12,7 @@ from studies.engine.results import (
     swept_names,
     uncontrolled_value,
 )
-from studies.engine.sweep import Plan
 from studies.space.methods import Analysis
-from studies.sweeps.dry_run import axis_records, sample_fault, sample_record
 from studies.sweeps.records import (
     Record,
     case_records,
@@ -93,35 +89,4 @@ def sensitivity_document(data: SweepData, by: str, analysis: Analysis) -> Record
         "n_left_out": analysis.n_left_out,
         "left_out": analysis.what,
         "notes": analysis.notes,
-    }
-
-
-def plan_document(plan: Plan) -> dict[str, Any]:
-    """What `studies sweep --dry-run` says."""
-    table = plan.table
-    programs = [
-        {
-            "law": group.structure.law,
-            "basis": group.structure.basis,
-            "feedback": group.structure.feedback,
-            "is_linear": group.structure.is_linear,
-            "n_modes": group.structure.n_modes,
-            "n_samples": group.structure.n_steps,
-            "substeps": group.structure.substeps,
-            "n_cases": len(group.rows),
-            "n_chunks": len(group.chunks()),
-            **group.layout._asdict(),
-        }
-        for group in plan.groups
-    ]
-    return {
-        "title": table.study.title,
-        "n_cases": len(table),
-        "n_left_out": table.n_dropped,
-        "n_duplicates": table.n_double,
-        "n_computed": plan.n_before,
-        "axes": axis_records(table),
-        "programs": programs,
-        "sample": sample_record(table),
-        "sample_fault": sample_fault(table),
     }

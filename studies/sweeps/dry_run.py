@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rich.console import Console
 
 from studies.engine.preflight import check_run
@@ -41,6 +43,37 @@ def print_plan(plan: Plan, console: Console) -> None:
         console.print(f"the sample cannot run: {fault}")
     if not plan.groups:
         console.print("nothing left to run")
+
+
+def plan_document(plan: Plan) -> dict[str, Any]:
+    """What `studies sweep --dry-run` says."""
+    table = plan.table
+    programs = [
+        {
+            "law": group.structure.law,
+            "basis": group.structure.basis,
+            "feedback": group.structure.feedback,
+            "is_linear": group.structure.is_linear,
+            "n_modes": group.structure.n_modes,
+            "n_samples": group.structure.n_steps,
+            "substeps": group.structure.substeps,
+            "n_cases": len(group.rows),
+            "n_chunks": len(group.chunks()),
+            **group.layout._asdict(),
+        }
+        for group in plan.groups
+    ]
+    return {
+        "title": table.study.title,
+        "n_cases": len(table),
+        "n_left_out": table.n_dropped,
+        "n_duplicates": table.n_double,
+        "n_computed": plan.n_before,
+        "axes": axis_records(table),
+        "programs": programs,
+        "sample": sample_record(table),
+        "sample_fault": sample_fault(table),
+    }
 
 
 def sample_record(table: CaseTable) -> Record:
