@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from rich.console import Console
@@ -24,6 +25,7 @@ from studies.fitting.statistics import Answer, Misfit, misfit, rivals
 from studies.study.paths import set_values
 from studies.study.spec import Study, parse_study
 
+F = TypeVar("F", bound=Callable[..., Any])
 #: Parameters up to which all likelihoods are profiled.
 PROFILED = 6
 #: Machines in the file of a tuning.
@@ -76,7 +78,7 @@ def fit_phases(spec: FitSpec) -> tuple[str, ...]:
 
 
 #: Many small matrices: two threads of BLAS took 135 s for a fit of responses, one 82 s.
-on_one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
+on_one_thread: Callable[[F], F] = threadpool_limits.wrap(limits=1, user_api="blas")
 
 
 @on_one_thread

@@ -302,7 +302,7 @@ def _changes(spec: TuneSpec, findings: TuneFindings, names: list[str]) -> list[l
     return rows
 
 
-def _change_of(name: str, baseline: DesignFigures, design: DesignFigures, part: slice) -> str:
+def _change_of(name: str, baseline: JudgedDesign, design: JudgedDesign, part: slice) -> str:
     """Change of the mean of a metric over some cases, unless a run ends before it settles."""
     before, after = (x.metrics[name][part] for x in (baseline, design))
     if name == "settling_time":
