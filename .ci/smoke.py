@@ -206,7 +206,7 @@ def build_wheel(folder: Path, until: float) -> Path:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="The wheel on all Pythons; core tests.")
-    parser.add_argument("--limit", type=float, default=900.0, help="time for all of them [s]")
+    parser.add_argument("--limit", type=float, default=1800.0, help="time for all of them [s]")
     until = time.monotonic() + parser.parse_args().limit
     found = pythons()
     print(f"smoke: Python {', '.join(sorted(found))}")
