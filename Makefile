@@ -33,7 +33,7 @@ test: .venv/installed  ## run the tests
 test-long: .venv/installed  ## run the long campaigns
 	$(PYTEST) -m long
 
-smoke: .venv/installed  ## run the main job and the core tests on every other supported Python here
+smoke: .venv/installed  ## run the wheel's main job on every supported Python here, core tests on the others
 	$(BIN)/python .ci/smoke.py
 
 lint: .venv/installed  ## lint, check format, types and the contract of imports

@@ -1,5 +1,6 @@
 from .atlas.run import run_atlas
 from .bench.run import run_bench
+from .cache import cache_contents
 from .config import configure, info
 from .engine.batched import batched
 from .engine.dataset import load
@@ -16,6 +17,7 @@ from .fitting.estimate import fit
 from .fitting.run import run_fit
 from .fitting.spec import load_fit
 from .paper.run import run_paper
+from .show.document import schema
 from .single.run import replay, simulate
 from .space.spec import load_sweep, parse_sweep
 from .spillover.run import spillover_design
@@ -42,6 +44,7 @@ __all__ = [
     "best_cases",
     "build_case",
     "build_structure",
+    "cache_contents",
     "chord_deflection",
     "configure",
     "export_design",
@@ -69,6 +72,7 @@ __all__ = [
     "run_study",
     "run_sweep",
     "run_tuning",
+    "schema",
     "simulate",
     "spillover_design",
     "status_rows",

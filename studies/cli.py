@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import warnings
@@ -17,11 +18,14 @@ from typer.exceptions import Abort, TyperException
 from studies import __version__
 from studies.atlas.commands import add_commands as add_atlas
 from studies.bench.commands import add_commands as add_bench
+from studies.cache import KINDS, VARIABLE, Kept, cache_contents, is_shared
 from studies.config import PACKAGE, configure, keep_programs, start
 from studies.errors import OWN_WARNINGS, StudyError, printable
 from studies.export.commands import add_commands as add_export
 from studies.fitting.commands import add_commands as add_fit
 from studies.paper.commands import add_commands as add_paper
+from studies.show import document
+from studies.show.document import AsJson, print_document
 from studies.single.commands import add_commands as add_single
 from studies.spillover.commands import add_commands as add_spillover
 from studies.sweeps.commands import add_commands as add_sweeps
@@ -184,16 +188,57 @@ def explore(
 
 
 @app.command()
-def info() -> None:
+def info(as_json: AsJson = False) -> None:
     """Show versions, devices, precision, compilation cache, and what sweeps run with."""
     start()
     from studies.config import info as facts
     from studies.engine.executor import executor_text
 
+    found = {**facts(), "executor": executor_text()}
+    if as_json:
+        print_document("info", found)
+        return
     table = Table(show_header=False)
-    for name, value in {**facts(), "sweeps run with": executor_text()}.items():
+    for name, value in found.items():
         table.add_row(name, str(value))
     console.print(table)
+
+
+@app.command()
+def cache(
+    clear: Annotated[bool, typer.Option("--clear", help="remove these files")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Show where compiled programs are kept, how many and how large; or remove them."""
+    found = cache_contents(clear)
+    if as_json:
+        kinds = [one._asdict() for one in found.kinds]
+        print_document("cache", {"folder": found.folder, "is_cleared": clear, "kinds": kinds})
+        return
+    console.print(f"folder: {found.folder}", soft_wrap=True)
+    table = Table("removed" if clear else "kept", "files", "size [MiB]")
+    whole = Kept("", found.files, found.bytes)
+    for one in (*found.kinds, whole):
+        table.add_row(KINDS.get(one.kind, "in all"), str(one.files), f"{one.bytes / 2**20:.1f}")
+    console.print(table)
+    if clear and is_shared():
+        console.print(
+            f"programs in XLA's own cache are left: {VARIABLE} names a folder where other programs "
+            "may keep theirs",
+            soft_wrap=True,
+        )
+
+
+@app.command()
+def schema(
+    command: Annotated[str, typer.Argument(help="whose document; default: list them")] = "",
+) -> None:
+    """Print the JSON schema of what a command prints with --json, or writes as JSON."""
+    if command:
+        print(json.dumps(document.schema(command), indent=1))
+        return
+    for name in document.documented():
+        console.print(name)
 
 
 if __name__ == "__main__":

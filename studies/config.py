@@ -10,13 +10,13 @@ import importlib.metadata
 import os
 import platform
 import re
-import stat
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from studies.cache import chosen_folder, exposure, is_usable
 from studies.errors import CacheWarning, StudyError, field_error, nearest
 
 PACKAGE = "flexlink-studies"
@@ -193,17 +193,15 @@ def info() -> dict[str, Any]:
     import jax
 
     kinds = [device.device_kind for device in jax.devices()]
-    folder = cache_folder()
     return {
         PACKAGE: _version(PACKAGE),
         "python": platform.python_version(),
         **{name: _version(name) for name in ("jax", "jaxlib", "numpy", "h5py", "llvmlite")},
-        "versions never tested": untested(),
+        "untested_versions": untested(),
         "processor": processor_text(),
         "devices": ", ".join(f"{kinds.count(kind)} x {kind}" for kind in sorted(set(kinds))),
         "precision": "float64" if _settings().jax_enable_x64 else "float32",
-        "cache": folder or "none",
-        "cache_mib": round(_folder_bytes(folder) / 2**20, 1) if folder else 0.0,
+        "cache": cache_folder() or "none",
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }
 
@@ -308,47 +306,17 @@ def _set_cache(cache: bool) -> None:
     _settings().update("jax_enable_compilation_cache", cache)
     if not cache:
         return
-    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(_default_cache_folder())
-    if not _is_usable_folder(folder) or _is_exposed(folder):
+    folder = chosen_folder()
+    is_there = is_usable(folder)
+    if fault := is_there and exposure(folder):
+        warnings.warn(fault, CacheWarning, stacklevel=3)
+    if not is_there or fault:
         # The cache only saves time: an unwritable home folder must not stop a study.
         _settings().update("jax_enable_compilation_cache", False)
         return
-    _settings().update("jax_compilation_cache_dir", folder)
+    _settings().update("jax_compilation_cache_dir", str(folder))
     # Reading an entry takes tens of milliseconds: not worth it for quick compilations.
     _settings().update("jax_persistent_cache_min_compile_time_secs", 0.5)
-
-
-def _is_usable_folder(folder: str) -> bool:
-    """Whether `folder` exists or can be created, and is writable."""
-    try:
-        # For this user only: anyone who can write to the cache can run code through it.
-        Path(folder).mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(folder, os.W_OK | os.X_OK)
-
-
-def _is_exposed(folder: str) -> bool:
-    """Whether others can put programs into the cache; says so."""
-    about = os.stat(folder)
-    if about.st_uid != os.getuid():
-        fault, cure = "belongs to another user", "name one of your own"
-    elif about.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        fault, cure = "can be written by others", f"`chmod go-w {folder}`, or name another one"
-    else:
-        return False
-    warnings.warn(
-        f"compiled programs are not cached: the folder {folder} {fault}, who could run code "
-        f"through it; {cure} in JAX_COMPILATION_CACHE_DIR",
-        CacheWarning,
-        stacklevel=4,
-    )
-    return True
-
-
-def _default_cache_folder() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME")
-    return Path(base) / PACKAGE if base else Path.home() / ".cache" / PACKAGE
 
 
 def usable_cores() -> int:
@@ -366,7 +334,3 @@ def _version(package: str) -> str:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return _ABSENT
-
-
-def _folder_bytes(folder: str) -> int:
-    return sum(entry.stat().st_size for entry in os.scandir(folder) if entry.is_file())

@@ -55,6 +55,8 @@ HEAVY = (
     "onset",
     "kernel",
     "cli",
+    "automation",
+    "documents",
     "paper",
     "dynamics",
     "notebooks",

@@ -217,22 +217,28 @@ def test_reports_that_cannot_be_are_refused_before_the_run(capsys, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"short.toml", "run.html"}
 
 
+def columns(document):
+    """Frequencies [Hz], damping ratios and names of the modes in a document."""
+    rows = ([x["frequency"], x["damping_ratio"], x["name"]] for x in document["modes"])
+    return tuple(zip(*rows, strict=True))
+
+
 def test_modes_as_json_and_as_table(capsys):
     code, out, err = run(capsys, "modes", "--modes", 2, "--json")
     found = json.loads(out)
     assert (code, err) == (0, "")
-    assert list(found) == ["frequencies_hz", "damping_ratios", "names"]
+    assert list(found) == ["format", "format_version", "modes", "units"]
+    frequency, ratio, names = map(list, columns(found))
     moves = [f"drive, platform {x}, 100 %" for x in ("translates", "translates", "turns")]
-    assert found["names"] == [
+    assert names == [
         *moves,
         *(f"links 1 2 3, mode {k}, 100 %" for k in (1, 1, 1, 2, 2, 2)),
     ]
-    frequency = np.array(found["frequencies_hz"])
-    assert len(frequency) == len(found["damping_ratios"]) == 3 + 3 * 2
+    assert len(frequency) == len(ratio) == 3 + 3 * 2
     assert np.all(np.diff(frequency) >= 0)
-    assert found["damping_ratios"] == [0.0] * 9
+    assert ratio == [0.0] * 9
     # the links vibrate near their pinned-pinned frequencies
-    assert np.all(np.abs(frequency[3:6] / 114.39 - 1) < 0.01)
+    assert np.all(np.abs(np.array(frequency[3:6]) / 114.39 - 1) < 0.01)
     code, out, _ = run(capsys, "modes", "--modes", 2, "--kd", 60, "--damping", 0.01, "--locked")
     assert code == 0 and "damping ratio" in out and "114.388" in out and "0.01000" in out
     assert "links 1 2 3, mode 2, 100 %" in out
@@ -277,22 +283,22 @@ def test_shares_of_modes_are_what_their_frequencies_gain_from_stiffness(thicknes
 def test_modes_at_another_pose_differ(capsys):
     moved = run(capsys, "modes", "--modes", 2, "--pose", 0.01, 0.005, 0.6, "--json")
     home = run(capsys, "modes", "--modes", 2, "--json")
-    moved, home = (np.array(json.loads(out)["frequencies_hz"]) for _, out, _ in (moved, home))
+    moved, home = (np.array(columns(json.loads(out))[0]) for _, out, _ in (moved, home))
     assert 1e-4 < np.max(np.abs(moved / home - 1)) < 0.2
 
 
 def test_modes_of_a_study_are_those_of_its_own_machine(capsys, tmp_path):
     """Patches, joint inertia and damping; a load changes the links' frequencies."""
     out = run(capsys, "modes", "measured", "--locked", "--json")[1]
-    found = json.loads(out)
-    frequency = np.array(found["frequencies_hz"]).reshape(-1, 3)
+    found, ratio, _ = columns(json.loads(out))
+    frequency = np.array(found).reshape(-1, 3)
     np.testing.assert_allclose(frequency[:2, 0], [92.5, 240.2], atol=0.1)
-    np.testing.assert_allclose(found["damping_ratios"], 0.01, rtol=1e-6)
+    np.testing.assert_allclose(ratio, 0.01, rtol=1e-6)
     study = tmp_path / "loaded.toml"
     study.write_text("[load]\nwrench = [20, 0, 0]\n[motion]\nmove_time = [0.1, 0.1, 0.1, 0.2]\n")
     out = run(capsys, "modes", study, "--kd", 0, "--pose", 0, 0, np.pi / 6, "--json")[1]
     np.testing.assert_allclose(
-        json.loads(out)["frequencies_hz"][3:6], [108.19, 118.16, 118.47], rtol=2e-4
+        columns(json.loads(out))[0][3:6], [108.19, 118.16, 118.47], rtol=2e-4
     )  # finite elements
 
 

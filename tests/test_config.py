@@ -177,7 +177,7 @@ def test_unusable_cache_folder_does_not_stop_a_study(tmp_path):
         "print(json.dumps(config.info()))\n",
         JAX_COMPILATION_CACHE_DIR=str(tmp_path / "file" / "cache"),
     )
-    assert facts["cache"] == "none" and facts["cache_mib"] == 0.0
+    assert facts["cache"] == "none"
 
 
 @pytest.mark.parametrize(
@@ -221,14 +221,13 @@ def test_info_is_plain_and_complete():
         "h5py",
         "devices",
         "cache",
-        "cache_mib",
         "xla_flags",
     } <= facts.keys()
     json.dumps(facts)
 
 
 def test_versions_that_were_never_tested_are_named(monkeypatch):
-    assert untested() == "none" == info()["versions never tested"]
+    assert untested() == "none" == info()["untested_versions"]
     version = config._version
     monkeypatch.setattr(config, "_version", lambda x: "0.11.1" if x == "jax" else version(x))
     assert untested() == "jax 0.11.1 (tested: 0.10, 0.12)"

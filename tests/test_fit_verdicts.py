@@ -4,6 +4,7 @@ import io
 import json
 from functools import cache
 
+import jsonschema
 import numpy as np
 import pytest
 from rich.console import Console
@@ -18,6 +19,7 @@ from studies.fitting.report import is_good, sentences, summary
 from studies.fitting.run import run_fit
 from studies.fitting.solve import SAME, exchanges
 from studies.fitting.statistics import UNKNOWN, describe_fit
+from studies.show.document import schema
 from studies.tuning.spec import load_tuning
 from tests.fits import ASKEW, FREQUENCY, RESPONSE, blank, made, spec_of, write
 from tests.pages import text_of
@@ -137,6 +139,7 @@ def test_equally_good_optima_come_first(exchanged):
     first, *_ = summary(found).splitlines()
     assert first.startswith("Not identifiable: 5 other optima lie in the data's region of 99 %")
     document = json.loads((out / "fit.json").read_text())
+    jsonschema.validate(document, schema("fit"))
     assert document["messages"][0] == first and document["is_good"] is False
     assigned = [sorted(x["values"].values()) for x in document["equally_good"]]
     np.testing.assert_allclose(assigned, [np.sort(found.answer.values)] * 5, rtol=1e-4)

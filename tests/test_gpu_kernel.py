@@ -131,7 +131,7 @@ def test_what_sweeps_run_with_is_said(monkeypatch):
     monkeypatch.setattr("studies.engine.executor.is_known", lambda: False)
     assert executor_text() == "XLA scan"
     monkeypatch.setattr("studies.engine.executor.is_available", lambda: False)
-    assert "extra 'fast'" in executor_text()
+    assert "needs llvmlite" in executor_text()
 
 
 def test_it_is_chosen_on_a_graphics_processor(monkeypatch):

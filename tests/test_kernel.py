@@ -10,9 +10,10 @@ import pytest
 from jaxmodel import status
 from jaxmodel.trigonometry import sine_cosine
 from studies.bench.works import METRICS, WORKS
-from studies.engine.executor import CaseLeaves, Executor
+from studies.engine.executor import CaseLeaves, Executor, executor_text
 from studies.engine.function import STEPPERS, TRACES, block_function
 from studies.engine.plan import Layout, chunk_cases, local_layout, plan_groups
+from studies.engine.programs import environment
 from studies.errors import NoKernelError
 from studies.kernels import compilation, cpu, llvm, native
 from studies.kernels.compilation import ObjectCache
@@ -132,8 +133,15 @@ def test_without_llvmlite_the_scan_runs(monkeypatch):
     table = build_table(small_spec(MIXED))
     group = plan_groups(table, np.arange(8), local_layout)[0]
     assert Executor(group.structure, LAYOUT).name == STEPPERS["kernel"]
-    monkeypatch.setattr(llvm, "binding", None)
-    assert Executor(group.structure, LAYOUT).name == STEPPERS["scan"]
+    for module in (llvm, native):
+        monkeypatch.setattr(module, "binding", None)
+    native.this_processor.cache_clear()
+    executor = Executor(group.structure, LAYOUT)
+    assert executor.name == STEPPERS["scan"]
+    result = executor.start(chunk_cases(table, group.rows, group.structure, LAYOUT.size)).wait()
+    assert np.all(np.isin(result.status, status.FINISHED))
+    assert "needs llvmlite" in executor_text() and len(environment()) > 8
+    native.this_processor.cache_clear()
 
 
 # --- the translation itself -----------------------------------------------------------------------
@@ -211,26 +219,26 @@ def test_code_is_kept_and_damage_is_noticed(tmp_path, monkeypatch):
 def test_only_the_users_own_code_is_taken_from_the_cache(tmp_path, monkeypatch):
     """Neither code with a hash of its own, nor another entry, nor one under another key."""
     monkeypatch.setattr(compilation, "cache_folder", lambda: str(tmp_path))
-    kept = ObjectCache("a")
+    kept = ObjectCache("kernel", "a")
     kept.keep(b"code")
-    assert ObjectCache("a").take() == b"code"
+    assert ObjectCache("kernel", "a").take() == b"code"
     (entry,) = tmp_path.glob("kernel-*")
     whole = entry.read_bytes()
     entry.write_bytes(hashlib.sha256(b"evil").hexdigest().encode() + b"\nevil")
-    assert ObjectCache("a").take() is None
-    ObjectCache("b").keep(b"other")
+    assert ObjectCache("kernel", "a").take() is None
+    ObjectCache("kernel", "b").keep(b"other")
     (other,) = set(tmp_path.glob("kernel-*")) - {entry}
     entry.write_bytes(other.read_bytes())
-    assert ObjectCache("a").take() is None
+    assert ObjectCache("kernel", "a").take() is None
     entry.write_bytes(whole)
-    assert ObjectCache("a").take() == b"code"
+    assert ObjectCache("kernel", "a").take() == b"code"
     assert (tmp_path / "key").stat().st_mode & 0o777 == 0o600
     (tmp_path / "key").chmod(0o644)  # a key that others have read is replaced
     compilation._key.cache_clear()
-    assert ObjectCache("a").take() is None
+    assert ObjectCache("kernel", "a").take() is None
     assert (tmp_path / "key").stat().st_mode & 0o777 == 0o600
-    ObjectCache("a").keep(b"code")
-    assert ObjectCache("a").take() == b"code"
+    ObjectCache("kernel", "a").keep(b"code")
+    assert ObjectCache("kernel", "a").take() == b"code"
 
 
 # --- other processors -----------------------------------------------------------------------------

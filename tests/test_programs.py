@@ -41,7 +41,7 @@ def test_the_next_process_does_not_trace(keeping):
     folder, next_process = keeping
     structure, x = Structure(), np.array([2.0, 3.0])
     first = scaled(structure, x, 1.0)
-    assert len(TRACED) == 1 and len(list(folder.glob("kernel-*"))) == 1
+    assert len(TRACED) == 1 and len(list(folder.glob("program-*"))) == 1
     next_process()
     again = scaled(structure, x, 1.0)
     assert len(TRACED) == 1
@@ -85,7 +85,7 @@ def test_other_flags_are_other_programs(keeping, monkeypatch):
 def test_damaged_entries_are_made_anew(keeping, damage):
     folder, next_process = keeping
     scaled(Structure(), np.ones(2), 1.0)
-    (path,) = folder.glob("kernel-*")
+    (path,) = folder.glob("program-*")
     whole = path.read_bytes()
     path.write_bytes(whole[:-1] if damage is None else damage)
     next_process()
@@ -97,7 +97,7 @@ def test_a_function_among_the_static_arguments_is_not_kept(keeping):
     folder, _ = keeping
     apply = kept_jit(static_argnums=0)(lambda function, x: function(x))
     assert apply(jnp.sin, 0.5) == pytest.approx(np.sin(0.5))
-    assert not list(folder.glob("kernel-*"))
+    assert not list(folder.glob("program-*"))
 
 
 def _raised(n, x, _):
@@ -127,7 +127,7 @@ def test_it_is_a_plain_jit_inside_other_programs(keeping):
     found = jax.vmap(lambda x: scaled(Structure(), x, 0.0)["sum"])(x)
     np.testing.assert_array_equal(found, 8 * x)
     assert jax.grad(lambda x: scaled(Structure(), x, 0.0)["sum"][0])(x[0]).tolist() == [8.0, 0.0]
-    assert not list(folder.glob("kernel-*"))
+    assert not list(folder.glob("program-*"))
 
 
 def test_only_commands_keep_programs(tmp_path, monkeypatch):

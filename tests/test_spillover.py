@@ -5,6 +5,7 @@ import re
 from functools import partial
 
 import jax
+import jsonschema
 import numpy as np
 import pytest
 import scipy.linalg
@@ -24,6 +25,7 @@ from studies.engine.controller import fixed_controller
 from studies.engine.runs import run_study
 from studies.engine.stability import follow_modes, loop_report, modal_damping
 from studies.errors import StudyError
+from studies.show.document import schema
 from studies.spillover import ModelMismatch, certify, compare_laws, patch_lengths
 from studies.spillover import run as spillover_run
 from studies.spillover.comparison import _controlled_links, _LawLoops
@@ -488,6 +490,7 @@ def test_command_passes_a_design_and_writes_everything(capsys, monkeypatch, tmp_
     page = parsed((out / "report.html").read_text())
     assert len(page.images) == 5 and page.title.startswith("Spillover certificate passed")
     data = json.loads((out / "certificate.json").read_text())
+    jsonschema.validate(data, schema("spillover"))
     assert data["is_passed"] and len(data["plants"]) == 8 and len(data["laws"]) == 7
     assert all(plant["passes"] for plant in data["plants"])
     with xarray.open_dataset(out / "spillover.h5") as store:
@@ -540,7 +543,9 @@ def test_command_fails_a_design(capsys, monkeypatch, tmp_path):
         report.startswith("# Spillover certificate failed: gain margin") and "## Laws" not in report
     )
     assert "| **no** |" in report and "- laws are not compared: not today" in report
-    assert not json.loads((out / "certificate.json").read_text())["is_passed"]
+    data = json.loads((out / "certificate.json").read_text())
+    jsonschema.validate(data, schema("spillover"))
+    assert not data["is_passed"]
 
 
 def test_a_certificate_is_written_whole_or_not_at_all(capsys, monkeypatch, tmp_path, comparison):

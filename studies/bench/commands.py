@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated, Any
 
 import typer
@@ -11,6 +10,7 @@ from rich.table import Table
 
 from studies.config import start
 from studies.errors import StudyError
+from studies.show.document import AsJson, print_document
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -28,7 +28,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         ] = 0,
         cases: Annotated[int, typer.Option(min=0, help="cases in the sweep; 0: 100,000")] = 0,
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
-        as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+        as_json: AsJson = False,
     ) -> None:
         """Measure speed and memory on this machine."""
         if what == "peers" and precision != "float64":
@@ -41,7 +41,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         figures = run_bench(what, work, executor, batch, cases)
         if as_json:
-            print(json.dumps(figures))
+            print_document("bench", {"peers": figures} if isinstance(figures, list) else figures)
         elif isinstance(figures, list):
             console.print(_peers(figures))
         else:

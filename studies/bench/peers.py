@@ -178,7 +178,7 @@ def find_peers(work: Work, report: Callable[[str], None]) -> list[Peer]:
     if is_available():
         peers.append(Peer(KERNEL, size, own("kernel")))
     else:
-        report("no traced kernel: install flexlink-studies[fast]")
+        report("no traced kernel: it needs the package llvmlite")
     try:
         peers.append(Peer("closed form, diffrax Tsit5, vmap", 8, by_diffrax(work, 8)))
     except ImportError:

@@ -82,7 +82,7 @@ def check_executor(executor: str, allowed: Iterable[str] = STEPPERS) -> None:
     if executor and executor not in allowed:
         raise field_error("--executor", executor, ", ".join(map(repr, allowed)))
     if executor in ("kernel", "gpu") and not is_available():
-        raise StudyError(f"--executor {executor}: needs llvmlite: install flexlink-studies[fast]")
+        raise StudyError(f"--executor {executor}: needs the package llvmlite")
     if executor == "gpu" and config.processor() != "cuda":
         raise StudyError(
             f"--executor gpu: needs an Nvidia graphics processor; JAX computes on "

@@ -295,7 +295,7 @@ def _check_gpu(function: BlockFunction, scan: BlockFunction, free: Any, own: Any
 def executor_text() -> str:
     """What sweeps run with here, in words."""
     if not is_available():
-        return "XLA scan; the traced kernel, several times faster, needs the extra 'fast'"
+        return "XLA scan; the traced kernel, several times faster, needs llvmlite"
     if processor() == "cpu":
         return f"traced kernel, vectors of {native.this_processor().vector_bytes} bytes"
     if processor() == "cuda" and is_known():

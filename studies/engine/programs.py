@@ -26,7 +26,7 @@ import numpy as np
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
 from studies import sources
-from studies.config import is_keeping, without_jax_cache
+from studies.config import is_keeping, processor_text, without_jax_cache
 from studies.kernels import native
 from studies.kernels.compilation import ObjectCache
 from studies.space.free import Placing
@@ -174,6 +174,7 @@ def environment() -> tuple[str, ...]:
         jax.__version__,
         jaxlib.version.__version__,
         *native.this_processor(),
+        processor_text(),
         os.environ.get("XLA_FLAGS", ""),
         str(jax.local_devices()),
         str(jax.dtypes.canonicalize_dtype(float)),

@@ -70,6 +70,12 @@ def _spectrum_frequencies(structure: Structure, case: Case) -> Any:
     return spectrum_frequencies(structure, find_bases(structure, case))
 
 
+def result_variables(run: Run) -> dict[str, Variable]:
+    """What a run ended like: its metrics, and what its cases have in the files of sweeps."""
+    labelled = {name: Variable(getattr(run.result, name), *PER_CASE[name]) for name in _OF_RESULTS}
+    return labelled | metric_variables(run.result)
+
+
 def run_variables(run: Run) -> dict[str, Variable]:
     """Contents of a run's file: axes, trajectories (if kept), metrics, judgement."""
     stations = np.array(run.study.metrics.stations)
@@ -85,9 +91,23 @@ def run_variables(run: Run) -> dict[str, Variable]:
             "frequency of spectral_density",
         ),
         "status": Variable(np.array(run.status), (), *STATUS_LABEL),
-        **{name: Variable(getattr(run.result, name), *PER_CASE[name]) for name in _OF_RESULTS},
-        **metric_variables(run.result),
+        **result_variables(run),
+        **loop_variables(run),
     }
+    if run.result.record is not None:
+        record = run.result.record
+        variables["time"] = Variable(record.time, ("time",), "s", "time")
+        for name, (dims, unit, text) in _RECORD_LABELS.items():
+            variables[name] = Variable(getattr(record, name), dims, unit, text)
+        variables["chord_deflection"] = Variable(
+            chord_deflection(run), ("time", "link"), "m", "mid-span relative to the chord B-C"
+        )
+    return variables
+
+
+def loop_variables(run: Run) -> dict[str, Variable]:
+    """Judgement of a run's linearised loop, its poles and its margins on the way; {} for none."""
+    variables: dict[str, Variable] = {}
     if run.loop is not None:
         variables |= {
             "loop_spectral_radius": Variable(
@@ -135,14 +155,6 @@ def run_variables(run: Run) -> dict[str, Variable]:
                 run.motion.gain_margin, instants, "1", "gain margin as if the instant lasted"
             ),
         }
-    if run.result.record is not None:
-        record = run.result.record
-        variables["time"] = Variable(record.time, ("time",), "s", "time")
-        for name, (dims, unit, text) in _RECORD_LABELS.items():
-            variables[name] = Variable(getattr(record, name), dims, unit, text)
-        variables["chord_deflection"] = Variable(
-            chord_deflection(run), ("time", "link"), "m", "mid-span relative to the chord B-C"
-        )
     return variables
 
 

@@ -19,6 +19,7 @@ from studies.fitting.spec import FitSpec
 from studies.fitting.statistics import REGION
 from studies.publish import REPORT, announce, check_folder, publish
 from studies.show import figures
+from studies.show.document import json_text
 from studies.store import Variable, write_store
 from studies.study.template import study_template
 
@@ -129,8 +130,6 @@ def document(fitted: Fitted) -> str:
         for k, name in enumerate(fitted.names)
     ]
     whole: dict[str, Any] = {
-        "format": "flexlink-fit",
-        "format_version": 1,
         "title": fitted.spec.study.title,
         "is_good": bool(is_good(fitted)),
         "is_explained": bool(answer.is_explained),
@@ -152,7 +151,7 @@ def document(fitted: Fitted) -> str:
             for x in fitted.checks
         ],
     }
-    return json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return json_text("fit", whole)
 
 
 def variables(fitted: Fitted) -> dict[str, Variable]:

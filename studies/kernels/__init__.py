@@ -3,6 +3,6 @@
 - `traced`: one sample of the step, as operations on scalars and the arrays they come from; it
   builds on `graph` (from JAX's equations), `fusion` (fewer, better ordered) and `tangents`;
   `routines` keeps functions that are called more than once.
-- `cpu`: that loop for this processor, written by `llvm` and `vectors`; needs the extra `fast`.
+- `cpu`: that loop for this processor, written by `llvm` and `vectors`; needs llvmlite.
 - `gpu`: the same loop for GPUs, as PTX.
 """

@@ -55,16 +55,17 @@ def _listen() -> None:
 
 
 class ObjectCache:
-    """Machine code of one module."""
+    """Machine code of one module, or whatever else is kept."""
 
-    def __init__(self, *names: str) -> None:
+    def __init__(self, kind: str, *names: str) -> None:
         """
         Args:
+            kind: of `studies.cache.KINDS`.
             names: everything the machine code depends on.
         """
         folder = cache_folder()
         name = hashlib.sha256("\0".join(names).encode()).hexdigest()
-        self._path = Path(folder) / f"kernel-{name}" if folder else None
+        self._path = Path(folder) / f"{kind}-{name}" if folder else None
         self._key = _key(Path(folder)) if folder else b""
 
     def take(self) -> bytes | None:

@@ -1,7 +1,7 @@
 """The traced loop on this processor: compiled by LLVM, vectors of cases side by side.
 
 XLA cannot do this: it fuses the step into many loops that recompute what they share. llvmlite is
-optional (extra `fast`); without it, XLA runs the same step.
+not there on every platform; without it, XLA runs the same step.
 """
 
 from __future__ import annotations
@@ -215,7 +215,7 @@ def kept_kernel(
     at = processor or native.this_processor()
 
     def kept(effort: int) -> ObjectCache:
-        return ObjectCache("loop", name, _code(), jax.__version__, *_names(at, effort))
+        return ObjectCache("kernel", name, _code(), jax.__version__, *_names(at, effort))
 
     @cache
     def written() -> tuple[bytes, str]:

@@ -1,6 +1,6 @@
 """A traced loop as LLVM instructions, completed by a writer for each processor.
 
-The optional llvmlite is imported only here and in `native`.
+llvmlite, which not every platform has, is imported only here and in `native`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from studies.kernels.traced import Change, InputLeaf, TracedLoop
 
 try:
     from llvmlite import ir as ir
-except ImportError:  # the extra is not installed
+except ImportError:  # not on this platform
     ir = None
 
 

@@ -7,6 +7,7 @@ from its input, and writes the machine code. It imports llvmlite only, so it sta
 from __future__ import annotations
 
 import json
+import platform
 import subprocess
 import sys
 from functools import cache
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 
 try:
     from llvmlite import binding as binding
-except ImportError:  # the extra is not installed
+except ImportError:  # not on this platform
     binding = None
 
 #: Longest time that a process of its own may take [s].
@@ -50,7 +51,9 @@ class Processor(NamedTuple):
 
 @cache
 def this_processor() -> Processor:
-    """The one that this program runs on."""
+    """The one that this program runs on; where LLVM is not there to say, no more than its kind."""
+    if binding is None:
+        return Processor(platform.machine(), "", "")
     features = binding.get_host_cpu_features().flatten()
     return Processor(binding.get_host_cpu_name(), features, binding.get_default_triple())
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from pathlib import Path
@@ -14,6 +13,7 @@ from rich.table import Table
 
 from studies.config import start
 from studies.publish import announce
+from studies.show.document import AsJson, print_document
 
 if TYPE_CHECKING:
     from studies.engine.runs import Run
@@ -33,6 +33,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         out: Annotated[Path | None, typer.Option(help="HDF5 file for the trajectories")] = None,
         report: _Report = False,
         precision: Annotated[str, typer.Option(help="float64 or float32")] = "float64",
+        as_json: AsJson = False,
     ) -> None:
         """Run one study and print its metrics; with --out, also save full trajectories."""
         start(precision)
@@ -40,6 +41,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.single.run import simulate as simulate_study
 
         run = simulate_study(study, out, report)
+        if as_json:
+            from studies.single.documents import run_document
+
+            print_document("simulate", run_document(run, uncontrolled_twin(run)))
+            return
         _print_run(run, uncontrolled_twin(run), console)
         _print_files(out, report, console)
 
@@ -85,11 +91,12 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         locked: Annotated[bool | None, typer.Option("--locked", help="hold the sliders")] = None,
         basis: Annotated[str | None, typer.Option(help="modal basis of the links")] = None,
         n_modes: Annotated[int | None, typer.Option("--modes", help="modes per link")] = None,
-        as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+        as_json: AsJson = False,
     ) -> None:
         """Natural frequencies and damping ratios of the assembled machine."""
         start()
         from studies.engine.modes import machine_modes
+        from studies.single.documents import modes_document
         from studies.study.spec import load_study
 
         result = machine_modes(
@@ -102,22 +109,18 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             basis=basis,
             n_modes=n_modes,
         )
+        document = modes_document(result)
         if as_json:
-            text = {
-                "frequencies_hz": result.frequency.tolist(),
-                "damping_ratios": result.damping_ratio.tolist(),
-                "names": result.names,
-            }
-            print(json.dumps(text))
+            print_document("modes", document)
             return
         if study is None:
             console.print(
                 "the paper's machine without damping; with it: studies modes paper", soft_wrap=True
             )
         table = Table("mode", "frequency [Hz]", "damping ratio [1]", "share of its energy")
-        rows = zip(result.frequency, result.damping_ratio, result.names, strict=True)
-        for k, (f, z, name) in enumerate(rows):
-            table.add_row(str(k + 1), f"{f:.4f}", f"{z:.5f}", name)
+        for row in document["modes"]:
+            numbers = f"{row['frequency']:.4f}", f"{row['damping_ratio']:.5f}"
+            table.add_row(str(row["mode"]), *numbers, row["name"])
         console.print(table)
 
 

@@ -29,11 +29,24 @@ class SamplingRequest(NamedTuple):
 class Analysis(NamedTuple):
     """Results of a design as a table, by factor."""
 
-    heads: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]  # most important factor first
+    names: tuple[str, ...]  # of its columns, in documents
+    heads: tuple[str, ...]  # of its columns, in tables
+    # most important factor first: its name, numbers, and intervals as pairs of numbers
+    values: tuple[tuple[Any, ...], ...]
     n_left_out: int  # by failed cases
     what: str  # is left out
     notes: tuple[str, ...] = ()
+    form: str = ".4g"  # of numbers in tables
+
+    @property
+    def rows(self) -> tuple[tuple[str, ...], ...]:
+        """The values as tables show them."""
+        return tuple(tuple(self._shown(value) for value in row) for row in self.values)
+
+    def _shown(self, value: Any) -> str:
+        if isinstance(value, tuple):
+            return " to ".join(map(self._shown, value))
+        return format(value, self.form) if isinstance(value, float) else str(value)
 
 
 class Method(NamedTuple):
@@ -126,30 +139,40 @@ def morris_points(count: int, dimensions: int, levels: int, seed: int) -> np.nda
 def _morris(points: np.ndarray, value: np.ndarray, names: list[str]) -> Analysis:
     effects = elementary_effects(points, value)
     rows = [
-        (names[k], *(f"{x[k]:.4g}" for x in effects[:3]), str(effects.n_used[k]))
+        (names[k], *(float(x[k]) for x in effects[:3]), int(effects.n_used[k]))
         for k in np.argsort(-effects.mean_size, kind="stable")
     ]
-    heads = ("factor", "mean |effect|", "mean effect", "deviation", "effects used")
-    return Analysis(heads, tuple(rows), effects.n_left_out, "effects")
+    return Analysis(
+        names=("factor", "mean_size", "mean", "deviation", "n_used"),
+        heads=("factor", "mean |effect|", "mean effect", "deviation", "effects used"),
+        values=tuple(rows),
+        n_left_out=effects.n_left_out,
+        what="effects",
+    )
 
 
 def _sobol(points: np.ndarray, value: np.ndarray, names: list[str]) -> Analysis:
     indices = sobol_indices(value, len(names))
-    rows = []
-    for k in np.argsort(-indices.total):
-        a, b = indices.first_interval[k], indices.total_interval[k]
-        first, total = f"{indices.first[k]:.3f}", f"{indices.total[k]:.3f}"
-        between = (f"{x[0]:.3f} to {x[1]:.3f}" for x in (a, b))
-        rows.append((names[k], first, next(between), total, next(between)))
+    rows = [
+        (
+            names[k],
+            float(indices.first[k]),
+            tuple(indices.first_interval[k].tolist()),
+            float(indices.total[k]),
+            tuple(indices.total_interval[k].tolist()),
+        )
+        for k in np.argsort(-indices.total)
+    ]
     notes = ("a first index beyond the total one: not settled yet, take more base points",)
     is_unsettled = bool(np.any(indices.first > indices.total_interval[:, 1]))
-    heads = ("factor", "first", "95 %", "total", "95 %")
     return Analysis(
-        heads=heads,
-        rows=tuple(rows),
+        names=("factor", "first", "first_interval", "total", "total_interval"),
+        heads=("factor", "first", "95 %", "total", "95 %"),
+        values=tuple(rows),
         n_left_out=indices.n_left_out,
         what="base points",
         notes=notes if is_unsettled else (),
+        form=".3f",
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from markupsafe import Markup
 
 from jaxmodel.laws import LAWS
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
+from studies.show.document import json_text
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
 from studies.spillover.certificate import Certificate, Spillover
@@ -187,8 +187,6 @@ def _laws(laws: Comparison) -> list[list[str]]:
 def document(certificate: Certificate, laws: Comparison | None) -> str:
     """JSON text: the verdict and every number, null if there is none."""
     whole: dict[str, Any] = {
-        "format": "flexlink-spillover",
-        "format_version": 2,
         "title": certificate.study.title,
         "is_passed": certificate.is_passed,
         "spillover": certificate.spillover and _spillover_entry(certificate.spillover),
@@ -201,7 +199,7 @@ def document(certificate: Certificate, laws: Comparison | None) -> str:
         "laws": [] if laws is None else [_law(laws, k) for k in range(len(laws.names))],
         "study": certificate.study.model_dump(mode="json"),
     }
-    return json.dumps(_plain(whole), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return json_text("spillover", whole, version=2)
 
 
 def _spillover_entry(worst: Spillover) -> dict[str, Any]:
@@ -253,13 +251,3 @@ def _law(laws: Comparison, k: int) -> dict[str, Any]:
         "control_energy_v2s": laws.control_energy[k],
         "run": describe(int(laws.status[k])),
     }
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _plain(entry) for name, entry in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -15,6 +15,7 @@ from studies.cluster.connect import LocalWorkers, Scheduler, Workers, WorkerTime
 from studies.config import start
 from studies.errors import StudyError
 from studies.publish import REPORT, announce
+from studies.show.document import AsJson, print_document
 
 #: Replaced in names of files: the brackets of entries.
 _NO_NAME = r"[^\w.-]+"
@@ -46,18 +47,21 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         scheduler: Scheduler = None,
         local_workers: LocalWorkers = None,
         worker_timeout: WorkerTimeout = 600.0,
+        as_json: AsJson = False,
     ) -> None:
         """Run thousands of cases from one file; finished cases survive any interruption."""
         from studies.engine.folder import SWEEPS, refuse_existing
 
         workers = Workers(scheduler, local_workers, worker_timeout)
+        if as_json and not dry_run:
+            raise StudyError("--json: for --dry-run only; the results: studies show DIR --json")
         if out is not None and not dry_run:
             refuse_existing(out, SWEEPS, resume)
         start(precision, cpu_only=workers.are_named)
         from studies.engine.progress import Phases
         from studies.engine.sweep import make_plan, run_sweep, sweep_phases
         from studies.space.spec import load_sweep
-        from studies.sweeps.dry_run import print_plan
+        from studies.sweeps.dry_run import plan_document, print_plan
 
         sweep_spec = load_sweep(spec)
         if dry_run and workers.are_named:
@@ -66,7 +70,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             if dry_run and is_wanted:
                 raise StudyError(f"{name}: --dry-run produces no results; leave one of them out")
         if dry_run:
-            print_plan(make_plan(sweep_spec, out if resume else None), console)
+            plan = make_plan(sweep_spec, out if resume else None)
+            if as_json:
+                print_document("sweep", plan_document(plan))
+            else:
+                print_plan(plan, console)
             return
         if out is None:
             raise StudyError("--out: name a folder for the results")
@@ -119,6 +127,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     def show(
         folder: Folder,
         failed: Annotated[bool, typer.Option("--failed", help="list failed cases")] = False,
+        as_json: AsJson = False,
     ) -> None:
         """Show statuses and best cases of a sweep, or its failed cases."""
         from studies.engine.results import read_sweep
@@ -126,6 +135,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.sweeps.show import show as show_sweep
 
         data = read_sweep(folder)
+        if as_json:
+            from studies.sweeps.documents import show_document
+
+            print_document("show", show_document(data, failed))
+            return
         show_sweep(data, console, failed)
         print_causes(data, console)
 
@@ -135,6 +149,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         by: Annotated[str, typer.Option(help="metric; the best come first, after - the worst")],
         subject_to: Annotated[str, typer.Option(help="condition on metrics and axes")] = "",
         count: Annotated[int, typer.Option(min=1, help="number of cases")] = 10,
+        as_json: AsJson = False,
     ) -> None:
         """List the best cases of a sweep by a metric."""
         from studies.engine.results import direction, read_sweep
@@ -147,6 +162,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         )
 
         data, name = read_sweep(folder), by.removeprefix("-")
+        if as_json:
+            from studies.sweeps.documents import best_document
+
+            print_document("best", best_document(data, by, subject_to, count))
+            return
         cases = ranked_cases(data, by, subject_to, count)
         print_uncontrolled(data, name, console)
         console.print(f"by {name}, {direction(by)} first, {counted_text(data, name)}:")
@@ -184,6 +204,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     def sensitivity(
         folder: Folder,
         by: Annotated[str, typer.Option(help="metric")] = "residual_rms",
+        as_json: AsJson = False,
     ) -> None:
         """Show which parameters matter, from a sweep with method morris or saltelli."""
         from studies.engine.results import read_sweep
@@ -192,6 +213,11 @@ def add_commands(app: typer.Typer, console: Console) -> None:
 
         data = read_sweep(folder)
         analysis = analyse(data, by)
+        if as_json:
+            from studies.sweeps.documents import sensitivity_document
+
+            print_document("sensitivity", sensitivity_document(data, by, analysis))
+            return
         design = f"a {data.spec.sweep.method} design"
         console.print(f"{label(data, by)}, {len(data.table.origin)} rows of {design}")
         table = Table(*analysis.heads)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rich.console import Console
 
 from studies.engine.preflight import check_run
@@ -10,6 +12,7 @@ from studies.errors import StudyError
 from studies.show.units import count_text
 from studies.space.table import CaseTable, case_study
 from studies.study.paths import field_unit, parse_entry
+from studies.sweeps.records import Record
 from studies.sweeps.show import Rows, print_rows, short_value
 
 
@@ -33,24 +36,88 @@ def print_plan(plan: Plan, console: Console) -> None:
             f"of {count_text(layout.devices, 'device')} x {count_text(layout.blocks, 'block')} x "
             f"{count_text(layout.lanes, 'lane')}"
         )
-    middle = len(table) // 2
-    values = ", ".join(f"{name} = {short_value(c[middle])}" for name, c in table.columns.items())
-    console.print(f"sample: case {middle}, id {table.case_id[middle].decode()}: {values}")
-    try:
-        check_run(case_study(table, middle))
-    except StudyError as error:
-        console.print(f"the sample cannot run: {error}")
+    sample = sample_record(table)
+    values = ", ".join(f"{name} = {short_value(sample[name])}" for name in table.columns)
+    console.print(f"sample: case {sample['case']}, id {sample['case_id']}: {values}")
+    if fault := sample_fault(table):
+        console.print(f"the sample cannot run: {fault}")
     if not plan.groups:
         console.print("nothing left to run")
 
 
-def axis_rows(table: CaseTable) -> Rows:
-    """Number of values of each column of a sweep, and their range."""
-    rows = []
+def plan_document(plan: Plan) -> dict[str, Any]:
+    """What `studies sweep --dry-run` says."""
+    table = plan.table
+    programs = [
+        {
+            "law": group.structure.law,
+            "basis": group.structure.basis,
+            "feedback": group.structure.feedback,
+            "is_linear": group.structure.is_linear,
+            "n_modes": group.structure.n_modes,
+            "n_samples": group.structure.n_steps,
+            "substeps": group.structure.substeps,
+            "n_cases": len(group.rows),
+            "n_chunks": len(group.chunks()),
+            **group.layout._asdict(),
+        }
+        for group in plan.groups
+    ]
+    return {
+        "title": table.study.title,
+        "n_cases": len(table),
+        "n_left_out": table.n_dropped,
+        "n_duplicates": table.n_double,
+        "n_computed": plan.n_before,
+        "axes": axis_records(table),
+        "programs": programs,
+        "sample": sample_record(table),
+        "sample_fault": sample_fault(table),
+    }
+
+
+def sample_record(table: CaseTable) -> Record:
+    """The case in the middle: its number, its id, and what varies."""
+    middle = len(table) // 2
+    values = {name: column[middle] for name, column in table.columns.items()}
+    return {"case": middle, "case_id": table.case_id[middle].decode()} | values
+
+
+def sample_fault(table: CaseTable) -> str:
+    """Why that case cannot run, "" if it can."""
+    try:
+        check_run(case_study(table, len(table) // 2))
+    except StudyError as error:
+        return str(error)
+    return ""
+
+
+def axis_records(table: CaseTable) -> list[Record]:
+    """Number of values of each column of a sweep, and their range, None for what has none."""
+    records = []
     for name, column in table.columns.items():
         entry = parse_entry(name)
-        unit = field_unit(entry.field if entry else name)
         is_numeric = column.dtype.kind in "fi"
-        ends = [f"{column.min():.4g}", f"{column.max():.4g}"] if is_numeric else ["", ""]
-        rows.append([name, unit, str(len({str(value) for value in column.tolist()})), *ends])
+        records.append(
+            {
+                "name": name,
+                "unit": field_unit(entry.field if entry else name),
+                "n_values": len({str(value) for value in column.tolist()}),
+                "smallest": column.min() if is_numeric else None,
+                "largest": column.max() if is_numeric else None,
+            }
+        )
+    return records
+
+
+def axis_rows(table: CaseTable) -> Rows:
+    """The same as a table."""
+    rows = [
+        [x["name"], x["unit"], str(x["n_values"]), *(_end(x[y]) for y in ("smallest", "largest"))]
+        for x in axis_records(table)
+    ]
     return Rows(["axis", "unit", "values", "smallest", "largest"], rows)
+
+
+def _end(value: float | None) -> str:
+    return "" if value is None else f"{value:.4g}"

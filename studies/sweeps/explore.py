@@ -24,8 +24,9 @@ from studies.show.figures import is_wide
 from studies.show.units import readable
 from studies.space.table import CaseTable, case_study
 from studies.study.fields import Fields
+from studies.sweeps.records import BESIDE, MARGIN, reason
 from studies.sweeps.sensitivity import scalar_columns
-from studies.sweeps.show import BESIDE, MARGIN, ranking, reason, shown_metric, unit_of_metric
+from studies.sweeps.show import ranking, shown_metric, unit_of_metric
 
 #: Figures by which replayed cases are chosen, beside the one that ranks.
 _FIGURES = (MARGIN, "peak_voltage")

@@ -24,7 +24,8 @@ from studies.space.axes import SHOWN_AS
 from studies.space.spec import BlockNode
 from studies.study.consistency import each_link
 from studies.study.margin import ENOUGH, HIGHEST
-from studies.sweeps.show import MARGIN, label, recommended, shown_metric, shown_value
+from studies.sweeps.records import MARGIN
+from studies.sweeps.show import label, recommended, shown_metric, shown_value
 
 #: More distinct values than this are no grid.
 FEW = 60

@@ -33,9 +33,9 @@ from studies.study.spec import Study
 from studies.study.template import study_template, toml_text, toml_value
 from studies.sweeps.dry_run import axis_rows
 from studies.sweeps.plots import front, plot, save_plot
+from studies.sweeps.records import MARGIN
 from studies.sweeps.screening import check_screen, draw_screen
 from studies.sweeps.show import (
-    MARGIN,
     SHARES,
     case_rows,
     cause_rows,

@@ -31,13 +31,13 @@ def failure_causes(data: SweepData) -> list[Cause]:
     Args:
         data: the sweep.
     """
-    from scipy.stats import ks_2samp  # takes a third of a second
-
     codes = data["status"]
     is_run = codes >= 0
     is_failed = (codes != status.OK)[is_run]
     if not is_failed.any() or is_failed.all():
         return []
+    from scipy.stats import ks_2samp  # takes a third of a second
+
     causes = []
     for name, column in scalar_columns(data):
         value = column[is_run]

@@ -14,7 +14,6 @@ from rich.table import Table as RichTable
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
-from studies.engine.columns import NOT_RUN, PER_CASE
 from studies.engine.results import (
     ROUNDING,
     SweepData,
@@ -33,16 +32,22 @@ from studies.show.units import headed, readable, settling_text
 from studies.study.entries import links_text
 from studies.study.margin import ENOUGH, margin_text
 from studies.study.resolution import is_deflection, least_step, resolution_text
+from studies.sweeps.records import (
+    MARGIN,
+    Record,
+    case_records,
+    failed_records,
+    reason,
+    status_records,
+    with_others,
+)
 from studies.sweeps.sensitivity import failure_causes, scalar_columns
 
 if TYPE_CHECKING:
     import pandas
 
-MARGIN = "gain_margin"
 #: After a value that is worse than that of the baseline without control.
 MARK = "*"
-#: Shown next to every metric of the cases that have them: what a design costs, and how safe it is.
-BESIDE = ("peak_voltage", "damping_ratio[controlled_mode=1]", MARGIN)
 
 
 #: Digits of a case's id that tables show.
@@ -72,12 +77,6 @@ def print_rows(listing: Rows, console: Console) -> None:
     for row in listing.rows:
         table.add_row(*row)
     console.print(table)
-
-
-def reason(code: int) -> str:
-    """A status in words."""
-    words = PER_CASE["status"][-1] | {NOT_RUN: "not run yet"}
-    return str(words.get(code, f"status {code}"))
 
 
 def select(data: SweepData, subject_to: str) -> np.ndarray:
@@ -123,7 +122,7 @@ def best_cases(
     if text:
         warnings.warn(text, ResolutionWarning, stacklevel=2)
     columns = {"case_id": data["case_id"], **dict(scalar_columns(data))}
-    columns |= {metric: metric_values(data, metric) for metric in _with_others(data, [name])}
+    columns |= {metric: metric_values(data, metric) for metric in with_others(data, [name])}
     table = {key: column[cases] for key, column in columns.items()}
     return pandas.DataFrame(table, index=pandas.Index(cases, name="case"))
 
@@ -146,7 +145,7 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
     """Print an overview, or the failed cases one by one."""
     codes = data["status"]
     if is_failed:
-        _print_failed(data, codes, console)
+        _print_failed(data, console)
         return
     console.print(f"{data.spec.study.title}: {data.n_cases} cases, {', '.join(swept_names(data))}")
     print_rows(status_rows(data), console)
@@ -167,27 +166,29 @@ def show(data: SweepData, console: Console, is_failed: bool) -> None:
 def status_rows(sweep: SweepData | str | Path) -> Rows:
     """Number of cases by status; of a folder, or of its data as read."""
     data = as_sweep(sweep)
-    counts = Counter(data["status"].tolist()).most_common()
-    rows = [[reason(code), str(n), f"{100 * n / data.n_cases:.1f}"] for code, n in counts]
+    rows = [
+        [x["status_text"], str(x["cases"]), f"{100 * x['cases'] / data.n_cases:.1f}"]
+        for x in status_records(data)
+    ]
     return Rows(["status", "cases", "share [%]"], rows)
 
 
-def _print_failed(data: SweepData, codes: np.ndarray, console: Console) -> None:
-    failed = np.flatnonzero((codes != status.OK) & (codes >= 0))
-    if len(failed) == 0:
+def _print_failed(data: SweepData, console: Console) -> None:
+    failed = failed_records(data)
+    if not failed:
         console.print("no failed case")
         return
     names = swept_names(data)
     rows = []
-    for k in failed[:LONGEST_TABLE]:
-        cells = [shown_value(data, name, int(k)) for name in names]
-        is_whole = codes[k] in status.FINISHED  # the case finished
-        time = "" if is_whole else f"{data['bad_time'][k]:.4g}"
-        rows.append([str(k), short_id(data, int(k)), reason(int(codes[k])), time, *cells])
+    for record in failed[:LONGEST_TABLE]:
+        time = "" if record["bad_time"] is None else f"{record['bad_time']:.4g}"
+        cells = (short_value(record[name]) for name in names)
+        rows.append([*_identity(record), record["status_text"], time, *cells])
     print_rows(Rows(["case", "id", "status", "from [s]", *names], rows), console)
     if len(failed) > LONGEST_TABLE:
         console.print(
-            f"and {len(failed) - LONGEST_TABLE} more; all of them: studies.load in Python"
+            f"and {len(failed) - LONGEST_TABLE} more; all of them: --json, or studies.load",
+            soft_wrap=True,
         )
 
 
@@ -273,45 +274,34 @@ def margin_warning(data: SweepData, cases: np.ndarray) -> str:
 
 def case_rows(data: SweepData, cases: np.ndarray, metrics: list[str]) -> Rows:
     """Cases with what varies, some metrics, and what else to look at before acting on them."""
-    names = swept_names(data)
-    metrics = _with_others(data, metrics)
-    columns = [shown_metric(data, name) for name in metrics]
+    names, metrics = swept_names(data), with_others(data, metrics)
     free = uncontrolled_value(data, metrics[0])
-    is_marked = np.zeros(data.n_cases, bool)
-    if free is not None:
-        is_marked = is_worse(metric_values(data, metrics[0]), free)
     rows = []
-    for k in cases:
-        cells = [shown_value(data, name, k) for name in names]
-        numbers = [
-            _number_text(data, name, column, k)
-            for name, column in zip(metrics, columns, strict=True)
-        ]
-        numbers[0] += f" {MARK}" if is_marked[k] else ""
-        rows.append([str(k), short_id(data, k), *cells, *numbers])
-    heads = [*names, *(label(data, x) for x in metrics)]
-    return Rows(["case", "id", *heads], rows)
+    for record in case_records(data, cases, metrics):
+        numbers = [_number_text(data, name, record) for name in metrics]
+        if free is not None and is_worse(record[metrics[0]], free):
+            numbers[0] += f" {MARK}"
+        cells = (short_value(record[name]) for name in names)
+        rows.append([*_identity(record), *cells, *numbers])
+    return Rows(["case", "id", *names, *(label(data, x) for x in metrics)], rows)
 
 
-def _with_others(data: SweepData, metrics: list[str]) -> list[str]:
-    """Metrics, and what else to look at before acting on them."""
-    return metrics + [name for name in BESIDE if name not in metrics and _is_there(data, name)]
+def _identity(record: Record) -> tuple[str, str]:
+    """Number of a case, and the start of its id."""
+    return str(record["case"]), record["case_id"][:ID_DIGITS]
 
 
-def _is_there(data: SweepData, name: str) -> bool:
-    """Whether a sweep has kept a metric, and some case has it."""
-    kept = name.partition("[")[0] in data.variables
-    return kept and bool(np.isfinite(metric_values(data, name)).any())
-
-
-def _number_text(data: SweepData, name: str, column: np.ndarray, case: int) -> str:
-    """A number of a case, from the metric's values in the unit that they are shown in."""
+def _number_text(data: SweepData, name: str, record: Record) -> str:
+    """A metric of a case in the unit that it is shown in."""
+    value = record[name]
     if name == MARGIN:
-        return margin_text(column[case])
+        return margin_text(value)
     if name.startswith("settling_time") and "command_end" in data.variables:
-        watched = data.spec.study.run.duration - float(data["command_end"][case])
-        return settling_text(1e-3 * float(column[case]), watched)
-    return f"{column[case]:.4g}"
+        end = float(data["command_end"][record["case"]])
+        return settling_text(float(value), data.spec.study.run.duration - end)
+    if is_metric(name) and value.dtype.kind == "f":
+        value = readable(unit_of_metric(data, name))[0] * value
+    return f"{value:.4g}"
 
 
 def short_id(data: SweepData, case: int) -> str:

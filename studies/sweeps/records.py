@@ -1,0 +1,100 @@
+"""What reading commands say of a sweep, as numbers in SI units under their names in its file.
+
+Tables (`studies.sweeps.show`) and JSON documents (`studies.show.document`) are made of these.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from jaxmodel import status
+from studies.engine.columns import NOT_RUN, PER_CASE
+from studies.engine.results import SweepData, metric_values, swept_names
+
+#: Names and values of one row.
+Record = dict[str, Any]
+MARGIN = "gain_margin"
+#: Stand next to every metric of the cases that have them: what a design costs, and how safe it is.
+BESIDE = ("peak_voltage", "damping_ratio[controlled_mode=1]", MARGIN)
+
+
+def reason(code: int) -> str:
+    """A status in words."""
+    words = PER_CASE["status"][-1] | {NOT_RUN: "not run yet"}
+    return str(words.get(code, f"status {code}"))
+
+
+def case_records(data: SweepData, cases: np.ndarray, metrics: Iterable[str]) -> list[Record]:
+    """Cases with what varies and some metrics.
+
+    Args:
+        data: the sweep.
+        cases: their numbers.
+        metrics: or entries of them.
+
+    Returns:
+        By case: its number, its whole id, each axis and each metric.
+
+    Raises:
+        StudyError: unknown metric.
+    """
+    values = {name: metric_values(data, name) for name in metrics}
+    return [
+        {"case": int(k), "case_id": str(data["case_id"][k])}
+        | {name: data[name][k] for name in swept_names(data)}
+        | {name: column[k] for name, column in values.items()}
+        for k in cases
+    ]
+
+
+def with_others(data: SweepData, metrics: list[str]) -> list[str]:
+    """Metrics, and what else to look at before acting on them."""
+    return metrics + [name for name in BESIDE if name not in metrics and _is_there(data, name)]
+
+
+def _is_there(data: SweepData, name: str) -> bool:
+    """Whether a sweep has kept a metric, and some case has it."""
+    kept = name.partition("[")[0] in data.variables
+    return kept and bool(np.isfinite(metric_values(data, name)).any())
+
+
+def failed_records(data: SweepData) -> list[Record]:
+    """Cases that have run and are not ok: status, when it appeared [s], and what varies."""
+    codes = data["status"]
+    failed = np.flatnonzero((codes != status.OK) & (codes >= 0))
+    return [
+        record
+        | {
+            "status": int(codes[record["case"]]),
+            "status_text": reason(int(codes[record["case"]])),
+            "bad_time": _bad_time(data, record["case"]),
+        }
+        for record in case_records(data, failed, ())
+    ]
+
+
+def _bad_time(data: SweepData, case: int) -> float | None:
+    """When a status appeared [s], None for a case that finished."""
+    is_whole = data["status"][case] in status.FINISHED
+    return None if is_whole else float(data["bad_time"][case])
+
+
+def status_records(data: SweepData) -> list[Record]:
+    """Number of cases by status, most frequent first."""
+    return [
+        {"status": code, "status_text": reason(code), "cases": n}
+        for code, n in Counter(data["status"].tolist()).most_common()
+    ]
+
+
+def units(data: SweepData, names: Iterable[str]) -> dict[str, str]:
+    """SI symbol of axes, metrics and entries of metrics, "1" for none."""
+    found = (
+        (name, data.variables.get(name) or data.variables.get(name.partition("[")[0]))
+        for name in names
+    )
+    return {name: "1" if variable is None else variable.units for name, variable in found}
