@@ -184,7 +184,7 @@ def workspace_map(
     x, y, margin = 1e3 * chart.x, 1e3 * chart.y, chart.squared_margin[turn]
     # colours run on over the border, where white covers them: it is smooth, the grid is not
     nearest = distance_transform_edt(np.isnan(value), return_distances=False, return_indices=True)
-    colors = {"cmap": "cividis", "vmin": low, "vmax": high}
+    colors: dict[str, Any] = {"cmap": "cividis", "vmin": low, "vmax": high}
     image = ax.pcolormesh(x, y, value[tuple(nearest)], shading="gouraud", rasterized=True, **colors)
     # an extra grid line around the map closes the border where poses reach the map's edge
     around = [np.pad(line, 1, mode="reflect", reflect_type="odd") for line in (x, y)]

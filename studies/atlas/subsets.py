@@ -96,7 +96,7 @@ class Subsets(NamedTuple):
 
     def each(self, pick: Callable[[np.ndarray], np.ndarray]) -> Subsets:
         """The same with another part of every array."""
-        return self._replace(**{name: pick(getattr(self, name)) for name in self._fields[1:]})
+        return Subsets(self.setting, *map(pick, self[1:]))
 
     def whole_links(self) -> Subsets:
         """Of choices of links, those with all modes of a link controlled, (settings, 8)."""
