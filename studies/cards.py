@@ -47,7 +47,7 @@ def card(result: Any) -> str:
 
 
 def _png(figure: Figure) -> bytes:
-    figure.set_figwidth(WIDTH)
+    figure.set_figwidth(min(WIDTH, figure.get_figwidth()))
     image = BytesIO()
     figure.savefig(image, format="png", dpi=DPI)
     return image.getvalue()
@@ -83,7 +83,7 @@ def _run(run: Any) -> Card:
         ax.set_xlabel("time [ms]")
         figures.legend_above(figure, ax)
     heads = ["link", *(headed(*unit) for unit in units)]
-    return Card(run.study.title, [x for x in lines if x], heads, rows, figure)
+    return Card(run.study.title, [x for x in lines if x], heads, rows, figure=figure)
 
 
 def _sweep(outcome: Any) -> Card:
@@ -107,7 +107,7 @@ def _sweep(outcome: Any) -> Card:
     if len(best):
         lines.append(f"Best by {metric}:")
         listing = case_rows(data, best, [metric])
-    return Card(data.spec.study.title, lines, listing.heads, listing.rows, figure)
+    return Card(data.spec.study.title, lines, listing.heads, listing.rows, figure=figure)
 
 
 def _tuning(found: Any) -> Card:
@@ -124,7 +124,11 @@ def _tuning(found: Any) -> Card:
     ]
     files = [f"{family.name} ({file_name(spec, family)})" for family in spec.moving]
     return Card(
-        spec.study.title, summary(spec, found), ["number", *files], rows, descent(spec, found)
+        spec.study.title,
+        summary(spec, found),
+        ["number", *files],
+        rows,
+        figure=descent(spec, found),
     )
 
 
@@ -135,7 +139,7 @@ def _fit(fitted: Any) -> Card:
 
     heads = ["parameter", "value", "sigma", "unit", "95 %", ""]
     drawn = next((figure for _, figure in all_figures(fitted)), None)
-    return Card(fitted.study.title, statements(fitted), heads, value_rows(fitted), drawn)
+    return Card(fitted.study.title, statements(fitted), heads, value_rows(fitted), figure=drawn)
 
 
 def _certificate(certificate: Any) -> Card:
@@ -161,7 +165,7 @@ def _certificate(certificate: Any) -> Card:
     figure, ax = figures.one_panel(2.6)
     margins(certificate, ax)
     heads = ["basis", "mismatch", "plant modes", "gain margin", "broken by"]
-    return Card(certificate.study.title, [x for x in lines if x], heads, rows, figure)
+    return Card(certificate.study.title, [x for x in lines if x], heads, rows, figure=figure)
 
 
 def _export(export: Any) -> Card:
@@ -176,7 +180,9 @@ def _export(export: Any) -> Card:
         f"Files: {', '.join(map(str, export.files))}",
     ]
     study = export.controller.study
-    return Card(study.title, lines, ["compared", "found", "allowed", ""], rows, sketch(study))
+    return Card(
+        study.title, lines, ["compared", "found", "allowed", ""], rows, figure=sketch(study)
+    )
 
 
 def _modes(modes: Any) -> Card:
@@ -196,7 +202,7 @@ def _modes(modes: Any) -> Card:
     ax.set(xlabel="frequency [Hz]", ylabel="energy [%]")
     figures.legend_above(figure, ax)
     heads = ["frequency [Hz]", "damping ratio [1]", "what moves"]
-    return Card("Natural modes of the machine", [], heads, rows, figure)
+    return Card("Natural modes of the machine", [], heads, rows, figure=figure)
 
 
 #: By the name of the type.
