@@ -8,7 +8,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 .DEFAULT_GOAL := help
-.PHONY: help study explore test test-long smoke lint check clean venv
+.PHONY: help study explore notebooks test test-long smoke lint check clean venv
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 16
@@ -26,6 +26,9 @@ explore: .venv/installed  ## coupling of the links, spillover of three designs, 
 	for design in paper paper_gains difference; do \
 	  $(BIN)/studies spillover $$design --out results/spillover-$$design; [ $$? -lt 2 ] || exit 2; done
 	$(PYTEST) -m "long or not long" tests/test_notebooks.py
+
+notebooks: .venv/notebooks  ## open the notebooks in JupyterLab
+	$(BIN)/jupyter lab --notebook-dir=notebooks
 
 test: .venv/installed  ## run the tests
 	$(PYTEST)
@@ -52,6 +55,11 @@ clean:  ## remove the environment, caches and build products; results stay
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(MAKE) --no-print-directory venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
 	  -c constraints.txt -e '.[test,dev]'
+	@touch $@
+
+.venv/notebooks: .venv/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
+	  -c constraints.txt -e '.[notebook]'
 	@touch $@
 
 venv:

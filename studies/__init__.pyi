@@ -30,7 +30,7 @@ from .sweeps.sensitivity import analyse
 from .sweeps.show import best_cases, status_rows
 from .tuning.audit import audit
 from .tuning.run import run_tuning
-from .tuning.spec import load_tuning
+from .tuning.spec import load_tuning, parse_tuning
 
 __all__ = [
     "Run",
@@ -63,6 +63,7 @@ __all__ = [
     "paper_study",
     "parse_study",
     "parse_sweep",
+    "parse_tuning",
     "plot",
     "replay",
     "run_atlas",

@@ -8,7 +8,9 @@ import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -125,3 +127,12 @@ def _is_alive(process: str) -> bool:
     except (ValueError, OSError, OverflowError):
         return False
     return True
+
+
+def shown(result: Any) -> str:
+    """A result as a notebook shows it, HTML.
+
+    Made by a module found by name: it knows all results, which do not need it, and only a notebook
+    loads it.
+    """
+    return str(import_module("studies.cards").card(result))

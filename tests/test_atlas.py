@@ -4,7 +4,6 @@ import io
 from functools import partial
 from itertools import permutations
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -64,6 +63,7 @@ def atlas(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "atlas_sweep", partial(subsets.atlas_sweep, settings=SETTINGS))
         patch.setattr(run, "evaluate_atlas", look)
+        patch.setattr(run, "MATTERS", -1.0)  # every setting's subsets of modes
         patch.setattr(run, "FIGURES", {n: drawn(n) for n in figures.FIGURES})
         patch.setattr(figures, "CLIP", (-0.002, 0.002, 1e-3))
         patch.setattr(findings, "map_workspace", partial(workspace.map_workspace, count=9))
@@ -116,24 +116,47 @@ def test_values_that_are_no_game_are_refused():
 
 def test_shares_of_the_atlas_sum_to_what_is_removed(atlas):
     folder, found = atlas
-    game = found.subsets.removed()
+    game = found.links.removed()
     with xarray.open_dataset(folder / run.DATA) as data:
-        total = data.shapley_share.sum("player").values
-        np.testing.assert_allclose(total, game[..., -1], rtol=1e-9, atol=1e-12)
+        for share in (data.shapley_share.sum("link"), data.mode_shapley_share.sum("player")):
+            np.testing.assert_allclose(share.values, game[..., -1], rtol=1e-9, atol=1e-12)
         assert np.abs(game[..., -1]).max() > 0.5
         assert np.all(np.isfinite(data.interaction))
+        np.testing.assert_array_equal(data.removed.sel(links="1+3"), game[..., 0b101])
+        assert data.links.values.tolist() == ["none", "1", "2", "3", "1+2", "1+3", "2+3", "1+2+3"]
+
+
+def test_subsets_come_in_the_order_of_people():
+    names = [subsets.subset_label(k, 1) for k in subsets.in_order(3)]
+    assert names == ["none", "1.1", "2.1", "3.1", "1.1+2.1", "1.1+3.1", "2.1+3.1", "1.1+2.1+3.1"]
+    spec = subsets.atlas_sweep(small_study(control__modes=2), SETTINGS[:1])
+    masks = np.array(spec.data["sweep"]["axes"]["control.mode_mask"])
+    assert masks.shape == (15, 3, 2)  # no link once
+    assert masks.sum(axis=(1, 2)).tolist() == [0, 1, 2, 1, 2, 1, 2, 2, 4, 2, 4, 2, 4, 3, 6]
+
+
+def test_modes_matter_where_their_control_changes_something():
+    one = made_up(np.ones((8, 3)), np.ones(8))
+    seen = one.each(lambda values: np.repeat(values[:, None], 2, axis=1))
+    assert subsets.beyond_first(seen, np.full(3, 0.5)).tolist() == [0.0]
+    seen.station[0, 1, 0b111, 2] = 0.8  # of link 3, with both modes controlled
+    assert subsets.beyond_first(seen, np.full(3, 0.5))[0] == pytest.approx(0.36)
+    # a third of that of all links, where link 3 is below an ADC step
+    few = subsets.beyond_first(seen, np.array([0.5, 0.5, 2.0]))[0]
+    assert few == pytest.approx(0.12)
+    assert subsets.beyond_first(seen, np.full(3, 2.0)).tolist() == [0.0]
 
 
 def test_a_case_of_the_atlas_is_the_run_of_its_study(atlas):
-    seen = atlas[1].subsets
+    seen = atlas[1].links
     where = seen.setting.index((0.03, "none"))
     moved = small_study(
         motion__move_time=0.03, shaper__kind="none", control__links=(True, False, True)
     )
     metrics = run_study(moved, has_record=False, has_loop=False).result.metrics
-    subset = seen.link_subsets[0b101]
-    np.testing.assert_allclose(seen.station[where, subset], metrics.residual_rms, rtol=1e-6)
-    np.testing.assert_allclose(seen.pose[where, subset], metrics.pose_error_rms, rtol=1e-6)
+    for found in (seen, atlas[1].subsets):  # one mode a link: its subsets are those of links
+        np.testing.assert_allclose(found.station[where, 0b101], metrics.residual_rms, rtol=1e-6)
+        np.testing.assert_allclose(found.pose[where, 0b101], metrics.pose_error_rms, rtol=1e-6)
 
 
 def test_atlas_writes_what_its_report_shows(atlas):
@@ -146,7 +169,7 @@ def test_atlas_writes_what_its_report_shows(atlas):
         assert f"![{name}]" in text
     assert "nan" not in text.lower()
     page = Page((folder / "report.html").read_text(encoding="utf-8"))
-    assert len(page.images) == len(figures.FIGURES) + 2
+    assert len(page.images) == len(figures.FIGURES) + len(figures.MODE_FIGURES) + 2
     assert page.title == "Coupling atlas"
     with Image.open(folder / figures.ANIMATION) as film:
         assert film.n_frames == 4
@@ -228,7 +251,6 @@ def made_up(link, platform):
     pose = np.stack([platform, 0 * platform, 0 * platform], axis=-1)
     return subsets.Subsets(
         setting=((0.1, "ei"),),
-        modes=1,
         status=np.zeros((1, 8), int),
         station=link[None, ..., None],
         pose=pose[None],
@@ -247,7 +269,7 @@ def test_claims_are_counted():
     assert steps.rises[0].tolist() == [0, 0, 0, 0, 3]
     assert np.argmax(steps.change[0, 4]) == steps.labels.index("1+2 -> 1+2+3")
     np.testing.assert_allclose(claims.two_links(seen).change[0], [-0.6, -0.55, -0.4])
-    signs = claims.table_1_signs(seen)
+    signs = claims.table_1_signs(seen.each(lambda values: values[:, None]))
     assert np.all(signs.agree[:, signs.is_controlled])
     np.testing.assert_allclose(signs.ours[0][signs.is_controlled], -0.75)
     np.testing.assert_allclose(signs.ours[0][~signs.is_controlled], 0.0)
@@ -270,17 +292,14 @@ def test_designs_without_subsets_are_refused(tmp_path, fields, message):
 
 def test_settings_with_failed_runs_are_left_out_in_words():
     seen = made_up(np.ones((8, 3)), np.ones(8))
-    twice = seen._replace(
-        setting=(*seen.setting, (0.03, "none")),
-        **{n: np.concatenate([getattr(seen, n)] * 2) for n in subsets.Subsets._fields[2:]},
-    )
+    twice = seen.each(lambda values: np.concatenate([values] * 2))
+    twice = twice._replace(setting=(*seen.setting, (0.03, "none")))
     twice.status[1, 3] = 1
     kept, dropped = run.sound_settings(twice)
     assert kept.setting == seen.setting and kept.station.shape[0] == 1
-    assert "0.03 s, no shaper: of 8 runs 1 " in dropped[0]
+    assert dropped[0].startswith("0.03 s, no shaper: runs with ")
     twice.status[:] = 1
-    with pytest.raises(StudyError, match="no setting"):
-        run.sound_settings(twice)
+    assert run.sound_settings(twice)[0].setting == ()
 
 
 def test_atlas_leaves_a_folder_of_something_else_alone(tmp_path):
@@ -304,7 +323,6 @@ def test_an_interrupted_drawing_says_how_to_go_on(tmp_path, monkeypatch, capsys)
     def stop(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run, "run_sweep", lambda *arguments: SimpleNamespace(is_interrupted=False))
-    monkeypatch.setattr(run, "_finish", stop)
+    monkeypatch.setattr(run, "_run", stop)
     code, _, err = command(capsys, "atlas", "--out", tmp_path / "out")
     assert code == 130 and f"continue with --resume --out {tmp_path / 'out'}" in err

@@ -81,9 +81,13 @@ def in_python(code, names):
 def start_names():
     """What makers are called; a sweep or a tuning is its study here, so that nothing starts JAX."""
     makers = SimpleNamespace(
-        Study=Study, paper_study=paper_study, parse_sweep=study_of, parse_study=study_of
+        Study=Study,
+        paper_study=paper_study,
+        parse_sweep=study_of,
+        parse_study=study_of,
+        parse_tuning=study_of,
     )
-    return {"studies": makers, "parse_tuning": study_of}
+    return {"studies": makers}
 
 
 def examples():

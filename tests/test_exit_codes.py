@@ -93,6 +93,7 @@ def test_a_sweep_with_lost_cases_fails_and_says_how_to_retry(
 def test_how_a_sweep_ended(capsys, monkeypatch, sweep_file, tmp_path, lost, is_interrupted, wanted):
     def ended(spec, *_, **__):
         return Outcome(
+            out=tmp_path,
             table=build_table(spec),
             n_done=6 - lost,
             n_run=3,
@@ -281,6 +282,8 @@ def test_a_replay_that_ends_otherwise_fails(capsys, monkeypatch, stored, wanted)
 
 @pytest.mark.parametrize("is_passed", [True, False])
 def test_a_certificate_that_is_not_passed_fails(capsys, monkeypatch, is_passed, tmp_path):
-    monkeypatch.setattr(spillover_run, "spillover_design", lambda *_: is_passed)
+    monkeypatch.setattr(
+        spillover_run, "spillover_design", lambda *_: SimpleNamespace(is_passed=is_passed)
+    )
     code, _, err = run(capsys, "spillover", "paper", "--out", tmp_path / "out")
     assert (code, err) == (0 if is_passed else 1, "")

@@ -383,6 +383,7 @@ def tuned():
     ]
     nothing = np.full(2, np.nan)
     found = TuneFindings(
+        spec=spec,
         at=at,
         baseline=own,
         judged=designs,

@@ -1,11 +1,18 @@
 """The notebooks run from top to bottom and are kept without outputs."""
 
+import ast
+from importlib import import_module
 from pathlib import Path
 
 import nbformat
 import pytest
 from nbclient import NotebookClient
 from nbformat.v4 import new_code_cell, new_notebook
+
+import studies
+
+#: Packages of the project, and how modules in them begin.
+OURS, DEEPER = ("jaxmodel", "studies"), ("jaxmodel.", "studies.")
 
 NOTEBOOKS = {
     path.stem: path for path in sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
@@ -38,6 +45,23 @@ def test_notebook_is_stripped(name):
     code = code_cells(read(name))
     assert all(cell.execution_count is None and not cell.outputs for cell in code)
     assert "configure()" in code[0].source
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_notebook_uses_public_names(name):
+    """Of the project, only what a package lists in its `__all__`."""
+    private = []
+    for cell in code_cells(read(name)):
+        lines = (x for x in cell.source.splitlines() if not x.startswith("%"))
+        for node in ast.walk(ast.parse("\n".join(lines))):
+            if isinstance(node, ast.ImportFrom) and node.module.split(".")[0] in OURS:
+                public = getattr(import_module(node.module), "__all__", ())
+                private += [f"{node.module}.{x.name}" for x in node.names if x.name not in public]
+            elif isinstance(node, ast.Import):
+                private += [x.name for x in node.names if x.name.startswith(DEEPER)]
+            elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "studies":
+                private += [node.attr] * (node.attr not in studies.__all__)
+    assert private == []
 
 
 @pytest.fixture(scope="module")
@@ -85,5 +109,6 @@ def check_outputs(book):
     failed = [output for output in outputs if output.output_type == "error"]
     assert not failed, "\n".join(failed[0].traceback)
     assert all(cell.execution_count for cell in code)
-    assert any("image/png" in output.get("data", {}) for output in outputs)
+    shown = [output.get("data", {}) for output in outputs]
+    assert any("image/png" in x or "data:image/png" in x.get("text/html", "") for x in shown)
     assert not [output for output in outputs if output.get("name") == "stderr"]

@@ -197,13 +197,13 @@ def test_atlas_has_the_numbers_of_the_paper_s_cases(short, tmp_path):
     study = short.runs.study.change(control__ratio_source="own_run")
     settings = tuple((time, shaper) for time in MOVES.values() for shaper in SHAPERS)
     quiet = Console(file=io.StringIO())
-    run_sweep(atlas_sweep(study, settings, has_modes=False), tmp_path / "runs", console=quiet)
-    seen = read_subsets(tmp_path / "runs")
+    run_sweep(atlas_sweep(study, settings), tmp_path / "runs", console=quiet)
+    seen = read_subsets(tmp_path / "runs").whole_links()
     for place, (time, shaper) in enumerate(settings):
         move = next(name for name, value in MOVES.items() if value == time)
         for links in (OFF, ONE, TWO, ALL):
             k = short.runs.where(move=move, shaper=shaper, modes=3, links=links)
-            subset = seen.link_subsets[sum(1 << i for i in range(3) if links[i])]
+            subset = sum(1 << i for i in range(3) if links[i])
             metrics = short.runs.result.metrics
             np.testing.assert_allclose(
                 seen.station[place, subset], metrics.residual_rms[k], rtol=1e-6

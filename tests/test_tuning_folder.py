@@ -166,6 +166,7 @@ def test_a_report_says_what_its_numbers_are():
     audited = [Disagreement("control.gain_factor", "tuned", 0, "objective", 1.0, 1.0, 0.0)]
     nothing = np.full(1, np.nan)
     found = TuneFindings(
+        spec,
         at,
         judged(1.0, 3.0, 0.02995),
         [judged(0.5, 1.3, 0.012)],

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from studies.atlas.subsets import Subsets, link_label
+from studies.atlas.subsets import CHOICES, Subsets, link_label
 from studies.study.printed import TABLE_1
 
 #: Columns of Table 1 after the uncontrolled one: links 1 to 3, links 1 and 2, link 1.
@@ -29,21 +29,19 @@ class Signs(NamedTuple):
         return np.sign(self.ours) == np.sign(self.paper)
 
 
-def table_1_signs(subsets: Subsets) -> Signs:
-    """Our Table 1: three links with two modes each, the others with the first mode only."""
+def table_1_signs(choices: Subsets) -> Signs:
+    """Our Table 1: three links with two modes each, the others with the first mode only.
+
+    Args:
+        choices: of links, (settings, C, 8).
+    """
     table = np.array(TABLE_1).T
-    columns = [_subset_number(subsets, TABLE_1_LINKS[0], 2)]
-    columns += [_subset_number(subsets, links, 1) for links in TABLE_1_LINKS[1:]]
-    peak = subsets.peak[:, :, :, 0]
+    peak = choices.peak[..., 0]  # (settings, C, 8, 3)
+    modes = (min(2, choices.modes) - 1, 0, 0)
+    columns = [peak[:, k, links] for k, links in zip(modes, TABLE_1_LINKS, strict=True)]
+    ours = np.stack(columns, axis=1) / peak[:, :1, 0] - 1
     on = (np.array(TABLE_1_LINKS)[:, None] >> np.arange(3)) & 1
-    return Signs(table[1:] / table[0] - 1, peak[:, columns] / peak[:, :1] - 1, on.astype(bool))
-
-
-def _subset_number(subsets: Subsets, links: int, count: int) -> int:
-    """Number of the subset with the first modes of some links."""
-    modes = subsets.modes
-    players = (i * modes + j for i in range(3) if links >> i & 1 for j in range(min(count, modes)))
-    return sum(1 << player for player in players)
+    return Signs(table[1:] / table[0] - 1, ours, on.astype(bool))
 
 
 class LinkSteps(NamedTuple):
@@ -59,10 +57,14 @@ class LinkSteps(NamedTuple):
         return np.sum(self.change > NO_CHANGE, axis=-1)
 
 
-def one_more_link(subsets: Subsets) -> LinkSteps:
-    """Change of every residual when one more link is controlled."""
-    left = np.sqrt(np.maximum(1 - subsets.removed()[..., subsets.link_subsets], 0.0))
-    steps = [(a, a | 1 << i) for a in range(8) for i in range(3) if not a >> i & 1]
+def one_more_link(links: Subsets) -> LinkSteps:
+    """Change of every residual when one more link is controlled.
+
+    Args:
+        links: the choices of links, (settings, 8).
+    """
+    left = np.sqrt(np.maximum(1 - links.removed(), 0.0))
+    steps = [(a, a | 1 << i) for a in CHOICES for i in range(3) if not a >> i & 1]
     labels = [f"{link_label(a)} -> {link_label(b)}" for a, b in steps]
     before, after = (left[..., [step[k] for step in steps]] for k in (0, 1))
     on = (np.array(steps)[:, 1:] >> np.arange(3)) & 1
@@ -76,9 +78,12 @@ class PairChanges(NamedTuple):
     change: np.ndarray  # [1], (settings, 3)
 
 
-def two_links(subsets: Subsets) -> PairChanges:
-    """The paper's claim: with two links controlled the residual error falls by more than 50 %."""
+def two_links(links: Subsets) -> PairChanges:
+    """The paper's claim: with two links controlled the residual error falls by more than 50 %.
+
+    Args:
+        links: the choices of links, (settings, 8).
+    """
     pairs = [1 << i | 1 << k for i, k in combinations(range(3), 2)]
-    error = subsets.platform[..., subsets.link_subsets]
-    change = error[..., pairs] / error[..., :1] - 1
+    change = links.platform[:, pairs] / links.platform[:, :1] - 1
     return PairChanges([link_label(pair) for pair in pairs], change)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,14 @@ from studies.atlas.attribution import effects, interaction, shapley
 from studies.atlas.drawing import Clip, animate, draw_mode, mode_skeleton
 from studies.atlas.findings import AtlasFindings
 from studies.atlas.platform import SETTINGS as RUNS
-from studies.atlas.subsets import TARGETS, link_label, player_labels, setting_label
+from studies.atlas.subsets import (
+    CHOICES,
+    TARGETS,
+    Subsets,
+    link_label,
+    player_labels,
+    setting_label,
+)
 from studies.show.figures import SERIES, SMALL, comparison, legend_above, new_figure
 from studies.show.skeleton import skeleton
 from studies.study.consistency import each_link
@@ -33,12 +41,11 @@ _COLUMNS = ["link 1", "link 2", "link 3", "platform"]
 
 
 def _subsets(findings: AtlasFindings) -> Figure:
-    subsets = findings.subsets
-    figure, axes = _panels(findings, 2.2)
-    rows = [link_label(k) for k in range(1, 8)]
+    figure, axes = _panels(findings, findings.links, 2.2)
+    rows = [link_label(k) for k in CHOICES[1:]]
     for ax, change in zip(axes, _link_changes(findings), strict=True):
-        image = plots.change_map(change[1:], rows, _COLUMNS, ax)
-    for ax in axes[: len(subsets.setting) : 2]:
+        image = plots.change_map(change[CHOICES[1:]], rows, _COLUMNS, ax)
+    for ax in axes[::2]:
         ax.set_ylabel("controlled links")
     figure.colorbar(
         image, ax=list(axes), shrink=0.5, extend="both", label="change of residual rms [%]"
@@ -48,34 +55,33 @@ def _subsets(findings: AtlasFindings) -> Figure:
 
 def _link_changes(findings: AtlasFindings) -> np.ndarray:
     """Change of the residual of links 1 to 3 and platform, (settings, 8, 4)."""
-    subsets = findings.subsets
-    chosen = subsets.link_subsets
-    residual = np.concatenate([subsets.link[:, chosen], subsets.platform[:, chosen, None]], axis=-1)
+    links = findings.links
+    residual = np.concatenate([links.link, links.platform[..., None]], axis=-1)
     return residual / residual[:, :1] - 1
 
 
-def _panels(findings: AtlasFindings, height: float) -> tuple[Figure, np.ndarray]:
-    """Two panels per row, one for each setting."""
-    settings = findings.subsets.setting
-    figure, axes = new_figure(-(-len(settings) // 2), min(len(settings), 2), height, False)
-    for k, ax in enumerate(axes.flat[: len(settings)]):
-        ax.set_title(findings.setting(k))
-    for ax in axes.flat[len(settings) :]:
+def _panels(findings: AtlasFindings, subsets: Subsets, height: float) -> tuple[Figure, np.ndarray]:
+    """Two panels per row, one for each setting of the subsets."""
+    labels = findings.labels(subsets)
+    count = len(labels)
+    figure, axes = new_figure(-(-count // 2), min(count, 2), height, False)
+    for ax, label in zip(axes.flat, labels, strict=False):
+        ax.set_title(label)
+    for ax in axes.flat[count:]:
         ax.remove()
-    return figure, axes.ravel()[: len(settings)]
+    return figure, axes.ravel()[:count]
 
 
 def _lattice(findings: AtlasFindings) -> Figure:
-    subsets = findings.subsets
-    figure, axes = _panels(findings, 1.9)
-    every = np.sqrt(np.mean(subsets.link[:, subsets.link_subsets] ** 2, axis=-1))
+    figure, axes = _panels(findings, findings.links, 1.9)
+    every = np.sqrt(np.mean(findings.links.link**2, axis=-1))
     for ax, residual in zip(axes, every, strict=True):
         plots.lattice(residual, ax)
     return figure
 
 
 def _effects(findings: AtlasFindings) -> Figure:
-    figure, axes = _panels(findings, 1.5)
+    figure, axes = _panels(findings, findings.links, 1.5)
     for ax, change in zip(axes, _link_changes(findings), strict=True):
         image = plots.change_map(effects(1 + change), _COLUMNS[:3], _COLUMNS, ax)
     for ax in axes[::2]:
@@ -87,26 +93,39 @@ def _effects(findings: AtlasFindings) -> Figure:
 
 
 def _shares(findings: AtlasFindings) -> Figure:
-    subsets = findings.subsets
+    """Shares of the links, and interactions of pairs of them."""
+    game = findings.links.removed()
+    pairs = list(combinations(range(3), 2))
+    index = interaction(game)
+    every = np.concatenate([shapley(game), *(index[..., i, k, None] for i, k in pairs)], axis=-1)
+    figure, axes = _panels(findings, findings.links, 1.9)
+    rows = [*_COLUMNS[:3], *(f"{i + 1} with {k + 1}" for i, k in pairs)]
+    for ax, share in zip(axes, every, strict=True):
+        plots.share_map(share.T, rows, list(TARGETS), ax)
+        ax.axhline(2.5, color="black", linewidth=0.8)
+    return figure
+
+
+def _mode_shares(findings: AtlasFindings) -> Figure:
+    subsets = _modes_of(findings)
+    labels, modes = findings.labels(subsets), [str(j + 1) for j in range(subsets.modes)]
     share = shapley(subsets.removed()).reshape(-1, len(TARGETS), 3, subsets.modes)
-    figure, axes = new_figure(len(subsets.setting), len(TARGETS), 1.3, False)
-    for row in range(len(subsets.setting)):
+    figure, axes = new_figure(len(labels), len(TARGETS), 1.3, False)
+    for row, label in enumerate(labels):
         for column, target in enumerate(TARGETS):
             ax = axes[row, column]
-            plots.share_map(share[row, column], ax)
-            ax.set_xticks(range(subsets.modes), [str(j + 1) for j in range(subsets.modes)])
-            ax.set_yticks(range(3), ["1", "2", "3"])
+            plots.share_map(share[row, column], ["1", "2", "3"], modes, ax)
             if row == 0:
                 ax.set_title(target)
-            if row == len(subsets.setting) - 1:
+            if row == len(labels) - 1:
                 ax.set_xlabel("mode")
-        axes[row, 0].set_ylabel(f"{findings.setting(row)}\nlink", fontsize=SMALL)
+        axes[row, 0].set_ylabel(f"{label}\nlink", fontsize=SMALL)
     return figure
 
 
 def _interactions(findings: AtlasFindings) -> Figure:
-    subsets = findings.subsets
-    figure, axes = _panels(findings, 2.4)
+    subsets = _modes_of(findings)
+    figure, axes = _panels(findings, subsets, 2.4)
     every = interaction(subsets.removed()[:, TARGETS.index("all links")])
     limit = float(np.max(np.abs(np.nan_to_num(every)), initial=1e-6))
     for ax, index in zip(axes, every, strict=True):
@@ -118,6 +137,12 @@ def _interactions(findings: AtlasFindings) -> Figure:
         label="interaction [% of the mean square],\npositive: more is removed together",
     )
     return figure
+
+
+def _modes_of(findings: AtlasFindings) -> Subsets:
+    """Subsets of modes, without which these figures are not drawn."""
+    assert findings.subsets is not None
+    return findings.subsets
 
 
 def _workspace(findings: AtlasFindings) -> Figure:
@@ -133,16 +158,8 @@ def _workspace(findings: AtlasFindings) -> Figure:
         limits = (float(np.nanpercentile(value, 1)), float(np.nanpercentile(value, 99)))
         for column, phi in enumerate(chart.phi):
             ax = axes[row, column]
-            is_own = np.allclose(path[:, 2], phi)
-            image = plots.workspace_map(
-                chart.x,
-                chart.y,
-                value[column],
-                chart.margin[column],
-                path[:, :2] if is_own else None,
-                ax,
-                limits,
-            )
+            own_path = path[:, :2] if np.allclose(path[:, 2], phi) else None
+            image = plots.workspace_map(chart, column, value[column], own_path, ax, limits)
             if row == 0:
                 ax.set_title(f"φ = {np.degrees(phi):.0f}°")
             if row == 2:
@@ -161,9 +178,7 @@ def _participation(findings: AtlasFindings) -> Figure:
         for link in range(3):
             ax = axes[row, link]
             value = 100 * chart.share[middle, :, :, row, link]
-            image = plots.workspace_map(
-                chart.x, chart.y, value, chart.margin[middle], None, ax, (0.0, 100.0)
-            )
+            image = plots.workspace_map(chart, middle, value, None, ax, (0.0, 100.0))
             rows, columns = np.nonzero(np.isfinite(value))
             ax.set_xlim(1e3 * chart.x[columns.min() - 1], 1e3 * chart.x[columns.max() + 1])
             ax.set_ylim(1e3 * chart.y[rows.min() - 1], 1e3 * chart.y[rows.max() + 1])
@@ -272,19 +287,22 @@ def _responses(findings: AtlasFindings) -> Figure:
     return figure
 
 
-#: What draws each figure, by its name.
+#: What draws each figure, by its name, and those of subsets of modes.
 FIGURES: dict[str, Callable[[AtlasFindings], Figure]] = {
     "subsets": _subsets,
     "helps": _effects,
     "lattice": _lattice,
     "shares": _shares,
-    "interactions": _interactions,
     "workspace": _workspace,
     "participation": _participation,
     "modes": _modes,
     "platform": _platform,
     "vibration": _vibration_after,
     "responses": _responses,
+}
+MODE_FIGURES: dict[str, Callable[[AtlasFindings], Figure]] = {
+    "mode_shares": _mode_shares,
+    "interactions": _interactions,
 }
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from studies.atlas.platform import PlatformError, Responses, platform_error, responses
-from studies.atlas.subsets import Subsets, setting_label
+from studies.atlas.subsets import Subsets, beyond_first, setting_label
 from studies.atlas.workspace import Map, PoseModes, map_workspace, natural_modes_at
 from studies.engine.batches import ProgressCallback
 from studies.engine.frame import frame_of
@@ -26,7 +26,8 @@ class AtlasFindings(NamedTuple):
     """What the atlas found."""
 
     study: Study
-    subsets: Subsets
+    choices: Subsets  # of links, (settings, C, 8)
+    subsets: Subsets | None  # of modes, where they matter, (settings, 2^(3C))
     platform: PlatformError
     responses: Responses
     map: Map
@@ -34,18 +35,39 @@ class AtlasFindings(NamedTuple):
     modes: PoseModes  # at these poses
     adc_step: np.ndarray  # of one ADC step, in the deflection of mode 1 [m], (3,)
 
-    def setting(self, k: int) -> str:
-        """A setting in words, with † if a link's uncontrolled residual is below an ADC step."""
-        is_small = (self.subsets.link[k, 0] < self.adc_step).any()
-        return setting_label(self.subsets.setting[k]) + (" †" if is_small else "")
+    @property
+    def links(self) -> Subsets:
+        """Choices of links with all their modes, (settings, 8)."""
+        return self.choices.whole_links()
+
+    @property
+    def beyond_first(self) -> np.ndarray:
+        """What modes 2 and up change at most [1], (settings,)."""
+        return beyond_first(self.choices, self.adc_step)
+
+    def labels(self, subsets: Subsets) -> list[str]:
+        """Settings in words, with † if a link's uncontrolled residual is below an ADC step."""
+        free = dict(zip(self.choices.setting, self.links.link[:, 0], strict=True))
+        return [
+            setting_label(x) + (" †" if (free[x] < self.adc_step).any() else "")
+            for x in subsets.setting
+        ]
 
 
-def evaluate_atlas(study: Study, subsets: Subsets, on_progress: ProgressCallback) -> AtlasFindings:
+def adc_step(study: Study) -> np.ndarray:
+    """What one ADC step is in the deflection of mode 1 [m], (3,)."""
+    return np.asarray(frame_of(*check_run(study)).adc_step)
+
+
+def evaluate_atlas(
+    study: Study, choices: Subsets, subsets: Subsets | None, on_progress: ProgressCallback
+) -> AtlasFindings:
     """All of the atlas except the runs of the subsets.
 
     Args:
         study: the design.
-        subsets: from `read_subsets`.
+        choices: of links, from `read_subsets`.
+        subsets: of modes; None where they do not matter.
         on_progress: called with progress messages.
 
     Raises:
@@ -59,16 +81,16 @@ def evaluate_atlas(study: Study, subsets: Subsets, on_progress: ProgressCallback
     chart = map_workspace(study)
     poses = np.stack([np.array(study.motion.waypoints[0]), _far_pose(chart)])
     modes = natural_modes_at(study, poses)
-    step = frame_of(*check_run(study)).adc_step
     return AtlasFindings(
         study=study,
+        choices=choices,
         subsets=subsets,
         platform=runs,
         responses=linear,
         map=chart,
         poses=poses,
         modes=modes,
-        adc_step=step,
+        adc_step=adc_step(study),
     )
 
 

@@ -76,9 +76,8 @@ def platform_error(study: Study, on_progress: Any = None) -> PlatformError:
     """
     on_progress = on_progress or (lambda text, share: None)
     study = long_enough(study, SETTINGS)
-    built = [
-        check_run(study.change(motion__move_time=t, shaper__kind=kind)) for t, kind in SETTINGS
-    ]
+    moved = [study.change(motion__move_time=t, shaper__kind=kind) for t, kind in SETTINGS]
+    built = [check_run(one) for one in moved]
     structure = built[0][0]._replace(substeps=max(x.substeps for x, _ in built))
     first = [x for _, case in built for x in (_with_links(case, LINK_SETS[0]), _rigid(case))]
     quiet = run_batches(structure, first, on_progress)
@@ -100,7 +99,8 @@ def platform_error(study: Study, on_progress: Any = None) -> PlatformError:
     drive, time = quiet.record.pose_error[1::2], quiet.record.time[0]
     end = np.asarray(quiet.command_end[::2])
     tick = 0.5 / study.electronics.sample_rate_hz
-    since = time - end[:, None] - residual_delay(study)
+    delay = np.array([residual_delay(one) for one in moved])
+    since = time - (end + delay)[:, None]
     window = (since > -tick) & (since < study.metrics.residual_length - tick)
     return PlatformError(
         time=time,

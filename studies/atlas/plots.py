@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import TwoSlopeNorm
+from scipy.ndimage import distance_transform_edt
 
-from studies.atlas.subsets import link_label
+from studies.atlas.subsets import CHOICES, link_label
+from studies.atlas.workspace import Map
 from studies.show.figures import CONTROLLED, SERIES, SMALL, WITHOUT, axes_or_new
 
 #: Changes: blue is less vibration, orange is more.
@@ -86,7 +88,7 @@ def lattice(residual: np.ndarray, ax: Axes | None = None) -> Axes:
         6: (2, 0),
         7: (3, 1),
     }
-    for a in range(8):
+    for a in CHOICES:
         for b in (a | 1 << i for i in range(3) if not a >> i & 1):
             is_better = residual[b] <= residual[a]
             ax.plot(
@@ -116,19 +118,20 @@ def lattice(residual: np.ndarray, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def share_map(share: np.ndarray, ax: Axes | None = None) -> Axes:
-    """Shapley shares of links and modes.
+def share_map(
+    share: np.ndarray, rows: list[str], columns: list[str], ax: Axes | None = None
+) -> None:
+    """Shapley shares, or interactions, as a map of numbers: blue removes vibration.
 
     Args:
-        share: of the mean square without control [1], (3, C).
+        share: of the mean square without control [1], (rows, columns).
+        rows, columns: their names.
         ax: where to draw; default: a new figure.
     """
-    modes = [f"mode {j + 1}" for j in range(share.shape[1])]
     ax = axes_or_new(ax)
-    change_map(-share, [f"link {i + 1}" for i in range(3)], modes, ax)
+    change_map(-share, rows, columns, ax)
     for text, value in zip(ax.texts, 100 * share.ravel(), strict=True):
         text.set_text(_signed(value, "-"))
-    return ax
 
 
 def interaction_map(
@@ -156,10 +159,9 @@ def interaction_map(
 
 
 def workspace_map(
-    x: np.ndarray,
-    y: np.ndarray,
+    chart: Map,
+    turn: int,
     value: np.ndarray,
-    margin: np.ndarray,
     path: np.ndarray | None = None,
     ax: Axes | None = None,
     limits: tuple[float, float] | None = None,
@@ -167,10 +169,9 @@ def workspace_map(
     """A quantity over the reachable poses.
 
     Args:
-        x, y: grid lines [m], (n,), (m,).
-        value: in the unit of the colour bar; NaN out of reach, (m, n).
-        margin: distance of the nearest link angle from a singularity [rad], NaN out of reach,
-            (m, n).
+        chart: from `map_workspace`.
+        turn: which of its orientations.
+        value: in the unit of the colour bar; NaN out of reach, (y, x).
         path: of the platform [m], (k, 2), or None.
         ax: where to draw; default: a new figure.
         limits: of the colours.
@@ -180,17 +181,20 @@ def workspace_map(
     """
     ax = axes_or_new(ax)
     low, high = limits or (float(np.nanmin(value)), float(np.nanmax(value)))
-    image = ax.pcolormesh(
-        1e3 * x, 1e3 * y, value, cmap="cividis", vmin=low, vmax=high, rasterized=True
-    )
+    x, y, margin = 1e3 * chart.x, 1e3 * chart.y, chart.squared_margin[turn]
+    # colours run on over the border, where white covers them: it is smooth, the grid is not
+    nearest = distance_transform_edt(np.isnan(value), return_distances=False, return_indices=True)
+    colors: dict[str, Any] = {"cmap": "cividis", "vmin": low, "vmax": high}
+    image = ax.pcolormesh(x, y, value[tuple(nearest)], shading="gouraud", rasterized=True, **colors)
     # an extra grid line around the map closes the border where poses reach the map's edge
-    reach = np.pad(np.where(np.isnan(margin), 0.0, 1.0), 1)
-    around = (np.pad(1e3 * line, 1, mode="reflect", reflect_type="odd") for line in (x, y))
-    ax.contour(*around, reach, [0.5], colors="#D55E00", linewidths=1.5)
-    lines = ax.contour(
-        1e3 * x, 1e3 * y, np.degrees(margin), [10, 20], colors="white", linewidths=0.7
-    )
-    ax.clabel(lines, fmt="%g°", fontsize=SMALL)
+    around = [np.pad(line, 1, mode="reflect", reflect_type="odd") for line in (x, y)]
+    whole = np.pad(margin, 1, constant_values=margin.min())
+    ax.contourf(*around, whole, [whole.min() - 1, 0.0], colors="white")
+    ax.contour(*around, whole, [0.0], colors="#D55E00", linewidths=1.5)
+    angles = (10, 20)
+    lines = ax.contour(x, y, margin, np.radians(angles) ** 2, colors="white", linewidths=0.7)
+    texts = {level: f"{angle}°" for level, angle in zip(lines.levels, angles, strict=True)}
+    ax.clabel(lines, fmt=texts, fontsize=SMALL)
     if path is not None:
         ax.plot(*(1e3 * path.T), color="black", linewidth=1.2)
     ax.set_aspect("equal")

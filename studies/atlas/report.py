@@ -14,7 +14,14 @@ from studies.atlas.findings import AtlasFindings
 from studies.atlas.platform import LINK_LABELS, OUTPUTS
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.plots import length_text
-from studies.atlas.subsets import TARGETS, link_label, setting_label
+from studies.atlas.subsets import (
+    CHOICES,
+    MATTERS,
+    TARGETS,
+    Subsets,
+    link_label,
+    setting_label,
+)
 from studies.atlas.workspace import MAP_MODES, Map
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
@@ -38,15 +45,19 @@ def report(findings: AtlasFindings, dropped: list[str], images: Path | None = No
         images,
         findings.study,
         study=findings.study,
-        delay=residual_delay(findings.study),
-        subsets=findings.subsets,
+        delays=[
+            1e3 * residual_delay(findings.study.change(motion__move_time=time))
+            for time, _ in findings.choices.setting
+        ],
+        modes=_modes(findings),
         dropped=dropped,
         most=_most_vibration(findings),
         adc_step=length_text(findings.adc_step.max()),
         is_stable=stable.all(),
         unstable=[name for name, fine in zip(LINK_LABELS, stable, strict=True) if not fine],
         radius=findings.responses.radius.max(),
-        choices=[link_label(k) for k in range(8)],
+        settings=len(findings.choices.setting),
+        choices=[link_label(k) for k in CHOICES],
         residuals=_residuals(findings),
         shares=_shares(findings),
         signs=_signs(findings),
@@ -76,13 +87,13 @@ def _by_setting(findings: AtlasFindings, cells: Iterable[Iterable[str]]) -> list
         findings: from `evaluate_atlas`.
         cells: of each setting, after its name.
     """
-    return [[findings.setting(k), *row] for k, row in enumerate(cells)]
+    labels = findings.labels(findings.choices)
+    return [[label, *row] for label, row in zip(labels, cells, strict=True)]
 
 
 def _all_links(findings: AtlasFindings) -> np.ndarray:
     """Residual of the three links by choice of controlled links [m], (settings, 8)."""
-    link = findings.subsets.link[:, findings.subsets.link_subsets]
-    return np.sqrt(np.mean(link**2, axis=-1))
+    return np.sqrt(np.mean(findings.links.link**2, axis=-1))
 
 
 def _most_vibration(findings: AtlasFindings) -> dict[str, Any]:
@@ -90,10 +101,10 @@ def _most_vibration(findings: AtlasFindings) -> dict[str, Any]:
     rms = _all_links(findings)
     k = int(np.argmax(rms[:, 0]))
     best = min((1, 2, 4), key=lambda subset: rms[k, subset])
-    link = findings.subsets.link[k, findings.subsets.link_subsets]  # (8, 3)
-    change = one_more_link(findings.subsets).change[k, ALL_LINKS]
+    link = findings.links.link[k]  # (8, 3)
+    change = one_more_link(findings.links).change[k, ALL_LINKS]
     return {
-        "setting": findings.setting(k),
+        "setting": findings.labels(findings.choices)[k],
         "free": length_text(rms[k, 0]),
         "controlled": length_text(rms[k, 7]),
         "best": link_label(best),
@@ -107,23 +118,44 @@ def _most_vibration(findings: AtlasFindings) -> dict[str, Any]:
 
 def _residuals(findings: AtlasFindings) -> list[list[str]]:
     """Rows of settings: residual of the three links for each choice of controlled links."""
-    return _by_setting(findings, (map(length_text, row) for row in _all_links(findings)))
+    return _by_setting(findings, (map(length_text, row[CHOICES]) for row in _all_links(findings)))
+
+
+def _modes(findings: AtlasFindings) -> dict[str, Any]:
+    """Whether modes 2 and up matter, and where all their subsets were run."""
+    subsets = findings.subsets
+    return {
+        "count": findings.choices.modes,
+        "change": 100 * findings.beyond_first,
+        "matters": 100 * MATTERS,
+        "labels": [] if subsets is None else findings.labels(subsets),
+        "shares": [] if subsets is None else _mode_shares(findings, subsets),
+    }
+
+
+def _mode_shares(findings: AtlasFindings, subsets: Subsets) -> list[list[str]]:
+    """Row of each setting: Shapley shares of the links' modes, link by link."""
+    share = 100 * shapley(subsets.removed()[:, ALL_LINKS]).reshape(-1, 3, subsets.modes)
+    return [
+        [label, *(", ".join(f"{x:.2f}" for x in link) for link in row)]
+        for label, row in zip(findings.labels(subsets), share, strict=True)
+    ]
 
 
 def _shares(findings: AtlasFindings) -> list[list[str]]:
-    """Row of each setting: Shapley shares of links, and of modes beyond the first."""
-    game = findings.subsets.removed()[:, ALL_LINKS]
-    share = 100 * shapley(game).reshape(len(game), 3, -1)
+    """Row of each setting: Shapley shares of links, and what modes beyond the first change."""
+    game = findings.links.removed()[:, ALL_LINKS]
+    beyond = 100 * findings.beyond_first
     cells = (
-        [*(f"{x:.2f}" for x in (*row.sum(axis=1), np.abs(row[:, 1:]).sum())), f"{100 * total:.4g}"]
-        for row, total in zip(share, game[:, -1], strict=True)
+        [*(f"{100 * x:.2f}" for x in row), f"{100 * total:.4g}", f"{change:.2g}"]
+        for row, total, change in zip(shapley(game), game[:, -1], beyond, strict=True)
     )
     return _by_setting(findings, cells)
 
 
 def _signs(findings: AtlasFindings) -> dict[str, Any]:
     """Table 1: changes of the spectral peak [%], and how many agree."""
-    signs = table_1_signs(findings.subsets)
+    signs = table_1_signs(findings.choices)
     on, paper, ours = signs.is_controlled, 100 * signs.paper, 100 * signs.ours
     agree = signs.agree[:, ~on]
 
@@ -150,7 +182,7 @@ def _signs(findings: AtlasFindings) -> dict[str, Any]:
 
 def _steps(findings: AtlasFindings) -> dict[str, Any]:
     """Steps to one more controlled link: how many of them increase vibration."""
-    steps = one_more_link(findings.subsets)
+    steps = one_more_link(findings.links)
 
     def cell(change: np.ndarray) -> str:
         worst = int(np.argmax(change))
@@ -185,7 +217,7 @@ def _at_drive(findings: AtlasFindings) -> dict[str, float] | None:
 
 def _pairs(findings: AtlasFindings) -> dict[str, Any]:
     """Two links controlled: change of the platform's error [%]."""
-    pairs = two_links(findings.subsets)
+    pairs = two_links(findings.links)
     return {
         "labels": [f"links {label}" for label in pairs.labels],
         "rows": _by_setting(findings, (map(_change, one) for one in pairs.change)),

@@ -1,4 +1,8 @@
-"""`studies atlas`: `runs/` (the sweep of all subsets), `atlas.h5`, figures, animation, report."""
+"""`studies atlas`: sweeps, `atlas.h5`, figures, animation, report.
+
+`runs/` is the sweep of the choices of links, `runs_modes/` that of all subsets of modes, made only
+where modes 2 and up matter.
+"""
 
 from __future__ import annotations
 
@@ -11,19 +15,24 @@ from threadpoolctl import threadpool_limits
 from jaxmodel import status
 from studies import config
 from studies.atlas.attribution import interaction, shapley
-from studies.atlas.figures import FIGURES, write_animation
-from studies.atlas.findings import AtlasFindings, evaluate_atlas
+from studies.atlas.figures import FIGURES, MODE_FIGURES, write_animation
+from studies.atlas.findings import AtlasFindings, adc_step, evaluate_atlas
 from studies.atlas.platform import LINK_LABELS
 from studies.atlas.platform import SETTINGS as RUNS
 from studies.atlas.report import report
 from studies.atlas.subsets import (
+    CHOICES,
+    MATTERS,
     TARGETS,
     Subsets,
     atlas_sweep,
+    beyond_first,
+    in_order,
     link_label,
     player_labels,
     read_subsets,
     setting_label,
+    subset_label,
 )
 from studies.atlas.workspace import PAIRS
 from studies.engine.columns import LINK_AXIS
@@ -35,10 +44,11 @@ from studies.errors import StudyError
 from studies.publish import REPORT, publish
 from studies.show.figures import save, styled, write_figure
 from studies.show.sketch import sketch
+from studies.space.spec import SweepSpec
 from studies.store import Variable, write_store
 from studies.study.spec import Study
 
-DATA, RUNS_FOLDER = "atlas.h5", ATLASES.mark
+DATA, RUNS_FOLDER, MODES_FOLDER = "atlas.h5", ATLASES.mark, "runs_modes"
 #: Phases after those of the sweep.
 LATER = ("analyse", "draw")
 
@@ -73,32 +83,67 @@ def run_atlas(
     with locked_folder(out, "atlas"):
         refuse_existing(out, ATLASES, is_resumed)
         with Phases(console, (*sweep_phases(spec), *LATER), is_quiet) as phases:
-            runs = run_sweep(spec, out / RUNS_FOLDER, is_resumed, phases=phases)
-            if runs.is_interrupted:
-                return False
             try:
-                _finish(study, out, phases, has_pdf)
+                _run(study, spec, out, is_resumed, phases, has_pdf)
             except KeyboardInterrupt:
                 return False
     return True
 
 
-def _finish(study: Study, out: Path, phases: Phases, has_pdf: bool) -> None:
-    """Everything after the runs of the subsets."""
+def _run(
+    study: Study, spec: SweepSpec, out: Path, is_resumed: bool, phases: Phases, has_pdf: bool
+) -> None:
+    """All of the atlas in an open folder; arguments as in `run_atlas`, and the sweep of links.
+
+    Raises:
+        KeyboardInterrupt: also where a sweep was interrupted.
+        StudyError: as `run_atlas`.
+    """
+    if run_sweep(spec, out / RUNS_FOLDER, is_resumed, phases=phases).is_interrupted:
+        raise KeyboardInterrupt
+    choices, dropped = sound_settings(read_subsets(out / RUNS_FOLDER))
+    if not choices.setting:
+        raise StudyError(f"atlas: no setting in which all cases run; {' '.join(dropped)}")
+    changes = beyond_first(choices, adc_step(study))
+    matter = tuple(choices.setting[k] for k in np.flatnonzero(changes > MATTERS))
+    phases.say(
+        f"modes 2 and up change the residual by {100 * changes.max():.2g} % of its mean square at "
+        f"most: all subsets of modes in {len(matter)} of {len(changes)} settings"
+    )
+    subsets = None
+    if matter:
+        every = atlas_sweep(study, settings=matter, has_every_mode=True)
+        if run_sweep(every, out / MODES_FOLDER, is_resumed, phases=phases).is_interrupted:
+            raise KeyboardInterrupt
+        subsets, more = sound_settings(read_subsets(out / MODES_FOLDER, has_every_mode=True))
+        dropped += more
+        subsets = subsets if subsets.setting else None
+    _finish(study, (choices, subsets), dropped, out, phases, has_pdf)
+
+
+def _finish(
+    study: Study,
+    found: tuple[Subsets, Subsets | None],
+    dropped: list[str],
+    out: Path,
+    phases: Phases,
+    has_pdf: bool,
+) -> None:
+    """Everything after the sweeps; found: choices of links, subsets of modes."""
 
     def on_progress(text: str, share: float) -> None:
         if share == 0:  # the beginning of a step; its end needs no message
             phases.say(text)
 
     phases.begin("analyse")
-    subsets, dropped = sound_settings(read_subsets(out / RUNS_FOLDER))
     with threadpool_limits(1, "blas"):  # many small matrices: more threads only slow them down
-        findings = evaluate_atlas(study, subsets, on_progress)
+        findings = evaluate_atlas(study, *found, on_progress)
     phases.begin("draw")
-    with publish(out) as staging:
+    drawn = FIGURES if findings.subsets is None else FIGURES | MODE_FIGURES
+    with publish(out, [f"{x}.{kind}" for x in MODE_FIGURES for kind in ("png", "pdf")]) as staging:
         write_store(staging / DATA, variables(findings), run_attributes(study))
         with styled():
-            for name, draw in FIGURES.items():
+            for name, draw in drawn.items():
                 save(draw(findings), staging, name, has_pdf)
             write_figure(sketch(study), staging / "machine.png")
         write_animation(findings, staging)
@@ -106,31 +151,22 @@ def _finish(study: Study, out: Path, phases: Phases, has_pdf: bool) -> None:
 
 
 def sound_settings(subsets: Subsets) -> tuple[Subsets, list[str]]:
-    """Settings in which every case finished, and, in words, what is wrong with the others.
-
-    Raises:
-        StudyError: there is none.
-    """
-    good = np.isin(subsets.status, (status.OK, status.SATURATED))
-    is_sound = [bool(part.all()) for part in good]
+    """Settings in which every case finished, and, in words, what is wrong with the others."""
+    is_sound = [bool(np.isin(x, (status.OK, status.SATURATED)).all()) for x in subsets.status]
     dropped = []
     for setting, codes, fine in zip(subsets.setting, subsets.status, is_sound, strict=True):
-        if fine:
-            continue
-        bad, counts = np.unique(codes[codes != status.OK], return_counts=True)
-        texts = [f"{n} {status.REASONS[int(k)]}" for k, n in zip(bad, counts, strict=True)]
-        dropped.append(f"{setting_label(setting)}: of {codes.size} runs {', '.join(texts)}.")
-    if not any(is_sound):
-        raise StudyError(f"atlas: no setting in which all cases run; {' '.join(dropped)}")
+        if not fine:
+            bad = [status.REASONS[int(k)] for k in np.unique(codes) if k != status.OK]
+            dropped.append(f"{setting_label(setting)}: runs with {', '.join(bad)}.")
     kept = tuple(s for s, fine in zip(subsets.setting, is_sound, strict=True) if fine)
-    arrays = {name: getattr(subsets, name)[is_sound] for name in Subsets._fields[2:]}
-    return subsets._replace(setting=kept, **arrays), dropped
+    return subsets.each(lambda values: values[is_sound])._replace(setting=kept), dropped
 
 
 def variables(findings: AtlasFindings) -> dict[str, Variable]:
     """All variables of `atlas.h5`."""
     return {
-        **_subset_variables(findings.subsets),
+        **_choice_variables(findings),
+        **(_mode_variables(findings.subsets) if findings.subsets is not None else {}),
         **_map_variables(findings),
         **_run_variables(findings),
     }
@@ -140,23 +176,52 @@ def _names(values: list[str], axis: str, text: str) -> Variable:
     return Variable(np.array(values), (axis,), "1", text)
 
 
-def _subset_variables(subsets: Subsets) -> dict[str, Variable]:
-    game = subsets.removed()
-    axes = ("setting", "subset")
-    per_link = (*axes, "link")
+def _choice_variables(findings: AtlasFindings) -> dict[str, Variable]:
+    """Of the choices of links, and the game whose players are whole links."""
+    choices = findings.choices
+    axes = ("setting", "first_modes", "links")
     return {
-        "setting": _names([setting_label(s) for s in subsets.setting], "setting", "move, shaper"),
-        "subset": Variable(
-            np.arange(game.shape[-1]),
-            ("subset",),
+        "setting": _names([setting_label(s) for s in choices.setting], "setting", "move, shaper"),
+        "first_modes": Variable(
+            np.arange(1, choices.modes + 1),
+            ("first_modes",),
             "1",
-            "which players are controlled: bit p for player p",
+            "how many modes of each controlled link are controlled, from the first on",
         ),
-        "player": _names(player_labels(subsets.modes), "player", "link.mode"),
+        "links": _names([link_label(k) for k in CHOICES], "links", "controlled"),
         "target": _names(list(TARGETS), "target", "whose residual"),
         "link": LINK_AXIS,
-        "links": _names([link_label(k) for k in range(8)], "links", "whole links controlled"),
-        "links_subset": Variable(subsets.link_subsets, ("links",), "1", "their subset"),
+        "beyond_first": Variable(
+            findings.beyond_first,
+            ("setting",),
+            "1",
+            "largest change that modes 2 and up make, share of the uncontrolled mean square",
+        ),
+        **_residual_variables(choices.each(lambda values: values[:, :, CHOICES]), axes, ""),
+        **_game_variables(choices.whole_links(), "setting", "links", "link", ""),
+    }
+
+
+def _mode_variables(subsets: Subsets) -> dict[str, Variable]:
+    """Of all subsets of modes, and the game whose players are modes."""
+    order, axes = in_order(3 * subsets.modes), ("mode_setting", "mode_subset")
+    labels = [setting_label(s) for s in subsets.setting]
+    names = [subset_label(k, subsets.modes) for k in order]
+    return {
+        "mode_setting": _names(labels, "mode_setting", "move, shaper"),
+        "mode_subset": _names(names, "mode_subset", "controlled, link.mode"),
+        "player": _names(player_labels(subsets.modes), "player", "link.mode"),
+        **_residual_variables(subsets.each(lambda values: values[:, order]), axes, "mode_"),
+        **_game_variables(subsets, *axes, "player", "mode_"),
+    }
+
+
+def _residual_variables(
+    subsets: Subsets, axes: tuple[str, ...], prefix: str
+) -> dict[str, Variable]:
+    """Residuals by the axes of `subsets`; prefix: of the names."""
+    per_link = (*axes, "link")
+    parts = {
         "residual_rms": Variable(
             subsets.station, (*per_link, "station"), "m", "rms chord deflection in the window"
         ),
@@ -173,25 +238,34 @@ def _subset_variables(subsets: Subsets) -> dict[str, Variable]:
             subsets.settling, per_link, "s", "after the reference trajectory"
         ),
         "peak_voltage": Variable(subsets.voltage, per_link, "V", "peak actuator voltage"),
+    }
+    return {prefix + name: variable for name, variable in parts.items()}
+
+
+def _game_variables(
+    subsets: Subsets, setting: str, subset: str, player: str, prefix: str
+) -> dict[str, Variable]:
+    """What subsets remove, and how players share in it; axes: their names."""
+    game = subsets.removed()
+    order = in_order(int(np.log2(game.shape[-1])))
+    parts = {
         "removed": Variable(
-            game,
-            ("setting", "target", "subset"),
+            game[..., order],
+            (setting, "target", subset),
             "1",
             "share of the uncontrolled mean square that control takes away",
         ),
         "shapley_share": Variable(
-            shapley(game),
-            ("setting", "target", "player"),
-            "1",
-            "Shapley share of it",
+            shapley(game), (setting, "target", player), "1", "Shapley share of it"
         ),
         "interaction": Variable(
             interaction(game),
-            ("setting", "target", "player", "other_player"),
+            (setting, "target", player, f"other_{player}"),
             "1",
             "Shapley interaction index of pairs",
         ),
     }
+    return {prefix + name: variable for name, variable in parts.items()}
 
 
 def _map_variables(findings: AtlasFindings) -> dict[str, Variable]:
@@ -202,6 +276,9 @@ def _map_variables(findings: AtlasFindings) -> dict[str, Variable]:
         "map_x": Variable(chart.x, ("map_x",), "m", "platform x"),
         "map_y": Variable(chart.y, ("map_y",), "m", "platform y"),
         "map_phi": Variable(chart.phi, ("map_phi",), "rad", "platform turn"),
+        "lift": Variable(
+            chart.lift, (*grid, "link"), "1", "sines of the link angles, above 1 out of reach"
+        ),
         "map_status": Variable(chart.status, grid, "1", "pose", status.REASONS),
         "gamma": Variable(chart.gamma, (*grid, "link"), "rad", "link angles"),
         "natural_frequency": Variable(

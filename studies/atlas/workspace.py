@@ -46,12 +46,13 @@ class PoseModes(NamedTuple):
 
 
 class Map(NamedTuple):
-    """Axes: phi, y, x; NaN where a pose is infeasible."""
+    """Axes: phi, y, x; NaN where a pose is infeasible, except in `lift`."""
 
     x: np.ndarray  # [m], (n,)
     y: np.ndarray  # [m], (n,)
     phi: np.ndarray  # [rad], (p,)
     status: np.ndarray  # code of the pose, (p, n, n)
+    lift: np.ndarray  # sines of the link angles, above 1 out of reach [1], (p, n, n, 3)
     gamma: np.ndarray  # link angles [rad], (p, n, n, 3)
     frequency: np.ndarray  # all natural frequencies [Hz], (p, n, n, m)
     bending: np.ndarray  # the three dominated by the links' first bending [Hz], (p, n, n, 3)
@@ -62,6 +63,17 @@ class Map(NamedTuple):
     def margin(self) -> np.ndarray:
         """Distance of the nearest link angle from 0 and 90 deg [rad], (p, n, n)."""
         return np.minimum(self.gamma, np.pi / 2 - self.gamma).min(axis=-1)
+
+    @property
+    def squared_margin(self) -> np.ndarray:
+        """Square of `margin`, negative out of reach [rad2], (p, n, n).
+
+        Unlike `margin` it crosses the border without a kink, so that contours of it are smooth.
+        """
+        sine = np.clip(self.lift, -1, 1)
+        low = np.arcsin(sine)
+        from_square = np.where(self.lift < 1, np.arccos(sine) ** 2, 2 * (1 - self.lift))
+        return np.minimum(low * np.abs(low), from_square).min(axis=-1)
 
     @property
     def spread(self) -> np.ndarray:
@@ -106,7 +118,7 @@ def map_workspace(study: Study, count: int = GRID, turns: tuple[float, ...] = TU
     x, y = _extent(structure, case, study, phi, count)
     grid = np.stack(np.meshgrid(phi, y, x, indexing="ij")[::-1], axis=-1)
     poses = grid.reshape(-1, 3)
-    codes, gamma, _ = (np.asarray(part) for part in _solve_poses(structure, case, poses))
+    codes, gamma, lifts = map(np.asarray, _solve_poses(structure, case, poses))
     good = codes == status.OK
     modes = _solve(structure, case, poses[good])
     chosen = np.sort(np.argsort(-modes.order_share[..., 0], axis=1)[:, :3], axis=1)
@@ -121,6 +133,7 @@ def map_workspace(study: Study, count: int = GRID, turns: tuple[float, ...] = TU
         y=y,
         phi=phi,
         status=codes.astype(int).reshape(grid.shape[:-1]),
+        lift=lifts.reshape(*grid.shape[:-1], 3),
         gamma=scatter(gamma[good]),
         frequency=scatter(modes.frequency),
         bending=scatter(np.take_along_axis(modes.frequency, chosen, axis=1)),
@@ -147,7 +160,7 @@ def _extent(
     """Grid lines that cover all feasible poses."""
     axis = np.linspace(-0.6, 0.6, 121) * study.machine.guide_side
     grid = np.stack(np.meshgrid(phi, axis, axis, indexing="ij")[::-1], axis=-1)
-    codes, _, _ = _solve_poses(structure, case, grid.reshape(-1, 3))
+    codes = _solve_poses(structure, case, grid.reshape(-1, 3))[0]
     good = (np.asarray(codes) == status.OK).reshape(grid.shape[:-1]).any(axis=0)
     step = axis[1] - axis[0]
     rows, columns = (axis[np.flatnonzero(good.any(axis=k))] for k in (1, 0))

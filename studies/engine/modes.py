@@ -13,6 +13,7 @@ from jaxmodel.linear import linearise, mass_and_stiffness, natural_modes, restin
 from jaxmodel.prepare import prepare
 from studies.engine.preflight import check_pose
 from studies.engine.programs import kept_jit
+from studies.publish import shown
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study, parse_study
 
@@ -38,6 +39,9 @@ class NamedModes(NamedTuple):
     link_share: np.ndarray  # [1], (m, 3, R)
     drive_share: np.ndarray  # [1], (m,)
     turn_share: np.ndarray  # of the platform's kinetic energy that is in rotation [1], (m,)
+
+    def _repr_html_(self) -> str:
+        return shown(self)
 
     @property
     def names(self) -> list[str]:

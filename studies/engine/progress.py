@@ -1,10 +1,14 @@
-"""Output of a long command: a live bar on a terminal, plain lines elsewhere, nothing if quiet."""
+"""Output of a long command: a live bar on a terminal, one line that changes in a notebook.
+
+Elsewhere plain lines, and nothing if quiet.
+"""
 
 from __future__ import annotations
 
 import time
 from collections import Counter
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -33,9 +37,15 @@ class Phases:
         self.present = ""
         self._started = time.perf_counter()
         self._bar: Progress | None = None
+        self._line: Any = None  # of a notebook
+        self._title = ""
 
     def __enter__(self) -> Phases:
-        if self.console.is_terminal and not self.is_quiet:
+        if self.console.is_jupyter and not self.is_quiet:
+            from IPython.display import display  # which is there in a notebook
+
+            self._line = display(_plain(""), raw=True, display_id=True)
+        elif self.console.is_terminal and not self.is_quiet:
             self._bar = Progress(
                 TextColumn("{task.description}"),
                 BarColumn(),
@@ -57,13 +67,13 @@ class Phases:
         name: one of `names`. note: what is done in it.
         """
         self.present = name
-        title = f"{name} ({self.names.index(name) + 1} of {len(self.names)})"
+        title = self._title = f"{name} ({self.names.index(name) + 1} of {len(self.names)})"
         if self._bar is not None:
             self._bar.tasks[0].total = None  # unknown, which `update` cannot set
             self._bar.update(self._bar.task_ids[0], description=title, completed=0, text=note)
         else:
             since = duration_text(time.perf_counter() - self._started)
-            self.say(f"{title}, {since} since the start{note and ': '}{note}")
+            self._rewrite(f"{title}, {since} since the start{note and ': '}{note}")
 
     def advance(self, done: int, total: int, text: str, left: str = "") -> None:
         """Show how far the present phase is.
@@ -77,12 +87,24 @@ class Phases:
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], total=total, completed=done, text=text)
         else:
+            self._rewrite(text if self._line is None else f"{self._title}: {text}")
+
+    def _rewrite(self, text: str) -> None:
+        """Show where the command is: in place of what was shown, where that is possible."""
+        if self._line is not None:
+            self._line.update(_plain(text), raw=True)
+        else:
             self.say(text)
 
     def say(self, text: str) -> None:
         """Print a line, unless quiet."""
         if not self.is_quiet:
             self.console.print(text, soft_wrap=True)
+
+
+def _plain(text: str) -> dict[str, str]:
+    """A text as notebooks take it."""
+    return {"text/plain": text}
 
 
 class Reporter:

@@ -17,6 +17,7 @@ from studies.engine.poles import PoleReport, pole_report, tracked_modes
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
 from studies.engine.stability import LoopFigures, run_report
+from studies.publish import shown
 from studies.study.cases import signed_power
 from studies.study.spec import Study
 
@@ -34,6 +35,9 @@ class Run(NamedTuple):
     loop: LoopFigures | None = None  # of its linearised sampled loop, if that is judged
     motion: LoopFigures | None = None  # with the forces of the motion, (k,)
     poles: PoleReport | None = None  # specified and obtained, where gains follow from poles
+
+    def _repr_html_(self) -> str:
+        return shown(self)
 
 
 def run_study(study: Study, has_record: bool = True, has_loop: bool = True) -> Run:

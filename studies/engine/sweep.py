@@ -41,6 +41,7 @@ from studies.engine.screen import (
 )
 from studies.engine.stored import chunk_arrays, kept_metrics, manifest_attributes, merge
 from studies.errors import StudyError
+from studies.publish import shown
 from studies.space.spec import SweepSpec
 from studies.space.table import CaseTable, build_table
 
@@ -53,6 +54,7 @@ def sweep_phases(spec: SweepSpec) -> tuple[str, ...]:
 class Outcome(NamedTuple):
     """How a sweep ended."""
 
+    out: Path  # its folder
     table: CaseTable
     n_done: int  # cases with results, those of earlier runs included
     n_run: int  # in this run
@@ -61,6 +63,9 @@ class Outcome(NamedTuple):
     is_interrupted: bool  # by Ctrl-C
     executor: str  # that ran the last chunks; "" if there were none
     lost: np.ndarray  # numbers of cases that were given up, with the reason in the folder
+
+    def _repr_html_(self) -> str:
+        return shown(self)
 
 
 class Plan(NamedTuple):
@@ -156,6 +161,7 @@ def run_sweep(
             merge(out, table, finished, attributes | timings, screened)
             folder.publish()
         return Outcome(
+            out=out,
             table=table,
             n_done=len(before) + run.n_run,
             n_run=run.n_run,

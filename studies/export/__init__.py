@@ -10,3 +10,7 @@
 - `targets` is the table of output formats, each made from a `job`; `run` leads from the design
   to the files.
 """
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -45,7 +45,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.export.run import export_design
 
         chosen = load_design(design, case)
-        if not export_design(chosen, target, out, verify, name, dac_bits, console):
+        if not export_design(chosen, target, out, verify, name, dac_bits, console).is_good:
             sys.exit(1)
 
     @app.command("import-gains")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 from rich.console import Console
 
@@ -16,15 +17,30 @@ from studies.export.document import study_hash
 from studies.export.job import Job
 from studies.export.report import report
 from studies.export.targets import TARGETS
-from studies.export.verify import (
-    Verification,
-)
-from studies.publish import check_folder, publish
+from studies.export.verify import Verification
+from studies.publish import check_folder, publish, shown
 
 REPORT, FAILED = "verification.html", "verification-failed.html"
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,30}")
 _DAC_BITS = (4, 16)
 DAC_BITS = 12
+
+
+class Exported(NamedTuple):
+    """An export."""
+
+    controller: FixedController
+    target: str
+    files: tuple[Path, ...]  # those written: without the controller if a comparison failed
+    verified: Verification | None  # None: nothing was compared
+
+    @property
+    def is_good(self) -> bool:
+        """Whether everything agreed; the controller is written only then."""
+        return self.verified is None or self.verified.is_passed
+
+    def _repr_html_(self) -> str:
+        return shown(self)
 
 
 def export_design(
@@ -35,7 +51,7 @@ def export_design(
     name: str = "flexlink",
     dac_bits: int | None = None,
     console: Console | None = None,
-) -> bool:
+) -> Exported:
     """Write a controller, verified if requested.
 
     Args:
@@ -48,7 +64,7 @@ def export_design(
         console: where messages go; default: standard output.
 
     Returns:
-        whether everything agreed; the files are written only then.
+        what was written and compared; `is_good`: whether everything agreed.
 
     Raises:
         StudyError: an argument out of range, or a controller that cannot be exported.
@@ -94,7 +110,7 @@ def export_design(
             (staging / file).write_text(text, encoding="utf-8")
     for file in texts:
         console.print(f"written: {out / file}", soft_wrap=True)
-    return is_good
+    return Exported(exported, target, tuple(out / file for file in texts), verified)
 
 
 def _check_arguments(target: str, name: str, dac_bits: int | None) -> None:

@@ -22,6 +22,7 @@ from studies.fitting.profiles import Likelihood, describe_confirmed
 from studies.fitting.solve import Optimum, Solution, solve
 from studies.fitting.spec import FitSpec
 from studies.fitting.statistics import Answer, Misfit, misfit, rivals
+from studies.publish import shown
 from studies.study.paths import set_values
 from studies.study.spec import Study, parse_study
 
@@ -51,6 +52,9 @@ class Fitted(NamedTuple):
     fault: str  # why the fitted study does not run, "" if it does
     experiments: tuple[Experiment, ...] = ()  # the most telling first; none if the model fails
     experiment_fault: str = ""  # why none was found
+
+    def _repr_html_(self) -> str:
+        return shown(self)
 
     @property
     def names(self) -> tuple[str, ...]:

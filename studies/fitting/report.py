@@ -28,15 +28,15 @@ GOOD = "The model explains the data within their noise, and every parameter is i
 
 def summary(fitted: Fitted) -> str:
     """Some lines: the verdict, the values, and what else is to be known of them."""
-    verdict, *others = _statements(fitted)
+    verdict, *others = statements(fitted)
     lines = [
         f"{name} = {value} +- {sigma} {unit} (95 %: {interval})".replace("  ", " ")
-        for name, value, sigma, unit, interval, _ in _rows(fitted)
+        for name, value, sigma, unit, interval, _ in value_rows(fitted)
     ]
     return "\n".join([verdict, *lines, *others])
 
 
-def _statements(fitted: Fitted) -> list[str]:
+def statements(fitted: Fitted) -> list[str]:
     """The verdict, then what else is to be known."""
     return [GOOD] * is_good(fitted) + sentences(fitted)
 
@@ -48,7 +48,7 @@ def report(fitted: Fitted, images: Path | None = None) -> str:
         fitted: the fit.
         images: folder with its figures; None: a page without.
     """
-    first, *others = _statements(fitted)
+    first, *others = statements(fitted)
     return page(
         "fitting/report.html",
         images,
@@ -56,7 +56,7 @@ def report(fitted: Fitted, images: Path | None = None) -> str:
         fitted=fitted,
         spec=fitted.spec,
         answer=fitted.answer,
-        rows=_rows(fitted),
+        rows=value_rows(fitted),
         is_good=is_good(fitted),
         first=first,
         others_said=others,
@@ -86,7 +86,7 @@ def _is_at_bound(place: float) -> bool:
     return not 1e-6 < place < 1 - 1e-6
 
 
-def _rows(fitted: Fitted) -> list[list[str]]:
+def value_rows(fitted: Fitted) -> list[list[str]]:
     """Name, value, standard deviation, unit, 95 % interval, and where the value came to lie."""
     rows = []
     u = fitted.solution.best.u

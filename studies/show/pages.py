@@ -15,7 +15,6 @@ import re
 from base64 import b64encode
 from collections.abc import Callable, Mapping
 from functools import cache
-from mimetypes import guess_type
 from pathlib import Path
 from typing import Any
 
@@ -160,11 +159,20 @@ def _image(folder: Path | None, file: str, caption: str) -> Markup:
         return Markup()
     if not (folder / file).is_file():
         raise ValueError(f"the report shows {file!r}, which is not among its images")
-    data = (folder / file).read_bytes()
+    return inline_image((folder / file).read_bytes(), caption)
+
+
+def inline_image(data: bytes, caption: str) -> Markup:
+    """An image inside its page.
+
+    Args:
+        data: of a PNG or GIF file.
+        caption: for those who cannot see it; may have `code`.
+    """
     is_png = data.startswith(b"\x89PNG")
     width = int.from_bytes(data[16:20], "big") if is_png else int.from_bytes(data[6:8], "little")
-    return Markup('<img src="data:{};base64,{}" alt="{}"{}>').format(
-        guess_type(file)[0] or "image/png",
+    return Markup('<img src="data:image/{};base64,{}" alt="{}"{}>').format(
+        "png" if is_png else "gif",
         b64encode(data).decode(),
         caption.replace("`", ""),
         Markup(' class="wide"') if width > WIDE else "",

@@ -1,3 +1,4 @@
+from . import plots
 from .certificate import Certificate, certify
 from .comparison import Comparison, compare_laws
 from .plants import ModelMismatch, patch_lengths
@@ -9,4 +10,5 @@ __all__ = [
     "certify",
     "compare_laws",
     "patch_lengths",
+    "plots",
 ]

@@ -13,6 +13,7 @@ from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.engine.controller import FixedController, fixed_controller
 from studies.engine.stability import LoopFigures, judge_loop, worst_figures
 from studies.errors import StudyError, field_error
+from studies.publish import shown
 from studies.spillover.judgement import breaking_motion, weakest_mode
 from studies.spillover.plants import (
     MISMATCHES,
@@ -62,6 +63,9 @@ class Certificate(NamedTuple):
     observation: np.ndarray  # channel signal per plant mode, (B, D, 3, C, R), see `SpilloverGains`
     actuation: np.ndarray  # modal force per channel force, (B, D, 3, R, C)
     notes: tuple[str, ...]  # what was left out, and why
+
+    def _repr_html_(self) -> str:
+        return shown(self)
 
     @property
     def least_damping(self) -> np.ndarray:

@@ -38,5 +38,5 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         from studies.engine.design import load_design
         from studies.spillover.run import spillover_design
 
-        if not spillover_design(load_design(design, case), out, margin, console, pdf):
+        if not spillover_design(load_design(design, case), out, margin, console, pdf).is_passed:
             sys.exit(1)

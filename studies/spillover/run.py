@@ -37,7 +37,7 @@ def spillover_design(
     margin: float = 2.0,
     console: Console | None = None,
     has_pdf: bool = False,
-) -> bool:
+) -> Certificate:
     """Write the certificate of a design, and the comparison of laws on its machine.
 
     Args:
@@ -48,7 +48,7 @@ def spillover_design(
         has_pdf: also write the figures as PDF.
 
     Returns:
-        whether the design passes.
+        the certificate; `is_passed`: whether the design passes.
 
     Raises:
         StudyError: as `certify`, or a folder that cannot be written to.
@@ -80,7 +80,7 @@ def spillover_design(
     for note in certificate.notes:
         console.print(note, soft_wrap=True)
     announce(console, out / REPORT, ", data and figures in the same folder")
-    return certificate.is_passed
+    return certificate
 
 
 def _check_owner(out: Path, study: Study) -> None:

@@ -8,3 +8,7 @@
   derivatives with finite differences, `report`, `plots` and `results` present them.
 - `run` leads from the file to the results, `folder` saves and resumes progress.
 """
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -12,6 +12,7 @@ from markupsafe import Markup
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.engine.poles import HEADER, difference, pole_rows
+from studies.publish import shown
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
 from studies.show.units import count_text, headed, is_cut_off, number, readable, settling_text
@@ -43,6 +44,7 @@ REFERENCE = "baseline"
 class TuneFindings(NamedTuple):
     """Everything that a tuning found."""
 
+    spec: TuneSpec
     at: Progress
     baseline: JudgedDesign  # the baseline
     judged: list[JudgedDesign]  # the best design of every family, in the order of `spec.families`
@@ -53,6 +55,9 @@ class TuneFindings(NamedTuple):
     run_time: float  # of a differentiated run [s]
     runs: int  # how many there were
     references: References = References(None, None, None, None)  # what designs have to beat
+
+    def _repr_html_(self) -> str:
+        return shown(self)
 
 
 def report(

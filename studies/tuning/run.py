@@ -206,6 +206,7 @@ def find(spec: TuneSpec, evaluator: Evaluator, at: Progress, phases: Phases) -> 
     phases.begin("compare derivatives", "with differences")
     audited = audit(spec, np.stack([(spec.free.places() + best) / 2, best]))
     return TuneFindings(
+        spec=spec,
         at=at,
         baseline=baseline,
         judged=judged,

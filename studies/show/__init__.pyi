@@ -1,0 +1,5 @@
+from . import figures
+
+__all__ = [
+    "figures",
+]

@@ -1,0 +1,5 @@
+from .run import make_evaluator
+
+__all__ = [
+    "make_evaluator",
+]
