@@ -65,6 +65,7 @@ class Scale {
       if (value < low) low = value;
       if (value > high) high = value;
     }
+    this.isConstant = !(low < high);
     if (!(low <= high)) [low, high] = [0, 1];
     if (low === high) [low, high] = this.isLog ? [low / 2, high * 2] : [low - 0.5, high + 0.5];
     [this.low, this.high] = [low, high].map((x) => this.inner(x));

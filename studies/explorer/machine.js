@@ -51,18 +51,18 @@ class ChosenCase {
 
   writeValues(row) {
     const { data } = this.state;
+    const hasBaseline = data.columns.some((column) => column.baseline !== null);
+    const line = (texts) => {
+      const cells = document.createElement("tr");
+      for (const text of hasBaseline ? texts : texts.slice(0, 2)) cells.insertCell().textContent = text;
+      return cells;
+    };
     const lines = data.columns.map((column) => {
-      const line = document.createElement("tr");
-      line.insertCell().textContent = column.text;
-      line.insertCell().textContent = shown(column, row);
-      line.insertCell().textContent = column.baseline === null ? "" : short(column.baseline);
-      return line;
+      const before = column.baseline === null ? "" : short(column.baseline);
+      return line([column.text, shown(column, row), before]);
     });
-    const status = document.createElement("tr");
-    status.insertCell().textContent = "status";
-    status.insertCell().textContent = data.reasons[data.status[row]];
-    status.insertCell();
-    this.parts.values.replaceChildren(...lines, status);
+    this.parts.values.replaceChildren(...lines, line(["status", data.reasons[data.status[row]], ""]));
+    this.parts.values.parentElement.tHead.rows[0].cells[2].hidden = !hasBaseline;
   }
 
   /** Of cases that were not replayed: how to do it, and which one is most alike. */

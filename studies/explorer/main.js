@@ -7,7 +7,7 @@ async function main() {
   const data = await readData();
   const state = new State(data);
   const rank = data.columns[data.rank];
-  const varying = data.columns.filter((x) => x.isParameter && x.scale.high > x.scale.low);
+  const varying = data.columns.filter((x) => x.isParameter && !x.scale.isConstant);
   const figures = data.columns.filter((x) => !x.isParameter && x !== rank);
   const others = figures.slice(0, Math.max(2, AT_FIRST - 1 - varying.length));
   const first = [...varying.slice(0, AT_FIRST - 3), rank, ...others].slice(0, AT_FIRST);
