@@ -8,7 +8,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 .DEFAULT_GOAL := help
-.PHONY: help study explore test test-long smoke lint check clean venv
+.PHONY: help study explore docs test test-long smoke lint check clean venv
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 16
@@ -26,6 +26,11 @@ explore: .venv/installed  ## coupling of the links, spillover of three designs, 
 	for design in paper paper_gains difference; do \
 	  $(BIN)/studies spillover $$design --out results/spillover-$$design; [ $$? -lt 2 ] || exit 2; done
 	$(PYTEST) -m "long or not long" tests/test_notebooks.py
+
+docs: .venv/installed  ## build the site with the documentation, notebooks run, into docs/_build/html
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
+	  -c constraints.txt -e '.[docs]'
+	$(BIN)/python -m sphinx -W --keep-going -n -q -c docs . docs/_build/html
 
 test: .venv/installed  ## run the tests
 	$(PYTEST)
@@ -45,7 +50,7 @@ lint: .venv/installed  ## lint, check format, types and the contract of imports
 check: lint test  ## all of it, as continuous integration does
 
 clean:  ## remove the environment, caches and build products; results stay
-	rm -rf .venv .venv-* build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf .venv .venv-* build docs/_build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 .venv/installed: pyproject.toml constraints.txt
