@@ -14,9 +14,9 @@ import studies
 from jaxmodel.laws import LAWS
 from jaxmodel.metrics import METRICS
 from studies.cli import app
+from studies.single.run import write_results
 from studies.space.spec import parse_sweep
-from studies.study.spec import Section, Study
-from studies.study.template import toml_text
+from studies.study.spec import Section, Study, parse_study
 from tests.documents import NOTEBOOKS, PAGES, ROOT, blocks, page
 
 SITE = ROOT / "docs"
@@ -195,8 +195,8 @@ def run_block(name, where):
 
 def test_the_code_of_the_start_page_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "my.toml").write_text(toml_text(SHORT))
-    studies.simulate("my.toml", "run.h5")
+    run = studies.run_study(parse_study(SHORT), has_loop=False)
+    write_results(tmp_path / "run.h5", run, has_report=False)
     run_block("docs/index.md", HERE)
 
 

@@ -77,7 +77,7 @@ def _value(parameter: Any) -> str:
         return f"{len(get_args(kind))} numbers"
     limits = [
         f"{sign} {value:,}"
-        for sign, value in ((">=", parameter.min), ("<=", parameter.max))
+        for sign, value in (("≥", parameter.min), ("≤", parameter.max))
         if value is not None
     ]
     return " ".join([_VALUES.get(kind, "path"), " and ".join(limits)]).strip()
@@ -142,7 +142,8 @@ def _fields_table(fields: Fields) -> str:
 
 def _allowed(info: FieldInfo) -> str:
     """In words; what describes itself at length has a table of its own."""
-    return allowed_values(info.annotation, info.metadata).partition(";")[0].replace("\0", "")
+    text = allowed_values(info.annotation, info.metadata).partition(";")[0]
+    return text.replace(">=", "≥").replace("<=", "≤")
 
 
 def _default(info: FieldInfo) -> str:
@@ -151,7 +152,7 @@ def _default(info: FieldInfo) -> str:
     if info.default is None:
         return "not given"
     if isinstance(info.default, BaseModel):
-        return "its own"
+        return "its own section"
     return f"`{toml_value(info.default)}`"
 
 
@@ -161,7 +162,7 @@ def _laws_text() -> str:
             f"`{law.name}.{x.name}`",
             x.text,
             x.unit,
-            f">= {x.low:g} and <= {x.high:g}",
+            f"≥ {x.low:g} and ≤ {x.high:g}",
             f"`{x.default:g}`",
         )
         for law in LAWS.values()

@@ -24,11 +24,17 @@ def add_members(
     app: Sphinx, what: str, name: str, found: Any, options: Any, lines: list[str]
 ) -> None:
     """Add to the docstring of a tuple what the comments beside its members say."""
+    lines[:] = [line.replace("|", "\\|") for line in lines]  # absolute values, no substitutions
     if what == "class" and hasattr(found, "_fields"):
         for member, text in members_text(inspect.getsource(found)).items():
             safe = re.sub(r"([*|_\\])", r"\\\1", text)
             lines += ["", f"- ``{member}``: {safe}"]
         lines.append("")
+
+
+def shorten(app: Sphinx, what: str, name: str, found: Any, *rest: Any) -> tuple[str, str] | None:
+    """The arguments of a study are its sections, which the field reference has."""
+    return ("(**sections)", "") if what == "class" and hasattr(found, "model_fields") else None
 
 
 def leave_out(
@@ -61,6 +67,7 @@ def _line(app: Sphinx, name: str) -> str:
 def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("source-read", fill_in)
     app.connect("autodoc-process-docstring", add_members)
+    app.connect("autodoc-process-signature", shorten)
     app.connect("autodoc-skip-member", leave_out)
     app.connect("build-finished", write_root)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
