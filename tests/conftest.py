@@ -56,6 +56,7 @@ HEAVY = (
     "kernel",
     "cli",
     "paper",
+    "docs",
     "dynamics",
     "notebooks",
     "fit_verdicts",
