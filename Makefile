@@ -27,10 +27,8 @@ explore: .venv/installed  ## coupling of the links, spillover of three designs, 
 	  $(BIN)/studies spillover $$design --out results/spillover-$$design; [ $$? -lt 2 ] || exit 2; done
 	$(PYTEST) -m "long or not long" tests/test_notebooks.py
 
-docs: .venv/installed  ## build the site with the documentation, notebooks run, into docs/_build/html
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
-	  -c constraints.txt -e '.[docs]'
-	$(BIN)/python -m sphinx -W --keep-going -n -q -c docs . docs/_build/html
+docs: .venv/installed-docs  ## build the site with the documentation, notebooks run, into docs/_build/html
+	$(BIN)/python -m sphinx -W --keep-going -n -q -j 2 -c docs . docs/_build/html
 
 test: .venv/installed  ## run the tests
 	$(PYTEST)
@@ -57,6 +55,11 @@ clean:  ## remove the environment, caches and build products; results stay
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(MAKE) --no-print-directory venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
 	  -c constraints.txt -e '.[test,dev]'
+	@touch $@
+
+.venv/installed-docs: .venv/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
+	  -c constraints.txt -e '.[docs]'
 	@touch $@
 
 venv:

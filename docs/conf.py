@@ -32,8 +32,7 @@ extensions = [
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "cache"
-nb_execution_raise_on_error = True
-nb_execution_timeout = 300  # [s], of one cell
+nb_execution_timeout = 600  # [s], of one cell
 nb_merge_streams = True
 
 smartquotes = False  # quotes are values of fields

@@ -20,6 +20,16 @@ def fill_in(app: Sphinx, name: str, source: list[str]) -> None:
     source[0] = re.sub(MARK, lambda found: TEXTS[found[1]](), source[0])
 
 
+def spread_notebooks(app: Sphinx, env: Any, names: list[str]) -> None:
+    """Read notebooks, which run, apart from each other: neighbours are read by one process."""
+    notebooks = [name for name in names if name.startswith("notebooks/")]
+    others = [name for name in names if name not in notebooks]
+    step = max(1, len(others) // max(1, len(notebooks)))
+    for k, name in enumerate(notebooks):
+        others.insert(k * (step + 1), name)
+    names[:] = others
+
+
 def add_members(
     app: Sphinx, what: str, name: str, found: Any, options: Any, lines: list[str]
 ) -> None:
@@ -65,6 +75,7 @@ def _line(app: Sphinx, name: str) -> str:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
+    app.connect("env-before-read-docs", spread_notebooks)
     app.connect("source-read", fill_in)
     app.connect("autodoc-process-docstring", add_members)
     app.connect("autodoc-process-signature", shorten)
