@@ -47,6 +47,7 @@ nitpick_ignore_regex = [
     (r"py:.*", r"Array|Path|[a-z_]+\.[A-Z]\w+|[A-Z]\w+"),
 ]
 
+html_math_renderer = "mathml"
 html_theme = "sphinx_book_theme"
 html_title = project
 html_static_path = ["_static"]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 from reference import TEXTS, members_text
 from sphinx.application import Sphinx
 
@@ -54,6 +55,14 @@ def leave_out(
     return True if type(found).__name__ == "_tuplegetter" else None
 
 
+def show_math(translator: Any, node: nodes.Element) -> None:
+    """A formula as MathML, which browsers show without a script."""
+    is_block = isinstance(node, nodes.math_block)
+    text = tex2mathml(node.astext(), as_block=is_block)
+    translator.body.append(text.replace("<mo>'</mo>", "<mo>\u2032</mo>"))
+    raise nodes.SkipNode
+
+
 def write_root(app: Sphinx, error: Exception | None) -> None:
     """Write `index.html`, which leads to the start page, and `llms.txt`, a list of all pages."""
     if error or app.builder.format != "html":
@@ -75,6 +84,7 @@ def _line(app: Sphinx, name: str) -> str:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
+    app.add_html_math_renderer("mathml", (show_math, None), (show_math, None))
     app.connect("env-before-read-docs", spread_notebooks)
     app.connect("source-read", fill_in)
     app.connect("autodoc-process-docstring", add_members)
