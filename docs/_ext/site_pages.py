@@ -59,7 +59,8 @@ def show_math(translator: Any, node: nodes.Element) -> None:
     """A formula as MathML, which browsers show without a script."""
     is_block = isinstance(node, nodes.math_block)
     text = tex2mathml(node.astext(), as_block=is_block)
-    translator.body.append(text.replace("<mo>'</mo>", "<mo>\u2032</mo>"))
+    text = text.replace("<mo>'</mo>", "<mo>\u2032</mo>")
+    translator.body.append(f'<div class="formula">{text}</div>' if is_block else text)
     raise nodes.SkipNode
 
 
