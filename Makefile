@@ -8,7 +8,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 .DEFAULT_GOAL := help
-.PHONY: help study explore notebooks test test-long smoke lint check clean venv
+.PHONY: help study explore docs notebooks test test-long smoke lint check clean venv
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /make \1\t/p' Makefile | expand -t 16
@@ -27,8 +27,11 @@ explore: .venv/installed  ## coupling of the links, spillover of three designs, 
 	  $(BIN)/studies spillover $$design --out results/spillover-$$design; [ $$? -lt 2 ] || exit 2; done
 	$(PYTEST) -m "long or not long" tests/test_notebooks.py
 
-notebooks: .venv/notebooks  ## open the notebooks in JupyterLab
+notebooks: .venv/with-notebook  ## open the notebooks in JupyterLab
 	$(BIN)/jupyter lab --notebook-dir=notebooks
+
+docs: .venv/with-docs  ## build the site with the documentation, notebooks run, into docs/_build/html
+	$(BIN)/python -m sphinx -W --keep-going -n -q -j 2 -c docs . docs/_build/html
 
 test: .venv/installed  ## run the tests
 	$(PYTEST)
@@ -48,7 +51,7 @@ lint: .venv/installed  ## lint, check format, types and the contract of imports
 check: lint test  ## all of it, as continuous integration does
 
 clean:  ## remove the environment, caches and build products; results stay
-	rm -rf .venv .venv-* build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf .venv .venv-* build docs/_build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 .venv/installed: pyproject.toml constraints.txt
@@ -57,9 +60,9 @@ clean:  ## remove the environment, caches and build products; results stay
 	  -c constraints.txt -e '.[test,dev]'
 	@touch $@
 
-.venv/notebooks: .venv/installed
+.venv/with-%: .venv/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
-	  -c constraints.txt -e '.[notebook]'
+	  -c constraints.txt -e '.[$*]'
 	@touch $@
 
 venv:

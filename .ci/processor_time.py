@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 TOP = Path(__file__).parents[1]
 SHORT = "run = { duration = 0.2 }\nmetrics = { residual_length = 0.05 }\n"
-#: The README's tuning, shorter.
+#: The tuning of docs/tutorials/tune.md, shorter.
 TUNING = """
 run = { duration = 0.15 }
 motion = { waypoints = [[0.0, 0.0, 0.5236], [0.0, 0.01, 0.5236]] }

@@ -346,8 +346,8 @@ def simulate(
         law: controller instead of the case's own, as for `sampled_loop.closed_loop`.
 
     Returns:
-        Result. Nothing is raised inside: `status` says what went wrong. Its derivatives are those
-        of the smooth loop: converters without rounding, limits with round corners.
+        Result, whose `status` says what went wrong; nothing is raised inside. Its derivatives are
+        those of the smooth loop: converters without rounding, limits with round corners.
     """
     has_converters = structure.feedback == "sampled" and not structure.is_smooth
     run = _rounded() if has_converters else _run

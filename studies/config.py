@@ -83,19 +83,22 @@ def configure(
 ) -> None:
     """Prepare JAX for studies; call it before the first JAX operation.
 
-    precision: "float64" or "float32", the default floating type.
-    devices: number of CPU devices; None: as in XLA_FLAGS, otherwise one per usable core.
-    flags: add COMPILER_FLAGS to XLA_FLAGS, except those the environment already sets.
-    cache: keep compiled programs in JAX_COMPILATION_CACHE_DIR or the user's cache folder, unless
-        others can write there (CacheWarning).
-
     XLA gets more threads than there are cores, through NPROC, see POOL. Python then looks for
     cyclic garbage less often, unless `gc.set_threshold` has been used before.
     If JAX has not been imported yet, XLA's alarm about slow compilations is hidden (LOG_LEVEL),
-    unless the environment sets its own level.
+    unless the environment sets its own level. Calls with equal settings can be repeated at any
+    time.
 
-    Raises StudyError for a value outside its range, or if JAX has already started without the
-    requested flags or devices. Calls with equal settings can be repeated at any time.
+    Args:
+        precision: "float64" or "float32", the default floating type.
+        devices: number of CPU devices; None: as in XLA_FLAGS, otherwise one per usable core.
+        flags: add COMPILER_FLAGS to XLA_FLAGS, except those the environment already sets.
+        cache: keep compiled programs in JAX_COMPILATION_CACHE_DIR or the user's cache folder,
+            unless others can write there (CacheWarning).
+
+    Raises:
+        StudyError: a value outside its range, or JAX has already started without the requested
+            flags or devices.
     """
     if precision not in PRECISIONS:
         hint = nearest(str(precision), PRECISIONS)

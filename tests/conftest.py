@@ -58,6 +58,7 @@ HEAVY = (
     "automation",
     "documents",
     "paper",
+    "docs",
     "dynamics",
     "notebooks",
     "fit_verdicts",

@@ -1,4 +1,4 @@
-"""docs/automation.md: its example runs as written, and its table names commands that there are."""
+"""docs/how-to/automation.md: its example runs as written, and its table names commands that there are."""
 
 import contextlib
 import io
@@ -15,7 +15,7 @@ from studies.cli import app
 from studies.show.document import documented
 from tests.test_cli import run
 
-PAGE = (Path(__file__).parents[1] / "docs" / "automation.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[1] / "docs" / "how-to" / "automation.md").read_text(encoding="utf-8")
 
 
 def block(language):

@@ -309,7 +309,7 @@ def test_ked_bends_links_by_the_rigid_motion_alone():
 
 @pytest.mark.parametrize(("kp", "peak", "residual"), [(2e4, 0.01, 0.15), (1e5, 0.08, None)])
 def test_ked_fails_where_the_drive_rings_with_the_links(kp, peak, residual):
-    """Two cells of the map of docs/exploring.md: 10 mm in 0.05 s."""
+    """Two cells of the map of docs/reference/exploring.md: 10 mm in 0.05 s."""
     study = load_study(SPECS / "paper.toml").change(
         motion__waypoints=(HOME, (0.0, 0.01, HOME[2])),
         motion__move_time=0.05,

@@ -26,6 +26,7 @@ from studies.engine.modes import machine_modes
 from studies.study.files import READY
 from studies.study.margin import margin_in_db
 from studies.study.spec import load_study, parse_study
+from tests.documents import page
 from tests.pages import TITLE, parsed, rendered, text_of
 
 HOME_PHI = math.pi / 6
@@ -484,8 +485,8 @@ def test_commands_that_run_nothing_need_no_jax(capsys):
 
 
 def test_every_command_has_a_call_in_python():
-    """Rows of docs/python.md: all commands, calls that there are, with arguments that they take."""
-    table = (Path(studies.__file__).parents[1] / "docs" / "python.md").read_text()
+    """The table of the docs: all commands, calls that there are, with arguments that they take."""
+    table = page("docs/reference/python.md")
     rows = dict(re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|$", table, re.MULTILINE))
     known = {one.name or one.callback.__name__ for one in app.registered_commands}
     assert {row.split()[0] for row in rows} == known

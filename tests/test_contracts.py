@@ -37,7 +37,7 @@ from studies.study.labels import RESERVED
 from studies.study.spec import parse_study
 from studies.study.template import study_template
 
-DOCS = Path(__file__).parents[1] / "docs" / "own-parts.md"
+DOCS = Path(__file__).parents[1] / "docs" / "how-to" / "own-parts.md"
 #: One fast move of a small model.
 SMALL = """
 [run]

@@ -6,9 +6,7 @@ All of them run as one table: the example as written, at half its gains, and wit
 import ast
 import contextlib
 import json
-import re
 import tomllib
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,10 +19,8 @@ from studies.study.files import READY, read_toml
 from studies.study.paths import field_value
 from studies.study.spec import Study, paper_study, parse_study
 from studies.study.window import residual_delay
+from tests.documents import NOTEBOOKS, PAGES, blocks, page
 
-ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 #: Sections of a file beside those of its study.
 WORK = ("sweep", "tune", "fit")
 #: Examples that are about something else.
@@ -36,10 +32,6 @@ FACTORS = (1.0, 0.5, 0.0)
 
 def study_of(data):
     return parse_study({name: value for name, value in data.items() if name not in WORK})
-
-
-def blocks(text, language):
-    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
 
 
 def in_toml(text):
@@ -184,7 +176,7 @@ def residual():
 
 
 def test_the_first_example_prints_what_the_readme_shows(tmp_path, monkeypatch, capsys):
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    text = page("README.md")
     monkeypatch.chdir(tmp_path)
     exec(compile(blocks(text, "python")[0], "README.md", "exec"), {})
     assert capsys.readouterr().out == blocks(text, "text")[0]
@@ -193,7 +185,13 @@ def test_the_first_example_prints_what_the_readme_shows(tmp_path, monkeypatch, c
 
 def test_there_are_examples():
     names = {name for name, _ in EXAMPLES}
-    assert {"README.md", "default", "tune.toml", "4_gradient_tuning.ipynb"} <= names
+    assert {
+        "own-machine.md",
+        "sweep.md",
+        "default",
+        "tune.toml",
+        "4_gradient_tuning.ipynb",
+    } <= names
     assert {path.name for path in READY.glob("*.toml")} >= OTHERS.keys()
 
 

@@ -132,7 +132,7 @@ void sample_interrupt(void);
 
 def test_the_example_of_the_documentation_compiles(capsys, designs, folders, tmp_path):
     out, _ = exported(capsys, designs, folders, "paper", "c-fixed")
-    page = (Path(__file__).parents[1] / "docs" / "export.md").read_text()
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "export.md").read_text()
     example = re.search(r"```c\n(#include.*?)```", page, re.DOTALL)[1]
     (tmp_path / "main.c").write_text(STUBS + example)
     made = ["-I", out, "-c", "-o", tmp_path / "main.o", tmp_path / "main.c"]

@@ -1,8 +1,5 @@
 """Gradients of the residual vibration agree with central differences, forward and reverse."""
 
-import re
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +10,7 @@ from jaxmodel.bases import find_bases
 from jaxmodel.control import pole_placement
 from jaxmodel.simulate import simulate
 from studies.study.cases import as_arrays, build_case, build_structure
+from tests.documents import blocks, page
 from tests.test_batch import short_study
 
 
@@ -104,10 +102,9 @@ def test_bad_case_leaves_gradients_of_others_alone(reverse, point):
 
 @pytest.mark.long  # in short: a case with converters, by kernels, in test_batched
 def test_rounded_loops_have_the_slope_of_the_smooth_loop():
-    """The code of the README: values with real converters, derivatives by smooth differences."""
-    text = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    (code,) = (x for x in blocks if "studies.batched" in x)
+    """Code of the docs: values with real converters, derivatives by smooth differences."""
+    codes = blocks(page("docs/reference/python.md"), "python")
+    (code,) = (x for x in codes if "studies.batched" in x)
     names = {}
     exec(code, names)
     residual, factors, slopes = (names[name] for name in ("residual", "factors", "slopes"))
@@ -120,7 +117,7 @@ def test_rounded_loops_have_the_slope_of_the_smooth_loop():
 
     @jax.jit
     def smooth(factor):
-        placed = names["place"](case, jnp.array([factor]))
+        placed = case._replace(control=case.control._replace(gain_factor=factor))
         return 1e6 * simulate(structure, placed).metrics.residual_rms.max()
 
     near = [float(smooth(factors[k, 0] + place * step)) for place in (-2, -1, 1, 2)]

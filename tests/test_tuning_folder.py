@@ -273,7 +273,7 @@ def test_placement_by_gradient_is_as_good_as_the_sweep(tmp_path):
     left = tuned.result.metrics.residual_rms.max()
     assert left <= 1.03 * residual[best].min()
     differentiated = int(found.at.iteration) * (1 + spec.tune.starts)
-    # what each costs is measured where compilers do their best: docs/tuning.md
+    # what each costs is measured where compilers do their best: docs/reference/tuning.md
     assert swept.n_run == 4096 and differentiated <= 4096 // 10
 
 

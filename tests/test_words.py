@@ -11,18 +11,17 @@ import pytest
 import typer
 
 from studies.cli import app
+from tests.documents import NOTEBOOKS, PAGES
 
 TOP = Path(__file__).parents[1]
 SOURCES = [
     path for package in ("jaxmodel", "studies") for path in sorted((TOP / package).rglob("*.py"))
 ]
 DOCUMENTS = [
-    TOP / "README.md",
-    *sorted((TOP / "docs").glob("*.md")),
+    *PAGES,
     *sorted((TOP / "studies").glob("*/report.html")),
     *sorted((TOP / "studies" / "specs").glob("*.toml")),
 ]
-NOTEBOOKS = sorted((TOP / "notebooks").glob("*.ipynb"))
 #: Pattern of what is not the field's word, what to write, and where the pattern finds it.
 PHRASES = (
     (r"told apart|tell \w+ apart", "identifiable, distinguish", "they cannot be told\napart"),

@@ -72,7 +72,7 @@ def run_atlas(
         has_pdf: also write the figures as PDF.
 
     Returns:
-        Whether it finished (False: interrupted by Ctrl-C; finished runs are kept).
+        Whether it finished; if not, Ctrl-C ended it, and finished runs are kept.
 
     Raises:
         StudyError: a fault of the design or the folder; no setting in which all cases finish.

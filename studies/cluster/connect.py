@@ -157,7 +157,7 @@ def _remote_cluster(scheduler: str) -> Iterator[Client]:
     if address.startswith("tls://") and context is None:
         raise StudyError(
             f"--scheduler {address}: no client certificates; set them for Dask "
-            "(distributed.comm.tls, docs/cluster.md)"
+            "(distributed.comm.tls, docs/how-to/cluster.md)"
         )
     try:
         client = Client(address, timeout=PATIENCE, set_as_default=False)

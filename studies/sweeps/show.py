@@ -103,8 +103,8 @@ def best_cases(
         count: how many.
 
     Returns:
-        A row per case: its id, what varies, the metric, peak voltage, damping and gain margin, in
-        SI units under their names in the sweep file. The index is the number of the case.
+        A row per case, with its id, what varies, the metric, peak voltage, damping and gain margin,
+        in SI units under their names in the sweep file. The index is the number of the case.
 
     Raises:
         StudyError: an argument that is none, unknown metric, or no case left.

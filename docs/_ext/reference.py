@@ -1,0 +1,200 @@
+"""Text of the reference pages, from the command line's own help and the schema of the files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, get_args, get_origin
+
+import typer
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from jaxmodel.laws import LAWS
+from jaxmodel.metrics import METRICS
+from studies.cli import app
+from studies.fitting.spec import ENTRIES, Fit
+from studies.space.spec import Block, Screen, Sweep
+from studies.study.explain import allowed_values, unit_of
+from studies.study.spec import OWN_FIELDS, Study
+from studies.study.template import toml_value
+from studies.tuning.spec import Scenarios, Tune
+
+#: Words for the value of an option.
+_VALUES = {bool: "", int: "whole number", float: "number", str: "text"}
+Fields = dict[str, FieldInfo]
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    cells = [heads, ["---"] * len(heads), *rows]
+    return "\n".join(
+        f"| {' | '.join(x.replace('|', chr(92) + '|') for x in row)} |" for row in cells
+    )
+
+
+# commands
+
+
+def commands_text() -> str:
+    """Every command with its arguments and options."""
+    command = typer.main.get_command(app)
+    parts = [_command_text(f"studies {name}", one) for name, one in command.commands.items()]
+    general = "## Before the command\n\n`studies [OPTION] COMMAND ...`\n\n" + _options(command)
+    return "\n\n".join([*parts, general])
+
+
+def _command_text(name: str, command: Any) -> str:
+    arguments = [_argument(x) for x in command.params if x.param_type_name == "argument"]
+    usage = " ".join([name, *arguments, "[OPTIONS]"])
+    return f"## {name}\n\n{command.help}\n\n`{usage}`\n\n{_options(command)}"
+
+
+def _argument(parameter: Any) -> str:
+    name = parameter.name.upper()
+    return name if parameter.required else f"[{name}]"
+
+
+def _options(command: Any) -> str:
+    return table(
+        ("argument, option", "value", "meaning", "default"),
+        (
+            (
+                f"`{_argument(x) if x.param_type_name == 'argument' else x.opts[0]}`",
+                _value(x),
+                x.help or "",
+                _default_of_option(x),
+            )
+            for x in command.params
+        ),
+    )
+
+
+def _value(parameter: Any) -> str:
+    kind = parameter.type_descriptor.annotation
+    if get_origin(kind) is tuple:
+        return f"{len(get_args(kind))} numbers"
+    limits = [
+        f"{sign} {value:,}"
+        for sign, value in (("≥", parameter.min), ("≤", parameter.max))
+        if value is not None
+    ]
+    return " ".join([_VALUES.get(kind, "path"), " and ".join(limits)]).strip()
+
+
+def _default_of_option(parameter: Any) -> str:
+    if parameter.required:
+        return "required"
+    is_left_out = parameter.default in (None, "", False) or parameter.is_eager
+    return "" if is_left_out else f"`{parameter.default}`"
+
+
+# fields
+
+
+def fields_text() -> str:
+    """Every field that a file may have."""
+    parts = ["## A study", _fields_table({"title": Study.model_fields["title"]})]
+    for name, info in Study.model_fields.items():
+        if _is_section(info.annotation):
+            parts.append(_section_text(f"[{name}]", info.annotation))
+            if OWN_FIELDS.startswith(f"{name}."):
+                parts.append(_laws_text())
+    own = {name: x for name, x in Sweep.model_fields.items() if name not in Block.model_fields}
+    parts += [
+        "## A sweep",
+        _section_text("[sweep] and [[sweep.blocks]]", Block),
+        _section_text("[sweep]", Sweep, own),
+        _section_text("[sweep.screen]", Screen),
+        "## A tuning",
+        _section_text("[tune]", Tune),
+        _section_text("[tune.scenarios]", Scenarios),
+        "## A fit",
+        _section_text("[fit]", Fit),
+    ]
+    parts += [_section_text(f'[[fit.data]], kind = "{kind}"', x) for kind, x in ENTRIES.items()]
+    return "\n\n".join(parts)
+
+
+def _is_section(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def _section_text(name: str, section: type[BaseModel], fields: Fields | None = None) -> str:
+    meaning = (section.__doc__ or "").strip()
+    return f"### `{name}`\n\n{meaning}\n\n{_fields_table(fields or section.model_fields)}"
+
+
+def _fields_table(fields: Fields) -> str:
+    rows = (
+        (
+            f"`{name}`",
+            info.description or (info.annotation.__doc__ or "").strip(),
+            unit_of(info),
+            _allowed(info),
+            _default(info),
+        )
+        for name, info in fields.items()
+    )
+    return table(("field", "meaning", "unit", "allowed", "default"), rows)
+
+
+def _allowed(info: FieldInfo) -> str:
+    """In words; what describes itself at length has a table of its own."""
+    text = allowed_values(info.annotation, info.metadata).partition(";")[0]
+    return text.replace(">=", "≥").replace("<=", "≤")
+
+
+def _default(info: FieldInfo) -> str:
+    if info.default is PydanticUndefined:
+        return "required"
+    if info.default is None:
+        return "not given"
+    if isinstance(info.default, BaseModel):
+        return "its own section"
+    return f"`{toml_value(info.default)}`"
+
+
+def _laws_text() -> str:
+    rows = (
+        (
+            f"`{law.name}.{x.name}`",
+            x.text,
+            x.unit,
+            f"≥ {x.low:g} and ≤ {x.high:g}",
+            f"`{x.default:g}`",
+        )
+        for law in LAWS.values()
+        for x in law.parameters
+    )
+    heads = ("field", "meaning", "unit", "allowed", "default")
+    meaning = "Fields of single laws; one number for all links, or three."
+    return f"### `[{OWN_FIELDS}]`\n\n{meaning}\n\n{table(heads, rows)}"
+
+
+def metrics_text() -> str:
+    """Every metric of a run."""
+    rows = ((f"`{x.name}`", x.text, x.unit, ", ".join(x.dims)) for x in METRICS.values())
+    return table(("metric", "meaning", "unit", "axes"), rows)
+
+
+#: What pages name in `<!-- generated: NAME -->`.
+TEXTS: dict[str, Callable[[], str]] = {
+    "commands": commands_text,
+    "fields": fields_text,
+    "metrics": metrics_text,
+}
+
+
+# members of tuples
+
+
+def members_text(source: str) -> dict[str, str]:
+    """What the comments beside the members of a class say, by name.
+
+    Args:
+        source: of the class, whose members stand one a line: `mass: Array  # of a slider [kg]`.
+    """
+    member = r"^    (\w+): [^#\n]+(?:  # (.+))?$"
+    return {name: text for name, text in re.findall(member, source, re.MULTILINE) if text}

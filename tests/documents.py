@@ -1,0 +1,22 @@
+"""The documents, and the blocks of code in them."""
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+#: README, and the pages of the site; what `make docs` builds is no source.
+PAGES = [
+    ROOT / "README.md",
+    *(path for path in sorted((ROOT / "docs").rglob("*.md")) if "_build" not in path.parts),
+]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+def blocks(text, language):
+    """Blocks of code in that language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
+def page(name):
+    """Text of a document, by its path from the root."""
+    return (ROOT / name).read_text(encoding="utf-8")
