@@ -1,4 +1,4 @@
-"""docs/how-to/automation.md: its example runs as written, and its table names commands that there are."""
+"""The page for scripts: its example runs as written, its table names commands that there are."""
 
 import contextlib
 import io

@@ -29,6 +29,7 @@ HERE, LONG = "here", "here, in a long test"
 PYTHON = {
     "README.md": ["test_examples"],
     "docs/index.md": [HERE],
+    "docs/how-to/automation.md": ["test_automation"],
     "docs/how-to/cluster.md": ["needs a cluster; test_cluster", "needs Slurm"],
     "docs/how-to/own-controller.md": ["needs python-control"],
     "docs/how-to/own-parts.md": ["test_contracts"] * 4,
