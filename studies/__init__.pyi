@@ -10,6 +10,7 @@ from .engine.run_data import chord_deflection
 from .engine.runs import Run, run_study
 from .engine.sweep import make_plan, run_sweep
 from .errors import StudyError
+from .explore import explore_results
 from .export.document import import_study
 from .export.run import export_design
 from .extensions import extend
@@ -47,6 +48,7 @@ __all__ = [
     "cache_contents",
     "chord_deflection",
     "configure",
+    "explore_results",
     "export_design",
     "extend",
     "fit",

@@ -182,9 +182,9 @@ def explore(
 ) -> None:
     """Write a page on which all cases can be looked at: brushed plots, tables, motion."""
     start()
-    from studies.explore import write_exploration
+    from studies.explore import explore_results
 
-    write_exploration(folder, console)
+    explore_results(folder, console)
 
 
 @app.command()

@@ -26,7 +26,7 @@ _KINDS = {
 }
 
 
-def write_exploration(folder: str | Path, console: Console | None = None) -> Path:
+def explore_results(folder: str | Path, console: Console | None = None) -> Path:
     """Write `explorer.html` into a folder of results, and return its path.
 
     Args:
