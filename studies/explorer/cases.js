@@ -33,7 +33,9 @@ class Conditions {
     if (!this.list.contains(document.activeElement)) this.write();
     const ok = state.keptRows.filter((row) => !state.isFailed(row)).length;
     const failed = state.keptRows.length - ok;
-    const text = failed ? `, ${failed.toLocaleString("en")} of them failed` : "";
+    const isPartial = state.keptRows.some((row) => state.data.status[row] < 0);
+    const how = isPartial ? "failed or have not run" : "failed";
+    const text = failed ? `, ${failed.toLocaleString("en")} of them ${how}` : "";
     this.count.textContent =
       `${state.keptRows.length.toLocaleString("en")} of ${state.data.n.toLocaleString("en")} ` +
       `${state.data.noun}s brushed${text}`;
