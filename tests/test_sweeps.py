@@ -563,4 +563,4 @@ def test_sweeps_of_loaded_links_end(tmp_path):
     for k in range(4):
         studies_command = str(Path(sys.executable).with_name("studies"))
         command = [studies_command, "sweep", "loaded.toml", "--out", f"out{k}"]
-        subprocess.run(command, cwd=tmp_path, env=plain, check=True, timeout=120)
+        subprocess.run(command, cwd=tmp_path, env=plain, check=True, timeout=300)
