@@ -253,7 +253,7 @@ def test_placement_by_gradient_is_as_good_as_the_sweep(tmp_path):
     spec = load_tuning(specs / "tune_placement.toml")
     asked = read_toml(specs / "placement.toml")
     for section in ("run", "link", "motion", "shaper", "drive", "metrics"):
-        assert spec.data[section] == asked[section]
+        assert spec.data.get(section) == asked.get(section)
     swept = run_sweep(parse_sweep(asked), tmp_path / "sweep", is_quiet=True)
     data = read_sweep(tmp_path / "sweep")
     best = ranked_cases(data, "residual_rms", "gain_margin >= 2", 15)
@@ -264,8 +264,9 @@ def test_placement_by_gradient_is_as_good_as_the_sweep(tmp_path):
     damping = data["damping_ratio"][safe, 0]
     assert spearmanr(residual[safe], damping).statistic < -0.98
     assert damping.max() > 3 * damping.min()
-    # the question discriminates, also against the middle of what is allowed
-    assert residual[best].max() > 1.2 * residual[best].min()
+    # the question discriminates: among the best 15 of 4,096, and against the middle of what is safe
+    assert residual[best].max() > 1.1 * residual[best].min()
+    assert np.median(residual[safe]) > 2 * residual[best].min()
     found = run_tuning(spec, tmp_path / "tune", False, Console(quiet=True), True)
     tuned = run_study(load_study(tmp_path / "tune" / "tuned.toml"), has_record=False)
     assert tuned.status == 0 and tuned.loop.gain_margin >= 2 * (1 - 1e-3)
