@@ -152,7 +152,7 @@ def test_brushing_changes_what_is_shown(tmp_path, width):
         third = tab.evaluate(SEEN)
         assert tab.errors == [] and third["over"] <= 0
     order, ok = table.order, np.flatnonzero(table.status == 0)
-    assert first["count"].startswith("400 of 400 cases brushed") and first["conditions"] == 0
+    assert first["count"].startswith("400 of 400 cases selected") and first["conditions"] == 0
     assert first["rows"] == [str(k) for k in order[:25]] and first["chosen"] == f"case {order[0]}"
     # pixels of the axis, from its upper end at 46 to its lower one at 286
     gain = table.column("gain").value
@@ -170,7 +170,7 @@ def test_brushing_changes_what_is_shown(tmp_path, width):
     assert brushed["rows"] == [k for k in outer if k in brushed["rows"]]  # the best come first
     assert {**released, "chosen": ""} == {**first, "chosen": ""}  # the chosen case stays
     assert both["conditions"] == 2 and both["count"] != first["count"]
-    assert without_failures["count"] == f"{len(ok)} of 400 cases brushed"
+    assert without_failures["count"] == f"{len(ok)} of 400 cases selected"
     assert "Pareto front" in without_failures["front"]
     assert third["chosen"] == f"case {order[2]}"
 

@@ -38,7 +38,7 @@ class Conditions {
     const text = failed ? `, ${failed.toLocaleString("en")} of them ${how}` : "";
     this.count.textContent =
       `${state.keptRows.length.toLocaleString("en")} of ${state.data.n.toLocaleString("en")} ` +
-      `${state.data.noun}s brushed${text}`;
+      `${state.data.noun}s selected${text}`;
   }
 
   write() {

@@ -59,6 +59,7 @@ class Scale {
   constructor(column) {
     this.labels = column.labels;
     this.isLog = column.isLog;
+    this.isWhole = column.value.every((value) => Number.isInteger(value));
     let low = Infinity;
     let high = -Infinity;
     for (const value of column.value) {
@@ -92,7 +93,7 @@ class Scale {
     }
     if (this.isLog && this.high - this.low >= 1) return this.decades(count);
     const [low, high] = [this.from(0), this.from(1)];
-    const raw = (high - low) / Math.max(count, 1);
+    const raw = Math.max((high - low) / Math.max(count, 1), this.isWhole ? 1 : 0);
     const power = 10 ** Math.floor(Math.log10(raw));
     const step = [1, 2, 5, 10].map((x) => x * power).find((x) => x >= raw);
     const ticks = [];
@@ -104,7 +105,13 @@ class Scale {
 
   decades(count) {
     const ticks = [];
-    for (let k = Math.ceil(this.low - 1e-9); k <= this.high + 1e-9; k++) ticks.push(10 ** k);
+    const inner = this.high - this.low < 2 ? [1, 2, 5] : [1];
+    for (let k = Math.floor(this.low); k <= this.high; k++) {
+      for (const part of inner) {
+        const share = this.to(part * 10 ** k);
+        if (share >= -1e-9 && share <= 1 + 1e-9) ticks.push(Number((part * 10 ** k).toPrecision(3)));
+      }
+    }
     const every = Math.ceil(ticks.length / Math.max(count, 1));
     return ticks.filter((_, k) => k % every === 0);
   }

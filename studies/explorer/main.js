@@ -13,10 +13,10 @@ async function main() {
   const first = [...varying.slice(0, AT_FIRST - 3), rank, ...others].slice(0, AT_FIRST);
 
   const parallel = new ParallelPlot(state, document.querySelector("#parallel canvas"), first);
-  const table = new CaseTable(state, document.getElementById("cases"), first);
+  const table = new CaseTable(state, document.getElementById("cases"), figuresFirst(first, rank));
   chooseColumns(data.columns, first, (columns) => {
     parallel.show(columns);
-    table.show(columns);
+    table.show(figuresFirst(columns, rank));
   });
   const better = figures.find((x) => x.better) ?? figures[0] ?? rank;
   const panels = [...document.querySelectorAll(".scatter")];
@@ -34,6 +34,12 @@ async function main() {
     width = window.innerWidth;
   });
   requestAnimationFrame(() => (document.body.dataset.isReady = ""));
+}
+
+/** Columns as a table has them: what ranks, the other figures, what was given. */
+function figuresFirst(columns, rank) {
+  const place = (column) => (column === rank ? 0 : column.isParameter ? 2 : 1);
+  return [...columns].sort((a, b) => place(a) - place(b));
 }
 
 /** Boxes to tick, one per column. */

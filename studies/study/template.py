@@ -22,6 +22,8 @@ STARTERS = (
     "machine.platform_mass",
     "link.length",
     "link.thickness",
+    "link.width",
+    "link.density",
     "link.youngs_modulus",
     "link.damping_ratio",
     "patches.centers",

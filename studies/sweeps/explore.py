@@ -21,12 +21,19 @@ from studies.errors import StudyError
 from studies.explorer.replays import replayed, rows_to_replay
 from studies.explorer.table import Column, ExplorerTable, Placement, text_column
 from studies.show.figures import is_wide
-from studies.show.units import readable
+from studies.show.units import is_cut_off, readable
 from studies.space.table import CaseTable, case_study
 from studies.study.fields import Fields
 from studies.sweeps.records import BESIDE, MARGIN, reason
 from studies.sweeps.sensitivity import scalar_columns
-from studies.sweeps.show import ranking, shown_metric, unit_of_metric
+from studies.sweeps.show import (
+    margin_warning,
+    ranked_cases,
+    ranking,
+    resolution_warning,
+    shown_metric,
+    unit_of_metric,
+)
 
 #: Figures by which replayed cases are chosen, beside the one that ranks.
 _FIGURES = (MARGIN, "peak_voltage")
@@ -60,6 +67,7 @@ def explore_sweep(folder: Path, on_progress: Callable[[int, int], None]) -> Expl
         baseline=_baseline(data, [x.name for x in figures]),
         command=f"studies replay {folder} --case {{}} --report --out case-{{}}.h5",
         placement=_placement(data.table),
+        notes=_warnings(data, rank),
     )
     n_ok = int(np.sum(codes == status.OK))
     by = [x for x in (rank, *_FIGURES) if _has_numbers(data, x)]
@@ -71,6 +79,16 @@ def explore_sweep(folder: Path, on_progress: Callable[[int, int], None]) -> Expl
         on_progress,
     )
     return table._replace(replays=done)
+
+
+def _warnings(data: SweepData, rank: str) -> tuple[str, ...]:
+    """What to know before acting on the best cases."""
+    try:
+        best = ranked_cases(data, rank)
+    except StudyError:  # none is ok
+        return ()
+    texts = resolution_warning(data, best, rank), margin_warning(data, best)
+    return tuple(text for text in texts if text)
 
 
 def _parameters(data: SweepData) -> list[Column]:
@@ -103,6 +121,9 @@ def _has_numbers(data: SweepData, name: str) -> bool:
 
 def _figure(data: SweepData, name: str) -> Column:
     values = shown_metric(data, name).astype(float)
+    if name.startswith("settling_time"):  # beyond what was watched nothing is known
+        watched = _watched(data)
+        values = np.where(is_cut_off(1e-3 * values, watched), np.nan, values)
     return Column(
         name=name,
         unit=_shown_unit(data, name),
@@ -112,6 +133,11 @@ def _figure(data: SweepData, name: str) -> Column:
     )
 
 
+def _watched(data: SweepData) -> np.ndarray:
+    """Time from the end of the reference trajectory to that of the run [s], (n,)."""
+    return np.asarray(data.table.values("run.duration").astype(float) - data["command_end"])
+
+
 def _shown_unit(data: SweepData, name: str) -> str:
     return readable(unit_of_metric(data, name))[1]
 
@@ -119,6 +145,9 @@ def _shown_unit(data: SweepData, name: str) -> str:
 def _baseline(data: SweepData, names: list[str]) -> dict[str, float]:
     """Figures without control, in the units shown."""
     found: dict[str, Any] = {name: uncontrolled_value(data, name) for name in names}
+    settling = found.get("settling_time")
+    if settling is not None and np.all(is_cut_off(settling, _watched(data))):
+        del found["settling_time"]
     return {
         name: readable(unit_of_metric(data, name))[0] * value
         for name, value in found.items()
