@@ -179,12 +179,15 @@ def init(
 @app.command()
 def explore(
     folder: Annotated[Path, typer.Argument(help="folder of a sweep, a tuning, a fit or an atlas")],
+    subject_to: Annotated[
+        str, typer.Option(help="condition whose best cases are replayed, too; for sweeps")
+    ] = "",
 ) -> None:
     """Write a page on which all cases can be looked at: brushed plots, tables, motion."""
     start()
     from studies.explore import explore_results
 
-    explore_results(folder, console)
+    explore_results(folder, console, subject_to)
 
 
 @app.command()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -26,19 +28,26 @@ _KINDS = {
 }
 
 
-def explore_results(folder: str | Path, console: Console | None = None) -> Path:
+def explore_results(
+    folder: str | Path, console: Console | None = None, subject_to: str = ""
+) -> Path:
     """Write `explorer.html` into a folder of results, and return its path.
 
     Args:
         folder: of a sweep, a tuning, a fit or an atlas.
         console: where progress goes; default: nowhere.
+        subject_to: condition on metrics and axes of a sweep; the best that meet it are replayed.
 
     Raises:
         StudyError: no results there, damaged ones, or a file that cannot be written.
     """
     folder = Path(folder)
-    fill = next((fill for name, fill in _KINDS.items() if (folder / name).is_file()), None)
+    fill = next((fill for name, fill in _KINDS.items() if os.path.isfile(folder / name)), None)
     if fill is None:
         raise StudyError(f"{folder}: no results of a sweep, a tuning, a fit or an atlas there")
     check_folder(folder)
+    if subject_to and fill is not explore_sweep:
+        raise StudyError(f"--subject-to {subject_to!r}: {folder} is not the folder of a sweep")
+    if subject_to:
+        fill = partial(explore_sweep, subject_to=subject_to)
     return write_explorer(folder, fill, console)

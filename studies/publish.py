@@ -18,6 +18,8 @@ from studies.errors import StudyError
 
 #: Of every command that writes a folder.
 REPORT = "report.html"
+#: Of those whose cases can be looked at.
+EXPLORER = "explorer.html"
 #: Name prefix of the folders in which files are prepared.
 _STAGED = ".unfinished-"
 

@@ -96,6 +96,51 @@ def test_the_best_case_within_any_limits_is_replayed(seed):
     assert len(few) <= 24 and few[0] == order[0] and len(set(few)) == len(few)
 
 
+def test_rows_without_a_figure_displace_no_other():
+    rng = np.random.default_rng(0)
+    figures = rng.random((400, 3))
+    figures[::2, 1] = np.nan  # such as the margin of loops without feedback
+    order = np.argsort(figures[:, 0], kind="stable")
+    whole = [row for row in order if not np.isnan(figures[row]).any()]
+    front = rows_to_replay(np.array(whole), figures, 10_000)[:5]
+    assert set(front) <= set(rows_to_replay(order, figures, 10_000))
+    rows = rows_to_replay(order, figures, 24)
+    assert np.isnan(figures[rows]).any(axis=1).mean() < 0.5
+    assert rows_to_replay(order[:0], figures) == []
+
+
+def test_values_that_a_page_cannot_hold_are_missing_and_named():
+    table = table_of(4)
+    value = np.array([1e-60, 1e-3, 1.0, 1e300])
+    page = explorer_page(
+        table._replace(columns=(*table.columns, Column("tiny", "", value, is_log=True)))
+    )
+    data, numbers = unpacked(page)
+    shown = numbers(data["columns"][-1]["value"])
+    assert np.isnan(shown[[0, 3]]).all() and np.isfinite(shown[1:3]).all()
+    assert "Some values of tiny are too large or too small" in page
+
+
+def test_a_case_is_named_in_each_part_of_its_command(tmp_path):
+    table = table_of(30)._replace(command=("replay 'a {}' --case ", " --out case-", ".h5"))
+    path = tmp_path / "explorer.html"
+    path.write_text(explorer_page(table), encoding="utf-8")
+    with opened(path, tmp_path, 1280) as tab:
+        tab.evaluate(READY)
+        best = table.order[0]
+        code = tab.evaluate("document.querySelector('[data-part=hint] code').textContent")
+        assert code == f"replay 'a {{}}' --case {best} --out case-{best}.h5"
+        first, second = (
+            f"""(() => {{ const s = document.querySelector("#conditions select");
+            s.value = "{k}"; s.dispatchEvent(new Event("change")); }})()"""
+            for k in (0, 1)
+        )
+        for script in (first, second):
+            tab.evaluate(script)
+            seen = at_rest(tab)
+        assert seen["conditions"] == 2 and tab.errors == []
+
+
 SEEN = """({
   count: document.getElementById("count").textContent,
   rows: [...document.querySelectorAll("#cases tbody tr")].map((x) => x.cells[0].textContent),

@@ -14,8 +14,9 @@ class Conditions {
     this.add.addEventListener("change", () => {
       const column = state.data.columns[this.add.value];
       this.add.value = "";
+      document.activeElement.blur();
+      this.isAdding = true;
       state.brush(column, [-Infinity, Infinity]);
-      this.list.lastElementChild.querySelector("input").focus();
     });
     this.failures = element.querySelector("input[name=failures]");
     this.failures.addEventListener("change", () => {
@@ -44,6 +45,8 @@ class Conditions {
   write() {
     this.list.replaceChildren();
     for (const [index, range] of this.state.ranges) this.list.append(this.item(index, range));
+    if (this.isAdding) this.list.lastElementChild?.querySelector("input").focus();
+    this.isAdding = false;
   }
 
   item(index, range) {

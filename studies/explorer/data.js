@@ -25,6 +25,7 @@ async function readData() {
     Object.fromEntries(Object.entries(record).map(([key, where]) => [key, array(where)]));
   data.columns.forEach((column, index) => {
     column.index = index;
+    column.bound ??= Infinity;
     column.value = array(column.value).values;
     column.text = column.unit ? `${column.name} [${column.unit}]` : column.name;
     column.scale = new Scale(column);
@@ -51,7 +52,8 @@ function short(value) {
 function shown(column, row) {
   const value = column.value[row];
   if (!Number.isFinite(value)) return "–";
-  return column.labels.length ? column.labels[value] : short(value);
+  if (column.labels.length) return column.labels[value];
+  return value >= column.bound ? `> ${short(column.bound)}` : short(value);
 }
 
 /** From values of a column to the range 0 to 1, and back. */
@@ -63,6 +65,7 @@ class Scale {
     let low = Infinity;
     let high = -Infinity;
     for (const value of column.value) {
+      if (!Number.isFinite(value)) continue;
       if (value < low) low = value;
       if (value > high) high = value;
     }

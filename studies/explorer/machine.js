@@ -69,11 +69,10 @@ class ChosenCase {
   writeHint(row) {
     const { data } = this.state;
     const { hint } = this.parts;
-    hint.hidden = Boolean(this.replay) || !(data.command || data.replays.length);
+    hint.hidden = Boolean(this.replay) || !(data.command.length || data.replays.length);
     if (hint.hidden) return;
-    const command = data.command.replace("{}", data.names[row]);
-    hint.querySelector("code").textContent = command;
-    hint.querySelector("span").hidden = !data.command;
+    hint.querySelector("code").textContent = data.command.join(data.names[row]);
+    hint.querySelector("span").hidden = !data.command.length;
     const near = nearestReplay(data, row);
     this.nearest.hidden = near < 0;
     this.nearest.value = near;

@@ -18,12 +18,11 @@ from studies.config import origin
 from studies.engine.progress import Phases
 from studies.explorer.replays import DrawnMotion, ReplayedCase
 from studies.explorer.table import ExplorerTable, shown_rows
-from studies.publish import publish
+from studies.publish import EXPLORER, check_target, publish
 from studies.show.figures import CONTROLLED, SERIES, WITHOUT
 from studies.show.pages import render
 from studies.show.sketch import ACTUATOR, OFF, ON, SENSOR
 
-EXPLORER = "explorer.html"
 #: The scripts of a page, in their order.
 SCRIPTS = ("data", "state", "plots", "parallel", "scatter", "cases", "machine", "main")
 _FOLDER = Path(__file__).parent
@@ -47,6 +46,7 @@ def write_explorer(
     Raises:
         StudyError: nothing to show, or the page cannot be written.
     """
+    check_target(folder / EXPLORER)
     with Phases(console or Console(quiet=True), ("explore",), is_quiet) as phases:
 
         def on_progress(done: int, total: int) -> None:
@@ -64,6 +64,7 @@ def write_explorer(
 
 def explorer_page(table: ExplorerTable) -> str:
     """The page of a table, as HTML."""
+    table, outside = _representable(table)
     rows = shown_rows(table)
     packed = _Arrays()
     data = _contents(table, rows, packed)
@@ -73,13 +74,27 @@ def explorer_page(table: ExplorerTable) -> str:
         "explorer/explorer.html",
         title=table.title,
         noun=table.noun,
-        notes=[*_thinning(table, rows), *table.notes],
+        notes=[*_thinning(table, rows), *outside, *table.notes],
         facts=origin(),
         script=Markup(script),
         digest=b64encode(sha256(script.encode()).digest()).decode(),
         data=Markup(_as_json(data)),
         arrays=packed.text(),
     )
+
+
+def _representable(table: ExplorerTable) -> tuple[ExplorerTable, list[str]]:
+    """The table without values that 4 bytes cannot hold, and a note on their columns."""
+    limits, columns, outside = np.finfo(np.float32), [], []
+    for column in table.columns:
+        size = np.abs(column.value)
+        is_lost = (size > limits.max) | ((size > 0) & (size < limits.tiny))
+        columns.append(column._replace(value=np.where(is_lost, np.nan, column.value)))
+        if is_lost.any():
+            outside.append(column.name)
+    names = ", ".join(outside)
+    notes = [f"Some values of {names} are too large or too small for this page."] if outside else []
+    return table._replace(columns=tuple(columns)), notes
 
 
 def _thinning(table: ExplorerTable, rows: np.ndarray) -> list[str]:
@@ -108,6 +123,7 @@ def _contents(table: ExplorerTable, rows: np.ndarray, packed: _Arrays) -> dict[s
                 "labels": list(column.labels),
                 "isLog": column.is_log,
                 "better": column.better,
+                "bound": _number(column.bound),
                 "baseline": _number(table.baseline.get(column.name, np.nan)),
                 "least": table.conditions.get(column.name),
                 "value": packed.add(column.value[rows]),

@@ -120,6 +120,8 @@ def rows_to_replay(order: np.ndarray, figures: np.ndarray, most: int = MOST_REPL
         figures: of all rows, the smaller the better, of which the first orders them, (n, k).
         most: how many.
     """
+    if not len(order):
+        return []
     front = _pareto_front(order, figures)
     if len(front) > most - most // 4:
         front = front[_spread(0, len(front), most - most // 4)]
@@ -130,6 +132,7 @@ def rows_to_replay(order: np.ndarray, figures: np.ndarray, most: int = MOST_REPL
 def _pareto_front(order: np.ndarray, figures: np.ndarray) -> np.ndarray:
     """Rows that no other row beats in some figure without losing in another, the best first."""
     front: list[int] = []
+    figures = np.where(np.isnan(figures), np.inf, figures)  # what is not known is worst
     for row in order:
         kept = figures[front]
         if not np.any(np.all(kept <= figures[row], axis=1)):

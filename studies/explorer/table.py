@@ -25,6 +25,7 @@ class Column(NamedTuple):
     labels: tuple[str, ...] = ()  # of texts, whose places in here are the values
     is_log: bool = False
     better: str = ""  # "smallest" or "largest"
+    bound: float = np.inf  # a value of this stands for larger ones
 
 
 class Placement(NamedTuple):
@@ -49,7 +50,7 @@ class ExplorerTable(NamedTuple):
     rank: str  # the column that orders the rows
     conditions: Mapping[str, float] = {}  # least values that the page begins with, by column
     baseline: Mapping[str, float] = {}  # values without control, by column
-    command: str = ""  # that reruns one of them; {} stands for its name
+    command: tuple[str, ...] = ()  # that reruns one of them; its name stands between these parts
     placement: Placement | None = None
     replays: tuple[ReplayedCase, ...] = ()
     notes: tuple[str, ...] = ()

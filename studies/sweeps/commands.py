@@ -14,7 +14,7 @@ from rich.table import Table
 from studies.cluster.connect import LocalWorkers, Scheduler, Workers, WorkerTimeout, runner_for
 from studies.config import start
 from studies.errors import StudyError
-from studies.publish import REPORT, announce
+from studies.publish import EXPLORER, REPORT, announce
 from studies.show.document import AsJson, print_document
 
 #: Replaced in names of files: the brackets of entries.
@@ -115,6 +115,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             console.print("" if checked is None else checked.text, soft_wrap=True)
         if report and not quiet:
             announce(console, out / REPORT)
+        if done.n_run and not explore:  # a page of fewer cases
+            (out / EXPLORER).unlink(missing_ok=True)
         if explore:
             from studies.explorer.page import write_explorer
             from studies.sweeps.explore import explore_sweep

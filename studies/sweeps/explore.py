@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -24,12 +25,14 @@ from studies.show.figures import is_wide
 from studies.show.units import is_cut_off, readable
 from studies.space.table import CaseTable, case_study
 from studies.study.fields import Fields
+from studies.study.margin import ENOUGH, HIGHEST
 from studies.sweeps.records import BESIDE, MARGIN, reason
 from studies.sweeps.sensitivity import scalar_columns
 from studies.sweeps.show import (
     margin_warning,
     ranked_cases,
     ranking,
+    requirement,
     resolution_warning,
     shown_metric,
     unit_of_metric,
@@ -37,23 +40,28 @@ from studies.sweeps.show import (
 
 #: Figures by which replayed cases are chosen, beside the one that ranks.
 _FIGURES = (MARGIN, "peak_voltage")
+#: Of the cases that meet a condition, how many of the best are replayed.
+FIRST = 6
 
 
-def explore_sweep(folder: Path, on_progress: Callable[[int, int], None]) -> ExplorerTable:
+def explore_sweep(
+    folder: Path, on_progress: Callable[[int, int], None], subject_to: str = ""
+) -> ExplorerTable:
     """Cases of a sweep, with a few of them replayed.
 
     Args:
         folder: of a sweep, finished or not.
         on_progress: called with the numbers of replayed cases, and of all.
+        subject_to: condition on metrics and axes; the best cases that meet it are replayed, too.
 
     Raises:
-        StudyError: no sweep there, or no case has run.
+        StudyError: no sweep there, or no case has what ranks them or meets the condition.
     """
     data = read_sweep(folder)
     rank = ranking(data)
     codes = data["status"]
-    if not np.any(codes >= 0) or rank.partition("[")[0] not in data.variables:
-        raise StudyError(f"{folder}: no case has run, so there is nothing to explore")
+    if rank.partition("[")[0] not in data.variables or not _has_numbers(data, rank):
+        raise StudyError(f"{folder}: no case has {rank}, so there is nothing to explore")
     names = [rank, *(x for x in (MARGIN, *BESIDE, *kept_metrics(data.spec)) if x != rank)]
     figures = [_figure(data, x) for x in dict.fromkeys(names) if _has_numbers(data, x)]
     table = ExplorerTable(
@@ -65,14 +73,17 @@ def explore_sweep(folder: Path, on_progress: Callable[[int, int], None]) -> Expl
         names=tuple(map(str, range(data.n_cases))),
         rank=rank,
         baseline=_baseline(data, [x.name for x in figures]),
-        command=f"studies replay {folder} --case {{}} --report --out case-{{}}.h5",
+        conditions=_conditions(data, rank),
+        command=(f"studies replay {quote(str(folder))} --case ", " --report --out case-", ".h5"),
         placement=_placement(data.table),
         notes=_warnings(data, rank),
     )
     n_ok = int(np.sum(codes == status.OK))
     by = [x for x in (rank, *_FIGURES) if _has_numbers(data, x)]
     smaller = [(-1 if direction(x) == "largest" else 1) * metric_values(data, x) for x in by]
-    rows = rows_to_replay(table.order[:n_ok], np.stack(smaller, axis=1))
+    wanted = ranked_cases(data, rank, subject_to, FIRST).tolist() if subject_to else []
+    others = rows_to_replay(table.order[:n_ok], np.stack(smaller, axis=1))
+    rows = list(dict.fromkeys([*wanted, *others]))
     done = replayed(
         rows,
         lambda row: case_study(data.table, row),
@@ -87,8 +98,18 @@ def _warnings(data: SweepData, rank: str) -> tuple[str, ...]:
         best = ranked_cases(data, rank)
     except StudyError:  # none is ok
         return ()
-    texts = resolution_warning(data, best, rank), margin_warning(data, best)
+    linear = "Figures are those of the linear model, drawn motions of the full one."
+    texts = (
+        linear if data.spec.sweep.fidelity == "linear" else "",
+        resolution_warning(data, best, rank),
+        margin_warning(data, best),
+    )
     return tuple(text for text in texts if text)
+
+
+def _conditions(data: SweepData, rank: str) -> dict[str, float]:
+    """The gain margin that recommended cases have, if any has it."""
+    return {MARGIN: ENOUGH} if MARGIN in requirement(data, rank) else {}
 
 
 def _parameters(data: SweepData) -> list[Column]:
@@ -130,6 +151,7 @@ def _figure(data: SweepData, name: str) -> Column:
         value=values,
         is_log=is_wide(values),
         better=direction(name),
+        bound=HIGHEST if name == MARGIN else np.inf,
     )
 
 
