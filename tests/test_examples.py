@@ -187,7 +187,8 @@ def test_there_are_examples():
     names = {name for name, _ in EXAMPLES}
     assert {
         "own-machine.md",
-        "sweep.md",
+        "automation.md",
+        "tune.md",
         "default",
         "tune.toml",
         "4_gradient_tuning.ipynb",
