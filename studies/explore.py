@@ -13,8 +13,8 @@ from studies.atlas.run import RUNS_FOLDER
 from studies.engine.folder import MANIFEST, TUNING
 from studies.errors import StudyError
 from studies.explorer.page import write_explorer
-from studies.fitting.explore import RESULTS as FIT
 from studies.fitting.explore import explore_fit
+from studies.fitting.run import DATA as FIT
 from studies.publish import check_folder
 from studies.sweeps.explore import explore_sweep
 from studies.tuning.explore import explore_tuning

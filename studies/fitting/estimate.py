@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple, ParamSpec, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -26,8 +25,6 @@ from studies.publish import shown
 from studies.study.paths import set_values
 from studies.study.spec import Study, parse_study
 
-P = ParamSpec("P")
-R = TypeVar("R")
 #: Parameters up to which all likelihoods are profiled.
 PROFILED = 6
 #: Machines in the file of a tuning.
@@ -72,7 +69,9 @@ def fit(spec: FitSpec, console: Console | None = None) -> Fitted:
     Raises:
         StudyError: data that cannot be used, or no starting point that leads to a fit.
     """
-    with Phases(console or Console(quiet=True), fit_phases(spec)) as phases:
+    phases = Phases(console or Console(quiet=True), fit_phases(spec))
+    # many small matrices: two threads of BLAS take 1.6 times as long
+    with phases, threadpool_limits(1, "blas"):
         return suggest(estimate(spec, phases), phases)
 
 
@@ -82,12 +81,6 @@ def fit_phases(spec: FitSpec) -> tuple[str, ...]:
     return ("fit", "profile", "machines", *samples, "check", "draw", "next experiment")
 
 
-def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """Let BLAS use one thread: with two, the many small matrices took 1.6 times as long."""
-    return threadpool_limits.wrap(limits=1, user_api="blas")(function)
-
-
-@on_one_thread
 def estimate(spec: FitSpec, phases: Phases | None = None) -> Fitted:
     """Fit a model to measurements, without the next experiment.
 
@@ -146,7 +139,6 @@ def estimate(spec: FitSpec, phases: Phases | None = None) -> Fitted:
     )
 
 
-@on_one_thread
 def suggest(fitted: Fitted, phases: Phases) -> Fitted:
     """The same with the next experiment, or with the reason why there is none."""
     if not fitted.answer.is_explained:  # a wrong model does not know what it would learn

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from studies.errors import StudyError
 from studies.explorer.table import Column, ExplorerTable, text_column
+from studies.fitting.run import DATA
 from studies.reading import parse_json
 from studies.show.figures import is_wide
-from studies.store import read_store
+from studies.store import Variable, read_store
 
-#: The file of a fit.
-RESULTS = "fit.h5"
 OPTIMUM, MACHINE = "optimum", "possible machine"
 #: How far a machine is from the best fit, in standard deviations along the correlated parameters.
 DISTANCE = "distance"
@@ -30,7 +29,7 @@ def explore_fit(folder: Path, on_progress: Callable[[int, int], None]) -> Explor
     Raises:
         StudyError: a file that is damaged.
     """
-    data, attributes = read_store(folder / RESULTS)
+    data, attributes = read_store(folder / DATA)
     try:
         optima, machines = data["optimum"].data, data["machine"].data
         values = np.concatenate([optima, machines])
@@ -40,7 +39,7 @@ def explore_fit(folder: Path, on_progress: Callable[[int, int], None]) -> Explor
         names = [str(name) for name in data["number"].data]
         title = str(parse_json(attributes["study"]).get("title", ""))
     except (KeyError, ValueError, TypeError) as error:
-        raise StudyError(f"{folder / RESULTS}: damaged ({error})") from None
+        raise StudyError(f"{folder / DATA}: damaged ({error})") from None
     parameters = [
         Column(name, "", values[:, k], is_parameter=True, is_log=is_wide(values[:, k]))
         for k, name in enumerate(names)
@@ -61,7 +60,7 @@ def explore_fit(folder: Path, on_progress: Callable[[int, int], None]) -> Explor
     )
 
 
-def _distances(gaps: np.ndarray, data: dict) -> np.ndarray:  # type: ignore[type-arg]
+def _distances(gaps: np.ndarray, data: Mapping[str, Variable]) -> np.ndarray:
     """Mahalanobis distances by the fit's standard deviations and correlation, (n,)."""
     sigma, correlation = data["sigma"].data, data["correlation"].data
     scaled = gaps / np.where(sigma > 0, sigma, np.inf)

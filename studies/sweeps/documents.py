@@ -16,6 +16,7 @@ from studies.space.methods import Analysis
 from studies.sweeps.records import (
     Record,
     case_records,
+    failed_cases,
     failed_records,
     status_records,
     units,
@@ -43,7 +44,7 @@ def show_document(data: SweepData, is_failed: bool) -> Record:
         "causes": [_cause(cause) for cause in failure_causes(data)],
         "best": best_document(data, by, condition) if _has(data, by) else None,
     }
-    return document | ({"failed": failed_records(data)} if is_failed else {})
+    return document | ({"failed": failed_records(data, failed_cases(data))} if is_failed else {})
 
 
 def _cause(cause: Cause) -> Record:

@@ -26,7 +26,7 @@ from studies.show.units import is_cut_off, readable
 from studies.space.table import CaseTable, case_study
 from studies.study.fields import Fields
 from studies.study.margin import ENOUGH, HIGHEST
-from studies.sweeps.records import BESIDE, MARGIN, reason
+from studies.sweeps.records import BESIDE, MARGIN, is_there, reason
 from studies.sweeps.sensitivity import scalar_columns
 from studies.sweeps.show import (
     margin_warning,
@@ -60,7 +60,7 @@ def explore_sweep(
     data = read_sweep(folder)
     rank = ranking(data)
     codes = data["status"]
-    if rank.partition("[")[0] not in data.variables or not _has_numbers(data, rank):
+    if not _has_numbers(data, rank):
         raise StudyError(f"{folder}: no case has {rank}, so there is nothing to explore")
     names = [rank, *(x for x in (MARGIN, *BESIDE, *kept_metrics(data.spec)) if x != rank)]
     figures = [_figure(data, x) for x in dict.fromkeys(names) if _has_numbers(data, x)]
@@ -84,11 +84,7 @@ def explore_sweep(
     wanted = ranked_cases(data, rank, subject_to, FIRST).tolist() if subject_to else []
     others = rows_to_replay(table.order[:n_ok], np.stack(smaller, axis=1))
     rows = list(dict.fromkeys([*wanted, *others]))
-    done = replayed(
-        rows,
-        lambda row: case_study(data.table, row),
-        on_progress,
-    )
+    done = replayed(rows, lambda row: case_study(data.table, row), on_progress)
     return table._replace(replays=done)
 
 
@@ -134,10 +130,7 @@ def _parameters(data: SweepData) -> list[Column]:
 
 def _has_numbers(data: SweepData, name: str) -> bool:
     """Whether some case has this figure, as one number of one unit."""
-    variable = data.variables.get(name.partition("[")[0])
-    if variable is None or ";" in variable.units:
-        return False
-    return bool(np.isfinite(metric_values(data, name)).any())
+    return is_there(data, name) and ";" not in unit_of_metric(data, name)
 
 
 def _figure(data: SweepData, name: str) -> Column:

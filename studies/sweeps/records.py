@@ -43,29 +43,34 @@ def case_records(data: SweepData, cases: np.ndarray, metrics: Iterable[str]) -> 
         StudyError: unknown metric.
     """
     values = {name: metric_values(data, name) for name in metrics}
+    axes = {name: data[name] for name in swept_names(data)}
     return [
         {"case": int(k), "case_id": str(data["case_id"][k])}
-        | {name: data[name][k] for name in swept_names(data)}
-        | {name: column[k] for name, column in values.items()}
+        | {name: column[k] for name, column in (axes | values).items()}
         for k in cases
     ]
 
 
 def with_others(data: SweepData, metrics: list[str]) -> list[str]:
     """Metrics, and what else to look at before acting on them."""
-    return metrics + [name for name in BESIDE if name not in metrics and _is_there(data, name)]
+    return metrics + [name for name in BESIDE if name not in metrics and is_there(data, name)]
 
 
-def _is_there(data: SweepData, name: str) -> bool:
+def is_there(data: SweepData, name: str) -> bool:
     """Whether a sweep has kept a metric, and some case has it."""
     kept = name.partition("[")[0] in data.variables
     return kept and bool(np.isfinite(metric_values(data, name)).any())
 
 
-def failed_records(data: SweepData) -> list[Record]:
-    """Cases that have run and are not ok: status, when it appeared [s], and what varies."""
+def failed_cases(data: SweepData) -> np.ndarray:
+    """Numbers of the cases that have run and are not ok."""
     codes = data["status"]
-    failed = np.flatnonzero((codes != status.OK) & (codes >= 0))
+    return np.flatnonzero((codes != status.OK) & (codes >= 0))
+
+
+def failed_records(data: SweepData, failed: np.ndarray) -> list[Record]:
+    """Such cases: status, when it appeared [s], and what varies."""
+    codes = data["status"]
     return [
         record
         | {

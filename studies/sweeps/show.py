@@ -36,6 +36,7 @@ from studies.sweeps.records import (
     MARGIN,
     Record,
     case_records,
+    failed_cases,
     failed_records,
     reason,
     status_records,
@@ -174,13 +175,13 @@ def status_rows(sweep: SweepData | str | Path) -> Rows:
 
 
 def _print_failed(data: SweepData, console: Console) -> None:
-    failed = failed_records(data)
-    if not failed:
+    failed = failed_cases(data)
+    if not len(failed):
         console.print("no failed case")
         return
     names = swept_names(data)
     rows = []
-    for record in failed[:LONGEST_TABLE]:
+    for record in failed_records(data, failed[:LONGEST_TABLE]):
         time = "" if record["bad_time"] is None else f"{record['bad_time']:.4g}"
         cells = (short_value(record[name]) for name in names)
         rows.append([*_identity(record), record["status_text"], time, *cells])

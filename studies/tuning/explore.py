@@ -17,10 +17,9 @@ from studies.store import Variable, read_store
 from studies.study.consistency import each_link
 from studies.study.spec import Study
 from studies.tuning.check import tuned_study
+from studies.tuning.folder import RESULTS
 from studies.tuning.spec import TuneSpec, parse_tuning
 
-#: The file of a tuning that holds all its starting points.
-RESULTS = "tune.h5"
 #: Statuses of a starting point.
 _REASONS = {0: "descended", 1: "stopped: a run did not finish"}
 
