@@ -145,9 +145,10 @@ def _fit(fitted: Any) -> Card:
 def _certificate(certificate: Any) -> Card:
     """Of `certify` and `spillover_design`."""
     from studies.spillover.plots import margins
-    from studies.spillover.report import spillover_text, verdict
+    from studies.spillover.report import damping_text, spillover_text, verdict
 
-    lines = [verdict(certificate), spillover_text(certificate), *certificate.notes]
+    texts = damping_text(certificate), spillover_text(certificate)
+    lines = [verdict(certificate), *texts, *certificate.notes]
     least = np.argsort(np.where(certificate.exists, certificate.margin, np.inf), axis=None)
     rows = []
     for k in least[: min(MOST, certificate.exists.sum())]:

@@ -6,6 +6,7 @@ import json
 import os
 import sys
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -63,7 +64,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         _check_text(sys.argv[1:] if arguments is None else arguments)
         with warnings.catch_warnings():
-            warnings.showwarning = _show_warning
+            warnings.showwarning = _show_each_once()
             if app(args=arguments, standalone_mode=False) == INTERRUPTED:
                 raise KeyboardInterrupt
     except (StudyError, TyperException) as error:
@@ -93,19 +94,26 @@ def _check_text(arguments: list[str]) -> None:
             raise StudyError(f"{name}: not UTF-8 text; rename the file or folder") from None
 
 
-def _show_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: Any = None,
-    line: str | None = None,
-) -> None:
-    """The program's own warnings as one line; others with their place in the code."""
-    if issubclass(category, OWN_WARNINGS):
-        print(f"studies: {printable(str(message))}", file=sys.stderr)
-    else:
-        print(warnings.formatwarning(message, category, filename, lineno), file=sys.stderr, end="")
+def _show_each_once() -> Callable[..., None]:
+    """What shows warnings: the program's own as one line, others with their place in the code."""
+    said: set[str] = set()  # the variants of a study repeat them
+
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: Any = None,
+        line: str | None = None,
+    ) -> None:
+        text = f"studies: {printable(str(message))}"
+        if not issubclass(category, OWN_WARNINGS):
+            text = warnings.formatwarning(message, category, filename, lineno).rstrip()
+        if text not in said:
+            said.add(text)
+            print(text, file=sys.stderr)
+
+    return show
 
 
 def _print_version(is_requested: bool) -> None:

@@ -533,6 +533,12 @@ def test_a_tuning_s_summary_and_recommendation():
     assert "residual_rms" in better and "slowest decay" in better and "gain margin" in worse
     assert summary(spec, found) == [
         f"{name}: {x.objective.mean():.4f} of the baseline's objective on 3 fresh machines, worst "
-        f"{x.objective.max():.4f}"
-        for name, x in zip(("gains", "all"), found.judged, strict=True)
+        f"{x.objective.max():.4f}{stop}"
+        for name, x, stop in zip(
+            ("gains", "all"), found.judged, ("", "; stopped by peak_voltage"), strict=True
+        )
     ]
+    alone = spec.tune.scenarios.model_copy(update={"spread": {}, "machines": {}})
+    spec = spec._replace(tune=spec.tune.model_copy(update={"scenarios": alone}))
+    first, *_, last = summary(spec, found)
+    assert "on 3 runs of the nominal machine" in first and "nothing of robustness" in last

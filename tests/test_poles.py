@@ -254,7 +254,7 @@ def test_what_cannot_be_placed_is_a_status(law, changes, code):
         ({"damping": 0.2, "pole_frequency_hz": [[99.0]] * 3}, "pole_frequency_hz.*: not given"),
         (
             {"damping": 0.2, "velocity_gain": [3.0, 3.0, 3.0]},
-            "velocity_gain = .*: not given where control.damping = 0.2 decides the gains",
+            "velocity_gain = .*: not given where control.damping = 0.2 decides the gains: change",
         ),
     ],
 )
@@ -355,9 +355,10 @@ def _check_cases(data: dict) -> None:
 
 def test_decays_and_damping_ratios_are_shown_in_their_units():
     poles = np.full((3, 1), 720 * (-0.21 + 1j * np.sqrt(1 - 0.21**2)))
-    (row, *_) = pole_rows(PoleReport(poles, poles, poles, 1.0, is_by_damping=True))
+    omega = np.full((3, 1), 720.0)
+    (row, *_) = pole_rows(PoleReport(poles, poles, poles, 1.0, True, omega, omega))
     assert row == ["1", "1", *["zeta 0.21, 114.6 Hz"] * 3]
-    (row, *_) = pole_rows(PoleReport(poles, poles, poles, 1.0))
+    (row, *_) = pole_rows(PoleReport(poles, poles, poles, 1.0, False, omega, omega))
     assert row == ["1", "1", *["151.2 1/s, 112 Hz"] * 3]
 
 
@@ -420,18 +421,22 @@ def test_assembled_poles_are_matched_to_links_and_differences_are_said():
     np.testing.assert_array_equal(_matched(asked[:, 0], poles), poles[[1, 2, 0]])
     assembled = asked * 1.001
     assembled[1, 0] = -110 + 710j
-    found = PoleReport(asked, asked, assembled, 1.0)
+    omega = np.abs(asked)
+    found = PoleReport(asked, asked, assembled, 1.0, False, omega, omega)
     rows = pole_rows(found)
     assert [row[:2] for row in rows] == [["1", "1"], ["1", "2"], ["1", "3"], ["2", "1"]]
     assert rows[1][2] == "100 1/s, 111.4 Hz" and rows[1][4] == "110 1/s, 113 Hz"
     assert "most in mode 1 of link 2: 110 1/s, 113 Hz instead of 100 1/s, 111.4" in difference(
         found
     )
-    other = PoleReport(asked, 1.1 * asked, 1.1 * asked, 2.0)
+    assert "coupled by the platform" in difference(found)
+    wrong = difference(found._replace(model_omega=1.1 * omega))
+    assert "model mismatch" in wrong and "coupled" not in wrong
+    other = PoleReport(asked, 1.1 * asked, 1.1 * asked, 2.0, False, omega, omega)
     assert difference(other) == (
         "Poles are placed for control.gain_factor = 1; with 2, the nominal link has others. The "
         "assembled machine has all of them as on the nominal link, to 2 %."
     )
-    same = PoleReport(asked, 1.1 * asked, asked, 1.0)
+    same = PoleReport(asked, 1.1 * asked, asked, 1.0, False, omega, omega)
     assert difference(same).startswith("The nominal link does not have them")
     assert difference(same).endswith("all of them as specified, to 2 %.")

@@ -146,6 +146,7 @@ def made_up_run(size=1.0, margin=3.25, code=status.OK, **changes):
         frequency_hz=RNG.uniform(100, 900, (2, 3)),
         damping_ratio=RNG.uniform(0.01, 0.3, (2, 3)),
         breaking_frequency=1199.25,
+        breaking="mode 5 of link 2 (2861 Hz)",
     )
     motion = LoopFigures(
         time=np.array([0.0, 0.1, 0.2]),
@@ -242,8 +243,8 @@ def test_sentences_of_a_run_show_its_numbers(one_run):
         f"clipped ADC channel: {100 * m.clipped_fraction:.3g} %; with a motor at its limit of 77 "
         f"N: {100 * m.motor_saturated_fraction:.3g} %.",
         "with 12 plant modes per link (the run has 4): gain margin 3.25 (10.2 dB), the factor by "
-        "which the loop gain (`control.gain_factor`) can still grow; beyond it, motion "
-        "at 1199 Hz grows, of a link's mode or of a controller's filter; spectral radius 0.987654",
+        "which the loop gain (`control.gain_factor`) can still grow; "
+        "beyond it goes unstable: mode 5 of link 2 (2861 Hz); spectral radius 0.987654",
         f"CAUTION: {100 * m.clipped_fraction:.2g} % of the samples have an ADC channel clipped; "
         f"{100 * m.saturated_fraction:.2g} % of the samples have an actuator at its limit; ",
         f"({force.min():.3g} to {force.max():.3g} N), the margin goes from "

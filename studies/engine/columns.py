@@ -60,7 +60,8 @@ PER_CASE: dict[str, tuple[Any, ...]] = {
     "breaking_mode": (
         (),
         "1",
-        "order of the link mode nearest to that frequency, 0: the drive, NaN: nothing",
+        "order of the link mode nearest to that frequency, 0: a mode of the platform on its "
+        "drive, NaN: nothing; the report of a replay names what moves",
     ),
     "damping_ratio": (
         ("controlled_mode",),

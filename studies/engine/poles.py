@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from itertools import permutations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxmodel.bases import find_bases
 from jaxmodel.case import Case, Structure
 from jaxmodel.nominal_loop import nominal_loop
 from studies.engine.programs import kept_jit
+from studies.engine.simplifications import MISMATCH_LIMIT, mismatch_text
 from studies.engine.stability import LoopFigures
 
 #: Relative difference of a decay or frequency that is worth a sentence [1].
@@ -24,7 +26,9 @@ class PoleReport(NamedTuple):
     nominal: np.ndarray  # of the nominal link's loop
     assembled: np.ndarray  # of the three assembled modes of each order, nearest to the nominal ones
     gain_factor: float  # control.gain_factor [1]
-    is_by_damping: bool = False  # specified as added damping ratios, and shown as such
+    is_by_damping: bool  # specified as added damping ratios, and shown as such
+    plant_omega: np.ndarray  # of the links between held ends [rad/s], (3, C)
+    model_omega: np.ndarray  # of the controller's model [rad/s], (3, C)
 
 
 def tracked_modes(structure: Structure) -> int:
@@ -33,7 +37,11 @@ def tracked_modes(structure: Structure) -> int:
     return min(most, structure.n_modes)
 
 
-_nominal_loop = kept_jit(static_argnums=0)(nominal_loop)
+@kept_jit(static_argnums=0)
+def _nominal_loop(structure: Structure, case: Case) -> Any:
+    """`nominal_loop`; frequencies of plant and controller's model [rad/s], (3, C) each."""
+    bases = find_bases(structure, case)
+    return *nominal_loop(structure, case), bases.plant_omega, bases.believed_omega
 
 
 def pole_report(structure: Structure, case: Case, loop: LoopFigures) -> PoleReport | None:
@@ -46,7 +54,7 @@ def pole_report(structure: Structure, case: Case, loop: LoopFigures) -> PoleRepo
     """
     if not structure.has_poles:
         return None
-    specified, matrix = map(np.asarray, _nominal_loop(structure, case))
+    specified, matrix, *omega = map(np.asarray, _nominal_loop(structure, case))
     is_on, period = ~np.isnan(specified), float(case.electronics.period)
     if not is_on.any():
         return None
@@ -63,7 +71,7 @@ def pole_report(structure: Structure, case: Case, loop: LoopFigures) -> PoleRepo
         assembled[:, mode] = np.where(is_on[:, mode], matched, np.nan)
     is_by_damping = bool(np.any(np.asarray(case.control.damping) >= 0))
     factor = float(case.control.gain_factor)
-    return PoleReport(specified, nominal, assembled, factor, is_by_damping=is_by_damping)
+    return PoleReport(specified, nominal, assembled, factor, is_by_damping, *omega)
 
 
 def _matched(nominal: np.ndarray, poles: np.ndarray) -> np.ndarray:
@@ -119,11 +127,22 @@ def difference(report: PoleReport) -> str:
     at = np.unravel_index(np.nanargmax(apart), apart.shape)
     sentences.append(
         f"The assembled machine differs most in mode {at[1] + 1} of link {at[0] + 1}: "
-        f"{shown(report.assembled[at])} instead of {shown(reference[at])} {than}. Its links are "
-        "coupled by the platform and patches act on all modes (spillover); gains are designed mode "
-        "by mode."
+        f"{shown(report.assembled[at])} instead of {shown(reference[at])} {than}. {_cause(report)}"
     )
     return " ".join(sentences)
+
+
+def _cause(report: PoleReport) -> str:
+    """Why the assembled machine has other poles than the nominal link."""
+    error = np.abs(report.model_omega / report.plant_omega - 1)
+    error = np.where(np.isnan(report.specified), 0.0, error)
+    if error.max() > MISMATCH_LIMIT:
+        text = mismatch_text(report.plant_omega, report.model_omega, error)
+        return f"First of all a {text} (control.basis, link.stiffness_factor)."
+    return (
+        "Its links are coupled by the platform and patches act on all modes (spillover); gains are "
+        "designed mode by mode."
+    )
 
 
 def _relative_distance(poles: np.ndarray, specified: np.ndarray) -> np.ndarray:

@@ -29,7 +29,8 @@ from jaxmodel.shaper import Taps, last_sample
 from jaxmodel.simulate import steady_load
 from studies import config
 from studies.engine.programs import kept_jit
-from studies.errors import field_error, warn_of_model
+from studies.engine.simplifications import warn_of_lumping, warn_of_mismatch, warn_of_patches
+from studies.errors import field_error
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.consistency import check_locked, each_link
 from studies.study.spec import AUTO, Study
@@ -37,8 +38,6 @@ from studies.study.window import never_settles, residual_delay
 
 #: More plant steps per sample than this are rejected.
 SUBSTEP_LIMIT = 200
-#: Most that lumping the axial inertia may cost without a word [1].
-LUMPING_LIMIT = 2e-3
 
 
 class Preflight(NamedTuple):
@@ -59,6 +58,7 @@ class Preflight(NamedTuple):
     steady_load: Any  # compression of the links at way-points over their critical force [1], (n, 3)
     critical_force: Any  # [N], (3,)
     lumping: Any  # what lumping the axial inertia costs along the unshaped path [1], ()
+    plant_omega: Any  # of the links between held ends [rad/s], (3, C)
     believed_omega: Any  # the controller's modes, as it believes them [rad/s], (3, C)
     controller: Controller
     taps: Taps  # of the shaper
@@ -102,6 +102,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
         steady_load(structure, case, plant),
         critical_force(plant),
         lumping,
+        prepared.bases.plant_omega,
         prepared.bases.believed_omega,
         prepared.loop.controller,
         prepared.taps,
@@ -155,12 +156,6 @@ def check_run(study: Study) -> tuple[Structure, Case]:
             "m, m, rad",
         )
     _check_load(study, prepared)
-    if prepared.lumping > LUMPING_LIMIT:
-        warn_of_model(
-            f"link.axial_inertia = {study.link.axial_inertia!r} moves deflections by about "
-            f"{100 * prepared.lumping:.2g} % on this path (limit {100 * LUMPING_LIMIT:g} %); "
-            "'distributed' is exact"
-        )
     _check_duration(study, structure, prepared)
     is_filtered = is_modal(structure) and structure.feedback != "none"
     if is_filtered and prepared.condition > study.metrics.condition_limit:
@@ -175,6 +170,9 @@ def check_run(study: Study) -> tuple[Structure, Case]:
     _check_rates(study, structure, prepared)
     if structure.feedback == "ideal":
         structure = structure._replace(substeps=_ideal_substeps(study, structure, case))
+    warn_of_patches(study)
+    warn_of_lumping(study, float(prepared.lumping))
+    warn_of_mismatch(study, prepared.plant_omega, prepared.believed_omega)
     return structure, case
 
 

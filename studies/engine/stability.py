@@ -24,6 +24,7 @@ from jaxmodel.motion import PathSample, end_of_path, sample_path
 from jaxmodel.parameters import Array
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices, loop_matrices
+from studies.engine.host_loop import SampledLoop, name_motion, sampled_loop
 from studies.engine.programs import kept_jit
 from studies.study.margin import HIGHEST, LOWEST, MARGIN_MODES
 
@@ -46,7 +47,9 @@ class LoopFigures(NamedTuple):
     gain_margin: Array  # largest common factor on all gains, all smaller ones stable [1], (...)
     spectral_radius: Array = None  # of the closed loop [1], (...)
     breaking_frequency: Array = None  # of what goes unstable at the margin [Hz], (...)
-    # order of the nearest link mode, 0: the drive; NaN as above, and for the static stiffness
+    breaking: str = ""  # what that is, see `name_motion`; of a single loop
+    # order of the link mode nearest to it, 0: a mode of the platform on its drive; NaN as above,
+    # and for the static stiffness
     breaking_mode: Array = None
     # least [1] of the most damped modes of each order, one per controlled link, (..., J)
     least_damping: Array = None
@@ -59,30 +62,6 @@ class LoopFigures(NamedTuple):
     def is_stable(self) -> bool:
         """Whether this loop and every one with smaller gains is stable."""
         return self.spectral_radius <= 1 + RADIUS_TOLERANCE and self.gain_margin >= 1
-
-
-class SampledLoop(NamedTuple):
-    """A linearised loop on the host."""
-
-    open: np.ndarray  # transition over a sample without gains, (n, n)
-    feedback: np.ndarray  # what the gains add, (n, n)
-    mode_poles: np.ndarray  # of the link modes without control [rad/s], NaN: overdamped, (J, 3)
-    omega: np.ndarray  # of the plant's modal coordinates [rad/s], (3, R)
-    period: float  # [s]
-
-    @property
-    def n_modes(self) -> int:
-        """R of each link."""
-        return self.omega.shape[1]
-
-    @property
-    def is_open_loop_stable(self) -> bool:
-        """Whether the plant is stable without control: no link beyond its critical force."""
-        return bool(np.abs(self.poles(0.0)).max() <= 1 + RADIUS_TOLERANCE)
-
-    def poles(self, factor: float) -> np.ndarray:
-        """Discrete poles with all gains times a factor, (n,)."""
-        return np.linalg.eigvals(self.open + factor * self.feedback)
 
 
 def with_margin_modes(
@@ -183,16 +162,6 @@ def _parts(
     return list(modes), jax.tree.map(lambda *x: np.stack(x), *parts)
 
 
-def sampled_loop(
-    matrices: LoopMatrices, omega: np.ndarray, period: float, n_tracked: int
-) -> SampledLoop:
-    """A loop on the host from matrices of `jaxmodel.sampled_loop`, NumPy arrays."""
-    poles = link_poles(matrices.plant, n_tracked)
-    return SampledLoop(
-        open=matrices.open, feedback=matrices.feedback, mode_poles=poles, omega=omega, period=period
-    )
-
-
 def loop_report(
     structure: Structure,
     case: Case,
@@ -288,6 +257,7 @@ def judge_loop(loop: SampledLoop, steps: np.ndarray = STEPS) -> LoopFigures:
         gain_margin=margin,
         spectral_radius=float(np.abs(poles(1.0)).max()),
         breaking_frequency=float(abs(np.angle(beyond)) / (2 * np.pi * loop.period)),
+        breaking=breaking_motion(loop, margin),
         frequency_hz=frequency,
         damping_ratio=ratio,
     )
@@ -321,6 +291,13 @@ def pole_beyond(loop: SampledLoop, margin: float) -> complex:
         return complex(np.nan)
     poles = loop.poles(breaking_factor(margin))
     return complex(poles[np.argmax(np.abs(poles))])
+
+
+def breaking_motion(loop: SampledLoop, margin: float) -> str:
+    """What goes unstable just beyond the margin, "" if that is `HIGHEST`."""
+    if margin >= HIGHEST:
+        return ""
+    return name_motion(loop, breaking_factor(margin), pole_beyond(loop, margin))
 
 
 def follow_modes(
@@ -422,28 +399,3 @@ def follow_poles(start: np.ndarray, sets: Iterable[np.ndarray]) -> np.ndarray:
         velocity, tracked = np.array(matched) - tracked, np.array(matched)
         path.append(tracked)
     return np.array(path)
-
-
-def link_poles(state: np.ndarray, n_tracked: int) -> np.ndarray:
-    """Poles [rad/s] of the uncontrolled link modes, in threes by ascending frequency, (J, 3).
-
-    These are the eigenvalues whose eigenvectors lie mainly in the modal coordinates; overdamped
-    modes have no such pole: NaN.
-
-    Args:
-        state: A of the plant, `LoopMatrices.plant`.
-        n_tracked: J.
-    """
-    modes = (state.shape[0] - 6) // 2
-    value, vector = np.linalg.eig(state)
-    upper = value.imag > 0
-    vector, value = vector[:, upper], value[upper]
-    weight = np.abs(vector[:3]).max(axis=0) / np.abs(vector[6 : 6 + modes]).max(axis=0)
-    # at most three pairs belong to the pose on its drive: those with the largest pose share
-    n_rigid = value.size - modes
-    flexible = np.sort_complex(1j * value[np.argsort(weight)[: value.size - max(n_rigid, 0)]])
-    flexible = flexible[np.argsort(np.abs(flexible))] / 1j
-    kept = min(flexible.size // 3, n_tracked)
-    poles = np.full((n_tracked, 3), np.nan, complex)
-    poles[:kept] = flexible[: 3 * kept].reshape(kept, 3)
-    return poles

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -176,13 +175,8 @@ def _print_run(run: Run, twin: Run | None, console: Console) -> None:
             poles.add_row(*row)
         console.print(poles)
         console.print(difference(run.poles), soft_wrap=True)
-    frequency = run.loop.breaking_frequency
-    if not math.isnan(frequency):
-        console.print(
-            f"beyond that margin, a mode at {frequency:.4g} Hz becomes unstable, of a link or of a "
-            "controller's filter: `studies spillover` names it",
-            soft_wrap=True,
-        )
+    if run.loop.breaking:
+        console.print(f"beyond that margin goes unstable: {run.loop.breaking}", soft_wrap=True)
     if warning := caution(run.loop.gain_margin):
         console.print(f"[bold red]{warning}[/]", soft_wrap=True, markup=True)
 

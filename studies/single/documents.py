@@ -25,7 +25,7 @@ def run_document(run: Run, twin: Run | None) -> dict[str, Any]:
         "status_text": describe(run.status),
         "metrics": _values(metrics),
         "without_control": free,
-        "loop": _values(loop) if loop else None,
+        "loop": _values(loop) | {"breaking": run.loop.breaking} if run.loop else None,
         "residual_delay": float(windows.residual_delay),
         "residual_length": float(windows.residual_length),
         "units": {name: variable.units for name, variable in labelled.items()},

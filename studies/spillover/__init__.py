@@ -1,7 +1,7 @@
 """Spillover: a controller on plants with modes it does not know, and a comparison of laws.
 
-- `plants` defines the plants and their linearised loops, `judgement` evaluates their poles,
-  `certificate` puts them together: `certify(study)`.
+- `plants` defines the plants and their linearised loops, `certificate` judges them:
+  `certify(study)`.
 - `laws` are control laws of equal strength, `comparison` judges and runs them:
   `compare_laws(study)`.
 - `report`, `plots` and `run` write everything into a folder, `commands` is `studies spillover`.

@@ -11,10 +11,10 @@ from jaxmodel.beam import BASES
 from jaxmodel.controller import linear_parts
 from jaxmodel.sampled_loop import RADIUS_TOLERANCE
 from studies.engine.controller import FixedController, fixed_controller
+from studies.engine.host_loop import SampledLoop, name_motion
 from studies.engine.stability import LoopFigures, judge_loop, worst_figures
 from studies.errors import StudyError, field_error
 from studies.publish import shown
-from studies.spillover.judgement import breaking_motion, weakest_mode
 from studies.spillover.plants import (
     MISMATCHES,
     LoopBuilder,
@@ -203,10 +203,21 @@ def _judge_plants(
                 [(modes, figures) for (modes, _), figures in zip(parts, each, strict=True)]
             ),
             free_damping=-poles.real / np.abs(poles),
-            weakest=weakest_mode(loop, each[least]),
-            breaking=breaking_motion(loop, each[least].gain_margin),
+            weakest=_weakest_mode(loop, each[least]),
+            breaking=each[least].breaking,
         )
     return judgements
+
+
+def _weakest_mode(loop: SampledLoop, figures: LoopFigures) -> str:
+    """The mode of least damping, "" if all are overdamped."""
+    ratio = figures.damping_ratio
+    if np.all(np.isnan(ratio)):
+        return ""
+    at = np.unravel_index(np.nanargmin(ratio), ratio.shape)
+    zeta, omega = ratio[at], 2 * np.pi * figures.frequency_hz[at]
+    decay = omega * (-zeta + 1j * np.sqrt(max(1 - zeta**2, 0.0)))
+    return name_motion(loop, 1.0, np.exp(decay * loop.period))
 
 
 def _certificate(

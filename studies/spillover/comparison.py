@@ -15,9 +15,8 @@ from jaxmodel.simulate import Result, simulate
 from studies.engine.controller import FixedController, fixed_controller
 from studies.engine.preflight import check_run
 from studies.engine.programs import kept_jit
-from studies.engine.stability import follow_modes, gain_margin, modal_damping
+from studies.engine.stability import breaking_motion, follow_modes, gain_margin, modal_damping
 from studies.spillover.certificate import STEPS
-from studies.spillover.judgement import breaking_motion
 from studies.spillover.laws import Candidate, all_laws
 from studies.spillover.plants import LoopBuilder, PlantVariant, plant_sizes
 from studies.study.margin import HIGHEST, LOWEST

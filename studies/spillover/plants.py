@@ -23,8 +23,8 @@ from jaxmodel.piezo import placement_faults
 from jaxmodel.prepare import prepare
 from jaxmodel.sampled_loop import LoopMatrices, loop_matrices
 from studies.engine.controller import FixedController
+from studies.engine.host_loop import SampledLoop, sampled_loop
 from studies.engine.programs import kept_jit
-from studies.engine.stability import SampledLoop, sampled_loop
 from studies.errors import field_error
 from studies.study.margin import MARGIN_MODES
 

@@ -47,6 +47,20 @@ def spillover_text(certificate: Certificate) -> str:
     )
 
 
+def damping_text(certificate: Certificate) -> str:
+    """What becomes of mode 1's damping on all plants, in a sentence; "" if it is overdamped."""
+    first = np.where(certificate.exists[..., None], certificate.damping_ratio[..., 0, :], np.nan)
+    if np.isnan(first).all():
+        return ""
+    most = np.max(np.where(np.isnan(first), -np.inf, first), axis=-1)
+    most = np.where(np.isfinite(most), most, np.nan)
+    plant = certificate.plants[np.unravel_index(np.nanargmin(most), most.shape)]
+    return (
+        f"damping ratio of mode 1, on the most damped link: {np.nanmin(most):.2g} to "
+        f"{np.nanmax(most):.2g} on these plants (least: {plant.basis}, {plant.mismatch})"
+    )
+
+
 def report(certificate: Certificate, laws: Comparison | None, images: Path | None = None) -> str:
     """The page of a certificate.
 
@@ -67,6 +81,7 @@ def report(certificate: Certificate, laws: Comparison | None, images: Path | Non
         breaking=certificate.breaking[certificate.worst],
         residual=_residual(laws) if laws is not None else None,
         spillover=spillover_text(certificate),
+        damping=damping_text(certificate),
         margin=margin,
         worst=certificate.plants[certificate.worst],
         share=margin / certificate.required,

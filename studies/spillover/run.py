@@ -22,7 +22,7 @@ from studies.show.sketch import sketch
 from studies.spillover import plots
 from studies.spillover.certificate import Certificate, certify
 from studies.spillover.comparison import Comparison, compare_laws
-from studies.spillover.report import document, report, spillover_text, verdict
+from studies.spillover.report import damping_text, document, report, spillover_text, verdict
 from studies.store import Variable, write_store
 from studies.study.labels import STATUS_LABEL
 from studies.study.spec import Study
@@ -61,7 +61,7 @@ def spillover_design(
         phases.begin("judge", "the controller on plants that differ from its nominal model")
         certificate = certify(study, margin)
         console.print(verdict(certificate), soft_wrap=True)
-        if text := spillover_text(certificate):
+        for text in filter(None, (damping_text(certificate), spillover_text(certificate))):
             console.print(text, soft_wrap=True)
         phases.begin("compare laws")
         laws = None

@@ -138,7 +138,9 @@ def _check_damping(study: Study) -> None:
         value = getattr(control, leaf)
         if value != type(control).model_fields[leaf].default:
             ratios = shown(control.damping)
-            allowed = f"not given where control.damping = {ratios} decides the gains"
+            allowed = (
+                f"not given where control.damping = {ratios} decides the gains: change that instead"
+            )
             raise field_error(f"control.{leaf}", value, allowed)
     most = 1 - _largest(study.link.damping_ratio)
     if _largest(control.damping) >= most:

@@ -305,7 +305,8 @@ class ControlSection(Section):
         "1",
         "added damping ratio, beside link.damping_ratio, from which the gains follow; natural "
         "frequencies are kept: one number, or one a link, is that of mode 1, others by (24); or "
-        "one list a link by mode; 0: none, empty: gains or decays as below",
+        "one list a link by mode; 0: none, empty: gains or decays as below; for "
+        "gain_factor = 1, another factor scales gains, not ratios",
         free=DESIGN,
     )
     pole_decay: EachMode[Decay] = described(

@@ -67,7 +67,9 @@ def free_numbers(written: dict[str, Any], study: Study) -> FreeNumbers:
         poles = "damping" if study.control.damping != () else "pole_decay"
         for number in free.numbers:
             if number.key.startswith(("control.velocity_gain", "control.position_gain")):
-                raise StudyError(f"tune.free.{number.key}: control.{poles} decides the gains")
+                raise StudyError(
+                    f"tune.free.{number.key}: control.{poles} decides the gains: free that instead"
+                )
     return free
 
 

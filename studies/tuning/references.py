@@ -15,7 +15,7 @@ from jaxmodel import status
 from jaxmodel.metrics import METRICS
 from studies.engine.frame import frame_of
 from studies.engine.preflight import check_run
-from studies.show.units import count_text, number, readable
+from studies.show.units import number, readable
 from studies.study.cases import build_cases
 from studies.study.entries import parse_entries
 from studies.study.resolution import is_deflection, least_step, resolution_text
@@ -24,7 +24,7 @@ from studies.tuning.check import JudgedDesign, PlainRuns, judge, shown_structure
 from studies.tuning.linear_fidelity import DesignFigures, loop_figures
 from studies.tuning.objective import allowed_limits, baseline_limits, judge_designs, objective_of
 from studies.tuning.optimise import KEPT, excess
-from studies.tuning.scenarios import lane_columns, scenario_columns
+from studies.tuning.scenarios import fresh_machines, lane_columns, scenario_columns
 from studies.tuning.spec import BASELINE, Family, TuneSpec
 
 FIELD = "control.gain_factor"
@@ -186,8 +186,7 @@ def reference_lines(spec: TuneSpec, baseline: JudgedDesign, references: Referenc
         baseline: the baseline, judged.
         references: what a tuned design has to beat.
     """
-    machines = count_text(spec.tune.scenarios.check, "fresh machine")
-    lines = []
+    machines, lines = fresh_machines(spec), []
     for name, design in references.designs:
         which = name
         if name == ALONE and references.scan is not None:

@@ -15,7 +15,7 @@ from studies.engine.poles import HEADER, difference, pole_rows
 from studies.publish import shown
 from studies.show.pages import page
 from studies.show.sketch import CAPTION
-from studies.show.units import count_text, headed, is_cut_off, number, readable, settling_text
+from studies.show.units import headed, is_cut_off, number, readable, settling_text
 from studies.study.entries import parse_entries
 from studies.study.margin import MARGIN_MODES, caution, margin_in_db, margin_text
 from studies.study.template import study_template, toml_text
@@ -26,7 +26,7 @@ from studies.tuning.linear_fidelity import DesignFigures
 from studies.tuning.objective import SHOWN
 from studies.tuning.optimise import GAIN, KEPT, PATIENCE, Progress, excess
 from studies.tuning.references import References, reference_lines, relative_margin, resolution_lines
-from studies.tuning.scenarios import move_label
+from studies.tuning.scenarios import fresh_machines, move_label
 from studies.tuning.spec import BASELINE, LOOP_LIMITS, Family, TuneSpec, label
 
 #: Lower limits.
@@ -220,8 +220,11 @@ def file_name(spec: TuneSpec, family: Family) -> str:
 
 def summary(spec: TuneSpec, findings: TuneFindings) -> list[str]:
     """What improved, one line per family."""
-    machines = count_text(spec.tune.scenarios.check, "fresh machine")
-    lines = []
+    machines, lines = fresh_machines(spec), []
+    active = {
+        name: [limit["name"] for limit in limits if limit["state"] == "active"]
+        for name, limits in _limits(spec, findings)
+    }
     for k, (family, design) in enumerate(zip(spec.families, findings.judged, strict=True)):
         is_moving = k < len(spec.moving)
         lost = is_moving and findings.at.beyond(findings.at.winner(k)) > 0
@@ -230,6 +233,12 @@ def summary(spec: TuneSpec, findings: TuneFindings) -> list[str]:
             f"on {machines}"
             + (f", worst {design.objective.max():.4f}" if len(design.objective) > 1 else "")
             + ("; a limit is violated" if lost else "")
+            + (f"; stopped by {' and '.join(stops)}" if (stops := active.get(family.name)) else "")
+        )
+    if not spec.tune.scenarios.has_others:
+        lines.append(
+            "All machines are nominal: [tune.scenarios] names nothing in which they differ, so "
+            "these figures say nothing of robustness."
         )
     lines += reference_lines(spec, findings.baseline, findings.references)
     return lines + _unmeasured(spec, findings)

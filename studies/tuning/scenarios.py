@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import scipy
 
+from studies.show.units import count_text
 from studies.space.axes import column_of
 from studies.study.fields import Columns
 from studies.study.paths import LINKS, as_tuples, known_field, set_value
@@ -48,6 +49,13 @@ def scenario_columns(
     for name in spec.tune.scenarios.each:
         columns[name] = np.repeat(column_of([move[name] for move in spec.moves]), count, axis=0)
     return columns
+
+
+def fresh_machines(spec: TuneSpec) -> str:
+    """What designs are judged on, in words."""
+    if spec.tune.scenarios.has_others:
+        return count_text(spec.tune.scenarios.check, "fresh machine")
+    return f"{count_text(spec.tune.scenarios.check, 'run')} of the nominal machine"
 
 
 def move_label(move: dict[str, Any]) -> str:

@@ -1,37 +1,74 @@
-"""What moves at the poles of a loop, in words: the mode of least damping, and what breaks it."""
+"""A linearised loop on the host, and what moves at its poles."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from studies.engine.stability import LoopFigures, SampledLoop, breaking_factor, pole_beyond
-from studies.study.margin import HIGHEST
+from jaxmodel.sampled_loop import RADIUS_TOLERANCE, LoopMatrices
 
 #: A mode or link with this share of the largest one's energy is named with it [1].
 PART = 1 / 3
 
 
-def weakest_mode(loop: SampledLoop, figures: LoopFigures) -> str:
-    """The mode of least damping, "" if all are overdamped.
+class SampledLoop(NamedTuple):
+    """A linearised loop on the host."""
+
+    open: np.ndarray  # transition over a sample without gains, (n, n)
+    feedback: np.ndarray  # what the gains add, (n, n)
+    mode_poles: np.ndarray  # of the link modes without control [rad/s], NaN: overdamped, (J, 3)
+    omega: np.ndarray  # of the plant's modal coordinates [rad/s], (3, R)
+    period: float  # [s]
+
+    @property
+    def n_modes(self) -> int:
+        """R of each link."""
+        return self.omega.shape[1]
+
+    @property
+    def is_open_loop_stable(self) -> bool:
+        """Whether the plant is stable without control: no link beyond its critical force."""
+        return bool(np.abs(self.poles(0.0)).max() <= 1 + RADIUS_TOLERANCE)
+
+    def poles(self, factor: float) -> np.ndarray:
+        """Discrete poles with all gains times a factor, (n,)."""
+        return np.linalg.eigvals(self.open + factor * self.feedback)
+
+
+def sampled_loop(
+    matrices: LoopMatrices, omega: np.ndarray, period: float, n_tracked: int
+) -> SampledLoop:
+    """A loop on the host from matrices of `jaxmodel.sampled_loop`, NumPy arrays."""
+    poles = link_poles(matrices.plant, n_tracked)
+    return SampledLoop(
+        open=matrices.open, feedback=matrices.feedback, mode_poles=poles, omega=omega, period=period
+    )
+
+
+def link_poles(state: np.ndarray, n_tracked: int) -> np.ndarray:
+    """Poles [rad/s] of the uncontrolled link modes, in threes by ascending frequency, (J, 3).
+
+    These are the eigenvalues whose eigenvectors lie mainly in the modal coordinates; overdamped
+    modes have no such pole: NaN.
 
     Args:
-        loop: the loop.
-        figures: its figures.
+        state: A of the plant, `LoopMatrices.plant`.
+        n_tracked: J.
     """
-    ratio = figures.damping_ratio
-    if np.all(np.isnan(ratio)):
-        return ""
-    at = np.unravel_index(np.nanargmin(ratio), ratio.shape)
-    zeta, omega = ratio[at], 2 * np.pi * figures.frequency_hz[at]
-    decay = omega * (-zeta + 1j * np.sqrt(max(1 - zeta**2, 0.0)))
-    return name_motion(loop, 1.0, np.exp(decay * loop.period))
-
-
-def breaking_motion(loop: SampledLoop, margin: float) -> str:
-    """What goes unstable just beyond the margin, "" if that is `HIGHEST`."""
-    if margin >= HIGHEST:
-        return ""
-    return name_motion(loop, breaking_factor(margin), pole_beyond(loop, margin))
+    modes = (state.shape[0] - 6) // 2
+    value, vector = np.linalg.eig(state)
+    upper = value.imag > 0
+    vector, value = vector[:, upper], value[upper]
+    weight = np.abs(vector[:3]).max(axis=0) / np.abs(vector[6 : 6 + modes]).max(axis=0)
+    # at most three pairs belong to the pose on its drive: those with the largest pose share
+    n_rigid = value.size - modes
+    flexible = np.sort_complex(1j * value[np.argsort(weight)[: value.size - max(n_rigid, 0)]])
+    flexible = flexible[np.argsort(np.abs(flexible))] / 1j
+    kept = min(flexible.size // 3, n_tracked)
+    poles = np.full((n_tracked, 3), np.nan, complex)
+    poles[:kept] = flexible[: 3 * kept].reshape(kept, 3)
+    return poles
 
 
 def name_motion(loop: SampledLoop, factor: float, pole: complex) -> str:
