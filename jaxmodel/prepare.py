@@ -8,7 +8,7 @@ from typing import NamedTuple
 from jaxmodel import shaper, status
 from jaxmodel.axial import axial_compliance
 from jaxmodel.bases import Bases, find_bases
-from jaxmodel.beam import ModalBasis
+from jaxmodel.beam import BASES, ModalBasis, pinned_free_roots
 from jaxmodel.case import Case, Structure
 from jaxmodel.channels import Channels
 from jaxmodel.control import active_modes, condition_number, left_inverse
@@ -25,7 +25,12 @@ from jaxmodel.laws.poles import is_unplaceable
 from jaxmodel.lazy import jax, jnp
 from jaxmodel.loop import LeftOut, Loop, Rest
 from jaxmodel.parameters import Array
-from jaxmodel.piezo import actuator_constant, placement_faults, sensor_constant
+from jaxmodel.piezo import (
+    actuator_constant,
+    bare_stiffness,
+    placement_faults,
+    sensor_constant,
+)
 from jaxmodel.plant import Plant, build_plant, damping_ratio
 from jaxmodel.static import static_remainder
 
@@ -35,6 +40,9 @@ SPECTRUM_SPAN = 0.1
 MODE_STEP_LIMIT = 100
 #: |Re lambda| h that one plant step may have outside the links; ETDRK4 is unstable from about 2.8.
 STIFFNESS_LIMIT = 2.5
+#: omega h of the highest mode of links whose ends are not on their chords: such modes are strongly
+#: coupled, which ETDRK4 integrates explicitly; 2e-4 of the bending at this limit [1].
+COUPLED_STEP_LIMIT = 1.5
 
 
 class Prepared(NamedTuple):
@@ -369,6 +377,19 @@ def drive_rate(case: Case) -> Array:
     damping = drive.kd + drive.viscous_friction + drive.coulomb_friction / drive.friction_speed
     rate = jnp.max(damping / mass + jnp.sqrt(drive.kp / mass))
     return jnp.where(case.drive.is_locked > 0, 0.0, rate)
+
+
+def coupled_rate(structure: Structure, case: Case) -> Array:
+    """omega of the highest mode of links whose ends are not on their chords [rad/s], 0: they are.
+
+    Of pinned-free links, sqrt(E I/(rhoA L^4)) (kL)^2.
+    """
+    if BASES[structure.basis].is_on_chord:
+        return jnp.zeros(())
+    beam = case.machine.beam
+    line_mass = beam.density * beam.width * beam.thickness
+    root = jnp.sqrt(bare_stiffness(beam) * beam.stiffness_factor / line_mass) / beam.length**2
+    return jnp.max(root) * pinned_free_roots(structure.n_modes)[-1] ** 2
 
 
 def _is_ill_conditioned(structure: Structure, case: Case, design: ControllerDesign) -> Array:

@@ -24,8 +24,9 @@ KINDS = {
     "program": "compiled programs",
     "data": "data of compiled programs",
     "kernel": "machine code of kernels",
+    "passport": "outcomes of `studies verify`",
 }
-_OWN = re.compile(r"\.?(program|data|kernel)-[0-9a-f]{64}(\.[0-9a-f]{8}\.tmp)?")
+_OWN = re.compile(r"\.?(program|data|kernel|passport)-[0-9a-f]{64}(\.[0-9a-f]{8}\.tmp)?")
 _XLA = re.compile(r"\w+-[0-9a-f]{64}-(cache|atime)")
 
 

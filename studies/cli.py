@@ -31,6 +31,7 @@ from studies.single.commands import add_commands as add_single
 from studies.spillover.commands import add_commands as add_spillover
 from studies.sweeps.commands import add_commands as add_sweeps
 from studies.tuning.commands import add_commands as add_tuning
+from studies.verify.commands import add_commands as add_verify
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -149,6 +150,7 @@ def prepare(
 for add_commands in (
     add_paper,
     add_single,
+    add_verify,
     add_sweeps,
     add_tuning,
     add_fit,

@@ -15,15 +15,15 @@ from jaxmodel.kinematics import close_chain
 from jaxmodel.linear import Moment, linearise, natural_modes
 from jaxmodel.parameters import HOME
 from jaxmodel.prepare import prepare
-from studies.bench import reference
 from studies.engine.preflight import check_run
 from studies.engine.runs import _simulate
 from studies.engine.stability import loop_report, run_report
 from studies.errors import ModelWarning, StudyError
+from studies.reference import lagrangian as reference
+from studies.reference import tables
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import load_study, paper_study
 
-DATA = Path(__file__).parent / "data"
 SPECS = Path(studies.__file__).parent / "specs"
 HOME_POSE = np.array(HOME)
 BARE = paper_study().change(
@@ -71,7 +71,7 @@ def fast_square(**changes):
 
     Deflections of mid-span [m], (T, 3), and poses (T, 3), at the instants of the file; time [s].
     """
-    given = np.genfromtxt(DATA / "fast_50ms.csv", delimiter=",", skip_header=3)
+    given = tables.fast_move()
     study = BARE.change(
         drive__kd=60.0,
         motion__move_time=0.05,
@@ -83,9 +83,9 @@ def fast_square(**changes):
         **changes,
     )
     record = _simulate(*arrays(study), True).record
-    at = np.round(given[:, 0] / 1e-4).astype(int)
+    at = np.round(given.time / 1e-4).astype(int)
     deflection = np.asarray(record.chord_deflection_stations)[at, :, 0]
-    return given[:, 0], (deflection, given[:, 1:4]), (np.asarray(record.pose)[at], given[:, 4:7])
+    return given.time, (deflection, given.deflection), (np.asarray(record.pose)[at], given.pose)
 
 
 FAST = [

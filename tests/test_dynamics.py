@@ -12,7 +12,7 @@ from jaxmodel import dynamics, kinematics, status
 from jaxmodel.beam import build_basis
 from jaxmodel.parameters import ASSEMBLIES, HOME, paper_machine
 from jaxmodel.plant import build_plant
-from studies.bench import reference
+from studies.reference import lagrangian as reference
 
 MACHINE = paper_machine()
 R = 3

@@ -16,7 +16,7 @@ from jaxmodel.kinematics import inverse_kinematics
 from jaxmodel.loop import PlantState, plant_rates, plant_step
 from jaxmodel.parameters import HOME
 from jaxmodel.prepare import prepare
-from studies.bench import reference
+from studies.reference import lagrangian as reference
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study
 

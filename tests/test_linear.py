@@ -1,8 +1,6 @@
 """Linearisation and free motion against an independent finite-element multibody code."""
 
-import json
 from functools import partial
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -13,18 +11,13 @@ from jaxmodel.loop import PlantState
 from jaxmodel.parameters import HOME
 from jaxmodel.prepare import prepare
 from jaxmodel.simulate import simulate
+from studies.reference import tables
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import paper_study
 
-DATA = Path(__file__).parent / "data"
 UNDAMPED = paper_study().change(
     link__modes=3, link__damping_ratio=0.0, control__feedback="none", drive__kd=0.0
 )
-ORACLE = {  # case of the finite-element code: fields that make it
-    "sliders_locked": {"drive__locked": True},
-    "sliders_free": {"drive__kp": 0.0},
-    "sliders_on_springs_2e4_N_per_m": {},
-}
 
 
 @partial(jax.jit, static_argnums=0)
@@ -38,24 +31,19 @@ def linear(study):
     return jax.tree.map(np.asarray, plant)
 
 
-def oracle_frequencies(name):
-    given = np.array(json.loads((DATA / "frequencies.json").read_text())["cases"][name])
-    return given[given > 1]  # its free rigid motions sit between 0 and 0.05 Hz
-
-
-@pytest.mark.parametrize("name", ORACLE)
+@pytest.mark.parametrize("name", tables.HELD)
 def test_frequencies_equal_finite_elements(name):
-    modes = natural_modes(linear(UNDAMPED.change(**ORACLE[name])))
+    modes = natural_modes(linear(UNDAMPED.change(**tables.HELD[name])))
     rigid = modes.frequency[modes.frequency < 1]
     found = modes.frequency[modes.frequency > 1]
     assert rigid.size == (0 if "springs" in name else 3)
-    np.testing.assert_allclose(found, oracle_frequencies(name), rtol=2e-4)
+    np.testing.assert_allclose(found, tables.frequencies(name), rtol=2e-4)
     assert not modes.damping_ratio.any()
 
 
 def test_one_mode_is_enough_for_the_first_frequency():
     modes = natural_modes(linear(UNDAMPED.change(link__modes=1, drive__kp=0.0)))
-    wanted = oracle_frequencies("sliders_free")[:3]
+    wanted = tables.frequencies("sliders_free")[:3]
     np.testing.assert_allclose(modes.frequency[3:], wanted, rtol=3e-6)
 
 
@@ -67,7 +55,7 @@ def test_pinned_free_modes_converge_slowly_to_the_same_frequencies():
 def test_first_frequencies_are_the_same_for_the_other_assembly():
     changes = {"machine__assembly": "outward", "drive__kp": 0.0}
     modes = natural_modes(linear(UNDAMPED.change(**changes)))
-    np.testing.assert_allclose(modes.frequency[3:], oracle_frequencies("sliders_free"), rtol=2e-4)
+    np.testing.assert_allclose(modes.frequency[3:], tables.frequencies("sliders_free"), rtol=2e-4)
 
 
 def test_damping_ratio_of_the_links_alone():
@@ -145,7 +133,7 @@ def test_flatten_and_unflatten_are_inverse():
 
 
 def test_released_link_moves_like_the_finite_element_link():
-    given = np.loadtxt(DATA / "free_response.csv", delimiter=",")
+    time, given = tables.free_response()
     study = UNDAMPED.change(
         link__modes=8,
         drive__locked=True,
@@ -159,7 +147,7 @@ def test_released_link_moves_like_the_finite_element_link():
     structure, case = build_structure(study), as_arrays(build_case(study))
     record = jax.jit(simulate, static_argnums=(0, 2))(structure, case, True).record
     deflection = np.asarray(record.chord_deflection_stations)[:, :, 0]
-    np.testing.assert_allclose(record.time[::2], given[:, 0], atol=1e-12)
-    np.testing.assert_allclose(deflection[::2, 0], given[:, 1], atol=0.001 * 5e-5)
+    np.testing.assert_allclose(record.time[::2], time, atol=1e-12)
+    np.testing.assert_allclose(deflection[::2, 0], given, atol=0.001 * 5e-5)
     # the neighbours feel that its chord grows and shrinks by 31 nm
     assert 0 < np.abs(deflection[:, 1:]).max() < 1e-3 * 5e-5

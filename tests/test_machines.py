@@ -13,12 +13,12 @@ from jaxmodel.beam import build_basis
 from jaxmodel.parameters import HOME
 from jaxmodel.plant import build_plant
 from studies import cli
-from studies.bench import reference
 from studies.engine.preflight import check_run
 from studies.engine.results import metric_values, read_sweep
 from studies.engine.runs import run_study
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
+from studies.reference import lagrangian as reference
 from studies.show.figures import styled
 from studies.show.sketch import sketch, standing
 from studies.space.spec import parse_sweep

@@ -30,11 +30,11 @@ from jaxmodel.drive import Reference
 from jaxmodel.loop import PlantState, ideal_voltage, plant_rates
 from jaxmodel.simulate import Start, begin
 from studies import config
-from studies.bench import reference
 from studies.bench.works import build_work, make_layout, timed
 from studies.engine.executor import Executor
 from studies.engine.plan import Layout
 from studies.kernels.llvm import is_available
+from studies.reference import lagrangian as reference
 from studies.study.cases import as_arrays
 from studies.study.spec import paper_study
 

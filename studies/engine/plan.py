@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 import resource
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
-from jaxmodel.prepare import STIFFNESS_LIMIT, drive_rate
+from jaxmodel.prepare import COUPLED_STEP_LIMIT, STIFFNESS_LIMIT, coupled_rate, drive_rate
 from studies.config import processor
 from studies.engine.preflight import SUBSTEP_LIMIT, mechanics_at, step_counts
 from studies.engine.programs import kept_jit
@@ -200,13 +202,18 @@ def _plant_steps(
     table: CaseTable, structure: Structure, members: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Plant steps per sample of each case, and which cases are too stiff for any allowed number."""
-    rate = _drive_rates(table, structure, members)
+    rate = _of_cases(table, structure, members, _DRIVE, _drive_rate)
     if structure.feedback == "ideal":
         rate = np.maximum(rate, _pole_decay(table, structure, members))
     period = 1 / table.values("electronics.sample_rate_hz")[members]
     needed = np.maximum(np.ceil(rate * period / STIFFNESS_LIMIT), 1)
     written = int(table.values("run.substeps")[members[0]])
     is_too_stiff = needed > (written or SUBSTEP_LIMIT)
+    if not BASES[structure.basis].is_on_chord:
+        coupled = _of_cases(
+            table, structure, members, ("link.",), partial(_coupled_rate, structure)
+        )
+        needed = np.maximum(needed, np.ceil(coupled * period / COUPLED_STEP_LIMIT))
     counts = np.full(len(members), written) if written else step_counts(needed)
     return np.where(is_too_stiff, written or 1, counts), is_too_stiff
 
@@ -216,18 +223,25 @@ _DRIVE = ("drive.", "machine.slider_mass")
 
 
 _drive_rate = kept_jit()(drive_rate)
+_coupled_rate = kept_jit(static_argnums=0)(coupled_rate)
 
 
-def _drive_rates(table: CaseTable, structure: Structure, members: np.ndarray) -> np.ndarray:
-    columns = {n: c[members] for n, c in table.fields.items() if n.startswith(_DRIVE)}
+def _of_cases(
+    table: CaseTable,
+    structure: Structure,
+    members: np.ndarray,
+    names: tuple[str, ...],
+    rate: Callable[[Case], Any],
+) -> np.ndarray:
+    """A rate of each case [1/s], (m,), that depends on columns with these beginnings alone."""
+    columns = {n: c[members] for n, c in table.fields.items() if n.startswith(names)}
     case = build_cases(table.study, columns, structure)
     is_many = [len(leaf) > 1 for leaf in jax.tree.leaves(case)]
     if not any(is_many):
-        one = float(_drive_rate(jax.tree.map(lambda x: x[0], case)))
-        return np.full(len(members), one)
+        return np.full(len(members), float(rate(jax.tree.map(lambda x: x[0], case))))
     axes = jax.tree.map(lambda x: 0 if len(x) > 1 else None, case)
     shared = jax.tree.map(lambda x: x if len(x) > 1 else x[0], case)
-    return np.asarray(jax.vmap(drive_rate, (axes,))(shared))
+    return np.asarray(jax.vmap(rate, (axes,))(shared))
 
 
 def _pole_decay(table: CaseTable, structure: Structure, members: np.ndarray) -> np.ndarray:

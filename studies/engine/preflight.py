@@ -19,8 +19,10 @@ from jaxmodel.linear import linearise, mechanical, resting
 from jaxmodel.motion import end_of_path, sample_path
 from jaxmodel.plant import damping_ratio
 from jaxmodel.prepare import (
+    COUPLED_STEP_LIMIT,
     MODE_STEP_LIMIT,
     STIFFNESS_LIMIT,
+    coupled_rate,
     drive_rate,
     lowpass_corner,
     prepare,
@@ -52,6 +54,7 @@ class Preflight(NamedTuple):
     shaper_length: Any  # [s], ()
     condition: Any  # worst condition number of filter and synthesizer [1], ()
     drive_rate: Any  # of the sliders' drive and friction [1/s], ()
+    coupled_rate: Any  # highest mode of links whose ends are not on their chords [rad/s], ()
     highest: Any  # frequency of the highest plant mode [rad/s], ()
     damping: Any  # largest damping ratio of a link mode [1], ()
     corner: Any  # highest low-pass corner of the velocity estimate [rad/s], ()
@@ -96,6 +99,7 @@ def _preflight(structure: Structure, case: Case) -> Preflight:
         shaper_length,
         worst,
         drive_rate(case),
+        coupled_rate(structure, case),
         jnp.max(prepared.loop.omega),
         damping,
         corner,
@@ -141,7 +145,11 @@ def check_run(study: Study) -> tuple[Structure, Case]:
     check_locked(study)
     structure, case = build_structure(study), as_arrays(build_case(study))
     prepared = preflight(structure, case)
-    structure = structure._replace(substeps=_drive_substeps(study, float(prepared.drive_rate)))
+    substeps = _drive_substeps(study, float(prepared.drive_rate))
+    if not study.run.substeps:
+        rate = float(prepared.coupled_rate) / study.electronics.sample_rate_hz
+        substeps = max(substeps, int(step_counts(rate / COUPLED_STEP_LIMIT)))
+    structure = structure._replace(substeps=substeps)
     for k, pose in enumerate(study.motion.waypoints):
         check_pose(
             study, f"motion.waypoints.{k}", pose, int(prepared.pose_status[k]), prepared.lift[k]

@@ -21,7 +21,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
 
-from studies import config
+from studies import config, passport
 from studies.errors import printable
 from studies.show.units import count_text, headed, number, span
 from studies.study.entries import links_text
@@ -149,9 +149,17 @@ def page(
         section=section,
         titles=titles,
         image=lambda file, caption: _image(folder, file, caption),
-        facts=config.origin(),
+        facts=config.origin() | _verified(appended),
         files={"Study file": study_template(appended)} if isinstance(appended, Study) else appended,
     )
+
+
+def _verified(appended: Study | Mapping[str, str]) -> dict[str, str]:
+    """What `studies verify` found about the study of a report under the present code."""
+    if not isinstance(appended, Study):
+        return {}
+    found = passport.find(appended)
+    return {"verified": found.text if found else "not with this code: `studies verify STUDY`"}
 
 
 def _image(folder: Path | None, file: str, caption: str) -> Markup:

@@ -27,10 +27,12 @@ def first_frequency(study: Study, with_patches: bool) -> np.ndarray:
     """Frequency of mode 1 of each link between held ends [Hz], (3,).
 
     Args:
-        study: links and patches; joint inertia is left out.
-        with_patches: the patches' mass and stiffness count.
+        study: links and patches.
+        with_patches: the patches' mass and stiffness and the joints' rotary inertia count.
     """
-    return np.array([_stodola(*_line(study, i, with_patches)) for i in range(3)])
+    joints = [each_link(getattr(study.link, f"joint_inertia_{end}")) for end in "bc"]
+    inertia = np.stack(joints, axis=1) * with_patches
+    return np.array([_stodola(*_line(study, i, with_patches), inertia[i]) for i in range(3)])
 
 
 def _line(study: Study, i: int, with_patches: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -63,14 +65,25 @@ def _line(study: Study, i: int, with_patches: bool) -> tuple[np.ndarray, np.ndar
     return x, mass, (second - first**2 / axial) * of(link, "stiffness_factor")
 
 
-def _stodola(x: np.ndarray, mass: np.ndarray, stiffness: np.ndarray) -> float:
+def _stodola(x: np.ndarray, mass: np.ndarray, stiffness: np.ndarray, joint: np.ndarray) -> float:
+    """Frequency of mode 1 [Hz]; joint: rotary inertia at both ends [kg m2], (2,)."""
     shape = np.sin(np.pi * x / x[-1])
     for _ in range(_ITERATIONS):
+        couple = joint * _end_slopes(x, shape)
         moment = _between_pins(x, mass * shape)
+        moment = moment + couple[0] * (1 - x / x[-1]) - couple[1] * x / x[-1]
         bent = _between_pins(x, moment / stiffness)
-        square = np.trapezoid(mass * shape * bent, x) / np.trapezoid(mass * bent**2, x)
+        slope = _end_slopes(x, bent)
+        work = np.trapezoid(mass * shape * bent, x) + couple @ slope
+        square = work / (np.trapezoid(mass * bent**2, x) + joint @ slope**2)
         shape = bent / np.abs(bent).max()
     return float(np.sqrt(square) / (2 * np.pi))
+
+
+def _end_slopes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """y' at both ends, (2,)."""
+    first, last = 4 * y[1] - 3 * y[0] - y[2], 3 * y[-1] - 4 * y[-2] + y[-3]
+    return np.array([first, last]) / (2 * x[1])
 
 
 def _between_pins(x: np.ndarray, load: np.ndarray) -> np.ndarray:

@@ -20,17 +20,17 @@ from jaxmodel.parameters import Geometry, Machine
 class RigidState(NamedTuple):
     """State of the reduced machine: free coordinates after the closure (6)."""
 
-    pose: jax.Array  # (3,)
-    pose_rate: jax.Array  # (3,)
-    q: jax.Array  # (3, R)
-    q_rate: jax.Array  # (3, R)
+    pose: Any  # (3,)
+    pose_rate: Any  # (3,)
+    q: Any  # (3, R)
+    q_rate: Any  # (3, R)
 
 
 class Loads(NamedTuple):
     """External forces."""
 
-    slider: jax.Array  # along the guides [N], (3,)
-    modal: jax.Array  # on the modal coordinates [N], (3, R)
+    slider: Any  # along the guides [N], (3,)
+    modal: Any  # on the modal coordinates [N], (3, R)
 
 
 def guides(geometry: Geometry) -> tuple[jax.Array, jax.Array, jax.Array]:

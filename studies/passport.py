@@ -1,0 +1,96 @@
+"""The outcome of `studies verify`, kept for reports that the same code makes afterwards.
+
+It is a small file in the folder of compiled programs, found by the digest of the code that makes
+numbers: any change to that code, a new version or another cache leaves a machine unverified.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from contextlib import suppress
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from studies import sources
+from studies.cache import chosen_folder, is_usable
+
+if TYPE_CHECKING:
+    from studies.study.spec import Study
+
+#: Modules whose sources decide what numbers mean.
+_DECISIVE = ("studies.engine", "studies.export", "studies.verify")
+_SAFE = re.compile(r"[^\w .,:;()@+/*-]")
+
+
+class Passport(NamedTuple):
+    """What a verification found, when and where."""
+
+    title: str  # of the study, "" for the paper's machine alone
+    passed: int  # rows
+    rows: int  # that could be checked
+    failed: tuple[str, ...]  # their assumptions
+    date: str  # ISO 8601
+    version: str
+    processor: str
+
+    @property
+    def text(self) -> str:
+        """In one line."""
+        what = f"{self.passed} of {self.rows} assumptions passed"
+        if self.failed:
+            what += f" (failed: {'; '.join(self.failed)})"
+        return f"{what}, {self.date}, version {self.version}, {self.processor}"
+
+
+def name_of(study: Study) -> str:
+    """A name for a study's values, whatever its title."""
+    values = study.model_dump(mode="json", exclude={"title"})
+    return sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def keep(study: Study, passport: Passport) -> None:
+    """Keep an outcome, unless there is no folder for it."""
+    folder = chosen_folder()
+    if not is_usable(folder):
+        return
+    file = _file(study, folder)
+    part = folder / f".{file.name}.{os.getpid() & 0xFFFFFFFF:08x}.tmp"
+    with suppress(OSError):  # a full disk must not turn a verification into a failure
+        part.write_text(json.dumps(passport._asdict()), encoding="utf-8")
+        part.replace(file)
+
+
+def find(study: Study | None) -> Passport | None:
+    """The outcome for a study under the present code, None if there is none."""
+    if study is None:
+        return None
+    try:
+        data: dict[str, Any] = json.loads(_file(study, chosen_folder()).read_text("utf-8"))
+        return Passport(
+            title=_plain(data["title"]),
+            passed=int(data["passed"]),
+            rows=int(data["rows"]),
+            failed=tuple(map(_plain, data["failed"])),
+            date=_plain(data["date"]),
+            version=_plain(data["version"]),
+            processor=_plain(data["processor"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError):
+        return None  # not there, or damaged: not verified
+
+
+def _plain(text: object) -> str:
+    return _SAFE.sub("", str(text))[:200]
+
+
+def _file(study: Study, folder: Path) -> Path:
+    return folder / f"passport-{sha256(f'{_digest()} {name_of(study)}'.encode()).hexdigest()}"
+
+
+@cache
+def _digest() -> str:
+    return sources.digest(*_DECISIVE)

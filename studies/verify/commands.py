@@ -1,0 +1,68 @@
+"""The command `studies verify`."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from studies.config import start
+from studies.show.document import AsJson, print_document
+
+if TYPE_CHECKING:
+    from studies.verify.run import Verification
+
+
+def add_commands(app: typer.Typer, console: Console) -> None:
+    """Add the command to the command line."""
+
+    @app.command()
+    def verify(
+        study: Annotated[
+            str | None,
+            typer.Argument(help="study file or ready-made design; default: the paper's machine"),
+        ] = None,
+        as_json: AsJson = False,
+    ) -> None:
+        """Check every assumption of the model, on a study's own machine, motion and controller."""
+        start()
+        from studies.study.spec import load_study
+        from studies.verify.run import verify as verify_study
+
+        def notify(name: str) -> None:
+            if not as_json:
+                console.print(f"checking {name}")
+
+        found = verify_study(None if study is None else load_study(study), notify)
+        if as_json:
+            print_document("verify", verify_document(found))
+        else:
+            _print(found, console)
+        if not found.is_passed:
+            sys.exit(1)
+
+
+def verify_document(found: Verification) -> dict[str, Any]:
+    """What `studies verify` says."""
+    rows = [
+        {**row._asdict(), "outcome": row.outcome, "left_out": row.left_out or None}
+        for row in found.rows
+    ]
+    return {"is_passed": found.is_passed, **found.summary._asdict(), "table": rows}
+
+
+def _print(found: Verification, console: Console) -> None:
+    table = Table("assumption", "checked against", "source", "difference", "allowed", "")
+    for row in found.rows:
+        numbers = ["-", "-"] if row.left_out else [f"{row.difference:.1e}", f"{row.allowed:.0e}"]
+        style = None if row.is_passed else "bold red"
+        table.add_row(row.assumption, row.against, row.source, *numbers, row.outcome, style=style)
+    console.print(table)
+    for row in found.rows:
+        if row.left_out or not row.is_passed:
+            why = row.left_out or row.note or "the difference is larger than allowed"
+            console.print(f"{row.outcome}: {row.assumption}: {why}", soft_wrap=True)
+    console.print(found.summary.text, soft_wrap=True)

@@ -1,0 +1,305 @@
+"""Links and patches: closed forms of beams, quadrature of mode shapes, laminate theory, statics."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import brentq
+
+from jaxmodel.beam import BASES, ModalBasis, build_basis
+from jaxmodel.case import Case, Structure
+from jaxmodel.loop import Loop
+from jaxmodel.parameters import Beam, Patches
+from jaxmodel.piezo import VACUUM_PERMITTIVITY
+from jaxmodel.prepare import prepare
+from studies.engine.programs import kept_jit
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.held_link import first_frequency
+from studies.study.spec import Study
+from studies.verify.rows import Row, largest, worst_relative
+
+#: Gauss points between patch ends: products of two shapes of 24 half-waves are exact to rounding.
+_POINTS = 40
+#: Places of stations and of what they measure, for the statics.
+_STATIONS = 3
+
+
+class Section(NamedTuple):
+    """A link between two neighbouring patch ends, counted by hand."""
+
+    left: float  # [m]
+    right: float
+    sensors: tuple[int, ...]  # that cover it
+    actuators: tuple[int, ...]
+    line_mass: float  # [kg/m]
+    stiffness: float  # E I about the neutral axis of its layers [N m2]
+
+
+def check_links(study: Study) -> list[Row]:
+    """Frequencies, integrals of shapes, piezo constants and statics of the study's links."""
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    loop = jax.tree.map(np.asarray, _loop(structure, case))
+    kind = structure.basis
+    integrals, signals, statics = [], [], []
+    for i in range(3):
+        beam, patches = _one(case.machine.beam, i), _one(case.machine.patches, i)
+        beam = beam._replace(length=float(beam.length))
+        sections = _sections(beam, patches, BASES[kind].has_joints)
+        x, line = _gauss(sections)
+        edges = np.concatenate([_ends(patches, part) for part in ("sensor", "actuator")], axis=None)
+        basis, shape, slope = jax.tree.map(
+            np.asarray, _shapes(kind, structure.n_modes, beam, patches, np.append(x, edges))
+        )
+        integrals.append(_integrals(basis, beam, shape[: x.size], slope[: x.size], x, line))
+        beside = slope[x.size :].reshape(2, 2, -1, structure.n_modes)
+        signals.append(_signals(loop, i, beam, patches, beside[:, 1] - beside[:, 0], basis))
+        statics.append(_statics(structure, case, loop, i, beam, patches))
+    return [
+        _frequencies(study, loop, case),
+        Row(
+            "modal masses, couplings and shortening of the links",
+            "Gauss quadrature of the shapes",
+            "Meirovitch 1967",
+            max(integrals),
+            1e-9,
+        ),
+        Row(
+            "volts per bending and force per volt of the patches",
+            "laminate theory, layer by layer, and the shapes' slopes",
+            "Crawley and Anderson 1990",
+            max(signals),
+            1e-7,
+        ),
+        Row(
+            "static bending by the patches, all modes",
+            "moments integrated over the link",
+            "Timoshenko and Gere 1961",
+            max(statics),
+            1e-9,
+            left_out="" if study.link.static_correction else "link.static_correction is off",
+        ),
+    ]
+
+
+def _one(tree: Any, i: int) -> Any:
+    """Link i's data of parameters that hold for one or all links."""
+    return jax.tree.map(lambda x: np.asarray(x)[i] if np.ndim(x) else np.asarray(x), tree)
+
+
+@kept_jit(static_argnums=0)
+def _loop(structure: Structure, case: Case) -> Loop:
+    return prepare(structure, case).loop
+
+
+@kept_jit(static_argnums=(0, 1))
+def _shapes(kind: str, n_modes: int, beam: Beam, patches: Patches, x: Any) -> Any:
+    """A link's basis; shapes Y_j(x) and slopes Y_j'(x), by differentiation of the shapes."""
+    patches = patches._replace(center=patches.center[None])
+
+    def at(x: Any) -> Any:
+        basis = build_basis(kind, beam, patches, n_modes, x)
+        tip = 0.0 if basis.tip is None else basis.tip[0]
+        return basis.deflection_at[0] + (x / beam.length)[:, None] * tip, basis
+
+    shape, slope, basis = jax.jvp(at, (x,), (jnp.ones_like(x),), has_aux=True)
+    return basis, shape, slope
+
+
+def _frequencies(study: Study, loop: Loop, case: Case) -> Row:
+    """Of the plant's modes, against the closed form of their basis."""
+    kind, source = study.link.basis, "Timoshenko, Young and Weaver 1974"
+    omega, beam = loop.omega, case.machine.beam
+    if kind == "loaded":
+        found, wanted = omega[:, 0] / (2 * np.pi), first_frequency(study, with_patches=True)
+        against, allowed = "Stodola's iteration with the patches' mass and stiffness, mode 1", 2e-4
+        return Row(
+            f"frequencies of the links ({kind})",
+            against,
+            source,
+            worst_relative(found, wanted),
+            allowed,
+        )
+    order = np.arange(1, omega.shape[1] + 1)
+    roots = order * np.pi if kind == "pinned_pinned" else _pinned_free(omega.shape[1])
+    root = np.sqrt(
+        beam.youngs_modulus * beam.stiffness_factor * beam.thickness**2 / (12 * beam.density)
+    )
+    wanted = np.broadcast_to(root / beam.length**2, (3,))[:, None] * roots**2
+    against = "(j pi)^2 sqrt(E I/(rhoA L^4))" if kind == "pinned_pinned" else "tan kL = tanh kL"
+    return Row(
+        f"frequencies of the links ({kind})", against, source, worst_relative(omega, wanted), 1e-9
+    )
+
+
+def _pinned_free(count: int) -> np.ndarray:
+    """Roots of tan kL = tanh kL."""
+
+    def excess(x: float) -> float:
+        return float(np.sin(x) - np.tanh(x) * np.cos(x))
+
+    middle = [(j + 0.25) * np.pi for j in range(1, count + 1)]
+    return np.array([brentq(excess, x - 0.5, x + 0.5, xtol=1e-14, rtol=1e-14) for x in middle])
+
+
+def _ends(patches: Patches, part: str) -> np.ndarray:
+    """Left and right ends of all sensors or actuators [m], (2, K)."""
+    half = float(getattr(patches, f"{part}_length")) / 2
+    return np.stack([np.asarray(patches.center) - half, np.asarray(patches.center) + half])
+
+
+def _sections(beam: Beam, patches: Patches, has_patches: bool) -> list[Section]:
+    """A link cut at all patch ends; `has_patches`: with their mass and stiffness."""
+    sensor, actuator = _ends(patches, "sensor"), _ends(patches, "actuator")
+    cuts = np.unique(np.concatenate([[0.0, beam.length], *sensor, *actuator]).round(12))
+    mass = float(beam.density * beam.width * beam.thickness)
+    ceramic = float(patches.density * patches.width * patches.thickness) * has_patches
+    found = []
+    for left, right in pairwise(map(float, cuts)):
+        middle = (left + right) / 2
+        over = [
+            tuple(np.flatnonzero((ends[0] < middle) & (middle < ends[1])).tolist())
+            for ends in (sensor, actuator)
+        ]
+        count = len(over[0]), len(over[1])
+        bending = _stiffness(beam, patches, count if has_patches else (0, 0))
+        line_mass = mass + ceramic * sum(count)
+        found.append(Section(left, right, over[0], over[1], line_mass, bending))
+    return found
+
+
+def _stiffness(beam: Beam, patches: Patches, count: tuple[int, int]) -> float:
+    """E I about the neutral axis of the layers: patches below, link, patches above [N m2]."""
+    core = float(beam.youngs_modulus * beam.width * beam.thickness)
+    skin = float(patches.youngs_modulus * patches.width * patches.thickness)
+    arm = float(beam.thickness + patches.thickness) / 2
+    axial = core + skin * sum(count)
+    shift = skin * arm * (count[1] - count[0]) / axial
+    own = core * float(beam.thickness) ** 2 / 12
+    own += skin * sum(count) * (arm**2 + float(patches.thickness) ** 2 / 12)
+    return (own - axial * shift**2) * float(beam.stiffness_factor)
+
+
+def _gauss(sections: list[Section]) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss points over a link [m], and weights without and with the line mass [m], [kg]."""
+    node, weight = np.polynomial.legendre.leggauss(_POINTS)
+    half = np.array([(s.right - s.left) / 2 for s in sections])[:, None]
+    middle = np.array([(s.right + s.left) / 2 for s in sections])[:, None]
+    line = np.array([s.line_mass for s in sections])[:, None]
+    return (middle + half * node).ravel(), np.stack(
+        [(half * weight).ravel(), (half * weight * line).ravel()]
+    )
+
+
+def _integrals(
+    basis: ModalBasis,
+    beam: Beam,
+    shape: np.ndarray,
+    slope: np.ndarray,
+    x: np.ndarray,
+    weights: np.ndarray,
+) -> float:
+    """Largest difference of an integral of the shapes, over the largest entry of its kind."""
+    plain, heavy = weights
+    total, first = heavy.sum(), float(heavy @ x)
+    joint = np.array([beam.joint_inertia_b, beam.joint_inertia_c], float)
+    ends = np.stack([_at_end(slope, x, 0.0), _at_end(slope, x, beam.length)])
+    inertia = heavy @ x**2 + joint.sum()
+    pairs = [
+        (basis.mass[0], np.diagonal((shape.T * heavy) @ shape + (ends.T * joint) @ ends)),
+        (basis.b[0], heavy @ shape),
+        (basis.c[0], (heavy * x) @ shape + joint @ ends),
+        (basis.link_mass[0], total),
+        (basis.first_moment[0], first),
+        (basis.inertia[0], inertia),
+    ]
+    scale = [1.0, total, first, 1.0, 1.0, 1.0]
+    if basis.shortening is not None:
+        mixed = 0.0 if basis.mixed_shortening is None else basis.mixed_shortening[0]
+        pairs.append((np.diag(basis.shortening[0]) + mixed, (slope.T * plain) @ slope))
+        scale.append(1.0)
+    if basis.inward is not None:
+        # what lies beyond a point: everything less what lies before it
+        beyond = total - _before(x, weights, 0), first - _before(x, weights, 1)
+        spread = basis.inward, basis.centrifugal
+        for found, weight in zip(spread, beyond, strict=True):
+            assert found is not None
+            pairs.append((found[0], (slope.T * (plain * weight)) @ slope))
+            scale.append(1.0)
+    worst = 0.0
+    for (found, wanted), size in zip(pairs, scale, strict=True):
+        size = size if size != 1.0 else float(np.abs(wanted).max())
+        worst = max(worst, float(np.abs(np.asarray(found) - wanted).max()) / size)
+    return worst
+
+
+def _at_end(slope: np.ndarray, x: np.ndarray, end: float) -> np.ndarray:
+    """Slopes at an end of the link, from the polynomial through the nearest Gauss points."""
+    near = np.argsort(np.abs(x - end))[:8]
+    return np.array(
+        [np.polynomial.Polynomial.fit(x[near] - end, row, 7)(0.0) for row in slope[near].T]
+    )
+
+
+def _before(x: np.ndarray, weights: np.ndarray, power: int) -> np.ndarray:
+    """int_0^x rhoA xi^power dxi at the Gauss points: rhoA is constant from cut to cut."""
+    plain, heavy = weights
+    line = (heavy / plain).reshape(-1, _POINTS)
+    points = x.reshape(-1, _POINTS)
+    width = plain.reshape(-1, _POINTS).sum(axis=1)
+    right = np.cumsum(width)
+    left = right - width
+    n = power + 1
+    whole = line[:, 0] * (right**n - left**n) / n
+    partial = line * (points**n - left[:, None] ** n) / n
+    return (np.concatenate([[0.0], np.cumsum(whole)[:-1]])[:, None] + partial).ravel()
+
+
+def _constants(beam: Beam, patches: Patches) -> tuple[float, float]:
+    """Moment per volt [N m/V] and volts per slope difference [V/rad], by summing layers."""
+    thick, piezo = float(beam.thickness), float(patches.thickness)
+    stiff, core = float(patches.youngs_modulus), float(beam.youngs_modulus)
+    width, arm = float(patches.width), (thick + piezo) / 2
+    # an actuator alone on its face bends the pair about the neutral axis of both
+    skin = stiff * width * piezo
+    axis = skin * arm / (skin + core * float(beam.width) * thick)
+    per_field = stiff * abs(float(patches.d31)) / piezo  # stress per volt [Pa/V]
+    actuator = per_field * width * piezo * (arm - axis)
+    # under a sensor both faces are covered, so the neutral axis is the link's middle
+    coupling = float(patches.d31) ** 2 * stiff
+    permittivity = VACUUM_PERMITTIVITY * float(patches.relative_permittivity) - coupling
+    charge = stiff * abs(float(patches.d31)) * width * arm  # per slope difference [C]
+    capacitance = permittivity * width * float(patches.sensor_length) / piezo
+    return actuator, charge / capacitance
+
+
+def _signals(
+    loop: Loop, i: int, beam: Beam, patches: Patches, bends: np.ndarray, basis: ModalBasis
+) -> float:
+    """What the loop's sensors see and its actuators do, against constants times slopes."""
+    actuator, sensor = _constants(beam, patches)
+    sees = largest(loop.sensor[i], sensor * bends[0])
+    does = largest(loop.actuator[i].T, actuator * bends[1] / basis.mass[0])
+    return max(sees, does)
+
+
+def _statics(
+    structure: Structure, case: Case, loop: Loop, i: int, beam: Beam, patches: Patches
+) -> float:
+    """Held voltages: sensors by all modes, against moments integrated over the link."""
+    if loop.left_out is None:
+        return 0.0
+    actuator, sensor = _constants(beam, patches)
+    count = structure.n_patches
+    wanted = np.zeros((count, count))
+    for section in _sections(beam, patches, BASES[structure.basis].has_joints):
+        flexibility = (section.right - section.left) / section.stiffness
+        for k in section.sensors:
+            for m in section.actuators:
+                wanted[k, m] += sensor * actuator * flexibility
+    stiffness = loop.plant.stiffness[i] / loop.plant.modal_mass[i]
+    modal = (loop.sensor[i] / stiffness) @ loop.actuator[i]
+    return largest(modal + loop.left_out.sensor[i], wanted)

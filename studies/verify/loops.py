@@ -1,0 +1,158 @@
+"""The digital loop of the study: margins, a run beside its linear loop, the exported C code."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.laws import LAWS
+from jaxmodel.linear import resting
+from jaxmodel.prepare import prepare
+from jaxmodel.sampled_loop import LoopMatrices, loop_matrices
+from jaxmodel.simulate import simulate
+from studies.engine.controller import fixed_controller
+from studies.engine.margins import judge_loops
+from studies.engine.preflight import check_run
+from studies.engine.programs import kept_jit
+from studies.engine.stability import loop_report
+from studies.errors import StudyError
+from studies.export.c_floating import floating_source
+from studies.export.compiler import find_compiler
+from studies.export.verify import reference_run, verify_floating
+from studies.study.spec import Study
+from studies.verify.rows import Row, largest
+
+#: Modal coordinate of mode 1 of link 1 at the start: linear to one part in 10^5 [m].
+_SMALL = 1e-7
+#: Samples of a released machine.
+_RELEASED = 300
+
+
+def check_loops(study: Study) -> list[Row]:
+    """Margins, release, exported C; left out where nothing is sampled."""
+    if study.control.feedback != "sampled":
+        return [_left_out(name, "control.feedback is not sampled") for name in _NAMES]
+    return [_margins(study), _release(study), _exported(study)]
+
+
+#: Of the exported controller.
+_NAME = "verified"
+_NAMES = (
+    "gain margin by frequency response",
+    "runs of the closed loop",
+    "exported C controller",
+)
+
+
+def _left_out(name: str, reason: str) -> Row:
+    return Row(name, "-", "-", 0.0, 0.0, left_out=reason)
+
+
+def _margins(study: Study) -> Row:
+    """Of sweeps, by the return difference, and of `simulate`, by eigenvalues."""
+    structure, case = check_run(study)
+    one = jax.tree.map(lambda x: np.asarray(x)[None], case)
+    found = judge_loops(structure, one).gain_margin[0]
+    wanted = loop_report(structure, case, case.path.waypoints[0], structure.n_controlled)
+    return Row(
+        _NAMES[0],
+        "eigenvalues of the transition matrix over a sample",
+        "MacFarlane and Postlethwaite 1977",
+        abs(found / wanted.gain_margin - 1) if wanted.gain_margin else float(found > 0),
+        5e-3,
+        note=f"margin {wanted.gain_margin:.4g}",
+    )
+
+
+_simulate = kept_jit(static_argnums=(0, 2))(simulate)
+
+
+@kept_jit(static_argnums=0)
+def _linear(structure: Structure, case: Case) -> tuple[LoopMatrices, Any]:
+    """The loop at the first way-point, and the volts of the sensors per modal coordinate."""
+    loop = prepare(structure, case).loop
+    pose = jnp.asarray(case.path.waypoints[0])
+    matrices = loop_matrices(structure, case, loop, loop.controller, pose, resting(structure, case))
+    return matrices, loop.sensor
+
+
+def _release(study: Study) -> Row:
+    """A machine at rest with one bent link, simulated, beside powers of its transition matrix."""
+    electronics = study.electronics
+    reason = ""
+    if electronics.sensor_highpass_hz > 0 or electronics.amplifier_hz > 0:
+        reason = "its start in the electronics is not defined"
+    if (
+        np.any(study.load.wrench)
+        or study.drive.coulomb_friction > 0
+        or LAWS[study.control.law].is_switching
+    ):
+        reason = "the loop is not linear"
+    if reason:
+        return _left_out(_NAMES[1], reason)
+    released = study.change(
+        run__duration=_RELEASED / electronics.sample_rate_hz,
+        run__smooth=True,
+        electronics__adc_bits=32,
+        electronics__adc_noise=0.0,
+        drive__ripple=0.0,
+        drive__pulse_force=(0.0, 0.0, 0.0),
+        load__pulse=(0.0, 0.0, 0.0),
+        motion__waypoints=study.motion.waypoints[:1],
+        motion__dwell=0.0,
+        motion__move_time=0.1,
+        shaper__kind="none",
+        metrics__residual_delay=0.0,
+        metrics__residual_length=100 / electronics.sample_rate_hz,
+        initial__modal=((_SMALL,), (), ()),
+        initial__load_deflection=(0.0, 0.0, 0.0),
+    )
+    structure, case = check_run(released)
+    record = _simulate(structure, case, True).record
+    assert record is not None
+    matrices, sensor = jax.tree.map(
+        np.asarray, _linear(structure._replace(n_steps=1, substeps=1), case)
+    )
+    transition, modes = matrices.open + matrices.feedback, 3 * structure.n_modes
+    state = np.zeros(len(transition))
+    state[6] = _SMALL  # and the filters settled on it
+    settled = sensor[0, :, 0] * _SMALL
+    state[6 + 2 * modes : 6 + 2 * modes + settled.size] = settled
+    states = [state]
+    for _ in range(_RELEASED - 1):
+        states.append(transition @ states[-1])
+    wanted = np.array(states)[:, 6 : 6 + modes]
+    found = np.asarray(record.modal_coordinate).reshape(_RELEASED, modes)
+    return Row(
+        _NAMES[1],
+        f"powers of the transition matrix, {_RELEASED} samples after a release",
+        "Franklin, Powell and Workman 1998",
+        largest(found, wanted),
+        2e-3,
+    )
+
+
+def _exported(study: Study) -> Row:
+    """C compiled on this machine, against the controller in JAX: hard inputs, and in the loop."""
+    compiler = find_compiler()
+    if not compiler:
+        return _left_out(_NAMES[2], "there is no C compiler")
+    try:
+        exported = fixed_controller(study)
+    except StudyError as error:
+        return _left_out(_NAMES[2], str(error))
+    source = floating_source(exported, _NAME, ["studies verify"])
+    result = verify_floating(exported, reference_run(exported), source, _NAME, compiler)
+    failed = [check for check in result.checks if not check.is_met]
+    return Row(
+        _NAMES[2],
+        f"the controller in JAX: {len(result.checks)} comparisons in double and single precision",
+        "ISO/IEC 9899:1999",
+        float(len(failed)),
+        0.0,
+        note="; ".join(f"{check.what}: {check.found}" for check in failed),
+    )

@@ -1,0 +1,166 @@
+"""Mechanics of the study's machine: Lagrangian, closure, structural damping."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel import dynamics
+from jaxmodel.bases import find_bases
+from jaxmodel.beam import ModalBasis
+from jaxmodel.case import Case, Structure
+from jaxmodel.kinematics import path_status
+from jaxmodel.loop import Loop
+from jaxmodel.parameters import Damping, Machine
+from jaxmodel.plant import Plant, build_plant
+from jaxmodel.prepare import prepare
+from studies.engine.programs import kept_jit
+from studies.reference.lagrangian import (
+    Loads,
+    RigidState,
+    by_lagrangian,
+    link_tips,
+    platform_joints,
+)
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.spec import Study
+from studies.verify.rows import Row, largest
+
+#: Random states.
+_STATES = 24
+
+
+def check_machine(study: Study) -> list[Row]:
+    """Accelerations, closure and damping ratios."""
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    return [*_accelerations(study, structure, case), _damping(structure, case)]
+
+
+@kept_jit(static_argnums=0)
+def _parts(structure: Structure, case: Case) -> tuple[ModalBasis, Plant, Loop]:
+    """Basis and plant of a machine without structural damping; the study's own loop."""
+    machine, basis = _undamped(case.machine), find_bases(structure, case).plant
+    stiffened = structure.has_shortening
+    if not stiffened:
+        basis = basis._replace(shortening=None, mixed_shortening=None)
+    if not structure.is_distributed:
+        basis = basis._replace(inward=None, centrifugal=None)
+    plant = build_plant(machine, basis, False, stiffened, structure.is_distributed)
+    return basis, plant, prepare(structure, case).loop
+
+
+def _undamped(machine: Machine) -> Machine:
+    none = Damping(ratio=np.zeros((3, 1)), count=np.ones(3, int), exponent=0.0)
+    return machine._replace(damping=none)
+
+
+def _accelerations(study: Study, structure: Structure, case: Case) -> list[Row]:
+    """At random states around the way-points, bent by up to 1 % and as fast as fast moves."""
+    basis, plant, _ = jax.tree.map(np.asarray, _parts(structure, case))
+    states = _random_states(study, plant, structure.n_modes)
+    found, wanted, open_by = map(np.asarray, _both(case.machine, basis, plant, states))
+    length = float(np.max(case.machine.beam.length))
+    against = "the Lagrangian, by automatic differentiation"
+    coupled = "" if structure.is_coupled else "run.model is ked"
+    parts = slice(3), slice(3, None)
+    worst = max(
+        largest(row[p], true[p]) for row, true in zip(found, wanted, strict=True) for p in parts
+    )
+    return [
+        Row(
+            "accelerations of platform and modes (1)-(9)",
+            f"{against}, {_STATES} random states of this machine",
+            "Lagrange 1788; Kane and Levinson 1985",
+            worst,
+            1e-9,
+            left_out=coupled,
+        ),
+        Row(
+            "closure of slider, bent link and platform (6)",
+            "both ways to the joints, over the link's length",
+            "Zhang, Mills and Cleghorn 2016",
+            float(open_by.max() / length),
+            1e-12,
+        ),
+    ]
+
+
+def _random_states(study: Study, plant: Plant, n_modes: int) -> tuple[RigidState, Loads]:
+    rng = np.random.default_rng(7)
+    length = float(np.min(study.link.length))
+    points = np.array(study.motion.waypoints, float)
+    poses: list[np.ndarray] = []
+    scale = 0.05 * length * np.array([1.0, 1.0, 0.0]) + np.array([0.0, 0.0, 0.05])
+    for _ in range(50 * _STATES):
+        pose = points[len(poses) % len(points)] + scale * rng.uniform(-1, 1, 3)
+        if int(_status(plant, pose)) == 0:
+            poses.append(pose)
+        if len(poses) == _STATES:
+            break
+        scale = scale * 0.98  # way-points may lie at the edge of what is in reach
+    count, order = len(poses), np.arange(1, n_modes + 1)
+    motion = RigidState(
+        pose=np.array(poses),
+        pose_rate=rng.normal(size=(count, 3)) * [0.3, 0.3, 1.0],
+        q=0.01 * length * rng.uniform(-1, 1, (count, 3, n_modes)) / order**2,
+        q_rate=rng.normal(size=(count, 3, n_modes)) / order,
+    )
+    return motion, Loads(10 * rng.normal(size=(count, 3)), 3 * rng.normal(size=motion.q.shape))
+
+
+@kept_jit()
+def _status(plant: Plant, pose: Any) -> Any:
+    return path_status(plant, pose[None])[0]
+
+
+@kept_jit()
+def _both(machine: Machine, basis: ModalBasis, plant: Plant, states: Any) -> Any:
+    """Accelerations by `jaxmodel` and by the Lagrangian, (n, 3 + 3 R); gaps at the joints [m]."""
+    machine = _undamped(machine)
+
+    def one(motion: RigidState, loads: Loads) -> Any:
+        chain = dynamics.modal_chain(plant, *motion)
+        found = dynamics.accelerations(
+            plant,
+            chain,
+            motion.pose_rate,
+            motion.q,
+            motion.q_rate,
+            loads.slider,
+            loads.modal / plant.modal_mass[:, None],
+        )
+        pose, modal = by_lagrangian(machine, basis, motion, loads)
+        gamma = jnp.arctan2(chain.sine, chain.cosine)
+        tips = link_tips(machine, basis, chain.rho, gamma, motion.q)
+        gap = jnp.abs(tips - platform_joints(machine.geometry, motion.pose)).max()
+        joined = [
+            jnp.concatenate([a, b.ravel()]) for a, b in ((found.pose, found.modal), (pose, modal))
+        ]
+        return *joined, gap
+
+    return jax.vmap(one)(*states)
+
+
+def _damping(structure: Structure, case: Case) -> Row:
+    """Ratios of the link modes as given, continued by the damping law."""
+    _, _, loop = jax.tree.map(np.asarray, _parts(structure, case))
+    given = jax.tree.map(np.asarray, case.machine.damping)
+    ratio, exponent = np.broadcast_to(given.ratio, (3, given.ratio.shape[-1])), given.exponent
+    wanted = np.empty_like(loop.omega)
+    for i in range(3):
+        count = int(np.broadcast_to(given.count, (3,))[i])
+        for j in range(loop.omega.shape[1]):
+            last = min(j, count - 1)
+            share = loop.omega[i, j] / loop.omega[i, last]
+            wanted[i, j] = ratio[i, last] * share**exponent
+    critical = 2 * np.sqrt(loop.plant.stiffness * loop.plant.modal_mass[:, None])
+    return Row(
+        "structural damping of the links' modes",
+        "damping over twice the square root of stiffness and mass",
+        "Rayleigh 1877",
+        largest(loop.plant.damping / critical, wanted),
+        1e-9,
+    )

@@ -1,0 +1,94 @@
+"""All checks of a study, in order, and their outcome kept for later reports."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import datetime
+from typing import NamedTuple
+
+import numpy as np
+
+from studies import __version__, passport
+from studies.config import processor_text, require_configured
+from studies.engine.preflight import check_run
+from studies.errors import StudyError
+from studies.passport import Passport
+from studies.study.spec import Study, paper_study
+from studies.verify.links import check_links
+from studies.verify.loops import check_loops
+from studies.verify.machine import check_machine
+from studies.verify.outside import check_outside
+from studies.verify.rows import Row
+from studies.verify.stepping import check_stepping
+from studies.verify.trajectories import check_trajectories
+
+#: What is checked, in this order, by names for progress.
+CHECKS: dict[str, Callable[[Study], list[Row]]] = {
+    "links and patches": check_links,
+    "trajectories and shapers": check_trajectories,
+    "mechanics": check_machine,
+    "time steps, kernels, metrics": check_stepping,
+    "digital loop": check_loops,
+    "figures of others": check_outside,
+}
+
+
+class Verification(NamedTuple):
+    """All rows of a verification."""
+
+    study: Study
+    rows: tuple[Row, ...]
+
+    @property
+    def is_passed(self) -> bool:
+        """Whether no row failed."""
+        return all(row.is_passed for row in self.rows)
+
+    @property
+    def summary(self) -> Passport:
+        """The outcome as later reports show it."""
+        checked = [row for row in self.rows if not row.left_out]
+        failed = tuple(row.assumption for row in checked if not row.is_passed)
+        return Passport(
+            title=self.study.title,
+            passed=len(checked) - len(failed),
+            rows=len(checked),
+            failed=failed,
+            date=datetime.now().astimezone().date().isoformat(),
+            version=__version__,
+            processor=processor_text(),
+        )
+
+
+def verify(
+    study: Study | None = None, on_progress: Callable[[str], None] = lambda _: None
+) -> Verification:
+    """Check every assumption of the model on a study's machine, motion and controller.
+
+    Args:
+        study: to verify; None: the paper's machine.
+        on_progress: called with what is checked next.
+
+    Returns:
+        Verification: a row per assumption; its outcome is kept for later reports.
+
+    Raises:
+        StudyError: a study that cannot run.
+
+    Example:
+        >>> verify(load_study("mine.toml")).is_passed  # doctest: +SKIP
+        True
+    """
+    require_configured()
+    study = study or paper_study()
+    check_run(study)
+    rows: list[Row] = []
+    for name, check in CHECKS.items():
+        on_progress(name)
+        try:
+            rows += check(study)
+        except (StudyError, FloatingPointError, np.linalg.LinAlgError, ValueError) as error:
+            rows.append(Row(name, "-", "-", np.inf, 0.0, note=f"it could not be checked: {error}"))
+    found = Verification(study, tuple(rows))
+    passport.keep(study, found.summary)
+    return found

@@ -1,0 +1,231 @@
+"""Time: energy, order of the step on the study's motion, kernels, metrics from trajectories."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.drive import Reference
+from jaxmodel.dynamics import kinetic_energy, modal_chain, potential_energy
+from jaxmodel.integrator import exponential_step
+from jaxmodel.kinematics import inverse_kinematics
+from jaxmodel.loop import Loop, PlantState, plant_step
+from jaxmodel.motion import end_of_path, sample_path
+from jaxmodel.plant import damping_ratio
+from jaxmodel.prepare import prepare
+from studies.engine.executor import Executor
+from studies.engine.plan import chunk_cases, local_layout, plan_groups
+from studies.engine.preflight import check_run
+from studies.engine.programs import kept_jit
+from studies.engine.runs import run_study
+from studies.space.spec import parse_sweep
+from studies.space.table import build_table
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.spec import Study
+from studies.verify.rows import Row, largest
+
+#: Samples that are stepped at most, and of them compared at most.
+_SAMPLES = 400
+#: Refinements of the working step; the last is the reference of the others' differences.
+_PARTS = (4, 8, 16)
+
+
+class Stepped(NamedTuple):
+    """What a row needs of a motion, at the samples."""
+
+    deflection: jax.Array  # chord deflection at the stations [m], (T, 3, S)
+    energy: jax.Array  # kinetic and bending [J], (T,)
+
+
+def check_stepping(study: Study) -> list[Row]:
+    """Energy, order and size of the step, kernel beside scan, metrics beside trajectories."""
+    return [_energy(study), *_steps(study), _kernel(study), *_metrics(study)]
+
+
+def _open_loop(study: Study) -> tuple[Structure, Case]:
+    """The study's machine and drive alone."""
+    study = study.change(
+        control__feedback="none",
+        electronics__sensor_highpass_hz=0.0,
+        electronics__amplifier_hz=0.0,
+        drive__ripple=0.0,
+    )
+    return build_structure(study), as_arrays(build_case(study))
+
+
+@kept_jit(static_argnums=(0, 1))
+def _step(
+    structure: Structure, n_samples: int, case: Case, parts: Any, start: PlantState, is_moving: Any
+) -> Stepped:
+    """The plant over samples, each in `parts` steps: its path, or held where it starts."""
+    loop: Loop = prepare(structure, case).loop
+    period = case.electronics.period
+    step = period / parts
+    zeta = damping_ratio(case.machine.damping, loop.omega)
+    exponential = exponential_step(loop.omega, zeta, step, case.electronics.antialias)
+    loop = loop._replace(plant_step=step, exponential=exponential)
+
+    def wanted(time: Any) -> Reference:
+        sample = sample_path(case.path, time * is_moving)
+        rho, rate = inverse_kinematics(loop.plant, sample.position, sample.velocity * is_moving)
+        wrench = case.load.wrench if structure.has_wrench else None
+        force = jnp.zeros(3) if structure.has_feedforward or structure.has_wrench else None
+        return Reference(rho, rate, force, jnp.zeros(3), wrench)
+
+    voltage = jnp.zeros((3, structure.n_patches))
+
+    def one_sample(state: PlantState, k: Any) -> tuple[PlantState, Stepped]:
+        def one_step(part: Any, state: PlantState) -> PlantState:
+            time = k * period + part * step
+            along = tuple(wanted(time + share * step) for share in (0.0, 0.5, 1.0))
+            return plant_step(structure, loop, state, along, voltage)[0]  # type: ignore[arg-type]
+
+        state = jax.lax.fori_loop(0, parts, one_step, state)
+        chain = modal_chain(loop.plant, state.pose, state.pose_rate, state.q, state.q_rate)
+        energy = kinetic_energy(loop.plant, chain, state.pose_rate, state.q, state.q_rate)
+        bent = jnp.einsum("isr,ir->is", loop.deflection_at, state.q)
+        return state, Stepped(bent, energy + potential_energy(loop.plant, state.q))
+
+    return jax.lax.scan(one_sample, start, jnp.arange(n_samples))[1]
+
+
+def _at_rest(structure: Structure, case: Case, q: np.ndarray) -> PlantState:
+    zero, still = np.zeros((3, structure.n_modes)), np.zeros(3)
+    bent = zero.copy()
+    bent[:, 0] = q
+    return PlantState(np.asarray(case.path.waypoints[0], float), still, bent, zero, zero, zero)
+
+
+def _energy(study: Study) -> Row:
+    """The machine without drive, friction, load and damping, bent and let go."""
+    free = study.change(
+        link__damping_ratio=0.0,
+        link__modes=min(study.link.modes, 3),
+        drive__kp=0.0,
+        drive__kd=0.0,
+        drive__kind="pd",
+        drive__coulomb_friction=0.0,
+        drive__viscous_friction=0.0,
+        load__wrench=(0.0, 0.0, 0.0),
+        initial__modal=(),
+    )
+    structure, case = _open_loop(free)
+    bent = 5e-4 * float(np.min(study.link.length)) * np.array([1.0, 0.5, -1.0])
+    start = _at_rest(structure, case, bent)
+    energy = np.asarray(_step(structure, _SAMPLES, case, 2, start, 0.0).energy)
+    return Row(
+        "energy of the free machine, bent and let go",
+        f"its start, over {_SAMPLES} samples",
+        "Hairer, Lubich and Wanner 2006",
+        float(np.abs(energy / energy[0] - 1).max()),
+        1e-6,
+        left_out="run.model is ked, which keeps none" if study.run.model == "ked" else "",
+    )
+
+
+def _steps(study: Study) -> list[Row]:
+    """Order of the time step, and its error, on the study's own path without control."""
+    structure, case = _open_loop(study.change(initial__modal=()))
+    structure = structure._replace(substeps=check_run(study)[0].substeps)
+    length = float(end_of_path(case.path)) if len(study.motion.waypoints) > 1 else 0.02
+    period = 1 / study.electronics.sample_rate_hz
+    n_samples = int(np.clip(np.ceil(length / period), 1, _SAMPLES))
+    n_samples = 2 ** int(np.ceil(np.log2(n_samples)))  # few programs
+    parts = structure.substeps * np.array(_PARTS)
+    bend = 0.0 if len(study.motion.waypoints) > 1 else 1e-4
+    start = _at_rest(structure, case, np.full(3, bend))
+    working, *finer = [
+        np.asarray(_step(structure, n_samples, case, int(n), start, 1.0).deflection)
+        for n in (structure.substeps, *parts)
+    ]
+    size = np.abs(finer[-1]).max()
+    change = [np.abs(b - a).max() for a, b in pairwise(finer)]
+    order = float(np.log2(change[0] / change[1])) if change[1] > 0 else np.nan
+    is_rough = study.drive.coulomb_friction > 0 or bool(np.any(study.load.wrench))
+    is_exact = change[1] < 1e-11 * size
+    reason = "friction is not smooth" if is_rough else ""
+    return [
+        Row(
+            "error of the time step on this motion",
+            f"steps of a {_PARTS[-1]}th, over the peak of bending",
+            "Cox and Matthews 2002",
+            float(np.abs(working - finer[-1]).max() / size),
+            1e-3,
+        ),
+        Row(
+            "order of the time step on this motion",
+            "4 or more, from steps of a 4th, an 8th and a 16th",
+            "Cox and Matthews 2002",
+            max(4 - order, 0.0) if np.isfinite(order) else np.inf,
+            0.3,
+            left_out=reason or ("the step is exact to rounding" if is_exact else ""),
+            note=f"order {order:.2f}",
+        ),
+    ]
+
+
+def _kernel(study: Study) -> Row:
+    """Two cases by the traced kernel and by XLA's scan."""
+    mass = study.machine.platform_mass
+    data = study.model_dump(mode="json", exclude_unset=True)
+    spec = parse_sweep(data | {"sweep": {"axes": {"machine.platform_mass": [mass, 1.01 * mass]}}})
+    table = build_table(spec)
+    rows = np.arange(len(table))
+    group = plan_groups(table, rows, local_layout)[0]
+    layout = local_layout(len(table), group.structure)
+    cases = chunk_cases(table, rows, group.structure, layout.size)
+    kernel = Executor(group.structure, layout, kind="kernel")
+    fast = kernel.start(cases).wait()
+    slow = Executor(group.structure, layout, kind="scan").start(cases).wait()
+    worst = 0.0
+    for a, b in zip(jax.tree.leaves(fast), jax.tree.leaves(slow), strict=True):
+        a, b = np.asarray(a, float), np.asarray(b, float)
+        if not np.array_equal(np.isnan(a), np.isnan(b)):
+            worst = np.inf
+        elif not np.isnan(b).all():
+            worst = max(worst, largest(np.nan_to_num(a), np.nan_to_num(b)))
+    return Row(
+        "machine code of sweeps",
+        "XLA's scan: all metrics of two cases",
+        "two compilers of the same loop",
+        worst,
+        1e-8,
+        left_out="" if "kernel" in kernel.name else kernel.name,
+    )
+
+
+def _metrics(study: Study) -> list[Row]:
+    """Residual vibration and peak voltage, computed again from the trajectories of a run."""
+    run = run_study(study, has_loop=False)
+    record, metrics, windows = run.result.record, run.result.metrics, run.case.windows
+    assert record is not None
+    begin = float(run.result.command_end) + float(windows.residual_delay)
+    half = 0.5 / study.electronics.sample_rate_hz
+    end = begin + float(windows.residual_length)
+    inside = (record.time > begin - half) & (record.time < end - half)
+    rms = np.sqrt(np.mean(record.chord_deflection_stations[inside] ** 2, axis=0))
+    peak = np.abs(record.actuator_voltage).max(axis=(0, 2))
+    reason = "" if run.status == 0 else "the run does not finish"
+    return [
+        Row(
+            "residual vibration as a metric",
+            "rms over the window, from the run's trajectories",
+            "its definition",
+            largest(metrics.residual_rms, rms),
+            0.01,
+            left_out=reason,
+        ),
+        Row(
+            "peak voltage as a metric",
+            "largest command of each link, from the run's trajectories",
+            "its definition",
+            largest(metrics.peak_voltage, peak),
+            1e-9,
+            left_out=reason,
+        ),
+    ]

@@ -1,0 +1,168 @@
+"""What the drive shall follow: the reference trajectory and the input shaper."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmodel.case import Case, Structure
+from jaxmodel.motion import Path, sample_path
+from jaxmodel.prepare import prepare
+from jaxmodel.shaper import SHAPERS, Taps, design_shaper
+from studies.engine.programs import kept_jit
+from studies.study.cases import as_arrays, build_case, build_structure
+from studies.study.held_link import first_frequency
+from studies.study.spec import Study
+from studies.verify.rows import Row, largest
+
+#: Mode and tolerance for which shapers are designed: any would do.
+_OMEGA, _ZETA, _TOLERANCE = 2 * np.pi * 114.4, 0.02, 0.05
+#: Width of the band with less than 5 % vibration over its centre frequency, undamped (Singhose,
+#: Seering and Singer 1994; Vaughan, Yano and Singhose 2008) [1].
+_INSENSITIVITY = {
+    "zv": 0.0637,
+    "zvd": 0.2871,
+    "ei": 0.3994,
+    "zvdd": 0.4804,
+    "ei2": 0.7245,
+    "ei3": 0.9639,
+}
+
+
+def check_trajectories(study: Study) -> list[Row]:
+    """Reference trajectory, all shapers, and the study's own on its sample grid."""
+    structure, case = build_structure(study), as_arrays(build_case(study))
+    return [_path(study, case), _no_vibration(), _insensitivity(), _taps(study, structure, case)]
+
+
+@kept_jit()
+def _sample(path: Path, time: Any) -> Any:
+    return sample_path(path, time)
+
+
+def _path(study: Study, case: Case) -> Row:
+    """Positions, rates and accelerations at many instants, move by move."""
+    path = jax.tree.map(np.asarray, case.path)
+    pauses = np.broadcast_to(path.dwell, path.move_time.shape)
+    starts = np.cumsum(np.append(0.0, path.move_time + pauses))[:-1]
+    u = np.linspace(0.01, 0.99, 51)
+    time = (starts[:, None] + u * path.move_time[:, None]).ravel()
+    angle, quintic = 2 * np.pi * u, np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
+    laws = {
+        "cycloid": [u - np.sin(angle) / (2 * np.pi), 1 - np.cos(angle), 2 * np.pi * np.sin(angle)],
+        "quintic": [quintic(u), quintic.deriv()(u), quintic.deriv(2)(u)],
+    }[study.motion.profile]
+    length = np.diff(path.waypoints, axis=0)[:, None]
+    found = jax.tree.map(np.asarray, _sample(path, time))
+    worst = 0.0
+    for order, (mine, law) in enumerate(zip(found, laws, strict=True)):
+        wanted = law[:, None] * length / path.move_time[:, None, None] ** order
+        wanted = wanted + (path.waypoints[:-1, None] if order == 0 else 0.0)
+        if wanted.size:
+            worst = max(worst, largest(mine, wanted.reshape(-1, 3)))
+    return Row(
+        "reference trajectory, its rates and accelerations",
+        f"(25) move by move ({study.motion.profile})",
+        "Zhang, Mills and Cleghorn 2016",
+        worst,
+        1e-9,
+        left_out="" if len(path.waypoints) > 1 else "the study does not move",
+    )
+
+
+@kept_jit()
+def _shapers(omega: Any, zeta: Any, tolerance: Any) -> Any:
+    """All shapers, (kind, impulse)."""
+    kinds = jnp.arange(len(SHAPERS))
+    return jax.vmap(lambda kind: design_shaper(kind, omega, zeta, tolerance))(kinds)
+
+
+def _vibration(amplitude: Any, time: Any, omega: Any, zeta: float) -> np.ndarray:
+    """Amplitude left after impulses over that after one at their end [1], (len(omega),).
+
+    The free response of the oscillator to each impulse, as a complex number, at the last of them.
+    """
+    omega = np.atleast_1d(omega)[:, None]
+    last = np.max(np.where(np.asarray(amplitude) != 0, time, 0))
+    pole = omega * (-zeta + 1j * np.sqrt(1 - zeta**2))
+    return np.abs(np.sum(amplitude * np.exp(pole * (last - time)), axis=1))
+
+
+def _no_vibration() -> Row:
+    """ZV, ZVD, ZVDD: no vibration at their mode, and none of its derivatives."""
+    impulses = jax.tree.map(np.asarray, _shapers(_OMEGA, _ZETA, 0.0))
+    worst, step = 0.0, 1e-3
+    for name, order in (("zv", 1), ("zvd", 2), ("zvdd", 3)):
+        amplitude, time = (x[list(SHAPERS).index(name)] for x in impulses)
+        at, near = _vibration(amplitude, time, np.array([1.0, 1 + step]) * _OMEGA, _ZETA)
+        # near the mode, V grows with the power of its zero: pi/2 step for each
+        worst = max(worst, at, abs(amplitude.sum() - 1), near - 1.05 * (np.pi / 2 * step) ** order)
+    return Row(
+        "ZV, ZVD and ZVDD shapers leave no vibration, their order of zero",
+        "free responses of a damped oscillator",
+        "Singer and Seering 1990",
+        worst,
+        1e-9,
+    )
+
+
+def _insensitivity() -> Row:
+    """Bands with less than 5 % vibration, and the sum of amplitudes."""
+    impulses = jax.tree.map(np.asarray, _shapers(_OMEGA, 0.0, _TOLERANCE))
+    ratio, worst = np.linspace(0.2, 1.8, 8001), 0.0
+    for name, width in _INSENSITIVITY.items():
+        amplitude, time = (x[list(SHAPERS).index(name)] for x in impulses)
+        level = _vibration(amplitude, time, ratio * _OMEGA, 0.0)
+        found = np.count_nonzero(level <= _TOLERANCE * (1 + 1e-9)) * (ratio[1] - ratio[0])
+        worst = max(worst, abs(found - width) / width, abs(amplitude.sum() - 1))
+    return Row(
+        "insensitivity of ZV, ZVD, ZVDD, EI, two- and three-hump EI shapers",
+        "published bands of 5 % vibration",
+        "Singhose 1996; Vaughan et al. 2008",
+        worst,
+        0.01,
+    )
+
+
+@kept_jit(static_argnums=0)
+def _taps_of(structure: Structure, case: Case) -> Taps:
+    return prepare(structure, case).taps
+
+
+def _taps(study: Study, structure: Structure, case: Case) -> Row:
+    """The study's shaper on its sample grid, against its impulses at their own instants."""
+    taps = jax.tree.map(np.asarray, _taps_of(structure, case))
+    shaper, time = study.shaper, taps.sample * float(case.electronics.period)
+    omega = 2 * np.pi * np.array(_shaped_frequencies(study))
+    amplitude, instant = np.ones(1), np.zeros(1)
+    for one in omega:
+        impulses = _shapers(one, shaper.damping_ratio, shaper.tolerance)
+        more = [np.asarray(x)[list(SHAPERS).index(shaper.kind)] for x in impulses]
+        amplitude = np.outer(amplitude, more[0]).ravel()
+        instant = np.add.outer(instant, more[1]).ravel()
+    zeta = shaper.damping_ratio
+    left = _vibration(taps.weight, time, omega, zeta) - _vibration(amplitude, instant, omega, zeta)
+    return Row(
+        f"the study's shaper ({shaper.kind}) on its sample grid",
+        "free responses to its impulses off the grid",
+        "Murphy and Watanabe 1992",
+        max(abs(taps.weight.sum() - 1), float(np.abs(left).max())),
+        5e-3,
+        left_out="" if shaper.kind != "none" else "shaper.kind is none",
+    )
+
+
+def _shaped_frequencies(study: Study) -> tuple[float, ...]:
+    """Of the modes to shape for [Hz]: mode 1 of the controller's model unless they are given."""
+    if study.shaper.frequencies_hz:
+        return study.shaper.frequencies_hz
+    given = study.control.frequencies_hz
+    if given:
+        rows = given if isinstance(given[0], tuple) else (given,)
+        if all(row and row[0] > 0 for row in rows):
+            return (float(np.mean([row[0] for row in rows])),)
+    nominal = study.change(link__stiffness_factor=1.0)
+    return (float(first_frequency(nominal, study.control.basis == "loaded").mean()),)
