@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
@@ -13,6 +14,7 @@ from studies.engine import results
 from studies.engine.columns import axis_variables, case_variables, label_of
 from studies.engine.results import SweepData, metric_values
 from studies.errors import ResolutionWarning, StudyError
+from studies.show.listing import Rows, print_rows
 from studies.space.indices import elementary_effects, sobol_indices
 from studies.space.table import build_table
 from studies.store import Variable
@@ -175,6 +177,53 @@ def test_a_table_of_cases_shows_each_number_in_its_unit():
         ]
         for k in range(8)
     ]
+
+
+def test_what_varies_has_its_unit():
+    axes = {"drive.kp": [1e4, 2e4], "placement": {"kind": "same", "candidates": 4}}
+    data = made_up(axes, residual_rms=np.ones((8, 3, 3)))
+    heads = case_rows(data, np.arange(8), ["residual_rms"]).heads
+    assert heads[2:] == ["drive.kp [N/m]", "patches.centers [m]", "residual_rms [µm]"]
+
+
+HEADS = ["case", "id", "patches.centers [m]", "residual_rms [µm]", "drive.pulse_force[0] [N]"]
+LISTING = Rows(
+    HEADS,
+    [
+        [str(k), 8 * str(k), f"[{k}.04851, {k}.1161, {k}.1432]", f"{k}.815e-05", "7"]
+        for k in range(7)
+    ],
+)
+
+
+@pytest.mark.parametrize("width", [150, 90, 75, 60, 45])
+def test_no_text_of_a_table_is_cut(capsys, width):
+    """Rows stand side by side where they would be too wide."""
+    print_rows(LISTING, Console(width=width, markup=False, highlight=False))
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= width and "…" not in text
+    columns, is_turned = {}, "case ┃ id" not in text
+    for table in text.split("┏")[1:]:
+        lines = [[x.strip() for x in re.split("[│┃]", line)[1:-1]] for line in table.splitlines()]
+        lines = [line for line in lines if line]
+        if is_turned:  # a new row begins with its heading, which may go on in the next line
+            starts = [k for k, line in enumerate(lines) if line[0][:4] in {x[:4] for x in HEADS}]
+            parts = [lines[a:b] for a, b in zip(starts, [*starts[1:], None], strict=True)]
+            for part in parts:
+                head, *texts = ("".join(x).replace(" ", "") for x in zip(*part, strict=True))
+                columns.setdefault(head, []).extend(texts)
+        else:
+            for head, *texts in zip(*_joined(lines), strict=True):
+                columns[head.replace(" ", "")] = [x.replace(" ", "") for x in texts]
+    wanted = zip(HEADS, *LISTING.rows, strict=True)
+    assert columns == {x.replace(" ", ""): [y.replace(" ", "") for y in xs] for x, *xs in wanted}
+
+
+def _joined(lines):
+    """Rows of a table from its lines: each begins where the number of its case stands."""
+    starts = [0, *(k for k, line in enumerate(lines) if line[0].isdigit())]
+    parts = [lines[a:b] for a, b in zip(starts, [*starts[1:], None], strict=True)]
+    return [["".join(cell) for cell in zip(*part, strict=True)] for part in parts]
 
 
 def test_every_unit_is_shown_as_its_multiple():

@@ -9,7 +9,6 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from studies.cluster.connect import LocalWorkers, Scheduler, Workers, WorkerTimeout, runner_for
 from studies.config import start
@@ -210,6 +209,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     ) -> None:
         """Show which parameters matter, from a sweep with method morris or saltelli."""
         from studies.engine.results import read_sweep
+        from studies.show.listing import Rows, print_rows
         from studies.sweeps.sensitivity import analyse
         from studies.sweeps.show import label
 
@@ -222,12 +222,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             return
         design = f"a {data.spec.sweep.method} design"
         console.print(f"{label(data, by)}, {len(data.table.origin)} rows of {design}")
-        table = Table(*analysis.heads)
-        for row in analysis.rows:
-            table.add_row(*row)
         for note in analysis.notes:
             console.print(note)
-        console.print(table)
+        print_rows(Rows(list(analysis.heads), list(analysis.rows)), console)
         if analysis.n_left_out:
             console.print(
                 f"left out because of failed cases: {analysis.n_left_out} {analysis.what}"
