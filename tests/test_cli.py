@@ -144,6 +144,9 @@ def test_simulate_writes_a_consistent_run(short_run):
     np.testing.assert_allclose(short_run.time, np.arange(500) * 1e-4, rtol=0, atol=1e-15)
     np.testing.assert_allclose(short_run.station, [0.25, 0.5, 0.75])
     assert list(short_run.pose_axis.values) == ["x", "y", "phi"]
+    np.testing.assert_allclose(short_run.spectrum_point, np.linspace(0.9, 1.1, 9))
+    ratio = short_run.spectrum_frequency / short_run.spectrum_frequency.sel(spectrum_point=1.0)
+    np.testing.assert_allclose(ratio, np.broadcast_to(short_run.spectrum_point, ratio.shape))
     assert int(short_run.status) == 0 and float(short_run.gain_margin) > 1
     assert json.loads(short_run.attrs["study"])["title"] == TITLE
     # the platform arrives (2 mm within 50 um), and middle and mid-span station are one place

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray
 from PIL import Image
 
 from studies.engine import plan
@@ -130,6 +131,12 @@ def check_uncontrolled(capsys, spec, folder):
     np.testing.assert_allclose(data.baseline["residual_rms"].data, wanted, rtol=1e-9)
     step = frame_of(*check_run(data.spec.study)).adc_step
     np.testing.assert_allclose(data.baseline["adc_step"].data, step, rtol=1e-12)
+    joined = xarray.open_dataset(folder / "results.h5", engine="h5netcdf")
+    with joined, xarray.open_dataset(folder / BASELINE, engine="h5netcdf") as baseline:
+        assert {"link", "station"} <= baseline.coords.keys() <= joined.coords.keys()
+        for name in baseline.coords:
+            xarray.testing.assert_identical(baseline[name], joined[name])
+        assert baseline.attrs["case_id"] and baseline.attrs["precision"] == "float64"
     told = f"residual_rms of the baseline without control: {1e6 * wanted.max():.4g} µm"
     value, is_ok = np.nanmax(data["residual_rms"], axis=(1, 2)), data["status"] == 0
     text = run(capsys, "best", folder, "--by", "residual_rms", "--count", "99")[1]

@@ -50,7 +50,7 @@ def made_up(axes, codes=None, sections=None, **arrays):
         dims, unit, *_ = label_of(name)
         variables[name] = Variable(np.array(values), ("case", *dims), unit, name)
     sizes = {d: n for x in variables.values() for d, n in zip(x.dims, x.data.shape, strict=True)}
-    return SweepData(variables | axis_variables(table, sizes), {}, spec, table)
+    return SweepData(variables | axis_variables(spec.study, sizes), {}, spec, table)
 
 
 def of_links(values):

@@ -76,7 +76,7 @@ def _least(text: str) -> int:
 
 
 def _widths(columns: list[list[str]], available: int) -> list[int]:
-    """Of each column: as much as its texts need to be on one line, from the left, if it is there."""
+    """Of each column: what its texts need for one line, from the left on, as far as it goes."""
     widths = [max(map(_least, column)) for column in columns]
     spare = available - _total(widths)
     for k, column in enumerate(columns):
