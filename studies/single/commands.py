@@ -119,8 +119,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             )
         table = Table("mode", "frequency [Hz]", "damping ratio [1]", "share of its energy")
         for row in document["modes"]:
-            numbers = f"{row['frequency']:.4f}", f"{row['damping_ratio']:.5f}"
-            table.add_row(str(row["mode"]), *numbers, row["name"])
+            numbers = f"{row['frequency_hz']:.4f}", f"{row['damping_ratio']:.5f}"
+            table.add_row(str(row["mode"]), *numbers, row["description"])
         console.print(table)
 
 
