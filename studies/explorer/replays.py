@@ -20,6 +20,8 @@ MOST_REPLAYS = 24
 N_POINTS, N_FRAMES = 900, 90
 #: Largest drawn deflection, as a share of the shortest link.
 DRAWN = 0.08
+#: Factor on bending at most: what it does not make visible, such as rounding, is not drawn [1].
+MOST_EXAGGERATED = 1e6
 #: Points drawn along a link, of those of a skeleton.
 EVERY = 4
 #: Of the time after the reference trajectory, what a moving machine shows [s].
@@ -41,7 +43,7 @@ class ReplayedCase(NamedTuple):
     row: int  # of the table
     time: np.ndarray  # of the deflections, from the end of the reference trajectory [ms], (T,)
     frame_time: np.ndarray  # [ms], (K,)
-    exaggeration: float  # of the bending drawn [1]
+    exaggeration: float  # of the bending drawn [1]; 0: none that could be seen
     guide: np.ndarray  # ends of the guides [mm], (3, 2, 2)
     motions: tuple[DrawnMotion, ...]  # as given and, if its links are controlled, without control
 
@@ -75,8 +77,8 @@ def _in_pictures(row: int, run: Run, twin: Run | None) -> ReplayedCase:
     time, end = np.asarray(record.time), float(run.result.command_end)
     runs = [run] if twin is None else [run, twin]
     bent = [chord_deflection(x) for x in runs]
-    peak = max(float(np.nanmax(np.abs(x), initial=1e-12)) for x in bent)
-    factor = float(f"{DRAWN * each_link(run.study.link.length).min() / peak:.1g}")
+    peak = max(float(np.nanmax(np.abs(x), initial=0)) for x in bent)
+    factor = exaggeration(peak, each_link(run.study.link.length).min())
     points = _spread(0, len(time), N_POINTS)
     last = min(end + AFTER, time[-1])
     frames = _spread(0, int(np.searchsorted(time, last)), N_FRAMES)
@@ -102,6 +104,12 @@ def _in_pictures(row: int, run: Run, twin: Run | None) -> ReplayedCase:
         guide=1e3 * parts.guide,
         motions=tuple(motions),
     )
+
+
+def exaggeration(peak: float, length: float) -> float:
+    """By how much to exaggerate bending of some peak [m] on a link [m]; 0 if it is too small."""
+    seen = DRAWN * length
+    return float(f"{seen / peak:.1g}") if peak * MOST_EXAGGERATED > seen else 0.0
 
 
 def _spread(first: int, last: int, most: int) -> np.ndarray:

@@ -224,7 +224,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         console.print(f"{label(data, by)}, {len(data.table.origin)} rows of {design}")
         for note in analysis.notes:
             console.print(note)
-        print_rows(Rows(list(analysis.heads), list(analysis.rows)), console)
+        print_rows(Rows(list(analysis.heads), [list(row) for row in analysis.rows]), console)
         if analysis.n_left_out:
             console.print(
                 f"left out because of failed cases: {analysis.n_left_out} {analysis.what}"
