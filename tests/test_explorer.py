@@ -9,6 +9,7 @@ from hashlib import sha256
 import numpy as np
 import pytest
 
+from studies.engine.front import pareto_front
 from studies.errors import StudyError
 from studies.explorer.page import explorer_page, write_explorer
 from studies.explorer.replays import exaggeration, rows_to_replay
@@ -123,6 +124,19 @@ def test_the_best_case_within_any_limits_is_replayed(seed):
             )
     few = rows_to_replay(order, figures, 24)
     assert len(few) <= 24 and few[0] == order[0] and len(set(few)) == len(few)
+
+
+def test_a_front_is_what_nothing_beats():
+    """Beside ties, equal rows and missing figures."""
+    rng = np.random.default_rng(1)
+    figures = rng.integers(0, 12, (200, 3)).astype(float)
+    figures[::7, 2] = np.nan
+    known = np.where(np.isnan(figures), np.inf, figures)
+    is_beaten = [np.any(np.all(known <= x, axis=1) & np.any(known < x, axis=1)) for x in known]
+    wanted = np.unique(known[~np.array(is_beaten)], axis=0)
+    front = pareto_front(figures)
+    np.testing.assert_array_equal(np.unique(known[front], axis=0), wanted)
+    assert 1 < len(front) == len(wanted) and np.all(np.diff(known[front, 0]) >= 0)
 
 
 def test_rows_without_a_figure_displace_no_other():

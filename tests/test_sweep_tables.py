@@ -179,6 +179,14 @@ def test_a_table_of_cases_shows_each_number_in_its_unit():
     ]
 
 
+def test_settling_is_watched_to_the_end_of_each_case_s_own_run():
+    axes = {"run.duration": [0.025, 0.04]}
+    settled = np.full((2, 3), 14.9e-3)
+    data = made_up(axes, settling_time=settled, command_end=np.full(2, 0.01))
+    rows = case_rows(data, np.arange(2), ["settling_time"]).rows
+    assert [row[3] for row in rows] == ["not within 15", "14.9"]
+
+
 def test_what_varies_has_its_unit():
     axes = {"drive.kp": [1e4, 2e4], "placement": {"kind": "same", "candidates": 4}}
     data = made_up(axes, residual_rms=np.ones((8, 3, 3)))

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from studies.engine.front import pareto_front
 from studies.engine.run_data import chord_deflection
 from studies.engine.runs import Run, run_study, uncontrolled_twin
 from studies.errors import StudyError
@@ -130,19 +131,8 @@ def rows_to_replay(order: np.ndarray, figures: np.ndarray, most: int = MOST_REPL
     """
     if not len(order):
         return []
-    front = _pareto_front(order, figures)
+    front = order[pareto_front(figures[order])]
     if len(front) > most - most // 4:
         front = front[_spread(0, len(front), most - most // 4)]
     others = order[_spread(0, len(order), most - len(front))]
     return list(dict.fromkeys([*front.tolist(), *others.tolist()]))[:most]
-
-
-def _pareto_front(order: np.ndarray, figures: np.ndarray) -> np.ndarray:
-    """Rows that no other row beats in some figure without losing in another, the best first."""
-    front: list[int] = []
-    figures = np.where(np.isnan(figures), np.inf, figures)  # what is not known is worst
-    for row in order:
-        kept = figures[front]
-        if not np.any(np.all(kept <= figures[row], axis=1)):
-            front.append(int(row))
-    return np.array(front, int)

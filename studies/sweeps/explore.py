@@ -30,7 +30,7 @@ from studies.show.words import baseline_text
 from studies.space.table import CaseTable, case_study
 from studies.study.fields import Fields
 from studies.study.margin import ENOUGH, HIGHEST
-from studies.sweeps.records import BESIDE, MARGIN, is_there, reason
+from studies.sweeps.records import BESIDE, MARGIN, is_there, reason, watched
 from studies.sweeps.sensitivity import scalar_columns
 from studies.sweeps.show import (
     margin_warning,
@@ -168,8 +168,7 @@ def _has_numbers(data: SweepData, name: str) -> bool:
 def _figure(data: SweepData, name: str) -> Column:
     values = shown_metric(data, name).astype(float)
     if name.startswith("settling_time"):  # beyond what was watched nothing is known
-        watched = _watched(data)
-        values = np.where(is_cut_off(1e-3 * values, watched), np.nan, values)
+        values = np.where(is_cut_off(1e-3 * values, watched(data)), np.nan, values)
     return Column(
         name=name,
         unit=_shown_unit(data, name),
@@ -180,11 +179,6 @@ def _figure(data: SweepData, name: str) -> Column:
     )
 
 
-def _watched(data: SweepData) -> np.ndarray:
-    """Time from the end of the reference trajectory to that of the run [s], (n,)."""
-    return np.asarray(data.table.values("run.duration").astype(float) - data["command_end"])
-
-
 def _shown_unit(data: SweepData, name: str) -> str:
     return readable(unit_of_metric(data, name))[1]
 
@@ -193,7 +187,7 @@ def _baseline(data: SweepData, names: list[str]) -> dict[str, float]:
     """Figures without control, in the units shown."""
     found: dict[str, Any] = {name: uncontrolled_value(data, name) for name in names}
     settling = found.get("settling_time")
-    if settling is not None and np.all(is_cut_off(settling, _watched(data))):
+    if settling is not None and np.all(is_cut_off(settling, watched(data))):
         del found["settling_time"]
     return {
         name: readable(unit_of_metric(data, name))[0] * value

@@ -40,6 +40,7 @@ from studies.sweeps.records import (
     failed_records,
     reason,
     status_records,
+    watched,
     with_others,
 )
 from studies.sweeps.sensitivity import failure_causes, scalar_columns
@@ -285,8 +286,7 @@ def _number_text(data: SweepData, name: str, record: Record) -> str:
     if name == MARGIN:
         return margin_text(value)
     if name.startswith("settling_time") and "command_end" in data.variables:
-        end = float(data["command_end"][record["case"]])
-        return settling_text(float(value), data.spec.study.run.duration - end)
+        return settling_text(float(value), float(watched(data)[record["case"]]))
     if is_metric(name) and value.dtype.kind == "f":
         value = readable(unit_of_metric(data, name))[0] * value
     return f"{value:.4g}"
