@@ -19,6 +19,7 @@ from studies.space.indices import elementary_effects, sobol_indices
 from studies.space.table import build_table
 from studies.store import Variable
 from studies.sweeps.dry_run import axis_rows
+from studies.sweeps.plots import front
 from studies.sweeps.report import report
 from studies.sweeps.sensitivity import analyse, failure_causes
 from studies.sweeps.show import (
@@ -563,6 +564,12 @@ def test_sensitivity_prints_its_rows(printed, method, count):
     text = printed(data, "sensitivity", "DIR")
     assert cells(text) == [list(found.heads), *map(list, found.rows)]
     assert f"residual_rms [µm], {len(data.table.origin)} rows of a {method} design" in text
+
+
+@pytest.mark.parametrize(("margins", "scale"), [(MARGINS, "log"), (MARGINS.clip(max=9), "linear")])
+def test_margins_over_decades_have_a_logarithmic_axis(margins, scale):
+    (ax, *_) = front(usual(gain_margin=margins), "residual_rms").axes
+    assert ax.get_xscale() == scale
 
 
 # --- the report -----------------------------------------------------------------------------------

@@ -97,6 +97,7 @@ def report(
         n_modes=max(MARGIN_MODES, study.link.modes),
         links=link_rows(run, twin),
         platform=_platform(run),
+        away=_largest_deviation(run),
         modes=_modes(run),
         pole_header=HEADER,
         pole_rows=pole_rows(run.poles) if run.poles is not None else [],
@@ -137,6 +138,14 @@ def _platform(run: Run) -> list[list[str]]:
     largest = np.abs(record.pose_error).max(axis=0)
     errors = largest, metrics.pose_error_rms, metrics.stretch_error_peak
     return [[name, *(number(error[k], "m") for error in errors)] for k, name in enumerate(_POSE)]
+
+
+def _largest_deviation(run: Run) -> tuple[float, float]:
+    """Of the platform from the reference trajectory at any time: distance [m], angle [rad]."""
+    record = run.result.record
+    assert record is not None
+    error = record.pose_error
+    return float(np.hypot(error[:, 0], error[:, 1]).max()), float(np.abs(error[:, 2]).max())
 
 
 def _modes(run: Run) -> list[list[str]]:

@@ -138,13 +138,16 @@ def front(data: SweepData, y: str) -> Figure:
             "o",
             color="black",
             markerfacecolor="none",
-            markersize=4,
+            markeredgewidth=1.2,
+            markersize=6,
             zorder=3,
         )
         ax.axvline(ENOUGH, color="black", linewidth=0.8, linestyle=":")
         ends = f" ({HIGHEST:g}: that or more)" if margin.max(initial=0.0) >= HIGHEST else ""
         ax.set(xlabel=f"gain margin{ends}", ylabel=label(data, y))
         _scale_ordinate(ax, value)
+        if figures.is_wide(margin):
+            figures.log_scale(ax, "x")
     return figure
 
 
