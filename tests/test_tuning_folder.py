@@ -28,7 +28,7 @@ from studies.tuning.folder import open_tuning
 from studies.tuning.linear_fidelity import DesignFigures
 from studies.tuning.objective import objective_of
 from studies.tuning.optimise import begin, is_compatible
-from studies.tuning.report import TuneFindings, report
+from studies.tuning.report import TuneFindings, n_outside, report
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import load_tuning, parse_tuning
 from tests.pages import parsed, text_of
@@ -350,6 +350,13 @@ def test_progress_of_other_shapes_is_damaged():
     assert is_compatible(spec, at) and is_compatible(spec._replace(tune=spec.tune.model_copy()), at)
     assert not is_compatible(spec, at._replace(best_place=at.best_place[:1]))
     assert not is_compatible(tuning(GAIN, starts=3, iterations=3), at)
+
+
+def test_starting_points_that_never_keep_the_limits_are_counted():
+    violation = np.array([[0.5, 0.5, np.nan], [0.0, 0.1, np.nan], [0.3, 0.2, np.nan], [9, 0, 0]])
+    history = np.stack([np.ones_like(violation), violation], axis=-1)
+    at = SimpleNamespace(history=history, iteration=np.array(3))
+    assert n_outside(at) == 2  # the last row is of an earlier, longer request
 
 
 def test_own_limits_need_something_to_be_a_share_of():

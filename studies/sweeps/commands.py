@@ -57,7 +57,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if out is not None and not dry_run:
             refuse_existing(out, SWEEPS, resume)
         start(precision, cpu_only=workers.are_named)
-        from studies.engine.progress import Phases
+        from studies.engine.progress import Phases, duration_text
         from studies.engine.sweep import make_plan, run_sweep, sweep_phases
         from studies.space.spec import load_sweep
         from studies.sweeps.dry_run import plan_document, print_plan
@@ -103,7 +103,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if not quiet:
             console.print(
                 f"{done.n_run} cases in {done.run_time:.1f} s and {done.compile_time:.1f} s of "
-                f"compiling; results: {out / 'results.h5'}",
+                f"compiling, {duration_text(phases.elapsed)} with all else; results: "
+                f"{out / 'results.h5'}",
                 soft_wrap=True,
             )
         if sweep_spec.screen is not None and not quiet:
