@@ -74,7 +74,7 @@ def gains(spec: TuneSpec, findings: TuneFindings) -> Figure:
                 1.0,
                 color="black",
                 linewidth=0.8,
-                label="the study's own values" if k == 0 else None,
+                label="baseline" if k == 0 else None,
             )
             ax.set(xlabel=OBJECTIVE, title=move_label(move), ylim=(rows - 0.4, -0.6))
             figures.log_scale(ax, "x")
