@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from studies.show import figures
 from studies.show.pages import inline_image, render
-from studies.show.units import count_text, headed, number
+from studies.show.units import count_text
 from studies.study.labels import describe
 from studies.study.margin import margin_in_db, margin_text
 
@@ -56,23 +56,12 @@ def _png(figure: Figure) -> bytes:
 def _run(run: Any) -> Card:
     """Of `run_study`."""
     from studies.engine.run_data import chord_deflection
-    from studies.single.summary import limits_text, settling_text
+    from studies.single.summary import limits_text, link_rows
 
-    metrics, loop = run.result.metrics, run.loop
+    loop = run.loop
     lines = [f"Status: {describe(run.status)}.", limits_text(run)]
     if loop is not None:
         lines.append(f"Gain margin {margin_in_db(loop.gain_margin)}.")
-    rows = [
-        [
-            str(i + 1),
-            number(metrics.residual_rms[i].max(), "m"),
-            number(metrics.residual_peak[i].max(), "m"),
-            settling_text(run, i),
-            number(metrics.peak_voltage[i], "V"),
-        ]
-        for i in range(3)
-    ]
-    units = (("residual, rms", "m"), ("residual, peak", "m"), ("settling", "s"), ("voltage", "V"))
     figure = None
     if run.result.record is not None:
         figure, ax = figures.one_panel(2.2)
@@ -82,8 +71,8 @@ def _run(run: Any) -> Card:
         ax.axvline(1e3 * float(run.result.command_end), color="#888888", linestyle=":")
         ax.set_xlabel("time [ms]")
         figures.legend_above(figure, ax)
-    heads = ["link", *(headed(*unit) for unit in units)]
-    return Card(run.study.title, [x for x in lines if x], heads, rows, figure=figure)
+    table = link_rows(run)
+    return Card(run.study.title, [x for x in lines if x], table.heads, table.rows, figure=figure)
 
 
 def _sweep(outcome: Any) -> Card:

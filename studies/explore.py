@@ -4,27 +4,21 @@ from __future__ import annotations
 
 import os
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 
 from rich.console import Console
 
-from studies.atlas.explore import explore_atlas
-from studies.atlas.run import RUNS_FOLDER
-from studies.engine.folder import MANIFEST, TUNING
+from studies.engine.folder import ATLASES, FIT, MANIFEST, TUNING
 from studies.errors import StudyError
 from studies.explorer.page import write_explorer
-from studies.fitting.explore import explore_fit
-from studies.fitting.run import DATA as FIT
-from studies.publish import check_folder
-from studies.sweeps.explore import explore_sweep
-from studies.tuning.explore import explore_tuning
 
-#: What fills a page, by what its folder holds.
+#: By what a folder holds: the module and the function that fill a page, imported when needed.
 _KINDS = {
-    MANIFEST: explore_sweep,
-    TUNING: explore_tuning,
-    FIT: explore_fit,
-    f"{RUNS_FOLDER}/{MANIFEST}": explore_atlas,
+    MANIFEST: ("studies.sweeps.explore", "explore_sweep"),
+    TUNING: ("studies.tuning.explore", "explore_tuning"),
+    FIT: ("studies.fitting.explore", "explore_fit"),
+    f"{ATLASES.mark}/{MANIFEST}": ("studies.atlas.explore", "explore_atlas"),
 }
 
 
@@ -42,12 +36,13 @@ def explore_results(
         StudyError: no results there, damaged ones, or a file that cannot be written.
     """
     folder = Path(folder)
-    fill = next((fill for name, fill in _KINDS.items() if os.path.isfile(folder / name)), None)
-    if fill is None:
+    kind = next((name for name in _KINDS if os.path.isfile(folder / name)), None)
+    if kind is None:
         raise StudyError(f"{folder}: no results of a sweep, a tuning, a fit or an atlas there")
-    check_folder(folder)
-    if subject_to and fill is not explore_sweep:
+    if subject_to and kind != MANIFEST:
         raise StudyError(f"--subject-to {subject_to!r}: {folder} is not the folder of a sweep")
+    module, name = _KINDS[kind]
+    fill = getattr(import_module(module), name)
     if subject_to:
-        fill = partial(explore_sweep, subject_to=subject_to)
+        fill = partial(fill, subject_to=subject_to)
     return write_explorer(folder, fill, console)

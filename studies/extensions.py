@@ -17,6 +17,7 @@ import sysconfig
 import traceback
 from collections.abc import Iterable
 from pathlib import Path
+from shlex import quote
 from types import ModuleType
 from typing import Any, cast
 
@@ -96,6 +97,11 @@ def extend_from_environment() -> None:
     for module in _requested_modules():
         if Path(module).resolve() not in sources.OUTSIDE:  # it can have another module name here
             extend(module)
+
+
+def options() -> str:
+    """What a command line needs before its command to load the same: "--with mine.py "."""
+    return "".join(f"--with {quote(os.path.relpath(name))} " for name in _requested_modules())
 
 
 def plugin_error(error: BaseException) -> str:

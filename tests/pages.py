@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 from base64 import b64decode
+from html import unescape
 from html.parser import HTMLParser
 from io import BytesIO
 
@@ -180,6 +181,12 @@ def tables_of(html):
             of_table = {name: [row[k] for row in rows] for k, name in enumerate(heads)}
             columns.setdefault(heading, []).append(of_table)
     return columns
+
+
+def about(html):
+    """What an explorer begins with, by what it says."""
+    pairs = re.findall("<dt>(.*?)</dt><dd>(.*?)</dd>", html)
+    return {name: unescape(text) for name, text in pairs}
 
 
 def unpacked(html):

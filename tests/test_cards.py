@@ -54,7 +54,7 @@ def test_a_result_shows_itself(results, name):
 
 def test_a_run_without_trajectories_shows_its_numbers():
     html = run_study(small_study(), has_record=False, has_loop=False)._repr_html_()
-    assert "residual, rms [µm]" in html and "<img" not in html
+    assert "residual rms [µm]" in html and "<img" not in html and "peak of the run" not in html
 
 
 def test_progress_in_a_notebook_is_one_line(monkeypatch):

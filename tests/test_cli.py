@@ -144,6 +144,9 @@ def test_simulate_writes_a_consistent_run(short_run):
     np.testing.assert_allclose(short_run.time, np.arange(500) * 1e-4, rtol=0, atol=1e-15)
     np.testing.assert_allclose(short_run.station, [0.25, 0.5, 0.75])
     assert list(short_run.pose_axis.values) == ["x", "y", "phi"]
+    np.testing.assert_allclose(short_run.spectrum_point, np.linspace(0.9, 1.1, 9))
+    ratio = short_run.spectrum_frequency / short_run.spectrum_frequency.sel(spectrum_point=1.0)
+    np.testing.assert_allclose(ratio, np.broadcast_to(short_run.spectrum_point, ratio.shape))
     assert int(short_run.status) == 0 and float(short_run.gain_margin) > 1
     assert json.loads(short_run.attrs["study"])["title"] == TITLE
     # the platform arrives (2 mm within 50 um), and middle and mid-span station are one place
@@ -219,8 +222,8 @@ def test_reports_that_cannot_be_are_refused_before_the_run(capsys, tmp_path):
 
 
 def columns(document):
-    """Frequencies [Hz], damping ratios and names of the modes in a document."""
-    rows = ([x["frequency"], x["damping_ratio"], x["name"]] for x in document["modes"])
+    """Frequencies [Hz], damping ratios and descriptions of the modes in a document."""
+    rows = ([x["frequency_hz"], x["damping_ratio"], x["description"]] for x in document["modes"])
     return tuple(zip(*rows, strict=True))
 
 
@@ -235,6 +238,11 @@ def test_modes_as_json_and_as_table(capsys):
         *moves,
         *(f"links 1 2 3, mode {k}, 100 %" for k in (1, 1, 1, 2, 2, 2)),
     ]
+    drive, link = found["modes"][2], found["modes"][8]
+    told = {"kind": "drive", "links": [], "order": None, "platform": "turns"}
+    assert drive == drive | told and drive["share"] == pytest.approx(1, abs=5e-3)
+    told = {"kind": "link", "links": [1, 2, 3], "order": 2, "platform": None}
+    assert link == link | told and link["share"] == pytest.approx(1, abs=5e-3)
     assert len(frequency) == len(ratio) == 3 + 3 * 2
     assert np.all(np.diff(frequency) >= 0)
     assert ratio == [0.0] * 9
@@ -255,7 +263,11 @@ def test_modes_name_their_link():
     assert locked.names == by_thickness
     np.testing.assert_allclose(locked.link_share.max(axis=(1, 2)), 1.0, rtol=1e-9)
     assert free.names[3:] == by_thickness and all("drive" in name for name in free.names[:3])
-    assert machine_modes(study, kp=0.0).names == ["rigid motion"] * 3 + by_thickness
+    rigid = machine_modes(study, kp=0.0)
+    assert rigid.names == ["rigid motion"] * 3 + by_thickness
+    assert [x.links for x in rigid.kinds] == [(), (), ()] + [(3,), (1,), (2,)] * 2
+    largest = rigid.link_share[3:].max(axis=(1, 2))
+    np.testing.assert_allclose([x.share for x in rigid.kinds[3:]], largest)
 
 
 @pytest.mark.parametrize("thickness", [UNLIKE["link"]["thickness"], 2e-3])

@@ -264,3 +264,11 @@ def test_the_site_is_built_without_warnings(tmp_path):
     api = (tmp_path / "docs/reference/api.html").read_text()
     names = [f"studies.{x}" for x in studies.__all__ if x != "__version__"]
     assert [x for x in names if f'id="{x}"' not in api] == []
+
+
+@pytest.mark.parametrize("name", [name for name in PAGES if "$$" in page(name)])
+def test_displayed_formulas_are_paragraphs(name):
+    """Inside one, their dollars end as text, and what follows as a formula."""
+    parts = re.split(r"\n\s*\n", page(name))
+    shown = [part.strip() for part in parts if "$$" in part]
+    assert all(part.count("$$") == 2 and part[:2] == part[-2:] == "$$" for part in shown), shown

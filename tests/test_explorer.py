@@ -1,6 +1,7 @@
 """Explorers: what a page holds, which cases it shows and reruns, how it behaves in a browser."""
 
 import json
+import os
 import re
 from base64 import b64encode
 from hashlib import sha256
@@ -8,12 +9,14 @@ from hashlib import sha256
 import numpy as np
 import pytest
 
+from studies.engine.front import pareto_front
 from studies.errors import StudyError
 from studies.explorer.page import explorer_page, write_explorer
-from studies.explorer.replays import rows_to_replay
+from studies.explorer.replays import exaggeration, rows_to_replay
 from studies.explorer.table import MOST_CASES, Column, ExplorerTable, shown_rows, text_column
+from studies.extensions import VARIABLE, options
 from tests.browser import opened
-from tests.pages import TITLE, unpacked
+from tests.pages import TITLE, about, unpacked
 from tests.test_cli import refused
 
 UNSTABLE = 3
@@ -56,6 +59,33 @@ def test_a_page_holds_its_numbers():
     np.testing.assert_array_equal(numbers(data["status"]), table.status)
 
 
+def test_a_page_begins_with_its_question_and_its_outcome():
+    table = table_of(50)._replace(about={"varied": "gain"}, conditions={"gain_margin": 2.0})
+    n_failed = int(np.sum(table.status != 0))
+    assert about(explorer_page(table)) == {
+        "varied": "gain",
+        "cases": f"50 cases: {50 - n_failed} ok, {n_failed} unstable",
+        "ranked": "by residual_rms, smallest first; selected at first: gain_margin ≥ 2",
+    }
+
+
+@pytest.mark.parametrize(
+    ("peak", "factor"), [(1e-3, 20), (0.04, 0.4), (1.7e-8, 9e5), (1.5e-8, 0), (0.0, 0)]
+)
+def test_bending_too_small_to_see_is_not_drawn(peak, factor):
+    """A fifth of a metre bends by 16 mm in drawings."""
+    assert exaggeration(peak, 0.2) == pytest.approx(factor)
+
+
+def test_a_command_names_the_files_that_were_loaded(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    names = [str(tmp_path / "my laws.py"), str(tmp_path / "more.py")]
+    monkeypatch.setenv(VARIABLE, os.pathsep.join(names))
+    assert options() == "--with 'my laws.py' --with more.py "
+    monkeypatch.delenv(VARIABLE)
+    assert options() == ""
+
+
 def test_a_page_stands_alone_and_runs_its_own_script_only():
     page = explorer_page(table_of(5)._replace(title=TITLE, names=tuple(["</script><b>"] * 5)))
     policy = re.search('http-equiv="Content-Security-Policy" content="([^"]*)"', page)[1]
@@ -94,6 +124,19 @@ def test_the_best_case_within_any_limits_is_replayed(seed):
             )
     few = rows_to_replay(order, figures, 24)
     assert len(few) <= 24 and few[0] == order[0] and len(set(few)) == len(few)
+
+
+def test_a_front_is_what_nothing_beats():
+    """Beside ties, equal rows and missing figures."""
+    rng = np.random.default_rng(1)
+    figures = rng.integers(0, 12, (200, 3)).astype(float)
+    figures[::7, 2] = np.nan
+    known = np.where(np.isnan(figures), np.inf, figures)
+    is_beaten = [np.any(np.all(known <= x, axis=1) & np.any(known < x, axis=1)) for x in known]
+    wanted = np.unique(known[~np.array(is_beaten)], axis=0)
+    front = pareto_front(figures)
+    np.testing.assert_array_equal(np.unique(known[front], axis=0), wanted)
+    assert 1 < len(front) == len(wanted) and np.all(np.diff(known[front, 0]) >= 0)
 
 
 def test_rows_without_a_figure_displace_no_other():
@@ -196,6 +239,10 @@ def test_brushing_changes_what_is_shown(tmp_path, width):
         tab.evaluate("document.querySelector('#cases tbody tr:nth-child(3)').click()")
         third = tab.evaluate(SEEN)
         assert tab.errors == [] and third["over"] <= 0
+        widths = tab.evaluate(
+            "[...document.querySelectorAll('#cases th')].map((x) => x.offsetWidth)"
+        )
+        assert max(widths[1:5]) < (160 if width > 700 else 90)  # of numbers
     order, ok = table.order, np.flatnonzero(table.status == 0)
     assert first["count"].startswith("400 of 400 cases selected") and first["conditions"] == 0
     assert first["rows"] == [str(k) for k in order[:25]] and first["chosen"] == f"case {order[0]}"

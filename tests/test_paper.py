@@ -266,6 +266,8 @@ def test_report_holds_the_papers_numbers_and_those_of_the_run(short):
         cells.append(f"{100 * ((density[on] / density[off]) ** 0.5 - 1):+.1f} %")
     assert f"| {' | '.join(cells)} |" in text
     assert text.splitlines()[2].startswith("**Result:**")
+    assert re.search(r"by a factor of [\d.]+ on the paper's move and of [\d.]+ on the faster", text)
+    assert "`fig06`, `fig08` and `fig10` show the error from 75 to 200 ms after it." in text
     for name in FIGURES:
         assert f"![{name}]" in text
     rows = [line for line in text.splitlines() if line.startswith("|")]

@@ -225,13 +225,16 @@ def test_sentences_of_a_run_show_its_numbers(one_run):
     without = 1e6 * twin.result.metrics.residual_rms.max(axis=1)[worst]
     settled = ["12.34", "not within 400", "0"][worst]
     force, planned = run.motion.axial_force, run.motion.gain_margin
+    error = run.result.record.pose_error
     buckling = np.pi**2 * 70e9 * 0.01 * np.array([2e-3, 2.1e-3, 1.9e-3]) ** 3 / 12 / 0.2**2
     for part in (
         f"**Result:** residual {1e6 * rms[worst]:.4g} µm rms on link {worst + 1}, the worst "
         f"({without:.4g} without control, {100 * (1e6 * rms[worst] / without - 1):+.3g} %), gain "
         "margin 3.25 (10.2 dB): ",
         f"Settling time {settled} ms ({settled} without control). Peak voltage "
-        f"{m.peak_voltage.max():.4g} of 91 V.",
+        f"{m.peak_voltage.max():.4g} of 91 V. The platform leaves the reference trajectory by at "
+        f"most {1e6 * np.linalg.norm(error[:, :2], axis=1).max():.4g} µm and "
+        f"{1e6 * abs(error[:, 2]).max():.4g} µrad.",
         "the largest of the stations at 20, 50, 87.5 % of the link.",
         "Residual window: 123 ms, from 45 ms after the end of the reference trajectory.",
         "stays within 2.5 µm. The run ends 400 ms after the reference trajectory.",

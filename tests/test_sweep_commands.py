@@ -1,16 +1,18 @@
 """The commands of sweeps, in one process: sweep, dry run, show, best, plot, sensitivity, replay."""
 
 import dataclasses
+import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray
 from PIL import Image
 
 from studies.engine import plan
 from studies.engine.design import load_design
-from studies.engine.folder import BASELINE
+from studies.engine.folder import BASELINE, MANIFEST
 from studies.engine.frame import frame_of
 from studies.engine.function import TRACES
 from studies.engine.preflight import check_run
@@ -20,7 +22,7 @@ from studies.errors import StudyError
 from studies.study.consistency import patch_centers
 from studies.study.template import toml_value
 from studies.sweeps.report import report
-from tests.pages import parsed, text_of, unpacked
+from tests.pages import about, parsed, text_of, unpacked
 from tests.sweeps import BASE
 from tests.test_cli import refused, run
 
@@ -130,6 +132,12 @@ def check_uncontrolled(capsys, spec, folder):
     np.testing.assert_allclose(data.baseline["residual_rms"].data, wanted, rtol=1e-9)
     step = frame_of(*check_run(data.spec.study)).adc_step
     np.testing.assert_allclose(data.baseline["adc_step"].data, step, rtol=1e-12)
+    joined = xarray.open_dataset(folder / "results.h5", engine="h5netcdf")
+    with joined, xarray.open_dataset(folder / BASELINE, engine="h5netcdf") as baseline:
+        assert {"link", "station"} <= baseline.coords.keys() <= joined.coords.keys()
+        for name in baseline.coords:
+            xarray.testing.assert_identical(baseline[name], joined[name])
+        assert baseline.attrs["case_id"] and baseline.attrs["precision"] == "float64"
     told = f"residual_rms of the baseline without control: {1e6 * wanted.max():.4g} µm"
     value, is_ok = np.nanmax(data["residual_rms"], axis=(1, 2)), data["status"] == 0
     text = run(capsys, "best", folder, "--by", "residual_rms", "--count", "99")[1]
@@ -172,6 +180,27 @@ def check_explorer(capsys, out):
     at = np.argmin(np.abs(record.time - command_end - 1e-3 * last))
     np.testing.assert_allclose(pose[-1], 1e3 * record.pose[at, :2], atol=1e-3)
     assert len(replay["motions"]) == 2 and "without control" not in data["reasons"].values()
+    page = (out / "explorer.html").read_text(encoding="utf-8")
+    said = about(page)
+    assert said["varied"] == "control.gain_factor, drive.kp, patches.centers (saltelli)"
+    assert said["cases"].startswith("40 cases: ") and "links of 200 mm" in said["baseline"]
+    assert "not of this sweep" not in page
+    check_strangers(capsys, out)
+
+
+def check_strangers(capsys, out):
+    """Cases of another sweep in the folder are neither shown nor called "not run" in silence."""
+    manifest = out / MANIFEST
+    before, page = manifest.read_bytes(), (out / "explorer.html").read_bytes()
+    spec = json.loads(before)
+    spec["spec"]["sweep"]["axes"]["drive.kp"]["to"] = 5e4
+    manifest.write_text(json.dumps(spec))
+    said = refused(capsys, "explore", out)
+    assert (
+        "no case has residual_rms; 40 finished cases in this folder are not of this sweep" in said
+    )
+    assert (out / "explorer.html").read_bytes() == page
+    manifest.write_bytes(before)
 
 
 def check_report(folder):

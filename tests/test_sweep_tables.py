@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
@@ -13,10 +14,12 @@ from studies.engine import results
 from studies.engine.columns import axis_variables, case_variables, label_of
 from studies.engine.results import SweepData, metric_values
 from studies.errors import ResolutionWarning, StudyError
+from studies.show.listing import Rows, print_rows
 from studies.space.indices import elementary_effects, sobol_indices
 from studies.space.table import build_table
 from studies.store import Variable
 from studies.sweeps.dry_run import axis_rows
+from studies.sweeps.plots import front
 from studies.sweeps.report import report
 from studies.sweeps.sensitivity import analyse, failure_causes
 from studies.sweeps.show import (
@@ -48,7 +51,7 @@ def made_up(axes, codes=None, sections=None, **arrays):
         dims, unit, *_ = label_of(name)
         variables[name] = Variable(np.array(values), ("case", *dims), unit, name)
     sizes = {d: n for x in variables.values() for d, n in zip(x.dims, x.data.shape, strict=True)}
-    return SweepData(variables | axis_variables(table, sizes), {}, spec, table)
+    return SweepData(variables | axis_variables(spec.study, sizes), {}, spec, table)
 
 
 def of_links(values):
@@ -175,6 +178,61 @@ def test_a_table_of_cases_shows_each_number_in_its_unit():
         ]
         for k in range(8)
     ]
+
+
+def test_settling_is_watched_to_the_end_of_each_case_s_own_run():
+    axes = {"run.duration": [0.025, 0.04]}
+    settled = np.full((2, 3), 14.9e-3)
+    data = made_up(axes, settling_time=settled, command_end=np.full(2, 0.01))
+    rows = case_rows(data, np.arange(2), ["settling_time"]).rows
+    assert [row[3] for row in rows] == ["not within 15", "14.9"]
+
+
+def test_what_varies_has_its_unit():
+    axes = {"drive.kp": [1e4, 2e4], "placement": {"kind": "same", "candidates": 4}}
+    data = made_up(axes, residual_rms=np.ones((8, 3, 3)))
+    heads = case_rows(data, np.arange(8), ["residual_rms"]).heads
+    assert heads[2:] == ["drive.kp [N/m]", "patches.centers [m]", "residual_rms [µm]"]
+
+
+HEADS = ["case", "id", "patches.centers [m]", "residual_rms [µm]", "drive.pulse_force[0] [N]"]
+LISTING = Rows(
+    HEADS,
+    [
+        [str(k), 8 * str(k), f"[{k}.04851, {k}.1161, {k}.1432]", f"{k}.815e-05", "7"]
+        for k in range(7)
+    ],
+)
+
+
+@pytest.mark.parametrize("width", [150, 90, 75, 60, 45])
+def test_no_text_of_a_table_is_cut(capsys, width):
+    """Rows stand side by side where they would be too wide."""
+    print_rows(LISTING, Console(width=width, markup=False, highlight=False))
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= width and "…" not in text
+    columns, is_turned = {}, "case ┃ id" not in text
+    for table in text.split("┏")[1:]:
+        lines = [[x.strip() for x in re.split("[│┃]", line)[1:-1]] for line in table.splitlines()]
+        lines = [line for line in lines if line]
+        if is_turned:  # a new row begins with its heading, which may go on in the next line
+            starts = [k for k, line in enumerate(lines) if line[0][:4] in {x[:4] for x in HEADS}]
+            parts = [lines[a:b] for a, b in zip(starts, [*starts[1:], None], strict=True)]
+            for part in parts:
+                head, *texts = ("".join(x).replace(" ", "") for x in zip(*part, strict=True))
+                columns.setdefault(head, []).extend(texts)
+        else:
+            for head, *texts in zip(*_joined(lines), strict=True):
+                columns[head.replace(" ", "")] = [x.replace(" ", "") for x in texts]
+    wanted = zip(HEADS, *LISTING.rows, strict=True)
+    assert columns == {x.replace(" ", ""): [y.replace(" ", "") for y in xs] for x, *xs in wanted}
+
+
+def _joined(lines):
+    """Rows of a table from its lines: each begins where the number of its case stands."""
+    starts = [0, *(k for k, line in enumerate(lines) if line[0].isdigit())]
+    parts = [lines[a:b] for a, b in zip(starts, [*starts[1:], None], strict=True)]
+    return [["".join(cell) for cell in zip(*part, strict=True)] for part in parts]
 
 
 def test_every_unit_is_shown_as_its_multiple():
@@ -506,6 +564,12 @@ def test_sensitivity_prints_its_rows(printed, method, count):
     text = printed(data, "sensitivity", "DIR")
     assert cells(text) == [list(found.heads), *map(list, found.rows)]
     assert f"residual_rms [µm], {len(data.table.origin)} rows of a {method} design" in text
+
+
+@pytest.mark.parametrize(("margins", "scale"), [(MARGINS, "log"), (MARGINS.clip(max=9), "linear")])
+def test_margins_over_decades_have_a_logarithmic_axis(margins, scale):
+    (ax, *_) = front(usual(gain_margin=margins), "residual_rms").axes
+    assert ax.get_xscale() == scale
 
 
 # --- the report -----------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from studies.engine.results import read_sweep
 from studies.engine.runs import run_study
 from studies.engine.sweep import run_sweep
 from studies.errors import StudyError
+from studies.explore import explore_results
 from studies.space.spec import parse_sweep
 from studies.store import read_store
 from studies.study import spec as spec_module
@@ -28,10 +29,10 @@ from studies.tuning.folder import open_tuning
 from studies.tuning.linear_fidelity import DesignFigures
 from studies.tuning.objective import objective_of
 from studies.tuning.optimise import begin, is_compatible
-from studies.tuning.report import TuneFindings, report
+from studies.tuning.report import TuneFindings, n_outside, report
 from studies.tuning.run import run_tuning
 from studies.tuning.spec import load_tuning, parse_tuning
-from tests.pages import parsed, text_of
+from tests.pages import about, parsed, text_of
 from tests.tunings import GAIN, SMALL, tuning
 
 FILE = """
@@ -134,6 +135,20 @@ def check_report(out):
             np.testing.assert_allclose(data["fresh_residual_rms"].data[row], wanted, rtol=1e-9)
 
 
+def check_explorer(out):
+    """Its page tells when the folder has been begun with another file since."""
+    said = about(explore_results(out).read_text(encoding="utf-8"))
+    assert said["free"] == "control.gain_factor, placement[0][0], placement[0][1], placement[0][2]"
+    assert said["starting points"] == "8 starting points: 8 descended"
+    manifest = out / "tune.json"
+    before = manifest.read_text()
+    stale = "is of another tuning file than"
+    assert stale not in (out / "explorer.html").read_text(encoding="utf-8")
+    manifest.write_text(before.replace('"iterations": 3', '"iterations": 7'))
+    assert stale in explore_results(out).read_text(encoding="utf-8")
+    manifest.write_text(before)
+
+
 def test_a_report_says_what_its_numbers_are():
     """Of made-up results: units, peaks, what has not settled, what must be warned of."""
     spec = parse_tuning(
@@ -224,6 +239,7 @@ def test_a_tuning_from_its_file_to_its_report(tmp_path, capsys):
     tuned = load_study(out / "tuned_gains.toml")
     assert tuned.control.gain_factor != paper_study().control.gain_factor
     check_report(out)
+    check_explorer(out)
     before, _ = read_store(out / "tune.h5")
     cli.main(["tune", str(file), "--out", str(out), "--resume", "--quiet"])
     after, _ = read_store(out / "tune.h5")
@@ -350,6 +366,13 @@ def test_progress_of_other_shapes_is_damaged():
     assert is_compatible(spec, at) and is_compatible(spec._replace(tune=spec.tune.model_copy()), at)
     assert not is_compatible(spec, at._replace(best_place=at.best_place[:1]))
     assert not is_compatible(tuning(GAIN, starts=3, iterations=3), at)
+
+
+def test_starting_points_that_never_keep_the_limits_are_counted():
+    violation = np.array([[0.5, 0.5, np.nan], [0.0, 0.1, np.nan], [0.3, 0.2, np.nan], [9, 0, 0]])
+    history = np.stack([np.ones_like(violation), violation], axis=-1)
+    at = SimpleNamespace(history=history, iteration=np.array(3))
+    assert n_outside(at) == 2  # the last row is of an earlier, longer request
 
 
 def test_own_limits_need_something_to_be_a_share_of():

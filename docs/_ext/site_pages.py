@@ -13,6 +13,8 @@ from reference import TEXTS, members_text
 from sphinx.application import Sphinx
 
 MARK = r"<!-- generated: (\w+) -->"
+#: Inline formulas with more characters than this get a box of their own.
+LONG = 40
 REDIRECT = '<!DOCTYPE html><meta http-equiv="refresh" content="0; url={}"><title>{}</title>\n'
 
 
@@ -60,7 +62,11 @@ def show_math(translator: Any, node: nodes.Element) -> None:
     is_block = isinstance(node, nodes.math_block)
     text = tex2mathml(node.astext(), as_block=is_block)
     text = text.replace("<mo>'</mo>", "<mo>\u2032</mo>")
-    translator.body.append(f'<div class="formula">{text}</div>' if is_block else text)
+    if is_block:
+        text = f'<div class="formula">{text}</div>'
+    elif len(node.astext()) > LONG:  # a line may be shorter, and formulas do not break
+        text = f'<span class="formula">{text}</span>'
+    translator.body.append(text)
     raise nodes.SkipNode
 
 

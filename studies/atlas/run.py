@@ -35,7 +35,7 @@ from studies.atlas.subsets import (
     subset_label,
 )
 from studies.atlas.workspace import PAIRS
-from studies.engine.columns import LINK_AXIS
+from studies.engine.columns import axis_variables
 from studies.engine.folder import ATLASES, locked_folder, refuse_existing
 from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
@@ -45,7 +45,7 @@ from studies.publish import REPORT, publish
 from studies.show.figures import save, styled, write_figure
 from studies.show.sketch import sketch
 from studies.space.spec import SweepSpec
-from studies.store import Variable, write_store
+from studies.store import Variable, axis_sizes, write_store
 from studies.study.spec import Study
 
 DATA, RUNS_FOLDER, MODES_FOLDER = "atlas.h5", ATLASES.mark, "runs_modes"
@@ -164,12 +164,13 @@ def sound_settings(subsets: Subsets) -> tuple[Subsets, list[str]]:
 
 def variables(findings: AtlasFindings) -> dict[str, Variable]:
     """All variables of `atlas.h5`."""
-    return {
+    found = {
         **_choice_variables(findings),
         **(_mode_variables(findings.subsets) if findings.subsets is not None else {}),
         **_map_variables(findings),
         **_run_variables(findings),
     }
+    return found | axis_variables(findings.study, axis_sizes(found))
 
 
 def _names(values: list[str], axis: str, text: str) -> Variable:
@@ -190,7 +191,6 @@ def _choice_variables(findings: AtlasFindings) -> dict[str, Variable]:
         ),
         "links": _names([link_label(k) for k in CHOICES], "links", "controlled"),
         "target": _names(list(TARGETS), "target", "whose residual"),
-        "link": LINK_AXIS,
         "beyond_first": Variable(
             findings.beyond_first,
             ("setting",),

@@ -8,16 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from jaxmodel import status
+from studies.engine.columns import axis_variables
 from studies.engine.folder import BASELINE
 from studies.engine.frame import frame_of
 from studies.engine.results import baseline_id, controlled, read_baseline
-from studies.engine.run_data import metric_variables
+from studies.engine.run_data import metric_variables, run_attributes
 from studies.engine.runs import run_uncontrolled
 from studies.engine.stored import kept_metrics
 from studies.errors import StudyError
 from studies.space.spec import SweepSpec
 from studies.space.table import CaseTable
-from studies.store import Variable, write_store
+from studies.store import Variable, axis_sizes, write_store
 from studies.study.labels import STATUS_LABEL
 
 
@@ -51,7 +52,9 @@ def keep_baseline(
     if run.status in status.FINISHED:
         metrics = metric_variables(run.result)
         variables |= {name: metrics[name] for name in kept_metrics(spec)}
-    write_store(folder / BASELINE, variables, {"case_id": baseline_id(spec)})
+    variables |= axis_variables(run.study, axis_sizes(variables))
+    attributes = run_attributes(run.study) | {"case_id": baseline_id(spec)}
+    write_store(folder / BASELINE, variables, attributes)
 
 
 def _is_stored(folder: Path, spec: SweepSpec) -> bool:

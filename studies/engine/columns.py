@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,8 @@ from studies.space.table import CaseTable, as_numbers
 from studies.store import Variable
 from studies.study.labels import DISTANCE_TEXT, STATION_TEXT, STATUS_LABEL
 from studies.study.margin import HIGHEST, MARGIN_MODES
-from studies.study.paths import field_unit, field_value, parse_entry
+from studies.study.paths import field_unit, parse_entry
+from studies.study.spec import Study
 
 #: Status of a case that has not run, and of one that its screen left out.
 NOT_RUN, LEFT_OUT = -1, -2
@@ -116,13 +117,21 @@ def case_variables(table: CaseTable) -> dict[str, Variable]:
     return variables
 
 
-def axis_variables(table: CaseTable, sizes: Mapping[str, int]) -> dict[str, Variable]:
-    """Coordinates of the metrics' axes."""
+def axis_variables(
+    study: Study, sizes: Mapping[str, int], swept: Container[str] = ()
+) -> dict[str, Variable]:
+    """Coordinates of the metrics' axes, the same in all files of results.
+
+    Args:
+        study: of the runs.
+        sizes: length of each axis of the file.
+        swept: fields that differ between its cases.
+    """
     axes = {"link": LINK_AXIS}
     if "pose_axis" in sizes:
         axes["pose_axis"] = POSE_AXIS
-    if "station" in sizes and "metrics.stations" not in table.columns:
-        stations = np.array(field_value(table.study, "metrics.stations"))
+    if "station" in sizes and "metrics.stations" not in swept:
+        stations = np.array(study.metrics.stations)
         axes["station"] = Variable(stations, ("station",), "1", STATION_TEXT)
     if "spectrum_point" in sizes:
         ratio = np.linspace(1 - SPECTRUM_SPAN, 1 + SPECTRUM_SPAN, sizes["spectrum_point"])

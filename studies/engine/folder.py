@@ -37,6 +37,8 @@ SCREEN = "screen"
 GIVEN_UP = "given_up"
 #: The corresponding file in a tuning's folder.
 TUNING = "tune.json"
+#: That of a fit.
+FIT = "fit.h5"
 #: The baseline of the sweep without control.
 BASELINE = "baseline.h5"
 #: Of the files in a folder: names of variables, contents of chunks.

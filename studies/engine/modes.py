@@ -24,6 +24,27 @@ EQUAL = 1e-6
 RIGID = 1e-6
 
 
+class ModeKind(NamedTuple):
+    """What holds most of a mode's energy."""
+
+    kind: str  # "link", "drive", or "rigid": nothing holds it
+    share: float = np.nan  # of the potential energy [1]
+    links: tuple[int, ...] = ()  # which take part, from 1
+    order: int | None = None  # of the links' mode, from 1
+    platform: str | None = None  # what it does on its drive: "translates" or "turns"
+
+    @property
+    def description(self) -> str:
+        """In words: "link 2, mode 1, 96 %"."""
+        if self.kind == "rigid":
+            return "rigid motion"
+        percent = f"{100 * self.share:.0f} %"
+        if self.kind == "drive":
+            return f"drive, platform {self.platform}, {percent}"
+        numbers = " ".join(map(str, self.links))
+        return f"link{'s' * (len(self.links) > 1)} {numbers}, mode {self.order}, {percent}"
+
+
 class NamedModes(NamedTuple):
     """Natural modes of the machine at a pose, ascending in frequency.
 
@@ -45,25 +66,29 @@ class NamedModes(NamedTuple):
         return shown(self)
 
     @property
+    def kinds(self) -> list[ModeKind]:
+        """What each mode is."""
+        shares = zip(self.link_share, self.drive_share, self.turn_share, strict=True)
+        return [_kind(*share) for share in shares]
+
+    @property
     def names(self) -> list[str]:
-        """What each mode is, with its share in the energy: "link 2, mode 1, 96 %"."""
-        return [
-            _name(*shares)
-            for shares in zip(self.link_share, self.drive_share, self.turn_share, strict=True)
-        ]
+        """The same in words, such as "link 2, mode 1, 96 %"."""
+        return [kind.description for kind in self.kinds]
 
 
-def _name(link_share: np.ndarray, drive_share: float, turn_share: float) -> str:
+def _kind(link_share: np.ndarray, drive_share: float, turn_share: float) -> ModeKind:
     if np.isnan(drive_share):
-        return "rigid motion"
+        return ModeKind("rigid")
     if drive_share > 0.5:
         platform = "turns" if turn_share > 0.5 else "translates"
-        return f"drive, platform {platform}, {100 * drive_share:.0f} %"
+        return ModeKind("drive", float(drive_share), platform=platform)
     order = int(link_share.sum(axis=0).argmax())
     share = link_share[:, order]
     links = np.flatnonzero(share >= share.max() / 3)  # the others hardly take part
-    which = f"link{'s' * (len(links) > 1)} {' '.join(str(i + 1) for i in links)}"
-    return f"{which}, mode {order + 1}, {100 * share[links].sum():.0f} %"
+    return ModeKind(
+        "link", float(share[links].sum()), links=tuple((links + 1).tolist()), order=order + 1
+    )
 
 
 def modes_study(

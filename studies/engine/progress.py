@@ -57,6 +57,11 @@ class Phases:
             self._bar.start()
         return self
 
+    @property
+    def elapsed(self) -> float:
+        """Time since the start [s]."""
+        return time.perf_counter() - self._started
+
     def __exit__(self, *_: object) -> None:
         if self._bar is not None:
             self._bar.stop()
@@ -72,7 +77,7 @@ class Phases:
             self._bar.tasks[0].total = None  # unknown, which `update` cannot set
             self._bar.update(self._bar.task_ids[0], description=title, completed=0, text=note)
         else:
-            since = duration_text(time.perf_counter() - self._started)
+            since = duration_text(self.elapsed)
             self._rewrite(f"{title}, {since} since the start{note and ': '}{note}")
 
     def advance(self, done: int, total: int, text: str, left: str = "") -> None:

@@ -120,7 +120,8 @@ def read_sweep(path: str | Path, cases: CaseTable | None = None) -> SweepData:
             return SweepData(variables, attributes, spec, cases, baseline)
     table = build_table(spec) if cases is None else cases
     gathered = gather(table, finished_cases(folder))
-    variables = case_variables(table) | gathered | axis_variables(table, axis_sizes(gathered))
+    axes = axis_variables(spec.study, axis_sizes(gathered), table.columns)
+    variables = case_variables(table) | gathered | axes
     variables = with_coordinates(variables)
     return SweepData(variables, {"title": spec.study.title}, spec, table, baseline)
 

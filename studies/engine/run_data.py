@@ -15,13 +15,13 @@ from jaxmodel.metrics import METRICS
 from jaxmodel.prepare import left_out_deflection, spectrum_frequencies
 from jaxmodel.simulate import Result
 from studies import config
-from studies.engine.columns import LINK_AXIS, PER_CASE, POSE_AXIS
+from studies.engine.columns import PER_CASE, axis_variables
 from studies.engine.poles import PoleReport
 from studies.engine.programs import kept_jit
 from studies.engine.runs import Run
-from studies.store import Variable
+from studies.store import Variable, axis_sizes
 from studies.study.consistency import each_link
-from studies.study.labels import STATION_TEXT, STATUS_LABEL
+from studies.study.labels import STATUS_LABEL
 from studies.study.margin import MARGIN_MODES
 from studies.study.spec import Study
 
@@ -78,12 +78,8 @@ def result_variables(run: Run) -> dict[str, Variable]:
 
 def run_variables(run: Run) -> dict[str, Variable]:
     """Contents of a run's file: axes, trajectories (if kept), metrics, judgement."""
-    stations = np.array(run.study.metrics.stations)
     frequency = np.asarray(_spectrum_frequencies(run.structure, run.case))
     variables = {
-        "station": Variable(stations, ("station",), "1", STATION_TEXT),
-        "link": LINK_AXIS,
-        "pose_axis": POSE_AXIS,
         "spectrum_frequency": Variable(
             frequency,
             ("link", "controlled_mode", "spectrum_point"),
@@ -102,7 +98,7 @@ def run_variables(run: Run) -> dict[str, Variable]:
         variables["chord_deflection"] = Variable(
             chord_deflection(run), ("time", "link"), "m", "mid-span relative to the chord B-C"
         )
-    return variables
+    return variables | axis_variables(run.study, axis_sizes(variables))
 
 
 def loop_variables(run: Run) -> dict[str, Variable]:

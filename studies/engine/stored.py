@@ -169,7 +169,7 @@ def merge(
         code = np.where(code == NOT_RUN, rest, code)
     variables |= joined_columns(table, finished, (*PER_CASE, *METRICS))
     variables["status"] = labelled("status", code)
-    variables |= axis_variables(table, axis_sizes(variables))
+    variables |= axis_variables(table.study, axis_sizes(variables), table.columns)
     write_store(folder / JOINED, variables, labels)
 
 

@@ -84,6 +84,12 @@ function named(text) {
   return span;
 }
 
+/** A text with places where a long name in it may go on in the next line. */
+function breakable(text) {
+  const pieces = text.split(/(?<=[._])(?=[A-Za-z])|(?<=\w)(?=\[)/);
+  return pieces.flatMap((piece, k) => (k ? [document.createElement("wbr"), piece] : [piece]));
+}
+
 /** A typed end of a range; empty or unfinished: none. */
 function bound(text, k) {
   const value = text.trim() === "" ? NaN : Number(text.replace(",", "."));
@@ -118,7 +124,7 @@ class CaseTable {
     }
     const button = document.createElement("button");
     const arrow = column === this.by ? (this.isForward ? " ↓" : " ↑") : "";
-    button.textContent = text + arrow;
+    button.append(...breakable(text + arrow));
     button.title = "sort by this column";
     button.addEventListener("click", () => {
       this.isForward = column === this.by ? !this.isForward : true;

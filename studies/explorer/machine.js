@@ -54,7 +54,9 @@ class ChosenCase {
     const hasBaseline = data.columns.some((column) => column.baseline !== null);
     const line = (texts) => {
       const cells = document.createElement("tr");
-      for (const text of hasBaseline ? texts : texts.slice(0, 2)) cells.insertCell().textContent = text;
+      for (const text of hasBaseline ? texts : texts.slice(0, 2)) {
+        cells.insertCell().append(...breakable(text));
+      }
       return cells;
     };
     const lines = data.columns.map((column) => {
@@ -175,8 +177,9 @@ class ChosenCase {
     this.slider.value = frame;
     const time = replay.frameTime.at(frame);
     this.parts.caption.textContent =
-      `${short(Number(time.toFixed(1)))} ms from the end of the motion; bending drawn ` +
-      `${short(replay.exaggeration)} times${both ? "; with control dark, without pale" : ""}`;
+      `${short(Number(time.toFixed(1)))} ms from the end of the motion; ` +
+      (replay.exaggeration ? `bending drawn ${short(replay.exaggeration)} times` : "no bending") +
+      (both ? "; with control dark, without pale" : "");
   }
 
   toggle() {

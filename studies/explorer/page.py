@@ -18,10 +18,11 @@ from studies.config import origin
 from studies.engine.progress import Phases
 from studies.explorer.replays import DrawnMotion, ReplayedCase
 from studies.explorer.table import ExplorerTable, shown_rows
-from studies.publish import EXPLORER, check_target, publish
+from studies.publish import EXPLORER, check_target, replacing
 from studies.show.figures import CONTROLLED, SERIES, WITHOUT
 from studies.show.pages import render
 from studies.show.sketch import ACTUATOR, OFF, ON, SENSOR
+from studies.show.units import count_text
 
 #: The scripts of a page, in their order.
 SCRIPTS = ("data", "state", "plots", "parallel", "scatter", "cases", "machine", "main")
@@ -55,8 +56,8 @@ def write_explorer(
 
         phases.begin("explore")
         text = explorer_page(fill(folder, on_progress))
-        with publish(folder) as staging:
-            (staging / EXPLORER).write_text(text, encoding="utf-8")
+        with replacing(folder / EXPLORER) as temporary:
+            temporary.write_text(text, encoding="utf-8")
     if console is not None and not is_quiet:
         console.print(f"explorer: {folder / EXPLORER}", soft_wrap=True)
     return folder / EXPLORER
@@ -74,6 +75,7 @@ def explorer_page(table: ExplorerTable) -> str:
         "explorer/explorer.html",
         title=table.title,
         noun=table.noun,
+        about=_about(table),
         notes=[*_thinning(table, rows), *outside, *table.notes],
         facts=origin(),
         script=Markup(script),
@@ -81,6 +83,19 @@ def explorer_page(table: ExplorerTable) -> str:
         data=Markup(_as_json(data)),
         arrays=packed.text(),
     )
+
+
+def _about(table: ExplorerTable) -> dict[str, str]:
+    """What was asked of which machine, how the runs ended, and what the page shows first."""
+    codes, counts = np.unique(table.status, return_counts=True)
+    endings = ", ".join(
+        f"{count:,} {table.reasons[int(code)]}" for code, count in zip(codes, counts, strict=True)
+    )
+    ranked = f"by {table.rank}, {table.column(table.rank).better} first"
+    limits = [f"{name} ≥ {least:g}" for name, least in table.conditions.items()]
+    first = f"; selected at first: {' and '.join(limits)}" if limits else ""
+    total = count_text(len(table.status), table.noun)
+    return {**table.about, f"{table.noun}s": f"{total}: {endings}", "ranked": ranked + first}
 
 
 def _representable(table: ExplorerTable) -> tuple[ExplorerTable, list[str]]:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from studies.engine.front import pareto_front
 from studies.engine.run_data import chord_deflection
 from studies.engine.runs import Run, run_study, uncontrolled_twin
 from studies.errors import StudyError
@@ -20,6 +21,8 @@ MOST_REPLAYS = 24
 N_POINTS, N_FRAMES = 900, 90
 #: Largest drawn deflection, as a share of the shortest link.
 DRAWN = 0.08
+#: Factor on bending at most: what it does not make visible, such as rounding, is not drawn [1].
+MOST_EXAGGERATED = 1e6
 #: Points drawn along a link, of those of a skeleton.
 EVERY = 4
 #: Of the time after the reference trajectory, what a moving machine shows [s].
@@ -41,7 +44,7 @@ class ReplayedCase(NamedTuple):
     row: int  # of the table
     time: np.ndarray  # of the deflections, from the end of the reference trajectory [ms], (T,)
     frame_time: np.ndarray  # [ms], (K,)
-    exaggeration: float  # of the bending drawn [1]
+    exaggeration: float  # of the bending drawn [1]; 0: none that could be seen
     guide: np.ndarray  # ends of the guides [mm], (3, 2, 2)
     motions: tuple[DrawnMotion, ...]  # as given and, if its links are controlled, without control
 
@@ -75,8 +78,8 @@ def _in_pictures(row: int, run: Run, twin: Run | None) -> ReplayedCase:
     time, end = np.asarray(record.time), float(run.result.command_end)
     runs = [run] if twin is None else [run, twin]
     bent = [chord_deflection(x) for x in runs]
-    peak = max(float(np.nanmax(np.abs(x), initial=1e-12)) for x in bent)
-    factor = float(f"{DRAWN * each_link(run.study.link.length).min() / peak:.1g}")
+    peak = max(float(np.nanmax(np.abs(x), initial=0)) for x in bent)
+    factor = exaggeration(peak, each_link(run.study.link.length).min())
     points = _spread(0, len(time), N_POINTS)
     last = min(end + AFTER, time[-1])
     frames = _spread(0, int(np.searchsorted(time, last)), N_FRAMES)
@@ -104,6 +107,12 @@ def _in_pictures(row: int, run: Run, twin: Run | None) -> ReplayedCase:
     )
 
 
+def exaggeration(peak: float, length: float) -> float:
+    """By how much to exaggerate bending of some peak [m] on a link [m]; 0 if it is too small."""
+    seen = DRAWN * length
+    return float(f"{seen / peak:.1g}") if peak * MOST_EXAGGERATED > seen else 0.0
+
+
 def _spread(first: int, last: int, most: int) -> np.ndarray:
     """Indices from `first` to before `last`, at most so many."""
     return np.unique(np.linspace(first, max(last - 1, first), most).astype(int))
@@ -122,19 +131,8 @@ def rows_to_replay(order: np.ndarray, figures: np.ndarray, most: int = MOST_REPL
     """
     if not len(order):
         return []
-    front = _pareto_front(order, figures)
+    front = order[pareto_front(figures[order])]
     if len(front) > most - most // 4:
         front = front[_spread(0, len(front), most - most // 4)]
     others = order[_spread(0, len(order), most - len(front))]
     return list(dict.fromkeys([*front.tolist(), *others.tolist()]))[:most]
-
-
-def _pareto_front(order: np.ndarray, figures: np.ndarray) -> np.ndarray:
-    """Rows that no other row beats in some figure without losing in another, the best first."""
-    front: list[int] = []
-    figures = np.where(np.isnan(figures), np.inf, figures)  # what is not known is worst
-    for row in order:
-        kept = figures[front]
-        if not np.any(np.all(kept <= figures[row], axis=1)):
-            front.append(int(row))
-    return np.array(front, int)

@@ -54,6 +54,7 @@ class ExplorerTable(NamedTuple):
     placement: Placement | None = None
     replays: tuple[ReplayedCase, ...] = ()
     notes: tuple[str, ...] = ()
+    about: Mapping[str, str] = {}  # the question and the machine, in words, by what they say
 
     def column(self, name: str) -> Column:
         """The column of a name; KeyError without one."""

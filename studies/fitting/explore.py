@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from studies.engine.folder import FIT
 from studies.errors import StudyError
 from studies.explorer.table import Column, ExplorerTable, text_column
-from studies.fitting.run import DATA
 from studies.reading import parse_json
 from studies.show.figures import is_wide
+from studies.show.words import machine_text
 from studies.store import Variable, read_store
+from studies.study.spec import parse_study
 
 OPTIMUM, MACHINE = "optimum", "possible machine"
 #: How far a machine is from the best fit, in standard deviations along the correlated parameters.
@@ -29,7 +31,7 @@ def explore_fit(folder: Path, on_progress: Callable[[int, int], None]) -> Explor
     Raises:
         StudyError: a file that is damaged.
     """
-    data, attributes = read_store(folder / DATA)
+    data, attributes = read_store(folder / FIT)
     try:
         optima, machines = data["optimum"].data, data["machine"].data
         values = np.concatenate([optima, machines])
@@ -37,15 +39,15 @@ def explore_fit(folder: Path, on_progress: Callable[[int, int], None]) -> Explor
         away = _distances(values - data["value"].data, data)
         rise = np.concatenate([data["optimum_rise"].data, np.full(len(machines), np.nan)])
         names = [str(name) for name in data["number"].data]
-        title = str(parse_json(attributes["study"]).get("title", ""))
+        study = parse_study(parse_json(attributes["study"]))
     except (KeyError, ValueError, TypeError) as error:
-        raise StudyError(f"{folder / DATA}: damaged ({error})") from None
+        raise StudyError(f"{folder / FIT}: damaged ({error})") from None
     parameters = [
         Column(name, "", values[:, k], is_parameter=True, is_log=is_wide(values[:, k]))
         for k, name in enumerate(names)
     ]
     return ExplorerTable(
-        title=title,
+        title=study.title,
         noun="machine",
         columns=(
             text_column("kind", kinds, is_parameter=True),
@@ -57,6 +59,7 @@ def explore_fit(folder: Path, on_progress: Callable[[int, int], None]) -> Explor
         reasons={0: "ok"},
         names=tuple(str(k + 1) for k in range(len(values))),
         rank=DISTANCE,
+        about={"fitted": ", ".join(names), "machine": machine_text(study)},
     )
 
 

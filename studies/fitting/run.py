@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
+from studies.engine.folder import FIT
 from studies.engine.progress import Phases
 from studies.engine.run_data import run_attributes
 from studies.fitting import plots
@@ -27,7 +28,7 @@ from studies.study.template import study_template
 #: Least gain margin of that tuning [1].
 MARGIN = 2.0
 #: Files of the folder.
-STUDY, TUNE, DATA, DOCUMENT = "fitted.toml", "fitted_tune.toml", "fit.h5", "fit.json"
+STUDY, TUNE, DATA, DOCUMENT = "fitted.toml", "fitted_tune.toml", FIT, "fit.json"
 
 
 def run_fit(

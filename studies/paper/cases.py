@@ -173,6 +173,7 @@ def paper_cases() -> list[PaperCase]:
 JUDGED = (
     "fast-none-3modes-links123",
     "damped-links123",
+    "weak",
     "paper-gains-own-ratios",
     "paper-ratios",
     "paper-preset",

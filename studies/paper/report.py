@@ -21,7 +21,7 @@ from studies.paper.cases import (
     TWO,
 )
 from studies.paper.context import Context, Machines, change
-from studies.paper.figures import PAPER_FIGURES
+from studies.paper.figures import PAPER_FIGURES, PLATFORM_DELAY, VIEW_LENGTH
 from studies.paper.measures import SETTLED
 from studies.paper.tables import (
     COLUMNS,
@@ -76,6 +76,7 @@ def report(machines: Machines, images: Path | None = None) -> str:
         residual=1e6 * nominal.measures.residual,
         bent=1e6 * runs.result.metrics.structural_peak.max(axis=2),
         damping=np.atleast_1d(fitted.runs.study.link.damping_ratio).tolist(),
+        view=(PLATFORM_DELAY, VIEW_LENGTH),
         adc_step=1e6 * runs.frame.adc_step,
         fitted_step=1e6 * fitted.runs.frame.adc_step,
         delays=sorted({1e3 * residual_delay(x.runs.study) for x in (fitted, nominal)}),

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 
 from studies.engine.batches import ProgressCallback
-from studies.engine.columns import LINK_AXIS, POSE_AXIS
+from studies.engine.columns import axis_variables
 from studies.engine.run_data import metric_variables, run_attributes
 from studies.paper.cases import (
     EXECUTOR,
@@ -35,8 +35,8 @@ from studies.paper.report import report
 from studies.publish import REPORT, announce, check_folder, publish
 from studies.show.figures import styled, write_figure
 from studies.show.sketch import sketch
-from studies.store import Variable, write_store
-from studies.study.labels import STATION_TEXT, STATUS_LABEL, describe
+from studies.store import Variable, axis_sizes, write_store
+from studies.study.labels import STATUS_LABEL, describe
 from studies.study.spec import Study, paper_study
 
 #: File of a machine's runs, by its field in `Machines`.
@@ -144,7 +144,7 @@ def paper_variables(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
         if name != "spectral_density"  # the periodograms below cover more
     }
     result, per_case = runs.result, ("case",)
-    return {
+    variables = {
         **_axes(runs, measures),
         **_case_labels(runs),
         "status": Variable(runs.status, per_case, *STATUS_LABEL),
@@ -160,6 +160,7 @@ def paper_variables(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
         **_trajectories(runs),
         **_loops(runs),
     }
+    return variables | axis_variables(runs.study, axis_sizes(variables))
 
 
 def _axes(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
@@ -168,13 +169,10 @@ def _axes(runs: PaperRuns, measures: Measures) -> dict[str, Variable]:
     return {
         "case": Variable(names, ("case",), "1", "name of the case"),
         "time": Variable(runs.record.time[0], ("time",), "s", "time"),
-        "link": LINK_AXIS,
-        "station": Variable(np.array(runs.study.metrics.stations), ("station",), "1", STATION_TEXT),
         "patch": Variable(np.arange(1, 4), ("patch",), "1", "patch pair, from the slider on"),
         "controlled_mode": Variable(
             np.arange(1, count + 1), ("controlled_mode",), "1", "mode of the controller"
         ),
-        "pose_axis": POSE_AXIS,
         "frequency": Variable(measures.frequency, ("frequency",), "Hz", "frequency"),
     }
 

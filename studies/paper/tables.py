@@ -17,6 +17,7 @@ from studies.paper.context import PLACES, Context, Machines, change, residual, r
 from studies.show.units import count_text
 from studies.study.consistency import each_link
 from studies.study.labels import describe
+from studies.study.margin import margin_text
 from studies.study.printed import TABLE_1
 
 #: Columns of every comparison with the paper.
@@ -213,7 +214,7 @@ def design_rows(context: Context) -> list[list[str]]:
         loop = runs.loops.get(case.name)
         margin, zeta = "not judged", "not judged"
         if loop is not None:
-            margin = f"{loop.gain_margin:.3g}, {loop.spectral_radius:.5f}"
+            margin = f"{margin_text(loop.gain_margin, 3)}, {loop.spectral_radius:.5f}"
             zeta = ", ".join(f"{z:.3f}" for z in loop.damping_ratio.min(axis=1))
         rows.append(
             [

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from jaxmodel.laws import LAWS
+from studies.show.units import count_text, span
+from studies.study.consistency import each_link, patch_centers
 from studies.study.spec import Study
 
 
@@ -36,6 +38,18 @@ def motion_text(study: Study) -> str:
     if any(study.initial.load_deflection) or any(map(any, study.initial.modal)):
         disturbances.append("links bent at the start")
     return ", ".join([moving, *disturbances])
+
+
+def machine_text(study: Study) -> str:
+    """Links and patches, in words."""
+    lengths = f"links of {span(1e3 * each_link(study.link.length))} mm"
+    pairs = patch_centers(study).shape[1]
+    return f"{lengths}, {count_text(pairs, 'patch pair')} each" if pairs else lengths
+
+
+def baseline_text(study: Study) -> str:
+    """A machine, its motion and its control, in words."""
+    return "; ".join((machine_text(study), motion_text(study), control_text(study)))
 
 
 def control_text(study: Study) -> str:

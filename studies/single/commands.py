@@ -118,42 +118,31 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             )
         table = Table("mode", "frequency [Hz]", "damping ratio [1]", "share of its energy")
         for row in document["modes"]:
-            numbers = f"{row['frequency']:.4f}", f"{row['damping_ratio']:.5f}"
-            table.add_row(str(row["mode"]), *numbers, row["name"])
+            numbers = f"{row['frequency_hz']:.4f}", f"{row['damping_ratio']:.5f}"
+            table.add_row(str(row["mode"]), *numbers, row["description"])
         console.print(table)
 
 
 def _print_run(run: Run, twin: Run | None, console: Console) -> None:
     """Print status, link metrics and stability; twin: the same run without control."""
     from studies.engine.poles import HEADER, difference, pole_rows
-    from studies.single.summary import limits_text, settling_text
+    from studies.show.listing import print_rows
+    from studies.single.summary import limits_text, link_rows
     from studies.study.labels import describe, remedy
     from studies.study.margin import MARGIN_MODES, caution, margin_in_db
     from studies.study.spec import AUTO
 
-    metrics, windows = run.result.metrics, run.case.windows
+    windows = run.case.windows
     console.print(f"status: {describe(run.status)}")
     if text := limits_text(run):
         console.print(f"[bold red]{text}[/]", soft_wrap=True, markup=True)
     if advice := remedy(run.status):
         console.print(f"next step: {advice}", soft_wrap=True)
-    table = Table("link", "residual rms, worst station [µm]")
-    if twin is not None:
-        table.add_column("without control [µm]")
-    for heading in ("settling [ms]", "peak voltage [V]"):
-        table.add_column(heading)
-    for i in range(3):
-        both = [x.result.metrics.residual_rms[i].max() for x in (run, twin) if x is not None]
-        table.add_row(
-            str(i + 1),
-            *(f"{1e6 * x:.4g}" for x in both),
-            settling_text(run, i),
-            f"{metrics.peak_voltage[i]:.4g}",
-        )
-    console.print(table)
+    print_rows(link_rows(run, twin), console)
     settled = run.study.metrics.residual_delay == AUTO
     console.print(
-        f"residual window: {1e3 * float(windows.residual_length):.4g} ms, from "
+        "deflections: at the worst station; residual window: "
+        f"{1e3 * float(windows.residual_length):.4g} ms, from "
         f"{1e3 * float(windows.residual_delay):.4g} ms after the reference trajectory"
         + (", when the slider drive has settled to 2 %" if settled else ""),
         soft_wrap=True,

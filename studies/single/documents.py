@@ -43,11 +43,13 @@ def _values(variables: dict[str, Variable]) -> dict[str, Any]:
 
 def modes_document(found: NamedModes) -> dict[str, Any]:
     """What `studies modes` says."""
-    rows = zip(found.frequency, found.damping_ratio, found.names, strict=True)
+    rows = zip(found.frequency, found.damping_ratio, found.kinds, strict=True)
     return {
         "modes": [
-            {"mode": k, "frequency": frequency, "damping_ratio": ratio, "name": name}
-            for k, (frequency, ratio, name) in enumerate(rows, 1)
+            {"mode": k, "frequency_hz": frequency, "damping_ratio": ratio}
+            | kind._asdict()
+            | {"description": kind.description}
+            for k, (frequency, ratio, kind) in enumerate(rows, 1)
         ],
-        "units": {"frequency": "Hz", "damping_ratio": "1"},
+        "units": {"frequency_hz": "Hz", "damping_ratio": "1", "share": "1"},
     }

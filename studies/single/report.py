@@ -21,7 +21,7 @@ from studies.show.pages import page
 from studies.show.sketch import CAPTION
 from studies.show.units import is_cut_off, number
 from studies.show.words import control_text, motion_text
-from studies.single.summary import limits_text, settling_text, watched
+from studies.single.summary import limits_text, link_rows, settling_text, watched
 from studies.study.margin import ENOUGH, MARGIN_MODES, caution
 
 #: Figures, by the end of the file name.
@@ -95,8 +95,9 @@ def report(
         command_end=float(result.command_end),
         buckling=np.broadcast_to(euler_force(run.case.machine.beam), (3,)),
         n_modes=max(MARGIN_MODES, study.link.modes),
-        links=_links(run, twin),
+        links=link_rows(run, twin),
         platform=_platform(run),
+        away=_largest_deviation(run),
         modes=_modes(run),
         pole_header=HEADER,
         pole_rows=pole_rows(run.poles) if run.poles is not None else [],
@@ -129,27 +130,6 @@ def _settling_delay(run: Run, free: Run, link: int) -> str:
     return f"{least}{100 * (after / before - 1):.3g} %" if is_later else ""
 
 
-def _links(run: Run, twin: Run | None) -> list[list[str]]:
-    """Row of each link."""
-    metrics = run.result.metrics
-    record = run.result.record
-    assert record is not None
-    largest = np.abs(record.chord_deflection_stations).max(axis=0)
-    lengths = [metrics.residual_rms, metrics.residual_peak, largest]
-    if twin is not None:
-        lengths.insert(1, twin.result.metrics.residual_rms)
-    return [
-        [
-            str(i + 1),
-            *(number(values[i].max(), "m") for values in lengths),
-            settling_text(run, i),
-            number(metrics.peak_voltage[i], "V"),
-            number(metrics.peak_force[i], "N"),
-        ]
-        for i in range(3)
-    ]
-
-
 def _platform(run: Run) -> list[list[str]]:
     """Row of each coordinate."""
     metrics = run.result.metrics
@@ -158,6 +138,14 @@ def _platform(run: Run) -> list[list[str]]:
     largest = np.abs(record.pose_error).max(axis=0)
     errors = largest, metrics.pose_error_rms, metrics.stretch_error_peak
     return [[name, *(number(error[k], "m") for error in errors)] for k, name in enumerate(_POSE)]
+
+
+def _largest_deviation(run: Run) -> tuple[float, float]:
+    """Of the platform from the reference trajectory at any time: distance [m], angle [rad]."""
+    record = run.result.record
+    assert record is not None
+    error = record.pose_error
+    return float(np.hypot(error[:, 0], error[:, 1]).max()), float(np.abs(error[:, 2]).max())
 
 
 def _modes(run: Run) -> list[list[str]]:

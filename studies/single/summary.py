@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from jaxmodel import status
 from studies.engine.runs import Run
 from studies.show import units
+from studies.show.listing import Rows
+from studies.show.units import headed, number
 
 
 def watched(run: Run) -> float:
@@ -15,6 +21,26 @@ def watched(run: Run) -> float:
 def settling_text(run: Run, link: int) -> str:
     """Settling time of a link [ms], or that it was outside the band to the end."""
     return units.settling_text(float(run.result.metrics.settling_time[link]), watched(run))
+
+
+def link_rows(run: Run, twin: Run | None = None) -> Rows:
+    """What each link did, at its worst station; twin: the same run without control."""
+    metrics, record = run.result.metrics, run.result.record
+    columns: dict[str, Sequence[str]] = {"link": ["1", "2", "3"]}
+
+    def add(name: str, unit: str, values: np.ndarray) -> None:
+        columns[headed(name, unit)] = [number(np.max(value), unit) for value in values]
+
+    add("residual rms", "m", metrics.residual_rms)
+    if twin is not None:
+        add("residual rms without control", "m", twin.result.metrics.residual_rms)
+    add("residual peak", "m", metrics.residual_peak)
+    if record is not None:
+        add("peak of the run", "m", np.abs(record.chord_deflection_stations).max(axis=0))
+    columns[headed("settling time", "s")] = [settling_text(run, link) for link in range(3)]
+    add("peak voltage", "V", metrics.peak_voltage)
+    add("peak motor force", "N", metrics.peak_force)
+    return Rows(list(columns), [list(row) for row in zip(*columns.values(), strict=True)])
 
 
 def limits_text(run: Run) -> str:

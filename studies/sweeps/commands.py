@@ -9,7 +9,6 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from studies.cluster.connect import LocalWorkers, Scheduler, Workers, WorkerTimeout, runner_for
 from studies.config import start
@@ -58,7 +57,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if out is not None and not dry_run:
             refuse_existing(out, SWEEPS, resume)
         start(precision, cpu_only=workers.are_named)
-        from studies.engine.progress import Phases
+        from studies.engine.progress import Phases, duration_text
         from studies.engine.sweep import make_plan, run_sweep, sweep_phases
         from studies.space.spec import load_sweep
         from studies.sweeps.dry_run import plan_document, print_plan
@@ -104,7 +103,8 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         if not quiet:
             console.print(
                 f"{done.n_run} cases in {done.run_time:.1f} s and {done.compile_time:.1f} s of "
-                f"compiling; results: {out / 'results.h5'}",
+                f"compiling, {duration_text(phases.elapsed)} with all else; results: "
+                f"{out / 'results.h5'}",
                 soft_wrap=True,
             )
         if sweep_spec.screen is not None and not quiet:
@@ -210,6 +210,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
     ) -> None:
         """Show which parameters matter, from a sweep with method morris or saltelli."""
         from studies.engine.results import read_sweep
+        from studies.show.listing import Rows, print_rows
         from studies.sweeps.sensitivity import analyse
         from studies.sweeps.show import label
 
@@ -222,12 +223,9 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             return
         design = f"a {data.spec.sweep.method} design"
         console.print(f"{label(data, by)}, {len(data.table.origin)} rows of {design}")
-        table = Table(*analysis.heads)
-        for row in analysis.rows:
-            table.add_row(*row)
         for note in analysis.notes:
             console.print(note)
-        console.print(table)
+        print_rows(Rows(list(analysis.heads), [list(row) for row in analysis.rows]), console)
         if analysis.n_left_out:
             console.print(
                 f"left out because of failed cases: {analysis.n_left_out} {analysis.what}"

@@ -9,11 +9,12 @@ from rich.console import Console
 from studies.engine.preflight import check_run
 from studies.engine.sweep import Plan
 from studies.errors import StudyError
+from studies.show.listing import Rows, print_rows
 from studies.show.units import count_text
 from studies.space.table import CaseTable, case_study
 from studies.study.paths import field_unit, parse_entry
 from studies.sweeps.records import Record
-from studies.sweeps.show import Rows, print_rows, short_value
+from studies.sweeps.show import short_value
 
 
 def print_plan(plan: Plan, console: Console) -> None:

@@ -10,23 +10,27 @@ from typing import Any
 import numpy as np
 
 from jaxmodel import status
+from studies.engine.folder import MANIFEST, finished_cases
 from studies.engine.results import (
     SweepData,
     direction,
     metric_values,
     read_sweep,
+    swept_names,
     uncontrolled_value,
 )
 from studies.engine.stored import kept_metrics
 from studies.errors import StudyError
 from studies.explorer.replays import replayed, rows_to_replay
 from studies.explorer.table import Column, ExplorerTable, Placement, text_column
+from studies.extensions import options
 from studies.show.figures import is_wide
 from studies.show.units import is_cut_off, readable
+from studies.show.words import baseline_text
 from studies.space.table import CaseTable, case_study
 from studies.study.fields import Fields
 from studies.study.margin import ENOUGH, HIGHEST
-from studies.sweeps.records import BESIDE, MARGIN, is_there, reason
+from studies.sweeps.records import BESIDE, MARGIN, is_there, reason, watched
 from studies.sweeps.sensitivity import scalar_columns
 from studies.sweeps.show import (
     margin_warning,
@@ -61,7 +65,8 @@ def explore_sweep(
     rank = ranking(data)
     codes = data["status"]
     if not _has_numbers(data, rank):
-        raise StudyError(f"{folder}: no case has {rank}, so there is nothing to explore")
+        why = " ".join(_strangers(folder, data)) or "so there is nothing to explore"
+        raise StudyError(f"{folder}: no case has {rank}; {why}")
     names = [rank, *(x for x in (MARGIN, *BESIDE, *kept_metrics(data.spec)) if x != rank)]
     figures = [_figure(data, x) for x in dict.fromkeys(names) if _has_numbers(data, x)]
     table = ExplorerTable(
@@ -74,9 +79,14 @@ def explore_sweep(
         rank=rank,
         baseline=_baseline(data, [x.name for x in figures]),
         conditions=_conditions(data, rank),
-        command=(f"studies replay {quote(str(folder))} --case ", " --report --out case-", ".h5"),
+        command=(
+            f"studies {options()}replay {quote(str(folder))} --case ",
+            " --report --out case-",
+            ".h5",
+        ),
         placement=_placement(data.table),
-        notes=_warnings(data, rank),
+        notes=(*_strangers(folder, data), *_warnings(data, rank)),
+        about=_about(data),
     )
     n_ok = int(np.sum(codes == status.OK))
     by = [x for x in (rank, *_FIGURES) if _has_numbers(data, x)]
@@ -86,6 +96,28 @@ def explore_sweep(
     rows = list(dict.fromkeys([*wanted, *others]))
     done = replayed(rows, lambda row: case_study(data.table, row), on_progress)
     return table._replace(replays=done)
+
+
+def _about(data: SweepData) -> dict[str, str]:
+    """What varied, and in which machine."""
+    varied = ", ".join(swept_names(data)) or "a list of cases"
+    return {
+        "varied": f"{varied} ({data.spec.sweep.method})",
+        "baseline": baseline_text(data.spec.study),
+    }
+
+
+def _strangers(folder: Path, data: SweepData) -> tuple[str, ...]:
+    """That some finished cases are none of the sweep, if they are."""
+    found = finished_cases(folder).case_id
+    count = int(np.sum(~np.isin(found, data.table.case_id)))
+    if not count:
+        return ()
+    has = "case in this folder is" if count == 1 else "cases in this folder are"
+    return (
+        f"{count:,} finished {has} not of this sweep: {folder / MANIFEST} has another study or "
+        "other axes than the one that ran them. They are not shown.",
+    )
 
 
 def _warnings(data: SweepData, rank: str) -> tuple[str, ...]:
@@ -136,8 +168,7 @@ def _has_numbers(data: SweepData, name: str) -> bool:
 def _figure(data: SweepData, name: str) -> Column:
     values = shown_metric(data, name).astype(float)
     if name.startswith("settling_time"):  # beyond what was watched nothing is known
-        watched = _watched(data)
-        values = np.where(is_cut_off(1e-3 * values, watched), np.nan, values)
+        values = np.where(is_cut_off(1e-3 * values, watched(data)), np.nan, values)
     return Column(
         name=name,
         unit=_shown_unit(data, name),
@@ -148,11 +179,6 @@ def _figure(data: SweepData, name: str) -> Column:
     )
 
 
-def _watched(data: SweepData) -> np.ndarray:
-    """Time from the end of the reference trajectory to that of the run [s], (n,)."""
-    return np.asarray(data.table.values("run.duration").astype(float) - data["command_end"])
-
-
 def _shown_unit(data: SweepData, name: str) -> str:
     return readable(unit_of_metric(data, name))[1]
 
@@ -161,7 +187,7 @@ def _baseline(data: SweepData, names: list[str]) -> dict[str, float]:
     """Figures without control, in the units shown."""
     found: dict[str, Any] = {name: uncontrolled_value(data, name) for name in names}
     settling = found.get("settling_time")
-    if settling is not None and np.all(is_cut_off(settling, _watched(data))):
+    if settling is not None and np.all(is_cut_off(settling, watched(data))):
         del found["settling_time"]
     return {
         name: readable(unit_of_metric(data, name))[0] * value

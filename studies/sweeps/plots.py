@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from jaxmodel import status
 from studies.engine.columns import LEFT_OUT
+from studies.engine.front import pareto_front
 from studies.engine.results import SweepData, as_sweep, metric_values, swept_names
 from studies.errors import StudyError
 from studies.show import figures
@@ -127,7 +128,9 @@ def front(data: SweepData, y: str) -> Figure:
         )
         if VOLTAGE in data.variables:
             figure.colorbar(dots, ax=ax, label=label(data, VOLTAGE))
-        best = np.array(sorted(pareto_front(margin, value), key=lambda k: margin[k]), int)
+        # margins are the same if four digits are
+        same = np.array([float(f"{x:.4g}") for x in margin])
+        best = pareto_front(np.stack([-same, value], axis=1))
         ax.plot(margin[best], value[best], "-", color="black", linewidth=0.8, zorder=3)
         ax.plot(
             margin[best],
@@ -135,29 +138,17 @@ def front(data: SweepData, y: str) -> Figure:
             "o",
             color="black",
             markerfacecolor="none",
-            markersize=4,
+            markeredgewidth=1.2,
+            markersize=6,
             zorder=3,
         )
         ax.axvline(ENOUGH, color="black", linewidth=0.8, linestyle=":")
         ends = f" ({HIGHEST:g}: that or more)" if margin.max(initial=0.0) >= HIGHEST else ""
         ax.set(xlabel=f"gain margin{ends}", ylabel=label(data, y))
         _scale_ordinate(ax, value)
+        if figures.is_wide(margin):
+            figures.log_scale(ax, "x")
     return figure
-
-
-def pareto_front(margin: np.ndarray, value: np.ndarray) -> list[int]:
-    """Cases on the Pareto front: none has a smaller value at the same or a larger margin.
-
-    Margins are the same if four digits are.
-    """
-    margin = np.array([float(f"{x:.4g}") for x in margin])
-    front: list[int] = []
-    lowest = np.inf
-    for k in np.lexsort((value, -margin)):
-        if value[k] < lowest:
-            front.append(int(k))
-            lowest = value[k]
-    return front
 
 
 def is_log(data: SweepData, name: str) -> bool:

@@ -62,6 +62,11 @@ def is_there(data: SweepData, name: str) -> bool:
     return kept and bool(np.isfinite(metric_values(data, name)).any())
 
 
+def watched(data: SweepData) -> np.ndarray:
+    """Time from the end of the reference trajectory to that of the run of each case [s], (n,)."""
+    return np.asarray(data.table.values("run.duration").astype(float) - data["command_end"])
+
+
 def failed_cases(data: SweepData) -> np.ndarray:
     """Numbers of the cases that have run and are not ok."""
     codes = data["status"]

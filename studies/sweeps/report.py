@@ -189,7 +189,9 @@ def _best(data: SweepData, metric: str) -> dict[str, Any] | None:
     return {
         "case": first,
         "value": with_unit(readings[first]),
-        "setting": ", ".join(f"{x} = {shown_value(data, x, first)}" for x in names),
+        "setting": ", ".join(
+            f"{x} = {shown_value(data, x, first)} {unit_of_metric(data, x)}".rstrip() for x in names
+        ),
         "margin": float(margin[first]) if np.isfinite(margin[first]) else None,
         "median": with_unit(np.median(readings[is_known])),
         "spread": spread if len(best) > 3 and spread < ALIKE else None,

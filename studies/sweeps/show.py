@@ -5,12 +5,11 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table as RichTable
 
 from jaxmodel import status
 from jaxmodel.metrics import METRICS
@@ -28,6 +27,7 @@ from studies.engine.results import (
 )
 from studies.engine.stored import kept_metrics
 from studies.errors import ResolutionWarning, StudyError, field_error
+from studies.show.listing import Rows, print_rows
 from studies.show.units import headed, readable, settling_text
 from studies.study.entries import links_text
 from studies.study.margin import ENOUGH, margin_text
@@ -40,6 +40,7 @@ from studies.sweeps.records import (
     failed_records,
     reason,
     status_records,
+    watched,
     with_others,
 )
 from studies.sweeps.sensitivity import failure_causes, scalar_columns
@@ -64,20 +65,6 @@ SHARES = (
     "their share in the lowest and highest quarter of a number, and at the best and worst value of "
     "a choice"
 )
-
-
-class Rows(NamedTuple):
-    """A table to print, or to write into a report."""
-
-    heads: list[str]
-    rows: list[list[str]]
-
-
-def print_rows(listing: Rows, console: Console) -> None:
-    table = RichTable(*listing.heads)
-    for row in listing.rows:
-        table.add_row(*row)
-    console.print(table)
 
 
 def select(data: SweepData, subject_to: str) -> np.ndarray:
@@ -185,7 +172,8 @@ def _print_failed(data: SweepData, console: Console) -> None:
         time = "" if record["bad_time"] is None else f"{record['bad_time']:.4g}"
         cells = (short_value(record[name]) for name in names)
         rows.append([*_identity(record), record["status_text"], time, *cells])
-    print_rows(Rows(["case", "id", "status", "from [s]", *names], rows), console)
+    heads = ["case", "id", "status", "from [s]", *(label(data, name) for name in names)]
+    print_rows(Rows(heads, rows), console)
     if len(failed) > LONGEST_TABLE:
         console.print(
             f"and {len(failed) - LONGEST_TABLE} more; all of them: --json, or studies.load",
@@ -284,7 +272,7 @@ def case_rows(data: SweepData, cases: np.ndarray, metrics: list[str]) -> Rows:
             numbers[0] += f" {MARK}"
         cells = (short_value(record[name]) for name in names)
         rows.append([*_identity(record), *cells, *numbers])
-    return Rows(["case", "id", *names, *(label(data, x) for x in metrics)], rows)
+    return Rows(["case", "id", *(label(data, x) for x in (*names, *metrics))], rows)
 
 
 def _identity(record: Record) -> tuple[str, str]:
@@ -298,8 +286,7 @@ def _number_text(data: SweepData, name: str, record: Record) -> str:
     if name == MARGIN:
         return margin_text(value)
     if name.startswith("settling_time") and "command_end" in data.variables:
-        end = float(data["command_end"][record["case"]])
-        return settling_text(float(value), data.spec.study.run.duration - end)
+        return settling_text(float(value), float(watched(data)[record["case"]]))
     if is_metric(name) and value.dtype.kind == "f":
         value = readable(unit_of_metric(data, name))[0] * value
     return f"{value:.4g}"

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from studies.errors import StudyError
 from studies.explorer.replays import MOST_REPLAYS, replayed
 from studies.explorer.table import Column, ExplorerTable, Placement, text_column
-from studies.reading import parse_json
+from studies.reading import parse_json, read_json
 from studies.show.figures import is_wide
 from studies.show.units import readable
+from studies.show.words import baseline_text
 from studies.store import Variable, read_store
 from studies.study.consistency import each_link
 from studies.study.spec import Study
 from studies.tuning.check import tuned_study
-from studies.tuning.folder import RESULTS
+from studies.tuning.folder import MANIFEST, RESULTS
 from studies.tuning.spec import TuneSpec, parse_tuning
 
 #: Statuses of a starting point.
@@ -50,6 +52,11 @@ def explore_tuning(folder: Path, on_progress: Callable[[int, int], None]) -> Exp
             names=tuple(str(k + 1) for k in range(len(values))),
             rank="objective",
             placement=_placement(spec, data),
+            about={
+                "free": ", ".join(str(name) for name in data["free"].data),
+                "baseline": baseline_text(spec.study),
+            },
+            notes=_is_stale(folder, attributes),
         )
     except (KeyError, ValueError, TypeError) as error:
         raise StudyError(f"{folder / RESULTS}: damaged ({error})") from None
@@ -61,6 +68,20 @@ def explore_tuning(folder: Path, on_progress: Callable[[int, int], None]) -> Exp
     rows = [int(row) for row in table.order[:MOST_REPLAYS] if table.status[row] == 0]
     done = replayed(rows, study_of, on_progress)
     return table._replace(replays=done)
+
+
+def _is_stale(folder: Path, attributes: Mapping[str, Any]) -> tuple[str, ...]:
+    """That the results are those of another file than the one the folder was last begun with."""
+    try:
+        begun = read_json(folder / MANIFEST).get("spec")
+    except (OSError, ValueError, AttributeError):
+        return ()
+    if begun == parse_json(attributes["tuning"]):
+        return ()
+    return (
+        f"{folder / RESULTS} is of another tuning file than {folder / MANIFEST}: the tuning begun "
+        "last is not finished. What is shown is the earlier one.",
+    )
 
 
 def _parameters(data: dict[str, Variable]) -> list[Column]:

@@ -18,7 +18,10 @@ OBJECTIVE = "objective (baseline: 1)"
 
 
 def descent(spec: TuneSpec, findings: TuneFindings) -> Figure:
-    """Best objective that keeps the limits, over iterations, by family; thin: every start."""
+    """Best objective that keeps the limits, over iterations, by family; thin: every start.
+
+    Curves begin where a starting point first keeps the limits.
+    """
     with figures.styled():
         figure, ax = figures.one_panel(3.6)
         history = findings.at.history[: int(findings.at.iteration)]
@@ -67,7 +70,12 @@ def gains(spec: TuneSpec, findings: TuneFindings) -> Figure:
                     zorder=3,
                     label="their mean" if first else None,
                 )
-            ax.axvline(1.0, color="black", linewidth=0.8)
+            ax.axvline(
+                1.0,
+                color="black",
+                linewidth=0.8,
+                label="baseline" if k == 0 else None,
+            )
             ax.set(xlabel=OBJECTIVE, title=move_label(move), ylim=(rows - 0.4, -0.6))
             figures.log_scale(ax, "x")
         axes[0].set_yticks(range(rows), [family.name for family in spec.families])

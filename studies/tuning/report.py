@@ -83,6 +83,7 @@ def report(
         findings=findings,
         ended=ended(spec, at),
         n_frozen=int(at.is_frozen.sum()),
+        n_outside=n_outside(at),
         names_links=all(parse_entries(name).names_a_link for name in spec.tune.objective),
         lower=LOWER,
         best=_best(spec, findings),
@@ -119,6 +120,12 @@ def report(
         meaning=MEANING,
         sketch_caption=CAPTION,
     )
+
+
+def n_outside(at: Progress) -> int:
+    """Starting points that keep the limits at no iteration."""
+    violation = at.history[: int(at.iteration), :, 1]
+    return int(np.sum(~np.any(violation <= KEPT, axis=0)))
 
 
 def ended(spec: TuneSpec, at: Progress) -> str:
