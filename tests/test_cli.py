@@ -182,7 +182,7 @@ def test_the_report_of_a_run_is_whole(short_folder, short_run):
     found = parsed((short_folder / "my run.html").read_text(encoding="utf-8"))
     assert found.title == f"{TITLE}: one run" and TITLE in found.text
     # links, platform, two tracked modes, versions
-    assert len(found.images) == 4 and found.rows == [[8] * 4, [4] * 4, [3] * 3, [2] * 8]
+    assert len(found.images) == 4 and found.rows == [[8] * 4, [4] * 4, [3] * 3, [2] * 9]
     rms = f"{1e6 * float(short_run.residual_rms[1].max()):.4g}"
     margin = f"gain margin {margin_in_db(float(short_run.gain_margin))}, the factor"
     watched = f"The run ends {50 - 1e3 * float(short_run.command_end):.4g} ms after"

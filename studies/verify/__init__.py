@@ -1,12 +1,12 @@
-"""Verification: every assumption of the model checked on the user's machine, in one table.
+"""ModelVerification: every assumption of the model checked on the user's machine, in one table.
 
 - `rows` is the table; `links`, `trajectories`, `outside` (published and
   finite-element figures), `machine` (mechanics), `stepping` (time steps, kernels, metrics) and
   `loops` (margins, exported C) fill it, each one way of checking: a function of a study.
-- `run` puts them together: `verify(study)`; `passport` keeps the outcome for later reports;
+- `run` puts them together: `verify_study(study)`; `passport` keeps the outcome for later reports;
   `commands` is `studies verify`.
 
-docs/theory.md, section 9, gives the reason for each limit.
+docs/theory.md, section 11, gives the reason for each limit.
 """
 
 import lazy_loader

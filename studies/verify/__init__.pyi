@@ -1,3 +1,3 @@
-from .rows import Row as Row
-from .run import Verification as Verification
-from .run import verify as verify
+from .rows import Assumption as Assumption
+from .run import ModelVerification as ModelVerification
+from .run import verify_study as verify_study

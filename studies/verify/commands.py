@@ -13,7 +13,7 @@ from studies.config import start
 from studies.show.document import AsJson, print_document
 
 if TYPE_CHECKING:
-    from studies.verify.run import Verification
+    from studies.verify.run import ModelVerification
 
 
 def add_commands(app: typer.Typer, console: Console) -> None:
@@ -27,10 +27,10 @@ def add_commands(app: typer.Typer, console: Console) -> None:
         ] = None,
         as_json: AsJson = False,
     ) -> None:
-        """Check every assumption of the model, on a study's own machine, motion and controller."""
+        """Check every assumption of the model on a study's machine, motion and controller."""
         start()
         from studies.study.spec import load_study
-        from studies.verify.run import verify as verify_study
+        from studies.verify.run import verify_study
 
         def notify(name: str) -> None:
             if not as_json:
@@ -45,7 +45,7 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             sys.exit(1)
 
 
-def verify_document(found: Verification) -> dict[str, Any]:
+def verify_document(found: ModelVerification) -> dict[str, Any]:
     """What `studies verify` says."""
     rows = [
         {**row._asdict(), "outcome": row.outcome, "left_out": row.left_out or None}
@@ -54,7 +54,7 @@ def verify_document(found: Verification) -> dict[str, Any]:
     return {"is_passed": found.is_passed, **found.summary._asdict(), "table": rows}
 
 
-def _print(found: Verification, console: Console) -> None:
+def _print(found: ModelVerification, console: Console) -> None:
     table = Table("assumption", "checked against", "source", "difference", "allowed", "")
     for row in found.rows:
         numbers = ["-", "-"] if row.left_out else [f"{row.difference:.1e}", f"{row.allowed:.0e}"]

@@ -20,7 +20,7 @@ from studies.engine.programs import kept_jit
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.held_link import first_frequency
 from studies.study.spec import Study
-from studies.verify.rows import Row, largest, worst_relative
+from studies.verify.rows import Assumption, largest, worst_relative
 
 #: Gauss points between patch ends: products of two shapes of 24 half-waves are exact to rounding.
 _POINTS = 40
@@ -28,7 +28,7 @@ _POINTS = 40
 _STATIONS = 3
 
 
-class Section(NamedTuple):
+class Segment(NamedTuple):
     """A link between two neighbouring patch ends, counted by hand."""
 
     left: float  # [m]
@@ -39,7 +39,7 @@ class Section(NamedTuple):
     stiffness: float  # E I about the neutral axis of its layers [N m2]
 
 
-def check_links(study: Study) -> list[Row]:
+def check_links(study: Study) -> list[Assumption]:
     """Frequencies, integrals of shapes, piezo constants and statics of the study's links."""
     structure, case = build_structure(study), as_arrays(build_case(study))
     loop = jax.tree.map(np.asarray, _loop(structure, case))
@@ -60,26 +60,26 @@ def check_links(study: Study) -> list[Row]:
         statics.append(_statics(structure, case, loop, i, beam, patches))
     return [
         _frequencies(study, loop, case),
-        Row(
-            "modal masses, couplings and shortening of the links",
-            "Gauss quadrature of the shapes",
-            "Meirovitch 1967",
-            max(integrals),
-            1e-9,
+        Assumption(
+            assumption="modal masses, couplings and shortening of the links",
+            against="Gauss quadrature of the shapes",
+            source="Meirovitch 1967",
+            difference=max(integrals),
+            allowed=1e-9,
         ),
-        Row(
-            "volts per bending and force per volt of the patches",
-            "laminate theory, layer by layer, and the shapes' slopes",
-            "Crawley and Anderson 1990",
-            max(signals),
-            1e-7,
+        Assumption(
+            assumption="volts per bending and force per volt of the patches",
+            against="laminate theory, layer by layer, and the shapes' slopes",
+            source="Crawley and Anderson 1990",
+            difference=max(signals),
+            allowed=1e-7,
         ),
-        Row(
-            "static bending by the patches, all modes",
-            "moments integrated over the link",
-            "Timoshenko and Gere 1961",
-            max(statics),
-            1e-9,
+        Assumption(
+            assumption="static bending by the patches, all modes",
+            against="moments integrated over the link",
+            source="Timoshenko and Gere 1961",
+            difference=max(statics),
+            allowed=1e-9,
             left_out="" if study.link.static_correction else "link.static_correction is off",
         ),
     ]
@@ -109,19 +109,19 @@ def _shapes(kind: str, n_modes: int, beam: Beam, patches: Patches, x: Any) -> An
     return basis, shape, slope
 
 
-def _frequencies(study: Study, loop: Loop, case: Case) -> Row:
+def _frequencies(study: Study, loop: Loop, case: Case) -> Assumption:
     """Of the plant's modes, against the closed form of their basis."""
     kind, source = study.link.basis, "Timoshenko, Young and Weaver 1974"
     omega, beam = loop.omega, case.machine.beam
     if kind == "loaded":
         found, wanted = omega[:, 0] / (2 * np.pi), first_frequency(study, with_patches=True)
         against, allowed = "Stodola's iteration with the patches' mass and stiffness, mode 1", 2e-4
-        return Row(
-            f"frequencies of the links ({kind})",
-            against,
-            source,
-            worst_relative(found, wanted),
-            allowed,
+        return Assumption(
+            assumption=f"frequencies of the links ({kind})",
+            against=against,
+            source=source,
+            difference=worst_relative(found, wanted),
+            allowed=allowed,
         )
     order = np.arange(1, omega.shape[1] + 1)
     roots = order * np.pi if kind == "pinned_pinned" else _pinned_free(omega.shape[1])
@@ -129,9 +129,13 @@ def _frequencies(study: Study, loop: Loop, case: Case) -> Row:
         beam.youngs_modulus * beam.stiffness_factor * beam.thickness**2 / (12 * beam.density)
     )
     wanted = np.broadcast_to(root / beam.length**2, (3,))[:, None] * roots**2
-    against = "(j pi)^2 sqrt(E I/(rhoA L^4))" if kind == "pinned_pinned" else "tan kL = tanh kL"
-    return Row(
-        f"frequencies of the links ({kind})", against, source, worst_relative(omega, wanted), 1e-9
+    law = "(j pi)^2 sqrt(E I/(rhoA L^4))" if kind == "pinned_pinned" else "tan kL = tanh kL"
+    return Assumption(
+        assumption=f"frequencies of the links ({kind})",
+        against=law,
+        source=source,
+        difference=worst_relative(omega, wanted),
+        allowed=1e-9,
     )
 
 
@@ -151,7 +155,7 @@ def _ends(patches: Patches, part: str) -> np.ndarray:
     return np.stack([np.asarray(patches.center) - half, np.asarray(patches.center) + half])
 
 
-def _sections(beam: Beam, patches: Patches, has_patches: bool) -> list[Section]:
+def _sections(beam: Beam, patches: Patches, has_patches: bool) -> list[Segment]:
     """A link cut at all patch ends; `has_patches`: with their mass and stiffness."""
     sensor, actuator = _ends(patches, "sensor"), _ends(patches, "actuator")
     cuts = np.unique(np.concatenate([[0.0, beam.length], *sensor, *actuator]).round(12))
@@ -167,7 +171,16 @@ def _sections(beam: Beam, patches: Patches, has_patches: bool) -> list[Section]:
         count = len(over[0]), len(over[1])
         bending = _stiffness(beam, patches, count if has_patches else (0, 0))
         line_mass = mass + ceramic * sum(count)
-        found.append(Section(left, right, over[0], over[1], line_mass, bending))
+        found.append(
+            Segment(
+                left=left,
+                right=right,
+                sensors=over[0],
+                actuators=over[1],
+                line_mass=line_mass,
+                stiffness=bending,
+            )
+        )
     return found
 
 
@@ -183,7 +196,7 @@ def _stiffness(beam: Beam, patches: Patches, count: tuple[int, int]) -> float:
     return (own - axial * shift**2) * float(beam.stiffness_factor)
 
 
-def _gauss(sections: list[Section]) -> tuple[np.ndarray, np.ndarray]:
+def _gauss(sections: list[Segment]) -> tuple[np.ndarray, np.ndarray]:
     """Gauss points over a link [m], and weights without and with the line mass [m], [kg]."""
     node, weight = np.polynomial.legendre.leggauss(_POINTS)
     half = np.array([(s.right - s.left) / 2 for s in sections])[:, None]

@@ -24,7 +24,7 @@ from studies.export.c_floating import floating_source
 from studies.export.compiler import find_compiler
 from studies.export.verify import reference_run, verify_floating
 from studies.study.spec import Study
-from studies.verify.rows import Row, largest
+from studies.verify.rows import Assumption, largest
 
 #: Modal coordinate of mode 1 of link 1 at the start: linear to one part in 10^5 [m].
 _SMALL = 1e-7
@@ -32,7 +32,7 @@ _SMALL = 1e-7
 _RELEASED = 300
 
 
-def check_loops(study: Study) -> list[Row]:
+def check_loops(study: Study) -> list[Assumption]:
     """Margins, release, exported C; left out where nothing is sampled."""
     if study.control.feedback != "sampled":
         return [_left_out(name, "control.feedback is not sampled") for name in _NAMES]
@@ -48,22 +48,24 @@ _NAMES = (
 )
 
 
-def _left_out(name: str, reason: str) -> Row:
-    return Row(name, "-", "-", 0.0, 0.0, left_out=reason)
+def _left_out(name: str, reason: str) -> Assumption:
+    return Assumption(
+        assumption=name, against="-", source="-", difference=0.0, allowed=0.0, left_out=reason
+    )
 
 
-def _margins(study: Study) -> Row:
+def _margins(study: Study) -> Assumption:
     """Of sweeps, by the return difference, and of `simulate`, by eigenvalues."""
     structure, case = check_run(study)
     one = jax.tree.map(lambda x: np.asarray(x)[None], case)
     found = judge_loops(structure, one).gain_margin[0]
     wanted = loop_report(structure, case, case.path.waypoints[0], structure.n_controlled)
-    return Row(
-        _NAMES[0],
-        "eigenvalues of the transition matrix over a sample",
-        "MacFarlane and Postlethwaite 1977",
-        abs(found / wanted.gain_margin - 1) if wanted.gain_margin else float(found > 0),
-        5e-3,
+    return Assumption(
+        assumption=_NAMES[0],
+        against="eigenvalues of the transition matrix over a sample",
+        source="MacFarlane and Postlethwaite 1977",
+        difference=abs(found / wanted.gain_margin - 1) if wanted.gain_margin else float(found > 0),
+        allowed=5e-3,
         note=f"margin {wanted.gain_margin:.4g}",
     )
 
@@ -80,7 +82,7 @@ def _linear(structure: Structure, case: Case) -> tuple[LoopMatrices, Any]:
     return matrices, loop.sensor
 
 
-def _release(study: Study) -> Row:
+def _release(study: Study) -> Assumption:
     """A machine at rest with one bent link, simulated, beside powers of its transition matrix."""
     electronics = study.electronics
     reason = ""
@@ -127,16 +129,16 @@ def _release(study: Study) -> Row:
         states.append(transition @ states[-1])
     wanted = np.array(states)[:, 6 : 6 + modes]
     found = np.asarray(record.modal_coordinate).reshape(_RELEASED, modes)
-    return Row(
-        _NAMES[1],
-        f"powers of the transition matrix, {_RELEASED} samples after a release",
-        "Franklin, Powell and Workman 1998",
-        largest(found, wanted),
-        2e-3,
+    return Assumption(
+        assumption=_NAMES[1],
+        against=f"powers of the transition matrix, {_RELEASED} samples after a release",
+        source="Franklin, Powell and Workman 1998",
+        difference=largest(found, wanted),
+        allowed=2e-3,
     )
 
 
-def _exported(study: Study) -> Row:
+def _exported(study: Study) -> Assumption:
     """C compiled on this machine, against the controller in JAX: hard inputs, and in the loop."""
     compiler = find_compiler()
     if not compiler:
@@ -148,11 +150,11 @@ def _exported(study: Study) -> Row:
     source = floating_source(exported, _NAME, ["studies verify"])
     result = verify_floating(exported, reference_run(exported), source, _NAME, compiler)
     failed = [check for check in result.checks if not check.is_met]
-    return Row(
-        _NAMES[2],
-        f"the controller in JAX: {len(result.checks)} comparisons in double and single precision",
-        "ISO/IEC 9899:1999",
-        float(len(failed)),
-        0.0,
+    return Assumption(
+        assumption=_NAMES[2],
+        against=f"the controller in JAX: {len(result.checks)} comparisons, double and single",
+        source="ISO/IEC 9899:1999",
+        difference=float(len(failed)),
+        allowed=0.0,
         note="; ".join(f"{check.what}: {check.found}" for check in failed),
     )

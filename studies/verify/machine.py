@@ -27,13 +27,13 @@ from studies.reference.lagrangian import (
 )
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study
-from studies.verify.rows import Row, largest
+from studies.verify.rows import Assumption, largest
 
 #: Random states.
 _STATES = 24
 
 
-def check_machine(study: Study) -> list[Row]:
+def check_machine(study: Study) -> list[Assumption]:
     """Accelerations, closure and damping ratios."""
     structure, case = build_structure(study), as_arrays(build_case(study))
     return [*_accelerations(study, structure, case), _damping(structure, case)]
@@ -41,7 +41,7 @@ def check_machine(study: Study) -> list[Row]:
 
 @kept_jit(static_argnums=0)
 def _parts(structure: Structure, case: Case) -> tuple[ModalBasis, Plant, Loop]:
-    """Basis and plant of a machine without structural damping; the study's own loop."""
+    """Basis and plant of a machine without structural damping; the study's loop."""
     machine, basis = _undamped(case.machine), find_bases(structure, case).plant
     stiffened = structure.has_shortening
     if not stiffened:
@@ -57,7 +57,7 @@ def _undamped(machine: Machine) -> Machine:
     return machine._replace(damping=none)
 
 
-def _accelerations(study: Study, structure: Structure, case: Case) -> list[Row]:
+def _accelerations(study: Study, structure: Structure, case: Case) -> list[Assumption]:
     """At random states around the way-points, bent by up to 1 % and as fast as fast moves."""
     basis, plant, _ = jax.tree.map(np.asarray, _parts(structure, case))
     states = _random_states(study, plant, structure.n_modes)
@@ -70,20 +70,20 @@ def _accelerations(study: Study, structure: Structure, case: Case) -> list[Row]:
         largest(row[p], true[p]) for row, true in zip(found, wanted, strict=True) for p in parts
     )
     return [
-        Row(
-            "accelerations of platform and modes (1)-(9)",
-            f"{against}, {_STATES} random states of this machine",
-            "Lagrange 1788; Kane and Levinson 1985",
-            worst,
-            1e-9,
+        Assumption(
+            assumption="accelerations of platform and modes (1)-(9)",
+            against=f"{against}, {_STATES} random states of this machine",
+            source="Lagrange 1788; Kane and Levinson 1985",
+            difference=worst,
+            allowed=1e-9,
             left_out=coupled,
         ),
-        Row(
-            "closure of slider, bent link and platform (6)",
-            "both ways to the joints, over the link's length",
-            "Zhang, Mills and Cleghorn 2016",
-            float(open_by.max() / length),
-            1e-12,
+        Assumption(
+            assumption="closure of slider, bent link and platform (6)",
+            against="both ways to the joints, over the link's length",
+            source="Zhang, Mills and Cleghorn 2016",
+            difference=float(open_by.max() / length),
+            allowed=1e-12,
         ),
     ]
 
@@ -144,7 +144,7 @@ def _both(machine: Machine, basis: ModalBasis, plant: Plant, states: Any) -> Any
     return jax.vmap(one)(*states)
 
 
-def _damping(structure: Structure, case: Case) -> Row:
+def _damping(structure: Structure, case: Case) -> Assumption:
     """Ratios of the link modes as given, continued by the damping law."""
     _, _, loop = jax.tree.map(np.asarray, _parts(structure, case))
     given = jax.tree.map(np.asarray, case.machine.damping)
@@ -157,10 +157,10 @@ def _damping(structure: Structure, case: Case) -> Row:
             share = loop.omega[i, j] / loop.omega[i, last]
             wanted[i, j] = ratio[i, last] * share**exponent
     critical = 2 * np.sqrt(loop.plant.stiffness * loop.plant.modal_mass[:, None])
-    return Row(
-        "structural damping of the links' modes",
-        "damping over twice the square root of stiffness and mass",
-        "Rayleigh 1877",
-        largest(loop.plant.damping / critical, wanted),
-        1e-9,
+    return Assumption(
+        assumption="structural damping of the links' modes",
+        against="damping over twice the square root of stiffness and mass",
+        source="Rayleigh 1877",
+        difference=largest(loop.plant.damping / critical, wanted),
+        allowed=1e-9,
     )

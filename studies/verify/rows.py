@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 
-class Row(NamedTuple):
+class Assumption(NamedTuple):
     """An assumption, what it is checked against, and how far apart both are."""
 
     assumption: str

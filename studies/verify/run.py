@@ -18,12 +18,12 @@ from studies.verify.links import check_links
 from studies.verify.loops import check_loops
 from studies.verify.machine import check_machine
 from studies.verify.outside import check_outside
-from studies.verify.rows import Row
+from studies.verify.rows import Assumption
 from studies.verify.stepping import check_stepping
 from studies.verify.trajectories import check_trajectories
 
 #: What is checked, in this order, by names for progress.
-CHECKS: dict[str, Callable[[Study], list[Row]]] = {
+CHECKS: dict[str, Callable[[Study], list[Assumption]]] = {
     "links and patches": check_links,
     "trajectories and shapers": check_trajectories,
     "mechanics": check_machine,
@@ -33,11 +33,11 @@ CHECKS: dict[str, Callable[[Study], list[Row]]] = {
 }
 
 
-class Verification(NamedTuple):
+class ModelVerification(NamedTuple):
     """All rows of a verification."""
 
     study: Study
-    rows: tuple[Row, ...]
+    rows: tuple[Assumption, ...]
 
     @property
     def is_passed(self) -> bool:
@@ -60,9 +60,9 @@ class Verification(NamedTuple):
         )
 
 
-def verify(
+def verify_study(
     study: Study | None = None, on_progress: Callable[[str], None] = lambda _: None
-) -> Verification:
+) -> ModelVerification:
     """Check every assumption of the model on a study's machine, motion and controller.
 
     Args:
@@ -70,25 +70,34 @@ def verify(
         on_progress: called with what is checked next.
 
     Returns:
-        Verification: a row per assumption; its outcome is kept for later reports.
+        ModelVerification: a row per assumption; its outcome is kept for later reports.
 
     Raises:
         StudyError: a study that cannot run.
 
     Example:
-        >>> verify(load_study("mine.toml")).is_passed  # doctest: +SKIP
+        >>> verify_study(load_study("mine.toml")).is_passed  # doctest: +SKIP
         True
     """
     require_configured()
     study = study or paper_study()
     check_run(study)
-    rows: list[Row] = []
+    rows: list[Assumption] = []
     for name, check in CHECKS.items():
         on_progress(name)
         try:
             rows += check(study)
         except (StudyError, FloatingPointError, np.linalg.LinAlgError, ValueError) as error:
-            rows.append(Row(name, "-", "-", np.inf, 0.0, note=f"it could not be checked: {error}"))
-    found = Verification(study, tuple(rows))
+            rows.append(
+                Assumption(
+                    assumption=name,
+                    against="-",
+                    source="-",
+                    difference=np.inf,
+                    allowed=0.0,
+                    note=f"it could not be checked: {error}",
+                )
+            )
+    found = ModelVerification(study, tuple(rows))
     passport.keep(study, found.summary)
     return found

@@ -27,7 +27,7 @@ from studies.space.spec import parse_sweep
 from studies.space.table import build_table
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import Study
-from studies.verify.rows import Row, largest
+from studies.verify.rows import Assumption, largest
 
 #: Samples that are stepped at most, and of them compared at most.
 _SAMPLES = 400
@@ -42,7 +42,7 @@ class Stepped(NamedTuple):
     energy: jax.Array  # kinetic and bending [J], (T,)
 
 
-def check_stepping(study: Study) -> list[Row]:
+def check_stepping(study: Study) -> list[Assumption]:
     """Energy, order and size of the step, kernel beside scan, metrics beside trajectories."""
     return [_energy(study), *_steps(study), _kernel(study), *_metrics(study)]
 
@@ -101,7 +101,7 @@ def _at_rest(structure: Structure, case: Case, q: np.ndarray) -> PlantState:
     return PlantState(np.asarray(case.path.waypoints[0], float), still, bent, zero, zero, zero)
 
 
-def _energy(study: Study) -> Row:
+def _energy(study: Study) -> Assumption:
     """The machine without drive, friction, load and damping, bent and let go."""
     free = study.change(
         link__damping_ratio=0.0,
@@ -118,18 +118,18 @@ def _energy(study: Study) -> Row:
     bent = 5e-4 * float(np.min(study.link.length)) * np.array([1.0, 0.5, -1.0])
     start = _at_rest(structure, case, bent)
     energy = np.asarray(_step(structure, _SAMPLES, case, 2, start, 0.0).energy)
-    return Row(
-        "energy of the free machine, bent and let go",
-        f"its start, over {_SAMPLES} samples",
-        "Hairer, Lubich and Wanner 2006",
-        float(np.abs(energy / energy[0] - 1).max()),
-        1e-6,
+    return Assumption(
+        assumption="energy of the free machine, bent and let go",
+        against=f"its start, over {_SAMPLES} samples",
+        source="Hairer, Lubich and Wanner 2006",
+        difference=float(np.abs(energy / energy[0] - 1).max()),
+        allowed=1e-6,
         left_out="run.model is ked, which keeps none" if study.run.model == "ked" else "",
     )
 
 
-def _steps(study: Study) -> list[Row]:
-    """Order of the time step, and its error, on the study's own path without control."""
+def _steps(study: Study) -> list[Assumption]:
+    """Order of the time step, and its error, on the study's path without control."""
     structure, case = _open_loop(study.change(initial__modal=()))
     structure = structure._replace(substeps=check_run(study)[0].substeps)
     length = float(end_of_path(case.path)) if len(study.motion.waypoints) > 1 else 0.02
@@ -150,26 +150,26 @@ def _steps(study: Study) -> list[Row]:
     is_exact = change[1] < 1e-11 * size
     reason = "friction is not smooth" if is_rough else ""
     return [
-        Row(
-            "error of the time step on this motion",
-            f"steps of a {_PARTS[-1]}th, over the peak of bending",
-            "Cox and Matthews 2002",
-            float(np.abs(working - finer[-1]).max() / size),
-            1e-3,
+        Assumption(
+            assumption="error of the time step on this motion",
+            against=f"steps of a {_PARTS[-1]}th, over the peak of bending",
+            source="Cox and Matthews 2002",
+            difference=float(np.abs(working - finer[-1]).max() / size),
+            allowed=1e-3,
         ),
-        Row(
-            "order of the time step on this motion",
-            "4 or more, from steps of a 4th, an 8th and a 16th",
-            "Cox and Matthews 2002",
-            max(4 - order, 0.0) if np.isfinite(order) else np.inf,
-            0.3,
+        Assumption(
+            assumption="order of the time step on this motion",
+            against="4 or more, from steps of a 4th, an 8th and a 16th",
+            source="Cox and Matthews 2002",
+            difference=max(4 - order, 0.0) if np.isfinite(order) else np.inf,
+            allowed=0.3,
             left_out=reason or ("the step is exact to rounding" if is_exact else ""),
             note=f"order {order:.2f}",
         ),
     ]
 
 
-def _kernel(study: Study) -> Row:
+def _kernel(study: Study) -> Assumption:
     """Two cases by the traced kernel and by XLA's scan."""
     mass = study.machine.platform_mass
     data = study.model_dump(mode="json", exclude_unset=True)
@@ -189,17 +189,17 @@ def _kernel(study: Study) -> Row:
             worst = np.inf
         elif not np.isnan(b).all():
             worst = max(worst, largest(np.nan_to_num(a), np.nan_to_num(b)))
-    return Row(
-        "machine code of sweeps",
-        "XLA's scan: all metrics of two cases",
-        "two compilers of the same loop",
-        worst,
-        1e-8,
+    return Assumption(
+        assumption="machine code of sweeps",
+        against="XLA's scan: all metrics of two cases",
+        source="two compilers of the same loop",
+        difference=worst,
+        allowed=1e-8,
         left_out="" if "kernel" in kernel.name else kernel.name,
     )
 
 
-def _metrics(study: Study) -> list[Row]:
+def _metrics(study: Study) -> list[Assumption]:
     """Residual vibration and peak voltage, computed again from the trajectories of a run."""
     run = run_study(study, has_loop=False)
     record, metrics, windows = run.result.record, run.result.metrics, run.case.windows
@@ -212,20 +212,20 @@ def _metrics(study: Study) -> list[Row]:
     peak = np.abs(record.actuator_voltage).max(axis=(0, 2))
     reason = "" if run.status == 0 else "the run does not finish"
     return [
-        Row(
-            "residual vibration as a metric",
-            "rms over the window, from the run's trajectories",
-            "its definition",
-            largest(metrics.residual_rms, rms),
-            0.01,
+        Assumption(
+            assumption="residual vibration as a metric",
+            against="rms over the window, from the run's trajectories",
+            source="its definition",
+            difference=largest(metrics.residual_rms, rms),
+            allowed=0.01,
             left_out=reason,
         ),
-        Row(
-            "peak voltage as a metric",
-            "largest command of each link, from the run's trajectories",
-            "its definition",
-            largest(metrics.peak_voltage, peak),
-            1e-9,
+        Assumption(
+            assumption="peak voltage as a metric",
+            against="largest command of each link, from the run's trajectories",
+            source="its definition",
+            difference=largest(metrics.peak_voltage, peak),
+            allowed=1e-9,
             left_out=reason,
         ),
     ]

@@ -16,7 +16,7 @@ from studies.engine.programs import kept_jit
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.held_link import first_frequency
 from studies.study.spec import Study
-from studies.verify.rows import Row, largest
+from studies.verify.rows import Assumption, largest
 
 #: Mode and tolerance for which shapers are designed: any would do.
 _OMEGA, _ZETA, _TOLERANCE = 2 * np.pi * 114.4, 0.02, 0.05
@@ -32,8 +32,8 @@ _INSENSITIVITY = {
 }
 
 
-def check_trajectories(study: Study) -> list[Row]:
-    """Reference trajectory, all shapers, and the study's own on its sample grid."""
+def check_trajectories(study: Study) -> list[Assumption]:
+    """Reference trajectory, all shapers, and the study's on its sample grid."""
     structure, case = build_structure(study), as_arrays(build_case(study))
     return [_path(study, case), _no_vibration(), _insensitivity(), _taps(study, structure, case)]
 
@@ -43,7 +43,7 @@ def _sample(path: Path, time: Any) -> Any:
     return sample_path(path, time)
 
 
-def _path(study: Study, case: Case) -> Row:
+def _path(study: Study, case: Case) -> Assumption:
     """Positions, rates and accelerations at many instants, move by move."""
     path = jax.tree.map(np.asarray, case.path)
     pauses = np.broadcast_to(path.dwell, path.move_time.shape)
@@ -63,12 +63,12 @@ def _path(study: Study, case: Case) -> Row:
         wanted = wanted + (path.waypoints[:-1, None] if order == 0 else 0.0)
         if wanted.size:
             worst = max(worst, largest(mine, wanted.reshape(-1, 3)))
-    return Row(
-        "reference trajectory, its rates and accelerations",
-        f"(25) move by move ({study.motion.profile})",
-        "Zhang, Mills and Cleghorn 2016",
-        worst,
-        1e-9,
+    return Assumption(
+        assumption="reference trajectory, its rates and accelerations",
+        against=f"(25) move by move ({study.motion.profile})",
+        source="Zhang, Mills and Cleghorn 2016",
+        difference=worst,
+        allowed=1e-9,
         left_out="" if len(path.waypoints) > 1 else "the study does not move",
     )
 
@@ -91,7 +91,7 @@ def _vibration(amplitude: Any, time: Any, omega: Any, zeta: float) -> np.ndarray
     return np.abs(np.sum(amplitude * np.exp(pole * (last - time)), axis=1))
 
 
-def _no_vibration() -> Row:
+def _no_vibration() -> Assumption:
     """ZV, ZVD, ZVDD: no vibration at their mode, and none of its derivatives."""
     impulses = jax.tree.map(np.asarray, _shapers(_OMEGA, _ZETA, 0.0))
     worst, step = 0.0, 1e-3
@@ -100,16 +100,16 @@ def _no_vibration() -> Row:
         at, near = _vibration(amplitude, time, np.array([1.0, 1 + step]) * _OMEGA, _ZETA)
         # near the mode, V grows with the power of its zero: pi/2 step for each
         worst = max(worst, at, abs(amplitude.sum() - 1), near - 1.05 * (np.pi / 2 * step) ** order)
-    return Row(
-        "ZV, ZVD and ZVDD shapers leave no vibration, their order of zero",
-        "free responses of a damped oscillator",
-        "Singer and Seering 1990",
-        worst,
-        1e-9,
+    return Assumption(
+        assumption="ZV, ZVD and ZVDD shapers leave no vibration, their order of zero",
+        against="free responses of a damped oscillator",
+        source="Singer and Seering 1990",
+        difference=worst,
+        allowed=1e-9,
     )
 
 
-def _insensitivity() -> Row:
+def _insensitivity() -> Assumption:
     """Bands with less than 5 % vibration, and the sum of amplitudes."""
     impulses = jax.tree.map(np.asarray, _shapers(_OMEGA, 0.0, _TOLERANCE))
     ratio, worst = np.linspace(0.2, 1.8, 8001), 0.0
@@ -118,12 +118,12 @@ def _insensitivity() -> Row:
         level = _vibration(amplitude, time, ratio * _OMEGA, 0.0)
         found = np.count_nonzero(level <= _TOLERANCE * (1 + 1e-9)) * (ratio[1] - ratio[0])
         worst = max(worst, abs(found - width) / width, abs(amplitude.sum() - 1))
-    return Row(
-        "insensitivity of ZV, ZVD, ZVDD, EI, two- and three-hump EI shapers",
-        "published bands of 5 % vibration",
-        "Singhose 1996; Vaughan et al. 2008",
-        worst,
-        0.01,
+    return Assumption(
+        assumption="insensitivity of ZV, ZVD, ZVDD, EI, two- and three-hump EI shapers",
+        against="published bands of 5 % vibration",
+        source="Singhose 1996; Vaughan et al. 2008",
+        difference=worst,
+        allowed=0.01,
     )
 
 
@@ -132,7 +132,7 @@ def _taps_of(structure: Structure, case: Case) -> Taps:
     return prepare(structure, case).taps
 
 
-def _taps(study: Study, structure: Structure, case: Case) -> Row:
+def _taps(study: Study, structure: Structure, case: Case) -> Assumption:
     """The study's shaper on its sample grid, against its impulses at their own instants."""
     taps = jax.tree.map(np.asarray, _taps_of(structure, case))
     shaper, time = study.shaper, taps.sample * float(case.electronics.period)
@@ -145,13 +145,13 @@ def _taps(study: Study, structure: Structure, case: Case) -> Row:
         instant = np.add.outer(instant, more[1]).ravel()
     zeta = shaper.damping_ratio
     left = _vibration(taps.weight, time, omega, zeta) - _vibration(amplitude, instant, omega, zeta)
-    return Row(
-        f"the study's shaper ({shaper.kind}) on its sample grid",
-        "free responses to its impulses off the grid",
-        "Murphy and Watanabe 1992",
-        max(abs(taps.weight.sum() - 1), float(np.abs(left).max())),
-        5e-3,
-        left_out="" if shaper.kind != "none" else "shaper.kind is none",
+    return Assumption(
+        assumption=f"the study's shaper ({shaper.kind}) on its sample grid",
+        against="free responses to its impulses off the grid",
+        source="Murphy and Watanabe 1992",
+        difference=max(abs(taps.weight.sum() - 1), float(np.abs(left).max())),
+        allowed=5e-3,
+        left_out="" if SHAPERS[shaper.kind].length > 1 else "there is no shaper",
     )
 
 
