@@ -18,6 +18,7 @@ HASH = "0f" * 32
 OWN = {
     "program": [f"program-{HASH}"],
     "data": [f"data-{HASH}"],
+    "passport": [f"passport-{HASH}"],
     "kernel": [f"kernel-{HASH}", f".kernel-{HASH}.0a1b2c3d.tmp"],
     "xla": [f"jit__lambda_-{HASH}-cache", f"jit_simulate-{HASH}-atime"],
 }
@@ -47,10 +48,10 @@ def test_kept_programs_are_counted_and_removed(capsys, folder):
     assert code == 0 and f"folder: {folder}\n" in out and "in all" in out
     found = cache_contents()
     assert {x.kind: x.files for x in found.kinds} == {k: len(names) for k, names in OWN.items()}
-    assert (found.folder, found.files, found.bytes) == (str(folder), 6, 6000)
+    assert (found.folder, found.files, found.bytes) == (str(folder), 7, 7000)
     code, out, _ = run(capsys, "cache", "--clear", "--json")
     kinds = json.loads(out)["kinds"]
-    assert code == 0 and sum(x["files"] for x in kinds) == 6 and kinds[0]["bytes"] == 2000
+    assert code == 0 and sum(x["files"] for x in kinds) == 7 and kinds[0]["bytes"] == 2000
     assert {path.name for path in folder.iterdir()} == LEFT
     assert (folder.parent / "precious").exists()
     code, out, _ = run(capsys, "cache", "--clear")
@@ -59,7 +60,7 @@ def test_kept_programs_are_counted_and_removed(capsys, folder):
 
 def test_programs_of_others_in_a_shared_folder_are_left(capsys, folder, monkeypatch):
     monkeypatch.setenv(VARIABLE, str(folder))
-    assert cache_contents().files == 6
+    assert cache_contents().files == 7
     code, out, _ = run(capsys, "cache", "--clear")
     assert code == 0 and f"{VARIABLE} names a folder where other programs" in out
     assert {path.name for path in folder.iterdir()} == {*LEFT, *OWN["xla"]}
@@ -99,7 +100,7 @@ def test_a_file_that_vanishes_meanwhile_is_not_missed(folder, monkeypatch):
 
     monkeypatch.setattr(cache.os, "scandir", slow)
     found = {x.kind: x.files for x in cache_contents(is_cleared=True).kinds}
-    assert found == {"program": 0, "data": 1, "kernel": 2, "xla": 2}
+    assert found == {"program": 0, "data": 1, "kernel": 2, "xla": 2, "passport": 1}
 
 
 def test_clearing_beside_processes_that_keep_and_take(folder, monkeypatch):

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxmodel import dynamics
 from jaxmodel.bases import find_bases
-from jaxmodel.beam import ModalBasis
+from jaxmodel.beam import BASES, ModalBasis
 from jaxmodel.case import Case, Structure
 from jaxmodel.kinematics import path_status
 from jaxmodel.loop import Loop
@@ -59,33 +59,39 @@ def _undamped(machine: Machine) -> Machine:
 
 def _accelerations(study: Study, structure: Structure, case: Case) -> list[Assumption]:
     """At random states around the way-points, bent by up to 1 % and as fast as fast moves."""
-    basis, plant, _ = jax.tree.map(np.asarray, _parts(structure, case))
-    states = _random_states(study, plant, structure.n_modes)
-    found, wanted, open_by = map(np.asarray, _both(case.machine, basis, plant, states))
-    length = float(np.max(case.machine.beam.length))
-    against = "the Lagrangian, by automatic differentiation"
+    forms = {"lumped": False}
+    if structure.has_shortening and BASES[structure.basis].is_on_chord:
+        forms["distributed"] = True
+    worst, open_by = {}, 0.0
+    for name, is_distributed in forms.items():
+        form = structure._replace(is_distributed=is_distributed)
+        basis, plant, _ = jax.tree.map(np.asarray, _parts(form, case))
+        states = _random_states(study, plant, structure.n_modes)
+        found, wanted, gaps = map(np.asarray, _both(case.machine, basis, plant, states))
+        parts = slice(3), slice(3, None)
+        pairs = [(row[p], true[p]) for row, true in zip(found, wanted, strict=True) for p in parts]
+        worst[name] = max(largest(row, true) for row, true in pairs)
+        open_by = max(open_by, float(gaps.max()))
     coupled = "" if structure.is_coupled else "run.model is ked"
-    parts = slice(3), slice(3, None)
-    worst = max(
-        largest(row[p], true[p]) for row, true in zip(found, wanted, strict=True) for p in parts
-    )
-    return [
+    rows = [
         Assumption(
-            assumption="accelerations of platform and modes (1)-(9)",
-            against=f"{against}, {_STATES} random states of this machine",
+            assumption=f"accelerations of platform and modes (1)-(9), {name} axial inertia",
+            against=f"the Lagrangian differentiated, {_STATES} random states of this machine",
             source="Lagrange 1788; Kane and Levinson 1985",
-            difference=worst,
+            difference=difference,
             allowed=1e-9,
             left_out=coupled,
-        ),
-        Assumption(
-            assumption="closure of slider, bent link and platform (6)",
-            against="both ways to the joints, over the link's length",
-            source="Zhang, Mills and Cleghorn 2016",
-            difference=float(open_by.max() / length),
-            allowed=1e-12,
-        ),
+        )
+        for name, difference in worst.items()
     ]
+    closure = Assumption(
+        assumption="closure of slider, bent link and platform (6)",
+        against="both ways to the joints, over the link's length",
+        source="Zhang, Mills and Cleghorn 2016",
+        difference=open_by / float(np.max(case.machine.beam.length)),
+        allowed=1e-12,
+    )
+    return [*rows, closure]
 
 
 def _random_states(study: Study, plant: Plant, n_modes: int) -> tuple[RigidState, Loads]:

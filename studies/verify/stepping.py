@@ -75,7 +75,9 @@ def _step(
         rho, rate = inverse_kinematics(loop.plant, sample.position, sample.velocity * is_moving)
         wrench = case.load.wrench if structure.has_wrench else None
         force = jnp.zeros(3) if structure.has_feedforward or structure.has_wrench else None
-        return Reference(rho, rate, force, jnp.zeros(3), wrench)
+        return Reference(
+            rho=rho, rho_rate=rate, feedforward=force, disturbance=jnp.zeros(3), wrench=wrench
+        )
 
     voltage = jnp.zeros((3, structure.n_patches))
 
@@ -98,7 +100,8 @@ def _at_rest(structure: Structure, case: Case, q: np.ndarray) -> PlantState:
     zero, still = np.zeros((3, structure.n_modes)), np.zeros(3)
     bent = zero.copy()
     bent[:, 0] = q
-    return PlantState(np.asarray(case.path.waypoints[0], float), still, bent, zero, zero, zero)
+    pose = np.asarray(case.path.waypoints[0], float)
+    return PlantState(pose=pose, pose_rate=still, q=bent, q_rate=zero, z=zero, z_rate=zero)
 
 
 def _energy(study: Study) -> Assumption:

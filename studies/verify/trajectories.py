@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
 from jaxmodel.motion import Path, sample_path
 from jaxmodel.prepare import prepare
@@ -165,4 +166,4 @@ def _shaped_frequencies(study: Study) -> tuple[float, ...]:
         if all(row and row[0] > 0 for row in rows):
             return (float(np.mean([row[0] for row in rows])),)
     nominal = study.change(link__stiffness_factor=1.0)
-    return (float(first_frequency(nominal, study.control.basis == "loaded").mean()),)
+    return (float(first_frequency(nominal, BASES[study.control.basis].has_joints).mean()),)
