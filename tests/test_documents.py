@@ -203,6 +203,7 @@ def test_a_schema_refuses_a_wrong_unit_of_nesting():
     whole = {"format": "flexlink-best", "format_version": 1, "by": "residual_rms"}
     whole |= {"direction": "smallest", "subject_to": "", "without_control": None, "cases": [case]}
     whole |= {"units": {"residual_rms": "m"}, "left_out": [], "warnings": []}
+    whole |= {"environments": [], "over": "worst"}
     jsonschema.validate(whole, rules)
     for change in ({"case": -1}, {"case": "1"}, {"case_id": 3}, {"residual_rms": {"um": 1}}):
         wrong = copy.deepcopy(whole)

@@ -14,7 +14,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from studies.errors import StudyError, field_error
 from studies.reading import check_depth
@@ -71,6 +71,15 @@ class Sweep(Block):
     seed: int = described(0, "1", "of the sampling methods", ge=0, le=10**9)
     metrics: tuple[str, ...] = described((), "-", "metrics to keep; empty: all")
     by: str = described("residual_rms", "-", "metric, or entry of one, that cases are ranked by")
+    environments: tuple[str, ...] = described(
+        (),
+        "-",
+        "axes that a design meets rather than chooses, such as its payload: cases that differ in "
+        "them alone are one design, ranked over all of them",
+    )
+    over: Literal["worst", "mean"] | Annotated[float, Field(gt=0, le=1)] = described(
+        "worst", "-", "how: by the worst case, the mean, or a quantile (1 is the worst)"
+    )
     fidelity: Literal["full", "linear"] = described(
         "full", "-", "model of the runs; linear: mechanics linearised at the last way-point"
     )
@@ -159,7 +168,7 @@ def _tuples(data: Any) -> Any:
     """Lists of blocks and cases as tuples; their contents are checked where they are used."""
     if not isinstance(data, dict):
         return data
-    listed = ("blocks", "cases", "metrics")
+    listed = ("blocks", "cases", "environments", "metrics")
     return {k: tuple(v) if k in listed and isinstance(v, list) else v for k, v in data.items()}
 
 

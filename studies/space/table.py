@@ -7,14 +7,15 @@ from the study's seed and the id. Both are thus the same in any sweep that conta
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from typing import Any
 
 import numpy as np
 
-from studies.errors import StudyError, field_error
-from studies.space.axes import ALIASES, LIMIT, READY_MADE
+from studies.errors import StudyError, field_error, nearest
+from studies.space.axes import ALIASES, LABELS, LIMIT, READY_MADE, SHOWN_AS
 from studies.space.condition import evaluate
 from studies.space.designs import length, spread
 from studies.space.spec import SweepSpec
@@ -72,6 +73,26 @@ class CaseTable:
         )
 
 
+def environment_columns(names: Iterable[str], columns: Iterable[str]) -> set[str]:
+    """Columns of the axes that `sweep.environments` names, their labels and entries.
+
+    Raises:
+        StudyError: a name of no axis.
+    """
+    found: set[str] = set()
+    for name in names:
+        stands_for = {name, LABELS.get(name, name), SHOWN_AS.get(name, name)}
+        own = {x for x in columns if x in stands_for or x.startswith(f"{name}[")}
+        own |= {label for label, field in LABELS.items() if field in own and label in columns}
+        if not own:
+            known = [x for x in columns if x not in LABELS.values()]
+            raise field_error(
+                "sweep.environments", name, ", ".join(known), hint=nearest(name, known)
+            )
+        found |= own
+    return found
+
+
 def build_table(spec: SweepSpec) -> CaseTable:
     """Expand a sweep into its cases.
 
@@ -79,6 +100,7 @@ def build_table(spec: SweepSpec) -> CaseTable:
         StudyError: a bad axis or condition, no case left, columns that do not fit one program.
     """
     columns = spread(spec.root, spec.study, spec.sweep.seed)
+    environment_columns(spec.sweep.environments, columns)
     _check_shapes(columns)
     _check_samples(spec.study, columns)
     _check_moves(spec.study, columns)

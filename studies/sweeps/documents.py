@@ -72,6 +72,8 @@ def best_document(data: SweepData, by: str, subject_to: str = "", count: int = 1
         "direction": direction(by),
         "subject_to": subject_to,
         "without_control": uncontrolled_value(data, name),
+        "environments": list(data.spec.sweep.environments),
+        "over": str(data.spec.sweep.over),
         "cases": case_records(data, cases, metrics),
         "units": units(data, [*swept_names(data), *metrics]),
         "left_out": [x for x in status_records(data) if x["status"] != status.OK],

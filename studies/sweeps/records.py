@@ -14,6 +14,7 @@ import numpy as np
 from jaxmodel import status
 from studies.engine.columns import NOT_RUN, PER_CASE
 from studies.engine.results import SweepData, metric_values, swept_names
+from studies.sweeps.environments import design_values
 
 #: Names and values of one row.
 Record = dict[str, Any]
@@ -37,12 +38,12 @@ def case_records(data: SweepData, cases: np.ndarray, metrics: Iterable[str]) -> 
         metrics: or entries of them.
 
     Returns:
-        By case: its number, its whole id, each axis and each metric.
+        By case: its number, its whole id, each axis and each metric, see `design_values`.
 
     Raises:
         StudyError: unknown metric.
     """
-    values = {name: metric_values(data, name) for name in metrics}
+    values = {name: design_values(data, name) for name in metrics}
     axes = {name: data[name] for name in swept_names(data)}
     return [
         {"case": int(k), "case_id": str(data["case_id"][k])}

@@ -32,6 +32,15 @@ from studies.show.units import headed, readable, settling_text
 from studies.study.entries import links_text
 from studies.study.margin import ENOUGH, margin_text
 from studies.study.resolution import is_deflection, least_step, resolution_text
+from studies.sweeps.environments import (
+    design_values,
+    environments_text,
+    has_environments,
+    one_each,
+    over_environments,
+    over_text,
+    whole_designs,
+)
 from studies.sweeps.records import (
     MARGIN,
     Record,
@@ -92,7 +101,9 @@ def best_cases(
 
     Returns:
         A row per case, with its id, what varies, the metric, peak voltage, damping and gain margin,
-        in SI units under their names in the sweep file. The index is the number of the case.
+        in SI units under their names in the sweep file. The index is the number of the case. With
+        `sweep.environments`, a row per design with its metrics over them (`sweep.over`), under the
+        case nearest to that.
 
     Raises:
         StudyError: an argument that is none, unknown metric, or no case left.
@@ -110,7 +121,7 @@ def best_cases(
     if text:
         warnings.warn(text, ResolutionWarning, stacklevel=2)
     columns = {"case_id": data["case_id"], **dict(scalar_columns(data))}
-    columns |= {metric: metric_values(data, metric) for metric in with_others(data, [name])}
+    columns |= {metric: design_values(data, metric) for metric in with_others(data, [name])}
     table = {key: column[cases] for key, column in columns.items()}
     return pandas.DataFrame(table, index=pandas.Index(cases, name="case"))
 
@@ -121,11 +132,17 @@ def ranked_cases(data: SweepData, by: str, subject_to: str = "", count: int = 10
     value = metric_values(data, name)
     if value.dtype.kind not in "fiub":
         raise StudyError(f"--by {by}: a text, not a number")
-    chosen = np.flatnonzero(select(data, subject_to) & np.isfinite(value))
+    chosen = np.flatnonzero(whole_designs(data, select(data, subject_to) & np.isfinite(value)))
+    of_all = "in each of its environments" if has_environments(data) else ""
+    what = "design" if of_all else "case"
     if len(chosen) == 0 and subject_to:
-        raise StudyError(f"--subject-to {subject_to!r}: no case with status ok meets it")
+        raise StudyError(
+            f"--subject-to {subject_to!r}: no {what} with status ok meets it {of_all}".rstrip()
+        )
     if len(chosen) == 0:
-        raise StudyError(f"--by {by}: no case with status ok has this metric")
+        raise StudyError(f"--by {by}: no {what} with status ok has this metric {of_all}".rstrip())
+    if has_environments(data):
+        chosen, value = one_each(data, by, chosen), over_environments(data, by)
     return chosen[np.argsort(-value[chosen] if is_large else value[chosen], kind="stable")][:count]
 
 
@@ -183,6 +200,8 @@ def _print_failed(data: SweepData, console: Console) -> None:
 
 def print_cases(data: SweepData, cases: np.ndarray, metrics: list[str], console: Console) -> None:
     """Print `case_rows`, and any warnings."""
+    if text := environments_text(data):
+        console.print(text, soft_wrap=True)
     print_rows(case_rows(data, cases, metrics), console)
     note = mark_note(data, cases, metrics[0])
     if note:
@@ -250,7 +269,9 @@ def _step_share(data: SweepData) -> np.ndarray:
 
 def margin_warning(data: SweepData, cases: np.ndarray) -> str:
     """Warning if cases have a gain margin below `ENOUGH`, "" if none has."""
-    margin = data[MARGIN][cases] if MARGIN in data.variables else np.full(len(cases), np.nan)
+    margin = np.full(len(cases), np.nan)
+    if MARGIN in data.variables:
+        margin = design_values(data, MARGIN)[cases]
     low = int(np.sum(margin < ENOUGH))
     if not low:
         return ""
@@ -272,7 +293,9 @@ def case_rows(data: SweepData, cases: np.ndarray, metrics: list[str]) -> Rows:
             numbers[0] += f" {MARK}"
         cells = (short_value(record[name]) for name in names)
         rows.append([*_identity(record), *cells, *numbers])
-    return Rows(["case", "id", *(label(data, x) for x in (*names, *metrics))], rows)
+    how = f"{over_text(data)} " if has_environments(data) else ""
+    measured = (f"{how}{label(data, x)}" for x in metrics)
+    return Rows(["case", "id", *(label(data, x) for x in names), *measured], rows)
 
 
 def _identity(record: Record) -> tuple[str, str]:
