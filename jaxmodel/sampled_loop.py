@@ -75,16 +75,10 @@ def loop_matrices(
     smooth = structure._replace(is_smooth=True, feedback="sampled")
     plant = linearise(smooth, loop, pose, moment)
     analogue = _with_electronics(smooth, plant, case)
-    n, n_inputs = analogue.enters.shape
-    held = jnp.zeros((n + n_inputs,) * 2, analogue.state.dtype)
-    held = held.at[:n, :n].set(analogue.state).at[:n, n:].set(analogue.enters)
-    # balance velocities against positions, or scaling costs the exponential digits
-    scale = jnp.concatenate([analogue.size, jnp.full((n_inputs,), 1e6)])
-    exact = jax.scipy.linalg.expm(held / scale[:, None] * scale * case.electronics.period)
-    exact = (exact * scale[:, None] / scale)[:n]
+    exact = _over_a_sample(analogue, case.electronics.period)
     from jax.flatten_util import ravel_pytree
 
-    n_sensors = 3 * structure.n_patches
+    n, n_sensors = len(exact), 3 * structure.n_patches
     rest, unpack = ravel_pytree(rest_controller(law))
 
     def advance(x: Array, factor: Array) -> Array:
@@ -114,6 +108,46 @@ def loop_matrices(
     )
 
 
+class SampledPlant(NamedTuple):
+    """What a controller acts on: x[k+1] = A x[k] + B u[k], y[k] = C x[k], over one sample.
+
+    u are commands of the actuators [V], y what the converters see [V], link by link, patch by
+    patch. Hold, amplifiers, anti-alias filter and the sample of computing delay are part of it; the
+    state is that of `LoopMatrices` without its controller, and last the commands that are held.
+    """
+
+    state: Array  # A, (n, n)
+    enter: Array  # B, (n, 3 K)
+    leave: Array  # C, (3 K, n)
+
+
+def sampled_plant(structure: Structure, case: Case, pose: Array) -> SampledPlant:
+    """The plant that a controller designed elsewhere acts on, at rest under the steady load.
+
+    Args:
+        structure: static choices.
+        case: the numbers.
+        pose: where to linearise [m, m, rad], (3,).
+
+    Returns:
+        SampledPlant.
+    """
+    smooth = structure._replace(is_smooth=True, feedback="sampled")
+    loop = prepare(smooth, case).loop
+    analogue = _with_electronics(
+        smooth, linearise(smooth, loop, pose, resting(structure, case)), case
+    )
+    exact = _over_a_sample(analogue, case.electronics.period)
+    n, n_sensors = len(exact), 3 * structure.n_patches
+    eye = jnp.eye(n_sensors, dtype=exact.dtype)
+    held = jnp.pad(exact[:, : n + n_sensors], ((0, n_sensors), (0, 0)))
+    return SampledPlant(
+        state=held,
+        enter=jnp.pad(eye, ((n, 0), (0, 0))),
+        leave=jnp.zeros((n_sensors, n + n_sensors), exact.dtype).at[:, analogue.filtered].set(eye),
+    )
+
+
 class _Analogue(NamedTuple):
     """Plant and electronics between two samples."""
 
@@ -122,6 +156,17 @@ class _Analogue(NamedTuple):
     filtered: slice  # of the state: what the converters see
     voltage: slice | None  # of the state: on the actuators; None: the command itself
     size: Array  # typical size of each entry of the state, (n,)
+
+
+def _over_a_sample(analogue: _Analogue, period: Array) -> Array:
+    """Exact transition over a sample with held commands and forces, (n, n + 3 K + 3)."""
+    n, n_inputs = analogue.enters.shape
+    held = jnp.zeros((n + n_inputs,) * 2, analogue.state.dtype)
+    held = held.at[:n, :n].set(analogue.state).at[:n, n:].set(analogue.enters)
+    # balance velocities against positions, or scaling costs the exponential digits
+    scale = jnp.concatenate([analogue.size, jnp.full((n_inputs,), 1e6)])
+    exact = jax.scipy.linalg.expm(held / scale[:, None] * scale * period)
+    return (exact * scale[:, None] / scale)[:n]
 
 
 def _with_electronics(structure: Structure, plant: LinearPlant, case: Case) -> _Analogue:

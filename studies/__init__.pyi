@@ -19,6 +19,7 @@ from .fitting.run import run_fit
 from .fitting.spec import load_fit
 from .paper.run import run_paper
 from .show.document import schema
+from .single.plant import plant_of, write_plant
 from .single.run import replay, simulate
 from .space.spec import load_sweep, parse_sweep
 from .spillover.run import spillover_design
@@ -67,6 +68,7 @@ __all__ = [
     "parse_study",
     "parse_sweep",
     "parse_tuning",
+    "plant_of",
     "plot",
     "replay",
     "run_atlas",
@@ -81,6 +83,7 @@ __all__ = [
     "spillover_design",
     "status_rows",
     "verify_study",
+    "write_plant",
     "write_study",
     "write_sweep_report",
 ]

@@ -122,6 +122,27 @@ def add_commands(app: typer.Typer, console: Console) -> None:
             table.add_row(str(row["mode"]), *numbers, row["description"])
         console.print(table)
 
+    @app.command()
+    def plant(
+        design: Annotated[Path, typer.Argument(help="study file, folder of a tuning or a sweep")],
+        out: Annotated[Path, typer.Option(help="NPZ, MAT or JSON file")],
+        case: Annotated[
+            str | None, typer.Option(help="case number, or id: and digits of the case's id")
+        ] = None,
+    ) -> None:
+        """Write the sampled linear plant of a design, for a controller designed elsewhere."""
+        start()
+        from studies.engine.design import load_design
+        from studies.single.plant import plant_of, write_plant
+
+        found = plant_of(load_design(design, case).study)
+        write_plant(found, out)
+        console.print(
+            f"{len(found.a)} states, {len(found.inputs)} actuators to {len(found.outputs)} "
+            f"sensors, {1e6 * found.sample_time:g} µs a sample; written: {out}",
+            soft_wrap=True,
+        )
+
 
 def _print_run(run: Run, twin: Run | None, console: Console) -> None:
     """Print status, link metrics and stability; twin: the same run without control."""
