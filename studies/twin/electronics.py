@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from studies.twin.plan import Electronics
+from studies.twin.plan import SignalPath
 
 
 class FilterStep(NamedTuple):
@@ -18,7 +18,7 @@ class FilterStep(NamedTuple):
     after: np.ndarray  # of that at its end, (3,)
 
 
-def filter_step(electronics: Electronics, step: float) -> FilterStep:
+def filter_step(electronics: SignalPath, step: float) -> FilterStep:
     """A patch drained by its amplifier's input, and the anti-alias filter behind it.
 
     s' = omega_h (u - s), z'' = omega_f^2 (u - s - z) - sqrt(2) omega_f z'; the exponential of it
@@ -42,7 +42,7 @@ def filter_step(electronics: Electronics, step: float) -> FilterStep:
 class SensorFilter:
     """All sensors' analogue chains, from rest."""
 
-    def __init__(self, electronics: Electronics, step: float, shape: tuple[int, ...]) -> None:
+    def __init__(self, electronics: SignalPath, step: float, shape: tuple[int, ...]) -> None:
         self._step = filter_step(electronics, step)
         self._state = np.zeros((3, *shape))
         self._last = np.zeros(shape)
@@ -55,6 +55,11 @@ class SensorFilter:
         self._state[2] = 0.0
         self._last = voltage
 
+    @property
+    def present(self) -> np.ndarray:
+        """Filtered voltages [V]."""
+        return np.array(self._state[1])
+
     def advance(self, voltage: np.ndarray) -> np.ndarray:
         """Filtered voltages [V] at the end of a step, from those of the patches there."""
         own = self._step
@@ -62,4 +67,4 @@ class SensorFilter:
         self._state += np.multiply.outer(own.before, self._last)
         self._state += np.multiply.outer(own.after, voltage)
         self._last = voltage
-        return self._state[1]
+        return self.present

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmodel.beam import BASES
 from jaxmodel.case import Case, Structure
 from jaxmodel.parameters import Beam, Damping, Patches
 from jaxmodel.piezo import actuator_constant, patch_ends, sensor_constant
@@ -20,7 +21,7 @@ from jaxmodel.static import link_pieces, section_stiffness
 SAME_CUT = 1e-6
 
 
-class Section(NamedTuple):
+class LinkSections(NamedTuple):
     """Constant data of the pieces of one link, (n,) each, from the slider to the platform."""
 
     right: np.ndarray  # where a piece ends [m]
@@ -33,7 +34,7 @@ class Link(NamedTuple):
     """One flexible link, its patches and its damping."""
 
     length: float  # [m]
-    section: Section
+    sections: LinkSections
     joint_inertia: tuple[float, float]  # J_B, J_C at its ends [kg m2]
     sensor_ends: np.ndarray  # from the slider joint [m], (K, 2)
     actuator_ends: np.ndarray  # [m], (K, 2)
@@ -50,7 +51,7 @@ class Guide(NamedTuple):
     slider_mass: float  # [kg]
 
 
-class Platform(NamedTuple):
+class PlatformBody(NamedTuple):
     """The rigid platform with its payload."""
 
     mass: float  # [kg]
@@ -64,20 +65,20 @@ class MachineData(NamedTuple):
 
     guides: tuple[Guide, ...]
     links: tuple[Link, ...]
-    platform: Platform
+    platform: PlatformBody
     is_locked: bool  # sliders held
 
 
 def describe_machine(structure: Structure, case: Case) -> MachineData:
     """Plain numbers of a case's machine.
 
-    Patches count as mass and stiffness where the plant's basis is `loaded`, as in the study.
+    Patches count as mass and stiffness where they do in the modal basis of the plant.
 
     Args:
         structure: static choices.
         case: the numbers.
     """
-    has_patches = structure.basis == "loaded"
+    has_patches = BASES[structure.basis].has_patches
     return MachineData(
         guides=tuple(_guide(case, i) for i in range(3)),
         links=tuple(_link(case, i, has_patches) for i in range(3)),
@@ -103,7 +104,7 @@ def _guide(case: Case, i: int) -> Guide:
     )
 
 
-def _platform(case: Case) -> Platform:
+def _platform(case: Case) -> PlatformBody:
     masses, geometry = case.machine.masses, case.machine.geometry
     own, payload = (float(np.asarray(x)) for x in (masses.platform_mass, masses.payload_mass))
     offset = np.zeros(2) if masses.payload_offset is None else np.asarray(masses.payload_offset)
@@ -113,7 +114,7 @@ def _platform(case: Case) -> Platform:
     psi = np.array([_each(geometry.joint_angle, i) for i in range(3)])
     radius = np.array([_each(geometry.joint_radius, i) for i in range(3)])
     joints = radius[:, None] * np.stack([np.cos(psi), np.sin(psi)], axis=1)
-    return Platform(own + payload, inertia + apart, center, joints)
+    return PlatformBody(own + payload, inertia + apart, center, joints)
 
 
 def _link(case: Case, i: int, has_patches: bool) -> Link:
@@ -123,7 +124,7 @@ def _link(case: Case, i: int, has_patches: bool) -> Link:
     damping = case.machine.damping
     return Link(
         length=beam.length,
-        section=_section(beam, patches, has_patches),
+        sections=_sections(beam, patches, has_patches),
         joint_inertia=(beam.joint_inertia_b, beam.joint_inertia_c) if has_patches else (0.0, 0.0),
         sensor_ends=_ends(patches, patches.sensor_length, beam.length),
         actuator_ends=_ends(patches, patches.actuator_length, beam.length),
@@ -141,7 +142,7 @@ def _ends(patches: Patches, size: float, length: float) -> np.ndarray:
     return np.clip(np.stack(patch_ends(patches.center, size), axis=1), 0.0, length)
 
 
-def _section(beam: Beam, patches: Patches, has_patches: bool) -> Section:
+def _sections(beam: Beam, patches: Patches, has_patches: bool) -> LinkSections:
     pieces = link_pieces(beam, patches._replace(center=jnp.asarray(patches.center)))
     bending = section_stiffness(beam, patches, pieces, has_patches)
     covers = np.asarray(jnp.sum(pieces.has_sensor + pieces.has_actuator, axis=0))
@@ -151,7 +152,7 @@ def _section(beam: Beam, patches: Patches, has_patches: bool) -> Section:
     line_mass = beam.density * area + patches.density * patch_area * covers
     left, right = np.asarray(pieces.left), np.asarray(pieces.right)
     is_there = right - left > SAME_CUT * beam.length
-    return Section(
+    return LinkSections(
         right=right[is_there],
         bending=np.asarray(bending)[is_there],
         axial=axial[is_there],

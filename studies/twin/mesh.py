@@ -57,16 +57,16 @@ def mesh_link(link: Link, n_elements: int) -> Mesh:
     size = link.length / n_elements * (1 + SAME_CUT)
     parts = [np.linspace(a, b, int(np.ceil((b - a) / size)) + 1)[:-1] for a, b in pairwise(cuts)]
     x = np.append(np.concatenate(parts), link.length)
-    piece = np.searchsorted(link.section.right, (x[1:] + x[:-1]) / 2)
+    piece = np.searchsorted(link.sections.right, (x[1:] + x[:-1]) / 2)
 
     def node(place: np.ndarray | float) -> np.ndarray:
         return np.abs(x - np.asarray(place)[..., None]).argmin(axis=-1)
 
     return Mesh(
         x=x,
-        bending=link.section.bending[piece],
-        axial=link.section.axial[piece],
-        line_mass=link.section.line_mass[piece],
+        bending=link.sections.bending[piece],
+        axial=link.sections.axial[piece],
+        line_mass=link.sections.line_mass[piece],
         middle=int(node(middle)),
         sensor_nodes=node(link.sensor_ends),
         actuator_nodes=node(link.actuator_ends),

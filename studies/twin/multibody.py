@@ -27,8 +27,14 @@ SliderForce = Callable[[int, float, float, float], float]
 class Settings(NamedTuple):
     """Resolution of the twin."""
 
-    n_elements: int = 40  # per link, at least
+    n_elements: int = 20  # per link, at least
     axial_factor: float = 1.0  # on E A of the links [1]
+    n_steps: int = 0  # of the integrator in a sample, even; 0: of about `STEP`
+
+
+DEFAULT = Settings()
+#: Length of a step [s].
+STEP = 1e-5
 
 
 class Model(NamedTuple):
@@ -45,7 +51,7 @@ class Model(NamedTuple):
     rho_start: np.ndarray  # [m], (3,)
     moments: tuple[dict[int, int], ...]  # load number of each node with a patch end, by link
     platform_loads: tuple[int, int]  # numbers of force and moment at the reference point
-    platform_center: np.ndarray  # see `machine.Platform`
+    platform_center: np.ndarray  # see `machine.PlatformBody`
 
 
 def load_exudyn() -> Any:
@@ -92,7 +98,7 @@ def build_model(
     machine: MachineData,
     pose: np.ndarray,
     force: SliderForce | None,
-    settings: Settings = Settings(),  # noqa: B008
+    settings: Settings = DEFAULT,
 ) -> Model:
     """Assemble the machine at rest with straight links.
 

@@ -11,23 +11,12 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxmodel.case import Case, Structure
+from jaxmodel.case import Case, Drive, Structure
 from jaxmodel.simulate import begin
 from studies.engine.programs import kept_jit
 
 
-class Drive(NamedTuple):
-    """Slider drives and friction, (3,) each; see `jaxmodel.drive`."""
-
-    kp: list[float]  # [N/m]
-    kd: list[float]  # [N s/m]
-    force_limit: list[float]  # [N]
-    coulomb_friction: list[float]  # [N]
-    friction_speed: list[float]  # [m/s]
-    viscous_friction: list[float]  # [N s/m]
-
-
-class Electronics(NamedTuple):
+class SignalPath(NamedTuple):
     """Analogue and converter data."""
 
     period: float  # of a sample [s]
@@ -41,7 +30,7 @@ class Electronics(NamedTuple):
     adc_noise: float  # rms at the ADC's input [V]
 
 
-class Plan(NamedTuple):
+class TwinPlan(NamedTuple):
     """A run of N samples with n steps each, N n + 1 instants."""
 
     n_samples: int
@@ -54,8 +43,8 @@ class Plan(NamedTuple):
     wrench: np.ndarray  # on the platform, held over a sample [N, N, N m], (N, 3)
     noise: np.ndarray | None  # of the ADC, standard normal, (N, 3, K)
     command_end: float  # when the shaped reference trajectory ends [s]
-    drive: Drive
-    electronics: Electronics
+    drive: Drive  # NumPy arrays
+    electronics: SignalPath
 
     @property
     def step(self) -> float:
@@ -63,8 +52,8 @@ class Plan(NamedTuple):
         return self.electronics.period / self.n_steps
 
 
-def plan_run(structure: Structure, case: Case, n_steps: int, after: float) -> Plan:
-    """Plan of a case's motion.
+def plan_run(structure: Structure, case: Case, n_steps: int, after: float) -> TwinPlan:
+    """TwinPlan of a case's motion.
 
     Args:
         structure: static choices, feedback "sampled".
@@ -80,8 +69,7 @@ def plan_run(structure: Structure, case: Case, n_steps: int, after: float) -> Pl
     count = min(round((end + after) / period) + 1, structure.n_steps)
     wrench = inputs.wrench if inputs.wrench is not None else np.zeros((count, 3))
     noise = inputs.adc_noise
-    drive = {name: getattr(loop.drive, name).tolist() for name in Drive._fields}
-    return Plan(
+    return TwinPlan(
         n_samples=count,
         n_steps=n_steps,
         pose=np.asarray(begun.state.plant.pose),
@@ -96,7 +84,7 @@ def plan_run(structure: Structure, case: Case, n_steps: int, after: float) -> Pl
         wrench=wrench[:count],
         noise=None if noise is None else noise[:count],
         command_end=end,
-        drive=Drive(**drive),
+        drive=loop.drive,
         electronics=_electronics(case, loop.controller),
     )
 
@@ -109,10 +97,10 @@ def _instants(x: np.ndarray, count: int) -> np.ndarray:
     return np.concatenate([x[:count, :-1].reshape(-1, 3), x[count - 1, -1:]])
 
 
-def _electronics(case: Case, controller: object) -> Electronics:
+def _electronics(case: Case, controller: object) -> SignalPath:
     own = {name: float(np.asarray(getattr(controller, name))) for name in _CONVERTER}
     electronics = case.electronics
-    return Electronics(
+    return SignalPath(
         period=float(np.asarray(electronics.period)),
         antialias=float(np.asarray(electronics.antialias)),
         highpass=float(np.asarray(electronics.sensor_highpass)),
@@ -124,7 +112,7 @@ def _electronics(case: Case, controller: object) -> Electronics:
 _CONVERTER = ("adc_gain", "adc_bias", "adc_step", "adc_top", "adc_noise")
 
 
-def resting(plan: Plan, duration: float) -> Plan:
+def resting(plan: TwinPlan, duration: float) -> TwinPlan:
     """The machine of a plan held where it starts, without disturbances and noise.
 
     Args:
