@@ -30,6 +30,7 @@ from studies.single.commands import add_commands as add_single
 from studies.spillover.commands import add_commands as add_spillover
 from studies.sweeps.commands import add_commands as add_sweeps
 from studies.tuning.commands import add_commands as add_tuning
+from studies.twin.commands import add_commands as add_twin
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -147,6 +148,7 @@ for add_commands in (
     add_export,
     add_atlas,
     add_spillover,
+    add_twin,
     add_bench,
 ):
     add_commands(app, console)

@@ -39,7 +39,8 @@ def exported_law(study: Study, factor: float = 1.0) -> Iterator[Law]:
         factor: on the loop gain, beside `control.gain_factor` [1].
 
     Raises:
-        StudyError: no controller to export, no compiler, or a sensor that the code takes for broken.
+        StudyError: no controller to export, no compiler, or a sensor that the code takes for a
+            broken one.
     """
     study = study.change(control__gain_factor=factor * study.control.gain_factor)
     exported, compiler = fixed_controller(study), check_compiler()

@@ -50,9 +50,7 @@ class _SliderForces:
         self._rho, self._rate, self._forward, self._jolt = (
             x.tolist() for x in (plan.rho, plan.rho_rate, plan.feedforward, _at_ends(plan))
         )
-        self._drive = [
-            np.broadcast_to(getattr(plan.drive, name), (3,)).tolist() for name in _DRIVE
-        ]
+        self._drive = [np.broadcast_to(getattr(plan.drive, name), (3,)).tolist() for name in _DRIVE]
 
     def __call__(self, i: int, time: float, position: float, speed: float) -> float:
         k = min(round(time / self._step), self._last) if self.is_moving else 0

@@ -1,7 +1,7 @@
 """The twin's gain margin, by growth, and the damping of its first modes, by decay.
 
-The machine rests, gets a pulse of small voltages, and rings. Gains are those of controllers exported
-with a larger `control.gain_factor`; converters do not round, so that the loop is linear.
+The machine rests, gets a pulse of small voltages, and rings. Controllers with larger gains are
+exported with a larger `control.gain_factor`; converters do not round, so that the loop is linear.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from studies.twin.multibody import DEFAULT, Settings
 from studies.twin.plan import TwinPlan, resting
 from studies.twin.ringing import ringing_poles
 
-#: Voltage of the pulse, on every actuator with a sign of its own, for one sample [V].
-PULSE = 10.0
+#: Voltage of the pulse, on every actuator with a sign of its own, for one sample [V]: for decay,
+#: and, so that what grows stays far below the actuators' limits, for growth.
+PULSE, SMALL_PULSE = 10.0, 0.5
 #: How long a run rings [s].
 RINGING, CONFIRMING = 0.12, 0.16
 #: Singular values of the signals below this share of the largest are noise: for all poles, and for
@@ -48,8 +49,9 @@ def ring(
     machine: MachineData,
     plan: TwinPlan,
     factor: float,
-    duration: float = RINGING,
     settings: Settings = DEFAULT,
+    duration: float = RINGING,
+    pulse: float = PULSE,
 ) -> TwinRun:
     """A free response of the loop after a pulse of voltages.
 
@@ -57,17 +59,15 @@ def ring(
         study: with the controller.
         machine: its machine.
         plan: of its motion, for the pose and the electronics.
-        factor: on all gains [1]; 0: without control.
-        duration: [s].
+        factor: on all gains, not 0 [1].
         settings: resolution.
+        duration: [s].
+        pulse: on every actuator, with a sign of its own [V].
     """
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (3, len(machine.links[0].sensor_ends)))
     at_rest = resting(plan, duration)
-    options = {"settings": settings, "kick": PULSE * signs, "is_exact": True}
-    if factor == 0:
-        return run_twin(machine, at_rest, None, **options)
     with exported_law(study, factor) as law:
-        return run_twin(machine, at_rest, law, **options)
+        return run_twin(machine, at_rest, law, settings, kick=pulse * signs, is_exact=True)
 
 
 def poles_of(run: TwinRun, period: float) -> np.ndarray:
@@ -106,7 +106,7 @@ class _Search:
 
     def ring(self, factor: float, duration: float = RINGING) -> TwinRun:
         self.runs += 1
-        return ring(*self._arguments, factor, duration, self._settings)
+        return ring(*self._arguments, factor, self._settings, duration, SMALL_PULSE)
 
     def pole(self, factor: float, near: complex | None) -> complex:
         """The pole that is left at the end of a run, or the one nearest to another."""

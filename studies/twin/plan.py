@@ -14,6 +14,7 @@ import numpy as np
 from jaxmodel.case import Case, Drive, Structure
 from jaxmodel.simulate import begin
 from studies.engine.programs import kept_jit
+from studies.twin.multibody import STEP, Settings
 
 
 class SignalPath(NamedTuple):
@@ -52,20 +53,20 @@ class TwinPlan(NamedTuple):
         return self.electronics.period / self.n_steps
 
 
-def plan_run(structure: Structure, case: Case, n_steps: int, after: float) -> TwinPlan:
+def plan_run(structure: Structure, case: Case, settings: Settings, after: float) -> TwinPlan:
     """TwinPlan of a case's motion.
 
     Args:
         structure: static choices, feedback "sampled".
         case: the numbers.
-        n_steps: steps of the twin in a sample, even.
+        settings: resolution.
         after: how long the run goes on after the reference trajectory [s].
     """
+    period = float(np.asarray(case.electronics.period))
+    n_steps = settings.n_steps or 2 * max(round(period / (2 * STEP)), 1)
     begun = _begin(structure._replace(substeps=n_steps // 2), case)
-    inputs, outline, loop = jax.tree.map(
-        np.asarray, (begun.inputs, begun.outline, begun.loop)
-    )
-    period, end = float(np.asarray(case.electronics.period)), float(outline.command_end)
+    inputs, outline, loop = jax.tree.map(np.asarray, (begun.inputs, begun.outline, begun.loop))
+    end = float(outline.command_end)
     count = min(round((end + after) / period) + 1, structure.n_steps)
     wrench = inputs.wrench if inputs.wrench is not None else np.zeros((count, 3))
     noise = inputs.adc_noise

@@ -41,9 +41,7 @@ class Reader:
     def voltages(self) -> np.ndarray:
         """Of the sensors: lambda_s times the difference of the slopes at their ends [V], (3, K)."""
         rows = []
-        for i, (mesh, link) in enumerate(
-            zip(self._model.meshes, self._machine.links, strict=True)
-        ):
+        for i, (mesh, link) in enumerate(zip(self._model.meshes, self._machine.links, strict=True)):
             slope = self._nodes(i)[mesh.sensor_nodes, 2:]  # (K, 2, 2)
             left, right = slope[:, 0], slope[:, 1]
             sine = left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]
@@ -56,9 +54,7 @@ class Reader:
         start, center = self._model.platform_start, self._model.platform_center
         x, y, phi = self._now[start : start + 3]
         c, s = np.cos(phi), np.sin(phi)
-        return np.array(
-            [x - c * center[0] + s * center[1], y - s * center[0] - c * center[1], phi]
-        )
+        return np.array([x - c * center[0] + s * center[1], y - s * center[0] - c * center[1], phi])
 
     def put_voltages(self, voltage: np.ndarray) -> None:
         """Pairs of moments lambda_a V at the ends of the actuators from now on.
@@ -66,9 +62,7 @@ class Reader:
         Args:
             voltage: [V], (3, K).
         """
-        for i, (mesh, link) in enumerate(
-            zip(self._model.meshes, self._machine.links, strict=True)
-        ):
+        for i, (mesh, link) in enumerate(zip(self._model.meshes, self._machine.links, strict=True)):
             moment = dict.fromkeys(self._model.moments[i], 0.0)
             for (left, right), volts in zip(
                 mesh.actuator_nodes.tolist(), voltage[i].tolist(), strict=True
