@@ -10,6 +10,7 @@ import pytest
 
 from studies.engine.preflight import check_run
 from studies.study.spec import Study
+from studies.twin import compare
 from studies.twin.machine import describe_machine
 from studies.twin.mesh import damping_matrix, held_modes, mesh_link
 from studies.twin.multibody import Settings, build_model, close_chain
@@ -65,3 +66,71 @@ def test_free_machine_has_the_frequencies_of_another_finite_element_model():
     square, _ = model.system.ComputeODE2Eigenvalues(computeComplexEigenvalues=False)
     frequency = np.sqrt(np.sort(np.abs(square))[: len(expected)]) / (2 * np.pi)
     np.testing.assert_allclose(frequency, expected, rtol=1e-5)
+
+
+SHORT = {
+    "run__duration": 0.1,
+    "motion__waypoints": ((0.0, 0.0, HOME[2]), (0.0, 0.01, HOME[2])),
+    "metrics__residual_delay": 0.0,
+    "metrics__residual_length": 0.04,
+}
+#: The links of our model do not stretch; steps of 25 us.
+STIFF = Settings(axial_factor=1000.0, n_steps=4)
+#: All that the twin supports beyond the default study.
+EVERYTHING = {
+    "link__basis": "loaded",
+    "control__basis": "loaded",
+    "link__length": (0.2, 0.21, 0.19),
+    "link__joint_inertia_c": 2e-6,
+    "link__damping_ratio": (0.01, 0.02),
+    "patches__centers": ((0.05, 0.1, 0.15), (0.055, 0.105, 0.15), (0.045, 0.095, 0.145)),
+    "shaper__kind": "zv",
+    "motion__move_time": 0.04,
+    "control__gain_factor": 0.3,
+    "electronics__amplifier_hz": 5000.0,
+    "electronics__sensor_highpass_hz": 2.0,
+    "electronics__adc_noise": 1e-4,
+    "drive__kind": "computed_torque",
+    "drive__coulomb_friction": 0.5,
+    "drive__friction_speed": 0.01,
+    "drive__viscous_friction": 3.0,
+    "drive__ripple": 0.5,
+    "drive__pulse_force": (5.0, 0.0, -3.0),
+    "drive__pulse_start": 0.0505,
+    "load__mass": 0.1,
+    "load__inertia": 5e-5,
+    "load__offset": (0.01, -0.02),
+    "load__wrench": (2.0, -1.0, 0.02),
+    "load__pulse": (0.0, 10.0, 0.0),
+    "load__pulse_start": 0.0552,
+}
+
+
+def differences(study, settings, machine=None):
+    """Of mid-span without and with control, and of voltages, all links together [1]."""
+    bench, ours = compare.Bench(study, settings), compare.our_runs(study)
+    bench.machine = bench.machine if machine is None else machine
+    pairs = [compare.pair(run, bench.run(k == 0)) for k, run in enumerate(ours)]
+    window = compare.in_window(bench.plan)
+    found = compare.cause("", pairs[1], pairs[0], window)
+    return np.array([found.free, found.controlled, found.voltage])
+
+
+def test_a_move_is_the_same_in_both_models_and_a_wrong_machine_is_noticed():
+    needs_exudyn()
+    study = Study().change(**SHORT)
+    found = differences(study, STIFF)
+    assert np.all(found < [2e-3, 1e-3, 4e-3]), found
+    machine = compare.Bench(study, STIFF).machine
+    softer = tuple(
+        link._replace(sections=link.sections._replace(bending=0.99 * link.sections.bending))
+        for link in machine.links
+    )
+    wrong = differences(study, STIFF, machine._replace(links=softer))
+    assert np.all(wrong > [1e-2, 4e-3, 4e-3]), wrong
+
+
+def test_everything_a_study_can_have_is_in_the_twin():
+    needs_exudyn()
+    found = differences(Study().change(**SHORT | EVERYTHING), STIFF)
+    assert np.all(found < 1e-2), found

@@ -116,11 +116,15 @@ def our_runs(study: Study, has_loop: bool = False) -> tuple[Run, Run]:
     free = uncontrolled_twin(run)
     assert free is not None
     for one in (run, free):
-        if int(one.result.status) not in status.FINISHED:
+        if one.status not in status.FINISHED:
             raise StudyError(
-                f"{study.title}: {describe(int(one.result.status))} at "
-                f"{one.result.bad_time:.4g} s; allowed: a study that runs to its end"
+                f"{study.title}: {describe(one.status)} at {one.result.bad_time:.4g} s; allowed: a "
+                "study that runs to its end"
             )
+    if run.status == status.UNSTABLE:
+        raise StudyError(
+            f"{study.title}: {describe(run.status)}; allowed: a stable loop, see studies simulate"
+        )
     return run, free
 
 
@@ -237,9 +241,9 @@ def causes(bench: Bench, ours: tuple[Run, Run], base: BothRuns) -> list[Cause]:
     window, settings, study = in_window(bench.plan), bench.settings, bench.study
     found = [cause("as they are", base.free, base.controlled, window)]
     for text, changed in (
-        ("theirs: links 1000 times stiffer in tension", {"axial_factor": 1000.0}),
-        ("theirs: twice the elements", {"n_elements": 2 * settings.n_elements}),
-        ("theirs: half the step", {"n_steps": 2 * bench.plan.n_steps}),
+        ("twin: links 1000 times stiffer in tension", {"axial_factor": 1000.0}),
+        ("twin: twice the elements", {"n_elements": 2 * settings.n_elements}),
+        ("twin: half the step", {"n_steps": 2 * bench.plan.n_steps}),
     ):
         other = Bench(study, settings._replace(**changed))
         pairs = [pair(one, other.run(k == 0)) for k, one in enumerate(ours)]
@@ -250,7 +254,7 @@ def causes(bench: Bench, ours: tuple[Run, Run], base: BothRuns) -> list[Cause]:
             both._replace(ours=our_signals(run, len(both.theirs.deflection)))
             for run, both in zip(runs, (base.controlled, base.free), strict=True)
         )
-        found.append(cause(f"ours: {MOST_MODES} modes a link", free, controlled, window))
+        found.append(cause(f"this model: {MOST_MODES} modes a link", free, controlled, window))
     fine = study.change(electronics__adc_bits=FINE_ADC)
     if not study.electronics.adc_noise:
         theirs = Bench(fine, settings).run(is_controlled=True)

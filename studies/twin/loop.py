@@ -44,7 +44,7 @@ class _SliderForces:
     """Motors, friction and disturbance along the guides, see `jaxmodel.drive`."""
 
     def __init__(self, plan: TwinPlan) -> None:
-        self.is_moving = False  # False: held at the start, whatever the time of a static solver
+        self.is_moving = False  # False: held at the start, without disturbance
         self._step, self._last = plan.step, len(plan.rho) - 1
         # lists, which are several times faster to index than arrays
         self._rho, self._rate, self._forward, self._jolt = (
@@ -54,11 +54,12 @@ class _SliderForces:
 
     def __call__(self, i: int, time: float, position: float, speed: float) -> float:
         k = min(round(time / self._step), self._last) if self.is_moving else 0
+        jolt = self._jolt[k][i] if self.is_moving else 0.0
         kp, kd, limit, dry, creep, viscous = (x[i] for x in self._drive)
         motor = kp * (self._rho[k][i] - position) + kd * (self._rate[k][i] - speed)
         motor = min(max(motor + self._forward[k][i], -limit), limit)
         rub = dry * math.tanh(speed / creep) if dry else 0.0
-        return float(motor + self._jolt[k][i] - viscous * speed - rub)
+        return float(motor + jolt - viscous * speed - rub)
 
 
 _DRIVE = ("kp", "kd", "force_limit", "coulomb_friction", "friction_speed", "viscous_friction")
@@ -97,7 +98,7 @@ def run_twin(
     force = _SliderForces(plan)
     model = build_model(machine, plan.pose, force, settings)
     stepper = _Stepper(model, machine, plan, law, kick, is_exact)
-    if np.any(plan.wrench[0]):
+    if np.any(plan.steady_wrench):
         _settle(model, plan, stepper)
     force.is_moving = True
     _solve(model, plan, stepper)
@@ -203,7 +204,7 @@ def _settle(model: Model, plan: TwinPlan, stepper: _Stepper) -> None:
     newton = settings.staticSolver.newton
     newton.residualMode = 1
     newton.relativeTolerance = newton.absoluteTolerance = TOLERANCE
-    stepper.reader.put_wrench(plan.wrench[0])
+    stepper.reader.put_wrench(plan.steady_wrench)
     _quietly(model, stepper, lambda: model.system.SolveStatic(settings, updateInitialValues=True))
 
 
@@ -228,7 +229,7 @@ def _solve(model: Model, plan: TwinPlan, stepper: _Stepper) -> None:
 
 def _quietly(model: Model, stepper: _Stepper, solve: Callable[[], Any]) -> None:
     """Run a solver without its messages; its failure becomes one sentence."""
-    model.exudyn.SetWriteToConsole(False)
+    model.exudyn.config.printToConsole = False
     try:
         solve()
     except Exception as error:
@@ -237,4 +238,4 @@ def _quietly(model: Model, stepper: _Stepper, solve: Callable[[], Any]) -> None:
         reason = str(error).strip().splitlines()[0]
         raise StudyError(f"studies twin: Exudyn's solver stopped: {reason}") from None
     finally:
-        model.exudyn.SetWriteToConsole(True)
+        model.exudyn.config.printToConsole = True

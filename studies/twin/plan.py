@@ -42,6 +42,7 @@ class TwinPlan(NamedTuple):
     feedforward: np.ndarray  # of the drives [N], (N n + 1, 3)
     disturbance: np.ndarray  # force on the sliders, held over a sample [N], (N, 3)
     wrench: np.ndarray  # on the platform, held over a sample [N, N, N m], (N, 3)
+    steady_wrench: np.ndarray  # with which it is in equilibrium at the start, (3,)
     noise: np.ndarray | None  # of the ADC, standard normal, (N, 3, K)
     command_end: float  # when the shaped reference trajectory ends [s]
     drive: Drive  # NumPy arrays
@@ -83,6 +84,7 @@ def plan_run(structure: Structure, case: Case, settings: Settings, after: float)
         ),
         disturbance=inputs.disturbance[:count],
         wrench=wrench[:count],
+        steady_wrench=np.asarray(case.load.wrench, float),
         noise=None if noise is None else noise[:count],
         command_end=end,
         drive=loop.drive,
@@ -129,7 +131,7 @@ def resting(plan: TwinPlan, duration: float) -> TwinPlan:
         rho_rate=still,
         feedforward=np.broadcast_to(plan.feedforward[0], (instants, 3)),
         disturbance=np.zeros((count, 3)),
-        wrench=np.broadcast_to(plan.wrench[0], (count, 3)),
+        wrench=np.broadcast_to(plan.steady_wrench, (count, 3)),
         noise=None,
         command_end=0.0,
     )

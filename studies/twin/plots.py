@@ -57,7 +57,7 @@ def side_by_side(plan: TwinPlan, runs: BothRuns) -> Figure:
         axes[4, 0],
     )
     axes[4, 0].legend(loc="upper right")
-    axes[4, 0].set_title("theirs minus ours, with control")
+    axes[4, 0].set_title("twin minus this model, with control")
     voltage = runs.controlled.theirs.voltage[shown]
     link, patch = np.unravel_index(np.argmax(np.sum(voltage**2, axis=0)), voltage.shape[1:])
     _both(axes[4, 1], time, runs.controlled, lambda x: x.voltage[shown, link, patch])
