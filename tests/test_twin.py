@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
+import scipy.integrate
 
+from studies.engine.design import Design
 from studies.engine.preflight import check_run
+from studies.errors import StudyError
+from studies.show.document import json_text, schema
 from studies.study.spec import Study
-from studies.twin import compare
+from studies.twin import compare, report
+from studies.twin.electronics import SensorFilter
 from studies.twin.machine import describe_machine
 from studies.twin.mesh import damping_matrix, held_modes, mesh_link
 from studies.twin.multibody import Settings, build_model, close_chain
+from studies.twin.plan import SignalPath
+from studies.twin.ringing import ringing_poles
+from studies.twin.run import twin_design
+from tests.test_cli import refused
 
 HOME = np.array([0.0, 0.0, np.pi / 6])
 DATA = Path(__file__).parent / "data"
@@ -134,3 +145,129 @@ def test_everything_a_study_can_have_is_in_the_twin():
     needs_exudyn()
     found = differences(Study().change(**SHORT | EVERYTHING), STIFF)
     assert np.all(found < 1e-2), found
+
+
+@pytest.mark.parametrize("highpass", [0.0, 300.0])
+def test_filters_are_stepped_exactly_where_signals_are_straight(highpass):
+    corner, step = 2 * np.pi * 2000.0, 2.5e-5
+    path = SignalPath(
+        period=1e-4,
+        antialias=corner,
+        highpass=highpass,
+        lag=0.0,
+        adc_gain=1.0,
+        adc_bias=0.0,
+        adc_step=1.0,
+        adc_top=1.0,
+        adc_noise=0.0,
+    )
+    grid = step * np.arange(41)
+    signal = np.interp(grid, [0.0, 5e-4, 1e-3], [1.0, 3.0, -2.0])
+
+    def rates(t, x):
+        u = np.interp(t, [0.0, 5e-4, 1e-3], [1.0, 3.0, -2.0])
+        s, z, rate = x
+        pull = corner**2 * (u - s - z) - np.sqrt(2.0) * corner * rate
+        return [highpass * (u - s), rate, pull]
+
+    start = [1.0, 0.0, 0.0] if highpass else [0.0, 1.0, 0.0]
+    exact = scipy.integrate.solve_ivp(
+        rates, (0, 1e-3), start, t_eval=grid, rtol=1e-10, atol=1e-12, max_step=step / 4
+    )
+    own = SensorFilter(path, step, (1,))
+    own.settle(signal[:1])
+    found = [own.present[0], *(own.advance(signal[k : k + 1])[0] for k in range(1, 41))]
+    np.testing.assert_allclose(found, exact.y[1], atol=1e-7)
+
+
+def test_ringing_tells_close_poles_apart():
+    poles = 2 * np.pi * np.array([-1.0 + 114j, -1.5 + 115j, -30 + 135j, 2.0 + 1199j])
+    shapes = np.random.default_rng(0).normal(size=(4, 9))
+    time = 1e-4 * np.arange(1200)
+    signals = (np.exp(np.outer(time, poles)) @ shapes).real
+    found = np.log(ringing_poles(signals, 300, 1e-8)) * 1e4
+    found = found[found.imag > 0]
+    np.testing.assert_allclose(np.sort_complex(found[:4]), np.sort_complex(poles), rtol=1e-5)
+    assert found[0] == pytest.approx(poles[3], rel=1e-6)  # what grows is left at the end
+
+
+def test_without_exudyn_one_sentence_says_what_to_install(capsys, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "exudyn", None)
+    message = refused(capsys, "twin", "paper", "--out", tmp_path / "out")
+    assert (
+        message.strip()
+        == "studies: studies twin: Exudyn is missing: install flexlink-studies[twin]"
+    )
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({"run__model": "ked"}, "run.model"),
+        ({"run__smooth": True}, "run.smooth"),
+        ({"link__basis": "pinned_free", "link__shortening": False}, "link.basis"),
+        ({"initial__modal": ((1e-6,), (), ())}, "initial.modal"),
+        ({"initial__load_deflection": (1e-6, 0.0, 0.0)}, "initial.load_deflection"),
+    ],
+)
+def test_what_the_twin_cannot_repeat_is_refused(fields, named):
+    with pytest.raises(StudyError, match=f"{named} = .*allowed: .*studies twin"):
+        compare.check_supported(Study().change(**fields))
+
+
+def test_a_run_that_ends_with_its_motion_is_refused():
+    study = Study().change(
+        run__duration=0.121, metrics__residual_delay=0.0, metrics__residual_length=5e-4
+    )
+    with pytest.raises(StudyError, match=r"run.duration = .*at least"):
+        compare.Bench(study, STIFF)
+
+
+def test_the_command_writes_report_figure_and_numbers(tmp_path):
+    needs_exudyn()
+    design = Design(Study().change(**SHORT), {})
+    settings = STIFF._replace(n_steps=8)
+    result = twin_design(design, tmp_path, settings=settings, has_changes=False)
+    document = json.loads((tmp_path / "twin.json").read_text())
+    jsonschema.validate(document, schema("twin"))
+    assert document == json.loads(json_text("twin", report.document(result)))
+    assert document["gain_margin"]["is_confirmed"]
+    assert document["gain_margin"]["theirs"] == pytest.approx(3.70, rel=0.01)
+    ours, theirs = (document["damping_ratio"][name] for name in ("ours", "theirs"))
+    np.testing.assert_allclose(theirs, ours, rtol=0.02)
+    page = (tmp_path / "report.html").read_text()
+    assert "mid-span deflection, link 1, with control" in page and "data:image/png" in page
+
+
+#: A machine whose links have little in common.
+THREE = {
+    "link__length": (0.2, 0.21, 0.19),
+    "link__thickness": (2e-3, 2.2e-3, 1.8e-3),
+    "patches__centers": ((0.05, 0.10, 0.15), (0.055, 0.105, 0.15), (0.045, 0.095, 0.145)),
+}
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(
+    ("fields", "deflection", "voltage"),
+    [
+        # the second loop's signals are so small that the rounding of its ADC is 0.6 % of them
+        ({"motion__move_time": 0.03}, 2.5e-3, 4e-3),
+        ({"motion__move_time": 0.05}, 2.5e-3, 1e-2),
+        ({"motion__move_time": 0.05, **THREE}, 3e-3, 1e-2),
+    ],
+)
+def test_the_square_is_the_same_in_both_models(fields, deflection, voltage, tmp_path):
+    needs_exudyn()
+    study = Study().change(run__duration=0.5, metrics__residual_length=0.1, **fields)
+    result = twin_design(Design(study, {}), tmp_path)
+    changes = {one.text: one for one in result.causes}
+    found = changes["as they are"]
+    assert found.controlled < deflection and found.voltage < voltage
+    # most of it is that links of our model do not stretch, or the ADC's rounding
+    assert changes["twin: links 1000 times stiffer in tension"].controlled < 1e-3
+    assert changes["both: an ADC that hardly rounds"].voltage < 3e-3
+    assert result.growth.is_confirmed
+    assert result.growth.margin == pytest.approx(float(result.loop.gain_margin), rel=1e-2)

@@ -27,8 +27,10 @@ RINGING, CONFIRMING = 0.12, 0.16
 #: Singular values of the signals below this share of the largest are noise: for all poles, and for
 #: those that are left late [1].
 ALL, LATE = 1e-8, 1e-6
+#: Voltages up to this share of their limit count as small [1], and the fewest samples to look at.
+LINEAR, FEWEST = 0.2, 150
 #: Factors of the first two runs, over the predicted margin, and how much further others go [1].
-NEAR, STRIDE = 0.015, 1.1
+NEAR, STRIDE = 0.015, 1.05
 #: Margins are confirmed by growth and decay at this distance [1].
 CONFIRMED = 0.01
 #: Runs that look for a factor that grows, or decays, before giving up; and where to stop [1].
@@ -111,15 +113,23 @@ class _Search:
     def pole(self, factor: float, near: complex | None) -> complex:
         """The pole that is left at the end of a run, or the one nearest to another."""
         run = self.ring(factor)
-        late = run.sensor[len(run.time) // 3 :].reshape(-1, run.sensor[0].size)
+        last = self._last_linear(run)
+        late = run.sensor[last // 3 : last].reshape(-1, run.sensor[0].size)
         ranked = ringing_poles(late, min(100, len(late) // 4), LATE)
         poles = np.log(ranked) / self._period
         poles = poles[poles.imag > 0]
         return complex(poles[0 if near is None else np.abs(poles - near).argmin()])
 
+    def _last_linear(self, run: TwinRun) -> int:
+        """Number of samples before voltages come near their limit, which would bound what grows."""
+        limit = self._arguments[0].electronics.voltage_limit
+        large = np.flatnonzero(np.abs(run.voltage).max(axis=(1, 2)) > LINEAR * limit)
+        return max(int(large[0]) if len(large) else len(run.time), FEWEST)
+
     def is_growing(self, factor: float) -> bool:
         """Whether voltages are larger in the last quarter of a run than in the one before."""
-        voltage = self.ring(factor, CONFIRMING).voltage
+        run = self.ring(factor, CONFIRMING)
+        voltage = run.voltage[: self._last_linear(run)]
         quarter = len(voltage) // 4
         last, before = voltage[-quarter:], voltage[-2 * quarter : -quarter]
         return bool(np.sum(last**2) > np.sum(before**2))

@@ -81,11 +81,9 @@ def gap_rows(result: TwinResult) -> list[list[str]]:
             texts = (f"{factor * x:.4g} {unit}" for x in numbers)
             rows.append([f"{one.name}, {entry}, {control}", *texts, _percent(one.gap.share[k])])
         if len(one.entries) > 1:
-            numbers = (np.linalg.norm(x) / len(x) ** 0.5 for x in one.gap)
-            texts = (f"{factor * x:.4g} {unit}" for x in numbers)
-            rows.append(
-                [f"{one.name}, all together, {control}", *texts, _percent(one.gap.whole)]
-            )
+            together = (float(np.linalg.norm(x)) / len(x) ** 0.5 for x in one.gap)
+            texts = (f"{factor * x:.4g} {unit}" for x in together)
+            rows.append([f"{one.name}, all together, {control}", *texts, _percent(one.gap.whole)])
     return rows
 
 

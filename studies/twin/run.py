@@ -57,26 +57,31 @@ def twin_design(
         phases.begin("theirs", f"{bench.plan.n_samples * bench.plan.n_steps} steps, twice")
         free, controlled = (pair(run, bench.run(run is ours[0])) for run in ours[::-1])
         runs = BothRuns(free, controlled)
-        phases.begin("changes", "stretch, mesh, step, modes and rounding, one at a time")
-        found = causes(bench, ours, runs) if has_changes else []
+        found = []
+        if has_changes:
+            phases.begin("changes", "stretch, mesh, step, modes and rounding, one at a time")
+            found = causes(bench, ours, runs)
         phases.begin("poles", "damping by decay, gain margin by growth")
         loop = ours[0].loop
         assert loop is not None
-        arguments = study, bench.machine, bench.plan
+        # implicit steps lower the frequencies of modes near the sample rate, whose aliases then
+        # fall elsewhere: loops near their margin need smaller steps than motions
+        fine = settings._replace(n_steps=2 * bench.plan.n_steps)
+        arguments = study, bench.machine, Bench(study, fine).plan
         result = TwinResult(
             study=study,
             plan=bench.plan,
             settings=settings,
-            version=exudyn.GetVersionString().split(";")[0].strip(),
+            version=f"Exudyn {exudyn.__version__}",
             runs=runs,
             causes=found,
             loop=loop,
             first_modes=first_modes(
-                ring(*arguments, 1.0, settings),
+                ring(*arguments, 1.0, fine),
                 bench.plan.electronics.period,
                 expected_poles(loop),
             ),
-            growth=margin_by_growth(*arguments, float(loop.gain_margin), settings),
+            growth=margin_by_growth(*arguments, float(loop.gain_margin), fine),
         )
         phases.begin("draw")
         if out is not None:
