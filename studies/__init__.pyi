@@ -32,6 +32,7 @@ from .sweeps.show import best_cases, status_rows
 from .tuning.audit import audit
 from .tuning.run import run_tuning
 from .tuning.spec import load_tuning, parse_tuning
+from .twin.run import twin_design
 
 __all__ = [
     "Run",
@@ -79,6 +80,7 @@ __all__ = [
     "simulate",
     "spillover_design",
     "status_rows",
+    "twin_design",
     "write_study",
     "write_sweep_report",
 ]

@@ -119,7 +119,7 @@ EVERYTHING = {
 
 def differences(study, settings, machine=None):
     """Of mid-span without and with control, and of voltages, all links together [1]."""
-    bench, ours = compare.Bench(study, settings), compare.our_runs(study)
+    bench, ours = compare.TwinBench(study, settings), compare.our_runs(study)
     bench.machine = bench.machine if machine is None else machine
     pairs = [compare.pair(run, bench.run(k == 0)) for k, run in enumerate(ours)]
     window = compare.in_window(bench.plan)
@@ -132,7 +132,7 @@ def test_a_move_is_the_same_in_both_models_and_a_wrong_machine_is_noticed():
     study = Study().change(**SHORT)
     found = differences(study, STIFF)
     assert np.all(found < [2e-3, 1e-3, 4e-3]), found
-    machine = compare.Bench(study, STIFF).machine
+    machine = compare.TwinBench(study, STIFF).machine
     softer = tuple(
         link._replace(sections=link.sections._replace(bending=0.99 * link.sections.bending))
         for link in machine.links
@@ -221,7 +221,7 @@ def test_a_run_that_ends_with_its_motion_is_refused():
         run__duration=0.121, metrics__residual_delay=0.0, metrics__residual_length=5e-4
     )
     with pytest.raises(StudyError, match=r"run.duration = .*at least"):
-        compare.Bench(study, STIFF)
+        compare.TwinBench(study, STIFF)
 
 
 def test_the_command_writes_report_figure_and_numbers(tmp_path):

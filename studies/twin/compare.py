@@ -29,7 +29,7 @@ MOST_MODES = 16
 FINE_ADC = 28
 
 
-class Signals(NamedTuple):
+class RunSignals(NamedTuple):
     """One run at its sampling instants."""
 
     deflection: np.ndarray  # of mid-span from the chord [m], (N, 3)
@@ -37,18 +37,18 @@ class Signals(NamedTuple):
     voltage: np.ndarray  # of the actuators [V], (N, 3, K)
 
 
-class Pair(NamedTuple):
+class BothModels(NamedTuple):
     """The same run by both models."""
 
-    ours: Signals
-    theirs: Signals
+    ours: RunSignals
+    theirs: RunSignals
 
 
 class BothRuns(NamedTuple):
     """The motion without and with control."""
 
-    free: Pair
-    controlled: Pair
+    free: BothModels
+    controlled: BothModels
 
 
 class Gap(NamedTuple):
@@ -75,7 +75,7 @@ class Gap(NamedTuple):
         return float(np.linalg.norm(self.difference)) / size if size > 0 else float("nan")
 
 
-class Cause(NamedTuple):
+class ChangedRun(NamedTuple):
     """One thing changed: the differences that are then left [1], NaN where it changes nothing."""
 
     text: str
@@ -128,7 +128,7 @@ def our_runs(study: Study, has_loop: bool = False) -> tuple[Run, Run]:
     return run, free
 
 
-class Bench:
+class TwinBench:
     """A study's motion, ready for the twin."""
 
     def __init__(self, study: Study, settings: Settings = DEFAULT) -> None:
@@ -159,18 +159,18 @@ def in_window(plan: TwinPlan) -> slice:
     return slice(round(plan.command_end / plan.electronics.period), plan.n_samples)
 
 
-def our_signals(run: Run, count: int) -> Signals:
+def our_signals(run: Run, count: int) -> RunSignals:
     """The first samples of one of `our_runs`."""
     record = run.result.record
     assert record is not None
-    return Signals(
+    return RunSignals(
         deflection=record.chord_deflection_stations[:count, :, 0],
         pose_error=record.pose_error[:count],
         voltage=record.actuator_voltage[:count],
     )
 
 
-def pair(ours: Run, theirs: TwinRun) -> Pair:
+def pair(ours: Run, theirs: TwinRun) -> BothModels:
     """Both models' signals of one run.
 
     Args:
@@ -180,10 +180,10 @@ def pair(ours: Run, theirs: TwinRun) -> Pair:
     record, own = ours.result.record, our_signals(ours, len(theirs.time))
     assert record is not None
     reference = record.pose[: len(theirs.time)] - own.pose_error
-    return Pair(own, Signals(theirs.deflection, theirs.pose - reference, theirs.voltage))
+    return BothModels(own, RunSignals(theirs.deflection, theirs.pose - reference, theirs.voltage))
 
 
-def gap(both: Pair, quantity: Callable[[Signals], np.ndarray], window: slice) -> Gap:
+def gap(both: BothModels, quantity: Callable[[RunSignals], np.ndarray], window: slice) -> Gap:
     """A quantity of a pair.
 
     Args:
@@ -200,29 +200,29 @@ def gap(both: Pair, quantity: Callable[[Signals], np.ndarray], window: slice) ->
     return Gap(rms(ours), rms(theirs), rms(theirs - ours))
 
 
-def deflection(signals: Signals) -> np.ndarray:
+def deflection(signals: RunSignals) -> np.ndarray:
     """Of mid-span [m], (N, 3)."""
     return signals.deflection
 
 
-def voltage(signals: Signals) -> np.ndarray:
+def voltage(signals: RunSignals) -> np.ndarray:
     """Of the actuators [V], (N, 3, K)."""
     return signals.voltage
 
 
-def place(signals: Signals) -> np.ndarray:
+def place(signals: RunSignals) -> np.ndarray:
     """Error of the platform's place [m], (N, 2)."""
     return signals.pose_error[:, :2]
 
 
-def turn(signals: Signals) -> np.ndarray:
+def turn(signals: RunSignals) -> np.ndarray:
     """Error of its angle [rad], (N, 1)."""
     return signals.pose_error[:, 2:]
 
 
-def cause(text: str, free: Pair | None, controlled: Pair, window: slice) -> Cause:
+def cause(text: str, free: BothModels | None, controlled: BothModels, window: slice) -> ChangedRun:
     """The differences of two pairs; free: None where nothing changes without control."""
-    return Cause(
+    return ChangedRun(
         text=text,
         free=float("nan") if free is None else gap(free, deflection, window).whole,
         controlled=gap(controlled, deflection, window).whole,
@@ -230,7 +230,7 @@ def cause(text: str, free: Pair | None, controlled: Pair, window: slice) -> Caus
     )
 
 
-def causes(bench: Bench, ours: tuple[Run, Run], base: BothRuns) -> list[Cause]:
+def causes(bench: TwinBench, ours: tuple[Run, Run], base: BothRuns) -> list[ChangedRun]:
     """What the difference is made of, one thing changed at a time.
 
     Args:
@@ -245,7 +245,7 @@ def causes(bench: Bench, ours: tuple[Run, Run], base: BothRuns) -> list[Cause]:
         ("twin: twice the elements", {"n_elements": 2 * settings.n_elements}),
         ("twin: half the step", {"n_steps": 2 * bench.plan.n_steps}),
     ):
-        other = Bench(study, settings._replace(**changed))
+        other = TwinBench(study, settings._replace(**changed))
         pairs = [pair(one, other.run(k == 0)) for k, one in enumerate(ours)]
         found.append(cause(text, pairs[1], pairs[0], window))
     if study.link.modes < MOST_MODES:
@@ -257,7 +257,7 @@ def causes(bench: Bench, ours: tuple[Run, Run], base: BothRuns) -> list[Cause]:
         found.append(cause(f"this model: {MOST_MODES} modes a link", free, controlled, window))
     fine = study.change(electronics__adc_bits=FINE_ADC)
     if not study.electronics.adc_noise:
-        theirs = Bench(fine, settings).run(is_controlled=True)
+        theirs = TwinBench(fine, settings).run(is_controlled=True)
         found.append(
             cause("both: an ADC that hardly rounds", None, pair(our_runs(fine)[0], theirs), window)
         )

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from studies.show import figures
-from studies.twin.compare import BothRuns, Pair, in_window
+from studies.twin.compare import BothModels, BothRuns, in_window
 from studies.twin.plan import TwinPlan
 
 OURS: dict[str, Any] = {"color": "#E69F00", "linewidth": 2.2, "label": "this model"}
@@ -71,7 +71,7 @@ def side_by_side(plan: TwinPlan, runs: BothRuns) -> Figure:
     return figure
 
 
-def _both(ax: Axes, time: np.ndarray, both: Pair, quantity: Any) -> None:
+def _both(ax: Axes, time: np.ndarray, both: BothModels, quantity: Any) -> None:
     ax.plot(time, quantity(both.ours), **OURS)
     ax.plot(time, quantity(both.theirs), **THEIRS)
     ax.margins(x=0.01)

@@ -11,7 +11,7 @@ import numpy as np
 from studies.show.pages import page
 from studies.show.words import control_text, motion_text
 from studies.study.margin import margin_text
-from studies.twin.compare import Cause, Gap, Pair, deflection, gap, place, turn, voltage
+from studies.twin.compare import BothModels, ChangedRun, Gap, deflection, gap, place, turn, voltage
 from studies.twin.result import FIGURE, TwinResult
 
 GAP_HEAD = ("after the motion, rms", "this model", "twin", "difference", "of the twin's")
@@ -24,7 +24,7 @@ CAUSE_HEAD = (
 POLE_HEAD = ("linearised loop", "this model", "twin", "difference")
 
 
-class Compared(NamedTuple):
+class ComparedQuantity(NamedTuple):
     """A quantity of both models."""
 
     name: str
@@ -34,7 +34,7 @@ class Compared(NamedTuple):
     entries: tuple[str, ...]
 
 
-def compared(result: TwinResult) -> list[Compared]:
+def compared(result: TwinResult) -> list[ComparedQuantity]:
     """Everything that is compared after the motion."""
     links, own = ("link 1", "link 2", "link 3"), []
 
@@ -56,12 +56,12 @@ def _compared(
     name: str,
     unit: str,
     is_controlled: bool,
-    both: Pair,
+    both: BothModels,
     quantity: Callable[[Any], np.ndarray],
     entries: tuple[str, ...],
     result: TwinResult,
-) -> Compared:
-    return Compared(
+) -> ComparedQuantity:
+    return ComparedQuantity(
         name=name,
         unit=unit,
         is_controlled=is_controlled,
@@ -91,7 +91,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:.2g} %" if np.isfinite(share) else "-"
 
 
-def cause_rows(found: list[Cause]) -> list[list[str]]:
+def cause_rows(found: list[ChangedRun]) -> list[list[str]]:
     """Row of each change."""
     return [
         [one.text, *(_percent(x) for x in (one.free, one.controlled, one.voltage))] for one in found

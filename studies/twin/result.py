@@ -8,7 +8,7 @@ import numpy as np
 
 from studies.engine.stability import LoopFigures
 from studies.study.spec import Study
-from studies.twin.compare import BothRuns, Cause, in_window
+from studies.twin.compare import BothRuns, ChangedRun, in_window
 from studies.twin.margin import GrowthMargin
 from studies.twin.multibody import Settings
 from studies.twin.plan import TwinPlan
@@ -25,7 +25,7 @@ class TwinResult(NamedTuple):
     settings: Settings
     version: str  # of Exudyn
     runs: BothRuns
-    causes: list[Cause]
+    causes: list[ChangedRun]
     loop: LoopFigures  # of our linearised sampled loop
     first_modes: np.ndarray  # the twin's poles nearest to our first modes' [rad/s], (3,)
     growth: GrowthMargin

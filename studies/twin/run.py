@@ -12,7 +12,7 @@ from studies.engine.runs import resolved_study
 from studies.publish import REPORT, announce, check_folder, publish
 from studies.show import figures
 from studies.show.document import json_text
-from studies.twin.compare import Bench, BothRuns, causes, check_supported, our_runs, pair
+from studies.twin.compare import BothRuns, TwinBench, causes, check_supported, our_runs, pair
 from studies.twin.law import check_compiler
 from studies.twin.margin import first_modes, margin_by_growth, ring
 from studies.twin.multibody import DEFAULT, Settings, load_exudyn
@@ -52,7 +52,7 @@ def twin_design(
     with Phases(console, PHASES, is_quiet=console.quiet) as phases:
         phases.begin("ours")
         study = resolved_study(design.study)
-        bench = Bench(study, settings)
+        bench = TwinBench(study, settings)
         ours = our_runs(study, has_loop=True)
         phases.begin("theirs", f"{bench.plan.n_samples * bench.plan.n_steps} steps, twice")
         free, controlled = (pair(run, bench.run(run is ours[0])) for run in ours[::-1])
@@ -67,7 +67,7 @@ def twin_design(
         # implicit steps lower the frequencies of modes near the sample rate, whose aliases then
         # fall elsewhere: loops near their margin need smaller steps than motions
         fine = settings._replace(n_steps=2 * bench.plan.n_steps)
-        arguments = study, bench.machine, Bench(study, fine).plan
+        arguments = study, bench.machine, TwinBench(study, fine).plan
         result = TwinResult(
             study=study,
             plan=bench.plan,
