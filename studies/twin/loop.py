@@ -30,7 +30,7 @@ SPECTRAL_RADIUS = 0.9
 
 
 class TwinRun(NamedTuple):
-    """RunSignals at the sampling instants."""
+    """Signals at the sampling instants."""
 
     time: np.ndarray  # [s], (N,)
     deflection: np.ndarray  # of mid-span from the chord [m], (N, 3)

@@ -9,7 +9,7 @@ from studies.twin.multibody import Model
 
 
 class Reader:
-    """RunSignals of a model at the last instant that was read."""
+    """Signals of a model at the last instant that was read."""
 
     def __init__(self, model: Model, machine: MachineData) -> None:
         self._model, self._machine = model, machine
