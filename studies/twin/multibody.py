@@ -116,16 +116,15 @@ def build_model(
 
     container = exudyn.SystemContainer()
     system = container.AddSystem()
-    ground = system.AddObject(items.ObjectGround())
     rho, ends = close_chain(machine, pose)
     meshes = tuple(mesh_link(link, settings.n_elements) for link in machine.links)
     body, platform_loads = _add_platform(system, items, machine, pose)
     nodes, sliders, moments = [], [], []
     for i, mesh in enumerate(meshes):
         own = _add_link(system, items, machine, mesh, i, ends[i], settings.axial_factor)
-        slider = _add_slider(system, items, machine, i, own[0], ground)
+        slider = _add_slider(system, items, machine, i, own[0])
         if force is not None and not machine.is_locked:
-            _add_drive(system, items, i, slider, ground, force, rho[i])
+            _add_drive(system, items, i, slider, force, rho[i])
         joint = system.AddMarker(items.MarkerNodePosition(nodeNumber=own[-1]))
         place = machine.platform.joints[i] - machine.platform.center
         at = system.AddMarker(items.MarkerBodyPosition(bodyNumber=body, localPosition=[*place, 0]))
@@ -216,9 +215,7 @@ def _add_link(
     return nodes
 
 
-def _add_slider(
-    system: Any, items: Any, machine: MachineData, i: int, first: int, ground: int
-) -> int:
+def _add_slider(system: Any, items: Any, machine: MachineData, i: int, first: int) -> int:
     """A mass with one coordinate, along which it takes the first node of its link."""
     guide = machine.guides[i]
     slider = system.AddNode(
@@ -258,7 +255,6 @@ def _add_drive(
     items: Any,
     i: int,
     slider: int,
-    ground: int,
     force: SliderForce,
     rho: float,
 ) -> None:
