@@ -61,6 +61,7 @@ class Basis(NamedTuple):
     modes: Callable[[Beam, Patches, int, Array], ModalBasis]  # of R modes, deflection at stations
     is_on_chord: bool  # both ends lie on the frame's axis: Y_j(L) = 0
     has_joints: bool = False  # includes rotary inertia at the joints
+    has_patches: bool = False  # includes the patches' mass and stiffness
 
 
 def build_basis(
@@ -401,6 +402,6 @@ BASES = Table(
     (
         Basis("pinned_pinned", _pinned_pinned, is_on_chord=True),
         Basis("pinned_free", _pinned_free, is_on_chord=False),
-        Basis("loaded", _loaded, is_on_chord=True, has_joints=True),
+        Basis("loaded", _loaded, is_on_chord=True, has_joints=True, has_patches=True),
     ),
 )

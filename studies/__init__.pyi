@@ -33,6 +33,7 @@ from .sweeps.show import best_cases, status_rows
 from .tuning.audit import audit
 from .tuning.run import run_tuning
 from .tuning.spec import load_tuning, parse_tuning
+from .twin.run import twin_design
 from .verify.run import verify_study
 
 __all__ = [
@@ -82,6 +83,7 @@ __all__ = [
     "simulate",
     "spillover_design",
     "status_rows",
+    "twin_design",
     "verify_study",
     "write_plant",
     "write_study",

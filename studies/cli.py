@@ -31,6 +31,7 @@ from studies.single.commands import add_commands as add_single
 from studies.spillover.commands import add_commands as add_spillover
 from studies.sweeps.commands import add_commands as add_sweeps
 from studies.tuning.commands import add_commands as add_tuning
+from studies.twin.commands import add_commands as add_twin
 from studies.verify.commands import add_commands as add_verify
 
 app = typer.Typer(
@@ -157,6 +158,7 @@ for add_commands in (
     add_export,
     add_atlas,
     add_spillover,
+    add_twin,
     add_bench,
 ):
     add_commands(app, console)

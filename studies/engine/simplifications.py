@@ -24,7 +24,7 @@ MISMATCH_LIMIT = 0.02
 
 def warn_of_patches(study: Study) -> None:
     """Warn of a plant without the patches' mass and stiffness where they move mode 1."""
-    if BASES[study.link.basis].has_joints:  # the basis that has all of the link
+    if BASES[study.link.basis].has_patches:
         return
     bare, real = (first_frequency(study, with_patches=value) for value in (False, True))
     shift = real / bare - 1
@@ -32,7 +32,7 @@ def warn_of_patches(study: Study) -> None:
     if abs(shift[i]) <= PATCH_LIMIT:
         return
     side = "lower" if shift[i] < 0 else "raise"
-    with_patches = next(name for name, basis in BASES.items() if basis.has_joints)
+    with_patches = next(name for name, basis in BASES.items() if basis.has_patches)
     warn_of_model(
         f"link.basis = {study.link.basis!r} leaves out the patches, which {side} mode 1 of link "
         f"{i + 1} by {100 * abs(shift[i]):.2g} %, from {bare[i]:.4g} to {real[i]:.4g} Hz between "

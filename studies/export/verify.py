@@ -124,7 +124,7 @@ def verify_floating(
 ) -> Verification:
     """C in double and single precision against the JAX controller."""
     checks, runs = [], {"JAX": reference}
-    with _load_code(exported, source, name, compiler, np.float64, np.float64) as code:
+    with load_code(exported, source, name, compiler, np.float64, np.float64) as code:
         sequences = {"recorded codes": reference.codes, **_hard_codes(exported, reference)}
         for label, codes in sequences.items():
             volts, faults = code.respond(codes * float(exported.controller.adc_step))
@@ -144,7 +144,7 @@ def verify_floating(
             exported.case,
             lambda codes: code.step(codes * step)[0].reshape(shape),
         )
-    with _load_code(exported, source, name, compiler, np.float32, np.float32) as code:
+    with load_code(exported, source, name, compiler, np.float32, np.float32) as code:
         volts, _ = code.respond(reference.codes * step)
         checks += _check_faults(exported, code, reference, bad, step, 0.0, ", float")
         single = _compare("", volts, reference.voltage, SINGLE)
@@ -168,7 +168,7 @@ def verify_fixed(
         exported.structure, exported.case, exported.controller, float(fixed.wires.dac_step)
     )
     shape = reference.codes.shape[1:]
-    with _load_code(exported, source, name, compiler, np.uint16, np.int32) as code:
+    with load_code(exported, source, name, compiler, np.uint16, np.int32) as code:
 
         def in_volts(codes: np.ndarray) -> np.ndarray:
             out = code.step(codes)[0].reshape(shape).astype(float)
@@ -229,7 +229,7 @@ def _model_responses(
     }
 
 
-def _load_code(
+def load_code(
     exported: FixedController,
     source: Source,
     name: str,
@@ -237,6 +237,16 @@ def _load_code(
     real: type,
     reference: type,
 ) -> AbstractContextManager[Code]:
+    """A controller's C code, compiled and loaded.
+
+    Args:
+        exported: the controller.
+        source: the same in C.
+        name: prefix of its functions.
+        compiler: command, from `find_compiler`.
+        real: NumPy's type of sensors and actuators.
+        reference: of the shaper.
+    """
     sizes = (
         3 * exported.n_patches,
         len(exported.channels.names),

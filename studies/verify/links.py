@@ -48,7 +48,7 @@ def check_links(study: Study) -> list[Assumption]:
     for i in range(3):
         beam, patches = _one(case.machine.beam, i), _one(case.machine.patches, i)
         beam = beam._replace(length=float(beam.length))
-        sections = _sections(beam, patches, BASES[kind].has_joints)
+        sections = _sections(beam, patches, BASES[kind].has_patches)
         x, line = _gauss(sections)
         edges = np.concatenate([_ends(patches, part) for part in ("sensor", "actuator")], axis=None)
         basis, shape, slope = jax.tree.map(
@@ -308,7 +308,7 @@ def _statics(
     actuator, sensor = _constants(beam, patches)
     count = structure.n_patches
     wanted = np.zeros((count, count))
-    for section in _sections(beam, patches, BASES[structure.basis].has_joints):
+    for section in _sections(beam, patches, BASES[structure.basis].has_patches):
         flexibility = (section.right - section.left) / section.stiffness
         for k in section.sensors:
             for m in section.actuators:

@@ -166,4 +166,4 @@ def _shaped_frequencies(study: Study) -> tuple[float, ...]:
         if all(row and row[0] > 0 for row in rows):
             return (float(np.mean([row[0] for row in rows])),)
     nominal = study.change(link__stiffness_factor=1.0)
-    return (float(first_frequency(nominal, BASES[study.control.basis].has_joints).mean()),)
+    return (float(first_frequency(nominal, BASES[study.control.basis].has_patches).mean()),)

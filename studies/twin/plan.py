@@ -1,0 +1,137 @@
+"""What acts on the twin from outside, on the grid of its time steps, and its electronics' numbers.
+
+References, disturbances and noise are the study's: shaped path, drive's feed-forward and seeded
+noise come from the same functions as in a run, evaluated at the end of each step of the twin.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxmodel.case import Case, Drive, Structure
+from jaxmodel.simulate import begin
+from studies.engine.programs import kept_jit
+from studies.twin.multibody import STEP, Settings
+
+
+class SignalPath(NamedTuple):
+    """Analogue and converter data."""
+
+    period: float  # of a sample [s]
+    antialias: float  # corner [rad/s]
+    highpass: float  # corner of a patch into its amplifier's input [rad/s]; 0: none
+    lag: float  # time constant of the actuators' amplifiers [s]; 0: none
+    adc_gain: float  # [1]
+    adc_bias: float  # [V]
+    adc_step: float  # [V]
+    adc_top: float  # highest code [1]
+    adc_noise: float  # rms at the ADC's input [V]
+
+
+class TwinPlan(NamedTuple):
+    """A run of N samples with n steps each, N n + 1 instants."""
+
+    n_samples: int
+    n_steps: int  # of the twin in a sample, n
+    pose: np.ndarray  # at the start [m, m, rad], (3,)
+    rho: np.ndarray  # reference of the sliders [m], (N n + 1, 3)
+    rho_rate: np.ndarray  # [m/s], (N n + 1, 3)
+    feedforward: np.ndarray  # of the drives [N], (N n + 1, 3)
+    disturbance: np.ndarray  # force on the sliders, held over a sample [N], (N, 3)
+    wrench: np.ndarray  # on the platform, held over a sample [N, N, N m], (N, 3)
+    steady_wrench: np.ndarray  # with which it is in equilibrium at the start, (3,)
+    noise: np.ndarray | None  # of the ADC, standard normal, (N, 3, K)
+    command_end: float  # when the shaped reference trajectory ends [s]
+    drive: Drive  # NumPy arrays
+    electronics: SignalPath
+
+    @property
+    def step(self) -> float:
+        """Length of a step [s]."""
+        return self.electronics.period / self.n_steps
+
+
+def plan_run(structure: Structure, case: Case, settings: Settings, after: float) -> TwinPlan:
+    """TwinPlan of a case's motion.
+
+    Args:
+        structure: static choices, feedback "sampled".
+        case: the numbers.
+        settings: resolution.
+        after: how long the run goes on after the reference trajectory [s].
+    """
+    period = float(np.asarray(case.electronics.period))
+    n_steps = settings.n_steps or 2 * max(round(period / (2 * STEP)), 1)
+    begun = _begin(structure._replace(substeps=n_steps // 2), case)
+    inputs, outline, loop = jax.tree.map(np.asarray, (begun.inputs, begun.outline, begun.loop))
+    end = float(outline.command_end)
+    count = min(round((end + after) / period) + 1, structure.n_steps)
+    wrench = inputs.wrench if inputs.wrench is not None else np.zeros((count, 3))
+    noise = inputs.adc_noise
+    return TwinPlan(
+        n_samples=count,
+        n_steps=n_steps,
+        pose=np.asarray(begun.state.plant.pose),
+        rho=_instants(inputs.rho, count),
+        rho_rate=_instants(inputs.rho_rate, count),
+        feedforward=(
+            np.zeros((count * n_steps + 1, 3))
+            if inputs.feedforward is None
+            else _instants(inputs.feedforward, count)
+        ),
+        disturbance=inputs.disturbance[:count],
+        wrench=wrench[:count],
+        steady_wrench=np.asarray(case.load.wrench, float),
+        noise=None if noise is None else noise[:count],
+        command_end=end,
+        drive=loop.drive,
+        electronics=_electronics(case, loop.controller),
+    )
+
+
+_begin = kept_jit(static_argnums=0)(begin)
+
+
+def _instants(x: np.ndarray, count: int) -> np.ndarray:
+    """From the points of each sample, (N, n + 1, 3), to all instants, (count n + 1, 3)."""
+    return np.concatenate([x[:count, :-1].reshape(-1, 3), x[count - 1, -1:]])
+
+
+def _electronics(case: Case, controller: object) -> SignalPath:
+    own = {name: float(np.asarray(getattr(controller, name))) for name in _CONVERTER}
+    electronics = case.electronics
+    return SignalPath(
+        period=float(np.asarray(electronics.period)),
+        antialias=float(np.asarray(electronics.antialias)),
+        highpass=float(np.asarray(electronics.sensor_highpass)),
+        lag=float(np.asarray(electronics.amplifier_lag)),
+        **own,
+    )
+
+
+_CONVERTER = ("adc_gain", "adc_bias", "adc_step", "adc_top", "adc_noise")
+
+
+def resting(plan: TwinPlan, duration: float) -> TwinPlan:
+    """The machine of a plan held where it starts, without disturbances and noise.
+
+    Args:
+        plan: of a motion.
+        duration: [s].
+    """
+    count = round(duration / plan.electronics.period)
+    instants = count * plan.n_steps + 1
+    still = np.zeros((instants, 3))
+    return plan._replace(
+        n_samples=count,
+        rho=np.broadcast_to(plan.rho[0], (instants, 3)),
+        rho_rate=still,
+        feedforward=np.broadcast_to(plan.feedforward[0], (instants, 3)),
+        disturbance=np.zeros((count, 3)),
+        wrench=np.broadcast_to(plan.steady_wrench, (count, 3)),
+        noise=None,
+        command_end=0.0,
+    )

@@ -1,0 +1,84 @@
+"""Reading the twin's signals from its coordinates, and putting voltages on it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from studies.twin.machine import MachineData
+from studies.twin.multibody import Model
+
+
+class Reader:
+    """Signals of a model at the last instant that was read."""
+
+    def __init__(self, model: Model, machine: MachineData) -> None:
+        self._model, self._machine = model, machine
+        self._now = model.reference
+        self._spans = [
+            slice(start, start + 4 * len(mesh.x))
+            for start, mesh in zip(model.link_start, model.meshes, strict=True)
+        ]
+        self._put: dict[int, tuple[float, ...]] = {}
+
+    def read(self) -> None:
+        """Take all coordinates of the present instant."""
+        data = self._model.system.systemData
+        self._now = self._model.reference + data.GetODE2Coordinates()
+
+    def _nodes(self, i: int) -> np.ndarray:
+        """x, y, x', y' of the nodes of a link, (n + 1, 4)."""
+        return self._now[self._spans[i]].reshape(-1, 4)
+
+    def deflection(self) -> np.ndarray:
+        """Of mid-span from the chord between the joints, to the left of it [m], (3,)."""
+        out = np.zeros(3)
+        for i, mesh in enumerate(self._model.meshes):
+            place = self._nodes(i)[:, :2]
+            chord, at = place[-1] - place[0], place[mesh.middle] - place[0]
+            out[i] = (chord[0] * at[1] - chord[1] * at[0]) / np.hypot(*chord)
+        return out
+
+    def voltages(self) -> np.ndarray:
+        """Of the sensors: lambda_s times the difference of the slopes at their ends [V], (3, K)."""
+        rows = []
+        for i, (mesh, link) in enumerate(zip(self._model.meshes, self._machine.links, strict=True)):
+            slope = self._nodes(i)[mesh.sensor_nodes, 2:]  # (K, 2, 2)
+            left, right = slope[:, 0], slope[:, 1]
+            sine = left[:, 0] * right[:, 1] - left[:, 1] * right[:, 0]
+            cosine = np.sum(left * right, axis=1)
+            rows.append(link.sensor_constant * np.arctan2(sine, cosine))
+        return np.stack(rows)
+
+    def pose(self) -> np.ndarray:
+        """Of the platform's reference point [m, m, rad], (3,)."""
+        start, center = self._model.platform_start, self._model.platform_center
+        x, y, phi = self._now[start : start + 3]
+        c, s = np.cos(phi), np.sin(phi)
+        return np.array([x - c * center[0] + s * center[1], y - s * center[0] - c * center[1], phi])
+
+    def put_voltages(self, voltage: np.ndarray) -> None:
+        """Pairs of moments lambda_a V at the ends of the actuators from now on.
+
+        Args:
+            voltage: [V], (3, K).
+        """
+        for i, (mesh, link) in enumerate(zip(self._model.meshes, self._machine.links, strict=True)):
+            moment = dict.fromkeys(self._model.moments[i], 0.0)
+            for (left, right), volts in zip(
+                mesh.actuator_nodes.tolist(), voltage[i].tolist(), strict=True
+            ):
+                moment[left] -= link.actuator_constant * volts
+                moment[right] += link.actuator_constant * volts
+            for node, size in moment.items():
+                self._set(self._model.moments[i][node], [0.0, 0.0, size])
+
+    def put_wrench(self, wrench: np.ndarray) -> None:
+        """Force and moment on the platform's reference point [N, N, N m], (3,)."""
+        force, moment = self._model.platform_loads
+        self._set(force, [wrench[0], wrench[1], 0.0])
+        self._set(moment, [0.0, 0.0, wrench[2]])
+
+    def _set(self, load: int, vector: list[float]) -> None:
+        if self._put.get(load) != (size := tuple(vector)):
+            self._model.system.SetLoadParameter(load, "loadVector", vector)
+            self._put[load] = size

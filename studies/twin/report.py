@@ -1,0 +1,217 @@
+"""Tables, JSON document and page of a twin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from studies.show.pages import page
+from studies.show.words import control_text, motion_text
+from studies.study.margin import margin_text
+from studies.twin.compare import BothModels, ChangedRun, Gap, deflection, gap, place, turn, voltage
+from studies.twin.result import FIGURE, TwinResult
+
+GAP_HEAD = ("after the motion, rms", "this model", "twin", "difference", "of the twin's")
+CAUSE_HEAD = (
+    "what is changed",
+    "mid-span without control",
+    "mid-span with control",
+    "voltages",
+)
+POLE_HEAD = ("linearised loop", "this model", "twin", "difference")
+
+
+class ComparedQuantity(NamedTuple):
+    """A quantity of both models."""
+
+    name: str
+    unit: str  # SI
+    is_controlled: bool
+    gap: Gap
+    entries: tuple[str, ...]
+
+
+def compared(result: TwinResult) -> list[ComparedQuantity]:
+    """Everything that is compared after the motion."""
+    links, own = ("link 1", "link 2", "link 3"), []
+
+    def add(
+        name: str, unit: str, quantity: Callable[[Any], np.ndarray], entries: tuple[str, ...]
+    ) -> None:
+        for is_controlled, both in ((False, result.runs.free), (True, result.runs.controlled)):
+            if name != "voltage" or is_controlled:
+                own.append(_compared(name, unit, is_controlled, both, quantity, entries, result))
+
+    add("mid-span deflection", "m", deflection, links)
+    add("voltage", "V", voltage, links)
+    add("platform, error of place", "m", place, ("x", "y"))
+    add("platform, error of angle", "rad", turn, ("phi",))
+    return own
+
+
+def _compared(
+    name: str,
+    unit: str,
+    is_controlled: bool,
+    both: BothModels,
+    quantity: Callable[[Any], np.ndarray],
+    entries: tuple[str, ...],
+    result: TwinResult,
+) -> ComparedQuantity:
+    return ComparedQuantity(
+        name=name,
+        unit=unit,
+        is_controlled=is_controlled,
+        gap=gap(both, quantity, result.window),
+        entries=entries,
+    )
+
+
+def gap_rows(result: TwinResult) -> list[list[str]]:
+    """Row of each quantity and link, and of all links together."""
+    rows = []
+    for one in compared(result):
+        factor, unit = {"m": (1e6, "µm"), "rad": (1e6, "µrad")}.get(one.unit, (1.0, one.unit))
+        control = "with control" if one.is_controlled else "without control"
+        for k, entry in enumerate(one.entries):
+            numbers = (one.gap.ours[k], one.gap.theirs[k], one.gap.difference[k])
+            texts = (f"{factor * x:.4g} {unit}" for x in numbers)
+            rows.append([f"{one.name}, {entry}, {control}", *texts, _percent(one.gap.share[k])])
+        if len(one.entries) > 1:
+            together = (float(np.linalg.norm(x)) / len(x) ** 0.5 for x in one.gap)
+            texts = (f"{factor * x:.4g} {unit}" for x in together)
+            rows.append([f"{one.name}, all together, {control}", *texts, _percent(one.gap.whole)])
+    return rows
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %" if np.isfinite(share) else "-"
+
+
+def cause_rows(found: list[ChangedRun]) -> list[list[str]]:
+    """Row of each change."""
+    return [
+        [one.text, *(_percent(x) for x in (one.free, one.controlled, one.voltage))] for one in found
+    ]
+
+
+def damping_ratios(result: TwinResult) -> tuple[np.ndarray, np.ndarray]:
+    """Of the first modes under control, ours and theirs [1], (n,) each."""
+    ours = result.loop.damping_ratio[0]
+    theirs = -result.first_modes.real / np.abs(result.first_modes)
+    return np.asarray(ours[np.isfinite(ours)]), theirs
+
+
+def pole_rows(result: TwinResult) -> list[list[str]]:
+    """Damping of the first modes, and the gain margin."""
+    ours, theirs = damping_ratios(result)
+    rows = [
+        [f"damping ratio of the first modes, {k + 1} of {len(ours)}", f"{a:.4f}", f"{b:.4f}"]
+        + [_percent(abs(a / b - 1))]
+        for k, (a, b) in enumerate(zip(ours, theirs, strict=True))
+    ]
+    growth, margin = result.growth, float(result.loop.gain_margin)
+    found = "not found" if np.isnan(growth.margin) else margin_text(growth.margin)
+    apart = _percent(abs(margin / growth.margin - 1))
+    return [*rows, ["gain margin, twin: by growth", margin_text(margin), found, apart]]
+
+
+def verdict(result: TwinResult) -> str:
+    """The comparison in a sentence."""
+    both, window = result.runs.controlled, result.window
+    margin = abs(float(result.loop.gain_margin) / result.growth.margin - 1)
+    text = (
+        f"in the {1e3 * (window.stop - window.start) * result.plan.electronics.period:.3g} ms "
+        f"after the motion, with control, mid-span deflections of all links differ by "
+        f"{_percent(gap(both, deflection, window).whole)} of their rms, voltages by "
+        f"{_percent(gap(both, voltage, window).whole)}"
+    )
+    if np.isnan(margin):
+        return f"{text}; no gain margin by growth was found"
+    seen = "growth 1 % beyond and decay 1 % below it seen"
+    return (
+        f"{text}; the gain margin by growth is {margin_text(result.growth.margin)}, "
+        f"{_percent(margin)} from the predicted {margin_text(float(result.loop.gain_margin))}"
+        f" ({seen if result.growth.is_confirmed else 'NOT confirmed by runs on both sides of it'})"
+    )
+
+
+def document(result: TwinResult) -> dict[str, Any]:
+    """All numbers, in SI units."""
+    ours, theirs = damping_ratios(result)
+    period, window = result.plan.electronics.period, result.window
+    return {
+        "title": result.study.title,
+        "verdict": verdict(result),
+        "exudyn": result.version,
+        "elements_per_link": result.settings.n_elements,
+        "steps_per_sample": result.plan.n_steps,
+        "command_end": result.plan.command_end,
+        "window_length": (window.stop - window.start) * period,
+        "compared": [
+            {
+                "quantity": one.name,
+                "unit": one.unit,
+                "with_control": one.is_controlled,
+                "entries": one.entries,
+                "rms_ours": one.gap.ours,
+                "rms_theirs": one.gap.theirs,
+                "rms_difference": one.gap.difference,
+                "relative": one.gap.share,
+                "relative_all": one.gap.whole,
+            }
+            for one in compared(result)
+        ],
+        "changes": [
+            {
+                "change": one.text,
+                "deflection_without_control": one.free,
+                "deflection_with_control": one.controlled,
+                "voltage": one.voltage,
+            }
+            for one in result.causes
+        ],
+        "damping_ratio": {"ours": ours, "theirs": theirs},
+        "gain_margin": {
+            "ours": float(result.loop.gain_margin),
+            "theirs": result.growth.margin,
+            "frequency_hz": result.growth.frequency,
+            "is_confirmed": result.growth.is_confirmed,
+        },
+        "study": result.study.model_dump(mode="json"),
+    }
+
+
+def report(result: TwinResult, images: Path | None = None) -> str:
+    """The page of a twin.
+
+    Args:
+        result: from `twin_design`.
+        images: folder with the figure; None: a page without.
+    """
+    electronics, period = result.study.electronics, result.plan.electronics.period
+    rounding = electronics.adc_range / 2**electronics.adc_bits / electronics.conditioner_gain
+    return page(
+        "twin/report.html",
+        images,
+        result.study,
+        study=result.study,
+        verdict=verdict(result),
+        motion=motion_text(result.study),
+        control=control_text(result.study),
+        version=result.version,
+        settings=result.settings,
+        step=period / result.plan.n_steps,
+        figure_file=f"{FIGURE}.png",
+        gap_head=GAP_HEAD,
+        gaps=gap_rows(result),
+        cause_head=CAUSE_HEAD,
+        causes=cause_rows(result.causes),
+        pole_head=POLE_HEAD,
+        poles=pole_rows(result),
+        growth=result.growth,
+        rounding=rounding,
+    )

@@ -1,0 +1,100 @@
+"""From a design to the comparison with its twin, and its folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from studies.engine.design import Design
+from studies.engine.progress import Phases
+from studies.engine.runs import resolved_study
+from studies.publish import REPORT, announce, check_folder, publish
+from studies.show import figures
+from studies.show.document import json_text
+from studies.twin.compare import BothRuns, TwinBench, causes, check_supported, our_runs, pair
+from studies.twin.law import check_compiler
+from studies.twin.margin import first_modes, margin_by_growth, ring
+from studies.twin.multibody import DEFAULT, Settings, load_exudyn
+from studies.twin.plots import side_by_side
+from studies.twin.report import document, report
+from studies.twin.result import FIGURE, TwinResult, expected_poles
+
+DOCUMENT = "twin.json"
+PHASES = ("ours", "theirs", "changes", "poles", "draw")
+
+
+def twin_design(
+    design: Design,
+    out: str | Path | None = None,
+    console: Console | None = None,
+    settings: Settings = DEFAULT,
+    has_changes: bool = True,
+) -> TwinResult:
+    """Repeat a design's loop with Exudyn and the exported controller, and compare.
+
+    Args:
+        design: what to repeat.
+        out: folder for the report, the figure and the numbers; None: nothing is written.
+        console: where messages go; default: standard output.
+        settings: resolution of the twin.
+        has_changes: also look for what the difference is made of, which takes most of the time.
+
+    Raises:
+        StudyError: Exudyn or a C compiler is missing, or a study that the twin cannot repeat.
+    """
+    exudyn = load_exudyn()
+    check_compiler()
+    check_supported(design.study)
+    console = console or Console(highlight=False, markup=False)
+    if out is not None:
+        check_folder(out)
+    with Phases(console, PHASES, is_quiet=console.quiet) as phases:
+        phases.begin("ours")
+        study = resolved_study(design.study)
+        bench = TwinBench(study, settings)
+        ours = our_runs(study, has_loop=True)
+        phases.begin("theirs", f"{bench.plan.n_samples * bench.plan.n_steps} steps, twice")
+        free, controlled = (pair(run, bench.run(run is ours[0])) for run in ours[::-1])
+        runs = BothRuns(free, controlled)
+        found = []
+        if has_changes:
+            phases.begin("changes", "stretch, mesh, step, modes and rounding, one at a time")
+            found = causes(bench, ours, runs)
+        phases.begin("poles", "damping by decay, gain margin by growth")
+        loop = ours[0].loop
+        assert loop is not None
+        # implicit steps lower the frequencies of modes near the sample rate, whose aliases then
+        # fall elsewhere: loops near their margin need smaller steps than motions
+        fine = settings._replace(n_steps=2 * bench.plan.n_steps)
+        arguments = study, bench.machine, TwinBench(study, fine).plan
+        result = TwinResult(
+            study=study,
+            plan=bench.plan,
+            settings=settings,
+            version=f"Exudyn {exudyn.__version__}",
+            runs=runs,
+            causes=found,
+            loop=loop,
+            first_modes=first_modes(
+                ring(*arguments, 1.0, fine),
+                bench.plan.electronics.period,
+                expected_poles(loop),
+            ),
+            growth=margin_by_growth(*arguments, float(loop.gain_margin), fine),
+        )
+        phases.begin("draw")
+        if out is not None:
+            _write(Path(out), result)
+    if out is not None:
+        announce(console, Path(out) / REPORT, ", numbers and figure in the same folder")
+    return result
+
+
+def _write(out: Path, result: TwinResult) -> None:
+    with publish(out) as staging:
+        with figures.styled():
+            figures.save(side_by_side(result.plan, result.runs), staging, FIGURE)
+        text = json_text("twin", document(result))
+        (staging / DOCUMENT).write_text(text, encoding="utf-8")
+        (staging / REPORT).write_text(report(result, staging), encoding="utf-8")
