@@ -303,6 +303,7 @@ def test_a_check_that_cannot_run_fails(checks, capsys):
 def test_a_damaged_outcome_is_none(checks, capsys):
     call(capsys, "verify")
     (file,) = passport.chosen_folder().glob("passport-*")
-    for text in ("", "{", "[1]", '{"title": "", "passed": "many"}'):
+    endless = '{"title": "", "passed": Infinity}'
+    for text in ("", "{", "[1]", '{"title": "", "passed": "many"}', endless, "[" * 100_000):
         file.write_text(text)
         assert passport.find(paper_study()) is None
