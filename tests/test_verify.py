@@ -10,13 +10,14 @@ from typing import NamedTuple
 import jsonschema
 import numpy as np
 import pytest
+from rich.console import Console
 
 import studies
 from studies import passport
 from studies.show.document import schema
 from studies.study.cases import as_arrays, build_case, build_structure
 from studies.study.spec import load_study, paper_study, parse_study
-from studies.verify import loops, run, stepping, trajectories
+from studies.verify import commands, loops, run, stepping, trajectories
 from studies.verify.rows import Assumption, largest, worst_relative
 from tests.machines import random_machine
 from tests.test_cli import run as call
@@ -340,6 +341,18 @@ def test_the_command(checks, capsys, tmp_path):
     assert "failed: x" in passport.find(heavy).text and passport.find(paper_study()).failed == ()
     # whatever its title
     assert passport.find(heavy.model_copy(update={"title": "heavy"})).failed == ("x",)
+
+
+@pytest.mark.parametrize(("width", "columns"), [(60, 4), (80, 5), (120, 6)])
+def test_the_table_fits_the_terminal(checks, capsys, width, columns):
+    word = "pinned_pinned"
+    checks["one"] = lambda _: [row(1e-4)._replace(assumption=f"links ({word})", against=word)]
+    console = Console(width=width)
+    commands._print(run.verify_study(), console)
+    table, text = capsys.readouterr().out.split("└")
+    assert f"({word})" in table and "…" not in table and "1 of 1" in text
+    lines = table.splitlines()
+    assert max(map(len, lines)) <= width and lines[3].count("│") == columns + 1
 
 
 def test_a_check_that_cannot_run_fails(checks, capsys):
